@@ -1,0 +1,88 @@
+"""Steps before the first contact in closed form.
+
+An undeformed body that moves with one velocity and touches nothing only falls, so its steps need no grid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from neuma_lib.sim.model import Body, MPMModel, contact_clearance
+from neuma_lib.sim.trajectory import Trajectory
+
+_MARGIN = 1e-3  # distance from the zone of contact at which free flight ends [dx]
+
+
+def free_flight_steps(
+    model: MPMModel,
+    bodies: Sequence[Body],
+    x0: Tensor,
+    v0: Tensor,
+    mass: Tensor,
+    vol0: Tensor,
+    F0: Tensor | None,
+    C0: Tensor | None,
+    last: int,
+) -> int:
+    """Number of leading steps, at most `last`, in which nothing but gravity acts and nothing can deform."""
+    if torch.is_grad_enabled():
+        if v0.ndim == 2 and v0.requires_grad or any(t is not None and t.requires_grad for t in (F0, C0)):
+            return 0
+    with torch.no_grad():
+        if v0.ndim == 2 and not (v0 == v0[0]).all():
+            return 0
+        if F0 is not None and not (F0 == torch.eye(3, dtype=F0.dtype, device=F0.device)).all():
+            return 0
+        if C0 is not None and C0.any():
+            return 0
+        clear = _clear_of_walls(model, x0, v0 if v0.ndim == 1 else v0[0], last)
+        if clear and not all(_at_rest(model, body, x0, mass, vol0) for body in bodies):
+            return 0
+    return clear
+
+
+def _clear_of_walls(model: MPMModel, x0: Tensor, v0: Tensor, last: int) -> int:
+    """Number of leading ballistic steps that start with all particles out of reach of the walls."""
+    box = torch.stack([x0.amin(dim=0), x0.amax(dim=0)]).double().cpu()
+    n = torch.arange(last, dtype=torch.float64)[:, None, None]
+    gravity = torch.tensor(model.gravity, dtype=torch.float64)
+    box = box + n * model.dt * v0.double().cpu() + model.dt**2 * n * (n + 1) / 2 * gravity
+    touching = contact_clearance(model, box) <= _MARGIN * model.dx
+    return int(touching.int().argmax()) if touching.any() else last
+
+
+def _at_rest(model: MPMModel, body: Body, x0: Tensor, mass: Tensor, vol0: Tensor) -> bool:
+    """Whether the law leaves F = I as it is and without a stress that could be felt in a step."""
+    eye = torch.eye(3, dtype=x0.dtype, device=x0.device)[None]
+    elastic, plastic = body.law.weights()
+    tau = body.law.elasticity.evaluate(eye, elastic)
+    F = body.law.plasticity.evaluate(eye, plastic)
+    eps = torch.finfo(x0.dtype).eps
+    kick = float(tau.abs().max() * vol0[body.start] / mass[body.start]) * model.dt / model.dx
+    return kick <= eps and float((F - eye).abs().max()) <= 4 * eps
+
+
+def ballistic(
+    model: MPMModel, start: tuple[Tensor, ...], tracers: Tensor | None, frames: Sequence[int]
+) -> Trajectory:
+    """Free flight in closed form: x_n = x0 + n dt v0 + g dt^2 n (n + 1) / 2, v_n = v0 + n dt g."""
+    x0, v0, F0, C0 = start
+    T = len(frames)
+    n = torch.tensor(frames, dtype=torch.float64)[:, None, None]
+    gravity = torch.tensor(model.gravity, dtype=torch.float64)
+    fall, gain = (
+        t.to(dtype=x0.dtype, device=x0.device)
+        for t in (model.dt**2 * n * (n + 1) / 2 * gravity, model.dt * n * gravity)
+    )
+    elapsed = (model.dt * n).to(dtype=x0.dtype, device=x0.device)
+    return Trajectory(
+        tuple(frames),
+        x0 + (elapsed * v0 + fall),
+        v0 + gain,
+        F0.expand(T, *F0.shape),
+        C0.expand(T, *C0.shape),
+        None if tracers is None else tracers + (elapsed * v0[0] + fall).detach(),
+    )

@@ -1,0 +1,155 @@
+"""What stays constant during a simulation: grid, time step, gravity, walls, and which law moves which particles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from neuma_lib.errors import InputError
+from neuma_lib.materials.base import Law
+
+WALLS = ("x_min", "x_max", "y_min", "y_max", "z_min", "z_max")
+CONDITIONS = ("no_slip", "slip", "sticky")
+COURANT_LIMIT = 0.8
+"""Largest stable c dt / dx. Between 1.0 and 1.2 a rollout still looks finite while its gradients explode."""
+
+
+@dataclass(frozen=True)
+class MPMModel:
+    """Constants of the material point method on the unit cube.
+
+    Node i of an axis lies at i dx, for i = 0 ... grid - 1, with dx = 1 / grid. Particles are free where their
+    stencil sees no wall node, ``(wall_cells + 0.5) dx < x < 1 - (wall_cells + 1.5) dx``, and the stencil itself
+    exists for ``0.5 dx <= x < 1 - 1.5 dx``.
+
+    Attributes:
+        grid: nodes along an edge of the cube.
+        dt: time step [s].
+        gravity: acceleration [m/s^2], y is up.
+        boundary: condition of the walls, one name for all or one a wall (keys `WALLS`, others stay "no_slip").
+            "no_slip" stops a wall node whose velocity points into the wall, "slip" stops only the component along
+            the wall's normal when it points into the wall, "sticky" stops wall nodes always.
+        wall_cells: thickness of the walls [nodes].
+
+    Raises:
+        InputError: a value is out of range or unknown.
+    """
+
+    grid: int
+    dt: float
+    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)
+    boundary: str | Mapping[str, str] | tuple[str, ...] = "no_slip"
+    wall_cells: int = 1
+
+    def __post_init__(self):
+        if not isinstance(self.grid, int) or self.grid < 6:
+            raise InputError(f"grid = {self.grid!r}: give the number of nodes along an edge, at least 6")
+        if not (isinstance(self.dt, (int, float)) and math.isfinite(self.dt) and self.dt > 0):
+            raise InputError(f"dt = {self.dt!r}: give a positive time step in seconds")
+        gravity = tuple(float(g) for g in self.gravity)
+        if len(gravity) != 3 or not all(math.isfinite(g) for g in gravity):
+            raise InputError(f"gravity = {self.gravity!r}: give three finite accelerations in m/s^2")
+        if not isinstance(self.wall_cells, int) or not 1 <= self.wall_cells <= (self.grid - 4) // 2:
+            raise InputError(
+                f"wall_cells = {self.wall_cells!r}: give a whole number from 1 to {(self.grid - 4) // 2} on this grid"
+            )
+        object.__setattr__(self, "gravity", gravity)
+        object.__setattr__(self, "boundary", _six_conditions(self.boundary))
+
+    @property
+    def dx(self) -> float:
+        """Node spacing [m]."""
+        return 1.0 / self.grid
+
+    @property
+    def stencil_range(self) -> tuple[float, float]:
+        """Half-open interval of coordinates whose three nodes all exist [m]."""
+        return 0.5 * self.dx, 1.0 - 1.5 * self.dx
+
+    @property
+    def free_range(self) -> tuple[float, float]:
+        """Open interval of coordinates that no wall node influences [m]."""
+        return (self.wall_cells + 0.5) * self.dx, 1.0 - (self.wall_cells + 1.5) * self.dx
+
+    def with_dt(self, dt: float) -> MPMModel:
+        """The same model with another time step [s]."""
+        return replace(self, dt=dt)
+
+    def courant(self, law: Law, rho: float) -> float:
+        """Courant number c dt / dx for the wave speed of the law at F = I and a density rho [kg/m^3]."""
+        return law.wave_speed(rho) * self.dt / self.dx
+
+    def check_courant(self, law: Law, rho: float) -> float:
+        """Courant number of the law.
+
+        Raises:
+            InputError: above `COURANT_LIMIT`; names the largest stable time step.
+        """
+        number = self.courant(law, rho)
+        if not number <= COURANT_LIMIT:
+            stable = self.dt * COURANT_LIMIT / number
+            raise InputError(
+                f"law {law.name!r} has Courant number {number:.3g} > {COURANT_LIMIT} on a {self.grid}^3 grid with "
+                f"dt = {self.dt:g} s: the largest stable step is dt = {stable:.3g} s (or use a coarser grid)"
+            )
+        return number
+
+
+@dataclass(frozen=True)
+class Body:
+    """Particles ``start`` to ``stop`` (excluded) follow ``law``."""
+
+    law: Law
+    start: int
+    stop: int
+
+
+def as_bodies(law: Law | Sequence[Body], count: int) -> tuple[Body, ...]:
+    """Bodies that cover `count` particles in order, each particle once; one law alone moves all of them.
+
+    Raises:
+        InputError: the ranges overlap, leave a gap, or do not end at `count`.
+    """
+    if isinstance(law, Law):
+        return (Body(law, 0, count),)
+    bodies = tuple(law)
+    expected = 0
+    for body in bodies:
+        if body.start != expected or body.stop <= body.start:
+            raise InputError(
+                f"body {body.law.name!r} has particles {body.start} to {body.stop}: it must start at {expected}, "
+                "where the one before it ends, and hold at least one particle"
+            )
+        expected = body.stop
+    if expected != count:
+        raise InputError(f"the bodies cover particles 0 to {expected}, but there are {count} particles")
+    return bodies
+
+
+def contact_clearance(model: MPMModel, x: Tensor) -> Tensor:
+    """Smallest distance of particles x (..., N, 3) to the zone that feels a wall [m], shape (...,); <= 0: contact."""
+    low, high = model.free_range
+    return torch.minimum(x - low, high - x).amin(dim=(-2, -1))
+
+
+def _six_conditions(boundary: str | Mapping[str, str] | Sequence[str]) -> tuple[str, ...]:
+    """Condition of each wall in the order of `WALLS`."""
+    if isinstance(boundary, str):
+        conditions = (boundary,) * 6
+    elif isinstance(boundary, Mapping):
+        unknown = sorted(set(boundary) - set(WALLS))
+        if unknown:
+            raise InputError(f"boundary: unknown wall {unknown[0]!r}; walls are {', '.join(WALLS)}")
+        conditions = tuple(boundary.get(wall, "no_slip") for wall in WALLS)
+    else:
+        conditions = tuple(boundary)
+        if len(conditions) != 6:
+            raise InputError(f"boundary: give one condition, or one for each of {', '.join(WALLS)}")
+    for condition in conditions:
+        if condition not in CONDITIONS:
+            raise InputError(f"boundary = {condition!r} is unknown; choose one of {', '.join(CONDITIONS)}")
+    return conditions

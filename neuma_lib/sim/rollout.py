@@ -1,0 +1,196 @@
+"""The one entry to the simulator, for ground truth, velocity estimation, training and evaluation alike.
+
+Callers differ in law, start and set of frames only. The gradient is one reverse loop over the stored states, not a
+graph of steps: autograd sees a single function from (x0, v0, F0, C0, weights of the laws) to the frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from neuma_lib.errors import InputError
+from neuma_lib.materials.base import Law
+from neuma_lib.sim.free_flight import ballistic, free_flight_steps
+from neuma_lib.sim.model import Body, MPMModel, as_bodies
+from neuma_lib.sim.simulation import KEEP, Simulation
+from neuma_lib.sim.trajectory import Trajectory
+
+
+def rollout(
+    model: MPMModel,
+    law: Law | Sequence[Body],
+    x0: Tensor,
+    v0: Tensor,
+    mass: Tensor,
+    vol0: Tensor,
+    *,
+    F0: Tensor | None = None,
+    C0: Tensor | None = None,
+    steps: int,
+    frames: Sequence[int],
+    tracers: Tensor | None = None,
+    skip_free_flight: bool = True,
+    keep: str = "auto",
+) -> Trajectory:
+    """Simulate particles and return their states at the frames.
+
+    Differentiable with respect to the weights of the laws, x0, v0, F0 and C0; tracers carry no gradient. Device and
+    precision (float32 or float64) are those of x0.
+
+    Args:
+        model: grid, time step, gravity and walls.
+        law: material of all particles, or bodies that each have a law and a range of particles on one grid.
+        x0: initial positions [m], shape (N, 3).
+        v0: initial velocities [m/s], shape (N, 3), or (3,) for one common velocity.
+        mass: particle masses [kg], shape (N,).
+        vol0: initial particle volumes [m^3], shape (N,).
+        F0: initial deformation gradients, shape (N, 3, 3); identity if None.
+        C0: initial affine velocities [1/s], shape (N, 3, 3); zero if None.
+        steps: number of time steps; the simulation ends at the last frame, which must not lie beyond.
+        frames: steps whose states are returned, strictly increasing, 0 is the start.
+        tracers: positions of passive points that follow the grid's velocity [m], shape (M, 3).
+        skip_free_flight: pass over the steps before the first contact in closed form while the state is undeformed
+            and moves with one velocity. Equal to the simulated flight to round-off, in value and gradient; not used
+            where a gradient could deform the state during the flight (v0 of shape (N, 3), F0 or C0 that require it).
+        keep: what the gradient keeps a step: "states" only (x, v, C, F; the rest is computed again), "all", or
+            "auto", which keeps all that fits `CACHE_LIMIT`.
+
+    Raises:
+        InputError: shapes, precision, frames, a particle outside the grid at the start, bodies that do not fit.
+        NonFiniteError: a particle became non-finite or left the grid; has attributes step and particle.
+    """
+    frames = _checked_frames(frames, steps)
+    bodies = as_bodies(law, len(x0))
+    _check_particles(model, x0, v0, mass, vol0, F0, C0, tracers)
+    if keep not in KEEP:
+        raise InputError(f"keep = {keep!r}: choose one of {', '.join(KEEP)}")
+
+    flight = free_flight_steps(model, bodies, x0, v0, mass, vol0, F0, C0, frames[-1]) if skip_free_flight else 0
+    eye = torch.eye(3, dtype=x0.dtype, device=x0.device).expand(len(x0), 3, 3)
+    start = (x0, v0.expand_as(x0), eye if F0 is None else F0, torch.zeros_like(eye) if C0 is None else C0)
+    seen = sum(n < flight for n in frames)
+    parts = []
+    if seen:
+        parts.append(ballistic(model, start, tracers, frames[:seen]))
+    if seen < len(frames):
+        landed = ballistic(model, start, tracers, [flight])
+        start = (landed.x[0], landed.v[0], start[2], start[3]) if flight else start
+        tracers = None if tracers is None else landed.tracers[0]
+        parts.append(_simulate(model, bodies, start, mass, vol0, tracers, flight, frames[seen:], keep))
+    return parts[0] if len(parts) == 1 else _joined(*parts)
+
+
+def _simulate(
+    model: MPMModel,
+    bodies: tuple[Body, ...],
+    start: tuple[Tensor, ...],
+    mass: Tensor,
+    vol0: Tensor,
+    tracers: Tensor | None,
+    first: int,
+    frames: tuple[int, ...],
+    keep: str,
+) -> Trajectory:
+    """Step from the state `start` at step `first` to the last frame."""
+    laws = {id(body.law): body.law for body in bodies}
+    law_weights = {key: law.weights() for key, law in laws.items()}
+    flat = [w for elastic, plastic in law_weights.values() for w in (*elastic, *plastic)]
+    inputs = (*start, *flat)
+    differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
+    simulation = Simulation(model, bodies, law_weights, start[0], frames[-1] - first, first, differentiable, keep)
+    simulation.set_mass(mass, vol0)
+    x, v, F, C, moved = _Rollout.apply(simulation, [n - first for n in frames], tracers, *inputs)
+    return Trajectory(tuple(frames), x, v, F, C, moved)
+
+
+class _Rollout(torch.autograd.Function):
+    """All steps as one function of the start and the weights."""
+
+    @staticmethod
+    def forward(ctx, simulation, frames, tracers, x0, v0, F0, C0, *weights):
+        ctx.simulation, ctx.frames = simulation, frames
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*weights)
+        result = simulation.run((x0, v0, F0, C0), weights, frames, tracers)
+        if tracers is not None:
+            ctx.mark_non_differentiable(result[-1])
+        return result
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad_x, grad_v, grad_F, grad_C, _):
+        start, weights = ctx.simulation.run_adjoint(ctx.saved_tensors, ctx.frames, (grad_x, grad_v, grad_F, grad_C))
+        return None, None, None, *start, *weights
+
+
+def _joined(first: Trajectory, second: Trajectory) -> Trajectory:
+    """One trajectory after the other."""
+    joined = {
+        name: torch.cat([getattr(first, name), getattr(second, name)])
+        for name in ("x", "v", "F", "C", "tracers")
+        if getattr(first, name) is not None
+    }
+    return Trajectory(first.frames + second.frames, **joined)
+
+
+def _checked_frames(frames: Sequence[int], steps: int) -> tuple[int, ...]:
+    frames = tuple(int(n) for n in frames)
+    if not frames or frames[0] < 0 or any(b <= a for a, b in zip(frames, frames[1:], strict=False)):
+        raise InputError(f"frames = {list(frames)}: give at least one step, from 0 on, in strictly increasing order")
+    if frames[-1] > steps:
+        raise InputError(f"frames end at step {frames[-1]}, but the rollout has {steps} steps")
+    return frames
+
+
+def _check_particles(
+    model: MPMModel,
+    x0: Tensor,
+    v0: Tensor,
+    mass: Tensor,
+    vol0: Tensor,
+    F0: Tensor | None,
+    C0: Tensor | None,
+    tracers: Tensor | None,
+) -> None:
+    """Shapes, precision, device, and the values that a user can get wrong."""
+    if x0.ndim != 2 or x0.shape[1] != 3 or len(x0) == 0:
+        raise InputError(f"x0 has shape {tuple(x0.shape)}: give positions of at least one particle, (N, 3)")
+    if x0.dtype not in (torch.float32, torch.float64):
+        raise InputError(f"x0 is {x0.dtype}: use float32 or float64")
+    N = len(x0)
+    shapes = {
+        "v0": (v0, [(N, 3), (3,)]),
+        "mass": (mass, [(N,)]),
+        "vol0": (vol0, [(N,)]),
+        "F0": (F0, [(N, 3, 3)]),
+        "C0": (C0, [(N, 3, 3)]),
+    }
+    for name, (value, allowed) in shapes.items():
+        if value is None:
+            continue
+        if tuple(value.shape) not in allowed:
+            raise InputError(f"{name} has shape {tuple(value.shape)}: expected {' or '.join(map(str, allowed))}")
+        if value.dtype != x0.dtype or value.device != x0.device:
+            raise InputError(
+                f"{name} is {value.dtype} on {value.device}, but x0 is {x0.dtype} on {x0.device}: give both alike"
+            )
+        if not torch.isfinite(value).all():
+            raise InputError(f"{name} has a value that is not finite")
+    for name, value in (("mass", mass), ("vol0", vol0)):
+        if not (value > 0).all():
+            raise InputError(f"{name} must be positive for every particle")
+    if tracers is not None and (tracers.ndim != 2 or tracers.shape[1] != 3 or tracers.dtype != x0.dtype):
+        raise InputError(f"tracers: give positions of shape (M, 3) as {x0.dtype}")
+    low, high = model.stencil_range
+    outside = ~((x0 >= low) & (x0 < high)).all(dim=1)
+    if outside.any():
+        p = int(outside.nonzero()[0])
+        place = ", ".join(f"{value:.4g}" for value in x0[p].tolist())
+        raise InputError(
+            f"{int(outside.sum())} of {N} particles start outside the grid, first particle {p} at ({place}) m: "
+            f"keep the object within [{low:.4g}, {high:.4g}) m on every axis (0.5 dx and 1.5 dx from the walls)"
+        )

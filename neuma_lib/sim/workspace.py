@@ -1,0 +1,210 @@
+"""Buffers of a rollout and the launches that work on them, made once for a size and used again.
+
+Nothing here is allocated per step: all launches are recorded on fixed memory and only their slot numbers change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from neuma_lib.sim import kernels
+from neuma_lib.sim.adjoint_kernels import adjoint_kernels
+from neuma_lib.sim.kernels import NEVER, forward_kernels, warp_types
+from neuma_lib.sim.model import MPMModel
+
+_CONDITION_CODES = {"no_slip": kernels.NO_SLIP, "slip": kernels.SLIP, "sticky": kernels.STICKY}
+
+
+class Layout(NamedTuple):
+    """All that decides the size and content of a workspace."""
+
+    model: MPMModel
+    particles: int
+    dtype: torch.dtype
+    device: torch.device
+    states: int  # slots of x, v, C, F: steps + 1 to differentiate, else 2
+    kept: int  # slots of what a step computes on the way: steps to keep it for the reverse loop, else 1
+    differentiable: bool
+
+
+class Workspace:
+    """State, grid and gradients of N particles in `layout.states` and `layout.kept` slots.
+
+    Attributes:
+        x, v: positions [m] and velocities [m/s], shape (states, N, 3).
+        C, F: affine velocities [1/s] and deformation gradients, shape (states, N, 3, 3).
+        tau, F_trial: Kirchhoff stresses [Pa] and trial deformation gradients, shape (kept, N, 3, 3).
+        grid, grid_v: momentum [kg m/s] and mass [kg], velocity [m/s] and indicator of mass, shape (kept, grid^3, 4).
+        mass, vol0: particle masses [kg] and initial volumes [m^3], shape (N,).
+        faults: first step and particle of a non-finite value and of one outside the grid, shape (2,).
+        grad_*: gradients of the above for one step, without a slot axis.
+    """
+
+    def __init__(self, layout: Layout):
+        self.layout = layout
+        self._views: dict[int, wp.array] = {}
+        N, nodes = layout.particles, layout.model.grid**3
+        states, kept = layout.states, layout.kept
+        self.x, self.v = self._vectors(states, N), self._vectors(states, N)
+        self.C, self.F = self._matrices(states, N), self._matrices(states, N)
+        self.tau, self.F_trial = self._matrices(kept, N), self._matrices(kept, N)
+        self.grid, self.grid_v = self._nodes(kept, nodes), self._nodes(kept, nodes)
+        self.mass, self.vol0 = self._scalars(N), self._scalars(N)
+        self.faults = self._buffer((2,), None, torch.int64)
+        self.faults.fill_(NEVER)
+        self._constants = _grid_constants(layout.model, layout.dtype)
+        self._record_forward()
+        if layout.differentiable:
+            self.grad_x, self.grad_v = self._vectors(N), self._vectors(N)
+            self.grad_C, self.grad_F = self._matrices(N), self._matrices(N)
+            self.grad_F_trial, self.grad_tau = self._matrices(N), self._matrices(N)
+            self.grad_F_elastic = self._matrices(N)
+            self.grad_grid = self._nodes(nodes)
+            self._record_adjoint()
+
+    def state(self, step: int) -> int:
+        """Slot of the state at the start of a step."""
+        return step % self.layout.states
+
+    def kept(self, step: int) -> int:
+        """Slot of what a step computes on the way."""
+        return step % self.layout.kept
+
+    def transfer_to_grid(self, step: int) -> None:
+        """tau and the state of a step to the velocities of the nodes."""
+        kept = self.kept(step)
+        self.grid[kept].zero_()
+        _run(self._p2g, self.state(step), kept)
+        _run(self._grid_update, kept)
+
+    def transfer_to_particles(self, step: int) -> None:
+        """Velocities of the nodes to x, v and C after the step, and to F_trial."""
+        _run(self._g2p, self.state(step), self.state(step + 1), self.kept(step), step)
+
+    def trial_deformation(self, step: int) -> None:
+        """F_trial of a step again, from the F before and the C after it."""
+        _run(self._trial, self.state(step), self.state(step + 1), self.kept(step))
+
+    def tracer_launch(self, tracers: Tensor) -> wp.Launch:
+        """A recorded launch, for :meth:`move_tracers`, that advects `tracers` (M, 3) in place."""
+        kernel = forward_kernels(self.layout.dtype).advect_tracers
+        positions = wp.from_torch(tracers, dtype=warp_types(self.layout.dtype).vec3)
+        return self._record(kernel, len(tracers), 0, self.grid_v, positions)
+
+    def move_tracers(self, launch: wp.Launch, step: int) -> None:
+        """Advect tracers by the node velocities of a step."""
+        _run(launch, self.kept(step))
+
+    def transfer_adjoint(self, step: int) -> None:
+        """Gradients of the state after a step and of F_trial to those of the state before it and of tau.
+
+        grad_x, grad_v and grad_C hold the former on entry and the latter on return; grad_F is set to the part that
+        comes through F_trial.
+        """
+        state, after, kept = self.state(step), self.state(step + 1), self.kept(step)
+        self.grad_grid.zero_()
+        _run(self._g2p_adjoint, state, after, kept)
+        _run(self._grid_adjoint, kept)
+        _run(self._p2g_adjoint, state, kept)
+
+    @contextmanager
+    def stream(self) -> Iterator[None]:
+        """Launch on torch's current stream, so that torch and Warp see each other's results in order."""
+        if self.layout.device.type != "cuda":
+            yield
+            return
+        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(self.layout.device))):
+            yield
+
+    def _buffer(self, shape: tuple[int, ...], warp_type, dtype: torch.dtype | None = None) -> Tensor:
+        """Zeros, and Warp's view of them for the launches."""
+        tensor = torch.zeros(shape, dtype=dtype or self.layout.dtype, device=self.layout.device)
+        self._views[id(tensor)] = wp.from_torch(tensor, dtype=warp_type)
+        return tensor
+
+    def _scalars(self, *lead: int) -> Tensor:
+        return self._buffer(lead, warp_types(self.layout.dtype).real)
+
+    def _vectors(self, *lead: int) -> Tensor:
+        return self._buffer((*lead, 3), warp_types(self.layout.dtype).vec3)
+
+    def _matrices(self, *lead: int) -> Tensor:
+        return self._buffer((*lead, 3, 3), warp_types(self.layout.dtype).mat33)
+
+    def _nodes(self, *lead: int) -> Tensor:
+        return self._buffer((*lead, 4), warp_types(self.layout.dtype).vec4)
+
+    def _record(self, kernel: wp.Kernel, dim: int | tuple[int, ...], *args: int | Tensor | wp.array) -> wp.Launch:
+        inputs = [self._views[id(arg)] if isinstance(arg, Tensor) else arg for arg in args]
+        device = wp.device_from_torch(self.layout.device)
+        return wp.launch(kernel, dim=dim, inputs=[self._constants, *inputs], device=device, record_cmd=True)
+
+    def _record_forward(self) -> None:
+        k = forward_kernels(self.layout.dtype)
+        N, nodes = self.layout.particles, self.layout.model.grid**3
+        self._p2g = self._record(
+            k.p2g, N, 0, 0, self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.grid
+        )
+        self._grid_update = self._record(k.grid_update, nodes, 0, self.grid, self.grid_v)
+        self._g2p = self._record(
+            k.g2p, N, 0, 0, 0, 0, self.grid_v, self.x, self.v, self.C, self.F, self.F_trial, self.faults
+        )
+        self._trial = self._record(k.trial_deformation, N, 0, 0, 0, self.C, self.F, self.F_trial)
+
+    def _record_adjoint(self) -> None:
+        k = adjoint_kernels(self.layout.dtype)
+        N, nodes = self.layout.particles, self.layout.model.grid**3
+        self._g2p_adjoint = self._record(
+            k.g2p_adjoint, N, 0, 0, 0, self.x, self.v, self.C, self.F, self.grid_v,
+            self.grad_v, self.grad_C, self.grad_F_trial, self.grad_x, self.grad_F, self.grad_grid,
+        )  # fmt: skip
+        self._grid_adjoint = self._record(k.grid_adjoint, nodes, 0, self.grid, self.grad_grid)
+        self._p2g_adjoint = self._record(
+            k.p2g_adjoint, N, 0, 0, self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.grad_grid,
+            self.grad_x, self.grad_v, self.grad_C, self.grad_tau,
+        )  # fmt: skip
+
+
+class WorkspaceLease:
+    """A workspace that goes back to the pool when nobody holds the lease, for example when a graph is freed."""
+
+    _idle: list[Workspace] = []
+    _most_idle = 4
+
+    def __init__(self, layout: Layout):
+        for i, workspace in enumerate(self._idle):
+            if workspace.layout == layout:
+                self.workspace = self._idle.pop(i)
+                self.workspace.faults.fill_(NEVER)
+                return
+        self.workspace = Workspace(layout)
+
+    def __del__(self):
+        workspace = getattr(self, "workspace", None)
+        if workspace is not None:
+            self._idle.append(workspace)
+            del self._idle[: -self._most_idle]
+
+
+def _run(launch: wp.Launch, *numbers: int) -> None:
+    """Launch with these values of the leading integer parameters (slots, step), which follow the constants."""
+    for i, number in enumerate(numbers):
+        launch.set_param_at_index_from_ctype(i + 1, number)
+    launch.launch()
+
+
+def _grid_constants(model: MPMModel, dtype: torch.dtype):
+    t = warp_types(dtype)
+    c = t.GridConstants()
+    c.n, c.wall_cells = model.grid, model.wall_cells
+    c.walls = t.walls6(*(_CONDITION_CODES[condition] for condition in model.boundary))
+    c.dx, c.inv_dx, c.dt = model.dx, float(model.grid), model.dt
+    c.gravity = t.vec3(*model.gravity)
+    c.x_low, c.x_high = model.stencil_range
+    return c
