@@ -20,8 +20,7 @@ Weights = tuple[Tensor, ...]
 
 
 class Constitutive(nn.Module):
-    """A pointwise map of deformation gradients, (N, 3, 3) -> (N, 3, 3), differentiable in F and in its
-    weights.
+    """A pointwise map of deformation gradients, (N, 3, 3) -> (N, 3, 3), differentiable in F and its weights.
 
     A subclass writes :meth:`response` in differentiable torch, and may override the rest with faster code.
     """
@@ -42,12 +41,14 @@ class Constitutive(nn.Module):
         return self.response(F, self.weights())
 
     def evaluate(self, F: Tensor, weights: Weights, out: Tensor | None = None) -> Tensor:
-        """The law without gradient. ``out`` (N, 3, 3), which must not alias F, receives the result if given.
+        """The law without gradient; ``out`` (N, 3, 3), not an alias of F, receives the result if given."""
         with torch.no_grad():
             value = self.response(F, weights)
         return value if out is None else out.copy_(value)
 
-    def evaluate_with_cache(self, F: Tensor, weights: Weights, out: Tensor | None = None) -> tuple[Tensor, Any]:
+    def evaluate_with_cache(
+        self, F: Tensor, weights: Weights, out: Tensor | None = None
+    ) -> tuple[Tensor, Any]:
         """As :meth:`evaluate`, and an opaque cache that spares :meth:`vjp` the recomputation.
 
         The cache owns its memory (several can be kept); None where a law has nothing to keep.
@@ -71,8 +72,7 @@ class Constitutive(nn.Module):
             grad_out: (N, 3, 3) gradient of a scalar with respect to the result.
             cache: from :meth:`evaluate_with_cache` at the same F and weights; None recomputes.
             grad_F: (N, 3, 3) buffer that receives the first result if given.
-            grad_weights: accumulators shaped as the weights; if given, the weight gradients are added to
-                them.
+            grad_weights: accumulators shaped as the weights; if given, the weight gradients are added to them.
 
         Returns:
             the gradient with respect to F, and one gradient a weight (the accumulators if they were given).
@@ -118,7 +118,7 @@ class Law(nn.Module):
         """Largest eigenvalue of the acoustic tensor Q_ik = n_j (d tau_ij / d F_kl) n_l at F = I over n [Pa].
 
         For an isotropic law this is the P-wave modulus, lam + 2 mu. Measured by one-sided differences in
-        float64 on 26 directions n (a neural law need not be isotropic, and its sorted singular values have a
+        float64 along 26 directions n (a neural law need not be isotropic, and its sorted singular values have a
         kink at F = I).
         """
         step = 1e-5

@@ -13,9 +13,7 @@ from neuma_lib.materials.base import Elasticity, Weights
 from neuma_lib.materials.principal import POISSON, YOUNG, Constants, isotropic_stress, lame
 
 STRETCH_MIN = 0.05
-"""Logarithms are taken of max(sigma, STRETCH_MIN), as in NCLaw, so that a crushed element keeps a finite
-stress.
-"""
+"""Logarithms are of max(sigma, STRETCH_MIN), as in NCLaw, so that a crushed element keeps a finite stress."""
 
 
 class AnalyticElasticity(Constants, Elasticity):

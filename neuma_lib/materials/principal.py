@@ -145,7 +145,8 @@ class Constants(nn.Module):
         unknown = sorted(set(values) - set(self.constants))
         if unknown:
             raise InputError(
-                f"{type(self).__name__} has no constant {', '.join(unknown)}; it has {', '.join(self.constants) or 'none'}"
+                f"{type(self).__name__} has no constant {', '.join(unknown)}; "
+                f"it has {', '.join(self.constants) or 'none'}"
             )
         self.values: dict[str, float | Tensor] = {}
         for name, constant in self.constants.items():

@@ -1,9 +1,8 @@
-"""Adjoints of the transfers in ``kernels``, written by hand and run in the opposite order.
+"""Adjoints of the transfers in `kernels`, written by hand and run in the opposite order.
 
-``grad_y`` is the derivative of the loss with respect to ``y``. Each kernel undoes one forward kernel: the adjoint
-of a gather is a scatter over the same stencil and the other way round, so ``g2p_adjoint`` reads like P2G and
-``p2g_adjoint`` like G2P. With d_i = x_i - x, and N' the slope of the B-spline, a weight moves by
-dw_i/dx = N'_i and an offset by dd_i/dx = -I.
+``grad_y`` is the derivative of the loss with respect to ``y``. The adjoint of a gather is a scatter over the same
+stencil and the other way round, so `g2p_adjoint` reads like P2G and `p2g_adjoint` like G2P. When the particle
+moves, a weight changes by dw_i/dx = N'_i / dx and an offset d_i = x_i - x by -I.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -18,13 +17,12 @@ from neuma_lib.sim.kernels import grid_functions, warp_types
 
 @functools.cache
 def adjoint_kernels(dtype: torch.dtype) -> SimpleNamespace:
-    """Kernels ``g2p_adjoint``, ``grid_adjoint`` and ``p2g_adjoint`` for one precision."""
-    t = warp_types(dtype)
-    real, vec3, vec4, mat33, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.GridConstants
-    functions = grid_functions(dtype)
-    base_node, offset = functions.base_node, functions.offset
-    wall_mask, moved_mask = functions.wall_mask, functions.moved_mask
-    weights, slopes = functions.weights, functions.weight_slopes
+    """Kernels `g2p_adjoint`, `grid_adjoint` and `p2g_adjoint` for one precision."""
+    t, functions = warp_types(dtype), grid_functions(dtype)
+    real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
+    base_node, weights, slopes = functions.base_node, functions.weights, functions.slopes
+    column, offsets, wall_mask = functions.column, functions.offsets, functions.wall_mask
+    moved_mask = functions.moved_mask
     kernel = functools.partial(
         wp.kernel, enable_backward=False, module=f"neuma_lib.sim.adjoint_{str(dtype).removeprefix('torch.')}"
     )
@@ -39,46 +37,46 @@ def adjoint_kernels(dtype: torch.dtype) -> SimpleNamespace:
         v: wp.array2d(dtype=vec3),
         C: wp.array2d(dtype=mat33),
         F: wp.array2d(dtype=mat33),
-        grid_v: wp.array2d(dtype=vec4),
+        grid_v_rows: wp.array2d(dtype=mat34),
         grad_v: wp.array(dtype=vec3),
         grad_C: wp.array(dtype=mat33),
         grad_F_trial: wp.array(dtype=mat33),
         grad_x: wp.array(dtype=vec3),
         grad_F: wp.array(dtype=mat33),
-        grad_grid_v: wp.array(dtype=vec4),
+        grad_grid_rows: wp.array(dtype=mat34),
     ):
-        """Gradients of (x, v, C)[after] and F_trial to those of grid_v (added), x (in place) and F (set)."""
+        """Gradients of x, v, C after the step and of F_trial to those of grid_v (added), x (in place), F (set)."""
         p = wp.tid()
         xp = x[now, p]
-        bi = base_node(c, xp[0])
-        bj = base_node(c, xp[1])
-        bk = base_node(c, xp[2])
+        bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
         f = xp * c.inv_dx - vec3(real(bi), real(bj), real(bk))
-        w = weights(f)
-        s = slopes(f)
-        # F_trial = (I + dt C) F and x[after] = x + dt v pass their gradients to C, F and v ...
-        gF_trial = grad_F_trial[p]
-        grad_F[p] = gF_trial + c.dt * (wp.transpose(C[after, p]) * gF_trial)
-        gC = grad_C[p] + c.dt * (gF_trial * wp.transpose(F[now, p]))
-        g_moved = wp.cw_mul(moved_mask(c, x[after, p]), grad_x[p])
-        gv = grad_v[p] + c.dt * g_moved
-        # ... and node i, with v = sum w_i v_i and C = (4/dx^2) sum w_i v_i d_i^T, gets w_i u_i.
-        D = (real(4.0) * c.inv_dx) * gC
-        u0 = gv - D * f
-        gx = vec3()
+        wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
+        si, sj, sk = slopes(f[0]), slopes(f[1]), slopes(f[2])
+        # F_trial = (I + dt C) F and x = x + dt v pass their gradients on to C, F and v.
+        g_trial = grad_F_trial[p]
+        grad_F[p] = g_trial + c.dt * (wp.transpose(C[after, p]) * g_trial)
+        g_C = grad_C[p] + c.dt * (g_trial * wp.transpose(F[now, p]))
+        g_x = wp.cw_mul(moved_mask(c, x[after, p]), grad_x[p])
+        g_v = grad_v[p] + c.dt * g_x
+        # Node i gets w_i u_i with u_i = g_v + D d_i / dx, which grows by a column of D from node to node.
+        D = (real(4.0) * c.inv_dx) * g_C
+        u0 = g_v - D * f
+        u_i = vec4(u0[0], u0[1], u0[2], real(0.0))
+        step_k = vec3(real(0.0), real(1.0), real(2.0))
+        slope_k = wp.outer(wp.cw_mul(wk, step_k), column(D, 2))
+        moving = vec3()  # sum (v_i . u_i) N'_i
         for i in range(3):
+            u_ij = u_i
             for j in range(3):
                 row = ((bi + i) * c.n + bj + j) * c.n + bk
-                for k in range(3):
-                    u = u0 + D * offset(i, j, k)
-                    weight = w[i, 0] * w[j, 1] * w[k, 2]
-                    wp.atomic_add(grad_grid_v, row + k, weight * vec4(u[0], u[1], u[2], real(0.0)))
-                    node = grid_v[kept, row + k]
-                    uv = u[0] * node[0] + u[1] * node[1] + u[2] * node[2]
-                    gx += uv * vec3(
-                        s[i, 0] * w[j, 1] * w[k, 2], w[i, 0] * s[j, 1] * w[k, 2], w[i, 0] * w[j, 1] * s[k, 2]
-                    )
-        grad_x[p] = g_moved + c.inv_dx * (gx - wp.transpose(D) * v[after, p])
+                wp.atomic_add(grad_grid_rows, row, (wi[i] * wj[j]) * (wp.outer(wk, u_ij) + slope_k))
+                nodes = grid_v_rows[kept, row]
+                vu = nodes * u_ij + wp.cw_mul(step_k, nodes * column(D, 2))
+                vu_w, vu_s = wp.dot(vu, wk), wp.dot(vu, sk)
+                moving += vec3(si[i] * wj[j] * vu_w, wi[i] * sj[j] * vu_w, wi[i] * wj[j] * vu_s)
+                u_ij += column(D, 1)
+            u_i += column(D, 0)
+        grad_x[p] = g_x + c.inv_dx * (moving - wp.transpose(D) * v[after, p])
 
     @kernel
     def grid_adjoint(
@@ -104,46 +102,50 @@ def adjoint_kernels(dtype: torch.dtype) -> SimpleNamespace:
         tau: wp.array2d(dtype=mat33),
         mass: wp.array(dtype=real),
         vol0: wp.array(dtype=real),
-        grad_grid: wp.array(dtype=vec4),
+        grad_grid_rows: wp.array(dtype=mat34),
         grad_x: wp.array(dtype=vec3),
         grad_v: wp.array(dtype=vec3),
         grad_C: wp.array(dtype=mat33),
         grad_tau: wp.array(dtype=mat33),
     ):
-        """Gradients of the nodes' momentum and mass to those of x (in place), v, C and tau (set)."""
+        """Gradients of the nodes' momentum and mass to those of x (added), v, C and tau (set)."""
         p = wp.tid()
         xp = x[now, p]
-        m = mass[p]
-        bi = base_node(c, xp[0])
-        bj = base_node(c, xp[1])
-        bk = base_node(c, xp[2])
+        bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
         f = xp * c.inv_dx - vec3(real(bi), real(bj), real(bk))
-        w = weights(f)
-        s = slopes(f)
-        stress = real(4.0) * c.dt * vol0[p] * c.inv_dx * c.inv_dx
-        A = (m * C[now, p] - stress * tau[kept, p]) * c.dx
+        wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
+        si, sj, sk = slopes(f[0]), slopes(f[1]), slopes(f[2])
+        wd_i = wp.cw_mul(wi, offsets(f[0]))
+        wd_j = wp.cw_mul(wj, offsets(f[1]))
+        wd_k = wp.cw_mul(wk, offsets(f[2]))
+        # The scattered q_i = (m v + A d_i, m), as in p2g.
+        m = mass[p]
+        stress = real(4.0) * c.dt * c.inv_dx * c.inv_dx * vol0[p]
+        A = c.dx * (m * C[now, p] - stress * tau[kept, p])
         q0 = m * v[now, p] - A * f
-        gq = vec3()  # sum w_i grad_(mv)_i
-        gA = mat33()  # sum w_i grad_(mv)_i d_i^T / dx
-        gx = vec3()
+        q_i = vec4(q0[0], q0[1], q0[2], m)
+        step_k = vec3(real(0.0), real(1.0), real(2.0))
+        total, G_i, G_j, G_k = vec4(), vec4(), vec4(), vec4()  # sum w g, columns of sum w g d^T / dx
+        moving = vec3()  # sum (g_i . q_i) N'_i
         for i in range(3):
+            q_ij = q_i
             for j in range(3):
-                row = ((bi + i) * c.n + bj + j) * c.n + bk
-                for k in range(3):
-                    node = grad_grid[row + k]
-                    q = q0 + A * offset(i, j, k)
-                    weight = w[i, 0] * w[j, 1] * w[k, 2]
-                    wg = weight * vec3(node[0], node[1], node[2])
-                    gq += wg
-                    gA += wp.outer(wg, offset(i, j, k) - f)
-                    qg = q[0] * node[0] + q[1] * node[1] + q[2] * node[2] + m * node[3]
-                    gx += qg * vec3(
-                        s[i, 0] * w[j, 1] * w[k, 2], w[i, 0] * s[j, 1] * w[k, 2], w[i, 0] * w[j, 1] * s[k, 2]
-                    )
-        gA = gA * c.dx
-        grad_v[p] = m * gq
-        grad_C[p] = m * gA
-        grad_tau[p] = -stress * gA
-        grad_x[p] = grad_x[p] + c.inv_dx * (gx - wp.transpose(A) * gq)
+                nodes = grad_grid_rows[((bi + i) * c.n + bj + j) * c.n + bk]
+                along_k = wk * nodes
+                total += (wi[i] * wj[j]) * along_k
+                G_i += (wd_i[i] * wj[j]) * along_k
+                G_j += (wi[i] * wd_j[j]) * along_k
+                G_k += (wi[i] * wj[j]) * (wd_k * nodes)
+                gq = nodes * q_ij + wp.cw_mul(step_k, nodes * column(A, 2))
+                gq_w, gq_s = wp.dot(gq, wk), wp.dot(gq, sk)
+                moving += vec3(si[i] * wj[j] * gq_w, wi[i] * sj[j] * gq_w, wi[i] * wj[j] * gq_s)
+                q_ij += column(A, 1)
+            q_i += column(A, 0)
+        g = vec3(total[0], total[1], total[2])
+        g_A = c.dx * mat33(G_i[0], G_j[0], G_k[0], G_i[1], G_j[1], G_k[1], G_i[2], G_j[2], G_k[2])
+        grad_v[p] = m * g
+        grad_C[p] = m * g_A
+        grad_tau[p] = -stress * g_A
+        grad_x[p] = grad_x[p] + c.inv_dx * (moving - wp.transpose(A) * g)
 
     return SimpleNamespace(g2p_adjoint=g2p_adjoint, grid_adjoint=grid_adjoint, p2g_adjoint=p2g_adjoint)

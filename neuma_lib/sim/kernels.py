@@ -1,13 +1,14 @@
-"""The three transfers of the material point method as Warp kernels: particles to grid, grid, grid to particles.
+"""The transfers of the material point method as Warp kernels: particles to grid, grid, grid to particles.
 
-MLS-MPM (Hu et al. 2018) with quadratic B-splines and the affine velocity ``C`` of APIC (Jiang et al. 2015); the
-order and the letters are those of the paper's Algorithm 2 (appendix "Introduction to the Material Point Method").
+MLS-MPM (Hu et al. 2018) with quadratic B-splines and the affine velocity C of APIC (Jiang et al. 2015), in the
+order and letters of the paper's Algorithm 2 (appendix "Introduction to the Material Point Method"). Their adjoints
+are in `adjoint_kernels`.
 
-Every array of particles has a leading axis of slots: a rollout that will be differentiated gives each step a slot
-of its own, any other one alternates between two. A grid node is one 4-vector, momentum and mass (``grid``) or
-velocity and an indicator of mass (``grid_v``), so that a node costs one load and one store.
-
-Kernels are made once per precision by :func:`forward_kernels`; their adjoints are in ``adjoint_kernels``.
+Memory: arrays of particles have a leading axis of slots. A rollout that will be differentiated gives each step a
+slot of its own, any other alternates between two. A grid node is a 4-vector, momentum and mass (``grid``) or
+velocity and 1 where there is mass (``grid_v``). A particle sees 3 x 3 rows of three nodes that lie side by side in
+memory, so kernels read and write ``rows``: a view of the grid whose element b is the 3 x 4 matrix of the nodes b,
+b + 1 and b + 2. Sums over the last axis of the stencil then are products with a row.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -32,31 +33,36 @@ NEVER = 2**62
 def warp_types(dtype: torch.dtype) -> SimpleNamespace:
     """Warp's scalar, vector and matrix types for a torch precision, and the struct of model constants."""
     real = {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
-    vec3 = wp.types.vector(length=3, dtype=real)
-    vec4 = wp.types.vector(length=4, dtype=real)
-    mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
-    walls6 = wp.types.vector(length=6, dtype=wp.int32)
+    types = SimpleNamespace(
+        real=real,
+        vec3=wp.types.vector(length=3, dtype=real),
+        vec4=wp.types.vector(length=4, dtype=real),
+        mat33=wp.types.matrix(shape=(3, 3), dtype=real),
+        mat34=wp.types.matrix(shape=(3, 4), dtype=real),
+        walls=wp.types.vector(length=6, dtype=wp.int32),
+    )
 
     @wp.struct
     class GridConstants:
         n: wp.int32  # nodes along an edge
         wall_cells: wp.int32  # thickness of the walls [nodes]
-        walls: walls6  # condition on x_min, x_max, y_min, y_max, z_min, z_max
+        walls: types.walls  # condition on x_min, x_max, y_min, y_max, z_min, z_max
         dx: real  # node spacing [m]
         inv_dx: real
         dt: real  # [s]
-        gravity: vec3  # [m/s^2]
+        gravity: types.vec3  # [m/s^2]
         x_low: real  # a quadratic stencil fits the grid for x_low <= x <= x_high [m]
         x_high: real
 
-    return SimpleNamespace(real=real, vec3=vec3, vec4=vec4, mat33=mat33, walls6=walls6, GridConstants=GridConstants)
+    types.GridConstants = GridConstants
+    return types
 
 
 @functools.cache
 def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
-    """Functions that the transfers and their adjoints share: interpolation stencil and wall condition."""
+    """Functions that the transfers and their adjoints share: interpolation stencil, wall condition, motion."""
     t = warp_types(dtype)
-    real, vec3, mat33, GridConstants = t.real, t.vec3, t.mat33, t.GridConstants
+    real, vec3, vec4, mat33, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.GridConstants
 
     @wp.func
     def base_node(c: GridConstants, x: real):
@@ -64,30 +70,28 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
         return wp.clamp(wp.int32(x * c.inv_dx - real(0.5)), 0, c.n - 3)
 
     @wp.func
-    def offset(i: wp.int32, j: wp.int32, k: wp.int32):
-        """Position of a node of the stencil relative to its base [dx]. (A function, because Warp 1.19 changes the
-        type of an unrolled loop's variable that is cast to float64 in place.)"""
-        return vec3(real(i), real(j), real(k))
+    def weights(f: real):
+        """Quadratic B-spline N at the three nodes of an axis; f: distance to the first of them [dx]."""
+        return vec3(
+            real(0.5) * (real(1.5) - f) * (real(1.5) - f),
+            real(0.75) - (f - real(1.0)) * (f - real(1.0)),
+            real(0.5) * (f - real(0.5)) * (f - real(0.5)),
+        )
 
     @wp.func
-    def weights(f: vec3):
-        """Quadratic B-spline N at the three nodes (rows) of each axis (columns); f: distance to the base [dx]."""
-        w = mat33()
-        for a in range(3):
-            w[0, a] = real(0.5) * (real(1.5) - f[a]) * (real(1.5) - f[a])
-            w[1, a] = real(0.75) - (f[a] - real(1.0)) * (f[a] - real(1.0))
-            w[2, a] = real(0.5) * (f[a] - real(0.5)) * (f[a] - real(0.5))
-        return w
+    def slopes(f: real):
+        """Derivative of the weights with respect to f."""
+        return vec3(f - real(1.5), real(2.0) - real(2.0) * f, f - real(0.5))
 
     @wp.func
-    def weight_slopes(f: vec3):
-        """Derivative of :func:`weights` with respect to f."""
-        w = mat33()
-        for a in range(3):
-            w[0, a] = f[a] - real(1.5)
-            w[1, a] = real(2.0) - real(2.0) * f[a]
-            w[2, a] = f[a] - real(0.5)
-        return w
+    def offsets(f: real):
+        """Offsets d of the three nodes of an axis from the particle [dx]."""
+        return vec3(-f, real(1.0) - f, real(2.0) - f)
+
+    @wp.func
+    def column(A: mat33, a: wp.int32):
+        """Column a of A, with a zero in the place of the mass."""
+        return vec4(A[0, a], A[1, a], A[2, a], real(0.0))
 
     @wp.func
     def wall_mask(c: GridConstants, node: wp.int32, v: vec3):
@@ -114,12 +118,12 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
 
     @wp.func
     def moved(c: GridConstants, x: vec3, v: vec3):
-        """Position after a step, kept where the stencil exists: soft bodies are pressed past the last free node."""
+        """Position after a step, kept where the stencil exists: soft bodies are pressed past the last node."""
         return wp.max(wp.min(x + c.dt * v, vec3(c.x_high)), vec3(c.x_low))
 
     @wp.func
     def moved_mask(c: GridConstants, x_new: vec3):
-        """Derivative of :func:`moved` with respect to its unclamped argument: 0 for each component at a bound."""
+        """Derivative of `moved` with respect to its unclamped argument: 0 for each component at a bound."""
         mask = vec3()
         for a in range(3):
             if x_new[a] > c.x_low and x_new[a] < c.x_high:
@@ -128,9 +132,10 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
 
     return SimpleNamespace(
         base_node=base_node,
-        offset=offset,
         weights=weights,
-        weight_slopes=weight_slopes,
+        slopes=slopes,
+        offsets=offsets,
+        column=column,
         wall_mask=wall_mask,
         moved=moved,
         moved_mask=moved_mask,
@@ -139,12 +144,11 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
 
 @functools.cache
 def forward_kernels(dtype: torch.dtype) -> SimpleNamespace:
-    """Kernels ``p2g``, ``grid_update``, ``g2p``, ``trial_deformation`` and ``advect_tracers`` for one precision."""
-    t = warp_types(dtype)
-    real, vec3, vec4, mat33, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.GridConstants
-    functions = grid_functions(dtype)
-    base_node, offset, weights = functions.base_node, functions.offset, functions.weights
-    wall_mask, moved = functions.wall_mask, functions.moved
+    """Kernels `p2g`, `grid_update`, `g2p`, `trial_deformation` and `advect_tracers` for one precision."""
+    t, functions = warp_types(dtype), grid_functions(dtype)
+    real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
+    base_node, weights, offsets = functions.base_node, functions.weights, functions.offsets
+    column, wall_mask, moved = functions.column, functions.wall_mask, functions.moved
     kernel = functools.partial(
         wp.kernel, enable_backward=False, module=f"neuma_lib.sim.forward_{str(dtype).removeprefix('torch.')}"
     )
@@ -160,32 +164,33 @@ def forward_kernels(dtype: torch.dtype) -> SimpleNamespace:
         tau: wp.array2d(dtype=mat33),
         mass: wp.array(dtype=real),
         vol0: wp.array(dtype=real),
-        grid: wp.array2d(dtype=vec4),
+        grid_rows: wp.array2d(dtype=mat34),
     ):
-        """m_i += w m;  (m v)_i += w (m v + A d_i),  A = m C - dt vol0 (4/dx^2) tau,  d_i = x_i - x."""
+        """m_i += w_i m and (m v)_i += w_i (m v + A d_i) with A = m C - dt vol0 (4/dx^2) tau, d_i = x_i - x."""
         p = wp.tid()
         xp = x[now, p]
-        m = mass[p]
-        bi = base_node(c, xp[0])
-        bj = base_node(c, xp[1])
-        bk = base_node(c, xp[2])
+        bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
         f = xp * c.inv_dx - vec3(real(bi), real(bj), real(bk))
-        w = weights(f)
-        A = (m * C[now, p] - (real(4.0) * c.dt * vol0[p] * c.inv_dx * c.inv_dx) * tau[kept, p]) * c.dx
+        wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
+        m = mass[p]
+        A = c.dx * (m * C[now, p] - (real(4.0) * c.dt * c.inv_dx * c.inv_dx * vol0[p]) * tau[kept, p])
+        # q = (m v + A d, m) grows by a column of A from node to node.
         q0 = m * v[now, p] - A * f
+        q_i = vec4(q0[0], q0[1], q0[2], m)
+        slope_k = wp.outer(wp.cw_mul(wk, vec3(real(0.0), real(1.0), real(2.0))), column(A, 2))
         for i in range(3):
+            q_ij = q_i
             for j in range(3):
                 row = ((bi + i) * c.n + bj + j) * c.n + bk
-                for k in range(3):
-                    q = q0 + A * offset(i, j, k)
-                    weight = w[i, 0] * w[j, 1] * w[k, 2]
-                    wp.atomic_add(grid, kept, row + k, weight * vec4(q[0], q[1], q[2], m))
+                wp.atomic_add(grid_rows, kept, row, (wi[i] * wj[j]) * (wp.outer(wk, q_ij) + slope_k))
+                q_ij += column(A, 1)
+            q_i += column(A, 0)
 
     @kernel
     def grid_update(
         c: GridConstants, kept: wp.int32, grid: wp.array2d(dtype=vec4), grid_v: wp.array2d(dtype=vec4)
     ):
-        """v_i = (m v)_i / m_i + dt g where there is mass, then the walls; no small number is added to the mass."""
+        """v_i = (m v)_i / m_i + dt g where there is mass, then the walls; nothing is added to the mass."""
         node = wp.tid()
         mv = grid[kept, node]
         result = vec4()
@@ -202,7 +207,7 @@ def forward_kernels(dtype: torch.dtype) -> SimpleNamespace:
         after: wp.int32,
         kept: wp.int32,
         step: wp.int32,
-        grid_v: wp.array2d(dtype=vec4),
+        grid_v_rows: wp.array2d(dtype=mat34),
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         C: wp.array2d(dtype=mat33),
@@ -210,32 +215,33 @@ def forward_kernels(dtype: torch.dtype) -> SimpleNamespace:
         F_trial: wp.array2d(dtype=mat33),
         faults: wp.array(dtype=wp.int64),
     ):
-        """v = sum w v_i;  C = (4/dx^2) sum w v_i d_i^T;  x += dt v, clamped;  F_trial = (I + dt C) F."""
+        """v = sum w_i v_i,  C = (4/dx^2) sum w_i v_i d_i^T,  x += dt v (clamped),  F_trial = (I + dt C) F."""
         p = wp.tid()
         xp = x[now, p]
-        bi = base_node(c, xp[0])
-        bj = base_node(c, xp[1])
-        bk = base_node(c, xp[2])
+        bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
         f = xp * c.inv_dx - vec3(real(bi), real(bj), real(bk))
-        w = weights(f)
-        v_new = vec3()
-        B = mat33()
+        wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
+        wd_i = wp.cw_mul(wi, offsets(f[0]))
+        wd_j = wp.cw_mul(wj, offsets(f[1]))
+        wd_k = wp.cw_mul(wk, offsets(f[2]))
+        total, B_i, B_j, B_k = vec4(), vec4(), vec4(), vec4()  # sum w v, columns of sum w v d^T / dx
         for i in range(3):
             for j in range(3):
-                row = ((bi + i) * c.n + bj + j) * c.n + bk
-                for k in range(3):
-                    node = grid_v[kept, row + k]
-                    weight = w[i, 0] * w[j, 1] * w[k, 2]
-                    wv = weight * vec3(node[0], node[1], node[2])
-                    v_new += wv
-                    B += wp.outer(wv, offset(i, j, k) - f)
-        C_new = (real(4.0) * c.inv_dx) * B
-        x_new = moved(c, xp, v_new)
-        x[after, p] = x_new
+                nodes = grid_v_rows[kept, ((bi + i) * c.n + bj + j) * c.n + bk]
+                along_k = wk * nodes
+                total += (wi[i] * wj[j]) * along_k
+                B_i += (wd_i[i] * wj[j]) * along_k
+                B_j += (wi[i] * wd_j[j]) * along_k
+                B_k += (wi[i] * wj[j]) * (wd_k * nodes)
+        v_new = vec3(total[0], total[1], total[2])
+        C_new = (real(4.0) * c.inv_dx) * mat33(
+            B_i[0], B_j[0], B_k[0], B_i[1], B_j[1], B_k[1], B_i[2], B_j[2], B_k[2]
+        )
+        x[after, p] = moved(c, xp, v_new)
         v[after, p] = v_new
         C[after, p] = C_new
         F_trial[kept, p] = F[now, p] + c.dt * (C_new * F[now, p])
-        # Faults keep the first (step, particle); NaN first, because a NaN position is no longer comparable.
+        # Faults keep the first (step, particle). A clamped position would hide both of them.
         here = wp.int64(step) * wp.int64(2147483648) + wp.int64(p)
         if not (wp.isfinite(v_new) and wp.isfinite(C_new)):
             wp.atomic_min(faults, 0, here)
@@ -258,25 +264,25 @@ def forward_kernels(dtype: torch.dtype) -> SimpleNamespace:
 
     @kernel
     def advect_tracers(
-        c: GridConstants, kept: wp.int32, grid_v: wp.array2d(dtype=vec4), x: wp.array(dtype=vec3)
+        c: GridConstants, kept: wp.int32, grid_v_rows: wp.array2d(dtype=mat34), x: wp.array(dtype=vec3)
     ):
         """x += dt v with v interpolated over the nodes that carry mass; a tracer that sees none of them stays."""
         p = wp.tid()
         xp = x[p]
-        bi = base_node(c, xp[0])
-        bj = base_node(c, xp[1])
-        bk = base_node(c, xp[2])
-        w = weights(xp * c.inv_dx - vec3(real(bi), real(bj), real(bk)))
+        bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
+        f = xp * c.inv_dx - vec3(real(bi), real(bj), real(bk))
+        wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
         total = vec4()
         for i in range(3):
             for j in range(3):
-                row = ((bi + i) * c.n + bj + j) * c.n + bk
-                for k in range(3):
-                    total += (w[i, 0] * w[j, 1] * w[k, 2]) * grid_v[kept, row + k]
+                total += (wi[i] * wj[j]) * (wk * grid_v_rows[kept, ((bi + i) * c.n + bj + j) * c.n + bk])
         if total[3] > real(0.0):
-            v = vec3(total[0], total[1], total[2]) / total[3]
-            x[p] = moved(c, xp, v)
+            x[p] = moved(c, xp, vec3(total[0], total[1], total[2]) / total[3])
 
     return SimpleNamespace(
-        p2g=p2g, grid_update=grid_update, g2p=g2p, trial_deformation=trial_deformation, advect_tracers=advect_tracers
+        p2g=p2g,
+        grid_update=grid_update,
+        g2p=g2p,
+        trial_deformation=trial_deformation,
+        advect_tracers=advect_tracers,
     )

@@ -1,4 +1,4 @@
-"""What stays constant during a simulation: grid, time step, gravity, walls, and which law moves which particles."""
+"""What stays constant in a simulation: grid, time step, gravity, walls, and which law moves which particles."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ class MPMModel:
     """Constants of the material point method on the unit cube.
 
     Node i of an axis lies at i dx, for i = 0 ... grid - 1, with dx = 1 / grid. Particles are free where their
-    stencil sees no wall node, ``(wall_cells + 0.5) dx < x < 1 - (wall_cells + 1.5) dx``, and the stencil itself
-    exists for ``0.5 dx <= x < 1 - 1.5 dx``.
+    stencil sees no wall node, ``(wall_cells + 0.5) dx < x < 1 - (wall_cells + 1.5) dx``. The stencil itself
+    exists for ``0.5 dx <= x <= 1 - 1.5 dx``, which no particle leaves.
 
     Attributes:
         grid: nodes along an edge of the cube.
         dt: time step [s].
         gravity: acceleration [m/s^2], y is up.
-        boundary: condition of the walls, one name for all or one a wall (keys `WALLS`, others stay "no_slip").
-            "no_slip" stops a wall node whose velocity points into the wall, "slip" stops only the component along
-            the wall's normal when it points into the wall, "sticky" stops wall nodes always.
+        boundary: condition of the walls, one name for all or one a wall (keys `WALLS`, others are "no_slip").
+            "no_slip" stops a wall node whose velocity points into the wall, "slip" only removes the component
+            that points into the wall, "sticky" stops wall nodes always.
         wall_cells: thickness of the walls [nodes].
 
     Raises:
@@ -54,8 +54,9 @@ class MPMModel:
         if len(gravity) != 3 or not all(math.isfinite(g) for g in gravity):
             raise InputError(f"gravity = {self.gravity!r}: give three finite accelerations in m/s^2")
         if not isinstance(self.wall_cells, int) or not 1 <= self.wall_cells <= (self.grid - 4) // 2:
+            most = (self.grid - 4) // 2
             raise InputError(
-                f"wall_cells = {self.wall_cells!r}: give a whole number from 1 to {(self.grid - 4) // 2} on this grid"
+                f"wall_cells = {self.wall_cells!r}: give a whole number from 1 to {most} on this grid"
             )
         object.__setattr__(self, "gravity", gravity)
         object.__setattr__(self, "boundary", _six_conditions(self.boundary))
@@ -67,7 +68,7 @@ class MPMModel:
 
     @property
     def stencil_range(self) -> tuple[float, float]:
-        """Half-open interval of coordinates whose three nodes all exist [m]."""
+        """Closed interval of coordinates whose three nodes all exist [m]."""
         return 0.5 * self.dx, 1.0 - 1.5 * self.dx
 
     @property
@@ -93,8 +94,8 @@ class MPMModel:
         if not number <= COURANT_LIMIT:
             stable = self.dt * COURANT_LIMIT / number
             raise InputError(
-                f"law {law.name!r} has Courant number {number:.3g} > {COURANT_LIMIT} on a {self.grid}^3 grid with "
-                f"dt = {self.dt:g} s: the largest stable step is dt = {stable:.3g} s (or use a coarser grid)"
+                f"law {law.name!r} has Courant number {number:.3g} > {COURANT_LIMIT} on a {self.grid}^3 grid "
+                f"with dt = {self.dt:g} s: the largest stable step is dt = {stable:.3g} s (or use a coarser grid)"
             )
         return number
 
@@ -121,8 +122,8 @@ def as_bodies(law: Law | Sequence[Body], count: int) -> tuple[Body, ...]:
     for body in bodies:
         if body.start != expected or body.stop <= body.start:
             raise InputError(
-                f"body {body.law.name!r} has particles {body.start} to {body.stop}: it must start at {expected}, "
-                "where the one before it ends, and hold at least one particle"
+                f"body {body.law.name!r} has particles {body.start} to {body.stop}: it must start at "
+                f"{expected}, where the one before it ends, and hold at least one particle"
             )
         expected = body.stop
     if expected != count:
@@ -131,7 +132,7 @@ def as_bodies(law: Law | Sequence[Body], count: int) -> tuple[Body, ...]:
 
 
 def contact_clearance(model: MPMModel, x: Tensor) -> Tensor:
-    """Smallest distance of particles x (..., N, 3) to the zone that feels a wall [m], shape (...,); <= 0: contact."""
+    """Smallest distance [m] of particles x (..., N, 3) to the zone that feels a wall; not positive in contact."""
     low, high = model.free_range
     return torch.minimum(x - low, high - x).amin(dim=(-2, -1))
 

@@ -1,7 +1,7 @@
 """The one entry to the simulator, for ground truth, velocity estimation, training and evaluation alike.
 
-Callers differ in law, start and set of frames only. The gradient is one reverse loop over the stored states, not a
-graph of steps: autograd sees a single function from (x0, v0, F0, C0, weights of the laws) to the frames.
+Callers differ in law, start and set of frames only. The gradient is one reverse loop over the stored states, not
+a graph of steps: autograd sees a single function from (x0, v0, F0, C0, weights of the laws) to the frames.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def rollout(
 ) -> Trajectory:
     """Simulate particles and return their states at the frames.
 
-    Differentiable with respect to the weights of the laws, x0, v0, F0 and C0; tracers carry no gradient. Device and
-    precision (float32 or float64) are those of x0.
+    Differentiable with respect to the weights of the laws, x0, v0, F0 and C0; masses, volumes and tracers carry
+    no gradient. Device and precision (float32 or float64) are those of x0.
 
     Args:
         model: grid, time step, gravity and walls.
@@ -53,15 +53,15 @@ def rollout(
         steps: number of time steps; the simulation ends at the last frame, which must not lie beyond.
         frames: steps whose states are returned, strictly increasing, 0 is the start.
         tracers: positions of passive points that follow the grid's velocity [m], shape (M, 3).
-        skip_free_flight: pass over the steps before the first contact in closed form while the state is undeformed
-            and moves with one velocity. Equal to the simulated flight to round-off, in value and gradient; not used
-            where a gradient could deform the state during the flight (v0 of shape (N, 3), F0 or C0 that require it).
-        keep: what the gradient keeps a step: "states" only (x, v, C, F; the rest is computed again), "all", or
-            "auto", which keeps all that fits `CACHE_LIMIT`.
+        skip_free_flight: take the steps before the first contact in closed form while the state is undeformed
+            and moves with one velocity: equal to simulating them, to round-off, in value and gradient. Not used
+            where a gradient could deform the state in flight (v0 of shape (N, 3), F0 or C0 that require it).
+        keep: what the gradient keeps a step: "states" (x, v, C, F; the rest is computed again), "all", or
+            "auto", which also keeps what fits a fixed amount of memory. Same gradient, other speed.
 
     Raises:
         InputError: shapes, precision, frames, a particle outside the grid at the start, bodies that do not fit.
-        NonFiniteError: a particle became non-finite or left the grid; has attributes step and particle.
+        NonFiniteError: a particle became non-finite or crossed a cell in a step; has attributes step, particle.
     """
     frames = _checked_frames(frames, steps)
     bodies = as_bodies(law, len(x0))
@@ -69,7 +69,9 @@ def rollout(
     if keep not in KEEP:
         raise InputError(f"keep = {keep!r}: choose one of {', '.join(KEEP)}")
 
-    flight = free_flight_steps(model, bodies, x0, v0, mass, vol0, F0, C0, frames[-1]) if skip_free_flight else 0
+    flight = 0
+    if skip_free_flight:
+        flight = free_flight_steps(model, bodies, x0, v0, mass, vol0, F0, C0, frames[-1])
     eye = torch.eye(3, dtype=x0.dtype, device=x0.device).expand(len(x0), 3, 3)
     start = (x0, v0.expand_as(x0), eye if F0 is None else F0, torch.zeros_like(eye) if C0 is None else C0)
     seen = sum(n < flight for n in frames)
@@ -77,9 +79,10 @@ def rollout(
     if seen:
         parts.append(ballistic(model, start, tracers, frames[:seen]))
     if seen < len(frames):
-        landed = ballistic(model, start, tracers, [flight])
-        start = (landed.x[0], landed.v[0], start[2], start[3]) if flight else start
-        tracers = None if tracers is None else landed.tracers[0]
+        if flight:
+            landed = ballistic(model, start, tracers, (flight,))
+            start = (landed.x[0], landed.v[0], start[2], start[3])
+            tracers = None if tracers is None else landed.tracers[0]
         parts.append(_simulate(model, bodies, start, mass, vol0, tracers, flight, frames[seen:], keep))
     return parts[0] if len(parts) == 1 else _joined(*parts)
 
@@ -101,10 +104,11 @@ def _simulate(
     flat = [w for elastic, plastic in law_weights.values() for w in (*elastic, *plastic)]
     inputs = (*start, *flat)
     differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
-    simulation = Simulation(model, bodies, law_weights, start[0], frames[-1] - first, first, differentiable, keep)
+    steps = frames[-1] - first
+    simulation = Simulation(model, bodies, law_weights, start[0], steps, first, differentiable, keep)
     simulation.set_mass(mass, vol0)
-    x, v, F, C, moved = _Rollout.apply(simulation, [n - first for n in frames], tracers, *inputs)
-    return Trajectory(tuple(frames), x, v, F, C, moved)
+    path = _Rollout.apply(simulation, [n - first for n in frames], tracers, *inputs)
+    return Trajectory(frames, *path)
 
 
 class _Rollout(torch.autograd.Function):
@@ -123,7 +127,8 @@ class _Rollout(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, grad_x, grad_v, grad_F, grad_C, _):
-        start, weights = ctx.simulation.run_adjoint(ctx.saved_tensors, ctx.frames, (grad_x, grad_v, grad_F, grad_C))
+        grads = (grad_x, grad_v, grad_F, grad_C)
+        start, weights = ctx.simulation.run_adjoint(ctx.saved_tensors, ctx.frames, grads)
         return None, None, None, *start, *weights
 
 
@@ -140,7 +145,7 @@ def _joined(first: Trajectory, second: Trajectory) -> Trajectory:
 def _checked_frames(frames: Sequence[int], steps: int) -> tuple[int, ...]:
     frames = tuple(int(n) for n in frames)
     if not frames or frames[0] < 0 or any(b <= a for a, b in zip(frames, frames[1:], strict=False)):
-        raise InputError(f"frames = {list(frames)}: give at least one step, from 0 on, in strictly increasing order")
+        raise InputError(f"frames = {list(frames)}: give at least one step, from 0 on, strictly increasing")
     if frames[-1] > steps:
         raise InputError(f"frames end at step {frames[-1]}, but the rollout has {steps} steps")
     return frames
@@ -173,10 +178,11 @@ def _check_particles(
         if value is None:
             continue
         if tuple(value.shape) not in allowed:
-            raise InputError(f"{name} has shape {tuple(value.shape)}: expected {' or '.join(map(str, allowed))}")
+            expected = " or ".join(map(str, allowed))
+            raise InputError(f"{name} has shape {tuple(value.shape)}: expected {expected}")
         if value.dtype != x0.dtype or value.device != x0.device:
             raise InputError(
-                f"{name} is {value.dtype} on {value.device}, but x0 is {x0.dtype} on {x0.device}: give both alike"
+                f"{name} is {value.dtype} on {value.device}, x0 is {x0.dtype} on {x0.device}: give both alike"
             )
         if not torch.isfinite(value).all():
             raise InputError(f"{name} has a value that is not finite")
@@ -186,11 +192,11 @@ def _check_particles(
     if tracers is not None and (tracers.ndim != 2 or tracers.shape[1] != 3 or tracers.dtype != x0.dtype):
         raise InputError(f"tracers: give positions of shape (M, 3) as {x0.dtype}")
     low, high = model.stencil_range
-    outside = ~((x0 >= low) & (x0 < high)).all(dim=1)
+    outside = ~((x0 >= low) & (x0 <= high)).all(dim=1)
     if outside.any():
         p = int(outside.nonzero()[0])
         place = ", ".join(f"{value:.4g}" for value in x0[p].tolist())
         raise InputError(
             f"{int(outside.sum())} of {N} particles start outside the grid, first particle {p} at ({place}) m: "
-            f"keep the object within [{low:.4g}, {high:.4g}) m on every axis (0.5 dx and 1.5 dx from the walls)"
+            f"place the object within [{low:.4g}, {high:.4g}] m on every axis (half a cell from the grid's edge)"
         )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import is_dataclass
 from typing import Any
 
 import torch
@@ -20,7 +21,7 @@ from neuma_lib.sim.kernels import NEVER
 from neuma_lib.sim.model import Body, MPMModel
 from neuma_lib.sim.workspace import Layout, Workspace, WorkspaceLease
 
-KEEP = {"auto": 1 << 30, "states": 0, "all": math.inf}
+KEEP = {"auto": 1 << 29, "states": 0, "all": math.inf}
 """Bytes that a rollout may spend on intermediate values for its reverse loop, beyond the states themselves."""
 
 
@@ -28,14 +29,14 @@ class Simulation:
     """The loop over the steps, forward and in reverse, on a leased workspace.
 
     Args:
-        model, bodies: as in :func:`rollout`.
-        law_weights: weights of the elasticity and of the plasticity of each distinct law, by id(law). Only their
-            order and number is used; values come with each call.
+        model, bodies: as in `rollout`.
+        law_weights: weights of the elasticity and of the plasticity of each distinct law, by id(law). Only
+            their order and number is used; values come with each call.
         like: a tensor of shape (N, 3) that gives count, precision and device.
         steps: number of steps.
         first: number of the first step, for messages.
-        differentiable: store what :meth:`run_adjoint` needs.
-        keep: see :func:`rollout`.
+        differentiable: store what `run_adjoint` needs.
+        keep: see `rollout`.
     """
 
     def __init__(
@@ -80,7 +81,11 @@ class Simulation:
         self.workspace.vol0.copy_(vol0)
 
     def run(
-        self, start: Sequence[Tensor], weights: Sequence[Tensor], frames: Sequence[int], tracers: Tensor | None
+        self,
+        start: Sequence[Tensor],
+        weights: Sequence[Tensor],
+        frames: Sequence[int],
+        tracers: Tensor | None = None,
     ) -> tuple[Tensor | None, ...]:
         """From the start (x, v, F, C) through all steps; x, v, F, C and tracers at the frames."""
         ws = self.workspace
@@ -93,18 +98,17 @@ class Simulation:
             moving = tracers.detach().clone(memory_format=torch.contiguous_format)
             paths = moving.new_empty(len(frames), *moving.shape)
             launch = ws.tracer_launch(moving)
-        frame = 0
+        frame_of = {step: frame for frame, step in enumerate(frames)}
         with ws.stream():
             for step in range(self.steps + 1):
-                if frame < len(frames) and frames[frame] == step:
+                if step in frame_of:
                     for buffer, values in zip(buffers, result, strict=True):
-                        values[frame].copy_(buffer[ws.state(step)])
-                    if moving is not None:
-                        paths[frame].copy_(moving)
-                    frame += 1
+                        values[frame_of[step]].copy_(buffer[ws.state(step)])
+                    if tracers is not None:
+                        paths[frame_of[step]].copy_(moving)
                 if step < self.steps:
                     self.step(step, weights)
-                    if moving is not None:
+                    if tracers is not None:
                         ws.move_tracers(launch, step)
         self._raise_faults(result[2][-1])
         return *result, paths
@@ -126,14 +130,13 @@ class Simulation:
         for buffer in buffers:
             buffer.zero_()
         grad_weights = [torch.zeros_like(w) for w in weights]
-        frame = len(frames) - 1
+        frame_of = {step: frame for frame, step in enumerate(frames)}
         with ws.stream():
             for step in range(self.steps, -1, -1):
-                if frame >= 0 and frames[frame] == step:
+                if step in frame_of:
                     for buffer, grad in zip(buffers, grads, strict=True):
                         if grad is not None:
-                            buffer.add_(grad[frame])
-                    frame -= 1
+                            buffer.add_(grad[frame_of[step]])
                 if step > 0:
                     self.step_adjoint(step - 1, weights, grad_weights)
         return tuple(buffer.clone() for buffer in buffers), grad_weights
@@ -154,9 +157,10 @@ class Simulation:
     def _evaluate(
         self, part: str, n: int, F: Tensor, weights: Sequence[Tensor], out: Tensor, cache: bool = False
     ) -> None:
-        """Elasticity or plasticity of every body; what their adjoints need is cached if asked or if it fits."""
+        """Elasticity or plasticity of every body; caches what the adjoint needs if asked to or if it fits."""
         for index, body in enumerate(self.bodies):
-            law, own, here = getattr(body.law, part), self._own(part, body, weights), slice(body.start, body.stop)
+            here = slice(body.start, body.stop)
+            law, own = getattr(body.law, part), self._own(part, body, weights)
             if cache or self._cache_bytes > 0:
                 _, kept = law.evaluate_with_cache(F[here], own, out[here])
                 self._caches[part, n, index] = kept
@@ -174,7 +178,7 @@ class Simulation:
         grad_F: Tensor,
         grad_weights: Sequence[Tensor],
     ) -> None:
-        """Adjoint of :meth:`_evaluate`; sets grad_F and adds to grad_weights."""
+        """Adjoint of `_evaluate`; sets grad_F and adds to grad_weights."""
         for index, body in enumerate(self.bodies):
             here = slice(body.start, body.stop)
             getattr(body.law, part).vjp(
@@ -226,6 +230,8 @@ def _bytes(cache: Any) -> int:
     """Memory of the tensors in a law's cache."""
     if isinstance(cache, Tensor):
         return cache.numel() * cache.element_size()
-    if isinstance(cache, (tuple, list)):
-        return sum(map(_bytes, cache))
-    return 0
+    if is_dataclass(cache):
+        cache = vars(cache).values()
+    elif not isinstance(cache, (tuple, list)):
+        return 0
+    return sum(map(_bytes, cache))

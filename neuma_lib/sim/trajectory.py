@@ -31,11 +31,10 @@ class Trajectory:
     def hold_last(self, count: int) -> Trajectory:
         """The same with the last frame repeated `count` times, for a rollout that stopped early."""
 
-        def held(values: Tensor | None) -> Tensor | None:
-            return None if values is None else torch.cat([values, values[-1:].expand(count, *values.shape[1:])])
-
-        return replace(
-            self,
-            frames=self.frames + (self.frames[-1],) * count,
-            **{name: held(getattr(self, name)) for name in ("x", "v", "F", "C", "tracers")},
-        )
+        values = {name: getattr(self, name) for name in ("x", "v", "F", "C", "tracers")}
+        held = {
+            name: torch.cat([value, value[-1:].expand(count, *value.shape[1:])])
+            for name, value in values.items()
+            if value is not None
+        }
+        return replace(self, frames=self.frames + (self.frames[-1],) * count, **held)

@@ -1,10 +1,11 @@
 """Buffers of a rollout and the launches that work on them, made once for a size and used again.
 
-Nothing here is allocated per step: all launches are recorded on fixed memory and only their slot numbers change.
+Nothing here is allocated per step: launches are recorded on fixed memory and only their slot numbers change.
 """
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -40,7 +41,8 @@ class Workspace:
         x, v: positions [m] and velocities [m/s], shape (states, N, 3).
         C, F: affine velocities [1/s] and deformation gradients, shape (states, N, 3, 3).
         tau, F_trial: Kirchhoff stresses [Pa] and trial deformation gradients, shape (kept, N, 3, 3).
-        grid, grid_v: momentum [kg m/s] and mass [kg], velocity [m/s] and indicator of mass, shape (kept, grid^3, 4).
+        grid: momentum [kg m/s] and mass [kg] of the nodes, shape (kept, grid^3, 4).
+        grid_v: velocity [m/s] of the nodes and 1 where there is mass, shape (kept, grid^3, 4).
         mass, vol0: particle masses [kg] and initial volumes [m^3], shape (N,).
         faults: first step and particle of a non-finite value and of one outside the grid, shape (2,).
         grad_*: gradients of the above for one step, without a slot axis.
@@ -57,7 +59,6 @@ class Workspace:
         self.grid, self.grid_v = self._nodes(kept, nodes), self._nodes(kept, nodes)
         self.mass, self.vol0 = self._scalars(N), self._scalars(N)
         self.faults = self._buffer((2,), None, torch.int64)
-        self.faults.fill_(NEVER)
         self._constants = _grid_constants(layout.model, layout.dtype)
         self._record_forward()
         if layout.differentiable:
@@ -92,10 +93,10 @@ class Workspace:
         _run(self._trial, self.state(step), self.state(step + 1), self.kept(step))
 
     def tracer_launch(self, tracers: Tensor) -> wp.Launch:
-        """A recorded launch, for :meth:`move_tracers`, that advects `tracers` (M, 3) in place."""
+        """A recorded launch, for `move_tracers`, that advects `tracers` (M, 3) in place."""
         kernel = forward_kernels(self.layout.dtype).advect_tracers
         positions = wp.from_torch(tracers, dtype=warp_types(self.layout.dtype).vec3)
-        return self._record(kernel, len(tracers), 0, self.grid_v, positions)
+        return self._record(kernel, len(tracers), 0, self._rows(self.grid_v), positions)
 
     def move_tracers(self, launch: wp.Launch, step: int) -> None:
         """Advect tracers by the node velocities of a step."""
@@ -104,8 +105,8 @@ class Workspace:
     def transfer_adjoint(self, step: int) -> None:
         """Gradients of the state after a step and of F_trial to those of the state before it and of tau.
 
-        grad_x, grad_v and grad_C hold the former on entry and the latter on return; grad_F is set to the part that
-        comes through F_trial.
+        grad_x, grad_v and grad_C hold the former on entry and the latter on return; grad_F is set to the part
+        that comes through F_trial.
         """
         state, after, kept = self.state(step), self.state(step + 1), self.kept(step)
         self.grad_grid.zero_()
@@ -140,7 +141,13 @@ class Workspace:
     def _nodes(self, *lead: int) -> Tensor:
         return self._buffer((*lead, 4), warp_types(self.layout.dtype).vec4)
 
-    def _record(self, kernel: wp.Kernel, dim: int | tuple[int, ...], *args: int | Tensor | wp.array) -> wp.Launch:
+    def _rows(self, nodes: Tensor) -> wp.array:
+        """View of nodes (..., nodes, 4) whose element b is the 3 x 4 matrix of the nodes b, b + 1 and b + 2."""
+        *lead, count, width = nodes.shape
+        rows = nodes.as_strided((*lead, count - 2, 3, width), (*nodes.stride()[:-1], width, 1))
+        return wp.from_torch(rows, dtype=warp_types(self.layout.dtype).mat34)
+
+    def _record(self, kernel: wp.Kernel, dim: int, *args: int | Tensor | wp.array) -> wp.Launch:
         inputs = [self._views[id(arg)] if isinstance(arg, Tensor) else arg for arg in args]
         device = wp.device_from_torch(self.layout.device)
         return wp.launch(kernel, dim=dim, inputs=[self._constants, *inputs], device=device, record_cmd=True)
@@ -148,25 +155,27 @@ class Workspace:
     def _record_forward(self) -> None:
         k = forward_kernels(self.layout.dtype)
         N, nodes = self.layout.particles, self.layout.model.grid**3
+        rows, rows_v = self._rows(self.grid), self._rows(self.grid_v)
         self._p2g = self._record(
-            k.p2g, N, 0, 0, self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.grid
-        )
+            k.p2g, N, 0, 0, self.x, self.v, self.C, self.tau, self.mass, self.vol0, rows
+        )  # fmt: skip
         self._grid_update = self._record(k.grid_update, nodes, 0, self.grid, self.grid_v)
         self._g2p = self._record(
-            k.g2p, N, 0, 0, 0, 0, self.grid_v, self.x, self.v, self.C, self.F, self.F_trial, self.faults
+            k.g2p, N, 0, 0, 0, 0, rows_v, self.x, self.v, self.C, self.F, self.F_trial, self.faults
         )
         self._trial = self._record(k.trial_deformation, N, 0, 0, 0, self.C, self.F, self.F_trial)
 
     def _record_adjoint(self) -> None:
         k = adjoint_kernels(self.layout.dtype)
         N, nodes = self.layout.particles, self.layout.model.grid**3
+        rows_v, grad_rows = self._rows(self.grid_v), self._rows(self.grad_grid)
         self._g2p_adjoint = self._record(
-            k.g2p_adjoint, N, 0, 0, 0, self.x, self.v, self.C, self.F, self.grid_v,
-            self.grad_v, self.grad_C, self.grad_F_trial, self.grad_x, self.grad_F, self.grad_grid,
+            k.g2p_adjoint, N, 0, 0, 0, self.x, self.v, self.C, self.F, rows_v,
+            self.grad_v, self.grad_C, self.grad_F_trial, self.grad_x, self.grad_F, grad_rows,
         )  # fmt: skip
         self._grid_adjoint = self._record(k.grid_adjoint, nodes, 0, self.grid, self.grad_grid)
         self._p2g_adjoint = self._record(
-            k.p2g_adjoint, N, 0, 0, self.x, self.v, self.C, self.tau, self.mass, self.vol0, self.grad_grid,
+            k.p2g_adjoint, N, 0, 0, self.x, self.v, self.C, self.tau, self.mass, self.vol0, grad_rows,
             self.grad_x, self.grad_v, self.grad_C, self.grad_tau,
         )  # fmt: skip
 
@@ -175,25 +184,26 @@ class WorkspaceLease:
     """A workspace that goes back to the pool when nobody holds the lease, for example when a graph is freed."""
 
     _idle: list[Workspace] = []
-    _most_idle = 4
+    _most_idle = 3
+    _lock = threading.RLock()  # leases may end in any thread, and in the middle of taking one
 
     def __init__(self, layout: Layout):
-        for i, workspace in enumerate(self._idle):
-            if workspace.layout == layout:
-                self.workspace = self._idle.pop(i)
-                self.workspace.faults.fill_(NEVER)
-                return
-        self.workspace = Workspace(layout)
+        with self._lock:
+            fitting = [workspace for workspace in self._idle if workspace.layout == layout]
+            if fitting:
+                self._idle.remove(fitting[-1])
+        self.workspace = fitting[-1] if fitting else Workspace(layout)
+        self.workspace.faults.fill_(NEVER)
 
     def __del__(self):
-        workspace = getattr(self, "workspace", None)
-        if workspace is not None:
-            self._idle.append(workspace)
-            del self._idle[: -self._most_idle]
+        if hasattr(self, "workspace"):
+            with self._lock:
+                self._idle.append(self.workspace)
+                del self._idle[: -self._most_idle]
 
 
 def _run(launch: wp.Launch, *numbers: int) -> None:
-    """Launch with these values of the leading integer parameters (slots, step), which follow the constants."""
+    """Launch with these values of the integer parameters (slots, step) that follow the constants."""
     for i, number in enumerate(numbers):
         launch.set_param_at_index_from_ctype(i + 1, number)
     launch.launch()
@@ -203,7 +213,7 @@ def _grid_constants(model: MPMModel, dtype: torch.dtype):
     t = warp_types(dtype)
     c = t.GridConstants()
     c.n, c.wall_cells = model.grid, model.wall_cells
-    c.walls = t.walls6(*(_CONDITION_CODES[condition] for condition in model.boundary))
+    c.walls = t.walls(*(_CONDITION_CODES[condition] for condition in model.boundary))
     c.dx, c.inv_dx, c.dt = model.dx, float(model.grid), model.dt
     c.gravity = t.vec3(*model.gravity)
     c.x_low, c.x_high = model.stencil_range

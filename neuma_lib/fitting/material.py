@@ -1,0 +1,335 @@
+"""Grounding the material law in the video (paper Sec. 3.2-3.4): low-rank corrections of both networks, from pixels.
+
+One loop serves the method and its ablations; they differ in the options that it is given:
+
+==============================  =======================================================================
+NeuMA                           rank-16 adaptor, `PixelLoss`, reconstructed body
+NeuMA w/ particle supervision   rank-16 adaptor, `ParticleLoss`, reconstructed body
+NeuMA w/o Bind                  rank-16 adaptor, `PixelLoss`, the Gaussians as particles
+NeuMA w/o dM                    full-rank adaptor (the base weights themselves), `PixelLoss`, reconstructed body
+==============================  =======================================================================
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.evaluation.metrics import chamfer_loss
+from neuma_lib.fitting.observation import Observation, Reconstruction
+from neuma_lib.materials.base import Law
+from neuma_lib.sim import MPMModel, Trajectory, rollout
+
+
+class TrajectoryLoss(Protocol):
+    """What training minimises: one number per frame from a simulated trajectory."""
+
+    frames: tuple[int, ...]
+
+    def __call__(self, path: Trajectory) -> Tensor:
+        """Losses of the frames, shape (T,)."""
+
+
+@dataclass
+class PixelLoss:
+    """Mean squared colour difference of each frame over all training views (paper Eq. 2)."""
+
+    body: Reconstruction
+    observation: Observation
+    covariance_gradient: bool = True
+
+    def __post_init__(self):
+        self.frames = self.observation.frames
+        self._renderer = self.body.particle_gs(
+            self.observation.cameras, covariance_gradient=self.covariance_gradient
+        )
+
+    def __call__(self, path: Trajectory) -> Tensor:
+        images = self._renderer(path.x, path.F)
+        return ((images - self.observation.images) ** 2).flatten(1).mean(1)
+
+
+@dataclass
+class ParticleLoss:
+    """Chamfer distance of each frame to ground-truth particles (the w/ P.S. ablation).
+
+    Attributes:
+        frames: steps of the frames.
+        targets: ground-truth positions [m], shape (T, M, 3).
+    """
+
+    frames: tuple[int, ...]
+    targets: Tensor
+
+    def __call__(self, path: Trajectory) -> Tensor:
+        return chamfer_loss(path.x, self.targets)
+
+
+@dataclass(frozen=True)
+class MaterialSettings:
+    """Hyper-parameters of the training loop.
+
+    Attributes:
+        iterations: optimiser steps, one full rollout each.
+        lr_elastic, lr_plastic: learning rates of the two networks.
+        lr_floor: fraction of the learning rates that the cosine schedule ends at.
+        betas: Adam's averaging factors.
+        gradient_clip: largest gradient norm of each network; the loss is divided by its first value before.
+        frame_weight_start: d of the frame weights d^k at the first iteration; it rises to 1 over the first third.
+        frame_weight_periods: k counts this many equal parts of the video, so that early frames are fitted first.
+        diverged_ratio: a loss above this multiple of the best one so far (at equal frame weights) counts as diverged.
+        max_recoveries: after so many returns to the last good state training ends there, marked as unstable.
+        checkpoint_every: iterations between checkpoints.
+    """
+
+    iterations: int = 100
+    lr_elastic: float = 0.05
+    lr_plastic: float = 0.005
+    lr_floor: float = 0.05
+    betas: tuple[float, float] = (0.9, 0.99)
+    gradient_clip: float = 1.0
+    frame_weight_start: float = 0.5
+    frame_weight_periods: int = 5
+    diverged_ratio: float = 5.0
+    max_recoveries: int = 6
+    checkpoint_every: int = 10
+
+
+@dataclass
+class History:
+    """Training curves, one entry an accepted iteration."""
+
+    loss: list[float] = field(default_factory=list)
+    weighted_loss: list[float] = field(default_factory=list)
+    gradient_norm_elastic: list[float] = field(default_factory=list)
+    gradient_norm_plastic: list[float] = field(default_factory=list)
+    lr_scale: list[float] = field(default_factory=list)
+    recoveries: list[dict] = field(default_factory=list)
+
+
+@dataclass
+class TrainedMaterial:
+    """Result of `train_material`: the law at its best training loss, how it got there, and whether it stayed stable."""
+
+    law: Law
+    history: History
+    best_loss: float
+    best_iteration: int
+    stable: bool
+
+    def summary(self) -> str:
+        """One line for people."""
+        first = self.history.loss[0]
+        note = "" if self.stable else "; UNSTABLE: last good state kept"
+        moves = f", {len(self.history.recoveries)} recoveries" if self.history.recoveries else ""
+        return (
+            f"loss {first:.3e} -> {self.best_loss:.3e} (x{first / max(self.best_loss, 1e-30):.1f} lower) "
+            f"at iteration {self.best_iteration}{moves}{note}"
+        )
+
+
+def frame_weights(iteration: int, count: int, settings: MaterialSettings) -> Tensor:
+    """Weights of the frames, shape (count,): d^k with k the part of the video, d rising to 1 over a third of training."""
+    rise = min(1.0, iteration / max(1.0, settings.iterations / 3))
+    d = settings.frame_weight_start + (1 - settings.frame_weight_start) * rise
+    part = torch.arange(count) * settings.frame_weight_periods // max(count, 1)
+    return d ** part.to(torch.get_default_dtype())
+
+
+def train_material(
+    model: MPMModel,
+    law: Law,
+    body: Reconstruction,
+    v0: Tensor,
+    loss: TrajectoryLoss,
+    settings: MaterialSettings,
+    *,
+    checkpoint: Checkpoint | None = None,
+    progress: Callable[[int, int, float], None] | None = None,
+    log: Callable[[str], None] = print,
+) -> TrainedMaterial:
+    """Optimise the law's trainable parameters so that the rollout matches the frames.
+
+    Args:
+        model: simulator constants.
+        law: prior with an adaptor; its parameters that require gradients are optimised, in place.
+        body: particles at the start.
+        v0: initial velocity [m/s], shape (3,).
+        loss: per-frame loss of a trajectory.
+        settings: hyper-parameters.
+        checkpoint: where to keep the state of the loop, so that a killed run goes on; None keeps none.
+        progress: called with (iteration, iterations, loss).
+        log: receives a line for every recovery from a diverging step.
+
+    Raises:
+        NonFiniteError: the very first rollout is not finite, so there is no good state to return to.
+        InputError: the law has nothing to train.
+    """
+    loop = _Loop(model, law, body, v0, loss, settings, log)
+    if checkpoint is not None and (state := checkpoint.load()) is not None:
+        loop.load_state_dict(state)
+        log(f"resumed at iteration {loop.iteration} of {settings.iterations}")
+    while loop.iteration < settings.iterations and not loop.ended:
+        loop.advance()
+        if progress:
+            progress(loop.iteration, settings.iterations, loop.history.loss[-1])
+        if checkpoint is not None and loop.iteration % settings.checkpoint_every == 0:
+            checkpoint.save(loop.state_dict())
+    loop.judge_last_step()
+    law.load_state_dict(loop.best["law"])
+    return TrainedMaterial(law, loop.history, loop.best["loss"], loop.best["iteration"], stable=not loop.ended)
+
+
+class Checkpoint(Protocol):
+    """A place that keeps one state of the loop across kills (`neuma_lib.checkpoint`)."""
+
+    def load(self) -> dict | None: ...
+
+    def save(self, state: dict) -> None: ...
+
+
+class _Loop:
+    """The state of training, and one step of it."""
+
+    def __init__(self, model, law, body, v0, loss, settings, log):
+        self.model, self.law, self.body, self.v0 = model, law, body, v0
+        self.loss, self.settings, self.log = loss, settings, log
+        self.nets = {
+            "elastic": [p for p in law.elasticity.parameters() if p.requires_grad],
+            "plastic": [p for p in law.plasticity.parameters() if p.requires_grad],
+        }
+        if not any(self.nets.values()):
+            raise InputError("the law has no trainable parameters: attach an adaptor before training")
+        rates = {"elastic": settings.lr_elastic, "plastic": settings.lr_plastic}
+        self.optimizer = torch.optim.Adam(
+            [{"params": p, "lr": rates[k], "base_lr": rates[k]} for k, p in self.nets.items() if p],
+            betas=settings.betas,
+        )
+        self.iteration, self.lr_scale, self.ended = 0, 1.0, False
+        self.history, self.first_loss = History(), None
+        self.best = {"loss": math.inf, "iteration": 0, "law": copy.deepcopy(law.state_dict())}
+        self.good: dict | None = None
+
+    def advance(self) -> None:
+        """One accepted optimiser step, or a return to the last good state."""
+        try:
+            frame_losses = self._frame_losses()
+            value = float(frame_losses.detach().mean())
+            if not math.isfinite(value):
+                raise NonFiniteError("material", f"the loss is not finite at iteration {self.iteration}")
+            if value > self.settings.diverged_ratio * max(self.best["loss"], 1e-12) and self.good is not None:
+                raise NonFiniteError("material", f"loss {value:.3e} against a best of {self.best['loss']:.3e}")
+            norms, weighted = self._backward(frame_losses)
+        except NonFiniteError as error:
+            self._recover(error)
+            return
+        self._keep_if_best(value)
+        self.good = self._snapshot()
+        self._step()
+        self.history.loss.append(value)
+        self.history.weighted_loss.append(weighted)
+        self.history.gradient_norm_elastic.append(norms.get("elastic", 0.0))
+        self.history.gradient_norm_plastic.append(norms.get("plastic", 0.0))
+        self.history.lr_scale.append(self.lr_scale)
+        self.iteration += 1
+
+    def judge_last_step(self) -> None:
+        """Whether the state after the last optimiser step is the best one."""
+        if self.ended:
+            return
+        try:
+            with torch.no_grad():
+                value = float(self._frame_losses().mean())
+        except NonFiniteError:
+            return
+        if math.isfinite(value):
+            self._keep_if_best(value)
+
+    def _frame_losses(self) -> Tensor:
+        body = self.body
+        path = rollout(
+            self.model,
+            self.law,
+            body.x0,
+            self.v0,
+            body.mass,
+            body.vol0,
+            steps=self.loss.frames[-1],
+            frames=self.loss.frames,
+        )
+        return self.loss(path)
+
+    def _backward(self, frame_losses: Tensor) -> tuple[dict[str, float], float]:
+        if self.first_loss is None:
+            self.first_loss = float(frame_losses.detach().mean())
+        weights = frame_weights(self.iteration, len(frame_losses), self.settings).to(frame_losses)
+        weighted = (weights * frame_losses).sum() / weights.sum()
+        self.optimizer.zero_grad(set_to_none=True)
+        (weighted / max(self.first_loss, 1e-30)).backward()
+        norms = {}
+        for name, parameters in self.nets.items():
+            if parameters:
+                norm = torch.nn.utils.clip_grad_norm_(parameters, self.settings.gradient_clip)
+                norms[name] = float(norm)
+                if not math.isfinite(norms[name]):
+                    raise NonFiniteError("material", f"{name} gradient is not finite at iteration {self.iteration}")
+        return norms, float(weighted.detach())
+
+    def _step(self) -> None:
+        s = self.settings
+        cosine = (1 + math.cos(math.pi * self.iteration / max(1, s.iterations))) / 2
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["base_lr"] * self.lr_scale * (s.lr_floor + (1 - s.lr_floor) * cosine)
+        self.optimizer.step()
+
+    def _keep_if_best(self, value: float) -> None:
+        if value < self.best["loss"]:
+            law = copy.deepcopy(self.law.state_dict())
+            self.best = {"loss": value, "iteration": self.iteration, "law": law}
+
+    def _snapshot(self) -> dict:
+        return {
+            "law": copy.deepcopy(self.law.state_dict()),
+            "optimizer": copy.deepcopy(self.optimizer.state_dict()),
+        }
+
+    def _recover(self, error: NonFiniteError) -> None:
+        """Return to the state before the diverging step, with half the learning rate."""
+        if self.good is None:
+            raise error
+        self.lr_scale /= 2
+        self.law.load_state_dict(self.best["law"])
+        self.optimizer.load_state_dict(copy.deepcopy(self.good["optimizer"]))
+        entry = {"iteration": self.iteration, "reason": str(error), "lr_scale": self.lr_scale}
+        self.history.recoveries.append(entry)
+        self.log(f"iteration {self.iteration}: {error}; back to the last good state, rates x{self.lr_scale:g}")
+        if len(self.history.recoveries) > self.settings.max_recoveries:
+            self.ended = True
+
+    def state_dict(self) -> dict:
+        """Everything that the next iterations depend on."""
+        return {
+            "iteration": self.iteration,
+            "lr_scale": self.lr_scale,
+            "ended": self.ended,
+            "first_loss": self.first_loss,
+            "history": copy.deepcopy(self.history.__dict__),
+            "best": copy.deepcopy(self.best),
+            "good": copy.deepcopy(self.good),
+            **self._snapshot(),
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """Continue from a `state_dict`."""
+        for key in ("iteration", "lr_scale", "ended", "first_loss", "best", "good"):
+            setattr(self, key, state[key])
+        self.history = History(**state["history"])
+        self.law.load_state_dict(state["law"])
+        self.optimizer.load_state_dict(state["optimizer"])

@@ -1,0 +1,102 @@
+"""What the optimisation loops may know: the reconstructed body, and the frames that the cameras saw."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from neuma_lib.binding import Binding
+from neuma_lib.errors import InputError
+from neuma_lib.render.cameras import Cameras
+from neuma_lib.render.gaussians import Gaussians
+from neuma_lib.render.particle_gs import ParticleGS
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A reconstructed object at t = 0.
+
+    Attributes:
+        x0: particle positions [m], shape (N, 3).
+        vol0: particle volumes [m^3], shape (N,).
+        mass: particle masses [kg], shape (N,).
+        gaussians: static kernels, G of them.
+        binding: (G, N) binding matrix.
+    """
+
+    x0: Tensor
+    vol0: Tensor
+    mass: Tensor
+    gaussians: Gaussians
+    binding: Binding
+
+    @classmethod
+    def of_gaussians(cls, gaussians: Gaussians, volume: float, density: float) -> Reconstruction:
+        """The kernels taken as particles (the paper's w/o Bind): one particle a kernel, equal shares of the volume [m^3]."""
+        count = len(gaussians.means)
+        vol0 = torch.full_like(gaussians.means[:, 0], volume / count)
+        return cls(gaussians.means, vol0, vol0 * density, gaussians, Binding.identity(count, gaussians.means))
+
+    def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Reconstruction:
+        """The same body in another precision or on another device."""
+        kind = dict(dtype=dtype, device=device)
+        return replace(
+            self,
+            x0=self.x0.to(**kind),
+            vol0=self.vol0.to(**kind),
+            mass=self.mass.to(**kind),
+            gaussians=self.gaussians.to(**kind),
+            binding=self.binding.to(**kind),
+        )
+
+    def particle_gs(self, cameras: Cameras, **options) -> ParticleGS:
+        """The renderer of this body for the given cameras."""
+        return ParticleGS(self.gaussians, self.binding, self.x0, cameras, **options)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """A video from V calibrated views.
+
+    Attributes:
+        frames: simulation step of each frame (0 is the start), length T, ascending.
+        images: colours over a white background in [0, 1], shape (T, V, H, W, 3).
+        cameras: the V views.
+    """
+
+    frames: tuple[int, ...]
+    images: Tensor
+    cameras: Cameras
+
+    def __post_init__(self):
+        if len(self.frames) != len(self.images):
+            raise InputError(f"{len(self.images)} images for {len(self.frames)} frames: every frame needs an image")
+        if list(self.frames) != sorted(set(self.frames)):
+            raise InputError(f"frames must ascend without repeats, got {self.frames}")
+
+    @property
+    def steps(self) -> int:
+        """Simulation steps from the start to the last frame."""
+        return self.frames[-1]
+
+    def select(self, keep: Sequence[int]) -> Observation:
+        """The frames with the given indices."""
+        keep = list(keep)
+        return replace(self, frames=tuple(self.frames[i] for i in keep), images=self.images[keep])
+
+    def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Observation:
+        """The same frames in another precision or on another device."""
+        return replace(
+            self,
+            images=self.images.to(dtype=dtype, device=device),
+            cameras=self.cameras.to(dtype=dtype, device=device),
+        )
+
+
+def over_white(rgba: Tensor) -> Tensor:
+    """Composite straight-alpha RGBA (..., 4) over white: colour (..., 3)."""
+    alpha = rgba[..., 3:]
+    return rgba[..., :3] * alpha + (1 - alpha)
