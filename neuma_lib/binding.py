@@ -1,8 +1,9 @@
 """Gaussian-particle binding: Algorithm 1 of the paper as a sparse matrix.
 
-Row i of the binding matrix B (G, N) holds the weights of the particles that carry Gaussian i: the particles inside
-its confidence ellipsoid, at most ``max_neighbours`` of them, equally weighted, so that every non-empty row sums
-to 1. Gaussians then follow the particles by ``x_t = x_0 + B (p_t - p_0)`` and ``F_bar = B F`` (paper, section 3.3).
+Row i of the binding matrix B (G, N) holds the weights of the particles that carry Gaussian i: the particles
+inside its confidence ellipsoid, at most ``max_neighbours`` of them, equally weighted, so that every
+non-empty row sums to 1. Gaussians then follow the particles by ``x_t = x_0 + B (p_t - p_0)`` and ``F_bar =
+B F`` (paper, section 3.3).
 
 The dense G x N matrix is never formed, and the ellipsoid test touches only particles near each Gaussian.
 """
@@ -20,7 +21,8 @@ from torch import Tensor
 from neuma_lib.errors import InputError
 
 _FIRST_QUERY = 32
-"""Nearest particles asked for at first; Gaussians that need more are asked again with four times as many."""
+"""Nearest particles asked for at first; Gaussians that need more are asked again with four times as
+many."""
 _CHUNK_ENTRIES = 2_000_000
 """Gaussian-particle pairs held at one time, which bounds the memory of a search whatever its input."""
 _SHARING_NEIGHBOURS = 16
@@ -48,9 +50,16 @@ class Binding:
 
     @classmethod
     def identity(cls, count: int, like: Tensor) -> Binding:
-        """Every Gaussian is its own particle (the paper's "w/o Bind"), in the precision and on the device of ``like``."""
+        """Every Gaussian is its own particle (the paper's "w/o Bind"), on the device of ``like``.
+
+        Args:
+            count: Gaussians, which are the particles too.
+            like: tensor whose device and floating type the weights take.
+        """
         index = torch.arange(count + 1, device=like.device)
-        return cls(index, index[:-1].clone(), torch.ones_like(like.reshape(count, -1)[:, 0]), (count, count))
+        return cls(
+            index, index[:-1].clone(), torch.ones(count, dtype=like.dtype, device=like.device), (count, count)
+        )
 
     @property
     def counts(self) -> Tensor:
@@ -92,8 +101,9 @@ class Binding:
         """
         if particle_field.ndim < 2 or particle_field.shape[1] != self.shape[1]:
             raise InputError(
-                f"binding: a field of shape {tuple(particle_field.shape)} does not fit {self.shape[1]} particles; "
-                "expected (frames, particles, ...). Rerun the binding stage if the particles changed."
+                f"binding: a field of shape {tuple(particle_field.shape)} does not fit "
+                f"{self.shape[1]} particles; expected (frames, particles, ...). Rerun the binding stage if "
+                "the particles changed."
             )
         return _Apply.apply(particle_field, self)
 
@@ -130,8 +140,8 @@ class _Apply(torch.autograd.Function):
 def _multiply(indptr: Tensor, indices: Tensor, values: Tensor, columns: Tensor) -> Tensor:
     """Compressed-row matrix (R, K) times a field (T, K, ...), frame by frame: (T, R, ...).
 
-    Bags summed with weights are a sparse product that is fast and deterministic on CPU and CUDA; frames are laid
-    side by side, so that each row of indices is read once for all of them.
+    Bags summed with weights are a sparse product that is fast and deterministic on CPU and CUDA; frames are
+    laid side by side, so that each row of indices is read once for all of them.
     """
     frames, _, *rest = columns.shape
     rows = len(indptr) - 1
@@ -153,9 +163,9 @@ def bind(
 ) -> Binding:
     """Bind every Gaussian to the particles inside its confidence ellipsoid (paper, Algorithm 1).
 
-    Particle j belongs to Gaussian i when ``(p_j - x_i)^T A_i^-1 (p_j - x_i) <= chi2_3(confidence)``; of these the
-    ``max_neighbours`` nearest in that distance are kept (the smaller index first where two are equally far) and
-    share the weight equally.
+    Particle j belongs to Gaussian i when ``(p_j - x_i)^T A_i^-1 (p_j - x_i) <= chi2_3(confidence)``; of
+    these the ``max_neighbours`` nearest in that distance are kept (the smaller index first where two are
+    equally far) and share the weight equally.
 
     Args:
         means: Gaussian centres [m], shape (G, 3).
@@ -169,8 +179,8 @@ def bind(
         (``Binding.orphans``).
 
     Raises:
-        InputError: shapes that do not fit, non-finite values, a covariance that is not positive definite, or a
-            setting outside its range.
+        InputError: shapes that do not fit, non-finite values, a covariance that is not positive definite,
+            or a setting outside its range.
     """
     centres, shapes, points = _checked(means, covars, particles)
     rows, columns = _pairs_inside(centres, shapes, points, _threshold(confidence), max_neighbours)
@@ -188,20 +198,21 @@ def bind_two_pass(
 ) -> tuple[Binding, Tensor, int, Tensor]:
     """Bind twice, so that no Gaussian is left without a particle (paper, section 3.4).
 
-    Gaussians that the first pass leaves empty get a particle of their own at their centre; the second pass binds
-    all Gaussians to the enlarged set. The added particles crowd at the surface. By default each takes its volume
-    from the particles around it, in proportions whose barycentre is its own position, which leaves total volume
-    and centre of mass (at one density) unchanged to round-off and every volume positive.
+    Gaussians that the first pass leaves empty get a particle of their own at their centre; the second pass
+    binds all Gaussians to the enlarged set. The added particles crowd at the surface. By default each takes
+    its volume from the particles around it, in proportions whose barycentre is its own position, which
+    leaves total volume and centre of mass (at one density) unchanged to round-off and every volume
+    positive.
 
     Args:
         means, covars, particles, confidence, max_neighbours: as in ``bind``.
         volumes: particle volumes [m^3], shape (N,), or the object's volume [m^3], to be spread evenly.
-        equal_mass: give all N + M particles the object's volume / (N + M), as the paper does. The total stays,
-            the centre of mass moves.
+        equal_mass: give all N + M particles the object's volume / (N + M), as the paper does. The total
+            stays, the centre of mass moves.
 
     Returns:
-        Tuple of the binding (G, N + M), the particles with the M added ones at the end (N + M, 3), the added
-        count M, and the volumes (N + M,).
+        Tuple of the binding (G, N + M), the particles with the M added ones at the end (N + M, 3), the
+        added count M, and the volumes (N + M,).
 
     Raises:
         InputError: as ``bind``; volumes that are not positive or do not fit the particles.
@@ -261,9 +272,10 @@ def _checked(means: Tensor, covars: Tensor, particles: Tensor) -> tuple[np.ndarr
 
 
 def _checked_volumes(volumes: Tensor | float, count: int) -> np.ndarray:
-    array = torch.as_tensor(volumes).detach().to("cpu", torch.float64).numpy()
-    if array.ndim == 0:
-        array = np.full(count, float(array) / count)
+    if isinstance(volumes, Tensor) and volumes.ndim:
+        array = volumes.detach().to("cpu", torch.float64).numpy()
+    else:
+        array = np.full(count, float(volumes) / count)
     if array.shape != (count,):
         raise InputError(f"binding: {array.shape} volumes do not fit {count} particles")
     if not (np.isfinite(array).all() and (array > 0).all()):
@@ -290,10 +302,10 @@ def _pairs_inside(
 ) -> tuple[np.ndarray, np.ndarray]:
     """All pairs (Gaussian, particle) of Algorithm 1, sorted by Gaussian, then by particle.
 
-    The k nearest particles of a Gaussian are enough when the k-th is so far away that anything beyond it lies
-    outside the ellipsoid, or is further in the Mahalanobis distance than ``most`` particles already found: the
-    smallest Mahalanobis distance at a Euclidean distance r is r^2 / lambda_max. Otherwise it is asked again with
-    more. The result is exact; only how much is read depends on the guess.
+    The k nearest particles of a Gaussian are enough when the k-th is so far away that anything beyond it
+    lies outside the ellipsoid, or is further in the Mahalanobis distance than ``most`` particles already
+    found: the smallest Mahalanobis distance at a Euclidean distance r is r^2 / lambda_max. Otherwise it is
+    asked again with more. The result is exact; only how much is read depends on the guess.
     """
     if most is not None and most < 1:
         raise InputError(f"binding.max_neighbours = {most}: choose 1 or more, or none for no limit")
@@ -354,9 +366,9 @@ def _share_volumes(points: np.ndarray, volumes: np.ndarray, added: np.ndarray) -
     """Volumes of the particles and of those added, with the sum and the first moment of the former alone.
 
     Added particle m at q takes ``w_m f_mj`` from its neighbour j, where ``sum_j f_mj = 1`` and
-    ``sum_j f_mj p_j = q`` (the smallest such f; negative, hence a gift, where q lies outside its neighbours).
-    w_m aims at an equal share among the group, and is lowered until no particle gives more than
-    ``_LARGEST_SHARE`` of its volume.
+    ``sum_j f_mj p_j = q`` (the smallest such f; negative, hence a gift, where q lies outside its
+    neighbours). w_m aims at an equal share among the group, and is lowered until no particle gives more
+    than ``_LARGEST_SHARE`` of its volume.
     """
     size = min(_SHARING_NEIGHBOURS, len(points))
     _, neighbours = cKDTree(points).query(added, k=np.arange(1, size + 1))

@@ -13,6 +13,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from neuma_lib.geometry import shapes
 from neuma_lib.geometry.volume import sample_tracers, sample_volume
 from neuma_lib.materials.base import Law
 from neuma_lib.sim import MPMModel, Trajectory, rollout
@@ -38,6 +39,21 @@ class GroundTruth:
     tracers_again: Tensor
     vol0: float
     mass: float
+
+
+def place(shape: str, size: float | None, height: float, center: Sequence[float]) -> trimesh.Trimesh:
+    """The true shape where a scene starts it.
+
+    Args:
+        shape: name of the shape (`neuma_lib.geometry.shapes`).
+        size: longest side of the bounding box [m]; None keeps the shape's own.
+        height: y of the bounding box's centre [m].
+        center: x and z of the bounding box's centre [m].
+    """
+    mesh = shapes.build(shape, size)
+    middle = mesh.bounds.mean(axis=0)
+    mesh.apply_translation([center[0] - middle[0], height - middle[1], center[1] - middle[2]])
+    return mesh
 
 
 def simulate_ground_truth(

@@ -1,13 +1,14 @@
 """Static Gaussian kernels from posed RGBA images (paper Sec. 3.1 and supplement, 3D Gaussian Splatting).
 
-Start: points sampled in the visual hull of the alpha masks, coloured from the images. Loss: L1 and SSIM over a
-random background, which makes alpha a fourth supervised channel, plus the anisotropy regulariser of PhysGaussian.
-Kernels with large screen-space gradients are cloned or split up to a fixed number; transparent ones are removed,
-at the end those with an opacity of at most 0.02, as in the paper.
+Start: points sampled in the visual hull of the alpha masks, coloured from the images. Loss: L1 and SSIM over
+a random background, which makes alpha a fourth supervised channel, plus the anisotropy regulariser of
+PhysGaussian. Kernels with large screen-space gradients are cloned or split up to a fixed number; transparent
+ones are removed, at the end those with an opacity of at most 0.02, as in the paper.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -33,8 +34,8 @@ class Densification:
         every: iterations between two rounds.
         max_count: kernels at most.
         growth: largest fraction of kernels added in a round.
-        split_scale: a kernel whose largest standard deviation exceeds this many mean spacings of the start is split
-            in two, a smaller one is cloned.
+        split_scale: a kernel whose largest standard deviation exceeds this many times that of the start is
+            split in two, a smaller one is cloned.
         min_opacity: kernels below are removed at each round.
     """
 
@@ -56,23 +57,25 @@ class GaussianFitSettings:
         batch: views a step.
         initial_count: kernels at the start.
         interior: fraction of them placed inside the hull, the others lie near its surface.
+        initial_opacity: opacity at the start, and for good of kernels that no camera ever sees.
         hull_resolution: voxels along the longest side of the hull's bounding box.
         sh_degree: highest SH degree, 0 to 3.
         ssim_weight: share of SSIM in the image loss, the rest is L1.
-        anisotropy_weight, max_anisotropy: weight of the regulariser and the ratio of longest to shortest axis above
-            which it acts.
+        anisotropy_weight, max_anisotropy: weight of the regulariser and the ratio of longest to shortest axis
+            above which it acts.
         min_scale, max_scale: limits of the standard deviations as fractions of the mean spacing of the start.
         rate_means: learning rate of the centres in mean spacings of the start; falls to a hundredth.
-        rate_scales, rate_quats, rate_opacities, rate_colours, rate_harmonics: the others; they fall to a tenth.
+        rate_scales, rate_quats, rate_opacities, rate_colours, rate_harmonics: the others; fall to a tenth.
         cull_opacity: kernels at most this opaque are removed at the end (paper: 0.02).
         held_out: every how many-th view is kept for measurement only; 0 for none.
         densification: rounds of adding and removing kernels.
     """
 
-    iterations: int = 2500
+    iterations: int = 1500
     batch: int = 1
     initial_count: int = 1000
     interior: float = 0.15
+    initial_opacity: float = 0.9
     hull_resolution: int = 64
     sh_degree: int = 1
     ssim_weight: float = 0.2
@@ -125,7 +128,7 @@ def fit_gaussians(
     """Fit Gaussian kernels to images of an object.
 
     Args:
-        images: (V, H, W, 4) RGBA with straight alpha in [0, 1]; alpha separates the object from its surroundings.
+        images: (V, H, W, 4) RGBA with straight alpha in [0, 1]; alpha shows the object alone.
         cameras: their V cameras.
         settings: see GaussianFitSettings.
         seed: of everything random; the same seed gives the same kernels on a CPU.
@@ -142,7 +145,9 @@ def fit_gaussians(
     images = images.to(cameras.viewmats.dtype)
     _check(images, cameras)
     generator = torch.Generator().manual_seed(seed)
-    held_out = list(range(settings.held_out // 2, len(cameras), settings.held_out)) if settings.held_out else []
+    held_out = (
+        list(range(settings.held_out // 2, len(cameras), settings.held_out)) if settings.held_out else []
+    )
     fitted = [i for i in range(len(cameras)) if i not in held_out]
 
     hull = visual_hull(images[fitted, ..., 3], cameras[fitted], settings.hull_resolution)
@@ -151,7 +156,8 @@ def fit_gaussians(
 
     losses: list[float] = []
     order: list[int] = []
-    first, last = (round(part * settings.iterations) for part in (settings.densification.start, settings.densification.stop))
+    rules = settings.densification
+    first, last = round(rules.start * settings.iterations), round(rules.stop * settings.iterations)
     for iteration in range(settings.iterations):
         views = []
         for _ in range(settings.batch):
@@ -162,8 +168,10 @@ def fit_gaussians(
         loss = kernels.step(images[views], cameras[views], background, iteration / settings.iterations)
         losses.append(loss)
         if not math.isfinite(loss):
-            raise NonFiniteError("gaussians", f"loss is {loss} in iteration {iteration}; lower the learning rates")
-        if first <= iteration < last and (iteration + 1) % settings.densification.every == 0:
+            raise NonFiniteError(
+                "gaussians", f"loss is {loss} in iteration {iteration}; lower the learning rates"
+            )
+        if first <= iteration < last and (iteration + 1) % rules.every == 0:
             kernels.densify(generator)
         if progress is not None:
             progress(iteration, loss)
@@ -186,7 +194,7 @@ def fit_gaussians(
 
 
 def evaluate(gaussians: Gaussians, images: Tensor, cameras: Cameras, views: list[int]) -> tuple[float, float]:
-    """Mean PSNR [dB] over ``views`` against RGBA images over white: full frame, and where alpha exceeds 1/2."""
+    """Mean PSNR [dB] over ``views`` against RGBA images over white: full frame; where alpha > 1/2."""
     if not views:
         return math.nan, math.nan
     full, inside = [], []
@@ -202,9 +210,6 @@ def evaluate(gaussians: Gaussians, images: Tensor, cameras: Cameras, views: list
         full.append(-10 * math.log10(float(error.mean())))
         inside.append(-10 * math.log10(float(error[rgba[..., 3] > 0.5].mean())))
     return sum(full) / len(full), sum(inside) / len(inside)
-
-
-# ------------------------------------------------------------------------------------------------ start
 
 
 @dataclass
@@ -249,7 +254,7 @@ def visual_hull(masks: Tensor, cameras: Cameras, resolution: int) -> Hull:
         occupied = _inside_masks(centres, masks, cameras, voxel).reshape(counts)
         if not occupied.any():
             raise InputError(
-                "gaussians: no point of space lies inside all masks; check that the masks show the object alone "
+                "gaussians: no point of space lies inside all masks; check that they show the object alone "
                 "and that the camera poses belong to these images"
             )
         found = occupied.nonzero()
@@ -263,17 +268,23 @@ def _inside_masks(points: Tensor, masks: Tensor, cameras: Cameras, margin: float
     inside = torch.ones(len(points), dtype=torch.bool, device=points.device)
     for view in range(len(cameras)):
         remaining = inside.nonzero()[:, 0]
+        if len(remaining) == 0:
+            break
         pixels, depths = cameras[view].project(points[remaining])
         # a mask widened by the voxel's half size keeps voxels that the silhouette's edge crosses
-        radius = int(float(0.5 * margin * cameras.Ks[view, 0, 0] / depths.mean()) + 0.5)
+        radius = int(float(0.5 * margin * cameras.Ks[view, 0, 0] / depths.median().clamp_min(margin)) + 0.5)
         mask = masks[view][None, None]
         if radius > 0:
             mask = torch.nn.functional.max_pool2d(mask, 2 * radius + 1, stride=1, padding=radius)
         column, row = (pixels[0].floor().long()).unbind(-1)
-        visible = (column >= 0) & (column < cameras.width) & (row >= 0) & (row < cameras.height) & (depths[0] > 0)
+        visible = (
+            (column >= 0) & (column < cameras.width) & (row >= 0) & (row < cameras.height) & (depths[0] > 0)
+        )
         column, row = column.clamp(0, cameras.width - 1), row.clamp(0, cameras.height - 1)
-        # a point outside the frame is unknown to that camera
-        inside[remaining] = (mask[0, 0][row, column] > 0.5) | ~visible
+        # outside the frame is outside the object, unless the frame cuts the object's mask
+        edges = masks[view][0], masks[view][-1], masks[view][:, 0], masks[view][:, -1]
+        cut = any(bool((edge > 0.5).any()) for edge in edges)
+        inside[remaining] = torch.where(visible, mask[0, 0][row, column] > 0.1, cut)
     return inside
 
 
@@ -287,7 +298,7 @@ def _initial_gaussians(
     inner = hull.occupied & ~shell
     wanted_inside = round(settings.interior * settings.initial_count) if inner.any() else 0
     wanted = ((shell, settings.initial_count - wanted_inside), (inner, wanted_inside))
-    # a shell voxel stands for about one voxel^2 of surface; spacings of a hexagonal sheet and of a packed volume
+    # a shell voxel stands for about one voxel^2 of surface; spacings of a packed sheet and volume
     surface_spacing = hull.voxel * math.sqrt(1.15 * float(shell.sum()) / wanted[0][1])
     volume_spacing = hull.voxel * (1.41 * float(inner.sum()) / max(wanted_inside, 1)) ** (1 / 3)
     means, spacings = [], []
@@ -307,7 +318,7 @@ def _initial_gaussians(
         means=means,
         quats=identity,
         scales=(0.5 * spacing[:, None]).expand(-1, 3).clone(),
-        opacities=torch.full_like(spacing, 0.5),
+        opacities=torch.full_like(spacing, settings.initial_opacity),
         sh0=rgb_to_sh0(_mean_colours(means, images, cameras))[:, None],
         shN=torch.zeros(count, higher, 3).to(means),
     )
@@ -315,21 +326,27 @@ def _initial_gaussians(
 
 
 def _spread(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Indices of about ``count`` of the points, one random point of each cell of a grid that has that many cells."""
+    """Indices of about ``count`` of the points, a random one of each cell of a grid with that many cells."""
     if count >= len(points):
         return torch.arange(len(points))
     low, high = 0.0, float((points.amax(0) - points.amin(0)).max())
     shuffled = torch.randperm(len(points), generator=generator)
     for _ in range(20):
         size = 0.5 * (low + high)
-        cells = torch.unique((points / size).floor(), dim=0, return_inverse=True)[1]
-        low, high = (size, high) if int(cells.max()) + 1 > count else (low, size)
-    cells = cells[shuffled]
+        cells = _cell_keys(points, size)
+        low, high = (size, high) if len(torch.unique(cells)) > count else (low, size)
+    cells = _cell_keys(points, high)[shuffled]
     order = torch.argsort(cells, stable=True)
     first = torch.ones_like(cells, dtype=torch.bool)
     first[1:] = cells[order][1:] != cells[order][:-1]
-    picked = shuffled[order[first]]
-    return picked[:count] if len(picked) >= count else picked
+    return shuffled[order[first]]
+
+
+def _cell_keys(points: Tensor, size: float) -> Tensor:
+    """One integer a point that is equal for points in the same cube of side ``size``."""
+    cells = ((points - points.amin(0)) / size).long()
+    extent = cells.amax(0) + 1
+    return (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
 
 
 def _mean_colours(points: Tensor, images: Tensor, cameras: Cameras) -> Tensor:
@@ -342,9 +359,6 @@ def _mean_colours(points: Tensor, images: Tensor, cameras: Cameras) -> Tensor:
     # a point on the surface is hidden from half of the cameras; those in front of it are the nearest
     weights = rgba[..., 3] * torch.softmax(-depths / (0.05 * depths.mean()), dim=0)
     return (weights[..., None] * rgba[..., :3]).sum(0) / weights.sum(0)[:, None].clamp_min(1e-6)
-
-
-# ------------------------------------------------------------------------------------------------ optimisation
 
 
 class _Kernels:
@@ -383,8 +397,9 @@ class _Kernels:
         """The kernels as they are now."""
         p = self.parameters
         quats = torch.nn.functional.normalize(p["quats"], dim=-1)
+        opacities = torch.sigmoid(p["opacities"])
         return Gaussians(
-            p["means"].clone(), quats, p["scales"].exp(), torch.sigmoid(p["opacities"]), p["sh0"].clone(), p["shN"].clone()
+            p["means"].clone(), quats, p["scales"].exp(), opacities, p["sh0"].clone(), p["shN"].clone()
         )
 
     def step(self, images: Tensor, cameras: Cameras, background: Tensor, done: float) -> float:
@@ -427,7 +442,9 @@ class _Kernels:
             v.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
             rate = self.rates[name] * (0.01 if name == "means" else 0.1) ** done
             value.addcdiv_(m, (v / correction2).sqrt_().add_(eps), value=-rate / correction1)
-        low, high = (math.log(part * self.spacing) for part in (self.settings.min_scale, self.settings.max_scale))
+        low, high = (
+            math.log(part * self.spacing) for part in (self.settings.min_scale, self.settings.max_scale)
+        )
         self.parameters["scales"].clamp_(low, high)
 
     def densify(self, generator: torch.Generator) -> None:
@@ -450,7 +467,7 @@ class _Kernels:
                 table[name] = table[name][keep]
 
     def _multiply(self, chosen: Tensor, generator: torch.Generator) -> None:
-        """Give each chosen kernel a twin; both shrink if it is large. Their opacities keep the pair's alpha."""
+        """Give each chosen kernel a twin; both shrink if it is large, else they share its alpha."""
         p = self.parameters
         scales = p["scales"][chosen].exp()
         large = scales.amax(dim=1) > self.settings.densification.split_scale * self.spacing * 0.5
@@ -459,7 +476,9 @@ class _Kernels:
         offsets = torch.where(large[:, None], offsets, 0.5 * offsets)
         opacities = 1 - (1 - torch.sigmoid(p["opacities"][chosen])).sqrt()
         p["opacities"][chosen] = torch.where(large, p["opacities"][chosen], torch.logit(opacities))
-        p["scales"][chosen] = torch.where(large[:, None], p["scales"][chosen] - math.log(1.6), p["scales"][chosen])
+        p["scales"][chosen] = torch.where(
+            large[:, None], p["scales"][chosen] - math.log(1.6), p["scales"][chosen]
+        )
         twins = {name: value[chosen] for name, value in p.items()}
         p["means"][chosen] -= 0.5 * offsets
         twins["means"] = twins["means"] + 0.5 * offsets
@@ -470,42 +489,45 @@ class _Kernels:
                 moments[name] = torch.cat([moments[name], torch.zeros_like(twins[name])])
 
 
-# ------------------------------------------------------------------------------------------------ loss
-
-
 def image_loss(pictures: Tensor, targets: Tensor, ssim_weight: float) -> Tensor:
     """(1 - w) L1 + w (1 - SSIM) of (B, H, W, 3) images, as in 3D Gaussian Splatting."""
     l1 = (pictures - targets).abs().mean()
     if ssim_weight == 0:
         return l1
-    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim(pictures, targets))
+    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim_map(pictures, targets).mean())
 
 
-def ssim(a: Tensor, b: Tensor, sigma: float = 1.5, radius: int = 5) -> Tensor:
-    """Mean structural similarity of (B, H, W, 3) images in [0, 1], 11 x 11 Gaussian window, zeros outside.
+def ssim_map(a: Tensor, b: Tensor, sigma: float = 1.5, radius: int = 5) -> Tensor:
+    """SSIM (B, 3, H, W) of (B, H, W, 3) images in [0, 1]: 11 x 11 Gaussian window, zeros outside.
 
     The window is applied as two banded matrices, which one GEMM a side does faster than a small convolution.
     """
     a, b = (image.movedim(-1, 1) for image in (a, b))
-    rows, columns = (_window(n, sigma, radius).to(a) for n in a.shape[-2:])
+    rows, columns = (_window(n, sigma, radius, a.dtype, a.device) for n in a.shape[-2:])
     maps = rows @ torch.stack([a, b, a * a, b * b, a * b]) @ columns.mT
     mean_a, mean_b, aa, bb, ab = maps
     product, squares = mean_a * mean_b, mean_a * mean_a + mean_b * mean_b
     c1, c2 = 0.01**2, 0.03**2
-    values = (2 * product + c1) * (2 * (ab - product) + c2) / ((squares + c1) * (aa + bb - squares + c2))
-    return values.mean()
+    return (2 * product + c1) * (2 * (ab - product) + c2) / ((squares + c1) * (aa + bb - squares + c2))
 
 
-def _window(size: int, sigma: float, radius: int) -> Tensor:
-    offsets = torch.arange(size)[:, None] - torch.arange(size)
+@functools.lru_cache(maxsize=8)
+def _window(size: int, sigma: float, radius: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    positions = torch.arange(size, dtype=torch.float64)
+    offsets = positions[:, None] - positions
     weights = torch.exp(-(offsets**2) / (2 * sigma**2)) * (offsets.abs() <= radius)
-    return weights / torch.exp(-(torch.arange(-radius, radius + 1) ** 2) / (2 * sigma**2)).sum()
+    full = torch.exp(-(torch.arange(-radius, radius + 1, dtype=torch.float64) ** 2) / (2 * sigma**2)).sum()
+    return (weights / full).to(device, dtype)
 
 
 def _check(images: Tensor, cameras: Cameras) -> None:
     expected = (len(cameras), cameras.height, cameras.width, 4)
     if tuple(images.shape) != expected:
-        raise InputError(f"gaussians: images have shape {tuple(images.shape)}, the cameras ask for {expected}")
+        raise InputError(
+            f"gaussians: images have shape {tuple(images.shape)}, the cameras ask for {expected}"
+        )
     empty = [i for i in range(len(images)) if not (images[i, ..., 3] > 0.5).any()]
     if empty:
-        raise InputError(f"gaussians: the mask (alpha) of view {empty[0]} is empty; remove the view or mend its mask")
+        raise InputError(
+            f"gaussians: the mask (alpha) of view {empty[0]} is empty; remove the view or mend its mask"
+        )

@@ -72,7 +72,7 @@ class Constitutive(nn.Module):
             grad_out: (N, 3, 3) gradient of a scalar with respect to the result.
             cache: from :meth:`evaluate_with_cache` at the same F and weights; None recomputes.
             grad_F: (N, 3, 3) buffer that receives the first result if given.
-            grad_weights: accumulators shaped as the weights; if given, the weight gradients are added to them.
+            grad_weights: accumulators shaped as the weights; if given, the gradients are added to them.
 
         Returns:
             the gradient with respect to F, and one gradient a weight (the accumulators if they were given).
@@ -118,7 +118,7 @@ class Law(nn.Module):
         """Largest eigenvalue of the acoustic tensor Q_ik = n_j (d tau_ij / d F_kl) n_l at F = I over n [Pa].
 
         For an isotropic law this is the P-wave modulus, lam + 2 mu. Measured by one-sided differences in
-        float64 along 26 directions n (a neural law need not be isotropic, and its sorted singular values have a
+        float64 along 26 directions n (a neural law need not be isotropic, and sorted singular values have a
         kink at F = I).
         """
         step = 1e-5

@@ -247,11 +247,11 @@ def rasterize(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Render T frames from V cameras.
 
-    Differentiable with respect to ``means``, ``covars``, ``opacities`` and ``sh``. A contribution counts where
-    its alpha is at least ``alpha_min``; alpha is limited to ``alpha_max`` (no gradient where it is); a pixel
-    ends before the Gaussian that would bring its transmittance below ``transmittance_min``. With alpha_min = 0,
-    alpha_max > 1 and transmittance_min = 0 the image is a smooth function of its inputs, apart from the order
-    in depth.
+    Differentiable with respect to ``means``, ``covars``, ``opacities`` and ``sh``. A contribution counts
+    where its alpha is at least ``alpha_min``; alpha is limited to ``alpha_max`` (no gradient where it is); a
+    pixel ends before the Gaussian that would bring its transmittance below ``transmittance_min``. With
+    alpha_min = 0, alpha_max > 1 and transmittance_min = 0 the image is a smooth function of its inputs, apart
+    from the order in depth.
 
     Args:
         means: Gaussian centres of every frame, world frame.

@@ -264,8 +264,8 @@ def kernels(dtype: torch.dtype):
         i = wp.tid()
         composite_image(
             i, splats.shape[1], int(seen[i]), alphas.shape[1], alphas.shape[2], planes.shape[3],
-            splats, order, alpha_min, alpha_max, transmittance_min, background[0], background[1], background[2],
-            planes, pictures, alphas,
+            splats, order, alpha_min, alpha_max, transmittance_min,
+            background[0], background[1], background[2], planes, pictures, alphas,
         )  # fmt: skip
 
     @wp.kernel(module=module, enable_backward=False)

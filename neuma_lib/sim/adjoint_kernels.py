@@ -1,8 +1,8 @@
 """Adjoints of the transfers in `kernels`, written by hand and run in the opposite order.
 
-``grad_y`` is the derivative of the loss with respect to ``y``. The adjoint of a gather is a scatter over the same
-stencil and the other way round, so `g2p_adjoint` reads like P2G and `p2g_adjoint` like G2P. When the particle
-moves, a weight changes by dw_i/dx = N'_i / dx and an offset d_i = x_i - x by -I.
+``grad_y`` is the derivative of the loss with respect to ``y``. The adjoint of a gather is a scatter over the
+same stencil and the other way round, so `g2p_adjoint` reads like P2G and `p2g_adjoint` like G2P. When the
+particle moves, a weight changes by dw_i/dx = N'_i / dx and an offset d_i = x_i - x by -I.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -45,7 +45,7 @@ def adjoint_kernels(dtype: torch.dtype) -> SimpleNamespace:
         grad_F: wp.array(dtype=mat33),
         grad_grid_rows: wp.array(dtype=mat34),
     ):
-        """Gradients of x, v, C after the step and of F_trial to those of grid_v (added), x (in place), F (set)."""
+        """Gradients of x, v, C after the step and of F_trial to those of grid_v (added), x and F (set)."""
         p = wp.tid()
         xp = x[now, p]
         bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])

@@ -1,14 +1,14 @@
 """The transfers of the material point method as Warp kernels: particles to grid, grid, grid to particles.
 
-MLS-MPM (Hu et al. 2018) with quadratic B-splines and the affine velocity C of APIC (Jiang et al. 2015), in the
-order and letters of the paper's Algorithm 2 (appendix "Introduction to the Material Point Method"). Their adjoints
-are in `adjoint_kernels`.
+MLS-MPM (Hu et al. 2018) with quadratic B-splines and the affine velocity C of APIC (Jiang et al. 2015), in
+the order and letters of the paper's Algorithm 2 (appendix "Introduction to the Material Point Method"). Their
+adjoints are in `adjoint_kernels`.
 
-Memory: arrays of particles have a leading axis of slots. A rollout that will be differentiated gives each step a
-slot of its own, any other alternates between two. A grid node is a 4-vector, momentum and mass (``grid``) or
-velocity and 1 where there is mass (``grid_v``). A particle sees 3 x 3 rows of three nodes that lie side by side in
-memory, so kernels read and write ``rows``: a view of the grid whose element b is the 3 x 4 matrix of the nodes b,
-b + 1 and b + 2. Sums over the last axis of the stencil then are products with a row.
+Memory: arrays of particles have a leading axis of slots. A rollout that will be differentiated gives each
+step a slot of its own, any other alternates between two. A grid node is a 4-vector, momentum and mass
+(``grid``) or velocity and 1 where there is mass (``grid_v``). A particle sees 3 x 3 rows of three nodes that
+lie side by side in memory, so kernels read and write ``rows``: a view of the grid whose element b is the 3 x 4
+matrix of the nodes b, b + 1 and b + 2. Sums over the last axis of the stencil then are products with a row.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -60,13 +60,13 @@ def warp_types(dtype: torch.dtype) -> SimpleNamespace:
 
 @functools.cache
 def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
-    """Functions that the transfers and their adjoints share: interpolation stencil, wall condition, motion."""
+    """Functions that the transfers and their adjoints share: stencil, wall condition, motion."""
     t = warp_types(dtype)
     real, vec3, vec4, mat33, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.GridConstants
 
     @wp.func
     def base_node(c: GridConstants, x: real):
-        """First of the three nodes that see coordinate x; clamped, so that no fault indexes outside the grid."""
+        """First of the three nodes that see coordinate x; clamped, so that no fault indexes outside."""
         return wp.clamp(wp.int32(x * c.inv_dx - real(0.5)), 0, c.n - 3)
 
     @wp.func
@@ -118,7 +118,7 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
 
     @wp.func
     def moved(c: GridConstants, x: vec3, v: vec3):
-        """Position after a step, kept where the stencil exists: soft bodies are pressed past the last node."""
+        """Position after a step, kept where the stencil exists: soft bodies are pressed past the last."""
         return wp.max(wp.min(x + c.dt * v, vec3(c.x_high)), vec3(c.x_low))
 
     @wp.func
@@ -166,7 +166,7 @@ def forward_kernels(dtype: torch.dtype) -> SimpleNamespace:
         vol0: wp.array(dtype=real),
         grid_rows: wp.array2d(dtype=mat34),
     ):
-        """m_i += w_i m and (m v)_i += w_i (m v + A d_i) with A = m C - dt vol0 (4/dx^2) tau, d_i = x_i - x."""
+        """m_i += w_i m, (m v)_i += w_i (m v + A d_i) with A = m C - dt vol0 (4/dx^2) tau, d_i = x_i - x."""
         p = wp.tid()
         xp = x[now, p]
         bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
@@ -266,7 +266,7 @@ def forward_kernels(dtype: torch.dtype) -> SimpleNamespace:
     def advect_tracers(
         c: GridConstants, kept: wp.int32, grid_v_rows: wp.array2d(dtype=mat34), x: wp.array(dtype=vec3)
     ):
-        """x += dt v with v interpolated over the nodes that carry mass; a tracer that sees none of them stays."""
+        """x += dt v, v interpolated over the nodes that carry mass; a tracer that sees none of them stays."""
         p = wp.tid()
         xp = x[p]
         bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])

@@ -1,4 +1,4 @@
-"""What stays constant in a simulation: grid, time step, gravity, walls, and which law moves which particles."""
+"""What stays constant in a simulation: grid, time step, gravity, walls, which law moves which particles."""
 
 from __future__ import annotations
 
@@ -94,8 +94,8 @@ class MPMModel:
         if not number <= COURANT_LIMIT:
             stable = self.dt * COURANT_LIMIT / number
             raise InputError(
-                f"law {law.name!r} has Courant number {number:.3g} > {COURANT_LIMIT} on a {self.grid}^3 grid "
-                f"with dt = {self.dt:g} s: the largest stable step is dt = {stable:.3g} s (or use a coarser grid)"
+                f"law {law.name!r} has Courant number {number:.3g} > {COURANT_LIMIT} on a {self.grid}^3 "
+                f"grid with dt = {self.dt:g} s: the largest stable step is dt = {stable:.3g} s"
             )
         return number
 
@@ -132,7 +132,7 @@ def as_bodies(law: Law | Sequence[Body], count: int) -> tuple[Body, ...]:
 
 
 def contact_clearance(model: MPMModel, x: Tensor) -> Tensor:
-    """Smallest distance [m] of particles x (..., N, 3) to the zone that feels a wall; not positive in contact."""
+    """Smallest distance [m] of particles x (..., N, 3) to the zone that feels a wall; <= 0 in contact."""
     low, high = model.free_range
     return torch.minimum(x - low, high - x).amin(dim=(-2, -1))
 

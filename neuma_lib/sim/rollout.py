@@ -1,7 +1,7 @@
 """The one entry to the simulator, for ground truth, velocity estimation, training and evaluation alike.
 
-Callers differ in law, start and set of frames only. The gradient is one reverse loop over the stored states, not
-a graph of steps: autograd sees a single function from (x0, v0, F0, C0, weights of the laws) to the frames.
+Callers differ in law, start and set of frames only. The gradient is one reverse loop over the stored states,
+not a graph of steps: autograd sees one function from (x0, v0, F0, C0, weights of the laws) to the frames.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def rollout(
 ) -> Trajectory:
     """Simulate particles and return their states at the frames.
 
-    Differentiable with respect to the weights of the laws, x0, v0, F0 and C0; masses, volumes and tracers carry
-    no gradient. Device and precision (float32 or float64) are those of x0.
+    Differentiable with respect to the weights of the laws, x0, v0, F0 and C0; masses, volumes and tracers
+    carry no gradient. Device and precision (float32 or float64) are those of x0.
 
     Args:
         model: grid, time step, gravity and walls.
@@ -54,14 +54,14 @@ def rollout(
         frames: steps whose states are returned, strictly increasing, 0 is the start.
         tracers: positions of passive points that follow the grid's velocity [m], shape (M, 3).
         skip_free_flight: take the steps before the first contact in closed form while the state is undeformed
-            and moves with one velocity: equal to simulating them, to round-off, in value and gradient. Not used
-            where a gradient could deform the state in flight (v0 of shape (N, 3), F0 or C0 that require it).
+            and moves with one velocity: equal to simulating them, to round-off, in value and gradient. Not
+            used where a gradient could deform the state (v0 of shape (N, 3), F0 or C0 that require it).
         keep: what the gradient keeps a step: "states" (x, v, C, F; the rest is computed again), "all", or
             "auto", which also keeps what fits a fixed amount of memory. Same gradient, other speed.
 
     Raises:
-        InputError: shapes, precision, frames, a particle outside the grid at the start, bodies that do not fit.
-        NonFiniteError: a particle became non-finite or crossed a cell in a step; has attributes step, particle.
+        InputError: shapes, precision, frames, a particle that starts outside the grid, bodies that misfit.
+        NonFiniteError: a particle became non-finite or crossed a cell in a step; has `step` and `particle`.
     """
     frames = _checked_frames(frames, steps)
     bodies = as_bodies(law, len(x0))
@@ -197,6 +197,6 @@ def _check_particles(
         p = int(outside.nonzero()[0])
         place = ", ".join(f"{value:.4g}" for value in x0[p].tolist())
         raise InputError(
-            f"{int(outside.sum())} of {N} particles start outside the grid, first particle {p} at ({place}) m: "
-            f"place the object within [{low:.4g}, {high:.4g}] m on every axis (half a cell from the grid's edge)"
+            f"{int(outside.sum())} of {N} particles start outside the grid (first: {p}, at {place} m): place "
+            f" the object within [{low:.4g}, {high:.4g}] m on every axis"
         )

@@ -22,7 +22,7 @@ from neuma_lib.sim.model import Body, MPMModel
 from neuma_lib.sim.workspace import Layout, Workspace, WorkspaceLease
 
 KEEP = {"auto": 1 << 29, "states": 0, "all": math.inf}
-"""Bytes that a rollout may spend on intermediate values for its reverse loop, beyond the states themselves."""
+"""Bytes that a rollout may spend on intermediate values for its reverse loop, beyond the states."""
 
 
 class Simulation:
@@ -208,9 +208,9 @@ class Simulation:
         happened = "moved by more than a cell in a step" if outside < not_finite else "became non-finite"
         raise NonFiniteError(
             "rollout",
-            f"particle {particle} (law {law.name!r}) {happened} at step {step} (t = {step * self.model.dt:.4g} s); "
-            "the simulation is unstable. Use a smaller dt (see MPMModel.check_courant), a slower start, or the last "
-            "good weights with a lower rate",
+            f"particle {particle} (law {law.name!r}) {happened} at step {step}, t = "
+            f"{step * self.model.dt:.4g} s: the simulation is unstable. Use a smaller dt (see "
+            "MPMModel.check_courant), a slower start, or the last good weights with a lower rate",
             step=step,
             particle=particle,
         )

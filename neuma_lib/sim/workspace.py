@@ -142,7 +142,7 @@ class Workspace:
         return self._buffer((*lead, 4), warp_types(self.layout.dtype).vec4)
 
     def _rows(self, nodes: Tensor) -> wp.array:
-        """View of nodes (..., nodes, 4) whose element b is the 3 x 4 matrix of the nodes b, b + 1 and b + 2."""
+        """View of nodes (..., nodes, 4) whose element b is the 3 x 4 matrix of nodes b, b + 1 and b + 2."""
         *lead, count, width = nodes.shape
         rows = nodes.as_strided((*lead, count - 2, 3, width), (*nodes.stride()[:-1], width, 1))
         return wp.from_torch(rows, dtype=warp_types(self.layout.dtype).mat34)
@@ -181,7 +181,7 @@ class Workspace:
 
 
 class WorkspaceLease:
-    """A workspace that goes back to the pool when nobody holds the lease, for example when a graph is freed."""
+    """A workspace that goes back to the pool when nobody holds the lease, as when a graph is freed."""
 
     _idle: list[Workspace] = []
     _most_idle = 3

@@ -1,0 +1,21 @@
+"""From nothing to the tables of the paper. `snakemake --cores 2 results/table1.csv`; docs/guide.md tells the rest."""
+
+
+configfile: "config/config.yaml"
+
+
+include: "workflow/rules/common.smk"
+include: "workflow/rules/dataset.smk"
+include: "workflow/rules/priors.smk"
+include: "workflow/rules/gaussians.smk"
+include: "workflow/rules/geometry.smk"
+include: "workflow/rules/binding.smk"
+include: "workflow/rules/velocity.smk"
+include: "workflow/rules/material.smk"
+include: "workflow/rules/evaluation.smk"
+include: "workflow/rules/paper.smk"
+
+
+rule all:
+    input:
+        rules.tables.input,

@@ -1,0 +1,113 @@
+"""Objects of the library from artifacts on disk, and back: `io` deals in arrays, this in bodies, laws and videos."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from neuma_lib import io
+from neuma_lib.binding import Binding
+from neuma_lib.errors import InputError
+from neuma_lib.fitting.observation import Observation, Reconstruction, over_white
+from neuma_lib.materials.neural import NeuralLaw
+from neuma_lib.materials.priors import load_prior
+from neuma_lib.render.cameras import Cameras
+from neuma_lib.render.gaussians import Gaussians
+
+
+def load_views(transforms: str | Path, views: Sequence[int] | None = None) -> tuple[torch.Tensor, Cameras]:
+    """Straight-alpha RGBA images (V, H, W, 4) in [0, 1] and their cameras, of an image set at one time."""
+    images = io.read_image_set(transforms, views)
+    return torch.from_numpy(images.images), _cameras(images, np.arange(len(images.images)))
+
+
+def load_observation(transforms: str | Path, views: Sequence[int]) -> Observation:
+    """The video of some views over a white background."""
+    images = io.read_image_set(transforms, views)
+    frames, index, columns = images.video(views)
+    return Observation(frames, over_white(torch.from_numpy(images.images[index])), _cameras(images, columns))
+
+
+def _cameras(images: io.ImageSet, index: np.ndarray) -> Cameras:
+    return Cameras(
+        torch.from_numpy(images.viewmats[index]).float(),
+        torch.from_numpy(images.Ks[index]).float(),
+        images.width,
+        images.height,
+    )
+
+
+def save_gaussians(path: str | Path, gaussians: Gaussians) -> None:
+    """Write Gaussians in the 3DGS layout."""
+    names = ("means", "quats", "scales", "opacities", "sh0", "shN")
+    io.write_gaussians(path, **{name: getattr(gaussians, name).detach().cpu().numpy() for name in names})
+
+
+def load_gaussians(path: str | Path) -> Gaussians:
+    """Read Gaussians in the 3DGS layout."""
+    return Gaussians(**{name: torch.from_numpy(array) for name, array in io.read_gaussians(path).items()})
+
+
+def save_binding(
+    path: str | Path, binding: Binding, x: torch.Tensor, vol0: torch.Tensor, attributes: Mapping[str, Any]
+) -> None:
+    """Write a binding with the particles that it binds to: x (N, 3) [m], vol0 (N,) [m^3]."""
+    arrays = {
+        "indptr": binding.indptr,
+        "indices": binding.indices,
+        "values": binding.values,
+        "x": x,
+        "vol0": vol0,
+    }
+    arrays = {name: tensor.cpu().numpy() for name, tensor in arrays.items()}
+    io.write_arrays(
+        path, arrays, {"gaussians": binding.shape[0], "particles": binding.shape[1], **attributes}
+    )
+
+
+def load_body(binding: str | Path, gaussians: str | Path, density: float) -> Reconstruction:
+    """The reconstructed body: bound particles with their volumes, and the Gaussians that they carry.
+
+    Raises:
+        InputError: the binding was made for other Gaussians.
+    """
+    kernels = load_gaussians(gaussians)
+    arrays, attributes = io.read_arrays(binding, required=("indptr", "indices", "values", "x", "vol0"))
+    if attributes.get("gaussians") != len(kernels):
+        raise InputError(
+            f"{binding} binds {attributes.get('gaussians')} Gaussians, {gaussians} has {len(kernels)}: run the rule"
+            " binding again"
+        )
+    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    shape = (len(kernels), len(arrays["x"]))
+    return Reconstruction(
+        x0=tensors["x"],
+        vol0=tensors["vol0"],
+        mass=tensors["vol0"] * density,
+        gaussians=kernels,
+        binding=Binding(tensors["indptr"], tensors["indices"], tensors["values"], shape),
+    )
+
+
+def save_adaptor(
+    path: str | Path, law: NeuralLaw, rank: int | None, alpha: float, metadata: Mapping[str, Any]
+) -> None:
+    """Write the tensors of a law's adaptor, with what is needed to attach them again."""
+    io.write_weights(path, law.adaptor_state(), {"rank": rank, "alpha": alpha, **metadata})
+
+
+def load_law(prior: str | Path, adaptor: str | Path | None = None) -> NeuralLaw:
+    """A prior, with a trained adaptor attached if one is given."""
+    law = load_prior(prior)
+    if adaptor is not None:
+        tensors, metadata = io.read_weights(adaptor)
+        if "rank" not in metadata or "alpha" not in metadata:
+            raise InputError(
+                f"{adaptor} has no rank and alpha in its metadata: it is not an adaptor of this project"
+            )
+        law.load_adaptor_state(tensors, rank=metadata["rank"], alpha=metadata["alpha"])
+    return law

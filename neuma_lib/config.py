@@ -1,0 +1,501 @@
+"""Typed settings of the whole pipeline: one home, one type, one default and one line of explanation each.
+
+`load` turns the merged YAML that the user gave into a `Config`; unknown keys, wrong types and impossible values are
+an `InputError` that names the key by its path. Sections are data only: what a stage does with them stands in the
+stage's own module, and a stage receives the complete section (all defaults filled in) as plain numbers.
+
+``docs/settings.md`` is generated from this file by `neuma_lib.settings_page`.
+"""
+
+from __future__ import annotations
+
+import copy
+import difflib
+import typing
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+
+from neuma_lib.errors import InputError
+
+Vector = tuple[float, float, float]
+
+
+class Section(BaseModel):
+    """A block of settings: immutable, and refuses keys that it does not know."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+
+    def plain(self) -> dict[str, Any]:
+        """The section as dicts, lists and scalars, with every default filled in."""
+        return self.model_dump(mode="json")
+
+
+def _numbers(part: Any) -> Any:
+    """YAML 1.1 reads 1e5 as text: turn every constant of a law into a number, its name excepted."""
+    if not isinstance(part, Mapping):
+        raise ValueError("expected a mapping with a 'name' and the constants of the law")
+    if "name" not in part:
+        raise ValueError("the key 'name' is missing")
+    return {k: str(v) if k == "name" else float(v) for k, v in part.items()}
+
+
+LawPart = Annotated[dict[str, str | float], BeforeValidator(_numbers)]
+
+
+class LawConfig(Section):
+    """An analytic material: two named laws with their constants in SI units."""
+
+    elasticity: LawPart = Field(
+        description="name and constants of the elastic law, for example E [Pa] and nu"
+    )
+    plasticity: LawPart = Field({"name": "identity"}, description="name and constants of the return map")
+
+
+class AppearanceConfig(Section):
+    """What an object looks like in Blender."""
+
+    kind: Literal["solid", "grains", "liquid"] = Field(
+        "solid", description="textured mesh, grains, or a liquid's surface"
+    )
+    colors: dict[str, str] = Field(
+        description="part of the shape -> sRGB colour '#rrggbb'; 'body' for all others"
+    )
+    accent: str = Field("", description="colour of the soft patches; empty: a darker shade of the part's own")
+    contrast: float = Field(0.5, ge=0, le=1, description="strength of the patches")
+    scale: float = Field(0.045, gt=0, description="size of the patches [m]")
+    seed: int = Field(0, description="seed of the patches")
+
+
+class SceneConfig(Section):
+    """A benchmark: what is thrown, of what, how, and what is believed about it."""
+
+    shape: str = Field(description="name of the shape: ball, duck, pawn, cat, bottle, fish or letter_X")
+    size: float | None = Field(
+        None, gt=0, description="longest side of the bounding box [m]; null: the shape's own"
+    )
+    height: float = Field(description="y of the bounding box's centre at the start [m]")
+    center: tuple[float, float] = Field((0.5, 0.5), description="x and z of the bounding box's centre [m]")
+    velocity: Vector = Field(description="initial velocity [m/s]")
+    density: float = Field(1000.0, gt=0, description="mass density rho [kg/m^3]")
+    law: LawConfig = Field(description="the true material, known to the ground truth only")
+    dt: float = Field(gt=0, description="time step [s]")
+    steps: int = Field(gt=0, description="simulated steps of the video")
+    frames: tuple[int, ...] | None = Field(
+        None,
+        description="steps of the video's frames, ascending from 0; none: dataset.frames of them, evenly spaced",
+    )
+    prior: str = Field(description="name in priors.laws, or path of a .safetensors or a released .pt file")
+    appearance: AppearanceConfig = Field(description="how Blender shows it")
+    story: str = Field("", description="in which way the prior is wrong, in words")
+    material: dict[str, Any] = Field(
+        {}, description="settings of the section material that this scene overrides"
+    )
+
+    @model_validator(mode="after")
+    def _frames_ascend(self) -> SceneConfig:
+        frames = self.frames
+        if frames is not None and (
+            list(frames) != sorted(set(frames)) or not frames or frames[0] != 0 or frames[-1] > self.steps
+        ):
+            raise ValueError("frames must ascend from 0 to at most 'steps' without repeats")
+        return self
+
+    def frame_steps(self, count: int) -> tuple[int, ...]:
+        """Steps of the video's frames: the scene's own list, or ``count`` steps evenly from 0 to the last one."""
+        if self.frames is not None:
+            return self.frames
+        count = min(count, self.steps + 1)
+        return tuple(round(i * self.steps / max(count - 1, 1)) for i in range(count))
+
+
+class ImagesConfig(Section):
+    """One set of Blender renders."""
+
+    views: int = Field(gt=0, description="number of cameras")
+    width: int = Field(128, ge=8, description="image width [px]")
+    height: int = Field(128, ge=8, description="image height [px]")
+    samples: int = Field(16, ge=1, description="Cycles samples a pixel (denoised)")
+
+
+class DatasetConfig(Section):
+    """Ground truth and its images."""
+
+    particles: int = Field(
+        8000, gt=0, description="ground-truth particles, at least four times the reconstruction's"
+    )
+    seed: int = Field(1000, description="seed of the ground truth, apart from the reconstruction's")
+    frames: int = Field(
+        25, ge=2, description="frames of a video, the first at step 0, for scenes that list none"
+    )
+    tracers: int = Field(100_000, gt=0, description="passive tracers that measure the motion of the truth")
+    static: ImagesConfig = Field(ImagesConfig(views=50), description="views on a sphere at t = 0")
+    dynamic: ImagesConfig = Field(
+        ImagesConfig(views=3, width=96, height=96), description="videos, view 0 frontal"
+    )
+
+
+class SimulationConfig(Section):
+    """The material point method."""
+
+    particles: int = Field(2000, gt=0, description="particles of the reconstructed body")
+    grid: int = Field(24, ge=8, description="grid nodes along each side of the unit cube")
+    gravity: Vector = Field((0.0, -9.8, 0.0), description="acceleration [m/s^2]")
+    boundary: str | dict[str, str] = Field(
+        "no_slip", description="condition of the walls: no_slip, slip or sticky, or one a wall (x_min, ...)"
+    )
+    wall_cells: int = Field(1, ge=1, description="thickness of the walls in cells")
+
+
+class PriorsConfig(Section):
+    """Pre-trained neural constitutive laws."""
+
+    laws: dict[str, LawConfig] = Field({}, description="analytic law that each prior is trained on, by name")
+    method: Literal["regression", "trajectory"] = Field(
+        "regression",
+        description="regression on stress and return-map pairs, or NCLaw's training on trajectories",
+    )
+    seed: int = Field(0, description="seed of the data and of the initial weights")
+    regression: dict[str, Any] = Field(
+        {}, description="settings of the regression (neuma_lib.fitting.priors)"
+    )
+    trajectory: dict[str, Any] = Field({}, description="settings of the training on trajectories")
+
+
+class GaussiansConfig(Section):
+    """Static 3D Gaussians from the views at t = 0."""
+
+    fit: dict[str, Any] = Field({}, description="settings of the fit (neuma_lib.fitting.gaussians)")
+
+
+class GeometryConfig(Section):
+    """Surface mesh and volume particles."""
+
+    surface: dict[str, Any] = Field(
+        {}, description="settings of the reconstruction (neuma_lib.geometry.surface)"
+    )
+    sampling: Literal["jittered", "uniform"] = Field("jittered", description="how particles fill the volume")
+
+
+class BindingConfig(Section):
+    """Gaussian-particle binding (paper Algorithm 1)."""
+
+    confidence: float = Field(0.95, gt=0, lt=1, description="tau of the chi-squared test")
+    max_neighbours: int = Field(10, ge=1, description="nearest particles kept for a Gaussian")
+    equal_mass: bool = Field(
+        False, description="give particles added by the second pass a full mass, as the paper does"
+    )
+
+
+class VelocityConfig(Section):
+    """Initial velocity from the frames before contact."""
+
+    views: tuple[int, ...] = Field((0,), min_length=1, description="views of the video that are used")
+    ridge: float = Field(
+        0.02, ge=0, description="penalty on the depth axis, relative to the best determined axis"
+    )
+    initial_frames: int = Field(3, ge=2, description="frames of the first estimate")
+    iterations: int = Field(30, ge=1, description="most Levenberg-Marquardt steps for a set of frames")
+    difference: float = Field(0.02, gt=0, description="half width of the central differences [m/s]")
+
+
+class MaterialConfig(Section):
+    """Adaptation of the material law: what is trained, on what, how."""
+
+    train: bool = Field(True, description="false: the prior as it is (NCLaw)")
+    supervision: Literal["pixels", "particles"] = Field(
+        "pixels", description="images, or ground-truth particles"
+    )
+    carrier: Literal["binding", "gaussians"] = Field(
+        "binding", description="bound volume particles, or the Gaussians themselves as particles (w/o Bind)"
+    )
+    views: tuple[int, ...] = Field((0,), min_length=1, description="training views of the video")
+    rank: int | None = Field(
+        16, ge=1, description="rank of the adaptor; null trains the base weights (w/o dM)"
+    )
+    alpha: float = Field(16.0, gt=0, description="the adaptor's scale is alpha / rank")
+    seed: int = Field(0, description="seed of the adaptor's initial weights")
+    iterations: int = Field(100, ge=1, description="optimiser steps, one full rollout each")
+    lr_scale: float = Field(1.0, gt=0, description="factor on both learning rates (sweeps, ablations)")
+    lr_elastic: float = Field(0.05, gt=0, description="learning rate of the elastic network")
+    lr_plastic: float = Field(0.005, gt=0, description="learning rate of the plastic network")
+    lr_floor: float = Field(
+        0.05, ge=0, le=1, description="fraction of the rates at the end of the cosine schedule"
+    )
+    betas: tuple[float, float] = Field((0.9, 0.99), description="averaging factors of Adam")
+    gradient_clip: float = Field(
+        1.0, gt=0, description="largest gradient norm of a network (normalised loss)"
+    )
+    frame_weight_start: float = Field(0.5, gt=0, le=1, description="d of the frame weights d^k at the start")
+    frame_weight_periods: int = Field(5, ge=1, description="number of parts of the video that k counts")
+    covariance_gradient: bool = Field(True, description="let image gradients reach F through the covariances")
+    diverged_ratio: float = Field(
+        5.0, gt=1, description="a loss above this multiple of the best has diverged"
+    )
+    max_recoveries: int = Field(
+        6, ge=0, description="returns to the last good state before training gives up"
+    )
+    checkpoint_every: int = Field(10, ge=1, description="iterations between checkpoints")
+
+
+class EvaluationConfig(Section):
+    """Rollout of the learned law and its measures."""
+
+    tracers: int = Field(100_000, gt=0, description="passive tracers in the prediction")
+    views: tuple[int, ...] = Field((1, 2), description="views that are measured and were not trained on")
+    video_view: int = Field(0, ge=0, description="view of the mp4 of prediction beside observation")
+    frame_rate: int = Field(12, ge=1, description="frames a second of the mp4")
+    video_magnify: int = Field(3, ge=1, description="enlargement of the mp4's pixels")
+
+
+class TableConfig(Section):
+    """Rows and columns of a table of the paper."""
+
+    scenes: tuple[str, ...] = Field(min_length=1, description="columns, in order")
+    methods: tuple[str, ...] = Field(
+        min_length=1, description="rows, in order; variants such as neuma+rank=4 too"
+    )
+
+
+class MethodConfig(Section):
+    """A method is a set of options over the same code."""
+
+    title: str = Field(description="name in tables")
+    material: dict[str, Any] = Field(
+        {}, description="settings of the section material that the method changes"
+    )
+
+
+class Config(Section):
+    """Everything."""
+
+    data_root: str = Field("data", description="folder of generated or supplied inputs")
+    results_root: str = Field("results", description="folder of everything computed")
+    kernel_cache: str = Field(".cache/warp", description="folder of compiled Warp kernels")
+    scenes_file: str = Field(
+        "config/scenes.yaml", description="table of the scenes; 'scenes' overrides parts of it"
+    )
+    device: Literal["auto", "cpu", "cuda"] = Field(
+        "auto", description="where to compute; auto: CUDA if there is one"
+    )
+    seed: int = Field(0, description="seed of every stage that has none of its own")
+    scenes: dict[str, SceneConfig] = Field({}, description="benchmarks by name")
+    dataset: DatasetConfig = Field(DatasetConfig(), description="ground truth and images")
+    simulation: SimulationConfig = Field(SimulationConfig(), description="material point method")
+    priors: PriorsConfig = Field(PriorsConfig(), description="pre-trained laws")
+    gaussians: GaussiansConfig = Field(GaussiansConfig(), description="static reconstruction")
+    geometry: GeometryConfig = Field(GeometryConfig(), description="mesh and particles")
+    binding: BindingConfig = Field(BindingConfig(), description="Gaussians to particles")
+    velocity: VelocityConfig = Field(VelocityConfig(), description="initial velocity")
+    material: MaterialConfig = Field(MaterialConfig(), description="adaptation of the law")
+    evaluation: EvaluationConfig = Field(EvaluationConfig(), description="measures and videos")
+    methods: dict[str, MethodConfig] = Field({}, description="methods by name")
+    tables: dict[str, TableConfig] = Field({}, description="tables by name")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Config:
+        for name, scene in self.scenes.items():
+            if "/" not in scene.prior and "." not in scene.prior and scene.prior not in self.priors.laws:
+                raise ValueError(
+                    f"scenes.{name}.prior: no prior '{scene.prior}' in priors.laws"
+                    + _close(scene.prior, self.priors.laws)
+                )
+            _overridden(self.material, scene.material, f"scenes.{name}.material")
+        for name, method in self.methods.items():
+            _overridden(self.material, method.material, f"methods.{name}.material")
+        for name, table in self.tables.items():
+            for scene in table.scenes:
+                if scene not in self.scenes:
+                    raise ValueError(f"tables.{name}.scenes: no scene '{scene}'{_close(scene, self.scenes)}")
+            for method in table.methods:
+                parse_method(method, self.methods)
+        return self
+
+    def scene(self, name: str) -> SceneConfig:
+        """The scene of that name."""
+        if name not in self.scenes:
+            raise InputError(f"no scene '{name}' in {self.scenes_file}{_close(name, self.scenes)}")
+        return self.scenes[name]
+
+    def method_title(self, method: str) -> str:
+        """Name of a method or variant for tables, for example "NeuMA, rank 4"."""
+        base, variant = parse_method(method, self.methods)
+        return ", ".join([self.methods[base].title, *(f"{k} {_scalar_text(v)}" for k, v in variant.items())])
+
+    def method_prior(self, scene: str, method: str) -> str:
+        """The prior that a method starts from: the scene's, unless the variant names another."""
+        _, variant = parse_method(method, self.methods)
+        prior = str(variant.get("prior", self.scene(scene).prior))
+        if "prior" in variant and prior not in self.priors.laws:
+            raise InputError(f"{method}: no prior '{prior}' in priors.laws{_close(prior, self.priors.laws)}")
+        return prior
+
+    def method_material(self, scene: str, method: str) -> MaterialConfig:
+        """Effective material settings: the section, changed by the scene, then the method, then its variant."""
+        base, variant = parse_method(method, self.methods)
+        variant.pop("prior", None)
+        section = self.material
+        for changes, origin in (
+            (self.scene(scene).material, f"scenes.{scene}.material"),
+            (self.methods[base].material, f"methods.{base}.material"),
+            (variant, method),
+        ):
+            section = _overridden(section, changes, origin)
+        return section
+
+
+def parse_method(text: str, methods: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Split a method's folder name, ``neuma+rank=4+seed=2``, into its base and its settings.
+
+    Keys are those of the section ``material``, and ``prior``. Values are YAML scalars; a comma makes a list.
+
+    Raises:
+        InputError: unknown method or key, a repeated key, or a piece without '='.
+    """
+    base, *pieces = text.split("+")
+    if base not in methods:
+        raise InputError(f"no method '{base}'{_close(base, methods)}")
+    variant: dict[str, Any] = {}
+    known = [*MaterialConfig.model_fields, "prior"]
+    for piece in pieces:
+        key, equals, value = piece.partition("=")
+        if not equals or not key or not value:
+            raise InputError(f"method '{text}': write variants as +key=value, not '+{piece}'")
+        if key not in known:
+            raise InputError(f"method '{text}': no setting '{key}'{_close(key, known)}")
+        if key in variant:
+            raise InputError(f"method '{text}': '{key}' is given twice")
+        kind = typing.get_origin(MaterialConfig.model_fields[key].annotation) if key != "prior" else None
+        values = [yaml.safe_load(v) for v in value.split(",")]
+        variant[key] = values if kind is tuple else yaml.safe_load(value)
+    return base, variant
+
+
+def load(raw: Mapping[str, Any], root: str | Path = ".") -> Config:
+    """Validate merged settings.
+
+    Args:
+        raw: the YAML as nested dicts. ``scenes_file`` (relative to ``root``) is read, and ``scenes`` changes it.
+        root: folder of the project.
+
+    Raises:
+        InputError: names every offending key by its path and suggests close matches.
+    """
+    raw = copy.deepcopy(dict(raw))
+    scenes_file = Path(root) / str(raw.get("scenes_file", Config.model_fields["scenes_file"].default))
+    scenes = read_yaml(scenes_file)
+    raw["scenes"] = merged(scenes, raw.get("scenes") or {})
+    return validate(Config, raw)
+
+
+def validate(kind: type, raw: Any, origin: str = "") -> Any:
+    """Build a section, with errors that name keys by their path below ``origin``."""
+    try:
+        return kind.model_validate(raw)
+    except ValidationError as error:
+        lines = [_explain(kind, problem, origin) for problem in error.errors()]
+        raise InputError("settings: " + "\n          ".join(lines)) from None
+
+
+def read_yaml(path: str | Path) -> dict[str, Any]:
+    """A YAML file as a dict. Raises InputError naming the file when it is missing or not a mapping."""
+    try:
+        content = yaml.safe_load(Path(path).read_text())
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist: give the path of an existing settings file") from None
+    except yaml.YAMLError as error:
+        raise InputError(f"{path} is not valid YAML: {error}") from None
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise InputError(f"{path} must hold 'key: value' lines, not a {type(content).__name__}")
+    return content
+
+
+def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """``base`` with ``changes`` laid over it, nested dicts merged, everything else replaced."""
+    result = dict(base)
+    for key, value in changes.items():
+        old = result.get(key)
+        both = isinstance(old, Mapping) and isinstance(value, Mapping)
+        result[key] = merged(old, value) if both else value
+    return result
+
+
+def pick(kind: type, section: Section | Mapping[str, Any], **others: Any) -> Any:
+    """Build the dataclass ``kind`` from the fields of the same names; ``others`` are given by hand."""
+    values = (
+        section
+        if isinstance(section, Mapping)
+        else {k: getattr(section, k) for k in type(section).model_fields}
+    )
+    return kind(
+        **{f.name: values[f.name] for f in fields(kind) if f.name in values and f.name not in others},
+        **others,
+    )
+
+
+def from_mapping(kind: type, values: Mapping[str, Any], origin: str) -> Any:
+    """Build the dataclass ``kind`` from a block of settings, blocks inside it too; lists become tuples.
+
+    Raises:
+        InputError: an unknown key, named by its path below ``origin``.
+    """
+    known = {f.name: f for f in fields(kind)}
+    built = {}
+    for key, value in values.items():
+        if key not in known:
+            raise InputError(f"settings: {origin}.{key}: unknown key{_close(key, known)}")
+        if isinstance(value, Mapping) and is_dataclass(known[key].default):
+            value = from_mapping(type(known[key].default), value, f"{origin}.{key}")
+        built[key] = tuple(value) if isinstance(value, list) else value
+    return kind(**built)
+
+
+def _overridden(section: MaterialConfig, changes: Mapping[str, Any], origin: str) -> MaterialConfig:
+    return validate(type(section), merged(section.plain(), changes), origin)
+
+
+def _close(word: str, known: Any) -> str:
+    """A hint: the close matches, or all that there is."""
+    matches = difflib.get_close_matches(str(word), [str(k) for k in known], n=3, cutoff=0.5)
+    if matches:
+        return f"; did you mean {' or '.join(matches)}?"
+    return f"; known: {', '.join(map(str, known))}" if known else ""
+
+
+def _scalar_text(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+
+
+def _explain(kind: type, problem: Mapping[str, Any], origin: str) -> str:
+    where = [str(p) for p in problem["loc"]]
+    path = ".".join([origin, *where] if origin else where)
+    if problem["type"] == "extra_forbidden":
+        siblings = _keys_at(kind, problem["loc"][:-1])
+        return f"{path}: unknown key{_close(where[-1], siblings)}"
+    if problem["type"] == "missing":
+        return f"{path}: this key is missing"
+    message = problem["msg"].removeprefix("Value error, ").removeprefix("settings: ")
+    if not path:
+        return message
+    given = problem.get("input")
+    return f"{path}: {message}" + (f" (given: {given!r})" if not isinstance(given, Mapping) else "")
+
+
+def _keys_at(kind: type, where: tuple) -> list[str]:
+    """Keys of the section at a path, for suggestions."""
+    for step in where:
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            if step not in kind.model_fields:
+                return []
+            kind = kind.model_fields[step].annotation
+        elif typing.get_origin(kind) is dict:
+            kind = typing.get_args(kind)[1]
+        else:
+            return []
+    return list(kind.model_fields) if isinstance(kind, type) and issubclass(kind, BaseModel) else []

@@ -1,0 +1,151 @@
+"""Tables of the paper from metrics: CSV for programs, Markdown for people."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from neuma_lib.errors import InputError
+
+PAPER_TABLE1 = {
+    "pac_nerf": (516.30, 137.73, 15.47, 15.38, 1.71, 2.21),
+    "nclaw": (56.13, 6.32, 3.31, 2.45, 2.61, 2.26),
+    "neuma": (1.19, 3.03, 1.27, 1.00, 0.65, 0.73),
+    "neuma_particle_supervision": (1.45, 3.74, 1.25, 1.00, 0.80, 0.84),
+    "neuma_without_binding": (3.34, 28.42, 4.62, 1.26, 0.97, 1.01),
+    "neuma_without_adaptor": (1.87, 3.63, 1.42, 1.36, 1.21, 1.23),
+}
+"""Chamfer distances of the paper's Table 1, in the order of `PAPER_SCENES`. They contain its sampling floor."""
+PAPER_SCENES = ("BouncyBall", "JellyDuck", "RubberPawn", "ClayCat", "SandFish", "HoneyBottle")
+
+QUANTITIES = {
+    "chamfer": "Chamfer distance (1e-4 m², mean over the sequence)",
+    "chamfer_excess": "Excess over the sampling floor (1e-4 m²)",
+    "tracer_rmse_mm": "Tracer RMSE from identical start points (mm)",
+}
+
+
+@dataclass
+class Table:
+    """Numbers with row and column names; the last column is the average.
+
+    Attributes:
+        columns: column names without the average.
+        rows: (quantity, method, title, one value a column) each.
+        marks: (method, column) of runs that diverged, whose last good state is shown.
+    """
+
+    columns: tuple[str, ...]
+    rows: list[tuple[str, str, str, tuple[float, ...]]] = field(default_factory=list)
+    marks: set[tuple[str, str]] = field(default_factory=set)
+
+    def values(self, quantity: str, method: str) -> dict[str, float]:
+        """One row as a dict, with "Average"."""
+        for q, m, _, values in self.rows:
+            if (q, m) == (quantity, method):
+                named = dict(zip(self.columns, values, strict=True))
+                return named | {"Average": sum(values) / len(values)}
+        raise InputError(f"table: no row {quantity} of {method}")
+
+    def csv(self) -> str:
+        """Comma-separated values: quantity, method, title, one column a scene, Average, diverged."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(["quantity", "method", "title", *self.columns, "Average", "diverged"])
+        for quantity, method, title, values in self.rows:
+            diverged = [c for c in self.columns if (method, c) in self.marks]
+            cells = [f"{v:.4f}" for v in (*values, sum(values) / len(values))]
+            writer.writerow([quantity, method, title, *cells, " ".join(diverged)])
+        return out.getvalue()
+
+    def markdown(self) -> str:
+        """One Markdown table a quantity; the paper's numbers stand below the Chamfer distances."""
+        parts = ["# Table 1: dynamics grounding", ""]
+        for quantity, heading in QUANTITIES.items():
+            rows = [row for row in self.rows if row[0] == quantity]
+            parts += [f"**{heading}**", "", self._header()]
+            if quantity == "chamfer":
+                rows += [row for row in self.rows if row[0] == "chamfer_floor"]
+            parts += [self._line(title, values, method) for _, method, title, values in rows]
+            if quantity == "chamfer" and set(self.columns) <= set(PAPER_SCENES):
+                parts += [self._paper_line(method, title) for _, method, title, _ in rows if method in PAPER_TABLE1]
+            parts.append("")
+        if self.marks:
+            parts += ["† The run diverged; its last good state is shown.", ""]
+        parts += [
+            "The floor is the distance between two samplings of the true motion with the same number of tracers."
+            " The paper's distances contain a floor of their own, set by its 30,000 particles: compare excesses,"
+            " not distances. Its scenes have the same starts but materials that it does not publish.",
+            "",
+        ]
+        return "\n".join(parts)
+
+    def _header(self) -> str:
+        names = [*self.columns, "Average"]
+        return f"| Method | {' | '.join(names)} |\n|---|{'---:|' * len(names)}"
+
+    def _line(self, title: str, values: Sequence[float], method: str) -> str:
+        marks = ["†" if (method, c) in self.marks else "" for c in self.columns]
+        cells = [f"{v:.2f}{m}" for v, m in zip((*values, sum(values) / len(values)), [*marks, ""], strict=True)]
+        return f"| {title} | {' | '.join(cells)} |"
+
+    def _paper_line(self, method: str, title: str) -> str:
+        paper = dict(zip(PAPER_SCENES, PAPER_TABLE1[method], strict=True))
+        return self._line(f"*paper: {title}*", [paper[c] for c in self.columns], "")
+
+
+def chamfer_table(
+    metrics: Mapping[str, Mapping[str, Mapping]], titles: Mapping[str, str], scenes: Sequence[str]
+) -> Table:
+    """Table 1 of the paper, with floor, excess and tracer error.
+
+    Args:
+        metrics: method -> scene -> content of its metrics.json.
+        titles: method -> name in the table, in the order of the rows.
+        scenes: columns in order.
+
+    Raises:
+        InputError: a method lacks a scene or a scene a quantity.
+    """
+    table = Table(tuple(scenes))
+
+    def row(quantity, method):
+        try:
+            return tuple(float(metrics[method][scene][quantity]) for scene in scenes)
+        except KeyError as missing:
+            raise InputError(f"table 1: {method} has no {missing}; run its evaluation again") from None
+
+    for quantity in QUANTITIES:
+        table.rows += [(quantity, method, title, row(quantity, method)) for method, title in titles.items()]
+    first = next(iter(titles))
+    table.rows.append(("chamfer_floor", "floor", "Sampling floor", row("chamfer_floor", first)))
+    table.marks = {
+        (method, scene)
+        for method in titles
+        for scene in scenes
+        if metrics[method][scene].get("diverged_at_step") is not None or metrics[method][scene].get("stable") is False
+    }
+    return table
+
+
+def report_table(
+    rows: Mapping[str, Mapping[str, float]], columns: Mapping[str, str], corner: str
+) -> tuple[str, str]:
+    """A plain table of numbers as CSV and as Markdown.
+
+    Args:
+        rows: row name -> quantity -> value.
+        columns: quantity -> heading in the Markdown table, in order.
+        corner: heading of the first column.
+    """
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow([corner, *columns])
+    lines = [f"| {corner} | {' | '.join(columns.values())} |", f"|---|{'---:|' * len(columns)}"]
+    for name, row in rows.items():
+        writer.writerow([name, *(row[key] for key in columns)])
+        cells = [f"{row[key]:d}" if isinstance(row[key], int) else f"{row[key]:.4g}" for key in columns]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return out.getvalue(), "\n".join(lines) + "\n"

@@ -1,0 +1,519 @@
+"""Procedural solids of the benchmarks: a ball, a duck, a pawn, a cat, a bottle, a fish, and letters.
+
+Every solid is a signed distance function (negative inside) put together from a few rounded primitives by a smooth
+minimum, and is meshed by marching cubes. Each primitive belongs to a named part (body, beak, eyes ...), so that a
+scene can colour parts; a part may also be only painted on the surface (eyes, a label), without changing the solid.
+
+Frame: right-handed, y up; what one recognises best faces +z, where the frontal camera stands. The nominal sizes in
+this file are metres at the benchmarks' scale; thin parts (necks, ears, tails) are kept near 6 cm so that a grid of
+24 cells a metre resolves them.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+import string
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+import trimesh
+from scipy import ndimage
+from skimage import measure
+
+from neuma_lib.errors import InputError
+
+Array = np.ndarray
+Distance = Callable[[Array], Array]
+
+NAMES = ("ball", "duck", "pawn", "cat", "bottle", "fish")
+"""Solids with a name of their own; ``letter_A`` ... ``letter_Z`` exist besides."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A solid as parts with signed distances.
+
+    Attributes:
+        parts: part name -> signed distance (n,3) -> (n,) in nominal metres; the solid is their smooth union.
+        blend: width of the smooth union [m].
+        paint: part name -> signed distance of a region whose surface takes that part's colour.
+        lower, upper: nominal box that holds the solid [m].
+    """
+
+    parts: dict[str, Distance]
+    blend: float
+    lower: tuple[float, float, float]
+    upper: tuple[float, float, float]
+    paint: dict[str, Distance] = field(default_factory=dict)
+
+    @property
+    def part_names(self) -> tuple[str, ...]:
+        """Names that an appearance can colour; the order is the one of :meth:`part_index`."""
+        return tuple(self.parts) + tuple(name for name in self.paint if name not in self.parts)
+
+    def distance(self, points: Array) -> Array:
+        """Approximate signed distance (n,) [nominal m] of points (n,3); negative inside."""
+        return smooth_union(self.blend, *(part(points) for part in self.parts.values()))
+
+    def part_weights(self, points: Array, softness: float) -> Array:
+        """How far points (n,3) belong to each of :attr:`part_names`: weights (n, parts) that sum to 1.
+
+        Borders between parts are ``softness`` [nominal m] wide, so that an image of them is not jagged.
+        """
+        distances = np.stack([part(points) for part in self.parts.values()], axis=1)
+        weights = np.zeros((len(points), len(self.part_names)))
+        nearest = np.clip(1.0 - (distances - distances.min(axis=1, keepdims=True)) / softness, 0.0, 1.0)
+        weights[:, : len(self.parts)] = nearest / nearest.sum(axis=1, keepdims=True)
+        for name, region in self.paint.items():
+            cover = np.clip(0.5 - region(points) / softness, 0.0, 1.0)[:, None]
+            weights *= 1.0 - cover
+            weights[:, self.part_names.index(name)] += cover[:, 0]
+        return weights
+
+    def part_index(self, points: Array) -> Array:
+        """Index (n,) into :attr:`part_names` of the part that points (n,3) belong to most."""
+        return self.part_weights(points, 1e-6).argmax(axis=1)
+
+
+# --- primitives: points (n,3) -> signed distance (n,) ------------------------------------------------------------
+
+
+def smooth_union(width: float, *distances: Array) -> Array:
+    """Polynomial smooth minimum, rounding the seams of a union over ``width`` [m]."""
+    result = distances[0]
+    for distance in distances[1:]:
+        overlap = np.maximum(width - np.abs(result - distance), 0.0) / max(width, 1e-12)
+        result = np.minimum(result, distance) - 0.25 * width * overlap**2
+    return result
+
+
+def _vector(*values: float) -> Array:
+    return np.asarray(values, dtype=np.float64)
+
+
+def sphere(centre: tuple[float, float, float], radius: float) -> Distance:
+    """Ball of one radius [m]."""
+    c = _vector(*centre)
+    return lambda p: np.linalg.norm(p - c, axis=1) - radius
+
+
+def ellipsoid(
+    centre: tuple[float, float, float], radii: tuple[float, float, float], tilt: float = 0.0
+) -> Distance:
+    """Ellipsoid, turned by ``tilt`` [degrees] about z; first-order distance, good near the surface."""
+    c, r = _vector(*centre), _vector(*radii)
+    cos, sin = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
+
+    def distance(p: Array) -> Array:
+        q = p - c
+        q = np.stack([cos * q[:, 0] + sin * q[:, 1], cos * q[:, 1] - sin * q[:, 0], q[:, 2]], axis=1)
+        k0 = np.linalg.norm(q / r, axis=1)
+        k1 = np.linalg.norm(q / r**2, axis=1)
+        return np.where(k1 > 1e-12, k0 * (k0 - 1.0) / np.maximum(k1, 1e-12), -r.min())
+
+    return distance
+
+
+def tapered_capsule(
+    start: tuple[float, float, float], stop: tuple[float, float, float], r_start: float, r_stop: float
+) -> Distance:
+    """Segment with a radius that changes linearly from one end to the other [m]."""
+    a, b = _vector(*start), _vector(*stop)
+    axis = b - a
+
+    def distance(p: Array) -> Array:
+        t = np.clip((p - a) @ axis / (axis @ axis), 0.0, 1.0)
+        return np.linalg.norm(p - a - t[:, None] * axis, axis=1) - (r_start + (r_stop - r_start) * t)
+
+    return distance
+
+
+def revolved(profile: Distance, centre: tuple[float, float] = (0.0, 0.0)) -> Distance:
+    """Solid of revolution about a vertical axis from a 2-D distance over (radius, y)."""
+    cx, cz = centre
+    return lambda p: profile(np.stack([np.hypot(p[:, 0] - cx, p[:, 2] - cz), p[:, 1]], axis=1))
+
+
+def polygon(corners: list[tuple[float, float]], rounding: float = 0.0) -> Distance:
+    """Exact signed distance to a closed polygon in 2-D, its corners rounded outwards by ``rounding`` [m]."""
+    a = np.asarray(corners, dtype=np.float64)
+    b = np.roll(a, -1, axis=0)
+
+    def distance(p: Array) -> Array:
+        best = np.full(len(p), np.inf)
+        odd = np.zeros(len(p), dtype=bool)
+        for s, e in zip(a, b, strict=True):
+            edge = e - s
+            t = np.clip((p - s) @ edge / (edge @ edge), 0.0, 1.0)
+            best = np.minimum(best, np.linalg.norm(p - s - t[:, None] * edge, axis=1))
+            crosses = (s[1] > p[:, 1]) != (e[1] > p[:, 1])
+            if edge[1] != 0.0:
+                odd ^= crosses & (p[:, 0] < s[0] + (p[:, 1] - s[1]) / edge[1] * edge[0])
+        return np.where(odd, -best, best) - rounding
+
+    return distance
+
+
+def extruded(profile: Distance, half_depth: float, rounding: float) -> Distance:
+    """Extrusion along z of a 2-D distance over (x, y), with rounded edges; total depth 2 ``half_depth`` [m]."""
+
+    def distance(p: Array) -> Array:
+        d = profile(p[:, :2]) + rounding
+        w = np.abs(p[:, 2]) - half_depth + rounding
+        outside = np.hypot(np.maximum(d, 0.0), np.maximum(w, 0.0))
+        return np.minimum(np.maximum(d, w), 0.0) + outside - rounding
+
+    return distance
+
+
+def mirrored(part: Distance) -> Distance:
+    """The part and its mirror image in the plane z = 0: the part is given for z >= 0."""
+    return lambda p: part(np.stack([p[:, 0], p[:, 1], np.abs(p[:, 2])], axis=1))
+
+
+def mirrored_x(part: Distance) -> Distance:
+    """The part and its mirror image in the plane x = 0: the part is given for x >= 0."""
+    return lambda p: part(np.stack([np.abs(p[:, 0]), p[:, 1], p[:, 2]], axis=1))
+
+
+def turned(part: Distance, degrees: float) -> Distance:
+    """The part turned about the vertical axis, counter-clockwise seen from above."""
+    cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return lambda p: part(
+        np.stack([cos * p[:, 0] - sin * p[:, 2], p[:, 1], sin * p[:, 0] + cos * p[:, 2]], axis=1)
+    )
+
+
+def union(width: float, *parts: Distance) -> Distance:
+    """Smooth union of parts as a part."""
+    return lambda p: smooth_union(width, *(part(p) for part in parts))
+
+
+# --- the solids --------------------------------------------------------------------------------------------------
+
+
+def _ball() -> Shape:
+    """A beach ball: six painted panels between two caps; its axis leans towards the camera."""
+    axis = _vector(0.25, 0.85, 0.46)
+    axis /= np.linalg.norm(axis)
+    east = np.cross(axis, _vector(0.0, 0.0, 1.0))
+    east /= np.linalg.norm(east)
+    north = np.cross(axis, east)
+
+    def panel(k: int) -> Distance:
+        def distance(p: Array) -> Array:
+            angle = np.arctan2(p @ north, p @ east) - (k + 0.5) * np.pi / 3
+            angle = np.abs((angle + np.pi) % (2 * np.pi) - np.pi)
+            return 0.13 * (angle - np.pi / 6)
+
+        return distance
+
+    def caps(p: Array) -> Array:
+        return 0.93 * np.linalg.norm(p, axis=1) - np.abs(p @ axis)
+
+    def second_colour(p: Array) -> Array:
+        return np.minimum(panel(0)(p), panel(3)(p))
+
+    def third_colour(p: Array) -> Array:
+        return np.minimum(panel(1)(p), panel(4)(p))
+
+    return Shape(
+        parts={"body": sphere((0, 0, 0), 0.13)},
+        blend=0.0,
+        lower=(-0.14,) * 3,
+        upper=(0.14,) * 3,
+        paint={"second": second_colour, "third": third_colour, "caps": caps},
+    )
+
+
+def _duck() -> Shape:
+    """A bath duck that looks to the right, turned a little towards the camera."""
+    turn = 28.0
+    body = union(
+        0.05,
+        ellipsoid((-0.015, 0.0, 0.0), (0.165, 0.105, 0.120)),
+        tapered_capsule((-0.10, 0.02, 0.0), (-0.185, 0.105, 0.0), 0.075, 0.032),
+        tapered_capsule((0.06, 0.05, 0.0), (0.075, 0.16, 0.0), 0.085, 0.07),
+    )
+    wing = mirrored(ellipsoid((-0.035, 0.02, 0.105), (0.085, 0.052, 0.032), tilt=-14.0))
+    head = sphere((0.085, 0.185, 0.0), 0.092)
+    beak = union(
+        0.02,
+        ellipsoid((0.185, 0.172, 0.0), (0.052, 0.024, 0.048), tilt=8.0),
+        ellipsoid((0.172, 0.152, 0.0), (0.042, 0.020, 0.040), tilt=-6.0),
+    )
+    eye = mirrored(sphere((0.135, 0.215, 0.070), 0.0235))
+    return Shape(
+        parts={
+            "body": turned(union(0.03, body, head), -turn),
+            "wing": turned(wing, -turn),
+            "beak": turned(beak, -turn),
+        },
+        blend=0.018,
+        lower=(-0.27, -0.13, -0.24),
+        upper=(0.27, 0.31, 0.24),
+        paint={"eye": turned(eye, -turn)},
+    )
+
+
+def _pawn() -> Shape:
+    """A chess pawn: foot, waist, collar and head, turned on a lathe."""
+    foot = polygon([(0, 0.012), (0.118, 0.012), (0.118, 0.045), (0, 0.045)], rounding=0.012)
+    step = polygon([(0, 0.05), (0.092, 0.05), (0.092, 0.075), (0, 0.075)], rounding=0.012)
+    waist = polygon([(0, 0.06), (0.082, 0.08), (0.058, 0.13), (0.046, 0.19), (0.044, 0.26), (0, 0.26)], 0.006)
+    collar = polygon([(0, 0.248), (0.074, 0.248), (0.074, 0.262), (0, 0.262)], rounding=0.014)
+    return Shape(
+        parts={
+            "body": union(0.03, revolved(step), revolved(waist), sphere((0, 0.335, 0), 0.082)),
+            "foot": revolved(foot),
+            "collar": revolved(collar),
+        },
+        blend=0.012,
+        lower=(-0.14, -0.01, -0.14),
+        upper=(0.14, 0.43, 0.14),
+    )
+
+
+def _cat() -> Shape:
+    """A sitting cat, its face to the camera, the tail around its side."""
+    body = union(
+        0.05,
+        ellipsoid((0, 0.085, -0.02), (0.098, 0.088, 0.098)),
+        tapered_capsule((0, 0.07, -0.01), (0, 0.185, 0.015), 0.090, 0.060),
+    )
+    legs = mirrored_x(tapered_capsule((0.042, 0.14, 0.055), (0.045, 0.032, 0.085), 0.034, 0.032))
+    thighs = mirrored_x(ellipsoid((0.088, 0.055, 0.015), (0.042, 0.056, 0.072)))
+    head = ellipsoid((0, 0.232, 0.035), (0.096, 0.076, 0.076))
+    muzzle = mirrored_x(sphere((0.020, 0.208, 0.098), 0.029))
+    ears = mirrored_x(tapered_capsule((0.058, 0.272, 0.030), (0.079, 0.338, 0.026), 0.040, 0.013))
+    tail = union(
+        0.02,
+        tapered_capsule((0.05, 0.035, -0.085), (0.145, 0.035, -0.045), 0.032, 0.031),
+        tapered_capsule((0.145, 0.035, -0.045), (0.163, 0.060, 0.03), 0.031, 0.030),
+        tapered_capsule((0.163, 0.060, 0.03), (0.152, 0.125, 0.065), 0.030, 0.028),
+    )
+    inner_ear = mirrored_x(ellipsoid((0.066, 0.300, 0.060), (0.020, 0.034, 0.034)))
+    eyes = mirrored_x(ellipsoid((0.038, 0.243, 0.105), (0.017, 0.020, 0.024)))
+    nose = ellipsoid((0, 0.222, 0.128), (0.014, 0.010, 0.014))
+
+    def stripes(p: Array) -> Array:
+        on_body = np.where(p[:, 1] < 0.172, np.abs(((p[:, 1] + 0.35 * p[:, 2]) % 0.058) - 0.029) - 0.010, 1.0)
+        back_only = p[:, 2] - 0.045
+        forehead = np.where(p[:, 1] > 0.265, np.abs((np.abs(p[:, 0]) + 0.013) % 0.026 - 0.013) - 0.006, 1.0)
+        forehead = np.maximum(forehead, np.abs(p[:, 0]) - 0.03)
+        return np.minimum(np.maximum(on_body, back_only), forehead)
+
+    def tail_tip(p: Array) -> Array:
+        return np.where((tail(p) < 0.01) & (p[:, 0] > 0.1), 0.098 - p[:, 1], 1.0)
+
+    white = union(0.0, muzzle, ellipsoid((0, 0.135, 0.08), (0.036, 0.05, 0.05)))
+    paws = mirrored_x(sphere((0.045, 0.022, 0.09), 0.045))
+    return Shape(
+        parts={
+            "body": union(0.03, body, legs, head, ears),
+            "thighs": thighs,
+            "muzzle": muzzle,
+            "tail": tail,
+        },
+        blend=0.018,
+        lower=(-0.15, -0.02, -0.14),
+        upper=(0.21, 0.37, 0.16),
+        paint={
+            "stripes": stripes,
+            "white": lambda p: np.minimum(np.minimum(white(p) - 0.004, paws(p)), tail_tip(p)),
+            "inner_ear": inner_ear,
+            "eyes": eyes,
+            "nose": nose,
+        },
+    )
+
+
+def _bottle() -> Shape:
+    """A honey bottle: a round body with a label, shoulders, a neck and a cap."""
+    body = polygon(
+        [(0, 0.02), (0.090, 0.02), (0.098, 0.05), (0.098, 0.215), (0.075, 0.265), (0.045, 0.30), (0, 0.30)], 0.016
+    )
+    neck = polygon([(0, 0.28), (0.042, 0.28), (0.042, 0.37), (0, 0.37)], 0.010)
+    cap = polygon([(0, 0.375), (0.056, 0.375), (0.056, 0.430), (0, 0.430)], 0.012)
+
+    def label(p: Array) -> Array:
+        return np.abs(p[:, 1] - 0.135) - 0.062
+
+    def stripe(p: Array) -> Array:
+        hexagon = np.maximum(np.abs(p[:, 1] - 0.135), 0.866 * np.abs(p[:, 0]) + 0.5 * np.abs(p[:, 1] - 0.135))
+        return np.where(np.abs(p[:, 2]) > 0.05, hexagon - 0.040, 1.0)
+
+    return Shape(
+        parts={"body": union(0.02, revolved(body), revolved(neck)), "cap": revolved(cap)},
+        blend=0.008,
+        lower=(-0.13, -0.01, -0.13),
+        upper=(0.13, 0.46, 0.13),
+        paint={"label": label, "emblem": stripe},
+    )
+
+
+def _fish() -> Shape:
+    """A fish that swims to the right, seen from its side."""
+    body = ellipsoid((0.03, 0, 0), (0.155, 0.098, 0.075))
+    stalk = tapered_capsule((-0.08, 0, 0), (-0.15, 0, 0), 0.055, 0.036)
+    tail_fin = extruded(
+        polygon([(-0.135, -0.012), (-0.195, -0.085), (-0.175, 0.0), (-0.195, 0.085), (-0.135, 0.012)], 0.022),
+        half_depth=0.031,
+        rounding=0.022,
+    )
+    dorsal = extruded(
+        polygon([(-0.055, 0.06), (-0.055, 0.115), (0.0, 0.118), (0.075, 0.07)], 0.018), half_depth=0.029, rounding=0.02
+    )
+    belly = extruded(
+        polygon([(-0.02, -0.06), (-0.05, -0.115), (-0.01, -0.112), (0.04, -0.07)], 0.016), half_depth=0.029, rounding=0.02
+    )
+    side_fin = mirrored(tapered_capsule((0.06, -0.025, 0.060), (0.0, -0.050, 0.092), 0.032, 0.024))
+    eye = mirrored(sphere((0.128, 0.030, 0.052), 0.026))
+    pupil = mirrored(sphere((0.134, 0.030, 0.060), 0.0165))
+    mouth = mirrored(ellipsoid((0.178, -0.026, 0.0), (0.030, 0.007, 0.06), tilt=12.0))
+
+    def stripes(p: Array) -> Array:
+        wave = p[:, 0] - 0.9 * p[:, 1] ** 2 / 0.1
+        on_body = np.minimum(np.abs(wave - 0.058) - 0.017, np.abs(wave + 0.042) - 0.017)
+        return np.where(np.maximum(body(p), -0.2) < 0.008, on_body, 1.0)
+
+    return Shape(
+        parts={
+            "body": union(0.04, body, stalk),
+            "fins": union(0.01, tail_fin, dorsal, belly),
+            "side_fins": side_fin,
+        },
+        blend=0.02,
+        lower=(-0.25, -0.17, -0.14),
+        upper=(0.21, 0.17, 0.14),
+        paint={"stripes": stripes, "eye": eye, "pupil": pupil, "mouth": mouth},
+    )
+
+
+def _letter(character: str) -> Shape:
+    """A capital letter as a rounded block, from the outline of the bold font that comes with matplotlib."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import TextPath
+
+    outline = TextPath((0, 0), character, size=1.0, prop=FontProperties(family="DejaVu Sans", weight="bold"))
+    box = outline.get_extents()
+    cell, margin = 0.004, 0.15
+    xs = np.arange(box.x0 - margin, box.x1 + margin, cell)
+    ys = np.arange(box.y0 - margin, box.y1 + margin, cell)
+    grid = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2)
+    # Even-odd over the outline's loops: each letter's holes are loops inside it.
+    filled = np.zeros(len(grid), dtype=bool)
+    for loop in outline.to_polygons():
+        filled ^= measure.points_in_poly(grid, loop)
+    filled = filled.reshape(len(xs), len(ys))
+    signed = (ndimage.distance_transform_edt(~filled) - ndimage.distance_transform_edt(filled)) * cell
+    signed = ndimage.gaussian_filter(signed, 2.0)
+    scale = 0.3 / (box.y1 - box.y0)
+    middle = _vector((box.x0 + box.x1) / 2, (box.y0 + box.y1) / 2)
+
+    def profile(q: Array) -> Array:
+        index = (q / scale + middle - _vector(xs[0], ys[0])) / cell
+        return scale * ndimage.map_coordinates(signed, index.T, order=1, mode="nearest")
+
+    half_width = scale * (box.x1 - box.x0) / 2 + 0.02
+    return Shape(
+        parts={"body": extruded(profile, half_depth=0.045, rounding=0.014)},
+        blend=0.0,
+        lower=(-half_width, -0.17, -0.065),
+        upper=(half_width, 0.17, 0.065),
+    )
+
+
+_MAKERS: dict[str, Callable[[], Shape]] = {
+    "ball": _ball,
+    "duck": _duck,
+    "pawn": _pawn,
+    "cat": _cat,
+    "bottle": _bottle,
+    "fish": _fish,
+}
+
+
+@lru_cache(maxsize=None)
+def shape(name: str) -> Shape:
+    """The solid of that name.
+
+    Raises:
+        InputError: no such solid; the message names those that exist.
+    """
+    if name in _MAKERS:
+        return _MAKERS[name]()
+    if re.fullmatch(r"letter_[A-Z]", name):
+        return _letter(name[-1])
+    near = difflib.get_close_matches(name, [*NAMES, *(f"letter_{c}" for c in string.ascii_uppercase)], n=1)
+    hint = f" Did you mean {near[0]!r}?" if near else ""
+    raise InputError(f"shape: {name!r} is not known.{hint} Choose one of {', '.join(NAMES)} or letter_A ... letter_Z.")
+
+
+def build(name: str, size: float | None = None, resolution: int = 96) -> trimesh.Trimesh:
+    """Mesh a solid.
+
+    Args:
+        name: one of :data:`NAMES` or ``letter_A`` ... ``letter_Z``.
+        size: longest side of the bounding box [m]; None keeps the nominal size.
+        resolution: cells along the longest side.
+
+    Returns:
+        A watertight mesh [m], faces outward, its bounding box centred at the origin, with the vertex attribute
+        ``part`` (indices into ``shape(name).part_names``) and what :func:`inside` and :func:`to_nominal` need.
+
+    Raises:
+        InputError: unknown name, or a size or resolution that is not positive.
+    """
+    solid = shape(name)
+    if resolution < 8:
+        raise InputError(f"resolution: {resolution} is too coarse for shape {name!r}; give at least 8.")
+    if size is not None and not size > 0.0:
+        raise InputError(f"size: {size} of shape {name!r} must be a positive length in metres.")
+    lower, upper = _vector(*solid.lower), _vector(*solid.upper)
+    cell = (upper - lower).max() / resolution
+    axes = [np.arange(lo - 1.5 * cell, hi + 1.5 * cell, cell) for lo, hi in zip(lower, upper, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    values = solid.distance(grid.reshape(-1, 3)).reshape(grid.shape[:3])
+    # A lattice value of exactly zero would give degenerate triangles.
+    values[np.abs(values) < 1e-7] = 1e-7
+    vertices, faces, _, _ = measure.marching_cubes(
+        values, 0.0, spacing=(cell,) * 3, gradient_direction="descent", allow_degenerate=False
+    )
+    vertices = vertices.astype(np.float64) + _vector(*(axis[0] for axis in axes))
+    mesh = trimesh.Trimesh(vertices, faces, process=True)
+    mesh = max(mesh.split(only_watertight=False), key=lambda body: abs(body.volume))
+    nominal = mesh.vertices.copy()
+    centre = mesh.bounds.mean(axis=0)
+    scale = 1.0 if size is None else size / np.ptp(nominal, axis=0).max()
+    result = trimesh.Trimesh((nominal - centre) * scale, mesh.faces, process=False)
+    result.vertex_attributes["part"] = solid.part_index(nominal)
+    result.metadata.update(shape=name, scale=float(scale), centre=centre.tolist())
+    return result
+
+
+def to_nominal(mesh: trimesh.Trimesh, points: Array) -> tuple[Shape, Array]:
+    """The solid of a mesh from :func:`build` and points (n,3) [m, mesh frame] in that solid's nominal frame.
+
+    Raises:
+        InputError: the mesh does not come from :func:`build`.
+    """
+    if "shape" not in mesh.metadata:
+        raise InputError(
+            "this mesh was not made by geometry.shapes.build, so its solid is not known; "
+            "sample it with geometry.volume instead."
+        )
+    nominal = np.asarray(points, dtype=np.float64) / mesh.metadata["scale"] + np.asarray(mesh.metadata["centre"])
+    return shape(mesh.metadata["shape"]), nominal
+
+
+def inside(mesh: trimesh.Trimesh, points: Array) -> Array:
+    """Whether points (n,3) [m, mesh frame] lie in the solid of a mesh from :func:`build` -> (n,) bool.
+
+    Decided by the signed distance function itself, so that it costs no ray casting.
+    """
+    solid, nominal = to_nominal(mesh, points)
+    return solid.distance(nominal) < 0.0

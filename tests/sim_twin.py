@@ -1,0 +1,77 @@
+"""The simulator once more in plain torch, for comparison: slow, obvious, differentiated by autograd."""
+
+import torch
+
+from neuma_lib.sim.model import as_bodies
+
+
+def step(model, bodies, x, v, F, C, mass, vol0):
+    """One step of the paper's Algorithm 2 with all 27 nodes of a particle as one axis."""
+    n, dx, dt = model.grid, model.dx, model.dt
+    tau = evaluate(bodies, "elasticity", F)
+    base = (x.detach() / dx - 0.5).int()
+    f = x / dx - base
+    w = torch.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2], dim=1)
+    ticks = torch.arange(3)
+    offset = torch.cartesian_prod(ticks, ticks, ticks)
+    i, j, k = offset.unbind(1)
+    weight = w[:, i, 0] * w[:, j, 1] * w[:, k, 2]
+    d = (offset - f[:, None]) * dx
+    node = base[:, None] + offset
+    flat = (node[..., 0] * n + node[..., 1]) * n + node[..., 2]
+
+    A = mass[:, None, None] * C - (4 * dt / dx**2) * vol0[:, None, None] * tau
+    q = (mass[:, None] * v)[:, None] + torch.einsum("pab,pib->pia", A, d)
+    m = torch.zeros(n**3, dtype=x.dtype).index_add(0, flat.flatten(), (weight * mass[:, None]).flatten())
+    mv = torch.zeros(n**3, 3, dtype=x.dtype).index_add(
+        0, flat.flatten(), (weight[..., None] * q).flatten(0, 1)
+    )
+
+    gravity = torch.tensor(model.gravity, dtype=x.dtype)
+    grid_v = torch.where(m[:, None] > 0, mv / m.clamp(min=1e-300)[:, None] + dt * gravity, 0.0)
+    grid_v = walls(model, grid_v.reshape(n, n, n, 3)).reshape(-1, 3)
+
+    v = torch.einsum("pi,pia->pa", weight, grid_v[flat])
+    C = (4 / dx**2) * torch.einsum("pi,pia,pib->pab", weight, grid_v[flat], d)
+    x = (x + dt * v).clamp(*model.stencil_range)
+    F = evaluate(bodies, "plasticity", F + dt * C @ F)
+    return x, v, F, C
+
+
+def walls(model, grid_v):
+    """Conditions on the wall nodes of a grid of velocities (n, n, n, 3), one wall after the other."""
+    n, cells = model.grid, model.wall_cells
+    for wall, condition in enumerate(model.boundary):
+        axis, upper = divmod(wall, 2)
+        index = torch.arange(n)
+        inside = (index >= n - cells) if upper else (index < cells)
+        shape = [1, 1, 1]
+        shape[axis] = n
+        inside = inside.reshape(shape).expand(n, n, n)
+        into = (grid_v[..., axis] > 0) if upper else (grid_v[..., axis] < 0)
+        if condition == "sticky":
+            stopped = inside[..., None].expand_as(grid_v)
+        elif condition == "no_slip":
+            stopped = (inside & into)[..., None].expand_as(grid_v)
+        else:
+            stopped = torch.zeros_like(grid_v, dtype=torch.bool)
+            stopped[..., axis] = inside & into
+        grid_v = torch.where(stopped, 0.0, grid_v)
+    return grid_v
+
+
+def evaluate(bodies, part, F):
+    """Elasticity or plasticity of every body."""
+    return torch.cat([getattr(body.law, part)(F[body.start : body.stop]) for body in bodies])
+
+
+def rollout(model, law, x0, v0, mass, vol0, F0, C0, frames):
+    """States (x, v, F, C) at the frames, each of shape (T, N, ...)."""
+    bodies = as_bodies(law, len(x0))
+    state, seen = (x0, v0, F0, C0), []
+    for n in range(frames[-1] + 1):
+        if n in frames:
+            seen.append(state)
+        if n < frames[-1]:
+            state = step(model, bodies, *state, mass, vol0)
+    return tuple(torch.stack(values) for values in zip(*seen, strict=True))

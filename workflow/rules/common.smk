@@ -1,0 +1,97 @@
+"""Reads and checks the settings, and says what every rule shares. Nothing is computed here."""
+
+import os
+import sys
+from pathlib import Path
+
+ROOT = Path(workflow.basedir).resolve()
+sys.path.insert(0, str(ROOT))
+
+from neuma_lib.config import load
+from neuma_lib.errors import InputError
+from neuma_lib.provenance import code_digest
+
+try:
+    SETTINGS = load(config)
+except InputError as error:
+    raise WorkflowError(str(error)) from None
+
+DATA = SETTINGS.data_root.rstrip("/")
+RESULTS = SETTINGS.results_root.rstrip("/")
+LOGS = f"{RESULTS}/logs"
+BENCHMARKS = f"{RESULTS}/benchmarks"
+KERNELS = f"{SETTINGS.kernel_cache}/ready"
+ENVIRONMENT = "../../envs/conda.yaml"
+WANTS_CUDA = {"cpu": False, "cuda": True, "auto": Path("/dev/nvidiactl").exists()}
+GPU = int(WANTS_CUDA[SETTINGS.device])
+
+# Scripts are processes of their own: they find the library, share one kernel cache, and keep to one thread each
+# (two OpenMP threads on a busy machine are far slower than one).
+os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+os.environ["NEUMA_KERNEL_CACHE"] = str(Path(SETTINGS.kernel_cache).resolve())
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")
+
+
+wildcard_constraints:
+    scene="|".join(SETTINGS.scenes),
+    prior="|".join(SETTINGS.priors.laws) or "none",
+    method=f"({'|'.join(SETTINGS.methods) or 'none'})([+][^/]*)?",
+    table="|".join(SETTINGS.tables) or "none",
+
+
+def code(script):
+    """Digest of a script and of the library code that it reaches; as a parameter it makes edits rerun the rule."""
+    return code_digest(ROOT / "workflow" / "scripts" / f"{script}.py", ROOT)
+
+
+def checked(function):
+    """An input or parameter function whose InputError ends Snakemake with its message alone."""
+
+    def call(wildcards):
+        try:
+            return function(wildcards)
+        except InputError as error:
+            raise WorkflowError(str(error)) from None
+
+    return call
+
+
+def scene_setting(*names):
+    """A function of wildcards: the named settings of the scene, as plain values."""
+
+    @checked
+    def choose(wildcards):
+        scene = SETTINGS.scene(wildcards.scene).plain()
+        return scene[names[0]] if len(names) == 1 else {name: scene[name] for name in names}
+
+    return choose
+
+
+def frame_steps(wildcards):
+    return list(SETTINGS.scene(wildcards.scene).frame_steps(SETTINGS.dataset.frames))
+
+
+def simulation_settings(wildcards):
+    """Constants of the simulator for a scene."""
+    section = SETTINGS.simulation.plain()
+    return {
+        "dt": SETTINGS.scene(wildcards.scene).dt,
+        **{name: section[name] for name in ("grid", "gravity", "boundary", "wall_cells")},
+    }
+
+
+def prior_file(name):
+    """The file of a prior: made here if it is a name in the settings, the user's own if it is a path."""
+    return f"{RESULTS}/priors/{name}.safetensors" if name in SETTINGS.priors.laws else name
+
+
+def table_metrics(table):
+    """Metrics of every cell of a table."""
+    rows = SETTINGS.tables[table]
+    return [f"{RESULTS}/{scene}/{method}/metrics.json" for method in rows.methods for scene in rows.scenes]
+
+
+def table_titles(table):
+    """Row names of a table by method."""
+    return {method: SETTINGS.method_title(method) for method in SETTINGS.tables[table].methods}

@@ -1,0 +1,28 @@
+"""Static Gaussian kernels from the views at t = 0 (paper Sec. 3.1)."""
+
+
+rule gaussians:
+    input:
+        kernels=ancient(KERNELS),
+        transforms=f"{DATA}/{{scene}}/static/transforms.json",
+    output:
+        gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
+        report=f"{RESULTS}/{{scene}}/gaussians.json",
+    params:
+        fit=SETTINGS.gaussians.fit,
+        seed=SETTINGS.seed,
+        device=SETTINGS.device,
+        code=code("gaussians"),
+    log:
+        f"{LOGS}/{{scene}}/gaussians.log",
+    benchmark:
+        f"{BENCHMARKS}/{{scene}}/gaussians.tsv"
+    threads: 1
+    resources:
+        gpu=GPU,
+        mem_mb=4000,
+        runtime=60,
+    conda:
+        ENVIRONMENT
+    script:
+        "../scripts/gaussians.py"

@@ -1,0 +1,52 @@
+"""Adaptation of the material law. A method is a block of settings over this one rule."""
+
+
+@checked
+def material_settings(wildcards):
+    return SETTINGS.method_material(wildcards.scene, wildcards.method).plain()
+
+
+@checked
+def material_prior(wildcards):
+    return prior_file(SETTINGS.method_prior(wildcards.scene, wildcards.method))
+
+
+@checked
+def true_particles(wildcards):
+    """Ground truth, for the particle-supervised ablation alone."""
+    material = SETTINGS.method_material(wildcards.scene, wildcards.method)
+    return f"{DATA}/{wildcards.scene}/particles.h5" if material.supervision == "particles" else []
+
+
+rule material:
+    input:
+        kernels=ancient(KERNELS),
+        transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
+        gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
+        binding=f"{RESULTS}/{{scene}}/binding.h5",
+        velocity=f"{RESULTS}/{{scene}}/velocity.json",
+        prior=material_prior,
+        truth=true_particles,
+    output:
+        adaptor=f"{RESULTS}/{{scene}}/{{method}}/adaptor.safetensors",
+        history=f"{RESULTS}/{{scene}}/{{method}}/history.json",
+    params:
+        simulation=simulation_settings,
+        density=scene_setting("density"),
+        material=material_settings,
+        checkpoint=lambda wildcards: f"{RESULTS}/{wildcards.scene}/{wildcards.method}/checkpoint.pt",
+        device=SETTINGS.device,
+        code=code("material"),
+    log:
+        f"{LOGS}/{{scene}}/{{method}}/material.log",
+    benchmark:
+        f"{BENCHMARKS}/{{scene}}/{{method}}/material.tsv"
+    threads: 1
+    resources:
+        gpu=GPU,
+        mem_mb=6000,
+        runtime=240,
+    conda:
+        ENVIRONMENT
+    script:
+        "../scripts/material.py"

@@ -1,0 +1,97 @@
+"""Tables of the paper, and the targets that name many results at once."""
+
+SCENES = list(SETTINGS.tables["table1"].scenes) if "table1" in SETTINGS.tables else list(SETTINGS.scenes)
+
+
+rule table1:
+    input:
+        metrics=lambda wildcards: table_metrics("table1"),
+    output:
+        csv=report(f"{RESULTS}/table1.csv", caption="../report/table1.rst", category="Tables"),
+        markdown=f"{RESULTS}/table1.md",
+    params:
+        scenes=SCENES,
+        methods=lambda wildcards: table_titles("table1"),
+        code=code("table1"),
+    log:
+        f"{LOGS}/table1.log",
+    benchmark:
+        f"{BENCHMARKS}/table1.tsv"
+    threads: 1
+    resources:
+        gpu=0,
+        mem_mb=1000,
+        runtime=5,
+    conda:
+        ENVIRONMENT
+    script:
+        "../scripts/table1.py"
+
+
+rule initial_states:
+    input:
+        reports=expand(f"{RESULTS}/{{scene}}/initial_state.json", scene=SCENES),
+    output:
+        csv=report(f"{RESULTS}/initial_states.csv", caption="../report/initial_states.rst", category="Tables"),
+        markdown=f"{RESULTS}/initial_states.md",
+    params:
+        scenes=SCENES,
+        code=code("initial_states"),
+    log:
+        f"{LOGS}/initial_states.log",
+    benchmark:
+        f"{BENCHMARKS}/initial_states.tsv"
+    threads: 1
+    resources:
+        gpu=0,
+        mem_mb=1000,
+        runtime=5,
+    conda:
+        ENVIRONMENT
+    script:
+        "../scripts/initial_states.py"
+
+
+rule timings:
+    input:
+        table=f"{RESULTS}/table1.csv",
+    output:
+        csv=f"{RESULTS}/timings.csv",
+        markdown=f"{RESULTS}/timings.md",
+    params:
+        benchmarks=BENCHMARKS,
+        code=code("timings"),
+    log:
+        f"{LOGS}/timings.log",
+    benchmark:
+        f"{BENCHMARKS}/timings.tsv"
+    threads: 1
+    resources:
+        gpu=0,
+        mem_mb=1000,
+        runtime=5,
+    conda:
+        ENVIRONMENT
+    script:
+        "../scripts/timings.py"
+
+
+rule dataset:
+    input:
+        expand(
+            f"{DATA}/{{scene}}/{{part}}",
+            scene=SCENES,
+            part=["particles.h5", "static/transforms.json", "dynamic/transforms.json"],
+        ),
+
+
+rule tables:
+    input:
+        rules.table1.output,
+        rules.initial_states.output,
+        rules.timings.output,
+
+
+rule videos:
+    input:
+        expand(f"{RESULTS}/{{scene}}/neuma/video.mp4", scene=SCENES),

@@ -1,0 +1,29 @@
+"""Neural constitutive laws trained on published analytic materials (the paper's M_0)."""
+
+
+rule prior:
+    input:
+        kernels=ancient(KERNELS),
+    output:
+        weights=f"{RESULTS}/priors/{{prior}}.safetensors",
+        report=f"{RESULTS}/priors/{{prior}}.json",
+    params:
+        law=lambda wildcards: SETTINGS.priors.laws[wildcards.prior].plain(),
+        method=SETTINGS.priors.method,
+        options=SETTINGS.priors.plain()[SETTINGS.priors.method],
+        seed=SETTINGS.priors.seed,
+        device=SETTINGS.device,
+        code=code("prior"),
+    log:
+        f"{LOGS}/priors/{{prior}}.log",
+    benchmark:
+        f"{BENCHMARKS}/priors/{{prior}}.tsv"
+    threads: 1
+    resources:
+        gpu=GPU,
+        mem_mb=4000,
+        runtime=60,
+    conda:
+        ENVIRONMENT
+    script:
+        "../scripts/prior.py"

@@ -1,0 +1,31 @@
+"""Initial velocity from the frames before contact (paper Sec. 3.1)."""
+
+
+rule velocity:
+    input:
+        kernels=ancient(KERNELS),
+        transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
+        gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
+        binding=f"{RESULTS}/{{scene}}/binding.h5",
+        prior=lambda wildcards: prior_file(SETTINGS.scenes[wildcards.scene].prior),
+    output:
+        velocity=f"{RESULTS}/{{scene}}/velocity.json",
+    params:
+        simulation=simulation_settings,
+        density=scene_setting("density"),
+        velocity=SETTINGS.velocity.plain(),
+        device=SETTINGS.device,
+        code=code("velocity"),
+    log:
+        f"{LOGS}/{{scene}}/velocity.log",
+    benchmark:
+        f"{BENCHMARKS}/{{scene}}/velocity.tsv"
+    threads: 1
+    resources:
+        gpu=GPU,
+        mem_mb=4000,
+        runtime=60,
+    conda:
+        ENVIRONMENT
+    script:
+        "../scripts/velocity.py"

@@ -1,0 +1,32 @@
+"""Fit static Gaussian kernels to the views at t = 0."""
+
+from dataclasses import asdict
+
+from neuma_lib.artifacts import load_views, save_gaussians
+from neuma_lib.config import from_mapping
+from neuma_lib.fitting.gaussians import GaussianFitSettings, fit_gaussians
+from neuma_lib.io import write_json
+from neuma_lib.progress import stage
+
+
+def main(transforms: str, output, params, run) -> None:
+    images, cameras = load_views(transforms)
+    settings = from_mapping(GaussianFitSettings, params.fit, "gaussians.fit")
+    gaussians, report = fit_gaussians(
+        images,
+        cameras,
+        settings,
+        seed=params.seed,
+        progress=lambda iteration, loss: run.progress(iteration + 1, settings.iterations, loss),
+    )
+    save_gaussians(output.gaussians, gaussians)
+    write_json(output.report, asdict(report))
+    run.say(
+        f"{report.count} Gaussians ({report.culled} culled), PSNR on held-out views {report.psnr:.1f} dB,"
+        f" inside the object {report.psnr_object:.1f} dB"
+    )
+
+
+if __name__ == "__main__":
+    with stage(f"gaussians {snakemake.wildcards.scene}", snakemake.log[0]) as run:
+        main(snakemake.input.transforms, snakemake.output, snakemake.params, run)

@@ -1,0 +1,48 @@
+"""Judge what training starts from against the truth: static fit, mesh, particles, velocity."""
+
+import numpy as np
+
+from neuma_lib.dataset import place
+from neuma_lib.geometry.volume import volume_iou
+from neuma_lib.io import read_arrays, read_json, read_mesh, write_json
+from neuma_lib.progress import stage
+
+
+def main(inputs, report_file: str, params, run) -> None:
+    scene = params.scene
+    fit, velocity = read_json(inputs.gaussians), read_json(inputs.velocity)
+    binding, attributes = read_arrays(inputs.binding, only=("vol0",))
+    mesh, true_mesh = (
+        read_mesh(inputs.mesh),
+        place(scene["shape"], scene["size"], scene["height"], scene["center"]),
+    )
+    error = np.asarray(velocity["v0"]) - np.asarray(scene["velocity"])
+    in_camera = np.asarray(velocity["camera_axes"]) @ error
+    speed = float(np.linalg.norm(scene["velocity"]))
+    added = int(attributes["added"])
+    report = {
+        "gaussians": fit["count"],
+        "psnr": fit["psnr"],
+        "psnr_object": fit["psnr_object"],
+        "volume_iou": float(volume_iou(mesh, true_mesh)),
+        "volume_ratio": float(mesh.volume / true_mesh.volume),
+        "particles_asked": params.particles,
+        "particles": int(attributes["particles"]) - added,
+        "particles_added": added,
+        "velocity": velocity["v0"],
+        "velocity_true": scene["velocity"],
+        "velocity_error_in_plane_percent": float(100 * np.linalg.norm(in_camera[:2]) / speed),
+        "velocity_error_depth": float(in_camera[2]),
+        "velocity_std_depth": velocity["std_camera"][2],
+    }
+    write_json(report_file, report)
+    run.say(
+        f"PSNR {report['psnr']:.1f} dB, volume IoU {report['volume_iou']:.3f}, {report['particles']} particles"
+        f" (+{added}), velocity error {report['velocity_error_in_plane_percent']:.2f} % in plane,"
+        f" {report['velocity_error_depth']:+.3f} m/s in depth"
+    )
+
+
+if __name__ == "__main__":
+    with stage(f"initial_state {snakemake.wildcards.scene}", snakemake.log[0]) as run:
+        main(snakemake.input, snakemake.output.report, snakemake.params, run)

@@ -1,0 +1,30 @@
+"""One table of what the stages before training reached, a scene a row."""
+
+from neuma_lib.evaluation.tables import report_table
+from neuma_lib.io import read_json, write_text
+from neuma_lib.progress import stage
+
+COLUMNS = {
+    "psnr": "PSNR held out [dB]",
+    "psnr_object": "PSNR inside [dB]",
+    "volume_iou": "volume IoU",
+    "gaussians": "Gaussians",
+    "particles": "particles",
+    "particles_added": "added by binding",
+    "velocity_error_in_plane_percent": "velocity error in plane [%]",
+    "velocity_error_depth": "error in depth [m/s]",
+    "velocity_std_depth": "estimated std in depth [m/s]",
+}
+
+
+def main(report_files: list[str], output, params, run) -> None:
+    reports = {scene: read_json(file) for scene, file in zip(params.scenes, report_files, strict=True)}
+    csv, markdown = report_table(reports, COLUMNS, "scene")
+    write_text(output.csv, csv)
+    write_text(output.markdown, markdown)
+    run.say(f"{len(reports)} scenes: {output.markdown}")
+
+
+if __name__ == "__main__":
+    with stage("initial_states", snakemake.log[0]) as run:
+        main(list(snakemake.input.reports), snakemake.output, snakemake.params, run)

@@ -1,0 +1,70 @@
+"""Adapt the material law to the video, or to ground-truth particles."""
+
+from dataclasses import asdict
+
+import torch
+
+from neuma_lib.artifacts import load_body, load_law, load_observation, save_adaptor
+from neuma_lib.checkpoint import Checkpoint
+from neuma_lib.config import pick
+from neuma_lib.device import choose_device
+from neuma_lib.fitting.material import MaterialSettings, ParticleLoss, PixelLoss, train_material
+from neuma_lib.fitting.observation import Reconstruction
+from neuma_lib.io import read_arrays, read_json, write_json
+from neuma_lib.progress import stage
+from neuma_lib.provenance import fingerprint
+from neuma_lib.sim import MPMModel
+
+
+def main(inputs, output, params, run) -> None:
+    settings = params.material
+    device = choose_device(params.device)
+    law = load_law(inputs.prior).to(device)
+    law.attach_adaptor(settings["rank"], settings["alpha"], settings["seed"])
+    body = load_body(inputs.binding, inputs.gaussians, params.density).to(torch.float32, device)
+    if settings["carrier"] == "gaussians":
+        body = Reconstruction.of_gaussians(body.gaussians, float(body.vol0.sum()), params.density)
+    v0 = torch.tensor(read_json(inputs.velocity)["v0"], dtype=torch.float32, device=device)
+    video = load_observation(inputs.transforms, settings["views"]).to(torch.float32, device)
+    if settings["supervision"] == "particles":
+        truth, _ = read_arrays(inputs.truth, required=("x", "frames"), only=("x", "frames"))
+        targets = torch.from_numpy(truth["x"]).to(device)
+        loss = ParticleLoss(tuple(truth["frames"].tolist()), targets)
+    else:
+        loss = PixelLoss(body, video, settings["covariance_gradient"])
+    files = {name: str(file) for name, file in inputs.items() if name != "kernels" and isinstance(file, str)}
+    stamp = {"simulation": params.simulation, "density": params.density, **settings}
+    checkpoint = Checkpoint(params.checkpoint, fingerprint(stamp, files, params.code))
+    scale = settings["lr_scale"]
+    trained = train_material(
+        MPMModel(**params.simulation),
+        law,
+        body,
+        v0,
+        loss,
+        pick(
+            MaterialSettings,
+            settings,
+            lr_elastic=scale * settings["lr_elastic"],
+            lr_plastic=scale * settings["lr_plastic"],
+        ),
+        checkpoint=checkpoint,
+        progress=run.progress,
+        log=run.say,
+    )
+    report = {
+        "best_loss": trained.best_loss,
+        "best_iteration": trained.best_iteration,
+        "stable": trained.stable,
+    }
+    write_json(output.history, {**report, **asdict(trained.history)})
+    save_adaptor(
+        output.adaptor, trained.law, settings["rank"], settings["alpha"], {"settings": settings, **report}
+    )
+    checkpoint.remove()
+    run.say(trained.summary())
+
+
+if __name__ == "__main__":
+    with stage(f"material {snakemake.wildcards.scene}/{snakemake.wildcards.method}", snakemake.log[0]) as run:
+        main(snakemake.input, snakemake.output, snakemake.params, run)

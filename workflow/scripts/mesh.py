@@ -1,0 +1,18 @@
+"""Reconstruct a watertight surface from Gaussians and views."""
+
+from neuma_lib.artifacts import load_gaussians, load_views
+from neuma_lib.geometry.surface import reconstruct
+from neuma_lib.io import write_mesh
+from neuma_lib.progress import stage
+
+
+def main(inputs, mesh_file: str, params, run) -> None:
+    images, cameras = load_views(inputs.transforms)
+    mesh = reconstruct(load_gaussians(inputs.gaussians), cameras, images, params.surface)
+    write_mesh(mesh_file, mesh.vertices, mesh.faces)
+    run.say(f"{len(mesh.faces)} faces, watertight: {mesh.is_watertight}, volume {1e3 * mesh.volume:.3f} l")
+
+
+if __name__ == "__main__":
+    with stage(f"mesh {snakemake.wildcards.scene}", snakemake.log[0]) as run:
+        main(snakemake.input, snakemake.output.mesh, snakemake.params, run)

@@ -1,0 +1,22 @@
+"""Fill the reconstructed surface with particles."""
+
+import numpy as np
+
+from neuma_lib.geometry.volume import sample_volume
+from neuma_lib.io import read_mesh, write_arrays
+from neuma_lib.progress import stage
+
+
+def main(mesh_file: str, particles_file: str, params, run) -> None:
+    mesh = read_mesh(mesh_file)
+    x = np.asarray(
+        sample_volume(mesh, params.count, seed=params.seed, method=params.sampling), dtype=np.float32
+    )
+    vol0 = np.full(len(x), mesh.volume / len(x), dtype=np.float32)
+    write_arrays(particles_file, {"x": x, "vol0": vol0}, {"volume": float(mesh.volume)})
+    run.say(f"{len(x)} particles (asked: {params.count}) in {1e3 * mesh.volume:.3f} l")
+
+
+if __name__ == "__main__":
+    with stage(f"particles {snakemake.wildcards.scene}", snakemake.log[0]) as run:
+        main(snakemake.input.mesh, snakemake.output.particles, snakemake.params, run)

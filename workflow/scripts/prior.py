@@ -1,0 +1,21 @@
+"""Train a neural constitutive law on an analytic one."""
+
+from neuma_lib.fitting.priors import train_prior
+from neuma_lib.io import write_json, write_weights
+from neuma_lib.progress import stage
+
+
+def main(name: str, output, params, run) -> None:
+    law, report = train_prior(
+        params.law, {"method": params.method, **params.options}, params.seed, run.progress
+    )
+    write_weights(
+        output.weights, law.prior_state(), {"prior": name, "law": params.law, "method": params.method}
+    )
+    write_json(output.report, report)
+    run.say(f"rollout against its law: Chamfer {report['chamfer']:.4f}e-4 m^2")
+
+
+if __name__ == "__main__":
+    with stage(f"prior {snakemake.wildcards.prior}", snakemake.log[0]) as run:
+        main(snakemake.wildcards.prior, snakemake.output, snakemake.params, run)

@@ -1,0 +1,41 @@
+"""Seconds of every stage and scene, from Snakemake's benchmark files."""
+
+from pathlib import Path
+
+from neuma_lib.evaluation.tables import report_table
+from neuma_lib.io import write_text
+from neuma_lib.progress import stage
+
+
+def main(folder: str, output, run) -> None:
+    rows: dict[str, dict[str, float]] = {}
+    for file in sorted(Path(folder).rglob("*.tsv")):
+        header, values = (line.split("\t") for line in file.read_text().splitlines()[:2])
+        measured = dict(zip(header, values, strict=True))
+        seconds, memory = float(measured["s"]), measured["max_rss"]
+        row = rows.setdefault(file.stem, {"runs": 0, "seconds": 0.0, "longest": 0.0, "memory": 0.0})
+        row["runs"] += 1
+        row["seconds"] += seconds
+        row["longest"] = max(row["longest"], seconds)
+        row["memory"] = max(row["memory"], float(memory) if memory not in ("-", "NA") else 0.0)
+    rows["total"] = {
+        "runs": sum(r["runs"] for r in rows.values()),
+        "seconds": sum(r["seconds"] for r in rows.values()),
+        "longest": max((r["longest"] for r in rows.values()), default=0.0),
+        "memory": max((r["memory"] for r in rows.values()), default=0.0),
+    }
+    titles = {
+        "runs": "runs",
+        "seconds": "all together [s]",
+        "longest": "longest [s]",
+        "memory": "most memory [MB]",
+    }
+    csv, markdown = report_table(rows, titles, "stage")
+    write_text(output.csv, csv)
+    write_text(output.markdown, markdown)
+    run.say(f"{rows['total']['seconds']:.0f} s of work in {rows['total']['runs']} runs: {output.markdown}")
+
+
+if __name__ == "__main__":
+    with stage("timings", snakemake.log[0]) as run:
+        main(snakemake.params.benchmarks, snakemake.output, run)
