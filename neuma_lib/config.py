@@ -1,8 +1,9 @@
 """Typed settings of the whole pipeline: one home, one type, one default and one line of explanation each.
 
 `load` turns the merged YAML that the user gave into a `Config`; unknown keys, wrong types and impossible values are
-an `InputError` that names the key by its path. Sections are data only: what a stage does with them stands in the
-stage's own module, and a stage receives the complete section (all defaults filled in) as plain numbers.
+an `InputError` that names the key by its path. Sections are data only, and a stage receives the complete section
+(all defaults filled in) as plain numbers. Hyper-parameters of an optimisation stand beside its code; `block` makes
+sections of them.
 
 ``docs/settings.md`` is generated from this file by `neuma_lib.settings_page`.
 """
@@ -18,21 +19,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
 
 from neuma_lib.errors import InputError
+from neuma_lib.settings_blocks import Section, block
 
 Vector = tuple[float, float, float]
-
-
-class Section(BaseModel):
-    """A block of settings: immutable, and refuses keys that it does not know."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
-
-    def plain(self) -> dict[str, Any]:
-        """The section as dicts, lists and scalars, with every default filled in."""
-        return self.model_dump(mode="json")
 
 
 def _numbers(part: Any) -> Any:
@@ -151,6 +143,10 @@ class SimulationConfig(Section):
     wall_cells: int = Field(1, ge=1, description="thickness of the walls in cells")
 
 
+RegressionConfig = block("fitting.priors", "RegressionSettings")
+TrajectoryConfig = block("fitting.priors", "TrajectorySettings")
+
+
 class PriorsConfig(Section):
     """Pre-trained neural constitutive laws."""
 
@@ -160,24 +156,18 @@ class PriorsConfig(Section):
         description="regression on stress and return-map pairs, or NCLaw's training on trajectories",
     )
     seed: int = Field(0, description="seed of the data and of the initial weights")
-    regression: dict[str, Any] = Field(
-        {}, description="settings of the regression (neuma_lib.fitting.priors)"
-    )
-    trajectory: dict[str, Any] = Field({}, description="settings of the training on trajectories")
+    regression: RegressionConfig = Field(RegressionConfig(), description="the regression")
+    trajectory: TrajectoryConfig = Field(TrajectoryConfig(), description="the training on trajectories")
 
 
-class GaussiansConfig(Section):
-    """Static 3D Gaussians from the views at t = 0."""
-
-    fit: dict[str, Any] = Field({}, description="settings of the fit (neuma_lib.fitting.gaussians)")
+GaussiansConfig = block("fitting.gaussians", "GaussianFitSettings")
+SurfaceConfig = block("geometry.surface", "SurfaceSettings")
 
 
 class GeometryConfig(Section):
     """Surface mesh and volume particles."""
 
-    surface: dict[str, Any] = Field(
-        {}, description="settings of the reconstruction (neuma_lib.geometry.surface)"
-    )
+    surface: SurfaceConfig = Field(SurfaceConfig(), description="reconstruction of the surface")
     sampling: Literal["jittered", "uniform"] = Field("jittered", description="how particles fill the volume")
 
 
@@ -203,7 +193,7 @@ class VelocityConfig(Section):
     difference: float = Field(0.02, gt=0, description="half width of the central differences [m/s]")
 
 
-class MaterialConfig(Section):
+class MaterialChoices(Section):
     """Adaptation of the material law: what is trained, on what, how."""
 
     train: bool = Field(True, description="false: the prior as it is (NCLaw)")
@@ -219,34 +209,17 @@ class MaterialConfig(Section):
     )
     alpha: float = Field(16.0, gt=0, description="the adaptor's scale is alpha / rank")
     seed: int = Field(0, description="seed of the adaptor's initial weights")
-    iterations: int = Field(100, ge=1, description="optimiser steps, one full rollout each")
     lr_scale: float = Field(1.0, gt=0, description="factor on both learning rates (sweeps, ablations)")
-    lr_elastic: float = Field(0.05, gt=0, description="learning rate of the elastic network")
-    lr_plastic: float = Field(0.005, gt=0, description="learning rate of the plastic network")
-    lr_floor: float = Field(
-        0.05, ge=0, le=1, description="fraction of the rates at the end of the cosine schedule"
-    )
-    betas: tuple[float, float] = Field((0.9, 0.99), description="averaging factors of Adam")
-    gradient_clip: float = Field(
-        1.0, gt=0, description="largest gradient norm of a network (normalised loss)"
-    )
-    frame_weight_start: float = Field(0.5, gt=0, le=1, description="d of the frame weights d^k at the start")
-    frame_weight_periods: int = Field(5, ge=1, description="number of parts of the video that k counts")
     covariance_gradient: bool = Field(True, description="let image gradients reach F through the covariances")
-    diverged_ratio: float = Field(
-        5.0, gt=1, description="a loss above this multiple of the best has diverged"
-    )
-    max_recoveries: int = Field(
-        6, ge=0, description="returns to the last good state before training gives up"
-    )
-    checkpoint_every: int = Field(10, ge=1, description="iterations between checkpoints")
+
+
+MaterialConfig = block("fitting.material", "MaterialSettings", base=MaterialChoices)
 
 
 class EvaluationConfig(Section):
     """Rollout of the learned law and its measures."""
 
     tracers: int = Field(100_000, gt=0, description="passive tracers in the prediction")
-    views: tuple[int, ...] = Field((1, 2), description="views that are measured and were not trained on")
     video_view: int = Field(0, ge=0, description="view of the mp4 of prediction beside observation")
     frame_rate: int = Field(12, ge=1, description="frames a second of the mp4")
     video_magnify: int = Field(3, ge=1, description="enlargement of the mp4's pixels")

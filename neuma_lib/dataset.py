@@ -45,14 +45,13 @@ def place(shape: str, size: float | None, height: float, center: Sequence[float]
     """The true shape where a scene starts it.
 
     Args:
-        shape: name of the shape (`neuma_lib.geometry.shapes`).
+        shape: name in `geometry.shapes`.
         size: longest side of the bounding box [m]; None keeps the shape's own.
         height: y of the bounding box's centre [m].
         center: x and z of the bounding box's centre [m].
     """
     mesh = shapes.build(shape, size)
-    middle = mesh.bounds.mean(axis=0)
-    mesh.apply_translation([center[0] - middle[0], height - middle[1], center[1] - middle[2]])
+    mesh.apply_translation([center[0], height, center[1]])
     return mesh
 
 

@@ -6,6 +6,8 @@ import typing
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
+import yaml
+
 from neuma_lib.config import Config, Section
 
 
@@ -67,7 +69,9 @@ def _default_text(value: Any) -> str:
         return "see below"
     if isinstance(value, tuple):
         return f"`{list(value)}`"
-    return "" if value in ("", {}) else f"`{'null' if value is None else value}`"
+    if value in ("", {}):
+        return ""
+    return f"`{yaml.safe_dump(value, default_flow_style=True).removesuffix('...' + chr(10)).strip()}`"
 
 
 if __name__ == "__main__":

@@ -49,7 +49,7 @@ def make_law(name, dtype=torch.float64):
 
 
 def imitate(elasticity, weights):
-    """Last layer (9, 64) with which tau = R X F^T is nearest to a law's stress at strains of a few percent."""
+    """Last layer (9, 64) with which tau = R X F^T is nearest to a law's stress at small strains."""
     generator = torch.Generator().manual_seed(1)
     noise = torch.randn(4000, 3, 3, generator=generator, dtype=torch.float64)
     F = torch.eye(3, dtype=torch.float64) + 0.05 * noise

@@ -5,9 +5,11 @@ Prints the number of finished images, a line each, on standard output; Blender's
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -21,16 +23,35 @@ def _quiet_stdout():
     return real
 
 
+def _claim_cores(count: int) -> list:
+    """Pin this process to ``count`` cores that no other Blender of ours holds, as far as there are any.
+
+    Cycles' own thread limit leaves its helpers on every core. Returns open lock files: keep them while rendering.
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        return []
+    cores, locks, mine = sorted(os.sched_getaffinity(0)), [], []
+    for core in cores:
+        if len(mine) == count:
+            break
+        lock = open(Path(tempfile.gettempdir()) / f"neuma-blender-{os.getuid()}-{core}.lock", "w")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            lock.close()
+            continue
+        locks.append(lock)
+        mine.append(core)
+    os.sched_setaffinity(0, mine or cores)
+    return locks
+
+
 def main(path: str) -> None:
     report = _quiet_stdout()
     with np.load(path) as file:
         job = dict(file)
     settings = json.loads(str(job["settings"]))
-    if hasattr(os, "sched_setaffinity"):
-        # Cycles' own thread limit leaves its helpers on every core.
-        cores = sorted(os.sched_getaffinity(0))
-        first = os.getpid() % len(cores)
-        os.sched_setaffinity(0, [cores[(first + k) % len(cores)] for k in range(min(settings["threads"], len(cores)))])
+    claimed = _claim_cores(settings["threads"])
     from neuma_lib.blender import cycles
 
     folder = Path(path).parent
@@ -45,6 +66,8 @@ def main(path: str) -> None:
         cycles.place(camera, job["c2w"][view])
         cycles.render(folder / f"{index:05d}.png")
         print(index + 1, file=report, flush=True)
+    for lock in claimed:
+        lock.close()
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ import trimesh
 from neuma_lib.errors import InputError
 from neuma_lib.geometry import shapes
 
-
 BORDER = 0.008
 """Width of the borders between parts [m]."""
 
@@ -39,7 +38,7 @@ class Appearance:
 
 
 def parse_color(text: str) -> np.ndarray:
-    """"#rrggbb" as three sRGB values in [0, 1].
+    """ "#rrggbb" as three sRGB values in [0, 1].
 
     Raises:
         InputError: another form.

@@ -35,7 +35,9 @@ class Views:
     @property
     def K(self) -> np.ndarray:
         """Intrinsic matrix, shape (3, 3) [px]."""
-        return np.array([[self.focal, 0.0, self.width / 2], [0.0, self.focal, self.height / 2], [0.0, 0.0, 1.0]])
+        return np.array(
+            [[self.focal, 0.0, self.width / 2], [0.0, self.focal, self.height / 2], [0.0, 0.0, 1.0]]
+        )
 
     @property
     def viewmats(self) -> np.ndarray:
@@ -79,7 +81,9 @@ def ring_directions(count: int) -> np.ndarray:
     if not 1 <= count <= 10:
         raise ValueError(f"a ring has 1 to 10 views, not {count}")
     azimuth = np.radians(108.0 * np.arange(count))
-    elevation = np.radians(np.where(np.arange(count) == 0, 0.0, np.where(np.arange(count) % 2 == 1, 15.0, 25.0)))
+    elevation = np.radians(
+        np.where(np.arange(count) == 0, 0.0, np.where(np.arange(count) % 2 == 1, 15.0, 25.0))
+    )
     return np.stack(
         [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)], axis=1
     )

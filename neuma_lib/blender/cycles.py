@@ -15,9 +15,8 @@ def start(settings: dict, width: int, height: int) -> None:
     """An empty scene with the renderer's settings and the light."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
-    render, cycles = scene.render, scene.cycles if hasattr(scene, "cycles") else None
+    render, cycles = scene.render, scene.cycles
     render.engine = "CYCLES"
-    cycles = scene.cycles
     cycles.device = "CPU"
     cycles.samples = settings["samples"]
     cycles.seed = settings["seed"]
@@ -25,7 +24,7 @@ def start(settings: dict, width: int, height: int) -> None:
     cycles.use_denoising = True
     cycles.denoiser = "OPENIMAGEDENOISE"
     cycles.denoising_prefilter = "FAST"
-    cycles.max_bounces = 2
+    cycles.max_bounces = 3
     render.threads_mode, render.threads = "FIXED", settings["threads"]
     render.use_persistent_data = True
     render.film_transparent = True

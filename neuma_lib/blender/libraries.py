@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 
 DEBIAN_PACKAGES = {
     "libX11.so": "libx11-6",
@@ -22,6 +24,8 @@ DEBIAN_PACKAGES = {
 }
 """Shared libraries that bpy needs even without a display, and the Debian/Ubuntu package of each."""
 
+EVERYTHING = "libx11-6 libxrender1 libxxf86vm1 libxfixes3 libxi6 libxkbcommon0 libsm6 libice6 libgl1"
+
 
 def explain_import_error(text: str) -> str:
     """One sentence that says what to install for the import error in ``text``; empty if there is none."""
@@ -29,7 +33,6 @@ def explain_import_error(text: str) -> str:
     if missing:
         library = missing.group(1)
         package = next((p for stem, p in DEBIAN_PACKAGES.items() if library.startswith(stem)), None)
-        every = " ".join(("libx11-6 libxrender1 libxxf86vm1 libxfixes3 libxi6 libxkbcommon0 libsm6 libice6 libgl1").split())
         if package is None:
             return (
                 f"Blender (bpy) needs the system library {library}: install the package that holds it "
@@ -37,11 +40,24 @@ def explain_import_error(text: str) -> str:
             )
         return (
             f"Blender (bpy) needs the system library {library}: install the Debian package {package}, for example "
-            f"`apt-get install {package}`; all that Blender needs: `apt-get install {every}`."
+            f"`apt-get install {package}`; all that Blender needs: `apt-get install {EVERYTHING}`."
         )
     if re.search(r"ModuleNotFoundError: No module named 'bpy'", text):
         return (
             "Blender's Python module is not installed: bpy 4.5 needs Python 3.11; make the project's environment "
-            "(`make environment`) and run with its interpreter."
+            "(`make env`) and run with its interpreter."
         )
     return ""
+
+
+def main() -> int:
+    """Try to load Blender in a process of its own and say what is missing: ``make check``."""
+    tried = subprocess.run([sys.executable, "-c", "import bpy"], capture_output=True, text=True)
+    if tried.returncode == 0:
+        return 0
+    print(explain_import_error(tried.stderr) or tried.stderr.strip(), file=sys.stderr)
+    return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

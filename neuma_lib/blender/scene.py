@@ -224,7 +224,9 @@ def render_static(
 ) -> None:
     """Render frame 0 from every camera, and write transforms.json: files ``s_<view>.png``."""
     names = [f"s_{view:03d}.png" for view in range(len(views))]
-    _render_set(geometry, views, [(0, v) for v in range(len(views))], names, [0], [0.0], out_dir, settings, progress)
+    _render_set(
+        geometry, views, [(0, v) for v in range(len(views))], names, [0], [0.0], out_dir, settings, progress
+    )
 
 
 def render_dynamic(

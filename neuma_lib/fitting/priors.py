@@ -290,8 +290,9 @@ class Network:
     """A network in normalised units while it is fitted; :meth:`weights` folds the units back in."""
 
     def __init__(self, z: Tensor, X: Tensor, generator: torch.Generator):
-        self.unit_in = z.square().mean(0).sqrt().clamp(min=1e-8)
-        size = X.norm(dim=1)
+        visited = torch.arange(len(z)) % 3 == 0
+        self.unit_in = z[visited].abs().median(0).values.clamp(min=1e-8)
+        size = X[visited].norm(dim=1)
         self.unit_out = float(size[size > 0].median()) if bool((size > 0).any()) else 1.0
         bounds = [(6 / sum(shape)) ** 0.5 for shape in SHAPES]
         self.layers = [
@@ -330,7 +331,7 @@ class Network:
             optimiser.step()
             schedule.step()
             if iteration % 50 == 0 or iteration >= settings.iterations - last:
-                value = float(loss)
+                value = float(loss.detach())
                 if not math.isfinite(value):
                     raise NonFiniteError("prior", f"regression diverged at iteration {iteration}; lower learning_rate")
                 progress(iteration + 1, value)

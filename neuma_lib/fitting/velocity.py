@@ -8,6 +8,7 @@ weakness by a penalty on |v_x| and |v_z|, which would also pull an oblique throw
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -109,6 +110,7 @@ def estimate_velocity(
     if len(observation.frames) < 2:
         raise InputError("velocity needs at least two frames of the training view before contact")
     body, observation = body.to(torch.float64), observation.to(torch.float64)
+    law = copy.deepcopy(law).to(torch.float64)
     if float(contact_clearance(model, body.x0)) <= 0:
         raise InputError("the body touches a wall in the first frame: the video must start before contact")
     axes = observation.cameras.viewmats[0, :3, :3].numpy()

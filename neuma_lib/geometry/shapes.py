@@ -14,9 +14,9 @@ from __future__ import annotations
 import difflib
 import re
 import string
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache
 
 import numpy as np
 import trimesh
@@ -212,7 +212,8 @@ def _ball() -> Shape:
         return distance
 
     def caps(p: Array) -> Array:
-        return 0.93 * np.linalg.norm(p, axis=1) - np.abs(p @ axis)
+        # Divided by the slope of the difference at its zero, to be metres.
+        return (0.93 * np.linalg.norm(p, axis=1) - np.abs(p @ axis)) / np.sqrt(1.0 - 0.93**2)
 
     def second_colour(p: Array) -> Array:
         return np.minimum(panel(0)(p), panel(3)(p))
@@ -334,7 +335,8 @@ def _cat() -> Shape:
 def _bottle() -> Shape:
     """A honey bottle: a round body with a label, shoulders, a neck and a cap."""
     body = polygon(
-        [(0, 0.02), (0.090, 0.02), (0.098, 0.05), (0.098, 0.215), (0.075, 0.265), (0.045, 0.30), (0, 0.30)], 0.016
+        [(0, 0.02), (0.090, 0.02), (0.098, 0.05), (0.098, 0.215), (0.075, 0.265), (0.045, 0.30), (0, 0.30)],
+        0.016,
     )
     neck = polygon([(0, 0.28), (0.042, 0.28), (0.042, 0.37), (0, 0.37)], 0.010)
     cap = polygon([(0, 0.375), (0.056, 0.375), (0.056, 0.430), (0, 0.430)], 0.012)
@@ -365,10 +367,14 @@ def _fish() -> Shape:
         rounding=0.022,
     )
     dorsal = extruded(
-        polygon([(-0.055, 0.06), (-0.055, 0.115), (0.0, 0.118), (0.075, 0.07)], 0.018), half_depth=0.029, rounding=0.02
+        polygon([(-0.055, 0.06), (-0.055, 0.115), (0.0, 0.118), (0.075, 0.07)], 0.018),
+        half_depth=0.029,
+        rounding=0.02,
     )
     belly = extruded(
-        polygon([(-0.02, -0.06), (-0.05, -0.115), (-0.01, -0.112), (0.04, -0.07)], 0.016), half_depth=0.029, rounding=0.02
+        polygon([(-0.02, -0.06), (-0.05, -0.115), (-0.01, -0.112), (0.04, -0.07)], 0.016),
+        half_depth=0.029,
+        rounding=0.02,
     )
     side_fin = mirrored(tapered_capsule((0.06, -0.025, 0.060), (0.0, -0.050, 0.092), 0.032, 0.024))
     eye = mirrored(sphere((0.128, 0.030, 0.052), 0.026))
@@ -437,7 +443,7 @@ _MAKERS: dict[str, Callable[[], Shape]] = {
 }
 
 
-@lru_cache(maxsize=None)
+@cache
 def shape(name: str) -> Shape:
     """The solid of that name.
 
@@ -450,7 +456,9 @@ def shape(name: str) -> Shape:
         return _letter(name[-1])
     near = difflib.get_close_matches(name, [*NAMES, *(f"letter_{c}" for c in string.ascii_uppercase)], n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
-    raise InputError(f"shape: {name!r} is not known.{hint} Choose one of {', '.join(NAMES)} or letter_A ... letter_Z.")
+    raise InputError(
+        f"shape: {name!r} is not known.{hint} Choose one of {', '.join(NAMES)} or letter_A ... letter_Z."
+    )
 
 
 def build(name: str, size: float | None = None, resolution: int = 96) -> trimesh.Trimesh:
@@ -463,7 +471,7 @@ def build(name: str, size: float | None = None, resolution: int = 96) -> trimesh
 
     Returns:
         A watertight mesh [m], faces outward, its bounding box centred at the origin, with the vertex attribute
-        ``part`` (indices into ``shape(name).part_names``) and what :func:`inside` and :func:`to_nominal` need.
+        ``part`` (indices into ``shape(name).part_names``) and what :func:`to_nominal` needs.
 
     Raises:
         InputError: unknown name, or a size or resolution that is not positive.
@@ -495,25 +503,38 @@ def build(name: str, size: float | None = None, resolution: int = 96) -> trimesh
     return result
 
 
+def place(
+    name: str, size: float | None, height: float, center: Sequence[float], resolution: int = 96
+) -> trimesh.Trimesh:
+    """The solid where a scene starts it.
+
+    Args:
+        name, size, resolution: as of :func:`build`.
+        height: y of the bounding box's centre [m].
+        center: x and z of the bounding box's centre [m].
+    """
+    mesh = build(name, size, resolution)
+    mesh.apply_translation([center[0], height, center[1]])
+    return mesh
+
+
 def to_nominal(mesh: trimesh.Trimesh, points: Array) -> tuple[Shape, Array]:
-    """The solid of a mesh from :func:`build` and points (n,3) [m, mesh frame] in that solid's nominal frame.
+    """The solid of a mesh from :func:`build`, and points (n,3) [m] beside it in that solid's nominal frame.
+
+    The mesh may have been moved since (not turned or scaled); points are in its present frame.
 
     Raises:
         InputError: the mesh does not come from :func:`build`.
     """
     if "shape" not in mesh.metadata:
         raise InputError(
-            "this mesh was not made by geometry.shapes.build, so its solid is not known; "
-            "sample it with geometry.volume instead."
+            "this mesh was not made by geometry.shapes.build, so its solid and parts are not known"
         )
-    nominal = np.asarray(points, dtype=np.float64) / mesh.metadata["scale"] + np.asarray(mesh.metadata["centre"])
-    return shape(mesh.metadata["shape"]), nominal
+    local = np.asarray(points, dtype=np.float64) - mesh.bounds.mean(axis=0)
+    return shape(mesh.metadata["shape"]), local / mesh.metadata["scale"] + np.asarray(mesh.metadata["centre"])
 
 
-def inside(mesh: trimesh.Trimesh, points: Array) -> Array:
-    """Whether points (n,3) [m, mesh frame] lie in the solid of a mesh from :func:`build` -> (n,) bool.
-
-    Decided by the signed distance function itself, so that it costs no ray casting.
-    """
+def depth(mesh: trimesh.Trimesh, points: Array) -> Array:
+    """Approximate depth (n,) [m] of points (n,3) [m] below the surface of a mesh from :func:`build`."""
     solid, nominal = to_nominal(mesh, points)
-    return solid.distance(nominal) < 0.0
+    return -solid.distance(nominal) * mesh.metadata["scale"]

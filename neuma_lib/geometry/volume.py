@@ -101,7 +101,7 @@ class _Columns:
             point = np.repeat(near[part], count)
             slot = np.arange(len(point)) - np.repeat(np.cumsum(count) - count, count)
             face = self.faces[np.repeat(self.start[key[part]], count) + slot]
-            np.add.at(winding, point, self._crossings(points[point], face))
+            winding += np.bincount(point, self._crossings(points[point], face), minlength=len(points))
         return winding > 0.5
 
     def _crossings(self, points: Array, face: NDArray[np.int64]) -> Array:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import torch
 import warp as wp
 from torch import Tensor, nn
-from torch.nn.functional import gelu
+from torch.nn.functional import gelu, pad
 
 from neuma_lib import warp_setup
 from neuma_lib.errors import InputError
@@ -32,6 +32,8 @@ SHAPES = ((WIDTH, FEATURES), (WIDTH, WIDTH), (9, WIDTH))
 PLASTIC_SCALE = 1e-3
 CPU_ROWS = 2048
 """Rows per matrix product on the CPU: larger ones leave the cache."""
+PADDED = 16
+"""Columns of the gradient of the features: BLAS is four times faster with 16 than with 13."""
 
 aten = torch.ops.aten
 
@@ -75,7 +77,7 @@ class _Forward:
 
 @dataclass
 class _Backward:
-    """Scratch of the adjoint of one chunk."""
+    """Scratch of the adjoint of one chunk. grad_z has columns of padding."""
 
     grad_Y: Tensor
     grad_h: Tensor
@@ -87,8 +89,11 @@ class _Backward:
     def like(cls, F: Tensor) -> _Backward:
         n = len(F)
         real, _, mat33 = warp_types(F.dtype)
-        grad_Y, grad_z = torch.empty_like(F), F.new_empty(n, FEATURES)
-        views = {"grad_Y": wp.from_torch(grad_Y, dtype=mat33), "grad_z": wp.from_torch(grad_z, dtype=real)}
+        grad_Y, grad_z = torch.empty_like(F), F.new_empty(n, PADDED)
+        views = {
+            "grad_Y": wp.from_torch(grad_Y, dtype=mat33),
+            "grad_z": wp.from_torch(grad_z[:, :FEATURES], dtype=real),
+        }
         return cls(grad_Y, F.new_empty(n, WIDTH), F.new_empty(n, WIDTH), grad_z, views)
 
 
@@ -189,6 +194,7 @@ class NeuralConstitutive(Constitutive):
             grad_weights = tuple(torch.zeros_like(w) for w in weights)
         _, output_adjoint, input_adjoint = output_kernels(F.dtype, self.kind)
         W0, W1, W2 = weights
+        padded_W0 = pad(W0, (0, PADDED - FEATURES))
         for index, rows in enumerate(_chunks(F)):
             if cache is None:
                 state = _scratch.get(_Forward, F[rows])
@@ -207,8 +213,8 @@ class NeuralConstitutive(Constitutive):
             grad_weights[1].addmm_(back.grad_a.mT, state.h0)
             torch.mm(back.grad_a, W1, out=back.grad_h)
             aten.gelu_backward.grad_input(back.grad_h, state.a0, grad_input=back.grad_a)
-            grad_weights[0].addmm_(back.grad_a.mT, state.z)
-            torch.mm(back.grad_a, W0, out=back.grad_z)
+            grad_weights[0].add_((state.z.mT @ back.grad_a).mT)  # this order of the product is the fast one
+            torch.mm(back.grad_a, padded_W0, out=back.grad_z)
             _launch(
                 input_adjoint, F[rows], F_view, views["R"], views["Vh"], views["z"], views["Y"], g,
                 back.views["grad_z"], self.scale, _matrices(grad_F[rows]),

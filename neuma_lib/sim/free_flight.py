@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from neuma_lib.sim.model import Body, MPMModel, contact_clearance
+from neuma_lib.sim.model import Body, MPMModel, contact_clearance, law_weights
 from neuma_lib.sim.trajectory import Trajectory
 
 _MARGIN = 1e-3  # distance from the zone of contact at which free flight ends [dx]
@@ -57,7 +57,7 @@ def _clear_of_walls(model: MPMModel, x0: Tensor, v0: Tensor, last: int) -> int:
 def _at_rest(model: MPMModel, body: Body, x0: Tensor, mass: Tensor, vol0: Tensor) -> bool:
     """Whether the law leaves F = I as it is and without a stress that could be felt in a step."""
     eye = torch.eye(3, dtype=x0.dtype, device=x0.device)[None]
-    elastic, plastic = body.law.weights()
+    elastic, plastic = law_weights(body.law, x0.dtype)
     tau = body.law.elasticity.evaluate(eye, elastic)
     F = body.law.plasticity.evaluate(eye, plastic)
     eps = torch.finfo(x0.dtype).eps

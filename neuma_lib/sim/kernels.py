@@ -7,8 +7,8 @@ adjoints are in `adjoint_kernels`.
 Memory: arrays of particles have a leading axis of slots. A rollout that will be differentiated gives each
 step a slot of its own, any other alternates between two. A grid node is a 4-vector, momentum and mass
 (``grid``) or velocity and 1 where there is mass (``grid_v``). A particle sees 3 x 3 rows of three nodes that
-lie side by side in memory, so kernels read and write ``rows``: a view of the grid whose element b is the 3 x 4
-matrix of the nodes b, b + 1 and b + 2. Sums over the last axis of the stencil then are products with a row.
+lie side by side in memory, so kernels read and write ``rows``: a view of the grid whose element b is the
+matrix (3 x 4) of nodes b, b + 1 and b + 2. Sums over the last axis of the stencil are products with a row.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.

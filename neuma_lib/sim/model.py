@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.errors import InputError
-from neuma_lib.materials.base import Law
+from neuma_lib.materials.base import Law, Weights
 
 WALLS = ("x_min", "x_max", "y_min", "y_max", "z_min", "z_max")
 CONDITIONS = ("no_slip", "slip", "sticky")
@@ -107,6 +107,12 @@ class Body:
     law: Law
     start: int
     stop: int
+
+
+def law_weights(law: Law, dtype: torch.dtype) -> tuple[Weights, Weights]:
+    """Weights of a law's elasticity and plasticity in the precision of a simulation."""
+    elastic, plastic = law.weights()
+    return tuple(w.to(dtype) for w in elastic), tuple(w.to(dtype) for w in plastic)
 
 
 def as_bodies(law: Law | Sequence[Body], count: int) -> tuple[Body, ...]:

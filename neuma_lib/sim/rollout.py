@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 from neuma_lib.errors import InputError
 from neuma_lib.materials.base import Law
 from neuma_lib.sim.free_flight import ballistic, free_flight_steps
-from neuma_lib.sim.model import Body, MPMModel, as_bodies
+from neuma_lib.sim.model import Body, MPMModel, as_bodies, law_weights
 from neuma_lib.sim.simulation import KEEP, Simulation
 from neuma_lib.sim.trajectory import Trajectory
 
@@ -100,18 +100,18 @@ def _simulate(
 ) -> Trajectory:
     """Step from the state `start` at step `first` to the last frame."""
     laws = {id(body.law): body.law for body in bodies}
-    law_weights = {key: law.weights() for key, law in laws.items()}
-    flat = [w for elastic, plastic in law_weights.values() for w in (*elastic, *plastic)]
+    weights = {key: law_weights(law, start[0].dtype) for key, law in laws.items()}
+    flat = [w for elastic, plastic in weights.values() for w in (*elastic, *plastic)]
     inputs = (*start, *flat)
     differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
     steps = frames[-1] - first
-    simulation = Simulation(model, bodies, law_weights, start[0], steps, first, differentiable, keep)
+    simulation = Simulation(model, bodies, weights, start[0], steps, first, differentiable, keep)
     simulation.set_mass(mass, vol0)
-    path = _Rollout.apply(simulation, [n - first for n in frames], tracers, *inputs)
+    path = RolloutFunction.apply(simulation, [n - first for n in frames], tracers, *inputs)
     return Trajectory(frames, *path)
 
 
-class _Rollout(torch.autograd.Function):
+class RolloutFunction(torch.autograd.Function):
     """All steps as one function of the start and the weights."""
 
     @staticmethod

@@ -195,17 +195,17 @@ class Simulation:
         return tuple(values[self._weight_slices[id(body.law), part]])
 
     def _raise_faults(self, F: Tensor) -> None:
-        """Raise if the particles' velocities, positions or last F (N, 3, 3) went wrong on the way."""
-        not_finite, outside = self.workspace.faults.tolist()
-        if not_finite == NEVER and outside == NEVER and not torch.isfinite(F).all():
+        """Raise if a velocity on the way or the last F (N, 3, 3) is not what a stable simulation gives."""
+        not_finite, too_fast = self.workspace.faults.tolist()
+        if min(not_finite, too_fast) == NEVER and not torch.isfinite(F).all():
             particle = int((~torch.isfinite(F).flatten(1).all(dim=1)).nonzero()[0])
             not_finite = (self.steps - 1) << 31 | particle
-        fault = min(not_finite, outside)
+        fault = min(not_finite, too_fast)
         if fault == NEVER:
             return
         step, particle = self.first + (fault >> 31) + 1, fault & (1 << 31) - 1
         law = next(body.law for body in self.bodies if body.start <= particle < body.stop)
-        happened = "moved by more than a cell in a step" if outside < not_finite else "became non-finite"
+        happened = "moved by more than a cell in a step" if too_fast < not_finite else "became non-finite"
         raise NonFiniteError(
             "rollout",
             f"particle {particle} (law {law.name!r}) {happened} at step {step}, t = "

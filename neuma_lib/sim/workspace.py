@@ -184,7 +184,7 @@ class WorkspaceLease:
     """A workspace that goes back to the pool when nobody holds the lease, as when a graph is freed."""
 
     _idle: list[Workspace] = []
-    _most_idle = 3
+    _most_idle = 2  # one in use by the graph of the last iteration, one for the next
     _lock = threading.RLock()  # leases may end in any thread, and in the middle of taking one
 
     def __init__(self, layout: Layout):

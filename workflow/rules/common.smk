@@ -20,7 +20,7 @@ DATA = SETTINGS.data_root.rstrip("/")
 RESULTS = SETTINGS.results_root.rstrip("/")
 LOGS = f"{RESULTS}/logs"
 BENCHMARKS = f"{RESULTS}/benchmarks"
-KERNELS = f"{SETTINGS.kernel_cache}/ready"
+KERNELS = SETTINGS.kernel_cache.rstrip("/")
 ENVIRONMENT = "../../envs/conda.yaml"
 WANTS_CUDA = {"cpu": False, "cuda": True, "auto": Path("/dev/nvidiactl").exists()}
 GPU = int(WANTS_CUDA[SETTINGS.device])
@@ -37,7 +37,12 @@ wildcard_constraints:
     scene="|".join(SETTINGS.scenes),
     prior="|".join(SETTINGS.priors.laws) or "none",
     method=f"({'|'.join(SETTINGS.methods) or 'none'})([+][^/]*)?",
-    table="|".join(SETTINGS.tables) or "none",
+    group="simulation|laws|rendering",
+
+
+def kernels(*groups):
+    """Files that say that groups of Warp kernels are compiled; `laws` brings `simulation` with it."""
+    return [f"{KERNELS}/{group}.ready" for group in groups]
 
 
 def code(script):

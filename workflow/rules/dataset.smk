@@ -2,31 +2,44 @@
 
 
 rule kernels:
+    input:
+        lambda wildcards: kernels("simulation") if wildcards.group == "laws" else [],
     output:
-        ready=KERNELS,
-    params:
-        device=SETTINGS.device,
-        code=code("kernels"),
+        ready=f"{KERNELS}/{{group}}.ready",
     log:
-        f"{LOGS}/kernels.log",
+        f"{LOGS}/kernels_{{group}}.log",
     benchmark:
-        f"{BENCHMARKS}/kernels.tsv"
+        f"{BENCHMARKS}/kernels_{{group}}.tsv"
+    conda:
+        ENVIRONMENT
     threads: 1
     resources:
         gpu=GPU,
         mem_mb=4000,
         runtime=30,
-    conda:
-        ENVIRONMENT
+    params:
+        device=SETTINGS.device,
+        code=lambda wildcards: code_digest(ROOT / "neuma_lib" / "warm_up" / f"{wildcards.group}.py", ROOT),
     script:
         "../scripts/kernels.py"
 
 
 rule ground_truth:
     input:
-        kernels=ancient(KERNELS),
+        kernels=kernels("simulation"),
     output:
         particles=f"{DATA}/{{scene}}/particles.h5",
+    log:
+        f"{LOGS}/{{scene}}/ground_truth.log",
+    benchmark:
+        f"{BENCHMARKS}/{{scene}}/ground_truth.tsv"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        gpu=GPU,
+        mem_mb=4000,
+        runtime=60,
     params:
         scene=scene_setting("shape", "size", "height", "center", "velocity", "density", "law"),
         simulation=simulation_settings,
@@ -36,17 +49,6 @@ rule ground_truth:
         seed=SETTINGS.dataset.seed,
         device=SETTINGS.device,
         code=code("ground_truth"),
-    log:
-        f"{LOGS}/{{scene}}/ground_truth.log",
-    benchmark:
-        f"{BENCHMARKS}/{{scene}}/ground_truth.tsv"
-    threads: 1
-    resources:
-        gpu=GPU,
-        mem_mb=4000,
-        runtime=60,
-    conda:
-        ENVIRONMENT
     script:
         "../scripts/ground_truth.py"
 
@@ -56,21 +58,22 @@ rule render_static:
         particles=f"{DATA}/{{scene}}/particles.h5",
     output:
         transforms=f"{DATA}/{{scene}}/static/transforms.json",
-    params:
-        scene=scene_setting("shape", "size", "appearance"),
-        images=SETTINGS.dataset.static.plain(),
-        code=code("render_static"),
     log:
         f"{LOGS}/{{scene}}/render_static.log",
     benchmark:
         f"{BENCHMARKS}/{{scene}}/render_static.tsv"
+    conda:
+        ENVIRONMENT
     threads: 1
     resources:
         gpu=0,
         mem_mb=4000,
         runtime=60,
-    conda:
-        ENVIRONMENT
+    params:
+        scene=scene_setting("shape", "size", "height", "center", "appearance"),
+        images=SETTINGS.dataset.static.plain(),
+        threads=1,
+        code=code("render_static"),
     script:
         "../scripts/render_static.py"
 
@@ -80,20 +83,21 @@ rule render_dynamic:
         particles=f"{DATA}/{{scene}}/particles.h5",
     output:
         transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
-    params:
-        scene=scene_setting("shape", "size", "appearance"),
-        images=SETTINGS.dataset.dynamic.plain(),
-        code=code("render_dynamic"),
     log:
         f"{LOGS}/{{scene}}/render_dynamic.log",
     benchmark:
         f"{BENCHMARKS}/{{scene}}/render_dynamic.tsv"
+    conda:
+        ENVIRONMENT
     threads: 1
     resources:
         gpu=0,
         mem_mb=4000,
         runtime=120,
-    conda:
-        ENVIRONMENT
+    params:
+        scene=scene_setting("shape", "size", "height", "center", "appearance"),
+        images=SETTINGS.dataset.dynamic.plain(),
+        threads=1,
+        code=code("render_dynamic"),
     script:
         "../scripts/render_dynamic.py"

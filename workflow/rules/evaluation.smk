@@ -1,6 +1,5 @@
 """How well a law predicts the motion, in numbers and to look at. Only here (and in w/ P.S.) is the truth read."""
 
-
 @checked
 def trained_adaptor(wildcards):
     """The adaptor, where the method trains one."""
@@ -17,28 +16,28 @@ rule initial_state:
         velocity=f"{RESULTS}/{{scene}}/velocity.json",
     output:
         report=f"{RESULTS}/{{scene}}/initial_state.json",
-    params:
-        scene=scene_setting("shape", "size", "height", "center", "velocity", "density"),
-        particles=SETTINGS.simulation.particles,
-        code=code("initial_state"),
     log:
         f"{LOGS}/{{scene}}/initial_state.log",
     benchmark:
         f"{BENCHMARKS}/{{scene}}/initial_state.tsv"
+    conda:
+        ENVIRONMENT
     threads: 1
     resources:
         gpu=0,
         mem_mb=2000,
         runtime=10,
-    conda:
-        ENVIRONMENT
+    params:
+        scene=scene_setting("shape", "size", "height", "center", "velocity", "density"),
+        particles=SETTINGS.simulation.particles,
+        code=code("initial_state"),
     script:
         "../scripts/initial_state.py"
 
 
 rule evaluation:
     input:
-        kernels=ancient(KERNELS),
+        kernels=kernels("laws"),
         truth=f"{DATA}/{{scene}}/particles.h5",
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
         gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
@@ -49,6 +48,17 @@ rule evaluation:
     output:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
         metrics=f"{RESULTS}/{{scene}}/{{method}}/metrics.json",
+    log:
+        f"{LOGS}/{{scene}}/{{method}}/evaluation.log",
+    benchmark:
+        f"{BENCHMARKS}/{{scene}}/{{method}}/evaluation.tsv"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        gpu=GPU,
+        mem_mb=4000,
+        runtime=60,
     params:
         simulation=simulation_settings,
         density=scene_setting("density"),
@@ -57,46 +67,35 @@ rule evaluation:
         seed=SETTINGS.seed,
         device=SETTINGS.device,
         code=code("evaluation"),
-    log:
-        f"{LOGS}/{{scene}}/{{method}}/evaluation.log",
-    benchmark:
-        f"{BENCHMARKS}/{{scene}}/{{method}}/evaluation.tsv"
-    threads: 1
-    resources:
-        gpu=GPU,
-        mem_mb=4000,
-        runtime=60,
-    conda:
-        ENVIRONMENT
     script:
         "../scripts/evaluation.py"
 
 
 rule video:
     input:
-        kernels=ancient(KERNELS),
+        kernels=kernels("rendering"),
         transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
         gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
         binding=f"{RESULTS}/{{scene}}/binding.h5",
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
     output:
         video=f"{RESULTS}/{{scene}}/{{method}}/video.mp4",
+    log:
+        f"{LOGS}/{{scene}}/{{method}}/video.log",
+    benchmark:
+        f"{BENCHMARKS}/{{scene}}/{{method}}/video.tsv"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        gpu=GPU,
+        mem_mb=2000,
+        runtime=20,
     params:
         density=scene_setting("density"),
         view=SETTINGS.evaluation.video_view,
         frame_rate=SETTINGS.evaluation.frame_rate,
         magnify=SETTINGS.evaluation.video_magnify,
         code=code("video"),
-    log:
-        f"{LOGS}/{{scene}}/{{method}}/video.log",
-    benchmark:
-        f"{BENCHMARKS}/{{scene}}/{{method}}/video.tsv"
-    threads: 1
-    resources:
-        gpu=GPU,
-        mem_mb=2000,
-        runtime=20,
-    conda:
-        ENVIRONMENT
     script:
         "../scripts/video.py"

@@ -3,26 +3,26 @@
 
 rule gaussians:
     input:
-        kernels=ancient(KERNELS),
+        kernels=kernels("rendering"),
         transforms=f"{DATA}/{{scene}}/static/transforms.json",
     output:
         gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
         report=f"{RESULTS}/{{scene}}/gaussians.json",
-    params:
-        fit=SETTINGS.gaussians.fit,
-        seed=SETTINGS.seed,
-        device=SETTINGS.device,
-        code=code("gaussians"),
     log:
         f"{LOGS}/{{scene}}/gaussians.log",
     benchmark:
         f"{BENCHMARKS}/{{scene}}/gaussians.tsv"
+    conda:
+        ENVIRONMENT
     threads: 1
     resources:
         gpu=GPU,
         mem_mb=4000,
         runtime=60,
-    conda:
-        ENVIRONMENT
+    params:
+        fit=SETTINGS.gaussians.plain(),
+        seed=SETTINGS.seed,
+        device=SETTINGS.device,
+        code=code("gaussians"),
     script:
         "../scripts/gaussians.py"

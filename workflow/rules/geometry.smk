@@ -3,25 +3,24 @@
 
 rule mesh:
     input:
-        kernels=ancient(KERNELS),
         transforms=f"{DATA}/{{scene}}/static/transforms.json",
         gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
     output:
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
-    params:
-        surface=SETTINGS.geometry.surface,
-        code=code("mesh"),
     log:
         f"{LOGS}/{{scene}}/mesh.log",
     benchmark:
         f"{BENCHMARKS}/{{scene}}/mesh.tsv"
+    conda:
+        ENVIRONMENT
     threads: 1
     resources:
         gpu=0,
         mem_mb=4000,
         runtime=30,
-    conda:
-        ENVIRONMENT
+    params:
+        surface=SETTINGS.geometry.surface.plain(),
+        code=code("mesh"),
     script:
         "../scripts/mesh.py"
 
@@ -31,21 +30,21 @@ rule particles:
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
     output:
         particles=f"{RESULTS}/{{scene}}/particles.h5",
-    params:
-        count=SETTINGS.simulation.particles,
-        sampling=SETTINGS.geometry.sampling,
-        seed=SETTINGS.seed,
-        code=code("particles"),
     log:
         f"{LOGS}/{{scene}}/particles.log",
     benchmark:
         f"{BENCHMARKS}/{{scene}}/particles.tsv"
+    conda:
+        ENVIRONMENT
     threads: 1
     resources:
         gpu=0,
         mem_mb=2000,
         runtime=10,
-    conda:
-        ENVIRONMENT
+    params:
+        wanted=SETTINGS.simulation.particles,
+        sampling=SETTINGS.geometry.sampling,
+        seed=SETTINGS.seed,
+        code=code("particles"),
     script:
         "../scripts/particles.py"

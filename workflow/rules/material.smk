@@ -1,6 +1,5 @@
 """Adaptation of the material law. A method is a block of settings over this one rule."""
 
-
 @checked
 def material_settings(wildcards):
     return SETTINGS.method_material(wildcards.scene, wildcards.method).plain()
@@ -20,7 +19,7 @@ def true_particles(wildcards):
 
 rule material:
     input:
-        kernels=ancient(KERNELS),
+        kernels=kernels("laws", "rendering"),
         transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
         gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
         binding=f"{RESULTS}/{{scene}}/binding.h5",
@@ -30,6 +29,17 @@ rule material:
     output:
         adaptor=f"{RESULTS}/{{scene}}/{{method}}/adaptor.safetensors",
         history=f"{RESULTS}/{{scene}}/{{method}}/history.json",
+    log:
+        f"{LOGS}/{{scene}}/{{method}}/material.log",
+    benchmark:
+        f"{BENCHMARKS}/{{scene}}/{{method}}/material.tsv"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        gpu=GPU,
+        mem_mb=6000,
+        runtime=240,
     params:
         simulation=simulation_settings,
         density=scene_setting("density"),
@@ -37,16 +47,5 @@ rule material:
         checkpoint=lambda wildcards: f"{RESULTS}/{wildcards.scene}/{wildcards.method}/checkpoint.pt",
         device=SETTINGS.device,
         code=code("material"),
-    log:
-        f"{LOGS}/{{scene}}/{{method}}/material.log",
-    benchmark:
-        f"{BENCHMARKS}/{{scene}}/{{method}}/material.tsv"
-    threads: 1
-    resources:
-        gpu=GPU,
-        mem_mb=6000,
-        runtime=240,
-    conda:
-        ENVIRONMENT
     script:
         "../scripts/material.py"

@@ -9,21 +9,21 @@ rule table1:
     output:
         csv=report(f"{RESULTS}/table1.csv", caption="../report/table1.rst", category="Tables"),
         markdown=f"{RESULTS}/table1.md",
-    params:
-        scenes=SCENES,
-        methods=lambda wildcards: table_titles("table1"),
-        code=code("table1"),
     log:
         f"{LOGS}/table1.log",
     benchmark:
         f"{BENCHMARKS}/table1.tsv"
+    conda:
+        ENVIRONMENT
     threads: 1
     resources:
         gpu=0,
         mem_mb=1000,
         runtime=5,
-    conda:
-        ENVIRONMENT
+    params:
+        scenes=SCENES,
+        methods=lambda wildcards: table_titles("table1"),
+        code=code("table1"),
     script:
         "../scripts/table1.py"
 
@@ -34,20 +34,20 @@ rule initial_states:
     output:
         csv=report(f"{RESULTS}/initial_states.csv", caption="../report/initial_states.rst", category="Tables"),
         markdown=f"{RESULTS}/initial_states.md",
-    params:
-        scenes=SCENES,
-        code=code("initial_states"),
     log:
         f"{LOGS}/initial_states.log",
     benchmark:
         f"{BENCHMARKS}/initial_states.tsv"
+    conda:
+        ENVIRONMENT
     threads: 1
     resources:
         gpu=0,
         mem_mb=1000,
         runtime=5,
-    conda:
-        ENVIRONMENT
+    params:
+        scenes=SCENES,
+        code=code("initial_states"),
     script:
         "../scripts/initial_states.py"
 
@@ -58,20 +58,20 @@ rule timings:
     output:
         csv=f"{RESULTS}/timings.csv",
         markdown=f"{RESULTS}/timings.md",
-    params:
-        benchmarks=BENCHMARKS,
-        code=code("timings"),
     log:
         f"{LOGS}/timings.log",
     benchmark:
         f"{BENCHMARKS}/timings.tsv"
+    conda:
+        ENVIRONMENT
     threads: 1
     resources:
         gpu=0,
         mem_mb=1000,
         runtime=5,
-    conda:
-        ENVIRONMENT
+    params:
+        benchmarks=BENCHMARKS,
+        code=code("timings"),
     script:
         "../scripts/timings.py"
 

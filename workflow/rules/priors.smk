@@ -3,10 +3,21 @@
 
 rule prior:
     input:
-        kernels=ancient(KERNELS),
+        kernels=kernels("laws"),
     output:
         weights=f"{RESULTS}/priors/{{prior}}.safetensors",
         report=f"{RESULTS}/priors/{{prior}}.json",
+    log:
+        f"{LOGS}/priors/{{prior}}.log",
+    benchmark:
+        f"{BENCHMARKS}/priors/{{prior}}.tsv"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        gpu=GPU,
+        mem_mb=4000,
+        runtime=60,
     params:
         law=lambda wildcards: SETTINGS.priors.laws[wildcards.prior].plain(),
         method=SETTINGS.priors.method,
@@ -14,16 +25,5 @@ rule prior:
         seed=SETTINGS.priors.seed,
         device=SETTINGS.device,
         code=code("prior"),
-    log:
-        f"{LOGS}/priors/{{prior}}.log",
-    benchmark:
-        f"{BENCHMARKS}/priors/{{prior}}.tsv"
-    threads: 1
-    resources:
-        gpu=GPU,
-        mem_mb=4000,
-        runtime=60,
-    conda:
-        ENVIRONMENT
     script:
         "../scripts/prior.py"

@@ -11,7 +11,7 @@ from neuma_lib.progress import stage
 
 def main(transforms: str, output, params, run) -> None:
     images, cameras = load_views(transforms)
-    settings = from_mapping(GaussianFitSettings, params.fit, "gaussians.fit")
+    settings = from_mapping(GaussianFitSettings, params.fit, "gaussians")
     gaussians, report = fit_gaussians(
         images,
         cameras,

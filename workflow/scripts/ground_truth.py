@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from neuma_lib.dataset import place, simulate_ground_truth
+from neuma_lib.dataset import simulate_ground_truth
+from neuma_lib.geometry.shapes import place
 from neuma_lib.io import write_arrays
 from neuma_lib.materials import analytic_law
 from neuma_lib.progress import stage

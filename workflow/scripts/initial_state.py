@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from neuma_lib.dataset import place
+from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.volume import volume_iou
 from neuma_lib.io import read_arrays, read_json, read_mesh, write_json
 from neuma_lib.progress import stage

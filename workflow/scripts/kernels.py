@@ -1,17 +1,18 @@
-"""Compile every Warp kernel once, into the cache that all other rules share."""
+"""Compile a group of Warp kernels once, into the cache that all other rules share."""
+
+from importlib import import_module
 
 from neuma_lib.device import choose_device
 from neuma_lib.io import write_text
 from neuma_lib.progress import stage
-from neuma_lib.warm_up import compile_kernels
 
 
-def main(ready: str, device: str, run) -> None:
-    count = compile_kernels(choose_device(device), run.progress)
-    write_text(ready, f"{count} pieces\n")
-    run.say("kernels of simulator, laws and renderer are compiled")
+def main(group: str, ready: str, device: str, run) -> None:
+    import_module(f"neuma_lib.warm_up.{group}").compile_kernels(choose_device(device))
+    write_text(ready, f"{group}\n")
+    run.say("compiled")
 
 
 if __name__ == "__main__":
-    with stage("kernels", snakemake.log[0]) as run:
-        main(snakemake.output.ready, snakemake.params.device, run)
+    with stage(f"kernels {snakemake.wildcards.group}", snakemake.log[0]) as run:
+        main(snakemake.wildcards.group, snakemake.output.ready, snakemake.params.device, run)

@@ -10,11 +10,11 @@ from neuma_lib.progress import stage
 def main(mesh_file: str, particles_file: str, params, run) -> None:
     mesh = read_mesh(mesh_file)
     x = np.asarray(
-        sample_volume(mesh, params.count, seed=params.seed, method=params.sampling), dtype=np.float32
+        sample_volume(mesh, params.wanted, seed=params.seed, method=params.sampling), dtype=np.float32
     )
     vol0 = np.full(len(x), mesh.volume / len(x), dtype=np.float32)
     write_arrays(particles_file, {"x": x, "vol0": vol0}, {"volume": float(mesh.volume)})
-    run.say(f"{len(x)} particles (asked: {params.count}) in {1e3 * mesh.volume:.3f} l")
+    run.say(f"{len(x)} particles (asked: {params.wanted}) in {1e3 * mesh.volume:.3f} l")
 
 
 if __name__ == "__main__":

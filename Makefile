@@ -1,0 +1,67 @@
+# make table1   the environment, then Table 1 of the paper at the default scale
+# make test     the tests (make test-all adds the slow ones)
+# make env      the environment alone        make lint    style checks
+# make lock     envs/ again from the pins in pyproject.toml
+# make unlock   after a killed Snakemake     make clean   everything computed, but not the environment
+
+PYTHON ?= python3.11
+VENV ?= .venv
+CORES ?= 2
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+SNAKEMAKE := $(BIN)/snakemake --cores $(CORES)
+
+.PHONY: table1 all dataset test test-all lint env check unlock lock clean
+
+table1: env unlock
+	$(SNAKEMAKE) results/table1.csv
+
+all dataset: env unlock
+	$(SNAKEMAKE) $@
+
+test: env
+	$(BIN)/python -m pytest -m "not slow"
+
+test-all: env
+	$(BIN)/python -m pytest
+
+lint: env
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/snakefmt --check Snakefile workflow
+	$(BIN)/snakemake --lint
+
+# A killed Snakemake leaves its lock behind. It is removed only when no other Snakemake runs in this folder.
+unlock: env
+	@if [ -n "$$(ls .snakemake/locks 2>/dev/null)" ]; then \
+	  for process in /proc/[0-9]*; do \
+	    if [ "$$(readlink $$process/cwd)" = "$(CURDIR)" ] && tr '\0' ' ' < $$process/cmdline 2>/dev/null | grep -q 'bin/snakemake '; then \
+	      echo "Another Snakemake (process $${process#/proc/}) is at work in this folder: let it finish, or stop it." >&2; exit 1; \
+	    fi; \
+	  done; \
+	  echo "Removing the lock that a killed Snakemake left behind."; \
+	  $(BIN)/snakemake --unlock; \
+	fi
+
+env: $(READY)
+
+$(READY): envs/requirements.txt envs/requirements-dev.txt
+	@command -v $(PYTHON) >/dev/null 2>&1 && $(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { \
+	  echo "Python 3.11 is needed (Blender's module bpy 4.5 has no other), and '$(PYTHON)' is not one." >&2; \
+	  echo "Debian 12: apt-get install python3.11 python3.11-venv   elsewhere: pyenv install 3.11, or conda create -n neuma python=3.11" >&2; \
+	  echo "Then: make PYTHON=/path/to/python3.11 ..." >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
+	  echo "Python's venv module is missing: apt-get install python3.11-venv" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r envs/requirements-dev.txt
+	@$(MAKE) --no-print-directory check
+	@touch $(READY)
+
+check:
+	@$(BIN)/python -m neuma_lib.blender.libraries
+
+lock: envs/lock.py pyproject.toml
+	$(BIN)/python envs/lock.py
+
+clean:
+	rm -rf data results .cache .snakemake .pytest_cache .ruff_cache

@@ -1,0 +1,250 @@
+"""A watertight surface of a static object from its silhouettes, around the Gaussians fitted to the same views.
+
+The body is carved (space carving, visual hull): a point belongs to it when every camera sees it inside the
+silhouette. Each alpha matte becomes a signed distance to its half-covered contour, which is known to a small part
+of a pixel; the least of the back-projected distances over the views is close to the signed distance of the hull,
+so the surface lies more finely than pixels or voxels. What no silhouette shows, a dent seen only by its shading,
+stays filled. The Gaussians say where to look.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
+from skimage.measure import find_contours, marching_cubes
+from torch import Tensor
+
+from neuma_lib.errors import InputError
+from neuma_lib.geometry.volume import check_mesh
+from neuma_lib.render.cameras import Cameras
+from neuma_lib.render.gaussians import Gaussians
+
+Array = NDArray[np.float64]
+
+_COARSE_RESOLUTION = 32
+"""Voxels along the longest side of the first look, which finds the body's box and the band around its surface."""
+_CONTOUR_STEPS = 8
+"""Points on each segment of a contour; a segment is at most a pixel's diagonal long."""
+
+
+@dataclass(frozen=True)
+class SurfaceSettings:
+    """Settings of `reconstruct`.
+
+    Attributes:
+        resolution: voxels along the longest side of the body.
+        matte_level: coverage at which a pixel counts as half inside.
+        smoothing: rounds of smoothing of the mesh, each of which moves it in and out again (Taubin), against
+            the noise of the mattes; the volume is kept.
+    """
+
+    resolution: int = 96
+    matte_level: float = 0.5
+    smoothing: int = 5
+
+    def __post_init__(self):
+        if self.resolution < 16:
+            raise InputError(f"geometry.surface.resolution = {self.resolution}: choose 16 or more")
+        if not 0.0 < self.matte_level < 1.0:
+            raise InputError(f"geometry.surface.matte_level = {self.matte_level}: choose between 0 and 1")
+        if self.smoothing < 0:
+            raise InputError(f"geometry.surface.smoothing = {self.smoothing}: choose 0 or more")
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Points of a regular lattice: origin (3,) [m], spacing [m], points along each axis."""
+
+    origin: Array
+    spacing: float
+    counts: NDArray[np.int64]
+
+    @classmethod
+    def around(cls, lower: Array, upper: Array, resolution: int) -> _Grid:
+        spacing = float((upper - lower).max()) / resolution
+        return cls(lower, spacing, np.ceil((upper - lower) / spacing).astype(np.int64) + 1)
+
+    def axes(self) -> list[Array]:
+        return [self.origin[k] + self.spacing * np.arange(n) for k, n in enumerate(self.counts)]
+
+
+def reconstruct(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    images: Tensor,
+    settings: SurfaceSettings | Mapping[str, Any] | None = None,
+) -> trimesh.Trimesh:
+    """Surface of the body that the views show (paper, section 3.2, where a multi-view method makes it).
+
+    Args:
+        gaussians: static reconstruction; its extent bounds the search, and is widened if the body is larger.
+        cameras: V views.
+        images: RGBA with straight alpha in [0, 1], shape (V, H, W, 4).
+        settings: a `SurfaceSettings` or a mapping of its fields.
+
+    Returns:
+        Watertight mesh in the world frame [m], one body without inner cavities, oriented outwards.
+
+    Raises:
+        InputError: images that do not fit the cameras, an empty matte, mattes that share no point of space, or an
+            unknown setting.
+    """
+    settings = _settings(settings)
+    if tuple(images.shape) != (len(cameras), cameras.height, cameras.width, 4):
+        raise InputError(
+            f"surface: images {tuple(images.shape)} do not fit {len(cameras)} cameras of "
+            f"{cameras.width} x {cameras.height} pixels; expected RGBA (views, height, width, 4)"
+        )
+    alpha = images[..., 3].detach().to("cpu", torch.float64)
+    cameras = cameras.to("cpu", torch.float64)
+    silhouettes = _silhouettes(alpha, settings.matte_level)
+
+    coarse, distance = _locate(gaussians, silhouettes, cameras)
+    reach = 2.0 * coarse.spacing
+    near = np.argwhere(distance > -coarse.spacing)
+    lower = coarse.origin + (near.min(axis=0) - 1) * coarse.spacing
+    upper = coarse.origin + (near.max(axis=0) + 1) * coarse.spacing
+    grid = _Grid.around(lower, upper, settings.resolution)
+    # Away from the surface the coarse distance is enough: it is only read for its sign there.
+    at = [(axis - coarse.origin[k]) / coarse.spacing for k, axis in enumerate(grid.axes())]
+    field = ndimage.map_coordinates(
+        distance, np.stack(np.meshgrid(*at, indexing="ij")), order=1, mode="nearest"
+    )
+    band = np.flatnonzero(np.abs(field.ravel()) < reach)
+    points = np.stack(np.unravel_index(band, field.shape), axis=1) * grid.spacing + grid.origin
+    field.ravel()[band] = _distance_inside(points, silhouettes, cameras)
+
+    mesh = _polygonise(_one_solid_body(field), grid)
+    if settings.smoothing:
+        _smooth(mesh, settings.smoothing)
+    check_mesh(mesh, "surface")
+    return mesh
+
+
+def _settings(given: SurfaceSettings | Mapping[str, Any] | None) -> SurfaceSettings:
+    if isinstance(given, SurfaceSettings):
+        return given
+    names = [field.name for field in fields(SurfaceSettings)]
+    unknown = sorted(set(given or {}) - set(names))
+    if unknown:
+        raise InputError(f"geometry.surface.{unknown[0]}: no such setting; there are {', '.join(names)}")
+    return SurfaceSettings(**(given or {}))
+
+
+def _silhouettes(alpha: Tensor, level: float) -> Tensor:
+    """Signed distances [px] at the pixel centres to the contours of the mattes, positive inside, (V, H, W)."""
+    distances = []
+    for view, matte in enumerate(alpha.numpy()):
+        if not np.isfinite(matte).all():
+            raise InputError(f"surface: the alpha of view {view} holds values that are not finite")
+        if not (matte > level).any():
+            raise InputError(
+                f"surface: the mask of view {view} is empty (no alpha above {level}); remove the view or matte it "
+                "again"
+            )
+        distances.append(_distance_to_contour(matte, level))
+    return torch.from_numpy(np.stack(distances))
+
+
+def _distance_to_contour(matte: Array, level: float) -> Array:
+    """Signed distance [px] from pixel centres to the level line of a matte (H, W), positive inside.
+
+    The matte is continued beyond the frame as it is at its edge, where a body may be cut off.
+    """
+    contours = find_contours(np.pad(matte, 1, mode="edge"), level)
+    inside = matte > level
+    if not contours:
+        return np.full(matte.shape, float(max(matte.shape)))
+    along = np.arange(_CONTOUR_STEPS)[:, None, None] / _CONTOUR_STEPS
+    pieces = [((1 - along) * line[:-1] + along * line[1:]).reshape(-1, 2) for line in contours]
+    pixels = np.stack(np.indices(matte.shape), axis=-1).reshape(-1, 2) + 1.0
+    distance, _ = cKDTree(np.concatenate(pieces)).query(pixels)
+    return np.where(inside, 1.0, -1.0) * distance.reshape(matte.shape)
+
+
+def _distance_inside(points: Array, silhouettes: Tensor, cameras: Cameras) -> Array:
+    """Least distance [m] of points (P, 3) to the silhouette cones, negative outside one, (P,).
+
+    A distance in the image is turned into metres at the point's depth. Points behind a camera are outside.
+    """
+    positions = torch.from_numpy(points)
+    size = torch.tensor([cameras.width, cameras.height], dtype=torch.float64)
+    least = torch.full((len(points),), float("inf"), dtype=torch.float64)
+    for view in range(len(cameras)):
+        pixels, depth = cameras[view].project(positions)
+        where = (2.0 * pixels / size - 1.0).nan_to_num(nan=2.0)[None]
+        distance = torch.nn.functional.grid_sample(
+            silhouettes[view][None, None], where, mode="bilinear", padding_mode="border", align_corners=False
+        )
+        distance = distance[0, 0, 0] * depth[0] / cameras.Ks[view, 0, 0]
+        least = torch.minimum(least, torch.where(depth[0] > 0, distance, -depth[0].abs() - 1e-3))
+    return least.numpy()
+
+
+def _locate(gaussians: Gaussians, silhouettes: Tensor, cameras: Cameras) -> tuple[_Grid, Array]:
+    """Coarse lattice that holds the whole body, and the distances on it.
+
+    Starts at the box of the Gaussians, and is doubled while the body reaches its walls.
+    """
+    if len(gaussians) == 0:
+        raise InputError("surface: there are no Gaussians; rerun the gaussians stage")
+    means = gaussians.means.detach().to("cpu", torch.float64).numpy()
+    reach = 2.0 * gaussians.covars().detach().diagonal(dim1=1, dim2=2).sqrt().to("cpu", torch.float64).numpy()
+    if not (np.isfinite(means).all() and np.isfinite(reach).all()):
+        raise InputError("surface: a Gaussian is not finite; rerun the gaussians stage")
+    lower, upper = (means - reach).min(axis=0), (means + reach).max(axis=0)
+    for _ in range(6):
+        margin = 0.05 * float((upper - lower).max())
+        grid = _Grid.around(lower - margin, upper + margin, _COARSE_RESOLUTION)
+        points = np.stack(np.meshgrid(*grid.axes(), indexing="ij"), axis=-1).reshape(-1, 3)
+        distance = _distance_inside(points, silhouettes, cameras).reshape(tuple(grid.counts))
+        interior = np.zeros(distance.shape, dtype=bool)
+        interior[1:-1, 1:-1, 1:-1] = True
+        if (distance > -grid.spacing).any() and not (distance[~interior] > 0).any():
+            return grid, distance
+        middle, half = (lower + upper) / 2, (upper - lower).max() / 2
+        lower, upper = middle - 2 * half, middle + 2 * half
+    if (distance > -grid.spacing).any():
+        raise InputError(
+            "surface: the masks do not bound a body; more views from other directions, or masks that the frame "
+            "does not cut, are needed"
+        )
+    raise InputError(
+        "surface: no point of space lies inside all masks; check that they show the object alone and that the "
+        "camera poses belong to these images"
+    )
+
+
+def _one_solid_body(field: Array) -> Array:
+    """The field with its largest body alone, without cavities, and closed at the lattice's walls."""
+    field = np.pad(field, 1, constant_values=min(float(field.min()), -1e-6))
+    bodies, count = ndimage.label(field > 0)
+    if count == 0:
+        raise InputError("surface: the body is thinner than a voxel; raise geometry.surface.resolution")
+    largest = 1 + int(np.argmax(np.bincount(bodies.ravel())[1:]))
+    filled = ndimage.binary_fill_holes(bodies == largest)
+    return np.where(filled, np.maximum(field, -field), np.minimum(field, -field))
+
+
+def _polygonise(field: Array, grid: _Grid) -> trimesh.Trimesh:
+    """Zero level of a field padded by one."""
+    # A value next to nothing would make faces without area.
+    least = 1e-3 * grid.spacing
+    field = np.where(field > 0, np.maximum(field, least), np.minimum(field, -least))
+    vertices, faces, _, _ = marching_cubes(field, 0.0, gradient_direction="ascent")
+    return trimesh.Trimesh(grid.origin + (vertices - 1.0) * grid.spacing, faces)
+
+
+def _smooth(mesh: trimesh.Trimesh, rounds: int) -> None:
+    """Taubin's smoothing, in place; a last offset along the normals restores the volume to second order."""
+    before = mesh.volume
+    trimesh.smoothing.filter_taubin(mesh, lamb=0.5, nu=0.53, iterations=2 * rounds)
+    mesh.vertices = mesh.vertices + (before - mesh.volume) / mesh.area * mesh.vertex_normals

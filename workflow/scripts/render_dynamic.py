@@ -1,0 +1,31 @@
+"""Film the moving object from a ring of cameras."""
+
+from pathlib import Path
+
+from neuma_lib.blender.appearance import Appearance
+from neuma_lib.blender.bodies import make_body
+from neuma_lib.blender.cameras import video_views
+from neuma_lib.blender.scene import RenderSettings, render_dynamic
+from neuma_lib.config import pick
+from neuma_lib.geometry.shapes import place
+from neuma_lib.io import read_arrays
+from neuma_lib.progress import stage
+
+
+def main(particles_file: str, transforms: str, params, run) -> None:
+    scene, images = params.scene, params.images
+    names = ("x", "tracers", "frames")
+    arrays, attributes = read_arrays(particles_file, only=names, required=names)
+    mesh = place(scene["shape"], scene["size"], scene["height"], scene["center"])
+    look = pick(Appearance, scene["appearance"])
+    body = make_body(scene["appearance"]["kind"], mesh, look, arrays["x"], arrays["tracers"])
+    views = video_views(body.points, images["views"], images["width"], images["height"])
+    settings = RenderSettings(samples=images["samples"], threads=params.threads)
+    steps = arrays["frames"].tolist()
+    render_dynamic(body, views, steps, attributes["dt"], Path(transforms).parent, settings, run.progress)
+    run.say(f"{len(views)} views, {len(steps)} frames of {views.width}x{views.height} px")
+
+
+if __name__ == "__main__":
+    with stage(f"render_dynamic {snakemake.wildcards.scene}", snakemake.log[0]) as run:
+        main(snakemake.input.particles, snakemake.output.transforms, snakemake.params, run)
