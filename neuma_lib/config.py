@@ -177,7 +177,7 @@ class BindingConfig(Section):
     confidence: float = Field(0.95, gt=0, lt=1, description="tau of the chi-squared test")
     max_neighbours: int = Field(10, ge=1, description="nearest particles kept for a Gaussian")
     equal_mass: bool = Field(
-        False, description="give particles added by the second pass a full mass, as the paper does"
+        False, description="all particles, added ones too, share the volume equally (paper)"
     )
 
 

@@ -13,7 +13,6 @@ import torch
 import trimesh
 from torch import Tensor
 
-from neuma_lib.geometry import shapes
 from neuma_lib.geometry.volume import sample_tracers, sample_volume
 from neuma_lib.materials.base import Law
 from neuma_lib.sim import MPMModel, Trajectory, rollout
@@ -39,20 +38,6 @@ class GroundTruth:
     tracers_again: Tensor
     vol0: float
     mass: float
-
-
-def place(shape: str, size: float | None, height: float, center: Sequence[float]) -> trimesh.Trimesh:
-    """The true shape where a scene starts it.
-
-    Args:
-        shape: name in `geometry.shapes`.
-        size: longest side of the bounding box [m]; None keeps the shape's own.
-        height: y of the bounding box's centre [m].
-        center: x and z of the bounding box's centre [m].
-    """
-    mesh = shapes.build(shape, size)
-    mesh.apply_translation([center[0], height, center[1]])
-    return mesh
 
 
 def simulate_ground_truth(

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import TextIO
 
 from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.owner import stop_with_owner
 
 PLAIN_INTERVAL = 15.0  # seconds between plain lines
 MOVING_INTERVAL = 0.2  # seconds between redraws of the moving line
@@ -39,6 +40,7 @@ def stage(name: str, log: str | Path | None = None, stream: TextIO | None = None
     Raises:
         SystemExit: in place of any exception of the block, after it was reported.
     """
+    stop_with_owner()
     run = Stage(name, log, stream or sys.stderr)
     try:
         with warnings.catch_warnings():

@@ -8,6 +8,9 @@ otherwise Warp's own per-user cache is used.
 from __future__ import annotations
 
 import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 import warp as wp
@@ -24,8 +27,26 @@ def init() -> None:
     cache = os.environ.get("NEUMA_KERNEL_CACHE")
     if cache:
         wp.config.kernel_cache_dir = cache
-    wp.init()
+    with _without_driver_warning():
+        wp.init()
     _started = True
+
+
+@contextmanager
+def _without_driver_warning() -> Iterator[None]:
+    """On a machine without a GPU Warp's native code warns on standard error, once in every process: leave that out."""
+    if torch.cuda.is_available():
+        yield
+        return
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def stream(device: torch.device) -> wp.Stream | None:

@@ -35,10 +35,6 @@ def start(settings: dict, width: int, height: int) -> None:
     render.image_settings.compression = 50
     scene.view_settings.view_transform = "Standard"
     scene.view_settings.look = "None"
-    for name in dir(render):
-        # Stamps are written into the file: dates, host and render times would make its bytes change.
-        if name.startswith("use_stamp"):
-            setattr(render, name, False)
     world = bpy.data.worlds.new("world")
     world.use_nodes = True
     background = world.node_tree.nodes["Background"]

@@ -24,7 +24,7 @@ DEBIAN_PACKAGES = {
 }
 """Shared libraries that bpy needs even without a display, and the Debian/Ubuntu package of each."""
 
-EVERYTHING = "libx11-6 libxrender1 libxxf86vm1 libxfixes3 libxi6 libxkbcommon0 libsm6 libice6 libgl1"
+EVERYTHING = "libx11-6 libxext6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libice6 libgl1"
 
 
 def explain_import_error(text: str) -> str:

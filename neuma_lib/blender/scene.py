@@ -1,6 +1,6 @@
 """Render an object from many cameras over many frames, in a Blender process of its own.
 
-The parent (this module) never imports bpy: it writes one job file, starts ``python -m neuma_lib.blender`` and collects
+The parent (this module) never imports bpy: it writes one job file, starts ``neuma_lib.blender.worker`` and collects
 the images, which appear in the target folder only when all of them are there. What is rendered is a
 :class:`Surface` (the mesh of a solid, moved), :class:`Grains` (sand) or a :class:`Liquid` (a new surface a frame).
 """
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -18,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from neuma_lib.blender import worker
 from neuma_lib.blender.appearance import to_linear
 from neuma_lib.blender.cameras import Views
 from neuma_lib.blender.libraries import explain_import_error
@@ -168,6 +170,8 @@ def render_images(
     """
     out_dir = Path(out_dir)
     out_dir.mkdir(parents=True, exist_ok=True)
+    for abandoned in out_dir.glob(".render-*"):  # of a process that was killed
+        shutil.rmtree(abandoned)
     with tempfile.TemporaryDirectory(prefix=".render-", dir=out_dir) as folder:
         job = Path(folder) / "job.npz"
         np.savez(
@@ -181,7 +185,21 @@ def render_images(
         )
         _run(job, len(shots), progress)
         for index, name in enumerate(names):
-            os.replace(Path(folder) / f"{index:05d}.png", out_dir / name)
+            image = Path(folder) / f"{index:05d}.png"
+            image.write_bytes(_pixels_only(image.read_bytes()))
+            os.replace(image, out_dir / name)
+
+
+def _pixels_only(png: bytes) -> bytes:
+    """A PNG file without its texts: Cycles leaves render times there, and equal images shall be equal bytes."""
+    kept, position = [png[:8]], 8
+    while position < len(png):
+        length = int.from_bytes(png[position : position + 4], "big")
+        chunk = png[position : position + length + 12]
+        if chunk[4:8] in (b"IHDR", b"IDAT", b"IEND"):
+            kept.append(chunk)
+        position += length + 12
+    return b"".join(kept)
 
 
 def _run(job: Path, total: int, progress: Progress | None) -> None:
@@ -191,7 +209,7 @@ def _run(job: Path, total: int, progress: Progress | None) -> None:
     log = job.with_suffix(".log")
     with open(log, "wb") as sink:
         process = subprocess.Popen(
-            [sys.executable, "-m", "neuma_lib.blender", str(job)],
+            [sys.executable, "-m", worker.__name__, str(job)],
             stdout=subprocess.PIPE,
             stderr=sink,
             env=environment,

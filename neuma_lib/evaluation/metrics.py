@@ -1,11 +1,14 @@
 """Measures of motion and of images (paper Sec. 4.1), and the Chamfer distance as a loss.
 
-The Chamfer distance of two point sets is the mean squared distance to the nearest point of the other set, summed
-over both directions, times 1e4. Between filled volumes it also holds a sampling floor, the distance of two samplings
-of one and the same body, which falls with the density of the points: see `neuma_lib.evaluation.evaluate`.
+The Chamfer distance of two point sets is the mean squared distance to the nearest point of the other set,
+summed over both directions, times 1e4. Between filled volumes it also holds a sampling floor, the distance
+of two samplings of one and the same body, which falls with the density of the points: see
+`neuma_lib.evaluation.evaluate`.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -13,7 +16,7 @@ from scipy.spatial import cKDTree
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
-from neuma_lib.errors import InputError
+from neuma_lib.errors import InputError, NonFiniteError
 
 CHAMFER_SCALE = 1e4
 """The paper reports squared metres times this."""
@@ -54,26 +57,36 @@ def tracer_rmse(a: Tensor, b: Tensor) -> Tensor:
     return (a.double() - b.double()).square().sum(-1).mean(-1).sqrt().cpu()
 
 
-def chamfer_loss(x: Tensor, targets: Tensor) -> Tensor:
+def chamfer_loss(x: Tensor, targets: Tensor | Sequence[Tensor]) -> Tensor:
     """Chamfer distance [m^2] of each frame, differentiable in x.
 
-    The nearest neighbours are found by a KD-tree and held fixed in the gradient.
+    The nearest neighbours are found by a KD-tree and held fixed in the gradient, which is exact where no
+    point is equally near to two others.
 
     Args:
         x: simulated particles [m], shape (T, N, 3).
-        targets: points to match [m], shape (T, M, 3).
+        targets: points to match [m], T sets of shape (M, 3), where M may differ from set to set.
 
     Returns:
         Losses, shape (T,).
+
+    Raises:
+        InputError: another number of frames than targets.
+        NonFiniteError: a particle that is not finite.
     """
     if len(x) != len(targets):
         raise InputError(f"chamfer_loss: {len(x)} frames against {len(targets)}")
-    positions, goals = x.detach().cpu().numpy(), targets.detach().cpu().numpy()
+    positions = x.detach().cpu().numpy()
+    finite = np.isfinite(positions).all(axis=2)
+    if not finite.all():
+        frame, particle = np.argwhere(~finite)[0]
+        raise NonFiniteError("chamfer_loss", f"particle {particle} of frame {frame} is not finite")
     losses = []
     for t in range(len(x)):
-        nearest_goal = torch.from_numpy(cKDTree(goals[t]).query(positions[t])[1]).to(x.device)
-        nearest_x = torch.from_numpy(cKDTree(positions[t]).query(goals[t])[1]).to(x.device)
         goal = targets[t].to(x)
+        there = goal.detach().cpu().numpy()
+        nearest_goal = torch.from_numpy(cKDTree(there).query(positions[t])[1]).to(x.device)
+        nearest_x = torch.from_numpy(cKDTree(positions[t]).query(there)[1]).to(x.device)
         forward = (x[t] - goal[nearest_goal]).square().sum(-1).mean()
         backward = (x[t][nearest_x] - goal).square().sum(-1).mean()
         losses.append(forward + backward)
@@ -81,7 +94,8 @@ def chamfer_loss(x: Tensor, targets: Tensor) -> Tensor:
 
 
 def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio [dB] of images in [0, 1], (H, W, 3); mask (H, W) keeps the pixels that count.
+    """Peak signal-to-noise ratio [dB] of images in [0, 1], (H, W, 3); mask (H, W) keeps the pixels that
+    count.
 
     Raises:
         InputError: shapes differ, or the mask keeps nothing.
@@ -99,11 +113,20 @@ def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = Non
 
 
 def ssim(image: np.ndarray, reference: np.ndarray) -> float:
-    """Structural similarity (Wang et al. 2004, Gaussian window of sigma 1.5) of images in [0, 1], (H, W, 3)."""
+    """Structural similarity (Wang et al. 2004, Gaussian window of sigma 1.5) of images in [0, 1], (H, W, 3).
+
+    Raises:
+        InputError: shapes differ, or a side is shorter than the window's 11 pixels.
+    """
+    image, reference = np.asarray(image, np.float64), np.asarray(reference, np.float64)
+    if image.shape != reference.shape:
+        raise InputError(f"ssim: images of shapes {image.shape} and {reference.shape} do not match")
+    if min(image.shape[:2]) < 11:
+        raise InputError(f"ssim: an image of {image.shape[:2]} pixels is smaller than the window of 11")
     return float(
         structural_similarity(
-            np.asarray(image, np.float64),
-            np.asarray(reference, np.float64),
+            image,
+            reference,
             channel_axis=-1,
             data_range=1.0,
             gaussian_weights=True,

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from neuma_lib.errors import InputError
 
+PAPER_SCENES = ("BouncyBall", "JellyDuck", "RubberPawn", "ClayCat", "SandFish", "HoneyBottle")
 PAPER_TABLE1 = {
     "pac_nerf": (516.30, 137.73, 15.47, 15.38, 1.71, 2.21),
     "nclaw": (56.13, 6.32, 3.31, 2.45, 2.61, 2.26),
@@ -17,14 +19,21 @@ PAPER_TABLE1 = {
     "neuma_without_binding": (3.34, 28.42, 4.62, 1.26, 0.97, 1.01),
     "neuma_without_adaptor": (1.87, 3.63, 1.42, 1.36, 1.21, 1.23),
 }
-"""Chamfer distances of the paper's Table 1, in the order of `PAPER_SCENES`. They contain its sampling floor."""
-PAPER_SCENES = ("BouncyBall", "JellyDuck", "RubberPawn", "ClayCat", "SandFish", "HoneyBottle")
+"""Chamfer distances of the paper's Table 1, columns as `PAPER_SCENES`; they contain its sampling floor."""
 
 QUANTITIES = {
     "chamfer": "Chamfer distance (1e-4 m², mean over the sequence)",
     "chamfer_excess": "Excess over the sampling floor (1e-4 m²)",
     "tracer_rmse_mm": "Tracer RMSE from identical start points (mm)",
 }
+"""What Table 1 shows of each run, by its name in metrics.json."""
+
+TRAINING_DIVERGED, ROLLOUT_DIVERGED = "†", "‡"
+FOOTNOTES = {
+    TRAINING_DIVERGED: "The training diverged; its last good state is shown.",
+    ROLLOUT_DIVERGED: "The predicted motion became non-finite; later frames hold the last finite state.",
+}
+"""Signs behind numbers, and what they mean."""
 
 
 @dataclass
@@ -34,19 +43,18 @@ class Table:
     Attributes:
         columns: column names without the average.
         rows: (quantity, method, title, one value a column) each.
-        marks: (method, column) of runs that diverged, whose last good state is shown.
+        marks: (method, column) -> signs of `FOOTNOTES`, for runs that diverged.
     """
 
     columns: tuple[str, ...]
     rows: list[tuple[str, str, str, tuple[float, ...]]] = field(default_factory=list)
-    marks: set[tuple[str, str]] = field(default_factory=set)
+    marks: dict[tuple[str, str], str] = field(default_factory=dict)
 
     def values(self, quantity: str, method: str) -> dict[str, float]:
         """One row as a dict, with "Average"."""
         for q, m, _, values in self.rows:
             if (q, m) == (quantity, method):
-                named = dict(zip(self.columns, values, strict=True))
-                return named | {"Average": sum(values) / len(values)}
+                return dict(zip([*self.columns, "Average"], _with_average(values), strict=True))
         raise InputError(f"table: no row {quantity} of {method}")
 
     def csv(self) -> str:
@@ -56,7 +64,7 @@ class Table:
         writer.writerow(["quantity", "method", "title", *self.columns, "Average", "diverged"])
         for quantity, method, title, values in self.rows:
             diverged = [c for c in self.columns if (method, c) in self.marks]
-            cells = [f"{v:.4f}" for v in (*values, sum(values) / len(values))]
+            cells = [f"{v:.4f}" for v in _with_average(values)]
             writer.writerow([quantity, method, title, *cells, " ".join(diverged)])
         return out.getvalue()
 
@@ -65,19 +73,19 @@ class Table:
         parts = ["# Table 1: dynamics grounding", ""]
         for quantity, heading in QUANTITIES.items():
             rows = [row for row in self.rows if row[0] == quantity]
-            parts += [f"**{heading}**", "", self._header()]
+            lines = [self._line(title, values, method) for _, method, title, values in rows]
             if quantity == "chamfer":
-                rows += [row for row in self.rows if row[0] == "chamfer_floor"]
-            parts += [self._line(title, values, method) for _, method, title, values in rows]
-            if quantity == "chamfer" and set(self.columns) <= set(PAPER_SCENES):
-                parts += [self._paper_line(method, title) for _, method, title, _ in rows if method in PAPER_TABLE1]
-            parts.append("")
-        if self.marks:
-            parts += ["† The run diverged; its last good state is shown.", ""]
+                lines += [self._line(row[2], row[3]) for row in self.rows if row[0] == "chamfer_floor"]
+                lines += self._paper_lines({method: title for _, method, title, _ in rows})
+            parts += [f"**{heading}**", "", self._header(), *lines, ""]
+        for sign, note in FOOTNOTES.items():
+            if any(sign in signs for signs in self.marks.values()):
+                parts += [f"{sign} {note}", ""]
         parts += [
-            "The floor is the distance between two samplings of the true motion with the same number of tracers."
-            " The paper's distances contain a floor of their own, set by its 30,000 particles: compare excesses,"
-            " not distances. Its scenes have the same starts but materials that it does not publish.",
+            "The floor is the distance between two samplings of the true motion with the same number "
+            "of tracers. The paper's distances contain a floor of their own, set by its 30,000 particles: "
+            "compare excesses, not distances. Its scenes have the same starts but materials that it does not "
+            "publish.",
             "",
         ]
         return "\n".join(parts)
@@ -86,20 +94,26 @@ class Table:
         names = [*self.columns, "Average"]
         return f"| Method | {' | '.join(names)} |\n|---|{'---:|' * len(names)}"
 
-    def _line(self, title: str, values: Sequence[float], method: str) -> str:
-        marks = ["†" if (method, c) in self.marks else "" for c in self.columns]
-        cells = [f"{v:.2f}{m}" for v, m in zip((*values, sum(values) / len(values)), [*marks, ""], strict=True)]
+    def _line(self, title: str, values: Sequence[float], method: str = "") -> str:
+        marks = [self.marks.get((method, column), "") for column in self.columns]
+        cells = [f"{v:.2f}{mark}" for v, mark in zip(_with_average(values), [*marks, ""], strict=True)]
         return f"| {title} | {' | '.join(cells)} |"
 
-    def _paper_line(self, method: str, title: str) -> str:
-        paper = dict(zip(PAPER_SCENES, PAPER_TABLE1[method], strict=True))
-        return self._line(f"*paper: {title}*", [paper[c] for c in self.columns], "")
+    def _paper_lines(self, titles: Mapping[str, str]) -> list[str]:
+        """The paper's rows of the methods shown, if it has all the columns."""
+        if not set(self.columns) <= set(PAPER_SCENES):
+            return []
+        lines = []
+        for method in filter(PAPER_TABLE1.__contains__, titles):
+            paper = dict(zip(PAPER_SCENES, PAPER_TABLE1[method], strict=True))
+            lines.append(self._line(f"*paper: {titles[method]}*", [paper[c] for c in self.columns]))
+        return lines
 
 
 def chamfer_table(
     metrics: Mapping[str, Mapping[str, Mapping]], titles: Mapping[str, str], scenes: Sequence[str]
 ) -> Table:
-    """Table 1 of the paper, with floor, excess and tracer error.
+    """Table 1 of the paper, with floor, excess and tracer error. Any method may have a row; none is implied.
 
     Args:
         metrics: method -> scene -> content of its metrics.json.
@@ -107,27 +121,40 @@ def chamfer_table(
         scenes: columns in order.
 
     Raises:
-        InputError: a method lacks a scene or a scene a quantity.
+        InputError: a method lacks a scene, or a scene a finite value.
     """
+    if not titles or not scenes:
+        raise InputError("table 1: there are no methods or no scenes; see tables.table1 in the configuration")
     table = Table(tuple(scenes))
 
-    def row(quantity, method):
-        try:
-            return tuple(float(metrics[method][scene][quantity]) for scene in scenes)
-        except KeyError as missing:
-            raise InputError(f"table 1: {method} has no {missing}; run its evaluation again") from None
+    def row(quantity: str, method: str) -> tuple[float, ...]:
+        values = []
+        for scene in scenes:
+            value = metrics.get(method, {}).get(scene, {}).get(quantity)
+            if not isinstance(value, int | float) or not math.isfinite(value):
+                raise InputError(
+                    f"table 1: {quantity} of {method} on {scene} is {value}; remove "
+                    f"{scene}/{method}/metrics.json from the results and run again"
+                )
+            values.append(float(value))
+        return tuple(values)
 
     for quantity in QUANTITIES:
         table.rows += [(quantity, method, title, row(quantity, method)) for method, title in titles.items()]
     first = next(iter(titles))
     table.rows.append(("chamfer_floor", "floor", "Sampling floor", row("chamfer_floor", first)))
-    table.marks = {
-        (method, scene)
-        for method in titles
-        for scene in scenes
-        if metrics[method][scene].get("diverged_at_step") is not None or metrics[method][scene].get("stable") is False
-    }
+    for method in titles:
+        for scene in scenes:
+            run = metrics[method][scene]
+            signs = TRAINING_DIVERGED if run.get("stable") is False else ""
+            signs += ROLLOUT_DIVERGED if run.get("diverged_at_step") is not None else ""
+            if signs:
+                table.marks[method, scene] = signs
     return table
+
+
+def _with_average(values: Sequence[float]) -> list[float]:
+    return [*values, sum(values) / len(values)]
 
 
 def report_table(

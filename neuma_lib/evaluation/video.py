@@ -11,7 +11,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 from neuma_lib.errors import InputError
 
-_LABEL = 18  # height of the line of text above each panel [px]
+_LABEL_HEIGHT = 18
+"""Line of text above each panel [px]."""
+_REPEATABLE = ("-fflags", "+bitexact", "-flags:v", "+bitexact", "-threads", "1", "-map_metadata", "-1")
+"""Encoder options that keep versions and dates out of the file, and threads from changing it."""
 
 
 def side_by_side(panels: Sequence[np.ndarray], labels: Sequence[str], magnify: int = 1) -> np.ndarray:
@@ -24,23 +27,39 @@ def side_by_side(panels: Sequence[np.ndarray], labels: Sequence[str], magnify: i
 
     Returns:
         uint8 video (T, H', W', 3) with even sides, as video codecs want them.
+
+    Raises:
+        InputError: no panels, panels that differ in length or height, or labels that do not match them.
     """
-    if len({p.shape[:2] for p in map(np.asarray, panels)}) != 1:
-        raise InputError(f"side_by_side: videos differ in length or height: {[np.shape(p) for p in panels]}")
+    panels = [_as_bytes(panel) for panel in panels]
+    if len({panel.shape[:2] for panel in panels}) != 1:
+        raise InputError(f"side_by_side: videos differ in length or height: {[p.shape for p in panels]}")
+    if len(labels) != len(panels):
+        raise InputError(f"side_by_side: {len(labels)} labels for {len(panels)} videos")
     columns = []
     for panel, label in zip(panels, labels, strict=True):
-        pixels = (np.clip(np.asarray(panel), 0, 1) * 255).round().astype(np.uint8)
-        pixels = pixels.repeat(magnify, axis=1).repeat(magnify, axis=2)
-        head = Image.new("RGB", (pixels.shape[2], _LABEL), "white")
-        ImageDraw.Draw(head).text((4, 2), label, fill="black", font=ImageFont.load_default(size=12))
-        columns.append(np.concatenate([np.broadcast_to(np.asarray(head), (len(pixels), _LABEL, *pixels.shape[2:])), pixels], 1))
-    video = np.concatenate(columns, axis=2)
-    even = [(0, n % 2) for n in video.shape[1:3]]
-    return np.pad(video, [(0, 0), *even, (0, 0)], mode="edge")
+        pixels = panel.repeat(magnify, axis=1).repeat(magnify, axis=2)
+        head = np.broadcast_to(
+            _heading(label, pixels.shape[2]), (len(pixels), _LABEL_HEIGHT, *pixels.shape[2:])
+        )
+        columns.append(np.concatenate([head, pixels], axis=1))
+    return _even(np.concatenate(columns, axis=2))
 
 
 def write_mp4(path: str | Path, video: np.ndarray, frame_rate: float) -> None:
-    """Encode a uint8 video (T, H, W, 3) as H.264; the same frames give the same bytes."""
+    """Encode a video as H.264; the same frames give the same bytes.
+
+    Args:
+        path: file to write, with the ending mp4.
+        video: uint8, or floats in [0, 1], shape (T, H, W, 3).
+        frame_rate: frames a second.
+
+    Raises:
+        InputError: no frames, or another shape.
+    """
+    video = _even(_as_bytes(video))
+    if len(video) == 0:
+        raise InputError(f"{path}: there are no frames to write")
     with imageio.get_writer(
         path,
         format="FFMPEG",
@@ -48,13 +67,44 @@ def write_mp4(path: str | Path, video: np.ndarray, frame_rate: float) -> None:
         fps=frame_rate,
         codec="libx264",
         macro_block_size=2,
-        output_params=["-crf", "18", "-preset", "medium", "-fflags", "+bitexact", "-flags:v", "+bitexact", "-threads", "1"],
+        output_params=["-crf", "18", "-preset", "medium", *_REPEATABLE],
     ) as writer:
         for frame in video:
             writer.append_data(frame)
 
 
 def strip(video: np.ndarray, count: int = 6) -> np.ndarray:
-    """Evenly spaced frames of a video (T, H, W, 3) side by side, (H, count * W, 3)."""
+    """Evenly spaced frames of a video (T, H, W, 3), first and last among them, as (H, count * W, 3)."""
     index = np.linspace(0, len(video) - 1, min(count, len(video))).round().astype(int)
-    return np.concatenate([video[i] for i in index], axis=1)
+    return np.concatenate([np.asarray(video[i]) for i in index], axis=1)
+
+
+def write_strips(path: str | Path, videos: Sequence[np.ndarray], count: int = 6) -> None:
+    """Strips of several videos (T, H, W, 3) of one size, one below the other, as a PNG without metadata."""
+    rows = [_as_bytes(strip(video, count)[None])[0] for video in videos]
+    if len({row.shape for row in rows}) != 1:
+        raise InputError(f"{path}: strips of different sizes {[row.shape for row in rows]}")
+    Image.fromarray(np.concatenate(rows)).save(path, format="PNG")
+
+
+def _as_bytes(video: np.ndarray) -> np.ndarray:
+    """A video as uint8; floats are taken to be in [0, 1]."""
+    video = np.asarray(video)
+    if video.ndim != 4 or video.shape[3] != 3:
+        raise InputError(f"video: shape {video.shape}; expected frames (T, H, W, 3)")
+    if video.dtype == np.uint8:
+        return video
+    if not np.isfinite(video).all():
+        raise InputError("video: a frame holds values that are not finite")
+    return (np.clip(video, 0, 1) * 255).round().astype(np.uint8)
+
+
+def _heading(label: str, width: int) -> np.ndarray:
+    head = Image.new("RGB", (width, _LABEL_HEIGHT), "white")
+    ImageDraw.Draw(head).text((4, 2), label, fill="black", font=ImageFont.load_default(size=12))
+    return np.asarray(head)
+
+
+def _even(video: np.ndarray) -> np.ndarray:
+    height, width = video.shape[1:3]
+    return np.pad(video, [(0, 0), (0, height % 2), (0, width % 2), (0, 0)], mode="edge")

@@ -118,6 +118,10 @@ class GaussianFitReport:
     train_psnr_object: float
 
 
+EPS2D = 0.3
+"""Variance that a pixel adds to a splat during the fit [px^2], as usual in Gaussian splatting."""
+
+
 def fit_gaussians(
     images: Tensor,
     cameras: Cameras,
@@ -135,7 +139,7 @@ def fit_gaussians(
         progress: called with (iteration, loss) after each iteration.
 
     Returns:
-        The kernels, without gradient, and a report.
+        The kernels, without gradient and with the pixels' blur absorbed (render them with ``eps2d=0``), and a report.
 
     Raises:
         InputError: shapes disagree, or a mask is empty.
@@ -177,7 +181,7 @@ def fit_gaussians(
             progress(iteration, loss)
 
     everything = kernels.gaussians()
-    gaussians = everything.cull(settings.cull_opacity)
+    gaussians = everything.cull(settings.cull_opacity).absorbing_blur(cameras, EPS2D)
     psnr, psnr_object = evaluate(gaussians, images, cameras, held_out)
     train_psnr, train_psnr_object = evaluate(gaussians, images, cameras, fitted)
     report = GaussianFitReport(
@@ -203,7 +207,7 @@ def evaluate(gaussians: Gaussians, images: Tensor, cameras: Cameras, views: list
         camera = cameras[view]
         picture, _ = rasterize(
             gaussians.means[None], covars[None], gaussians.opacities, sh, camera.viewmats, camera.Ks,
-            camera.width, camera.height,
+            camera.width, camera.height, eps2d=0.0,
         )  # fmt: skip
         rgba = images[view]
         error = (picture[0, 0].clamp(0, 1) - (rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:])) ** 2
@@ -416,6 +420,7 @@ class _Kernels:
             cameras.width,
             cameras.height,
             background=background,
+            eps2d=EPS2D,
             statistics=self.statistics,
             workspace=self.workspace,
         )

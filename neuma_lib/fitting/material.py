@@ -89,9 +89,9 @@ class MaterialSettings:
         checkpoint_every: iterations between checkpoints.
     """
 
-    iterations: int = 100
-    lr_elastic: float = 0.05
-    lr_plastic: float = 0.005
+    iterations: int = 50
+    lr_elastic: float = 0.02
+    lr_plastic: float = 0.002
     lr_floor: float = 0.05
     betas: tuple[float, float] = (0.9, 0.99)
     gradient_clip: float = 1.0

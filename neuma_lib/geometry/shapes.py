@@ -314,9 +314,8 @@ def _cat() -> Shape:
     paws = mirrored_x(sphere((0.045, 0.022, 0.09), 0.045))
     return Shape(
         parts={
-            "body": union(0.03, body, legs, head, ears),
+            "body": union(0.018, union(0.03, body, legs, head, ears), muzzle),
             "thighs": thighs,
-            "muzzle": muzzle,
             "tail": tail,
         },
         blend=0.018,

@@ -1,10 +1,11 @@
-"""A watertight surface of a static object from its silhouettes, around the Gaussians fitted to the same views.
+"""A watertight surface of a static object from its silhouettes, around the Gaussians fitted to the same
+views.
 
 The body is carved (space carving, visual hull): a point belongs to it when every camera sees it inside the
-silhouette. Each alpha matte becomes a signed distance to its half-covered contour, which is known to a small part
-of a pixel; the least of the back-projected distances over the views is close to the signed distance of the hull,
-so the surface lies more finely than pixels or voxels. What no silhouette shows, a dent seen only by its shading,
-stays filled. The Gaussians say where to look.
+silhouette. Each alpha matte becomes a signed distance to its half-covered contour, which is known to a
+small part of a pixel; the least of the back-projected distances over the views is close to the signed
+distance of the hull, so the surface lies more finely than pixels or voxels. What no silhouette shows, a
+dent seen only by its shading, stays filled. The Gaussians say where to look.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ from neuma_lib.render.gaussians import Gaussians
 Array = NDArray[np.float64]
 
 _COARSE_RESOLUTION = 32
-"""Voxels along the longest side of the first look, which finds the body's box and the band around its surface."""
+"""Voxels along the longest side of the first look, which finds the body's box and the band around its
+surface."""
 _CONTOUR_STEPS = 8
 """Points on each segment of a contour; a segment is at most a pixel's diagonal long."""
 
@@ -94,8 +96,8 @@ def reconstruct(
         Watertight mesh in the world frame [m], one body without inner cavities, oriented outwards.
 
     Raises:
-        InputError: images that do not fit the cameras, an empty matte, mattes that share no point of space, or an
-            unknown setting.
+        InputError: images that do not fit the cameras, an empty matte, mattes that share no point of space,
+            or an unknown setting.
     """
     settings = _settings(settings)
     if tuple(images.shape) != (len(cameras), cameras.height, cameras.width, 4):
@@ -140,15 +142,21 @@ def _settings(given: SurfaceSettings | Mapping[str, Any] | None) -> SurfaceSetti
 
 
 def _silhouettes(alpha: Tensor, level: float) -> Tensor:
-    """Signed distances [px] at the pixel centres to the contours of the mattes, positive inside, (V, H, W)."""
+    """Signed distances [px] at the pixel centres to the contours of the mattes, positive inside, (V, H,
+    W)."""
     distances = []
     for view, matte in enumerate(alpha.numpy()):
         if not np.isfinite(matte).all():
             raise InputError(f"surface: the alpha of view {view} holds values that are not finite")
         if not (matte > level).any():
             raise InputError(
-                f"surface: the mask of view {view} is empty (no alpha above {level}); remove the view or matte it "
-                "again"
+                f"surface: the mask of view {view} is empty (no alpha above {level}); remove the view or "
+                "make its matte again"
+            )
+        if (matte > level).all():
+            raise InputError(
+                f"surface: the mask of view {view} covers the whole frame, so it shows no outline; images "
+                "need an alpha matte of the object"
             )
         distances.append(_distance_to_contour(matte, level))
     return torch.from_numpy(np.stack(distances))
@@ -160,14 +168,11 @@ def _distance_to_contour(matte: Array, level: float) -> Array:
     The matte is continued beyond the frame as it is at its edge, where a body may be cut off.
     """
     contours = find_contours(np.pad(matte, 1, mode="edge"), level)
-    inside = matte > level
-    if not contours:
-        return np.full(matte.shape, float(max(matte.shape)))
     along = np.arange(_CONTOUR_STEPS)[:, None, None] / _CONTOUR_STEPS
     pieces = [((1 - along) * line[:-1] + along * line[1:]).reshape(-1, 2) for line in contours]
     pixels = np.stack(np.indices(matte.shape), axis=-1).reshape(-1, 2) + 1.0
     distance, _ = cKDTree(np.concatenate(pieces)).query(pixels)
-    return np.where(inside, 1.0, -1.0) * distance.reshape(matte.shape)
+    return np.where(matte > level, 1.0, -1.0) * distance.reshape(matte.shape)
 
 
 def _distance_inside(points: Array, silhouettes: Tensor, cameras: Cameras) -> Array:
@@ -214,12 +219,12 @@ def _locate(gaussians: Gaussians, silhouettes: Tensor, cameras: Cameras) -> tupl
         lower, upper = middle - 2 * half, middle + 2 * half
     if (distance > -grid.spacing).any():
         raise InputError(
-            "surface: the masks do not bound a body; more views from other directions, or masks that the frame "
-            "does not cut, are needed"
+            "surface: the masks do not bound a body; more views from other directions, or masks that the "
+            "frame does not cut, are needed"
         )
     raise InputError(
-        "surface: no point of space lies inside all masks; check that they show the object alone and that the "
-        "camera poses belong to these images"
+        "surface: no point of space lies inside all masks; check that they show the object alone and that "
+        "the camera poses belong to these images"
     )
 
 
@@ -228,7 +233,11 @@ def _one_solid_body(field: Array) -> Array:
     field = np.pad(field, 1, constant_values=min(float(field.min()), -1e-6))
     bodies, count = ndimage.label(field > 0)
     if count == 0:
-        raise InputError("surface: the body is thinner than a voxel; raise geometry.surface.resolution")
+        raise InputError(
+            "surface: no point of space lies inside all masks; check that they show the object alone and "
+            "that the camera poses belong to these images (a body thinner than a voxel needs a higher "
+            "geometry.surface.resolution)"
+        )
     largest = 1 + int(np.argmax(np.bincount(bodies.ravel())[1:]))
     filled = ndimage.binary_fill_holes(bodies == largest)
     return np.where(filled, np.maximum(field, -field), np.minimum(field, -field))

@@ -46,8 +46,8 @@ def check_mesh(mesh: trimesh.Trimesh, name: str = "mesh") -> None:
 def inside(mesh: trimesh.Trimesh, points: Array) -> NDArray[np.bool_]:
     """Which points lie inside a closed mesh.
 
-    A ray from each point along +z counts the faces that it leaves and enters through. Overlapping closed parts
-    count as one body.
+    A ray from each point along +z counts the faces that it leaves and enters through. Overlapping closed
+    parts count as one body.
 
     Args:
         mesh: watertight, oriented outwards [m].
@@ -107,8 +107,8 @@ class _Columns:
     def _crossings(self, points: Array, face: NDArray[np.int64]) -> Array:
         """+1 where the upward ray of a point leaves through the face, -1 where it enters, 0 elsewhere.
 
-        The side of a point with respect to an edge is computed from the edge's ends in one order for both faces
-        that share it, and a point on the edge belongs to one side: exactly one of the two faces is hit.
+        The side of a point with respect to an edge is computed from the edge's ends in one order for both
+        faces that share it, and a point on the edge belongs to one side: exactly one of the two faces is hit.
         """
         corners = self.corners[face]
         x, y = points[:, 0], points[:, 1]
@@ -166,8 +166,8 @@ def sample_volume(
             break
     if abs(len(best) - count) > 0.05 * count:
         raise InputError(
-            f"volume sampling: {len(best)} points at best where {count} were asked for; a jittered grid cannot "
-            "hit so small a count in this body, use the uniform method or more points"
+            f"volume sampling: {len(best)} points at best where {count} were asked for; a jittered grid "
+            "cannot hit so small a count in this body, use the uniform method or more points"
         )
     return best
 
@@ -199,8 +199,8 @@ def _uniform(columns: _Columns, mesh: trimesh.Trimesh, count: int, rng: np.rando
 def volume_iou(a: trimesh.Trimesh, b: trimesh.Trimesh, resolution: int = 96) -> float:
     """Volume of the intersection over that of the union.
 
-    Measured on a jittered grid with ``resolution`` cells along the longest side of the common bounding box, which
-    is accurate to about 1e-3 at the default.
+    Measured on a jittered grid with ``resolution`` cells along the longest side of the common bounding box,
+    which is accurate to about 1e-3 at the default.
 
     Raises:
         InputError: a mesh without an inside.

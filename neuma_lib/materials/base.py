@@ -47,11 +47,13 @@ class Constitutive(nn.Module):
         return value if out is None else out.copy_(value)
 
     def evaluate_with_cache(
-        self, F: Tensor, weights: Weights, out: Tensor | None = None
+        self, F: Tensor, weights: Weights, out: Tensor | None = None, cache: Any = None
     ) -> tuple[Tensor, Any]:
-        """As :meth:`evaluate`, and an opaque cache that spares :meth:`vjp` the recomputation.
+        """As `evaluate`, and an opaque cache that spares `vjp` the recomputation.
 
-        The cache owns its memory (several can be kept); None where a law has nothing to keep.
+        The cache owns its memory, so that several can be kept. One that this method returned for as many rows
+        and that is no longer needed can be given back as `cache` to be filled again. None where a law keeps
+        nothing.
         """
         return self.evaluate(F, weights, out), None
 

@@ -147,25 +147,24 @@ class NeuralConstitutive(Constitutive):
         return R @ X @ F.mT if self.kind == "elasticity" else F + self.scale * (R @ X)
 
     def evaluate(self, F: Tensor, weights: Weights, out: Tensor | None = None) -> Tensor:
-        return self._evaluate(F, weights, out, keep=False)[0]
+        return self._evaluate(F, weights, out)
 
-    def evaluate_with_cache(self, F, weights, out=None):
-        return self._evaluate(F, weights, out, keep=True)
+    def evaluate_with_cache(self, F, weights, out=None, cache=None):
+        cache = cache or [_Forward.like(F[rows]) for rows in _chunks(F)]
+        return self._evaluate(F, weights, out, cache), cache
 
     @torch.no_grad()
-    def _evaluate(self, F, weights, out, keep):
+    def _evaluate(self, F, weights, out, states=None):
         F = F.detach().contiguous()
         out = torch.empty_like(F) if out is None else out
         result, _, _ = output_kernels(F.dtype, self.kind)
-        states = []
-        for rows in _chunks(F):
-            state = _Forward.like(F[rows]) if keep else _scratch.get(_Forward, F[rows])
+        for index, rows in enumerate(_chunks(F)):
+            state = states[index] if states else _scratch.get(_Forward, F[rows])
             F_view = self._network(F[rows], weights, state)
             _launch(
                 result, F[rows], F_view, state.views["R"], state.views["Y"], self.scale, _matrices(out[rows])
             )
-            states.append(state)
-        return out, (states if keep else None)
+        return out
 
     def _network(self, F: Tensor, weights: Weights, state: _Forward) -> wp.array:
         """Fill ``state`` from the rows F; returns Warp's view of F."""

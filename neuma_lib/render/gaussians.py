@@ -7,6 +7,7 @@ import dataclasses
 import torch
 
 from neuma_lib.errors import InputError
+from neuma_lib.render.cameras import Cameras
 from neuma_lib.render.sh import MAX_DEGREE, coefficient_count
 
 
@@ -71,6 +72,20 @@ class Gaussians:
     def covars(self) -> torch.Tensor:
         """(G, 3, 3) covariances A_0 = R S^2 R^T [m^2]."""
         return covariances(self.quats, self.scales)
+
+    def absorbing_blur(self, cameras: Cameras, eps2d: float) -> Gaussians:
+        """The kernels with the blur of the cameras' pixels as a part of their own size.
+
+        Splatting widens every projected kernel by a pixel's variance ``eps2d`` [px^2]. Kernels that were fitted
+        under one set of cameras would therefore look larger through cameras with larger pixels, by up to a pixel
+        at the silhouette. Here each kernel grows by what ``eps2d`` was worth in the mean camera, in metres; rendered
+        with ``eps2d=0`` they look the same through those cameras, and keep their size through all others (the idea
+        of Mip-Splatting's 3D smoothing filter, Yu et al. 2024).
+        """
+        _, depth = cameras.project(self.means)
+        focal = cameras.Ks[:, 0, 0].to(depth)
+        blur = eps2d * (depth / focal[:, None]).square().mean(dim=0)
+        return dataclasses.replace(self, scales=(self.scales.square() + blur[:, None]).sqrt())
 
     def cull(self, min_opacity: float) -> Gaussians:
         """Those with opacity above ``min_opacity`` (the paper uses 0.02)."""

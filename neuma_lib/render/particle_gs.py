@@ -24,6 +24,7 @@ class ParticleGS:
         cameras: V views.
         background: colour behind the kernels.
         covariance_gradient: whether gradients reach the particles through the covariances as well as the means.
+        eps2d: variance that a pixel adds to a splat [px^2]; kernels of `fit_gaussians` hold it already.
     """
 
     def __init__(
@@ -34,9 +35,10 @@ class ParticleGS:
         cameras: Cameras,
         background: tuple[float, float, float] = (1.0, 1.0, 1.0),
         covariance_gradient: bool = True,
+        eps2d: float = 0.0,
     ):
         self.gaussians, self.binding, self.x0, self.cameras = gaussians, binding, x0, cameras
-        self.background, self.covariance_gradient = background, covariance_gradient
+        self.background, self.covariance_gradient, self.eps2d = background, covariance_gradient, eps2d
         with torch.no_grad():
             self._covars0 = gaussians.covars()
             self._sh = gaussians.sh()
@@ -66,6 +68,7 @@ class ParticleGS:
             self.cameras.width,
             self.cameras.height,
             background=self.background,
+            eps2d=self.eps2d,
         )
         return images
 

@@ -57,7 +57,7 @@ class Simulation:
         limit = KEEP[keep]
         self._keeps = differentiable and steps > 0 and step_bytes * steps <= limit
         self._cache_bytes = limit - step_bytes * steps if self._keeps else 0
-        self._caches: dict[tuple[str, int, int], Any] = {}
+        self._cached: set[tuple[str, int, int]] = set()
         self._lease = WorkspaceLease(
             Layout(
                 model=model,
@@ -162,9 +162,11 @@ class Simulation:
             here = slice(body.start, body.stop)
             law, own = getattr(body.law, part), self._own(part, body, weights)
             if cache or self._cache_bytes > 0:
-                _, kept = law.evaluate_with_cache(F[here], own, out[here])
-                self._caches[part, n, index] = kept
-                self._cache_bytes -= _bytes(kept)
+                key = self._cache_key(part, n, body)
+                caches = self.workspace.caches
+                _, caches[key] = law.evaluate_with_cache(F[here], own, out[here], caches.get(key))
+                self._cached.add((part, n, index))
+                self._cache_bytes -= _bytes(caches[key])
             else:
                 law.evaluate(F[here], own, out[here])
 
@@ -181,14 +183,19 @@ class Simulation:
         """Adjoint of `_evaluate`; sets grad_F and adds to grad_weights."""
         for index, body in enumerate(self.bodies):
             here = slice(body.start, body.stop)
+            cached = (part, n, index) in self._cached
             getattr(body.law, part).vjp(
                 F[here],
                 self._own(part, body, weights),
                 grad_out[here],
-                cache=self._caches.pop((part, n, index), None),
+                cache=self.workspace.caches[self._cache_key(part, n, body)] if cached else None,
                 grad_F=grad_F[here],
                 grad_weights=self._own(part, body, grad_weights),
             )
+
+    def _cache_key(self, part: str, n: int, body: Body) -> tuple:
+        """Name of a cache that any law of the same type and range of particles can use again."""
+        return type(getattr(body.law, part)), body.start, body.stop, self.workspace.kept(n)
 
     def _own(self, part: str, body: Body, values: Sequence[Tensor]) -> Weights:
         """Those of the flat list of weights (or of their gradients) that belong to a part of a body's law."""

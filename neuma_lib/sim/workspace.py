@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
@@ -46,11 +46,13 @@ class Workspace:
         mass, vol0: particle masses [kg] and initial volumes [m^3], shape (N,).
         faults: first step and particle of a non-finite value and of one outside the grid, shape (2,).
         grad_*: gradients of the above for one step, without a slot axis.
+        caches: what the laws keep of their evaluations, owned here so that the next rollout can overwrite it.
     """
 
     def __init__(self, layout: Layout):
         self.layout = layout
         self._views: dict[int, wp.array] = {}
+        self.caches: dict[tuple, Any] = {}
         N, nodes = layout.particles, layout.model.grid**3
         states, kept = layout.states, layout.kept
         self.x, self.v = self._vectors(states, N), self._vectors(states, N)

@@ -9,6 +9,7 @@ sys.path.insert(0, str(ROOT))
 
 from neuma_lib.config import load
 from neuma_lib.errors import InputError
+from neuma_lib.owner import claim
 from neuma_lib.provenance import code_digest
 
 try:
@@ -28,6 +29,7 @@ GPU = int(WANTS_CUDA[SETTINGS.device])
 # Scripts are processes of their own: they find the library, share one kernel cache, and keep to one thread each
 # (two OpenMP threads on a busy machine are far slower than one).
 os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+claim()  # a killed Snakemake takes its scripts with it
 os.environ["NEUMA_KERNEL_CACHE"] = str(Path(SETTINGS.kernel_cache).resolve())
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"):
     os.environ.setdefault(variable, "1")

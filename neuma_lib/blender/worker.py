@@ -1,4 +1,4 @@
-"""The Blender process: ``python -m neuma_lib.blender job.npz`` renders a job of `neuma_lib.blender.scene`.
+"""The Blender process: ``python -m neuma_lib.blender.worker job.npz`` renders a job of `neuma_lib.blender.scene`.
 
 Prints the number of finished images, a line each, on standard output; Blender's own chatter goes to standard error.
 """
