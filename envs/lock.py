@@ -20,7 +20,16 @@ HEADER = "# Made by `make lock` from the pins in pyproject.toml; do not edit.\n"
 
 def resolve(extras: list[str]) -> list[str]:
     """Exact requirements of the project with some extras, one a line, sorted."""
-    command = [sys.executable, "-m", "piptools", "compile", "--quiet", "--dry-run", "--no-header", "--no-annotate"]
+    command = [
+        sys.executable,
+        "-m",
+        "piptools",
+        "compile",
+        "--quiet",
+        "--dry-run",
+        "--no-header",
+        "--no-annotate",
+    ]
     command += ["--strip-extras", "--no-emit-index-url", "--no-emit-find-links", "--no-emit-trusted-host"]
     command += ["--allow-unsafe", "--resolver=backtracking", "--output-file=-"]
     command += [f"--extra={extra}" for extra in extras]

@@ -70,7 +70,10 @@ def simulate_ground_truth(
     model.check_courant(law, density)
     points = sample_volume(mesh, particles, seed=seed)
     x0 = torch.as_tensor(points, dtype=torch.float32)
-    start = [torch.as_tensor(sample_tracers(mesh, tracers, seed=seed + 1 + k), dtype=torch.float32) for k in range(2)]
+    start = [
+        torch.as_tensor(sample_tracers(mesh, tracers, seed=seed + 1 + k), dtype=torch.float32)
+        for k in range(2)
+    ]
     vol0 = float(mesh.volume) / len(x0)
     share = torch.full((len(x0),), vol0, dtype=torch.float32)
     with torch.no_grad():

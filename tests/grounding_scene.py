@@ -45,7 +45,9 @@ def ball(height: float = 0.3, count: int = 300, gaussians: int = 120, seed: int 
 def camera(size: int = 32, dtype=torch.float64) -> Cameras:
     """One frontal view of the whole fall."""
     eye = torch.tensor([[0.5, 0.3, 2.0]], dtype=dtype)
-    view = look_at(eye, torch.tensor([0.5, 0.25, 0.5], dtype=dtype), torch.tensor([0.0, 1.0, 0.0], dtype=dtype))
+    view = look_at(
+        eye, torch.tensor([0.5, 0.25, 0.5], dtype=dtype), torch.tensor([0.0, 1.0, 0.0], dtype=dtype)
+    )
     f = 1.8 * size
     K = torch.tensor([[[f, 0, size / 2], [0, f, size / 2], [0, 0, 1]]], dtype=dtype)
     return Cameras(view, K, size, size)

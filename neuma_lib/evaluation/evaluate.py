@@ -119,6 +119,7 @@ def evaluate(
         "chamfer_per_frame": [float(c) for c in chamfer],
         "chamfer_floor_per_frame": [float(c) for c in floor],
         "tracer_rmse_mm_per_frame": [float(e) for e in rmse],
+        "courant": model.courant(law, body.density),
         "diverged_at_step": failed_at,
     }
     return Evaluation(path, predicted, metrics)

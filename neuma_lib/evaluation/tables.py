@@ -176,3 +176,47 @@ def report_table(
         cells = [f"{row[key]:d}" if isinstance(row[key], int) else f"{row[key]:.4g}" for key in columns]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return out.getvalue(), "\n".join(lines) + "\n"
+
+
+def learning_rate_table(rows: Sequence[Mapping]) -> tuple[str, str, dict[str, float]]:
+    """Compare learning rates: what every method reaches on every scene.
+
+    Args:
+        rows: one run each, with method, scene, lr_scale, loss (its history), best_loss, stable, recoveries and
+            chamfer_excess.
+
+    Returns:
+        CSV, Markdown, and for each method the factor whose best training loss, relative to the loss of the prior and
+        averaged over the scenes geometrically, is lowest.
+    """
+    header = (
+        "method",
+        "lr_scale",
+        "scene",
+        "loss of the prior",
+        "best loss",
+        "ratio",
+        "recoveries",
+        "stable",
+        "excess",
+    )
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(header)
+    lines = [f"| {' | '.join(header)} |", f"|{'---|' * len(header)}"]
+    logs: dict[str, dict[float, list[float]]] = {}
+    for row in rows:
+        first, best = row["loss"][0], row["best_loss"]
+        logs.setdefault(row["method"], {}).setdefault(row["lr_scale"], []).append(math.log(best / first))
+        cells = (
+            row["method"], f"{row['lr_scale']:g}", row["scene"], f"{first:.3e}", f"{best:.3e}", f"{best / first:.4f}",
+            len(row["recoveries"]), "yes" if row["stable"] else "no", f"{row['chamfer_excess']:.3f}",
+        )  # fmt: skip
+        writer.writerow(cells)
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    chosen = {
+        method: min(scales, key=lambda scale: sum(scales[scale]) / len(scales[scale]))
+        for method, scales in logs.items()
+    }
+    lines += ["", "Best by training loss: " + ", ".join(f"{m} ×{s:g}" for m, s in chosen.items()) + "."]
+    return out.getvalue(), "\n".join(lines) + "\n", chosen

@@ -136,7 +136,7 @@ class TrainedMaterial:
 
 
 def frame_weights(iteration: int, count: int, settings: MaterialSettings) -> Tensor:
-    """Weights of the frames, shape (count,): d^k with k the part of the video, d rising to 1 over a third of training."""
+    """Weights of the frames, shape (count,): d^k, k the part of the video; d rises to 1 over a third of training."""
     rise = min(1.0, iteration / max(1.0, settings.iterations / 3))
     d = settings.frame_weight_start + (1 - settings.frame_weight_start) * rise
     part = torch.arange(count) * settings.frame_weight_periods // max(count, 1)
@@ -170,8 +170,9 @@ def train_material(
 
     Raises:
         NonFiniteError: the very first rollout is not finite, so there is no good state to return to.
-        InputError: the law has nothing to train.
+        InputError: the law has nothing to train, or is too stiff for the time step.
     """
+    model.check_courant(law, body.density)
     loop = _Loop(model, law, body, v0, loss, settings, log)
     if checkpoint is not None and (state := checkpoint.load()) is not None:
         loop.load_state_dict(state)
@@ -184,7 +185,9 @@ def train_material(
             checkpoint.save(loop.state_dict())
     loop.judge_last_step()
     law.load_state_dict(loop.best["law"])
-    return TrainedMaterial(law, loop.history, loop.best["loss"], loop.best["iteration"], stable=not loop.ended)
+    return TrainedMaterial(
+        law, loop.history, loop.best["loss"], loop.best["iteration"], stable=not loop.ended
+    )
 
 
 class Checkpoint(Protocol):
@@ -225,7 +228,9 @@ class _Loop:
             if not math.isfinite(value):
                 raise NonFiniteError("material", f"the loss is not finite at iteration {self.iteration}")
             if value > self.settings.diverged_ratio * max(self.best["loss"], 1e-12) and self.good is not None:
-                raise NonFiniteError("material", f"loss {value:.3e} against a best of {self.best['loss']:.3e}")
+                raise NonFiniteError(
+                    "material", f"loss {value:.3e} against a best of {self.best['loss']:.3e}"
+                )
             norms, weighted = self._backward(frame_losses)
         except NonFiniteError as error:
             self._recover(error)
@@ -279,7 +284,9 @@ class _Loop:
                 norm = torch.nn.utils.clip_grad_norm_(parameters, self.settings.gradient_clip)
                 norms[name] = float(norm)
                 if not math.isfinite(norms[name]):
-                    raise NonFiniteError("material", f"{name} gradient is not finite at iteration {self.iteration}")
+                    raise NonFiniteError(
+                        "material", f"{name} gradient is not finite at iteration {self.iteration}"
+                    )
         return norms, float(weighted.detach())
 
     def _step(self) -> None:
@@ -309,7 +316,9 @@ class _Loop:
         self.optimizer.load_state_dict(copy.deepcopy(self.good["optimizer"]))
         entry = {"iteration": self.iteration, "reason": str(error), "lr_scale": self.lr_scale}
         self.history.recoveries.append(entry)
-        self.log(f"iteration {self.iteration}: {error}; back to the last good state, rates x{self.lr_scale:g}")
+        self.log(
+            f"iteration {self.iteration}: {error}; back to the last good state, rates x{self.lr_scale:g}"
+        )
         if len(self.history.recoveries) > self.settings.max_recoveries:
             self.ended = True
 

@@ -35,10 +35,15 @@ class Reconstruction:
 
     @classmethod
     def of_gaussians(cls, gaussians: Gaussians, volume: float, density: float) -> Reconstruction:
-        """The kernels taken as particles (the paper's w/o Bind): one particle a kernel, equal shares of the volume [m^3]."""
+        """The kernels as particles (the paper's w/o Bind), one each, with equal shares of the volume [m^3]."""
         count = len(gaussians.means)
         vol0 = torch.full_like(gaussians.means[:, 0], volume / count)
         return cls(gaussians.means, vol0, vol0 * density, gaussians, Binding.identity(count, gaussians.means))
+
+    @property
+    def density(self) -> float:
+        """Smallest mass density of a particle [kg/m^3], where waves are fastest."""
+        return float((self.mass / self.vol0).min())
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Reconstruction:
         """The same body in another precision or on another device."""
@@ -73,7 +78,9 @@ class Observation:
 
     def __post_init__(self):
         if len(self.frames) != len(self.images):
-            raise InputError(f"{len(self.images)} images for {len(self.frames)} frames: every frame needs an image")
+            raise InputError(
+                f"{len(self.images)} images for {len(self.frames)} frames: every frame needs an image"
+            )
         if list(self.frames) != sorted(set(self.frames)):
             raise InputError(f"frames must ascend without repeats, got {self.frames}")
 

@@ -2,11 +2,11 @@
 
 Two ways lead from an analytic law to a pair of networks:
 
-- ``regression`` (default): the law is known, so its stress and return map are regressed directly, on deformation
-  gradients that cubes thrown about a box visit. One further round adds those that the networks' own rollouts
-  visit. Seconds a prior.
-- ``trajectory``: NCLaw's training (Ma et al. 2023): one thrown cube, only its particles' positions are seen, and
-  the gradient goes through the simulator. Many minutes a prior.
+- ``regression`` (default): the law is known, so its stress and return map are regressed directly, on
+  deformation gradients that cubes thrown about a box visit. One further round adds those that rollouts of
+  the networks visit. Seconds a prior.
+- ``trajectory``: NCLaw's training (Ma et al. 2023): one thrown cube, only its particles' positions are seen,
+  and the gradient goes through the simulator. Many minutes a prior.
 
 Either way the result is judged by its rollout against the law's, on throws that training has not seen.
 """
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -59,7 +59,7 @@ class RegressionSettings:
     throws: int = 8
     side_particles: int = 8
     grid: int = 20
-    duration: float = 0.4
+    duration: float = 0.45
     dt: float = 1e-3
     samples: int = 131072
     noise_low: float = 1e-3
@@ -81,7 +81,7 @@ class TrajectorySettings:
         dt: time step [s].
         side_particles: particles along the cube's edge.
         grid: grid nodes along the box.
-        reset_first, reset_last: steps after which the state is set back to the truth, in the first and last epoch.
+        reset_first, reset_last: steps from one reset to the true state to the next, first and last epoch.
         learning_rate_elastic, learning_rate_plastic: of Adam, decayed to zero by a cosine.
         gradient_clip: largest norm of each network's gradient.
     """
@@ -117,8 +117,8 @@ def train_prior(
         progress: called with (iterations done, iterations in all, loss).
 
     Returns:
-        the law, and a report of plain numbers: losses, and how its rollout differs from its law's on unseen throws
-        (``chamfer`` [1e-4 m^2], ``rmse`` [m], both means over frames and throws).
+        the law, and a report of plain numbers: losses, and how its rollout differs from its law's on unseen
+        throws, see :func:`judge`.
 
     Raises:
         InputError: unknown method, setting or material.
@@ -135,10 +135,11 @@ def train_prior(
             f"priors.{method}: unknown {', '.join(unknown)}; the settings are {', '.join(known)}"
         )
     chosen = METHODS[method](**values)
-    train = _train_by_regression if method == "regression" else _train_by_trajectory
+    train = train_by_regression if method == "regression" else train_by_trajectory
     law, report = train(spec, chosen, seed, progress or (lambda done, total, loss: None))
     report["method"] = method
-    report.update(judge(law, spec, seed=seed))
+    how = chosen if method == "regression" else RegressionSettings()
+    report.update(judge(law, spec, how, seed))
     return law, report
 
 
@@ -175,8 +176,8 @@ def longest_step(law: Law, settings: RegressionSettings) -> float:
 def random_throw(law: Law, generator: torch.Generator, settings: RegressionSettings) -> Throw:
     """A cube of random size, place, orientation, velocity and spin.
 
-    Half of the throws take half the time step, so that the trial states of both are seen; not if the law depends
-    on the rate, because a network knows one step only.
+    Half of the throws take half the time step, so that the trial states of both are seen; not if the law
+    depends on the rate, because a network knows one step only.
     """
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
@@ -236,7 +237,7 @@ def visited_stretches(throw: Throw, law: Law, every: int = 8) -> tuple[Tensor, T
 # ------------------------------------------------------------------------------------------------ regression
 
 
-def _train_by_regression(
+def train_by_regression(
     spec: Mapping[str, Any], settings: RegressionSettings, seed: int, progress: Progress
 ) -> tuple[NeuralLaw, dict[str, Any]]:
     generator = torch.Generator().manual_seed(seed)
@@ -376,7 +377,7 @@ def _law_of(networks: Mapping[str, Network]) -> NeuralLaw:
 # ------------------------------------------------------------------------------------------------ trajectory
 
 
-def _train_by_trajectory(
+def train_by_trajectory(
     spec: Mapping[str, Any], settings: TrajectorySettings, seed: int, progress: Progress
 ) -> tuple[NeuralLaw, dict[str, Any]]:
     throw = _nclaw_throw(settings)
@@ -406,7 +407,7 @@ def _train_by_trajectory(
             )  # fmt: skip
             loss = (path.x - truth.x[first + 1 : first + count + 1]).square().mean(dim=(1, 2)).sum()
             loss.backward()
-            total += float(loss)
+            total += float(loss.detach())
         for parameters, _ in groups.values():
             nn.utils.clip_grad_norm_(parameters, settings.gradient_clip)
         optimiser.step()
@@ -435,23 +436,33 @@ def _nclaw_throw(settings: TrajectorySettings) -> Throw:
 
 
 def judge(
-    law: Law, spec: Mapping[str, Any], seed: int = 0, throws: int = 3, frames: int = 20
+    law: Law,
+    spec: Mapping[str, Any],
+    settings: RegressionSettings | None = None,
+    seed: int = 0,
+    throws: int = 3,
+    frames: int = 20,
 ) -> dict[str, float]:
     """How far a law's rollouts are from those of the analytic law, on throws of their own.
 
     Returns:
-        ``chamfer`` (mean squared nearest-neighbour distance, both directions summed [1e-4 m^2]) and ``rmse`` of
-        corresponding particles [m], means over frames and throws, and ``rmse_worst``, the worst frame's.
+        ``chamfer`` (mean squared nearest-neighbour distance, both directions summed [1e-4 m^2]) and ``rmse``
+        of corresponding particles [m], means over frames and throws; ``rmse_worst``, the worst frame's [m].
     """
     generator = torch.Generator().manual_seed(10_000 + seed)
-    settings = replace(RegressionSettings(), duration=0.5)
+    settings = settings or RegressionSettings()
     chamfers, errors = [], []
     reference = reference_law(spec, settings)
     for _ in range(throws):
         throw = random_throw(reference, generator, settings)
         steps = [round(i * throw.steps / frames) for i in range(1, frames + 1)]
-        with torch.no_grad():
-            seen, truth = throw.run(law, steps), throw.run(reference, steps)
+        try:
+            with torch.no_grad():
+                seen, truth = throw.run(law, steps), throw.run(reference, steps)
+        except NonFiniteError as error:
+            raise NonFiniteError(
+                "prior", f"the trained law is unstable ({error.detail}); train it longer"
+            ) from error
         errors.append((seen.x - truth.x).square().sum(-1).mean(-1).sqrt())
         chamfers.append(float(chamfer_sequence(seen.x, truth.x).mean()))
     rmse = torch.stack(errors)

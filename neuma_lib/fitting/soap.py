@@ -1,7 +1,7 @@
 """SOAP: Adam in the eigenbasis of Shampoo's preconditioner (Vyas et al. 2024), for small matrices.
 
-A network of three small layers that has to learn rotations and kinks is ill-conditioned for Adam: at equal time
-SOAP ends with a five to ten times lower loss in the regression of priors.
+A network of three small layers that has to learn rotations and kinks is ill-conditioned for Adam: at equal
+time SOAP ends with a five to ten times lower loss in the regression of priors.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ from neuma_lib.sim import MPMModel, rollout
 from neuma_lib.sim.model import contact_clearance
 
 NUISANCE_SCALE = 0.02
-"""Constant shift [m] and relative enlargement are counted in units of this: about a velocity of 1 m/s in a few frames."""
+"""Unit of the constant shift [m] and of the relative enlargement: about 1 m/s over a few frames."""
 _TILE = 12  # side [px] of the image tiles whose residuals are taken as correlated
 
 

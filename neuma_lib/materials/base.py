@@ -16,6 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from neuma_lib.errors import NonFiniteError
+
 Weights = tuple[Tensor, ...]
 
 
@@ -136,6 +138,8 @@ class Law(nn.Module):
         tau = self.elasticity.evaluate(F.to(device), tuple(w.detach().double() for w in weights)).cpu()
         tangent = ((tau[:-1] - tau[-1]) / step).reshape(len(n), 3, 3, 3)
         Q = torch.einsum("daij,dj->dia", tangent, n)
+        if not torch.isfinite(Q).all():
+            raise NonFiniteError("wave speed", f"the tangent of law {self.name!r} at F = I is not finite")
         return float(torch.linalg.eigvalsh(0.5 * (Q + Q.mT)).max())
 
     def wave_speed(self, rho: float) -> float:

@@ -15,8 +15,8 @@ class Adaptor(nn.Module):
 
     ``Delta_l = (alpha / rank) B_l A_l`` (LoRA), or a full matrix ``D_l`` if ``rank`` is None (training the
     base weights, the paper's "w/o LoRA"). ``s_l`` is the root mean square of W0_l over that of a
-    Xavier-uniform matrix of its shape, so that one learning rate serves priors whose weights differ in size.
-    Delta is zero at the start.
+    Xavier-uniform matrix of its shape, so that one learning rate serves priors whose weights differ in size; a
+    layer of zeros (the identity as a network) counts as Xavier-sized. Delta is zero at the start.
 
     Args:
         base: the frozen weights W0_l, (out, in) each.
@@ -37,7 +37,8 @@ class Adaptor(nn.Module):
         self.scales: list[float] = []
         for W0 in base:
             rows, columns = W0.shape
-            self.scales.append(float(W0.detach().square().mean().sqrt()) / (2 / (rows + columns)) ** 0.5)
+            size = float(W0.detach().square().mean().sqrt()) / (2 / (rows + columns)) ** 0.5
+            self.scales.append(size or 1.0)
             if rank is None:
                 self.D.append(nn.Parameter(torch.zeros_like(W0)))
                 continue

@@ -160,9 +160,10 @@ class Constants(nn.Module):
                     raise InputError(
                         f"{type(self).__name__}.{name} must be a number, not {value!r}"
                     ) from None
-            if not constant.admits(float(value)):
+            number = float(value.detach()) if isinstance(value, Tensor) else value
+            if not constant.admits(number):
                 raise InputError(
-                    f"{type(self).__name__}.{name} = {float(value):g} must lie between {constant.low:g} and "
+                    f"{type(self).__name__}.{name} = {number:g} must lie between {constant.low:g} and "
                     f"{constant.high:g} {constant.unit}"
                 )
             self.values[name] = value

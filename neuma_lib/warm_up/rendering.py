@@ -17,7 +17,9 @@ def compile_kernels(device: torch.device) -> None:
         opacities = torch.full((4,), 0.5, dtype=dtype, device=device)
         sh = torch.zeros(4, 4, 3, dtype=dtype, device=device)
         K = torch.tensor([[[16.0, 0.0, 8.0], [0.0, 16.0, 8.0], [0.0, 0.0, 1.0]]])
-        viewmats = look_at(torch.tensor([[0.5, 0.5, 2.0]]), torch.full((3,), 0.5), torch.tensor([0.0, 1.0, 0.0]))
+        viewmats = look_at(
+            torch.tensor([[0.5, 0.5, 2.0]]), torch.full((3,), 0.5), torch.tensor([0.0, 1.0, 0.0])
+        )
         camera = Cameras(viewmats, K, 16, 16).to(device, dtype)
         images, _ = rasterize(means, covars, opacities, sh, camera.viewmats, camera.Ks, 16, 16)
         images.sum().backward()

@@ -93,10 +93,24 @@ def prior_file(name):
     return f"{RESULTS}/priors/{name}.safetensors" if name in SETTINGS.priors.laws else name
 
 
-def table_metrics(table):
-    """Metrics of every cell of a table."""
+def table_files(table, name):
+    """A file of every cell of a table, row by row."""
     rows = SETTINGS.tables[table]
-    return [f"{RESULTS}/{scene}/{method}/metrics.json" for method in rows.methods for scene in rows.scenes]
+    return [f"{RESULTS}/{scene}/{method}/{name}" for method in rows.methods for scene in rows.scenes]
+
+
+def table_cells(table):
+    """Method, learning-rate factor and scene of every cell of a table, in the order of `table_files`."""
+    rows = SETTINGS.tables[table]
+    return [
+        {
+            "method": method.partition("+")[0],
+            "lr_scale": SETTINGS.method_material(scene, method).lr_scale,
+            "scene": scene,
+        }
+        for method in rows.methods
+        for scene in rows.scenes
+    ]
 
 
 def table_titles(table):

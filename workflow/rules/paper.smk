@@ -5,7 +5,7 @@ SCENES = list(SETTINGS.tables["table1"].scenes) if "table1" in SETTINGS.tables e
 
 rule table1:
     input:
-        metrics=lambda wildcards: table_metrics("table1"),
+        metrics=lambda wildcards: table_files("table1", "metrics.json"),
     output:
         csv=report(f"{RESULTS}/table1.csv", caption="../report/table1.rst", category="Tables"),
         markdown=f"{RESULTS}/table1.md",
@@ -30,7 +30,7 @@ rule table1:
 
 rule initial_states:
     input:
-        reports=expand(f"{RESULTS}/{{scene}}/initial_state.json", scene=SCENES),
+        reports=expand(f"{RESULTS}/{{scene}}/initial_state.json", scene=SETTINGS.scenes),
     output:
         csv=report(f"{RESULTS}/initial_states.csv", caption="../report/initial_states.rst", category="Tables"),
         markdown=f"{RESULTS}/initial_states.md",
@@ -46,10 +46,35 @@ rule initial_states:
         mem_mb=1000,
         runtime=5,
     params:
-        scenes=SCENES,
+        scenes=list(SETTINGS.scenes),
         code=code("initial_states"),
     script:
         "../scripts/initial_states.py"
+
+
+rule learning_rates:
+    input:
+        histories=lambda wildcards: table_files("learning_rates", "history.json"),
+        metrics=lambda wildcards: table_files("learning_rates", "metrics.json"),
+    output:
+        csv=f"{RESULTS}/learning_rates.csv",
+        markdown=f"{RESULTS}/learning_rates.md",
+    log:
+        f"{LOGS}/learning_rates.log",
+    benchmark:
+        f"{BENCHMARKS}/learning_rates.tsv"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        gpu=0,
+        mem_mb=1000,
+        runtime=5,
+    params:
+        cells=lambda wildcards: table_cells("learning_rates"),
+        code=code("learning_rates"),
+    script:
+        "../scripts/learning_rates.py"
 
 
 rule timings:

@@ -18,6 +18,7 @@ def main(inputs, report_file: str, params, run) -> None:
     )
     error = np.asarray(velocity["v0"]) - np.asarray(scene["velocity"])
     in_camera = np.asarray(velocity["camera_axes"]) @ error
+    free = np.asarray(velocity["without_ridge"]["v0"]) - np.asarray(scene["velocity"])
     speed = float(np.linalg.norm(scene["velocity"]))
     added = int(attributes["added"])
     report = {
@@ -33,6 +34,7 @@ def main(inputs, report_file: str, params, run) -> None:
         "velocity_true": scene["velocity"],
         "velocity_error_in_plane_percent": float(100 * np.linalg.norm(in_camera[:2]) / speed),
         "velocity_error_depth": float(in_camera[2]),
+        "velocity_error_depth_without_ridge": float(np.asarray(velocity["camera_axes"])[2] @ free),
         "velocity_std_depth": velocity["std_camera"][2],
     }
     write_json(report_file, report)

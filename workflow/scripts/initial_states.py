@@ -13,6 +13,7 @@ COLUMNS = {
     "particles_added": "added by binding",
     "velocity_error_in_plane_percent": "velocity error in plane [%]",
     "velocity_error_depth": "error in depth [m/s]",
+    "velocity_error_depth_without_ridge": "without ridge [m/s]",
     "velocity_std_depth": "estimated std in depth [m/s]",
 }
 

@@ -9,16 +9,14 @@ from neuma_lib.sim import MPMModel
 
 def main(inputs, velocity_file: str, params, run) -> None:
     options = dict(params.velocity)
-    estimate = estimate_velocity(
-        MPMModel(**params.simulation),
-        load_law(inputs.prior),
-        load_body(inputs.binding, inputs.gaussians, params.density),
-        load_observation(inputs.transforms, options.pop("views")),
-        **options,
-        progress=run.progress,
-    )
-    write_json(velocity_file, estimate.as_dict())
+    model, law = MPMModel(**params.simulation), load_law(inputs.prior)
+    body = load_body(inputs.binding, inputs.gaussians, params.density)
+    video = load_observation(inputs.transforms, options.pop("views"))
+    estimate = estimate_velocity(model, law, body, video, **options, progress=run.progress)
+    free = estimate_velocity(model, law, body, video, **{**options, "ridge": 0.0})
+    write_json(velocity_file, {**estimate.as_dict(), "without_ridge": free.as_dict()})
     run.say(estimate.summary())
+    run.say(f"without the ridge: {free.summary()}")
 
 
 if __name__ == "__main__":

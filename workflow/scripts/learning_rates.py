@@ -1,0 +1,19 @@
+"""What each method reaches with each learning rate; the best is chosen by training loss, without ground truth."""
+
+from neuma_lib.evaluation.tables import learning_rate_table
+from neuma_lib.io import read_json, write_text
+from neuma_lib.progress import stage
+
+
+def main(inputs, output, params, run) -> None:
+    cells = zip(params.cells, inputs.histories, inputs.metrics, strict=True)
+    rows = [{**cell, **read_json(history), **read_json(metrics)} for cell, history, metrics in cells]
+    csv, markdown, best = learning_rate_table(rows)
+    write_text(output.csv, csv)
+    write_text(output.markdown, markdown)
+    run.say("best: " + ", ".join(f"{method} x{scale:g}" for method, scale in best.items()))
+
+
+if __name__ == "__main__":
+    with stage("learning_rates", snakemake.log[0]) as run:
+        main(snakemake.input, snakemake.output, snakemake.params, run)
