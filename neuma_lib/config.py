@@ -223,6 +223,9 @@ class EvaluationConfig(Section):
     video_view: int = Field(0, ge=0, description="view of the mp4 of prediction beside observation")
     frame_rate: int = Field(12, ge=1, description="frames a second of the mp4")
     video_magnify: int = Field(3, ge=1, description="enlargement of the mp4's pixels")
+    overview: tuple[str, ...] = Field(
+        ("BouncyBall", "RubberPawn", "ClayCat"), description="scenes of the overview picture"
+    )
 
 
 class TableConfig(Section):

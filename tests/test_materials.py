@@ -575,3 +575,26 @@ def test_plasticity_shares_or_overrides_the_elastic_constants():
     assert law.plasticity.values["E"] == E
     spec["plasticity"]["E"] = 2e5
     assert analytic_law(spec).plasticity.values["E"] == 2e5
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", PARTS)
+def test_cuda_equals_cpu(name, dtype):
+    part, F = all_parts()[name], deformations(3000).to(dtype)
+    probe = torch.randn(F.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype)
+    weights = weights_of(part, dtype)
+    on_gpu = tuple(w.cuda() for w in weights)
+    value, there = part.evaluate(F, weights), part.evaluate(F.cuda(), on_gpu)
+    eps = torch.finfo(dtype).eps
+    assert there.is_cuda
+    assert float((there.cpu() - value).abs().max()) < 256 * eps * max(
+        stiffness(part), float(value.abs().max())
+    )
+    grad_F, grad_weights = part.vjp(F, weights, probe)
+    grad_F_there, grad_weights_there = part.vjp(F.cuda(), on_gpu, probe.cuda())
+    # divided differences of nearly equal stretches lose a third of the digits, see principal._apart
+    loose = 256 * eps if name.startswith("neural") else 64 * eps ** (2 / 3)
+    assert float((grad_F_there.cpu() - grad_F).norm() / grad_F.norm()) < loose
+    for grad, other in zip(grad_weights, grad_weights_there, strict=True):
+        assert float((other.cpu() - grad).norm() / grad.norm()) < 256 * eps

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -85,6 +85,33 @@ def write_strips(path: str | Path, videos: Sequence[np.ndarray], count: int = 6)
     if len({row.shape for row in rows}) != 1:
         raise InputError(f"{path}: strips of different sizes {[row.shape for row in rows]}")
     Image.fromarray(np.concatenate(rows)).save(path, format="PNG")
+
+
+def film_strips(
+    columns: Sequence[tuple[str, Mapping[str, np.ndarray]]], count: int = 5, magnify: int = 1
+) -> np.ndarray:
+    """A still that compares videos: a block a scene, a labelled strip of frames for each of its videos.
+
+    Args:
+        columns: (heading, label -> video (T, H, W, 3)) for each block; blocks stand below each other.
+        count: frames of a strip.
+        magnify: whole factor of enlargement.
+
+    Returns:
+        uint8 image (H', W', 3).
+    """
+    blocks = []
+    for heading, videos in columns:
+        rows = [_as_bytes(strip(video, count)[None])[0] for video in videos.values()]
+        rows = [row.repeat(magnify, axis=0).repeat(magnify, axis=1) for row in rows]
+        for label, row in zip(videos, rows, strict=True):
+            blocks.append(_heading(f"{heading}: {label}", row.shape[1]))
+            blocks.append(row)
+    width = max(block.shape[1] for block in blocks)
+    blocks = [
+        np.pad(block, [(0, 0), (0, width - block.shape[1]), (0, 0)], constant_values=255) for block in blocks
+    ]
+    return np.concatenate(blocks)
 
 
 def _as_bytes(video: np.ndarray) -> np.ndarray:

@@ -138,7 +138,7 @@ def train_prior(
     train = train_by_regression if method == "regression" else train_by_trajectory
     law, report = train(spec, chosen, seed, progress or (lambda done, total, loss: None))
     report["method"] = method
-    how = chosen if method == "regression" else RegressionSettings()
+    how = chosen if method == "regression" else RegressionSettings(grid=chosen.grid, dt=chosen.dt)
     report.update(judge(law, spec, how, seed))
     return law, report
 
@@ -270,7 +270,32 @@ def train_by_regression(
             losses[part].append(network.fit(z, X, settings, generator, shown))
             networks[part] = network
             done += settings.iterations
-    return _law_of(networks), {"loss": losses, "pairs": settings.samples}
+    law = _law_of(networks)
+    report = {"loss": losses, "pairs": settings.samples}
+    report.update(plastic_errors(law, reference, plastic, generator))
+    return law, report
+
+
+def plastic_errors(
+    law: Law, reference: Law, pool: Tensor, generator: torch.Generator, count: int = 20000
+) -> dict[str, float]:
+    """Errors of a step's plastic correction F - F_trial on visited stretches (M, 3).
+
+    Returns:
+        ``elastic_error``: mean norm of the correction where the law makes none; ``yield_error``: mean norm of the
+        error over the mean norm of the correction where it makes one. Zero where there are no such states.
+    """
+    sigma = pool[torch.randint(len(pool), (count,), generator=generator)]
+    F = sigma[:, :, None] * random_rotations(count, generator)
+    true = reference.plasticity.evaluate(F, ()) - F
+    error = (law.plasticity.evaluate(F, law.plasticity.weights()) - F - true).norm(dim=(1, 2))
+    yields = true.norm(dim=(1, 2)) > 0
+    errors = {"elastic_error": 0.0, "yield_error": 0.0}
+    if bool((~yields).any()):
+        errors["elastic_error"] = float(error[~yields].mean())
+    if bool(yields.any()):
+        errors["yield_error"] = float(error[yields].mean() / true[yields].norm(dim=(1, 2)).mean())
+    return errors
 
 
 def sample_deformations(pool: Tensor, settings: RegressionSettings, generator: torch.Generator) -> Tensor:

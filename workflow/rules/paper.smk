@@ -101,6 +101,41 @@ rule timings:
         "../scripts/timings.py"
 
 
+def overview_files(pattern):
+    return expand(pattern, scene=SETTINGS.evaluation.overview)
+
+
+rule overview:
+    input:
+        kernels=kernels("rendering"),
+        transforms=overview_files(f"{DATA}/{{scene}}/dynamic/transforms.json"),
+        gaussians=overview_files(f"{RESULTS}/{{scene}}/gaussians.ply"),
+        binding=overview_files(f"{RESULTS}/{{scene}}/binding.h5"),
+        prior=overview_files(f"{RESULTS}/{{scene}}/nclaw/rollout.h5"),
+        learned=overview_files(f"{RESULTS}/{{scene}}/neuma/rollout.h5"),
+    output:
+        picture=f"{RESULTS}/figures/overview.png",
+    log:
+        f"{LOGS}/overview.log",
+    benchmark:
+        f"{BENCHMARKS}/overview.tsv"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        gpu=0,
+        mem_mb=2000,
+        runtime=10,
+    params:
+        scenes=list(SETTINGS.evaluation.overview),
+        density=[SETTINGS.scene(name).density for name in SETTINGS.evaluation.overview],
+        view=SETTINGS.evaluation.video_view,
+        shown=7,
+        code=code("overview"),
+    script:
+        "../scripts/overview.py"
+
+
 rule dataset:
     input:
         expand(
