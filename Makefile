@@ -31,17 +31,9 @@ lint: env
 	$(BIN)/snakefmt --check Snakefile workflow
 	$(BIN)/snakemake --lint
 
-# A killed Snakemake leaves its lock behind. It is removed only when no other Snakemake runs in this folder.
+# A killed Snakemake leaves its lock behind.
 unlock: env
-	@if [ -n "$$(ls .snakemake/locks 2>/dev/null)" ]; then \
-	  for process in /proc/[0-9]*; do \
-	    if [ "$$(readlink $$process/cwd)" = "$(CURDIR)" ] && tr '\0' ' ' < $$process/cmdline 2>/dev/null | grep -q 'bin/snakemake '; then \
-	      echo "Another Snakemake (process $${process#/proc/}) is at work in this folder: let it finish, or stop it." >&2; exit 1; \
-	    fi; \
-	  done; \
-	  echo "Removing the lock that a killed Snakemake left behind."; \
-	  $(BIN)/snakemake --unlock; \
-	fi
+	@$(BIN)/python workflow/unlock.py
 
 env: $(READY)
 

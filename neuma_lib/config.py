@@ -438,7 +438,7 @@ def _overridden(section: MaterialConfig, changes: Mapping[str, Any], origin: str
 
 def _close(word: str, known: Any) -> str:
     """A hint: the close matches, or all that there is."""
-    matches = difflib.get_close_matches(str(word), [str(k) for k in known], n=3, cutoff=0.5)
+    matches = difflib.get_close_matches(str(word), [str(k) for k in known], n=2, cutoff=0.6)
     if matches:
         return f"; did you mean {' or '.join(matches)}?"
     return f"; known: {', '.join(map(str, known))}" if known else ""

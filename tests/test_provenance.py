@@ -87,7 +87,7 @@ class TestThisProject:
     def reached(self, script):
         return set(reached_modules(SCRIPTS / f"{script}.py", ROOT))
 
-    @pytest.mark.parametrize("script", ["gaussians", "velocity", "material", "video", "kernels"])
+    @pytest.mark.parametrize("script", ["gaussians", "velocity", "material", "video"])
     def test_what_renders_depends_on_the_rasterizer(self, script):
         assert "neuma_lib.render.rasterizer" in self.reached(script)
 

@@ -90,8 +90,8 @@ class MaterialSettings:
     """
 
     iterations: int = 50
-    lr_elastic: float = 0.02
-    lr_plastic: float = 0.002
+    lr_elastic: float = 0.01
+    lr_plastic: float = 0.0005
     lr_floor: float = 0.05
     betas: tuple[float, float] = (0.9, 0.99)
     gradient_clip: float = 1.0

@@ -1,6 +1,7 @@
 """Reads and checks the settings, and says what every rule shares. Nothing is computed here."""
 
 import os
+import shutil
 import sys
 from pathlib import Path
 
@@ -23,16 +24,20 @@ LOGS = f"{RESULTS}/logs"
 BENCHMARKS = f"{RESULTS}/benchmarks"
 KERNELS = SETTINGS.kernel_cache.rstrip("/")
 ENVIRONMENT = "../../envs/conda.yaml"
-WANTS_CUDA = {"cpu": False, "cuda": True, "auto": Path("/dev/nvidiactl").exists()}
+WANTS_CUDA = {"cpu": False, "cuda": True, "auto": shutil.which("nvidia-smi") is not None}
 GPU = int(WANTS_CUDA[SETTINGS.device])
 
 # Scripts are processes of their own: they find the library, share one kernel cache, and keep to one thread each
 # (two OpenMP threads on a busy machine are far slower than one).
-os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+os.environ.update(
+    {
+        "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]),
+        "NEUMA_KERNEL_CACHE": str(Path(SETTINGS.kernel_cache).resolve()),
+        **{name: os.environ.get(name, "1") for name in THREAD_LIMITS},
+    }
+)
 claim()  # a killed Snakemake takes its scripts with it
-os.environ["NEUMA_KERNEL_CACHE"] = str(Path(SETTINGS.kernel_cache).resolve())
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
 
 
 wildcard_constraints:
@@ -116,3 +121,31 @@ def table_cells(table):
 def table_titles(table):
     """Row names of a table by method."""
     return {method: SETTINGS.method_title(method) for method in SETTINGS.tables[table].methods}
+
+
+@checked
+def material_settings(wildcards):
+    return SETTINGS.method_material(wildcards.scene, wildcards.method).plain()
+
+
+@checked
+def material_prior(wildcards):
+    return prior_file(SETTINGS.method_prior(wildcards.scene, wildcards.method))
+
+
+@checked
+def true_particles(wildcards):
+    """Ground truth, for the particle-supervised ablation alone."""
+    material = SETTINGS.method_material(wildcards.scene, wildcards.method)
+    return f"{DATA}/{wildcards.scene}/particles.h5" if material.supervision == "particles" else []
+
+
+@checked
+def trained_adaptor(wildcards):
+    """The adaptor, where the method trains one."""
+    material = SETTINGS.method_material(wildcards.scene, wildcards.method)
+    return f"{RESULTS}/{wildcards.scene}/{wildcards.method}/adaptor.safetensors" if material.train else []
+
+
+def overview_files(pattern):
+    return expand(pattern, scene=SETTINGS.evaluation.overview)

@@ -1,11 +1,5 @@
 """How well a law predicts the motion, in numbers and to look at. Only here (and in w/ P.S.) is the truth read."""
 
-@checked
-def trained_adaptor(wildcards):
-    """The adaptor, where the method trains one."""
-    material = SETTINGS.method_material(wildcards.scene, wildcards.method)
-    return f"{RESULTS}/{wildcards.scene}/{wildcards.method}/adaptor.safetensors" if material.train else []
-
 
 rule initial_state:
     input:

@@ -1,21 +1,5 @@
 """Adaptation of the material law. A method is a block of settings over this one rule."""
 
-@checked
-def material_settings(wildcards):
-    return SETTINGS.method_material(wildcards.scene, wildcards.method).plain()
-
-
-@checked
-def material_prior(wildcards):
-    return prior_file(SETTINGS.method_prior(wildcards.scene, wildcards.method))
-
-
-@checked
-def true_particles(wildcards):
-    """Ground truth, for the particle-supervised ablation alone."""
-    material = SETTINGS.method_material(wildcards.scene, wildcards.method)
-    return f"{DATA}/{wildcards.scene}/particles.h5" if material.supervision == "particles" else []
-
 
 rule material:
     input:

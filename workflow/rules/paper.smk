@@ -101,10 +101,6 @@ rule timings:
         "../scripts/timings.py"
 
 
-def overview_files(pattern):
-    return expand(pattern, scene=SETTINGS.evaluation.overview)
-
-
 rule overview:
     input:
         kernels=kernels("rendering"),
