@@ -84,6 +84,9 @@ class MaterialSettings:
         gradient_clip: largest gradient norm of each network; the loss is divided by its first value before.
         frame_weight_start: d of the frame weights d^k at the first iteration; it rises to 1 over the first third.
         frame_weight_periods: k counts this many equal parts of the video, so that early frames are fitted first.
+        warm_up: iterations over which the rates rise linearly from zero.
+        recovery_growth: after a return to the last good state the rates are halved; each accepted iteration
+            multiplies them by this, up to their full size.
         diverged_ratio: a loss above this multiple of the best one so far (at equal frame weights) counts as diverged.
         max_recoveries: after so many returns to the last good state training ends there, marked as unstable.
         checkpoint_every: iterations between checkpoints.
@@ -97,6 +100,8 @@ class MaterialSettings:
     gradient_clip: float = 1.0
     frame_weight_start: float = 0.5
     frame_weight_periods: int = 5
+    warm_up: int = 5
+    recovery_growth: float = 1.1
     diverged_ratio: float = 5.0
     max_recoveries: int = 6
     checkpoint_every: int = 10
@@ -243,6 +248,7 @@ class _Loop:
         self.history.gradient_norm_elastic.append(norms.get("elastic", 0.0))
         self.history.gradient_norm_plastic.append(norms.get("plastic", 0.0))
         self.history.lr_scale.append(self.lr_scale)
+        self.lr_scale = min(1.0, self.lr_scale * self.settings.recovery_growth)
         self.iteration += 1
 
     def judge_last_step(self) -> None:
@@ -292,8 +298,11 @@ class _Loop:
     def _step(self) -> None:
         s = self.settings
         cosine = (1 + math.cos(math.pi * self.iteration / max(1, s.iterations))) / 2
+        schedule = min(1.0, (self.iteration + 1) / max(1, s.warm_up)) * (
+            s.lr_floor + (1 - s.lr_floor) * cosine
+        )
         for group in self.optimizer.param_groups:
-            group["lr"] = group["base_lr"] * self.lr_scale * (s.lr_floor + (1 - s.lr_floor) * cosine)
+            group["lr"] = group["base_lr"] * self.lr_scale * schedule
         self.optimizer.step()
 
     def _keep_if_best(self, value: float) -> None:

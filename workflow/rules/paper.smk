@@ -151,3 +151,8 @@ rule tables:
 rule videos:
     input:
         expand(f"{RESULTS}/{{scene}}/neuma/video.mp4", scene=SCENES),
+
+
+rule figures:
+    input:
+        rules.overview.output,
