@@ -1,8 +1,8 @@
 """Time of one training iteration's parts on this machine: rollout forward and backward, and rendering.
 
-    python benchmarks/rollout.py                        # 2,000 particles, 24^3 grid, 100 steps, neural law
-    python benchmarks/rollout.py --render               # and 20 frames of 1,500 Gaussians at 64 px
-    python benchmarks/rollout.py --particles 30000 --grid 32 --steps 400 --device cuda
+    python -m benchmarks.rollout                        # 2,000 particles, 24^3 grid, 100 steps, neural law
+    python -m benchmarks.rollout --render               # and 20 frames of 1,500 Gaussians at 64 px
+    python -m benchmarks.rollout --particles 30000 --grid 32 --steps 400 --device cuda
 
 The rollout is compared with the same kernels under one autograd function per step, the usual way to build a
 differentiable simulator. The best of several repetitions counts: other load only adds time.
