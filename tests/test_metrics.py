@@ -13,8 +13,14 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.evaluation.metrics import chamfer, chamfer_loss, chamfer_sequence, psnr, ssim, tracer_rmse
-from neuma_lib.evaluation.tables import PAPER_SCENES, PAPER_TABLE1, chamfer_table, report_table
-from neuma_lib.evaluation.video import side_by_side, strip, write_mp4, write_strips
+from neuma_lib.evaluation.tables import (
+    PAPER_SCENES,
+    PAPER_TABLE1,
+    chamfer_table,
+    learning_rate_table,
+    report_table,
+)
+from neuma_lib.evaluation.video import film_strips, side_by_side, strip, write_mp4
 
 
 def points(*shape, seed=0):
@@ -207,12 +213,31 @@ def test_video_shows_both_panels_and_is_the_same_every_time(film, tmp_path):
     assert np.abs(read.astype(float) - video).mean() < 8
 
 
-def test_strips_show_the_first_and_the_last_frame(film, tmp_path):
+def test_strips_show_the_first_and_the_last_frame(film):
     still = strip(film, 4)
     assert still.shape == (33, 4 * 41, 3)
     assert np.array_equal(still[:, :41], film[0]) and np.array_equal(still[:, -41:], film[-1])
-    write_strips(tmp_path / "strips.png", [film, 1 - film], 4)
-    assert imageio.imread(tmp_path / "strips.png").shape == (66, 4 * 41, 3)
+    below = film_strips([("scene", {"seen": film, "predicted": 1 - film})], count=4, magnify=2)
+    assert below.shape[1:] == (2 * 4 * 41, 3)
+    row = np.round(255 * still).astype(np.uint8).repeat(2, axis=0).repeat(2, axis=1)
+    heading = len(below) // 2 - len(row)
+    assert np.array_equal(below[heading : heading + len(row)], row)
+
+
+def test_learning_rate_is_chosen_by_the_geometric_mean_of_the_training_loss():
+    def run(scale, scene, best, excess):
+        return {
+            "method": "neuma", "lr_scale": scale, "scene": scene, "loss": [1.0, best], "best_loss": best,
+            "stable": True, "recoveries": [], "chamfer_excess": excess,
+        }  # fmt: skip
+
+    # The arithmetic mean and the excess, which knows the truth, would both choose the other factor.
+    rows = [run(0.5, "a", 0.001, 9), run(0.5, "b", 0.3, 9), run(1.0, "a", 0.1, 1), run(1.0, "b", 0.1, 1)]
+    table, markdown, best = learning_rate_table(rows)
+    assert best == {"neuma": 0.5}
+    read = list(csv.DictReader(io.StringIO(table)))
+    assert [float(row["ratio"]) for row in read] == [0.001, 0.3, 0.1, 0.1]
+    assert "neuma ×0.5" in markdown
 
 
 def test_unusable_videos_are_named(film, tmp_path):

@@ -79,14 +79,6 @@ def strip(video: np.ndarray, count: int = 6) -> np.ndarray:
     return np.concatenate([np.asarray(video[i]) for i in index], axis=1)
 
 
-def write_strips(path: str | Path, videos: Sequence[np.ndarray], count: int = 6) -> None:
-    """Strips of several videos (T, H, W, 3) of one size, one below the other, as a PNG without metadata."""
-    rows = [_as_bytes(strip(video, count)[None])[0] for video in videos]
-    if len({row.shape for row in rows}) != 1:
-        raise InputError(f"{path}: strips of different sizes {[row.shape for row in rows]}")
-    Image.fromarray(np.concatenate(rows)).save(path, format="PNG")
-
-
 def film_strips(
     columns: Sequence[tuple[str, Mapping[str, np.ndarray]]], count: int = 5, magnify: int = 1
 ) -> np.ndarray:
