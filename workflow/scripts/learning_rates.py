@@ -7,7 +7,7 @@ from neuma_lib.progress import stage
 
 def main(inputs, output, params, run) -> None:
     cells = zip(params.cells, inputs.histories, inputs.metrics, strict=True)
-    rows = [{**cell, **read_json(history), **read_json(metrics)} for cell, history, metrics in cells]
+    rows = [{**read_json(history), **read_json(metrics), **cell} for cell, history, metrics in cells]
     csv, markdown, best = learning_rate_table(rows)
     write_text(output.csv, csv)
     write_text(output.markdown, markdown)
