@@ -13,7 +13,7 @@ def step(model, bodies, x, v, F, C, mass, vol0):
     f = x / dx - base
     w = torch.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2], dim=1)
     ticks = torch.arange(3)
-    offset = torch.cartesian_prod(ticks, ticks, ticks)
+    offset = torch.cartesian_prod(ticks, ticks, ticks).to(x.device)
     i, j, k = offset.unbind(1)
     weight = w[:, i, 0] * w[:, j, 1] * w[:, k, 2]
     d = (offset - f[:, None]) * dx
@@ -22,12 +22,10 @@ def step(model, bodies, x, v, F, C, mass, vol0):
 
     A = mass[:, None, None] * C - (4 * dt / dx**2) * vol0[:, None, None] * tau
     q = (mass[:, None] * v)[:, None] + torch.einsum("pab,pib->pia", A, d)
-    m = torch.zeros(n**3, dtype=x.dtype).index_add(0, flat.flatten(), (weight * mass[:, None]).flatten())
-    mv = torch.zeros(n**3, 3, dtype=x.dtype).index_add(
-        0, flat.flatten(), (weight[..., None] * q).flatten(0, 1)
-    )
+    m = x.new_zeros(n**3).index_add(0, flat.flatten(), (weight * mass[:, None]).flatten())
+    mv = x.new_zeros(n**3, 3).index_add(0, flat.flatten(), (weight[..., None] * q).flatten(0, 1))
 
-    gravity = torch.tensor(model.gravity, dtype=x.dtype)
+    gravity = x.new_tensor(model.gravity)
     grid_v = torch.where(m[:, None] > 0, mv / m.clamp(min=1e-300)[:, None] + dt * gravity, 0.0)
     grid_v = walls(model, grid_v.reshape(n, n, n, 3)).reshape(-1, 3)
 
@@ -43,7 +41,7 @@ def walls(model, grid_v):
     n, cells = model.grid, model.wall_cells
     for wall, condition in enumerate(model.boundary):
         axis, upper = divmod(wall, 2)
-        index = torch.arange(n)
+        index = torch.arange(n, device=grid_v.device)
         inside = (index >= n - cells) if upper else (index < cells)
         shape = [1, 1, 1]
         shape[axis] = n

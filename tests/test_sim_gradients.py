@@ -1,11 +1,14 @@
 """Gradients of a rollout against finite differences, against the torch twin, and against each other."""
 
+import math
+
 import pytest
 import sim_twin
 import torch
 from sim_scenes import DT, cube, make_law, strained
 
-from neuma_lib.sim import Body, MPMModel, rollout, simulation
+from neuma_lib.errors import InputError
+from neuma_lib.sim import Body, MPMModel, rollout, storage
 
 IN_THE_AIR = MPMModel(14, DT)
 ON_A_STICKY_FLOOR = MPMModel(14, DT, boundary={"y_min": "sticky"})  # stops its nodes always: no switch
@@ -167,10 +170,36 @@ def test_what_is_kept_does_not_change_the_gradient(monkeypatch):
 
     everything = run("all")
     step_bytes = 8 * (18 * COUNT + 8 * model.grid**3)
-    monkeypatch.setitem(simulation.KEEP, "auto", 12 * step_bytes + 7 * 2000 * COUNT)
+    monkeypatch.setitem(storage.KEEP, "auto", 12 * step_bytes + 7 * 2000 * COUNT)
     for keep in ("states", "auto"):
         for a, b in zip(run(keep), everything, strict=True):
             assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("keep,segment", [("states", 5), ("all", 4), ("all", 2)])
+def test_segments_do_not_change_the_gradient(keep, segment):
+    """With little memory the steps are computed again, segment by segment: the same bytes, also the second time."""
+    x, mass, vol0 = cube(2000, side=0.25, centre=(0.5, 0.2, 0.5))
+    start, steps = (x, *strained(x)), 13
+    law = make_law("neural")
+    parameters = trainable(law)
+    model, frames = MPMModel(14, DT), (0, 3, 7, steps)
+    _, expected = gradients(model, law, start, mass, vol0, frames, parameters, keep=keep)
+    state, step = 8 * 24 * len(x), 8 * (18 * len(x) + 8 * model.grid**3)
+    memory = state * (segment + 1 + math.ceil(steps / segment)) + step * (segment if keep == "all" else 1)
+    planned = storage.plan_storage(steps, len(x), model.grid**3, 8, keep, memory, on_gpu=False)
+    assert planned == storage.Storage(segment, keep == "all", 0)
+    loss = random_loss()(simulate(model, law, start, mass, vol0, frames, keep=keep, memory=memory))
+    for _ in range(2):
+        grads = torch.autograd.grad(loss, parameters, retain_graph=True)
+        for a, b in zip(grads, expected[-len(grads) :], strict=True):
+            assert torch.equal(a, b)
+
+
+def test_too_little_memory():
+    start, mass, vol0 = scene(0.2)
+    with pytest.raises(InputError, match="memory = .* is too little for 13 steps of .* particles"):
+        gradients(MPMModel(14, DT), make_law("neural"), start, mass, vol0, (13,), memory=1000)
 
 
 def test_backward_twice():

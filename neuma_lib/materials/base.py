@@ -11,6 +11,7 @@ where LoRA is merged), uses the same tensors at every step and returns their gra
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from typing import Any
 
 import torch
@@ -26,6 +27,13 @@ class Constitutive(nn.Module):
 
     A subclass writes :meth:`response` in differentiable torch, and may override the rest with faster code.
     """
+
+    capturable = False
+    """Whether `evaluate` and `vjp` can be recorded in a CUDA graph: no read from the device, all scratch reused."""
+
+    def graph_key(self) -> Hashable:
+        """Equal for laws that do the same with the same weights, so that they can share recorded graphs."""
+        return self
 
     def weights(self) -> Weights:
         """Tensors that a rollout differentiates, as a differentiable function of the module's parameters.

@@ -13,19 +13,21 @@ import torch
 import warp as wp
 
 from neuma_lib.sim.kernels import grid_functions, warp_types
+from neuma_lib.sim.scatter import scatter_functions
 
 
 @functools.cache
-def adjoint_kernels(dtype: torch.dtype) -> SimpleNamespace:
-    """Kernels `g2p_adjoint`, `grid_adjoint` and `p2g_adjoint` for one precision."""
+def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamespace:
+    """Kernels `g2p_adjoint`, `grid_adjoint` and `p2g_adjoint` for one precision and one way to scatter."""
     t, functions = warp_types(dtype), grid_functions(dtype)
+    ordered = scatter != "atomic"
+    run_of, deposit = vars(scatter_functions(dtype, scatter, 3)).values()
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
     base_node, weights, slopes = functions.base_node, functions.weights, functions.slopes
     column, offsets, wall_mask = functions.column, functions.offsets, functions.wall_mask
     moved_mask = functions.moved_mask
-    kernel = functools.partial(
-        wp.kernel, enable_backward=False, module=f"neuma_lib.sim.adjoint_{str(dtype).removeprefix('torch.')}"
-    )
+    module = f"neuma_lib.sim.adjoint_{str(dtype).removeprefix('torch.')}_{scatter}"
+    kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
 
     @kernel
     def g2p_adjoint(
@@ -33,6 +35,9 @@ def adjoint_kernels(dtype: torch.dtype) -> SimpleNamespace:
         now: wp.int32,
         after: wp.int32,
         kept: wp.int32,
+        side: wp.int32,
+        epoch: wp.int32,
+        order: wp.array2d(dtype=wp.int32),
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         C: wp.array2d(dtype=mat33),
@@ -43,18 +48,23 @@ def adjoint_kernels(dtype: torch.dtype) -> SimpleNamespace:
         grad_F_trial: wp.array(dtype=mat33),
         grad_x: wp.array(dtype=vec3),
         grad_F: wp.array(dtype=mat33),
-        grad_grid_rows: wp.array(dtype=mat34),
+        grad_grid_rows: wp.array2d(dtype=mat34),
     ):
         """Gradients of x, v, C after the step and of F_trial to those of grid_v (added), x and F (set)."""
         p = wp.tid()
+        alive = p < grad_x.shape[0]
+        if wp.static(ordered):
+            p = order[epoch, wp.min(p, grad_x.shape[0] - 1)]
         xp = x[now, p]
         bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
+        run = run_of(wp.where(alive, (bi * c.n + bj) * c.n + bk, -1))
         f = xp * c.inv_dx - vec3(real(bi), real(bj), real(bk))
         wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
         si, sj, sk = slopes(f[0]), slopes(f[1]), slopes(f[2])
         # F_trial = (I + dt C) F and x = x + dt v pass their gradients on to C, F and v.
         g_trial = grad_F_trial[p]
-        grad_F[p] = g_trial + c.dt * (wp.transpose(C[after, p]) * g_trial)
+        if alive:
+            grad_F[p] = g_trial + c.dt * (wp.transpose(C[after, p]) * g_trial)
         g_C = grad_C[p] + c.dt * (g_trial * wp.transpose(F[now, p]))
         g_x = wp.cw_mul(moved_mask(c, x[after, p]), grad_x[p])
         g_v = grad_v[p] + c.dt * g_x
@@ -69,40 +79,50 @@ def adjoint_kernels(dtype: torch.dtype) -> SimpleNamespace:
             u_ij = u_i
             for j in range(3):
                 row = ((bi + i) * c.n + bj + j) * c.n + bk
-                wp.atomic_add(grad_grid_rows, row, (wi[i] * wj[j]) * (wp.outer(wk, u_ij) + slope_k))
+                deposit(grad_grid_rows, side, row, (wi[i] * wj[j]) * (wp.outer(wk, u_ij) + slope_k), run)
                 nodes = grid_v_rows[kept, row]
                 vu = nodes * u_ij + wp.cw_mul(step_k, nodes * column(D, 2))
                 vu_w, vu_s = wp.dot(vu, wk), wp.dot(vu, sk)
                 moving += vec3(si[i] * wj[j] * vu_w, wi[i] * sj[j] * vu_w, wi[i] * wj[j] * vu_s)
                 u_ij += column(D, 1)
             u_i += column(D, 0)
-        grad_x[p] = g_x + c.inv_dx * (moving - wp.transpose(D) * v[after, p])
+        if alive:
+            grad_x[p] = g_x + c.inv_dx * (moving - wp.transpose(D) * v[after, p])
 
     @kernel
     def grid_adjoint(
-        c: GridConstants, kept: wp.int32, grid: wp.array2d(dtype=vec4), grad_grid: wp.array(dtype=vec4)
+        c: GridConstants,
+        kept: wp.int32,
+        side: wp.int32,
+        grid: wp.array2d(dtype=vec4),
+        grad_grid: wp.array2d(dtype=vec4),
     ):
-        """In place: gradient of a node's velocity to the gradients of its momentum and mass."""
+        """In place: gradient of a node's velocity to the gradients of its momentum and mass.
+
+        The other side of `grad_grid` is cleared for the step before this one.
+        """
         node = wp.tid()
         mv = grid[kept, node]
         if mv[3] > real(0.0):
             v = vec3(mv[0], mv[1], mv[2]) / mv[3]
-            g = grad_grid[node]
+            g = grad_grid[side, node]
             g_mv = wp.cw_mul(vec3(g[0], g[1], g[2]), wall_mask(c, node, v + c.dt * c.gravity)) / mv[3]
-            grad_grid[node] = vec4(g_mv[0], g_mv[1], g_mv[2], -wp.dot(g_mv, v))
+            grad_grid[side, node] = vec4(g_mv[0], g_mv[1], g_mv[2], -wp.dot(g_mv, v))
+        grad_grid[1 - side, node] = vec4()
 
     @kernel
     def p2g_adjoint(
         c: GridConstants,
         now: wp.int32,
         kept: wp.int32,
+        side: wp.int32,
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         C: wp.array2d(dtype=mat33),
         tau: wp.array2d(dtype=mat33),
         mass: wp.array(dtype=real),
         vol0: wp.array(dtype=real),
-        grad_grid_rows: wp.array(dtype=mat34),
+        grad_grid_rows: wp.array2d(dtype=mat34),
         grad_x: wp.array(dtype=vec3),
         grad_v: wp.array(dtype=vec3),
         grad_C: wp.array(dtype=mat33),
@@ -130,7 +150,7 @@ def adjoint_kernels(dtype: torch.dtype) -> SimpleNamespace:
         for i in range(3):
             q_ij = q_i
             for j in range(3):
-                nodes = grad_grid_rows[((bi + i) * c.n + bj + j) * c.n + bk]
+                nodes = grad_grid_rows[side, ((bi + i) * c.n + bj + j) * c.n + bk]
                 along_k = wk * nodes
                 total += (wi[i] * wj[j]) * along_k
                 G_i += (wd_i[i] * wj[j]) * along_k

@@ -9,6 +9,9 @@ step a slot of its own, any other alternates between two. A grid node is a 4-vec
 (``grid``) or velocity and 1 where there is mass (``grid_v``). A particle sees 3 x 3 rows of three nodes that
 lie side by side in memory, so kernels read and write ``rows``: a view of the grid whose element b is the
 matrix (3 x 4) of nodes b, b + 1 and b + 2. Sums over the last axis of the stencil are products with a row.
+
+Order: where a scatter to the grid wants neighbours side by side (`scatter`), thread i takes particle
+``order[epoch, i]``, the particles sorted by cell a few steps ago. A gather is faster in the order of memory.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -19,6 +22,7 @@ import torch
 import warp as wp
 
 from neuma_lib import warp_setup
+from neuma_lib.sim.scatter import scatter_functions
 
 warp_setup.init()
 
@@ -143,21 +147,33 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
 
 
 @functools.cache
-def forward_kernels(dtype: torch.dtype) -> SimpleNamespace:
-    """Kernels `p2g`, `grid_update`, `g2p`, `trial_deformation` and `advect_tracers` for one precision."""
+def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamespace:
+    """Kernels `cells`, `p2g`, `grid_update`, `g2p`, `trial_deformation` and `advect_tracers` for one precision
+    and one way to scatter.
+    """
     t, functions = warp_types(dtype), grid_functions(dtype)
+    ordered = scatter != "atomic"
+    run_of, deposit = vars(scatter_functions(dtype, scatter, 4)).values()
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
     base_node, weights, offsets = functions.base_node, functions.weights, functions.offsets
     column, wall_mask, moved = functions.column, functions.wall_mask, functions.moved
-    kernel = functools.partial(
-        wp.kernel, enable_backward=False, module=f"neuma_lib.sim.forward_{str(dtype).removeprefix('torch.')}"
-    )
+    module = f"neuma_lib.sim.forward_{str(dtype).removeprefix('torch.')}_{scatter}"
+    kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
+
+    @kernel
+    def cells(c: GridConstants, now: wp.int32, x: wp.array2d(dtype=vec3), cell: wp.array(dtype=wp.int32)):
+        """Index of the first node that a particle sees, to sort by."""
+        p = wp.tid()
+        xp = x[now, p]
+        cell[p] = (base_node(c, xp[0]) * c.n + base_node(c, xp[1])) * c.n + base_node(c, xp[2])
 
     @kernel
     def p2g(
         c: GridConstants,
         now: wp.int32,
         kept: wp.int32,
+        epoch: wp.int32,
+        order: wp.array2d(dtype=wp.int32),
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         C: wp.array2d(dtype=mat33),
@@ -168,8 +184,12 @@ def forward_kernels(dtype: torch.dtype) -> SimpleNamespace:
     ):
         """m_i += w_i m, (m v)_i += w_i (m v + A d_i) with A = m C - dt vol0 (4/dx^2) tau, d_i = x_i - x."""
         p = wp.tid()
+        alive = p < mass.shape[0]
+        if wp.static(ordered):
+            p = order[epoch, wp.min(p, mass.shape[0] - 1)]
         xp = x[now, p]
         bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
+        run = run_of(wp.where(alive, (bi * c.n + bj) * c.n + bk, -1))
         f = xp * c.inv_dx - vec3(real(bi), real(bj), real(bk))
         wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
         m = mass[p]
@@ -182,7 +202,7 @@ def forward_kernels(dtype: torch.dtype) -> SimpleNamespace:
             q_ij = q_i
             for j in range(3):
                 row = ((bi + i) * c.n + bj + j) * c.n + bk
-                wp.atomic_add(grid_rows, kept, row, (wi[i] * wj[j]) * (wp.outer(wk, q_ij) + slope_k))
+                deposit(grid_rows, kept, row, (wi[i] * wj[j]) * (wp.outer(wk, q_ij) + slope_k), run)
                 q_ij += column(A, 1)
             q_i += column(A, 0)
 
@@ -280,6 +300,7 @@ def forward_kernels(dtype: torch.dtype) -> SimpleNamespace:
             x[p] = moved(c, xp, vec3(total[0], total[1], total[2]) / total[3])
 
     return SimpleNamespace(
+        cells=cells,
         p2g=p2g,
         grid_update=grid_update,
         g2p=g2p,

@@ -16,7 +16,8 @@ from neuma_lib.errors import InputError
 from neuma_lib.materials.base import Law
 from neuma_lib.sim.free_flight import ballistic, free_flight_steps
 from neuma_lib.sim.model import Body, MPMModel, as_bodies, law_weights
-from neuma_lib.sim.simulation import KEEP, Simulation
+from neuma_lib.sim.simulation import Simulation
+from neuma_lib.sim.storage import KEEP
 from neuma_lib.sim.trajectory import Trajectory
 
 
@@ -35,6 +36,8 @@ def rollout(
     tracers: Tensor | None = None,
     skip_free_flight: bool = True,
     keep: str = "auto",
+    memory: float | None = None,
+    scatter: str | None = None,
 ) -> Trajectory:
     """Simulate particles and return their states at the frames.
 
@@ -58,6 +61,9 @@ def rollout(
             used where a gradient could deform the state (v0 of shape (N, 3), F0 or C0 that require it).
         keep: what the gradient keeps a step: "states" (x, v, C, F; the rest is computed again), "all", or
             "auto", which also keeps what fits a fixed amount of memory. Same gradient, other speed.
+        memory: most bytes that the gradient may keep; where that is too little for the states of all steps, these
+            are computed a second time, segment by segment. None: no limit. Same gradient, slower.
+        scatter: how particles are added to nodes, see `scatter.SCATTERS`; None takes the fastest way.
 
     Raises:
         InputError: shapes, precision, frames, a particle that starts outside the grid, bodies that misfit.
@@ -83,7 +89,9 @@ def rollout(
             landed = ballistic(model, start, tracers, (flight,))
             start = (landed.x[0], landed.v[0], start[2], start[3])
             tracers = None if tracers is None else landed.tracers[0]
-        parts.append(_simulate(model, bodies, start, mass, vol0, tracers, flight, frames[seen:], keep))
+        parts.append(
+            _simulate(model, bodies, start, mass, vol0, tracers, flight, frames[seen:], keep, memory, scatter)
+        )
     return parts[0] if len(parts) == 1 else _joined(*parts)
 
 
@@ -97,6 +105,8 @@ def _simulate(
     first: int,
     frames: tuple[int, ...],
     keep: str,
+    memory: float | None,
+    scatter: str | None,
 ) -> Trajectory:
     """Step from the state `start` at step `first` to the last frame."""
     laws = {id(body.law): body.law for body in bodies}
@@ -105,7 +115,9 @@ def _simulate(
     inputs = (*start, *flat)
     differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
     steps = frames[-1] - first
-    simulation = Simulation(model, bodies, weights, start[0], steps, first, differentiable, keep)
+    simulation = Simulation(
+        model, bodies, weights, start[0], steps, first, differentiable, keep, memory, scatter
+    )
     simulation.set_mass(mass, vol0)
     path = RolloutFunction.apply(simulation, [n - first for n in frames], tracers, *inputs)
     return Trajectory(frames, *path)

@@ -7,8 +7,7 @@ A step turns the state (x, v, C, F) at t into that at t + dt (paper Sec. 3.2 and
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import is_dataclass
 from typing import Any
 
@@ -19,14 +18,17 @@ from neuma_lib.errors import NonFiniteError
 from neuma_lib.materials.base import Weights
 from neuma_lib.sim.kernels import NEVER
 from neuma_lib.sim.model import Body, MPMModel
+from neuma_lib.sim.scatter import scatter_for
+from neuma_lib.sim.storage import plan_storage
 from neuma_lib.sim.workspace import Layout, Workspace, WorkspaceLease
-
-KEEP = {"auto": 1 << 29, "states": 0, "all": math.inf}
-"""Bytes that a rollout may spend on intermediate values for its reverse loop, beyond the states."""
 
 
 class Simulation:
     """The loop over the steps, forward and in reverse, on a leased workspace.
+
+    The steps are taken in segments. All states of a segment are in the workspace together if the rollout is to
+    be differentiated; otherwise only the last one, and segments end at the frames. On a GPU a segment, there and
+    back, is a CUDA graph, replayed from the third time on (`GraphCache`).
 
     Args:
         model, bodies: as in `rollout`.
@@ -36,7 +38,8 @@ class Simulation:
         steps: number of steps.
         first: number of the first step, for messages.
         differentiable: store what `run_adjoint` needs.
-        keep: see `rollout`.
+        keep, memory: see `rollout`.
+        scatter: how particles are added to nodes, one of `scatter.SCATTERS`; None takes the fastest.
     """
 
     def __init__(
@@ -49,26 +52,36 @@ class Simulation:
         first: int,
         differentiable: bool,
         keep: str,
+        memory: float | None = None,
+        scatter: str | None = None,
     ):
         self.model, self.bodies = model, bodies
-        self.steps, self.first = steps, first
+        self.steps, self.first, self.differentiable = steps, first, differentiable
         self._weight_slices = _weight_slices(law_weights)
-        step_bytes = like.element_size() * (18 * len(like) + 8 * model.grid**3)  # tau, F_trial; grid, grid_v
-        limit = KEEP[keep]
-        self._keeps = differentiable and steps > 0 and step_bytes * steps <= limit
-        self._cache_bytes = limit - step_bytes * steps if self._keeps else 0
+        on_gpu = like.device.type == "cuda"
+        size = dict(steps=steps, particles=len(like), nodes=model.grid**3, itemsize=like.element_size())
+        storage = plan_storage(**size, keep=keep, memory=memory if differentiable else None, on_gpu=on_gpu)
+        self._segment = storage.segment
+        self._keeps = differentiable and storage.keeps
+        self._cache_bytes = storage.cache_bytes if self._keeps else 0
         self._cached: set[tuple[str, int, int]] = set()
+        self._loaded = 0  # segment whose states are in the workspace
         self._lease = WorkspaceLease(
             Layout(
                 model=model,
                 particles=len(like),
                 dtype=like.dtype,
                 device=like.device,
-                states=steps + 1 if differentiable else 2,
-                kept=steps if self._keeps else 1,
+                states=self._segment + 1 if differentiable else 2,
+                kept=self._segment if self._keeps else 1,
+                marks=-(-steps // self._segment) if differentiable and self._segment < steps else 0,
                 differentiable=differentiable,
+                scatter=scatter or scatter_for(like.device, like.dtype),
             )
         )
+        parts = [getattr(body.law, part) for body in bodies for part in ("elasticity", "plasticity")]
+        self._replays = on_gpu and all(part.capturable for part in parts)
+        self._setup = tuple((b.start, b.stop) for b in bodies), tuple(part.graph_key() for part in parts)
 
     @property
     def workspace(self) -> Workspace:
@@ -89,33 +102,39 @@ class Simulation:
     ) -> tuple[Tensor | None, ...]:
         """From the start (x, v, F, C) through all steps; x, v, F, C and tracers at the frames."""
         ws = self.workspace
-        buffers = (ws.x, ws.v, ws.F, ws.C)
-        for buffer, value in zip(buffers, start, strict=True):
-            buffer[0].copy_(value)
+        states = (ws.x, ws.v, ws.F, ws.C)
         result = tuple(value.new_empty(len(frames), *value.shape) for value in start)
-        moving = paths = launch = None
-        if tracers is not None:
-            moving = tracers.detach().clone(memory_format=torch.contiguous_format)
-            paths = moving.new_empty(len(frames), *moving.shape)
-            launch = ws.tracer_launch(moving)
-        frame_of = {step: frame for frame, step in enumerate(frames)}
-        with ws.stream():
-            for step in range(self.steps + 1):
-                if step in frame_of:
-                    for buffer, values in zip(buffers, result, strict=True):
-                        values[frame_of[step]].copy_(buffer[ws.state(step)])
-                    if tracers is not None:
-                        paths[frame_of[step]].copy_(moving)
-                if step < self.steps:
-                    self.step(step, weights)
-                    if tracers is not None:
-                        ws.move_tracers(launch, step)
-        self._raise_faults(result[2][-1])
-        return *result, paths
+        for state, value in zip(states, start, strict=True):
+            state[0].copy_(value)
+        if self._replays:
+            ws.load_weights(weights)
+            weights = ws.weights
+        paths = None if tracers is None else _Paths(ws, tracers, frames)
+        faults = [ws.faults.clone()]
+        self._copy_frames(0, [0], frames, result)
+        ended = 0
+        for index, (first, steps) in enumerate(self._segments(frames)):
+            if ended:
+                for state in states:
+                    state[0].copy_(state[ended])
+            for mark, state in zip(ws.marks, states, strict=True):
+                if len(mark):
+                    mark[index].copy_(state[0])
+            if paths is None:
+                self._do(("forward", steps), lambda steps=steps: self._advance(steps, weights))
+            else:
+                self._advance(steps, weights, lambda n, first=first: paths.follow(n, first))
+            ended, self._loaded = ws.state(steps), index
+            self._copy_frames(first, range(1, steps + 1) if self.differentiable else [steps], frames, result)
+            faults.append(torch.where(ws.faults < NEVER, ws.faults + (first << 31), ws.faults))
+            ws.faults.fill_(NEVER)
+        self._raise_faults(torch.stack(faults).amin(0), result[2][-1])
+        return *result, None if paths is None else paths.seen
 
     def step(self, n: int, weights: Sequence[Tensor]) -> None:
         """State n to state n + 1."""
         ws = self.workspace
+        ws.sort(n)
         self._evaluate("elasticity", n, ws.F[ws.state(n)], weights, ws.tau[ws.kept(n)])
         ws.transfer_to_grid(n)
         ws.transfer_to_particles(n)
@@ -126,20 +145,37 @@ class Simulation:
     ) -> tuple[tuple[Tensor, ...], list[Tensor]]:
         """Gradients of x, v, F, C at the frames to those of the start (x, v, F, C) and of the weights."""
         ws = self.workspace
-        buffers = (ws.grad_x, ws.grad_v, ws.grad_F, ws.grad_C)
-        for buffer in buffers:
-            buffer.zero_()
-        grad_weights = [torch.zeros_like(w) for w in weights]
-        frame_of = {step: frame for frame, step in enumerate(frames)}
-        with ws.stream():
-            for step in range(self.steps, -1, -1):
-                if step in frame_of:
-                    for buffer, grad in zip(buffers, grads, strict=True):
-                        if grad is not None:
-                            buffer.add_(grad[frame_of[step]])
-                if step > 0:
-                    self.step_adjoint(step - 1, weights, grad_weights)
-        return tuple(buffer.clone() for buffer in buffers), grad_weights
+        if self._replays:
+            weights, grad_weights = ws.weights, ws.grad_weights
+        else:
+            grad_weights = [torch.zeros_like(w) for w in weights]
+        totals = (ws.grad_x, ws.grad_v, ws.grad_F, ws.grad_C)
+        for total in (*totals, *grad_weights):
+            total.zero_()
+        for index, (first, steps) in reversed(list(enumerate(self._segments(frames)))):
+            if index != self._loaded:
+                for mark, state in zip(ws.marks, (ws.x, ws.v, ws.F, ws.C), strict=True):
+                    state[0].copy_(mark[index])
+                self._do(("forward", steps), lambda steps=steps: self._advance(steps, weights))
+                self._loaded = index
+            here = [f for f, n in enumerate(frames) if first < n <= first + steps]
+            at = tuple(frames[f] - first for f in here)
+            part = slice(here[0], here[-1] + 1) if here else slice(0)
+            seeds = [None if grad is None else grad[part] for grad in grads]
+            name = ("adjoint", steps, at, tuple(seed is not None for seed in seeds))
+            if self._replays:
+                seeds = ws.load_seeds(name, seeds)
+            self._do(
+                name,
+                lambda steps=steps, at=at, seeds=seeds: self._go_back(
+                    steps, at, seeds, weights, grad_weights
+                ),
+            )
+        if frames[0] == 0:
+            for total, grad in zip(totals, grads, strict=True):
+                if grad is not None:
+                    total.add_(grad[0])
+        return tuple(total.clone() for total in totals), [grad.clone() for grad in grad_weights]
 
     def step_adjoint(self, n: int, weights: Sequence[Tensor], grad_weights: Sequence[Tensor]) -> None:
         """Gradients of state n + 1, in the workspace, to those of state n; those of the weights are added."""
@@ -153,6 +189,65 @@ class Simulation:
         ws.transfer_adjoint(n)
         self._vjp("elasticity", n, F, weights, ws.grad_tau, ws.grad_F_elastic, grad_weights)
         ws.grad_F.add_(ws.grad_F_elastic)
+
+    def _segments(self, frames: Sequence[int]) -> list[tuple[int, int]]:
+        """First step and number of steps of each segment."""
+        if self.differentiable:
+            borders = [*range(0, self.steps, self._segment), self.steps]
+        else:
+            borders = sorted({0, *frames, self.steps})
+        return [(a, b - a) for a, b in zip(borders, borders[1:], strict=False)]
+
+    def _do(self, name: Hashable, launches: Callable[[], None]) -> None:
+        """Launch, by a graph where these are used."""
+        if self._replays:
+            self.workspace.graphs.run((name, self._setup), launches)
+        else:
+            launches()
+
+    def _advance(
+        self, steps: int, weights: Sequence[Tensor], after_step: Callable[[int], None] | None = None
+    ) -> None:
+        """All steps of a segment."""
+        with self.workspace.stream():
+            for n in range(steps):
+                self.step(n, weights)
+                if after_step:
+                    after_step(n)
+
+    def _go_back(
+        self,
+        steps: int,
+        at: Sequence[int],
+        seeds: Sequence[Tensor | None],
+        weights: Sequence[Tensor],
+        grad_weights: Sequence[Tensor],
+    ) -> None:
+        """All steps of a segment in reverse, adding the seeds, gradients of the states after steps `at`."""
+        ws = self.workspace
+        totals = (ws.grad_x, ws.grad_v, ws.grad_F, ws.grad_C)
+        frame_of = {n: index for index, n in enumerate(at)}
+        ws.grad_grid.zero_()
+        with ws.stream():
+            for n in range(steps, 0, -1):
+                if n in frame_of:
+                    for total, seed in zip(totals, seeds, strict=True):
+                        if seed is not None:
+                            total.add_(seed[frame_of[n]])
+                self.step_adjoint(n - 1, weights, grad_weights)
+
+    def _copy_frames(
+        self, first: int, steps: Sequence[int], frames: Sequence[int], result: Sequence[Tensor]
+    ) -> None:
+        """States after some steps of the segment that starts at step `first`, where they are frames."""
+        ws = self.workspace
+        frame_of = {n: index for index, n in enumerate(frames)}
+        here = [(frame_of[first + n], ws.state(n)) for n in steps if first + n in frame_of]
+        if here:
+            part = slice(here[0][0], here[-1][0] + 1)
+            slots = torch.tensor([slot for _, slot in here], device=ws.layout.device)
+            for values, state in zip(result, (ws.x, ws.v, ws.F, ws.C), strict=True):
+                torch.index_select(state, 0, slots, out=values[part])
 
     def _evaluate(
         self, part: str, n: int, F: Tensor, weights: Sequence[Tensor], out: Tensor, cache: bool = False
@@ -201,9 +296,9 @@ class Simulation:
         """Those of the flat list of weights (or of their gradients) that belong to a part of a body's law."""
         return tuple(values[self._weight_slices[id(body.law), part]])
 
-    def _raise_faults(self, F: Tensor) -> None:
+    def _raise_faults(self, faults: Tensor, F: Tensor) -> None:
         """Raise if a velocity on the way or the last F (N, 3, 3) is not what a stable simulation gives."""
-        not_finite, too_fast = self.workspace.faults.tolist()
+        not_finite, too_fast = faults.tolist()
         if min(not_finite, too_fast) == NEVER and not torch.isfinite(F).all():
             particle = int((~torch.isfinite(F).flatten(1).all(dim=1)).nonzero()[0])
             not_finite = (self.steps - 1) << 31 | particle
@@ -221,6 +316,26 @@ class Simulation:
             step=step,
             particle=particle,
         )
+
+
+class _Paths:
+    """Tracers (M, 3) on their way, and where they were at the frames, `seen` (T, M, 3)."""
+
+    def __init__(self, ws: Workspace, tracers: Tensor, frames: Sequence[int]):
+        self._ws, self._frame_of = ws, {n: index for index, n in enumerate(frames)}
+        self._now = tracers.detach().clone(memory_format=torch.contiguous_format)
+        self._launch = ws.tracer_launch(self._now)
+        self.seen = self._now.new_empty(len(frames), *self._now.shape)
+        self._look(0)
+
+    def follow(self, n: int, first: int) -> None:
+        """Move with the nodes of step n of the segment that starts at step `first`."""
+        self._ws.move_tracers(self._launch, n)
+        self._look(first + n + 1)
+
+    def _look(self, step: int) -> None:
+        if step in self._frame_of:
+            self.seen[self._frame_of[step]].copy_(self._now)
 
 
 def _weight_slices(law_weights: dict[int, tuple[Weights, Weights]]) -> dict[tuple[int, str], slice]:

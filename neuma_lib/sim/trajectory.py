@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -30,11 +31,13 @@ class Trajectory:
 
     def hold_last(self, count: int) -> Trajectory:
         """The same with the last frame repeated `count` times, for a rollout that stopped early."""
+        held = self._each(lambda value: torch.cat([value, value[-1:].expand(count, *value.shape[1:])]))
+        return replace(held, frames=self.frames + (self.frames[-1],) * count)
 
+    def cpu(self) -> Trajectory:
+        """The same in main memory."""
+        return self._each(torch.Tensor.cpu)
+
+    def _each(self, function: Callable[[Tensor], Tensor]) -> Trajectory:
         values = {name: getattr(self, name) for name in ("x", "v", "F", "C", "tracers")}
-        held = {
-            name: torch.cat([value, value[-1:].expand(count, *value.shape[1:])])
-            for name, value in values.items()
-            if value is not None
-        }
-        return replace(self, frames=self.frames + (self.frames[-1],) * count, **held)
+        return replace(self, **{name: function(value) for name, value in values.items() if value is not None})

@@ -6,7 +6,7 @@ Nothing here is allocated per step: launches are recorded on fixed memory and on
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -16,8 +16,15 @@ from torch import Tensor
 
 from neuma_lib.sim import kernels
 from neuma_lib.sim.adjoint_kernels import adjoint_kernels
+from neuma_lib.sim.graphs import MOST_GRAPHS, GraphCache
 from neuma_lib.sim.kernels import NEVER, forward_kernels, warp_types
 from neuma_lib.sim.model import MPMModel
+
+SORT_EVERY = 16
+"""Steps after which particles are sorted by cell again, where the scatter profits from it."""
+
+BLOCK = 64
+"""Threads of a block on a GPU: 30,000 particles are few, so small blocks spread better over the processors."""
 
 _CONDITION_CODES = {"no_slip": kernels.NO_SLIP, "slip": kernels.SLIP, "sticky": kernels.STICKY}
 
@@ -29,9 +36,11 @@ class Layout(NamedTuple):
     particles: int
     dtype: torch.dtype
     device: torch.device
-    states: int  # slots of x, v, C, F: steps + 1 to differentiate, else 2
-    kept: int  # slots of what a step computes on the way: steps to keep it for the reverse loop, else 1
+    states: int  # slots of x, v, C, F: steps of a segment + 1 to differentiate, else 2
+    kept: int  # slots of what a step computes on the way: steps of a segment to keep it, else 1
     differentiable: bool
+    marks: int = 0  # slots of states at the start of a segment, if there are several
+    scatter: str = "atomic"  # see `scatter`
 
 
 class Workspace:
@@ -45,14 +54,23 @@ class Workspace:
         grid_v: velocity [m/s] of the nodes and 1 where there is mass, shape (kept, grid^3, 4).
         mass, vol0: particle masses [kg] and initial volumes [m^3], shape (N,).
         faults: first step and particle of a non-finite value and of one outside the grid, shape (2,).
-        grad_*: gradients of the above for one step, without a slot axis.
+        order: particles sorted by cell, every `SORT_EVERY` steps, shape (epochs, N).
+        marks: x, v, F and C at the start of each segment, shape (segments, ...), empty if there is only one.
+        grad_*: gradients of the above for one step, without a slot axis. grad_grid has two sides that steps use
+            in turn.
         caches: what the laws keep of their evaluations, owned here so that the next rollout can overwrite it.
+        weights, grad_weights: weights of the laws and their gradients at a fixed place, for the graphs.
+        graphs: recorded loops over these buffers.
     """
 
     def __init__(self, layout: Layout):
         self.layout = layout
         self._views: dict[int, wp.array] = {}
         self.caches: dict[tuple, Any] = {}
+        self.graphs = GraphCache()
+        self.weights: list[Tensor] = []
+        self.grad_weights: list[Tensor] = []
+        self._seeds: dict[Hashable, list[Tensor | None]] = {}
         N, nodes = layout.particles, layout.model.grid**3
         states, kept = layout.states, layout.kept
         self.x, self.v = self._vectors(states, N), self._vectors(states, N)
@@ -61,6 +79,13 @@ class Workspace:
         self.grid, self.grid_v = self._nodes(kept, nodes), self._nodes(kept, nodes)
         self.mass, self.vol0 = self._scalars(N), self._scalars(N)
         self.faults = self._buffer((2,), None, torch.int64)
+        self.marks = tuple(
+            value.new_empty(layout.marks, *value.shape[1:]) for value in (self.x, self.v, self.F, self.C)
+        )
+        self.sorts = layout.scatter != "atomic"
+        epochs = -(-max(states - 1, 1) // SORT_EVERY) if self.sorts and layout.differentiable else 1
+        self.order = self._buffer((epochs, N if self.sorts else 1), None, torch.int32)
+        self.cells = self._buffer((N if self.sorts else 1,), None, torch.int32)
         self._constants = _grid_constants(layout.model, layout.dtype)
         self._record_forward()
         if layout.differentiable:
@@ -68,7 +93,7 @@ class Workspace:
             self.grad_C, self.grad_F = self._matrices(N), self._matrices(N)
             self.grad_F_trial, self.grad_tau = self._matrices(N), self._matrices(N)
             self.grad_F_elastic = self._matrices(N)
-            self.grad_grid = self._nodes(nodes)
+            self.grad_grid = self._nodes(2, nodes)
             self._record_adjoint()
 
     def state(self, step: int) -> int:
@@ -79,11 +104,43 @@ class Workspace:
         """Slot of what a step computes on the way."""
         return step % self.layout.kept
 
+    def epoch(self, step: int) -> int:
+        """Slot of the order of the particles in a step."""
+        return step // SORT_EVERY % len(self.order)
+
+    def sort(self, step: int) -> None:
+        """Order the particles by cell if the kernels profit from it and it is time to."""
+        if self.sorts and step % SORT_EVERY == 0:
+            _run(self._cells, self.state(step))
+            self.order[self.epoch(step)].copy_(torch.sort(self.cells, stable=True).indices)
+
+    def load_weights(self, weights: Sequence[Tensor]) -> None:
+        """Copy weights to their fixed place."""
+        if [w.shape for w in weights] != [w.shape for w in self.weights]:
+            self.weights = [torch.empty_like(w, memory_format=torch.contiguous_format) for w in weights]
+            self.grad_weights = [torch.zeros_like(w) for w in self.weights]
+        for own, weight in zip(self.weights, weights, strict=True):
+            own.copy_(weight)
+
+    def load_seeds(self, name: Hashable, seeds: Sequence[Tensor | None]) -> list[Tensor | None]:
+        """Copy gradients of the frames to a fixed place of that name."""
+        if name not in self._seeds:
+            if len(self._seeds) == MOST_GRAPHS:  # no graph may outlive what it reads
+                self._seeds, self.graphs = {}, GraphCache()
+            self._seeds[name] = [
+                None if seed is None else torch.empty_like(seed, memory_format=torch.contiguous_format)
+                for seed in seeds
+            ]
+        for own, seed in zip(self._seeds[name], seeds, strict=True):
+            if own is not None:
+                own.copy_(seed)
+        return self._seeds[name]
+
     def transfer_to_grid(self, step: int) -> None:
         """tau and the state of a step to the velocities of the nodes."""
         kept = self.kept(step)
         self.grid[kept].zero_()
-        _run(self._p2g, self.state(step), kept)
+        _run(self._p2g, self.state(step), kept, self.epoch(step))
         _run(self._grid_update, kept)
 
     def transfer_to_particles(self, step: int) -> None:
@@ -96,7 +153,7 @@ class Workspace:
 
     def tracer_launch(self, tracers: Tensor) -> wp.Launch:
         """A recorded launch, for `move_tracers`, that advects `tracers` (M, 3) in place."""
-        kernel = forward_kernels(self.layout.dtype).advect_tracers
+        kernel = forward_kernels(self.layout.dtype, self.layout.scatter).advect_tracers
         positions = wp.from_torch(tracers, dtype=warp_types(self.layout.dtype).vec3)
         return self._record(kernel, len(tracers), 0, self._rows(self.grid_v), positions)
 
@@ -108,13 +165,13 @@ class Workspace:
         """Gradients of the state after a step and of F_trial to those of the state before it and of tau.
 
         grad_x, grad_v and grad_C hold the former on entry and the latter on return; grad_F is set to the part
-        that comes through F_trial.
+        that comes through F_trial. Steps run downwards after `grad_grid` was cleared once.
         """
         state, after, kept = self.state(step), self.state(step + 1), self.kept(step)
-        self.grad_grid.zero_()
-        _run(self._g2p_adjoint, state, after, kept)
-        _run(self._grid_adjoint, kept)
-        _run(self._p2g_adjoint, state, kept)
+        side = step % 2
+        _run(self._g2p_adjoint, state, after, kept, side, self.epoch(step))
+        _run(self._grid_adjoint, kept, side)
+        _run(self._p2g_adjoint, state, kept, side)
 
     @contextmanager
     def stream(self) -> Iterator[None]:
@@ -122,7 +179,8 @@ class Workspace:
         if self.layout.device.type != "cuda":
             yield
             return
-        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(self.layout.device))):
+        stream = wp.stream_from_torch(torch.cuda.current_stream(self.layout.device))
+        with wp.ScopedStream(stream, sync_enter=False):
             yield
 
     def _buffer(self, shape: tuple[int, ...], warp_type, dtype: torch.dtype | None = None) -> Tensor:
@@ -151,33 +209,52 @@ class Workspace:
 
     def _record(self, kernel: wp.Kernel, dim: int, *args: int | Tensor | wp.array) -> wp.Launch:
         inputs = [self._views[id(arg)] if isinstance(arg, Tensor) else arg for arg in args]
-        device = wp.device_from_torch(self.layout.device)
-        return wp.launch(kernel, dim=dim, inputs=[self._constants, *inputs], device=device, record_cmd=True)
+        options = {"block_dim": BLOCK} if self.layout.device.type == "cuda" else {}
+        return wp.launch(
+            kernel,
+            dim=dim,
+            inputs=[self._constants, *inputs],
+            device=wp.device_from_torch(self.layout.device),
+            record_cmd=True,
+            **options,
+        )
+
+    @property
+    def _scattering_threads(self) -> int:
+        """Threads of a kernel that scatters: whole warps where these work together."""
+        N = self.layout.particles
+        return -(-N // BLOCK) * BLOCK if self.sorts else N
 
     def _record_forward(self) -> None:
-        k = forward_kernels(self.layout.dtype)
+        k = forward_kernels(self.layout.dtype, self.layout.scatter)
         N, nodes = self.layout.particles, self.layout.model.grid**3
         rows, rows_v = self._rows(self.grid), self._rows(self.grid_v)
+        if self.sorts:
+            self._cells = self._record(k.cells, N, 0, self.x, self.cells)
         self._p2g = self._record(
-            k.p2g, N, 0, 0, self.x, self.v, self.C, self.tau, self.mass, self.vol0, rows
+            k.p2g, self._scattering_threads, 0, 0, 0, self.order,
+            self.x, self.v, self.C, self.tau, self.mass, self.vol0, rows,
         )  # fmt: skip
         self._grid_update = self._record(k.grid_update, nodes, 0, self.grid, self.grid_v)
         self._g2p = self._record(
-            k.g2p, N, 0, 0, 0, 0, rows_v, self.x, self.v, self.C, self.F, self.F_trial, self.faults
-        )
+            k.g2p, N, 0, 0, 0, 0,
+            rows_v, self.x, self.v, self.C, self.F, self.F_trial, self.faults,
+        )  # fmt: skip
         self._trial = self._record(k.trial_deformation, N, 0, 0, 0, self.C, self.F, self.F_trial)
 
     def _record_adjoint(self) -> None:
-        k = adjoint_kernels(self.layout.dtype)
+        k = adjoint_kernels(self.layout.dtype, self.layout.scatter)
         N, nodes = self.layout.particles, self.layout.model.grid**3
         rows_v, grad_rows = self._rows(self.grid_v), self._rows(self.grad_grid)
         self._g2p_adjoint = self._record(
-            k.g2p_adjoint, N, 0, 0, 0, self.x, self.v, self.C, self.F, rows_v,
+            k.g2p_adjoint, self._scattering_threads, 0, 0, 0, 0, 0, self.order,
+            self.x, self.v, self.C, self.F, rows_v,
             self.grad_v, self.grad_C, self.grad_F_trial, self.grad_x, self.grad_F, grad_rows,
         )  # fmt: skip
-        self._grid_adjoint = self._record(k.grid_adjoint, nodes, 0, self.grid, self.grad_grid)
+        self._grid_adjoint = self._record(k.grid_adjoint, nodes, 0, 0, self.grid, self.grad_grid)
         self._p2g_adjoint = self._record(
-            k.p2g_adjoint, N, 0, 0, self.x, self.v, self.C, self.tau, self.mass, self.vol0, grad_rows,
+            k.p2g_adjoint, N, 0, 0, 0,
+            self.x, self.v, self.C, self.tau, self.mass, self.vol0, grad_rows,
             self.grad_x, self.grad_v, self.grad_C, self.grad_tau,
         )  # fmt: skip
 
@@ -196,6 +273,12 @@ class WorkspaceLease:
                 self._idle.remove(fitting[-1])
         self.workspace = fitting[-1] if fitting else Workspace(layout)
         self.workspace.faults.fill_(NEVER)
+
+    @classmethod
+    def forget(cls) -> None:
+        """Give the memory of idle workspaces back."""
+        with cls._lock:
+            cls._idle.clear()
 
     def __del__(self):
         if hasattr(self, "workspace"):
