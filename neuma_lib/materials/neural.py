@@ -6,12 +6,16 @@ features (sigma - 1, F^T F - I, det F - 1); its symmetrised output X gives
 - elasticity: P = R X, tau = P F^T;
 - plasticity: F = F_trial + 1e-3 R X.
 
+In float32 on a recent GPU the kernels of :mod:`neural_fused` do the work; what is here serves everything else, and is
+their slow twin.
+
 Without bias, zero features give zero output: any rotation is free of stress; and R makes both maps objective.
 """
 
 from __future__ import annotations
 
 import threading
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 
 import torch
@@ -23,6 +27,7 @@ from neuma_lib import warp_setup
 from neuma_lib.errors import InputError
 from neuma_lib.linalg import rotation_and_singular_values
 from neuma_lib.linalg_kernels import pack_count, warp_types
+from neuma_lib.materials import neural_fused
 from neuma_lib.materials.base import Constitutive, Elasticity, Law, Plasticity, Weights
 from neuma_lib.materials.lora import Adaptor
 from neuma_lib.materials.neural_kernels import FEATURES, feature_kernel, output_kernels
@@ -120,6 +125,12 @@ class NeuralConstitutive(Constitutive):
 
     kind: str
     scale: float
+    capturable = True
+    fused: bool | None = None
+    """Whether evaluate and vjp use :mod:`neural_fused`: None where it runs, False never, True always."""
+
+    def graph_key(self) -> Hashable:
+        return type(self), self.fused
 
     def __init__(self, weights: Weights | None = None, seed: int = 0):
         """Args: weights: three matrices of :data:`SHAPES`; Xavier-uniform from ``seed`` if not given."""
@@ -146,10 +157,18 @@ class NeuralConstitutive(Constitutive):
         X = 0.5 * (Y + Y.mT)
         return R @ X @ F.mT if self.kind == "elasticity" else F + self.scale * (R @ X)
 
+    def uses_fused(self, F: Tensor) -> bool:
+        """Whether F, by its device and dtype and by :attr:`fused`, goes to the fused kernels."""
+        return neural_fused.supported(F.device, F.dtype) if self.fused is None else self.fused
+
     def evaluate(self, F: Tensor, weights: Weights, out: Tensor | None = None) -> Tensor:
-        return self._evaluate(F, weights, out)
+        if not self.uses_fused(F):
+            return self._evaluate(F, weights, out)
+        return neural_fused.evaluate(F, weights, self.kind, self.scale, out)
 
     def evaluate_with_cache(self, F, weights, out=None, cache=None):
+        if self.uses_fused(F):
+            return self.evaluate(F, weights, out), None
         cache = cache or [_Forward.like(F[rows]) for rows in _chunks(F)]
         return self._evaluate(F, weights, out, cache), cache
 
@@ -186,6 +205,8 @@ class NeuralConstitutive(Constitutive):
 
     @torch.no_grad()
     def vjp(self, F, weights, grad_out, cache=None, grad_F=None, grad_weights=None):
+        if cache is None and self.uses_fused(F):
+            return neural_fused.vjp(F, weights, grad_out, self.kind, self.scale, grad_F, grad_weights)
         F, grad_out = F.detach().contiguous(), grad_out.contiguous()
         weights = tuple(w.detach() for w in weights)
         grad_F = torch.empty_like(F) if grad_F is None else grad_F

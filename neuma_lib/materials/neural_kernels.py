@@ -16,7 +16,7 @@ FEATURES = 13
 
 # features: sigma - 1 (3), F^T F - I (9, row-major), det F - 1 (1); the SVD scales a[] in place, so F is read
 # before
-_GRAM = """
+GRAM = """
     Pack gram[9], det;
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j) gram[3 * i + j] = a[i] * a[j] + a[3 + i] * a[3 + j] + a[6 + i] * a[6 + j];
@@ -52,7 +52,7 @@ def feature_kernel(dtype: torch.dtype):
     """Kernel (F, z (n, 13), R, Vh, n) over packs: features and rotation; U = R V is not kept."""
     real, _, mat33 = warp_types(dtype)
 
-    @wp.func_native(snippet(LOAD, _GRAM, SVD, _STORE, dtype=dtype))
+    @wp.func_native(snippet(LOAD, GRAM, SVD, _STORE, dtype=dtype))
     def feature_pack(
         F: wp.array(dtype=mat33),
         z: wp.array2d(dtype=real),
