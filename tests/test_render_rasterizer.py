@@ -24,16 +24,16 @@ def render_with_gradients(render, scene, seed=1, **options):
     return (images.detach(), alphas.detach()), torch.autograd.grad(loss, inputs)
 
 
-@pytest.mark.parametrize("pixel_major", [False, True])
+@pytest.mark.parametrize("compositor", ["rows", "pixels"])
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
 @pytest.mark.parametrize("options", [{}, SMOOTH, LOOSE], ids=["default", "smooth", "loose"])
-def test_equals_twin(options, coefficients, pixel_major):
+def test_equals_twin(options, coefficients, compositor):
     # two frames and two views; wide Gaussians, so that pixels end early and alphas are clamped; some sh give
     # colours below zero
     scene = random_scene(2, 50, 2, WIDTH, HEIGHT, coefficients, scale=0.06)
     scene[3] = scene[3] * 3
     expected, expected_grads = render_with_gradients(torch_reference.rasterize, scene, **options)
-    actual, grads = render_with_gradients(rasterize, scene, pixel_major=pixel_major, **options)
+    actual, grads = render_with_gradients(rasterize, scene, compositor=compositor, **options)
     for a, b in zip(expected, actual, strict=True):
         assert (a - b).abs().max() < 1e-9
     for a, b in zip(expected_grads, grads, strict=True):

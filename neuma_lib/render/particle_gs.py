@@ -13,6 +13,9 @@ from neuma_lib.render.deformation import deform
 from neuma_lib.render.gaussians import Gaussians
 from neuma_lib.render.rasterizer import rasterize
 
+_BATCH_BYTES = {"cpu": 16e6, "cuda": 1.5e9}
+"""Memory of the buffers of one batch of frames: what stays in a CPU's cache, what keeps a GPU busy."""
+
 
 class ParticleGS:
     """Renders the states of bound particles: ``images = particle_gs(x, F)``.
@@ -57,7 +60,10 @@ class ParticleGS:
 
     def __call__(self, x: Tensor, F: Tensor) -> Tensor:
         """Images (T, V, H, W, 3) in [0, 1] of the particle states x (T, N, 3) [m] and F (T, N, 3, 3)."""
-        means, covars = self.deformed(x, F)
+        return self.splatted(*self.deformed(x, F))
+
+    def splatted(self, means: Tensor, covars: Tensor) -> Tensor:
+        """Images (T, V, H, W, 3) of deformed kernels, means (T, G, 3) [m] and covariances (T, G, 3, 3) [m^2]."""
         images, _ = rasterize(
             means,
             covars,
@@ -72,8 +78,19 @@ class ParticleGS:
         )
         return images
 
-    def batches(self, x: Tensor, F: Tensor, size: int) -> Iterator[tuple[slice, Tensor]]:
-        """Render ``size`` frames at a time: yields (slice of frames, images), so that memory stays bounded."""
+    @property
+    def frames_per_batch(self) -> int:
+        """Frames to render together, forward and backward: estimated by the bytes of images and projected kernels."""
+        pixels = self.cameras.width * self.cameras.height
+        per_view = (14 * pixels + 60 * len(self.gaussians)) * self.x0.element_size()
+        return max(1, int(_BATCH_BYTES[self.x0.device.type] / (per_view * len(self.cameras))))
+
+    def batches(self, x: Tensor, F: Tensor, size: int | None = None) -> Iterator[tuple[slice, Tensor]]:
+        """Render ``size`` frames at a time (None: `frames_per_batch`): yields (slice of frames, images).
+
+        States may be on another device than the kernels, so that memory there stays bounded too.
+        """
+        size = size or self.frames_per_batch
         for start in range(0, len(x), size):
             part = slice(start, min(start + size, len(x)))
-            yield part, self(x[part], F[part])
+            yield part, self(x[part].to(self.x0), F[part].to(self.x0))

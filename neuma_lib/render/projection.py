@@ -4,8 +4,10 @@ Conventions are those of gsplat: camera z forward, pixel centres at half integer
 added to the projected covariance, the tangents x/z and y/z of the Jacobian limited to 30 % beyond the image,
 colour max(0, 1/2 + SH) along the direction from the camera to the mean, depth = camera z.
 
-A splat is a record of ``SPLAT_SIZE`` numbers: mean (2) [px], conic A, B, C [1/px^2] (the exponent is
--(A dx^2 + C dy^2)/2 - B dx dy), opacity, RGB.
+A splat is a record of ``SPLAT_SIZE`` numbers, three groups of four so that a GPU can load it in three aligned
+pieces: mean (2) [px], conic A, B, C [1/px^2] (the exponent is -(A dx^2 + C dy^2)/2 - B dx dy), opacity, RGB, and
+the ellipse A dx^2 + 2 B dx dy + C dy^2 <= reach in which alpha can be alpha_min or more: reach, and half the width
+and height of the ellipse's bounding box [px]. Gradients leave the last three out.
 """
 
 import functools
@@ -14,19 +16,91 @@ import torch
 import warp as wp
 
 from neuma_lib import warp_setup
+from neuma_lib.render.arrays import matrices, plain, target, vectors
 from neuma_lib.render.sh import SH_C0, SH_C1, SH_C2, SH_C3
 
 warp_setup.init()
 
-SPLAT_SIZE = 9
+SPLAT_SIZE = 12
 NEAR_PLANE = 0.01
+REACH_SLACK = 0.02
+"""Added to the reach so that rounding never cuts a pixel off: the compositors test alpha itself."""
+UNLIMITED = 1.0e20
+"""Reach where alpha_min = 0."""
 CULLED = 1.0e30
 """Depth written for Gaussians that no pixel can see."""
 
 
+def for_device(sh: torch.Tensor) -> torch.Tensor:
+    """The same harmonics (G, K, 3), on CUDA stored coefficient by coefficient: neighbouring threads, which work on
+    neighbouring Gaussians, then read neighbouring numbers. On a CPU a Gaussian's coefficients stay together."""
+    return sh.transpose(0, 1).contiguous().transpose(0, 1) if sh.is_cuda else sh.contiguous()
+
+
+def project(means, covars, opacities, sh, viewmats, Ks, settings, empty) -> tuple[torch.Tensor, torch.Tensor]:
+    """Splats (T V, G, SPLAT_SIZE) and depths (T V, G) of T frames seen by V cameras, image t V + v.
+
+    Arguments as of ``rasterizer.rasterize``, ``settings`` and ``empty`` as in ``compositing``. The record of a culled
+    Gaussian (depth ``CULLED``) is not written.
+    """
+    shape = (len(means) * len(viewmats), means.shape[1])
+    splats, depths = empty("splats", (*shape, SPLAT_SIZE), means), empty("depths", shape, means)
+    kernel, _, _ = kernels(means.dtype)
+    wp.launch(
+        kernel,
+        dim=shape,
+        inputs=[
+            vectors(means), matrices(covars), plain(opacities), vectors(sh), matrices(viewmats), matrices(Ks),
+            float(settings.width), float(settings.height), settings.eps2d, settings.alpha_min,
+        ],
+        outputs=[plain(splats), plain(depths)],
+        **target(means),
+    )  # fmt: skip
+    return splats, depths
+
+
+def geometry_adjoint(
+    means, covars, sh, viewmats, Ks, settings, splats, depths, grad_splats
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Gradients of means (T, G, 3) and covariances (T, G, 3, 3) from those of the splats."""
+    grad_means, grad_covars = torch.empty_like(means), torch.empty_like(covars)
+    _, kernel, _ = kernels(means.dtype)
+    wp.launch(
+        kernel,
+        dim=means.shape[:2],
+        inputs=[
+            vectors(means), matrices(covars), vectors(sh), matrices(viewmats), matrices(Ks),
+            float(settings.width), float(settings.height), plain(splats), plain(depths), plain(grad_splats),
+        ],
+        outputs=[vectors(grad_means), matrices(grad_covars)],
+        **target(means),
+    )  # fmt: skip
+    return grad_means, grad_covars
+
+
+def appearance_adjoint(means, sh, viewmats, splats, depths, grad_splats) -> tuple[torch.Tensor, torch.Tensor]:
+    """Gradients of opacities (G,) and harmonics (G, K, 3) from those of the splats, summed over all images."""
+    grad_opacities, grad_sh = means.new_empty(len(sh)), torch.empty_like(sh)
+    _, _, kernel = kernels(means.dtype)
+    wp.launch(
+        kernel,
+        dim=len(sh),
+        inputs=[vectors(means), matrices(viewmats), plain(splats), plain(depths), plain(grad_splats)],
+        outputs=[plain(grad_opacities), vectors(grad_sh)],
+        **target(means),
+    )
+    return grad_opacities, grad_sh
+
+
 @functools.cache
 def kernels(dtype: torch.dtype):
-    """``(project, project_adjoint)`` Warp kernels for float32 or float64."""
+    """``(project, geometry_adjoint, appearance_adjoint)`` Warp kernels for float32 or float64.
+
+    The adjoint is in two parts because training a material needs the first only: ``geometry_adjoint`` gives the
+    gradients of means and covariances, with a thread for every Gaussian of a frame; ``appearance_adjoint`` those of
+    opacities and harmonics, with a thread for every Gaussian, which sums over all images without atomics. Loops over
+    harmonics have a constant length and a test inside, so that they unroll and the coefficients stay in registers.
+    """
     real = wp.dtype_from_torch(dtype)
     vec3 = wp.types.vector(3, real)
     vec16 = wp.types.vector(16, real)
@@ -40,6 +114,7 @@ def kernels(dtype: torch.dtype):
     zero, half, one, two, three, four, six, eight = (real(v) for v in (0, 0.5, 1, 2, 3, 4, 6, 8))
     tangent_margin = real(0.3)
     near = real(NEAR_PLANE)
+    reach_slack, unlimited = real(REACH_SLACK), real(UNLIMITED)
     culled = real(CULLED)
     c0, c1 = real(SH_C0), real(SH_C1)
     c2a, c2b, c2c = (real(v) for v in SH_C2)
@@ -134,6 +209,17 @@ def kernels(dtype: torch.dtype):
     def symmetric(m: mat33):
         return half * (m + wp.transpose(m))
 
+    @wp.func(module=module)
+    def colour_gradient(
+        splats: wp.array3d(dtype=real), grad_splats: wp.array3d(dtype=real), image: int, g: int
+    ):
+        # none where the colour was limited to zero
+        grad = vec3()
+        for i in range(3):
+            if splats[image, g, 6 + i] > zero:
+                grad[i] = grad_splats[image, g, 6 + i]
+        return grad
+
     @wp.kernel(module=module, enable_backward=False)
     def project(
         means: wp.array2d(dtype=vec3),  # (T, G)
@@ -174,10 +260,11 @@ def kernels(dtype: torch.dtype):
         b = half * (cov[0, 1] + cov[1, 0])
         c = cov[1, 1] + eps2d
         det = a * c - b * b
-        if det <= zero:
+        if not (det > zero):  # also where it is not a number
             return
         mean_x = fx * p[0] * rz + cx
         mean_y = fy * p[1] * rz + cy
+        reach = unlimited
         if alpha_min > zero:
             # exact bounding box of the region where opacity * exp(-sigma) >= alpha_min
             reach = two * wp.log(opacity / alpha_min)
@@ -196,8 +283,9 @@ def kernels(dtype: torch.dtype):
         direction = wp.normalize(mean + wp.transpose(rotation) * translation)
         values = sh_values(direction, count)
         colour = vec3(half, half, half)
-        for k in range(count):
-            colour += values[k] * sh[g, k]
+        for k in range(16):
+            if k < count:
+                colour += values[k] * sh[g, k]
 
         depths[image, g] = p[2]
         splats[image, g, 0] = mean_x
@@ -208,9 +296,13 @@ def kernels(dtype: torch.dtype):
         splats[image, g, 5] = opacity
         for i in range(3):
             splats[image, g, 6 + i] = wp.max(colour[i], zero)
+        reach += reach_slack
+        splats[image, g, 9] = reach
+        splats[image, g, 10] = wp.sqrt(reach * a)
+        splats[image, g, 11] = wp.sqrt(reach * c)
 
     @wp.kernel(module=module, enable_backward=False)
-    def project_adjoint(
+    def geometry_adjoint(
         means: wp.array2d(dtype=vec3),  # (T, G)
         covars: wp.array2d(dtype=mat33),  # (T, G)
         sh: wp.array2d(dtype=vec3),  # (G, K)
@@ -223,88 +315,106 @@ def kernels(dtype: torch.dtype):
         grad_splats: wp.array3d(dtype=real),  # (T V, G, SPLAT_SIZE)
         grad_means: wp.array2d(dtype=vec3),  # (T, G), out
         grad_covars: wp.array2d(dtype=mat33),  # (T, G), out
-        grad_opacities: wp.array(dtype=real),  # (G,), out
-        grad_sh: wp.array2d(dtype=vec3),  # (G, K), out
     ):
-        # One thread a Gaussian, over all its images: the sums need no atomics and keep their order.
-        g = wp.tid()
+        t, g = wp.tid()
         views = viewmats.shape[0]
         count = sh.shape[1]
-        grad_opacity = zero
-        for k in range(count):
-            grad_sh[g, k] = vec3()
-        for t in range(means.shape[0]):
-            mean = means[t, g]
-            covar = symmetric(covars[t, g])
-            grad_mean = vec3()
-            grad_covar = mat33()
-            for v in range(views):
-                image = t * views + v
-                if depths[image, g] < culled:
-                    rotation = rotation_of(viewmats[v])
-                    translation = translation_of(viewmats[v])
-                    intrinsics = Ks[v]
-                    fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
-                    p = rotation * mean + translation
-                    rz = one / p[2]
-                    tan_x = p[0] * rz
-                    tan_y = p[1] * rz
-                    u = limited_tangent(tan_x, fx, cx, width)
-                    w = limited_tangent(tan_y, fy, cy, height)
-                    jacobian = mat23(fx * rz, zero, -fx * u * rz, zero, fy * rz, -fy * w * rz)
-                    m = jacobian * rotation
+        mean = means[t, g]
+        covar = symmetric(covars[t, g])
+        grad_mean = vec3()
+        grad_covar = mat33()
+        for v in range(views):
+            image = t * views + v
+            if depths[image, g] < culled:
+                rotation = rotation_of(viewmats[v])
+                translation = translation_of(viewmats[v])
+                intrinsics = Ks[v]
+                fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
+                p = rotation * mean + translation
+                rz = one / p[2]
+                tan_x = p[0] * rz
+                tan_y = p[1] * rz
+                u = limited_tangent(tan_x, fx, cx, width)
+                w = limited_tangent(tan_y, fy, cy, height)
+                jacobian = mat23(fx * rz, zero, -fx * u * rz, zero, fy * rz, -fy * w * rz)
+                m = jacobian * rotation
 
-                    # conic = cov^-1, so d cov = - conic (d conic) conic with B counted twice in the exponent
-                    conic = mat22(
-                        splats[image, g, 2], splats[image, g, 3], splats[image, g, 3], splats[image, g, 4]
-                    )
-                    g_conic = mat22(
-                        grad_splats[image, g, 2],
-                        half * grad_splats[image, g, 3],
-                        half * grad_splats[image, g, 3],
-                        grad_splats[image, g, 4],
-                    )
-                    g_cov = -conic * g_conic * conic
-                    grad_covar += wp.transpose(m) * g_cov * m
-                    g_jacobian = two * g_cov * m * covar * wp.transpose(rotation)
+                # conic = cov^-1, so d cov = - conic (d conic) conic with B counted twice in the exponent
+                conic = mat22(
+                    splats[image, g, 2], splats[image, g, 3], splats[image, g, 3], splats[image, g, 4]
+                )
+                g_conic = mat22(
+                    grad_splats[image, g, 2],
+                    half * grad_splats[image, g, 3],
+                    half * grad_splats[image, g, 3],
+                    grad_splats[image, g, 4],
+                )
+                g_cov = -conic * g_conic * conic
+                grad_covar += wp.transpose(m) * g_cov * m
+                g_jacobian = two * g_cov * m * covar * wp.transpose(rotation)
 
-                    g_x = grad_splats[image, g, 0] * fx * rz
-                    g_y = grad_splats[image, g, 1] * fy * rz
-                    g_z = -(g_x * tan_x + g_y * tan_y)
-                    g_z -= rz * rz * (fx * g_jacobian[0, 0] + fy * g_jacobian[1, 1])
-                    # third column of the Jacobian: -f (x/z) / z, x/z held fixed where it is limited
-                    g_u = -fx * rz * g_jacobian[0, 2]
-                    g_w = -fy * rz * g_jacobian[1, 2]
-                    g_z -= rz * (u * g_u + w * g_w)
-                    if u == tan_x:
-                        g_x += g_u * rz
-                        g_z -= g_u * tan_x * rz
-                    if w == tan_y:
-                        g_y += g_w * rz
-                        g_z -= g_w * tan_y * rz
-                    grad_mean += wp.transpose(rotation) * vec3(g_x, g_y, g_z)
+                g_x = grad_splats[image, g, 0] * fx * rz
+                g_y = grad_splats[image, g, 1] * fy * rz
+                g_z = -(g_x * tan_x + g_y * tan_y)
+                g_z -= rz * rz * (fx * g_jacobian[0, 0] + fy * g_jacobian[1, 1])
+                # third column of the Jacobian: -f (x/z) / z, x/z held fixed where it is limited
+                g_u = -fx * rz * g_jacobian[0, 2]
+                g_w = -fy * rz * g_jacobian[1, 2]
+                g_z -= rz * (u * g_u + w * g_w)
+                if u == tan_x:
+                    g_x += g_u * rz
+                    g_z -= g_u * tan_x * rz
+                if w == tan_y:
+                    g_y += g_w * rz
+                    g_z -= g_w * tan_y * rz
+                grad_mean += wp.transpose(rotation) * vec3(g_x, g_y, g_z)
 
-                    grad_opacity += grad_splats[image, g, 5]
-                    g_colour = vec3()
-                    for i in range(3):
-                        if splats[image, g, 6 + i] > zero:
-                            g_colour[i] = grad_splats[image, g, 6 + i]
+                if count > 1:
                     ray = mean + wp.transpose(rotation) * translation
                     length = wp.length(ray)
                     direction = ray / length
-                    values = sh_values(direction, count)
-                    for k in range(count):
-                        grad_sh[g, k] = grad_sh[g, k] + values[k] * g_colour
-                    if count > 1:
-                        slopes = sh_gradients(direction, count)
-                        g_direction = vec3()
-                        for k in range(1, count):
+                    slopes = sh_gradients(direction, count)
+                    g_colour = colour_gradient(splats, grad_splats, image, g)
+                    g_direction = vec3()
+                    for k in range(1, 16):
+                        if k < count:
                             weight = wp.dot(sh[g, k], g_colour)
                             for i in range(3):
                                 g_direction[i] += slopes[i, k] * weight
-                        grad_mean += (g_direction - direction * wp.dot(direction, g_direction)) / length
-            grad_means[t, g] = grad_mean
-            grad_covars[t, g] = grad_covar
-        grad_opacities[g] = grad_opacity
+                    grad_mean += (g_direction - direction * wp.dot(direction, g_direction)) / length
+        grad_means[t, g] = grad_mean
+        grad_covars[t, g] = grad_covar
 
-    return project, project_adjoint
+    @wp.kernel(module=module, enable_backward=False)
+    def appearance_adjoint(
+        means: wp.array2d(dtype=vec3),  # (T, G)
+        viewmats: wp.array(dtype=mat44),  # (V,)
+        splats: wp.array3d(dtype=real),  # (T V, G, SPLAT_SIZE)
+        depths: wp.array2d(dtype=real),  # (T V, G)
+        grad_splats: wp.array3d(dtype=real),  # (T V, G, SPLAT_SIZE)
+        grad_opacities: wp.array(dtype=real),  # (G,), out
+        grad_sh: wp.array2d(dtype=vec3),  # (G, K), out
+    ):
+        g = wp.tid()
+        views = viewmats.shape[0]
+        count = grad_sh.shape[1]
+        grad_opacity = zero
+        grad_harmonics = mat316()
+        for t in range(means.shape[0]):
+            for v in range(views):
+                image = t * views + v
+                if depths[image, g] < culled:
+                    grad_opacity += grad_splats[image, g, 5]
+                    g_colour = colour_gradient(splats, grad_splats, image, g)
+                    ray = means[t, g] + wp.transpose(rotation_of(viewmats[v])) * translation_of(viewmats[v])
+                    values = sh_values(wp.normalize(ray), count)
+                    for k in range(16):
+                        if k < count:
+                            for i in range(3):
+                                grad_harmonics[i, k] += values[k] * g_colour[i]
+        grad_opacities[g] = grad_opacity
+        for k in range(16):
+            if k < count:
+                grad_sh[g, k] = vec3(grad_harmonics[0, k], grad_harmonics[1, k], grad_harmonics[2, k])
+
+    return project, geometry_adjoint, appearance_adjoint

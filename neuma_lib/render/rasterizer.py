@@ -1,21 +1,25 @@
 """Differentiable Gaussian splatting of a batch of frames (paper Sec. 3.3 and the supplement's 3DGS).
 
-One autograd function holds the whole render: projection, depth order and compositing, each a Warp kernel with
-a hand-written adjoint. A CPU composites splat by splat (``splat_rows``), a GPU pixel by pixel
-(``splat_pixels``).
+One autograd function holds the whole render: projection and compositing, Warp kernels with hand-written adjoints.
+A CPU composites splat by splat (``splat_rows``), a GPU tile by tile (``splat_tiles``) or, in float64, pixel by pixel
+(``splat_pixels``). ``gsplat_backend`` renders by the gsplat package instead, where that is installed.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
-import warp as wp
 
-from neuma_lib import warp_setup
 from neuma_lib.errors import InputError
-from neuma_lib.render import projection, splat_pixels, splat_rows
+from neuma_lib.render import gsplat_backend, projection, splat_pixels, splat_rows, splat_tiles
+from neuma_lib.render.compositing import Settings
+
+Compositor = Literal["rows", "pixels", "tiles", "gsplat"]
+COMPOSITORS = {"rows": splat_rows, "pixels": splat_pixels, "tiles": splat_tiles}
 
 
 @dataclasses.dataclass
@@ -58,147 +62,65 @@ class _FreshBuffers:
 
 @dataclasses.dataclass(frozen=True)
 class _Options:
-    width: int
-    height: int
-    alpha_min: float
-    alpha_max: float
-    transmittance_min: float
-    eps2d: float
-    pixel_major: bool
+    settings: Settings
+    compositor: str
     statistics: Statistics | None
     buffers: Workspace | _FreshBuffers
-
-
-def _vectors(tensor: torch.Tensor) -> wp.array:
-    """(..., 3) tensor as an array of vectors."""
-    real = wp.dtype_from_torch(tensor.dtype)
-    return wp.from_torch(tensor, dtype=wp.types.vector(3, real), requires_grad=False)
-
-
-def _matrices(tensor: torch.Tensor) -> wp.array:
-    """(..., n, n) tensor as an array of matrices."""
-    real = wp.dtype_from_torch(tensor.dtype)
-    size = tensor.shape[-1]
-    return wp.from_torch(tensor, dtype=wp.types.matrix((size, size), real), requires_grad=False)
-
-
-def _plain(tensor: torch.Tensor) -> wp.array:
-    return wp.from_torch(tensor, requires_grad=False)
-
-
-def _launch_target(device: torch.device) -> dict:
-    return {"device": wp.device_from_torch(device), "stream": warp_setup.stream(device)}
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, covars, opacities, sh, viewmats, Ks, background, options: _Options):
-        T, G, V = means.shape[0], means.shape[1], viewmats.shape[0]
-        images, height, width = T * V, options.height, options.width
-        inputs = tuple(
-            x.detach().contiguous() for x in (means, covars, opacities, sh, viewmats, Ks, background)
+        sh = projection.for_device(sh.detach())
+        means, covars, opacities, viewmats, Ks, background = (
+            x.detach().contiguous() for x in (means, covars, opacities, viewmats, Ks, background)
         )
-        means, covars, opacities, sh, viewmats, Ks, background = inputs
-        launch = _launch_target(means.device)
-        empty = options.buffers.empty
-
-        splats = empty("splats", (images, G, projection.SPLAT_SIZE), means)
-        depths = empty("depths", (images, G), means)
-        project, _ = projection.kernels(means.dtype)
-        wp.launch(
-            project,
-            dim=(images, G),
-            inputs=[
-                _vectors(means), _matrices(covars), _plain(opacities), _vectors(sh), _matrices(viewmats),
-                _matrices(Ks), float(width), float(height), options.eps2d, options.alpha_min,
-            ],
-            outputs=[_plain(splats), _plain(depths)],
-            **launch,
-        )  # fmt: skip
-        order = torch.argsort(depths, dim=1, stable=True)
-        seen = (depths < projection.CULLED).sum(dim=1)
-
-        pictures = empty("pictures", (images, height, width, 3), means)
-        alphas = empty("alphas", (images, height, width), means)
-        common = [_plain(splats), _plain(order), _plain(seen)]
-        thresholds = [options.alpha_min, options.alpha_max, options.transmittance_min]
-        if options.pixel_major:
-            composite, _ = splat_pixels.kernels(means.dtype)
-            remains = (
-                empty("transmittances", (images, height, width), means),
-                empty("stops", (images, height, width), means, torch.int32),
-            )
-            dim, outputs = (images, height, width), [_plain(pictures), _plain(alphas), *map(_plain, remains)]
-        else:
-            composite, _ = splat_rows.kernels(means.dtype)
-            pitch = splat_rows.padded_width(width)
-            remains = (empty("planes", (images, splat_rows.FORWARD_PLANES, height, pitch), means),)
-            dim, outputs = images, [_plain(remains[0]), _plain(pictures), _plain(alphas)]
-        wp.launch(
-            composite, dim=dim, inputs=[*common, *thresholds, _plain(background)], outputs=outputs, **launch
-        )
-
-        ctx.save_for_backward(
-            means, covars, sh, viewmats, Ks, background, splats, depths, order, seen, *remains
-        )
+        settings, empty = options.settings, options.buffers.empty
+        splats, depths = projection.project(means, covars, opacities, sh, viewmats, Ks, settings, empty)
+        composite = COMPOSITORS[options.compositor].composite
+        pictures, alphas, kept = composite(splats, depths, background, settings, empty)
+        ctx.save_for_backward(means, covars, sh, viewmats, Ks, background, splats, depths, *kept)
         ctx.options = options
-        return pictures.view(T, V, height, width, 3), alphas.view(T, V, height, width)
+        shape = (len(means), len(viewmats), settings.height, settings.width)
+        return pictures.view(*shape, 3), alphas.view(shape)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_pictures, grad_alphas):
-        means, covars, sh, viewmats, Ks, background, splats, depths, order, seen, *remains = ctx.saved_tensors
+        means, covars, sh, viewmats, Ks, background, splats, depths, *kept = ctx.saved_tensors
         options: _Options = ctx.options
-        images, G = depths.shape
-        height, width = options.height, options.width
-        launch = _launch_target(means.device)
-        empty = options.buffers.empty
-        grad_pictures = grad_pictures.contiguous().view(images, height, width, 3)
-        grad_alphas = grad_alphas.contiguous().view(images, height, width)
+        settings, empty = options.settings, options.buffers.empty
+        width, height = settings.width, settings.height
+        grad_pictures = grad_pictures.contiguous().view(-1, height, width, 3)
+        grad_alphas = grad_alphas.contiguous().view(-1, height, width)
 
         grad_splats = empty("grad_splats", splats.shape, means)
-        grads = [_plain(grad_pictures), _plain(grad_alphas)]
-        order_arguments = [_plain(splats), _plain(order)]
-        thresholds = [options.alpha_min, options.alpha_max]
-        if options.pixel_major:
-            grad_splats.zero_()
-            _, composite_adjoint = splat_pixels.kernels(means.dtype)
-            dim = (images, height, width)
-            inputs = [*order_arguments, *thresholds, _plain(background), *map(_plain, remains), *grads]
-            outputs = [_plain(grad_splats)]
-        else:
-            _, composite_adjoint = splat_rows.kernels(means.dtype)
-            dim = images
-            inputs = [
-                *order_arguments, _plain(seen), *thresholds, _plain(background), _plain(remains[0]), *grads
-            ]  # fmt: skip
-            scratch = empty("scratch", (images, splat_rows.BACKWARD_PLANES, *remains[0].shape[2:]), means)
-            outputs = [_plain(scratch), _plain(grad_splats)]
-        wp.launch(composite_adjoint, dim=dim, inputs=inputs, outputs=outputs, **launch)
-
+        COMPOSITORS[options.compositor].composite_adjoint(
+            splats, kept, background, settings, grad_pictures, grad_alphas, grad_splats, empty
+        )
         if options.statistics is not None:
             visible = depths < projection.CULLED
-            scale = torch.tensor([width / 2, height / 2], dtype=means.dtype, device=means.device)
-            norms = torch.where(visible, (grad_splats[..., :2] * scale).norm(dim=-1), 0.0)
-            options.statistics.screen_gradients = norms.sum(dim=0)
+            scaled = torch.stack(
+                [grad_splats[..., 0] * (width / 2), grad_splats[..., 1] * (height / 2)], dim=-1
+            )
+            options.statistics.screen_gradients = torch.where(visible, scaled.norm(dim=-1), 0.0).sum(dim=0)
             options.statistics.views = visible.sum(dim=0)
 
-        grad_means = torch.empty_like(means)
-        grad_covars = torch.empty_like(covars)
-        grad_opacities = means.new_empty(G)
-        grad_sh = torch.empty_like(sh)
-        _, project_adjoint = projection.kernels(means.dtype)
-        wp.launch(
-            project_adjoint,
-            dim=G,
-            inputs=[
-                _vectors(means), _matrices(covars), _vectors(sh), _matrices(viewmats), _matrices(Ks),
-                float(width), float(height), _plain(splats), _plain(depths), _plain(grad_splats),
-            ],
-            outputs=[_vectors(grad_means), _matrices(grad_covars), _plain(grad_opacities), _vectors(grad_sh)],
-            **launch,
-        )  # fmt: skip
+        grad_means = grad_covars = grad_opacities = grad_sh = None
+        seen = (splats, depths, grad_splats)
+        if any(ctx.needs_input_grad[:2]):
+            grad_means, grad_covars = projection.geometry_adjoint(
+                means, covars, sh, viewmats, Ks, settings, *seen
+            )
+        if any(ctx.needs_input_grad[2:4]):
+            grad_opacities, grad_sh = projection.appearance_adjoint(means, sh, viewmats, *seen)
         return grad_means, grad_covars, grad_opacities, grad_sh, None, None, None, None
+
+
+@functools.lru_cache(maxsize=32)
+def _constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+    """Kept, because a copy to the GPU makes the host wait."""
+    return torch.tensor(values, dtype=dtype, device=device)
 
 
 def check_shapes(means, covars, opacities, sh, viewmats, Ks) -> None:
@@ -243,7 +165,7 @@ def rasterize(
     eps2d: float = 0.3,
     statistics: Statistics | None = None,
     workspace: Workspace | None = None,
-    pixel_major: bool | None = None,
+    compositor: Compositor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Render T frames from V cameras.
 
@@ -266,29 +188,42 @@ def rasterize(
         eps2d: blur added to the projected covariance [px^2].
         statistics: filled by the backward pass when given.
         workspace: keeps buffers between calls; the images returned then live in it.
-        pixel_major: choose the compositing kernels; default: pixel by pixel on CUDA, splat by splat on CPU.
+        compositor: "rows" (CPU), "pixels" (any device), "tiles" (CUDA, float32) or "gsplat" (CUDA, float32; other
+            limit of alpha, see ``gsplat_backend``). Default: rows on CPU; on CUDA tiles for float32 and pixels for
+            float64. Tiles and gsplat read one number from the GPU a call, so a CUDA graph cannot hold them.
 
     Returns:
         images (T, V, H, W, 3) over ``background`` and alphas (T, V, H, W).
 
     Raises:
-        InputError: shapes, dtypes or devices disagree.
+        InputError: shapes, dtypes or devices disagree, or the compositor cannot work with them.
     """
     check_shapes(means, covars, opacities, sh, viewmats, Ks)
-    on_cpu = means.device.type == "cpu"
-    pixel_major = not on_cpu if pixel_major is None else pixel_major
-    if not pixel_major and not on_cpu:
-        raise InputError("rasterize: pixel_major=False is for CPU tensors only")
-    options = _Options(
+    if isinstance(background, torch.Tensor):
+        background = background.to(means)
+    else:
+        background = _constant(tuple(background), means.dtype, means.device)
+    on_cpu, single = means.device.type == "cpu", means.dtype == torch.float32
+    if compositor is None:
+        compositor = "rows" if on_cpu else "tiles" if single else "pixels"
+    works = {"rows": on_cpu, "pixels": True, "tiles": not on_cpu and single, "gsplat": not on_cpu and single}
+    if not works.get(compositor, False):
+        raise InputError(
+            f"rasterize: compositor {compositor!r} does not work with {means.dtype} on {means.device}; "
+            f"choose {' or '.join(name for name, can in works.items() if can)}, or leave it out"
+        )
+    settings = Settings(
         int(width),
         int(height),
         float(alpha_min),
         float(alpha_max),
         float(transmittance_min),
         float(eps2d),
-        pixel_major,
-        statistics,
-        workspace if workspace is not None else _FreshBuffers(),
     )
-    background = torch.as_tensor(background, dtype=means.dtype, device=means.device)
+    if compositor == "gsplat":
+        if statistics is not None:
+            raise InputError("rasterize: compositor 'gsplat' fills no statistics, leave one of the two out")
+        return gsplat_backend.rasterize(means, covars, opacities, sh, viewmats, Ks, background, settings)
+    buffers = workspace if workspace is not None else _FreshBuffers()
+    options = _Options(settings, compositor, statistics, buffers)
     return _Rasterize.apply(means, covars, opacities, sh, viewmats, Ks, background, options)

@@ -1,7 +1,8 @@
-"""Pixel-major compositing for CUDA: one thread a pixel walks the splats of its image in depth order.
+"""Pixel-major compositing: one thread a pixel walks all splats of its image in depth order.
 
-It gives the same images and gradients as ``splat_rows`` to rounding. Gradients of a splat are summed with
-atomics, so their last bits vary between runs.
+Simple and slow: the way to float64 images on CUDA, where ``splat_tiles`` works in float32. It gives the same images
+and gradients as ``splat_rows`` to rounding. Gradients of a splat are summed with atomics, so their last bits vary
+between runs.
 """
 
 import functools
@@ -10,8 +11,53 @@ import torch
 import warp as wp
 
 from neuma_lib import warp_setup
+from neuma_lib.render.arrays import plain, target
+from neuma_lib.render.compositing import Settings, depth_order
 
 warp_setup.init()
+
+
+def composite(splats, depths, background, settings: Settings, empty):
+    """See ``compositing``."""
+    shape = (*depths.shape[:1], settings.height, settings.width)
+    pictures, alphas = empty("pictures", (*shape, 3), splats), empty("alphas", shape, splats)
+    kept = (
+        *depth_order(depths),
+        empty("transmittances", shape, splats),
+        empty("stops", shape, splats, torch.int32),
+    )
+    order, seen, transmittances, stops = map(plain, kept)
+    kernel, _ = kernels(splats.dtype)
+    wp.launch(
+        kernel,
+        dim=shape,
+        inputs=[
+            plain(splats), order, seen, settings.alpha_min, settings.alpha_max, settings.transmittance_min,
+            plain(background),
+        ],
+        outputs=[plain(pictures), plain(alphas), transmittances, stops],
+        **target(splats),
+    )  # fmt: skip
+    return pictures, alphas, kept
+
+
+def composite_adjoint(
+    splats, kept, background, settings: Settings, grad_pictures, grad_alphas, grad_splats, empty
+):
+    """See ``compositing``."""
+    order, _, transmittances, stops = map(plain, kept)
+    grad_splats.zero_()
+    _, kernel = kernels(splats.dtype)
+    wp.launch(
+        kernel,
+        dim=grad_alphas.shape,
+        inputs=[
+            plain(splats), order, settings.alpha_min, settings.alpha_max, plain(background), transmittances, stops,
+            plain(grad_pictures), plain(grad_alphas),
+        ],
+        outputs=[plain(grad_splats)],
+        **target(splats),
+    )  # fmt: skip
 
 
 @functools.cache

@@ -16,6 +16,8 @@ import torch
 import warp as wp
 
 from neuma_lib import warp_setup
+from neuma_lib.render.arrays import plain, target
+from neuma_lib.render.compositing import Settings, depth_order
 from neuma_lib.render.projection import SPLAT_SIZE
 
 warp_setup.init()
@@ -23,6 +25,46 @@ warp_setup.init()
 LANES = 8
 FORWARD_PLANES = 5  # transmittance, red, green, blue, rank of the first splat that was not drawn
 BACKWARD_PLANES = 5  # transmittance, gradients of red, green, blue, gradient-weighted light from behind
+
+
+def composite(splats, depths, background, settings: Settings, empty):
+    """See ``compositing``."""
+    shape = (*depths.shape[:1], settings.height, settings.width)
+    pictures, alphas = empty("pictures", (*shape, 3), splats), empty("alphas", shape, splats)
+    planes = (shape[0], FORWARD_PLANES, settings.height, padded_width(settings.width))
+    kept = (*depth_order(depths), empty("planes", planes, splats))
+    order, seen, planes = map(plain, kept)
+    kernel, _ = kernels(splats.dtype)
+    wp.launch(
+        kernel,
+        dim=shape[0],
+        inputs=[
+            plain(splats), order, seen, settings.alpha_min, settings.alpha_max, settings.transmittance_min,
+            plain(background),
+        ],
+        outputs=[planes, plain(pictures), plain(alphas)],
+        **target(splats),
+    )  # fmt: skip
+    return pictures, alphas, kept
+
+
+def composite_adjoint(
+    splats, kept, background, settings: Settings, grad_pictures, grad_alphas, grad_splats, empty
+):
+    """See ``compositing``."""
+    order, seen, planes = kept
+    scratch = empty("scratch", (planes.shape[0], BACKWARD_PLANES, *planes.shape[2:]), splats)
+    _, kernel = kernels(splats.dtype)
+    wp.launch(
+        kernel,
+        dim=planes.shape[0],
+        inputs=[
+            plain(splats), plain(order), plain(seen), settings.alpha_min, settings.alpha_max, plain(background),
+            plain(planes), plain(grad_pictures), plain(grad_alphas),
+        ],
+        outputs=[plain(scratch), plain(grad_splats)],
+        **target(splats),
+    )  # fmt: skip
 
 
 def padded_width(width: int) -> int:
