@@ -46,7 +46,7 @@ class Binding:
     indices: Tensor
     values: Tensor
     shape: tuple[int, int]
-    _transposed: dict = field(default_factory=dict, repr=False, compare=False)
+    _compressed: dict = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
     def identity(cls, count: int, like: Tensor) -> Binding:
@@ -107,20 +107,24 @@ class Binding:
             )
         return _Apply.apply(particle_field, self)
 
-    def _matrix(self, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-        return self.indptr, self.indices, self.values.to(dtype)
+    def rows(self, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+        """B in compressed rows for a kernel: indptr and indices as int32, weights of the given dtype; made once."""
+        if ("rows", dtype) not in self._compressed:
+            self._compressed["rows", dtype] = (self.indptr.int(), self.indices.int(), self.values.to(dtype))
+        return self._compressed["rows", dtype]
 
-    def _transposed_matrix(self, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-        """B^T in compressed rows, made at the first use: the adjoint of ``apply`` is a product with it."""
-        if dtype not in self._transposed:
+    def columns(self, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+        """B^T likewise, the Gaussians of each particle: what the adjoint of ``apply`` multiplies with."""
+        if ("columns", dtype) not in self._compressed:
             rows = torch.repeat_interleave(
                 torch.arange(self.shape[0], device=self.indptr.device), self.counts
             )
             order = torch.argsort(self.indices, stable=True)
             counts = torch.bincount(self.indices, minlength=self.shape[1])
             indptr = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
-            self._transposed[dtype] = (indptr, rows[order], self.values[order].to(dtype))
-        return self._transposed[dtype]
+            columns = (indptr.int(), rows[order].int(), self.values[order].to(dtype))
+            self._compressed["columns", dtype] = columns
+        return self._compressed["columns", dtype]
 
 
 class _Apply(torch.autograd.Function):
@@ -129,12 +133,12 @@ class _Apply(torch.autograd.Function):
     @staticmethod
     def forward(ctx, particle_field: Tensor, binding: Binding) -> Tensor:
         ctx.binding = binding
-        return _multiply(*binding._matrix(particle_field.dtype), particle_field)
+        return _multiply(*binding.rows(particle_field.dtype), particle_field)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
-        return _multiply(*ctx.binding._transposed_matrix(grad.dtype), grad), None
+        return _multiply(*ctx.binding.columns(grad.dtype), grad), None
 
 
 def _multiply(indptr: Tensor, indices: Tensor, values: Tensor, columns: Tensor) -> Tensor:

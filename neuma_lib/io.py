@@ -14,6 +14,7 @@ import json
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,11 +24,13 @@ import numpy as np
 
 from neuma_lib.errors import InputError
 from neuma_lib.ply import read_ply, write_ply
+from neuma_lib.released import released_frames
 
 QUANTITIES = {
     "x": ("m", "particle positions, shape (T, N, 3), or (N, 3) where there is one state"),
     "v": ("m/s", "particle velocities, shape (T, N, 3)"),
     "F": ("1", "elastic deformation gradients, shape (T, N, 3, 3)"),
+    "F_total": ("1", "total deformation gradients, plastic flow included, shape (T, N, 3, 3)"),
     "C": ("1/s", "APIC affine velocities, shape (T, N, 3, 3)"),
     "frames": ("1", "simulation step of each frame, shape (T,)"),
     "time": ("s", "time of each frame, shape (T,)"),
@@ -38,6 +41,7 @@ QUANTITIES = {
     "indptr": ("1", "row starts of a sparse matrix, shape (rows + 1,)"),
     "indices": ("1", "columns of a sparse matrix, shape (entries,)"),
     "values": ("1", "entries of a sparse matrix, shape (entries,)"),
+    "images": ("1", "pictures of a figure, colours 0 to 255, shape (rows, columns, H, W, 3)"),
 }
 
 
@@ -154,7 +158,7 @@ class ImageSet:
     """Calibrated images: one entry a file, in the order of transforms.json.
 
     Attributes:
-        images: straight-alpha RGBA in [0, 1], float32, shape (K, H, W, 4).
+        images: straight-alpha RGBA, uint8, shape (K, H, W, 4).
         viewmats: world to camera, OpenCV axes, shape (K, 4, 4).
         Ks: intrinsics [px], pixel centres at +0.5, shape (K, 3, 3).
         views: camera number of each image, shape (K,).
@@ -218,13 +222,36 @@ def write_transforms(
     write_json(path, {**intrinsics, **extra, "frames": entries})
 
 
+def list_images(source: str | Path, path: str | Path) -> ImageSet:
+    """Write a transforms.json for images that stay where another list names them; returns what it lists.
+
+    Args:
+        source: a transforms.json, or a list in the layout of the authors' release.
+        path: the new transforms.json.
+
+    Raises:
+        InputError: as of `read_image_set`.
+    """
+    images = read_image_set(source)
+    data = read_transforms(source)
+    files = [_image_file(Path(source).parent, frame["file_path"], source) for frame in data["frames"]]
+    places = [os.path.relpath(file.resolve(), Path(path).parent.resolve()) for file in files]
+    frames = [{**f, "file_path": place} for f, place in zip(data.pop("frames"), places, strict=True)]
+    write_transforms(path, data, frames)
+    return images
+
+
 def read_transforms(path: str | Path) -> dict[str, Any]:
     """Read and check transforms.json: for every frame a file, a pose, and intrinsics (its own or the file's).
+
+    A list in the layout of the authors' release is read as well (`neuma_lib.released`).
 
     Raises:
         InputError: names the file, the frame and the missing or wrong entry.
     """
     data = read_json(path)
+    if isinstance(data, list):
+        data = {"frames": released_frames(data, path)}
     if not isinstance(data, dict) or not data.get("frames"):
         raise InputError(f"{path}: the list 'frames' is missing or empty")
     for i, frame in enumerate(data["frames"]):
@@ -281,16 +308,10 @@ def read_image_set(path: str | Path, views: Sequence[int] | None = None) -> Imag
     ]
     if not chosen:
         raise InputError(f"{path}: no frame belongs to the views {list(views or ())}")
-    images = [
-        _read_rgba(_image_file(folder, frame["file_path"], path), frame.get("sha256")) for _, frame in chosen
-    ]
-    shape = images[0].shape
-    for image, (_, frame) in zip(images, chosen, strict=True):
-        if image.shape != shape:
-            raise InputError(
-                f"{folder / frame['file_path']} is {image.shape[1]}x{image.shape[0]}, others {shape[1]}x{shape[0]}"
-            )
-    height, width = shape[:2]
+    images = _read_all(
+        [(_image_file(folder, frame["file_path"], path), frame.get("sha256")) for _, frame in chosen]
+    )
+    height, width = images.shape[1:3]
     merged = [{**data, **frame} for _, frame in chosen]
     for values in merged:
         if (int(values.get("w", width)), int(values.get("h", height))) != (width, height):
@@ -300,7 +321,7 @@ def read_image_set(path: str | Path, views: Sequence[int] | None = None) -> Imag
             )
     poses = np.array([frame["transform_matrix"] for _, frame in chosen], dtype=np.float64)
     return ImageSet(
-        images=np.stack(images),
+        images=images,
         viewmats=np.linalg.inv(poses @ OPENGL_TO_OPENCV),
         Ks=np.stack([_intrinsic_matrix(values, width, height) for values in merged]),
         views=np.array([int(frame.get("view", i)) for i, frame in chosen]),
@@ -319,6 +340,25 @@ def _image_file(folder: Path, name: str, listed_in: str | Path) -> Path:
     )
 
 
+def _read_all(files: Sequence[tuple[Path, str | None]]) -> np.ndarray:
+    """Images of one size (K, H, W, 4), on all cores: decoding and checksums run outside Python's lock."""
+    first = _read_rgba(*files[0])
+    images = np.empty((len(files), *first.shape), dtype=np.uint8)
+    images[0] = first
+
+    def read(row: int) -> None:
+        image = _read_rgba(*files[row])
+        if image.shape != first.shape:
+            sizes = (f"{i.shape[1]}x{i.shape[0]}" for i in (image, first))
+            raise InputError("{} is {}, others {}".format(files[row][0], *sizes))
+        images[row] = image
+
+    with ThreadPoolExecutor() as pool:
+        for _ in pool.map(read, range(1, len(files))):
+            pass
+    return images
+
+
 def _read_rgba(path: Path, sha256: str | None) -> np.ndarray:
     from PIL import Image
 
@@ -332,14 +372,14 @@ def _read_rgba(path: Path, sha256: str | None) -> np.ndarray:
             if image.mode in ("I;16", "I"):
                 raise InputError(f"{path} has 16 bits a channel: convert it to 8-bit RGBA")
             has_alpha = "A" in image.mode or "transparency" in image.info
-            pixels = np.asarray(image.convert("RGBA"), dtype=np.float32) / np.float32(255)
+            pixels = np.asarray(image.convert("RGBA"))
     except (OSError, SyntaxError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path} is not a readable image, perhaps truncated ({error}): replace it") from None
     if not has_alpha:
         raise InputError(f"{path} has no alpha channel: the object's mask must be stored as alpha (RGBA)")
-    if not (pixels[..., 3] > 0.5).any():
+    if not (pixels[..., 3] > 127).any():
         raise InputError(
             f"{path}: the mask (alpha) is empty, the object is not in the picture: remove this frame"
         )

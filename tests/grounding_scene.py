@@ -54,14 +54,14 @@ def camera(size: int = 32, dtype=torch.float64) -> Cameras:
 
 
 def observe(body: Reconstruction, v0, frames, spec=TRUTH, model=MODEL, size: int = 32) -> Observation:
-    """Video of the ball under an analytic law."""
-    cameras = camera(size, body.x0.dtype)
+    """Video of the ball under an analytic law, made where the ball is."""
+    cameras = camera(size, body.x0.dtype).to(body.x0.device)
     with torch.no_grad():
         path = rollout(
             model,
-            analytic_law(spec, model.dt),
+            analytic_law(spec, model.dt).to(body.x0.device),
             body.x0,
-            torch.as_tensor(v0, dtype=body.x0.dtype),
+            torch.as_tensor(v0).to(body.x0),
             body.mass,
             body.vol0,
             steps=frames[-1],

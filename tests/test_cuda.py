@@ -1,14 +1,16 @@
 """The CPU and a CUDA GPU run the same functions and agree. Skipped, saying so, where there is no GPU."""
 
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
-from grounding_scene import MODEL, TRUTH, ball, camera
+from grounding_scene import MODEL, TRUTH, ball, camera, observe
 from sim_scenes import make_law
 
+from neuma_lib.checkpoint import Checkpoint
 from neuma_lib.fitting.material import MaterialSettings, PixelLoss, train_material
-from neuma_lib.fitting.observation import Observation
+from neuma_lib.fitting.velocity import estimate_velocity
 from neuma_lib.materials import analytic_law, neural_law
 from neuma_lib.sim import rollout
 
@@ -62,6 +64,62 @@ def test_float32_stays_as_near_to_float64_as_the_cpu_does(law):
     assert relative(x_gpu, truth) < 5 * relative(x_cpu, truth)
 
 
+@pytest.fixture(scope="module")
+def drop():
+    """A ball in contact: arguments of a rollout on the GPU in float32, and a neural law with an adaptor."""
+    body = ball(height=0.2, dtype=torch.float32).to(torch.float32, "cuda")
+    law = make_law("neural", torch.float32)
+    law.attach_adaptor(rank=4, seed=1)
+    law = law.to("cuda")
+    v0 = torch.tensor([0.3, -2.0, 0.1], device="cuda")
+    return law, (MODEL, law, body.x0, v0, body.mass, body.vol0)
+
+
+def gradient(law, arguments, **options):
+    """Positions and gradients of the adaptor of a rollout of `STEPS` steps."""
+    path = rollout(*arguments, steps=STEPS, frames=FRAMES, skip_free_flight=False, **options)
+    trained = [p for p in law.parameters() if p.requires_grad]
+    grads = torch.autograd.grad(path.x.square().sum() + path.F.square().sum(), trained)
+    return path.x.detach(), torch.cat([g.flatten() for g in grads])
+
+
+@pytest.mark.parametrize("scatter", ["runs", "runs_scalar"])
+def test_sums_over_runs_of_particles_equal_single_additions(drop, scatter):
+    """Sorted and summed in warps, with and without vector atomics."""
+    x, grad = gradient(*drop, scatter="atomic")
+    x_runs, grad_runs = gradient(*drop, scatter=scatter)
+    assert relative(x_runs, x) < 1e-5
+    assert relative(grad_runs, grad) < 1e-3
+
+
+@pytest.mark.parametrize("options", [{}, {"keep": "states"}, {"memory": 2.0e6}])
+def test_graphs_replay_what_was_launched(drop, options):
+    """The first call launches, the second records, later ones replay: also with other weights and a new loss."""
+    law, arguments = drop
+    x, grad = gradient(law, arguments, **options)
+    for _ in range(3):
+        x_again, grad_again = gradient(law, arguments, **options)
+        assert relative(x_again, x) < 1e-5
+        assert relative(grad_again, grad) < 1e-3
+    adapted = copy.deepcopy(law)
+    with torch.no_grad():
+        for p in adapted.parameters():
+            if p.requires_grad:
+                p.add_(0.02)
+    x_other, grad_other = gradient(adapted, (arguments[0], adapted, *arguments[2:]), **options)
+    x_plain, grad_plain = gradient(adapted, (arguments[0], adapted, *arguments[2:]), scatter="atomic")
+    assert relative(x_other, x_plain) < 1e-5 < relative(x_other, x)
+    assert relative(grad_other, grad_plain) < 1e-3
+
+
+def test_prediction_without_gradient_replays_too(drop):
+    law, arguments = drop
+    with torch.no_grad():
+        paths = [rollout(*arguments, steps=STEPS, frames=FRAMES, skip_free_flight=False).x for _ in range(4)]
+    x, _ = gradient(law, arguments)
+    assert all(relative(path, x) < 1e-5 for path in paths)
+
+
 def render(device, dtype):
     body = ball(dtype=dtype).to(dtype, device)
     eye = torch.eye(3, dtype=dtype, device=device).expand(2, len(body.x0), 3, 3)
@@ -82,29 +140,56 @@ def test_particle_gs_agrees():
     assert float((difference.amax(-1) > 1 / 255).double().mean()) < 1e-3
 
 
-def test_training_runs_on_the_gpu():
-    body = ball(dtype=torch.float32).to(torch.float32, "cuda")
+def train(device, settings, checkpoint=None):
+    """Fit a stiff random law to the video of a soft ball in contact."""
+    body = ball(dtype=torch.float32).to(torch.float32, device)
     law = neural_law(seed=5)
     with torch.no_grad():
         law.elasticity.base[2].mul_(3e4 / max(law.longitudinal_modulus(), 1.0))
-    law = law.to("cuda")
+    law = law.to(device)
     law.attach_adaptor(rank=4, seed=1)
-    cameras = camera(dtype=torch.float32).to(device="cuda")
-    v0 = torch.tensor([0.0, -1.5, 0.0], device="cuda")
-    frames = (0, 20, 40)
-    with torch.no_grad():
-        path = rollout(
-            MODEL,
-            analytic_law(TRUTH, MODEL.dt).to("cuda"),
-            body.x0,
-            v0,
-            body.mass,
-            body.vol0,
-            steps=40,
-            frames=frames,
-        )
-        video = Observation(frames, body.particle_gs(cameras)(path.x, path.F), cameras)
-    result = train_material(
-        MODEL, law, body, v0, PixelLoss(body, video), MaterialSettings(iterations=5), log=lambda _: None
-    )
+    v0 = torch.tensor([0.0, -1.5, 0.0], device=device)
+    loss = PixelLoss(body, observe(body, v0, (0, 20, 40)), frames_per_batch=2)
+    return train_material(MODEL, law, body, v0, loss, settings, checkpoint=checkpoint, log=lambda _: None)
+
+
+def test_training_runs_on_the_gpu():
+    result = train("cuda", MaterialSettings(iterations=5))
     assert result.best_loss < result.history.loss[0]
+    assert len(result.history.seconds) == 5
+
+
+class Killed(Checkpoint):
+    """Writes its first state, and then the power fails."""
+
+    def save(self, state):
+        super().save(state)
+        raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("device", ["cuda", "cpu"])
+def test_a_training_killed_on_the_gpu_resumes_on_either_device(tmp_path, device):
+    settings = MaterialSettings(iterations=6, checkpoint_every=3)
+    whole = train("cuda", settings)
+    with pytest.raises(KeyboardInterrupt):
+        train("cuda", settings, Killed(tmp_path / "state.pt", {}))
+    resumed = train(device, settings, Checkpoint(tmp_path / "state.pt", {}))
+    assert resumed.history.loss == pytest.approx(whole.history.loss, rel=0.02)
+    for name, value in whole.law.adaptor_state().items():
+        found = resumed.law.adaptor_state()[name]
+        assert found.device.type == device
+        assert relative(found.cpu(), value.cpu()) < 0.05, name
+
+
+def test_velocity_from_bytes_agrees():
+    """Frames before contact on both devices, from images as they are decoded."""
+    found = {}
+    for device in ("cpu", "cuda"):
+        body = ball().to(torch.float64, device)
+        seen = observe(body, [0.5, -1.2, 0.4], (0, 4, 8, 12, 16))
+        opaque = torch.ones_like(seen.images[..., :1])
+        pixels = (255 * torch.cat([seen.images, opaque], -1).clamp(0, 1)).round().to(torch.uint8)
+        law = analytic_law(TRUTH, MODEL.dt).to(device)
+        found[device] = estimate_velocity(MODEL, law, body, replace(seen, images=pixels))
+    assert abs(found["cuda"].v0 - found["cpu"].v0).max() < 1e-6
+    assert abs(found["cuda"].std - found["cpu"].std).max() < 1e-6

@@ -14,24 +14,35 @@ from __future__ import annotations
 
 import copy
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from statistics import median
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
 
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.evaluation.metrics import chamfer_loss
+from neuma_lib.fitting.framewise import framewise
+from neuma_lib.fitting.image_loss import mean_squared_error
 from neuma_lib.fitting.observation import Observation, Reconstruction
+from neuma_lib.fitting.total_deformation import every_step, total_deformation
 from neuma_lib.materials.base import Law
 from neuma_lib.sim import MPMModel, Trajectory, rollout
 
 
 class TrajectoryLoss(Protocol):
-    """What training minimises: one number per frame from a simulated trajectory."""
+    """What training minimises: one number per frame from a simulated trajectory.
+
+    Attributes:
+        frames: steps of the frames.
+        total: whether F of the trajectory shall be the total deformation instead of its elastic part.
+    """
 
     frames: tuple[int, ...]
+    total: bool
 
     def __call__(self, path: Trajectory) -> Tensor:
         """Losses of the frames, shape (T,)."""
@@ -39,21 +50,35 @@ class TrajectoryLoss(Protocol):
 
 @dataclass
 class PixelLoss:
-    """Mean squared colour difference of each frame over all training views (paper Eq. 2)."""
+    """Mean squared colour difference of each frame over all training views (paper Eq. 2).
+
+    Attributes:
+        body: what is rendered.
+        observation: the video.
+        covariance_gradient: whether gradients reach the deformation gradients through the covariances.
+        frames_per_batch: frames rendered at a time, forward and backward (`framewise`); None: as many as a render of
+            moderate memory allows. The value does not depend on it.
+        total: whether the total deformation stretches the Gaussians, not its elastic part.
+    """
 
     body: Reconstruction
     observation: Observation
     covariance_gradient: bool = True
+    frames_per_batch: int | None = None
+    total: bool = False
 
     def __post_init__(self):
         self.frames = self.observation.frames
         self._renderer = self.body.particle_gs(
             self.observation.cameras, covariance_gradient=self.covariance_gradient
         )
+        self._batch = self.frames_per_batch or self._renderer.frames_per_batch
 
     def __call__(self, path: Trajectory) -> Tensor:
-        images = self._renderer(path.x, path.F)
-        return ((images - self.observation.images) ** 2).flatten(1).mean(1)
+        return framewise(self._losses, self._batch, path.x, path.F)
+
+    def _losses(self, part: slice, x: Tensor, F: Tensor) -> Tensor:
+        return mean_squared_error(self._renderer(x, F), self.observation.images[part])
 
 
 @dataclass
@@ -67,6 +92,7 @@ class ParticleLoss:
 
     frames: tuple[int, ...]
     targets: Tensor
+    total: ClassVar[bool] = False
 
     def __call__(self, path: Trajectory) -> Tensor:
         return chamfer_loss(path.x, self.targets)
@@ -81,6 +107,8 @@ class MaterialSettings:
         lr_elastic, lr_plastic: learning rates of the two networks.
         lr_floor: fraction of the learning rates that the cosine schedule ends at.
         betas: Adam's averaging factors.
+        zero_gradients: false adds every iteration's gradient to the clipped ones before it, as the authors' released
+            loop does.
         gradient_clip: largest gradient norm of each network; the loss is divided by its first value before.
         frame_weight_start: d of the frame weights d^k at the first iteration; it rises to 1 over the first third.
         frame_weight_periods: k counts this many equal parts of the video, so that early frames are fitted first.
@@ -97,6 +125,7 @@ class MaterialSettings:
     lr_plastic: float = 0.0005
     lr_floor: float = 0.05
     betas: tuple[float, float] = (0.9, 0.99)
+    zero_gradients: bool = True
     gradient_clip: float = 1.0
     frame_weight_start: float = 0.5
     frame_weight_periods: int = 5
@@ -109,13 +138,14 @@ class MaterialSettings:
 
 @dataclass
 class History:
-    """Training curves, one entry an accepted iteration."""
+    """Training curves, one entry an accepted iteration; ``seconds`` is the wall time that it took [s]."""
 
     loss: list[float] = field(default_factory=list)
     weighted_loss: list[float] = field(default_factory=list)
     gradient_norm_elastic: list[float] = field(default_factory=list)
     gradient_norm_plastic: list[float] = field(default_factory=list)
     lr_scale: list[float] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
     recoveries: list[dict] = field(default_factory=list)
 
 
@@ -136,7 +166,7 @@ class TrainedMaterial:
         moves = f", {len(self.history.recoveries)} recoveries" if self.history.recoveries else ""
         return (
             f"loss {first:.3e} -> {self.best_loss:.3e} (x{first / max(self.best_loss, 1e-30):.1f} lower) "
-            f"at iteration {self.best_iteration}{moves}{note}"
+            f"at iteration {self.best_iteration}{moves}, {median(self.history.seconds):.3g} s an iteration{note}"
         )
 
 
@@ -227,6 +257,7 @@ class _Loop:
 
     def advance(self) -> None:
         """One accepted optimiser step, or a return to the last good state."""
+        started = time.perf_counter()
         try:
             frame_losses = self._frame_losses()
             value = float(frame_losses.detach().mean())
@@ -248,6 +279,7 @@ class _Loop:
         self.history.gradient_norm_elastic.append(norms.get("elastic", 0.0))
         self.history.gradient_norm_plastic.append(norms.get("plastic", 0.0))
         self.history.lr_scale.append(self.lr_scale)
+        self.history.seconds.append(time.perf_counter() - started)
         self.lr_scale = min(1.0, self.lr_scale * self.settings.recovery_growth)
         self.iteration += 1
 
@@ -264,7 +296,7 @@ class _Loop:
             self._keep_if_best(value)
 
     def _frame_losses(self) -> Tensor:
-        body = self.body
+        body, frames = self.body, self.loss.frames
         path = rollout(
             self.model,
             self.law,
@@ -272,17 +304,18 @@ class _Loop:
             self.v0,
             body.mass,
             body.vol0,
-            steps=self.loss.frames[-1],
-            frames=self.loss.frames,
+            steps=frames[-1],
+            frames=every_step(frames) if self.loss.total else frames,
         )
-        return self.loss(path)
+        return self.loss(total_deformation(path, self.model.dt, frames) if self.loss.total else path)
 
     def _backward(self, frame_losses: Tensor) -> tuple[dict[str, float], float]:
         if self.first_loss is None:
             self.first_loss = float(frame_losses.detach().mean())
         weights = frame_weights(self.iteration, len(frame_losses), self.settings).to(frame_losses)
         weighted = (weights * frame_losses).sum() / weights.sum()
-        self.optimizer.zero_grad(set_to_none=True)
+        if self.settings.zero_gradients:
+            self.optimizer.zero_grad(set_to_none=True)
         (weighted / max(self.first_loss, 1e-30)).backward()
         norms = {}
         for name, parameters in self.nets.items():
@@ -323,6 +356,7 @@ class _Loop:
         self.lr_scale /= 2
         self.law.load_state_dict(self.best["law"])
         self.optimizer.load_state_dict(copy.deepcopy(self.good["optimizer"]))
+        self.optimizer.zero_grad(set_to_none=True)
         entry = {"iteration": self.iteration, "reason": str(error), "lr_scale": self.lr_scale}
         self.history.recoveries.append(entry)
         self.log(
@@ -341,6 +375,7 @@ class _Loop:
             "history": copy.deepcopy(self.history.__dict__),
             "best": copy.deepcopy(self.best),
             "good": copy.deepcopy(self.good),
+            "gradients": [None if p.grad is None else p.grad.clone() for p in self._parameters()],
             **self._snapshot(),
         }
 
@@ -351,3 +386,9 @@ class _Loop:
         self.history = History(**state["history"])
         self.law.load_state_dict(state["law"])
         self.optimizer.load_state_dict(state["optimizer"])
+        for parameter, gradient in zip(self._parameters(), state["gradients"], strict=True):
+            # Counts where gradients are not zeroed; a checkpoint may come from another device.
+            parameter.grad = None if gradient is None else gradient.to(parameter)
+
+    def _parameters(self) -> list[torch.nn.Parameter]:
+        return [p for parameters in self.nets.values() for p in parameters]

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.binding import Binding
+from neuma_lib.density import Density, density_at
 from neuma_lib.errors import InputError
 from neuma_lib.render.cameras import Cameras
 from neuma_lib.render.gaussians import Gaussians
@@ -34,11 +35,12 @@ class Reconstruction:
     binding: Binding
 
     @classmethod
-    def of_gaussians(cls, gaussians: Gaussians, volume: float, density: float) -> Reconstruction:
+    def of_gaussians(cls, gaussians: Gaussians, volume: float, density: Density) -> Reconstruction:
         """The kernels as particles (the paper's w/o Bind), one each, with equal shares of the volume [m^3]."""
         count = len(gaussians.means)
         vol0 = torch.full_like(gaussians.means[:, 0], volume / count)
-        return cls(gaussians.means, vol0, vol0 * density, gaussians, Binding.identity(count, gaussians.means))
+        mass = vol0 * density_at(gaussians.means, density)
+        return cls(gaussians.means, vol0, mass, gaussians, Binding.identity(count, gaussians.means))
 
     @property
     def density(self) -> float:
@@ -68,8 +70,10 @@ class Observation:
 
     Attributes:
         frames: simulation step of each frame (0 is the start), length T, ascending.
-        images: colours over a white background in [0, 1], shape (T, V, H, W, 3).
-        cameras: the V views.
+        images: straight-alpha RGBA as uint8, shape (T, V, H, W, 4), as decoded from files: a quarter of the memory of
+            floats. Or, for renders of our own, floating colours over white in [0, 1], shape (T, V, H, W, 3).
+            `colours` gives either as the latter.
+        cameras: the V views; their precision is that of the colours.
     """
 
     frames: tuple[int, ...]
@@ -81,6 +85,13 @@ class Observation:
             raise InputError(
                 f"{len(self.images)} images for {len(self.frames)} frames: every frame needs an image"
             )
+        channels = 4 if self.images.dtype == torch.uint8 else 3
+        views, height, width = len(self.cameras), self.cameras.height, self.cameras.width
+        if tuple(self.images.shape[1:]) != (views, height, width, channels):
+            raise InputError(
+                f"images of shape {tuple(self.images.shape)} and {self.images.dtype} do not fit {views} cameras of"
+                f" {width}x{height} pixels: give RGBA as uint8 or RGB as floats, (T, V, H, W, channels)"
+            )
         if list(self.frames) != sorted(set(self.frames)):
             raise InputError(f"frames must ascend without repeats, got {self.frames}")
 
@@ -89,21 +100,29 @@ class Observation:
         """Simulation steps from the start to the last frame."""
         return self.frames[-1]
 
+    def colours(self, part: slice | Sequence[int] = slice(None)) -> Tensor:
+        """Colours over a white background in [0, 1] of some frames, all by default, shape (T', V, H, W, 3)."""
+        images = self.images[part]
+        if images.dtype != torch.uint8:
+            return images
+        return over_white(images.to(self.cameras.viewmats.dtype) / 255)
+
     def select(self, keep: Sequence[int]) -> Observation:
         """The frames with the given indices."""
         keep = list(keep)
         return replace(self, frames=tuple(self.frames[i] for i in keep), images=self.images[keep])
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Observation:
-        """The same frames in another precision or on another device."""
+        """The same frames on another device, with cameras and colours in another precision."""
+        stored = torch.uint8 if self.images.dtype == torch.uint8 else dtype
         return replace(
             self,
-            images=self.images.to(dtype=dtype, device=device),
+            images=self.images.to(dtype=stored, device=device),
             cameras=self.cameras.to(dtype=dtype, device=device),
         )
 
 
 def over_white(rgba: Tensor) -> Tensor:
-    """Composite straight-alpha RGBA (..., 4) over white: colour (..., 3)."""
+    """Composite straight-alpha RGBA (..., 4) in [0, 1] over white: colour (..., 3)."""
     alpha = rgba[..., 3:]
     return rgba[..., :3] * alpha + (1 - alpha)

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.fitting.framewise import parts
 from neuma_lib.fitting.observation import Observation, Reconstruction
 from neuma_lib.materials.base import Law
 from neuma_lib.sim import MPMModel, rollout
@@ -123,21 +124,20 @@ def estimate_velocity(
     law = copy.deepcopy(law).to(torch.float64)
     if float(contact_clearance(model, body.x0)) <= 0:
         raise InputError("the body touches a wall in the first frame: the video must start before contact")
-    axes = observation.cameras.viewmats[0, :3, :3].numpy()
+    axes = observation.cameras.viewmats[0, :3, :3].cpu().numpy()
     unknowns = np.zeros(6)  # velocity [m/s], and the nuisance in units of NUISANCE_SCALE
     used = list(range(min(initial_frames, len(observation.frames))))
     accepted = 0
     for _ in range(6):
         seen = observation.select(used)
-        fit = _levenberg_marquardt(
-            model, law, body, seen, unknowns, axes, ridge, iterations, difference, progress
-        )
-        unknowns, accepted = fit["unknowns"], accepted + fit["accepted"]
+        residuals = _Residuals(model, law, body, seen, difference)
+        unknowns, fit, steps = _levenberg_marquardt(residuals, unknowns, axes, ridge, iterations, progress)
+        accepted += steps
         wider = _frames_before_contact(model, body, observation, unknowns[:3])
         if wider == used or len(wider) < 2:
             break
         used = wider
-    std, std_camera, information = _uncertainty(fit["J"], fit["r"], seen.images.shape, axes)
+    std, std_camera, information = _uncertainty(fit, axes)
     return VelocityEstimate(
         v0=unknowns[:3],
         std=std,
@@ -146,39 +146,115 @@ def estimate_velocity(
         information=information,
         frames=seen.frames,
         nuisance=NUISANCE_SCALE * unknowns[3:],
-        loss=float(np.sqrt(np.mean(fit["r"] ** 2))),
+        loss=fit.rms,
         iterations=accepted,
         ridge=ridge,
     )
 
 
-def _render(
-    model: MPMModel, law: Law, body: Reconstruction, seen: Observation, unknowns: np.ndarray
-) -> Tensor:
-    v0, nuisance = torch.as_tensor(unknowns).to(body.x0).split(3)
-    right, down, enlargement = NUISANCE_SCALE * nuisance
-    axes = seen.cameras.viewmats[0, :3, :3].to(body.x0)
-    with torch.no_grad():
-        path = rollout(model, law, body.x0, v0, body.mass, body.vol0, steps=seen.steps, frames=seen.frames)
-        centre = path.x.mean(dim=1, keepdim=True)
-        x = centre + (1 + enlargement) * (path.x - centre) + right * axes[0] + down * axes[1]
-        return body.particle_gs(seen.cameras)(x, (1 + enlargement) * path.F)
+@dataclass(frozen=True)
+class _Linearisation:
+    """The least-squares problem around some unknowns: residuals r, Jacobian J, summed up over all pixels.
+
+    Attributes:
+        curvature: J^T J, shape (6, 6).
+        scores: J^T r of every tile of the image, summed over the frames, shape (tiles, 6).
+        cost: r^T r.
+        rms: root mean square of r.
+    """
+
+    curvature: np.ndarray
+    scores: np.ndarray
+    cost: float
+    rms: float
+
+    @property
+    def slope(self) -> np.ndarray:
+        """J^T r, shape (6,)."""
+        return self.scores.sum(axis=0)
+
+
+@dataclass
+class _Residuals:
+    """Rendered minus observed colours as a function of the unknowns. A few frames at a time are in memory."""
+
+    model: MPMModel
+    law: Law
+    body: Reconstruction
+    seen: Observation
+    difference: float
+
+    def __post_init__(self):
+        self._renderer = self.body.particle_gs(self.seen.cameras)
+
+    def cost(self, unknowns: np.ndarray) -> float:
+        """Sum of squares."""
+        return self._checked(
+            sum(self._residual(unknowns, part).square().sum() for part in self._parts()), unknowns
+        )
+
+    def linearise(self, unknowns: np.ndarray) -> _Linearisation:
+        """Sums of the residuals and of their central differences."""
+        cost, curvature, scores = 0.0, 0.0, 0.0
+        for part in self._parts():
+            r = self._residual(unknowns, part)
+            J = torch.stack(
+                [
+                    self._render(unknowns + e, part) - self._render(unknowns - e, part)
+                    for e in self.difference * np.eye(6)
+                ]
+            ) / (2 * self.difference)
+            cost = cost + r.square().sum()
+            curvature = curvature + J.flatten(1) @ J.flatten(1).T
+            scores = scores + torch.stack([_tile_sums(column * r) for column in J], dim=1)
+        cost = self._checked(cost, unknowns)
+        rms = float(np.sqrt(cost / (len(self.seen.frames) * r[0].numel())))
+        return _Linearisation(curvature.cpu().numpy(), scores.cpu().numpy(), cost, rms)
+
+    def _parts(self):
+        return parts(len(self.seen.frames), self._renderer.frames_per_batch)
+
+    def _residual(self, unknowns: np.ndarray, part: slice) -> Tensor:
+        return self._render(unknowns, part) - self.seen.colours(part)
+
+    def _render(self, unknowns: np.ndarray, part: slice) -> Tensor:
+        body, frames = self.body, self.seen.frames[part]
+        v0, nuisance = torch.as_tensor(unknowns).to(body.x0).split(3)
+        right, down, enlargement = NUISANCE_SCALE * nuisance
+        axes = self.seen.cameras.viewmats[0, :3, :3]
+        with torch.no_grad():
+            path = rollout(
+                self.model, self.law, body.x0, v0, body.mass, body.vol0, steps=frames[-1], frames=frames
+            )
+            centre = path.x.mean(dim=1, keepdim=True)
+            x = centre + (1 + enlargement) * (path.x - centre) + right * axes[0] + down * axes[1]
+            return self._renderer(x, (1 + enlargement) * path.F)
+
+    def _checked(self, cost: Tensor, unknowns: np.ndarray) -> float:
+        value = float(cost)
+        if not np.isfinite(value):
+            raise NonFiniteError(
+                "velocity", f"rendered images are not finite at v0 = {unknowns[:3].tolist()}"
+            )
+        return value
+
+
+def _tile_sums(values: Tensor) -> Tensor:
+    """Sums of (T, V, H, W, C) over the frames, the channels and the pixels of each tile, shape (V * tiles,)."""
+    picture = values.sum(dim=(0, 4))
+    sums = torch.nn.functional.avg_pool2d(picture[:, None], _TILE, ceil_mode=True, divisor_override=1)
+    return sums.flatten()
 
 
 def _levenberg_marquardt(
-    model, law, body, seen, start, axes, ridge, iterations, difference, progress
-) -> dict:
-    """Minimise |r(v, nuisance)|^2 + ridge * curvature * (depth . v)^2, r = rendered - observed."""
-
-    def residual(u):
-        r = (_render(model, law, body, seen, u) - seen.images).flatten().cpu().numpy()
-        if not np.isfinite(r).all():
-            raise NonFiniteError("velocity", f"rendered images are not finite at v0 = {u[:3].tolist()}")
-        return r
-
-    def jacobian(u):
-        columns = [residual(u + e) - residual(u - e) for e in difference * np.eye(6)]
-        return np.stack(columns, axis=1) / (2 * difference)
+    residuals: _Residuals,
+    start: np.ndarray,
+    axes: np.ndarray,
+    ridge: float,
+    iterations: int,
+    progress: Callable[[int, int, float], None] | None,
+) -> tuple[np.ndarray, _Linearisation, int]:
+    """Minimise |r(u)|^2 + ridge * curvature * (depth . v)^2: the unknowns, their surroundings, accepted steps."""
 
     def penalty(H):
         P = np.zeros((6, 6))
@@ -186,23 +262,22 @@ def _levenberg_marquardt(
         return P
 
     u, damping, accepted = start, 1e-3, 0
-    r, J = residual(u), jacobian(u)
+    fit = residuals.linearise(u)
     for iteration in range(iterations):
-        H = J.T @ J
+        H = fit.curvature
         P = penalty(H)
-        step = -np.linalg.solve(H + P + damping * np.diag(np.diag(H)), J.T @ r + P @ u)
+        step = -np.linalg.solve(H + P + damping * np.diag(np.diag(H)), fit.slope + P @ u)
         trial = u + step
-        r_trial = residual(trial)
-        if r_trial @ r_trial + trial @ P @ trial < r @ r + u @ P @ u:
-            u, r, damping, accepted = trial, r_trial, max(damping / 5, 1e-9), accepted + 1
-            J = jacobian(u)
+        if residuals.cost(trial) + trial @ P @ trial < fit.cost + u @ P @ u:
+            u, damping, accepted = trial, max(damping / 5, 1e-9), accepted + 1
+            fit = residuals.linearise(u)
         else:
             damping *= 8
         if progress:
-            progress(iteration + 1, iterations, float(np.sqrt(np.mean(r**2))))
+            progress(iteration + 1, iterations, fit.rms)
         if np.linalg.norm(step) < 1e-5 or damping > 1e6:
             break
-    return {"unknowns": u, "r": r, "J": J, "accepted": accepted}
+    return u, fit, accepted
 
 
 def _frames_before_contact(
@@ -210,8 +285,7 @@ def _frames_before_contact(
 ) -> list[int]:
     """Indices of the leading frames in which the body, flying freely with v0, is clear of every wall."""
     clear = []
-    g = torch.tensor(model.gravity, dtype=body.x0.dtype)
-    v = torch.as_tensor(v0, dtype=body.x0.dtype)
+    g, v = (torch.as_tensor(vector).to(body.x0) for vector in (model.gravity, v0))
     for index, n in enumerate(observation.frames):
         x = body.x0 + n * model.dt * v + g * model.dt**2 * n * (n + 1) / 2
         if float(contact_clearance(model, x)) <= 0:
@@ -220,7 +294,7 @@ def _frames_before_contact(
     return clear
 
 
-def _uncertainty(J: np.ndarray, r: np.ndarray, shape: torch.Size, axes: np.ndarray):
+def _uncertainty(fit: _Linearisation, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Standard deviations of an unregularised fit whose residuals are correlated inside tiles of the image.
 
     Residuals come from what the static reconstruction cannot show, not from independent pixel noise: scores are
@@ -228,15 +302,8 @@ def _uncertainty(J: np.ndarray, r: np.ndarray, shape: torch.Size, axes: np.ndarr
     H^-1 (sum_c g_c g_c^T) H^-1). The curvature that is left for the velocity when the nuisance is free is the Schur
     complement of H.
     """
-    T, V, height, width, channels = shape
-    H = J.T @ J
-    rows, columns = -(-height // _TILE), -(-width // _TILE)
-    tile = (np.arange(height) // _TILE)[:, None] * columns + (np.arange(width) // _TILE)[None]
-    tile = (np.arange(V)[:, None, None] * rows * columns + tile[None])[None, ..., None]
-    tile = np.broadcast_to(tile, (T, V, height, width, channels)).ravel()
-    scores = np.stack([np.bincount(tile, weights=column * r) for column in J.T], axis=1)
-    inverse = np.linalg.pinv(H)
-    covariance = (inverse @ (scores.T @ scores) @ inverse)[:3, :3]
+    inverse = np.linalg.pinv(fit.curvature)
+    covariance = (inverse @ (fit.scores.T @ fit.scores) @ inverse)[:3, :3]
     in_camera = axes @ covariance @ axes.T
     curvature = 1 / np.diag(axes @ inverse[:3, :3] @ axes.T)
     return (

@@ -1,25 +1,31 @@
-"""Kernels of the rasterizer."""
+"""Kernels from particles to the image loss."""
 
 from __future__ import annotations
 
 import torch
 
+from neuma_lib.binding import Binding
+from neuma_lib.fitting.image_loss import mean_squared_error
 from neuma_lib.render.cameras import Cameras, look_at
+from neuma_lib.render.deformation import deform
 from neuma_lib.render.rasterizer import rasterize
 
 
 def compile_kernels(device: torch.device) -> None:
-    """One small image, forward and backward, in both precisions."""
+    """The loss of one small image, forward and backward, in both precisions."""
     for dtype in (torch.float32, torch.float64):
         generator = torch.Generator().manual_seed(0)
-        means = (0.4 + 0.2 * torch.rand(1, 4, 3, generator=generator)).to(device, dtype).requires_grad_()
-        covars = (0.05**2 * torch.eye(3, dtype=dtype, device=device)).repeat(1, 4, 1, 1)
+        x0 = (0.4 + 0.2 * torch.rand(4, 3, generator=generator)).to(device, dtype)
+        covars = (0.05**2 * torch.eye(3, dtype=dtype, device=device)).repeat(4, 1, 1)
+        F = torch.eye(3, dtype=dtype, device=device).repeat(1, 4, 1, 1).requires_grad_()
+        moved = deform(x0, covars, Binding.identity(4, x0), x0, x0[None].clone().requires_grad_(), F)
         opacities = torch.full((4,), 0.5, dtype=dtype, device=device)
-        sh = torch.zeros(4, 4, 3, dtype=dtype, device=device)
+        sh = torch.zeros(4, 4, 3, dtype=dtype, device=device).requires_grad_()
         K = torch.tensor([[[16.0, 0.0, 8.0], [0.0, 16.0, 8.0], [0.0, 0.0, 1.0]]])
         viewmats = look_at(
             torch.tensor([[0.5, 0.5, 2.0]]), torch.full((3,), 0.5), torch.tensor([0.0, 1.0, 0.0])
         )
         camera = Cameras(viewmats, K, 16, 16).to(device, dtype)
-        images, _ = rasterize(means, covars, opacities, sh, camera.viewmats, camera.Ks, 16, 16)
-        images.sum().backward()
+        images, _ = rasterize(*moved, opacities, sh, camera.viewmats, camera.Ks, 16, 16)
+        observed = torch.zeros(1, 1, 16, 16, 4, dtype=torch.uint8, device=device)
+        mean_squared_error(images, observed).sum().backward()

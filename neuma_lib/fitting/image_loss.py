@@ -1,0 +1,133 @@
+"""Mean squared colour difference between rendered images and decoded files, without copies of either.
+
+The observed pixels stay as they were decoded, four bytes each; the kernels composite them over white on the way. One
+pass reads both images for the loss, one reads them again and writes the gradient.
+"""
+
+# No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
+import functools
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from neuma_lib import warp_setup
+from neuma_lib.errors import InputError
+from neuma_lib.render.arrays import plain, target, vectors
+
+warp_setup.init()
+
+_GPU_LANES = 4096
+"""Partial sums of a frame on a GPU: neighbouring threads read neighbouring pixels, and few frames fill the device."""
+
+
+def mean_squared_error(images: Tensor, observed: Tensor) -> Tensor:
+    """Mean squared difference of each frame over all its views, pixels and channels (paper Eq. 2), shape (T,).
+
+    Differentiable with respect to ``images``. Sums are taken in double precision and in a fixed order, so equal inputs
+    give equal bits.
+
+    Args:
+        images: rendered colours over white, float32 or float64, shape (T, V, H, W, 3).
+        observed: straight-alpha RGBA as uint8, shape (T, V, H, W, 4), or floating colours over white like ``images``.
+
+    Raises:
+        InputError: shapes that do not fit.
+    """
+    bytes_ = observed.dtype == torch.uint8
+    if images.shape[:-1] != observed.shape[:-1] or observed.shape[-1] != (4 if bytes_ else 3):
+        raise InputError(
+            f"image loss: rendered images {tuple(images.shape)} do not fit observed ones {tuple(observed.shape)}"
+        )
+    if not bytes_:
+        return (images - observed).square().flatten(1).mean(1)
+    return _SquaredError.apply(images, observed)
+
+
+class _SquaredError(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, images: Tensor, observed: Tensor) -> Tensor:
+        images, observed = images.contiguous(), observed.contiguous()
+        T, pixels = len(images), images[0].numel() // 3
+        lanes = 1 if images.device.type == "cpu" else min(_GPU_LANES, pixels)
+        sums = images.new_empty(T, lanes, dtype=torch.float64)
+        squared_error, _ = kernels(images.dtype)
+        wp.launch(
+            squared_error,
+            dim=(T, lanes),
+            inputs=_pair(images, observed),
+            outputs=[plain(sums)],
+            **target(images),
+        )
+        ctx.save_for_backward(images, observed)
+        ctx.lanes = lanes
+        return (sums.sum(1) / (3 * pixels)).to(images.dtype)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
+        images, observed = ctx.saved_tensors
+        grad_images = torch.empty_like(images)
+        scale = grad * (2 * len(images) / images.numel())
+        _, adjoint = kernels(images.dtype)
+        wp.launch(
+            adjoint,
+            dim=(len(images), ctx.lanes),
+            inputs=[*_pair(images, observed), plain(scale), ctx.lanes],
+            outputs=[vectors(grad_images.view(len(images), -1, 3))],
+            **target(images),
+        )
+        return grad_images, None
+
+
+def _pair(images: Tensor, observed: Tensor) -> list[wp.array]:
+    """Colours (T, P) as vectors, and pixels (T, P) as one integer each."""
+    packed = observed.view(torch.int32).view(len(observed), -1)
+    return [vectors(images.view(len(images), -1, 3)), plain(packed)]
+
+
+@functools.cache
+def kernels(dtype: torch.dtype):
+    """``(squared_error, squared_error_adjoint)`` of a dtype, over (T, lanes): a lane takes every lanes-th pixel."""
+    real = wp.dtype_from_torch(dtype)
+    vec3 = wp.types.vector(3, real)
+    module = wp.get_module(f"{__name__}.{str(dtype).removeprefix('torch.')}")
+    kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
+
+    @wp.func(module=module)
+    def over_white(pixel: wp.int32):
+        """Colour of a straight-alpha pixel, whose bytes are R, G, B, A from the lowest up, over white."""
+        rgba, unit, byte = wp.uint32(pixel), real(1.0) / real(255.0), wp.uint32(255)
+        alpha = unit * real(rgba >> wp.uint32(24))
+        red = unit * real(rgba & byte)
+        green = unit * real((rgba >> wp.uint32(8)) & byte)
+        blue = unit * real((rgba >> wp.uint32(16)) & byte)
+        light = real(1.0) - alpha
+        return vec3(red * alpha + light, green * alpha + light, blue * alpha + light)
+
+    @kernel
+    def squared_error(
+        images: wp.array2d(dtype=vec3),  # (T, P)
+        observed: wp.array2d(dtype=wp.int32),  # (T, P)
+        sums: wp.array2d(dtype=wp.float64),  # (T, lanes), out
+    ):
+        t, lane = wp.tid()
+        total = wp.float64(0.0)
+        for p in range(lane, images.shape[1], sums.shape[1]):
+            error = images[t, p] - over_white(observed[t, p])
+            total += wp.float64(wp.dot(error, error))
+        sums[t, lane] = total
+
+    @kernel
+    def squared_error_adjoint(
+        images: wp.array2d(dtype=vec3),  # (T, P)
+        observed: wp.array2d(dtype=wp.int32),  # (T, P)
+        scale: wp.array(dtype=real),  # (T,)
+        lanes: int,
+        grad: wp.array2d(dtype=vec3),  # (T, P), out
+    ):
+        t, lane = wp.tid()
+        for p in range(lane, images.shape[1], lanes):
+            grad[t, p] = scale[t] * (images[t, p] - over_white(observed[t, p]))
+
+    return squared_error, squared_error_adjoint
