@@ -22,7 +22,8 @@ from neuma_lib.render import deform, rasterize
 from neuma_lib.sim import MPMModel, rollout
 from neuma_lib.sim.model import as_bodies
 from neuma_lib.sim.rollout import RolloutFunction
-from neuma_lib.sim.simulation import KEEP, Simulation
+from neuma_lib.sim.simulation import Simulation
+from neuma_lib.sim.storage import KEEP
 
 
 def rollout_step_by_step(model, law, x, v, mass, vol0, frames):

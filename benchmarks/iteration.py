@@ -1,0 +1,300 @@
+"""Where the time of one training iteration goes, on whatever device there is.
+
+    python -m benchmarks.iteration                      # the paper's scale on a GPU, the default scale on a CPU
+    python -m benchmarks.iteration --particles 60000 --pixels 400
+
+Every part is timed alone, on the state in the middle of the motion, and compared with its floor: the bytes that it
+must move (each input read once, each result written once) over the bandwidth of a copy, or the operations of its
+networks over the rate of a matrix product, whichever is longer, both measured here. The simulation as a whole and the
+rasterizer are also compared with their plain twins in torch, differentiated by autograd, at a size that these can do.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from benchmarks.scene import SMALL, BenchmarkScene, Size, make_scene
+from benchmarks.timing import arithmetic, bandwidth, device_name, peak_memory, seconds, seconds_a_call
+from neuma_lib.fitting.image_loss import mean_squared_error
+from neuma_lib.fitting.material import MaterialSettings, PixelLoss, train_material
+from neuma_lib.fitting.observation import Observation
+from neuma_lib.render import rasterize, torch_reference
+from neuma_lib.sim import Trajectory, rollout
+from neuma_lib.sim.model import as_bodies
+from neuma_lib.sim.simulation import Simulation
+from neuma_lib.sim.workspace import SORT_EVERY
+from tests import sim_twin
+
+NETWORK = 2 * (13 * 64 + 64 * 64 + 64 * 9)
+"""Operations of one network for one particle, forward."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """One line of the table.
+
+    Attributes:
+        name: what it does.
+        seconds: time of one call.
+        calls: calls in an iteration.
+        bytes, operations: least that a call must move and compute.
+    """
+
+    name: str
+    seconds: float
+    calls: float
+    bytes: float
+    operations: float = 0.0
+
+    def floor(self, rate: float, peak: float) -> float:
+        """Shortest time of a call on a device of that bandwidth [B/s] and arithmetic [1/s]."""
+        return max(self.bytes / rate, self.operations / peak)
+
+
+def simulation_parts(scene: BenchmarkScene, device: torch.device) -> list[Part]:
+    """The kernels of a step, there and back, on a state in contact."""
+    size, law = scene.size, scene.law
+    N, nodes = size.particles, size.grid**3
+    middle = size.steps // 2
+    with torch.no_grad():
+        path = _roll(scene, steps=middle, frames=(middle,))
+    weights = law.weights()
+    flat = [w.detach() for part in weights for w in part]
+    elastic, plastic = flat[:3], flat[3:]
+    bodies = as_bodies(law, N)
+    sim = Simulation(
+        scene.model, bodies, {id(law): weights}, scene.body.x0, 2, 0, differentiable=True, keep="all"
+    )
+    sim.set_mass(scene.body.mass, scene.body.vol0)
+    sim.run((path.x[0], path.v[0], path.F[0], path.C[0]), flat, (2,))
+    ws = sim.workspace
+    F, F_trial, tau = ws.F[0], ws.F_trial[0], ws.tau[0]
+    for grad in (ws.grad_x, ws.grad_v, ws.grad_C, ws.grad_F):
+        grad.normal_()
+    ws.grad_grid.zero_()
+    grads = [torch.zeros_like(w) for w in flat]
+
+    def on_stream(work: Callable[..., object], *args) -> Callable[[], None]:
+        def call():
+            with ws.stream():
+                work(*args)
+
+        return call
+
+    def law_back(part, value, weights, grad_out, grad_in, totals):
+        return lambda: part.vjp(value, weights, grad_out, grad_F=grad_in, grad_weights=totals)
+
+    particle = 4.0 * N
+    rows = [
+        ("elasticity", lambda: law.elasticity.evaluate(F, elastic, tau), 18 * particle, NETWORK * N),
+        (
+            "plasticity",
+            lambda: law.plasticity.evaluate(F_trial, plastic, ws.F[1]),
+            18 * particle,
+            NETWORK * N,
+        ),
+        ("P2G and grid", on_stream(ws.transfer_to_grid, 0), 26 * particle + 48 * nodes, 0),
+        ("G2P", on_stream(ws.transfer_to_particles, 0), 36 * particle + 16 * nodes, 0),
+        (
+            "plasticity, adjoint",
+            law_back(law.plasticity, F_trial, plastic, ws.grad_F, ws.grad_F_trial, grads[3:]),
+            27 * particle,
+            3 * NETWORK * N,
+        ),
+        ("transfers, adjoint", on_stream(ws.transfer_adjoint, 0), (60 + 53) * particle + 80 * nodes, 0),
+        (
+            "elasticity, adjoint",
+            law_back(law.elasticity, F, elastic, ws.grad_tau, ws.grad_F_elastic, grads[:3]),
+            27 * particle,
+            3 * NETWORK * N,
+        ),
+    ]
+    parts = [
+        Part(name, seconds_a_call(work, device), size.steps, moved, operations)
+        for name, work, moved, operations in rows
+    ]
+    if ws.sorts:
+        parts.append(
+            Part(
+                "sorting by cell",
+                seconds_a_call(on_stream(ws.sort, 0), device),
+                size.steps / SORT_EVERY,
+                8 * particle,
+            )
+        )
+    return parts
+
+
+def rendering_parts(scene: BenchmarkScene, device: torch.device, frames: int) -> list[Part]:
+    """Binding, rasterizer and loss of a batch of frames, there and back."""
+    size, body = scene.size, scene.body
+    with torch.no_grad():
+        path = _roll(scene, steps=size.steps, frames=size.frame_steps[-frames:])
+    x, F = path.x.requires_grad_(), path.F.requires_grad_()
+    renderer = body.particle_gs(scene.observation.cameras)
+    N, G, pixels = size.particles, size.gaussians, size.pixels**2
+    means, covars = renderer.deformed(x, F)
+    inputs = [t.detach().requires_grad_() for t in (means, covars)]
+    images = renderer.splatted(*inputs)
+    part = slice(len(size.frame_steps) - frames, None)
+    detached = images.detach().requires_grad_()
+    grad_image = torch.randn_like(detached)
+    calls = len(size.frame_steps) / frames
+    deformed = 4.0 * frames * G * 12
+    states = 4.0 * frames * N * 12
+    image = 4.0 * frames * pixels * 3
+
+    def back(outputs, leaves, grads):
+        return lambda: torch.autograd.grad(outputs, leaves, grads, retain_graph=True)
+
+    grad_deformed = [torch.randn_like(t) for t in (means, covars)]
+    rows = [
+        ("binding", lambda: renderer.deformed(x.detach(), F.detach()), states + deformed),
+        ("binding, adjoint", back((means, covars), (x, F), grad_deformed), states + deformed),
+        ("rasterizer", lambda: renderer.splatted(*(t.detach() for t in inputs)), deformed + image),
+        ("rasterizer, adjoint", back(images, inputs, grad_image), 2 * deformed + image),
+        (
+            "loss and its gradient",
+            lambda: _loss_gradient(scene.observation, detached, part),
+            2 * image + image / 3,
+        ),
+    ]
+    return [Part(name, seconds(work, device), calls, moved) for name, work, moved in rows]
+
+
+def _loss_gradient(observation: Observation, images: torch.Tensor, part: slice) -> torch.Tensor:
+    value = mean_squared_error(images, observation.images[part])
+    return torch.autograd.grad(value.sum(), images)[0]
+
+
+def _roll(scene: BenchmarkScene, **options) -> Trajectory:
+    body = scene.body
+    return rollout(
+        scene.model, scene.law, body.x0, scene.v0, body.mass, body.vol0, skip_free_flight=False, **options
+    )
+
+
+def simulate_and_back(scene: BenchmarkScene, **options) -> None:
+    """One rollout of all steps and its adjoint."""
+    path = _roll(scene, steps=scene.size.steps, frames=scene.size.frame_steps, **options)
+    scene.law.zero_grad()
+    (path.x.square().mean() + path.F.square().mean()).backward()
+
+
+def iterations(scene: BenchmarkScene, count: int) -> list[float]:
+    """Wall time of each of some training iterations [s], by the training loop itself."""
+    loss = PixelLoss(scene.body, scene.observation)
+    settings = MaterialSettings(iterations=count, lr_elastic=1e-4, lr_plastic=1e-5)
+    trained = train_material(scene.model, scene.law, scene.body, scene.v0, loss, settings, log=lambda _: None)
+    return trained.history.seconds
+
+
+def twin_step(scene: BenchmarkScene, device: torch.device, steps: int = 5) -> float:
+    """Time of a step and its gradient by the plain torch twin [s]."""
+    body = scene.body
+    eye = torch.eye(3, device=device).expand(len(body.x0), 3, 3)
+    v0 = scene.v0.expand_as(body.x0)
+
+    def work():
+        x, *_ = sim_twin.rollout(
+            scene.model, scene.law, body.x0, v0, body.mass, body.vol0, eye, torch.zeros_like(eye), (steps,)
+        )
+        scene.law.zero_grad()
+        x.square().mean().backward()
+
+    return seconds(work, device, repetitions=2) / steps
+
+
+def twin_render(device: torch.device) -> tuple[float, float]:
+    """Time of a small render and its gradient by the plain torch twin and by the rasterizer [s]."""
+    scene = make_scene(dataclasses.replace(SMALL, gaussians=300, pixels=48, frames=1), device)
+    body, cameras = scene.body, scene.observation.cameras
+    gaussians = body.gaussians
+    means = gaussians.means[None].clone().requires_grad_()
+    covars = gaussians.covars()[None].detach()
+    rest = (gaussians.opacities, gaussians.sh(), cameras.viewmats, cameras.Ks, cameras.width, cameras.height)
+
+    def work(render):
+        image, _ = render(means, covars, *rest)
+        torch.autograd.grad(image.square().mean(), means)
+
+    return tuple(seconds(lambda r=r: work(r), device, 2) for r in (torch_reference.rasterize, rasterize))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    for field in dataclasses.fields(Size):
+        parser.add_argument(f"--{field.name}", type=type(field.default), help=f"{field.default} on a GPU")
+    parser.add_argument(
+        "--batch", type=int, default=40, help="frames that are rendered at a time in the parts"
+    )
+    parser.add_argument("--output", type=Path, help="also write the table there, as Markdown")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    device = torch.device(args.device)
+    given = {f.name: value for f in dataclasses.fields(Size) if (value := getattr(args, f.name)) is not None}
+    size = dataclasses.replace(Size() if device.type == "cuda" else SMALL, **given)
+    scene = make_scene(size, device)
+    lines = report(scene, device, min(args.batch, len(size.frame_steps)))
+    print("\n".join(lines))
+    if args.output:
+        args.output.write_text("\n".join(lines) + "\n")
+
+
+def report(scene: BenchmarkScene, device: torch.device, batch: int) -> list[str]:
+    """The table, line by line, in Markdown."""
+    size = scene.size
+    rate, peak = bandwidth(device), arithmetic(device)
+    parts = [*simulation_parts(scene, device), *rendering_parts(scene, device, batch)]
+    simulation = seconds(lambda: simulate_and_back(scene), device)
+    bounded = seconds(lambda: simulate_and_back(scene, memory=memory_of_states(size) / 2), device, 3)
+    times = []
+    memory = peak_memory(lambda: times.extend(iterations(scene, 8)), device)
+    whole = min(times[3:])
+    total = sum(part.seconds * part.calls for part in parts)
+    lines = [
+        f"{size.particles} particles, {size.grid}³ grid, {size.steps} steps, {len(size.frame_steps)} renders of "
+        f"{size.gaussians} Gaussians at {size.pixels}×{size.pixels}, float32, {device_name(device)}; copy "
+        f"{rate / 1e12:.2f} TB/s, matrix product {peak / 1e12:.2f} TFLOP/s.",
+        "",
+        "| part | a call [µs] | calls | iteration [ms] | share | floor of a call [µs] | call / floor |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    for part in parts:
+        floor = part.floor(rate, peak)
+        lines.append(
+            f"| {part.name} | {1e6 * part.seconds:.1f} | {part.calls:.0f} | {1e3 * part.seconds * part.calls:.1f} | "
+            f"{100 * part.seconds * part.calls / total:.0f} % | {1e6 * floor:.1f} | {part.seconds / floor:.1f} |"
+        )
+    gibibytes = f"{memory / 2**30:.2f} GiB" if memory == memory else "not counted"
+    step, (slow, fast) = twin_step(scene, device), twin_render(device)
+    lines += [
+        f"| **sum of the parts** | | | {1e3 * total:.1f} | 100 % | | |",
+        "",
+        "| whole | time | torch twin | twin / ours |",
+        "|---|---:|---:|---:|",
+        f"| training iteration | {1e3 * whole:.1f} ms, {gibibytes} | | |",
+        f"| simulation and networks, there and back | {1e3 * simulation:.1f} ms | {step * size.steps:.2f} s | "
+        f"{step * size.steps / simulation:.0f} |",
+        f"| the same with half of the memory for states | {1e3 * bounded:.1f} ms | | |",
+        f"| one image of 300 Gaussians at 48×48 and its gradient | {1e3 * fast:.2f} ms | {1e3 * slow:.0f} ms | "
+        f"{slow / fast:.0f} |",
+    ]
+    return lines
+
+
+def memory_of_states(size: Size) -> float:
+    """Bytes of the states of all steps."""
+    return 4.0 * 24 * size.particles * (size.steps + 1)
+
+
+if __name__ == "__main__":
+    main()

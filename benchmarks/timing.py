@@ -1,0 +1,75 @@
+"""Time and memory of work on a device, and what the device could do at best."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import torch
+
+
+def synchronize(device: torch.device) -> None:
+    """Wait for all work handed out so far."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def seconds(work: Callable[[], object], device: torch.device, repetitions: int = 5) -> float:
+    """Wall time of the fastest of some repetitions, after one that does not count (compilation, memory).
+
+    Other load only adds time, so the best is the least disturbed.
+    """
+    best = float("inf")
+    for repetition in range(repetitions + 1):
+        synchronize(device)
+        started = time.perf_counter()
+        work()
+        synchronize(device)
+        if repetition:
+            best = min(best, time.perf_counter() - started)
+    return best
+
+
+def seconds_a_call(work: Callable[[], object], device: torch.device, calls: int = 20) -> float:
+    """Time of one of many small calls: on a GPU inside a CUDA graph, free of the cost of launching from Python."""
+    if device.type == "cpu":
+        return seconds(work, device)
+    work()
+    synchronize(device)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+        for _ in range(calls):
+            work()
+    return seconds(graph.replay, device) / calls
+
+
+def peak_memory(work: Callable[[], object], device: torch.device) -> float:
+    """Largest memory that torch held on a GPU during the work [bytes]; NaN on a CPU, where nobody counts."""
+    if device.type == "cpu":
+        work()
+        return float("nan")
+    torch.cuda.reset_peak_memory_stats(device)
+    work()
+    return torch.cuda.max_memory_allocated(device)
+
+
+def bandwidth(device: torch.device) -> float:
+    """Measured bytes a second of a large copy, read and written bytes together."""
+    size = 2**30 if device.type == "cuda" else 2**27
+    source = torch.empty(size // 4, device=device).normal_()
+    target = torch.empty_like(source)
+    return 2 * size / seconds(lambda: target.copy_(source), device)
+
+
+def arithmetic(device: torch.device) -> float:
+    """Measured float32 operations a second of a large matrix product, without reduced-precision modes."""
+    n = 8192 if device.type == "cuda" else 1024
+    a, b = (torch.empty(n, n, device=device).normal_() for _ in range(2))
+    return 2 * n**3 / seconds(lambda: a @ b, device)
+
+
+def device_name(device: torch.device) -> str:
+    """What a reader has to know of the machine."""
+    if device.type == "cuda":
+        return f"one {torch.cuda.get_device_name(device)}"
+    return f"CPU, {torch.get_num_threads()} thread(s)"
