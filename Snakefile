@@ -4,8 +4,12 @@
 configfile: "config/config.yaml"
 
 
+report: "workflow/report/workflow.rst"
+
+
 include: "workflow/rules/common.smk"
 include: "workflow/rules/dataset.smk"
+include: "workflow/rules/packing.smk"
 include: "workflow/rules/priors.smk"
 include: "workflow/rules/gaussians.smk"
 include: "workflow/rules/geometry.smk"
@@ -13,7 +17,11 @@ include: "workflow/rules/binding.smk"
 include: "workflow/rules/velocity.smk"
 include: "workflow/rules/material.smk"
 include: "workflow/rules/evaluation.smk"
+include: "workflow/rules/experiments.smk"
+include: "workflow/rules/metrics.smk"
 include: "workflow/rules/paper.smk"
+include: "workflow/rules/figure_inputs.smk"
+include: "workflow/rules/figures.smk"
 
 
 rule all:

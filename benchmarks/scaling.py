@@ -55,6 +55,8 @@ def measure(
     """Seconds and peak bytes of an iteration, or of its simulation for sizes that rendering does not see."""
     size = dataclasses.replace(base, **{axis: value})
     rendered = axis in ("frames", "pixels")
+    if axis == "grid":  # the same Courant number
+        size = dataclasses.replace(size, dt=base.dt * min(1.0, base.grid / value))
     if axis == "steps":
         size = dataclasses.replace(size, frames=min(base.frames, value))
     scene = make_scene(size if rendered else dataclasses.replace(size, gaussians=10, pixels=8), device)

@@ -101,7 +101,7 @@ def soft_law() -> NeuralLaw:
     law = neural_law(seed=3).double()
     W0, W1, _ = (w.detach() for w in law.elasticity.weights())
     noise = torch.randn(4000, 3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    F = torch.eye(3, dtype=torch.float64) + 0.1 * noise
+    F = torch.eye(3, dtype=torch.float64) + 0.2 * noise
     R, sigma = rotation_and_singular_values(F)
     X = R.mT @ analytic_law(SOFT, dt=1.0).elasticity(F) @ torch.linalg.inv(F).mT
     hidden = gelu(gelu(features(F, sigma) @ W0.mT) @ W1.mT)

@@ -1,6 +1,6 @@
 """Copy the tables of a finished run to docs/results, with the machine, the commit and the date above each.
 
-python docs/record.py            # after: snakemake --cores 2 tables results/figures/overview.png
+python docs/record.py            # after: snakemake --cores 2 tables results/figures/main_res.png
 """
 
 from __future__ import annotations
@@ -12,7 +12,17 @@ import shutil
 import subprocess
 from pathlib import Path
 
-TABLES = ("table1", "initial_states", "timings", "learning_rates")
+TABLES = (
+    "table1",
+    "table2",
+    "table3",
+    "table4",
+    "table5",
+    "uneven_mass",
+    "initial_states",
+    "timings",
+    "learning_rates",
+)
 
 
 def processor() -> str:
@@ -43,9 +53,9 @@ def main() -> None:
         if source.exists():
             (out / f"{name}.md").write_text(f"{origin}\n\n{source.read_text()}")
             shutil.copyfile(source.with_suffix(".csv"), out / f"{name}.csv")
-    picture = results / "figures" / "overview.png"
+    picture = results / "figures" / "main_res.png"
     if picture.exists():
-        shutil.copyfile(picture, out / "overview.png")
+        shutil.copyfile(picture, out / "main_res.png")
 
 
 if __name__ == "__main__":

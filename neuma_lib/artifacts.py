@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,25 +12,28 @@ import torch
 
 from neuma_lib import io
 from neuma_lib.binding import Binding
+from neuma_lib.density import Density, density_at
 from neuma_lib.errors import InputError
-from neuma_lib.fitting.observation import Observation, Reconstruction, over_white
+from neuma_lib.fitting.observation import Observation, Reconstruction
 from neuma_lib.materials.neural import NeuralLaw
 from neuma_lib.materials.priors import load_prior
 from neuma_lib.render.cameras import Cameras
 from neuma_lib.render.gaussians import Gaussians
+from neuma_lib.sim import each_its_own
 
 
 def load_views(transforms: str | Path, views: Sequence[int] | None = None) -> tuple[torch.Tensor, Cameras]:
     """Straight-alpha RGBA images (V, H, W, 4) in [0, 1] and their cameras, of an image set at one time."""
     images = io.read_image_set(transforms, views)
-    return torch.from_numpy(images.images), _cameras(images, np.arange(len(images.images)))
+    pixels = torch.from_numpy(images.images).float() / 255
+    return pixels, _cameras(images, np.arange(len(pixels)))
 
 
 def load_observation(transforms: str | Path, views: Sequence[int]) -> Observation:
-    """The video of some views over a white background."""
+    """The video of some views, with its pixels as they are stored: 1 GB for 400 frames of 800 x 800."""
     images = io.read_image_set(transforms, views)
     frames, index, columns = images.video(views)
-    return Observation(frames, over_white(torch.from_numpy(images.images[index])), _cameras(images, columns))
+    return Observation(frames, torch.from_numpy(images.images[index]), _cameras(images, columns))
 
 
 def _cameras(images: io.ImageSet, index: np.ndarray) -> Cameras:
@@ -69,8 +73,12 @@ def save_binding(
     )
 
 
-def load_body(binding: str | Path, gaussians: str | Path, density: float) -> Reconstruction:
+def load_body(binding: str | Path, gaussians: str | Path, density: Density) -> Reconstruction:
     """The reconstructed body: bound particles with their volumes, and the Gaussians that they carry.
+
+    Args:
+        binding, gaussians: files of a scene, or of an experiment.
+        density: what is known of it, or believed.
 
     Raises:
         InputError: the binding was made for other Gaussians.
@@ -87,10 +95,42 @@ def load_body(binding: str | Path, gaussians: str | Path, density: float) -> Rec
     return Reconstruction(
         x0=tensors["x"],
         vol0=tensors["vol0"],
-        mass=tensors["vol0"] * density,
+        mass=tensors["vol0"] * density_at(tensors["x"], density),
         gaussians=kernels,
         binding=Binding(tensors["indptr"], tensors["indices"], tensors["values"], shape),
     )
+
+
+def load_start(
+    binding: str | Path, gaussians: str | Path, velocity: str | Path, densities: Sequence[Density]
+) -> tuple[Reconstruction, torch.Tensor, list[int]]:
+    """What a prediction starts from: the reconstructed bodies of a scene (one) or of an experiment.
+
+    Args:
+        binding, gaussians, velocity: files of the scene or experiment.
+        densities: of each body.
+
+    Returns:
+        All bodies as one, velocities of the particles [m/s] (N, 3), and the particle count of each body.
+    """
+    together = load_body(binding, gaussians, 1.0)
+    found = io.read_json(velocity)
+    parts = found.get("bodies", [{**found, "particles": len(together.x0)}])
+    counts = [part["particles"] for part in parts]
+    if sum(counts) != len(together.x0) or len(densities) != len(counts):
+        raise InputError(f"{velocity} is of other bodies than {binding}: make both again")
+    density = [density_at(x, d) for x, d in zip(together.x0.split(counts), densities, strict=True)]
+    body = replace(together, mass=together.vol0 * torch.cat(density))
+    return body, each_its_own([part["v0"] for part in parts], counts), counts
+
+
+def load_motion(rollout: str | Path) -> tuple[torch.Tensor, torch.Tensor]:
+    """What renders need of a rollout: positions (T, N, 3) [m], and deformations (T, N, 3, 3) that stretch Gaussians.
+
+    These are elastic, or the total ones where the method says so and the file has them.
+    """
+    arrays, _ = io.read_arrays(rollout, required=("x", "F"), only=("x", "F", "F_total"))
+    return torch.from_numpy(arrays["x"]), torch.from_numpy(arrays.get("F_total", arrays["F"]))
 
 
 def save_adaptor(

@@ -63,6 +63,24 @@ class AppearanceConfig(Section):
     seed: int = Field(0, description="seed of the patches")
 
 
+class SplitDensityConfig(Section):
+    """Two mass densities on either side of a plane."""
+
+    axis: Literal["x", "y", "z"] = Field("x", description="axis that the plane is normal to")
+    at: float = Field(0.5, description="where the plane cuts the axis [m]")
+    below: float = Field(gt=0, description="density on the side of smaller coordinates [kg/m^3]")
+    above: float = Field(gt=0, description="density on the other side [kg/m^3]")
+
+
+class SuppliedConfig(Section):
+    """Image sets that were made elsewhere: a transforms.json, or a list in the layout of the authors' release."""
+
+    static: str | None = Field(None, description="views at t = 0; null: rendered by Blender")
+    dynamic: str | None = Field(
+        None, description="videos with the frames that the scene's settings name; null: rendered by Blender"
+    )
+
+
 class SceneConfig(Section):
     """A benchmark: what is thrown, of what, how, and what is believed about it."""
 
@@ -73,16 +91,22 @@ class SceneConfig(Section):
     height: float = Field(description="y of the bounding box's centre at the start [m]")
     center: tuple[float, float] = Field((0.5, 0.5), description="x and z of the bounding box's centre [m]")
     velocity: Vector = Field(description="initial velocity [m/s]")
-    density: float = Field(1000.0, gt=0, description="mass density rho [kg/m^3]")
+    density: Annotated[float, Field(gt=0)] | SplitDensityConfig = Field(
+        1000.0,
+        description="mass density rho [kg/m^3], or two of them at t = 0: {axis: x, at: 0.5, below: 800, above: 1200}",
+    )
     law: LawConfig = Field(description="the true material, known to the ground truth only")
     dt: float = Field(gt=0, description="time step [s]")
     steps: int = Field(gt=0, description="simulated steps of the video")
     frames: tuple[int, ...] | None = Field(
         None,
-        description="steps of the video's frames, ascending from 0; none: dataset.frames of them, evenly spaced",
+        description="steps of the video's frames, ascending from 0; null: as dataset.frames or dataset.stride say",
     )
     prior: str = Field(description="name in priors.laws, or path of a .safetensors or a released .pt file")
     appearance: AppearanceConfig = Field(description="how Blender shows it")
+    images: SuppliedConfig = Field(
+        SuppliedConfig(), description="files of its images, where Blender makes none"
+    )
     story: str = Field("", description="in which way the prior is wrong, in words")
     material: dict[str, Any] = Field(
         {}, description="settings of the section material that this scene overrides"
@@ -97,12 +121,46 @@ class SceneConfig(Section):
             raise ValueError("frames must ascend from 0 to at most 'steps' without repeats")
         return self
 
-    def frame_steps(self, count: int) -> tuple[int, ...]:
-        """Steps of the video's frames: the scene's own list, or ``count`` steps evenly from 0 to the last one."""
-        if self.frames is not None:
-            return self.frames
-        count = min(count, self.steps + 1)
-        return tuple(round(i * self.steps / max(count - 1, 1)) for i in range(count))
+
+class BodyConfig(Section):
+    """A body of an experiment."""
+
+    scene: str = Field(description="scene whose material it has: the true law, or the one learned there")
+    shape: str | None = Field(
+        None,
+        description="name of a shape, whose mesh is known to the truth and to the prediction; null: the scene's own "
+        "object, reconstructed, and its estimated velocity",
+    )
+    size: float | None = Field(
+        None, gt=0, description="longest side of the bounding box [m]; null: the shape's own"
+    )
+    height: float | None = Field(
+        None, description="y of the bounding box's centre at the start [m]; null: the scene's"
+    )
+    center: tuple[float, float] | None = Field(
+        None, description="x and z of the bounding box's centre [m]; null: the scene's"
+    )
+    velocity: Vector | None = Field(None, description="initial velocity [m/s]; null: the scene's")
+
+    @model_validator(mode="after")
+    def _placed_only_with_a_shape(self) -> BodyConfig:
+        placed = [key for key in ("size", "height", "center", "velocity") if getattr(self, key) is not None]
+        if self.shape is None and placed:
+            raise ValueError(
+                f"{', '.join(placed)}: a reconstructed object starts as in its scene; name a shape"
+            )
+        return self
+
+
+class ExperimentConfig(Section):
+    """Laws learned in scenes, put to use elsewhere: on another shape, together, or for longer."""
+
+    title: str = Field(description="name in tables")
+    bodies: tuple[BodyConfig, ...] = Field(min_length=1, description="what moves, on one grid")
+    steps: int = Field(gt=0, description="simulated steps")
+    dt: float | None = Field(
+        None, gt=0, description="time step [s]; null: the smallest of the bodies' scenes"
+    )
 
 
 class ImagesConfig(Section):
@@ -114,6 +172,17 @@ class ImagesConfig(Section):
     samples: int = Field(16, ge=1, description="Cycles samples a pixel (denoised)")
 
 
+class PackingConfig(Section):
+    """How much of a ground truth travels in a packed dataset; all tracers do."""
+
+    particles: int = Field(
+        30_000,
+        gt=0,
+        description="particles kept, drawn at random, with volumes and masses scaled to the same total",
+    )
+    deformations: int = Field(1000, gt=0, description="those of them whose deformation gradient is kept")
+
+
 class DatasetConfig(Section):
     """Ground truth and its images."""
 
@@ -121,14 +190,38 @@ class DatasetConfig(Section):
         8000, gt=0, description="ground-truth particles, at least four times the reconstruction's"
     )
     seed: int = Field(1000, description="seed of the ground truth, apart from the reconstruction's")
-    frames: int = Field(
-        25, ge=2, description="frames of a video, the first at step 0, for scenes that list none"
+    steps: int | None = Field(None, gt=0, description="steps of every video; null: those of its scene")
+    frames: int | None = Field(
+        25, ge=2, description="frames of a video, evenly from step 0 to the last, for scenes that list none"
+    )
+    stride: int | None = Field(
+        None, ge=1, description="steps between two frames; in place of frames, which is null then"
     )
     tracers: int = Field(100_000, gt=0, description="passive tracers that measure the motion of the truth")
     static: ImagesConfig = Field(ImagesConfig(views=50), description="views on a sphere at t = 0")
     dynamic: ImagesConfig = Field(
         ImagesConfig(views=3, width=96, height=96), description="videos, view 0 frontal"
     )
+    packed: str | None = Field(
+        None,
+        min_length=1,
+        description="folder of packed datasets, `<scene>.images.zip` and `<scene>.truth.zip`, to unpack in place of "
+        "simulating and rendering; null: the dataset is made here",
+    )
+    packing: PackingConfig = Field(PackingConfig(), description="what the target `packed` keeps")
+
+    @model_validator(mode="after")
+    def _one_rule_for_frames(self) -> DatasetConfig:
+        if (self.frames is None) == (self.stride is None):
+            raise ValueError("give either frames or stride, and null for the other")
+        return self
+
+    def frame_steps(self, steps: int) -> tuple[int, ...]:
+        """Steps of the frames of a video of ``steps`` steps."""
+        if self.stride is not None:
+            return tuple(range(0, steps + 1, self.stride))
+        count = min(self.frames, steps + 1)
+        return tuple(round(i * steps / max(count - 1, 1)) for i in range(count))
 
 
 class SimulationConfig(Section):
@@ -186,7 +279,7 @@ class VelocityConfig(Section):
 
     views: tuple[int, ...] = Field((0,), min_length=1, description="views of the video that are used")
     ridge: float = Field(
-        0.02, ge=0, description="penalty on the depth axis, relative to the best determined axis"
+        0.0, ge=0, description="penalty on the depth axis, relative to the best determined axis"
     )
     initial_frames: int = Field(3, ge=2, description="frames of the first estimate")
     iterations: int = Field(30, ge=1, description="most Levenberg-Marquardt steps for a set of frames")
@@ -211,6 +304,14 @@ class MaterialChoices(Section):
     seed: int = Field(0, description="seed of the adaptor's initial weights")
     lr_scale: float = Field(1.0, gt=0, description="factor on both learning rates (sweeps, ablations)")
     covariance_gradient: bool = Field(True, description="let image gradients reach F through the covariances")
+    covariance_from: Literal["elastic", "total"] = Field(
+        "elastic",
+        description="deformation that stretches the Gaussians: the elastic F (paper), or the total one, with all that "
+        "has flowed",
+    )
+    assumed_density: float | None = Field(
+        None, gt=0, description="density believed everywhere [kg/m^3]; null: the scene's is told"
+    )
 
 
 MaterialConfig = block("fitting.material", "MaterialSettings", base=MaterialChoices)
@@ -220,21 +321,80 @@ class EvaluationConfig(Section):
     """Rollout of the learned law and its measures."""
 
     tracers: int = Field(100_000, gt=0, description="passive tracers in the prediction")
+    views: tuple[int, ...] | None = Field(
+        None, min_length=1, description="views of the image metrics; null: those that training does not see"
+    )
+    margin: float = Field(
+        0.1,
+        ge=0,
+        description="image metrics look at the bounding box of the object, observed and predicted, widened on each "
+        "side by this fraction of its longer side",
+    )
     video_view: int = Field(0, ge=0, description="view of the mp4 of prediction beside observation")
     frame_rate: int = Field(12, ge=1, description="frames a second of the mp4")
     video_magnify: int = Field(3, ge=1, description="enlargement of the mp4's pixels")
-    overview: tuple[str, ...] = Field(
-        ("BouncyBall", "RubberPawn", "ClayCat"), description="scenes of the overview picture"
+
+
+class FiguresConfig(Section):
+    """What the figures show. Methods that a figure compares are those of tables.table1."""
+
+    magnify: int = Field(
+        3, ge=1, description="enlargement of the cameras of the videos for renders in figures"
     )
+    size: int = Field(
+        288,
+        ge=32,
+        description="width of pictures that have a camera of their own (experiments, particles) [px]",
+    )
+    view: int = Field(0, ge=0, description="view of the videos that is shown")
+    shown: int = Field(
+        5, ge=3, description="frames of a sequence, more in figures of one object, fewer of many"
+    )
+    main_res: tuple[str, ...] = Field(
+        ("BouncyBall", "RubberPawn", "ClayCat"), min_length=1, description="scenes of the renders over time"
+    )
+    particles_app: str = Field("JellyDuck", description="scene whose particles are shown under all methods")
+    lora_alphav: tuple[str, ...] = Field(
+        ("BouncyBall", "RubberPawn"), min_length=1, description="scenes of the interpolation"
+    )
+    weights: tuple[float, ...] = Field(
+        (0.0, 0.25, 0.5, 0.75, 1.0, 1.25), min_length=1, description="weights w of the adaptor, in order"
+    )
+    letters: tuple[str, ...] = Field((), description="experiments with one letter each, in order")
+    meetings: tuple[str, ...] = Field((), description="experiments with several objects")
+    ext_time: str = Field("", description="experiment that goes on after its scene's video ends")
+    gradient_analysis: tuple[str, ...] = Field(
+        ("BouncyBall", "RubberPawn"), min_length=1, description="scenes of the gradient norms"
+    )
+    pipeline: str = Field("ClayCat", description="scene that is shown through all stages")
+    material_response: tuple[str, ...] = Field(
+        ("BouncyBall", "JellyDuck", "RubberPawn", "ClayCat", "SandFish", "HoneyBottle"),
+        min_length=1,
+        description="scenes of the tests of material points",
+    )
+    shear_rate: float = Field(20.0, gt=0, description="rate of shear of the test of yielding [1/s]")
+    total_shear: float = Field(0.6, gt=0, description="amount of shear that the test of yielding ends at")
 
 
 class TableConfig(Section):
     """Rows and columns of a table of the paper."""
 
-    scenes: tuple[str, ...] = Field(min_length=1, description="columns, in order")
-    methods: tuple[str, ...] = Field(
-        min_length=1, description="rows, in order; variants such as neuma+rank=4 too"
+    scenes: tuple[str, ...] = Field((), description="columns, in order")
+    experiments: tuple[str, ...] = Field((), description="columns after the scenes, in order")
+    methods: tuple[str, ...] = Field((), description="rows, in order; variants such as neuma+rank=4 too")
+    titles: dict[str, str] = Field({}, description="names of rows other than the methods' own, by method")
+    seeds: int = Field(
+        1,
+        ge=1,
+        description="runs of each method that draws an adaptor at random, as method+seed=k; with several, mean and "
+        "standard deviation are shown",
     )
+
+    @model_validator(mode="after")
+    def _has_columns(self) -> TableConfig:
+        if not self.scenes and not self.experiments:
+            raise ValueError("give at least one scene or experiment, a column each")
+        return self
 
 
 class MethodConfig(Section):
@@ -269,7 +429,9 @@ class Config(Section):
     velocity: VelocityConfig = Field(VelocityConfig(), description="initial velocity")
     material: MaterialConfig = Field(MaterialConfig(), description="adaptation of the law")
     evaluation: EvaluationConfig = Field(EvaluationConfig(), description="measures and videos")
+    figures: FiguresConfig = Field(FiguresConfig(), description="figures")
     methods: dict[str, MethodConfig] = Field({}, description="methods by name")
+    experiments: dict[str, ExperimentConfig] = Field({}, description="uses of learned laws by name")
     tables: dict[str, TableConfig] = Field({}, description="tables by name")
 
     @model_validator(mode="after")
@@ -283,19 +445,92 @@ class Config(Section):
             _overridden(self.material, scene.material, f"scenes.{name}.material")
         for name, method in self.methods.items():
             _overridden(self.material, method.material, f"methods.{name}.material")
+        for name, experiment in self.experiments.items():
+            for k, body in enumerate(experiment.bodies):
+                if body.scene not in self.scenes:
+                    where = f"experiments.{name}.bodies.{k}.scene"
+                    raise ValueError(f"{where}: no scene '{body.scene}'{_close(body.scene, self.scenes)}")
+        self._check_figures()
         for name, table in self.tables.items():
-            for scene in table.scenes:
-                if scene not in self.scenes:
-                    raise ValueError(f"tables.{name}.scenes: no scene '{scene}'{_close(scene, self.scenes)}")
-            for method in table.methods:
+            for kind, known in (("scenes", self.scenes), ("experiments", self.experiments)):
+                for column in getattr(table, kind):
+                    if column not in known:
+                        where = f"tables.{name}.{kind}"
+                        raise ValueError(f"{where}: no {kind[:-1]} '{column}'{_close(column, known)}")
+            for method in (*table.methods, *table.titles):
                 parse_method(method, self.methods)
         return self
+
+    def _check_figures(self) -> None:
+        """That what figures show exists; names of scenes matter only where there are scenes."""
+        drawn = self.figures
+        scenes = {
+            "particles_app": [drawn.particles_app],
+            "pipeline": [drawn.pipeline],
+            **{key: getattr(drawn, key) for key in ("main_res", "lora_alphav")},
+            **{key: getattr(drawn, key) for key in ("gradient_analysis", "material_response")},
+        }
+        experiments = {
+            "letters": drawn.letters,
+            "meetings": drawn.meetings,
+            "ext_time": [drawn.ext_time] if drawn.ext_time else [],
+        }
+        for chosen, known, kind in (
+            (scenes if self.scenes else {}, self.scenes, "scene"),
+            (experiments, self.experiments, "experiment"),
+        ):
+            for key, names in chosen.items():
+                for name in names:
+                    if name not in known:
+                        raise ValueError(f"figures.{key}: no {kind} '{name}'{_close(name, known)}")
 
     def scene(self, name: str) -> SceneConfig:
         """The scene of that name."""
         if name not in self.scenes:
             raise InputError(f"no scene '{name}' in {self.scenes_file}{_close(name, self.scenes)}")
         return self.scenes[name]
+
+    def experiment(self, name: str) -> ExperimentConfig:
+        """The experiment of that name."""
+        if name not in self.experiments:
+            raise InputError(f"no experiment '{name}'{_close(name, self.experiments)}")
+        return self.experiments[name]
+
+    def experiment_bodies(self, name: str) -> list[dict[str, Any]]:
+        """Complete plain descriptions of an experiment's bodies: those of their scenes, placed where it says.
+
+        Each has ``scene``, and ``reconstructed`` for one that starts as the reconstruction of its scene's object.
+        """
+        found = []
+        for body in self.experiment(name).bodies:
+            scene = self.scene(body.scene).plain()
+            keys = ("shape", "size", "height", "center", "velocity", "density", "law", "appearance")
+            own = {key: value for key, value in body.plain().items() if value is not None}
+            own |= {"size": body.size} if body.shape is not None else {}
+            found.append({**{key: scene[key] for key in keys}, **own, "reconstructed": body.shape is None})
+        return found
+
+    def experiment_dt(self, name: str) -> float:
+        """Time step of an experiment [s]."""
+        experiment = self.experiment(name)
+        return experiment.dt or min(self.scene(body.scene).dt for body in experiment.bodies)
+
+    def method_density(self, scene: str, method: str) -> float | dict[str, Any]:
+        """Density that a method takes the scene's body to have: the scene's, unless it assumes another."""
+        assumed = self.method_material(scene, method).assumed_density
+        return self.scene(scene).plain()["density"] if assumed is None else assumed
+
+    def seeded(self, table: str, method: str, scene: str) -> list[str]:
+        """The runs behind a cell of a table: the method itself, and variants of other seeds if it has several."""
+        material = self.method_material(scene, method)
+        random = material.train and material.rank is not None
+        others = range(1, self.tables[table].seeds) if random else ()
+        return [method, *(f"{method}+seed={k}" for k in others)]
+
+    def frame_steps(self, name: str) -> tuple[int, ...]:
+        """Steps of the frames of a scene's video."""
+        scene = self.scene(name)
+        return scene.frames or self.dataset.frame_steps(self.dataset.steps or scene.steps)
 
     def method_title(self, method: str) -> str:
         """Name of a method or variant for tables, for example "NeuMA, rank 4"."""

@@ -1,4 +1,4 @@
-"""Ground truth of a synthetic benchmark: a known shape of a known material, simulated by the same MPM.
+"""Ground truth of a synthetic benchmark: known shapes of known materials, simulated by the same MPM.
 
 Only evaluation and the particle-supervised ablation may read what this module makes. It uses more particles than the
 reconstruction, another seed and an analytic law, so that no later stage can meet its own discretisation again.
@@ -13,81 +13,105 @@ import torch
 import trimesh
 from torch import Tensor
 
-from neuma_lib.geometry.volume import sample_tracers, sample_volume
+from neuma_lib.density import Density, density_at
+from neuma_lib.geometry.volume import check_apart, sample_tracers, sample_volume
 from neuma_lib.materials.base import Law
-from neuma_lib.sim import MPMModel, Trajectory, rollout
+from neuma_lib.sim import MPMModel, Trajectory, consecutive, each_its_own, rollout
+
+
+@dataclass(frozen=True)
+class TrueBody:
+    """A solid where it starts.
+
+    Attributes:
+        mesh: its surface, watertight [m].
+        law: analytic material.
+        velocity: initial velocity [m/s].
+        density: mass density [kg/m^3], see `neuma_lib.density`.
+    """
+
+    mesh: trimesh.Trimesh
+    law: Law
+    velocity: Sequence[float]
+    density: Density = 1000.0
 
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """A simulated object.
+    """Simulated bodies, the particles of one after those of another.
 
     Attributes:
         frames: simulation steps of the frames, length T.
-        path: particle states at the frames (x [m], v [m/s], F), n particles.
-        tracers: passive tracers from a jittered grid in the true shape [m], shape (T, M, 3).
-        tracers_again: tracers from another jittered grid, shape (T, M, 3): their distance to ``tracers`` is the
+        path: particle states at the frames (x [m], v [m/s], F), N particles.
+        tracers: passive tracers from a jittered grid in the true shapes [m], shape (T, M, 3).
+        tracers_again: tracers from another jittered grid, shape (T, M', 3): their distance to ``tracers`` is the
             sampling floor of the Chamfer distance.
-        vol0: particle volume [m^3].
-        mass: particle mass [kg].
+        vol0: particle volumes [m^3], shape (N,).
+        mass: particle masses [kg], shape (N,).
     """
 
     frames: tuple[int, ...]
     path: Trajectory
     tracers: Tensor
     tracers_again: Tensor
-    vol0: float
-    mass: float
+    vol0: Tensor
+    mass: Tensor
 
 
 def simulate_ground_truth(
     model: MPMModel,
-    law: Law,
-    mesh: trimesh.Trimesh,
-    v0: Sequence[float],
-    density: float,
+    bodies: Sequence[TrueBody],
     frames: Sequence[int],
     *,
     particles: int,
     tracers: int,
     seed: int,
+    device: torch.device | str = "cpu",
 ) -> GroundTruth:
-    """Fill a placed watertight mesh with particles and simulate it.
+    """Fill placed watertight meshes with particles and simulate them on one grid.
 
     Args:
         model: simulator constants.
-        law: analytic material.
-        mesh: the true shape where it starts [m].
-        v0: initial velocity [m/s].
-        density: [kg/m^3].
+        bodies: what moves.
         frames: steps to keep, 0 is the start.
-        particles, tracers: wanted counts.
+        particles: wanted count in each body.
+        tracers: wanted count in all bodies together, equally dense in each.
         seed: of particle and tracer positions.
+        device: where to simulate; the result is on the CPU.
 
     Raises:
-        InputError: the mesh is not watertight, lies outside the domain, or the time step is too large for the law.
+        InputError: a mesh is not watertight or lies outside the domain, bodies overlap, or the time step is too
+            large for a law.
     """
-    model.check_courant(law, density)
-    points = sample_volume(mesh, particles, seed=seed)
-    x0 = torch.as_tensor(points, dtype=torch.float32)
+    check_apart([body.mesh for body in bodies])
+    solids = [
+        torch.as_tensor(sample_volume(b.mesh, particles, seed=seed), dtype=torch.float32) for b in bodies
+    ]
+    shares = [
+        torch.full((len(x),), float(b.mesh.volume) / len(x)) for b, x in zip(bodies, solids, strict=True)
+    ]
+    densities = [density_at(x, b.density) for b, x in zip(bodies, solids, strict=True)]
+    for body, density in zip(bodies, densities, strict=True):
+        model.check_courant(body.law, float(density.min()))
+    together = trimesh.util.concatenate([body.mesh for body in bodies])
     start = [
-        torch.as_tensor(sample_tracers(mesh, tracers, seed=seed + 1 + k), dtype=torch.float32)
+        torch.as_tensor(sample_tracers(together, tracers, seed=seed + 1 + k), dtype=torch.float32)
         for k in range(2)
     ]
-    vol0 = float(mesh.volume) / len(x0)
-    share = torch.full((len(x0),), vol0, dtype=torch.float32)
+    counts = [len(x) for x in solids]
+    vol0, mass = torch.cat(shares), torch.cat(shares) * torch.cat(densities)
     with torch.no_grad():
         path = rollout(
             model,
-            law,
-            x0,
-            torch.as_tensor(v0, dtype=torch.float32),
-            share * density,
-            share,
+            consecutive([body.law for body in bodies], counts),
+            torch.cat(solids).to(device),
+            each_its_own([body.velocity for body in bodies], counts).to(device),
+            mass.to(device),
+            vol0.to(device),
             steps=max(frames),
             frames=frames,
-            tracers=torch.cat(start),
-        )
+            tracers=torch.cat(start).to(device),
+        ).cpu()
     split = len(start[0])
     return GroundTruth(
         frames=tuple(frames),
@@ -95,5 +119,5 @@ def simulate_ground_truth(
         tracers=path.tracers[:, :split],
         tracers_again=path.tracers[:, split:],
         vol0=vol0,
-        mass=vol0 * density,
+        mass=mass,
     )

@@ -235,7 +235,9 @@ def list_images(source: str | Path, path: str | Path) -> ImageSet:
     images = read_image_set(source)
     data = read_transforms(source)
     files = [_image_file(Path(source).parent, frame["file_path"], source) for frame in data["frames"]]
-    places = [os.path.relpath(file.resolve(), Path(path).parent.resolve()) for file in files]
+    folder = Path(path).parent
+    folder.mkdir(parents=True, exist_ok=True)
+    places = [os.path.relpath(file.resolve(), folder.resolve()) for file in files]
     frames = [{**f, "file_path": place} for f, place in zip(data.pop("frames"), places, strict=True)]
     write_transforms(path, data, frames)
     return images

@@ -51,6 +51,9 @@ def test_default_settings_are_valid(loaded):
         ({"tables": {"table1": {"scenes": ["BouncyBal"]}}}, r"no scene 'BouncyBal'; did you mean BouncyBall"),
         ({"tables": {"table1": {"methods": ["neuma+rnk=4"]}}}, r"no setting 'rnk'; did you mean rank"),
         ({"scenes": {"New": {"shape": "ball"}}}, r"scenes\.New\.height: this key is missing"),
+        ({"dataset": {"stride": 4}}, r"dataset: give either frames or stride"),
+        ({"dataset": {"frames": None}}, r"dataset: give either frames or stride"),
+        ({"scenes": {"BouncyBall": {"images": {"video": "x"}}}}, r"BouncyBall\.images\.video: unknown key"),
         ({"scenes_file": "nowhere.yaml"}, r"nowhere\.yaml does not exist"),
     ],
 )
@@ -132,10 +135,52 @@ class TestVariants:
             loaded.method_material("BouncyBall", "neuma+rank=x")
 
 
-def test_frames_are_even_and_end_with_the_video(loaded):
-    scene = loaded.scene("BouncyBall").model_copy(update={"steps": 100, "frames": None})
-    assert scene.frame_steps(5) == (0, 25, 50, 75, 100)
-    assert scene.frame_steps(1000) == tuple(range(101))
+class TestFrames:
+    def frames(self, raw, scene=None, **dataset):
+        changes = {"dataset": dataset, "scenes": {"BouncyBall": {"steps": 100, **(scene or {})}}}
+        return settings.load(settings.merged(raw, changes), ROOT).frame_steps("BouncyBall")
+
+    def test_a_number_of_frames_is_even_and_ends_with_the_video(self, raw):
+        assert self.frames(raw, frames=5) == (0, 25, 50, 75, 100)
+        assert self.frames(raw, frames=1000) == tuple(range(101))
+
+    def test_a_stride_starts_with_the_video(self, raw):
+        assert self.frames(raw, frames=None, stride=25) == (0, 25, 50, 75, 100)
+        assert self.frames(raw, frames=None, stride=30) == (0, 30, 60, 90)
+
+    def test_steps_of_every_video(self, raw):
+        assert self.frames(raw, frames=None, stride=10, steps=40) == (0, 10, 20, 30, 40)
+
+    def test_a_scene_may_list_its_own(self, raw):
+        own = {"frames": [0, 7, 9]}
+        assert self.frames(raw, own, frames=None, stride=10, steps=40) == (0, 7, 9)
+
+
+class TestScaleOfThePaper:
+    def overlay(self, raw, *names):
+        for name in names:
+            raw = settings.merged(raw, settings.read_yaml(ROOT / "config" / f"{name}.yaml"))
+        return settings.load(raw, ROOT)
+
+    def test_paper(self, raw):
+        paper = self.overlay(raw, "paper")
+        assert (paper.simulation.particles, paper.simulation.grid, paper.material.iterations) == (
+            30000,
+            32,
+            1000,
+        )
+        assert (paper.dataset.dynamic.width, paper.dataset.static.height) == (800, 800)
+        assert paper.gaussians.densification.max_count == 20000 and paper.device == "cuda"
+        for scene in paper.scenes:
+            assert paper.frame_steps(scene) == tuple(range(401))
+
+    def test_light_differs_in_images_alone(self, raw, loaded):
+        paper, light = self.overlay(raw, "paper"), self.overlay(raw, "paper", "paper_light")
+        assert light.frame_steps("BouncyBall") == tuple(range(0, 401, 4))
+        same = ("device", "simulation", "gaussians", "material", "scenes", "kernel_cache")
+        assert all(getattr(light, name) == getattr(paper, name) for name in same)
+        roots = [getattr(c, root) for c in (loaded, paper, light) for root in ("data_root", "results_root")]
+        assert len(set(roots)) == 6
 
 
 def test_settings_page_is_up_to_date():

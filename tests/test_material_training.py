@@ -84,7 +84,7 @@ def test_training_lowers_the_loss_and_moves_the_adaptor_only(problem):
     result = train(problem, law)
     assert result.stable
     assert result.best_loss < 0.7 * result.history.loss[0]
-    assert len(result.history.loss) == SETTINGS.iterations
+    assert len(result.history.loss) == len(result.history.seconds) == SETTINGS.iterations
     for before, after in zip(base, [p for p in law.parameters() if not p.requires_grad], strict=True):
         assert torch.equal(before, after)
 

@@ -6,8 +6,10 @@ import torch
 from grounding_scene import MODEL, PRIOR, ball, observe
 
 from neuma_lib.errors import InputError
+from neuma_lib.fitting.observation import Observation
 from neuma_lib.fitting.velocity import estimate_velocity
 from neuma_lib.materials import analytic_law
+from neuma_lib.render.particle_gs import ParticleGS
 
 FRAMES = (0, 4, 8, 12, 16, 20, 40)
 
@@ -48,12 +50,26 @@ def test_uncertainty_covers_the_error_of_noisy_images():
     noise = torch.Generator().manual_seed(3)
     errors, stds = [], []
     for _ in range(4):
-        noisy = clean.images + 0.05 * torch.randn(clean.images.shape, generator=noise, dtype=torch.float64)
+        noisy = clean.colours() + 0.05 * torch.randn(clean.images.shape, generator=noise, dtype=torch.float64)
         found = estimate(body, type(clean)(clean.frames, noisy, clean.cameras), ridge=0.0)
         errors.append(found.v0 - v0)
         stds.append(found.std)
     ratio = np.sqrt(np.mean(np.square(errors), 0)) / np.mean(stds, 0)
     assert (ratio < 3).all() and (ratio > 0.2).all()
+
+
+def test_bytes_are_their_colours_and_few_frames_at_a_time_give_the_sums_of_all(monkeypatch):
+    body = ball()
+    clean = observe(body, [0.5, -1.2, 0.4], FRAMES)
+    opaque = torch.ones_like(clean.images[..., :1])
+    pixels = (255 * torch.cat([clean.images, opaque], -1).clamp(0, 1)).round().to(torch.uint8)
+    decoded = Observation(clean.frames, pixels, clean.cameras)
+    found = estimate(body, decoded, ridge=0.0)
+    assert found.loss > 0
+    monkeypatch.setattr(ParticleGS, "frames_per_batch", 2)
+    again = estimate(body, Observation(clean.frames, decoded.colours(), clean.cameras), ridge=0.0)
+    for name in ("v0", "std", "information", "loss"):
+        np.testing.assert_allclose(getattr(again, name), getattr(found, name), rtol=1e-6)
 
 
 def test_a_body_that_starts_in_contact_is_an_input_error():

@@ -18,6 +18,8 @@ import torch
 import yaml
 
 from neuma_lib.checkpoint import Checkpoint
+from neuma_lib.evaluation.lpips import expected_shapes
+from neuma_lib.io import read_arrays, write_weights
 
 ROOT = Path(__file__).resolve().parents[1]
 PARTS = (
@@ -215,7 +217,7 @@ def test_comments_and_docstrings_rerun_nothing(clone):
 def test_a_training_parameter_reruns_training_and_evaluation_only(clone):
     change = ("--config", "material={iterations: 9}", "--")
     before = clone.artifacts()
-    assert clone.plan(*change, TABLE) == {"material": 1, "evaluation": 1, "table1": 1}
+    assert clone.plan(*change, TABLE) == {"material": 1, "evaluation": 1, "chamfer_table": 1}
     clone.run(*change, TABLE)
     after = clone.artifacts()
     changed = {name for name in before if before[name] != after[name]}
@@ -231,9 +233,16 @@ def test_editing_the_rasterizer_reruns_what_renders(clone):
     original = file.read_text()
     file.write_text(original + "\nEDITED = True\n")
     plan = clone.plan(TABLE)
-    assert {"kernels", "gaussians", "mesh", "binding", "velocity", "material", "evaluation", "table1"} <= set(
-        plan
-    )
+    assert {
+        "kernels",
+        "gaussians",
+        "mesh",
+        "binding",
+        "velocity",
+        "material",
+        "evaluation",
+        "chamfer_table",
+    } <= set(plan)
     assert not {"ground_truth", "render_static", "render_dynamic", "prior"} & set(plan)
     assert plan["kernels"] == 1
     truth = clone.root / "tiny/data/BouncyBall/particles.h5"
@@ -248,10 +257,10 @@ def test_editing_the_rasterizer_reruns_what_renders(clone):
     [
         (
             "neuma_lib/evaluation/evaluate.py",
-            {"evaluation", "table1"},
+            {"evaluation", "chamfer_table"},
             {"material", "velocity", "ground_truth"},
         ),
-        ("neuma_lib/evaluation/tables.py", {"table1"}, {"evaluation"}),
+        ("neuma_lib/evaluation/tables.py", {"chamfer_table"}, {"evaluation"}),
         (
             "neuma_lib/binding.py",
             {"binding", "velocity", "material", "evaluation"},
@@ -276,6 +285,70 @@ def test_edits_rerun_what_depends_on_them(clone, file, runs, spared):
 def test_a_variant_has_a_folder_of_its_own(finished):
     plan = finished.plan(f"{SCENE}/neuma+rank=2+seed=3/metrics.json")
     assert plan == {"material": 1, "evaluation": 1}
+
+
+# ---- learned laws elsewhere, and measures of images
+
+
+def test_laws_are_put_to_use_on_other_bodies_and_images_are_measured(clone):
+    """A letter above the reconstructed ball, both with the learned law; stand-in weights for LPIPS."""
+    generator = torch.Generator().manual_seed(0)
+    weights = {
+        name: 0.1 * (torch.rand(shape, generator=generator) - 0.4)
+        for net in ("alex", "vgg")
+        for name, shape in expected_shapes(net).items()
+    }
+    write_weights(clone.root / "tiny/data/weights/lpips.safetensors", weights, {})
+    targets = ("tiny/results/table2.csv", "tiny/results/table4.csv", f"{SCENE}/neuma/image_metrics.json")
+    output = clone.run(*targets)
+    assert re.search(r"^experiment_start letter_and_ball: 2 bodies, ", output, re.MULTILINE)
+    assert clone.plan(*targets) == {}
+
+    folder = clone.root / "tiny/results/experiments/letter_and_ball"
+    letter, ball = json.loads((folder / "velocity.json").read_text())["bodies"]
+    assert letter["v0"] == [0, -2, 0]
+    assert ball["v0"] == json.loads((clone.root / SCENE / "velocity.json").read_text())["v0"]
+    path, _ = read_arrays(folder / "nclaw" / "rollout.h5")
+    assert path["x"].shape[1] == letter["particles"] + ball["particles"]
+    split = letter["particles"]
+    assert path["x"][0, :split, 1].min() > path["x"][0, split:, 1].max()
+    # They meet: in free fall the letter would be below the floor.
+    fallen = path["x"][0, :split, 1].mean() - path["x"][-1, :split, 1].mean()
+    assert 0.05 < fallen < 0.45 < 2.0 * 0.18 + 0.5 * 9.8 * 0.18**2
+    header, *rows = (clone.root / "tiny/results/table2.csv").read_text().splitlines()
+    assert header.startswith("quantity,method,title,letter_and_ball,Average")
+    assert rows[0].startswith("chamfer,nclaw,the prior,") and len(rows) == 7
+    assert "BouncyBall" in (clone.root / "tiny/results/table4.csv").read_text()
+    measured = json.loads((clone.root / SCENE / "neuma" / "image_metrics.json").read_text())
+    assert measured["views"] == [1] and len(measured["ssim_per_frame"]) == 7
+    assert measured["psnr"] > 8 and measured["lpips_vgg"] != 0
+
+
+def test_seeds_and_assumed_densities_are_runs_of_their_own(finished):
+    plan = finished.plan("--config", "tables={table1: {seeds: 3}}", "--", TABLE)
+    assert plan == {"material": 2, "evaluation": 2, "chamfer_table": 1}
+    plan = finished.plan(f"{SCENE}/neuma+assumed_density=900/metrics.json")
+    assert plan == {"material": 1, "evaluation": 1}
+
+
+def test_all_tables_can_be_planned(finished):
+    plan = finished.plan("tables")
+    assert {"experiment_truth", "experiment_start", "experiment", "benchmark_table"} <= set(plan)
+    assert plan["chamfer_table"] >= 4 and plan["prior"] == 7
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_without_the_gpu_that_is_asked_for_nothing_is_begun(kernels, tmp_path):
+    project = copied(tmp_path, kernels)
+    adaptor = f"{SCENE}/neuma/adaptor.safetensors"
+    cuda = ("--config", "device=cuda", "--")
+    assert project.plan(*cuda, adaptor)["material"] == 1
+    output = project.run(*cuda, adaptor, succeeds=False)
+    assert "torch sees no CUDA device" in output and "gaussians, material, prior, velocity" in output
+    assert "Traceback (most recent call last)" not in output
+    assert not (tmp_path / "tiny").exists()
+    output = project.run(*cuda, "tiny/data/BouncyBall/particles.h5")
+    assert "ground_truth BouncyBall: " in output
 
 
 # ---- killed and run again

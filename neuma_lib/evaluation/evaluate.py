@@ -12,7 +12,8 @@ from neuma_lib.errors import NonFiniteError
 from neuma_lib.evaluation.metrics import chamfer_sequence, tracer_rmse
 from neuma_lib.fitting.observation import Reconstruction
 from neuma_lib.materials.base import Law
-from neuma_lib.sim import MPMModel, Trajectory, rollout
+from neuma_lib.sim import Body, MPMModel, Trajectory, rollout
+from neuma_lib.sim.model import as_bodies
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class Evaluation:
 
 def predict(
     model: MPMModel,
-    law: Law,
+    law: Law | Sequence[Body],
     body: Reconstruction,
     v0: Tensor,
     frames: Sequence[int],
@@ -83,7 +84,7 @@ def predict(
 
 def evaluate(
     model: MPMModel,
-    law: Law,
+    law: Law | Sequence[Body],
     body: Reconstruction,
     v0: Tensor,
     frames: Sequence[int],
@@ -95,9 +96,9 @@ def evaluate(
 
     Args:
         model: simulator constants.
-        law: material to judge.
+        law: material to judge, or several with their ranges of particles.
         body: reconstructed particles.
-        v0: estimated velocity [m/s], shape (3,).
+        v0: estimated velocity [m/s], shape (3,) or (N, 3).
         frames: simulation steps, T of them.
         truth: tracers of the ground truth [m], shape (T, M, 3).
         truth_again: tracers of the ground truth from another sampling of the shape, shape (T, M, 3).
@@ -108,6 +109,7 @@ def evaluate(
     predicted, same_start = path.tracers[:, : len(tracers)], path.tracers[:, len(tracers) :]
     chamfer = chamfer_sequence(predicted, truth)
     floor = chamfer_sequence(truth_again, truth)
+    density = body.mass / body.vol0
     rmse = 1e3 * tracer_rmse(same_start, truth)
     metrics = {
         "chamfer": float(chamfer.mean()),
@@ -119,7 +121,10 @@ def evaluate(
         "chamfer_per_frame": [float(c) for c in chamfer],
         "chamfer_floor_per_frame": [float(c) for c in floor],
         "tracer_rmse_mm_per_frame": [float(e) for e in rmse],
-        "courant": model.courant(law, body.density),
+        "courant": max(
+            model.courant(part.law, float(density[part.start : part.stop].min()))
+            for part in as_bodies(law, len(density))
+        ),
         "diverged_at_step": failed_at,
     }
     return Evaluation(path, predicted, metrics)

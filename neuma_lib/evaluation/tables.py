@@ -1,4 +1,4 @@
-"""Tables of the paper from metrics: CSV for programs, Markdown for people."""
+"""Tables of Chamfer distances from metrics: CSV for programs, Markdown for people, the paper's numbers beside ours."""
 
 from __future__ import annotations
 
@@ -8,25 +8,19 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from neuma_lib.errors import InputError
+import numpy as np
 
-PAPER_SCENES = ("BouncyBall", "JellyDuck", "RubberPawn", "ClayCat", "SandFish", "HoneyBottle")
-PAPER_TABLE1 = {
-    "pac_nerf": (516.30, 137.73, 15.47, 15.38, 1.71, 2.21),
-    "nclaw": (56.13, 6.32, 3.31, 2.45, 2.61, 2.26),
-    "neuma": (1.19, 3.03, 1.27, 1.00, 0.65, 0.73),
-    "neuma_particle_supervision": (1.45, 3.74, 1.25, 1.00, 0.80, 0.84),
-    "neuma_without_binding": (3.34, 28.42, 4.62, 1.26, 0.97, 1.01),
-    "neuma_without_adaptor": (1.87, 3.63, 1.42, 1.36, 1.21, 1.23),
-}
-"""Chamfer distances of the paper's Table 1, columns as `PAPER_SCENES`; they contain its sampling floor."""
+from neuma_lib.errors import InputError
+from neuma_lib.evaluation.paper import Claim, PaperTable
 
 QUANTITIES = {
     "chamfer": "Chamfer distance (1e-4 m², mean over the sequence)",
     "chamfer_excess": "Excess over the sampling floor (1e-4 m²)",
     "tracer_rmse_mm": "Tracer RMSE from identical start points (mm)",
 }
-"""What Table 1 shows of each run, by its name in metrics.json."""
+"""What is shown of each run, by its name in metrics.json."""
+JUDGED = "chamfer_excess"
+"""Quantity that claims are judged by: distances of other scenes and other floors cannot be compared."""
 
 TRAINING_DIVERGED, ROLLOUT_DIVERGED = "†", "‡"
 FOOTNOTES = {
@@ -36,187 +30,229 @@ FOOTNOTES = {
 """Signs behind numbers, and what they mean."""
 
 
+@dataclass(frozen=True)
+class Row:
+    """Numbers of one quantity and method.
+
+    Attributes:
+        quantity: its name in metrics.json.
+        method: name of the method, or "floor".
+        title: name in the table.
+        runs: one line a seed, one column a scene or experiment, shape (S, C).
+    """
+
+    quantity: str
+    method: str
+    title: str
+    runs: np.ndarray
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Means over the seeds with the average over all columns behind them, shape (C + 1,)."""
+        return self._averaged().mean(axis=0)
+
+    @property
+    def std(self) -> np.ndarray | None:
+        """Standard deviations over the seeds (of the average too), shape (C + 1,); None with a single seed."""
+        return self._averaged().std(axis=0, ddof=1) if len(self.runs) > 1 else None
+
+    def _averaged(self) -> np.ndarray:
+        return np.concatenate([self.runs, self.runs.mean(axis=1, keepdims=True)], axis=1)
+
+
 @dataclass
 class Table:
     """Numbers with row and column names; the last column is the average.
 
     Attributes:
-        columns: column names without the average.
-        rows: (quantity, method, title, one value a column) each.
+        columns: column names without the average -> their headings.
+        paper: the table of the paper that it stands beside, if any.
+        rows: in order.
         marks: (method, column) -> signs of `FOOTNOTES`, for runs that diverged.
     """
 
-    columns: tuple[str, ...]
-    rows: list[tuple[str, str, str, tuple[float, ...]]] = field(default_factory=list)
+    columns: dict[str, str]
+    paper: PaperTable | None = None
+    rows: list[Row] = field(default_factory=list)
     marks: dict[tuple[str, str], str] = field(default_factory=dict)
 
-    def values(self, quantity: str, method: str) -> dict[str, float]:
-        """One row as a dict, with "Average"."""
-        for q, m, _, values in self.rows:
-            if (q, m) == (quantity, method):
-                return dict(zip([*self.columns, "Average"], _with_average(values), strict=True))
+    def row(self, quantity: str, method: str) -> Row:
+        """One row.
+
+        Raises:
+            InputError: there is none.
+        """
+        for row in self.rows:
+            if (row.quantity, row.method) == (quantity, method):
+                return row
         raise InputError(f"table: no row {quantity} of {method}")
 
+    def values(self, quantity: str, method: str) -> dict[str, float]:
+        """Means of one row by column, with "Average"."""
+        return dict(zip([*self.columns, "Average"], self.row(quantity, method).mean.tolist(), strict=True))
+
     def csv(self) -> str:
-        """Comma-separated values: quantity, method, title, one column a scene, Average, diverged."""
+        """Comma-separated values: quantity, method, title, one column a scene, Average, diverged.
+
+        With several seeds, a row ``<quantity>_std`` follows each row of means.
+        """
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(["quantity", "method", "title", *self.columns, "Average", "diverged"])
-        for quantity, method, title, values in self.rows:
-            diverged = [c for c in self.columns if (method, c) in self.marks]
-            cells = [f"{v:.4f}" for v in _with_average(values)]
-            writer.writerow([quantity, method, title, *cells, " ".join(diverged)])
+        for row in self.rows:
+            diverged = " ".join(c for c in self.columns if (row.method, c) in self.marks)
+            for suffix, values in (("", row.mean), ("_std", row.std)):
+                if values is not None:
+                    cells = [f"{v:.4f}" for v in values]
+                    writer.writerow([row.quantity + suffix, row.method, row.title, *cells, diverged])
         return out.getvalue()
 
     def markdown(self) -> str:
-        """One Markdown table a quantity; the paper's numbers stand below the Chamfer distances."""
-        parts = ["# Table 1: dynamics grounding", ""]
+        """One Markdown table a quantity, the paper's numbers below the Chamfer distances, and what holds of it."""
+        paper = self.paper
+        parts = [f"# {paper.heading}", ""] if paper else []
+        printed: list[str] = []
         for quantity, heading in QUANTITIES.items():
-            rows = [row for row in self.rows if row[0] == quantity]
-            lines = [self._line(title, values, method) for _, method, title, values in rows]
+            rows = [row for row in self.rows if row.quantity == quantity]
+            lines = [self._line(row) for row in rows]
             if quantity == "chamfer":
-                lines += [self._line(row[2], row[3]) for row in self.rows if row[0] == "chamfer_floor"]
-                lines += self._paper_lines({method: title for _, method, title, _ in rows})
+                lines += [self._line(row) for row in self.rows if row.quantity == "chamfer_floor"]
+                printed = self._paper_lines(rows)
+                lines += printed
             parts += [f"**{heading}**", "", self._header(), *lines, ""]
+        if any(len(row.runs) > 1 for row in self.rows):
+            parts += [
+                "± is the standard deviation over seeds, for methods that draw their adaptor at random.",
+                "",
+            ]
         for sign, note in FOOTNOTES.items():
             if any(sign in signs for signs in self.marks.values()):
                 parts += [f"{sign} {note}", ""]
+        verdicts = self.verdicts()
+        if verdicts:
+            parts += ["**What holds**", "", *(f"- {line}" for line in verdicts), ""]
         parts += [
             "The floor is the distance between two samplings of the true motion with the same number "
             "of tracers. The paper's distances contain a floor of their own, set by its 30,000 particles: "
             "compare excesses, not distances. Its scenes have the same starts but materials that it does not "
-            "publish.",
+            "publish." + (f" Its numbers are those of {paper.label}." if printed else ""),
             "",
         ]
         return "\n".join(parts)
 
+    def verdicts(self) -> list[str]:
+        """A sentence for each claim whose rows and columns are here: whether it holds, with the numbers."""
+        claims = self.paper.claims if self.paper else ()
+        methods = {row.method for row in self.rows}
+        return [
+            self._verdict(claim)
+            for claim in claims
+            if {*claim.better, *claim.worse} <= methods and set(claim.columns) <= set(self.columns)
+        ]
+
+    def _verdict(self, claim: Claim) -> str:
+        columns = claim.columns or tuple(self.columns)
+        index = [list(self.columns).index(column) for column in columns]
+
+        def means(method: str) -> np.ndarray:
+            return self.row(JUDGED, method).mean[index]
+
+        highest = max(claim.better, key=lambda method: means(method).mean())
+        lowest = min(claim.worse, key=lambda method: means(method).mean())
+        ours = [float(means(method).mean()) for method in (highest, lowest)]
+        per_column = [np.stack([means(m) for m in group]) for group in (claim.better, claim.worse)]
+        lower = int((per_column[0].max(axis=0) <= per_column[1].min(axis=0)).sum())
+        titles = [self.row(JUDGED, method).title for method in (highest, lowest)]
+        said = f"{'Holds' if ours[0] <= ours[1] else 'Does not hold'}: {claim.text}."
+        said += f" Excess {ours[0]:.3f} ({titles[0]}) against {ours[1]:.3f} ({titles[1]}) on average;"
+        said += f" it is so in {lower} of {len(columns)} columns."
+        return said + self._paper_verdict(claim, columns)
+
+    def _paper_verdict(self, claim: Claim, columns: Sequence[str]) -> str:
+        """The same comparison with the paper's distances."""
+        if not claim.by_paper:
+            return " The paper does not compare these."
+        groups = [
+            [self.paper.row(method, columns) for method in group] for group in (claim.better, claim.worse)
+        ]
+        if any(row is None for group in groups for row in group):
+            return ""
+        means = [[sum(row) / len(row) for row in group] for group in groups]
+        return f" Paper, floors included: {max(means[0]):.2f} against {min(means[1]):.2f}."
+
     def _header(self) -> str:
-        names = [*self.columns, "Average"]
+        names = [*self.columns.values(), "Average"]
         return f"| Method | {' | '.join(names)} |\n|---|{'---:|' * len(names)}"
 
-    def _line(self, title: str, values: Sequence[float], method: str = "") -> str:
-        marks = [self.marks.get((method, column), "") for column in self.columns]
-        cells = [f"{v:.2f}{mark}" for v, mark in zip(_with_average(values), [*marks, ""], strict=True)]
-        return f"| {title} | {' | '.join(cells)} |"
+    def _line(self, row: Row) -> str:
+        marks = [*(self.marks.get((row.method, column), "") for column in self.columns), ""]
+        spread = [""] * len(marks) if row.std is None else [f" ± {s:.2f}" for s in row.std]
+        cells = [f"{v:.2f}{s}{mark}" for v, s, mark in zip(row.mean, spread, marks, strict=True)]
+        return f"| {row.title} | {' | '.join(cells)} |"
 
-    def _paper_lines(self, titles: Mapping[str, str]) -> list[str]:
+    def _paper_lines(self, rows: Sequence[Row]) -> list[str]:
         """The paper's rows of the methods shown, if it has all the columns."""
-        if not set(self.columns) <= set(PAPER_SCENES):
-            return []
         lines = []
-        for method in filter(PAPER_TABLE1.__contains__, titles):
-            paper = dict(zip(PAPER_SCENES, PAPER_TABLE1[method], strict=True))
-            lines.append(self._line(f"*paper: {titles[method]}*", [paper[c] for c in self.columns]))
+        for row in rows:
+            printed = self.paper.row(row.method, list(self.columns)) if self.paper else None
+            if printed is not None:
+                lines.append(self._line(Row("chamfer", "", f"*paper: {row.title}*", np.array([printed]))))
         return lines
 
 
 def chamfer_table(
-    metrics: Mapping[str, Mapping[str, Mapping]], titles: Mapping[str, str], scenes: Sequence[str]
+    metrics: Mapping[str, Mapping[str, Sequence[Mapping]]],
+    titles: Mapping[str, str],
+    columns: Mapping[str, str],
+    paper: PaperTable | None = None,
 ) -> Table:
-    """Table 1 of the paper, with floor, excess and tracer error. Any method may have a row; none is implied.
+    """A table of distances with floor, excess and tracer error. Any method may have a row; none is implied.
 
     Args:
-        metrics: method -> scene -> content of its metrics.json.
+        metrics: method -> scene or experiment -> content of its metrics.json, one a seed.
         titles: method -> name in the table, in the order of the rows.
-        scenes: columns in order.
+        columns: scene or experiment -> heading, in order.
+        paper: what to show beside it.
 
     Raises:
-        InputError: a method lacks a scene, or a scene a finite value.
+        InputError: a method lacks a column, or a column a finite value.
     """
-    if not titles or not scenes:
-        raise InputError("table 1: there are no methods or no scenes; see tables.table1 in the configuration")
-    table = Table(tuple(scenes))
+    if not titles or not columns:
+        raise InputError(
+            "table: there are no methods, or no scenes and experiments; see tables in the configuration"
+        )
+    table = Table(dict(columns), paper)
 
-    def row(quantity: str, method: str) -> tuple[float, ...]:
-        values = []
-        for scene in scenes:
-            value = metrics.get(method, {}).get(scene, {}).get(quantity)
-            if not isinstance(value, int | float) or not math.isfinite(value):
-                raise InputError(
-                    f"table 1: {quantity} of {method} on {scene} is {value}; remove "
-                    f"{scene}/{method}/metrics.json from the results and run again"
-                )
-            values.append(float(value))
-        return tuple(values)
+    def row(quantity: str, method: str, title: str, name: str | None = None) -> Row:
+        seeds = min(len(metrics.get(method, {}).get(column, ())) for column in columns)
+        runs = [
+            [_number(quantity, method, column, metrics[method][column][k]) for column in columns]
+            for k in range(seeds)
+        ]
+        if not runs:
+            missing = next(column for column in columns if not metrics.get(method, {}).get(column))
+            raise InputError(f"table: there is no metrics.json of {method} on {missing}")
+        return Row(quantity, name or method, title, np.array(runs))
 
     for quantity in QUANTITIES:
-        table.rows += [(quantity, method, title, row(quantity, method)) for method, title in titles.items()]
-    first = next(iter(titles))
-    table.rows.append(("chamfer_floor", "floor", "Sampling floor", row("chamfer_floor", first)))
+        table.rows += [row(quantity, method, title) for method, title in titles.items()]
+    first = row("chamfer_floor", next(iter(titles)), "Sampling floor", "floor")
+    table.rows.append(Row(first.quantity, first.method, first.title, first.runs[:1]))
     for method in titles:
-        for scene in scenes:
-            run = metrics[method][scene]
-            signs = TRAINING_DIVERGED if run.get("stable") is False else ""
-            signs += ROLLOUT_DIVERGED if run.get("diverged_at_step") is not None else ""
+        for column in columns:
+            runs = metrics[method][column]
+            signs = TRAINING_DIVERGED if any(run.get("stable") is False for run in runs) else ""
+            signs += ROLLOUT_DIVERGED if any(run.get("diverged_at_step") is not None for run in runs) else ""
             if signs:
-                table.marks[method, scene] = signs
+                table.marks[method, column] = signs
     return table
 
 
-def _with_average(values: Sequence[float]) -> list[float]:
-    return [*values, sum(values) / len(values)]
-
-
-def report_table(
-    rows: Mapping[str, Mapping[str, float]], columns: Mapping[str, str], corner: str
-) -> tuple[str, str]:
-    """A plain table of numbers as CSV and as Markdown.
-
-    Args:
-        rows: row name -> quantity -> value.
-        columns: quantity -> heading in the Markdown table, in order.
-        corner: heading of the first column.
-    """
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([corner, *columns])
-    lines = [f"| {corner} | {' | '.join(columns.values())} |", f"|---|{'---:|' * len(columns)}"]
-    for name, row in rows.items():
-        writer.writerow([name, *(row[key] for key in columns)])
-        cells = [f"{row[key]:d}" if isinstance(row[key], int) else f"{row[key]:.4g}" for key in columns]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return out.getvalue(), "\n".join(lines) + "\n"
-
-
-def learning_rate_table(rows: Sequence[Mapping]) -> tuple[str, str, dict[str, float]]:
-    """Compare learning rates: what every method reaches on every scene.
-
-    Args:
-        rows: one run each, with method, scene, lr_scale, loss (its history), best_loss, stable, recoveries and
-            chamfer_excess.
-
-    Returns:
-        CSV, Markdown, and for each method the factor whose best training loss, relative to the loss of the prior and
-        averaged over the scenes geometrically, is lowest.
-    """
-    header = (
-        "method",
-        "lr_scale",
-        "scene",
-        "loss of the prior",
-        "best loss",
-        "ratio",
-        "recoveries",
-        "stable",
-        "excess",
-    )
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(header)
-    lines = [f"| {' | '.join(header)} |", f"|{'---|' * len(header)}"]
-    logs: dict[str, dict[float, list[float]]] = {}
-    for row in rows:
-        first, best = row["loss"][0], row["best_loss"]
-        logs.setdefault(row["method"], {}).setdefault(row["lr_scale"], []).append(math.log(best / first))
-        cells = (
-            row["method"], f"{row['lr_scale']:g}", row["scene"], f"{first:.3e}", f"{best:.3e}", f"{best / first:.4f}",
-            len(row["recoveries"]), "yes" if row["stable"] else "no", f"{row['chamfer_excess']:.3f}",
-        )  # fmt: skip
-        writer.writerow(cells)
-        lines.append(f"| {' | '.join(map(str, cells))} |")
-    chosen = {
-        method: min(scales, key=lambda scale: sum(scales[scale]) / len(scales[scale]))
-        for method, scales in logs.items()
-    }
-    lines += ["", "Best by training loss: " + ", ".join(f"{m} ×{s:g}" for m, s in chosen.items()) + "."]
-    return out.getvalue(), "\n".join(lines) + "\n", chosen
+def _number(quantity: str, method: str, column: str, run: Mapping) -> float:
+    value = run.get(quantity)
+    if not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(
+            f"table: {quantity} of {method} on {column} is {value}; remove "
+            f"{column}/{method}/metrics.json from the results and run again"
+        )
+    return float(value)

@@ -1,8 +1,8 @@
-"""Moving pictures: prediction beside observation as mp4, and strips of frames as one still."""
+"""Moving pictures: prediction beside observation as mp4."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -71,39 +71,6 @@ def write_mp4(path: str | Path, video: np.ndarray, frame_rate: float) -> None:
     ) as writer:
         for frame in video:
             writer.append_data(frame)
-
-
-def strip(video: np.ndarray, count: int = 6) -> np.ndarray:
-    """Evenly spaced frames of a video (T, H, W, 3), first and last among them, as (H, count * W, 3)."""
-    index = np.linspace(0, len(video) - 1, min(count, len(video))).round().astype(int)
-    return np.concatenate([np.asarray(video[i]) for i in index], axis=1)
-
-
-def film_strips(
-    columns: Sequence[tuple[str, Mapping[str, np.ndarray]]], count: int = 5, magnify: int = 1
-) -> np.ndarray:
-    """A still that compares videos: a block a scene, a labelled strip of frames for each of its videos.
-
-    Args:
-        columns: (heading, label -> video (T, H, W, 3)) for each block; blocks stand below each other.
-        count: frames of a strip.
-        magnify: whole factor of enlargement.
-
-    Returns:
-        uint8 image (H', W', 3).
-    """
-    blocks = []
-    for heading, videos in columns:
-        rows = [_as_bytes(strip(video, count)[None])[0] for video in videos.values()]
-        rows = [row.repeat(magnify, axis=0).repeat(magnify, axis=1) for row in rows]
-        for label, row in zip(videos, rows, strict=True):
-            blocks.append(_heading(f"{heading}: {label}", row.shape[1]))
-            blocks.append(row)
-    width = max(block.shape[1] for block in blocks)
-    blocks = [
-        np.pad(block, [(0, 0), (0, width - block.shape[1]), (0, 0)], constant_values=255) for block in blocks
-    ]
-    return np.concatenate(blocks)
 
 
 def _as_bytes(video: np.ndarray) -> np.ndarray:

@@ -332,9 +332,9 @@ def _initial_gaussians(
 def _spread(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Indices of about ``count`` of the points, a random one of each cell of a grid with that many cells."""
     if count >= len(points):
-        return torch.arange(len(points))
+        return torch.arange(len(points), device=points.device)
     low, high = 0.0, float((points.amax(0) - points.amin(0)).max())
-    shuffled = torch.randperm(len(points), generator=generator)
+    shuffled = torch.randperm(len(points), generator=generator).to(points.device)
     for _ in range(20):
         size = 0.5 * (low + high)
         cells = _cell_keys(points, size)

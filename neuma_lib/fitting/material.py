@@ -118,6 +118,8 @@ class MaterialSettings:
         diverged_ratio: a loss above this multiple of the best one so far (at equal frame weights) counts as diverged.
         max_recoveries: after so many returns to the last good state training ends there, marked as unstable.
         checkpoint_every: iterations between checkpoints.
+        memory: most GiB for what a rollout's gradient keeps; with less, steps are computed again, see `rollout`.
+            null: no limit.
     """
 
     iterations: int = 50
@@ -134,6 +136,7 @@ class MaterialSettings:
     diverged_ratio: float = 5.0
     max_recoveries: int = 6
     checkpoint_every: int = 10
+    memory: float | None = None
 
 
 @dataclass
@@ -306,6 +309,7 @@ class _Loop:
             body.vol0,
             steps=frames[-1],
             frames=every_step(frames) if self.loss.total else frames,
+            memory=None if self.settings.memory is None else self.settings.memory * 2**30,
         )
         return self.loss(total_deformation(path, self.model.dt, frames) if self.loss.total else path)
 

@@ -5,6 +5,8 @@ Meshes are `trimesh.Trimesh` in metres, watertight and oriented outwards; points
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -57,6 +59,17 @@ def inside(mesh: trimesh.Trimesh, points: Array) -> NDArray[np.bool_]:
         True inside, shape (P,).
     """
     return _Columns(mesh).inside(np.asarray(points, dtype=np.float64))
+
+
+def check_apart(meshes: Sequence[trimesh.Trimesh]) -> None:
+    """Make sure that no two solids share space.
+
+    Raises:
+        InputError: a vertex of one lies inside another.
+    """
+    for (i, a), (j, b) in combinations(enumerate(meshes), 2):
+        if inside(a, b.vertices).any() or inside(b, a.vertices).any():
+            raise InputError(f"bodies {i} and {j} overlap at the start: move one of them (height, center)")
 
 
 class _Columns:

@@ -1,7 +1,15 @@
 """Differentiable material point method: one rollout for data, fitting and evaluation."""
 
-from neuma_lib.sim.model import Body, MPMModel, contact_clearance
+from neuma_lib.sim.model import Body, MPMModel, consecutive, contact_clearance, each_its_own
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.trajectory import Trajectory
 
-__all__ = ["Body", "MPMModel", "Trajectory", "contact_clearance", "rollout"]
+__all__ = [
+    "Body",
+    "MPMModel",
+    "Trajectory",
+    "consecutive",
+    "contact_clearance",
+    "each_its_own",
+    "rollout",
+]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -135,6 +136,17 @@ def as_bodies(law: Law | Sequence[Body], count: int) -> tuple[Body, ...]:
     if expected != count:
         raise InputError(f"the bodies cover particles 0 to {expected}, but there are {count} particles")
     return bodies
+
+
+def consecutive(laws: Sequence[Law], counts: Sequence[int]) -> tuple[Body, ...]:
+    """Bodies of the given particle counts, one after the other, each with its law."""
+    ends = list(accumulate(counts))
+    return tuple(Body(law, end - n, end) for law, n, end in zip(laws, counts, ends, strict=True))
+
+
+def each_its_own(values: Sequence[Sequence[float]], counts: Sequence[int]) -> Tensor:
+    """One row of values a body, repeated for each of its particles: shape (N, K), float32."""
+    return torch.tensor(values, dtype=torch.float32).repeat_interleave(torch.tensor(counts), dim=0)
 
 
 def contact_clearance(model: MPMModel, x: Tensor) -> Tensor:

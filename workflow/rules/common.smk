@@ -4,6 +4,7 @@ import os
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 ROOT = Path(workflow.basedir).resolve()
 sys.path.insert(0, str(ROOT))
@@ -24,8 +25,11 @@ LOGS = f"{RESULTS}/logs"
 BENCHMARKS = f"{RESULTS}/benchmarks"
 KERNELS = SETTINGS.kernel_cache.rstrip("/")
 ENVIRONMENT = "../../envs/conda.yaml"
-WANTS_CUDA = {"cpu": False, "cuda": True, "auto": shutil.which("nvidia-smi") is not None}
-GPU = int(WANTS_CUDA[SETTINGS.device])
+HAS_CUDA = shutil.which("nvidia-smi") is not None
+GPU = int({"cpu": False, "cuda": True, "auto": HAS_CUDA}[SETTINGS.device])
+# Kernels and ground truths are made with or without a GPU, so that its images can be rendered where none is.
+EITHER_DEVICE = "cpu" if SETTINGS.device == "cpu" else "auto"
+EITHER_GPU = int(GPU and HAS_CUDA)
 
 # Scripts are processes of their own: they find the library, share one kernel cache, and keep to one thread each
 # (two OpenMP threads on a busy machine are far slower than one).
@@ -40,10 +44,31 @@ os.environ.update(
 claim()  # a killed Snakemake takes its scripts with it
 
 
+# Runs when all jobs are known and none has started, and not in a dry run. A cluster's nodes are not this machine.
+onstart:
+    rules = sorted({job.rule.name for job in workflow.dag.needrun_jobs() if job.resources.get("gpu")})
+    if SETTINGS.device == "cuda" and rules and workflow.local_exec:
+        from neuma_lib.device import choose_device
+
+        try:
+            choose_device("cuda")
+        except InputError as error:
+            raise WorkflowError(
+                f"{error}. Rules that wait for one: {', '.join(rules)}. Ground truth and images (target 'dataset')"
+                " need none."
+            ) from None
+
+
+# Tables of distances; the other two have rules of their own.
+CHAMFER_TABLES = [name for name in SETTINGS.tables if name not in ("table4", "learning_rates")]
+
+
 wildcard_constraints:
     scene="|".join(SETTINGS.scenes),
     prior="|".join(SETTINGS.priors.laws) or "none",
     method=f"({'|'.join(SETTINGS.methods) or 'none'})([+][^/]*)?",
+    experiment="|".join(SETTINGS.experiments) or "none",
+    table="|".join(CHAMFER_TABLES) or "none",
     group="simulation|laws|rendering",
 
 
@@ -80,17 +105,39 @@ def scene_setting(*names):
     return choose
 
 
+def scenes_with(part, origin):
+    """Pattern of the scenes whose part ('static', 'dynamic', 'truth') is 'made', 'supplied' by the user or 'packed'.
+
+    Each file has one maker. A truth is not supplied: that of a scene with a video of the user's is simulated.
+    """
+
+    def origin_in(scene):
+        if getattr(scene.images, "dynamic" if part == "truth" else part):
+            return "made" if part == "truth" else "supplied"
+        return "packed" if SETTINGS.dataset.packed else "made"
+
+    return "|".join(n for n, scene in SETTINGS.scenes.items() if origin_in(scene) == origin) or "none"
+
+
+def truth_memory(wildcards):
+    """Memory that a ground truth takes [MB]: twice the particles (x, v, F, C) and tracers of all frames."""
+    bytes_a_frame = 96 * SETTINGS.dataset.particles + 24 * SETTINGS.dataset.tracers
+    return 2000 + 2 * len(SETTINGS.frame_steps(wildcards.scene)) * bytes_a_frame // 10**6
+
+
 def frame_steps(wildcards):
-    return list(SETTINGS.scene(wildcards.scene).frame_steps(SETTINGS.dataset.frames))
+    return list(SETTINGS.frame_steps(wildcards.scene))
 
 
 def simulation_settings(wildcards):
     """Constants of the simulator for a scene."""
+    return simulator(SETTINGS.scene(wildcards.scene).dt)
+
+
+def simulator(dt):
+    """Constants of the simulator with a time step [s]."""
     section = SETTINGS.simulation.plain()
-    return {
-        "dt": SETTINGS.scene(wildcards.scene).dt,
-        **{name: section[name] for name in ("grid", "gravity", "boundary", "wall_cells")},
-    }
+    return {"dt": dt, **{name: section[name] for name in ("grid", "gravity", "boundary", "wall_cells")}}
 
 
 def prior_file(name):
@@ -98,29 +145,51 @@ def prior_file(name):
     return f"{RESULTS}/priors/{name}.safetensors" if name in SETTINGS.priors.laws else name
 
 
+def table_runs(table):
+    """Every run behind a table, row by row: its method (without the seed), column, and folder."""
+    chosen = SETTINGS.tables[table]
+    columns = [(scene, scene, scene) for scene in chosen.scenes]
+    columns += [(n, SETTINGS.experiments[n].bodies[0].scene, f"experiments/{n}") for n in chosen.experiments]
+    return [
+        {"method": method, "column": column, "scene": scene, "folder": f"{RESULTS}/{folder}/{run}"}
+        for method in chosen.methods
+        for column, scene, folder in columns
+        for run in SETTINGS.seeded(table, method, scene)
+    ]
+
+
 def table_files(table, name):
-    """A file of every cell of a table, row by row."""
-    rows = SETTINGS.tables[table]
-    return [f"{RESULTS}/{scene}/{method}/{name}" for method in rows.methods for scene in rows.scenes]
+    """A file of every run behind a table, in the order of `table_runs`."""
+    return [f"{run['folder']}/{name}" for run in table_runs(table)]
 
 
 def table_cells(table):
-    """Method, learning-rate factor and scene of every cell of a table, in the order of `table_files`."""
-    rows = SETTINGS.tables[table]
+    """Method and column of every run behind a table, in the order of `table_runs`."""
+    return [[run["method"], run["column"]] for run in table_runs(table)]
+
+
+def learning_rate_cells(table):
+    """Method, learning-rate factor and scene of every run behind a table, in the order of `table_runs`."""
     return [
         {
-            "method": method.partition("+")[0],
-            "lr_scale": SETTINGS.method_material(scene, method).lr_scale,
-            "scene": scene,
+            "method": run["method"].partition("+")[0],
+            "lr_scale": SETTINGS.method_material(run["scene"], run["method"]).lr_scale,
+            "scene": run["scene"],
         }
-        for method in rows.methods
-        for scene in rows.scenes
+        for run in table_runs(table)
     ]
 
 
 def table_titles(table):
     """Row names of a table by method."""
-    return {method: SETTINGS.method_title(method) for method in SETTINGS.tables[table].methods}
+    chosen = SETTINGS.tables[table]
+    return {method: chosen.titles.get(method) or SETTINGS.method_title(method) for method in chosen.methods}
+
+
+def table_columns(table):
+    """Headings of a table by scene and experiment."""
+    chosen = SETTINGS.tables[table]
+    return {s: s for s in chosen.scenes} | {n: SETTINGS.experiments[n].title for n in chosen.experiments}
 
 
 @checked
@@ -147,5 +216,62 @@ def trained_adaptor(wildcards):
     return f"{RESULTS}/{wildcards.scene}/{wildcards.method}/adaptor.safetensors" if material.train else []
 
 
-def overview_files(pattern):
-    return expand(pattern, scene=SETTINGS.evaluation.overview)
+@checked
+def method_density(wildcards):
+    return SETTINGS.method_density(wildcards.scene, wildcards.method)
+
+
+@checked
+def evaluation_views(wildcards):
+    """Views that image metrics are taken in: those that are asked for, or those that training does not see."""
+    seen = SETTINGS.method_material(wildcards.scene, wildcards.method).views
+    unseen = [view for view in range(SETTINGS.dataset.dynamic.views) if view not in seen]
+    return list(SETTINGS.evaluation.views or unseen or seen)
+
+
+def scene_bodies(wildcards):
+    """What the ground truth of a scene simulates."""
+    keys = ("shape", "size", "height", "center", "velocity", "density", "law")
+    return [scene_setting(*keys)(wildcards)]
+
+
+def experiment_bodies(*keys):
+    """A function of wildcards: the named settings of an experiment's bodies."""
+
+    @checked
+    def choose(wildcards):
+        return [{key: body[key] for key in keys} for body in SETTINGS.experiment_bodies(wildcards.experiment)]
+
+    return choose
+
+
+def experiment_frames(wildcards):
+    return list(SETTINGS.dataset.frame_steps(SETTINGS.experiment(wildcards.experiment).steps))
+
+
+def experiment_simulation(wildcards):
+    """Constants of the simulator for an experiment."""
+    return simulator(SETTINGS.experiment_dt(wildcards.experiment))
+
+
+def reconstructed_files(name):
+    """A function of wildcards: a file of the scene of each body that is the scene's own object."""
+
+    @checked
+    def choose(wildcards):
+        bodies = SETTINGS.experiment_bodies(wildcards.experiment)
+        return [f"{RESULTS}/{body['scene']}/{name}" for body in bodies if body["reconstructed"]]
+
+    return choose
+
+
+def of_each_body(function):
+    """A function of wildcards of scene and method, applied to the scene of each body of an experiment."""
+
+    @checked
+    def choose(wildcards):
+        bodies = SETTINGS.experiment(wildcards.experiment).bodies
+        found = [function(SimpleNamespace(scene=body.scene, method=wildcards.method)) for body in bodies]
+        return [value for value in found if value != []]
+
+    return choose

@@ -14,11 +14,11 @@ rule kernels:
         ENVIRONMENT
     threads: 1
     resources:
-        gpu=GPU,
+        gpu=EITHER_GPU,
         mem_mb=4000,
         runtime=30,
     params:
-        device=SETTINGS.device,
+        device=EITHER_DEVICE,
         code=lambda wildcards: code_digest(ROOT / "neuma_lib" / "warm_up" / f"{wildcards.group}.py", ROOT),
     script:
         "../scripts/kernels.py"
@@ -33,21 +33,23 @@ rule ground_truth:
         f"{LOGS}/{{scene}}/ground_truth.log",
     benchmark:
         f"{BENCHMARKS}/{{scene}}/ground_truth.tsv"
+    wildcard_constraints:
+        scene=scenes_with("truth", "made"),
     conda:
         ENVIRONMENT
     threads: 1
     resources:
-        gpu=GPU,
-        mem_mb=4000,
+        gpu=EITHER_GPU,
+        mem_mb=truth_memory,
         runtime=60,
     params:
-        scene=scene_setting("shape", "size", "height", "center", "velocity", "density", "law"),
+        bodies=scene_bodies,
         simulation=simulation_settings,
         frames=frame_steps,
         particles=SETTINGS.dataset.particles,
         tracers=SETTINGS.dataset.tracers,
         seed=SETTINGS.dataset.seed,
-        device=SETTINGS.device,
+        device=EITHER_DEVICE,
         code=code("ground_truth"),
     script:
         "../scripts/ground_truth.py"
@@ -62,6 +64,8 @@ rule render_static:
         f"{LOGS}/{{scene}}/render_static.log",
     benchmark:
         f"{BENCHMARKS}/{{scene}}/render_static.tsv"
+    wildcard_constraints:
+        scene=scenes_with("static", "made"),
     conda:
         ENVIRONMENT
     threads: 1
@@ -87,13 +91,15 @@ rule render_dynamic:
         f"{LOGS}/{{scene}}/render_dynamic.log",
     benchmark:
         f"{BENCHMARKS}/{{scene}}/render_dynamic.tsv"
+    wildcard_constraints:
+        scene=scenes_with("dynamic", "made"),
     conda:
         ENVIRONMENT
     threads: 1
     resources:
         gpu=0,
         mem_mb=4000,
-        runtime=120,
+        runtime=240,
     params:
         scene=scene_setting("shape", "size", "height", "center", "appearance"),
         images=SETTINGS.dataset.dynamic.plain(),
@@ -101,3 +107,40 @@ rule render_dynamic:
         code=code("render_dynamic"),
     script:
         "../scripts/render_dynamic.py"
+
+
+rule supplied_static:
+    input:
+        images=lambda wildcards: SETTINGS.scene(wildcards.scene).images.static,
+    output:
+        transforms=f"{DATA}/{{scene}}/static/transforms.json",
+    log:
+        f"{LOGS}/{{scene}}/supplied_static.log",
+    benchmark:
+        f"{BENCHMARKS}/{{scene}}/supplied_static.tsv"
+    wildcard_constraints:
+        scene=scenes_with("static", "supplied"),
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        gpu=0,
+        mem_mb=4000,
+        runtime=10,
+    params:
+        code=code("supplied"),
+    script:
+        "../scripts/supplied.py"
+
+
+use rule supplied_static as supplied_dynamic with:
+    input:
+        images=lambda wildcards: SETTINGS.scene(wildcards.scene).images.dynamic,
+    output:
+        transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
+    log:
+        f"{LOGS}/{{scene}}/supplied_dynamic.log",
+    benchmark:
+        f"{BENCHMARKS}/{{scene}}/supplied_dynamic.tsv"
+    wildcard_constraints:
+        scene=scenes_with("dynamic", "supplied"),

@@ -55,7 +55,8 @@ rule evaluation:
         runtime=60,
     params:
         simulation=simulation_settings,
-        density=scene_setting("density"),
+        densities=lambda wildcards: [method_density(wildcards)],
+        covariance_from=lambda wildcards: material_settings(wildcards)["covariance_from"],
         frames=frame_steps,
         tracers=SETTINGS.evaluation.tracers,
         seed=SETTINGS.seed,
@@ -90,6 +91,7 @@ rule video:
         view=SETTINGS.evaluation.video_view,
         frame_rate=SETTINGS.evaluation.frame_rate,
         magnify=SETTINGS.evaluation.video_magnify,
+        device=SETTINGS.device,
         code=code("video"),
     script:
         "../scripts/video.py"

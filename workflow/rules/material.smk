@@ -26,7 +26,7 @@ rule material:
         runtime=240,
     params:
         simulation=simulation_settings,
-        density=scene_setting("density"),
+        density=method_density,
         material=material_settings,
         checkpoint=lambda wildcards: f"{RESULTS}/{wildcards.scene}/{wildcards.method}/checkpoint.pt",
         device=SETTINGS.device,

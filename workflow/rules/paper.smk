@@ -1,18 +1,21 @@
 """Tables of the paper, and the targets that name many results at once."""
 
+from neuma_lib.evaluation.paper import PAPER
+
 SCENES = list(SETTINGS.tables["table1"].scenes) if "table1" in SETTINGS.tables else list(SETTINGS.scenes)
+BENCHMARK_SCENES = list(SETTINGS.tables["table4"].scenes) if "table4" in SETTINGS.tables else SCENES
 
 
-rule table1:
+rule chamfer_table:
     input:
-        metrics=lambda wildcards: table_files("table1", "metrics.json"),
+        metrics=lambda wildcards: table_files(wildcards.table, "metrics.json"),
     output:
-        csv=report(f"{RESULTS}/table1.csv", caption="../report/table1.rst", category="Tables"),
-        markdown=f"{RESULTS}/table1.md",
+        csv=report(f"{RESULTS}/{{table}}.csv", caption="../report/chamfer_table.rst", category="Tables"),
+        markdown=f"{RESULTS}/{{table}}.md",
     log:
-        f"{LOGS}/table1.log",
+        f"{LOGS}/{{table}}.log",
     benchmark:
-        f"{BENCHMARKS}/table1.tsv"
+        f"{BENCHMARKS}/{{table}}.tsv"
     conda:
         ENVIRONMENT
     threads: 1
@@ -21,11 +24,37 @@ rule table1:
         mem_mb=1000,
         runtime=5,
     params:
-        scenes=SCENES,
-        methods=lambda wildcards: table_titles("table1"),
-        code=code("table1"),
+        cells=lambda wildcards: table_cells(wildcards.table),
+        titles=lambda wildcards: table_titles(wildcards.table),
+        columns=lambda wildcards: table_columns(wildcards.table),
+        caption=lambda wildcards: (
+            PAPER[wildcards.table].caption if wildcards.table in PAPER else wildcards.table
+        ),
+        code=code("chamfer_table"),
     script:
-        "../scripts/table1.py"
+        "../scripts/chamfer_table.py"
+
+
+rule benchmark_table:
+    output:
+        csv=report(f"{RESULTS}/table4.csv", caption="../report/table4.rst", category="Tables"),
+        markdown=f"{RESULTS}/table4.md",
+    log:
+        f"{LOGS}/table4.log",
+    benchmark:
+        f"{BENCHMARKS}/table4.tsv"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        gpu=0,
+        mem_mb=1000,
+        runtime=5,
+    params:
+        scenes=lambda wildcards: {name: SETTINGS.scene(name).plain() for name in BENCHMARK_SCENES},
+        code=code("benchmark_table"),
+    script:
+        "../scripts/benchmark_table.py"
 
 
 rule initial_states:
@@ -71,7 +100,7 @@ rule learning_rates:
         mem_mb=1000,
         runtime=5,
     params:
-        cells=lambda wildcards: table_cells("learning_rates"),
+        cells=lambda wildcards: learning_rate_cells("learning_rates"),
         code=code("learning_rates"),
     script:
         "../scripts/learning_rates.py"
@@ -81,7 +110,7 @@ rule timings:
     input:
         table=f"{RESULTS}/table1.csv",
     output:
-        csv=f"{RESULTS}/timings.csv",
+        csv=report(f"{RESULTS}/timings.csv", caption="../report/timings.rst", category="Run times"),
         markdown=f"{RESULTS}/timings.md",
     log:
         f"{LOGS}/timings.log",
@@ -101,37 +130,6 @@ rule timings:
         "../scripts/timings.py"
 
 
-rule overview:
-    input:
-        kernels=kernels("rendering"),
-        transforms=overview_files(f"{DATA}/{{scene}}/dynamic/transforms.json"),
-        gaussians=overview_files(f"{RESULTS}/{{scene}}/gaussians.ply"),
-        binding=overview_files(f"{RESULTS}/{{scene}}/binding.h5"),
-        prior=overview_files(f"{RESULTS}/{{scene}}/nclaw/rollout.h5"),
-        learned=overview_files(f"{RESULTS}/{{scene}}/neuma/rollout.h5"),
-    output:
-        picture=f"{RESULTS}/figures/overview.png",
-    log:
-        f"{LOGS}/overview.log",
-    benchmark:
-        f"{BENCHMARKS}/overview.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
-    resources:
-        gpu=0,
-        mem_mb=2000,
-        runtime=10,
-    params:
-        scenes=list(SETTINGS.evaluation.overview),
-        density=[SETTINGS.scene(name).density for name in SETTINGS.evaluation.overview],
-        view=SETTINGS.evaluation.video_view,
-        shown=7,
-        code=code("overview"),
-    script:
-        "../scripts/overview.py"
-
-
 rule dataset:
     input:
         expand(
@@ -143,7 +141,7 @@ rule dataset:
 
 rule tables:
     input:
-        rules.table1.output,
+        expand(f"{RESULTS}/{{table}}.{{kind}}", table=[*CHAMFER_TABLES, "table4"], kind=["csv", "md"]),
         rules.initial_states.output,
         rules.timings.output,
 
@@ -151,8 +149,3 @@ rule tables:
 rule videos:
     input:
         expand(f"{RESULTS}/{{scene}}/neuma/video.mp4", scene=SCENES),
-
-
-rule figures:
-    input:
-        rules.overview.output,

@@ -1,45 +1,60 @@
-"""Roll the learned law out from the estimated start and compare it with the ground truth."""
+"""Roll learned laws out from the estimated start and compare them with the ground truth."""
+
+from itertools import zip_longest
 
 import numpy as np
 import torch
 
-from neuma_lib.artifacts import load_body, load_law
+from neuma_lib.artifacts import load_law, load_start
 from neuma_lib.device import choose_device
-from neuma_lib.evaluation.evaluate import evaluate
+from neuma_lib.evaluation.evaluate import evaluate, predict
+from neuma_lib.fitting.total_deformation import every_step, total_deformation
 from neuma_lib.geometry.volume import sample_tracers
-from neuma_lib.io import read_arrays, read_json, read_mesh, read_weights, write_arrays, write_json
+from neuma_lib.io import read_arrays, read_mesh, read_weights, write_arrays, write_json
 from neuma_lib.progress import stage
-from neuma_lib.sim import MPMModel
+from neuma_lib.sim import MPMModel, consecutive
+
+
+def listed(files) -> list[str]:
+    """Named input files as a list: Snakemake gives one file as a text."""
+    return [files] if isinstance(files, str) else list(files or ())
 
 
 def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
+    priors, adaptors = listed(inputs.prior), listed(inputs.get("adaptor"))
     truth, _ = read_arrays(
         inputs.truth, only=("tracers", "tracers_again"), required=("tracers", "tracers_again")
     )
     tracers = sample_tracers(read_mesh(inputs.mesh), params.tracers, seed=params.seed)
-    velocity = read_json(inputs.velocity)
-    evaluation = evaluate(
+    body, v0, counts = load_start(inputs.binding, inputs.gaussians, inputs.velocity, params.densities)
+    laws = [load_law(prior, adaptor).to(device) for prior, adaptor in zip_longest(priors, adaptors)]
+    start = (
         MPMModel(**params.simulation),
-        load_law(inputs.prior, inputs.get("adaptor") or None).to(device),
-        load_body(inputs.binding, inputs.gaussians, params.density).to(torch.float32, device),
-        torch.tensor(velocity["v0"], dtype=torch.float32, device=device),
+        consecutive(laws, counts),
+        body.to(torch.float32, device),
+        v0.to(device),
+    )
+    evaluation = evaluate(
+        *start,
         params.frames,
         torch.from_numpy(truth["tracers"]).to(device),
         torch.from_numpy(truth["tracers_again"]).to(device),
         torch.as_tensor(np.asarray(tracers), dtype=torch.float32, device=device),
     )
     path = {name: getattr(evaluation.path, name).cpu().numpy() for name in ("x", "F")}
+    if params.get("covariance_from") == "total":
+        every, _ = predict(*start, every_step(params.frames))
+        total = total_deformation(every, params.simulation["dt"], params.frames)
+        path["F_total"] = total.F.cpu().numpy()
     write_arrays(
         output.rollout, {**path, "frames": np.asarray(params.frames)}, {"dt": params.simulation["dt"]}
     )
-    stable = read_weights(inputs.adaptor)[1]["stable"] if inputs.get("adaptor") else True
+    stable = all(read_weights(adaptor)[1]["stable"] for adaptor in adaptors)
     write_json(output.metrics, {**evaluation.metrics, "stable": stable})
     run.say(evaluation.summary())
 
 
 if __name__ == "__main__":
-    with stage(
-        f"evaluation {snakemake.wildcards.scene}/{snakemake.wildcards.method}", snakemake.log[0]
-    ) as run:
+    with stage(f"{snakemake.rule} {'/'.join(snakemake.wildcards)}", snakemake.log[0]) as run:
         main(snakemake.input, snakemake.output, snakemake.params, run)

@@ -4,17 +4,19 @@ from dataclasses import asdict
 
 from neuma_lib.artifacts import load_views, save_gaussians
 from neuma_lib.config import from_mapping
+from neuma_lib.device import choose_device
 from neuma_lib.fitting.gaussians import GaussianFitSettings, fit_gaussians
 from neuma_lib.io import write_json
 from neuma_lib.progress import stage
 
 
 def main(transforms: str, output, params, run) -> None:
+    device = choose_device(params.device)
     images, cameras = load_views(transforms)
     settings = from_mapping(GaussianFitSettings, params.fit, "gaussians")
     gaussians, report = fit_gaussians(
-        images,
-        cameras,
+        images.to(device),
+        cameras.to(device=device),
         settings,
         seed=params.seed,
         progress=lambda iteration, loss: run.progress(iteration + 1, settings.iterations, loss),

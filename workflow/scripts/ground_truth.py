@@ -1,8 +1,9 @@
-"""Simulate the true material of a benchmark."""
+"""Simulate the true materials of a benchmark or an experiment."""
 
 import numpy as np
 
-from neuma_lib.dataset import simulate_ground_truth
+from neuma_lib.dataset import TrueBody, simulate_ground_truth
+from neuma_lib.device import choose_device
 from neuma_lib.geometry.shapes import place
 from neuma_lib.io import write_arrays
 from neuma_lib.materials import analytic_law
@@ -11,37 +12,42 @@ from neuma_lib.sim import MPMModel
 
 
 def main(output, params, run) -> None:
-    scene, model = params.scene, MPMModel(**params.simulation)
-    law = analytic_law(scene["law"], dt=model.dt)
-    mesh = place(scene["shape"], scene["size"], scene["height"], scene["center"])
+    model = MPMModel(**params.simulation)
+    bodies = [
+        TrueBody(
+            place(body["shape"], body["size"], body["height"], body["center"]),
+            analytic_law(body["law"], dt=model.dt),
+            body["velocity"],
+            body["density"],
+        )
+        for body in params.bodies
+    ]
     truth = simulate_ground_truth(
         model,
-        law,
-        mesh,
-        scene["velocity"],
-        scene["density"],
+        bodies,
         params.frames,
         particles=params.particles,
         tracers=params.tracers,
         seed=params.seed,
+        device=choose_device(params.device),
     )
     arrays = {name: getattr(truth.path, name).numpy() for name in ("x", "v", "F")}
-    count = arrays["x"].shape[1]
     arrays |= {
         "frames": np.asarray(truth.frames),
         "time": np.asarray(truth.frames) * model.dt,
-        "vol0": np.full(count, truth.vol0, dtype=np.float32),
-        "mass": np.full(count, truth.mass, dtype=np.float32),
-        "tracers": truth.tracers.numpy(),
-        "tracers_again": truth.tracers_again.numpy(),
+        **{name: getattr(truth, name).numpy() for name in ("vol0", "mass", "tracers", "tracers_again")},
     }
-    write_arrays(output.particles, arrays, {"dt": model.dt, "scene": scene, "simulation": params.simulation})
-    lowest = float(arrays["x"][..., 1].min())
+    write_arrays(
+        output.particles,
+        arrays,
+        {"dt": model.dt, "bodies": params.bodies, "simulation": params.simulation},
+    )
+    count, lowest = arrays["x"].shape[1], float(arrays["x"][..., 1].min())
     run.say(
         f"{count} particles, {truth.frames[-1]} steps, {len(truth.frames)} frames, lowest point {lowest:.3f} m"
     )
 
 
 if __name__ == "__main__":
-    with stage(f"ground_truth {snakemake.wildcards.scene}", snakemake.log[0]) as run:
+    with stage(f"{snakemake.rule} {'/'.join(snakemake.wildcards)}", snakemake.log[0]) as run:
         main(snakemake.output, snakemake.params, run)

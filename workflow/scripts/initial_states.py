@@ -1,6 +1,6 @@
 """One table of what the stages before training reached, a scene a row."""
 
-from neuma_lib.evaluation.tables import report_table
+from neuma_lib.evaluation.reports import report_table
 from neuma_lib.io import read_json, write_text
 from neuma_lib.progress import stage
 

@@ -31,7 +31,8 @@ def main(inputs, output, params, run) -> None:
         targets = torch.from_numpy(truth["x"]).to(device)
         loss = ParticleLoss(tuple(truth["frames"].tolist()), targets)
     else:
-        loss = PixelLoss(body, video, settings["covariance_gradient"])
+        total = settings["covariance_from"] == "total"
+        loss = PixelLoss(body, video, settings["covariance_gradient"], total=total)
     files = {name: str(file) for name, file in inputs.items() if name != "kernels" and isinstance(file, str)}
     stamp = {"simulation": params.simulation, "density": params.density, **settings}
     checkpoint = Checkpoint(params.checkpoint, fingerprint(stamp, files, params.code))
@@ -57,7 +58,9 @@ def main(inputs, output, params, run) -> None:
         "best_iteration": trained.best_iteration,
         "stable": trained.stable,
     }
-    write_json(output.history, {**report, **asdict(trained.history)})
+    curves = asdict(trained.history)
+    del curves["seconds"]  # the same settings give the same file
+    write_json(output.history, {**report, **curves})
     save_adaptor(
         output.adaptor, trained.law, settings["rank"], settings["alpha"], {"settings": settings, **report}
     )

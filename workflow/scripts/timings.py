@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from neuma_lib.evaluation.tables import report_table
+from neuma_lib.evaluation.reports import report_table
 from neuma_lib.io import write_text
 from neuma_lib.progress import stage
 

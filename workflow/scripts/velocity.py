@@ -1,6 +1,9 @@
 """Estimate the initial velocity from the frames before contact."""
 
+import torch
+
 from neuma_lib.artifacts import load_body, load_law, load_observation
+from neuma_lib.device import choose_device
 from neuma_lib.fitting.velocity import estimate_velocity
 from neuma_lib.io import write_json
 from neuma_lib.progress import stage
@@ -9,14 +12,17 @@ from neuma_lib.sim import MPMModel
 
 def main(inputs, velocity_file: str, params, run) -> None:
     options = dict(params.velocity)
-    model, law = MPMModel(**params.simulation), load_law(inputs.prior)
-    body = load_body(inputs.binding, inputs.gaussians, params.density)
-    video = load_observation(inputs.transforms, options.pop("views"))
+    device = choose_device(params.device)
+    model, law = MPMModel(**params.simulation), load_law(inputs.prior).to(device)
+    body = load_body(inputs.binding, inputs.gaussians, params.density).to(torch.float32, device)
+    video = load_observation(inputs.transforms, options.pop("views")).to(torch.float32, device)
     estimate = estimate_velocity(model, law, body, video, **options, progress=run.progress)
-    free = estimate_velocity(model, law, body, video, **{**options, "ridge": 0.0})
+    free = estimate
+    if options["ridge"]:
+        free = estimate_velocity(model, law, body, video, **{**options, "ridge": 0.0})
+        run.say(f"without the ridge: {free.summary()}")
     write_json(velocity_file, {**estimate.as_dict(), "without_ridge": free.as_dict()})
     run.say(estimate.summary())
-    run.say(f"without the ridge: {free.summary()}")
 
 
 if __name__ == "__main__":

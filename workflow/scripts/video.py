@@ -1,29 +1,32 @@
 """Film the prediction beside the observation."""
 
+import numpy as np
 import torch
 
-from neuma_lib.artifacts import load_body, load_observation
+from neuma_lib.artifacts import load_body, load_motion, load_observation
+from neuma_lib.device import choose_device
 from neuma_lib.evaluation.metrics import psnr
 from neuma_lib.evaluation.video import side_by_side, write_mp4
-from neuma_lib.io import atomic, read_arrays
+from neuma_lib.io import atomic
 from neuma_lib.progress import stage
 
 
 def main(inputs, video_file: str, params, run) -> None:
-    observation = load_observation(inputs.transforms, [params.view])
-    body = load_body(inputs.binding, inputs.gaussians, params.density)
-    arrays, _ = read_arrays(inputs.rollout, required=("x", "F"))
-    x, F = torch.from_numpy(arrays["x"]), torch.from_numpy(arrays["F"])
+    device = choose_device(params.device)
+    observation = load_observation(inputs.transforms, [params.view]).to(torch.float32, device)
+    body = load_body(inputs.binding, inputs.gaussians, params.density).to(torch.float32, device)
+    x, F = load_motion(inputs.rollout)
     renderer = body.particle_gs(observation.cameras)
+    panels, quality = [], []
     with torch.no_grad():
-        frames = [images[:, 0] for _, images in renderer.batches(x, F, size=8)]
-    predicted, seen = torch.cat(frames), observation.images[:, 0]
-    video = side_by_side(
-        [seen.numpy(), predicted.numpy()], ["observation", "prediction"], magnify=params.magnify
-    )
+        for part, images in renderer.batches(x, F):
+            predicted, seen = images[:, 0], observation.colours(part)[:, 0]
+            quality += [float(psnr(p, s)) for p, s in zip(predicted, seen, strict=True)]
+            pair = [seen.cpu().numpy(), predicted.cpu().numpy()]
+            panels.append(side_by_side(pair, ["observation", "prediction"], magnify=params.magnify))
+    video = np.concatenate(panels)
     with atomic(video_file) as partial:
         write_mp4(partial, video, params.frame_rate)
-    quality = [float(psnr(p, s)) for p, s in zip(predicted, seen, strict=True)]
     run.say(f"{len(video)} frames, PSNR {sum(quality) / len(quality):.1f} dB on average")
 
 

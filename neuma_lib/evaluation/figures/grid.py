@@ -1,0 +1,68 @@
+"""Pictures in rows and columns, placed to the hundredth of an inch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+GAP = 0.02
+"""Between pictures [in]."""
+
+
+def picture_height(images: np.ndarray, columns: int, width: float) -> float:
+    """Height [in] of a picture of the grid ``images`` (..., H, W, 3) when ``columns`` of them fill ``width`` [in]."""
+    each = (width - GAP * (columns - 1)) / columns
+    return each * images.shape[-3] / images.shape[-2]
+
+
+def place(figure: Figure, left: float, top: float, width: float, height: float, **options) -> Axes:
+    """Axes whose upper left corner lies at (left, top) inches from that of the figure."""
+    full_width, full_height = figure.get_size_inches()
+    box = (left / full_width, 1 - (top + height) / full_height, width / full_width, height / full_height)
+    return figure.add_axes(box, **options)
+
+
+def image_grid(
+    figure: Figure,
+    images: np.ndarray,
+    left: float,
+    top: float,
+    width: float,
+    rows: Sequence[str] = (),
+    columns: Sequence[str] = (),
+) -> float:
+    """Draw pictures (R, C, H, W, 3) below and right of (left, top) [in]; their lower end [in].
+
+    Args:
+        width: of the pictures together [in].
+        rows: titles left of the pictures.
+        columns: titles above them.
+    """
+    count = images.shape[1]
+    height = picture_height(images, count, width)
+    each = (width - GAP * (count - 1)) / count
+    for i, row in enumerate(images):
+        for j, image in enumerate(row):
+            axes = place(figure, left + j * (each + GAP), top + i * (height + GAP), each, height)
+            axes.imshow(image, interpolation="antialiased", aspect="auto")
+            axes.set_axis_off()
+            if i == 0 and j < len(columns):
+                axes.text(
+                    0.5, 1.02, columns[j], transform=axes.transAxes, ha="center", va="bottom", fontsize=6.5
+                )
+            if j == 0 and i < len(rows):
+                axes.text(
+                    -0.04, 0.5, rows[i], transform=axes.transAxes, ha="right", va="center", fontsize=6.5
+                )
+    return top + len(images) * (height + GAP) - GAP
+
+
+def note(figure: Figure, left: float, top: float, text: str, **options) -> None:
+    """Text at (left, top) inches from the upper left corner."""
+    width, height = figure.get_size_inches()
+    figure.text(
+        left / width, 1 - top / height, text, **{"ha": "left", "va": "center", "fontsize": 7, **options}
+    )

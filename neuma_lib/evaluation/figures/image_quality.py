@@ -1,0 +1,47 @@
+"""Quality of rendered images against the observation, views that training did not see (paper, fig:image_quality)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from neuma_lib.evaluation import style
+
+MEASURES = {
+    "psnr": "PSNR [dB] ↑",
+    "ssim": "SSIM ↑",
+    "lpips_vgg": "LPIPS (VGG) ↓",
+    "lpips_alex": "LPIPS (Alex) ↓",
+}
+SPREAD = 0.62
+"""Part of a scene's slot over which the methods stand side by side."""
+
+
+@style.styled
+def draw(data: Mapping) -> Figure:
+    """Draw one row a measure; every method has a point in every scene, and one for the mean over scenes.
+
+    Args:
+        data: ``titles`` {method: name}, ``scenes`` in order, and a {method: {scene: value}} for each of `MEASURES`.
+    """
+    scenes, titles = list(data["scenes"]), data["titles"]
+    figure = style.new_figure(style.PAGE, 0.4 + 1.15 * len(MEASURES))
+    panels = figure.subplots(len(MEASURES), 1, sharex=True)
+    offsets = np.linspace(-SPREAD / 2, SPREAD / 2, len(titles)) if len(titles) > 1 else [0.0]
+    for axes, (measure, label) in zip(panels, MEASURES.items()):
+        for offset, (method, title) in zip(offsets, titles.items()):
+            values = [data[measure][method][scene] for scene in scenes]
+            values.append(float(np.mean(values)))
+            kind = style.look(method)
+            axes.plot(np.arange(len(values)) + offset, values, kind.marker, color=kind.color, label=title)
+        axes.axvspan(len(scenes) - 0.5, len(scenes) + 0.5, color=style.LIGHT, alpha=0.6, linewidth=0)
+        axes.set(ylabel=label, xlim=(-0.5, len(scenes) + 0.5))
+        axes.grid(axis="y")
+        for edge in range(len(scenes) - 1):
+            axes.axvline(edge + 0.5, color=style.LIGHT, linewidth=0.5)
+    panels[-1].set_xticks(range(len(scenes) + 1), [*scenes, "average"])
+    figure.align_ylabels(panels)
+    style.legend_above(figure, panels[0], len(titles))
+    return figure

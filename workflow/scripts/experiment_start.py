@@ -1,0 +1,54 @@
+"""Put the bodies of an experiment together: solids filled anew, or objects as they were reconstructed."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+import trimesh
+
+from neuma_lib.artifacts import load_body, save_binding, save_gaussians
+from neuma_lib.assembly import join, painted
+from neuma_lib.blender.appearance import Appearance, colors_at
+from neuma_lib.config import pick
+from neuma_lib.geometry.shapes import place, shape
+from neuma_lib.geometry.volume import sample_volume
+from neuma_lib.io import read_json, read_mesh, write_json, write_mesh
+from neuma_lib.progress import stage
+
+
+def look_of(entry: dict) -> Appearance:
+    """The look of the body's scene, as far as its own shape has the parts that are coloured there."""
+    known = shape(entry["shape"]).part_names
+    colors = {name: value for name, value in entry["appearance"]["colors"].items() if name in known}
+    return pick(Appearance, entry["appearance"], colors=colors)
+
+
+def main(inputs, output, params, run) -> None:
+    reconstructed: Iterator = zip(inputs.binding, inputs.gaussians, inputs.mesh, inputs.velocity, strict=True)
+    bodies, meshes, starts = [], [], []
+    for entry in params.bodies:
+        if entry["reconstructed"]:
+            binding, gaussians, surface, velocity = next(reconstructed)
+            body, mesh, v0 = load_body(binding, gaussians, 1.0), read_mesh(surface), read_json(velocity)["v0"]
+        else:
+            mesh = place(entry["shape"], entry["size"], entry["height"], entry["center"])
+            x0 = sample_volume(mesh, params.particles, seed=params.seed, method=params.sampling)
+            colors = torch.from_numpy(colors_at(mesh, x0, look_of(entry)))
+            body = painted(mesh, torch.as_tensor(x0, dtype=torch.float32), 1.0, colors)
+            v0 = entry["velocity"]
+        bodies.append(body)
+        meshes.append(mesh)
+        starts.append(
+            {"scene": entry["scene"], "v0": v0, "particles": len(body.x0), "gaussians": len(body.gaussians)}
+        )
+    together, surface = join(bodies), trimesh.util.concatenate(meshes)
+    save_gaussians(output.gaussians, together.gaussians)
+    save_binding(output.binding, together.binding, together.x0, together.vol0, {})
+    write_mesh(output.mesh, np.asarray(surface.vertices), np.asarray(surface.faces))
+    write_json(output.velocity, {"bodies": starts})
+    run.say(f"{len(bodies)} bodies, {len(together.x0)} particles, {len(together.gaussians)} Gaussians")
+
+
+if __name__ == "__main__":
+    with stage(f"{snakemake.rule} {'/'.join(snakemake.wildcards)}", snakemake.log[0]) as run:
+        main(snakemake.input, snakemake.output, snakemake.params, run)

@@ -1,0 +1,14 @@
+"""Unpack the static or the dynamic images of a scene."""
+
+from neuma_lib.packing import unpack_images
+from neuma_lib.progress import stage
+
+
+def main(packed: str, transforms: str, params, run) -> None:
+    unpack_images(packed, {params.part: transforms}, {params.part: params.steps}, run.progress)
+    run.say(f"unpacked from {packed}")
+
+
+if __name__ == "__main__":
+    with stage(f"{snakemake.rule} {snakemake.wildcards.scene}", snakemake.log[0]) as run:
+        main(snakemake.input.packed, snakemake.output.transforms, snakemake.params, run)
