@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 _COARSE_RESOLUTION = 32
 """Voxels along the longest side of the first look, which finds the body's box and the band around its
 surface."""
+_BAND = 6.0
+"""Distance from a contour [px] up to which it is measured to a small part of a pixel."""
 _CONTOUR_STEPS = 8
 """Points on each segment of a contour; a segment is at most a pixel's diagonal long."""
 
@@ -165,14 +167,21 @@ def _silhouettes(alpha: Tensor, level: float) -> Tensor:
 def _distance_to_contour(matte: Array, level: float) -> Array:
     """Signed distance [px] from pixel centres to the level line of a matte (H, W), positive inside.
 
-    The matte is continued beyond the frame as it is at its edge, where a body may be cut off.
+    The matte is continued beyond the frame as it is at its edge, where a body may be cut off. Distances of more than
+    `_BAND` pixels are those to the nearest pixel on the other side, right to about half a pixel: a surface lies where
+    distances vanish, and the nearest of a circle's many points is dear to find from its middle.
     """
+    inside = matte > level
+    distance = np.where(
+        inside, ndimage.distance_transform_edt(inside) - 0.5, 0.5 - ndimage.distance_transform_edt(~inside)
+    )
     contours = find_contours(np.pad(matte, 1, mode="edge"), level)
     along = np.arange(_CONTOUR_STEPS)[:, None, None] / _CONTOUR_STEPS
     pieces = [((1 - along) * line[:-1] + along * line[1:]).reshape(-1, 2) for line in contours]
-    pixels = np.stack(np.indices(matte.shape), axis=-1).reshape(-1, 2) + 1.0
-    distance, _ = cKDTree(np.concatenate(pieces)).query(pixels)
-    return np.where(matte > level, 1.0, -1.0) * distance.reshape(matte.shape)
+    near = np.abs(distance) < _BAND
+    exact, _ = cKDTree(np.concatenate(pieces)).query(np.argwhere(near) + 1.0)
+    distance[near] = np.where(inside[near], exact, -exact)
+    return distance
 
 
 def _distance_inside(points: Array, silhouettes: Tensor, cameras: Cameras) -> Array:
