@@ -9,7 +9,9 @@ from grounding_scene import MODEL, TRUTH, ball, camera, observe
 from sim_scenes import make_law
 
 from neuma_lib.checkpoint import Checkpoint
+from neuma_lib.fitting import observation
 from neuma_lib.fitting.material import MaterialSettings, PixelLoss, train_material
+from neuma_lib.fitting.observation import Observation
 from neuma_lib.fitting.velocity import estimate_velocity
 from neuma_lib.materials import analytic_law, neural_law
 from neuma_lib.sim import rollout
@@ -61,7 +63,8 @@ def test_float32_stays_as_near_to_float64_as_the_cpu_does(law):
     truth, _ = throw(law, "cpu", torch.float64)
     x_cpu, _ = throw(law, "cpu", torch.float32)
     x_gpu, _ = throw(law, "cuda", torch.float32)
-    assert relative(x_gpu, truth) < 5 * relative(x_cpu, truth)
+    gpu, cpu = relative(x_gpu, truth), relative(x_cpu, truth)
+    assert gpu < 5 * cpu and cpu < 5 * gpu
 
 
 @pytest.fixture(scope="module")
@@ -193,3 +196,16 @@ def test_velocity_from_bytes_agrees():
         found[device] = estimate_velocity(MODEL, law, body, replace(seen, images=pixels))
     assert abs(found["cuda"].v0 - found["cpu"].v0).max() < 1e-6
     assert abs(found["cuda"].std - found["cpu"].std).max() < 1e-6
+
+
+def test_a_video_that_does_not_fit_stays_off_the_device(monkeypatch):
+    """Frames then go there a part at a time; colours and losses are the same."""
+    cameras = camera(dtype=torch.float32)
+    images = torch.randint(256, (3, 1, cameras.height, cameras.width, 4), dtype=torch.uint8)
+    video = Observation((0, 1, 2), images, cameras)
+    kept = video.to(torch.float32, "cuda")
+    monkeypatch.setattr(observation, "_DEVICE_SHARE", 0.0)
+    streamed = video.to(torch.float32, "cuda")
+    assert kept.images.is_cuda and not streamed.images.is_cuda
+    assert torch.equal(kept.colours(slice(1, 3)), streamed.colours(slice(1, 3)))
+    assert streamed.stored([2]).is_cuda

@@ -78,7 +78,7 @@ class PixelLoss:
         return framewise(self._losses, self._batch, path.x, path.F)
 
     def _losses(self, part: slice, x: Tensor, F: Tensor) -> Tensor:
-        return mean_squared_error(self._renderer(x, F), self.observation.images[part])
+        return mean_squared_error(self._renderer(x, F), self.observation.stored(part))
 
 
 @dataclass

@@ -15,6 +15,9 @@ from neuma_lib.render.cameras import Cameras
 from neuma_lib.render.gaussians import Gaussians
 from neuma_lib.render.particle_gs import ParticleGS
 
+_DEVICE_SHARE = 0.3
+"""Largest part of a GPU's free memory that a video may take; the rollout and the renders need the rest."""
+
 
 @dataclass(frozen=True)
 class Reconstruction:
@@ -102,10 +105,14 @@ class Observation:
 
     def colours(self, part: slice | Sequence[int] = slice(None)) -> Tensor:
         """Colours over a white background in [0, 1] of some frames, all by default, shape (T', V, H, W, 3)."""
-        images = self.images[part]
+        images = self.stored(part)
         if images.dtype != torch.uint8:
             return images
         return over_white(images.to(self.cameras.viewmats.dtype) / 255)
+
+    def stored(self, part: slice | Sequence[int] = slice(None)) -> Tensor:
+        """Images of some frames as they are stored, on the cameras' device."""
+        return self.images[part].to(self.cameras.viewmats.device, non_blocking=True)
 
     def select(self, keep: Sequence[int]) -> Observation:
         """The frames with the given indices."""
@@ -113,13 +120,23 @@ class Observation:
         return replace(self, frames=tuple(self.frames[i] for i in keep), images=self.images[keep])
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Observation:
-        """The same frames on another device, with cameras and colours in another precision."""
-        stored = torch.uint8 if self.images.dtype == torch.uint8 else dtype
-        return replace(
-            self,
-            images=self.images.to(dtype=stored, device=device),
-            cameras=self.cameras.to(dtype=dtype, device=device),
-        )
+        """The same frames on another device, with cameras and colours in another precision.
+
+        Images go along if they take at most `_DEVICE_SHARE` of a GPU's free memory. Otherwise they stay, and go there
+        a part at a time (`stored`).
+        """
+        images = self.images if self.images.dtype == torch.uint8 else self.images.to(dtype)
+        if device is not None:
+            images = images.to(device) if _fits(images, torch.device(device)) else images.cpu().pin_memory()
+        return replace(self, images=images, cameras=self.cameras.to(dtype=dtype, device=device))
+
+
+def _fits(images: Tensor, device: torch.device) -> bool:
+    """Whether images should be kept on a device."""
+    if device.type != "cuda":
+        return True
+    free, _ = torch.cuda.mem_get_info(device)
+    return images.numel() * images.element_size() <= _DEVICE_SHARE * free
 
 
 def over_white(rgba: Tensor) -> Tensor:
