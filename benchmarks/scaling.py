@@ -89,6 +89,7 @@ def exponent(axis: str, rows: list[dict]) -> float:
 def draw(rows: list[dict], path: Path, title: str) -> None:
     """Time and memory over every size, with a line of slope one."""
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import FuncFormatter, LogLocator
 
     axes_names = list(dict.fromkeys(row["axis"] for row in rows))
     figure, axes = plt.subplots(2, len(axes_names), figsize=(2.3 * len(axes_names), 4.2), squeeze=False)
@@ -110,6 +111,9 @@ def draw(rows: list[dict], path: Path, title: str) -> None:
             )
             ax.set_xticks(sizes, [f"{s:,}" for s in sizes], rotation=45, fontsize=7)
             ax.minorticks_off()
+            ax.set_ylim(0.5 * min(values), 2 * max(values))
+            ax.yaxis.set_major_locator(LogLocator(base=10, subs=(1, 2, 5)))
+            ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             ax.tick_params(labelsize=7)
             if column == 0:
                 ax.set_ylabel(unit, fontsize=8)
