@@ -111,8 +111,8 @@ class _Scratch(threading.local):
     def get(self, kind: type, F: Tensor):
         key = (kind, len(F), F.dtype, F.device)
         if key not in self.buffers:
-            if len(self.buffers) > 32:
-                self.buffers.clear()
+            if len(self.buffers) > 32:  # those of a GPU stay: recorded graphs hold their addresses
+                self.buffers = {k: buffer for k, buffer in self.buffers.items() if k[-1].type != "cpu"}
             self.buffers[key] = kind.like(F)
         return self.buffers[key]
 
