@@ -117,6 +117,7 @@ class Workspace:
     def load_weights(self, weights: Sequence[Tensor]) -> None:
         """Copy weights to their fixed place."""
         if [w.shape for w in weights] != [w.shape for w in self.weights]:
+            self._forget_graphs()
             self.weights = [torch.empty_like(w, memory_format=torch.contiguous_format) for w in weights]
             self.grad_weights = [torch.zeros_like(w) for w in self.weights]
         for own, weight in zip(self.weights, weights, strict=True):
@@ -125,8 +126,8 @@ class Workspace:
     def load_seeds(self, name: Hashable, seeds: Sequence[Tensor | None]) -> list[Tensor | None]:
         """Copy gradients of the frames to a fixed place of that name."""
         if name not in self._seeds:
-            if len(self._seeds) == MOST_GRAPHS:  # no graph may outlive what it reads
-                self._seeds, self.graphs = {}, GraphCache()
+            if len(self._seeds) == MOST_GRAPHS:
+                self._forget_graphs()
             self._seeds[name] = [
                 None if seed is None else torch.empty_like(seed, memory_format=torch.contiguous_format)
                 for seed in seeds
@@ -135,6 +136,10 @@ class Workspace:
             if own is not None:
                 own.copy_(seed)
         return self._seeds[name]
+
+    def _forget_graphs(self) -> None:
+        """No graph may outlive what it reads."""
+        self._seeds, self.graphs = {}, GraphCache()
 
     def transfer_to_grid(self, step: int) -> None:
         """tau and the state of a step to the velocities of the nodes."""
