@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 import warp as wp
 
-from neuma_lib.binding import Binding
 from neuma_lib.errors import InputError
 from neuma_lib.render.arrays import matrices, plain, target, vectors
 from neuma_lib.render.deformation_kernels import kernels
@@ -17,6 +16,17 @@ class AppliesToParticles(Protocol):
     """The part of a binding that is used here: rows average the particles bound to each Gaussian."""
 
     def apply(self, field: torch.Tensor) -> torch.Tensor: ...
+
+
+@runtime_checkable
+class SparseBinding(AppliesToParticles, Protocol):
+    """A binding whose rows and columns can be walked, as `neuma_lib.binding.Binding`."""
+
+    shape: tuple[int, int]
+
+    def rows(self, dtype: torch.dtype) -> tuple[torch.Tensor, ...]: ...
+
+    def columns(self, dtype: torch.dtype) -> tuple[torch.Tensor, ...]: ...
 
 
 def deform(
@@ -53,14 +63,14 @@ def deform(
     """
     F = F if covariance_gradient else F.detach()
     at_rest = (means, covars, x0)
-    if not isinstance(binding, Binding) or any(value.requires_grad for value in at_rest):
+    if not isinstance(binding, SparseBinding) or any(value.requires_grad for value in at_rest):
         F_bar = binding.apply(F)
         return means + binding.apply(x - x0), F_bar @ covars @ F_bar.mT
     _check_shapes(binding, means, covars, x0, x, F)
     return _Deform.apply(binding, *(value.contiguous() for value in at_rest), x, F)
 
 
-def _check_shapes(binding: Binding, means, covars, x0, x, F) -> None:
+def _check_shapes(binding: SparseBinding, means, covars, x0, x, F) -> None:
     G, N = binding.shape
     T = len(x)
     expected = {
@@ -86,7 +96,7 @@ class _Deform(torch.autograd.Function):
     """The fused deformation; gradients with respect to x and F only."""
 
     @staticmethod
-    def forward(ctx, binding: Binding, means, covars, x0, x, F):
+    def forward(ctx, binding: SparseBinding, means, covars, x0, x, F):
         T, G = len(x), len(means)
         x, F = x.contiguous(), F.contiguous()
         carry, _, _ = kernels(x.dtype)
