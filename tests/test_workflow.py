@@ -261,11 +261,10 @@ def test_editing_the_rasterizer_reruns_what_renders(clone):
             {"material", "velocity", "ground_truth"},
         ),
         ("neuma_lib/evaluation/tables.py", {"chamfer_table"}, {"evaluation"}),
-        pytest.param(
+        (
             "neuma_lib/binding.py",
             {"binding", "velocity", "material", "evaluation"},
             {"gaussians", "mesh", "prior"},
-            marks=pytest.mark.xfail(reason="more is planned than depends on it: cause not found yet"),
         ),
         (
             "neuma_lib/blender/cycles.py",
