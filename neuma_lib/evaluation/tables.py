@@ -163,7 +163,7 @@ class Table:
         per_column = [np.stack([means(m) for m in group]) for group in (claim.better, claim.worse)]
         lower = int((per_column[0].max(axis=0) <= per_column[1].min(axis=0)).sum())
         titles = [self.row(JUDGED, method).title for method in (highest, lowest)]
-        said = f"{'Holds' if ours[0] <= ours[1] else 'Does not hold'}: {claim.text}."
+        said = f"{'Holds' if ours[0] <= ours[1] else 'Does not hold'}: {claim.text.rstrip('.')}."
         said += f" Excess {ours[0]:.3f} ({titles[0]}) against {ours[1]:.3f} ({titles[1]}) on average;"
         said += f" it is so in {lower} of {len(columns)} columns."
         return said + self._paper_verdict(claim, columns)

@@ -373,9 +373,10 @@ FEATURES = r"""
         __syncwarp();
 """
 
-EVALUATE = r"""
+# Both kernels: the first two products, with h0 in x and what the second layer is before its gelu, unscaled, in y.
+LAYERS = r"""
         unsigned high[2][4], low[2][4];
-        float x[2][8][4], y[2][8][4], Y[2][2][4], down, size = 0.0f;
+        float x[2][8][4], y[2][8][4], up_h0, down_h0, down;
         clear(x);
         load16(Z_AT, high, low);
         layer0(high, low, 0, x, 0);
@@ -391,12 +392,12 @@ EVALUATE = r"""
             }
             return magnitude;
         };
-        size = activate(x, down_z * down0);
-        warp_scales(size, up, down);
+        float size = activate(x, down_z * down0);
+        warp_scales(size, up_h0, down_h0);
         clear(y);
         #pragma unroll
         for (int j = 0; j < 4; ++j) {
-            fragments(x, j, up, high, low);
+            fragments(x, j, up_h0, high, low);
             #pragma unroll
             for (int n8 = 0; n8 < 8; n8 += 4) {
                 unsigned b[4][4];
@@ -404,8 +405,12 @@ EVALUATE = r"""
                 multiply(y, n8, high, low, b);
             }
         }
-        size = activate(y, down * down1);
+"""
+
+EVALUATE = r"""
+        size = activate(y, down_h0 * down1);
         warp_scales(size, up, down);
+        float Y[2][2][4];
         clear(Y);
         #pragma unroll
         for (int j = 0; j < 4; ++j) {
@@ -429,10 +434,8 @@ EVALUATE = r"""
     }
 """
 
-# With g the gradient of the result, B = R^T grad_P and grad_Y = sym(B). The rotation returns to F by
-# R skew(V kappa), kappa_i = m_i / (sigma_j + sigma_k), m = Vh axial(B X); see ``input_adjoint`` of the twin, whose
-# M - M^T is skew(m).
-VJP = r"""
+# Backward only: what the end needs again is put down, and registers are free for the layers.
+PUT_DOWN = r"""
         float* state = (float*)(pool + STATE_AT) + thread;
         float* downs = (float*)(pool + PEAKS_AT) + 16;
         auto publish = [&](int which, float value) {
@@ -446,37 +449,16 @@ VJP = r"""
         #pragma unroll
         for (int k = 0; k < 3; ++k) state[128 * (18 + k)] = sums[k];
         publish(0, down_z);
+"""
 
-        unsigned high[2][4], low[2][4];
-        float x[2][8][4], y[2][8][4], up_h0, down_h0, down;
-        clear(x);
-        load16(Z_AT, high, low);
-        layer0(high, low, 0, x, 0);
-        layer0(high, low, 4, x, 4);
-        float size = 0.0f, factor_a = down_z * down0;
-        #pragma unroll
-        for (int i = 0; i < 64; ++i) {
-            float& a = ((float*)x)[i];
-            a *= factor_a;
-            a *= normal_cdf(a);
-            size = largest(size, a);
-        }
-        warp_scales(size, up_h0, down_h0);
+# With g the gradient of the result, B = R^T grad_P and grad_Y = sym(B). The rotation returns to F by
+# R skew(V kappa), kappa_i = m_i / (sigma_j + sigma_k), m = Vh axial(B X); see ``input_adjoint`` of the twin, whose
+# M - M^T is skew(m).
+VJP = r"""
         publish(1, down_h0);
-        clear(y);
-        #pragma unroll
-        for (int j = 0; j < 4; ++j) {
-            fragments(x, j, up_h0, high, low);
-            #pragma unroll
-            for (int n8 = 0; n8 < 8; n8 += 4) {
-                unsigned b[4][4];
-                weights_T(W1_AT, 8192, j, n8, b);
-                multiply(y, n8, high, low, b);
-            }
-        }
         // y turns from the second layer into gelu' there, x into h1
         size = 0.0f;
-        factor_a = down_h0 * down1;
+        float factor_a = down_h0 * down1;
         #pragma unroll
         for (int i = 0; i < 64; ++i) {
             const float a = ((float*)y)[i] * factor_a, cdf = normal_cdf(a);
@@ -783,7 +765,8 @@ def source(kind: str, backward: bool, machine: str = CUDA) -> str:
     constants += f"    const bool ELASTIC = {str(kind == 'elasticity').lower()};\n    const float FLOOR = {floor!r}f;\n"
     prefetch = "prefetch((const float*)grad_out + 9 * (size_t)row);" if backward else ""
     features = FEATURES.replace("{GRAM}", GRAM).replace("{SVD}", SVD).replace("{PREFETCH}", prefetch)
-    return constants + machine + TOOLS + features + (VJP if backward else EVALUATE) + END
+    body = PUT_DOWN + LAYERS + VJP if backward else LAYERS + EVALUATE
+    return constants + machine + TOOLS + features + body + END
 
 
 # Arrays are handed over as addresses: Warp's array objects would cost more time than the launch.

@@ -22,7 +22,6 @@ from neuma_lib import warp_setup
 warp_setup.init()
 
 SCATTERS = ("atomic", "runs", "runs_scalar")
-WARP = 32
 
 # Bits of a run, as a thread sees it: 0-7 the lane after its last member, 8-15 how many halving steps its warp's
 # longest run needs, 16 whether this thread is the first member, which adds the sum.
