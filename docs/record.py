@@ -1,6 +1,6 @@
-"""Copy the tables of a finished run to docs/results, with the machine, the commit and the date above each.
+"""Copy tables and figures of a run to docs/results, with the machine, the commit and the date above each table.
 
-python docs/record.py            # after: snakemake --cores 2 tables results/figures/main_res.png
+python docs/record.py            # after: snakemake --cores 2 tables figures
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ import platform
 import shutil
 import subprocess
 from pathlib import Path
+
+from PIL import Image
 
 TABLES = (
     "table1",
@@ -23,6 +25,9 @@ TABLES = (
     "timings",
     "learning_rates",
 )
+
+WIDTH = 1400
+"""Of figures on a page [px]; in print they are larger."""
 
 
 def processor() -> str:
@@ -37,7 +42,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--results", default="results", help="folder of the run")
     parser.add_argument("--out", default="docs/results", help="folder to write to")
-    parser.add_argument("--cores", type=int, default=2, help="cores that Snakemake was given")
+    parser.add_argument(
+        "--machine", default=f"2 cores of {processor()}, no GPU", help="what the run was computed on"
+    )
+    parser.add_argument(
+        "--tables", nargs="*", default=TABLES, help="tables to copy; figures are always copied"
+    )
     options = parser.parse_args()
     results, out = Path(options.results), Path(options.out)
     out.mkdir(parents=True, exist_ok=True)
@@ -45,17 +55,20 @@ def main() -> None:
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True
     ).stdout.strip()
     origin = (
-        f"{datetime.date.today()}, commit {commit or 'unknown'}, {options.cores} cores of {processor()}, no GPU,"
-        " default settings (`config/config.yaml`). Made by `snakemake --cores 2 tables` and `python docs/record.py`."
+        f"{datetime.date.today()}, commit {commit or 'unknown'}, {options.machine},"
+        " default settings (`config/config.yaml`). Made by `snakemake tables figures` and `python docs/record.py`."
     )
-    for name in TABLES:
+    for name in options.tables:
         source = results / f"{name}.md"
         if source.exists():
             (out / f"{name}.md").write_text(f"{origin}\n\n{source.read_text()}")
             shutil.copyfile(source.with_suffix(".csv"), out / f"{name}.csv")
-    picture = results / "figures" / "main_res.png"
-    if picture.exists():
-        shutil.copyfile(picture, out / "main_res.png")
+    for picture in sorted((results / "figures").glob("*.png")):
+        (out / "figures").mkdir(exist_ok=True)
+        with Image.open(picture) as image:
+            size = WIDTH, round(image.height * WIDTH / image.width)
+            small = image.convert("RGB").resize(size, Image.LANCZOS)
+        small.save(out / "figures" / picture.name, optimize=True)
 
 
 if __name__ == "__main__":

@@ -37,6 +37,7 @@ def draw(data: Mapping) -> Figure:
                 MARKERS[k % len(MARKERS)],
                 color=style.SEQUENCE[k % len(style.SEQUENCE)],
                 label=title,
+                clip_on=False,
             )
         axes.set(title=label, xlim=(-0.5, len(scenes) - 0.5))
         axes.set_xticks(range(len(scenes)), scenes, rotation=30, ha="right")

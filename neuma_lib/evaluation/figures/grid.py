@@ -7,9 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.textpath import TextPath
 
 GAP = 0.02
 """Between pictures [in]."""
+TITLE = 6.5
+"""Size of the titles of rows and columns [pt]."""
 
 
 def picture_height(images: np.ndarray, columns: int, width: float) -> float:
@@ -38,7 +41,7 @@ def image_grid(
 
     Args:
         width: of the pictures together [in].
-        rows: titles left of the pictures.
+        rows: titles left of the pictures, broken where they are wider than `left`.
         columns: titles above them.
     """
     count = images.shape[1]
@@ -51,13 +54,29 @@ def image_grid(
             axes.set_axis_off()
             if i == 0 and j < len(columns):
                 axes.text(
-                    0.5, 1.02, columns[j], transform=axes.transAxes, ha="center", va="bottom", fontsize=6.5
+                    0.5, 1.02, columns[j], transform=axes.transAxes, ha="center", va="bottom", fontsize=TITLE
                 )
             if j == 0 and i < len(rows):
+                title = broken(rows[i], left - 0.04 * each - GAP)
                 axes.text(
-                    -0.04, 0.5, rows[i], transform=axes.transAxes, ha="right", va="center", fontsize=6.5
+                    -0.04, 0.5, title, transform=axes.transAxes, ha="right", va="center", fontsize=TITLE
                 )
     return top + len(images) * (height + GAP) - GAP
+
+
+def broken(text: str, width: float) -> str:
+    """The text with lines broken at spaces so that none is wider than `width` [in], unless a word is."""
+    lines: list[str] = []
+    for line in text.split("\n"):
+        words = line.split(" ")
+        lines.append(words[0])
+        for word in words[1:]:
+            longer = f"{lines[-1]} {word}"
+            if TextPath((0, 0), longer, size=TITLE).get_extents().width <= 72 * width:
+                lines[-1] = longer
+            else:
+                lines.append(word)
+    return "\n".join(lines)
 
 
 def note(figure: Figure, left: float, top: float, text: str, **options) -> None:
