@@ -38,6 +38,12 @@ def processor() -> str:
     return platform.processor()
 
 
+def head() -> str:
+    """The commit that is checked out."""
+    found = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
+    return found.stdout.strip() or "unknown"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--results", default="results", help="folder of the run")
@@ -48,14 +54,12 @@ def main() -> None:
     parser.add_argument(
         "--tables", nargs="*", default=TABLES, help="tables to copy; figures are always copied"
     )
+    parser.add_argument("--commit", default=head(), help="code of the run")
     options = parser.parse_args()
     results, out = Path(options.results), Path(options.out)
     out.mkdir(parents=True, exist_ok=True)
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True
-    ).stdout.strip()
     origin = (
-        f"{datetime.date.today()}, commit {commit or 'unknown'}, {options.machine},"
+        f"{datetime.date.today()}, commit {options.commit}, {options.machine},"
         " default settings (`config/config.yaml`). Made by `snakemake tables figures` and `python docs/record.py`."
     )
     for name in options.tables:
