@@ -18,18 +18,28 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from matplotlib.textpath import TextPath
 from PIL import Image
 
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation import style
+from neuma_lib.evaluation.figures.grid import TITLE, broken
 from neuma_lib.evaluation.panels import Panels, load_panels, save_panels
-from neuma_lib.evaluation.pictures import cropped, evenly, frontal, magnified, mean_height
+from neuma_lib.evaluation.pictures import (
+    cropped,
+    evenly,
+    frontal,
+    magnified,
+    mean_height,
+    monotone_frames,
+)
 from neuma_lib.evaluation.response import Visited, largest_shear_stress, sheared, uniaxial, yielding
 from neuma_lib.materials import analytic_law
 from neuma_lib.render.cameras import Cameras
 from neuma_lib.render.spheres import draw_spheres
 
 ROOT = Path(__file__).resolve().parents[1]
+SETTINGS = yaml.safe_load((ROOT / "config/config.yaml").read_text())
 METHODS = [name for name in style.METHODS if name not in ("truth", "pac_nerf", "spring_gaus")]
 TITLES = {method: f"NeuMA {method[6:]}" for method in METHODS}
 SCENES = ["BouncyBall", "JellyDuck", "RubberPawn", "ClayCat", "SandFish", "HoneyBottle"]
@@ -105,6 +115,8 @@ DATA = {
         6,
         7,
         {"letters": 4, "materials": [*SCENES, SCENES[0]], "times": [f"{i} ms" for i in range(7)]},
+        row_titles=["67 % of\nthe sequence"] * 4
+        + [SETTINGS["experiments"][name]["title"] for name in SETTINGS["figures"]["meetings"]],
         column_titles="NEURIPS",
     ),  # fmt: skip
     "ext_time": lambda: pictures(
@@ -133,6 +145,7 @@ DATA = {
             "chamfer": {"neuma": 0.3, "neuma+assumed_density=1000": 2.0},
             "floor": 0.1,
         },
+        row_titles=["Observation", "NCLaw", *SETTINGS["tables"]["uneven_mass"]["titles"].values()],
     ),  # fmt: skip
     "pipeline": lambda: pictures(
         5,
@@ -214,8 +227,7 @@ def test_every_figure_has_caption_rule_and_test():
 
 
 def test_one_look_a_method():
-    config = yaml.safe_load((ROOT / "config/config.yaml").read_text())
-    assert set(config["methods"]) <= set(style.METHODS)
+    assert set(SETTINGS["methods"]) <= set(style.METHODS)
     for part in ("color", "marker"):
         looks = [getattr(kind, part) for kind in style.METHODS.values()]
         assert len(set(looks)) == len(looks)
@@ -305,6 +317,21 @@ def test_crops_have_one_size_and_lose_nothing():
     assert cut[0].shape[1:] == cut[1].shape[1:]
     for before, after in zip((small, large), cut, strict=True):
         assert (before < 255).sum() == (after < 255).sum()
+
+
+def test_row_titles_break_where_they_are_too_wide():
+    title = "NeuMA, 1000 kg/m³ assumed\neverywhere"
+    lines = broken(title, 1.0).split("\n")
+    assert len(lines) > 2 and " ".join(lines).split() == title.split()
+    assert max(TextPath((0, 0), line, size=TITLE).get_extents().width for line in lines) <= 72
+    assert broken(title, 9.0) == title
+    assert broken("unbreakable", 0.1) == "unbreakable"
+
+
+def test_monotone_frames_are_counted_where_the_motions_part():
+    heights = [[1.0, 3.0, 1.0, 5.0], [1.0, 2.0, 2.0, 4.0], [1.0, 1.0, 1.5, 4.0]]
+    assert monotone_frames(heights) == (2, 3)
+    assert monotone_frames(heights[::-1]) == (2, 3)
 
 
 def test_mean_height_is_that_of_the_centre_of_mass():

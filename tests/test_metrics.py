@@ -231,7 +231,7 @@ def test_claims_are_judged_by_the_numbers():
         ("a", "b"),
         {"neuma": (1.0, 2.0), "nclaw": (3.0, 3.0), "other": (2.0, 5.0)},
         (
-            Claim("NeuMA is best", ("neuma",), ("nclaw", "other")),
+            Claim("NeuMA is best, w/ P.S.", ("neuma",), ("nclaw", "other")),
             Claim("others are best", ("nclaw", "other"), ("neuma",), ("b",)),
             Claim("nobody prints this", ("neuma",), ("nclaw",), by_paper=False),
             Claim("of a row that is not here", ("neuma",), ("pac_nerf",)),
@@ -243,8 +243,8 @@ def test_claims_are_judged_by_the_numbers():
     table = chamfer_table(metrics, titles, {"a": "a", "b": "b"}, paper)
     best, others, unprinted = table.verdicts()
     assert best == (
-        "Holds: NeuMA is best. Excess 1.500 (NeuMA) against 2.500 (NCLaw) on average; it is so in 1 of 2 columns."
-        " Paper, floors included: 1.50 against 3.00."
+        "Holds: NeuMA is best, w/ P.S. Excess 1.500 (NeuMA) against 2.500 (NCLaw) on average; it is so in"
+        " 1 of 2 columns. Paper, floors included: 1.50 against 3.00."
     )
     assert others.startswith("Does not hold: others are best. Excess 6.000 (Other) against 2.000 (NeuMA)")
     assert others.endswith("in 0 of 1 columns. Paper, floors included: 5.00 against 2.00.")

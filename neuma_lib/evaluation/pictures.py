@@ -89,6 +89,17 @@ def mean_height(x: np.ndarray | Tensor, mass: np.ndarray | Tensor) -> list[float
     return (np.asarray(x, np.float64)[..., 1] @ (mass / mass.sum())).tolist()
 
 
+def monotone_frames(heights: Sequence[Sequence[float]], apart: float = 0.002) -> tuple[int, int]:
+    """In how many frames heights (W, T) [m] rise or fall with every step of the weight, and of how many.
+
+    Counted are frames whose heights are more than ``apart`` [m] from each other: before contact all are the same.
+    """
+    steps = np.diff(heights, axis=0)
+    parted = np.ptp(heights, axis=0) > apart
+    monotone = (steps >= 0).all(axis=0) | (steps <= 0).all(axis=0)
+    return int((monotone & parted).sum()), int(parted.sum())
+
+
 def evenly(count: int, total: int) -> list[int]:
     """Indices of ``count`` frames out of ``total``, the first and the last among them."""
     return sorted(set(np.linspace(0, total - 1, min(count, total)).round().astype(int).tolist()))

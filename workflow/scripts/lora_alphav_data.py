@@ -13,6 +13,7 @@ from neuma_lib.evaluation.pictures import (
     magnified,
     mean_height,
     milliseconds,
+    monotone_frames,
     observed,
     renders,
 )
@@ -24,6 +25,7 @@ from neuma_lib.sim import MPMModel
 def main(inputs, data_file: str, params, run) -> None:
     device = choose_device(params.device)
     blocks, rows, scenes = [], [], {}
+    inside = [k for k, weight in enumerate(params.weights) if 0 <= weight <= 1]
     for k, (scene, setting) in enumerate(params.scenes.items()):
         model = MPMModel(**setting["simulation"])
         video = load_observation(inputs.transforms[k], [params.view])
@@ -40,6 +42,10 @@ def main(inputs, data_file: str, params, run) -> None:
             columns.append(renders(body, cameras, path.x[shown], path.F[shown]))
             heights.append(mean_height(path.x.cpu(), body.mass.cpu()))
             run.detail(f"{scene}: w = {weight:g}" + (f" diverged at step {diverged}" if diverged else ""))
+        monotone, parted = monotone_frames([heights[k] for k in inside])
+        run.say(
+            f"{scene}: between 0 and 1, height monotone in w in {monotone} of {parted} frames after contact"
+        )
         columns.append(observed(video, shown, params.magnify))
         blocks.append(np.stack(columns, axis=1))
         rows += milliseconds([video.frames[i] for i in shown], model.dt)
@@ -51,7 +57,6 @@ def main(inputs, data_file: str, params, run) -> None:
         }
     titles = [f"$w$ = {weight:g}" for weight in params.weights] + ["observed"]
     numbers = {"weights": params.weights, "scenes": scenes}
-    inside = [k for k, weight in enumerate(params.weights) if 0 <= weight <= 1]
     images = np.concatenate(cropped(blocks, guides=[block[:, [*inside, -1]] for block in blocks]))
     save_panels(data_file, Panels(images, tuple(rows), tuple(titles), numbers))
     run.say(f"{len(params.weights)} weights on {len(scenes)} scenes: {data_file}")
