@@ -50,7 +50,7 @@ $(READY): envs/requirements.txt envs/requirements-dev.txt
 	@touch $(READY)
 
 check:
-	@$(BIN)/python -m neuma_lib.blender.libraries
+	@$(BIN)/python -m neuma_lib.data.blender.libraries
 
 lock: envs/lock.py pyproject.toml
 	$(BIN)/python envs/lock.py

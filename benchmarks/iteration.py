@@ -22,12 +22,14 @@ from benchmarks.scene import SMALL, BenchmarkScene, Size, make_scene
 from benchmarks.timing import arithmetic, bandwidth, device_name, peak_memory, seconds, seconds_a_call
 from neuma_lib.fitting.image_loss import mean_squared_error
 from neuma_lib.fitting.material import MaterialSettings, PixelLoss, train_material
-from neuma_lib.fitting.observation import Observation
-from neuma_lib.render import rasterize, torch_reference
-from neuma_lib.sim import Trajectory, rollout
 from neuma_lib.sim.model import as_bodies
+from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.simulation import Simulation
+from neuma_lib.sim.state import Trajectory
 from neuma_lib.sim.workspace import SORT_EVERY, WorkspaceLease
+from neuma_lib.splatting import torch_reference
+from neuma_lib.splatting.observation import Observation
+from neuma_lib.splatting.rasterizer import rasterize
 from tests import sim_twin
 
 NETWORK = 2 * (13 * 64 + 64 * 64 + 64 * 9)

@@ -16,8 +16,7 @@ from collections.abc import Callable
 
 import torch
 
-from neuma_lib.materials import neural_law
-from neuma_lib.materials.neural import SHAPES, NeuralConstitutive
+from neuma_lib.mechanics.neural import SHAPES, NeuralConstitutive, neural_law
 
 BANDWIDTH = 4.3e12
 """Bytes per second of a copy."""

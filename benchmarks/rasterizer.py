@@ -19,11 +19,12 @@ from collections.abc import Callable
 
 import torch
 
-from neuma_lib.render import Cameras, projection, rasterize, splat_tiles
-from neuma_lib.render.cameras import look_at
-from neuma_lib.render.compositing import Settings
-from neuma_lib.render.gaussians import covariances
-from neuma_lib.render.rasterizer import COMPOSITORS
+from neuma_lib.splatting import compositor_cuda as splat_tiles
+from neuma_lib.splatting import projection
+from neuma_lib.splatting.cameras import Cameras, look_at
+from neuma_lib.splatting.compositing import Settings
+from neuma_lib.splatting.gaussians import covariances
+from neuma_lib.splatting.rasterizer import COMPOSITORS, rasterize
 
 RADIUS = 0.15  # m
 DISTANCE = 1.6  # m

@@ -16,14 +16,14 @@ from collections.abc import Callable
 
 import torch
 
-from neuma_lib.binding import bind
-from neuma_lib.materials.neural import NeuralLaw, neural_law
-from neuma_lib.render import deform, rasterize
-from neuma_lib.sim import MPMModel, rollout
-from neuma_lib.sim.model import as_bodies
-from neuma_lib.sim.rollout import RolloutFunction
+from neuma_lib.coupling.deformation import deform
+from neuma_lib.coupling.particle_binding import bind
+from neuma_lib.mechanics.neural import NeuralLaw, neural_law
+from neuma_lib.sim.memory import KEEP
+from neuma_lib.sim.model import MPMModel, as_bodies
+from neuma_lib.sim.rollout import RolloutFunction, rollout
 from neuma_lib.sim.simulation import Simulation
-from neuma_lib.sim.storage import KEEP
+from neuma_lib.splatting.rasterizer import rasterize
 
 
 def rollout_step_by_step(model, law, x, v, mass, vol0, frames):

@@ -11,13 +11,15 @@ from dataclasses import dataclass
 import torch
 from torch.nn.functional import gelu
 
-from neuma_lib.binding import bind
-from neuma_lib.fitting.observation import Observation, Reconstruction
-from neuma_lib.linalg import rotation_and_singular_values
-from neuma_lib.materials import analytic_law, neural_law
-from neuma_lib.materials.neural import NeuralLaw, features
-from neuma_lib.render import Cameras, Gaussians
-from neuma_lib.sim import MPMModel
+from neuma_lib.coupling.particle_binding import bind
+from neuma_lib.coupling.reconstruction import Reconstruction
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.neural import NeuralLaw, features, neural_law
+from neuma_lib.mechanics.singular_values import rotation_and_singular_values
+from neuma_lib.sim.model import MPMModel
+from neuma_lib.splatting.cameras import Cameras
+from neuma_lib.splatting.gaussians import Gaussians
+from neuma_lib.splatting.observation import Observation
 
 DENSITY = 1000.0  # kg/m^3
 SOFT = {"elasticity": {"name": "fixed_corotated", "E": 3e4, "nu": 0.3}}

@@ -1,10 +1,23 @@
-"""Where to compute."""
+"""Where to compute, and the one place that starts Warp: quiet, with a kernel cache that several processes can share.
+
+The cache folder is taken from the environment variable ``NEUMA_KERNEL_CACHE`` when it is set (the workflow sets
+it to a folder of the project and fills it by one warm-up rule, so that two jobs never compile the same kernels);
+otherwise Warp's own per-user cache is used.
+"""
 
 from __future__ import annotations
 
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
+import warp as wp
 
 from neuma_lib.errors import InputError
+
+_started = False
 
 
 def choose_device(name: str = "auto") -> torch.device:
@@ -20,3 +33,39 @@ def choose_device(name: str = "auto") -> torch.device:
             "device: cuda is asked for, but torch sees no CUDA device; set device: cpu, or mend the driver"
         )
     return torch.device(name)
+
+
+def start_warp() -> None:
+    """Start Warp once per process. Safe to call from every module that defines kernels."""
+    global _started
+    if _started:
+        return
+    wp.config.log_level = wp.LOG_WARNING
+    cache = os.environ.get("NEUMA_KERNEL_CACHE")
+    if cache:
+        wp.config.kernel_cache_dir = cache
+    with _without_driver_warning():
+        wp.init()
+    _started = True
+
+
+@contextmanager
+def _without_driver_warning() -> Iterator[None]:
+    """On a machine without a GPU Warp's native code warns on standard error, once in every process: leave that out."""
+    if torch.cuda.is_available():
+        yield
+        return
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+def warp_stream(device: torch.device) -> wp.Stream | None:
+    """Warp's view of torch's current stream, so that kernels queue in order with torch; None on the CPU."""
+    return None if device.type == "cpu" else wp.stream_from_torch(torch.cuda.current_stream(device))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neuma_lib.materials.base import Law
+from neuma_lib.mechanics.law import Law
 
 OUTER = 0.005
 """Part of the visited states that is left out at either end of a range, as outliers."""

@@ -11,11 +11,11 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from neuma_lib import warp_setup
+from neuma_lib.device import start_warp
 from neuma_lib.errors import InputError
-from neuma_lib.render.arrays import plain, target, vectors
+from neuma_lib.splatting.arrays import plain, target, vectors
 
-warp_setup.init()
+start_warp()
 
 _GPU_LANES = 4096
 """Partial sums of a frame on a GPU: neighbouring threads read neighbouring pixels, and few frames fill the device."""

@@ -23,14 +23,17 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor
 
+from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
-from neuma_lib.evaluation.metrics import chamfer_loss
-from neuma_lib.fitting.framewise import framewise
+from neuma_lib.fitting.frame_batches import framewise
 from neuma_lib.fitting.image_loss import mean_squared_error
-from neuma_lib.fitting.observation import Observation, Reconstruction
-from neuma_lib.fitting.total_deformation import every_step, total_deformation
-from neuma_lib.materials.base import Law
-from neuma_lib.sim import MPMModel, Trajectory, rollout
+from neuma_lib.geometry.chamfer import chamfer_loss
+from neuma_lib.mechanics.law import Law
+from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import Trajectory
+from neuma_lib.sim.total_deformation import every_step, total_deformation
+from neuma_lib.splatting.observation import Observation
 
 
 class TrajectoryLoss(Protocol):
@@ -229,7 +232,7 @@ def train_material(
 
 
 class Checkpoint(Protocol):
-    """A place that keeps one state of the loop across kills (`neuma_lib.checkpoint`)."""
+    """A place that keeps one state of the loop across kills (`neuma_lib.io.checkpoint`)."""
 
     def load(self) -> dict | None: ...
 

@@ -23,13 +23,15 @@ from torch import Tensor, nn
 from torch.nn.functional import gelu
 
 from neuma_lib.errors import InputError, NonFiniteError
-from neuma_lib.evaluation.metrics import chamfer_sequence
 from neuma_lib.fitting.soap import SOAP
-from neuma_lib.linalg import svd3
-from neuma_lib.materials import Law, NeuralLaw, analytic_law, neural_law
-from neuma_lib.materials.elasticity import STRETCH_MIN
-from neuma_lib.materials.neural import LAYER_KEYS, PLASTIC_SCALE, SHAPES, features
-from neuma_lib.sim import MPMModel, rollout
+from neuma_lib.geometry.chamfer import chamfer_sequence
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.elasticity import STRETCH_MIN
+from neuma_lib.mechanics.law import Law
+from neuma_lib.mechanics.neural import LAYER_KEYS, PLASTIC_SCALE, SHAPES, NeuralLaw, features, neural_law
+from neuma_lib.mechanics.singular_values import svd3
+from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.rollout import rollout
 
 DENSITY = 1000.0
 """Density of every training cube [kg/m^3]."""
@@ -110,7 +112,7 @@ def train_prior(
     """Train a neural law on an analytic one.
 
     Args:
-        spec: the analytic law, see :func:`neuma_lib.materials.analytic_law`.
+        spec: the analytic law, see :func:`neuma_lib.mechanics.analytic.analytic_law`.
         settings: ``method`` ("regression" or "trajectory") and fields of :class:`RegressionSettings` or
             :class:`TrajectorySettings`.
         seed: of throws, noise, initial weights and batches.

@@ -20,12 +20,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
-from neuma_lib.fitting.framewise import parts
-from neuma_lib.fitting.observation import Observation, Reconstruction
-from neuma_lib.materials.base import Law
-from neuma_lib.sim import MPMModel, rollout
-from neuma_lib.sim.model import contact_clearance
+from neuma_lib.fitting.frame_batches import parts
+from neuma_lib.mechanics.law import Law
+from neuma_lib.sim.model import MPMModel, contact_clearance
+from neuma_lib.sim.rollout import rollout
+from neuma_lib.splatting.observation import Observation
 
 NUISANCE_SCALE = 0.02
 """Unit of the constant shift [m] and of the relative enlargement: about 1 m/s over a few frames."""

@@ -25,8 +25,8 @@ from torch import Tensor
 
 from neuma_lib.errors import InputError
 from neuma_lib.geometry.volume import check_mesh
-from neuma_lib.render.cameras import Cameras
-from neuma_lib.render.gaussians import Gaussians
+from neuma_lib.splatting.cameras import Cameras
+from neuma_lib.splatting.gaussians import Gaussians
 
 Array = NDArray[np.float64]
 

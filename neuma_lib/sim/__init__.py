@@ -2,7 +2,7 @@
 
 from neuma_lib.sim.model import Body, MPMModel, consecutive, contact_clearance, each_its_own
 from neuma_lib.sim.rollout import rollout
-from neuma_lib.sim.trajectory import Trajectory
+from neuma_lib.sim.state import Trajectory
 
 __all__ = [
     "Body",

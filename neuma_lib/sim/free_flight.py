@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.sim.model import Body, MPMModel, contact_clearance, law_weights
-from neuma_lib.sim.trajectory import Trajectory
+from neuma_lib.sim.state import Trajectory
 
 _MARGIN = 1e-3  # distance from the zone of contact at which free flight ends [dx]
 

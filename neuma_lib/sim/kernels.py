@@ -21,10 +21,10 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from neuma_lib import warp_setup
+from neuma_lib.device import start_warp
 from neuma_lib.sim.scatter import scatter_functions
 
-warp_setup.init()
+start_warp()
 
 NO_SLIP, SLIP, STICKY = 0, 1, 2
 """Codes of the boundary conditions in ``GridConstants.walls``."""

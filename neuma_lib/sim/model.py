@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.errors import InputError
-from neuma_lib.materials.base import Law, Weights
+from neuma_lib.mechanics.law import Law, Weights
 
 WALLS = ("x_min", "x_max", "y_min", "y_max", "z_min", "z_max")
 CONDITIONS = ("no_slip", "slip", "sticky")

@@ -13,12 +13,12 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from neuma_lib.errors import InputError
-from neuma_lib.materials.base import Law
+from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.free_flight import ballistic, free_flight_steps
+from neuma_lib.sim.memory import KEEP
 from neuma_lib.sim.model import Body, MPMModel, as_bodies, law_weights
 from neuma_lib.sim.simulation import Simulation
-from neuma_lib.sim.storage import KEEP
-from neuma_lib.sim.trajectory import Trajectory
+from neuma_lib.sim.state import Trajectory
 
 
 def rollout(

@@ -17,9 +17,9 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from neuma_lib import warp_setup
+from neuma_lib.device import start_warp
 
-warp_setup.init()
+start_warp()
 
 SCATTERS = ("atomic", "runs", "runs_scalar")
 

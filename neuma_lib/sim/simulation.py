@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 
 from neuma_lib.errors import NonFiniteError
-from neuma_lib.materials.base import Weights
+from neuma_lib.mechanics.law import Weights
 from neuma_lib.sim.kernels import NEVER
+from neuma_lib.sim.memory import plan_storage
 from neuma_lib.sim.model import Body, MPMModel
 from neuma_lib.sim.scatter import scatter_for
-from neuma_lib.sim.storage import plan_storage
 from neuma_lib.sim.workspace import Layout, Workspace, WorkspaceLease
 
 

@@ -9,10 +9,10 @@ from types import SimpleNamespace
 ROOT = Path(workflow.basedir).resolve()
 sys.path.insert(0, str(ROOT))
 
-from neuma_lib.config import load
+from neuma_lib.config.settings import load
 from neuma_lib.errors import InputError
-from neuma_lib.owner import claim
-from neuma_lib.provenance import code_digest
+from workflow.owner import claim
+from workflow.provenance import code_digest
 
 try:
     SETTINGS = load(config)

@@ -19,7 +19,7 @@ rule kernels:
         runtime=30,
     params:
         device=EITHER_DEVICE,
-        code=lambda wildcards: code_digest(ROOT / "neuma_lib" / "warm_up" / f"{wildcards.group}.py", ROOT),
+        code=lambda wildcards: code_digest(ROOT / "workflow" / "kernels" / f"{wildcards.group}.py", ROOT),
     script:
         "../scripts/kernels.py"
 

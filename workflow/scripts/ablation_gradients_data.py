@@ -1,7 +1,7 @@
 """What choices in gradient and covariance lead to."""
 
-from neuma_lib.io import read_json, write_json
-from neuma_lib.progress import stage
+from neuma_lib.io.files import read_json, write_json
+from workflow.stage import stage
 
 
 def main(inputs, data_file: str, params, run) -> None:

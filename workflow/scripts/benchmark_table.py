@@ -1,8 +1,8 @@
 """Table 4 of the paper from the settings of the scenes."""
 
 from neuma_lib.evaluation.reports import benchmark_table
-from neuma_lib.io import write_text
-from neuma_lib.progress import stage
+from neuma_lib.io.files import write_text
+from workflow.stage import stage
 
 
 def main(output, params, run) -> None:

@@ -2,10 +2,10 @@
 
 import torch
 
-from neuma_lib.artifacts import load_gaussians, save_binding
-from neuma_lib.binding import bind_two_pass
-from neuma_lib.io import read_arrays
-from neuma_lib.progress import stage
+from neuma_lib.coupling.particle_binding import bind_two_pass
+from neuma_lib.io.artifacts import load_gaussians, save_binding
+from neuma_lib.io.hdf5 import read_arrays
+from workflow.stage import stage
 
 
 def main(inputs, binding_file: str, params, run) -> None:

@@ -1,7 +1,7 @@
 """Chamfer distances over time of all methods and scenes."""
 
-from neuma_lib.io import read_json, write_json
-from neuma_lib.progress import stage
+from neuma_lib.io.files import read_json, write_json
+from workflow.stage import stage
 
 
 def main(metric_files: list[str], data_file: str, params, run) -> None:

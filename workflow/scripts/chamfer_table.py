@@ -2,8 +2,8 @@
 
 from neuma_lib.evaluation.paper import PAPER
 from neuma_lib.evaluation.tables import chamfer_table
-from neuma_lib.io import read_json, write_text
-from neuma_lib.progress import stage
+from neuma_lib.io.files import read_json, write_text
+from workflow.stage import stage
 
 
 def main(name: str, metric_files: list[str], output, params, run) -> None:

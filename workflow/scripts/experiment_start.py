@@ -6,14 +6,15 @@ import numpy as np
 import torch
 import trimesh
 
-from neuma_lib.artifacts import load_body, save_binding, save_gaussians
-from neuma_lib.assembly import join, painted
-from neuma_lib.blender.appearance import Appearance, colors_at
-from neuma_lib.config import pick
+from neuma_lib.config.settings import pick
+from neuma_lib.coupling.bodies import join, painted
+from neuma_lib.data.blender.appearance import Appearance, colors_at
 from neuma_lib.geometry.shapes import place, shape
 from neuma_lib.geometry.volume import sample_volume
-from neuma_lib.io import read_json, read_mesh, write_json, write_mesh
-from neuma_lib.progress import stage
+from neuma_lib.io.artifacts import load_body, save_binding, save_gaussians
+from neuma_lib.io.files import read_json, write_json
+from neuma_lib.io.ply import read_mesh, write_mesh
+from workflow.stage import stage
 
 
 def look_of(entry: dict) -> Appearance:

@@ -3,9 +3,8 @@
 import numpy as np
 import torch
 
-from neuma_lib.artifacts import load_body
-from neuma_lib.evaluation.panels import Panels, save_panels
-from neuma_lib.evaluation.pictures import (
+from neuma_lib.evaluation.figures.panels import Panels, save_panels
+from neuma_lib.evaluation.figures.pictures import (
     cropped,
     evenly,
     frontal,
@@ -15,9 +14,10 @@ from neuma_lib.evaluation.pictures import (
     renders,
     sphere_radius,
 )
-from neuma_lib.evaluation.style import TRUE_PARTICLES
-from neuma_lib.io import read_arrays
-from neuma_lib.progress import stage
+from neuma_lib.evaluation.figures.style import TRUE_PARTICLES
+from neuma_lib.io.artifacts import load_body
+from neuma_lib.io.hdf5 import read_arrays
+from workflow.stage import stage
 
 
 def main(inputs, data_file: str, params, run) -> None:

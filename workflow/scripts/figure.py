@@ -3,10 +3,10 @@
 from importlib import import_module
 from pathlib import Path
 
-from neuma_lib.evaluation.panels import load_panels
-from neuma_lib.evaluation.style import save
-from neuma_lib.io import read_json
-from neuma_lib.progress import stage
+from neuma_lib.evaluation.figures.panels import load_panels
+from neuma_lib.evaluation.figures.style import save
+from neuma_lib.io.files import read_json
+from workflow.stage import stage
 
 
 def main(name: str, data_file: str, output, run) -> None:

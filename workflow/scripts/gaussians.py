@@ -2,12 +2,12 @@
 
 from dataclasses import asdict
 
-from neuma_lib.artifacts import load_views, save_gaussians
-from neuma_lib.config import from_mapping
+from neuma_lib.config.settings import from_mapping
 from neuma_lib.device import choose_device
 from neuma_lib.fitting.gaussians import GaussianFitSettings, fit_gaussians
-from neuma_lib.io import write_json
-from neuma_lib.progress import stage
+from neuma_lib.io.artifacts import load_views, save_gaussians
+from neuma_lib.io.files import write_json
+from workflow.stage import stage
 
 
 def main(transforms: str, output, params, run) -> None:

@@ -4,9 +4,9 @@ from statistics import median
 
 import torch
 
-from neuma_lib.artifacts import load_law
-from neuma_lib.io import read_json, write_json
-from neuma_lib.progress import stage
+from neuma_lib.io.artifacts import load_law
+from neuma_lib.io.files import read_json, write_json
+from workflow.stage import stage
 
 
 def relative_change(part) -> float:

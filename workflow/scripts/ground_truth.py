@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from neuma_lib.dataset import TrueBody, simulate_ground_truth
+from neuma_lib.data.ground_truth import TrueBody, simulate_ground_truth
 from neuma_lib.device import choose_device
 from neuma_lib.geometry.shapes import place
-from neuma_lib.io import write_arrays
-from neuma_lib.materials import analytic_law
-from neuma_lib.progress import stage
-from neuma_lib.sim import MPMModel
+from neuma_lib.io.hdf5 import write_arrays
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.sim.model import MPMModel
+from workflow.stage import stage
 
 
 def main(output, params, run) -> None:

@@ -3,13 +3,15 @@
 import numpy as np
 import torch
 
-from neuma_lib.artifacts import load_body, load_motion, load_observation
 from neuma_lib.device import choose_device
 from neuma_lib.errors import InputError
-from neuma_lib.evaluation.images import MEASURES, image_metrics
+from neuma_lib.evaluation.image_metrics import MEASURES, image_metrics
 from neuma_lib.evaluation.lpips import LPIPS
-from neuma_lib.io import read_arrays, read_weights, write_json
-from neuma_lib.progress import stage
+from neuma_lib.io.artifacts import load_body, load_motion, load_observation
+from neuma_lib.io.files import write_json
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.weights import read_weights
+from workflow.stage import stage
 
 
 def measure_view(body, observation, x, F, networks, margin) -> list[dict[str, float]]:

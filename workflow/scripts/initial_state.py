@@ -4,8 +4,10 @@ import numpy as np
 
 from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.volume import volume_iou
-from neuma_lib.io import read_arrays, read_json, read_mesh, write_json
-from neuma_lib.progress import stage
+from neuma_lib.io.files import read_json, write_json
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.ply import read_mesh
+from workflow.stage import stage
 
 
 def main(inputs, report_file: str, params, run) -> None:

@@ -1,8 +1,8 @@
 """One table of what the stages before training reached, a scene a row."""
 
 from neuma_lib.evaluation.reports import report_table
-from neuma_lib.io import read_json, write_text
-from neuma_lib.progress import stage
+from neuma_lib.io.files import read_json, write_text
+from workflow.stage import stage
 
 COLUMNS = {
     "psnr": "PSNR held out [dB]",

@@ -3,12 +3,12 @@
 from importlib import import_module
 
 from neuma_lib.device import choose_device
-from neuma_lib.io import write_text
-from neuma_lib.progress import stage
+from neuma_lib.io.files import write_text
+from workflow.stage import stage
 
 
 def main(group: str, ready: str, device: str, run) -> None:
-    import_module(f"neuma_lib.warm_up.{group}").compile_kernels(choose_device(device))
+    import_module(f"workflow.kernels.{group}").compile_kernels(choose_device(device))
     write_text(ready, f"{group}\n")
     run.say("compiled")
 

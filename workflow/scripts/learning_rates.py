@@ -1,8 +1,8 @@
 """What each method reaches with each learning rate; the best is chosen by training loss, without ground truth."""
 
 from neuma_lib.evaluation.reports import learning_rate_table
-from neuma_lib.io import read_json, write_text
-from neuma_lib.progress import stage
+from neuma_lib.io.files import read_json, write_text
+from workflow.stage import stage
 
 
 def main(inputs, output, params, run) -> None:

@@ -3,11 +3,9 @@
 import numpy as np
 import torch
 
-from neuma_lib.artifacts import load_body, load_law, load_observation
 from neuma_lib.device import choose_device
-from neuma_lib.evaluation.evaluate import predict
-from neuma_lib.evaluation.panels import Panels, save_panels
-from neuma_lib.evaluation.pictures import (
+from neuma_lib.evaluation.figures.panels import Panels, save_panels
+from neuma_lib.evaluation.figures.pictures import (
     cropped,
     evenly,
     magnified,
@@ -17,9 +15,12 @@ from neuma_lib.evaluation.pictures import (
     observed,
     renders,
 )
-from neuma_lib.io import read_arrays, read_json
-from neuma_lib.progress import stage
-from neuma_lib.sim import MPMModel
+from neuma_lib.evaluation.motion import predict
+from neuma_lib.io.artifacts import load_body, load_law, load_observation
+from neuma_lib.io.files import read_json
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.sim.model import MPMModel
+from workflow.stage import stage
 
 
 def main(inputs, data_file: str, params, run) -> None:

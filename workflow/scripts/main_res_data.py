@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from neuma_lib.artifacts import load_body, load_motion, load_observation
-from neuma_lib.evaluation.panels import Panels, save_panels
-from neuma_lib.evaluation.pictures import cropped, evenly, magnified, milliseconds, observed, renders
-from neuma_lib.progress import stage
+from neuma_lib.evaluation.figures.panels import Panels, save_panels
+from neuma_lib.evaluation.figures.pictures import cropped, evenly, magnified, milliseconds, observed, renders
+from neuma_lib.io.artifacts import load_body, load_motion, load_observation
+from workflow.stage import stage
 
 
 def main(inputs, data_file: str, params, run) -> None:

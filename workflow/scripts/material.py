@@ -4,16 +4,17 @@ from dataclasses import asdict
 
 import torch
 
-from neuma_lib.artifacts import load_body, load_law, load_observation, save_adaptor
-from neuma_lib.checkpoint import Checkpoint
-from neuma_lib.config import pick
+from neuma_lib.config.settings import pick
+from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.device import choose_device
 from neuma_lib.fitting.material import MaterialSettings, ParticleLoss, PixelLoss, train_material
-from neuma_lib.fitting.observation import Reconstruction
-from neuma_lib.io import read_arrays, read_json, write_json
-from neuma_lib.progress import stage
-from neuma_lib.provenance import fingerprint
-from neuma_lib.sim import MPMModel
+from neuma_lib.io.artifacts import load_body, load_law, load_observation, save_adaptor
+from neuma_lib.io.checkpoint import Checkpoint
+from neuma_lib.io.files import read_json, write_json
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.sim.model import MPMModel
+from workflow.provenance import fingerprint
+from workflow.stage import stage
 
 
 def main(inputs, output, params, run) -> None:

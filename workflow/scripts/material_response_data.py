@@ -2,11 +2,12 @@
 
 import torch
 
-from neuma_lib.artifacts import load_law
 from neuma_lib.evaluation.response import Visited, largest_shear_stress, sheared, uniaxial, yielding
-from neuma_lib.io import read_arrays, write_json
-from neuma_lib.materials import analytic_law
-from neuma_lib.progress import stage
+from neuma_lib.io.artifacts import load_law
+from neuma_lib.io.files import write_json
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.mechanics.analytic import analytic_law
+from workflow.stage import stage
 
 BEYOND = 1.6
 """How far the tests go beyond the visited range."""

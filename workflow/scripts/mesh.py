@@ -1,9 +1,9 @@
 """Reconstruct a watertight surface from Gaussians and views."""
 
-from neuma_lib.artifacts import load_gaussians, load_views
 from neuma_lib.geometry.surface import reconstruct
-from neuma_lib.io import write_mesh
-from neuma_lib.progress import stage
+from neuma_lib.io.artifacts import load_gaussians, load_views
+from neuma_lib.io.ply import write_mesh
+from workflow.stage import stage
 
 
 def main(inputs, mesh_file: str, params, run) -> None:

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from neuma_lib.packing import pack_images
-from neuma_lib.progress import stage
+from neuma_lib.io.packed import pack_images
+from workflow.stage import stage
 
 
 def main(inputs, packed: str, run) -> None:

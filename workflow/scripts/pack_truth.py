@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from neuma_lib.packing import pack_truth
-from neuma_lib.progress import stage
+from neuma_lib.io.packed import pack_truth
+from workflow.stage import stage
 
 
 def main(particles_file: str, packed: str, params, run) -> None:

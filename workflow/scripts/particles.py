@@ -3,8 +3,9 @@
 import numpy as np
 
 from neuma_lib.geometry.volume import sample_volume
-from neuma_lib.io import read_mesh, write_arrays
-from neuma_lib.progress import stage
+from neuma_lib.io.hdf5 import write_arrays
+from neuma_lib.io.ply import read_mesh
+from workflow.stage import stage
 
 
 def main(mesh_file: str, particles_file: str, params, run) -> None:

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from neuma_lib.evaluation.panels import Panels, save_panels
-from neuma_lib.evaluation.pictures import (
+from neuma_lib.evaluation.figures.panels import Panels, save_panels
+from neuma_lib.evaluation.figures.pictures import (
     cropped,
     evenly,
     frontal,
@@ -11,9 +11,9 @@ from neuma_lib.evaluation.pictures import (
     particle_pictures,
     sphere_radius,
 )
-from neuma_lib.evaluation.style import TRUE_PARTICLES, look
-from neuma_lib.io import read_arrays
-from neuma_lib.progress import stage
+from neuma_lib.evaluation.figures.style import TRUE_PARTICLES, look
+from neuma_lib.io.hdf5 import read_arrays
+from workflow.stage import stage
 
 
 def main(inputs, data_file: str, params, run) -> None:

@@ -2,10 +2,9 @@
 
 import numpy as np
 
-from neuma_lib.artifacts import load_body, load_law, load_motion, load_observation, load_views
-from neuma_lib.evaluation import stages
-from neuma_lib.evaluation.panels import Panels, save_panels
-from neuma_lib.evaluation.pictures import (
+from neuma_lib.evaluation.figures import stages
+from neuma_lib.evaluation.figures.panels import Panels, save_panels
+from neuma_lib.evaluation.figures.pictures import (
     as_bytes,
     cropped,
     evenly,
@@ -14,10 +13,11 @@ from neuma_lib.evaluation.pictures import (
     observed,
     renders,
 )
-from neuma_lib.evaluation.style import RAMP
-from neuma_lib.fitting.observation import over_white
-from neuma_lib.io import read_mesh
-from neuma_lib.progress import stage
+from neuma_lib.evaluation.figures.style import RAMP
+from neuma_lib.io.artifacts import load_body, load_law, load_motion, load_observation, load_views
+from neuma_lib.io.ply import read_mesh
+from neuma_lib.splatting.observation import over_white
+from workflow.stage import stage
 
 SHOWN = 5
 """Pictures of every stage."""

@@ -1,8 +1,9 @@
 """Train a neural constitutive law on an analytic one."""
 
 from neuma_lib.fitting.priors import train_prior
-from neuma_lib.io import write_json, write_weights
-from neuma_lib.progress import stage
+from neuma_lib.io.files import write_json
+from neuma_lib.io.weights import write_weights
+from workflow.stage import stage
 
 
 def main(name: str, output, params, run) -> None:

@@ -2,14 +2,14 @@
 
 from pathlib import Path
 
-from neuma_lib.blender.appearance import Appearance
-from neuma_lib.blender.bodies import make_body
-from neuma_lib.blender.cameras import static_views
-from neuma_lib.blender.scene import RenderSettings, render_static
-from neuma_lib.config import pick
+from neuma_lib.config.settings import pick
+from neuma_lib.data.blender.appearance import Appearance
+from neuma_lib.data.blender.bodies import make_body
+from neuma_lib.data.blender.scene import RenderSettings, render_static
 from neuma_lib.geometry.shapes import place
-from neuma_lib.io import read_arrays
-from neuma_lib.progress import stage
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.splatting.viewpoints import static_views
+from workflow.stage import stage
 
 
 def main(particles_file: str, transforms: str, params, run) -> None:

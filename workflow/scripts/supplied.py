@@ -1,7 +1,7 @@
 """Take images that were made elsewhere, in our layout or in that of the authors' release."""
 
-from neuma_lib.io import list_images
-from neuma_lib.progress import stage
+from neuma_lib.io.images import list_images
+from workflow.stage import stage
 
 
 def main(source: str, transforms: str, run) -> None:

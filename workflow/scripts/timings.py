@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from neuma_lib.evaluation.reports import report_table
-from neuma_lib.io import write_text
-from neuma_lib.progress import stage
+from neuma_lib.io.files import write_text
+from workflow.stage import stage
 
 
 def main(folder: str, output, run) -> None:

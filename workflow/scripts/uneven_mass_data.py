@@ -3,9 +3,8 @@
 import numpy as np
 from matplotlib.colors import to_rgb
 
-from neuma_lib.artifacts import load_body, load_motion, load_observation
-from neuma_lib.evaluation.panels import Panels, save_panels
-from neuma_lib.evaluation.pictures import (
+from neuma_lib.evaluation.figures.panels import Panels, save_panels
+from neuma_lib.evaluation.figures.pictures import (
     cropped,
     evenly,
     magnified,
@@ -15,9 +14,10 @@ from neuma_lib.evaluation.pictures import (
     renders,
     sphere_radius,
 )
-from neuma_lib.evaluation.style import ORANGE, SKY
-from neuma_lib.io import read_json
-from neuma_lib.progress import stage
+from neuma_lib.evaluation.figures.style import ORANGE, SKY
+from neuma_lib.io.artifacts import load_body, load_motion, load_observation
+from neuma_lib.io.files import read_json
+from workflow.stage import stage
 
 
 def main(inputs, data_file: str, params, run) -> None:

@@ -1,7 +1,7 @@
 """Unpack the static or the dynamic images of a scene."""
 
-from neuma_lib.packing import unpack_images
-from neuma_lib.progress import stage
+from neuma_lib.io.packed import unpack_images
+from workflow.stage import stage
 
 
 def main(packed: str, transforms: str, params, run) -> None:

@@ -1,7 +1,7 @@
 """Unpack the ground truth of a scene."""
 
-from neuma_lib.packing import unpack_truth
-from neuma_lib.progress import stage
+from neuma_lib.io.packed import unpack_truth
+from workflow.stage import stage
 
 
 def main(packed: str, particles_file: str, params, run) -> None:

@@ -2,12 +2,12 @@
 
 import torch
 
-from neuma_lib.artifacts import load_body, load_law, load_observation
 from neuma_lib.device import choose_device
 from neuma_lib.fitting.velocity import estimate_velocity
-from neuma_lib.io import write_json
-from neuma_lib.progress import stage
-from neuma_lib.sim import MPMModel
+from neuma_lib.io.artifacts import load_body, load_law, load_observation
+from neuma_lib.io.files import write_json
+from neuma_lib.sim.model import MPMModel
+from workflow.stage import stage
 
 
 def main(inputs, velocity_file: str, params, run) -> None:

@@ -3,12 +3,12 @@
 import numpy as np
 import torch
 
-from neuma_lib.artifacts import load_body, load_motion, load_observation
 from neuma_lib.device import choose_device
 from neuma_lib.evaluation.metrics import psnr
 from neuma_lib.evaluation.video import side_by_side, write_mp4
-from neuma_lib.io import atomic
-from neuma_lib.progress import stage
+from neuma_lib.io.artifacts import load_body, load_motion, load_observation
+from neuma_lib.io.files import atomic
+from workflow.stage import stage
 
 
 def main(inputs, video_file: str, params, run) -> None:

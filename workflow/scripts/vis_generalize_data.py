@@ -3,11 +3,11 @@
 import numpy as np
 import torch
 
-from neuma_lib.artifacts import load_body
-from neuma_lib.evaluation.panels import Panels, save_panels
-from neuma_lib.evaluation.pictures import evenly, frontal, milliseconds, renders
-from neuma_lib.io import read_arrays
-from neuma_lib.progress import stage
+from neuma_lib.evaluation.figures.panels import Panels, save_panels
+from neuma_lib.evaluation.figures.pictures import evenly, frontal, milliseconds, renders
+from neuma_lib.io.artifacts import load_body
+from neuma_lib.io.hdf5 import read_arrays
+from workflow.stage import stage
 
 UNIT = 1000.0
 """Densities do not show in pictures."""

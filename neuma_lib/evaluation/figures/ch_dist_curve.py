@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from matplotlib.figure import Figure
 
-from neuma_lib.evaluation import style
+from neuma_lib.evaluation.figures import style
 
 COLUMNS = 3
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from neuma_lib.evaluation import style
+from neuma_lib.evaluation.figures import style
 from neuma_lib.evaluation.figures.grid import image_grid, picture_height, place
-from neuma_lib.evaluation.panels import Panels
+from neuma_lib.evaluation.figures.panels import Panels
 
 LEFT, TOP, CURVE = 0.92, 0.2, 1.3
 

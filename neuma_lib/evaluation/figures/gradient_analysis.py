@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
-from neuma_lib.evaluation import style
+from neuma_lib.evaluation.figures import style
 
 NETWORKS = {"elastic": (style.BLUE, "-"), "plastic": (style.VERMILION, (0, (4, 1.5)))}
 

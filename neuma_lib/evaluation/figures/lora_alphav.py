@@ -6,9 +6,9 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from neuma_lib.evaluation import style
+from neuma_lib.evaluation.figures import style
 from neuma_lib.evaluation.figures.grid import image_grid, note, picture_height, place
-from neuma_lib.evaluation.panels import Panels
+from neuma_lib.evaluation.figures.panels import Panels
 
 LEFT, LEGEND, TITLE, PICTURES, CURVES, BETWEEN = 0.5, 0.2, 0.34, 4.0, 1.85, 0.38
 

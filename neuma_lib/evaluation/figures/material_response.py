@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from neuma_lib.evaluation import style
+from neuma_lib.evaluation.figures import style
 
 LAWS = {"truth": "true law", "nclaw": "prior", "neuma": "NeuMA"}
 TESTS = {

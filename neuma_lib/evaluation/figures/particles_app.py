@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure
 
-from neuma_lib.evaluation import style
+from neuma_lib.evaluation.figures import style
 from neuma_lib.evaluation.figures.grid import image_grid, picture_height
-from neuma_lib.evaluation.panels import Panels
+from neuma_lib.evaluation.figures.panels import Panels
 
 LEFT, TOP = 0.92, 0.18
 

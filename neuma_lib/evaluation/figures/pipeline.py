@@ -5,9 +5,9 @@ from __future__ import annotations
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
 
-from neuma_lib.evaluation import style
+from neuma_lib.evaluation.figures import style
 from neuma_lib.evaluation.figures.grid import image_grid, note, picture_height
-from neuma_lib.evaluation.panels import Panels
+from neuma_lib.evaluation.figures.panels import Panels
 
 LEFT, RIGHT, HEAD, TITLES = 0.8, 0.42, 0.2, 0.16
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure
 
-from neuma_lib.evaluation import style
+from neuma_lib.evaluation.figures import style
 from neuma_lib.evaluation.figures.grid import image_grid, note, picture_height, place
-from neuma_lib.evaluation.panels import Panels
+from neuma_lib.evaluation.figures.panels import Panels
 
 LEFT, TOP, BARS = 0.98, 0.2, 1.25
 PAPER = 1.33

@@ -1,0 +1,75 @@
+"""Several bodies on one grid, and bodies that were never filmed: solids painted with kernels of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+import trimesh
+from scipy.spatial import cKDTree
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from neuma_lib.coupling.binding import Binding
+from neuma_lib.coupling.reconstruction import Reconstruction
+from neuma_lib.mechanics.density import Density, density_at
+from neuma_lib.splatting.gaussians import Gaussians
+from neuma_lib.splatting.spherical_harmonics import rgb_to_sh0
+
+KERNEL_WIDTH = 0.55
+"""Standard deviation of a painted kernel in distances between particles: closed surfaces, edges still sharp."""
+_OPACITY = 0.95
+_LIGHT = (0.35, 0.8, 0.5)
+"""Direction to the light that painted bodies are shaded by: from above, a little to the right of the camera."""
+_AMBIENT = 0.45
+"""Brightness of what faces away from the light."""
+
+
+def join(bodies: Sequence[Reconstruction]) -> Reconstruction:
+    """Bodies as one: particles and kernels of one after those of another, every kernel on particles of its own."""
+    offsets = np.cumsum([0, *(len(body.x0) for body in bodies)])
+    entries = np.cumsum([0, *(len(body.binding.indices) for body in bodies)])
+    parts = [body.binding for body in bodies]
+    starts = [b.indptr[:-1] + int(n) for b, n in zip(parts, entries, strict=False)]
+    binding = Binding(
+        torch.cat([*starts, torch.tensor([int(entries[-1])])]),
+        torch.cat([b.indices + int(n) for b, n in zip(parts, offsets, strict=False)]),
+        torch.cat([b.values for b in parts]),
+        (sum(b.shape[0] for b in parts), int(offsets[-1])),
+    )
+    most = max(body.gaussians.shN.shape[1] for body in bodies)
+    kernels = [body.gaussians for body in bodies]
+    padded = [torch.nn.functional.pad(k.shN, (0, 0, 0, most - k.shN.shape[1])) for k in kernels]
+    names = ("means", "quats", "scales", "opacities", "sh0")
+    gaussians = Gaussians(
+        **{name: torch.cat([getattr(k, name) for k in kernels]) for name in names}, shN=torch.cat(padded)
+    )
+    x0, vol0, mass = (torch.cat([getattr(body, name) for body in bodies]) for name in ("x0", "vol0", "mass"))
+    return Reconstruction(x0, vol0, mass, gaussians, binding)
+
+
+def painted(mesh: trimesh.Trimesh, x0: Tensor, density: Density, colors: Tensor) -> Reconstruction:
+    """A solid filled with particles, with one round kernel on each of them, so that it can be rendered.
+
+    Args:
+        mesh: surface of the solid, watertight [m].
+        x0: particles inside it [m], shape (N, 3).
+        density: mass density [kg/m^3].
+        colors: of the particles, RGB in [0, 1], shape (N, 3); a fixed light shades each by the surface nearest to it.
+    """
+    volume = float(mesh.volume) / len(x0)
+    vol0 = torch.full_like(x0[:, 0], volume)
+    nearest = cKDTree(mesh.triangles_center).query(x0.numpy())[1]
+    normals = torch.from_numpy(np.asarray(mesh.face_normals)[nearest]).to(x0)
+    facing = (normals @ normalize(x0.new_tensor(_LIGHT), dim=0)).clamp(min=0)
+    rgb = (_AMBIENT + (1 - _AMBIENT) * facing)[:, None] * colors.to(x0)
+    gaussians = Gaussians(
+        means=x0,
+        quats=x0.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(x0), 1),
+        scales=torch.full_like(x0, KERNEL_WIDTH * volume ** (1 / 3)),
+        opacities=torch.full_like(vol0, _OPACITY),
+        sh0=rgb_to_sh0(rgb)[:, None, :],
+        shN=x0.new_zeros(len(x0), 0, 3),
+    )
+    return Reconstruction(x0, vol0, vol0 * density_at(x0, density), gaussians, Binding.identity(len(x0), x0))

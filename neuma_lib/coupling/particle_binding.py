@@ -1,0 +1,269 @@
+"""Gaussian-particle binding: Algorithm 1 of the paper as a sparse matrix.
+
+Row i of the binding matrix B (G, N) holds the weights of the particles that carry Gaussian i: the particles
+inside its confidence ellipsoid, at most ``max_neighbours`` of them, equally weighted, so that every
+non-empty row sums to 1. Gaussians then follow the particles by ``x_t = x_0 + B (p_t - p_0)`` and ``F_bar =
+B F`` (paper, section 3.3).
+
+The dense G x N matrix is never formed, and the ellipsoid test touches only particles near each Gaussian.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from scipy.special import chdtri
+from torch import Tensor
+
+from neuma_lib.coupling.binding import Binding
+from neuma_lib.errors import InputError
+
+_FIRST_QUERY = 32
+"""Nearest particles asked for at first; Gaussians that need more are asked again with four times as
+many."""
+_CHUNK_ENTRIES = 2_000_000
+"""Gaussian-particle pairs held at one time, which bounds the memory of a search whatever its input."""
+_SHARING_NEIGHBOURS = 16
+"""Particles among which an added particle's volume is collected."""
+_LARGEST_SHARE = 0.5
+"""Part of a particle's volume that all added particles together may take from it."""
+
+
+def bind(
+    means: Tensor,
+    covars: Tensor,
+    particles: Tensor,
+    confidence: float = 0.95,
+    max_neighbours: int | None = 10,
+) -> Binding:
+    """Bind every Gaussian to the particles inside its confidence ellipsoid (paper, Algorithm 1).
+
+    Particle j belongs to Gaussian i when ``(p_j - x_i)^T A_i^-1 (p_j - x_i) <= chi2_3(confidence)``; of
+    these the ``max_neighbours`` nearest in that distance are kept (the smaller index first where two are
+    equally far) and share the weight equally.
+
+    Args:
+        means: Gaussian centres [m], shape (G, 3).
+        covars: Gaussian covariances [m^2], shape (G, 3, 3).
+        particles: particle positions [m], shape (N, 3).
+        confidence: probability that defines the ellipsoid, in (0, 1).
+        max_neighbours: most particles in a row; None for the paper's Algorithm 1 without a limit.
+
+    Returns:
+        Binding of shape (G, N) on the device and with the dtype of ``means``; rows may be empty
+        (``Binding.orphans``).
+
+    Raises:
+        InputError: shapes that do not fit, non-finite values, a covariance that is not positive definite,
+            or a setting outside its range.
+    """
+    centres, shapes, points = _checked(means, covars, particles)
+    rows, columns = _pairs_inside(centres, shapes, points, _threshold(confidence), max_neighbours)
+    return _binding_from_pairs(rows, columns, (len(centres), len(points)), means)
+
+
+def bind_two_pass(
+    means: Tensor,
+    covars: Tensor,
+    particles: Tensor,
+    volumes: Tensor | float,
+    confidence: float = 0.95,
+    max_neighbours: int | None = 10,
+    equal_mass: bool = False,
+) -> tuple[Binding, Tensor, int, Tensor]:
+    """Bind twice, so that no Gaussian is left without a particle (paper, section 3.4).
+
+    Gaussians that the first pass leaves empty get a particle of their own at their centre; the second pass
+    binds all Gaussians to the enlarged set. The added particles crowd at the surface. By default each takes
+    its volume from the particles around it, in proportions whose barycentre is its own position, which
+    leaves total volume and centre of mass (at one density) unchanged to round-off and every volume
+    positive.
+
+    Args:
+        means, covars, particles, confidence, max_neighbours: as in ``bind``.
+        volumes: particle volumes [m^3], shape (N,), or the object's volume [m^3], to be spread evenly.
+        equal_mass: give all N + M particles the object's volume / (N + M), as the paper does. The total
+            stays, the centre of mass moves.
+
+    Returns:
+        Tuple of the binding (G, N + M), the particles with the M added ones at the end (N + M, 3), the
+        added count M, and the volumes (N + M,).
+
+    Raises:
+        InputError: as ``bind``; volumes that are not positive or do not fit the particles.
+    """
+    centres, shapes, points = _checked(means, covars, particles)
+    shares = _checked_volumes(volumes, len(points))
+    threshold = _threshold(confidence)
+    rows, columns = _pairs_inside(centres, shapes, points, threshold, max_neighbours)
+    orphans = np.flatnonzero(np.bincount(rows, minlength=len(centres)) == 0)
+    added = centres[orphans]
+
+    if len(orphans):
+        # Every Gaussian is bound anew: an added particle may lie inside its neighbours' ellipsoids as well.
+        together = np.concatenate([points, added])
+        rows, columns = _pairs_inside(centres, shapes, together, threshold, max_neighbours)
+        if equal_mass:
+            shares = np.full(len(together), shares.sum() / len(together))
+        else:
+            shares = _share_volumes(points, shares, added)
+    count = len(points) + len(orphans)
+    enlarged = torch.cat([particles, means[torch.as_tensor(orphans, device=means.device)].to(particles)])
+    return (
+        _binding_from_pairs(rows, columns, (len(centres), count), means),
+        enlarged,
+        len(orphans),
+        torch.as_tensor(shares, dtype=particles.dtype, device=particles.device),
+    )
+
+
+def _threshold(confidence: float) -> float:
+    if not 0.0 < confidence < 1.0:
+        raise InputError(
+            f"binding.confidence = {confidence}: choose a probability between 0 and 1, such as 0.95"
+        )
+    return float(chdtri(3, 1.0 - confidence))
+
+
+def _checked(means: Tensor, covars: Tensor, particles: Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Inputs in float64 on the CPU, after checks of shapes and finiteness."""
+    if means.ndim != 2 or means.shape[1] != 3 or covars.shape != (len(means), 3, 3):
+        raise InputError(
+            f"binding: Gaussian means {tuple(means.shape)} and covariances {tuple(covars.shape)} must be "
+            "(G, 3) and (G, 3, 3)"
+        )
+    if particles.ndim != 2 or particles.shape[1] != 3 or len(particles) == 0:
+        raise InputError(f"binding: particles {tuple(particles.shape)} must be (N, 3) with N > 0")
+    arrays = []
+    for name, values in (("Gaussian mean", means), ("Gaussian covariance", covars), ("particle", particles)):
+        array = values.detach().to("cpu", torch.float64).numpy()
+        finite = np.isfinite(array).reshape(len(array), -1).all(1)
+        if not finite.all():
+            raise InputError(
+                f"binding: {name} {int(np.argmin(finite))} is not finite; rerun the stage that made it"
+            )
+        arrays.append(array)
+    return arrays[0], arrays[1], arrays[2]
+
+
+def _checked_volumes(volumes: Tensor | float, count: int) -> np.ndarray:
+    if isinstance(volumes, Tensor) and volumes.ndim:
+        array = volumes.detach().to("cpu", torch.float64).numpy()
+    else:
+        array = np.full(count, float(volumes) / count)
+    if array.shape != (count,):
+        raise InputError(f"binding: {array.shape} volumes do not fit {count} particles")
+    if not (np.isfinite(array).all() and (array > 0).all()):
+        raise InputError("binding: particle volumes must be finite and positive; rerun the geometry stage")
+    return array
+
+
+def _whitening(shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Maps W with ``|W d|^2 = d^T A^-1 d``, and the largest eigenvalue of each covariance."""
+    eigenvalues, eigenvectors = np.linalg.eigh(shapes)
+    largest = eigenvalues[:, 2]
+    if not (largest > 0).all():
+        worst = int(np.argmin(largest))
+        raise InputError(
+            f"binding: the covariance of Gaussian {worst} is not positive definite; rerun the gaussians stage"
+        )
+    # A disc fitted flat has a third axis at round-off: its floor keeps the inverse finite.
+    eigenvalues = np.maximum(eigenvalues, 1e-12 * largest[:, None])
+    return np.swapaxes(eigenvectors, 1, 2) / np.sqrt(eigenvalues)[:, :, None], largest
+
+
+def _pairs_inside(
+    centres: np.ndarray, shapes: np.ndarray, points: np.ndarray, threshold: float, most: int | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """All pairs (Gaussian, particle) of Algorithm 1, sorted by Gaussian, then by particle.
+
+    The k nearest particles of a Gaussian are enough when the k-th is so far away that anything beyond it
+    lies outside the ellipsoid, or is further in the Mahalanobis distance than ``most`` particles already
+    found: the smallest Mahalanobis distance at a Euclidean distance r is r^2 / lambda_max. Otherwise it is
+    asked again with more. The result is exact; only how much is read depends on the guess.
+    """
+    if most is not None and most < 1:
+        raise InputError(f"binding.max_neighbours = {most}: choose 1 or more, or none for no limit")
+    whitening, largest = _whitening(shapes)
+    tree = cKDTree(points)
+    pending = np.arange(len(centres))
+    asked = min(_FIRST_QUERY, len(points))
+    found_rows: list[np.ndarray] = []
+    found_columns: list[np.ndarray] = []
+    while len(pending):
+        unfinished = []
+        chunk = max(1, _CHUNK_ENTRIES // asked)
+        for start in range(0, len(pending), chunk):
+            rows = pending[start : start + chunk]
+            reach, columns = tree.query(centres[rows], k=np.arange(1, asked + 1))
+            offsets = points[columns] - centres[rows, None, :]
+            distances = np.square(np.einsum("gab,gkb->gka", whitening[rows], offsets)).sum(2)
+            inside = distances <= threshold
+            unseen = np.square(reach[:, -1]) / largest[rows]
+            bound = np.full(len(rows), threshold)
+            if most is not None and most < asked:
+                bound = np.minimum(bound, np.partition(distances, most - 1, axis=1)[:, most - 1])
+            complete = (unseen > bound) | (asked == len(points))
+            unfinished.append(rows[~complete])
+            inside = inside[complete]
+            if most is not None and most < asked:
+                # Stable in (distance, index): the particle index breaks ties.
+                order = np.lexsort((columns[complete], distances[complete]), axis=1)
+                rank = np.empty_like(order)
+                np.put_along_axis(rank, order, np.arange(asked)[None, :], axis=1)
+                inside &= rank < most
+            local, slot = np.nonzero(inside)
+            found_rows.append(rows[complete][local])
+            found_columns.append(columns[complete][local, slot])
+        pending = np.concatenate(unfinished)
+        asked = min(4 * asked, len(points))
+    rows = np.concatenate(found_rows) if found_rows else np.empty(0, np.int64)
+    columns = np.concatenate(found_columns) if found_columns else np.empty(0, np.int64)
+    order = np.lexsort((columns, rows))
+    return rows[order], columns[order]
+
+
+def _binding_from_pairs(
+    rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int], like: Tensor
+) -> Binding:
+    counts = np.bincount(rows, minlength=shape[0])
+    indptr = np.concatenate([[0], np.cumsum(counts)])
+    values = 1.0 / counts[rows]
+    return Binding(
+        torch.as_tensor(indptr, dtype=torch.int64, device=like.device),
+        torch.as_tensor(columns, dtype=torch.int64, device=like.device),
+        torch.as_tensor(values, dtype=like.dtype, device=like.device),
+        shape,
+    )
+
+
+def _share_volumes(points: np.ndarray, volumes: np.ndarray, added: np.ndarray) -> np.ndarray:
+    """Volumes of the particles and of those added, with the sum and the first moment of the former alone.
+
+    Added particle m at q takes ``w_m f_mj`` from its neighbour j, where ``sum_j f_mj = 1`` and
+    ``sum_j f_mj p_j = q`` (the smallest such f; negative, hence a gift, where q lies outside its
+    neighbours). w_m aims at an equal share among the group, and is lowered until no particle gives more
+    than ``_LARGEST_SHARE`` of its volume.
+    """
+    size = min(_SHARING_NEIGHBOURS, len(points))
+    _, neighbours = cKDTree(points).query(added, k=np.arange(1, size + 1))
+    offsets = points[neighbours] - added[:, None, :]
+    scale = np.sqrt(np.square(offsets).sum(2).mean(1))
+    scale[scale == 0.0] = 1.0
+    system = np.concatenate(
+        [np.ones((len(added), 1, size)), np.swapaxes(offsets, 1, 2) / scale[:, None, None]], 1
+    )
+    wanted = np.array([1.0, 0.0, 0.0, 0.0])
+    fractions = np.linalg.pinv(system, rcond=1e-8) @ wanted
+    residual = np.abs(np.einsum("mak,mk->ma", system, fractions) - wanted).max(1)
+
+    taken = np.maximum(fractions, 0.0)
+    demand = np.bincount(neighbours.ravel(), taken.ravel(), minlength=len(points))
+    with np.errstate(divide="ignore"):
+        offer = np.where(taken > 0, (volumes / demand)[neighbours], np.inf).min(1)
+    weight = np.minimum(volumes[neighbours].mean(1) * size / (size + 1), _LARGEST_SHARE * offer)
+    # Neighbours in one plane cannot balance a particle off it: it then rides along without volume.
+    weight[residual > 1e-9] = 0.0
+    given = np.bincount(neighbours.ravel(), (weight[:, None] * fractions).ravel(), minlength=len(points))
+    return np.concatenate([volumes - given, weight])

@@ -1,0 +1,96 @@
+"""Particle-GS (paper Sec. 3.3): Gaussian kernels carried by simulated particles and splatted into images."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from neuma_lib.coupling.binding import Binding
+from neuma_lib.coupling.deformation import deform
+from neuma_lib.splatting.cameras import Cameras
+from neuma_lib.splatting.gaussians import Gaussians
+from neuma_lib.splatting.rasterizer import rasterize
+
+_BATCH_BYTES = {"cpu": 16e6, "cuda": 1.5e9}
+"""Memory of the buffers of one batch of frames: what stays in a CPU's cache, what keeps a GPU busy."""
+
+
+class ParticleGS:
+    """Renders the states of bound particles: ``images = particle_gs(x, F)``.
+
+    Args:
+        gaussians: static kernels at t = 0, G of them.
+        binding: row-stochastic (G, N) binding matrix of Algorithm 1.
+        x0: particle positions at t = 0 [m], shape (N, 3).
+        cameras: V views.
+        background: colour behind the kernels.
+        covariance_gradient: whether gradients reach the particles through the covariances as well as the means.
+        eps2d: variance that a pixel adds to a splat [px^2]; kernels of `fit_gaussians` hold it already.
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        binding: Binding,
+        x0: Tensor,
+        cameras: Cameras,
+        background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        covariance_gradient: bool = True,
+        eps2d: float = 0.0,
+    ):
+        self.gaussians, self.binding, self.x0, self.cameras = gaussians, binding, x0, cameras
+        self.background, self.covariance_gradient, self.eps2d = background, covariance_gradient, eps2d
+        with torch.no_grad():
+            self._covars0 = gaussians.covars()
+            self._sh = gaussians.sh()
+
+    def deformed(self, x: Tensor, F: Tensor) -> tuple[Tensor, Tensor]:
+        """Kernel means (T, G, 3) and covariances (T, G, 3, 3) for particle states x (T, N, 3) and F (T, N, 3, 3)."""
+        return deform(
+            self.gaussians.means,
+            self._covars0,
+            self.binding,
+            self.x0,
+            x,
+            F,
+            covariance_gradient=self.covariance_gradient,
+        )
+
+    def __call__(self, x: Tensor, F: Tensor) -> Tensor:
+        """Images (T, V, H, W, 3) in [0, 1] of the particle states x (T, N, 3) [m] and F (T, N, 3, 3)."""
+        return self.splatted(*self.deformed(x, F))
+
+    def splatted(self, means: Tensor, covars: Tensor) -> Tensor:
+        """Images (T, V, H, W, 3) of deformed kernels, means (T, G, 3) [m] and covariances (T, G, 3, 3) [m^2]."""
+        images, _ = rasterize(
+            means,
+            covars,
+            self.gaussians.opacities,
+            self._sh,
+            self.cameras.viewmats,
+            self.cameras.Ks,
+            self.cameras.width,
+            self.cameras.height,
+            background=self.background,
+            eps2d=self.eps2d,
+        )
+        return images
+
+    @property
+    def frames_per_batch(self) -> int:
+        """Frames to render together, forward and backward: estimated by the bytes of images and projected kernels."""
+        pixels = self.cameras.width * self.cameras.height
+        per_view = (14 * pixels + 60 * len(self.gaussians)) * self.x0.element_size()
+        return max(1, int(_BATCH_BYTES[self.x0.device.type] / (per_view * len(self.cameras))))
+
+    def batches(self, x: Tensor, F: Tensor, size: int | None = None) -> Iterator[tuple[slice, Tensor]]:
+        """Render ``size`` frames at a time (None: `frames_per_batch`): yields (slice of frames, images).
+
+        States may be on another device than the kernels, so that memory there stays bounded too.
+        """
+        size = size or self.frames_per_batch
+        for start in range(0, len(x), size):
+            part = slice(start, min(start + size, len(x)))
+            yield part, self(x[part].to(self.x0), F[part].to(self.x0))

@@ -1,0 +1,62 @@
+"""What the optimisation loops may know: the reconstructed body, and the frames that the cameras saw."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from neuma_lib.coupling.binding import Binding
+from neuma_lib.coupling.particle_gs import ParticleGS
+from neuma_lib.mechanics.density import Density, density_at
+from neuma_lib.splatting.cameras import Cameras
+from neuma_lib.splatting.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A reconstructed object at t = 0.
+
+    Attributes:
+        x0: particle positions [m], shape (N, 3).
+        vol0: particle volumes [m^3], shape (N,).
+        mass: particle masses [kg], shape (N,).
+        gaussians: static kernels, G of them.
+        binding: (G, N) binding matrix.
+    """
+
+    x0: Tensor
+    vol0: Tensor
+    mass: Tensor
+    gaussians: Gaussians
+    binding: Binding
+
+    @classmethod
+    def of_gaussians(cls, gaussians: Gaussians, volume: float, density: Density) -> Reconstruction:
+        """The kernels as particles (the paper's w/o Bind), one each, with equal shares of the volume [m^3]."""
+        count = len(gaussians.means)
+        vol0 = torch.full_like(gaussians.means[:, 0], volume / count)
+        mass = vol0 * density_at(gaussians.means, density)
+        return cls(gaussians.means, vol0, mass, gaussians, Binding.identity(count, gaussians.means))
+
+    @property
+    def density(self) -> float:
+        """Smallest mass density of a particle [kg/m^3], where waves are fastest."""
+        return float((self.mass / self.vol0).min())
+
+    def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Reconstruction:
+        """The same body in another precision or on another device."""
+        kind = dict(dtype=dtype, device=device)
+        return replace(
+            self,
+            x0=self.x0.to(**kind),
+            vol0=self.vol0.to(**kind),
+            mass=self.mass.to(**kind),
+            gaussians=self.gaussians.to(**kind),
+            binding=self.binding.to(**kind),
+        )
+
+    def particle_gs(self, cameras: Cameras, **options) -> ParticleGS:
+        """The renderer of this body for the given cameras."""
+        return ParticleGS(self.gaussians, self.binding, self.x0, cameras, **options)

@@ -1,0 +1,98 @@
+"""From simulated particles to what is rendered: a solid's own mesh, sand as grains, honey as a surface."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+
+from neuma_lib.data.blender.appearance import Appearance, colors_at
+from neuma_lib.data.blender.scene import Grains, Liquid, Surface
+from neuma_lib.errors import InputError
+from neuma_lib.geometry.shapes import depth
+from neuma_lib.geometry.skinning import carry, skinning_matrix
+
+KINDS = ("solid", "grains", "liquid")
+MOST_GRAINS = 30_000
+MOST_DROPS = 12_000  # points that a liquid's surface is made from
+
+
+def make_body(
+    kind: str,
+    mesh: trimesh.Trimesh,
+    appearance: Appearance,
+    x: np.ndarray,
+    tracers: np.ndarray | None = None,
+) -> Surface | Grains | Liquid:
+    """What Blender shows.
+
+    Args:
+        kind: "solid", "grains" or "liquid".
+        mesh: the true shape where the motion starts, from ``shapes.build`` [m].
+        appearance: colours by rest position.
+        x: particle positions, frame 0 at rest in the mesh [m], shape (T, N, 3).
+        tracers: passive points of the same motion (T, M, 3) [m]; where they are given, grains and the liquid's
+            surface are made from some of them, because they are finer than the particles.
+
+    Raises:
+        InputError: another kind.
+    """
+    x = np.asarray(x, dtype=np.float64)
+    if kind == "solid":
+        vertices = carry(skinning_matrix(mesh.vertices, x[0]), x)
+        return Surface(vertices, np.asarray(mesh.faces), colors_at(mesh, mesh.vertices, appearance))
+    points = x if tracers is None else np.asarray(tracers)
+    if kind == "grains":
+        return _grains(mesh, appearance, _some(points, MOST_GRAINS))
+    if kind == "liquid":
+        return _liquid(mesh, appearance, _some(points, MOST_DROPS))
+    raise InputError(f"appearance.kind: {kind!r} is not known; choose one of {', '.join(KINDS)}")
+
+
+def _some(points: np.ndarray, most: int) -> np.ndarray:
+    """At most ``most`` of the points (T, M, 3): the same ones in every frame."""
+    if points.shape[1] > most:
+        points = points[:, np.sort(np.random.default_rng(0).choice(points.shape[1], most, replace=False))]
+    return points.astype(np.float64)
+
+
+def _grains(mesh: trimesh.Trimesh, appearance: Appearance, points: np.ndarray) -> Grains:
+    """Balls somewhat wider than the spacing of their centres; none stands out of the rest surface."""
+    radius = 0.65 * float((mesh.volume / points.shape[1]) ** (1 / 3))
+    points = points[:, depth(mesh, points[0]) > 0.8 * radius]
+    return Grains(points, radius, colors_at(mesh, points[0], appearance))
+
+
+def _liquid(mesh: trimesh.Trimesh, appearance: Appearance, points: np.ndarray) -> Liquid:
+    """A surface around the points of every frame; the one at rest holds the true shape's volume within 2 %."""
+    spacing = float((mesh.volume / points.shape[1]) ** (1 / 3))
+    rest_colors = colors_at(mesh, points[0], appearance)
+    surfaces = []
+    for frame in points:
+        vertices, faces = _liquid_surface(frame, spacing)
+        distance, near = cKDTree(frame).query(vertices, k=8)
+        weight = 1.0 / (distance**2 + (0.5 * spacing) ** 2)
+        weight /= weight.sum(axis=1, keepdims=True)
+        surfaces.append((vertices, faces, np.einsum("vk,vkc->vc", weight, rest_colors[near])))
+    return Liquid(surfaces)
+
+
+def _liquid_surface(points: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Smooth surface of the fluid with the given particles: vertices (n, 3) [m] and faces (m, 3)."""
+    import pysplashsurf
+
+    # One thread keeps the bytes the same from run to run.
+    result = pysplashsurf.reconstruction_pipeline(
+        np.ascontiguousarray(points, dtype=np.float64),
+        particle_radius=spacing / 2,
+        smoothing_length=2.5,
+        cube_size=1.0,
+        iso_surface_threshold=0.48,
+        mesh_cleanup=True,
+        mesh_smoothing_iters=15,
+        mesh_smoothing_weights=True,
+        multi_threading=False,
+    )
+    result = result[0] if isinstance(result, tuple) else result
+    surface = getattr(result, "mesh", result)
+    return np.asarray(surface.vertices, dtype=np.float64), np.asarray(surface.triangles, dtype=np.int64)

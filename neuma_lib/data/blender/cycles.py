@@ -1,0 +1,161 @@
+"""The Blender scene itself. The only module that imports bpy: use it through `neuma_lib.data.blender.scene`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+from mathutils import Matrix, Vector
+
+SENSOR = 36.0  # width of the camera's sensor [mm]; only its ratio to the lens matters
+
+
+def start(settings: dict, width: int, height: int) -> None:
+    """An empty scene with the renderer's settings and the light."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    render, cycles = scene.render, scene.cycles
+    render.engine = "CYCLES"
+    cycles.device = "CPU"
+    cycles.samples = settings["samples"]
+    cycles.seed = settings["seed"]
+    cycles.use_adaptive_sampling = False
+    cycles.use_denoising = True
+    cycles.denoiser = "OPENIMAGEDENOISE"
+    cycles.denoising_prefilter = "FAST"
+    cycles.max_bounces = 3
+    render.threads_mode, render.threads = "FIXED", settings["threads"]
+    render.use_persistent_data = True
+    render.film_transparent = True
+    render.resolution_x, render.resolution_y, render.resolution_percentage = width, height, 100
+    render.image_settings.file_format = "PNG"
+    render.image_settings.color_mode = "RGBA"
+    render.image_settings.color_depth = "8"
+    render.image_settings.compression = 50
+    scene.view_settings.view_transform = "Standard"
+    scene.view_settings.look = "None"
+    world = bpy.data.worlds.new("world")
+    world.use_nodes = True
+    background = world.node_tree.nodes["Background"]
+    background.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
+    background.inputs["Strength"].default_value = settings["ambient"]
+    scene.world = world
+    key = bpy.data.lights.new("key", "SUN")
+    key.energy = settings["key"] * np.pi * 0.5
+    key.angle = np.radians(90.0)
+    lamp = bpy.data.objects.new("key", key)
+    towards = Vector((0.35, 0.8, 0.5)).normalized()
+    lamp.rotation_mode = "QUATERNION"
+    lamp.rotation_quaternion = towards.to_track_quat("Z", "Y")
+    scene.collection.objects.link(lamp)
+
+
+def add_camera(focal: float, width: int) -> bpy.types.Object:
+    """A pinhole camera with square pixels; ``focal`` [px]."""
+    data = bpy.data.cameras.new("camera")
+    data.sensor_fit = "HORIZONTAL"
+    data.sensor_width = SENSOR
+    data.lens = focal * SENSOR / width
+    data.clip_start, data.clip_end = 0.01, 100.0
+    camera = bpy.data.objects.new("camera", data)
+    bpy.context.scene.collection.objects.link(camera)
+    bpy.context.scene.camera = camera
+    return camera
+
+
+def place(camera: bpy.types.Object, c2w: np.ndarray) -> None:
+    """Put the camera at a camera-to-world pose (4, 4); Blender's camera axes are OpenGL's."""
+    camera.matrix_world = Matrix(c2w.tolist())
+
+
+def render(path: Path) -> None:
+    """Render the scene to a PNG file."""
+    bpy.context.scene.render.filepath = str(path)
+    bpy.ops.render.render(write_still=True)
+
+
+def _material() -> bpy.types.Material:
+    """Matt, coloured by the attribute ``rest_color``."""
+    material = bpy.data.materials.new("body")
+    material.use_nodes = True
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    nodes.clear()
+    attribute = nodes.new("ShaderNodeAttribute")
+    attribute.attribute_name = "rest_color"
+    diffuse = nodes.new("ShaderNodeBsdfDiffuse")
+    output = nodes.new("ShaderNodeOutputMaterial")
+    links.new(attribute.outputs["Color"], diffuse.inputs["Color"])
+    links.new(diffuse.outputs["BSDF"], output.inputs["Surface"])
+    return material
+
+
+def _grain_nodes(radius: float, material: bpy.types.Material) -> bpy.types.NodeTree:
+    """Geometry nodes that turn vertices into native balls."""
+    tree = bpy.data.node_groups.new("grains", "GeometryNodeTree")
+    tree.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
+    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    source, sink = tree.nodes.new("NodeGroupInput"), tree.nodes.new("NodeGroupOutput")
+    balls = tree.nodes.new("GeometryNodeMeshToPoints")
+    balls.inputs["Radius"].default_value = radius
+    dress = tree.nodes.new("GeometryNodeSetMaterial")
+    dress.inputs["Material"].default_value = material
+    tree.links.new(source.outputs[0], balls.inputs["Mesh"])
+    tree.links.new(balls.outputs[0], dress.inputs["Geometry"])
+    tree.links.new(dress.outputs[0], sink.inputs[0])
+    return tree
+
+
+class Body:
+    """The object of a job, shown one frame at a time."""
+
+    def __init__(self, job: dict[str, np.ndarray]):
+        self.job = job
+        self.material = _material()
+        self.same_faces = len(job["face_start"]) == 2
+        self.object: bpy.types.Object | None = None
+
+    def show(self, frame: int) -> None:
+        """Bring the geometry of one frame into the scene."""
+        start, stop = (int(i) for i in self.job["vertex_start"][frame : frame + 2])
+        vertices = self.job["vertices"][start:stop]
+        if self.object is not None and self.same_faces:
+            mesh = self.object.data
+            mesh.vertices.foreach_set("co", vertices.ravel())
+            mesh.update()
+            return
+        if self.same_faces:
+            faces, colors = self.job["faces"], self.job["colors"]
+        else:
+            first, last = (int(i) for i in self.job["face_start"][frame : frame + 2])
+            faces, colors = self.job["faces"][first:last], self.job["colors"][start:stop]
+        mesh = self._mesh(vertices, faces, colors)
+        if self.object is None:
+            self.object = bpy.data.objects.new("body", mesh)
+            bpy.context.scene.collection.objects.link(self.object)
+            radius = float(self.job["radius"])
+            if radius > 0.0:
+                modifier = self.object.modifiers.new("grains", "NODES")
+                modifier.node_group = _grain_nodes(radius, self.material)
+        else:
+            old = self.object.data
+            self.object.data = mesh
+            bpy.data.meshes.remove(old)
+
+    def _mesh(self, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> bpy.types.Mesh:
+        mesh = bpy.data.meshes.new("body")
+        mesh.vertices.add(len(vertices))
+        mesh.vertices.foreach_set("co", np.ascontiguousarray(vertices, np.float32).ravel())
+        if len(faces):
+            mesh.loops.add(faces.size)
+            mesh.loops.foreach_set("vertex_index", np.ascontiguousarray(faces, np.int32).ravel())
+            mesh.polygons.add(len(faces))
+            mesh.polygons.foreach_set("loop_start", np.arange(0, faces.size, 3, dtype=np.int32))
+            mesh.update(calc_edges=True)
+            mesh.polygons.foreach_set("use_smooth", np.ones(len(faces), dtype=bool))
+        attribute = mesh.attributes.new("rest_color", "FLOAT_COLOR", "POINT")
+        rgba = np.concatenate([colors, np.ones((len(colors), 1), np.float32)], axis=1)
+        attribute.data.foreach_set("color", np.ascontiguousarray(rgba, np.float32).ravel())
+        mesh.materials.append(self.material)
+        mesh.update()
+        return mesh

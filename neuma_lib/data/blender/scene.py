@@ -1,0 +1,296 @@
+"""Render an object from many cameras over many frames, in a Blender process of its own.
+
+The parent (this module) never imports bpy: it writes one job file, starts ``neuma_lib.data.blender.worker`` and
+collects the images, which appear in the target folder only when all of them are there. What is rendered is a
+:class:`Surface` (the mesh of a solid, moved), :class:`Grains` (sand) or a :class:`Liquid` (a new surface a frame).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from neuma_lib.data.blender import worker
+from neuma_lib.data.blender.appearance import to_linear
+from neuma_lib.data.blender.libraries import explain_import_error
+from neuma_lib.errors import InputError
+from neuma_lib.io.images import write_transforms
+from neuma_lib.splatting.viewpoints import Views
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """How Cycles renders.
+
+    Attributes:
+        samples: samples a pixel, denoised (the alpha channel is not: 8 are usable, 16 clean).
+        seed: of the sampler; the same seed gives the same bytes.
+        threads: CPU cores that the process may use.
+        ambient: radiance of the uniform surroundings; it colours the surface the same wherever it turns.
+        key: strength of one wide soft light from above the frontal camera, which gives the form its shade.
+    """
+
+    samples: int = 16
+    seed: int = 0
+    threads: int = 1
+    ambient: float = 0.82
+    key: float = 0.35
+
+
+@dataclass(frozen=True)
+class Surface:
+    """One mesh whose vertices move.
+
+    Attributes:
+        vertices: positions [m], shape (T, n, 3).
+        faces: vertex indices, shape (m, 3).
+        colors: sRGB vertex colours in [0, 1], shape (n, 3).
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colors: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+    @property
+    def points(self) -> np.ndarray:
+        """Everything that has to be in the frame (k, 3) [m]."""
+        return self.vertices.reshape(-1, 3)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What the Blender process reads: vertices of all frames in a row, and where each frame starts."""
+        frames, count = self.vertices.shape[:2]
+        return {
+            "vertices": self.points.astype(np.float32),
+            "vertex_start": np.arange(frames + 1) * count,
+            "faces": self.faces.astype(np.int32),
+            "face_start": np.array([0, len(self.faces)]),
+            "colors": to_linear(self.colors).astype(np.float32),
+            "radius": np.array(0.0),
+        }
+
+
+@dataclass(frozen=True)
+class Grains:
+    """Balls of one size that move.
+
+    Attributes:
+        centres: positions [m], shape (T, n, 3).
+        radius: [m].
+        colors: sRGB colours in [0, 1], shape (n, 3).
+    """
+
+    centres: np.ndarray
+    radius: float
+    colors: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.centres)
+
+    @property
+    def points(self) -> np.ndarray:
+        """Everything that has to be in the frame (k, 3) [m]; the grains' radius is left to the frame's margin."""
+        return self.centres.reshape(-1, 3)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """As of :class:`Surface`, without faces."""
+        frames, count = self.centres.shape[:2]
+        return {
+            "vertices": self.points.astype(np.float32),
+            "vertex_start": np.arange(frames + 1) * count,
+            "faces": np.zeros((0, 3), np.int32),
+            "face_start": np.array([0, 0]),
+            "colors": to_linear(self.colors).astype(np.float32),
+            "radius": np.array(float(self.radius)),
+        }
+
+
+@dataclass(frozen=True)
+class Liquid:
+    """A surface of its own for every frame: tuples of vertices (n, 3) [m], faces (m, 3), sRGB colours (n, 3)."""
+
+    surfaces: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]
+
+    def __len__(self) -> int:
+        return len(self.surfaces)
+
+    @property
+    def points(self) -> np.ndarray:
+        """Everything that has to be in the frame (k, 3) [m]."""
+        return np.concatenate([s[0] for s in self.surfaces])
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """As of :class:`Surface`, with faces and colours of every frame."""
+        return {
+            "vertices": self.points.astype(np.float32),
+            "vertex_start": np.cumsum([0, *(len(s[0]) for s in self.surfaces)]),
+            "faces": np.concatenate([s[1] for s in self.surfaces]).astype(np.int32),
+            "face_start": np.cumsum([0, *(len(s[1]) for s in self.surfaces)]),
+            "colors": to_linear(np.concatenate([s[2] for s in self.surfaces])).astype(np.float32),
+            "radius": np.array(0.0),
+        }
+
+
+def render_images(
+    geometry: Surface | Grains | Liquid,
+    views: Views,
+    shots: Sequence[tuple[int, int]],
+    out_dir: str | Path,
+    settings: RenderSettings,
+    names: Sequence[str],
+    progress: Progress | None = None,
+) -> None:
+    """Render shots to RGBA PNG files.
+
+    Args:
+        geometry: the object, frames 0 ... len - 1.
+        views: cameras.
+        shots: (frame, camera) of each image; shots of one frame should stand together.
+        out_dir: folder of the images, created; images of the same names are replaced.
+        settings: of the renderer.
+        names: file name of each shot.
+        progress: called with the number of finished images and of all.
+
+    Raises:
+        InputError: Blender cannot be imported; the message names the Debian package or pip package to install.
+        RuntimeError: Blender failed; the message ends with its last words.
+    """
+    out_dir = Path(out_dir)
+    out_dir.mkdir(parents=True, exist_ok=True)
+    for abandoned in out_dir.glob(".render-*"):  # of a process that was killed
+        shutil.rmtree(abandoned)
+    with tempfile.TemporaryDirectory(prefix=".render-", dir=out_dir) as folder:
+        job = Path(folder) / "job.npz"
+        np.savez(
+            job,
+            **geometry.arrays(),
+            c2w=views.c2w,
+            focal=views.focal,
+            size=np.array([views.width, views.height]),
+            shots=np.asarray(shots, dtype=np.int64).reshape(-1, 2),
+            settings=json.dumps(asdict(settings)),
+        )
+        _run(job, len(shots), progress)
+        for index, name in enumerate(names):
+            image = Path(folder) / f"{index:05d}.png"
+            image.write_bytes(_pixels_only(image.read_bytes()))
+            os.replace(image, out_dir / name)
+
+
+def _pixels_only(png: bytes) -> bytes:
+    """A PNG file without its texts: Cycles leaves render times there, and equal images shall be equal bytes."""
+    kept, position = [png[:8]], 8
+    while position < len(png):
+        length = int.from_bytes(png[position : position + 4], "big")
+        chunk = png[position : position + length + 12]
+        if chunk[4:8] in (b"IHDR", b"IDAT", b"IEND"):
+            kept.append(chunk)
+        position += length + 12
+    return b"".join(kept)
+
+
+def _run(job: Path, total: int, progress: Progress | None) -> None:
+    """Start Blender on a job file and follow it."""
+    root = str(Path(__file__).resolve().parents[2])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
+    log = job.with_suffix(".log")
+    with open(log, "wb") as sink:
+        process = subprocess.Popen(
+            [sys.executable, "-m", worker.__name__, str(job)],
+            stdout=subprocess.PIPE,
+            stderr=sink,
+            env=environment,
+            text=True,
+        )
+        try:
+            for line in process.stdout:
+                if progress is not None and line.strip().isdigit():
+                    progress(int(line), total)
+            process.wait()
+        except BaseException:
+            process.kill()
+            process.wait()
+            raise
+    if process.returncode:
+        words = log.read_text(errors="replace")
+        hint = explain_import_error(words)
+        if hint:
+            raise InputError(hint)
+        tail = "\n".join(words.strip().splitlines()[-12:])
+        raise RuntimeError(f"Blender ended with status {process.returncode}:\n{tail}")
+
+
+def render_static(
+    geometry: Surface | Grains | Liquid,
+    views: Views,
+    out_dir: str | Path,
+    settings: RenderSettings | None = None,
+    progress: Progress | None = None,
+) -> None:
+    """Render frame 0 from every camera, and write transforms.json: files ``s_<view>.png``."""
+    names = [f"s_{view:03d}.png" for view in range(len(views))]
+    _render_set(
+        geometry, views, [(0, v) for v in range(len(views))], names, [0], [0.0], out_dir, settings, progress
+    )
+
+
+def render_dynamic(
+    geometry: Surface | Grains | Liquid,
+    views: Views,
+    steps: Sequence[int],
+    dt: float,
+    out_dir: str | Path,
+    settings: RenderSettings | None = None,
+    progress: Progress | None = None,
+) -> None:
+    """Render every frame from every camera, and write transforms.json: files ``d_<view>_<step>.png``.
+
+    Args:
+        steps: simulation step of each frame of ``geometry``.
+        dt: time step [s].
+    """
+    if len(steps) != len(geometry):
+        raise InputError(f"steps: {len(steps)} steps are given for {len(geometry)} frames of geometry")
+    shots = [(frame, view) for frame in range(len(geometry)) for view in range(len(views))]
+    names = [f"d_{view}_{steps[frame]:04d}.png" for frame, view in shots]
+    times = [float(step) * dt for step in steps]
+    _render_set(geometry, views, shots, names, steps, times, out_dir, settings, progress)
+
+
+def _render_set(geometry, views, shots, names, steps, times, out_dir, settings, progress) -> None:
+    out_dir = Path(out_dir)
+    # A folder without transforms.json is an unfinished one.
+    (out_dir / "transforms.json").unlink(missing_ok=True)
+    render_images(geometry, views, shots, out_dir, settings or RenderSettings(), names, progress)
+    frames = [
+        {
+            "file_path": name,
+            "transform_matrix": views.c2w[view].tolist(),
+            "view": int(view),
+            "step": int(steps[frame]),
+            "time": round(times[frame], 9),
+        }
+        for name, (frame, view) in zip(names, shots, strict=True)
+    ]
+    intrinsics = {
+        "w": views.width,
+        "h": views.height,
+        "fl_x": views.focal,
+        "fl_y": views.focal,
+        "cx": views.width / 2,
+        "cy": views.height / 2,
+    }
+    write_transforms(out_dir / "transforms.json", intrinsics, frames)

@@ -1,0 +1,74 @@
+"""The Blender process: ``python -m neuma_lib.data.blender.worker job.npz`` renders a job of `scene`.
+
+Prints the number of finished images, a line each, on standard output; Blender's own chatter goes to standard error.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+
+def _quiet_stdout():
+    """A stream to the real standard output; file descriptor 1 becomes standard error, because Blender prints in C."""
+    sys.stdout.flush()
+    real = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    return real
+
+
+def _claim_cores(count: int) -> list:
+    """Pin this process to ``count`` cores that no other Blender of ours holds, as far as there are any.
+
+    Cycles' own thread limit leaves its helpers on every core. Returns open lock files: keep them while rendering.
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        return []
+    cores, locks, mine = sorted(os.sched_getaffinity(0)), [], []
+    for core in cores:
+        if len(mine) == count:
+            break
+        lock = open(Path(tempfile.gettempdir()) / f"neuma-blender-{os.getuid()}-{core}.lock", "w")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            lock.close()
+            continue
+        locks.append(lock)
+        mine.append(core)
+    os.sched_setaffinity(0, mine or cores)
+    return locks
+
+
+def main(path: str) -> None:
+    report = _quiet_stdout()
+    with np.load(path) as file:
+        job = dict(file)
+    settings = json.loads(str(job["settings"]))
+    claimed = _claim_cores(settings["threads"])
+    from neuma_lib.data.blender import cycles
+
+    folder = Path(path).parent
+    cycles.start(settings, *(int(s) for s in job["size"]))
+    body = cycles.Body(job)
+    camera = cycles.add_camera(float(job["focal"]), int(job["size"][0]))
+    shown = None
+    for index, (frame, view) in enumerate(job["shots"]):
+        if frame != shown:
+            body.show(int(frame))
+            shown = frame
+        cycles.place(camera, job["c2w"][view])
+        cycles.render(folder / f"{index:05d}.png")
+        print(index + 1, file=report, flush=True)
+    for lock in claimed:
+        lock.close()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

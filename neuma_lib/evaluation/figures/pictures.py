@@ -1,0 +1,152 @@
+"""Pictures for figures: renders at higher magnification than the training images, particles, and their crops."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from matplotlib.colors import to_rgb
+from torch import Tensor
+
+from neuma_lib.coupling.reconstruction import Reconstruction
+from neuma_lib.splatting.cameras import Cameras
+from neuma_lib.splatting.observation import Observation
+from neuma_lib.splatting.spheres import draw_spheres
+from neuma_lib.splatting.viewpoints import video_views
+
+_WHITE = 250
+"""A colour at least this light is background."""
+_BATCH = 4
+"""Frames that are rendered at a time."""
+
+
+def magnified(cameras: Cameras, factor: int) -> Cameras:
+    """The same cameras with ``factor`` times as many pixels along each axis."""
+    scale = torch.tensor([factor, factor, 1.0], dtype=cameras.Ks.dtype, device=cameras.Ks.device)
+    return Cameras(
+        cameras.viewmats, cameras.Ks * scale[:, None], cameras.width * factor, cameras.height * factor
+    )
+
+
+def frontal(points: np.ndarray, width: int, height: int) -> Cameras:
+    """A horizontal camera that sees points (..., 3) [m], as view 0 of the videos does."""
+    views = video_views(points.reshape(-1, 3), 1, width, height)
+    return Cameras(
+        torch.from_numpy(views.viewmats).float(), torch.from_numpy(views.K[None]).float(), width, height
+    )
+
+
+def as_bytes(images: Tensor | np.ndarray) -> np.ndarray:
+    """Colours in [0, 1] as uint8; bytes stay what they are."""
+    images = images.detach().cpu().numpy() if isinstance(images, Tensor) else np.asarray(images)
+    if images.dtype == np.uint8:
+        return images
+    return (255 * images.clip(0, 1)).round().astype(np.uint8)
+
+
+def renders(body: Reconstruction, cameras: Cameras, x: Tensor, F: Tensor) -> np.ndarray:
+    """Splatted Gaussians of particle states x (T, N, 3) [m], F (T, N, 3, 3) in the first view: uint8 (T, H, W, 3)."""
+    with torch.no_grad():
+        parts = [images[:, 0] for _, images in body.particle_gs(cameras[0]).batches(x, F, size=_BATCH)]
+    return as_bytes(torch.cat(parts))
+
+
+def observed(observation: Observation, index: Sequence[int], factor: int) -> np.ndarray:
+    """Frames of the video as they are, each pixel repeated: uint8 (T, H factor, W factor, 3)."""
+    images = as_bytes(observation.colours(list(index))[:, 0])
+    return images.repeat(factor, axis=1).repeat(factor, axis=2)
+
+
+def particle_pictures(
+    x: np.ndarray | Tensor, color: str | np.ndarray, radius: float, cameras: Cameras
+) -> np.ndarray:
+    """Particles x (T, N, 3) [m] as spheres in the first view: uint8 (T, H, W, 3).
+
+    Args:
+        color: one name or code of matplotlib, or colours (N, 3) in [0, 1].
+        radius: of the spheres [m].
+    """
+    colors = np.asarray(to_rgb(color) if isinstance(color, str) else color)
+    viewmat, K = cameras.viewmats[0].double().cpu().numpy(), cameras.Ks[0].double().cpu().numpy()
+    return np.stack(
+        [
+            draw_spheres(
+                np.asarray(frame, np.float64), colors, radius, viewmat, K, cameras.width, cameras.height
+            )
+            for frame in x
+        ]
+    )
+
+
+def sphere_radius(vol0: np.ndarray | Tensor) -> float:
+    """Radius [m] of spheres that fill particles of mean volume ``vol0`` (N,) [m^3] without visible gaps."""
+    return 0.62 * float(np.asarray(vol0).mean()) ** (1 / 3)
+
+
+def mean_height(x: np.ndarray | Tensor, mass: np.ndarray | Tensor) -> list[float]:
+    """Height of the centre of mass [m] at T times, of particles x (T, N, 3) [m] of masses (N,)."""
+    mass = np.asarray(mass, np.float64)
+    return (np.asarray(x, np.float64)[..., 1] @ (mass / mass.sum())).tolist()
+
+
+def monotone_frames(heights: Sequence[Sequence[float]], apart: float = 0.002) -> tuple[int, int]:
+    """In how many frames heights (W, T) [m] rise or fall with every step of the weight, and of how many.
+
+    Counted are frames whose heights are more than ``apart`` [m] from each other: before contact all are the same.
+    """
+    steps = np.diff(heights, axis=0)
+    parted = np.ptp(heights, axis=0) > apart
+    monotone = (steps >= 0).all(axis=0) | (steps <= 0).all(axis=0)
+    return int((monotone & parted).sum()), int(parted.sum())
+
+
+def evenly(count: int, total: int) -> list[int]:
+    """Indices of ``count`` frames out of ``total``, the first and the last among them."""
+    return sorted(set(np.linspace(0, total - 1, min(count, total)).round().astype(int).tolist()))
+
+
+def milliseconds(steps: Sequence[int], dt: float) -> list[str]:
+    """Titles of pictures at simulation steps of ``dt`` [s]."""
+    return [f"{1e3 * dt * step:.0f} ms" for step in steps]
+
+
+def cropped(
+    groups: Sequence[np.ndarray], margin: float = 0.03, guides: Sequence[np.ndarray] | None = None
+) -> list[np.ndarray]:
+    """Cut pictures to what is not white, each group by a box of its own, all boxes of one size.
+
+    Args:
+        groups: uint8 pictures (..., H, W, 3) of one camera each.
+        margin: of the box, relative to the longer side of a picture.
+        guides: pictures that say where the boxes lie, one array a group; the groups themselves if None.
+
+    Returns:
+        The groups, all of one height and width; white is added where a box leaves its picture.
+    """
+    boxes = []
+    for images in guides or groups:
+        flat = images.reshape(-1, *images.shape[-3:])
+        shown = (flat < _WHITE).any(axis=(0, 3))
+        if not shown.any():
+            shown[:] = True
+        rows, columns = np.flatnonzero(shown.any(1)), np.flatnonzero(shown.any(0))
+        boxes.append((rows[0], rows[-1] + 1, columns[0], columns[-1] + 1))
+    pad = round(margin * max(max(images.shape[-3:-1]) for images in groups))
+    height = max(bottom - top for top, bottom, _, _ in boxes) + 2 * pad
+    width = max(right - left for _, _, left, right in boxes) + 2 * pad
+    cut = []
+    for images, (_, bottom, left, right) in zip(groups, boxes, strict=True):
+        first_row = bottom + pad - height  # bodies stand on the lower edge
+        first_column = (left + right - width) // 2
+        border = [(0, 0)] * (images.ndim - 3) + [(height, height), (width, width), (0, 0)]
+        padded = np.pad(images, border, constant_values=255)
+        cut.append(
+            padded[
+                ...,
+                first_row + height : first_row + 2 * height,
+                first_column + width : first_column + 2 * width,
+                :,
+            ]
+        )
+    return cut

@@ -1,0 +1,145 @@
+"""The one place for the look of figures: sizes, fonts, colours of methods, and how a figure is saved.
+
+Widths are those of a two-column page; fonts are 7 points in print, never below 6. Colours are those of Okabe and Ito
+(2008), which people with any colour vision can tell apart; lines also differ in dash, points in marker, so that
+nothing is lost in black and white.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from neuma_lib.io.files import atomic
+
+COLUMN, PAGE = 3.3, 6.9
+"""Widths of a column and of a page [in]."""
+DPI = 300
+"""Resolution of the PNG files and of pictures inside PDF files."""
+
+BLACK, GREY, LIGHT = "#000000", "#7f7f7f", "#e6e6e6"
+ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILION, PURPLE = (
+    "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7",
+)  # fmt: skip
+SEQUENCE = (BLUE, ORANGE, GREEN, PURPLE, VERMILION, SKY)
+"""Colours of things that are not methods, in order."""
+RAMP = "cividis"
+"""Colour map of ordered quantities: even in lightness, and the same to colour-blind eyes."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """Colour, marker and dash of one method."""
+
+    color: str
+    marker: str = "o"
+    dash: str | tuple = "-"
+
+    @property
+    def line(self) -> dict:
+        """Keywords for `Axes.plot`."""
+        return {"color": self.color, "linestyle": self.dash}
+
+
+METHODS = {
+    "truth": Look(BLACK, "*", "-"),
+    "neuma": Look(BLUE, "o", "-"),
+    "nclaw": Look(ORANGE, "s", (0, (4, 1.5))),
+    "neuma_particle_supervision": Look(GREEN, "^", (0, (1, 1))),
+    "neuma_without_binding": Look(VERMILION, "v", (0, (5, 1, 1, 1))),
+    "neuma_without_adaptor": Look(PURPLE, "D", (0, (2, 1))),
+    "pac_nerf": Look(SKY, "P", (0, (5, 1, 1, 1, 1, 1))),
+    "spring_gaus": Look(YELLOW, "X", (0, (3, 2))),
+}
+"""One look a method, everywhere."""
+TRUE_PARTICLES = "#8c8c8c"
+"""The truth as shaded spheres, whose shading black would hide."""
+
+SETTINGS = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "mathtext.fontset": "dejavusans",
+    "font.size": 7,
+    "axes.titlesize": 7,
+    "axes.labelsize": 7,
+    "xtick.labelsize": 6.5,
+    "ytick.labelsize": 6.5,
+    "legend.fontsize": 6.5,
+    "figure.titlesize": 8,
+    "legend.frameon": False,
+    "legend.handlelength": 2.2,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlepad": 4,
+    "axes.labelpad": 2,
+    "axes.axisbelow": True,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.major.size": 2.5,
+    "ytick.major.size": 2.5,
+    "xtick.minor.size": 1.5,
+    "ytick.minor.size": 1.5,
+    "lines.linewidth": 1.1,
+    "lines.markersize": 3.5,
+    "grid.color": LIGHT,
+    "grid.linewidth": 0.5,
+    "savefig.dpi": DPI,
+    "pdf.fonttype": 42,  # text stays text
+}
+
+
+def look(method: str) -> Look:
+    """The look of a method; a variant such as ``neuma+rank=4`` has that of its base, unknown ones are grey."""
+    return METHODS.get(method.partition("+")[0], Look(GREY))
+
+
+def styled(draw: Callable[..., Figure]) -> Callable[..., Figure]:
+    """Make a drawing function draw in this style, whatever the user's own settings of matplotlib are."""
+
+    @functools.wraps(draw)
+    def inside(*args, **kwargs) -> Figure:
+        with matplotlib.rc_context():
+            matplotlib.rcdefaults()
+            matplotlib.rcParams.update(SETTINGS)
+            return draw(*args, **kwargs)
+
+    return inside
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure of a size in print [in] whose panels find their places without overlap."""
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def new_canvas(width: float, height: float) -> Figure:
+    """An empty figure of a size in print [in] whose parts are placed by hand (`figures.grid`)."""
+    return Figure(figsize=(width, height))
+
+
+def legend_above(figure: Figure, axes: Axes, columns: int, handles: Iterable | None = None) -> None:
+    """One legend for all panels, above them."""
+    found, labels = axes.get_legend_handles_labels()
+    if handles is not None:
+        found = list(handles)
+        labels = [handle.get_label() for handle in found]
+    figure.legend(found, labels, loc="outside upper center", ncols=columns)
+
+
+def save(figure: Figure, *paths: str | Path) -> None:
+    """Write a figure; the ending of each path gives the format. The same figure gives the same bytes."""
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(SETTINGS)
+        for path in paths:
+            kind = Path(path).suffix[1:]
+            # Dates and versions would make every file new.
+            nothing = {"pdf": {"CreationDate": None, "Producer": None}, "png": {"Software": None}}
+            with atomic(path) as partial:
+                figure.savefig(partial, format=kind, dpi=DPI, metadata=nothing.get(kind))

@@ -1,0 +1,84 @@
+"""State of a long computation on disk, so that a killed run goes on where it was.
+
+A checkpoint stands outside a stage's declared outputs, is stamped with a fingerprint of settings, inputs and code,
+and is removed when the stage has written its result. One that belongs to something else is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from neuma_lib.errors import InputError
+from neuma_lib.io.files import atomic
+
+
+class Checkpoint:
+    """One state on disk.
+
+    Args:
+        path: file to keep it in.
+        fingerprint: short texts or numbers that must be equal for a resumed run to mean the same thing, by name
+            (see `workflow.provenance.fingerprint`).
+    """
+
+    def __init__(self, path: str | Path, fingerprint: Mapping[str, Any]):
+        self.path = Path(path)
+        self.fingerprint = {k: str(v) for k, v in fingerprint.items()}
+
+    def save(self, state: Mapping[str, Any]) -> None:
+        """Replace the state: weights, optimiser, scheduler, iteration; the generators' states are added."""
+        content = {"fingerprint": self.fingerprint, "generators": _generator_states(), "state": dict(state)}
+        with atomic(self.path) as partial:
+            torch.save(content, partial)
+
+    def load(self) -> dict[str, Any] | None:
+        """The saved state, with the random generators put back; None where there is none.
+
+        Raises:
+            InputError: the file is damaged, or belongs to other settings, inputs or code.
+        """
+        if not self.path.exists():
+            return None
+        remedy = f"remove it to start again:  rm '{self.path}'"
+        try:
+            content = torch.load(self.path, map_location="cpu", weights_only=True)
+            found, generators, state = content["fingerprint"], content["generators"], content["state"]
+        except Exception as error:  # torch raises many kinds for a damaged file
+            raise InputError(
+                f"checkpoint {self.path} cannot be read ({type(error).__name__}); {remedy}"
+            ) from None
+        names = sorted(set(found) | set(self.fingerprint))
+        changed = [
+            f"{k} (was {found.get(k, 'absent')}, is {self.fingerprint.get(k, 'absent')})"
+            for k in names
+            if found.get(k) != self.fingerprint.get(k)
+        ]
+        if changed:
+            raise InputError(
+                f"checkpoint {self.path} belongs to another run: {', '.join(changed)} changed since; go back to the"
+                f" former settings to resume it, or {remedy}"
+            )
+        _restore_generators(generators)
+        return state
+
+    def remove(self) -> None:
+        """Forget the state: the result is written."""
+        self.path.unlink(missing_ok=True)
+
+
+def _generator_states() -> dict[str, Any]:
+    """Torch's generators; numpy's global one is not used in this library."""
+    states = {"torch": torch.get_rng_state()}
+    if torch.cuda.is_available():
+        states["cuda"] = torch.cuda.get_rng_state_all()
+    return states
+
+
+def _restore_generators(states: Mapping[str, Any]) -> None:
+    torch.set_rng_state(states["torch"])
+    if "cuda" in states and torch.cuda.is_available():
+        torch.cuda.set_rng_state_all(states["cuda"][: torch.cuda.device_count()])

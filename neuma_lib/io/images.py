@@ -1,0 +1,252 @@
+"""Calibrated images: transforms.json and the files that it lists."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuma_lib.errors import InputError
+from neuma_lib.io.files import read_json, sha256_file, write_json
+from neuma_lib.io.released import released_frames
+
+
+@dataclass(frozen=True)
+class ImageSet:
+    """Calibrated images: one entry a file, in the order of transforms.json.
+
+    Attributes:
+        images: straight-alpha RGBA, uint8, shape (K, H, W, 4).
+        viewmats: world to camera, OpenCV axes, shape (K, 4, 4).
+        Ks: intrinsics [px], pixel centres at +0.5, shape (K, 3, 3).
+        views: camera number of each image, shape (K,).
+        steps: simulation step of each image, shape (K,).
+        names: file names.
+    """
+
+    images: np.ndarray
+    viewmats: np.ndarray
+    Ks: np.ndarray
+    views: np.ndarray
+    steps: np.ndarray
+    names: tuple[str, ...]
+
+    @property
+    def width(self) -> int:
+        return self.images.shape[2]
+
+    @property
+    def height(self) -> int:
+        return self.images.shape[1]
+
+    def video(self, views: Sequence[int]) -> tuple[tuple[int, ...], np.ndarray, np.ndarray]:
+        """Frames of some views: steps, indices into the images of shape (T, V), and camera indices of shape (V,).
+
+        Raises:
+            InputError: a view is missing, or the views were not filmed at the same steps.
+        """
+        columns = []
+        for view in views:
+            chosen = np.flatnonzero(self.views == view)
+            if len(chosen) == 0:
+                raise InputError(
+                    f"view {view} is not among the filmed views {sorted(set(self.views.tolist()))}"
+                )
+            columns.append(chosen[np.argsort(self.steps[chosen], kind="stable")])
+        steps = [tuple(self.steps[c].tolist()) for c in columns]
+        if any(s != steps[0] for s in steps):
+            raise InputError(f"views {list(views)} were not filmed at the same steps")
+        index = np.stack(columns, axis=1)
+        return steps[0], index, index[0]
+
+
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def write_transforms(
+    path: str | Path, intrinsics: Mapping[str, float], frames: Sequence[Mapping[str, Any]], **extra: Any
+) -> None:
+    """Write transforms.json beside images that exist already; the sha256 of each image is added.
+
+    Args:
+        path: .../transforms.json.
+        intrinsics: fl_x, fl_y, cx, cy [px], w, h.
+        frames: dicts with ``file_path`` relative to the folder, ``transform_matrix`` (camera to world, OpenGL
+            axes, 4 x 4) and what else is known of a frame (``view``, ``step``, ``time``).
+        extra: further top-level entries.
+    """
+    folder = Path(path).parent
+    entries = [{**frame, "sha256": sha256_file(folder / frame["file_path"])} for frame in frames]
+    write_json(path, {**intrinsics, **extra, "frames": entries})
+
+
+def list_images(source: str | Path, path: str | Path) -> ImageSet:
+    """Write a transforms.json for images that stay where another list names them; returns what it lists.
+
+    Args:
+        source: a transforms.json, or a list in the layout of the authors' release.
+        path: the new transforms.json.
+
+    Raises:
+        InputError: as of `read_image_set`.
+    """
+    images = read_image_set(source)
+    data = read_transforms(source)
+    files = [_image_file(Path(source).parent, frame["file_path"], source) for frame in data["frames"]]
+    folder = Path(path).parent
+    folder.mkdir(parents=True, exist_ok=True)
+    places = [os.path.relpath(file.resolve(), folder.resolve()) for file in files]
+    frames = [{**f, "file_path": place} for f, place in zip(data.pop("frames"), places, strict=True)]
+    write_transforms(path, data, frames)
+    return images
+
+
+def read_transforms(path: str | Path) -> dict[str, Any]:
+    """Read and check transforms.json: for every frame a file, a pose, and intrinsics (its own or the file's).
+
+    A list in the layout of the authors' release is read as well (`neuma_lib.io.released`).
+
+    Raises:
+        InputError: names the file, the frame and the missing or wrong entry.
+    """
+    data = read_json(path)
+    if isinstance(data, list):
+        data = {"frames": released_frames(data, path)}
+    if not isinstance(data, dict) or not data.get("frames"):
+        raise InputError(f"{path}: the list 'frames' is missing or empty")
+    for i, frame in enumerate(data["frames"]):
+        if "file_path" not in frame:
+            raise InputError(f"{path}: frame {i} has no file_path")
+        _check_intrinsics({**data, **frame}, f"{path}: frame {i} ({frame['file_path']})")
+        matrix = np.asarray(frame.get("transform_matrix", ()), dtype=object)
+        if matrix.shape != (4, 4):
+            raise InputError(
+                f"{path}: frame {i} ({frame['file_path']}) needs a 4x4 transform_matrix (camera to world)"
+            )
+        matrix = matrix.astype(np.float64)
+        rotation = matrix[:3, :3]
+        if not np.isfinite(matrix).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
+            raise InputError(
+                f"{path}: the transform_matrix of frame {i} ({frame['file_path']}) is not a rigid motion"
+            )
+    return data
+
+
+def _check_intrinsics(values: Mapping[str, Any], where: str) -> None:
+    if "fl_x" not in values and "camera_angle_x" not in values:
+        raise InputError(
+            f"{where} has no intrinsics: give fl_x, fl_y, cx, cy in pixels, or camera_angle_x in radians"
+        )
+    for key in ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x"):
+        value = values.get(key, 1)
+        if not (isinstance(value, int | float) and math.isfinite(value) and value > 0):
+            raise InputError(f"{where}: {key} must be a positive number, not {value!r}")
+
+
+def _intrinsic_matrix(values: Mapping[str, Any], width: int, height: int) -> np.ndarray:
+    focal = values["fl_x"] if "fl_x" in values else 0.5 * width / math.tan(0.5 * values["camera_angle_x"])
+    cx, cy = values.get("cx", width / 2), values.get("cy", height / 2)
+    return np.array([[focal, 0, cx], [0, values.get("fl_y", focal), cy], [0, 0, 1]], dtype=np.float64)
+
+
+def read_image_set(path: str | Path, views: Sequence[int] | None = None) -> ImageSet:
+    """Read the images that a transforms.json lists, verifying their checksums where it holds them.
+
+    Args:
+        path: .../transforms.json.
+        views: read the images of these views only; None reads all.
+
+    Raises:
+        InputError: missing image, truncated or changed image, image of another size, no intrinsics, empty mask.
+    """
+    data = read_transforms(path)
+    folder = Path(path).parent
+    chosen = [
+        (i, frame)
+        for i, frame in enumerate(data["frames"])
+        if views is None or int(frame.get("view", i)) in views
+    ]
+    if not chosen:
+        raise InputError(f"{path}: no frame belongs to the views {list(views or ())}")
+    images = _read_all(
+        [(_image_file(folder, frame["file_path"], path), frame.get("sha256")) for _, frame in chosen]
+    )
+    height, width = images.shape[1:3]
+    merged = [{**data, **frame} for _, frame in chosen]
+    for values in merged:
+        if (int(values.get("w", width)), int(values.get("h", height))) != (width, height):
+            raise InputError(
+                f"{path}: w, h of {values['file_path']} are {values['w']}x{values['h']}, the image is {width}x{height}:"
+                " correct the intrinsics"
+            )
+    poses = np.array([frame["transform_matrix"] for _, frame in chosen], dtype=np.float64)
+    return ImageSet(
+        images=images,
+        viewmats=np.linalg.inv(poses @ OPENGL_TO_OPENCV),
+        Ks=np.stack([_intrinsic_matrix(values, width, height) for values in merged]),
+        views=np.array([int(frame.get("view", i)) for i, frame in chosen]),
+        steps=np.array([int(frame.get("step", 0)) for _, frame in chosen]),
+        names=tuple(frame["file_path"] for _, frame in chosen),
+    )
+
+
+def _image_file(folder: Path, name: str, listed_in: str | Path) -> Path:
+    for candidate in (folder / name, folder / f"{name}.png"):
+        if candidate.is_file():
+            return candidate
+    raise InputError(
+        f"{folder / name} is missing although {listed_in} lists it: remove the frame from the list, or render it again"
+        f" with `snakemake --cores 2 --forcerun render_static render_dynamic`"
+    )
+
+
+def _read_all(files: Sequence[tuple[Path, str | None]]) -> np.ndarray:
+    """Images of one size (K, H, W, 4), on all cores: decoding and checksums run outside Python's lock."""
+    first = _read_rgba(*files[0])
+    images = np.empty((len(files), *first.shape), dtype=np.uint8)
+    images[0] = first
+
+    def read(row: int) -> None:
+        image = _read_rgba(*files[row])
+        if image.shape != first.shape:
+            sizes = (f"{i.shape[1]}x{i.shape[0]}" for i in (image, first))
+            raise InputError("{} is {}, others {}".format(files[row][0], *sizes))
+        images[row] = image
+
+    with ThreadPoolExecutor() as pool:
+        for _ in pool.map(read, range(1, len(files))):
+            pass
+    return images
+
+
+def _read_rgba(path: Path, sha256: str | None) -> np.ndarray:
+    from PIL import Image
+
+    if sha256 is not None and sha256_file(path) != sha256:
+        raise InputError(
+            f"{path} is damaged or was changed: its sha256 differs from the one in transforms.json; render it again"
+        )
+    try:
+        with Image.open(path) as image:
+            image.load()
+            if image.mode in ("I;16", "I"):
+                raise InputError(f"{path} has 16 bits a channel: convert it to 8-bit RGBA")
+            has_alpha = "A" in image.mode or "transparency" in image.info
+            pixels = np.asarray(image.convert("RGBA"))
+    except (OSError, SyntaxError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path} is not a readable image, perhaps truncated ({error}): replace it") from None
+    if not has_alpha:
+        raise InputError(f"{path} has no alpha channel: the object's mask must be stored as alpha (RGBA)")
+    if not (pixels[..., 3] > 127).any():
+        raise InputError(
+            f"{path}: the mask (alpha) is empty, the object is not in the picture: remove this frame"
+        )
+    return pixels

@@ -1,0 +1,187 @@
+"""Isotropic tensor functions through singular values, and the constants of analytic laws.
+
+Every analytic law here is isotropic: with F = U diag(sigma) V^T it is known by three principal values
+y(sigma), as a stress U diag(y) U^T or as a deformation U diag(y) V^T. Their adjoints need divided differences
+of y, which are finite at equal singular values; :func:`_apart` evaluates them without a branch by keeping the
+two values at least eps^(1/3) apart (error eps^(2/3), because the quotient is an even function of the
+distance).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from neuma_lib.errors import InputError
+from neuma_lib.mechanics.singular_values import away_from_zero, rotation_and_singular_values, svd3
+
+PrincipalFunction = Callable[[Tensor], Tensor]
+"""Singular values (N, 3) -> principal values (N, 3), equivariant under permutations."""
+
+PAIRS = ((0, 1), (0, 2), (1, 2))
+
+
+def _apart(sigma: Tensor, function: PrincipalFunction) -> tuple[Tensor, Tensor]:
+    """For each pair (i, j) of :data:`PAIRS`: sigma_i, sigma_j moved apart about their mean, and y_i, y_j
+    there.
+
+    Returns:
+        two tensors (N, 3 pairs, 2).
+    """
+    least = torch.finfo(sigma.dtype).eps ** (1 / 3)
+    moved = sigma[:, None].repeat(1, 3, 1)
+    for pair, (i, j) in enumerate(PAIRS):
+        mean = 0.5 * (sigma[:, i] + sigma[:, j])
+        half = 0.5 * (sigma[:, i] - sigma[:, j]).clamp(min=least)
+        moved[:, pair, i] = mean + half
+        moved[:, pair, j] = mean - half
+    y = function(moved.reshape(-1, 3)).reshape(-1, 3, 3)
+    index = torch.tensor(PAIRS, device=sigma.device).expand(len(sigma), 3, 2)
+    return moved.gather(2, index), y.gather(2, index)
+
+
+def _symmetric(pairs: Tensor) -> Tensor:
+    """(N, 3 pairs) -> symmetric (N, 3, 3) with zero diagonal."""
+    zero = torch.zeros_like(pairs[:, 0])
+    a, b, c = pairs.unbind(1)
+    return torch.stack([zero, a, b, a, zero, c, b, c, zero], dim=1).reshape(-1, 3, 3)
+
+
+class _Stress(torch.autograd.Function):
+    """(F, y) -> U diag(y) U^T; the gradient to F is that of U at fixed y."""
+
+    @staticmethod
+    def forward(ctx, F, y, function):
+        U, sigma, Vh = svd3(F)
+        ctx.function = function
+        ctx.save_for_backward(U, sigma, Vh)
+        return (U * y[:, None]) @ U.mT
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad):
+        U, sigma, Vh = ctx.saved_tensors
+        G = U.mT @ grad @ U
+        s, y = _apart(sigma, ctx.function)
+        floor = torch.finfo(s.dtype).eps
+        quotient = (y[..., 0] - y[..., 1]) / ((s[..., 0] - s[..., 1]) * away_from_zero(s.sum(-1), floor))
+        K = _symmetric(quotient) * (G + G.mT) * sigma[:, None]
+        return U @ K @ Vh, G.diagonal(dim1=1, dim2=2), None
+
+
+class _Deformation(torch.autograd.Function):
+    """(F, y) -> U diag(y) V^T, and F itself where y equals sigma; the gradient to F is that of U, V at fixed
+    y.
+    """
+
+    @staticmethod
+    def forward(ctx, F, y, function):
+        U, sigma, Vh = svd3(F)
+        ctx.function = function
+        ctx.save_for_backward(U, sigma, Vh)
+        unchanged = (y == sigma).all(dim=1)
+        return torch.where(unchanged[:, None, None], F, (U * y[:, None]) @ Vh)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad):
+        U, sigma, Vh = ctx.saved_tensors
+        G = U.mT @ grad @ Vh.mT
+        s, y = _apart(sigma, ctx.function)
+        floor = torch.finfo(s.dtype).eps
+        stretch = _symmetric((y[..., 0] - y[..., 1]) / (s[..., 0] - s[..., 1]))
+        turn = _symmetric(y.sum(-1) / away_from_zero(s.sum(-1), floor))
+        K = 0.5 * stretch * (G + G.mT) + 0.5 * turn * (G - G.mT)
+        return U @ K @ Vh, G.diagonal(dim1=1, dim2=2), None
+
+
+def isotropic_stress(F: Tensor, function: PrincipalFunction) -> Tensor:
+    """U diag(y(sigma)) U^T, (N, 3, 3), differentiable in F and in what ``function`` closes over."""
+    _, sigma = rotation_and_singular_values(F) if F.requires_grad else (None, svd3(F)[1])
+    return _Stress.apply(F, function(sigma), function)
+
+
+def isotropic_deformation(F: Tensor, function: PrincipalFunction) -> Tensor:
+    """U diag(y(sigma)) V^T, (N, 3, 3), differentiable likewise; exactly F where y(sigma) equals sigma."""
+    _, sigma = rotation_and_singular_values(F) if F.requires_grad else (None, svd3(F)[1])
+    return _Deformation.apply(F, function(sigma), function)
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A material constant: its unit and admissible open interval (bounds included where closed is True)."""
+
+    unit: str
+    low: float
+    high: float = math.inf
+    closed: bool = False
+    default: float | None = None
+
+    def admits(self, value: float) -> bool:
+        if self.closed:
+            return self.low <= value <= self.high
+        return self.low < value < self.high
+
+
+YOUNG = Constant("Pa", 0.0)
+POISSON = Constant("1", -1.0, 0.5)
+
+
+class Constants(nn.Module):
+    """Mix-in that checks and holds a law's constants.
+
+    A constant given as a number is fixed. One given as a tensor that requires a gradient becomes one of the
+    law's ``weights()``, in the order of ``constants``: so an analytic law can be fitted like a neural one.
+    """
+
+    constants: dict[str, Constant] = {}
+
+    def __init__(self, **values: float | Tensor):
+        super().__init__()
+        unknown = sorted(set(values) - set(self.constants))
+        if unknown:
+            raise InputError(
+                f"{type(self).__name__} has no constant {', '.join(unknown)}; "
+                f"it has {', '.join(self.constants) or 'none'}"
+            )
+        self.values: dict[str, float | Tensor] = {}
+        for name, constant in self.constants.items():
+            value = values.get(name, constant.default)
+            if value is None:
+                raise InputError(f"{type(self).__name__} needs the constant {name} [{constant.unit}]")
+            if not isinstance(value, Tensor):
+                try:
+                    value = float(value)
+                except (TypeError, ValueError):
+                    raise InputError(
+                        f"{type(self).__name__}.{name} must be a number, not {value!r}"
+                    ) from None
+            number = float(value.detach()) if isinstance(value, Tensor) else value
+            if not constant.admits(number):
+                raise InputError(
+                    f"{type(self).__name__}.{name} = {number:g} must lie between {constant.low:g} and "
+                    f"{constant.high:g} {constant.unit}"
+                )
+            self.values[name] = value
+
+    def _fitted(self) -> list[str]:
+        return [n for n, v in self.values.items() if isinstance(v, Tensor) and v.requires_grad]
+
+    def weights(self) -> tuple[Tensor, ...]:
+        return tuple(self.values[name] for name in self._fitted())
+
+    def with_weights(self, weights: tuple[Tensor, ...]) -> dict[str, float | Tensor]:
+        """All constants, with the given weights in place of the fitted ones."""
+        return {**self.values, **dict(zip(self._fitted(), weights, strict=True))}
+
+    def extra_repr(self) -> str:
+        return ", ".join(f"{name}={float(value):g}" for name, value in self.values.items())
+
+
+def lame(E: float | Tensor, nu: float | Tensor) -> tuple[float | Tensor, float | Tensor]:
+    """Lamé parameters mu, lam [Pa] of Young's modulus E [Pa] and Poisson's ratio nu."""
+    return E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))

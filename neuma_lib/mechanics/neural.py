@@ -1,0 +1,355 @@
+"""Neural constitutive laws (NCLaw, Ma et al. 2023): the paper's M_0, optionally with an adaptor Delta M.
+
+One network of three layers without bias, 13 -> 64 -> 64 -> 9 with GELU between, reads the rotation-invariant
+features (sigma - 1, F^T F - I, det F - 1); its symmetrised output X gives
+
+- elasticity: P = R X, tau = P F^T;
+- plasticity: F = F_trial + 1e-3 R X.
+
+In float32 on a recent GPU the kernels of :mod:`neural_fused` do the work; what is here serves everything else, and is
+their slow twin.
+
+Without bias, zero features give zero output: any rotation is free of stress; and R makes both maps objective.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Hashable
+from dataclasses import dataclass, field
+
+import torch
+import warp as wp
+from torch import Tensor, nn
+from torch.nn.functional import gelu, pad
+
+from neuma_lib.device import warp_stream
+from neuma_lib.errors import InputError
+from neuma_lib.mechanics import neural_fused
+from neuma_lib.mechanics.adaptor import Adaptor
+from neuma_lib.mechanics.law import Constitutive, Elasticity, Law, Plasticity, Weights
+from neuma_lib.mechanics.neural_kernels import FEATURES, feature_kernel, output_kernels
+from neuma_lib.mechanics.singular_values import rotation_and_singular_values
+from neuma_lib.mechanics.singular_values_kernels import pack_count, warp_types
+
+WIDTH = 64
+SHAPES = ((WIDTH, FEATURES), (WIDTH, WIDTH), (9, WIDTH))
+PLASTIC_SCALE = 1e-3
+CPU_ROWS = 2048
+"""Rows per matrix product on the CPU: larger ones leave the cache."""
+PADDED = 16
+"""Columns of the gradient of the features: BLAS is four times faster with 16 than with 13."""
+
+aten = torch.ops.aten
+
+
+def features(F: Tensor, sigma: Tensor) -> Tensor:
+    """(N, 13) features of F (N, 3, 3) with singular values sigma (N, 3); differentiable torch."""
+    eye = torch.eye(3, dtype=F.dtype, device=F.device)
+    gram = (F.mT @ F - eye).reshape(-1, 9)
+    return torch.cat([sigma - 1, gram, torch.linalg.det(F)[:, None] - 1], dim=1)
+
+
+@dataclass
+class _Forward:
+    """Activations of up to ``rows`` matrices: what the adjoint needs of a forward pass."""
+
+    z: Tensor
+    R: Tensor
+    Vh: Tensor
+    a0: Tensor
+    h0: Tensor
+    a1: Tensor
+    h1: Tensor
+    Y: Tensor
+    views: dict[str, wp.array] = field(default_factory=dict)
+
+    @classmethod
+    def like(cls, F: Tensor) -> _Forward:
+        n = len(F)
+        state = cls(
+            F.new_empty(n, FEATURES),
+            torch.empty_like(F),
+            torch.empty_like(F),
+            *(F.new_empty(n, WIDTH) for _ in range(4)),
+            torch.empty_like(F),
+        )
+        real, _, mat33 = warp_types(F.dtype)
+        state.views = {name: wp.from_torch(getattr(state, name), dtype=mat33) for name in ("R", "Vh", "Y")}
+        state.views["z"] = wp.from_torch(state.z, dtype=real)
+        return state
+
+
+@dataclass
+class _Backward:
+    """Scratch of the adjoint of one chunk. grad_z has columns of padding."""
+
+    grad_Y: Tensor
+    grad_h: Tensor
+    grad_a: Tensor
+    grad_z: Tensor
+    views: dict[str, wp.array]
+
+    @classmethod
+    def like(cls, F: Tensor) -> _Backward:
+        n = len(F)
+        real, _, mat33 = warp_types(F.dtype)
+        grad_Y, grad_z = torch.empty_like(F), F.new_empty(n, PADDED)
+        views = {
+            "grad_Y": wp.from_torch(grad_Y, dtype=mat33),
+            "grad_z": wp.from_torch(grad_z[:, :FEATURES], dtype=real),
+        }
+        return cls(grad_Y, F.new_empty(n, WIDTH), F.new_empty(n, WIDTH), grad_z, views)
+
+
+class _Scratch(threading.local):
+    """Reused buffers by (kind, rows, dtype, device), one set a thread."""
+
+    def __init__(self):
+        self.buffers: dict[tuple, _Forward | _Backward] = {}
+
+    def get(self, kind: type, F: Tensor):
+        key = (kind, len(F), F.dtype, F.device)
+        if key not in self.buffers:
+            if len(self.buffers) > 32:  # those of a GPU stay: recorded graphs hold their addresses
+                self.buffers = {k: buffer for k, buffer in self.buffers.items() if k[-1].type != "cpu"}
+            self.buffers[key] = kind.like(F)
+        return self.buffers[key]
+
+
+_scratch = _Scratch()
+
+
+class NeuralConstitutive(Constitutive):
+    """A network with frozen base weights and, if one is attached, an adaptor."""
+
+    kind: str
+    scale: float
+    capturable = True
+    fused: bool | None = None
+    """Whether evaluate and vjp use :mod:`neural_fused`: None where it runs, False never, True always."""
+
+    def graph_key(self) -> Hashable:
+        return type(self), self.fused
+
+    def __init__(self, weights: Weights | None = None, seed: int = 0):
+        """Args: weights: three matrices of :data:`SHAPES`; Xavier-uniform from ``seed`` if not given."""
+        super().__init__()
+        if weights is None:
+            generator = torch.Generator().manual_seed(seed)
+            bounds = [(6 / sum(shape)) ** 0.5 for shape in SHAPES]
+            weights = tuple(
+                (2 * torch.rand(s, generator=generator) - 1) * b for s, b in zip(SHAPES, bounds, strict=True)
+            )
+        shapes = tuple(tuple(w.shape) for w in weights)
+        if shapes != SHAPES:
+            raise InputError(f"a neural law has weights of shapes {SHAPES}, not {shapes}")
+        self.base = nn.ParameterList(nn.Parameter(w.detach().clone(), requires_grad=False) for w in weights)
+        self.adaptor: Adaptor | None = None
+
+    def weights(self) -> Weights:
+        return tuple(self.base) if self.adaptor is None else self.adaptor(tuple(self.base))
+
+    def response(self, F: Tensor, weights: Weights) -> Tensor:
+        R, sigma = rotation_and_singular_values(F)
+        W0, W1, W2 = weights
+        Y = (gelu(gelu(features(F, sigma) @ W0.mT) @ W1.mT) @ W2.mT).reshape(-1, 3, 3)
+        X = 0.5 * (Y + Y.mT)
+        return R @ X @ F.mT if self.kind == "elasticity" else F + self.scale * (R @ X)
+
+    def uses_fused(self, F: Tensor) -> bool:
+        """Whether F, by its device and dtype and by :attr:`fused`, goes to the fused kernels."""
+        return neural_fused.supported(F.device, F.dtype) if self.fused is None else self.fused
+
+    def evaluate(self, F: Tensor, weights: Weights, out: Tensor | None = None) -> Tensor:
+        if not self.uses_fused(F):
+            return self._evaluate(F, weights, out)
+        return neural_fused.evaluate(F, weights, self.kind, self.scale, out)
+
+    def evaluate_with_cache(self, F, weights, out=None, cache=None):
+        if self.uses_fused(F):
+            return self.evaluate(F, weights, out), None
+        cache = cache or [_Forward.like(F[rows]) for rows in _chunks(F)]
+        return self._evaluate(F, weights, out, cache), cache
+
+    @torch.no_grad()
+    def _evaluate(self, F, weights, out, states=None):
+        F = F.detach().contiguous()
+        out = torch.empty_like(F) if out is None else out
+        result, _, _ = output_kernels(F.dtype, self.kind)
+        for index, rows in enumerate(_chunks(F)):
+            state = states[index] if states else _scratch.get(_Forward, F[rows])
+            F_view = self._network(F[rows], weights, state)
+            _launch(
+                result, F[rows], F_view, state.views["R"], state.views["Y"], self.scale, _matrices(out[rows])
+            )
+        return out
+
+    def _network(self, F: Tensor, weights: Weights, state: _Forward) -> wp.array:
+        """Fill ``state`` from the rows F; returns Warp's view of F."""
+        F_view, views = _matrices(F), state.views
+        wp.launch(
+            feature_kernel(F.dtype),
+            dim=pack_count(len(F), F.device),
+            inputs=[F_view, views["z"], views["R"], views["Vh"], len(F)],
+            device=F_view.device,
+            stream=warp_stream(F.device),
+        )
+        W0, W1, W2 = weights
+        torch.mm(state.z, W0.mT, out=state.a0)
+        aten.gelu.out(state.a0, out=state.h0)
+        torch.mm(state.h0, W1.mT, out=state.a1)
+        aten.gelu.out(state.a1, out=state.h1)
+        torch.mm(state.h1, W2.mT, out=state.Y.view(-1, 9))
+        return F_view
+
+    @torch.no_grad()
+    def vjp(self, F, weights, grad_out, cache=None, grad_F=None, grad_weights=None):
+        if cache is None and self.uses_fused(F):
+            return neural_fused.vjp(F, weights, grad_out, self.kind, self.scale, grad_F, grad_weights)
+        F, grad_out = F.detach().contiguous(), grad_out.contiguous()
+        weights = tuple(w.detach() for w in weights)
+        grad_F = torch.empty_like(F) if grad_F is None else grad_F
+        if grad_weights is None:
+            grad_weights = tuple(torch.zeros_like(w) for w in weights)
+        _, output_adjoint, input_adjoint = output_kernels(F.dtype, self.kind)
+        W0, W1, W2 = weights
+        padded_W0 = pad(W0, (0, PADDED - FEATURES))
+        for index, rows in enumerate(_chunks(F)):
+            if cache is None:
+                state = _scratch.get(_Forward, F[rows])
+                F_view = self._network(F[rows], weights, state)
+            else:
+                state = cache[index]
+                F_view = _matrices(F[rows])
+            back = _scratch.get(_Backward, F[rows])
+            g = _matrices(grad_out[rows])
+            views = state.views
+            _launch(output_adjoint, F[rows], F_view, views["R"], g, self.scale, back.views["grad_Y"])
+            grad_Y = back.grad_Y.view(-1, 9)
+            grad_weights[2].addmm_(grad_Y.mT, state.h1)
+            torch.mm(grad_Y, W2, out=back.grad_h)
+            aten.gelu_backward.grad_input(back.grad_h, state.a1, grad_input=back.grad_a)
+            grad_weights[1].addmm_(back.grad_a.mT, state.h0)
+            torch.mm(back.grad_a, W1, out=back.grad_h)
+            aten.gelu_backward.grad_input(back.grad_h, state.a0, grad_input=back.grad_a)
+            grad_weights[0].add_((state.z.mT @ back.grad_a).mT)  # this order of the product is the fast one
+            torch.mm(back.grad_a, padded_W0, out=back.grad_z)
+            _launch(
+                input_adjoint, F[rows], F_view, views["R"], views["Vh"], views["z"], views["Y"], g,
+                back.views["grad_z"], self.scale, _matrices(grad_F[rows]),
+            )  # fmt: skip
+        return grad_F, grad_weights
+
+
+def _chunks(F: Tensor) -> list[slice]:
+    size = CPU_ROWS if F.device.type == "cpu" else max(len(F), 1)
+    return [slice(i, min(i + size, len(F))) for i in range(0, len(F), size)]
+
+
+def _matrices(x: Tensor) -> wp.array:
+    return wp.from_torch(x, dtype=warp_types(x.dtype)[2], requires_grad=False)
+
+
+def _launch(kernel, F: Tensor, *inputs) -> None:
+    wp.launch(kernel, dim=len(F), inputs=inputs, device=inputs[0].device, stream=warp_stream(F.device))
+
+
+class NeuralElasticity(NeuralConstitutive, Elasticity):
+    """P = R X, tau = P F^T [Pa]."""
+
+    kind = "elasticity"
+    scale = 1.0
+
+
+class NeuralPlasticity(NeuralConstitutive, Plasticity):
+    """F = F_trial + 1e-3 R X."""
+
+    kind = "plasticity"
+    scale = PLASTIC_SCALE
+
+
+class NeuralLaw(Law):
+    """A pair of networks; the adaptor, once attached, holds the only trainable parameters."""
+
+    elasticity: NeuralElasticity
+    plasticity: NeuralPlasticity
+
+    @property
+    def parts(self) -> dict[str, NeuralConstitutive]:
+        return {"elasticity": self.elasticity, "plasticity": self.plasticity}
+
+    def attach_adaptor(self, rank: int | None = 16, alpha: float = 16.0, seed: int = 0) -> None:
+        """Give both networks a fresh adaptor, zero at the start."""
+        for offset, part in enumerate(self.parts.values()):
+            part.adaptor = Adaptor(tuple(part.base), rank, alpha, seed=2 * seed + offset)
+
+    def set_adaptor_weight(self, weight: float) -> None:
+        """Interpolate between the prior (0) and the adapted law (1); also beyond."""
+        for part in self.parts.values():
+            if part.adaptor is None:
+                raise InputError("the law has no adaptor whose weight could be set")
+            part.adaptor.weight = float(weight)
+
+    def adaptor_parameters(self, part: str) -> list[nn.Parameter]:
+        """Trainable tensors of the adaptor of ``part`` ("elasticity" or "plasticity")."""
+        adaptor = self.parts[part].adaptor
+        return [] if adaptor is None else list(adaptor.parameters())
+
+    def adaptor_state(self) -> dict[str, Tensor]:
+        """The adaptor's tensors by name ("elasticity.A.0", ...), detached; the inverse of
+        :meth:`load_adaptor_state`.
+        """
+        return {
+            f"{name}.{key}": value.detach().clone()
+            for name, part in self.parts.items()
+            if part.adaptor is not None
+            for key, value in part.adaptor.state_dict().items()
+        }
+
+    def load_adaptor_state(
+        self, state: dict[str, Tensor], rank: int | None = 16, alpha: float = 16.0
+    ) -> None:
+        """Attach an adaptor with the given tensors.
+
+        Raises:
+            InputError: the tensors do not fit an adaptor of this rank.
+        """
+        self.attach_adaptor(rank, alpha)
+        for name, part in self.parts.items():
+            own = {key[len(name) + 1 :]: value for key, value in state.items() if key.startswith(name + ".")}
+            try:
+                part.adaptor.load_state_dict(own)
+            except RuntimeError as error:
+                raise InputError(f"adaptor of the {name} does not fit rank {rank}: {error}") from None
+
+    def prior_state(self) -> dict[str, Tensor]:
+        """Merged weights under the names of NCLaw's checkpoints, prefixed by the part."""
+        return {
+            f"{name}.{key}": weight.detach().clone().contiguous()
+            for name, part in self.parts.items()
+            for key, weight in zip(LAYER_KEYS, part.weights(), strict=True)
+        }
+
+
+LAYER_KEYS = ("layers.0.fc.weight", "layers.1.fc.weight", "final_layer.fc.weight")
+
+
+def neural_law(state: dict[str, Tensor] | None = None, name: str = "neural", seed: int = 0) -> NeuralLaw:
+    """Neural law from the tensors of :meth:`NeuralLaw.prior_state`, or random (Xavier-uniform) from ``seed``.
+
+    Raises:
+        InputError: a tensor is missing or has another shape.
+    """
+    if state is None:
+        return NeuralLaw(NeuralElasticity(seed=2 * seed), NeuralPlasticity(seed=2 * seed + 1), name)
+    parts = []
+    for kind in (NeuralElasticity, NeuralPlasticity):
+        keys = [f"{kind.kind}.{key}" for key in LAYER_KEYS]
+        missing = [key for key in keys if key not in state]
+        if missing:
+            raise InputError(
+                f"prior {name}: weights {', '.join(missing)} are missing; an NCLaw checkpoint has them"
+            )
+        parts.append(kind(tuple(state[key].float() for key in keys)))
+    return NeuralLaw(*parts, name)

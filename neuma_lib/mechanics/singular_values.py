@@ -1,0 +1,90 @@
+"""Batched singular value decomposition and rotation of 3x3 matrices, with an adjoint that is safe at F = I.
+
+F = U diag(sigma) Vh with det U = det V = +1, |sigma| descending, and the sign of det F in the last singular
+value. The rotation R = U Vh and symmetric functions of sigma are smooth where U and V themselves are not
+(equal singular values, as in every undeformed body), so gradients are only ever taken through R and sigma.
+"""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from neuma_lib.device import warp_stream
+from neuma_lib.mechanics.singular_values_kernels import pack_count, svd_kernel, warp_types
+
+
+def svd3(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Singular value decomposition, to round-off in float32 and float64; no gradient.
+
+    Args:
+        F: (N, 3, 3).
+
+    Returns:
+        U (N, 3, 3), sigma (N, 3), Vh (N, 3, 3), in the convention of this module.
+    """
+    F = F.detach().contiguous()
+    U, sigma, Vh = torch.empty_like(F), F.new_empty(F.shape[:-1]), torch.empty_like(F)
+    _, vec3, mat33 = warp_types(F.dtype)
+    arrays = [wp.from_torch(x, dtype=t) for x, t in ((F, mat33), (U, mat33), (sigma, vec3), (Vh, mat33))]
+    if len(F):
+        wp.launch(
+            svd_kernel(F.dtype),
+            dim=pack_count(len(F), F.device),
+            inputs=[*arrays, len(F)],
+            device=arrays[0].device,
+            stream=warp_stream(F.device),
+        )
+    return U, sigma, Vh
+
+
+def away_from_zero(x: Tensor, floor: Tensor | float) -> Tensor:
+    """x with its magnitude raised to at least ``floor`` (zero counts as positive)."""
+    return torch.where(x < 0, x.clamp(max=-floor), x.clamp(min=floor))
+
+
+def rotation_singular_values_vjp(
+    U: Tensor, sigma: Tensor, Vh: Tensor, grad_R: Tensor, grad_sigma: Tensor
+) -> Tensor:
+    """Adjoint of F -> (R, sigma).
+
+    With dF' = U^T dF V the singular values move by diag dF' and R by U K' Vh, where K'_ij = (dF'_ij - dF'_ji)
+    / (sigma_i + sigma_j); no difference of singular values occurs. R itself is singular where sigma_i +
+    sigma_j = 0 (an element turned inside out along two axes): there the quotient is bounded instead of
+    infinite.
+
+    Args:
+        U, sigma, Vh: (N, 3, 3), (N, 3), (N, 3, 3) from :func:`svd3`.
+        grad_R: (N, 3, 3); grad_sigma: (N, 3).
+
+    Returns:
+        gradient with respect to F, (N, 3, 3).
+    """
+    M = U.mT @ grad_R @ Vh.mT
+    floor = torch.finfo(sigma.dtype).eps ** 0.5
+    total = away_from_zero(sigma[:, :, None] + sigma[:, None, :], floor)
+    K = (M - M.mT) / total + torch.diag_embed(grad_sigma)
+    return U @ K @ Vh
+
+
+class _RotationAndSingularValues(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, F):
+        U, sigma, Vh = svd3(F)
+        ctx.save_for_backward(U, sigma, Vh)
+        return U @ Vh, sigma
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad_R, grad_sigma):
+        return rotation_singular_values_vjp(*ctx.saved_tensors, grad_R, grad_sigma)
+
+
+def rotation_and_singular_values(F: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotation R (N, 3, 3) and singular values (N, 3) of F (N, 3, 3), differentiable once.
+
+    The gradient of symmetric functions of sigma is exact everywhere, that of a single sigma where it is
+    distinct.
+    """
+    return _RotationAndSingularValues.apply(F)

@@ -1,0 +1,7 @@
+"""Gaussian splatting: cameras, Gaussians, and a differentiable rasterizer for batches of frames."""
+
+from neuma_lib.splatting.cameras import Cameras
+from neuma_lib.splatting.gaussians import Gaussians
+from neuma_lib.splatting.rasterizer import Statistics, Workspace, rasterize
+
+__all__ = ["Cameras", "Gaussians", "Statistics", "Workspace", "rasterize"]

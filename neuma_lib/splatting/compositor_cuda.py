@@ -1,0 +1,579 @@
+"""Compositing for CUDA in float32: every image in tiles, every tile with the list of its splats in depth order.
+
+Lists. A splat enters a tile where the ellipse with alpha >= alpha_min comes nearer than a hair to one of the tile's
+pixel centres: in every row of tiles an ellipse covers one interval of columns, which has a closed form, so the lists
+hold no tiles that only a bounding box would touch. All splats of all images are sorted by depth once, written to
+the lists in that order, and sorted stably by tile. The number of entries is read by the host, once a call.
+
+Compositing. A warp owns a patch of 8 x (4 LANE_PIXELS) pixels, ``LANE_PIXELS`` a lane, and walks the list of its tile
+without waiting for other warps: 32 entries at a time, each lane fetches one splat and tests it against the patch
+exactly (the quadratic form's minimum over the rectangle of pixel centres); the warp then composites the entries that
+passed. So lists stay short, as for large tiles, and pixels see few splats in vain, as for small ones. A warp ends when
+its pixels are opaque.
+
+Adjoint. The same walk backwards. A splat's nine sums over a patch are first taken over the pixels of a lane and then
+over lanes by halving: at each of five exchanges between lanes both sides keep the half of the sums that is theirs, so
+that nine sums take 12 exchanges instead of 45, and end in nine lanes that add them to memory by one instruction. (The
+other good order, a lane a splat and pixels passed from lane to lane, needs the state of the pixels stored for every
+32 splats and does as much arithmetic at this patch size.) Sums end in memory in any order: last bits vary between runs.
+
+Memory at the peak of a call, bytes: 24 a pixel (images, alphas, what the adjoint needs), 16 a pixel more for the
+gradients that come in, 130 a splat (of every image), 52 an entry of the lists, of which 4 stay for the adjoint. A
+splat of 3 px deviation has 4 to 5 entries: 40 images of 800 x 800 with 20,000 splats each take 1.3 GB.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+
+import torch
+import warp as wp
+
+from neuma_lib.device import start_warp
+from neuma_lib.errors import InputError
+from neuma_lib.splatting.arrays import plain, target
+from neuma_lib.splatting.compositing import Settings
+from neuma_lib.splatting.projection import CULLED, SPLAT_SIZE
+
+start_warp()
+
+TILE = 16  # pixels a side of a tile; a multiple of the patch's sides
+LANE_PIXELS = 2  # pixels of a lane, below one another: a patch has 8 columns and 4 rows a pixel
+PATCH_WIDTH = 8
+SLACK = 0.01  # [px] added to intervals of pixels, for rounding
+
+
+def composite(splats, depths, background, settings: Settings, empty):
+    """See ``compositing``."""
+    shape = (*depths.shape[:1], settings.height, settings.width)
+    pictures, alphas = empty("pictures", (*shape, 3), splats), empty("alphas", shape, splats)
+    ids, starts = lists(splats, depths, settings.width, settings.height, TILE)
+    kept = (ids, starts, empty("transmittances", shape, splats), empty("stops", shape, splats, torch.int32))
+    kernel, _, threads = kernels(TILE, LANE_PIXELS)
+    wp.launch(
+        kernel,
+        dim=(len(starts) - 1) * threads,
+        block_dim=threads,
+        inputs=[
+            plain(splats), plain(ids), plain(starts), settings.alpha_min, settings.alpha_max,
+            settings.transmittance_min, plain(background),
+        ],
+        outputs=[plain(pictures), plain(alphas), *map(plain, kept[2:])],
+        **target(splats),
+    )  # fmt: skip
+    return pictures, alphas, kept
+
+
+def composite_adjoint(
+    splats, kept, background, settings: Settings, grad_pictures, grad_alphas, grad_splats, empty
+):
+    """See ``compositing``."""
+    ids, starts, *_ = kept
+    grad_splats.zero_()
+    _, kernel, threads = kernels(TILE, LANE_PIXELS)
+    wp.launch(
+        kernel,
+        dim=(len(starts) - 1) * threads,
+        block_dim=threads,
+        inputs=[
+            plain(splats), *map(plain, kept), settings.alpha_min, settings.alpha_max, plain(background),
+            plain(grad_pictures), plain(grad_alphas),
+        ],
+        outputs=[plain(grad_splats)],
+        **target(splats),
+    )  # fmt: skip
+    _, _, finish = list_kernels()
+    wp.launch(
+        finish,
+        dim=splats.shape[:2],
+        inputs=[plain(splats)],
+        outputs=[plain(grad_splats)],
+        **target(splats),
+    )
+
+
+def lists(
+    splats: torch.Tensor, depths: torch.Tensor, width: int, height: int, tile: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Splats of every tile from near to far. Works on CPU and CUDA; reads one number from the GPU.
+
+    Args:
+        splats: (I, G, SPLAT_SIZE) and depths (I, G) of ``projection``, float32.
+        width, height: of the images [px].
+        tile: side of a tile [px].
+
+    Returns:
+        ids (N,) int32: splat g of image i is i G + g; starts (tiles + 1,) int32: entries ``starts[t]`` to
+        ``starts[t + 1]`` belong to tile t, tiles counted along rows, then images.
+
+    Raises:
+        InputError: more pixels, splats or entries than int32 counts.
+    """
+    images, count = depths.shape
+    tiles = images * -(-width // tile) * -(-height // tile)
+    count_tiles, list_tiles, _ = list_kernels()
+    order = torch.argsort(depths.view(-1), stable=True)
+    sizes = depths.new_empty(len(order), dtype=torch.int32)
+    geometry = [plain(order), plain(splats), plain(depths), width, height, tile]
+    wp.launch(count_tiles, dim=len(order), inputs=geometry, outputs=[plain(sizes)], **target(splats))
+    ends = torch.cumsum(sizes, dim=0, dtype=torch.int64)
+    total = int(ends[-1]) if len(ends) else 0
+    if max(total, len(order), tiles * tile**2) >= 2**31:
+        raise InputError(
+            f"rasterize: {images} images of {width} x {height} px and {count} Gaussians, {total} entries in tiles, "
+            "are more than 2^31; render fewer frames a call"
+        )
+    if total == 0:
+        return sizes.new_empty(0), sizes.new_zeros(tiles + 1)
+    keys, ids = sizes.new_empty(total), sizes.new_empty(total)
+    wp.launch(
+        list_tiles,
+        dim=len(order),
+        inputs=[*geometry, plain(sizes), plain(ends)],
+        outputs=[plain(keys), plain(ids)],
+        **target(splats),
+    )
+    keys, permutation = torch.sort(keys, stable=True)
+    limits = torch.arange(tiles + 1, dtype=torch.int32, device=keys.device)
+    return ids[permutation], torch.searchsorted(keys, limits, out_int32=True)
+
+
+@functools.cache
+def list_kernels():
+    """``(count_tiles, list_tiles, finish)`` Warp kernels; ``finish`` turns sums into gradients."""
+    module = wp.get_module(f"{__name__}.lists")
+    # Counting and listing must agree to the last bit: no contraction, which may differ between two kernels.
+    wp.set_module_options({"fuse_fp": False}, module)
+    culled = wp.float32(CULLED)
+    slack = wp.float32(SLACK)
+
+    @wp.func(module=module)
+    def pixels(low: float, high: float, extent: int):
+        # first and last pixel whose centre is between low and high; none: first > last
+        last = float(extent)
+        first_pixel = int(wp.ceil(wp.clamp(low - 0.5 - slack, -1.0, last)))
+        last_pixel = int(wp.floor(wp.clamp(high - 0.5 + slack, -1.0, last)))
+        # the integers are limited once more in case low or high is not a number
+        return wp.clamp(first_pixel, 0, extent), wp.clamp(last_pixel, -1, extent - 1)
+
+    @wp.func(module=module)
+    def half_width(dy: float, reach: float, A: float, half_height: float):
+        part = dy / half_height
+        return wp.sqrt(reach / A) * wp.sqrt(wp.max(1.0 - part * part, 0.0))
+
+    @wp.func(module=module)
+    def columns(splats: wp.array3d(dtype=float), image: int, g: int, low: float, high: float, width: int):
+        # first and last pixel column of the ellipse between the heights low and high above its centre
+        mean = splats[image, g, 0]
+        A, B, C = splats[image, g, 2], splats[image, g, 3], splats[image, g, 4]
+        reach, half_height = splats[image, g, 9], splats[image, g, 11]
+        bottom = wp.clamp(low, -half_height, half_height)
+        top = wp.clamp(high, -half_height, half_height)
+        tilt = B / C * splats[image, g, 10]  # height of the leftmost point, and minus that of the rightmost
+        left = wp.clamp(tilt, bottom, top)
+        right = wp.clamp(-tilt, bottom, top)
+        slope = -B / A
+        first, last = pixels(
+            mean + slope * left - half_width(left, reach, A, half_height),
+            mean + slope * right + half_width(right, reach, A, half_height),
+            width,
+        )
+        return first, last
+
+    @wp.kernel(module=module, enable_backward=False)
+    def count_tiles(
+        order: wp.array(dtype=wp.int64),  # (I G,) by depth
+        splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
+        depths: wp.array2d(dtype=float),  # (I, G)
+        width: int,
+        height: int,
+        tile: int,
+        sizes: wp.array(dtype=int),  # (I G,) number of tiles, out
+    ):
+        rank = wp.tid()
+        splat = int(order[rank])
+        image = splat // splats.shape[1]
+        g = splat - image * splats.shape[1]
+        size = int(0)  # noqa: UP018, a constant would not be counted up in a loop by Warp
+        if depths[image, g] < culled:
+            centre, half_height = splats[image, g, 1], splats[image, g, 11]
+            top, bottom = pixels(centre - half_height, centre + half_height, height)
+            if top <= bottom:
+                for row in range(top // tile, bottom // tile + 1):
+                    low = float(wp.max(row * tile, top)) + 0.5 - centre
+                    high = float(wp.min(row * tile + tile - 1, bottom)) + 0.5 - centre
+                    first, last = columns(splats, image, g, low, high, width)
+                    if first <= last:
+                        size += last // tile - first // tile + 1
+        sizes[rank] = size
+
+    @wp.kernel(module=module, enable_backward=False)
+    def list_tiles(
+        order: wp.array(dtype=wp.int64),  # (I G,)
+        splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
+        depths: wp.array2d(dtype=float),  # (I, G)
+        width: int,
+        height: int,
+        tile: int,
+        sizes: wp.array(dtype=int),  # (I G,)
+        ends: wp.array(dtype=wp.int64),  # (I G,) sums of sizes
+        keys: wp.array(dtype=int),  # (N,) tile of every entry, out
+        ids: wp.array(dtype=int),  # (N,) splat of every entry, out
+    ):
+        rank = wp.tid()
+        if sizes[rank] == 0:
+            return
+        splat = int(order[rank])
+        image = splat // splats.shape[1]
+        g = splat - image * splats.shape[1]
+        tiles_x = (width + tile - 1) // tile
+        tiles_y = (height + tile - 1) // tile
+        position = int(ends[rank]) - sizes[rank]
+        centre, half_height = splats[image, g, 1], splats[image, g, 11]
+        top, bottom = pixels(centre - half_height, centre + half_height, height)
+        for row in range(top // tile, bottom // tile + 1):
+            low = float(wp.max(row * tile, top)) + 0.5 - centre
+            high = float(wp.min(row * tile + tile - 1, bottom)) + 0.5 - centre
+            first, last = columns(splats, image, g, low, high, width)
+            if first <= last:
+                for column in range(first // tile, last // tile + 1):
+                    keys[position] = (image * tiles_y + row) * tiles_x + column
+                    ids[position] = splat
+                    position += 1
+
+    @wp.kernel(module=module, enable_backward=False)
+    def finish(
+        splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
+        grad_splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE), sums of the adjoint in, gradients out
+    ):
+        image, g = wp.tid()
+        # one assignment a line: Warp copies the value then, while a tuple would refer to the array
+        s = grad_splats[image, g, 0]
+        s_x = grad_splats[image, g, 1]
+        s_y = grad_splats[image, g, 2]
+        s_xx = grad_splats[image, g, 3]
+        s_xy = grad_splats[image, g, 4]
+        s_yy = grad_splats[image, g, 5]
+        A, B, C = splats[image, g, 2], splats[image, g, 3], splats[image, g, 4]
+        grad_splats[image, g, 0] = A * s_x + B * s_y
+        grad_splats[image, g, 1] = B * s_x + C * s_y
+        grad_splats[image, g, 2] = -0.5 * s_xx
+        grad_splats[image, g, 3] = -s_xy
+        grad_splats[image, g, 4] = -0.5 * s_yy
+        grad_splats[image, g, 5] = s / splats[image, g, 5]
+
+    return count_tiles, list_tiles, finish
+
+
+# Code shared by both passes. A thread knows its tile, its patch and its pixels: column x, rows y + 4 p. `fetch` puts
+# the splat of an entry on the warp's board, for powers of two: weights of dx^2, dx dy, dy^2 and log2 of the opacity.
+_COMMON = """
+    constexpr unsigned ALL = 0xffffffffu;
+    const float LOG2_E = 1.44269504f;
+    __shared__ float4 places[WARPS][32];  // mean, weights of dx^2 and dx dy
+    __shared__ float4 shades[WARPS][32];  // weight of dy^2, log2(opacity), red, green
+    __shared__ float2 others[WARPS][32];  // blue, splat
+    const int warp = thread / 32, lane = thread % 32;
+    const int tiles_x = (width + TILE - 1) / TILE, tiles_y = (height + TILE - 1) / TILE;
+    const int image = tile / (tiles_x * tiles_y);
+    const int tile_row = tile / tiles_x - image * tiles_y, tile_column = tile % tiles_x;
+    const int patch_x = tile_column * TILE + warp % (TILE / PATCH_WIDTH) * PATCH_WIDTH;
+    const int patch_y = tile_row * TILE + warp / (TILE / PATCH_WIDTH) * PATCH_HEIGHT;
+    const int x = patch_x + lane % PATCH_WIDTH, y = patch_y + lane / PATCH_WIDTH;
+    const int begin = starts.data[tile], end = starts.data[tile + 1];
+    const float4* records = (const float4*)splats.data;
+
+    auto exp2_fast = [](float v) {
+#if defined(__CUDA_ARCH__)
+        float e;
+        asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(e) : "f"(v));
+        return e;
+#else
+        return exp2f(v);
+#endif
+    };
+    // does the ellipse come near one of the patch's pixel centres? The minimum of the quadratic form over their
+    // rectangle lies on one of the two sides that face the mean, or is the mean.
+    auto touches = [&](float mx, float my, float A, float B, float C, float reach) {
+        const float x0 = patch_x + 0.5f - mx, x1 = x0 + (PATCH_WIDTH - 1);
+        const float y0 = patch_y + 0.5f - my, y1 = y0 + (PATCH_HEIGHT - 1);
+        const float side_x = fminf(fmaxf(x0, 0.0f), x1), side_y = fminf(fmaxf(y0, 0.0f), y1);
+        const float along_y = fminf(fmaxf(__fdividef(-B * side_x, C), y0), y1);
+        const float along_x = fminf(fmaxf(__fdividef(-B * side_y, A), x0), x1);
+        const float q_x = A * side_x * side_x + 2.0f * B * side_x * along_y + C * along_y * along_y;
+        const float q_y = A * along_x * along_x + 2.0f * B * along_x * side_y + C * side_y * side_y;
+        return fminf(q_x, q_y) <= reach;
+    };
+    auto fetch = [&](int entry) {
+        const int splat = ids.data[entry];
+        const float4* record = records + 3LL * splat;
+        const float4 p = record[0], q = record[1], r = record[2];
+        if (!touches(p.x, p.y, p.z, p.w, q.x, r.y)) return false;
+        places[warp][lane] = make_float4(p.x, p.y, -0.5f * LOG2_E * p.z, -LOG2_E * p.w);
+        shades[warp][lane] = make_float4(-0.5f * LOG2_E * q.x, log2f(q.y), q.z, q.w);
+        others[warp][lane] = make_float2(r.x, __int_as_float(splat));
+        return true;
+    };
+"""
+_FORWARD = (
+    _COMMON
+    + """
+    const long long corner = ((long long)image * height + y) * width + x;  // the lane's first pixel
+    if (begin == end) {
+        // no splats: the warp writes its rows of the tile one after another, so that stores are contiguous
+        const int left = tile_column * TILE, columns = min(TILE, width - left);
+        for (int row = tile_row * TILE + warp; row < min(height, (tile_row + 1) * TILE); row += WARPS) {
+            const long long at = ((long long)image * height + row) * width + left;
+            for (int k = lane; k < 3 * columns; k += 32) pictures.data[3 * at + k] = background.data[k % 3];
+            for (int k = lane; k < columns; k += 32) alphas.data[at + k] = 0.0f;
+        }
+        return;
+    }
+    float T[LANE_PIXELS], red[LANE_PIXELS], green[LANE_PIXELS], blue[LANE_PIXELS];
+    int stop[LANE_PIXELS];  // list position after the last splat that was drawn
+    bool open[LANE_PIXELS];
+#pragma unroll
+    for (int p = 0; p < LANE_PIXELS; ++p) {
+        T[p] = 1.0f;
+        red[p] = green[p] = blue[p] = 0.0f;
+        stop[p] = 0;
+        open[p] = x < width && y + 4 * p < height;
+    }
+    for (int base = begin; base < end; base += 32) {
+        bool any_open = false;
+#pragma unroll
+        for (int p = 0; p < LANE_PIXELS; ++p) any_open |= open[p];
+        if (!__any_sync(ALL, any_open)) break;
+        __syncwarp();  // the board of the round before has been read
+        const bool hit = base + lane < end && fetch(base + lane);
+        unsigned todo = __ballot_sync(ALL, hit);
+        __syncwarp();
+        while (todo) {
+            const int k = __ffs(todo) - 1;
+            todo &= todo - 1;
+            const float4 place = places[warp][k], shade = shades[warp][k];
+            const float splat_blue = others[warp][k].x;
+            const float dx = x + 0.5f - place.x, dy0 = y + 0.5f - place.y;
+            const float constant = place.z * dx * dx, linear = place.w * dx;
+#pragma unroll
+            for (int p = 0; p < LANE_PIXELS; ++p) {
+                const float dy = dy0 + 4 * p;
+                const float power = fmaf(dy, fmaf(shade.x, dy, linear), constant);
+                const float alpha = fminf(exp2_fast(power + shade.y), alpha_max);
+                if (open[p] && power <= 0.0f && alpha >= alpha_min) {
+                    const float after = T[p] * (1.0f - alpha);
+                    if (after < transmittance_min) {
+                        open[p] = false;
+                    } else {
+                        const float weight = alpha * T[p];
+                        red[p] = fmaf(weight, shade.z, red[p]);
+                        green[p] = fmaf(weight, shade.w, green[p]);
+                        blue[p] = fmaf(weight, splat_blue, blue[p]);
+                        T[p] = after;
+                        stop[p] = base - begin + k + 1;
+                    }
+                }
+            }
+        }
+    }
+#pragma unroll
+    for (int p = 0; p < LANE_PIXELS; ++p) {
+        if (x < width && y + 4 * p < height) {
+            const long long at = corner + 4LL * p * width;
+            pictures.data[3 * at] = fmaf(T[p], background.data[0], red[p]);
+            pictures.data[3 * at + 1] = fmaf(T[p], background.data[1], green[p]);
+            pictures.data[3 * at + 2] = fmaf(T[p], background.data[2], blue[p]);
+            alphas.data[at] = 1.0f - T[p];
+            transmittances.data[at] = T[p];
+            stops.data[at] = stop[p];
+        }
+    }
+"""
+)
+_BACKWARD = (
+    _COMMON
+    + """
+    if (begin == end) return;
+    const long long corner = ((long long)image * height + y) * width + x;
+    float T[LANE_PIXELS], red[LANE_PIXELS], green[LANE_PIXELS], blue[LANE_PIXELS];  // colours: of the image's gradient
+    float behind[LANE_PIXELS];  // gradient-weighted light that reaches the pixel from behind the current splat
+    int stop[LANE_PIXELS], last = 0;
+#pragma unroll
+    for (int p = 0; p < LANE_PIXELS; ++p) {
+        T[p] = red[p] = green[p] = blue[p] = behind[p] = 0.0f;
+        stop[p] = 0;
+        if (x < width && y + 4 * p < height) {
+            const long long at = corner + 4LL * p * width;
+            stop[p] = stops.data[at];
+            T[p] = transmittances.data[at];
+            red[p] = grad_pictures.data[3 * at];
+            green[p] = grad_pictures.data[3 * at + 1];
+            blue[p] = grad_pictures.data[3 * at + 2];
+            behind[p] = T[p] * (red[p] * background.data[0] + green[p] * background.data[1]
+                + blue[p] * background.data[2] - grad_alphas.data[at]);
+        }
+        last = max(last, stop[p]);
+    }
+    for (int step = 16; step > 0; step /= 2) last = max(last, __shfl_xor_sync(ALL, last, step));
+    const bool upper16 = lane & 16, upper8 = lane & 8, upper4 = lane & 4, upper2 = lane & 2;
+    const bool writes = lane % 4 == 0 || lane == 2;
+    const int slot = lane == 2 ? 8 : lane / 4;
+
+    for (int base = (last - 1) & ~31; last > 0 && base >= 0; base -= 32) {
+        __syncwarp();
+        const bool hit = base + lane < last && fetch(begin + base + lane);
+        unsigned todo = __ballot_sync(ALL, hit);
+        __syncwarp();
+        while (todo) {
+            const int k = 31 - __clz(todo);
+            todo ^= 1u << k;
+            const float4 place = places[warp][k], shade = shades[warp][k];
+            const float2 other = others[warp][k];
+            const float dx = x + 0.5f - place.x, dy0 = y + 0.5f - place.y;
+            const float constant = place.z * dx * dx, linear = place.w * dx;
+            float raw[LANE_PIXELS];
+            bool drawn[LANE_PIXELS], any_drawn = false;
+#pragma unroll
+            for (int p = 0; p < LANE_PIXELS; ++p) {
+                const float dy = dy0 + 4 * p;
+                const float power = fmaf(dy, fmaf(shade.x, dy, linear), constant);
+                raw[p] = exp2_fast(power + shade.y);
+                drawn[p] = base + k < stop[p] && power <= 0.0f && fminf(raw[p], alpha_max) >= alpha_min;
+                any_drawn |= drawn[p];
+            }
+            if (!__any_sync(ALL, any_drawn)) continue;
+            // sums over the pixels: slope times 1, dx, dy, dx^2, dx dy, dy^2, and weight times the image's gradient
+            float s = 0.0f, s_y = 0.0f, s_yy = 0.0f, w_red = 0.0f, w_green = 0.0f, w_blue = 0.0f;
+#pragma unroll
+            for (int p = 0; p < LANE_PIXELS; ++p) {
+                if (drawn[p]) {
+                    const float alpha = fminf(raw[p], alpha_max), dy = dy0 + 4 * p;
+                    const float inverse = __fdividef(1.0f, 1.0f - alpha);
+                    T[p] *= inverse;
+                    const float weight = alpha * T[p];
+                    const float light = red[p] * shade.z + green[p] * shade.w + blue[p] * other.x;
+                    const float slope = raw[p] <= alpha_max ? alpha * (T[p] * light - behind[p] * inverse) : 0.0f;
+                    behind[p] = fmaf(weight, light, behind[p]);
+                    s += slope;
+                    s_y = fmaf(slope, dy, s_y);
+                    s_yy = fmaf(slope * dy, dy, s_yy);
+                    w_red = fmaf(weight, red[p], w_red);
+                    w_green = fmaf(weight, green[p], w_green);
+                    w_blue = fmaf(weight, blue[p], w_blue);
+                }
+            }
+            float sums[8] = {s, s * dx, s_y, s * dx * dx, s_y * dx, s_yy, w_red, w_green};
+#pragma unroll
+            for (int i = 0; i < 4; ++i) {
+                const float given = upper16 ? sums[i] : sums[i + 4];
+                sums[i] = (upper16 ? sums[i + 4] : sums[i]) + __shfl_xor_sync(ALL, given, 16);
+            }
+#pragma unroll
+            for (int i = 0; i < 2; ++i) {
+                const float given = upper8 ? sums[i] : sums[i + 2];
+                sums[i] = (upper8 ? sums[i + 2] : sums[i]) + __shfl_xor_sync(ALL, given, 8);
+            }
+            {
+                const float given = upper4 ? sums[0] : sums[1];
+                sums[0] = (upper4 ? sums[1] : sums[0]) + __shfl_xor_sync(ALL, given, 4);
+            }
+            w_blue += __shfl_xor_sync(ALL, w_blue, 16);
+            w_blue += __shfl_xor_sync(ALL, w_blue, 8);
+            w_blue += __shfl_xor_sync(ALL, w_blue, 4);
+            // the ninth sum joins: lanes with bit 1 carry it on, the others sum number lane / 4
+            const float given = upper2 ? sums[0] : w_blue;
+            float sum = (upper2 ? w_blue : sums[0]) + __shfl_xor_sync(ALL, given, 2);
+            sum += __shfl_xor_sync(ALL, sum, 1);
+            if (writes) atomicAdd(grad_splats.data + (long long)SPLAT_SIZE * __float_as_int(other.y) + slot, sum);
+        }
+    }
+"""
+)
+
+
+def source(template: str, tile: int, lane_pixels: int) -> str:
+    """CUDA code of a pass with its constants."""
+    height = 4 * lane_pixels
+    values = {
+        "TILE": tile,
+        "LANE_PIXELS": lane_pixels,
+        "PATCH_WIDTH": PATCH_WIDTH,
+        "PATCH_HEIGHT": height,
+        "WARPS": tile * tile // (PATCH_WIDTH * height),
+        "SPLAT_SIZE": SPLAT_SIZE,
+    }
+    for name, value in values.items():
+        template = re.sub(rf"\b{name}\b", str(value), template)
+    return template
+
+
+@functools.cache
+def kernels(tile: int, lane_pixels: int):
+    """``(composite, composite_adjoint, threads)``: Warp kernels, launched with a block of ``threads`` a tile.
+
+    CUDA only. All threads of a block must enter, so that warps are whole.
+    """
+    module = wp.get_module(f"{__name__}.tile{tile}x{lane_pixels}")
+    threads = tile * tile // lane_pixels
+
+    @wp.func_native(source(_FORWARD, tile, lane_pixels))
+    def composite_patch(
+        tile: int, thread: int, width: int, height: int,
+        splats: wp.array3d(dtype=float), ids: wp.array(dtype=int), starts: wp.array(dtype=int),
+        alpha_min: float, alpha_max: float, transmittance_min: float, background: wp.array(dtype=float),
+        pictures: wp.array4d(dtype=float), alphas: wp.array3d(dtype=float),
+        transmittances: wp.array3d(dtype=float), stops: wp.array3d(dtype=int),
+    ): ...  # fmt: skip
+
+    @wp.func_native(source(_BACKWARD, tile, lane_pixels))
+    def composite_patch_adjoint(
+        tile: int, thread: int, width: int, height: int,
+        splats: wp.array3d(dtype=float), ids: wp.array(dtype=int), starts: wp.array(dtype=int),
+        transmittances: wp.array3d(dtype=float), stops: wp.array3d(dtype=int),
+        alpha_min: float, alpha_max: float, background: wp.array(dtype=float),
+        grad_pictures: wp.array4d(dtype=float), grad_alphas: wp.array3d(dtype=float),
+        grad_splats: wp.array3d(dtype=float),
+    ): ...  # fmt: skip
+
+    @wp.kernel(module=module, enable_backward=False, launch_bounds=threads)
+    def composite(
+        splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
+        ids: wp.array(dtype=int),  # (N,)
+        starts: wp.array(dtype=int),  # (tiles + 1,)
+        alpha_min: float,
+        alpha_max: float,
+        transmittance_min: float,
+        background: wp.array(dtype=float),  # (3,)
+        pictures: wp.array4d(dtype=float),  # (I, H, W, 3), out
+        alphas: wp.array3d(dtype=float),  # (I, H, W), out
+        transmittances: wp.array3d(dtype=float),  # (I, H, W), out; tiles without splats are left out
+        stops: wp.array3d(dtype=int),  # (I, H, W), out, likewise
+    ):
+        i = wp.tid()
+        composite_patch(
+            i // threads, i % threads, alphas.shape[2], alphas.shape[1], splats, ids, starts, alpha_min, alpha_max,
+            transmittance_min, background, pictures, alphas, transmittances, stops,
+        )  # fmt: skip
+
+    @wp.kernel(module=module, enable_backward=False, launch_bounds=threads)
+    def composite_adjoint(
+        splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
+        ids: wp.array(dtype=int),  # (N,)
+        starts: wp.array(dtype=int),  # (tiles + 1,)
+        transmittances: wp.array3d(dtype=float),  # (I, H, W)
+        stops: wp.array3d(dtype=int),  # (I, H, W)
+        alpha_min: float,
+        alpha_max: float,
+        background: wp.array(dtype=float),  # (3,)
+        grad_pictures: wp.array4d(dtype=float),  # (I, H, W, 3)
+        grad_alphas: wp.array3d(dtype=float),  # (I, H, W)
+        grad_splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE), sums that `finish` reads, added to
+    ):
+        i = wp.tid()
+        composite_patch_adjoint(
+            i // threads, i % threads, grad_alphas.shape[2], grad_alphas.shape[1], splats, ids, starts,
+            transmittances, stops, alpha_min, alpha_max, background, grad_pictures, grad_alphas, grad_splats,
+        )  # fmt: skip
+
+    return composite, composite_adjoint, threads

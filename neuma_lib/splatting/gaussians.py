@@ -1,0 +1,109 @@
+"""The Gaussian kernels of a static object (paper Sec. 3.3: x, alpha, A, c)."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+
+from neuma_lib.errors import InputError
+from neuma_lib.splatting.cameras import Cameras
+from neuma_lib.splatting.spherical_harmonics import MAX_DEGREE, coefficient_count
+
+
+@dataclasses.dataclass
+class Gaussians:
+    """G anisotropic 3D Gaussians.
+
+    Attributes:
+        means: (G, 3) centres, world frame [m].
+        quats: (G, 4) rotations as quaternions (w, x, y, z); need not be normalised.
+        scales: (G, 3) standard deviations along the rotated axes [m].
+        opacities: (G,) in (0, 1).
+        sh0: (G, 1, 3) spherical harmonics of degree 0.
+        shN: (G, K - 1, 3) the higher degrees, K = 1, 4, 9 or 16.
+    """
+
+    means: torch.Tensor
+    quats: torch.Tensor
+    scales: torch.Tensor
+    opacities: torch.Tensor
+    sh0: torch.Tensor
+    shN: torch.Tensor
+
+    def __post_init__(self):
+        count = self.means.shape[0]
+        expected = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3)}
+        for name, shape in expected.items():
+            if tuple(getattr(self, name).shape) != (count, *shape):
+                actual = tuple(getattr(self, name).shape)
+                raise InputError(f"gaussians: {name} has shape {actual}, expected {(count, *shape)}")
+        allowed = [coefficient_count(degree) - 1 for degree in range(MAX_DEGREE + 1)]
+        if self.shN.dim() != 3 or self.shN.shape[0] != count or self.shN.shape[1] not in allowed:
+            raise InputError(f"gaussians: shN has shape {tuple(self.shN.shape)}, expected (G, K - 1, 3)")
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def __getitem__(self, index) -> Gaussians:
+        """Some of the Gaussians: a boolean mask, an index tensor or a slice."""
+        return Gaussians(
+            **{field.name: getattr(self, field.name)[index] for field in dataclasses.fields(self)}
+        )
+
+    def to(self, device=None, dtype: torch.dtype | None = None) -> Gaussians:
+        return Gaussians(
+            **{field.name: getattr(self, field.name).to(device, dtype) for field in dataclasses.fields(self)}
+        )
+
+    def sh(self) -> torch.Tensor:
+        """(G, K, 3) all harmonics."""
+        return torch.cat([self.sh0, self.shN], dim=1)
+
+    @property
+    def log_scales(self) -> torch.Tensor:
+        return torch.log(self.scales)
+
+    @property
+    def degree(self) -> int:
+        """Highest SH degree."""
+        return int(round((self.shN.shape[1] + 1) ** 0.5)) - 1
+
+    def covars(self) -> torch.Tensor:
+        """(G, 3, 3) covariances A_0 = R S^2 R^T [m^2]."""
+        return covariances(self.quats, self.scales)
+
+    def absorbing_blur(self, cameras: Cameras, eps2d: float) -> Gaussians:
+        """The kernels with the blur of the cameras' pixels as a part of their own size.
+
+        Splatting widens every projected kernel by a pixel's variance ``eps2d`` [px^2]. Kernels that were fitted
+        under one set of cameras would therefore look larger through cameras with larger pixels, by up to a pixel
+        at the silhouette. Here each kernel grows by what ``eps2d`` was worth in the mean camera, in metres; rendered
+        with ``eps2d=0`` they look the same through those cameras, and keep their size through all others (the idea
+        of Mip-Splatting's 3D smoothing filter, Yu et al. 2024).
+        """
+        _, depth = cameras.project(self.means)
+        focal = cameras.Ks[:, 0, 0].to(depth)
+        blur = eps2d * (depth / focal[:, None]).square().mean(dim=0)
+        return dataclasses.replace(self, scales=(self.scales.square() + blur[:, None]).sqrt())
+
+    def cull(self, min_opacity: float) -> Gaussians:
+        """Those with opacity above ``min_opacity`` (the paper uses 0.02)."""
+        return self[self.opacities > min_opacity]
+
+
+def rotations(quats: torch.Tensor) -> torch.Tensor:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4), w first, normalised here."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+def covariances(quats: torch.Tensor, scales: torch.Tensor) -> torch.Tensor:
+    """(G, 3, 3) R S S^T R^T of rotations (G, 4) and standard deviations (G, 3)."""
+    half = rotations(quats) * scales[..., None, :]
+    return half @ half.mT

@@ -1,0 +1,232 @@
+"""Differentiable Gaussian splatting of a batch of frames (paper Sec. 3.3 and the supplement's 3DGS).
+
+One autograd function holds the whole render: projection and compositing, Warp kernels with hand-written adjoints.
+A CPU composites splat by splat (``splat_rows``), a GPU tile by tile (``splat_tiles``) or, in float64, pixel by pixel
+(``splat_pixels``). ``gsplat_backend`` renders by the gsplat package instead, where that is installed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+
+from neuma_lib.errors import InputError
+from neuma_lib.splatting import compositor_cpu as splat_rows
+from neuma_lib.splatting import compositor_cuda as splat_tiles
+from neuma_lib.splatting import compositor_pixels as splat_pixels
+from neuma_lib.splatting import gsplat_backend, projection
+from neuma_lib.splatting.compositing import Settings
+
+Compositor = Literal["rows", "pixels", "tiles", "gsplat"]
+COMPOSITORS = {"rows": splat_rows, "pixels": splat_pixels, "tiles": splat_tiles}
+
+
+@dataclasses.dataclass
+class Statistics:
+    """What the last backward pass saw of every Gaussian, for densification and pruning.
+
+    Attributes:
+        screen_gradients: (G,) norm of the loss gradient with respect to the projected mean, in units of half
+            the image (as in 3D Gaussian splatting), summed over the images.
+        views: (G,) number of images in which the Gaussian took part.
+    """
+
+    screen_gradients: torch.Tensor | None = None
+    views: torch.Tensor | None = None
+
+
+class Workspace:
+    """Buffers kept between calls of the same shape, so that a loop allocates little and can be captured.
+
+    A call overwrites what the call before it left: with a workspace, run backward before the next forward.
+    """
+
+    def __init__(self):
+        self._buffers: dict[str, torch.Tensor] = {}
+
+    def empty(self, name: str, shape: Sequence[int], like: torch.Tensor, dtype=None) -> torch.Tensor:
+        dtype = dtype or like.dtype
+        buffer = self._buffers.get(name)
+        if buffer is None or buffer.shape != shape or buffer.dtype != dtype or buffer.device != like.device:
+            buffer = self._buffers[name] = torch.empty(shape, dtype=dtype, device=like.device)
+        return buffer
+
+
+class _FreshBuffers:
+    """Allocates every time: results of several calls may be alive together."""
+
+    def empty(self, name: str, shape: Sequence[int], like: torch.Tensor, dtype=None) -> torch.Tensor:
+        return torch.empty(shape, dtype=dtype or like.dtype, device=like.device)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    settings: Settings
+    compositor: str
+    statistics: Statistics | None
+    buffers: Workspace | _FreshBuffers
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, means, covars, opacities, sh, viewmats, Ks, background, options: _Options):
+        sh = projection.for_device(sh.detach())
+        means, covars, opacities, viewmats, Ks, background = (
+            x.detach().contiguous() for x in (means, covars, opacities, viewmats, Ks, background)
+        )
+        settings, empty = options.settings, options.buffers.empty
+        splats, depths = projection.project(means, covars, opacities, sh, viewmats, Ks, settings, empty)
+        composite = COMPOSITORS[options.compositor].composite
+        pictures, alphas, kept = composite(splats, depths, background, settings, empty)
+        ctx.save_for_backward(means, covars, sh, viewmats, Ks, background, splats, depths, *kept)
+        ctx.options = options
+        shape = (len(means), len(viewmats), settings.height, settings.width)
+        return pictures.view(*shape, 3), alphas.view(shape)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad_pictures, grad_alphas):
+        means, covars, sh, viewmats, Ks, background, splats, depths, *kept = ctx.saved_tensors
+        options: _Options = ctx.options
+        settings, empty = options.settings, options.buffers.empty
+        width, height = settings.width, settings.height
+        grad_pictures = grad_pictures.contiguous().view(-1, height, width, 3)
+        grad_alphas = grad_alphas.contiguous().view(-1, height, width)
+
+        grad_splats = empty("grad_splats", splats.shape, means)
+        COMPOSITORS[options.compositor].composite_adjoint(
+            splats, kept, background, settings, grad_pictures, grad_alphas, grad_splats, empty
+        )
+        if options.statistics is not None:
+            visible = depths < projection.CULLED
+            scaled = torch.stack(
+                [grad_splats[..., 0] * (width / 2), grad_splats[..., 1] * (height / 2)], dim=-1
+            )
+            options.statistics.screen_gradients = torch.where(visible, scaled.norm(dim=-1), 0.0).sum(dim=0)
+            options.statistics.views = visible.sum(dim=0)
+
+        grad_means = grad_covars = grad_opacities = grad_sh = None
+        seen = (splats, depths, grad_splats)
+        if any(ctx.needs_input_grad[:2]):
+            grad_means, grad_covars = projection.geometry_adjoint(
+                means, covars, sh, viewmats, Ks, settings, *seen
+            )
+        if any(ctx.needs_input_grad[2:4]):
+            grad_opacities, grad_sh = projection.appearance_adjoint(means, sh, viewmats, *seen)
+        return grad_means, grad_covars, grad_opacities, grad_sh, None, None, None, None
+
+
+@functools.lru_cache(maxsize=32)
+def _constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+    """Kept, because a copy to the GPU makes the host wait."""
+    return torch.tensor(values, dtype=dtype, device=device)
+
+
+def check_shapes(means, covars, opacities, sh, viewmats, Ks) -> None:
+    """Raise InputError unless the arguments of ``rasterize`` agree in shape, dtype and device."""
+    T, G, V = means.shape[0], means.shape[1], viewmats.shape[0]
+    expected = {
+        "means": (means, (T, G, 3)),
+        "covars": (covars, (T, G, 3, 3)),
+        "opacities": (opacities, (G,)),
+        "sh": (sh, (G, sh.shape[1] if sh.dim() == 3 else -1, 3)),
+        "viewmats": (viewmats, (V, 4, 4)),
+        "Ks": (Ks, (V, 3, 3)),
+    }
+    for name, (tensor, shape) in expected.items():
+        if tuple(tensor.shape) != shape:
+            raise InputError(f"rasterize: {name} has shape {tuple(tensor.shape)}, expected {shape}")
+        if tensor.dtype != means.dtype or tensor.device != means.device:
+            raise InputError(
+                f"rasterize: {name} is {tensor.dtype} on {tensor.device}, "
+                f"means are {means.dtype} on {means.device}"
+            )
+    if means.dtype not in (torch.float32, torch.float64):
+        raise InputError(f"rasterize: dtype {means.dtype} is not supported, use float32 or float64")
+    if sh.shape[1] not in (1, 4, 9, 16):
+        raise InputError(f"rasterize: sh has {sh.shape[1]} coefficients a channel, expected 1, 4, 9 or 16")
+
+
+def rasterize(
+    means: torch.Tensor,  # (T, G, 3) [m]
+    covars: torch.Tensor,  # (T, G, 3, 3) [m^2]
+    opacities: torch.Tensor,  # (G,) in (0, 1)
+    sh: torch.Tensor,  # (G, K, 3)
+    viewmats: torch.Tensor,  # (V, 4, 4) world to camera, OpenCV axes
+    Ks: torch.Tensor,  # (V, 3, 3) [px]
+    width: int,
+    height: int,
+    *,
+    background: Sequence[float] | torch.Tensor = (1.0, 1.0, 1.0),
+    alpha_min: float = 1.0 / 255.0,
+    alpha_max: float = 0.99,
+    transmittance_min: float = 1e-4,
+    eps2d: float = 0.3,
+    statistics: Statistics | None = None,
+    workspace: Workspace | None = None,
+    compositor: Compositor | None = None,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Render T frames from V cameras.
+
+    Differentiable with respect to ``means``, ``covars``, ``opacities`` and ``sh``. A contribution counts
+    where its alpha is at least ``alpha_min``; alpha is limited to ``alpha_max`` (no gradient where it is); a
+    pixel ends before the Gaussian that would bring its transmittance below ``transmittance_min``. With
+    alpha_min = 0, alpha_max > 1 and transmittance_min = 0 the image is a smooth function of its inputs, apart
+    from the order in depth.
+
+    Args:
+        means: Gaussian centres of every frame, world frame.
+        covars: covariances of every frame; the symmetric part is used.
+        opacities: shared by all frames.
+        sh: colour coefficients shared by all frames; K = 1, 4, 9 or 16. Not rotated with the Gaussians.
+        viewmats: camera poses.
+        Ks: intrinsics without skew; pixel centres are at half integers.
+        width, height: image size [px].
+        background: colour behind the Gaussians, no gradient.
+        alpha_min, alpha_max, transmittance_min: thresholds, see above.
+        eps2d: blur added to the projected covariance [px^2].
+        statistics: filled by the backward pass when given.
+        workspace: keeps buffers between calls; the images returned then live in it.
+        compositor: "rows" (CPU), "pixels" (any device), "tiles" (CUDA, float32) or "gsplat" (CUDA, float32; other
+            limit of alpha, see ``gsplat_backend``). Default: rows on CPU; on CUDA tiles for float32 and pixels for
+            float64. Tiles and gsplat read one number from the GPU a call, so a CUDA graph cannot hold them.
+
+    Returns:
+        images (T, V, H, W, 3) over ``background`` and alphas (T, V, H, W).
+
+    Raises:
+        InputError: shapes, dtypes or devices disagree, or the compositor cannot work with them.
+    """
+    check_shapes(means, covars, opacities, sh, viewmats, Ks)
+    if isinstance(background, torch.Tensor):
+        background = background.to(means)
+    else:
+        background = _constant(tuple(background), means.dtype, means.device)
+    on_cpu, single = means.device.type == "cpu", means.dtype == torch.float32
+    if compositor is None:
+        compositor = "rows" if on_cpu else "tiles" if single else "pixels"
+    works = {"rows": on_cpu, "pixels": True, "tiles": not on_cpu and single, "gsplat": not on_cpu and single}
+    if not works.get(compositor, False):
+        raise InputError(
+            f"rasterize: compositor {compositor!r} does not work with {means.dtype} on {means.device}; "
+            f"choose {' or '.join(name for name, can in works.items() if can)}, or leave it out"
+        )
+    settings = Settings(
+        int(width),
+        int(height),
+        float(alpha_min),
+        float(alpha_max),
+        float(transmittance_min),
+        float(eps2d),
+    )
+    if compositor == "gsplat":
+        if statistics is not None:
+            raise InputError("rasterize: compositor 'gsplat' fills no statistics, leave one of the two out")
+        return gsplat_backend.rasterize(means, covars, opacities, sh, viewmats, Ks, background, settings)
+    buffers = workspace if workspace is not None else _FreshBuffers()
+    options = _Options(settings, compositor, statistics, buffers)
+    return _Rasterize.apply(means, covars, opacities, sh, viewmats, Ks, background, options)

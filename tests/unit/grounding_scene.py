@@ -1,0 +1,72 @@
+"""A small grounding problem without files: a soft ball that a camera watches, with its motion known."""
+
+from __future__ import annotations
+
+import torch
+
+from neuma_lib.coupling.particle_binding import bind_two_pass
+from neuma_lib.coupling.reconstruction import Reconstruction
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.rollout import rollout
+from neuma_lib.splatting.cameras import Cameras, look_at
+from neuma_lib.splatting.gaussians import Gaussians
+from neuma_lib.splatting.observation import Observation
+
+MODEL = MPMModel(grid=16, dt=2e-3)
+TRUTH = {"elasticity": {"name": "fixed_corotated", "E": 3e4, "nu": 0.3}, "plasticity": {"name": "identity"}}
+PRIOR = {"elasticity": {"name": "fixed_corotated", "E": 1e5, "nu": 0.2}, "plasticity": {"name": "identity"}}
+RADIUS = 0.13
+
+
+def ball(height: float = 0.3, count: int = 300, gaussians: int = 120, seed: int = 0, dtype=torch.float64):
+    """A ball of particles with coloured kernels on and in it."""
+    g = torch.Generator().manual_seed(seed)
+
+    def inside(n):
+        direction = torch.randn(n, 3, generator=g, dtype=torch.float64)
+        radius = RADIUS * torch.rand(n, 1, generator=g, dtype=torch.float64) ** (1 / 3)
+        return torch.tensor([0.5, height, 0.5], dtype=torch.float64) + radius * direction / direction.norm(
+            dim=1, keepdim=True
+        )
+
+    kernels = Gaussians(
+        means=inside(gaussians),
+        quats=torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(gaussians, 1),
+        scales=torch.full((gaussians, 3), 0.022, dtype=torch.float64),
+        opacities=torch.full((gaussians,), 0.7, dtype=torch.float64),
+        sh0=1.5 * torch.randn(gaussians, 1, 3, generator=g, dtype=torch.float64),
+        shN=torch.zeros(gaussians, 0, 3, dtype=torch.float64),
+    )
+    volume = 4 / 3 * torch.pi * RADIUS**3
+    particles = inside(count)
+    binding, x0, _, vol0 = bind_two_pass(kernels.means, kernels.covars(), particles, volume / count)
+    return Reconstruction(x0, vol0, 1000 * vol0, kernels, binding).to(dtype)
+
+
+def camera(size: int = 32, dtype=torch.float64) -> Cameras:
+    """One frontal view of the whole fall."""
+    eye = torch.tensor([[0.5, 0.3, 2.0]], dtype=dtype)
+    view = look_at(
+        eye, torch.tensor([0.5, 0.25, 0.5], dtype=dtype), torch.tensor([0.0, 1.0, 0.0], dtype=dtype)
+    )
+    f = 1.8 * size
+    K = torch.tensor([[[f, 0, size / 2], [0, f, size / 2], [0, 0, 1]]], dtype=dtype)
+    return Cameras(view, K, size, size)
+
+
+def observe(body: Reconstruction, v0, frames, spec=TRUTH, model=MODEL, size: int = 32) -> Observation:
+    """Video of the ball under an analytic law, made where the ball is."""
+    cameras = camera(size, body.x0.dtype).to(body.x0.device)
+    with torch.no_grad():
+        path = rollout(
+            model,
+            analytic_law(spec, model.dt).to(body.x0.device),
+            body.x0,
+            torch.as_tensor(v0).to(body.x0),
+            body.mass,
+            body.vol0,
+            steps=frames[-1],
+            frames=frames,
+        )
+        return Observation(tuple(frames), body.particle_gs(cameras)(path.x, path.F), cameras)

@@ -1,0 +1,100 @@
+"""Laws, particles and motions that the simulator's tests share."""
+
+import torch
+from torch.nn.functional import gelu
+
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.neural import features, neural_law
+from neuma_lib.mechanics.singular_values import rotation_and_singular_values
+
+DENSITY = 1000.0
+DT = 1e-3
+
+SPECS = {
+    "fixed_corotated": {"elasticity": {"name": "fixed_corotated", "E": 5e4, "nu": 0.3}},
+    "stvk": {"elasticity": {"name": "stvk", "E": 5e4, "nu": 0.3}},
+    "hencky": {"elasticity": {"name": "hencky", "E": 5e4, "nu": 0.3}},
+    "neo_hookean": {"elasticity": {"name": "neo_hookean", "E": 5e4, "nu": 0.3}},
+    "fluid": {
+        "elasticity": {"name": "fluid", "E": 5e4, "nu": 0.3},
+        "plasticity": {"name": "fluid_projection"},
+    },
+    "von_mises": {
+        "elasticity": {"name": "hencky", "E": 5e4, "nu": 0.3},
+        "plasticity": {"name": "von_mises", "yield_stress": 5e2},
+    },
+    "drucker_prager": {
+        "elasticity": {"name": "hencky", "E": 5e4, "nu": 0.2},
+        "plasticity": {"name": "drucker_prager", "friction_angle": 30.0},
+    },
+    "viscous_flow": {
+        "elasticity": {"name": "hencky", "E": 5e4, "nu": 0.4},
+        "plasticity": {"name": "viscous_flow", "viscosity": 10.0},
+    },
+}
+SYMMETRIC = tuple(SPECS)
+EVERY_LAW = (*SPECS, "neural")
+
+
+def make_law(name, dtype=torch.float64):
+    """An analytic law by name, or a neural one: a random network whose last layer imitates a soft solid."""
+    if name != "neural":
+        return analytic_law(SPECS[name], dt=DT, name=name)
+    law = neural_law(seed=3).double()
+    with torch.no_grad():
+        law.elasticity.base[-1].copy_(
+            imitate(make_law("fixed_corotated").elasticity, law.elasticity.weights())
+        )
+    return law.to(dtype)
+
+
+def imitate(elasticity, weights):
+    """Last layer (9, 64) with which tau = R X F^T is nearest to a law's stress at small strains."""
+    generator = torch.Generator().manual_seed(1)
+    noise = torch.randn(4000, 3, 3, generator=generator, dtype=torch.float64)
+    F = torch.eye(3, dtype=torch.float64) + 0.05 * noise
+    R, sigma = rotation_and_singular_values(F)
+    X = R.mT @ elasticity(F) @ torch.linalg.inv(F).mT
+    hidden = gelu(gelu(features(F, sigma) @ weights[0].T) @ weights[1].T)
+    return torch.linalg.lstsq(hidden, X.reshape(-1, 9)).solution.T
+
+
+def cube(count=300, side=0.3, centre=(0.5, 0.5, 0.5), seed=0, dtype=torch.float64):
+    """Random particles in a cube: positions [m], masses [kg] and volumes [m^3]."""
+    generator = torch.Generator().manual_seed(seed)
+    spread = torch.rand(count, 3, generator=generator, dtype=torch.float64) - 0.5
+    x = torch.tensor(centre, dtype=torch.float64) + side * spread
+    vol0 = torch.full((count,), side**3 / count, dtype=torch.float64)
+    return x.to(dtype), (DENSITY * vol0).to(dtype), vol0.to(dtype)
+
+
+def spinning(x, omega=(3.0, -2.0, 5.0), velocity=(0.0, 0.0, 0.0)):
+    """Velocities [m/s] and affine velocities [1/s] of a rigid rotation about the mean of x."""
+    omega = torch.tensor(omega, dtype=x.dtype)
+    spin = torch.linalg.cross(omega.expand(3, 3), torch.eye(3, dtype=x.dtype)).T
+    v = (x - x.mean(dim=0)) @ spin.T + torch.tensor(velocity, dtype=x.dtype)
+    return v, spin.expand(len(x), 3, 3).contiguous()
+
+
+def strained(x, seed=0, size=0.05):
+    """A random start (v, F, C) with distinct principal stretches, away from the kinks of sorted values."""
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.randn(3, len(x), 3, 3, generator=generator, dtype=torch.float64).to(x.dtype)
+    Q = torch.linalg.qr(noise[0])[0]
+    stretch = torch.diag(torch.tensor([1.1, 1.0, 0.92], dtype=x.dtype))
+    F = Q @ stretch @ Q.mT @ (torch.eye(3, dtype=x.dtype) + 0.2 * size * noise[1])
+    C = 20 * size * noise[2]
+    v = torch.tensor([0.4, -0.6, 0.2], dtype=x.dtype) + size * noise[2, :, 0]
+    return v, F, C
+
+
+def linear_momentum(mass, v):
+    """Sum of m v [kg m/s], shape (3,)."""
+    return (mass[:, None] * v).sum(dim=0)
+
+
+def angular_momentum(model, mass, x, v, C):
+    """Sum of x cross m v and of APIC's part m (dx^2 / 4) axial(C) [kg m^2/s], shape (3,)."""
+    axial = torch.stack([C[:, 2, 1] - C[:, 1, 2], C[:, 0, 2] - C[:, 2, 0], C[:, 1, 0] - C[:, 0, 1]], dim=1)
+    orbit = torch.linalg.cross(x, v)
+    return (mass[:, None] * (orbit + model.dx**2 / 4 * axial)).sum(dim=0)

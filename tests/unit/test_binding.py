@@ -1,0 +1,211 @@
+"""Binding: the sparse search against Algorithm 1 written out, and what added particles must not change."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import chi2
+
+from neuma_lib.coupling.particle_binding import bind, bind_two_pass
+from neuma_lib.errors import InputError
+
+
+def random_gaussians(count, seed, spread=1.0, size=0.05, anisotropy=1.0, dtype=torch.float64):
+    """Centres in a cube and covariances with scales over ``exp(+-anisotropy)``."""
+    generator = torch.Generator().manual_seed(seed)
+    means = torch.rand(count, 3, generator=generator, dtype=dtype) * spread
+    scales = size * torch.exp(anisotropy * (2 * torch.rand(count, 3, generator=generator, dtype=dtype) - 1))
+    rotations = torch.linalg.qr(torch.randn(count, 3, 3, generator=generator, dtype=dtype))[0]
+    return means, rotations @ torch.diag_embed(scales**2) @ rotations.transpose(1, 2)
+
+
+def random_particles(count, seed, spread=1.0, dtype=torch.float64):
+    return torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=dtype) * spread
+
+
+def algorithm_1(means, covars, particles, confidence=0.95, max_neighbours=None):
+    """The paper's double loop, one row at a time, with the released code's limit on the neighbours."""
+    threshold = chi2.ppf(confidence, 3)
+    B = torch.zeros(len(means), len(particles), dtype=means.dtype)
+    for i in range(len(means)):
+        d_p = particles - means[i]
+        d_m = (d_p * torch.linalg.solve(covars[i], d_p.T).T).sum(1)
+        inside = torch.nonzero(d_m <= threshold).flatten()
+        if max_neighbours is not None:
+            inside = inside[torch.argsort(d_m[inside], stable=True)[:max_neighbours]]
+        B[i, inside] = 1.0
+        if len(inside):
+            B[i] /= B[i].sum()
+    return B
+
+
+@pytest.mark.parametrize("max_neighbours", [None, 1, 10])
+@pytest.mark.parametrize("size, anisotropy", [(0.02, 0.3), (0.06, 1.5), (0.3, 0.5)])
+def test_matches_the_dense_algorithm(size, anisotropy, max_neighbours):
+    means, covars = random_gaussians(150, seed=1, size=size, anisotropy=anisotropy)
+    particles = random_particles(700, seed=2)
+    sparse = bind(means, covars, particles, max_neighbours=max_neighbours)
+    dense = algorithm_1(means, covars, particles, max_neighbours=max_neighbours)
+    torch.testing.assert_close(sparse.dense(), dense, rtol=1e-14, atol=0)
+
+
+def test_needles_far_longer_than_the_particle_spacing_are_exact():
+    means, covars = random_gaussians(40, seed=3, size=0.02)
+    covars = covars * 0 + torch.diag(torch.tensor([0.25, 2e-3, 1e-3], dtype=torch.float64)) ** 2
+    particles = random_particles(4000, seed=4)
+    torch.testing.assert_close(
+        bind(means, covars, particles).dense(), algorithm_1(means, covars, particles, max_neighbours=10)
+    )
+
+
+def test_confidence_widens_the_ellipsoid():
+    means, covars = random_gaussians(80, seed=5)
+    particles = random_particles(500, seed=6)
+    for confidence in (0.5, 0.99):
+        torch.testing.assert_close(
+            bind(means, covars, particles, confidence, None).dense(),
+            algorithm_1(means, covars, particles, confidence),
+        )
+
+
+def test_ties_go_to_the_smaller_index():
+    particles = torch.tensor([[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0], [0, 0, 1.0]], dtype=torch.float64)
+    binding = bind(
+        torch.zeros(1, 3, dtype=torch.float64),
+        torch.eye(3, dtype=torch.float64)[None],
+        particles,
+        max_neighbours=2,
+    )
+    assert binding.indices.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("equal_mass", [False, True])
+def test_two_passes_leave_no_gaussian_empty_and_rows_sum_to_one(equal_mass):
+    means, covars = random_gaussians(300, seed=7, size=0.01)
+    particles = random_particles(500, seed=8)
+    first = bind(means, covars, particles)
+    binding, enlarged, added, volumes = bind_two_pass(means, covars, particles, 0.1, equal_mass=equal_mass)
+    assert added == len(first.orphans) > 0
+    assert binding.shape == (300, 500 + added) and enlarged.shape == (500 + added, 3)
+    torch.testing.assert_close(enlarged[500:], means[first.orphans])
+    assert len(binding.orphans) == 0
+    torch.testing.assert_close(binding.dense().sum(1), torch.ones(300, dtype=torch.float64))
+    torch.testing.assert_close(binding.dense(), algorithm_1(means, covars, enlarged, max_neighbours=10))
+    assert (volumes > 0).all()
+    torch.testing.assert_close(volumes.sum(), torch.tensor(0.1, dtype=torch.float64), rtol=1e-13, atol=0)
+
+
+@pytest.mark.parametrize("outside", [0.0, 0.15])
+@pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-13), (torch.float32, 3e-7)])
+def test_added_particles_keep_mass_and_centre_of_mass(dtype, tolerance, outside):
+    """Also with Gaussians outside the body, as they are at a fitted surface, and with uneven volumes."""
+    means, covars = random_gaussians(1500, seed=9, size=0.006, spread=1 + 2 * outside, dtype=dtype)
+    means = means - outside
+    particles = random_particles(2000, seed=10, dtype=dtype)
+    before = torch.rand(2000, generator=torch.Generator().manual_seed(11), dtype=dtype) + 0.5
+    _, enlarged, added, after = bind_two_pass(means, covars, particles, before)
+    assert added > 500
+    assert after.min() >= 0 and (after[:2000] >= 0.49 * before).all()
+    before, after, particles, enlarged = (a.double() for a in (before, after, particles, enlarged))
+    torch.testing.assert_close(after.sum(), before.sum(), rtol=tolerance, atol=0)
+    centre = (before @ particles) / before.sum()
+    torch.testing.assert_close((after @ enlarged) / after.sum(), centre, rtol=0, atol=tolerance)
+
+
+def test_equal_mass_is_the_papers():
+    means, covars = random_gaussians(200, seed=12, size=0.01)
+    _, _, added, volumes = bind_two_pass(means, covars, random_particles(300, seed=13), 0.2, equal_mass=True)
+    torch.testing.assert_close(volumes, torch.full_like(volumes, 0.2 / (300 + added)))
+
+
+def test_apply_and_its_gradient():
+    means, covars = random_gaussians(60, seed=14, size=0.05)
+    particles = random_particles(90, seed=15)
+    binding = bind(means, covars, particles)
+    dense = binding.dense()
+    assert len(binding.orphans) > 0, "the case without particles must be covered"
+    for shape in ((4, 90), (4, 90, 3), (2, 90, 3, 3)):
+        values = torch.randn(shape, dtype=torch.float64, requires_grad=True)
+        out = binding.apply(values)
+        expected = torch.einsum("gn,tn...->tg...", dense, values)
+        torch.testing.assert_close(out, expected)
+        cotangent = torch.randn_like(out)
+        (mine,) = torch.autograd.grad(out, values, cotangent, retain_graph=True)
+        (twin,) = torch.autograd.grad(expected, values, cotangent)
+        torch.testing.assert_close(mine, twin)
+    torch.testing.assert_close(
+        binding.to(dtype=torch.float32).apply(values.float().detach()), out.float(), rtol=1e-5, atol=1e-6
+    )
+
+
+def test_rigid_motion_carries_the_gaussians():
+    """Bound particles that all translate carry their Gaussians by the same vector (rows sum to 1)."""
+    means, covars = random_gaussians(100, seed=16, size=0.02)
+    particles = random_particles(400, seed=17)
+    binding, enlarged, _, _ = bind_two_pass(means, covars, particles, 1.0)
+    shift = torch.tensor([0.1, -0.2, 0.3], dtype=torch.float64)
+    moved = binding.apply((enlarged + shift - enlarged)[None])[0]
+    torch.testing.assert_close(moved, shift.expand(100, 3))
+
+
+def test_same_input_gives_the_same_bytes():
+    means, covars = random_gaussians(500, seed=18, size=0.02, dtype=torch.float32)
+    particles = random_particles(800, seed=19, dtype=torch.float32)
+    runs = [bind_two_pass(means, covars, particles, 0.3) for _ in range(2)]
+    for first, second in zip(runs[0], runs[1], strict=True):
+        if isinstance(first, torch.Tensor):
+            assert torch.equal(first, second)
+    assert torch.equal(runs[0][0].indices, runs[1][0].indices)
+    assert torch.equal(runs[0][0].values, runs[1][0].values)
+
+
+def test_paper_scale_needs_seconds(capsys):
+    """20,000 Gaussians and 30,000 particles; the bound only tells the sparse search from a dense one."""
+    means, covars = random_gaussians(
+        20_000, seed=20, size=0.012, spread=0.5, anisotropy=0.8, dtype=torch.float32
+    )
+    particles = random_particles(30_000, seed=21, spread=0.5, dtype=torch.float32)
+    start = time.perf_counter()
+    binding, _, added, _ = bind_two_pass(means, covars, particles, 0.125)
+    seconds = time.perf_counter() - start
+    with capsys.disabled():
+        print(
+            f"\nbinding 20,000 x 30,000 twice: {seconds:.1f} s, {len(binding.indices)} entries, {added} added"
+        )
+    assert seconds < 60
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (dict(confidence=95), "binding.confidence"),
+        (dict(max_neighbours=0), "binding.max_neighbours"),
+        (dict(particles=torch.zeros(0, 3)), "particles"),
+        (dict(particles=torch.full((5, 3), float("nan"))), "particle 0 is not finite"),
+        (dict(covars=torch.zeros(4, 3, 3)), "not positive definite"),
+        (dict(covars=torch.zeros(3, 3, 3)), "covariances"),
+    ],
+)
+def test_bad_input_is_named(change, words):
+    inputs = dict(means=torch.zeros(4, 3), covars=torch.eye(3).expand(4, 3, 3), particles=torch.ones(5, 3))
+    with pytest.raises(InputError, match=words):
+        bind(**(inputs | change))
+
+
+def test_volumes_must_fit():
+    inputs = (torch.zeros(4, 3), torch.eye(3).expand(4, 3, 3), torch.ones(5, 3))
+    with pytest.raises(InputError, match="volumes"):
+        bind_two_pass(*inputs, torch.ones(4))
+    with pytest.raises(InputError, match="positive"):
+        bind_two_pass(*inputs, -1.0)
+
+
+def test_threshold_is_the_papers():
+    """chi2 with three degrees of freedom at 95 %: 7.815."""
+    edge = np.sqrt(7.8147)
+    particles = torch.tensor([[edge - 1e-3, 0, 0], [edge + 1e-3, 0, 0]], dtype=torch.float64)
+    binding = bind(torch.zeros(1, 3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)[None], particles)
+    assert binding.indices.tolist() == [0]

@@ -1,0 +1,255 @@
+"""Cameras, colours, and what the Blender process makes of them."""
+
+import importlib.util
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from neuma_lib.data.blender.appearance import Appearance, colors_at, smooth_noise, to_linear
+from neuma_lib.data.blender.bodies import make_body
+from neuma_lib.data.blender.libraries import explain_import_error
+from neuma_lib.data.blender.scene import (
+    Grains,
+    RenderSettings,
+    Surface,
+    render_dynamic,
+    render_images,
+    render_static,
+)
+from neuma_lib.errors import InputError
+from neuma_lib.geometry import shapes
+from neuma_lib.io.images import read_image_set
+from neuma_lib.splatting import viewpoints as cameras
+from neuma_lib.splatting.cameras import Cameras
+
+needs_blender = pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="needs Blender (bpy)")
+
+
+# ------------------------------------------------------------------------------------------- cameras
+
+
+def test_fifty_views_are_spread_evenly():
+    directions = cameras.sphere_directions(50)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(directions.mean(axis=0), 0.0, atol=0.02)
+    cosines = directions @ directions.T - 2 * np.eye(50)
+    nearest = np.degrees(np.arccos(cosines.max(axis=1)))
+    # 50 caps of equal area have a radius of 16.3 degrees: neighbours are about twice that apart.
+    assert nearest.min() > 22 and nearest.max() < 34
+
+
+def test_training_view_is_frontal():
+    points = np.random.default_rng(0).uniform(0.3, 0.7, (100, 3))
+    views = cameras.video_views(points, 3, 96, 96)
+    np.testing.assert_allclose(views.c2w[0, :3, :3], np.eye(3), atol=1e-12)
+    assert views.c2w[0, 2, 3] > 1.0
+    right, up = (
+        views.project(np.array([[0.5, 0.5, 0.5], [0.6, 0.5, 0.5], [0.5, 0.6, 0.5]]))[0, 1:]
+        - views.project(np.array([[0.5, 0.5, 0.5]]))[0]
+    )
+    assert right[0] > 0 and abs(right[1]) < 1e-9
+    assert up[1] < 0 and abs(up[0]) < 1e-9
+
+
+@pytest.mark.parametrize("width, height", [(96, 96), (128, 72)])
+def test_framing_is_tight_and_holds_every_point(width, height):
+    points = np.random.default_rng(1).normal([0.5, 0.3, 0.5], [0.05, 0.15, 0.1], (500, 3))
+    views = cameras.framing(cameras.ring_directions(10), points, width, height, fill=0.9)
+    reach = np.abs(views.project(points) / np.array([width / 2, height / 2]) - 1.0).max()
+    np.testing.assert_allclose(reach, 0.9, atol=1e-9)
+
+
+def test_projection_is_the_rasterizer_s():
+    points = np.random.default_rng(2).uniform(0.3, 0.7, (50, 3))
+    views = cameras.static_views(points, 7, 128, 96)
+    theirs = Cameras.from_opengl(
+        torch.from_numpy(views.c2w), torch.from_numpy(views.K).expand(7, 3, 3), views.width, views.height
+    )
+    pixels, depths = theirs.project(torch.from_numpy(points))
+    assert (depths > 0).all()
+    np.testing.assert_allclose(pixels.numpy(), views.project(points), atol=1e-9)
+
+
+# ------------------------------------------------------------------------------------------- colours
+
+
+def test_noise_is_smooth_and_fills_its_range():
+    points = np.random.default_rng(3).uniform(-1, 1, (20000, 3))
+    values = smooth_noise(points, 0.05, seed=4)
+    assert values.min() > 0.0 and values.max() < 1.0 and values.std() > 0.1
+    nearby = smooth_noise(points + 1e-4, 0.05, seed=4)
+    # A cubic step over a cell of 5 cm has slope 1.5; the second octave, half as wide and 3/7 as high, adds to it.
+    assert np.abs(nearby - values).max() < 3**0.5 * 1e-4 * 1.5 / 0.05 * 3**0.5 * 1.3
+
+
+def test_colors_name_what_is_wrong():
+    mesh = shapes.build("duck", 0.3, 32)
+    with pytest.raises(InputError, match="no part.*beek.*its parts are body"):
+        colors_at(mesh, mesh.vertices, Appearance({"body": "#ffffff", "beek": "#000000"}))
+    with pytest.raises(InputError, match="'body'"):
+        colors_at(mesh, mesh.vertices, Appearance({"beak": "#000000"}))
+    with pytest.raises(InputError, match="#rrggbb"):
+        colors_at(mesh, mesh.vertices, Appearance({"body": "yellow"}))
+
+
+def test_parts_have_their_colours():
+    mesh = shapes.build("pawn", 0.4, 48)
+    colors = colors_at(mesh, mesh.vertices, Appearance({"body": "#0000ff", "foot": "#ff0000"}, contrast=0.0))
+    y = mesh.vertices[:, 1]
+    np.testing.assert_allclose(
+        colors[y > y.max() - 0.05], np.broadcast_to([0, 0, 1.0], (sum(y > y.max() - 0.05), 3))
+    )
+    np.testing.assert_allclose(
+        colors[y < y.min() + 0.02], np.broadcast_to([1.0, 0, 0], (sum(y < y.min() + 0.02), 3))
+    )
+
+
+def test_srgb_decodes_to_linear_light():
+    np.testing.assert_allclose(to_linear(np.array([0.0, 0.5, 1.0])), [0.0, 0.21404, 1.0], atol=1e-5)
+
+
+# ------------------------------------------------------------------------------------------- bodies
+
+
+def test_grains_stay_inside_the_rest_surface():
+    mesh = shapes.place("fish", 0.4, 0.28, (0.5, 0.5), 48)
+    rng = np.random.default_rng(5)
+    points = rng.uniform(mesh.bounds[0], mesh.bounds[1], (30000, 3))
+    points = points[shapes.depth(mesh, points) > 0]
+    body = make_body("grains", mesh, Appearance({"body": "#c9a86a"}), points[None], points[None])
+    assert shapes.depth(mesh, body.centres[0]).min() > 0.75 * body.radius
+    assert len(body.colors) == body.centres.shape[1]
+
+
+def test_liquid_surface_is_closed_and_holds_the_volume():
+    pytest.importorskip("pysplashsurf")
+    import trimesh
+
+    mesh = shapes.place("bottle", 0.4, 0.42, (0.5, 0.5), 48)
+    rng = np.random.default_rng(6)
+    points = rng.uniform(mesh.bounds[0], mesh.bounds[1], (30000, 3))
+    points = points[shapes.depth(mesh, points) > 0]
+    body = make_body("liquid", mesh, Appearance({"body": "#d98f24"}), points[None], points[None])
+    vertices, faces, colors = body.surfaces[0]
+    surface = trimesh.Trimesh(vertices, faces, process=False)
+    assert surface.is_watertight and len(colors) == len(vertices)
+    np.testing.assert_allclose(surface.volume, mesh.volume, rtol=0.03)
+
+
+def test_unknown_kind_is_named():
+    mesh = shapes.build("ball", 0.2, 16)
+    with pytest.raises(InputError, match="'foam'.*solid, grains, liquid"):
+        make_body("foam", mesh, Appearance({"body": "#ffffff"}), np.zeros((1, 10, 3)))
+
+
+# ------------------------------------------------------------------------------------------- Blender
+
+
+def test_missing_libraries_are_named_with_their_package():
+    text = "ImportError: libXi.so.6: cannot open shared object file: No such file or directory"
+    assert "apt-get install libxi6" in explain_import_error(text)
+    assert "libfoo.so.1" in explain_import_error(text.replace("libXi.so.6", "libfoo.so.1"))
+    assert "Python 3.11" in explain_import_error("ModuleNotFoundError: No module named 'bpy'")
+    assert explain_import_error("Segmentation fault") == ""
+
+
+def test_failing_import_reaches_the_user(tmp_path, monkeypatch):
+    """A bpy that cannot load its libraries, in the real process."""
+    broken = tmp_path / "modules"
+    broken.mkdir()
+    (broken / "bpy.py").write_text(
+        "raise ImportError('libSM.so.6: cannot open shared object file: No such file')"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(broken))
+    body = Grains(np.full((1, 1, 3), 0.5), 0.1, np.ones((1, 3)))
+    views = cameras.framing(cameras.ring_directions(1), np.array([[0.4] * 3, [0.6] * 3]), 16, 16)
+    with pytest.raises(InputError, match="libsm6"):
+        render_static(body, views, tmp_path / "out")
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+@needs_blender
+def test_renders_agree_with_the_cameras(tmp_path):
+    """Centroids of small balls at known points, against their projections: 0.1 px."""
+    points = np.array(
+        [[0.5, 0.5, 0.5], [0.3, 0.62, 0.45], [0.68, 0.4, 0.6], [0.36, 0.33, 0.62], [0.62, 0.7, 0.36]]
+    )
+    body = Grains(points[None], 0.012, np.ones((5, 3)))
+    corners = np.array([[0.25] * 3, [0.75] * 3])
+    views = cameras.framing(cameras.ring_directions(4)[[0, 1, 3]], corners, 144, 128, fill=1.0)
+    render_static(body, views, tmp_path, RenderSettings(samples=64))
+    images = read_image_set(tmp_path / "transforms.json")
+    np.testing.assert_allclose(images.viewmats, views.viewmats, atol=1e-9)
+    np.testing.assert_allclose(images.Ks[0], views.K, atol=1e-9)
+    row, column = np.mgrid[:128, :144] + 0.5
+    pixels = np.stack([column, row], axis=-1)
+    checked = 0
+    for alpha, expected in zip(images.images[..., 3], views.project(points), strict=True):
+        for k, centre in enumerate(expected):
+            if np.linalg.norm(np.delete(expected, k, axis=0) - centre, axis=1).min() < 14:
+                continue
+            weight = alpha * (np.linalg.norm(pixels - centre, axis=-1) < 7)
+            centroid = (weight[..., None] * pixels).sum(axis=(0, 1)) / weight.sum()
+            np.testing.assert_allclose(centroid, centre, atol=0.1)
+            checked += 1
+    assert checked >= 12
+
+
+@needs_blender
+def test_same_job_same_bytes_and_moving_mesh(tmp_path):
+    mesh = shapes.place("ball", 0.08, 0.4, (0.5, 0.5), 40)
+    colors = colors_at(mesh, mesh.vertices, Appearance({"body": "#f4c534"}))
+    moved = np.stack([mesh.vertices, mesh.vertices + [0.05, -0.1, 0.0]])
+    body = Surface(moved, mesh.faces, colors)
+    views = cameras.video_views(body.points, 2, 48, 48)
+    done = []
+    (tmp_path / "b" / ".render-abandoned").mkdir(parents=True)
+    for folder in ("a", "b"):
+        render_dynamic(
+            body,
+            views,
+            [0, 8],
+            1e-3,
+            tmp_path / folder,
+            RenderSettings(samples=4),
+            lambda k, n: done.append((k, n)),
+        )
+    assert done == [(k, 4) for k in (1, 2, 3, 4)] * 2
+    names = sorted(p.name for p in (tmp_path / "a").iterdir())
+    assert names == ["d_0_0000.png", "d_0_0008.png", "d_1_0000.png", "d_1_0008.png", "transforms.json"]
+    assert names == sorted(p.name for p in (tmp_path / "b").iterdir())
+    for name in names:
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    images = read_image_set(tmp_path / "a" / "transforms.json")
+    steps, index, _ = images.video([0])
+    assert steps == (0, 8)
+    row, column = np.mgrid[:48, :48] + 0.5
+    alpha = images.images[index[:, 0], :, :, 3]
+    middle = np.stack([(alpha * m).sum(axis=(1, 2)) / alpha.sum(axis=(1, 2)) for m in (column, row)], axis=1)
+    np.testing.assert_allclose(middle, views.project(moved.mean(axis=1))[0], atol=0.15)
+    times = [f["time"] for f in json.loads((tmp_path / "a" / "transforms.json").read_text())["frames"]]
+    assert times == [0.0, 0.0, 0.008, 0.008]
+
+
+@needs_blender
+def test_colours_on_the_image_are_those_of_the_surface(tmp_path):
+    """Matt, mostly ambient light: a flat colour stays near itself, wherever the surface turns."""
+    mesh = shapes.place("ball", 0.26, 0.3, (0.5, 0.5), 48)
+    gray = np.full((len(mesh.vertices), 3), 0.6)
+    body = Surface(mesh.vertices[None], mesh.faces, gray)
+    render_images(
+        body,
+        cameras.static_views(body.points, 6, 48, 48),
+        [(0, k) for k in range(6)],
+        tmp_path,
+        RenderSettings(samples=8),
+        [f"{k}.png" for k in range(6)],
+    )
+    import imageio.v3 as imageio
+
+    inside = np.concatenate(
+        [(p := imageio.imread(tmp_path / f"{k}.png") / 255.0)[p[..., 3] == 1.0] for k in range(6)]
+    )
+    assert np.abs(inside[:, :3] - 0.6).max() < 0.12

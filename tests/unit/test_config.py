@@ -1,0 +1,188 @@
+"""Settings: mistakes are found by path, variants mean what they say, the documentation follows the types."""
+
+from pathlib import Path
+
+import pytest
+
+from neuma_lib.config import settings
+from neuma_lib.config.page import settings_markdown
+from neuma_lib.errors import InputError
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def raw():
+    return settings.read_yaml(ROOT / "config" / "config.yaml")
+
+
+@pytest.fixture(scope="module")
+def loaded(raw):
+    return settings.load(raw, ROOT)
+
+
+def test_default_settings_are_valid(loaded):
+    assert loaded.tables["table1"].scenes[0] == "BouncyBall"
+    assert loaded.dataset.particles >= 4 * loaded.simulation.particles
+    assert loaded.dataset.seed != loaded.seed
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"matreial": {}}, r"matreial: unknown key; did you mean material\?"),
+        ({"material": {"lr_elastc": 1}}, r"material\.lr_elastc: unknown key; did you mean lr_elastic"),
+        ({"material": {"iterations": "many"}}, r"material\.iterations: .*integer.*'many'"),
+        ({"material": {"rank": 0}}, r"material\.rank: .*greater than or equal to 1"),
+        ({"dataset": {"static": {"veiws": 3}}}, r"dataset\.static\.veiws: unknown key; did you mean views"),
+        (
+            {"scenes": {"BouncyBall": {"hieght": 1}}},
+            r"scenes\.BouncyBall\.hieght: unknown key; did you mean height",
+        ),
+        (
+            {"scenes": {"BouncyBall": {"prior": "jely"}}},
+            r"no prior 'jely' in priors\.laws; did you mean jelly",
+        ),
+        (
+            {"scenes": {"BouncyBall": {"material": {"lr": 1}}}},
+            r"scenes\.BouncyBall\.material\.lr: unknown key",
+        ),
+        ({"methods": {"neuma": {"material": {"rnk": 4}}}}, r"methods\.neuma\.material\.rnk: unknown key"),
+        ({"tables": {"table1": {"scenes": ["BouncyBal"]}}}, r"no scene 'BouncyBal'; did you mean BouncyBall"),
+        ({"tables": {"table1": {"methods": ["neuma+rnk=4"]}}}, r"no setting 'rnk'; did you mean rank"),
+        ({"scenes": {"New": {"shape": "ball"}}}, r"scenes\.New\.height: this key is missing"),
+        ({"dataset": {"stride": 4}}, r"dataset: give either frames or stride"),
+        ({"dataset": {"frames": None}}, r"dataset: give either frames or stride"),
+        ({"scenes": {"BouncyBall": {"images": {"video": "x"}}}}, r"BouncyBall\.images\.video: unknown key"),
+        ({"scenes_file": "nowhere.yaml"}, r"nowhere\.yaml does not exist"),
+    ],
+)
+def test_mistakes_are_named(raw, change, message):
+    with pytest.raises(InputError, match=message):
+        settings.load(settings.merged(raw, change), ROOT)
+
+
+def test_every_mistake_is_reported_at_once(raw):
+    with pytest.raises(InputError) as error:
+        settings.load(settings.merged(raw, {"material": {"a": 1, "b": 2}}), ROOT)
+    assert "material.a" in str(error.value) and "material.b" in str(error.value)
+
+
+def test_invalid_yaml_names_the_file(tmp_path):
+    (tmp_path / "broken.yaml").write_text("a: [1,\n")
+    with pytest.raises(InputError, match=r"broken\.yaml is not valid YAML"):
+        settings.read_yaml(tmp_path / "broken.yaml")
+
+
+def test_numbers_without_a_point_are_numbers(raw):
+    """YAML 1.1 reads 1e5 as text."""
+    change = {
+        "priors": {"laws": {"jelly": {"elasticity": {"name": "fixed_corotated", "E": "1e5", "nu": 0.2}}}}
+    }
+    jelly = settings.load(settings.merged(raw, change), ROOT).priors.laws["jelly"]
+    assert jelly.elasticity["E"] == 1e5
+
+
+class TestVariants:
+    def test_parse(self, loaded):
+        assert settings.parse_method("neuma", loaded.methods) == ("neuma", {})
+        base, variant = settings.parse_method(
+            "neuma+rank=4+lr_elastic=0.1+views=0,2+prior=sand", loaded.methods
+        )
+        assert base == "neuma"
+        assert variant == {"rank": 4, "lr_elastic": 0.1, "views": [0, 2], "prior": "sand"}
+
+    @pytest.mark.parametrize(
+        ("name", "message"),
+        [
+            ("neumo", "no method 'neumo'; did you mean neuma"),
+            ("neuma+rank", r"write variants as \+key=value"),
+            ("neuma+rank=", r"write variants as \+key=value"),
+            ("neuma+rank=4+rank=8", "'rank' is given twice"),
+            ("neuma+ranks=4", "no setting 'ranks'; did you mean rank"),
+        ],
+    )
+    def test_mistakes(self, loaded, name, message):
+        with pytest.raises(InputError, match=message):
+            settings.parse_method(name, loaded.methods)
+
+    def test_layers_section_scene_method_variant(self, raw):
+        layers = {
+            "material": {"lr_elastic": 1.0, "lr_plastic": 1.0, "alpha": 1.0, "iterations": 1},
+            "scenes": {"BouncyBall": {"material": {"lr_plastic": 2.0, "alpha": 2.0, "iterations": 2}}},
+            "methods": {"neuma": {"material": {"alpha": 3.0, "iterations": 3}}},
+        }
+        loaded = settings.load(settings.merged(raw, layers), ROOT)
+        material = loaded.method_material("BouncyBall", "neuma+iterations=4")
+        values = (material.lr_elastic, material.lr_plastic, material.alpha, material.iterations)
+        assert values == (1.0, 2.0, 3.0, 4)
+
+    def test_a_method_is_a_block_of_settings(self, loaded):
+        chosen = {m: loaded.method_material("BouncyBall", m) for m in loaded.tables["table1"].methods}
+        assert not chosen["nclaw"].train
+        assert chosen["neuma_particle_supervision"].supervision == "particles"
+        assert chosen["neuma_without_binding"].carrier == "gaussians"
+        assert chosen["neuma_without_adaptor"].rank is None
+
+    def test_prior(self, loaded):
+        assert loaded.method_prior("BouncyBall", "neuma") == "jelly"
+        assert loaded.method_prior("BouncyBall", "neuma+prior=sand") == "sand"
+        with pytest.raises(InputError, match="no prior 'snad'"):
+            loaded.method_prior("BouncyBall", "neuma+prior=snad")
+
+    def test_wrong_value_names_the_variant(self, loaded):
+        with pytest.raises(InputError, match=r"neuma\+rank=x\.rank"):
+            loaded.method_material("BouncyBall", "neuma+rank=x")
+
+
+class TestFrames:
+    def frames(self, raw, scene=None, **dataset):
+        changes = {"dataset": dataset, "scenes": {"BouncyBall": {"steps": 100, **(scene or {})}}}
+        return settings.load(settings.merged(raw, changes), ROOT).frame_steps("BouncyBall")
+
+    def test_a_number_of_frames_is_even_and_ends_with_the_video(self, raw):
+        assert self.frames(raw, frames=5) == (0, 25, 50, 75, 100)
+        assert self.frames(raw, frames=1000) == tuple(range(101))
+
+    def test_a_stride_starts_with_the_video(self, raw):
+        assert self.frames(raw, frames=None, stride=25) == (0, 25, 50, 75, 100)
+        assert self.frames(raw, frames=None, stride=30) == (0, 30, 60, 90)
+
+    def test_steps_of_every_video(self, raw):
+        assert self.frames(raw, frames=None, stride=10, steps=40) == (0, 10, 20, 30, 40)
+
+    def test_a_scene_may_list_its_own(self, raw):
+        own = {"frames": [0, 7, 9]}
+        assert self.frames(raw, own, frames=None, stride=10, steps=40) == (0, 7, 9)
+
+
+class TestScaleOfThePaper:
+    def overlay(self, raw, *names):
+        for name in names:
+            raw = settings.merged(raw, settings.read_yaml(ROOT / "config" / f"{name}.yaml"))
+        return settings.load(raw, ROOT)
+
+    def test_paper(self, raw):
+        paper = self.overlay(raw, "paper")
+        assert (paper.simulation.particles, paper.simulation.grid, paper.material.iterations) == (
+            30000,
+            32,
+            1000,
+        )
+        assert (paper.dataset.dynamic.width, paper.dataset.static.height) == (800, 800)
+        assert paper.gaussians.densification.max_count == 20000 and paper.device == "cuda"
+        for scene in paper.scenes:
+            assert paper.frame_steps(scene) == tuple(range(401))
+
+    def test_light_differs_in_images_alone(self, raw, loaded):
+        paper, light = self.overlay(raw, "paper"), self.overlay(raw, "paper", "paper_light")
+        assert light.frame_steps("BouncyBall") == tuple(range(0, 401, 4))
+        same = ("device", "simulation", "gaussians", "material", "scenes", "kernel_cache")
+        assert all(getattr(light, name) == getattr(paper, name) for name in same)
+        roots = [getattr(c, root) for c in (loaded, paper, light) for root in ("data_root", "results_root")]
+        assert len(set(roots)) == 6
+
+
+def test_settings_page_is_up_to_date():
+    page = ROOT / "docs" / "settings.md"
+    assert page.read_text() == settings_markdown(), "run: python -m neuma_lib.config.page > docs/settings.md"

@@ -1,0 +1,227 @@
+"""The CPU and a CUDA GPU run the same functions and agree. Skipped, saying so, where there is no GPU."""
+
+import copy
+from dataclasses import replace
+
+import pytest
+import torch
+from grounding_scene import MODEL, TRUTH, ball, camera, observe
+from sim_scenes import make_law
+
+from neuma_lib.coupling import reconstruction as observation
+from neuma_lib.fitting.material import MaterialSettings, PixelLoss, train_material
+from neuma_lib.fitting.velocity import estimate_velocity
+from neuma_lib.io.checkpoint import Checkpoint
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.neural import neural_law
+from neuma_lib.sim.model import Body
+from neuma_lib.sim.rollout import rollout
+from neuma_lib.splatting.observation import Observation
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+
+STEPS, FRAMES = 50, (0, 10, 25, 50)
+
+
+def throw(law, device, dtype):
+    """Start and gradient of a rollout through contact: positions, and gradients of x0, v0 and the weights."""
+    body = ball(height=0.24, dtype=dtype)
+    law = copy.deepcopy(law).to(device=device, dtype=dtype)
+    trained = [p for p in law.parameters() if p.requires_grad]
+    x0 = body.x0.to(device).requires_grad_()
+    v0 = torch.tensor([0.3, -2.0, 0.1], dtype=dtype, device=device, requires_grad=True)
+    path = rollout(MODEL, law, x0, v0, body.mass.to(device), body.vol0.to(device), steps=STEPS, frames=FRAMES)
+    weight = torch.linspace(0.5, 1.5, path.x.numel(), dtype=dtype, device=device).reshape(path.x.shape)
+    grads = torch.autograd.grad((weight * path.x.square()).sum(), [x0, v0, *trained])
+    return path.x.detach().cpu().double(), [g.cpu().double() for g in grads]
+
+
+def relative(a, b):
+    return float((a - b).norm() / b.norm())
+
+
+@pytest.fixture(scope="module", params=["analytic", "neural"])
+def law(request):
+    if request.param == "analytic":
+        return analytic_law(TRUTH, MODEL.dt)
+    law = make_law("neural")
+    law.attach_adaptor(rank=4, seed=1)
+    with torch.no_grad():
+        for p in law.parameters():
+            if p.requires_grad:
+                p.add_(0.01 * torch.randn(p.shape, generator=torch.Generator().manual_seed(0)).to(p))
+    return law
+
+
+def test_rollout_through_contact_agrees_in_float64(law):
+    x_cpu, grads_cpu = throw(law, "cpu", torch.float64)
+    x_gpu, grads_gpu = throw(law, "cuda", torch.float64)
+    assert float((x_cpu - x_gpu).abs().max()) < 1e-9
+    for on_gpu, on_cpu in zip(grads_gpu, grads_cpu, strict=True):
+        assert relative(on_gpu, on_cpu) < 1e-7
+
+
+def test_float32_stays_as_near_to_float64_as_the_cpu_does(law):
+    truth, _ = throw(law, "cpu", torch.float64)
+    x_cpu, _ = throw(law, "cpu", torch.float32)
+    x_gpu, _ = throw(law, "cuda", torch.float32)
+    gpu, cpu = relative(x_gpu, truth), relative(x_cpu, truth)
+    assert gpu < 5 * cpu and cpu < 5 * gpu
+
+
+@pytest.fixture(scope="module")
+def drop():
+    """A ball in contact: arguments of a rollout on the GPU in float32, and a neural law with an adaptor."""
+    body = ball(height=0.2, dtype=torch.float32).to(torch.float32, "cuda")
+    law = make_law("neural", torch.float32)
+    law.attach_adaptor(rank=4, seed=1)
+    law = law.to("cuda")
+    v0 = torch.tensor([0.3, -2.0, 0.1], device="cuda")
+    return law, (MODEL, law, body.x0, v0, body.mass, body.vol0)
+
+
+def gradient(law, arguments, **options):
+    """Positions and gradients of the adaptor of a rollout of `STEPS` steps."""
+    path = rollout(*arguments, steps=STEPS, frames=FRAMES, skip_free_flight=False, **options)
+    trained = [p for p in law.parameters() if p.requires_grad]
+    grads = torch.autograd.grad(path.x.square().sum() + path.F.square().sum(), trained)
+    return path.x.detach(), torch.cat([g.flatten() for g in grads])
+
+
+@pytest.mark.parametrize("scatter", ["runs", "runs_scalar"])
+def test_sums_over_runs_of_particles_equal_single_additions(drop, scatter):
+    """Sorted and summed in warps, with and without vector atomics."""
+    x, grad = gradient(*drop, scatter="atomic")
+    x_runs, grad_runs = gradient(*drop, scatter=scatter)
+    assert relative(x_runs, x) < 1e-5
+    assert relative(grad_runs, grad) < 1e-3
+
+
+@pytest.mark.parametrize("options", [{}, {"keep": "states"}, {"memory": 2.0e6}])
+def test_graphs_replay_what_was_launched(drop, options):
+    """The first call launches, the second records, later ones replay: also with other weights and a new loss."""
+    law, arguments = drop
+    x, grad = gradient(law, arguments, **options)
+    for _ in range(3):
+        x_again, grad_again = gradient(law, arguments, **options)
+        assert relative(x_again, x) < 1e-5
+        assert relative(grad_again, grad) < 1e-3
+    adapted = copy.deepcopy(law)
+    with torch.no_grad():
+        for p in adapted.parameters():
+            if p.requires_grad:
+                p.add_(0.02)
+    x_other, grad_other = gradient(adapted, (arguments[0], adapted, *arguments[2:]), **options)
+    x_plain, grad_plain = gradient(adapted, (arguments[0], adapted, *arguments[2:]), scatter="atomic")
+    assert relative(x_other, x_plain) < 1e-5 < relative(x_other, x)
+    assert relative(grad_other, grad_plain) < 1e-3
+
+
+def test_graphs_of_one_body_survive_a_rollout_of_two(drop):
+    """Other weights at other places in between: nothing recorded may read the old ones."""
+    law, arguments = drop
+    count = len(arguments[2])
+    pair = [Body(law, 0, count // 2), Body(copy.deepcopy(law), count // 2, count)]
+    x, grad = gradient(law, arguments)
+    for _ in range(4):
+        x_two, _ = gradient(law, (arguments[0], pair, *arguments[2:]))
+        x_again, grad_again = gradient(law, arguments)
+        assert relative(x_two, x) < 1e-5 and relative(x_again, x) < 1e-5
+        assert relative(grad_again, grad) < 1e-3
+
+
+def test_prediction_without_gradient_replays_too(drop):
+    law, arguments = drop
+    with torch.no_grad():
+        paths = [rollout(*arguments, steps=STEPS, frames=FRAMES, skip_free_flight=False).x for _ in range(4)]
+    x, _ = gradient(law, arguments)
+    assert all(relative(path, x) < 1e-5 for path in paths)
+
+
+def render(device, dtype):
+    body = ball(dtype=dtype).to(dtype, device)
+    eye = torch.eye(3, dtype=dtype, device=device).expand(2, len(body.x0), 3, 3)
+    x = torch.stack([body.x0, body.x0 + 0.01]).requires_grad_()
+    images = body.particle_gs(camera(dtype=dtype).to(device=device))(x, eye)
+    (grad,) = torch.autograd.grad(images.square().sum(), x)
+    return images.detach().cpu(), grad.cpu()
+
+
+def test_particle_gs_agrees():
+    images_cpu, grad_cpu = render("cpu", torch.float64)
+    images_gpu, grad_gpu = render("cuda", torch.float64)
+    assert float((images_cpu - images_gpu).abs().max()) < 1e-9
+    assert relative(grad_gpu, grad_cpu) < 1e-7
+    images_32, _ = render("cuda", torch.float32)
+    difference = (images_32.double() - images_cpu).abs()
+    assert float(difference.mean()) < 1e-5
+    assert float((difference.amax(-1) > 1 / 255).double().mean()) < 1e-3
+
+
+def train(device, settings, checkpoint=None):
+    """Fit a stiff random law to the video of a soft ball in contact."""
+    body = ball(dtype=torch.float32).to(torch.float32, device)
+    law = neural_law(seed=5)
+    with torch.no_grad():
+        law.elasticity.base[2].mul_(3e4 / max(law.longitudinal_modulus(), 1.0))
+    law = law.to(device)
+    law.attach_adaptor(rank=4, seed=1)
+    v0 = torch.tensor([0.0, -1.5, 0.0], device=device)
+    loss = PixelLoss(body, observe(body, v0, (0, 20, 40)), frames_per_batch=2)
+    return train_material(MODEL, law, body, v0, loss, settings, checkpoint=checkpoint, log=lambda _: None)
+
+
+def test_training_runs_on_the_gpu():
+    result = train("cuda", MaterialSettings(iterations=5))
+    assert result.best_loss < result.history.loss[0]
+    assert len(result.history.seconds) == 5
+
+
+class Killed(Checkpoint):
+    """Writes its first state, and then the power fails."""
+
+    def save(self, state):
+        super().save(state)
+        raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("device", ["cuda", "cpu"])
+def test_a_training_killed_on_the_gpu_resumes_on_either_device(tmp_path, device):
+    settings = MaterialSettings(iterations=6, checkpoint_every=3)
+    whole = train("cuda", settings)
+    with pytest.raises(KeyboardInterrupt):
+        train("cuda", settings, Killed(tmp_path / "state.pt", {}))
+    resumed = train(device, settings, Checkpoint(tmp_path / "state.pt", {}))
+    assert resumed.history.loss == pytest.approx(whole.history.loss, rel=0.02)
+    for name, value in whole.law.adaptor_state().items():
+        found = resumed.law.adaptor_state()[name]
+        assert found.device.type == device
+        assert relative(found.cpu(), value.cpu()) < 0.05, name
+
+
+def test_velocity_from_bytes_agrees():
+    """Frames before contact on both devices, from images as they are decoded."""
+    found = {}
+    for device in ("cpu", "cuda"):
+        body = ball().to(torch.float64, device)
+        seen = observe(body, [0.5, -1.2, 0.4], (0, 4, 8, 12, 16))
+        opaque = torch.ones_like(seen.images[..., :1])
+        pixels = (255 * torch.cat([seen.images, opaque], -1).clamp(0, 1)).round().to(torch.uint8)
+        law = analytic_law(TRUTH, MODEL.dt).to(device)
+        found[device] = estimate_velocity(MODEL, law, body, replace(seen, images=pixels))
+    # single precision on the GPU, double on the CPU: far below what the images leave open
+    assert (abs(found["cuda"].v0 - found["cpu"].v0) < 0.25 * found["cpu"].std).all()
+    assert (abs(found["cuda"].std - found["cpu"].std) < 0.1 * found["cpu"].std).all()
+
+
+def test_a_video_that_does_not_fit_stays_off_the_device(monkeypatch):
+    """Frames then go there a part at a time; colours and losses are the same."""
+    cameras = camera(dtype=torch.float32)
+    images = torch.randint(256, (3, 1, cameras.height, cameras.width, 4), dtype=torch.uint8)
+    video = Observation((0, 1, 2), images, cameras)
+    kept = video.to(torch.float32, "cuda")
+    monkeypatch.setattr(observation, "_DEVICE_SHARE", 0.0)
+    streamed = video.to(torch.float32, "cuda")
+    assert kept.images.is_cuda and not streamed.images.is_cuda
+    assert torch.equal(kept.colours(slice(1, 3)), streamed.colours(slice(1, 3)))
+    assert streamed.stored([2]).is_cuda

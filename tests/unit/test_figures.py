@@ -1,0 +1,418 @@
+"""Figures: every one draws from its data in print quality; particles, crops and tests of material points are right."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from importlib import import_module
+from itertools import combinations
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pytest
+import torch
+import yaml
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from matplotlib.textpath import TextPath
+from PIL import Image
+
+from neuma_lib.errors import InputError
+from neuma_lib.evaluation.figures import style
+from neuma_lib.evaluation.figures.grid import TITLE, broken
+from neuma_lib.evaluation.figures.panels import Panels, load_panels, save_panels
+from neuma_lib.evaluation.figures.pictures import (
+    cropped,
+    evenly,
+    frontal,
+    magnified,
+    mean_height,
+    monotone_frames,
+)
+from neuma_lib.evaluation.response import Visited, largest_shear_stress, sheared, uniaxial, yielding
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.splatting.cameras import Cameras
+from neuma_lib.splatting.spheres import draw_spheres
+
+ROOT = Path(__file__).resolve().parents[2]
+SETTINGS = yaml.safe_load((ROOT / "config/config.yaml").read_text())
+METHODS = [name for name in style.METHODS if name not in ("truth", "pac_nerf", "spring_gaus")]
+TITLES = {method: f"NeuMA {method[6:]}" for method in METHODS}
+SCENES = ["BouncyBall", "JellyDuck", "RubberPawn", "ClayCat", "SandFish", "HoneyBottle"]
+
+
+def pictures(rows: int, columns: int, numbers: dict, row_titles=None, column_titles=None) -> Panels:
+    """Coloured discs on white."""
+    generator = np.random.default_rng(0)
+    y, x = np.mgrid[:60, :48]
+    images = np.full((rows, columns, 60, 48, 3), 255, dtype=np.uint8)
+    for row in images:
+        for image in row:
+            image[(x - 24) ** 2 + (y - 40) ** 2 < 200] = generator.integers(0, 200, 3)
+    return Panels(
+        images,
+        tuple(row_titles or (f"NeuMA w/o {i}" for i in range(rows))),
+        tuple(column_titles or (f"{64 * j} ms" for j in range(columns))),
+        numbers,
+    )
+
+
+def curves(count: int = 20) -> list[float]:
+    return (0.1 + np.abs(np.random.default_rng(count).standard_normal(count)).cumsum()).tolist()
+
+
+def cells(low: float, high: float, methods, scenes) -> dict:
+    generator = np.random.default_rng(1)
+    return {m: {s: float(generator.uniform(low, high)) for s in scenes} for m in methods}
+
+
+def response() -> dict:
+    x = np.linspace(-0.2, 0.2, 9).tolist()
+    test = {"x": x, "stress": {law: curves(9) for law in ("truth", "nclaw", "neuma")}, "visited": [-0.1, 0.1]}
+    return {"uniaxial": test, "shear": test, "yield": {**test, "x": np.linspace(0, 0.6, 9).tolist()}}
+
+
+DATA = {
+    "ch_dist_curve": lambda: {
+        "titles": TITLES,
+        "scenes": {
+            scene: {
+                "time": np.linspace(0, 0.25, 20).tolist(),
+                "floor": [0.1] * 20,
+                "chamfer": {method: curves() for method in METHODS},
+            }
+            for scene in SCENES
+        },
+    },
+    "image_quality": lambda: {
+        "titles": TITLES,
+        "scenes": SCENES,
+        "psnr": cells(20, 35, METHODS, SCENES),
+        "ssim": cells(0.8, 1, METHODS, SCENES),
+        "lpips_vgg": cells(0, 0.2, METHODS, SCENES),
+        "lpips_alex": cells(0, 0.2, METHODS, SCENES),
+    },
+    "main_res": lambda: pictures(6, 15, {"groups": [(scene, 5) for scene in SCENES[:3]]}),
+    "particles_app": lambda: pictures(6, 8, {}),
+    "lora_alphav": lambda: pictures(
+        6,
+        7,
+        {
+            "weights": [0, 0.25, 0.5, 0.75, 1, 1.25],
+            "scenes": {
+                s: {"rows": 3, "time": [0, 0.1, 0.2], "heights": [[3, 2, 1]] * 6, "truth": [3, 2, 2]}
+                for s in SCENES[:2]
+            },
+        },
+        row_titles=["64 ms", "128 ms", "256 ms"] * 2,
+        column_titles=[*(f"$w$ = {w / 4:g}" for w in range(6)), "observed"],
+    ),
+    "vis_generalize": lambda: pictures(
+        6,
+        7,
+        {"letters": 4, "materials": [*SCENES, SCENES[0]], "times": [f"{i} ms" for i in range(7)]},
+        row_titles=["67 % of\nthe sequence"] * 4
+        + [SETTINGS["experiments"][name]["title"] for name in SETTINGS["figures"]["meetings"]],
+        column_titles="NEURIPS",
+    ),  # fmt: skip
+    "ext_time": lambda: pictures(
+        3,
+        9,
+        {
+            "observed": 0.25,
+            "time": np.linspace(0, 0.75, 20).tolist(),
+            "titles": {"truth": "Truth", "nclaw": "NCLaw", "neuma": "NeuMA"},
+            "heights": {"truth": curves(), "nclaw": curves(), "neuma": curves()},
+        },
+    ),
+    "gradient_analysis": lambda: {
+        scene: {
+            "norms": {"elastic": curves(50), "plastic": curves(50)},
+            "change": {"elastic": 0.1, "plastic": 0.02},
+            "wrong": "elastic and plastic",
+        }
+        for scene in ("BouncyBall", "RubberPawn")
+    },
+    "uneven_mass": lambda: pictures(
+        4,
+        5,
+        {
+            "rows": {"neuma": 2, "neuma+assumed_density=1000": 3},
+            "chamfer": {"neuma": 0.3, "neuma+assumed_density=1000": 2.0},
+            "floor": 0.1,
+        },
+        row_titles=["Observation", "NCLaw", *SETTINGS["tables"]["uneven_mass"]["titles"].values()],
+    ),  # fmt: skip
+    "pipeline": lambda: pictures(
+        5,
+        5,
+        {"first": ["views", "kernels", "surface", "particles", "binding"], "heads": ["text"] * 5},
+        row_titles=["I\ninitial\nstate", "II\nsimulation", "III\nrendering", "\nobservation", "\ndifference"],
+    ),  # fmt: skip
+    "material_response": lambda: {scene: response() for scene in SCENES},
+    "ablation_gradients": lambda: {
+        "scenes": SCENES[:3],
+        "titles": {"a": "NeuMA", "b": "gradients not zeroed"},
+        **{name: cells(0, 1, "ab", SCENES) for name in ("loss", "chamfer_excess", "tracer_rmse_mm", "psnr")},
+    },
+}
+
+
+def drawing(name: str):
+    return import_module(f"neuma_lib.evaluation.figures.{name}").draw(DATA[name]())
+
+
+@pytest.mark.parametrize("name", DATA)
+def test_figure_is_ready_for_print(name, tmp_path):
+    figure = drawing(name)
+    png, pdf = tmp_path / "figure.png", tmp_path / "figure.pdf"
+    style.save(figure, png, pdf)
+    assert pdf.read_bytes().startswith(b"%PDF")
+    with Image.open(png) as image:
+        assert image.width in (round(style.PAGE * style.DPI), round(style.COLUMN * style.DPI))
+        assert len(image.convert("L").getcolors(1 << 20)) > 10  # not empty
+    width, height = figure.get_size_inches()
+    assert height < 9
+    texts = [t for t in figure.findobj(Text) if t.get_text().strip() and t.get_visible()]
+    assert texts and min(text.get_fontsize() for text in texts) >= 6
+    ticks = {
+        label
+        for axes in figure.axes
+        for axis in (axes.xaxis, axes.yaxis)
+        for label in [*axis.get_ticklabels(which="both"), axis.offsetText]
+    }
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    for text in set(texts) - ticks:
+        box, page = text.get_window_extent(renderer), figure.bbox
+        inside = box.x0 > -1 and box.y0 > -1 and box.x1 < page.x1 + 1 and box.y1 < page.y1 + 1
+        assert inside, f"{name}: '{text.get_text()}' leaves the page"
+
+
+@pytest.mark.parametrize("name", ["ch_dist_curve", "main_res"])
+def test_same_data_same_bytes(name, tmp_path):
+    for folder in "ab":
+        (tmp_path / folder).mkdir()
+        style.save(drawing(name), tmp_path / folder / "figure.png", tmp_path / folder / "figure.pdf")
+    for kind in ("png", "pdf"):
+        first, second = ((tmp_path / folder / f"figure.{kind}").read_bytes() for folder in "ab")
+        assert first == second
+
+
+def test_user_settings_of_matplotlib_do_not_matter():
+    with matplotlib.rc_context({"font.size": 30, "lines.linewidth": 9}):
+        figure = drawing("ch_dist_curve")
+    assert figure.axes[0].title.get_fontsize() == style.SETTINGS["axes.titlesize"]
+
+
+def test_every_figure_has_caption_rule_and_test():
+    rules = "".join(
+        (ROOT / f"workflow/rules/{name}.smk").read_text() for name in ("figure_inputs", "figures")
+    )
+    modules = {path.stem for path in (ROOT / "neuma_lib/evaluation/figures").glob("*.py")} - {
+        "__init__",
+        "grid",
+    }
+    listed = set(re.findall(r'^    "(\w+)": "(?:json|h5)",$', rules, re.MULTILINE))
+    assert modules == listed == set(DATA)
+    for name in modules:
+        assert (ROOT / f"workflow/report/{name}.rst").read_text().strip()
+        assert f"rule {name}_data:" in rules
+
+
+# ---- style
+
+
+def test_one_look_a_method():
+    assert set(SETTINGS["methods"]) <= set(style.METHODS)
+    for part in ("color", "marker"):
+        looks = [getattr(kind, part) for kind in style.METHODS.values()]
+        assert len(set(looks)) == len(looks)
+    assert style.look("neuma+rank=4") == style.look("neuma")
+    assert style.look("somebody_else").color == style.GREY
+
+
+# Machado, Oliveira and Fernandes (2009), complete dichromacy.
+DEUTERANOPIA = [
+    [0.367322, 0.860646, -0.227968],
+    [0.280085, 0.672501, 0.047413],
+    [-0.011820, 0.042940, 0.968881],
+]
+PROTANOPIA = [
+    [0.152286, 1.052583, -0.204868],
+    [0.114503, 0.786281, 0.099216],
+    [-0.003882, -0.048116, 1.051998],
+]
+
+
+@pytest.mark.parametrize(
+    "eyes", [np.eye(3), DEUTERANOPIA, PROTANOPIA], ids=["all", "deuteranopia", "protanopia"]
+)
+def test_methods_look_different_to_all_eyes(eyes):
+    from skimage.color import rgb2lab
+
+    shown = {
+        m: rgb2lab(np.clip(np.asarray(eyes) @ to_rgb(kind.color), 0, 1)) for m, kind in style.METHODS.items()
+    }
+    for a, b in combinations(shown, 2):
+        assert np.linalg.norm(shown[a] - shown[b]) > 12, (a, b)
+
+
+# ---- pictures
+
+
+CAMERA = Cameras(torch.eye(4)[None], torch.tensor([[[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]]), 64, 48)
+
+
+def spheres(points, colors, radius=0.1):
+    K, viewmat = CAMERA.Ks[0].numpy(), CAMERA.viewmats[0].numpy()
+    return draw_spheres(np.array(points, float), np.array(colors, float), radius, viewmat, K, 64, 48)
+
+
+def test_sphere_stands_where_and_as_large_as_projected():
+    image = spheres([[0.1, -0.05, 1.0]], [0, 0, 0])
+    rows, columns = np.nonzero((image < 128).all(-1))
+    assert abs(columns.mean() + 0.5 - 42) < 0.3 and abs(rows.mean() + 0.5 - 19) < 0.3
+    assert len(rows) == pytest.approx(np.pi * 10**2, rel=0.05)
+
+
+def test_near_spheres_hide_far_ones_whatever_the_order():
+    red, blue = [1.0, 0, 0], [0, 0, 1.0]
+    for order in (1, -1):
+        image = spheres([[0, 0, 1.0], [0, 0, 1.5]][::order], [red, blue][::order])
+        assert image[24, 32, 0] > 60 and image[24, 32, 2] < 10
+
+
+def test_no_sphere_no_picture():
+    assert (spheres(np.zeros((0, 3)), [0, 0, 0]) == 255).all()
+    assert (spheres([[0, 0, -1.0]], [0, 0, 0]) == 255).all()
+
+
+def test_magnified_cameras_see_the_same():
+    points = torch.tensor([[0.1, 0.2, 1.0], [-0.2, 0.1, 2.0]])
+    large = magnified(CAMERA, 3)
+    assert (large.width, large.height) == (192, 144)
+    assert torch.allclose(large.project(points)[0], 3 * CAMERA.project(points)[0])
+
+
+def test_frontal_camera_sees_everything():
+    points = np.random.default_rng(0).uniform(0.2, 0.8, (50, 3))
+    pixels, depth = frontal(points, 80, 60).project(torch.from_numpy(points).float())
+    assert (
+        (pixels >= 0).all()
+        and (pixels[..., 0] < 80).all()
+        and (pixels[..., 1] < 60).all()
+        and (depth > 0).all()
+    )
+
+
+def test_crops_have_one_size_and_lose_nothing():
+    small, large = np.full((2, 40, 50, 3), 255, np.uint8), np.full((3, 60, 50, 3), 255, np.uint8)
+    small[0, 30:39, 2:12] = 0
+    large[:, 5:55, 20:30] = 0
+    cut = cropped([small, large])
+    assert cut[0].shape[1:] == cut[1].shape[1:]
+    for before, after in zip((small, large), cut, strict=True):
+        assert (before < 255).sum() == (after < 255).sum()
+
+
+def test_row_titles_break_where_they_are_too_wide():
+    title = "NeuMA, 1000 kg/m³ assumed\neverywhere"
+    lines = broken(title, 1.0).split("\n")
+    assert len(lines) > 2 and " ".join(lines).split() == title.split()
+    assert max(TextPath((0, 0), line, size=TITLE).get_extents().width for line in lines) <= 72
+    assert broken(title, 9.0) == title
+    assert broken("unbreakable", 0.1) == "unbreakable"
+
+
+def test_monotone_frames_are_counted_where_the_motions_part():
+    heights = [[1.0, 3.0, 1.0, 5.0], [1.0, 2.0, 2.0, 4.0], [1.0, 1.0, 1.5, 4.0]]
+    assert monotone_frames(heights) == (2, 3)
+    assert monotone_frames(heights[::-1]) == (2, 3)
+
+
+def test_mean_height_is_that_of_the_centre_of_mass():
+    x = np.zeros((2, 2, 3))
+    x[1, :, 1] = [1.0, 4.0]
+    assert mean_height(x, np.array([2.0, 1.0])) == pytest.approx([0.0, 2.0])
+
+
+def test_evenly_keeps_the_ends():
+    assert evenly(5, 33) == [0, 8, 16, 24, 32]
+    assert evenly(5, 3) == [0, 1, 2]
+
+
+def test_panels_survive_the_disk(tmp_path):
+    panels = pictures(2, 3, {"weights": [0.5], "name": "ΔM"})
+    save_panels(tmp_path / "a.h5", panels)
+    again = load_panels(tmp_path / "a.h5")
+    assert (again.images == panels.images).all()
+    assert (again.rows, again.columns, again.numbers) == (panels.rows, panels.columns, panels.numbers)
+    with pytest.raises(InputError, match="titles"):
+        Panels(panels.images, ("one",), panels.columns)
+
+
+# ---- tests of material points
+
+E, NU, YIELD = 1e5, 0.3, 2e3
+MU = E / (2 * (1 + NU))
+HENCKY = {"elasticity": {"name": "hencky", "E": E, "nu": NU}}
+MISES = {**HENCKY, "plasticity": {"name": "von_mises", "yield_stress": YIELD}}
+
+
+@pytest.mark.parametrize("name", ["hencky", "neo_hookean", "fixed_corotated", "stvk"])
+def test_small_uniaxial_stretch_follows_youngs_modulus(name):
+    law = analytic_law({"elasticity": {"name": name, "E": E, "nu": NU}})
+    strain = torch.tensor([-1e-4, 0.0, 1e-4], dtype=torch.float64)
+    assert torch.allclose(uniaxial(law, 1 + strain), E * strain, rtol=2e-3, atol=1e-3)
+
+
+def test_large_uniaxial_stretch_of_hencky_is_closed_form():
+    stretch = torch.tensor([0.6, 1.5, 2.0], dtype=torch.float64)
+    assert torch.allclose(uniaxial(analytic_law(HENCKY), stretch), E * stretch.log(), rtol=1e-5)
+
+
+def test_small_shear_follows_the_shear_modulus():
+    shear = torch.tensor([-1e-4, 1e-4], dtype=torch.float64)
+    assert torch.allclose(sheared(analytic_law(HENCKY), shear), MU * shear, rtol=1e-3)
+
+
+def test_yielding_ends_on_the_plateau():
+    shear, stress = yielding(analytic_law(MISES), rate=20.0, dt=5e-4, steps=60)
+    elastic = shear < 0.9 * YIELD / 2**0.5 / MU
+    assert torch.allclose(stress[elastic], MU * shear[elastic], rtol=1e-2)
+    assert stress[-1] == pytest.approx(YIELD / 2**0.5, rel=2e-2)
+
+
+def test_visited_range_of_known_states():
+    gamma = 0.3
+    F = torch.eye(3).repeat(1000, 1, 1)
+    F[:, 0, 1] = gamma
+    seen = Visited.of(F)
+    assert seen.shear == pytest.approx((-gamma, gamma), rel=1e-4)
+    assert seen.stretch[0] * seen.stretch[1] == pytest.approx(
+        1.0, rel=1e-4
+    ) and seen.pressed == pytest.approx(1.0)
+    F = torch.eye(3).repeat(10, 1, 1)
+    F[:, 0, 1] = 1e-3
+    assert largest_shear_stress(analytic_law(HENCKY), F) == pytest.approx(MU * 1e-3, rel=1e-2)
+
+
+# ---- the workflow
+
+
+def test_all_figures_plan(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "snakemake", "--configfile", "tests/workflow/tiny.yaml", "--cores", "1",
+          "--dry-run", "--quiet",         "rules", "--nolock", "--forceall", "figures"],
+        cwd=ROOT, text=True, capture_output=True, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+
+
+def test_save_writes_nothing_else(tmp_path):
+    style.save(Figure(figsize=(1, 1)), tmp_path / "a.png", tmp_path / "a.pdf")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.pdf", "a.png"]

@@ -1,0 +1,379 @@
+"""Every artifact comes back as it was written, in the same bytes each time; damaged ones are named."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from neuma_lib.errors import InputError
+from neuma_lib.io import files as io
+from neuma_lib.io.ply_container import read_ply
+
+RNG = np.random.default_rng(0)
+
+
+def cube():
+    import trimesh
+
+    return trimesh.creation.box((0.2, 0.2, 0.2))
+
+
+# ---- safety of writing
+
+
+def test_a_failing_writer_leaves_the_old_file_and_nothing_else(tmp_path):
+    path = tmp_path / "metrics.json"
+    io.write_json(path, {"a": 1})
+    with pytest.raises(ValueError):
+        io.write_json(path, {"a": float("nan")})
+    with pytest.raises(RuntimeError), io.atomic(path) as partial:
+        partial.write_text("half")
+        raise RuntimeError
+    assert io.read_json(path) == {"a": 1}
+    assert [p.name for p in tmp_path.iterdir()] == ["metrics.json"]
+
+
+def test_the_name_keeps_its_ending_while_written(tmp_path):
+    with io.atomic(tmp_path / "video.mp4") as partial:
+        assert partial.suffix == ".mp4" and partial.parent == tmp_path
+        partial.write_bytes(b"")
+
+
+def test_json(tmp_path):
+    (tmp_path / "broken.json").write_text('{"a": ')
+    with pytest.raises(InputError, match=r"broken\.json is not valid JSON"):
+        io.read_json(tmp_path / "broken.json")
+    with pytest.raises(InputError, match=r"absent\.json does not exist"):
+        io.read_json(tmp_path / "absent.json")
+
+
+# ---- arrays
+
+
+def trajectory():
+    return {
+        "x": RNG.random((3, 5, 3), dtype=np.float32),
+        "F": RNG.random((3, 5, 3, 3), dtype=np.float32),
+        "frames": np.array([0, 4, 9]),
+        "C": None,
+    }
+
+
+def test_arrays_round_trip_with_units(tmp_path):
+    import h5py
+
+    arrays, path = trajectory(), tmp_path / "particles.h5"
+    io.write_arrays(path, arrays, {"dt": 1e-3, "scene": {"shape": "ball"}, "title": "Ball"})
+    found, attributes = io.read_arrays(path, required=("x", "frames"))
+    assert set(found) == {"x", "F", "frames"}
+    for name in found:
+        assert found[name].dtype == arrays[name].dtype
+        np.testing.assert_array_equal(found[name], arrays[name])
+    assert attributes["dt"] == 1e-3 and json.loads(attributes["scene"]) == {"shape": "ball"}
+    with h5py.File(path) as file:
+        assert file["x"].attrs["unit"] == "m" and "shape (T, N, 3)" in file["x"].attrs["description"]
+    only, _ = io.read_arrays(path, only=("x",))
+    assert set(only) == {"x"}
+
+
+def test_arrays_problems(tmp_path):
+    path = tmp_path / "particles.h5"
+    io.write_arrays(path, trajectory())
+    with pytest.raises(InputError, match=r"particles\.h5 has no dataset v, tracers"):
+        io.read_arrays(path, required=("x", "v", "tracers"))
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=r"particles\.h5 cannot be read as HDF5"):
+        io.read_arrays(path)
+    io.write_arrays(path, {"x": np.full((2, 3), np.nan)})
+    with pytest.raises(InputError, match=r"particles\.h5: dataset x holds values that are not finite"):
+        io.read_arrays(path)
+
+
+# ---- image sets
+
+INTRINSICS = {"fl_x": 20.0, "fl_y": 21.0, "cx": 8.0, "cy": 6.0, "w": 16, "h": 12}
+
+
+@pytest.fixture
+def image_set(tmp_path):
+    """Two views at three steps, written out of order."""
+    frames = []
+    for step in (5, 0, 2):
+        for view in (1, 0):
+            name = f"d_{view}_{step:03d}.png"
+            pixels = np.full((12, 16, 4), 10 * step + view, dtype=np.uint8)
+            pixels[2:9, 3:12, 3] = 255
+            Image.fromarray(pixels, "RGBA").save(tmp_path / name)
+            pose = np.eye(4)
+            pose[:3, 3] = (0.1 * view, 0.5, 2.0)
+            frames.append(
+                {
+                    "file_path": name,
+                    "transform_matrix": pose.tolist(),
+                    "view": view,
+                    "step": step,
+                    "time": 1e-3 * step,
+                }
+            )
+    path = tmp_path / "transforms.json"
+    io.write_transforms(path, INTRINSICS, frames)
+    return path
+
+
+def edit(path, change):
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+
+
+def test_image_set(image_set):
+    images = io.read_image_set(image_set)
+    assert images.images.shape == (6, 12, 16, 4) and images.images.dtype == np.uint8
+    assert (images.width, images.height) == (16, 12)
+    steps, index, columns = images.video([0, 1])
+    assert steps == (0, 2, 5) and index.shape == (3, 2)
+    assert images.images[index[2, 1], 0, 0, 0] == 51
+    np.testing.assert_allclose(images.Ks[0], [[20, 0, 8], [0, 21, 6], [0, 0, 1]])
+    # A point one metre in front of an OpenGL camera (its -z) is one metre along +z of the OpenCV camera.
+    point = images.viewmats[columns[1]] @ np.array([0.1, 0.6, 1.0, 1.0])
+    np.testing.assert_allclose(point, [0, -0.1, 1, 1], atol=1e-12)
+    assert len(io.read_image_set(image_set, views=[1]).images) == 3
+
+
+def test_camera_angle_and_own_intrinsics_of_a_frame(image_set):
+    angle = 2 * np.arctan(16 / (2 * 20.0))
+
+    def change(data):
+        for key in ("fl_x", "fl_y", "cx", "cy"):
+            del data[key]
+        data["camera_angle_x"] = angle
+        data["frames"][0]["fl_x"] = 40.0
+
+    edit(image_set, change)
+    Ks = io.read_image_set(image_set).Ks
+    np.testing.assert_allclose(Ks[1], [[20, 0, 8], [0, 20, 6], [0, 0, 1]])
+    assert Ks[0, 0, 0] == 40.0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda d: [d.pop(k) for k in ("fl_x", "fl_y")],
+            r"transforms\.json: frame 0 \(d_1_005\.png\) has no intrinsics",
+        ),
+        (lambda d: d.update(fl_x=-3), r"fl_x must be a positive number, not -3"),
+        (lambda d: d.update(frames=[]), "'frames' is missing or empty"),
+        (lambda d: d["frames"][2].pop("file_path"), "frame 2 has no file_path"),
+        (
+            lambda d: d["frames"][2].pop("transform_matrix"),
+            r"frame 2 \(d_1_000\.png\) needs a 4x4 transform_matrix",
+        ),
+        (lambda d: d["frames"][1].update(transform_matrix=(2 * np.eye(4)).tolist()), "not a rigid motion"),
+        (lambda d: d.update(w=32), "w, h of d_1_005.png are 32x12, the image is 16x12"),
+    ],
+)
+def test_bad_transforms(image_set, change, message):
+    edit(image_set, change)
+    with pytest.raises(InputError, match=message):
+        io.read_image_set(image_set)
+
+
+def test_missing_image(image_set):
+    (image_set.parent / "d_1_002.png").unlink()
+    with pytest.raises(InputError, match=r"d_1_002\.png is missing although .*--forcerun"):
+        io.read_image_set(image_set)
+
+
+def test_changed_image(image_set):
+    Image.new("RGBA", (16, 12), (1, 2, 3, 255)).save(image_set.parent / "d_0_000.png")
+    with pytest.raises(InputError, match=r"d_0_000\.png is damaged or was changed"):
+        io.read_image_set(image_set)
+
+
+def without_checksums(data):
+    for frame in data["frames"]:
+        del frame["sha256"]
+
+
+def test_truncated_png(image_set):
+    edit(image_set, without_checksums)
+    path = image_set.parent / "d_0_000.png"
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(InputError, match=r"d_0_000\.png is not a readable image, perhaps truncated"):
+        io.read_image_set(image_set)
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (Image.new("RGB", (16, 12)), "has no alpha channel"),
+        (Image.new("RGBA", (16, 12), (9, 9, 9, 0)), r"the mask \(alpha\) is empty"),
+        (Image.new("RGBA", (12, 16), (9, 9, 9, 255)), "is 12x16, others 16x12"),
+        (Image.new("I;16", (16, 12)), "16 bits"),
+    ],
+)
+def test_unusable_images(image_set, image, message):
+    edit(image_set, without_checksums)
+    image.save(image_set.parent / "d_0_000.png")
+    with pytest.raises(InputError, match=rf"d_0_000\.png.*{message}"):
+        io.read_image_set(image_set)
+
+
+def test_views_that_do_not_exist_or_do_not_match(image_set):
+    with pytest.raises(InputError, match="view 7 is not among the filmed views"):
+        io.read_image_set(image_set).video([7])
+    edit(image_set, lambda d: d["frames"].pop(0))
+    with pytest.raises(InputError, match="not filmed at the same steps"):
+        io.read_image_set(image_set).video([0, 1])
+
+
+# ---- meshes
+
+
+def test_mesh_round_trip(tmp_path):
+    mesh = cube()
+    io.write_mesh(tmp_path / "mesh.ply", mesh.vertices, mesh.faces)
+    found = io.read_mesh(tmp_path / "mesh.ply")
+    np.testing.assert_allclose(found.vertices, mesh.vertices, atol=1e-8)
+    np.testing.assert_array_equal(found.faces, mesh.faces)
+
+
+def test_foreign_meshes(tmp_path):
+    mesh = cube()
+    for encoding in ("ascii", "binary"):
+        path = tmp_path / f"{encoding}.ply"
+        path.write_bytes(mesh.export(file_type="ply", encoding=encoding))
+        assert io.read_mesh(path).volume == pytest.approx(mesh.volume, rel=1e-5)
+
+
+def test_bad_meshes(tmp_path):
+    mesh, path = cube(), tmp_path / "mesh.ply"
+    vertices = mesh.vertices.copy()
+    vertices[3, 1] = np.nan
+    io.write_mesh(path, vertices, mesh.faces)
+    with pytest.raises(InputError, match=r"mesh\.ply: vertex 3 of 8 is not finite"):
+        io.read_mesh(path)
+    io.write_mesh(path, mesh.vertices, mesh.faces[1:])
+    with pytest.raises(InputError, match=r"mesh\.ply is not watertight.*close its holes"):
+        io.read_mesh(path)
+    assert len(io.read_mesh(path, watertight=False).faces) == 11
+    io.write_mesh(path, mesh.vertices, mesh.faces[:, ::-1])
+    with pytest.raises(InputError, match="faces point inwards"):
+        io.read_mesh(path)
+    io.write_mesh(path, mesh.vertices, mesh.faces)
+    path.write_bytes(path.read_bytes()[:-7])
+    with pytest.raises(InputError, match=r"mesh\.ply is truncated or damaged"):
+        io.read_mesh(path)
+    path.write_bytes(b"solid nothing")
+    with pytest.raises(InputError, match="is not a PLY file"):
+        io.read_mesh(path)
+
+
+# ---- Gaussians
+
+
+def kernels(count=7, bands=9):
+    return {
+        "means": RNG.normal(size=(count, 3)).astype(np.float32),
+        "quats": (q := RNG.normal(size=(count, 4)).astype(np.float32))
+        / np.linalg.norm(q, axis=1, keepdims=True),
+        "scales": RNG.uniform(0.001, 0.1, (count, 3)).astype(np.float32),
+        "opacities": RNG.uniform(0.01, 0.99, count).astype(np.float32),
+        "sh0": RNG.normal(size=(count, 1, 3)).astype(np.float32),
+        "shN": RNG.normal(size=(count, bands - 1, 3)).astype(np.float32),
+    }
+
+
+@pytest.mark.parametrize("bands", [1, 4, 9, 16])
+def test_gaussians_round_trip(tmp_path, bands):
+    expected = kernels(bands=bands)
+    io.write_gaussians(tmp_path / "g.ply", **expected)
+    found = io.read_gaussians(tmp_path / "g.ply")
+    for name, array in expected.items():
+        assert found[name].shape == array.shape and found[name].dtype == np.float32
+        np.testing.assert_allclose(found[name], array, rtol=2e-6, atol=2e-6)
+
+
+def test_gaussians_have_the_layout_of_the_3dgs_release(tmp_path):
+    expected = kernels(bands=16)
+    io.write_gaussians(tmp_path / "g.ply", **expected)
+    rows, _ = read_ply(tmp_path / "g.ply")
+    names = [
+        "x",
+        "y",
+        "z",
+        "nx",
+        "ny",
+        "nz",
+        *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(45)),
+    ]
+    names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    assert list(rows.dtype.names) == names
+    # f_rest is stored channel by channel: 15 coefficients of red, then of green, then of blue.
+    np.testing.assert_array_equal(rows["f_rest_16"], expected["shN"][:, 1, 1])
+    np.testing.assert_allclose(rows["scale_2"], np.log(expected["scales"][:, 2]), rtol=1e-6)
+    np.testing.assert_allclose(1 / (1 + np.exp(-rows["opacity"])), expected["opacities"], rtol=1e-5)
+
+
+def test_bad_gaussians(tmp_path):
+    path = tmp_path / "g.ply"
+    io.write_mesh(path, cube().vertices, cube().faces)
+    with pytest.raises(InputError, match=r"g\.ply misses the properties f_dc_0, .*opacity.*rot_3"):
+        io.read_gaussians(path)
+    broken = kernels()
+    broken["means"][4, 0] = np.inf
+    io.write_gaussians(path, **broken)
+    with pytest.raises(InputError, match=r"g\.ply: means of Gaussian 4 is not finite"):
+        io.read_gaussians(path)
+    io.write_gaussians(path, **kernels(bands=6))
+    with pytest.raises(InputError, match="15 f_rest_"):
+        io.read_gaussians(path)
+
+
+# ---- weights
+
+
+def test_weights(tmp_path):
+    path = tmp_path / "adaptor.safetensors"
+    tensors = {"elasticity.A.0": torch.randn(4, 13), "elasticity.B.0": torch.zeros(64, 4)}
+    io.write_weights(path, tensors, {"rank": 4, "settings": {"lr": 0.1}})
+    found, metadata = io.read_weights(path)
+    assert metadata == {"rank": 4, "settings": {"lr": 0.1}}
+    assert all(torch.equal(found[name], tensors[name]) for name in tensors)
+    path.write_bytes(path.read_bytes()[:-9])
+    with pytest.raises(InputError, match=r"adaptor\.safetensors is not a readable safetensors file"):
+        io.read_weights(path)
+    io.write_weights(path, {"B": torch.tensor([1.0, float("nan")])}, {})
+    with pytest.raises(InputError, match="B is not finite"):
+        io.read_weights(path)
+
+
+# ---- same content, same bytes
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda p: io.write_arrays(
+            p, {"x": np.arange(6.0).reshape(2, 3), "frames": np.arange(2)}, {"dt": 1.0, "b": [1]}
+        ),
+        lambda p: io.write_json(p, {"b": 1.5, "a": [1, 2]}),
+        lambda p: io.write_mesh(p, cube().vertices, cube().faces),
+        lambda p: io.write_gaussians(p, **{k: np.ones_like(v) * 0.5 for k, v in kernels().items()}),
+        lambda p: io.write_weights(p, {"a": torch.ones(3), "b": torch.zeros(2)}, {"z": 1, "y": 2, "x": 3}),
+    ],
+    ids=["h5", "json", "mesh", "gaussians", "weights"],
+)
+def test_same_bytes(tmp_path, write):
+    contents = set()
+    for folder in ("first", "second"):
+        path = tmp_path / folder / "file"
+        write(path)
+        contents.add(path.read_bytes())
+    assert len(contents) == 1
+    assert str(tmp_path).encode() not in contents.pop()

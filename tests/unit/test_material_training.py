@@ -1,0 +1,170 @@
+"""The training loop: gradients of the whole chain, progress, recovery, and resuming."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from grounding_scene import MODEL, ball, camera, observe
+
+from neuma_lib.coupling.reconstruction import Reconstruction
+from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.fitting.material import (
+    MaterialSettings,
+    ParticleLoss,
+    PixelLoss,
+    frame_weights,
+    train_material,
+)
+from neuma_lib.mechanics.neural import neural_law
+from neuma_lib.sim.rollout import rollout
+
+FRAMES = (0, 20, 40, 60)
+V0 = torch.tensor([0.0, -1.5, 0.0], dtype=torch.float64)
+
+
+def stiff_random_law(dtype=torch.float64, rank=4):
+    """A random network scaled so that its small-strain stiffness is near 3e4 Pa, with a fresh adaptor."""
+    torch.manual_seed(2)
+    law = neural_law(seed=5).to(dtype)
+    with torch.no_grad():
+        modulus = max(law.longitudinal_modulus(), 1.0)
+        law.elasticity.base[2].mul_(3e4 / modulus)
+    law.attach_adaptor(rank=rank, seed=1)
+    return law
+
+
+@pytest.fixture(scope="module")
+def problem():
+    body = ball()
+    return body, PixelLoss(body, observe(body, V0, FRAMES))
+
+
+def test_gradient_of_the_whole_chain_from_adaptor_to_image_loss(problem):
+    body, loss = problem
+    law = stiff_random_law()
+    parameters = [p for p in law.parameters() if p.requires_grad]
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():  # away from B = 0, where A has no gradient
+        for p in parameters:
+            p.add_(0.05 * torch.randn(p.shape, generator=generator, dtype=p.dtype))
+
+    def value():
+        path = rollout(MODEL, law, body.x0, V0, body.mass, body.vol0, steps=60, frames=FRAMES)
+        return loss(path).mean()
+
+    grads = torch.autograd.grad(value(), parameters)
+    direction = [torch.randn(p.shape, generator=generator, dtype=p.dtype) for p in parameters]
+    slope = sum(float((g * d).sum()) for g, d in zip(grads, direction, strict=True))
+    h = 1e-6
+    values = []
+    for sign in (1, -1):
+        with torch.no_grad():
+            for p, d in zip(parameters, direction, strict=True):
+                p.add_(sign * h * d)
+            values.append(float(value()))
+            for p, d in zip(parameters, direction, strict=True):
+                p.sub_(sign * h * d)
+    assert slope != 0
+    assert (values[0] - values[1]) / (2 * h) == pytest.approx(slope, rel=1e-5)
+
+
+SETTINGS = MaterialSettings(iterations=12, lr_elastic=0.02, lr_plastic=0.002, checkpoint_every=3)
+
+
+def train(problem, law=None, settings=SETTINGS, **options):
+    body, loss = problem
+    law = law or stiff_random_law()
+    return train_material(MODEL, law, body, V0, loss, settings, log=lambda _: None, **options)
+
+
+def test_training_lowers_the_loss_and_moves_the_adaptor_only(problem):
+    law = stiff_random_law()
+    base = copy.deepcopy([p for p in law.parameters() if not p.requires_grad])
+    result = train(problem, law)
+    assert result.stable
+    assert result.best_loss < 0.7 * result.history.loss[0]
+    assert len(result.history.loss) == len(result.history.seconds) == SETTINGS.iterations
+    for before, after in zip(base, [p for p in law.parameters() if not p.requires_grad], strict=True):
+        assert torch.equal(before, after)
+
+
+class MemoryCheckpoint:
+    def __init__(self, fail_after=None):
+        self.state, self.saves, self.fail_after = None, 0, fail_after
+
+    def load(self):
+        return copy.deepcopy(self.state)
+
+    def save(self, state):
+        self.state = copy.deepcopy(state)
+        self.saves += 1
+        if self.saves == self.fail_after:
+            raise KeyboardInterrupt
+
+
+def test_a_killed_run_resumes_to_the_same_bits(problem):
+    whole = train(problem).law.adaptor_state()
+    keep = MemoryCheckpoint(fail_after=2)
+    with pytest.raises(KeyboardInterrupt):
+        train(problem, checkpoint=keep)
+    resumed = train(problem, checkpoint=keep).law.adaptor_state()
+    assert keep.saves == 4
+    for name, value in whole.items():
+        assert torch.equal(value, resumed[name]), name
+
+
+def test_a_diverging_step_returns_to_the_last_good_state(problem):
+    messages = []
+    body, loss = problem
+    wild = MaterialSettings(iterations=8, lr_elastic=50.0, lr_plastic=5.0, max_recoveries=3)
+    law = stiff_random_law()
+    result = train_material(MODEL, law, body, V0, loss, wild, log=messages.append)
+    assert result.history.recoveries and any("last good state" in m for m in messages)
+    assert result.history.recoveries[0]["lr_scale"] == 0.5
+    assert np.isfinite(result.best_loss) and result.best_loss <= result.history.loss[0]
+    assert all(torch.isfinite(p).all() for p in law.parameters())
+
+
+def test_a_law_that_fails_from_the_start_stops_loudly(problem):
+    law = stiff_random_law()
+    with torch.no_grad():
+        law.elasticity.base[0][0, 0] = float("nan")
+    with pytest.raises(NonFiniteError):
+        train(problem, law)
+
+
+def test_nothing_to_train_is_an_input_error(problem):
+    with pytest.raises(InputError, match="adaptor"):
+        train(problem, neural_law(seed=0).to(torch.float64))
+
+
+def test_particles_supervise_through_the_same_loop(problem):
+    body, pixels = problem
+    with torch.no_grad():
+        path = rollout(
+            MODEL, stiff_random_law(), body.x0, V0, body.mass, body.vol0 * 0.5, steps=60, frames=FRAMES
+        )
+    result = train((body, ParticleLoss(FRAMES, path.x)))
+    assert result.best_loss < result.history.loss[0]
+
+
+def test_gaussians_can_be_the_particles(problem):
+    body, pixels = problem
+    volume = float(body.vol0.sum())
+    shell = Reconstruction.of_gaussians(body.gaussians, volume, 1000.0)
+    assert float(shell.mass.sum()) == pytest.approx(1000 * volume)
+    images = shell.particle_gs(camera())(
+        shell.x0[None], torch.eye(3, dtype=torch.float64).expand(1, len(shell.x0), 3, 3)
+    )
+    bound = body.particle_gs(camera())(
+        body.x0[None], torch.eye(3, dtype=torch.float64).expand(1, len(body.x0), 3, 3)
+    )
+    assert torch.allclose(images, bound, atol=1e-9)
+
+
+def test_frame_weights_start_with_early_frames_and_end_uniform():
+    settings = MaterialSettings(iterations=90)
+    first, last = frame_weights(0, 10, settings), frame_weights(60, 10, settings)
+    assert first.tolist() == [1, 1, 0.5, 0.5, 0.25, 0.25, 0.125, 0.125, 0.0625, 0.0625]
+    assert last.tolist() == [1] * 10

@@ -1,0 +1,232 @@
+"""The fused kernels of the neural law agree with their twin; on a CPU the same kernel text runs in an emulation."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from neuma_lib.mechanics import neural_fused as fused
+from neuma_lib.mechanics.neural import neural_law
+
+COMPILER = shutil.which("g++")
+KINDS = ("elasticity", "plasticity")
+REGIMES = ("near identity", "large strain", "inverted")
+
+PROGRAM = """
+#include "cuda_emulator.h"
+typedef uint64_t Address;
+%(functions)s
+int main(int, char** argv)
+{
+    const char* folder = argv[1];
+    const bool elastic = argv[2][0] == 'e', backward = argv[3][0] == '1';
+    const int blocks = atoi(argv[4]), bytes = atoi(argv[5]);
+    const float factor = atof(argv[6]);
+    auto F = emulator::read<float>(folder, "F"), W0 = emulator::read<float>(folder, "W0"),
+         W1 = emulator::read<float>(folder, "W1"), W2 = emulator::read<float>(folder, "W2"),
+         g = emulator::read<float>(folder, "g");
+    std::vector<float> result(F.size()), sums(backward ? blocks * 5504 : 0, NAN);
+    const int n = F.size() / 9;
+    auto at = [](std::vector<float>& x) { return Address(x.data()); };
+    emulator::launch(blocks, bytes, [&] {
+        if (backward)
+            (elastic ? vjp_elasticity : vjp_plasticity)(
+                at(F), at(W0), at(W1), at(W2), at(g), factor, n, at(result), at(sums));
+        else
+            (elastic ? evaluate_elasticity : evaluate_plasticity)(
+                at(F), at(W0), at(W1), at(W2), factor, n, at(result));
+    });
+    emulator::write(folder, "result", result);
+    emulator::write(folder, "sums", sums);
+}
+"""
+
+
+def deformations(regime, n, seed=0):
+    """(n, 3, 3) float64, rounded to float32."""
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.randn(n, 3, 3, generator=generator, dtype=torch.float64)
+    F = torch.eye(3, dtype=torch.float64) + (0.4 if regime == "large strain" else 1e-2) * noise
+    if regime == "inverted":
+        F = torch.linalg.qr(noise)[0] @ torch.diag(torch.tensor([1.3, 0.8, -0.6], dtype=torch.float64)) @ F
+    return F.float().double()
+
+
+def probe(n):
+    return (
+        torch.randn(n, 3, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64).float().double()
+    )
+
+
+def law_part(kind):
+    """A law whose weights differ in size by layer, as trained ones do."""
+    part = getattr(neural_law(seed=3), kind).double()
+    for weight, size in zip(part.base, (0.7, 1.3, 400.0), strict=True):
+        weight.mul_(size)
+        weight.copy_(weight.float())
+    return part
+
+
+def twin(part, F, g, dtype):
+    """Result, gradient of F and gradients of the weights by the twin, in float64."""
+    weights = tuple(w.to(F.device, dtype) for w in part.weights())
+    F, g = F.to(dtype), g.to(dtype)
+    part.fused = False
+    value = part.evaluate(F, weights)
+    grad_F, grad_weights = part.vjp(F, weights, g)
+    return [x.double() for x in (value, grad_F, *grad_weights)]
+
+
+def distance(a, b):
+    return float((a - b).norm() / b.norm())
+
+
+@pytest.fixture(scope="module")
+def emulated(tmp_path_factory):
+    """A function (part, F, g, blocks) -> result, grad_F and gradients of the weights, of the emulated kernels."""
+    if COMPILER is None:
+        pytest.skip("needs g++")
+    folder = tmp_path_factory.mktemp("emulated")
+    arguments = "Address F, Address W0, Address W1, Address W2"
+    functions = []
+    for kind in KINDS:
+        forward, backward = (fused.source(kind, which, "EMULATED_MACHINE\n") for which in (False, True))
+        functions.append(
+            f"void evaluate_{kind}({arguments}, float factor, int n, Address out)\n{{\n{forward}\n}}\n"
+            f"void vjp_{kind}({arguments}, Address grad_out, float factor, int n, Address grad_F, Address partials)\n"
+            f"{{\n{backward}\n}}\n"
+        )
+    (folder / "program.cpp").write_text(PROGRAM % {"functions": "".join(functions)})
+    command = [
+        COMPILER,
+        "-std=c++17",
+        "-O1",
+        "-w",
+        "-I",
+        str(Path(__file__).parent),
+        "program.cpp",
+        "-o",
+        "program",
+    ]
+    subprocess.run(command, cwd=folder, check=True)
+
+    def run(part, F, g, blocks):
+        arrays = dict(zip(("F", "W0", "W1", "W2", "g"), (F, *part.weights(), g), strict=True))
+        for name, value in arrays.items():
+            value.detach().float().numpy().tofile(folder / name)
+        found = []
+        for backward, size in ((0, fused.EVALUATE_BYTES), (1, fused.VJP_BYTES)):
+            size -= fused.ALIGNMENT
+            options = [part.kind, str(backward), str(blocks), str(size), str(part.scale)]
+            subprocess.run([folder / "program", str(folder), *options], check=True)
+            result = np.fromfile(folder / "result", np.float32).reshape(-1, 3, 3)
+            found.append(torch.from_numpy(result).double())
+        sums = torch.from_numpy(np.fromfile(folder / "sums", np.float32)).double().reshape(blocks, -1).sum(0)
+        shapes = [w.shape for w in part.weights()]
+        parts = sums.split([s.numel() for s in shapes])
+        return [*found, *(x.reshape(s) for x, s in zip(parts, shapes, strict=True))]
+
+    return run
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "regime, n, blocks", [(REGIMES[0], 1, 1), (REGIMES[1], 133, 1), (REGIMES[2], 133, 2)]
+)
+def test_emulated_kernels_are_as_near_to_float64_as_the_float32_twin(emulated, kind, regime, n, blocks):
+    part, F, g = law_part(kind), deformations(regime, n), probe(n)
+    truth, plain = twin(part, F, g, torch.float64), twin(part, F, g, torch.float32)
+    found = emulated(part, F, g, blocks)
+    for exact, slow, fast in zip(truth, plain, found, strict=True):
+        assert distance(fast, exact) < 5 * distance(slow, exact) + 1e-7
+
+
+def test_a_cpu_and_float64_go_to_the_twin():
+    part = law_part("elasticity")
+    assert part.fused is None and not part.uses_fused(torch.zeros(1, 3, 3))
+    assert not fused.supported(torch.device("cuda"), torch.float64)
+
+
+CUDA = pytest.mark.skipif(
+    not (torch.cuda.is_available() and fused.supported(torch.device("cuda", 0), torch.float32)),
+    reason="needs a CUDA GPU with float16 tensor cores and 113 KB of shared memory a block",
+)
+
+
+def on_gpu(part, F, g):
+    """Arguments of the fused kernels: float32 on the GPU, rows that begin between multiples of 16 bytes."""
+    F, g = (torch.cat([x[:1], x]).float().cuda()[1:] for x in (F, g))
+    return F, tuple(w.float().cuda() for w in part.weights()), g
+
+
+@CUDA
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("regime", REGIMES)
+@pytest.mark.parametrize("n", [1, 31, 4096 + 5, 30_000, 70_001])
+def test_fused_is_as_near_to_float64_as_the_float32_twin(kind, regime, n):
+    part, F, g = law_part(kind), deformations(regime, n), probe(n)
+    F32, weights, g32 = on_gpu(part, F, g)
+    assert part.uses_fused(F32)
+    value = part.evaluate(F32, weights)
+    grad_F, grad_weights = part.vjp(F32, weights, g32)
+    found = [x.double() for x in (value, grad_F, *grad_weights)]
+    truth, plain = (twin(part, F.cuda(), g.cuda(), dtype) for dtype in (torch.float64, torch.float32))
+    for exact, slow, fast in zip(truth, plain, found, strict=True):
+        assert distance(fast, exact) < 5 * distance(slow, exact) + 1e-7
+
+
+@CUDA
+@pytest.mark.parametrize("kind", KINDS)
+def test_fused_fills_buffers_accumulates_and_repeats_itself(kind):
+    part = law_part(kind)
+    F, weights, g = on_gpu(part, deformations("large strain", 1000), probe(1000))
+    out, grad_F = torch.empty_like(F), torch.empty_like(F)
+    totals = tuple(torch.ones_like(w) for w in weights)
+    assert part.evaluate_with_cache(F, weights, out) == (out, None)
+    plain_F, plain_weights = part.vjp(F, weights, g)
+    returned = part.vjp(F, weights, g, grad_F=grad_F, grad_weights=totals)
+    assert returned[0] is grad_F and returned[1] is totals
+    assert torch.equal(out, part.evaluate(F, weights)) and torch.equal(grad_F, plain_F)
+    for total, grad in zip(totals, plain_weights, strict=True):
+        assert torch.equal(total, grad + 1)
+    strided = tuple(torch.zeros(*reversed(w.shape), device="cuda").mT for w in weights)
+    part.vjp(F, weights, g, grad_weights=strided)
+    assert all(torch.equal(a, b) for a, b in zip(strided, plain_weights, strict=True))
+
+
+@CUDA
+def test_what_is_not_finite_shows():
+    part = law_part("elasticity")
+    F, weights, g = on_gpu(part, deformations("near identity", 300), probe(300))
+    F[200, 1, 1] = float("nan")
+    value = part.evaluate(F, weights)
+    grad_F, _ = part.vjp(F, weights, g)
+    assert value[200].isnan().all() and grad_F[200].isnan().any()
+    assert value[:128].isfinite().all() and grad_F[:128].isfinite().all()
+
+
+@CUDA
+@pytest.mark.parametrize("kind", KINDS)
+def test_fused_can_be_captured_in_a_graph(kind):
+    part = law_part(kind)
+    F, weights, g = on_gpu(part, deformations("large strain", 5000), probe(5000))
+    out, grad_F = torch.empty_like(F), torch.empty_like(F)
+    totals = tuple(torch.zeros_like(w) for w in weights)
+
+    def work():
+        part.evaluate(F, weights, out)
+        part.vjp(F, weights, g, grad_F=grad_F, grad_weights=totals)
+
+    work()
+    expected = [out.clone(), grad_F.clone(), *(2 * t for t in totals)]
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        work()
+    for buffer in (out, grad_F):
+        buffer.zero_()
+    graph.replay()
+    for found, value in zip((out, grad_F, *totals), expected, strict=True):
+        assert torch.equal(found, value)

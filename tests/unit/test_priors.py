@@ -1,0 +1,205 @@
+"""Priors: what the networks are fitted to, that fitting works and is repeatable, and that bad settings are named."""
+
+import math
+
+import pytest
+import torch
+
+from neuma_lib.errors import InputError
+from neuma_lib.fitting.priors import (
+    RegressionSettings,
+    TrajectorySettings,
+    random_rotations,
+    random_throw,
+    reference_law,
+    sample_deformations,
+    targets,
+    train_by_trajectory,
+    train_prior,
+    visited_stretches,
+)
+from neuma_lib.fitting.soap import SOAP
+from neuma_lib.io.laws import prior_bytes
+from neuma_lib.mechanics.neural import PLASTIC_SCALE
+from neuma_lib.mechanics.singular_values import svd3
+
+JELLY = {"elasticity": {"name": "fixed_corotated", "E": 1e5, "nu": 0.2}, "plasticity": {"name": "identity"}}
+PLASTICINE = {
+    "elasticity": {"name": "hencky", "E": 3e5, "nu": 0.25},
+    "plasticity": {"name": "von_mises", "yield_stress": 5e3},
+}
+SAND = {
+    "elasticity": {"name": "hencky", "E": 1e6, "nu": 0.2},
+    "plasticity": {"name": "drucker_prager", "friction_angle": 25},
+}
+WATER = {"elasticity": {"name": "fluid", "E": 1e5, "nu": 0.3}, "plasticity": {"name": "fluid_projection"}}
+OTHERS = {
+    "neo-Hookean + von Mises": {
+        "elasticity": {"name": "neo_hookean", "E": 3e5, "nu": 0.25},
+        "plasticity": {"name": "von_mises", "yield_stress": 5e3},
+    },
+    "StVK + Drucker-Prager": {
+        "elasticity": {"name": "stvk", "E": 1e6, "nu": 0.2},
+        "plasticity": {"name": "drucker_prager", "friction_angle": 25},
+    },
+    "Hencky + viscous flow": {
+        "elasticity": {"name": "hencky", "E": 1e5, "nu": 0.4},
+        "plasticity": {"name": "viscous_flow", "viscosity": 20.0},
+    },
+}
+LAWS = {"jelly": JELLY, "plasticine": PLASTICINE, "sand": SAND, "water": WATER, **OTHERS}
+TINY = {
+    "throws": 2,
+    "side_particles": 4,
+    "grid": 12,
+    "duration": 0.15,
+    "samples": 4096,
+    "iterations": 500,
+    "batch": 512,
+    "rounds": 2,
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_the_target_of_a_network_is_its_law(name):
+    """R X F^T = tau and F + 1e-3 R X = F_new: the form of the networks can hold every analytic law."""
+    law = reference_law(LAWS[name], RegressionSettings())
+    pool = 1 + 0.05 * torch.randn(200, 3, generator=torch.Generator().manual_seed(0))
+    F = sample_deformations(pool, RegressionSettings(samples=600), torch.Generator().manual_seed(1)).double()
+    U, _, Vh = svd3(F)
+    eps = torch.finfo(torch.float32).eps  # of the targets
+    for part, scale in (("elasticity", 1.0), ("plasticity", PLASTIC_SCALE)):
+        _, X = targets(law, part, F)
+        X = X.double().reshape(-1, 3, 3)
+        assert torch.equal(X, X.mT)
+        value = getattr(law, part).evaluate(F, ())
+        built = (U @ Vh) @ X @ F.mT if part == "elasticity" else F + scale * (U @ Vh) @ X
+        size = value.abs().amax(dim=(1, 2)) + scale * X.abs().amax(dim=(1, 2))
+        assert float(((built - value).abs().amax(dim=(1, 2)) / (size + 1e-30)).max()) < 64 * eps
+
+
+def test_random_rotations_are_rotations_and_uniform():
+    R = random_rotations(20000, torch.Generator().manual_seed(0))
+    eye = torch.eye(3).expand_as(R)
+    torch.testing.assert_close(R @ R.mT, eye, rtol=0, atol=1e-5)
+    torch.testing.assert_close(torch.linalg.det(R), torch.ones(len(R)))
+    # entries of a uniform rotation have mean 0 and variance 1/3: five standard errors
+    assert float(R.mean(0).abs().max()) < 5 / math.sqrt(3 * len(R))
+    assert float((R.square().mean(0) - 1 / 3).abs().max()) < 5 * 0.3 / math.sqrt(len(R))
+
+
+def test_throws_stay_in_the_box_and_hit_its_floor():
+    law, settings = reference_law(JELLY, RegressionSettings()), RegressionSettings(side_particles=4)
+    generator = torch.Generator().manual_seed(0)
+    strains = []
+    for _ in range(4):
+        throw = random_throw(law, generator, settings)
+        low, high = throw.model.free_range
+        assert bool(((throw.x0 > low) & (throw.x0 < high)).all())
+        assert throw.model.courant(law, 1000.0) <= 0.5 + 1e-3
+        elastic, trial = visited_stretches(throw, law)
+        assert elastic.shape[1] == trial.shape[1] == 3
+        strains.append(float(elastic.log().abs().max()))
+    assert max(strains) > 0.05
+
+
+def test_soap_solves_an_ill_conditioned_matrix_problem():
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randn(400, 12, generator=generator) @ torch.diag(torch.logspace(0, -2, 12))
+    truth = torch.randn(5, 12, generator=generator)
+    losses = {}
+    for kind in (SOAP, torch.optim.Adam):
+        W = torch.zeros(5, 12, requires_grad=True)
+        optimiser = kind([W], lr=2e-2)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, 600)
+        for _ in range(600):
+            optimiser.zero_grad()
+            loss = (rows @ (W - truth).mT).square().mean()
+            loss.backward()
+            optimiser.step()
+            schedule.step()
+        losses[kind] = float(loss.detach())
+    assert losses[SOAP] < 0.1 * losses[torch.optim.Adam]
+
+
+@pytest.fixture(scope="module")
+def tiny_plasticine():
+    return train_prior(PLASTICINE, TINY, seed=3)
+
+
+def test_regression_learns(tiny_plasticine):
+    law, report = tiny_plasticine
+    loss = report["loss"]
+    assert loss["elasticity"][-1] < 0.1  # the untrained network has 1 or more
+    assert loss["plasticity"][-1] < 0.7
+    assert report["chamfer"] < 0.5
+    assert law.wave_speed(1000.0) == pytest.approx(
+        reference_law(PLASTICINE, RegressionSettings()).wave_speed(1000.0), rel=0.1
+    )
+
+
+def test_same_seed_same_bytes(tiny_plasticine):
+    again, report = train_prior(PLASTICINE, TINY, seed=3)
+    assert prior_bytes(again) == prior_bytes(tiny_plasticine[0])
+    assert report == tiny_plasticine[1]
+
+
+def test_trained_law_is_objective_and_free_of_stress_at_rest(tiny_plasticine):
+    law, generator = tiny_plasticine[0], torch.Generator().manual_seed(0)
+    Q, F = (random_rotations(200, generator).double() for _ in range(2))
+    U, _, Vh = svd3(Q)
+    Q = U @ Vh  # a rotation to double precision
+    F = F + 0.05 * torch.randn(200, 3, 3, generator=generator).double()
+    elastic, plastic = (tuple(w.double() for w in part) for part in law.weights())
+    tau, returned = law.elasticity.evaluate(F, elastic), law.plasticity.evaluate(F, plastic)
+    eps = torch.finfo(torch.float64).eps
+    gain = float(
+        torch.linalg.norm(elastic[0], 2) * torch.linalg.norm(elastic[1], 2) * torch.linalg.norm(elastic[2], 2)
+    )
+    turned = law.elasticity.evaluate(Q @ F, elastic)
+    assert float((turned - Q @ tau @ Q.mT).abs().max()) < 32 * eps * gain
+    assert float((law.plasticity.evaluate(Q @ F, plastic) - Q @ returned).abs().max()) < 32 * eps * gain
+    assert float(law.elasticity.evaluate(Q, elastic).abs().max()) < 32 * eps * gain
+
+
+def test_identity_is_learned_exactly_and_can_still_be_adapted():
+    law, _ = train_prior(JELLY, {**TINY, "rounds": 1}, seed=1)
+    F = torch.eye(3) + 0.1 * torch.randn(50, 3, 3, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(law.plasticity.evaluate(F, law.plasticity.weights()), F)
+    law.attach_adaptor(rank=4)
+    weights = law.plasticity.weights()
+    _, grads = law.plasticity.vjp(
+        F, weights, torch.randn(F.shape, generator=torch.Generator().manual_seed(1))
+    )
+    torch.autograd.backward(weights, grads)
+    assert float(law.plasticity.adaptor.B[2].grad.abs().max()) > 0
+
+
+def test_trajectory_training_lowers_its_loss():
+    options = TrajectorySettings(
+        epochs=6, steps=160, side_particles=4, grid=10, dt=2e-3, reset_first=40, reset_last=40
+    )
+    law, report = train_by_trajectory(JELLY, options, 0, lambda done, total, loss: None)
+    assert report["loss"][-1] < report["loss"][0]
+    assert not any(w.requires_grad for w in (*law.elasticity.base, *law.plasticity.base))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"method": "guessing"}, "choose from regression, trajectory"),
+        ({"iteration": 3}, "unknown iteration"),
+        ({"method": "trajectory", "rounds": 2}, "unknown rounds"),
+    ],
+)
+def test_bad_settings_are_named(settings, message):
+    with pytest.raises(InputError, match=message):
+        train_prior(JELLY, settings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LAWS)
+def test_default_settings_reach_the_released_priors(name):
+    """Rollouts of priors trained by the authors differ from their laws by a Chamfer distance of 0.1 to 0.5e-4 m^2."""
+    _, report = train_prior(LAWS[name])
+    assert report["chamfer"] < 0.1

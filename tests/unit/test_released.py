@@ -1,0 +1,116 @@
+"""Images in the layout of the authors' release load as they are, alone and as a scene's images in the workflow."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from PIL import Image
+from test_workflow import copied
+
+from neuma_lib.errors import InputError
+from neuma_lib.io import files as io
+from neuma_lib.io.artifacts import load_observation
+
+K = [[40.0, 0.0, 16.0], [0.0, 41.0, 15.0], [0.0, 0.0, 1.0]]
+
+
+def write_release(folder, letter="d", kind="dynamic", views=(0, 2), steps=(0, 2, 4)):
+    """A set as the authors lay it out; pixel (0, 0) tells view and step. Returns its list."""
+    (folder / f"data_{kind}").mkdir(parents=True)
+    entries = []
+    for view in views:
+        for step in steps:
+            name = f"./data_{kind}/{letter}_{view}_{step:03d}.png"
+            pixels = np.zeros((30, 32, 4), dtype=np.uint8)
+            pixels[8:20, 9 + step : 19 + step] = (200, 90, 30, 255)
+            pixels[0, 0] = (view, step, 0, 0)
+            Image.fromarray(pixels, "RGBA").save(folder / name)
+            pose = np.eye(4)
+            pose[:3, 3] = (0.5, 0.4 + 0.1 * view, 2.0)
+            entries.append({"file_path": name, "c2w": pose.tolist(), "intrinsic": K})
+    path = folder / f"data_{kind}.json"
+    path.write_text(json.dumps(entries))
+    return path
+
+
+def test_release_is_read_as_it_is(tmp_path):
+    images = io.read_image_set(write_release(tmp_path))
+    assert images.images.shape == (6, 30, 32, 4)
+    assert images.views.tolist() == [0, 0, 0, 2, 2, 2] and images.steps.tolist() == [0, 2, 4] * 2
+    assert (images.images[:, 0, 0, :2] == np.stack([images.views, images.steps], axis=1)).all()
+    np.testing.assert_allclose(images.Ks, np.tile(K, (6, 1, 1)))
+    # One metre in front of an OpenGL camera (its -z) is one metre along +z of the OpenCV camera.
+    np.testing.assert_allclose(images.viewmats[3] @ [0.5, 0.6, 1.0, 1.0], [0, 0, 1, 1], atol=1e-12)
+
+
+def test_release_is_a_video(tmp_path):
+    video = load_observation(write_release(tmp_path), views=[2])
+    assert video.frames == (0, 2, 4) and video.images.shape == (3, 1, 30, 32, 4)
+    assert video.images.dtype == torch.uint8
+
+
+def test_names_without_view_and_step_are_views_at_the_start(tmp_path):
+    path = write_release(tmp_path)
+    entries = json.loads(path.read_text())[:3]
+    for i, entry in enumerate(entries):
+        renamed = tmp_path / f"image{i}.png"
+        (tmp_path / entry["file_path"]).rename(renamed)
+        entry |= {"file_path": renamed.name, "c2w": entry["c2w"][:3]}
+    path.write_text(json.dumps(entries))
+    images = io.read_image_set(path)
+    assert images.views.tolist() == [0, 1, 2] and images.steps.tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda e: e.pop("file_path"), r"data_dynamic\.json: entry 1 has no file_path"),
+        (lambda e: e.pop("c2w"), r"entry 1 \(.*d_0_002\.png\): c2w must be a 4x4 matrix of numbers"),
+        (lambda e: e.update(c2w=[[1, 2]]), "c2w must be a 4x4 matrix"),
+        (lambda e: e.update(intrinsic=[["a"] * 3] * 3), "intrinsic must be a 3x3 matrix of numbers"),
+        (lambda e: e.update(intrinsic=[[40, 1, 16], [0, 41, 15], [0, 0, 1]]), "pinhole camera without skew"),
+        (lambda e: e.update(intrinsic=[[-4, 0, 16], [0, 41, 15], [0, 0, 1]]), "fl_x must be a positive"),
+        (lambda e: e.update(c2w=(2 * np.eye(4)).tolist()), "is not a rigid motion"),
+        (lambda e: e.update(file_path="./d_0_009.png"), r"d_0_009\.png is missing although .*data_dynamic"),
+    ],
+)
+def test_mistakes_are_named(tmp_path, change, message):
+    path = write_release(tmp_path)
+    entries = json.loads(path.read_text())
+    change(entries[1])
+    path.write_text(json.dumps(entries))
+    with pytest.raises(InputError, match=message):
+        io.read_image_set(path)
+
+
+def test_listed_images_stay_where_they_are(tmp_path):
+    source = write_release(tmp_path / "release")
+    listed = tmp_path / "project" / "data" / "scene" / "dynamic" / "transforms.json"
+    io.list_images(source, listed)
+    assert [f.name for f in listed.parent.iterdir()] == ["transforms.json"]
+    ours, theirs = io.read_image_set(listed), io.read_image_set(source)
+    assert (ours.images == theirs.images).all() and (ours.viewmats == theirs.viewmats).all()
+    assert (ours.Ks == theirs.Ks).all() and (ours.steps == theirs.steps).all()
+    image = tmp_path / "release/data_dynamic/d_0_000.png"
+    image.write_bytes(image.read_bytes() + b"\0")
+    with pytest.raises(InputError, match="was changed"):
+        io.read_image_set(listed)
+
+
+def test_workflow_takes_supplied_images_in_place_of_blenders(tmp_path):
+    project = copied(tmp_path / "project", tmp_path / "kernels")
+    images = {kind: str(write_release(tmp_path / kind, kind=kind)) for kind in ("static", "dynamic")}
+    settings = yaml.safe_load((project.root / "tests/workflow/tiny.yaml").read_text())
+    settings["scenes"]["BouncyBall"]["images"] = images
+    (project.root / "tests/workflow/tiny.yaml").write_text(yaml.safe_dump(settings))
+    targets = [f"tiny/data/BouncyBall/{kind}/transforms.json" for kind in images]
+    assert project.plan(f"{targets[0]}") == {"supplied_static": 1}
+    output = project.run(*targets)
+    assert "6 images of 32x30 px, 2 views" in output
+    for kind, target in zip(images, targets, strict=True):
+        ours, theirs = io.read_image_set(project.root / target), io.read_image_set(images[kind])
+        assert (ours.images == theirs.images).all() and (ours.viewmats == theirs.viewmats).all()
+    others = project.plan("tiny/data/ClayCat/static/transforms.json")
+    assert others["render_static"] == 1 and "supplied_static" not in others

@@ -1,0 +1,282 @@
+"""Gradients of a rollout against finite differences, against the torch twin, and against each other."""
+
+import math
+
+import pytest
+import sim_twin
+import torch
+from sim_scenes import DT, cube, make_law, strained
+
+from neuma_lib.errors import InputError
+from neuma_lib.sim import storage
+from neuma_lib.sim.model import Body, MPMModel
+from neuma_lib.sim.rollout import rollout
+
+IN_THE_AIR = MPMModel(14, DT)
+ON_A_STICKY_FLOOR = MPMModel(14, DT, boundary={"y_min": "sticky"})  # stops its nodes always: no switch
+COUNT = 60
+
+
+def scene(centre_y=0.5):
+    """A strained, moving cube: start (x, v, F, C), mass and volume."""
+    x, mass, vol0 = cube(COUNT, side=0.25, centre=(0.5, centre_y, 0.5))
+    return (x, *strained(x)), mass, vol0
+
+
+def random_loss(seed=0):
+    """A fixed random linear function of x, v, F and C at all frames, with comparable parts."""
+
+    def loss(states):
+        generator = torch.Generator().manual_seed(seed)
+        total = 0.0
+        for values, scale in zip(states, (10.0, 1.0, 1.0, 0.1), strict=True):
+            weights = torch.randn(values.shape, generator=generator, dtype=torch.float64)
+            total = total + scale * (weights.to(values) * values).sum()
+        return total
+
+    return loss
+
+
+def simulate(model, law, start, mass, vol0, frames, **options):
+    """States (x, v, F, C) at the frames."""
+    x, v, F, C = start
+    path = rollout(model, law, x, v, mass, vol0, F0=F, C0=C, steps=frames[-1], frames=frames, **options)
+    return path.x, path.v, path.F, path.C
+
+
+def simulate_slowly(model, law, start, mass, vol0, frames):
+    """The same by the torch twin."""
+    x, v, F, C = start
+    return sim_twin.rollout(model, law, x, v, mass, vol0, F, C, frames)
+
+
+def trainable(law):
+    """Parameters of a neural law's networks, made to require gradients."""
+    parameters = [*law.elasticity.base, *law.plasticity.base]
+    for parameter in parameters:
+        parameter.requires_grad_()
+    return parameters
+
+
+def gradients(model, law, start, mass, vol0, frames, parameters=(), run=simulate, **options):
+    """Loss and its gradients with respect to x, v, F, C and the parameters."""
+    start = tuple(value.clone().requires_grad_() for value in start)
+    loss = random_loss()(run(model, law, start, mass, vol0, frames, **options))
+    return loss.detach(), torch.autograd.grad(loss, [*start, *parameters])
+
+
+def assert_slopes_match(function, points, grads, sizes):
+    """Each gradient against a central difference along a random direction of its input."""
+    for index, (point, grad, size) in enumerate(zip(points, grads, sizes, strict=True)):
+        generator = torch.Generator().manual_seed(7 + index)
+        direction = torch.randn(point.shape, generator=generator, dtype=point.dtype)
+        direction *= size / direction.norm()
+
+        def shifted(sign, index=index, direction=direction):
+            moved = [p + sign * direction if i == index else p for i, p in enumerate(points)]
+            return function(moved)
+
+        difference = float(shifted(1) - shifted(-1)) / 2
+        slope = float((grad * direction).sum())
+        scale = float(grad.norm() * direction.norm()) / direction.numel() ** 0.5  # of a typical direction
+        assert abs(difference - slope) < 1e-6 * max(abs(slope), scale), (index, difference, slope)
+
+
+@pytest.mark.parametrize("model, height", [(IN_THE_AIR, 0.5), (ON_A_STICKY_FLOOR, 0.2)], ids=["air", "floor"])
+@pytest.mark.parametrize("steps", [1, 20])
+@pytest.mark.parametrize("name", ["fixed_corotated", "hencky", "neo_hookean", "viscous_flow", "neural"])
+def test_finite_differences(name, steps, model, height):
+    """One step and twenty, with respect to x0, v0, F0, C0 and the weights, on states without switches."""
+    start, mass, vol0 = scene(height)
+    law = make_law(name)
+    parameters = trainable(law) if name == "neural" else []
+    _, grads = gradients(model, law, start, mass, vol0, (steps,), parameters)
+
+    def value(points):
+        with torch.no_grad():
+            for parameter, point in zip(parameters, points[4:], strict=True):
+                parameter.copy_(point)
+            return random_loss()(simulate(model, law, points[:4], mass, vol0, (steps,)))
+
+    points = [p.detach().clone() for p in (*start, *parameters)]
+    # Plastic weights move F by a thousandth of their own change: a larger step stands out of the round-off.
+    relative = [1e-5] * 3 + [1e-3] * 3
+    sizes = [1e-5, 1e-4, 1e-5, 1e-4]
+    sizes += [r * float(p.norm()) for r, p in zip(relative, points[4:], strict=False)]
+    assert_slopes_match(value, points, grads, sizes)
+
+
+def corner():
+    """A model whose walls differ, and a cube in the corner where three of them meet."""
+    boundary = {"y_min": "no_slip", "x_min": "slip", "z_min": "sticky"}
+    model = MPMModel(14, DT, boundary=boundary, wall_cells=2)
+    x, mass, vol0 = cube(COUNT, side=0.25, centre=(0.22, 0.22, 0.22))
+    return model, (x, *strained(x)), mass, vol0
+
+
+@pytest.mark.parametrize("keep", ["states", "all"])
+@pytest.mark.parametrize("name", ["von_mises", "drucker_prager", "fluid", "neural"])
+def test_equals_torch_twin(name, keep):
+    """States and gradients of 15 steps, at walls of every kind and with plastic flow, to 1e-9."""
+    model, start, mass, vol0 = corner()
+    law = make_law(name)
+    parameters = trainable(law) if name == "neural" else []
+    frames = (0, 4, 15)
+
+    states = simulate(model, law, start, mass, vol0, frames)
+    for a, b in zip(states, simulate_slowly(model, law, start, mass, vol0, frames), strict=True):
+        assert (a - b).abs().max() < 1e-9 * b.abs().max()
+    _, grads = gradients(model, law, start, mass, vol0, frames, parameters, keep=keep)
+    _, expected = gradients(model, law, start, mass, vol0, frames, parameters, run=simulate_slowly)
+    for a, b in zip(grads, expected, strict=True):
+        assert (a - b).abs().max() < 1e-9 * b.abs().max()
+
+
+def test_pressed_against_the_end_of_the_grid():
+    """Particles that stop where the stencil ends: states and gradients of the torch twin."""
+    model = MPMModel(14, 2e-3, boundary="slip")
+    x, mass, vol0 = cube(COUNT, side=0.2, centre=(0.5, 0.18, 0.5))
+    _, F, C = strained(x)
+    v = torch.tensor([0.3, -8.0, 0.1], dtype=x.dtype).repeat(COUNT, 1)
+    start, law, frames = (x, v, F, C), make_law("drucker_prager"), (4, 12)
+    states = simulate(model, law, start, mass, vol0, frames)
+    assert (states[0][-1, :, 1] == model.stencil_range[0]).sum() > 3
+    _, grads = gradients(model, law, start, mass, vol0, frames)
+    _, expected = gradients(model, law, start, mass, vol0, frames, run=simulate_slowly)
+    for a, b in zip(grads, expected, strict=True):
+        assert (a - b).abs().max() < 1e-9 * b.abs().max()
+
+
+def test_several_bodies_equal_torch_twin():
+    """Two bodies in contact, one law used twice and trained: its gradients add up."""
+    model, start, mass, vol0 = corner()
+    law, other = make_law("neural"), make_law("hencky")
+    parameters = trainable(law)
+    bodies = [Body(law, 0, 25), Body(other, 25, 40), Body(law, 40, COUNT)]
+
+    _, grads = gradients(model, bodies, start, mass, vol0, (10,), parameters)
+    _, expected = gradients(model, bodies, start, mass, vol0, (10,), parameters, run=simulate_slowly)
+    for a, b in zip(grads, expected, strict=True):
+        assert (a - b).abs().max() < 1e-9 * b.abs().max()
+
+
+def test_what_is_kept_does_not_change_the_gradient(monkeypatch):
+    """All, states only, and a budget that is spent half-way give the same bytes."""
+    start, mass, vol0 = scene(0.2)
+    law = make_law("neural")
+    parameters = trainable(law)
+    model = MPMModel(14, DT)
+
+    def run(keep):
+        return gradients(model, law, start, mass, vol0, (3, 12), parameters, keep=keep)[1]
+
+    everything = run("all")
+    step_bytes = 8 * (18 * COUNT + 8 * model.grid**3)
+    monkeypatch.setitem(storage.KEEP, "auto", 12 * step_bytes + 7 * 2000 * COUNT)
+    for keep in ("states", "auto"):
+        for a, b in zip(run(keep), everything, strict=True):
+            assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("keep,segment", [("states", 5), ("all", 4), ("all", 2)])
+def test_segments_do_not_change_the_gradient(keep, segment):
+    """With little memory the steps are computed again, segment by segment: the same bytes, also the second time."""
+    x, mass, vol0 = cube(2000, side=0.25, centre=(0.5, 0.2, 0.5))
+    start, steps = (x, *strained(x)), 13
+    law = make_law("neural")
+    parameters = trainable(law)
+    model, frames = MPMModel(14, DT), (0, 3, 7, steps)
+    _, expected = gradients(model, law, start, mass, vol0, frames, parameters, keep=keep)
+    state, step = 8 * 24 * len(x), 8 * (18 * len(x) + 8 * model.grid**3)
+    memory = state * (segment + 1 + math.ceil(steps / segment)) + step * (segment if keep == "all" else 1)
+    planned = storage.plan_storage(steps, len(x), model.grid**3, 8, keep, memory, on_gpu=False)
+    assert planned == storage.Storage(segment, keep == "all", 0)
+    loss = random_loss()(simulate(model, law, start, mass, vol0, frames, keep=keep, memory=memory))
+    for _ in range(2):
+        grads = torch.autograd.grad(loss, parameters, retain_graph=True)
+        for a, b in zip(grads, expected[-len(grads) :], strict=True):
+            assert torch.equal(a, b)
+
+
+def test_too_little_memory():
+    start, mass, vol0 = scene(0.2)
+    with pytest.raises(InputError, match="memory = .* is too little for 13 steps of .* particles"):
+        gradients(MPMModel(14, DT), make_law("neural"), start, mass, vol0, (13,), memory=1000)
+
+
+def test_backward_twice():
+    """A graph that is retained can be used again, also after other rollouts."""
+    start, mass, vol0 = scene(0.2)
+    law = make_law("neural")
+    parameters = trainable(law)
+    model = MPMModel(14, DT)
+    loss = random_loss()(simulate(model, law, start, mass, vol0, (3, 12), keep="all"))
+    first = torch.autograd.grad(loss, parameters, retain_graph=True)
+    random_loss()(simulate(model, law, start, mass, vol0, (3, 12))).backward()
+    for a, b in zip(first, torch.autograd.grad(loss, parameters), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_frames_add_up():
+    """The gradient of a sum over frames is the sum of the gradients of rollouts that end at each frame."""
+    start, mass, vol0 = scene()
+    law = make_law("hencky")
+    frames = (0, 2, 9)
+
+    def grad_v(frames):
+        v = start[1].clone().requires_grad_()
+        states = simulate(IN_THE_AIR, law, (start[0], v, *start[2:]), mass, vol0, frames)
+        return torch.autograd.grad((states[0] ** 2).sum() + states[1].sum(), v)[0]
+
+    together = grad_v(frames)
+    # Frames given one by one: v at frame 0 is the start itself.
+    apart = sum(grad_v((n,)) for n in frames)
+    torch.testing.assert_close(together, apart, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("frames", [(3, 8), (5, 40)], ids=["in flight", "through contact"])
+def test_gradient_through_a_skipped_flight(frames):
+    """Closed form and simulation have the same gradient with respect to x0, one common v0 and the weights."""
+    model = MPMModel(14, 2e-3)
+    x0, mass, vol0 = cube(COUNT, side=0.25, centre=(0.5, 0.3, 0.5))
+    law = make_law("neural")
+    parameters = trainable(law)
+
+    def grads(skip):
+        x = x0.clone().requires_grad_()
+        v = torch.tensor([0.3, -2.0, 0.1], dtype=torch.float64, requires_grad=True)
+        path = rollout(model, law, x, v, mass, vol0, steps=frames[-1], frames=frames, skip_free_flight=skip)
+        loss = random_loss()((path.x, path.v, path.F, path.C))
+        return torch.autograd.grad(loss, (x, v, *parameters), materialize_grads=True)
+
+    for a, b in zip(grads(True), grads(False), strict=True):
+        assert (a - b).abs().max() < 1e-7 * max(1.0, float(b.abs().max()))
+
+
+def test_float32_gradients_are_those_of_float64():
+    start, mass, vol0 = scene(0.2)
+    grads = {}
+    for dtype in (torch.float32, torch.float64):
+        law = make_law("neural", dtype)
+        inputs = [value.to(dtype) for value in (*start, mass, vol0)]
+        _, grads[dtype] = gradients(ON_A_STICKY_FLOOR, law, inputs[:4], *inputs[4:], (20,), trainable(law))
+    for a, b in zip(grads[torch.float32], grads[torch.float64], strict=True):
+        assert (a - b).norm() < 1e-3 * b.norm()
+
+
+def test_weights_take_the_precision_of_the_particles():
+    """A law in float32 simulates particles in float64, and its gradients arrive in float32."""
+    start, mass, vol0 = scene()
+    law = make_law("neural", torch.float32)
+    parameters = trainable(law)
+    _, grads = gradients(IN_THE_AIR, law, start, mass, vol0, (5,), parameters)
+    assert grads[0].dtype == torch.float64
+    assert all(grad.dtype == torch.float32 and grad.abs().max() > 0 for grad in grads[4:])
+
+
+def test_no_gradient_wanted_none_made():
+    start, mass, vol0 = scene()
+    with torch.no_grad():
+        states = simulate(IN_THE_AIR, make_law("neural"), start, mass, vol0, (5,))
+    assert not any(values.requires_grad for values in states)
+    assert not any(v.requires_grad for v in simulate(IN_THE_AIR, make_law("hencky"), start, mass, vol0, (5,)))

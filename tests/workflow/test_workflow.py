@@ -1,0 +1,466 @@
+"""The workflow as a user runs it: real Snakemake, every stage, on a setting of two minutes (tiny.yaml)."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from neuma_lib.evaluation.lpips import expected_shapes
+from neuma_lib.io.checkpoint import Checkpoint
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.weights import write_weights
+
+ROOT = Path(__file__).resolve().parents[2]
+PARTS = (
+    "Snakefile",
+    "Makefile",
+    "pyproject.toml",
+    "config",
+    "envs",
+    "neuma_lib",
+    "profiles",
+    "workflow",
+    "tests/workflow/tiny.yaml",
+)
+TABLE = "tiny/results/table1.csv"
+SCENE = "tiny/results/BouncyBall"
+
+
+class Project:
+    """A copy of the working tree in a folder of its own."""
+
+    def __init__(self, root: Path):
+        self.root = root
+
+    def command(self, *words: str) -> list[str]:
+        return [
+            sys.executable,
+            "-m",
+            "snakemake",
+            "--configfile",
+            "tests/workflow/tiny.yaml",
+            "--cores",
+            "2",
+            *words,
+        ]
+
+    def run(self, *words: str, succeeds: bool = True) -> str:
+        """Run Snakemake; its output."""
+        done = subprocess.run(
+            self.command(*words),
+            cwd=self.root,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            timeout=900,
+        )
+        assert (done.returncode == 0) == succeeds, done.stdout[-4000:]
+        return done.stdout
+
+    def plan(self, *words: str) -> dict[str, int]:
+        """Rules that Snakemake would run, with the number of their jobs."""
+        text = self.run("--dry-run", *words)
+        stats = re.search(r"^job +count\n[- ]+\n(.*?)^total", text, re.MULTILINE | re.DOTALL)
+        assert stats or "Nothing to be done" in text, text[-4000:]
+        return {line.split()[0]: int(line.split()[1]) for line in stats[1].splitlines()} if stats else {}
+
+    def start(self, *words: str) -> subprocess.Popen:
+        """Start Snakemake as the leader of a process group of its own."""
+        with open(self.root / "started.log", "w") as log:
+            return subprocess.Popen(
+                self.command(*words),
+                cwd=self.root,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+
+    def processes(self, script: str) -> list[int]:
+        """Running Python processes of a script of this copy."""
+        found = []
+        for process in Path("/proc").glob("[0-9]*"):
+            try:
+                here = (process / "cwd").resolve() == self.root
+                words = (process / "cmdline").read_bytes().split(b"\0")
+            except OSError:
+                continue
+            if here and b"python" in words[0] and any(w.endswith(f".{script}.py".encode()) for w in words):
+                found.append(int(process.name))
+        return found
+
+    def artifacts(self) -> dict[str, str]:
+        """Digests of all data and results; logs and benchmarks are no artifacts."""
+        files = [f for f in (self.root / "tiny").rglob("*") if f.is_file()]
+        kept = {str(f.relative_to(self.root)): f for f in files if not {"logs", "benchmarks"} & set(f.parts)}
+        return {name: hashlib.sha256(f.read_bytes()).hexdigest() for name, f in sorted(kept.items())}
+
+    def clone(self, root: Path) -> Project:
+        """A copy of the project as it stands, with everything computed and Snakemake's records."""
+        shutil.copytree(self.root, root)
+        return Project(root.resolve())
+
+
+def wait_for(condition, seconds: float = 60.0):
+    """Wait until the condition is true and return its value."""
+    end = time.monotonic() + seconds
+    while not (value := condition()):
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+    return value
+
+
+def copied(folder: Path, kernels: Path, origin: Path = ROOT) -> Project:
+    """A copy of the sources at ``origin`` in a folder of its own."""
+    for part in PARTS:
+        source, target = origin / part, folder / part
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if source.is_dir():
+            shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy2(source, target)
+    settings = yaml.safe_load((ROOT / "tests" / "workflow" / "tiny.yaml").read_text())
+    (folder / "tests" / "workflow" / "tiny.yaml").write_text(
+        yaml.safe_dump({**settings, "kernel_cache": str(kernels)})
+    )
+    return Project(folder.resolve())
+
+
+@pytest.fixture(scope="module")
+def kernels(tmp_path_factory):
+    """A kernel cache that all copies share."""
+    return tmp_path_factory.mktemp("kernels")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, kernels):
+    """A copy in which Table 1 has been made from nothing. Tests leave it as they found it."""
+    project = copied(tmp_path_factory.mktemp("project"), kernels)
+    project.output = project.run(TABLE, f"{SCENE}/initial_state.json", f"{SCENE}/neuma/video.mp4")
+    return project
+
+
+@pytest.fixture
+def clone(finished, tmp_path):
+    """A finished copy to spoil."""
+    return finished.clone(tmp_path / "clone")
+
+
+# ---- from nothing to a table
+
+
+def test_table_from_nothing(finished):
+    table = (finished.root / TABLE).read_text().splitlines()
+    assert table[0].startswith("quantity,method,title,BouncyBall,Average")
+    rows = {tuple(line.split(",")[:2]) for line in table[1:]}
+    assert {
+        ("chamfer", "nclaw"),
+        ("chamfer", "neuma"),
+        ("chamfer_excess", "neuma"),
+        ("chamfer_floor", "floor"),
+    } <= rows
+    assert "| NeuMA |" in (finished.root / "tiny/results/table1.md").read_text()
+    assert (finished.root / SCENE / "neuma" / "video.mp4").stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    "stage", ["ground_truth", "render_static", "gaussians", "mesh", "binding", "velocity", "material"]
+)
+def test_every_stage_says_what_it_made_and_logs_it(finished, stage):
+    said = re.findall(rf"^{stage} .*?: .*\d.*$", finished.output, re.MULTILINE)
+    assert said
+    log = next((finished.root / "tiny/results/logs").rglob(f"{stage}.log"))
+    assert said[-1].split(": ", 1)[1] in log.read_text()
+
+
+def test_same_seed_same_bytes_in_another_folder(finished, kernels, tmp_path):
+    again = copied(tmp_path / "elsewhere", kernels, finished.root)
+    again.run(TABLE, f"{SCENE}/initial_state.json", f"{SCENE}/neuma/video.mp4")
+    first, second = finished.artifacts(), again.artifacts()
+    assert first == second
+    assert {Path(name).name for name in first} >= {
+        *("particles.h5", "transforms.json", "gaussians.ply", "mesh.ply", "binding.h5", "velocity.json"),
+        *(
+            "jelly.safetensors",
+            "adaptor.safetensors",
+            "rollout.h5",
+            "metrics.json",
+            "video.mp4",
+            "table1.csv",
+        ),
+    }
+    for name in first:
+        assert str(finished.root).encode() not in (finished.root / name).read_bytes(), name
+
+
+# ---- what runs again, and what does not
+
+
+def test_nothing_to_do_when_nothing_changed(finished):
+    assert finished.plan(TABLE) == {}
+
+
+def test_touching_reruns_nothing(clone):
+    for folder in ("neuma_lib", "workflow", "config", "tests", "envs", "tiny"):
+        for file in (clone.root / folder).rglob("*"):
+            if file.is_file():
+                os.utime(file)
+    assert clone.plan(TABLE) == {}
+
+
+def test_comments_and_docstrings_rerun_nothing(clone):
+    for name in ("neuma_lib/render/rasterizer.py", "workflow/scripts/material.py"):
+        file = clone.root / name
+        file.write_text(re.sub(r'^"""', '"""Reworded. ', file.read_text(), count=1) + "\n# a remark\n")
+    assert clone.plan(TABLE) == {}
+
+
+def test_a_training_parameter_reruns_training_and_evaluation_only(clone):
+    change = ("--config", "material={iterations: 9}", "--")
+    before = clone.artifacts()
+    assert clone.plan(*change, TABLE) == {"material": 1, "evaluation": 1, "chamfer_table": 1}
+    clone.run(*change, TABLE)
+    after = clone.artifacts()
+    changed = {name for name in before if before[name] != after[name]}
+    assert {Path(name).name for name in changed} <= {
+        *("adaptor.safetensors", "history.json", "rollout.h5", "metrics.json", "table1.csv", "table1.md"),
+    }
+    assert f"{SCENE}/neuma/adaptor.safetensors" in changed
+    assert clone.plan(*change, TABLE) == {}
+
+
+def test_editing_the_rasterizer_reruns_what_renders(clone):
+    file = clone.root / "neuma_lib" / "render" / "rasterizer.py"
+    original = file.read_text()
+    file.write_text(original + "\nEDITED = True\n")
+    plan = clone.plan(TABLE)
+    assert {
+        "kernels",
+        "gaussians",
+        "mesh",
+        "binding",
+        "velocity",
+        "material",
+        "evaluation",
+        "chamfer_table",
+    } <= set(plan)
+    assert not {"ground_truth", "render_static", "render_dynamic", "prior"} & set(plan)
+    assert plan["kernels"] == 1
+    truth = clone.root / "tiny/data/BouncyBall/particles.h5"
+    made = truth.stat().st_mtime_ns
+    clone.run(f"{SCENE}/gaussians.ply")
+    assert truth.stat().st_mtime_ns == made
+    assert "gaussians" not in clone.plan(f"{SCENE}/gaussians.ply")
+
+
+@pytest.mark.parametrize(
+    ("file", "runs", "spared"),
+    [
+        (
+            "neuma_lib/evaluation/evaluate.py",
+            {"evaluation", "chamfer_table"},
+            {"material", "velocity", "ground_truth"},
+        ),
+        ("neuma_lib/evaluation/tables.py", {"chamfer_table"}, {"evaluation"}),
+        (
+            "neuma_lib/binding.py",
+            {"binding", "velocity", "material", "evaluation"},
+            {"gaussians", "mesh", "prior"},
+        ),
+        (
+            "neuma_lib/blender/cycles.py",
+            {"render_static", "render_dynamic", "gaussians"},
+            {"ground_truth", "prior"},
+        ),
+        ("neuma_lib/sim/rollout.py", {"ground_truth", "prior", "material"}, set()),
+        ("workflow/scripts/binding.py", {"binding", "velocity", "evaluation"}, {"particles", "gaussians"}),
+    ],
+)
+def test_edits_rerun_what_depends_on_them(clone, file, runs, spared):
+    path = clone.root / file
+    path.write_text(path.read_text() + "\nEDITED = True\n")
+    plan = set(clone.plan(TABLE))
+    assert runs <= plan and not spared & plan
+
+
+def test_a_variant_has_a_folder_of_its_own(finished):
+    plan = finished.plan(f"{SCENE}/neuma+rank=2+seed=3/metrics.json")
+    assert plan == {"material": 1, "evaluation": 1}
+
+
+# ---- learned laws elsewhere, and measures of images
+
+
+def test_laws_are_put_to_use_on_other_bodies_and_images_are_measured(clone):
+    """A letter above the reconstructed ball, both with the learned law; stand-in weights for LPIPS."""
+    generator = torch.Generator().manual_seed(0)
+    weights = {
+        name: 0.1 * (torch.rand(shape, generator=generator) - 0.4)
+        for net in ("alex", "vgg")
+        for name, shape in expected_shapes(net).items()
+    }
+    write_weights(clone.root / "tiny/data/weights/lpips.safetensors", weights, {})
+    targets = ("tiny/results/table2.csv", "tiny/results/table4.csv", f"{SCENE}/neuma/image_metrics.json")
+    output = clone.run(*targets)
+    assert re.search(r"^experiment_start letter_and_ball: 2 bodies, ", output, re.MULTILINE)
+    assert clone.plan(*targets) == {}
+
+    folder = clone.root / "tiny/results/experiments/letter_and_ball"
+    letter, ball = json.loads((folder / "velocity.json").read_text())["bodies"]
+    assert letter["v0"] == [0, -2, 0]
+    assert ball["v0"] == json.loads((clone.root / SCENE / "velocity.json").read_text())["v0"]
+    path, _ = read_arrays(folder / "nclaw" / "rollout.h5")
+    assert path["x"].shape[1] == letter["particles"] + ball["particles"]
+    split = letter["particles"]
+    assert path["x"][0, :split, 1].min() > path["x"][0, split:, 1].max()
+    # They meet: in free fall the letter would be below the floor.
+    fallen = path["x"][0, :split, 1].mean() - path["x"][-1, :split, 1].mean()
+    assert 0.05 < fallen < 0.45 < 2.0 * 0.18 + 0.5 * 9.8 * 0.18**2
+    header, *rows = (clone.root / "tiny/results/table2.csv").read_text().splitlines()
+    assert header.startswith("quantity,method,title,letter_and_ball,Average")
+    assert rows[0].startswith("chamfer,nclaw,the prior,") and len(rows) == 7
+    assert "BouncyBall" in (clone.root / "tiny/results/table4.csv").read_text()
+    measured = json.loads((clone.root / SCENE / "neuma" / "image_metrics.json").read_text())
+    assert measured["views"] == [1] and len(measured["ssim_per_frame"]) == 7
+    assert measured["psnr"] > 8 and measured["lpips_vgg"] != 0
+
+
+def test_seeds_and_assumed_densities_are_runs_of_their_own(finished):
+    plan = finished.plan("--config", "tables={table1: {seeds: 3}}", "--", TABLE)
+    assert plan == {"material": 2, "evaluation": 2, "chamfer_table": 1}
+    plan = finished.plan(f"{SCENE}/neuma+assumed_density=900/metrics.json")
+    assert plan == {"material": 1, "evaluation": 1}
+
+
+def test_all_tables_can_be_planned(finished):
+    plan = finished.plan("tables")
+    assert {"experiment_truth", "experiment_start", "experiment", "benchmark_table"} <= set(plan)
+    assert plan["chamfer_table"] >= 4 and plan["prior"] == 7
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_without_the_gpu_that_is_asked_for_nothing_is_begun(kernels, tmp_path):
+    project = copied(tmp_path, kernels)
+    adaptor = f"{SCENE}/neuma/adaptor.safetensors"
+    cuda = ("--config", "device=cuda", "--")
+    assert project.plan(*cuda, adaptor)["material"] == 1
+    output = project.run(*cuda, adaptor, succeeds=False)
+    assert "torch sees no CUDA device" in output and "gaussians, material, prior, velocity" in output
+    assert "Traceback (most recent call last)" not in output
+    assert not (tmp_path / "tiny").exists()
+    output = project.run(*cuda, "tiny/data/BouncyBall/particles.h5")
+    assert "ground_truth BouncyBall: " in output
+
+
+# ---- killed and run again
+
+LONG = "neuma+iterations=40+checkpoint_every=1"
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(finished, tmp_path_factory):
+    """The adaptor of a training that nobody disturbed."""
+    project = finished.clone(tmp_path_factory.mktemp("uninterrupted") / "clone")
+    project.run(f"{SCENE}/{LONG}/adaptor.safetensors")
+    assert not (project.root / SCENE / LONG / "checkpoint.pt").exists()
+    return (project.root / SCENE / LONG / "adaptor.safetensors").read_bytes()
+
+
+def started_training(project: Project) -> tuple[subprocess.Popen, int]:
+    """Start training, and wait until it has gone some way. Returns Snakemake and the number of the training process."""
+    snakemake = project.start(f"{SCENE}/{LONG}/adaptor.safetensors")
+    checkpoint = project.root / SCENE / LONG / "checkpoint.pt"
+    first = wait_for(lambda: checkpoint.exists() and checkpoint.stat().st_mtime_ns)
+    wait_for(lambda: checkpoint.stat().st_mtime_ns > first)
+    (training,) = project.processes("material")
+    return snakemake, training
+
+
+def resumed(project: Project) -> bytes:
+    output = project.run(f"{SCENE}/{LONG}/adaptor.safetensors")
+    assert re.search(r"resumed at iteration \d+ of 40", output)
+    assert not (project.root / SCENE / LONG / "checkpoint.pt").exists()
+    return (project.root / SCENE / LONG / "adaptor.safetensors").read_bytes()
+
+
+def test_killed_training_resumes_with_the_same_result(clone, uninterrupted):
+    snakemake, training = started_training(clone)
+    os.kill(training, signal.SIGKILL)
+    assert snakemake.wait(60) != 0
+    left = {f.name for f in (clone.root / SCENE / LONG).iterdir()}
+    assert left - {".partial-checkpoint.pt"} == {"checkpoint.pt"}
+    assert resumed(clone) == uninterrupted
+
+
+def test_killed_snakemake_resumes_with_the_same_result(clone, uninterrupted):
+    make = ["make", "-o", "env", "unlock", f"VENV={sys.prefix}"]
+    snakemake, training = started_training(clone)
+    busy = subprocess.run(make, cwd=clone.root, capture_output=True, text=True)
+    assert busy.returncode != 0 and "at work in this folder" in busy.stdout
+    os.kill(snakemake.pid, signal.SIGKILL)
+    snakemake.wait(60)
+    # Its scripts do not go on alone.
+    wait_for(lambda: not clone.processes("material"), 20)
+    assert "unlock" in clone.run(f"{SCENE}/{LONG}/adaptor.safetensors", succeeds=False)
+    wait_for(lambda: subprocess.run(make, cwd=clone.root, capture_output=True).returncode == 0, 20)
+    assert resumed(clone) == uninterrupted
+
+
+# ---- bad input
+
+
+def test_mistyped_key(finished):
+    output = finished.run("--config", "material={iteratons: 3}", "--", TABLE, succeeds=False)
+    assert "material.iteratons: unknown key; did you mean iterations" in output
+    assert "Traceback (most recent call last)" not in output
+
+
+def test_mistyped_variant(finished):
+    output = finished.run(f"{SCENE}/neuma+rnk=3/metrics.json", succeeds=False)
+    assert "no setting 'rnk'; did you mean rank" in output
+    assert "Traceback (most recent call last)" not in output
+
+
+@pytest.mark.parametrize("damage", ["truncated", "missing", "no intrinsics"])
+def test_damaged_images(clone, damage):
+    folder = clone.root / "tiny/data/BouncyBall/static"
+    file = folder / "s_003.png"
+    if damage == "truncated":
+        file.write_bytes(file.read_bytes()[:-100])
+    elif damage == "missing":
+        file.unlink()
+    else:
+        file = folder / "transforms.json"
+        data = json.loads(file.read_text())
+        for entry in (data, *data["frames"]):
+            for key in ("fl_x", "fl_y", "camera_angle_x"):
+                entry.pop(key, None)
+        file.write_text(json.dumps(data))
+    output = clone.run("--forcerun", "gaussians", "--", f"{SCENE}/gaussians.ply", succeeds=False)
+    error = next(line for line in output.splitlines() if line.startswith("gaussians BouncyBall: ERROR"))
+    assert str(file.relative_to(clone.root)) in error and "gaussians.log" in error
+    assert "Traceback (most recent call last)" not in output
+    assert not (clone.root / SCENE / "gaussians.ply").exists()
+    assert not list((clone.root / SCENE).glob(".partial*"))
+
+
+def test_checkpoint_of_other_settings(clone):
+    path = f"{SCENE}/neuma+seed=7/checkpoint.pt"
+    Checkpoint(clone.root / path, {"setting lr_elastic": "1.0"}).save(
+        {"iteration": 1, "weights": torch.zeros(3)}
+    )
+    output = clone.run(f"{SCENE}/neuma+seed=7/adaptor.safetensors", succeeds=False)
+    assert f"checkpoint {path} belongs to another run" in output and f"rm '{path}'" in output
+    assert "Traceback (most recent call last)" not in output
+    assert [f.name for f in (clone.root / path).parent.iterdir()] == ["checkpoint.pt"]
