@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from neuma_lib import owner, progress
+from workflow import owner
+from workflow import stage as progress
 from neuma_lib.errors import InputError, NonFiniteError
 
 ROOT = Path(__file__).resolve().parents[2]

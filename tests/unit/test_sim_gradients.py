@@ -8,7 +8,7 @@ import torch
 from sim_scenes import DT, cube, make_law, strained
 
 from neuma_lib.errors import InputError
-from neuma_lib.sim import storage
+from neuma_lib.sim import memory as storage
 from neuma_lib.sim.model import Body, MPMModel
 from neuma_lib.sim.rollout import rollout
 
