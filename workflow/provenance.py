@@ -25,7 +25,7 @@ from typing import Any
 from neuma_lib.io.files import sha256_file
 
 PACKAGE = "neuma_lib"
-CATALOGUES = frozenset({"neuma_lib.io.files", "neuma_lib.io.artifacts", "neuma_lib.config.settings"})
+CATALOGUES = frozenset({"neuma_lib.io.files", "neuma_lib.config.settings"})
 
 
 def code_digest(script: str | Path, root: str | Path) -> str:

@@ -19,8 +19,6 @@ from typing import Any
 
 from neuma_lib.errors import InputError
 
-# ------------------------------------------------------------------------------------------------- writing safely
-
 
 @contextmanager
 def atomic(path: str | Path) -> Iterator[Path]:
@@ -52,35 +50,20 @@ def write_json(path: str | Path, data: Any) -> None:
 def read_json(path: str | Path) -> Any:
     """Read JSON. Raises InputError when the file is missing or is not JSON."""
     try:
-        return json.loads(_existing(path).read_text())
+        return json.loads(existing(path).read_text())
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InputError(
             f"{path} is not valid JSON ({error}): delete it and run the workflow again"
         ) from None
 
 
-def _existing(path: str | Path) -> Path:
+def existing(path: str | Path) -> Path:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path} does not exist: run the stage that makes it, or correct the path")
     return path
 
 
-# -------------------------------------------------------------------------------------------------------- HDF5
-
-
-# -------------------------------------------------------------------------------------------- images and cameras
-
-
 def sha256_file(path: str | Path) -> str:
     """Hex digest of a file's bytes."""
-    return hashlib.sha256(_existing(path).read_bytes()).hexdigest()
-
-
-# ------------------------------------------------------------------------------------------------------- meshes
-
-
-# ---------------------------------------------------------------------------------------------------- Gaussians
-
-
-# ------------------------------------------------------------------------------------------------------ weights
+    return hashlib.sha256(existing(path).read_bytes()).hexdigest()

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import _existing, atomic
+from neuma_lib.io.files import atomic, existing
 
 QUANTITIES = {
     "x": ("m", "particle positions, shape (T, N, 3), or (N, 3) where there is one state"),
@@ -68,7 +68,7 @@ def read_arrays(
     """
     import h5py
 
-    path = _existing(path)
+    path = existing(path)
     try:
         with h5py.File(path, "r") as file:
             missing = [name for name in required if name not in file]

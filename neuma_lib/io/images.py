@@ -11,10 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import read_json, sha256_file, write_json
 from neuma_lib.io.released import released_frames
+from neuma_lib.splatting.cameras import Cameras
+from neuma_lib.splatting.observation import Observation
 
 
 @dataclass(frozen=True)
@@ -250,3 +253,26 @@ def _read_rgba(path: Path, sha256: str | None) -> np.ndarray:
             f"{path}: the mask (alpha) is empty, the object is not in the picture: remove this frame"
         )
     return pixels
+
+
+def load_views(transforms: str | Path, views: Sequence[int] | None = None) -> tuple[torch.Tensor, Cameras]:
+    """Straight-alpha RGBA images (V, H, W, 4) in [0, 1] and their cameras, of an image set at one time."""
+    images = read_image_set(transforms, views)
+    pixels = torch.from_numpy(images.images).float() / 255
+    return pixels, _cameras(images, np.arange(len(pixels)))
+
+
+def load_observation(transforms: str | Path, views: Sequence[int]) -> Observation:
+    """The video of some views, with its pixels as they are stored: 1 GB for 400 frames of 800 x 800."""
+    images = read_image_set(transforms, views)
+    frames, index, columns = images.video(views)
+    return Observation(frames, torch.from_numpy(images.images[index]), _cameras(images, columns))
+
+
+def _cameras(images: ImageSet, index: np.ndarray) -> Cameras:
+    return Cameras(
+        torch.from_numpy(images.viewmats[index]).float(),
+        torch.from_numpy(images.Ks[index]).float(),
+        images.width,
+        images.height,
+    )

@@ -1,16 +1,17 @@
-"""Files of neural laws: our own ``.safetensors`` and the released NCLaw / NeuMA ``.pt``."""
+"""Files of neural laws: priors (our own ``.safetensors``, the released NCLaw / NeuMA ``.pt``) and adaptors."""
 
 from __future__ import annotations
 
 import pickle
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
 from neuma_lib.errors import InputError
+from neuma_lib.io.weights import read_weights, write_weights
 from neuma_lib.mechanics.neural import NeuralLaw, neural_law
 
 
@@ -18,8 +19,8 @@ def load_prior(path: str | Path, device: torch.device | str = "cpu") -> NeuralLa
     """Neural law from a file.
 
     Args:
-        path: ``.safetensors`` as written by :func:`prior_bytes`, or ``.pt``: a dict with ``elasticity`` and
-            ``plasticity``, each with the three weights of an NCLaw network.
+        path: ``.safetensors`` with a law's merged weights (`NeuralLaw.prior_state`), or ``.pt``: a dict with
+            ``elasticity`` and ``plasticity``, each with the three weights of an NCLaw network.
 
     Raises:
         InputError: no such file, another format, missing weights or other shapes.
@@ -28,13 +29,7 @@ def load_prior(path: str | Path, device: torch.device | str = "cpu") -> NeuralLa
     if not path.is_file():
         raise InputError(f"prior {path}: no such file")
     if path.suffix == ".safetensors":
-        try:
-            with safe_open(path, framework="pt", device="cpu") as file:
-                state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a mapping)
-        except SafetensorError as error:
-            raise InputError(
-                f"prior {path}: not a readable safetensors file ({error}); make it again"
-            ) from None
+        state, _ = read_weights(path)
     elif path.suffix in (".pt", ".pth"):
         state = _released(path)
     else:
@@ -43,11 +38,6 @@ def load_prior(path: str | Path, device: torch.device | str = "cpu") -> NeuralLa
         return neural_law(state, name=path.stem).to(device)
     except InputError as error:
         raise InputError(f"prior {path}: {error}") from None
-
-
-def prior_bytes(law: NeuralLaw, metadata: dict[str, str] | None = None) -> bytes:
-    """Contents of a ``.safetensors`` file of the law's merged weights; the same law gives the same bytes."""
-    return save({key: value.cpu() for key, value in law.prior_state().items()}, metadata)
 
 
 def _released(path: Path) -> dict[str, Tensor]:
@@ -61,3 +51,23 @@ def _released(path: Path) -> dict[str, Tensor]:
             raise InputError(f"prior {path}: expected a dict with elasticity and plasticity")
         parts.update({f"{part}.{key}": value for key, value in content[part].items()})
     return parts
+
+
+def save_adaptor(
+    path: str | Path, law: NeuralLaw, rank: int | None, alpha: float, metadata: Mapping[str, Any]
+) -> None:
+    """Write the tensors of a law's adaptor, with what is needed to attach them again."""
+    write_weights(path, law.adaptor_state(), {"rank": rank, "alpha": alpha, **metadata})
+
+
+def load_law(prior: str | Path, adaptor: str | Path | None = None) -> NeuralLaw:
+    """A prior, with a trained adaptor attached if one is given."""
+    law = load_prior(prior)
+    if adaptor is not None:
+        tensors, metadata = read_weights(adaptor)
+        if "rank" not in metadata or "alpha" not in metadata:
+            raise InputError(
+                f"{adaptor} has no rank and alpha in its metadata: it is not an adaptor of this project"
+            )
+        law.load_adaptor_state(tensors, rank=metadata["rank"], alpha=metadata["alpha"])
+    return law

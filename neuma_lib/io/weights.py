@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import _existing, atomic
+from neuma_lib.io.files import atomic, existing
 
 
 def write_weights(path: str | Path, tensors: Mapping[str, Any], metadata: Mapping[str, Any]) -> None:
@@ -28,7 +28,7 @@ def read_weights(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """
     from safetensors import SafetensorError, safe_open
 
-    path = _existing(path)
+    path = existing(path)
     try:
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

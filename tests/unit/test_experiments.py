@@ -17,8 +17,9 @@ from neuma_lib.data.ground_truth import TrueBody, simulate_ground_truth
 from neuma_lib.errors import InputError
 from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.volume import check_apart, sample_volume
-from neuma_lib.io.artifacts import load_start, save_binding, save_gaussians
 from neuma_lib.io.files import write_json
+from neuma_lib.io.gaussians import save_gaussians
+from neuma_lib.io.particles import load_start, save_binding
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.density import density_at
 from neuma_lib.sim.model import MPMModel, consecutive, each_its_own

@@ -8,8 +8,14 @@ import torch
 from PIL import Image
 
 from neuma_lib.errors import InputError
-from neuma_lib.io import files as io
-from neuma_lib.io.ply_container import read_ply
+from neuma_lib.io.files import atomic, read_json, write_json
+from neuma_lib.io.gaussians import load_gaussians, save_gaussians
+from neuma_lib.io.hdf5 import read_arrays, write_arrays
+from neuma_lib.io.images import read_image_set, write_transforms
+from neuma_lib.io.mesh import read_mesh, write_mesh
+from neuma_lib.io.ply import read_ply
+from neuma_lib.io.weights import read_weights, write_weights
+from neuma_lib.splatting.gaussians import Gaussians
 
 RNG = np.random.default_rng(0)
 
@@ -25,18 +31,18 @@ def cube():
 
 def test_a_failing_writer_leaves_the_old_file_and_nothing_else(tmp_path):
     path = tmp_path / "metrics.json"
-    io.write_json(path, {"a": 1})
+    write_json(path, {"a": 1})
     with pytest.raises(ValueError):
-        io.write_json(path, {"a": float("nan")})
-    with pytest.raises(RuntimeError), io.atomic(path) as partial:
+        write_json(path, {"a": float("nan")})
+    with pytest.raises(RuntimeError), atomic(path) as partial:
         partial.write_text("half")
         raise RuntimeError
-    assert io.read_json(path) == {"a": 1}
+    assert read_json(path) == {"a": 1}
     assert [p.name for p in tmp_path.iterdir()] == ["metrics.json"]
 
 
 def test_the_name_keeps_its_ending_while_written(tmp_path):
-    with io.atomic(tmp_path / "video.mp4") as partial:
+    with atomic(tmp_path / "video.mp4") as partial:
         assert partial.suffix == ".mp4" and partial.parent == tmp_path
         partial.write_bytes(b"")
 
@@ -44,9 +50,9 @@ def test_the_name_keeps_its_ending_while_written(tmp_path):
 def test_json(tmp_path):
     (tmp_path / "broken.json").write_text('{"a": ')
     with pytest.raises(InputError, match=r"broken\.json is not valid JSON"):
-        io.read_json(tmp_path / "broken.json")
+        read_json(tmp_path / "broken.json")
     with pytest.raises(InputError, match=r"absent\.json does not exist"):
-        io.read_json(tmp_path / "absent.json")
+        read_json(tmp_path / "absent.json")
 
 
 # ---- arrays
@@ -65,8 +71,8 @@ def test_arrays_round_trip_with_units(tmp_path):
     import h5py
 
     arrays, path = trajectory(), tmp_path / "particles.h5"
-    io.write_arrays(path, arrays, {"dt": 1e-3, "scene": {"shape": "ball"}, "title": "Ball"})
-    found, attributes = io.read_arrays(path, required=("x", "frames"))
+    write_arrays(path, arrays, {"dt": 1e-3, "scene": {"shape": "ball"}, "title": "Ball"})
+    found, attributes = read_arrays(path, required=("x", "frames"))
     assert set(found) == {"x", "F", "frames"}
     for name in found:
         assert found[name].dtype == arrays[name].dtype
@@ -74,22 +80,22 @@ def test_arrays_round_trip_with_units(tmp_path):
     assert attributes["dt"] == 1e-3 and json.loads(attributes["scene"]) == {"shape": "ball"}
     with h5py.File(path) as file:
         assert file["x"].attrs["unit"] == "m" and "shape (T, N, 3)" in file["x"].attrs["description"]
-    only, _ = io.read_arrays(path, only=("x",))
+    only, _ = read_arrays(path, only=("x",))
     assert set(only) == {"x"}
 
 
 def test_arrays_problems(tmp_path):
     path = tmp_path / "particles.h5"
-    io.write_arrays(path, trajectory())
+    write_arrays(path, trajectory())
     with pytest.raises(InputError, match=r"particles\.h5 has no dataset v, tracers"):
-        io.read_arrays(path, required=("x", "v", "tracers"))
+        read_arrays(path, required=("x", "v", "tracers"))
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match=r"particles\.h5 cannot be read as HDF5"):
-        io.read_arrays(path)
-    io.write_arrays(path, {"x": np.full((2, 3), np.nan)})
+        read_arrays(path)
+    write_arrays(path, {"x": np.full((2, 3), np.nan)})
     with pytest.raises(InputError, match=r"particles\.h5: dataset x holds values that are not finite"):
-        io.read_arrays(path)
+        read_arrays(path)
 
 
 # ---- image sets
@@ -119,7 +125,7 @@ def image_set(tmp_path):
                 }
             )
     path = tmp_path / "transforms.json"
-    io.write_transforms(path, INTRINSICS, frames)
+    write_transforms(path, INTRINSICS, frames)
     return path
 
 
@@ -130,7 +136,7 @@ def edit(path, change):
 
 
 def test_image_set(image_set):
-    images = io.read_image_set(image_set)
+    images = read_image_set(image_set)
     assert images.images.shape == (6, 12, 16, 4) and images.images.dtype == np.uint8
     assert (images.width, images.height) == (16, 12)
     steps, index, columns = images.video([0, 1])
@@ -140,7 +146,7 @@ def test_image_set(image_set):
     # A point one metre in front of an OpenGL camera (its -z) is one metre along +z of the OpenCV camera.
     point = images.viewmats[columns[1]] @ np.array([0.1, 0.6, 1.0, 1.0])
     np.testing.assert_allclose(point, [0, -0.1, 1, 1], atol=1e-12)
-    assert len(io.read_image_set(image_set, views=[1]).images) == 3
+    assert len(read_image_set(image_set, views=[1]).images) == 3
 
 
 def test_camera_angle_and_own_intrinsics_of_a_frame(image_set):
@@ -153,7 +159,7 @@ def test_camera_angle_and_own_intrinsics_of_a_frame(image_set):
         data["frames"][0]["fl_x"] = 40.0
 
     edit(image_set, change)
-    Ks = io.read_image_set(image_set).Ks
+    Ks = read_image_set(image_set).Ks
     np.testing.assert_allclose(Ks[1], [[20, 0, 8], [0, 20, 6], [0, 0, 1]])
     assert Ks[0, 0, 0] == 40.0
 
@@ -179,19 +185,19 @@ def test_camera_angle_and_own_intrinsics_of_a_frame(image_set):
 def test_bad_transforms(image_set, change, message):
     edit(image_set, change)
     with pytest.raises(InputError, match=message):
-        io.read_image_set(image_set)
+        read_image_set(image_set)
 
 
 def test_missing_image(image_set):
     (image_set.parent / "d_1_002.png").unlink()
     with pytest.raises(InputError, match=r"d_1_002\.png is missing although .*--forcerun"):
-        io.read_image_set(image_set)
+        read_image_set(image_set)
 
 
 def test_changed_image(image_set):
     Image.new("RGBA", (16, 12), (1, 2, 3, 255)).save(image_set.parent / "d_0_000.png")
     with pytest.raises(InputError, match=r"d_0_000\.png is damaged or was changed"):
-        io.read_image_set(image_set)
+        read_image_set(image_set)
 
 
 def without_checksums(data):
@@ -204,7 +210,7 @@ def test_truncated_png(image_set):
     path = image_set.parent / "d_0_000.png"
     path.write_bytes(path.read_bytes()[:-40])
     with pytest.raises(InputError, match=r"d_0_000\.png is not a readable image, perhaps truncated"):
-        io.read_image_set(image_set)
+        read_image_set(image_set)
 
 
 @pytest.mark.parametrize(
@@ -220,15 +226,15 @@ def test_unusable_images(image_set, image, message):
     edit(image_set, without_checksums)
     image.save(image_set.parent / "d_0_000.png")
     with pytest.raises(InputError, match=rf"d_0_000\.png.*{message}"):
-        io.read_image_set(image_set)
+        read_image_set(image_set)
 
 
 def test_views_that_do_not_exist_or_do_not_match(image_set):
     with pytest.raises(InputError, match="view 7 is not among the filmed views"):
-        io.read_image_set(image_set).video([7])
+        read_image_set(image_set).video([7])
     edit(image_set, lambda d: d["frames"].pop(0))
     with pytest.raises(InputError, match="not filmed at the same steps"):
-        io.read_image_set(image_set).video([0, 1])
+        read_image_set(image_set).video([0, 1])
 
 
 # ---- meshes
@@ -236,8 +242,8 @@ def test_views_that_do_not_exist_or_do_not_match(image_set):
 
 def test_mesh_round_trip(tmp_path):
     mesh = cube()
-    io.write_mesh(tmp_path / "mesh.ply", mesh.vertices, mesh.faces)
-    found = io.read_mesh(tmp_path / "mesh.ply")
+    write_mesh(tmp_path / "mesh.ply", mesh.vertices, mesh.faces)
+    found = read_mesh(tmp_path / "mesh.ply")
     np.testing.assert_allclose(found.vertices, mesh.vertices, atol=1e-8)
     np.testing.assert_array_equal(found.faces, mesh.faces)
 
@@ -247,60 +253,62 @@ def test_foreign_meshes(tmp_path):
     for encoding in ("ascii", "binary"):
         path = tmp_path / f"{encoding}.ply"
         path.write_bytes(mesh.export(file_type="ply", encoding=encoding))
-        assert io.read_mesh(path).volume == pytest.approx(mesh.volume, rel=1e-5)
+        assert read_mesh(path).volume == pytest.approx(mesh.volume, rel=1e-5)
 
 
 def test_bad_meshes(tmp_path):
     mesh, path = cube(), tmp_path / "mesh.ply"
     vertices = mesh.vertices.copy()
     vertices[3, 1] = np.nan
-    io.write_mesh(path, vertices, mesh.faces)
+    write_mesh(path, vertices, mesh.faces)
     with pytest.raises(InputError, match=r"mesh\.ply: vertex 3 of 8 is not finite"):
-        io.read_mesh(path)
-    io.write_mesh(path, mesh.vertices, mesh.faces[1:])
+        read_mesh(path)
+    write_mesh(path, mesh.vertices, mesh.faces[1:])
     with pytest.raises(InputError, match=r"mesh\.ply is not watertight.*close its holes"):
-        io.read_mesh(path)
-    assert len(io.read_mesh(path, watertight=False).faces) == 11
-    io.write_mesh(path, mesh.vertices, mesh.faces[:, ::-1])
+        read_mesh(path)
+    assert len(read_mesh(path, watertight=False).faces) == 11
+    write_mesh(path, mesh.vertices, mesh.faces[:, ::-1])
     with pytest.raises(InputError, match="faces point inwards"):
-        io.read_mesh(path)
-    io.write_mesh(path, mesh.vertices, mesh.faces)
+        read_mesh(path)
+    write_mesh(path, mesh.vertices, mesh.faces)
     path.write_bytes(path.read_bytes()[:-7])
     with pytest.raises(InputError, match=r"mesh\.ply is truncated or damaged"):
-        io.read_mesh(path)
+        read_mesh(path)
     path.write_bytes(b"solid nothing")
     with pytest.raises(InputError, match="is not a PLY file"):
-        io.read_mesh(path)
+        read_mesh(path)
 
 
 # ---- Gaussians
 
 
-def kernels(count=7, bands=9):
-    return {
-        "means": RNG.normal(size=(count, 3)).astype(np.float32),
-        "quats": (q := RNG.normal(size=(count, 4)).astype(np.float32))
+def random_gaussians(count=7, bands=9, seed=0):
+    rng = np.random.default_rng(seed)
+    arrays = {
+        "means": rng.normal(size=(count, 3)).astype(np.float32),
+        "quats": (q := rng.normal(size=(count, 4)).astype(np.float32))
         / np.linalg.norm(q, axis=1, keepdims=True),
-        "scales": RNG.uniform(0.001, 0.1, (count, 3)).astype(np.float32),
-        "opacities": RNG.uniform(0.01, 0.99, count).astype(np.float32),
-        "sh0": RNG.normal(size=(count, 1, 3)).astype(np.float32),
-        "shN": RNG.normal(size=(count, bands - 1, 3)).astype(np.float32),
+        "scales": rng.uniform(0.001, 0.1, (count, 3)).astype(np.float32),
+        "opacities": rng.uniform(0.01, 0.99, count).astype(np.float32),
+        "sh0": rng.normal(size=(count, 1, 3)).astype(np.float32),
+        "shN": rng.normal(size=(count, bands - 1, 3)).astype(np.float32),
     }
+    return Gaussians(**{name: torch.from_numpy(array) for name, array in arrays.items()})
 
 
 @pytest.mark.parametrize("bands", [1, 4, 9, 16])
 def test_gaussians_round_trip(tmp_path, bands):
-    expected = kernels(bands=bands)
-    io.write_gaussians(tmp_path / "g.ply", **expected)
-    found = io.read_gaussians(tmp_path / "g.ply")
-    for name, array in expected.items():
-        assert found[name].shape == array.shape and found[name].dtype == np.float32
-        np.testing.assert_allclose(found[name], array, rtol=2e-6, atol=2e-6)
+    expected = random_gaussians(bands=bands)
+    save_gaussians(tmp_path / "g.ply", expected)
+    found = load_gaussians(tmp_path / "g.ply")
+    for name, array in vars(expected).items():
+        assert getattr(found, name).dtype == torch.float32
+        torch.testing.assert_close(getattr(found, name), array, rtol=2e-6, atol=2e-6)
 
 
 def test_gaussians_have_the_layout_of_the_3dgs_release(tmp_path):
-    expected = kernels(bands=16)
-    io.write_gaussians(tmp_path / "g.ply", **expected)
+    expected = random_gaussians(bands=16)
+    save_gaussians(tmp_path / "g.ply", expected)
     rows, _ = read_ply(tmp_path / "g.ply")
     names = [
         "x",
@@ -315,24 +323,25 @@ def test_gaussians_have_the_layout_of_the_3dgs_release(tmp_path):
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     assert list(rows.dtype.names) == names
     # f_rest is stored channel by channel: 15 coefficients of red, then of green, then of blue.
-    np.testing.assert_array_equal(rows["f_rest_16"], expected["shN"][:, 1, 1])
-    np.testing.assert_allclose(rows["scale_2"], np.log(expected["scales"][:, 2]), rtol=1e-6)
-    np.testing.assert_allclose(1 / (1 + np.exp(-rows["opacity"])), expected["opacities"], rtol=1e-5)
+    np.testing.assert_array_equal(rows["f_rest_16"], expected.shN[:, 1, 1])
+    np.testing.assert_allclose(rows["scale_2"], np.log(expected.scales[:, 2]), rtol=1e-6)
+    np.testing.assert_allclose(1 / (1 + np.exp(-rows["opacity"])), expected.opacities, rtol=1e-5)
 
 
 def test_bad_gaussians(tmp_path):
     path = tmp_path / "g.ply"
-    io.write_mesh(path, cube().vertices, cube().faces)
+    write_mesh(path, cube().vertices, cube().faces)
     with pytest.raises(InputError, match=r"g\.ply misses the properties f_dc_0, .*opacity.*rot_3"):
-        io.read_gaussians(path)
-    broken = kernels()
-    broken["means"][4, 0] = np.inf
-    io.write_gaussians(path, **broken)
+        load_gaussians(path)
+    broken = random_gaussians()
+    broken.means[4, 0] = np.inf
+    save_gaussians(path, broken)
     with pytest.raises(InputError, match=r"g\.ply: means of Gaussian 4 is not finite"):
-        io.read_gaussians(path)
-    io.write_gaussians(path, **kernels(bands=6))
-    with pytest.raises(InputError, match="15 f_rest_"):
-        io.read_gaussians(path)
+        load_gaussians(path)
+    save_gaussians(path, random_gaussians(bands=4))
+    path.write_bytes(path.read_bytes().replace(b"property float f_rest_8\n", b"property float other\n"))
+    with pytest.raises(InputError, match="8 f_rest_"):
+        load_gaussians(path)
 
 
 # ---- weights
@@ -341,16 +350,16 @@ def test_bad_gaussians(tmp_path):
 def test_weights(tmp_path):
     path = tmp_path / "adaptor.safetensors"
     tensors = {"elasticity.A.0": torch.randn(4, 13), "elasticity.B.0": torch.zeros(64, 4)}
-    io.write_weights(path, tensors, {"rank": 4, "settings": {"lr": 0.1}})
-    found, metadata = io.read_weights(path)
+    write_weights(path, tensors, {"rank": 4, "settings": {"lr": 0.1}})
+    found, metadata = read_weights(path)
     assert metadata == {"rank": 4, "settings": {"lr": 0.1}}
     assert all(torch.equal(found[name], tensors[name]) for name in tensors)
     path.write_bytes(path.read_bytes()[:-9])
     with pytest.raises(InputError, match=r"adaptor\.safetensors is not a readable safetensors file"):
-        io.read_weights(path)
-    io.write_weights(path, {"B": torch.tensor([1.0, float("nan")])}, {})
+        read_weights(path)
+    write_weights(path, {"B": torch.tensor([1.0, float("nan")])}, {})
     with pytest.raises(InputError, match="B is not finite"):
-        io.read_weights(path)
+        read_weights(path)
 
 
 # ---- same content, same bytes
@@ -359,13 +368,15 @@ def test_weights(tmp_path):
 @pytest.mark.parametrize(
     "write",
     [
-        lambda p: io.write_arrays(
+        lambda p: write_arrays(
             p, {"x": np.arange(6.0).reshape(2, 3), "frames": np.arange(2)}, {"dt": 1.0, "b": [1]}
         ),
-        lambda p: io.write_json(p, {"b": 1.5, "a": [1, 2]}),
-        lambda p: io.write_mesh(p, cube().vertices, cube().faces),
-        lambda p: io.write_gaussians(p, **{k: np.ones_like(v) * 0.5 for k, v in kernels().items()}),
-        lambda p: io.write_weights(p, {"a": torch.ones(3), "b": torch.zeros(2)}, {"z": 1, "y": 2, "x": 3}),
+        lambda p: write_json(p, {"b": 1.5, "a": [1, 2]}),
+        lambda p: write_mesh(p, cube().vertices, cube().faces),
+        lambda p: save_gaussians(
+            p, Gaussians(**{k: 0.5 * torch.ones_like(v) for k, v in vars(random_gaussians()).items()})
+        ),
+        lambda p: write_weights(p, {"a": torch.ones(3), "b": torch.zeros(2)}, {"z": 1, "y": 2, "x": 3}),
     ],
     ids=["h5", "json", "mesh", "gaussians", "weights"],
 )

@@ -11,7 +11,8 @@ from PIL import Image
 from test_workflow import copied
 
 from neuma_lib.errors import InputError
-from neuma_lib.io import files as io
+from neuma_lib.io.hdf5 import read_arrays, write_arrays
+from neuma_lib.io.images import list_images, read_image_set, write_transforms
 from neuma_lib.io.packed import STEPS, pack_images, pack_truth, unpack_images, unpack_truth
 
 FRAMES = (0, 3, 6, 9, 20, 30, 40)  # of tests/workflow/tiny.yaml
@@ -34,7 +35,7 @@ def write_set(folder, steps, views=2):
             pose[:3, 3] = (0.5, 0.1 * view, 2.0)
             place = {"file_path": name, "transform_matrix": pose.tolist(), "fl_x": 40.0 + view}
             frames.append({**place, "view": view, "step": step, "time": step * 2e-3})
-    io.write_transforms(folder / "transforms.json", {"w": 32, "h": 24, "cx": 16.0, "cy": 12.0}, frames)
+    write_transforms(folder / "transforms.json", {"w": 32, "h": 24, "cx": 16.0, "cy": 12.0}, frames)
 
 
 def write_truth(path, count=60):
@@ -57,7 +58,7 @@ def write_truth(path, count=60):
         "tracers": path_of(100),
         "tracers_again": path_of(90),
     }
-    io.write_arrays(path, arrays, {"dt": 2e-3, "bodies": [{"shape": "ball"}]})
+    write_arrays(path, arrays, {"dt": 2e-3, "bodies": [{"shape": "ball"}]})
     return arrays
 
 
@@ -77,7 +78,7 @@ def sets(folder):
 
 def assert_same_images(first, second):
     for ours, theirs in zip(sets(first).values(), sets(second).values(), strict=True):
-        a, b = io.read_image_set(ours), io.read_image_set(theirs)
+        a, b = read_image_set(ours), read_image_set(theirs)
         for name in ("images", "viewmats", "Ks", "views", "steps"):
             assert np.array_equal(getattr(a, name), getattr(b, name)), name
         data = [json.loads(file.read_text()) for file in (ours, theirs)]
@@ -108,7 +109,7 @@ class TestImages:
     def test_images_elsewhere_come_home(self, scene, tmp_path):
         """A list of images in another folder is packed by their names."""
         listed = tmp_path / "listed" / "transforms.json"
-        io.list_images(sets(scene)["dynamic"], listed)
+        list_images(sets(scene)["dynamic"], listed)
         pack_images(tmp_path / "images.zip", {"dynamic": listed})
         unpack_images(tmp_path / "images.zip", {"dynamic": tmp_path / "unpacked" / "transforms.json"})
         assert (tmp_path / "unpacked" / "d_1_0040.png").is_file()
@@ -141,10 +142,10 @@ class TestImages:
 
 class TestTruth:
     def test_within_half_a_step(self, scene, tmp_path):
-        before, _ = io.read_arrays(scene / "particles.h5")
+        before, _ = read_arrays(scene / "particles.h5")
         pack_truth(tmp_path / "truth.zip", scene / "particles.h5", particles=60, deformations=20, seed=1)
         unpack_truth(tmp_path / "truth.zip", tmp_path / "particles.h5", FRAMES, 2e-3)
-        after, attributes = io.read_arrays(tmp_path / "particles.h5")
+        after, attributes = read_arrays(tmp_path / "particles.h5")
         for name, array in after.items():
             if name != "F":
                 assert np.abs(array - before[name]).max() <= STEPS.get(name, 0) / 2 + 1e-7, name
@@ -155,10 +156,10 @@ class TestTruth:
         assert json.loads(attributes["packed"])["rounded_to"] == STEPS
 
     def test_a_part_of_the_particles_has_all_the_mass(self, scene, tmp_path):
-        before, _ = io.read_arrays(scene / "particles.h5")
+        before, _ = read_arrays(scene / "particles.h5")
         pack_truth(tmp_path / "truth.zip", scene / "particles.h5", particles=25, deformations=5, seed=1)
         unpack_truth(tmp_path / "truth.zip", tmp_path / "particles.h5")
-        after, _ = io.read_arrays(tmp_path / "particles.h5")
+        after, _ = read_arrays(tmp_path / "particles.h5")
         assert after["x"].shape[1] == len(after["mass"]) == 25
         for name in ("mass", "vol0"):
             np.testing.assert_allclose(after[name].sum(), before[name].sum(), rtol=1e-6)
@@ -260,7 +261,7 @@ def test_workflow_packs_and_takes_a_packed_dataset_without_blender(scene, tmp_pa
     (project.root / "tests/workflow/tiny.yaml").write_text(yaml.safe_dump(settings))
     project.run("dataset")
     assert_same_images(scene, data)
-    assert io.read_arrays(data / "particles.h5")[0]["tracers"].shape == (len(FRAMES), 100, 3)
+    assert read_arrays(data / "particles.h5")[0]["tracers"].shape == (len(FRAMES), 100, 3)
     plan = project.plan("tiny/results/table1.csv")
     assert "gaussians" in plan
     assert not {"ground_truth", "render_static", "render_dynamic", "unpack_truth"} & set(plan)

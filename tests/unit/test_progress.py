@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from neuma_lib.errors import InputError, NonFiniteError
 from workflow import owner
 from workflow import stage as progress
-from neuma_lib.errors import InputError, NonFiniteError
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -10,8 +10,7 @@ from PIL import Image
 from test_workflow import copied
 
 from neuma_lib.errors import InputError
-from neuma_lib.io import files as io
-from neuma_lib.io.artifacts import load_observation
+from neuma_lib.io.images import list_images, load_observation, read_image_set
 
 K = [[40.0, 0.0, 16.0], [0.0, 41.0, 15.0], [0.0, 0.0, 1.0]]
 
@@ -36,7 +35,7 @@ def write_release(folder, letter="d", kind="dynamic", views=(0, 2), steps=(0, 2,
 
 
 def test_release_is_read_as_it_is(tmp_path):
-    images = io.read_image_set(write_release(tmp_path))
+    images = read_image_set(write_release(tmp_path))
     assert images.images.shape == (6, 30, 32, 4)
     assert images.views.tolist() == [0, 0, 0, 2, 2, 2] and images.steps.tolist() == [0, 2, 4] * 2
     assert (images.images[:, 0, 0, :2] == np.stack([images.views, images.steps], axis=1)).all()
@@ -59,7 +58,7 @@ def test_names_without_view_and_step_are_views_at_the_start(tmp_path):
         (tmp_path / entry["file_path"]).rename(renamed)
         entry |= {"file_path": renamed.name, "c2w": entry["c2w"][:3]}
     path.write_text(json.dumps(entries))
-    images = io.read_image_set(path)
+    images = read_image_set(path)
     assert images.views.tolist() == [0, 1, 2] and images.steps.tolist() == [0, 0, 0]
 
 
@@ -82,21 +81,21 @@ def test_mistakes_are_named(tmp_path, change, message):
     change(entries[1])
     path.write_text(json.dumps(entries))
     with pytest.raises(InputError, match=message):
-        io.read_image_set(path)
+        read_image_set(path)
 
 
 def test_listed_images_stay_where_they_are(tmp_path):
     source = write_release(tmp_path / "release")
     listed = tmp_path / "project" / "data" / "scene" / "dynamic" / "transforms.json"
-    io.list_images(source, listed)
+    list_images(source, listed)
     assert [f.name for f in listed.parent.iterdir()] == ["transforms.json"]
-    ours, theirs = io.read_image_set(listed), io.read_image_set(source)
+    ours, theirs = read_image_set(listed), read_image_set(source)
     assert (ours.images == theirs.images).all() and (ours.viewmats == theirs.viewmats).all()
     assert (ours.Ks == theirs.Ks).all() and (ours.steps == theirs.steps).all()
     image = tmp_path / "release/data_dynamic/d_0_000.png"
     image.write_bytes(image.read_bytes() + b"\0")
     with pytest.raises(InputError, match="was changed"):
-        io.read_image_set(listed)
+        read_image_set(listed)
 
 
 def test_workflow_takes_supplied_images_in_place_of_blenders(tmp_path):
@@ -110,7 +109,7 @@ def test_workflow_takes_supplied_images_in_place_of_blenders(tmp_path):
     output = project.run(*targets)
     assert "6 images of 32x30 px, 2 views" in output
     for kind, target in zip(images, targets, strict=True):
-        ours, theirs = io.read_image_set(project.root / target), io.read_image_set(images[kind])
+        ours, theirs = read_image_set(project.root / target), read_image_set(images[kind])
         assert (ours.images == theirs.images).all() and (ours.viewmats == theirs.viewmats).all()
     others = project.plan("tiny/data/ClayCat/static/transforms.json")
     assert others["render_static"] == 1 and "supplied_static" not in others

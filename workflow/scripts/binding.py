@@ -3,8 +3,9 @@
 import torch
 
 from neuma_lib.coupling.particle_binding import bind_two_pass
-from neuma_lib.io.artifacts import load_gaussians, save_binding
+from neuma_lib.io.gaussians import load_gaussians
 from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.particles import save_binding
 from workflow.stage import stage
 
 

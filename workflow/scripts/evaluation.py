@@ -8,10 +8,11 @@ import torch
 from neuma_lib.device import choose_device
 from neuma_lib.evaluation.motion import evaluate, predict
 from neuma_lib.geometry.volume import sample_tracers
-from neuma_lib.io.artifacts import load_law, load_start
 from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
-from neuma_lib.io.ply import read_mesh
+from neuma_lib.io.laws import load_law
+from neuma_lib.io.mesh import read_mesh
+from neuma_lib.io.particles import load_start
 from neuma_lib.io.weights import read_weights
 from neuma_lib.sim.model import MPMModel, consecutive
 from neuma_lib.sim.total_deformation import every_step, total_deformation

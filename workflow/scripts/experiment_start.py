@@ -11,9 +11,10 @@ from neuma_lib.coupling.bodies import join, painted
 from neuma_lib.data.blender.appearance import Appearance, colors_at
 from neuma_lib.geometry.shapes import place, shape
 from neuma_lib.geometry.volume import sample_volume
-from neuma_lib.io.artifacts import load_body, save_binding, save_gaussians
 from neuma_lib.io.files import read_json, write_json
-from neuma_lib.io.ply import read_mesh, write_mesh
+from neuma_lib.io.gaussians import save_gaussians
+from neuma_lib.io.mesh import read_mesh, write_mesh
+from neuma_lib.io.particles import load_body, save_binding
 from workflow.stage import stage
 
 

@@ -15,8 +15,8 @@ from neuma_lib.evaluation.figures.pictures import (
     sphere_radius,
 )
 from neuma_lib.evaluation.figures.style import TRUE_PARTICLES
-from neuma_lib.io.artifacts import load_body
 from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.particles import load_body
 from workflow.stage import stage
 
 

@@ -5,8 +5,9 @@ from dataclasses import asdict
 from neuma_lib.config.settings import from_mapping
 from neuma_lib.device import choose_device
 from neuma_lib.fitting.gaussians import GaussianFitSettings, fit_gaussians
-from neuma_lib.io.artifacts import load_views, save_gaussians
 from neuma_lib.io.files import write_json
+from neuma_lib.io.gaussians import save_gaussians
+from neuma_lib.io.images import load_views
 from workflow.stage import stage
 
 

@@ -4,8 +4,8 @@ from statistics import median
 
 import torch
 
-from neuma_lib.io.artifacts import load_law
 from neuma_lib.io.files import read_json, write_json
+from neuma_lib.io.laws import load_law
 from workflow.stage import stage
 
 

@@ -7,9 +7,10 @@ from neuma_lib.device import choose_device
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.image_metrics import MEASURES, image_metrics
 from neuma_lib.evaluation.lpips import LPIPS
-from neuma_lib.io.artifacts import load_body, load_motion, load_observation
 from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.images import load_observation
+from neuma_lib.io.particles import load_body, load_motion
 from neuma_lib.io.weights import read_weights
 from workflow.stage import stage
 

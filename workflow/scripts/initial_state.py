@@ -6,7 +6,7 @@ from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.volume import volume_iou
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.hdf5 import read_arrays
-from neuma_lib.io.ply import read_mesh
+from neuma_lib.io.mesh import read_mesh
 from workflow.stage import stage
 
 

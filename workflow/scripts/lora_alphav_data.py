@@ -16,9 +16,11 @@ from neuma_lib.evaluation.figures.pictures import (
     renders,
 )
 from neuma_lib.evaluation.motion import predict
-from neuma_lib.io.artifacts import load_body, load_law, load_observation
 from neuma_lib.io.files import read_json
 from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.images import load_observation
+from neuma_lib.io.laws import load_law
+from neuma_lib.io.particles import load_body
 from neuma_lib.sim.model import MPMModel
 from workflow.stage import stage
 

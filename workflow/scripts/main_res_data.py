@@ -4,7 +4,8 @@ import numpy as np
 
 from neuma_lib.evaluation.figures.panels import Panels, save_panels
 from neuma_lib.evaluation.figures.pictures import cropped, evenly, magnified, milliseconds, observed, renders
-from neuma_lib.io.artifacts import load_body, load_motion, load_observation
+from neuma_lib.io.images import load_observation
+from neuma_lib.io.particles import load_body, load_motion
 from workflow.stage import stage
 
 

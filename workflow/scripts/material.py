@@ -8,10 +8,12 @@ from neuma_lib.config.settings import pick
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.device import choose_device
 from neuma_lib.fitting.material import MaterialSettings, ParticleLoss, PixelLoss, train_material
-from neuma_lib.io.artifacts import load_body, load_law, load_observation, save_adaptor
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.images import load_observation
+from neuma_lib.io.laws import load_law, save_adaptor
+from neuma_lib.io.particles import load_body
 from neuma_lib.sim.model import MPMModel
 from workflow.provenance import fingerprint
 from workflow.stage import stage

@@ -3,9 +3,9 @@
 import torch
 
 from neuma_lib.evaluation.response import Visited, largest_shear_stress, sheared, uniaxial, yielding
-from neuma_lib.io.artifacts import load_law
 from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.laws import load_law
 from neuma_lib.mechanics.analytic import analytic_law
 from workflow.stage import stage
 

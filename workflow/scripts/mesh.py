@@ -1,8 +1,9 @@
 """Reconstruct a watertight surface from Gaussians and views."""
 
 from neuma_lib.geometry.surface import reconstruct
-from neuma_lib.io.artifacts import load_gaussians, load_views
-from neuma_lib.io.ply import write_mesh
+from neuma_lib.io.gaussians import load_gaussians
+from neuma_lib.io.images import load_views
+from neuma_lib.io.mesh import write_mesh
 from workflow.stage import stage
 
 

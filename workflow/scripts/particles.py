@@ -4,7 +4,7 @@ import numpy as np
 
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.hdf5 import write_arrays
-from neuma_lib.io.ply import read_mesh
+from neuma_lib.io.mesh import read_mesh
 from workflow.stage import stage
 
 

@@ -14,8 +14,10 @@ from neuma_lib.evaluation.figures.pictures import (
     renders,
 )
 from neuma_lib.evaluation.figures.style import RAMP
-from neuma_lib.io.artifacts import load_body, load_law, load_motion, load_observation, load_views
-from neuma_lib.io.ply import read_mesh
+from neuma_lib.io.images import load_observation, load_views
+from neuma_lib.io.laws import load_law
+from neuma_lib.io.mesh import read_mesh
+from neuma_lib.io.particles import load_body, load_motion
 from neuma_lib.splatting.observation import over_white
 from workflow.stage import stage
 

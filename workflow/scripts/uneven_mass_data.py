@@ -15,8 +15,9 @@ from neuma_lib.evaluation.figures.pictures import (
     sphere_radius,
 )
 from neuma_lib.evaluation.figures.style import ORANGE, SKY
-from neuma_lib.io.artifacts import load_body, load_motion, load_observation
 from neuma_lib.io.files import read_json
+from neuma_lib.io.images import load_observation
+from neuma_lib.io.particles import load_body, load_motion
 from workflow.stage import stage
 
 

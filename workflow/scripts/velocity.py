@@ -4,8 +4,10 @@ import torch
 
 from neuma_lib.device import choose_device
 from neuma_lib.fitting.velocity import estimate_velocity
-from neuma_lib.io.artifacts import load_body, load_law, load_observation
 from neuma_lib.io.files import write_json
+from neuma_lib.io.images import load_observation
+from neuma_lib.io.laws import load_law
+from neuma_lib.io.particles import load_body
 from neuma_lib.sim.model import MPMModel
 from workflow.stage import stage
 

@@ -6,8 +6,9 @@ import torch
 from neuma_lib.device import choose_device
 from neuma_lib.evaluation.metrics import psnr
 from neuma_lib.evaluation.video import side_by_side, write_mp4
-from neuma_lib.io.artifacts import load_body, load_motion, load_observation
 from neuma_lib.io.files import atomic
+from neuma_lib.io.images import load_observation
+from neuma_lib.io.particles import load_body, load_motion
 from workflow.stage import stage
 
 

@@ -5,8 +5,8 @@ import torch
 
 from neuma_lib.evaluation.figures.panels import Panels, save_panels
 from neuma_lib.evaluation.figures.pictures import evenly, frontal, milliseconds, renders
-from neuma_lib.io.artifacts import load_body
 from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.particles import load_body
 from workflow.stage import stage
 
 UNIT = 1000.0

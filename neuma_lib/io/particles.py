@@ -1,4 +1,4 @@
-"""Objects of the library from artifacts on disk, and back: `io` deals in arrays, this in bodies, laws and videos."""
+"""Reconstructed bodies: particles, the Gaussians bound to them, their start and their motion."""
 
 from __future__ import annotations
 
@@ -7,58 +7,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from neuma_lib.coupling.binding import Binding
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import read_json
+from neuma_lib.io.gaussians import load_gaussians
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
-from neuma_lib.io.images import ImageSet, read_image_set
-from neuma_lib.io.laws import load_prior
-from neuma_lib.io.ply import read_gaussians, write_gaussians
-from neuma_lib.io.weights import read_weights, write_weights
 from neuma_lib.mechanics.density import Density, density_at
-from neuma_lib.mechanics.neural import NeuralLaw
 from neuma_lib.sim.model import each_its_own
-from neuma_lib.splatting.cameras import Cameras
-from neuma_lib.splatting.gaussians import Gaussians
-from neuma_lib.splatting.observation import Observation
-
-
-def load_views(transforms: str | Path, views: Sequence[int] | None = None) -> tuple[torch.Tensor, Cameras]:
-    """Straight-alpha RGBA images (V, H, W, 4) in [0, 1] and their cameras, of an image set at one time."""
-    images = read_image_set(transforms, views)
-    pixels = torch.from_numpy(images.images).float() / 255
-    return pixels, _cameras(images, np.arange(len(pixels)))
-
-
-def load_observation(transforms: str | Path, views: Sequence[int]) -> Observation:
-    """The video of some views, with its pixels as they are stored: 1 GB for 400 frames of 800 x 800."""
-    images = read_image_set(transforms, views)
-    frames, index, columns = images.video(views)
-    return Observation(frames, torch.from_numpy(images.images[index]), _cameras(images, columns))
-
-
-def _cameras(images: ImageSet, index: np.ndarray) -> Cameras:
-    return Cameras(
-        torch.from_numpy(images.viewmats[index]).float(),
-        torch.from_numpy(images.Ks[index]).float(),
-        images.width,
-        images.height,
-    )
-
-
-def save_gaussians(path: str | Path, gaussians: Gaussians) -> None:
-    """Write Gaussians in the 3DGS layout."""
-    names = ("means", "quats", "scales", "opacities", "sh0", "shN")
-    write_gaussians(path, **{name: getattr(gaussians, name).detach().cpu().numpy() for name in names})
-
-
-def load_gaussians(path: str | Path) -> Gaussians:
-    """Read Gaussians in the 3DGS layout."""
-    return Gaussians(**{name: torch.from_numpy(array) for name, array in read_gaussians(path).items()})
 
 
 def save_binding(
@@ -134,23 +92,3 @@ def load_motion(rollout: str | Path) -> tuple[torch.Tensor, torch.Tensor]:
     """
     arrays, _ = read_arrays(rollout, required=("x", "F"), only=("x", "F", "F_total"))
     return torch.from_numpy(arrays["x"]), torch.from_numpy(arrays.get("F_total", arrays["F"]))
-
-
-def save_adaptor(
-    path: str | Path, law: NeuralLaw, rank: int | None, alpha: float, metadata: Mapping[str, Any]
-) -> None:
-    """Write the tensors of a law's adaptor, with what is needed to attach them again."""
-    write_weights(path, law.adaptor_state(), {"rank": rank, "alpha": alpha, **metadata})
-
-
-def load_law(prior: str | Path, adaptor: str | Path | None = None) -> NeuralLaw:
-    """A prior, with a trained adaptor attached if one is given."""
-    law = load_prior(prior)
-    if adaptor is not None:
-        tensors, metadata = read_weights(adaptor)
-        if "rank" not in metadata or "alpha" not in metadata:
-            raise InputError(
-                f"{adaptor} has no rank and alpha in its metadata: it is not an adaptor of this project"
-            )
-        law.load_adaptor_state(tensors, rank=metadata["rank"], alpha=metadata["alpha"])
-    return law

@@ -1,0 +1,98 @@
+"""Gaussians as PLY, in the layout of the 3DGS release."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from neuma_lib.errors import InputError
+from neuma_lib.io.files import atomic, existing
+from neuma_lib.io.ply import read_ply, write_ply
+from neuma_lib.splatting.gaussians import Gaussians
+from neuma_lib.splatting.spherical_harmonics import MAX_DEGREE, coefficient_count
+
+REST_COUNTS = [3 * (coefficient_count(degree) - 1) for degree in range(MAX_DEGREE + 1)]
+"""Numbers of f_rest_* properties that a file may have: three channels of the degrees above 0."""
+
+
+def save_gaussians(path: str | Path, gaussians: Gaussians) -> None:
+    """Write Gaussians in the layout of the 3DGS release, which every splat viewer opens.
+
+    Scales are stored as logarithms, opacities as logits, the higher harmonics channel by channel.
+    """
+    arrays = {f.name: getattr(gaussians, f.name).detach().cpu().numpy() for f in fields(gaussians)}
+    means, quats, scales, opacities, sh0, shN = arrays.values()
+    G, rest = len(means), shN.shape[1] * 3
+    opacities = np.clip(np.asarray(opacities, dtype=np.float64), 1e-7, 1 - 1e-7)
+    columns = {
+        **dict(zip("xyz", np.asarray(means).T, strict=True)),
+        **dict.fromkeys(("nx", "ny", "nz"), np.zeros(G)),
+        **{f"f_dc_{i}": sh0[:, 0, i] for i in range(3)},
+        **{f"f_rest_{i}": c for i, c in enumerate(np.swapaxes(shN, 1, 2).reshape(G, rest).T)},
+        "opacity": np.log(opacities / (1 - opacities)),
+        **{f"scale_{i}": np.log(scales[:, i]) for i in range(3)},
+        **{f"rot_{i}": quats[:, i] for i in range(4)},
+    }
+    rows = np.empty(G, dtype=[(name, "<f4") for name in columns])
+    for name, column in columns.items():
+        rows[name] = column
+    with atomic(path) as partial:
+        write_ply(partial, rows)
+
+
+def load_gaussians(path: str | Path) -> Gaussians:
+    """Read Gaussians in the 3DGS layout, in float32, with unit quaternions.
+
+    Raises:
+        InputError: missing properties (they are listed), or values that are not finite.
+    """
+    rows, _ = read_ply(existing(path))
+    names = set(rows.dtype.names)
+    groups = {
+        "means": ["x", "y", "z"],
+        "sh0": [f"f_dc_{i}" for i in range(3)],
+        "opacities": ["opacity"],
+        "scales": [f"scale_{i}" for i in range(3)],
+        "quats": [f"rot_{i}" for i in range(4)],
+    }
+    missing = [name for group in groups.values() for name in group if name not in names]
+    if missing:
+        raise InputError(
+            f"{path} misses the properties {', '.join(missing)}: it is not a 3D Gaussian splatting file"
+        )
+    rest = sum(name.startswith("f_rest_") for name in names)
+    if rest not in REST_COUNTS or any(f"f_rest_{i}" not in names for i in range(rest)):
+        raise InputError(
+            f"{path}: {rest} f_rest_* properties are not a whole number of SH degrees (0, 9, 24 or 45)"
+        )
+
+    def stack(columns):
+        if not columns:
+            return np.zeros((len(rows), 0), np.float32)
+        return np.stack([rows[c] for c in columns], axis=1).astype(np.float32)
+
+    raw = {key: stack(columns) for key, columns in groups.items()}
+    raw["shN"] = stack([f"f_rest_{i}" for i in range(rest)])
+    for key, array in raw.items():
+        bad = ~np.isfinite(array).all(axis=1)
+        if bad.any():
+            raise InputError(
+                f"{path}: {key} of Gaussian {int(np.argmax(bad))} is not finite: fit the Gaussians again"
+            )
+    norm = np.linalg.norm(raw["quats"], axis=1, keepdims=True)
+    if (norm == 0).any():
+        raise InputError(
+            f"{path}: the rotation of Gaussian {int(np.argmin(norm))} is zero: fit the Gaussians again"
+        )
+    arrays = {
+        "means": raw["means"],
+        "quats": raw["quats"] / norm,
+        "scales": np.exp(raw["scales"]),
+        "opacities": (1 / (1 + np.exp(-raw["opacities"][:, 0].astype(np.float64)))).astype(np.float32),
+        "sh0": raw["sh0"][:, None, :],
+        "shN": np.ascontiguousarray(np.swapaxes(raw["shN"].reshape(len(rows), 3, rest // 3), 1, 2)),
+    }
+    return Gaussians(**{name: torch.from_numpy(array) for name, array in arrays.items()})

@@ -1,0 +1,61 @@
+"""Surfaces as PLY."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuma_lib.errors import InputError
+from neuma_lib.io.files import atomic, existing
+from neuma_lib.io.ply import read_ply, write_ply
+
+
+def write_mesh(
+    path: str | Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray | None = None
+) -> None:
+    """Write a triangle mesh: vertices (N, 3) [m], faces (M, 3), optional colours (N, 3) in [0, 255]."""
+    kind = [(axis, "<f4") for axis in "xyz"] + (
+        [(c, "u1") for c in ("red", "green", "blue")] if colors is not None else []
+    )
+    rows = np.empty(len(vertices), dtype=kind)
+    for i, axis in enumerate("xyz"):
+        rows[axis] = vertices[:, i]
+    if colors is not None:
+        for i, channel in enumerate(("red", "green", "blue")):
+            rows[channel] = colors[:, i]
+    with atomic(path) as partial:
+        write_ply(partial, rows, faces)
+
+
+def read_mesh(path: str | Path, watertight: bool = True) -> Any:
+    """Read a triangle mesh as `trimesh.Trimesh` in metres.
+
+    Raises:
+        InputError: missing properties, values that are not finite, or holes where ``watertight`` is asked for.
+    """
+    import trimesh
+
+    rows, faces = read_ply(existing(path))
+    missing = [axis for axis in "xyz" if axis not in rows.dtype.names]
+    if missing or faces is None or len(faces) == 0:
+        raise InputError(
+            f"{path} is not a triangle mesh: {'no faces' if not missing else 'no ' + ', '.join(missing)}"
+        )
+    vertices = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    bad = ~np.isfinite(vertices).all(axis=1)
+    if bad.any():
+        raise InputError(
+            f"{path}: vertex {int(np.argmax(bad))} of {len(bad)} is not finite: repair or rebuild the mesh"
+        )
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError(f"{path}: a face names a vertex that does not exist: rebuild the mesh")
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    if watertight and not mesh.is_watertight:
+        raise InputError(
+            f"{path} is not watertight, so it has no inside: close its holes (a mesh repair tool) first"
+        )
+    if watertight and mesh.volume <= 0:
+        raise InputError(f"{path} has a volume of {mesh.volume:.3g} m^3: its faces point inwards, flip them")
+    return mesh
