@@ -324,7 +324,7 @@ def test_gaussians_have_the_layout_of_the_3dgs_release(tmp_path):
     assert list(rows.dtype.names) == names
     # f_rest is stored channel by channel: 15 coefficients of red, then of green, then of blue.
     np.testing.assert_array_equal(rows["f_rest_16"], expected.shN[:, 1, 1])
-    np.testing.assert_allclose(rows["scale_2"], np.log(expected.scales[:, 2]), rtol=1e-6)
+    np.testing.assert_allclose(rows["scale_2"], np.log(expected.scales[:, 2].numpy()), rtol=1e-6)
     np.testing.assert_allclose(1 / (1 + np.exp(-rows["opacity"])), expected.opacities, rtol=1e-5)
 
 
