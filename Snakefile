@@ -27,3 +27,6 @@ include: "workflow/rules/figures.smk"
 rule all:
     input:
         rules.tables.input,
+
+
+complete(workflow, RESULTS)

@@ -11,6 +11,7 @@ sys.path.insert(0, str(ROOT))
 
 from neuma_lib.config.settings import load
 from neuma_lib.errors import InputError
+from workflow.defaults import complete
 from workflow.owner import claim
 from workflow.provenance import code_digest
 
@@ -21,10 +22,7 @@ except InputError as error:
 
 DATA = SETTINGS.data_root.rstrip("/")
 RESULTS = SETTINGS.results_root.rstrip("/")
-LOGS = f"{RESULTS}/logs"
-BENCHMARKS = f"{RESULTS}/benchmarks"
 KERNELS = SETTINGS.kernel_cache.rstrip("/")
-ENVIRONMENT = "../../envs/conda.yaml"
 HAS_CUDA = shutil.which("nvidia-smi") is not None
 GPU = int({"cpu": False, "cuda": True, "auto": HAS_CUDA}[SETTINGS.device])
 # Kernels and ground truths are made with or without a GPU, so that its images can be rendered where none is.
@@ -75,11 +73,6 @@ wildcard_constraints:
 def kernels(*groups):
     """Files that say that groups of Warp kernels are compiled; `laws` brings `simulation` with it."""
     return [f"{KERNELS}/{group}.ready" for group in groups]
-
-
-def code(script):
-    """Digest of a script and of the library code that it reaches; as a parameter it makes edits rerun the rule."""
-    return code_digest(ROOT / "workflow" / "scripts" / f"{script}.py", ROOT)
 
 
 def checked(function):

@@ -6,17 +6,8 @@ rule kernels:
         lambda wildcards: kernels("simulation") if wildcards.group == "laws" else [],
     output:
         ready=f"{KERNELS}/{{group}}.ready",
-    log:
-        f"{LOGS}/kernels_{{group}}.log",
-    benchmark:
-        f"{BENCHMARKS}/kernels_{{group}}.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
     resources:
         gpu=EITHER_GPU,
-        mem_mb=4000,
-        runtime=30,
     params:
         device=EITHER_DEVICE,
         code=lambda wildcards: code_digest(ROOT / "workflow" / "kernels" / f"{wildcards.group}.py", ROOT),
@@ -29,19 +20,11 @@ rule ground_truth:
         kernels=kernels("simulation"),
     output:
         particles=f"{DATA}/{{scene}}/particles.h5",
-    log:
-        f"{LOGS}/{{scene}}/ground_truth.log",
-    benchmark:
-        f"{BENCHMARKS}/{{scene}}/ground_truth.tsv"
     wildcard_constraints:
         scene=scenes_with("truth", "made"),
-    conda:
-        ENVIRONMENT
-    threads: 1
     resources:
         gpu=EITHER_GPU,
         mem_mb=truth_memory,
-        runtime=60,
     params:
         bodies=scene_bodies,
         simulation=simulation_settings,
@@ -50,7 +33,6 @@ rule ground_truth:
         tracers=SETTINGS.dataset.tracers,
         seed=SETTINGS.dataset.seed,
         device=EITHER_DEVICE,
-        code=code("ground_truth"),
     script:
         "../scripts/ground_truth.py"
 
@@ -60,24 +42,12 @@ rule render_static:
         particles=f"{DATA}/{{scene}}/particles.h5",
     output:
         transforms=f"{DATA}/{{scene}}/static/transforms.json",
-    log:
-        f"{LOGS}/{{scene}}/render_static.log",
-    benchmark:
-        f"{BENCHMARKS}/{{scene}}/render_static.tsv"
     wildcard_constraints:
         scene=scenes_with("static", "made"),
-    conda:
-        ENVIRONMENT
-    threads: 1
-    resources:
-        gpu=0,
-        mem_mb=4000,
-        runtime=60,
     params:
         scene=scene_setting("shape", "size", "height", "center", "appearance"),
         images=SETTINGS.dataset.static.plain(),
         threads=1,
-        code=code("render_static"),
     script:
         "../scripts/render_static.py"
 
@@ -87,24 +57,14 @@ rule render_dynamic:
         particles=f"{DATA}/{{scene}}/particles.h5",
     output:
         transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
-    log:
-        f"{LOGS}/{{scene}}/render_dynamic.log",
-    benchmark:
-        f"{BENCHMARKS}/{{scene}}/render_dynamic.tsv"
     wildcard_constraints:
         scene=scenes_with("dynamic", "made"),
-    conda:
-        ENVIRONMENT
-    threads: 1
     resources:
-        gpu=0,
-        mem_mb=4000,
         runtime=240,
     params:
         scene=scene_setting("shape", "size", "height", "center", "appearance"),
         images=SETTINGS.dataset.dynamic.plain(),
         threads=1,
-        code=code("render_dynamic"),
     script:
         "../scripts/render_dynamic.py"
 
@@ -114,21 +74,8 @@ rule supplied_static:
         images=lambda wildcards: SETTINGS.scene(wildcards.scene).images.static,
     output:
         transforms=f"{DATA}/{{scene}}/static/transforms.json",
-    log:
-        f"{LOGS}/{{scene}}/supplied_static.log",
-    benchmark:
-        f"{BENCHMARKS}/{{scene}}/supplied_static.tsv"
     wildcard_constraints:
         scene=scenes_with("static", "supplied"),
-    conda:
-        ENVIRONMENT
-    threads: 1
-    resources:
-        gpu=0,
-        mem_mb=4000,
-        runtime=10,
-    params:
-        code=code("supplied"),
     script:
         "../scripts/supplied.py"
 
@@ -138,9 +85,5 @@ use rule supplied_static as supplied_dynamic with:
         images=lambda wildcards: SETTINGS.scene(wildcards.scene).images.dynamic,
     output:
         transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
-    log:
-        f"{LOGS}/{{scene}}/supplied_dynamic.log",
-    benchmark:
-        f"{BENCHMARKS}/{{scene}}/supplied_dynamic.tsv"
     wildcard_constraints:
         scene=scenes_with("dynamic", "supplied"),

@@ -10,21 +10,9 @@ rule initial_state:
         velocity=f"{RESULTS}/{{scene}}/velocity.json",
     output:
         report=f"{RESULTS}/{{scene}}/initial_state.json",
-    log:
-        f"{LOGS}/{{scene}}/initial_state.log",
-    benchmark:
-        f"{BENCHMARKS}/{{scene}}/initial_state.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
-    resources:
-        gpu=0,
-        mem_mb=2000,
-        runtime=10,
     params:
         scene=scene_setting("shape", "size", "height", "center", "velocity", "density"),
         particles=SETTINGS.simulation.particles,
-        code=code("initial_state"),
     script:
         "../scripts/initial_state.py"
 
@@ -42,17 +30,8 @@ rule evaluation:
     output:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
         metrics=f"{RESULTS}/{{scene}}/{{method}}/metrics.json",
-    log:
-        f"{LOGS}/{{scene}}/{{method}}/evaluation.log",
-    benchmark:
-        f"{BENCHMARKS}/{{scene}}/{{method}}/evaluation.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
     resources:
         gpu=GPU,
-        mem_mb=4000,
-        runtime=60,
     params:
         simulation=simulation_settings,
         densities=lambda wildcards: [method_density(wildcards)],
@@ -61,7 +40,6 @@ rule evaluation:
         tracers=SETTINGS.evaluation.tracers,
         seed=SETTINGS.seed,
         device=SETTINGS.device,
-        code=code("evaluation"),
     script:
         "../scripts/evaluation.py"
 
@@ -75,23 +53,13 @@ rule video:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
     output:
         video=f"{RESULTS}/{{scene}}/{{method}}/video.mp4",
-    log:
-        f"{LOGS}/{{scene}}/{{method}}/video.log",
-    benchmark:
-        f"{BENCHMARKS}/{{scene}}/{{method}}/video.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
     resources:
         gpu=GPU,
-        mem_mb=2000,
-        runtime=20,
     params:
         density=scene_setting("density"),
         view=SETTINGS.evaluation.video_view,
         frame_rate=SETTINGS.evaluation.frame_rate,
         magnify=SETTINGS.evaluation.video_magnify,
         device=SETTINGS.device,
-        code=code("video"),
     script:
         "../scripts/video.py"

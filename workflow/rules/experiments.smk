@@ -6,17 +6,8 @@ rule experiment_truth:
         kernels=kernels("simulation"),
     output:
         particles=f"{DATA}/experiments/{{experiment}}/particles.h5",
-    log:
-        f"{LOGS}/experiments/{{experiment}}/experiment_truth.log",
-    benchmark:
-        f"{BENCHMARKS}/experiments/{{experiment}}/experiment_truth.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
     resources:
         gpu=EITHER_GPU,
-        mem_mb=4000,
-        runtime=60,
     params:
         bodies=experiment_bodies("shape", "size", "height", "center", "velocity", "density", "law"),
         simulation=experiment_simulation,
@@ -25,7 +16,6 @@ rule experiment_truth:
         tracers=SETTINGS.dataset.tracers,
         seed=SETTINGS.dataset.seed,
         device=EITHER_DEVICE,
-        code=code("ground_truth"),
     script:
         "../scripts/ground_truth.py"
 
@@ -41,17 +31,6 @@ rule experiment_start:
         gaussians=f"{RESULTS}/experiments/{{experiment}}/gaussians.ply",
         mesh=f"{RESULTS}/experiments/{{experiment}}/mesh.ply",
         velocity=f"{RESULTS}/experiments/{{experiment}}/velocity.json",
-    log:
-        f"{LOGS}/experiments/{{experiment}}/experiment_start.log",
-    benchmark:
-        f"{BENCHMARKS}/experiments/{{experiment}}/experiment_start.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
-    resources:
-        gpu=0,
-        mem_mb=2000,
-        runtime=10,
     params:
         bodies=experiment_bodies(
             "scene", "reconstructed", "shape", "size", "height", "center", "velocity", "appearance"
@@ -59,7 +38,6 @@ rule experiment_start:
         particles=SETTINGS.simulation.particles,
         sampling=SETTINGS.geometry.sampling,
         seed=SETTINGS.seed,
-        code=code("experiment_start"),
     script:
         "../scripts/experiment_start.py"
 
@@ -77,17 +55,8 @@ rule experiment:
     output:
         rollout=f"{RESULTS}/experiments/{{experiment}}/{{method}}/rollout.h5",
         metrics=f"{RESULTS}/experiments/{{experiment}}/{{method}}/metrics.json",
-    log:
-        f"{LOGS}/experiments/{{experiment}}/{{method}}/experiment.log",
-    benchmark:
-        f"{BENCHMARKS}/experiments/{{experiment}}/{{method}}/experiment.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
     resources:
         gpu=GPU,
-        mem_mb=4000,
-        runtime=60,
     params:
         simulation=experiment_simulation,
         densities=of_each_body(method_density),
@@ -95,6 +64,5 @@ rule experiment:
         tracers=SETTINGS.evaluation.tracers,
         seed=SETTINGS.seed,
         device=SETTINGS.device,
-        code=code("evaluation"),
     script:
         "../scripts/evaluation.py"

@@ -18,20 +18,8 @@ for figure, kind in DATA_FILES.items():
                 labels={"figure": figure},
             ),
             pdf=f"{FIGURES}/{figure}.pdf",
-        log:
-            f"{LOGS}/figures/{figure}.log",
-        benchmark:
-            f"{BENCHMARKS}/figures/{figure}.tsv"
-        conda:
-            ENVIRONMENT
-        threads: 1
-        resources:
-            gpu=0,
-            mem_mb=1000,
-            runtime=5,
         params:
             figure=figure,
-            code=code("figure"),
             drawing=code_digest(ROOT / "neuma_lib" / "evaluation" / "figures" / f"{figure}.py", ROOT),
         script:
             "../scripts/figure.py"
@@ -45,21 +33,9 @@ rule ch_dist_curve_data:
         metrics=of_cells(COMPARED, "metrics.json") if COMPARED else [],
     output:
         data=f"{FIGURES}/ch_dist_curve.json",
-    log:
-        f"{LOGS}/figures/ch_dist_curve_data.log",
-    benchmark:
-        f"{BENCHMARKS}/figures/ch_dist_curve_data.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
-    resources:
-        gpu=0,
-        mem_mb=1000,
-        runtime=5,
     params:
         titles=TITLES,
         scenes={scene: SETTINGS.scene(scene).dt for scene in (COMPARED.scenes if COMPARED else ())},
-        code=code("ch_dist_curve_data"),
     script:
         "../scripts/ch_dist_curve_data.py"
 
@@ -69,21 +45,9 @@ rule image_quality_data:
         metrics=of_cells(COMPARED, "image_metrics.json") if COMPARED else [],
     output:
         data=f"{FIGURES}/image_quality.json",
-    log:
-        f"{LOGS}/figures/image_quality_data.log",
-    benchmark:
-        f"{BENCHMARKS}/figures/image_quality_data.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
-    resources:
-        gpu=0,
-        mem_mb=1000,
-        runtime=5,
     params:
         titles=TITLES,
         scenes=list(COMPARED.scenes if COMPARED else ()),
-        code=code("image_quality_data"),
     script:
         "../scripts/image_quality_data.py"
 
@@ -97,24 +61,14 @@ rule main_res_data:
         rollouts=of_methods(DRAWN.main_res, METHODS, "rollout.h5"),
     output:
         data=f"{FIGURES}/main_res.h5",
-    log:
-        f"{LOGS}/figures/main_res_data.log",
-    benchmark:
-        f"{BENCHMARKS}/figures/main_res_data.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
     resources:
-        gpu=0,
         mem_mb=6000,
-        runtime=10,
     params:
         titles=TITLES,
         scenes=scene_constants(DRAWN.main_res),
         view=DRAWN.view,
         shown=DRAWN.shown,
         magnify=DRAWN.magnify,
-        code=code("main_res_data"),
     script:
         "../scripts/main_res_data.py"
 
@@ -126,23 +80,13 @@ rule particles_app_data:
         rollouts=of_methods([DRAWN.particles_app], METHODS, "rollout.h5"),
     output:
         data=f"{FIGURES}/particles_app.h5",
-    log:
-        f"{LOGS}/figures/particles_app_data.log",
-    benchmark:
-        f"{BENCHMARKS}/figures/particles_app_data.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
     resources:
-        gpu=0,
         mem_mb=6000,
-        runtime=10,
     params:
         titles=TITLES,
         dt=SETTINGS.scene(DRAWN.particles_app).dt,
         shown=DRAWN.shown + 3,
         size=DRAWN.size,
-        code=code("particles_app_data"),
     script:
         "../scripts/particles_app_data.py"
 
@@ -159,17 +103,9 @@ rule lora_alphav_data:
         adaptor=of_scenes(f"{RESULTS}/{{scene}}/neuma/adaptor.safetensors", DRAWN.lora_alphav),
     output:
         data=f"{FIGURES}/lora_alphav.h5",
-    log:
-        f"{LOGS}/figures/lora_alphav_data.log",
-    benchmark:
-        f"{BENCHMARKS}/figures/lora_alphav_data.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
     resources:
         gpu=GPU,
         mem_mb=8000,
-        runtime=20,
     params:
         scenes=scene_constants(DRAWN.lora_alphav),
         weights=list(DRAWN.weights),
@@ -177,7 +113,6 @@ rule lora_alphav_data:
         shown=DRAWN.shown - 1,
         magnify=DRAWN.magnify,
         device=SETTINGS.device,
-        code=code("lora_alphav_data"),
     script:
         "../scripts/lora_alphav_data.py"
 
@@ -190,17 +125,8 @@ rule vis_generalize_data:
         binding=of_experiments([*DRAWN.letters, *DRAWN.meetings], "binding.h5"),
     output:
         data=f"{FIGURES}/vis_generalize.h5",
-    log:
-        f"{LOGS}/figures/vis_generalize_data.log",
-    benchmark:
-        f"{BENCHMARKS}/figures/vis_generalize_data.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
     resources:
-        gpu=0,
         mem_mb=6000,
-        runtime=10,
     params:
         letters=lambda wildcards: [
             {"letter": body["shape"].removeprefix("letter_"), "material": body["scene"]}
@@ -209,7 +135,6 @@ rule vis_generalize_data:
         others=lambda wildcards: {name: SETTINGS.experiment(name).title for name in DRAWN.meetings},
         shown=DRAWN.shown - 1,
         size=DRAWN.size,
-        code=code("vis_generalize_data"),
     script:
         "../scripts/vis_generalize_data.py"
 
@@ -223,24 +148,14 @@ rule ext_time_data:
         rollouts=expand(f"{RESULTS}/experiments/{DRAWN.ext_time}/{{method}}/rollout.h5", method=PREDICTED),
     output:
         data=f"{FIGURES}/ext_time.h5",
-    log:
-        f"{LOGS}/figures/ext_time_data.log",
-    benchmark:
-        f"{BENCHMARKS}/figures/ext_time_data.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
     resources:
-        gpu=0,
         mem_mb=6000,
-        runtime=10,
     params:
         titles={method: SETTINGS.method_title(method) for method in PREDICTED},
         density=lambda wildcards: SETTINGS.experiment_bodies(DRAWN.ext_time)[0]["density"],
         observed=lambda wildcards: video_length(SETTINGS.experiment(DRAWN.ext_time).bodies[0].scene),
         shown=DRAWN.shown + 4,
         size=DRAWN.size,
-        code=code("ext_time_data"),
     script:
         "../scripts/ext_time_data.py"
 
@@ -253,20 +168,8 @@ rule gradient_analysis_data:
         prior=priors_of(DRAWN.gradient_analysis),
     output:
         data=f"{FIGURES}/gradient_analysis.json",
-    log:
-        f"{LOGS}/figures/gradient_analysis_data.log",
-    benchmark:
-        f"{BENCHMARKS}/figures/gradient_analysis_data.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
-    resources:
-        gpu=0,
-        mem_mb=1000,
-        runtime=5,
     params:
         scenes={scene: wrong_laws(scene) for scene in DRAWN.gradient_analysis},
-        code=code("gradient_analysis_data"),
     script:
         "../scripts/gradient_analysis_data.py"
 
@@ -281,24 +184,14 @@ rule uneven_mass_data:
         metrics=of_cells(UNEVEN, "metrics.json") if UNEVEN else [],
     output:
         data=f"{FIGURES}/uneven_mass.h5",
-    log:
-        f"{LOGS}/figures/uneven_mass_data.log",
-    benchmark:
-        f"{BENCHMARKS}/figures/uneven_mass_data.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
     resources:
-        gpu=0,
         mem_mb=6000,
-        runtime=10,
     params:
         titles=table_titles("uneven_mass") if UNEVEN else {},
         scene=scene_constants(UNEVEN.scenes if UNEVEN else ()),
         view=DRAWN.view,
         shown=DRAWN.shown,
         magnify=DRAWN.magnify,
-        code=code("uneven_mass_data"),
     script:
         "../scripts/uneven_mass_data.py"
 
@@ -316,23 +209,13 @@ rule pipeline_data:
         rollout=f"{RESULTS}/{DRAWN.pipeline}/neuma/rollout.h5",
     output:
         data=f"{FIGURES}/pipeline.h5",
-    log:
-        f"{LOGS}/figures/pipeline_data.log",
-    benchmark:
-        f"{BENCHMARKS}/figures/pipeline_data.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
     resources:
-        gpu=0,
         mem_mb=6000,
-        runtime=10,
     params:
         scene=scene_constants([DRAWN.pipeline])[DRAWN.pipeline],
         views=SETTINGS.dataset.static.views,
         view=DRAWN.view,
         magnify=DRAWN.magnify,
-        code=code("pipeline_data"),
     script:
         "../scripts/pipeline_data.py"
 
@@ -345,22 +228,12 @@ rule material_response_data:
         adaptor=of_methods(DRAWN.material_response, ["neuma"], "adaptor.safetensors"),
     output:
         data=f"{FIGURES}/material_response.json",
-    log:
-        f"{LOGS}/figures/material_response_data.log",
-    benchmark:
-        f"{BENCHMARKS}/figures/material_response_data.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
     resources:
-        gpu=0,
         mem_mb=6000,
-        runtime=10,
     params:
         scenes=scene_constants(DRAWN.material_response),
         rate=DRAWN.shear_rate,
         total_shear=DRAWN.total_shear,
-        code=code("material_response_data"),
     script:
         "../scripts/material_response_data.py"
 
@@ -372,21 +245,9 @@ rule ablation_gradients_data:
         image_metrics=of_cells(ABLATION, "image_metrics.json") if ABLATION else [],
     output:
         data=f"{FIGURES}/ablation_gradients.json",
-    log:
-        f"{LOGS}/figures/ablation_gradients_data.log",
-    benchmark:
-        f"{BENCHMARKS}/figures/ablation_gradients_data.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
-    resources:
-        gpu=0,
-        mem_mb=1000,
-        runtime=5,
     params:
         titles=table_titles("ablation_gradients") if ABLATION else {},
         scenes=list(ABLATION.scenes if ABLATION else ()),
-        code=code("ablation_gradients_data"),
     script:
         "../scripts/ablation_gradients_data.py"
 

@@ -7,20 +7,8 @@ rule mesh:
         gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
     output:
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
-    log:
-        f"{LOGS}/{{scene}}/mesh.log",
-    benchmark:
-        f"{BENCHMARKS}/{{scene}}/mesh.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
-    resources:
-        gpu=0,
-        mem_mb=4000,
-        runtime=30,
     params:
         surface=SETTINGS.geometry.surface.plain(),
-        code=code("mesh"),
     script:
         "../scripts/mesh.py"
 
@@ -30,21 +18,9 @@ rule particles:
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
     output:
         particles=f"{RESULTS}/{{scene}}/particles.h5",
-    log:
-        f"{LOGS}/{{scene}}/particles.log",
-    benchmark:
-        f"{BENCHMARKS}/{{scene}}/particles.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
-    resources:
-        gpu=0,
-        mem_mb=2000,
-        runtime=10,
     params:
         wanted=SETTINGS.simulation.particles,
         sampling=SETTINGS.geometry.sampling,
         seed=SETTINGS.seed,
-        code=code("particles"),
     script:
         "../scripts/particles.py"

@@ -13,13 +13,6 @@ rule material:
     output:
         adaptor=f"{RESULTS}/{{scene}}/{{method}}/adaptor.safetensors",
         history=f"{RESULTS}/{{scene}}/{{method}}/history.json",
-    log:
-        f"{LOGS}/{{scene}}/{{method}}/material.log",
-    benchmark:
-        f"{BENCHMARKS}/{{scene}}/{{method}}/material.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
     resources:
         gpu=GPU,
         mem_mb=6000,
@@ -30,6 +23,5 @@ rule material:
         material=material_settings,
         checkpoint=lambda wildcards: f"{RESULTS}/{wildcards.scene}/{wildcards.method}/checkpoint.pt",
         device=SETTINGS.device,
-        code=code("material"),
     script:
         "../scripts/material.py"

@@ -4,19 +4,6 @@
 rule lpips_weights:
     output:
         weights=f"{DATA}/weights/lpips.safetensors",
-    log:
-        f"{LOGS}/lpips_weights.log",
-    benchmark:
-        f"{BENCHMARKS}/lpips_weights.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
-    resources:
-        gpu=0,
-        mem_mb=2000,
-        runtime=20,
-    params:
-        code=code("lpips_weights"),
     script:
         "../scripts/lpips_weights.py"
 
@@ -31,22 +18,12 @@ rule image_metrics:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
     output:
         metrics=f"{RESULTS}/{{scene}}/{{method}}/image_metrics.json",
-    log:
-        f"{LOGS}/{{scene}}/{{method}}/image_metrics.log",
-    benchmark:
-        f"{BENCHMARKS}/{{scene}}/{{method}}/image_metrics.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
     resources:
         gpu=GPU,
-        mem_mb=4000,
-        runtime=60,
     params:
         density=scene_setting("density"),
         views=evaluation_views,
         margin=SETTINGS.evaluation.margin,
         device=SETTINGS.device,
-        code=code("image_metrics"),
     script:
         "../scripts/image_metrics.py"

@@ -11,19 +11,6 @@ if SETTINGS.dataset.packed is None:
             dynamic=f"{DATA}/{{scene}}/dynamic/transforms.json",
         output:
             packed=f"{PACKED}/{{scene}}.images.zip",
-        log:
-            f"{LOGS}/{{scene}}/pack_images.log",
-        benchmark:
-            f"{BENCHMARKS}/{{scene}}/pack_images.tsv"
-        conda:
-            ENVIRONMENT
-        threads: 1
-        resources:
-            gpu=0,
-            mem_mb=4000,
-            runtime=30,
-        params:
-            code=code("pack_images"),
         script:
             "../scripts/pack_images.py"
 
@@ -32,21 +19,11 @@ if SETTINGS.dataset.packed is None:
             particles=f"{DATA}/{{scene}}/particles.h5",
         output:
             packed=f"{PACKED}/{{scene}}.truth.zip",
-        log:
-            f"{LOGS}/{{scene}}/pack_truth.log",
-        benchmark:
-            f"{BENCHMARKS}/{{scene}}/pack_truth.tsv"
-        conda:
-            ENVIRONMENT
-        threads: 1
         resources:
-            gpu=0,
             mem_mb=truth_memory,
-            runtime=30,
         params:
             packing=SETTINGS.dataset.packing.plain(),
             seed=SETTINGS.dataset.seed,
-            code=code("pack_truth"),
         script:
             "../scripts/pack_truth.py"
 
@@ -63,23 +40,13 @@ else:
             packed=f"{PACKED}/{{scene}}.truth.zip",
         output:
             particles=f"{DATA}/{{scene}}/particles.h5",
-        log:
-            f"{LOGS}/{{scene}}/unpack_truth.log",
-        benchmark:
-            f"{BENCHMARKS}/{{scene}}/unpack_truth.tsv"
         wildcard_constraints:
             scene=scenes_with("truth", "packed"),
-        conda:
-            ENVIRONMENT
-        threads: 1
         resources:
-            gpu=0,
             mem_mb=truth_memory,
-            runtime=30,
         params:
             steps=frame_steps,
             dt=scene_setting("dt"),
-            code=code("unpack_truth"),
         script:
             "../scripts/unpack_truth.py"
 
@@ -88,36 +55,19 @@ else:
             packed=f"{PACKED}/{{scene}}.images.zip",
         output:
             transforms=f"{DATA}/{{scene}}/static/transforms.json",
-        log:
-            f"{LOGS}/{{scene}}/unpack_static.log",
-        benchmark:
-            f"{BENCHMARKS}/{{scene}}/unpack_static.tsv"
         wildcard_constraints:
             scene=scenes_with("static", "packed"),
-        conda:
-            ENVIRONMENT
-        threads: 1
-        resources:
-            gpu=0,
-            mem_mb=1000,
-            runtime=30,
         params:
             part="static",
             steps=[0],
-            code=code("unpack_images"),
         script:
             "../scripts/unpack_images.py"
 
     use rule unpack_static as unpack_dynamic with:
         output:
             transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
-        log:
-            f"{LOGS}/{{scene}}/unpack_dynamic.log",
-        benchmark:
-            f"{BENCHMARKS}/{{scene}}/unpack_dynamic.tsv"
         wildcard_constraints:
             scene=scenes_with("dynamic", "packed"),
         params:
             part="dynamic",
             steps=frame_steps,
-            code=code("unpack_images"),

@@ -12,17 +12,6 @@ rule chamfer_table:
     output:
         csv=report(f"{RESULTS}/{{table}}.csv", caption="../report/chamfer_table.rst", category="Tables"),
         markdown=f"{RESULTS}/{{table}}.md",
-    log:
-        f"{LOGS}/{{table}}.log",
-    benchmark:
-        f"{BENCHMARKS}/{{table}}.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
-    resources:
-        gpu=0,
-        mem_mb=1000,
-        runtime=5,
     params:
         cells=lambda wildcards: table_cells(wildcards.table),
         titles=lambda wildcards: table_titles(wildcards.table),
@@ -30,7 +19,6 @@ rule chamfer_table:
         caption=lambda wildcards: (
             PAPER[wildcards.table].caption if wildcards.table in PAPER else wildcards.table
         ),
-        code=code("chamfer_table"),
     script:
         "../scripts/chamfer_table.py"
 
@@ -39,20 +27,8 @@ rule benchmark_table:
     output:
         csv=report(f"{RESULTS}/table4.csv", caption="../report/table4.rst", category="Tables"),
         markdown=f"{RESULTS}/table4.md",
-    log:
-        f"{LOGS}/table4.log",
-    benchmark:
-        f"{BENCHMARKS}/table4.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
-    resources:
-        gpu=0,
-        mem_mb=1000,
-        runtime=5,
     params:
         scenes=lambda wildcards: {name: SETTINGS.scene(name).plain() for name in BENCHMARK_SCENES},
-        code=code("benchmark_table"),
     script:
         "../scripts/benchmark_table.py"
 
@@ -63,20 +39,8 @@ rule initial_states:
     output:
         csv=report(f"{RESULTS}/initial_states.csv", caption="../report/initial_states.rst", category="Tables"),
         markdown=f"{RESULTS}/initial_states.md",
-    log:
-        f"{LOGS}/initial_states.log",
-    benchmark:
-        f"{BENCHMARKS}/initial_states.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
-    resources:
-        gpu=0,
-        mem_mb=1000,
-        runtime=5,
     params:
         scenes=list(SETTINGS.scenes),
-        code=code("initial_states"),
     script:
         "../scripts/initial_states.py"
 
@@ -88,20 +52,8 @@ rule learning_rates:
     output:
         csv=f"{RESULTS}/learning_rates.csv",
         markdown=f"{RESULTS}/learning_rates.md",
-    log:
-        f"{LOGS}/learning_rates.log",
-    benchmark:
-        f"{BENCHMARKS}/learning_rates.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
-    resources:
-        gpu=0,
-        mem_mb=1000,
-        runtime=5,
     params:
         cells=lambda wildcards: learning_rate_cells("learning_rates"),
-        code=code("learning_rates"),
     script:
         "../scripts/learning_rates.py"
 
@@ -112,20 +64,8 @@ rule timings:
     output:
         csv=report(f"{RESULTS}/timings.csv", caption="../report/timings.rst", category="Run times"),
         markdown=f"{RESULTS}/timings.md",
-    log:
-        f"{LOGS}/timings.log",
-    benchmark:
-        f"{BENCHMARKS}/timings.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
-    resources:
-        gpu=0,
-        mem_mb=1000,
-        runtime=5,
     params:
-        benchmarks=BENCHMARKS,
-        code=code("timings"),
+        benchmarks=f"{RESULTS}/benchmarks",
     script:
         "../scripts/timings.py"
 

@@ -7,23 +7,13 @@ rule prior:
     output:
         weights=f"{RESULTS}/priors/{{prior}}.safetensors",
         report=f"{RESULTS}/priors/{{prior}}.json",
-    log:
-        f"{LOGS}/priors/{{prior}}.log",
-    benchmark:
-        f"{BENCHMARKS}/priors/{{prior}}.tsv"
-    conda:
-        ENVIRONMENT
-    threads: 1
     resources:
         gpu=GPU,
-        mem_mb=4000,
-        runtime=60,
     params:
         law=lambda wildcards: SETTINGS.priors.laws[wildcards.prior].plain(),
         method=SETTINGS.priors.method,
         options=SETTINGS.priors.plain()[SETTINGS.priors.method],
         seed=SETTINGS.priors.seed,
         device=SETTINGS.device,
-        code=code("prior"),
     script:
         "../scripts/prior.py"

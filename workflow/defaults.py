@@ -1,0 +1,53 @@
+"""What a rule with a script need not say. What it says itself stands.
+
+log, benchmark  <results>/{logs,benchmarks}/<one folder for each wildcard>/<rule>.{log,tsv}
+conda           the locked environment
+params.code     digest of the script and of the library modules behind it: an edit there reruns the rule
+resources       `RESOURCES`, and one thread (Snakemake's own default)
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from workflow.provenance import code_digest
+
+RESOURCES = {"gpu": 0, "mem_mb": 4000, "runtime": 60}  # GPUs, MB, minutes
+CONDA = "../../envs/conda.yaml"  # relative to the files of the rules
+
+
+def complete(workflow, results: str) -> None:
+    """Give every rule of a workflow what it left out. To be called when all rules are known.
+
+    Snakemake makes a rule of what its directives say (`rule.ruleinfo`) in `snakemake.workflow.Workflow.rule`. This
+    does the same, in the same way, for directives that are missing.
+
+    Args:
+        workflow: Snakemake's.
+        results: folder of the results, which holds logs and benchmarks.
+    """
+    for rule in workflow.rules:
+        if not rule.script:
+            continue
+        said, path = rule.ruleinfo, _wildcard_path(rule)
+        rule.log_modifier = rule.benchmark_modifier = rule.output_modifier
+        if not said.log:
+            rule.set_log(f"{results}/logs/{path}.log")
+        if not said.benchmark:
+            rule.benchmark = f"{results}/benchmarks/{path}.tsv"
+        if not said.conda_env:
+            rule.conda_env = CONDA
+        if "code" not in rule.params.keys():
+            root = Path(workflow.basedir)
+            rule.set_params(code=code_digest(root / "workflow" / "scripts" / Path(rule.script).name, root))
+        resources = type(rule.resources).from_mapping(dict(RESOURCES))
+        resources.update(said.resources[1] if said.resources else {})
+        resources.update(workflow.resource_settings._parsed_overwrite_resources.get(rule.name, {}))
+        rule.resources.update(resources)
+
+
+def _wildcard_path(rule) -> str:
+    """The rule's name in a folder for each of its wildcards, in the order of its first output."""
+    output = str(rule.output[0])
+    wildcards = sorted(rule.wildcard_names, key=lambda name: output.index("{" + name))
+    return "/".join([*(f"{{{name}}}" for name in wildcards), rule.name])
