@@ -19,8 +19,7 @@ from collections.abc import Callable
 
 import torch
 
-from neuma_lib.splatting import compositor_cuda as splat_tiles
-from neuma_lib.splatting import projection
+from neuma_lib.splatting import compositor_cuda, projection
 from neuma_lib.splatting.cameras import Cameras, look_at
 from neuma_lib.splatting.compositing import Settings
 from neuma_lib.splatting.gaussians import covariances
@@ -97,7 +96,7 @@ def stages(name: str, inputs, cameras: Cameras, repetitions: int) -> dict[str, f
     grad_splats = torch.empty_like(splats)
 
     def lists():
-        return splat_tiles.lists(splats, depths, settings.width, settings.height, splat_tiles.TILE)
+        return compositor_cuda.lists(splats, depths, settings.width, settings.height, compositor_cuda.TILE)
 
     def blend():
         return compositor.composite(splats, depths, background, settings, empty)
@@ -173,9 +172,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int)
     parser.add_argument("--views", type=int, default=1)
     parser.add_argument("--appearance", action="store_true", help="also gradients of opacities and colours")
-    parser.add_argument(
-        "--compositors", nargs="+", help="rows, pixels, tiles, gsplat; default: those that are fast"
-    )
+    parser.add_argument("--compositors", nargs="+", help="rows (CPU), tiles, gsplat (CUDA); default: ours")
     parser.add_argument(
         "--tiles",
         nargs="+",
@@ -195,10 +192,10 @@ def main() -> None:
     truth = reference(inputs, cameras)
 
     columns: dict[str, dict[str, float]] = {}
-    for name in args.compositors or (["rows", "pixels"] if small else ["tiles"]):
+    for name in args.compositors or ["rows" if small else "tiles"]:
         for shape in args.tiles if name == "tiles" else [""]:
             if shape:
-                splat_tiles.TILE, splat_tiles.LANE_PIXELS = map(int, shape.split("x"))
+                compositor_cuda.TILE, compositor_cuda.LANE_PIXELS = map(int, shape.split("x"))
             times = stages(name, inputs, cameras, args.repetitions) if name in COMPOSITORS else {}
             result, image = whole(name, inputs, cameras, args.appearance, args.repetitions)
             times |= result

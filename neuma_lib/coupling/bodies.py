@@ -1,4 +1,4 @@
-"""Several bodies on one grid, and bodies that were never filmed: solids painted with kernels of their own."""
+"""Several bodies on one grid, and bodies without a video: solids with one Gaussian on each particle."""
 
 from __future__ import annotations
 
@@ -17,40 +17,40 @@ from neuma_lib.mechanics.density import Density, density_at
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.spherical_harmonics import rgb_to_sh0
 
-KERNEL_WIDTH = 0.55
-"""Standard deviation of a painted kernel in distances between particles: closed surfaces, edges still sharp."""
+_WIDTH = 0.55
+"""Standard deviation of a Gaussian in distances between particles: closed surfaces, edges still sharp."""
 _OPACITY = 0.95
 _LIGHT = (0.35, 0.8, 0.5)
-"""Direction to the light that painted bodies are shaded by: from above, a little to the right of the camera."""
+"""Direction to the light that shades these solids: from above, a little to the right of the camera."""
 _AMBIENT = 0.45
 """Brightness of what faces away from the light."""
 
 
 def join(bodies: Sequence[Reconstruction]) -> Reconstruction:
-    """Bodies as one: particles and kernels of one after those of another, every kernel on particles of its own."""
+    """Bodies as one: particles and Gaussians of one after those of another, each Gaussian bound as it was."""
     offsets = np.cumsum([0, *(len(body.x0) for body in bodies)])
     entries = np.cumsum([0, *(len(body.binding.indices) for body in bodies)])
-    parts = [body.binding for body in bodies]
-    starts = [b.indptr[:-1] + int(n) for b, n in zip(parts, entries, strict=False)]
+    bindings = [body.binding for body in bodies]
+    starts = [b.indptr[:-1] + int(n) for b, n in zip(bindings, entries, strict=False)]
     binding = Binding(
         torch.cat([*starts, torch.tensor([int(entries[-1])])]),
-        torch.cat([b.indices + int(n) for b, n in zip(parts, offsets, strict=False)]),
-        torch.cat([b.values for b in parts]),
-        (sum(b.shape[0] for b in parts), int(offsets[-1])),
+        torch.cat([b.indices + int(n) for b, n in zip(bindings, offsets, strict=False)]),
+        torch.cat([b.values for b in bindings]),
+        (sum(b.shape[0] for b in bindings), int(offsets[-1])),
     )
     most = max(body.gaussians.shN.shape[1] for body in bodies)
-    kernels = [body.gaussians for body in bodies]
-    padded = [torch.nn.functional.pad(k.shN, (0, 0, 0, most - k.shN.shape[1])) for k in kernels]
+    parts = [body.gaussians for body in bodies]
+    padded = [torch.nn.functional.pad(g.shN, (0, 0, 0, most - g.shN.shape[1])) for g in parts]
     names = ("means", "quats", "scales", "opacities", "sh0")
     gaussians = Gaussians(
-        **{name: torch.cat([getattr(k, name) for k in kernels]) for name in names}, shN=torch.cat(padded)
+        **{name: torch.cat([getattr(g, name) for g in parts]) for name in names}, shN=torch.cat(padded)
     )
     x0, vol0, mass = (torch.cat([getattr(body, name) for body in bodies]) for name in ("x0", "vol0", "mass"))
     return Reconstruction(x0, vol0, mass, gaussians, binding)
 
 
-def painted(mesh: trimesh.Trimesh, x0: Tensor, density: Density, colors: Tensor) -> Reconstruction:
-    """A solid filled with particles, with one round kernel on each of them, so that it can be rendered.
+def coloured_solid(mesh: trimesh.Trimesh, x0: Tensor, density: Density, colors: Tensor) -> Reconstruction:
+    """A solid filled with particles, with one round Gaussian on each of them, so that it can be rendered.
 
     Args:
         mesh: surface of the solid, watertight [m].
@@ -67,7 +67,7 @@ def painted(mesh: trimesh.Trimesh, x0: Tensor, density: Density, colors: Tensor)
     gaussians = Gaussians(
         means=x0,
         quats=x0.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(x0), 1),
-        scales=torch.full_like(x0, KERNEL_WIDTH * volume ** (1 / 3)),
+        scales=torch.full_like(x0, _WIDTH * volume ** (1 / 3)),
         opacities=torch.full_like(vol0, _OPACITY),
         sh0=rgb_to_sh0(rgb)[:, None, :],
         shN=x0.new_zeros(len(x0), 0, 3),

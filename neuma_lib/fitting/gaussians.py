@@ -20,7 +20,7 @@ from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.geometry.visual_hull import Hull, visual_hull
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians, covariances, rotations
-from neuma_lib.splatting.rasterizer import Statistics, Workspace, rasterize
+from neuma_lib.splatting.rasterizer import RenderBuffers, Statistics, rasterize
 from neuma_lib.splatting.spherical_harmonics import coefficient_count, rgb_to_sh0
 
 WHITE = (1.0, 1.0, 1.0)
@@ -314,7 +314,7 @@ class _Kernels:
         self.first_moments = {name: torch.zeros_like(value) for name, value in self.parameters.items()}
         self.second_moments = {name: torch.zeros_like(value) for name, value in self.parameters.items()}
         self.steps = 0
-        self.workspace = Workspace()
+        self.buffers = RenderBuffers()
         self.statistics = Statistics()
         self._reset_statistics()
 
@@ -347,7 +347,7 @@ class _Kernels:
             background=background,
             eps2d=EPS2D,
             statistics=self.statistics,
-            workspace=self.workspace,
+            buffers=self.buffers,
         )
         alpha = images[..., 3:]
         targets = images[..., :3] * alpha + (1 - alpha) * background

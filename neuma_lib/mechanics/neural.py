@@ -291,11 +291,6 @@ class NeuralLaw(Law):
                 raise InputError("the law has no adaptor whose weight could be set")
             part.adaptor.weight = float(weight)
 
-    def adaptor_parameters(self, part: str) -> list[nn.Parameter]:
-        """Trainable tensors of the adaptor of ``part`` ("elasticity" or "plasticity")."""
-        adaptor = self.parts[part].adaptor
-        return [] if adaptor is None else list(adaptor.parameters())
-
     def adaptor_state(self) -> dict[str, Tensor]:
         """The adaptor's tensors by name ("elasticity.A.0", ...), detached; the inverse of
         :meth:`load_adaptor_state`.

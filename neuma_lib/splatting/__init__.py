@@ -2,6 +2,6 @@
 
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians
-from neuma_lib.splatting.rasterizer import Statistics, Workspace, rasterize
+from neuma_lib.splatting.rasterizer import RenderBuffers, Statistics, rasterize
 
-__all__ = ["Cameras", "Gaussians", "Statistics", "Workspace", "rasterize"]
+__all__ = ["Cameras", "Gaussians", "RenderBuffers", "Statistics", "rasterize"]

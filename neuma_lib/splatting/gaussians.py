@@ -61,10 +61,6 @@ class Gaussians:
         return torch.cat([self.sh0, self.shN], dim=1)
 
     @property
-    def log_scales(self) -> torch.Tensor:
-        return torch.log(self.scales)
-
-    @property
     def degree(self) -> int:
         """Highest SH degree."""
         return int(round((self.shN.shape[1] + 1) ** 0.5)) - 1

@@ -19,7 +19,6 @@ from neuma_lib.splatting.projection import NEAR_PLANE
 
 ALPHA_MIN = 1.0 / 255.0
 TRANSMITTANCE_MIN = 1e-4
-UPPER_TRIANGLE = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 
 
 def rasterize(means, covars, opacities, sh, viewmats, Ks, background, settings: Settings):

@@ -1,8 +1,8 @@
 """Differentiable Gaussian splatting of a batch of frames (paper Sec. 3.3 and the supplement's 3DGS).
 
 One autograd function holds the whole render: projection and compositing, Warp kernels with hand-written adjoints.
-A CPU composites splat by splat (``splat_rows``), a GPU tile by tile (``splat_tiles``) or, in float64, pixel by pixel
-(``splat_pixels``). ``gsplat_backend`` renders by the gsplat package instead, where that is installed.
+A CPU composites splat by splat (``compositor_cpu``), a GPU tile by tile (``compositor_cuda``). ``gsplat_backend``
+renders by the gsplat package instead, where that is installed.
 """
 
 from __future__ import annotations
@@ -10,19 +10,17 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Sequence
+from types import ModuleType
 from typing import Literal
 
 import torch
 
 from neuma_lib.errors import InputError
-from neuma_lib.splatting import compositor_cpu as splat_rows
-from neuma_lib.splatting import compositor_cuda as splat_tiles
-from neuma_lib.splatting import compositor_pixels as splat_pixels
-from neuma_lib.splatting import gsplat_backend, projection
+from neuma_lib.splatting import compositor_cpu, compositor_cuda, gsplat_backend, projection
 from neuma_lib.splatting.compositing import Settings
 
-Compositor = Literal["rows", "pixels", "tiles", "gsplat"]
-COMPOSITORS = {"rows": splat_rows, "pixels": splat_pixels, "tiles": splat_tiles}
+Compositor = Literal["rows", "tiles", "gsplat"]
+COMPOSITORS = {"rows": compositor_cpu, "tiles": compositor_cuda}
 
 
 @dataclasses.dataclass
@@ -39,10 +37,10 @@ class Statistics:
     views: torch.Tensor | None = None
 
 
-class Workspace:
-    """Buffers kept between calls of the same shape, so that a loop allocates little and can be captured.
+class RenderBuffers:
+    """Memory kept between calls of the same shape, so that a loop allocates little and can be captured.
 
-    A call overwrites what the call before it left: with a workspace, run backward before the next forward.
+    A call overwrites what the call before it left: run backward before the next forward.
     """
 
     def __init__(self):
@@ -66,9 +64,9 @@ class _FreshBuffers:
 @dataclasses.dataclass(frozen=True)
 class _Options:
     settings: Settings
-    compositor: str
+    compositor: ModuleType
     statistics: Statistics | None
-    buffers: Workspace | _FreshBuffers
+    buffers: RenderBuffers | _FreshBuffers
 
 
 class _Rasterize(torch.autograd.Function):
@@ -80,8 +78,7 @@ class _Rasterize(torch.autograd.Function):
         )
         settings, empty = options.settings, options.buffers.empty
         splats, depths = projection.project(means, covars, opacities, sh, viewmats, Ks, settings, empty)
-        composite = COMPOSITORS[options.compositor].composite
-        pictures, alphas, kept = composite(splats, depths, background, settings, empty)
+        pictures, alphas, kept = options.compositor.composite(splats, depths, background, settings, empty)
         ctx.save_for_backward(means, covars, sh, viewmats, Ks, background, splats, depths, *kept)
         ctx.options = options
         shape = (len(means), len(viewmats), settings.height, settings.width)
@@ -98,7 +95,7 @@ class _Rasterize(torch.autograd.Function):
         grad_alphas = grad_alphas.contiguous().view(-1, height, width)
 
         grad_splats = empty("grad_splats", splats.shape, means)
-        COMPOSITORS[options.compositor].composite_adjoint(
+        options.compositor.composite_adjoint(
             splats, kept, background, settings, grad_pictures, grad_alphas, grad_splats, empty
         )
         if options.statistics is not None:
@@ -167,7 +164,7 @@ def rasterize(
     transmittance_min: float = 1e-4,
     eps2d: float = 0.3,
     statistics: Statistics | None = None,
-    workspace: Workspace | None = None,
+    buffers: RenderBuffers | None = None,
     compositor: Compositor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Render T frames from V cameras.
@@ -190,10 +187,11 @@ def rasterize(
         alpha_min, alpha_max, transmittance_min: thresholds, see above.
         eps2d: blur added to the projected covariance [px^2].
         statistics: filled by the backward pass when given.
-        workspace: keeps buffers between calls; the images returned then live in it.
-        compositor: "rows" (CPU), "pixels" (any device), "tiles" (CUDA, float32) or "gsplat" (CUDA, float32; other
-            limit of alpha, see ``gsplat_backend``). Default: rows on CPU; on CUDA tiles for float32 and pixels for
-            float64. Tiles and gsplat read one number from the GPU a call, so a CUDA graph cannot hold them.
+        buffers: memory kept between calls; the images returned then live in it.
+        compositor: "rows" (CPU), "tiles" (CUDA, float32) or "gsplat" (CUDA, float32; other limit of alpha, see
+            ``gsplat_backend``). Default: rows on CPU, tiles on CUDA. Tiles and gsplat read one number from the GPU a
+            call, so a CUDA graph cannot hold them. In float64 a CUDA device leaves the work to the CPU: that serves
+            comparisons only.
 
     Returns:
         images (T, V, H, W, 3) over ``background`` and alphas (T, V, H, W).
@@ -202,14 +200,22 @@ def rasterize(
         InputError: shapes, dtypes or devices disagree, or the compositor cannot work with them.
     """
     check_shapes(means, covars, opacities, sh, viewmats, Ks)
+    if means.is_cuda and means.dtype == torch.float64 and compositor is None:
+        options = dict(
+            background=background, alpha_min=alpha_min, alpha_max=alpha_max, transmittance_min=transmittance_min,
+            eps2d=eps2d, statistics=statistics, buffers=buffers,
+        )  # fmt: skip
+        on_cpu = (tensor.cpu() for tensor in (means, covars, opacities, sh, viewmats, Ks))
+        images, alphas = rasterize(*on_cpu, width, height, **options)
+        return images.to(means.device), alphas.to(means.device)
     if isinstance(background, torch.Tensor):
         background = background.to(means)
     else:
         background = _constant(tuple(background), means.dtype, means.device)
     on_cpu, single = means.device.type == "cpu", means.dtype == torch.float32
     if compositor is None:
-        compositor = "rows" if on_cpu else "tiles" if single else "pixels"
-    works = {"rows": on_cpu, "pixels": True, "tiles": not on_cpu and single, "gsplat": not on_cpu and single}
+        compositor = "rows" if on_cpu else "tiles"
+    works = {"rows": on_cpu, "tiles": not on_cpu and single, "gsplat": not on_cpu and single}
     if not works.get(compositor, False):
         raise InputError(
             f"rasterize: compositor {compositor!r} does not work with {means.dtype} on {means.device}; "
@@ -227,6 +233,5 @@ def rasterize(
         if statistics is not None:
             raise InputError("rasterize: compositor 'gsplat' fills no statistics, leave one of the two out")
         return gsplat_backend.rasterize(means, covars, opacities, sh, viewmats, Ks, background, settings)
-    buffers = workspace if workspace is not None else _FreshBuffers()
-    options = _Options(settings, compositor, statistics, buffers)
+    options = _Options(settings, COMPOSITORS[compositor], statistics, buffers or _FreshBuffers())
     return _Rasterize.apply(means, covars, opacities, sh, viewmats, Ks, background, options)

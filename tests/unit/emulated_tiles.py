@@ -1,4 +1,4 @@
-"""The CUDA code of ``splat_tiles`` compiled for the CPU, warp by warp, as a compositor for tests."""
+"""The CUDA code of ``compositor_cuda`` compiled for the CPU, warp by warp, as a compositor for tests."""
 
 import ctypes
 import functools
@@ -9,11 +9,11 @@ from pathlib import Path
 import torch
 import warp as wp
 
-from neuma_lib.splatting import compositor_cuda as splat_tiles
+from neuma_lib.splatting import compositor_cuda
 from neuma_lib.splatting.arrays import plain, target
 
 COMPILER = shutil.which("g++") or shutil.which("clang++")
-PASSES = {"composite_patch": splat_tiles._FORWARD, "composite_patch_adjoint": splat_tiles._BACKWARD}
+PASSES = {"composite_patch": compositor_cuda._FORWARD, "composite_patch_adjoint": compositor_cuda._BACKWARD}
 ARGUMENTS = {
     "composite_patch": """int width, int height, Array<float> splats, Array<int> ids, Array<int> starts,
         float alpha_min, float alpha_max, float transmittance_min, Array<float> background,
@@ -34,7 +34,7 @@ def library(folder: Path, tile: int, lane_pixels: int) -> ctypes.CDLL:
     code = '#include "warp_emulation.hpp"\n'
     for name, arguments in ARGUMENTS.items():
         code += f"static void {name}(int tile, int thread, {arguments}) {{\n"
-        code += splat_tiles.source(PASSES[name], tile, lane_pixels) + "}\n"
+        code += compositor_cuda.source(PASSES[name], tile, lane_pixels) + "}\n"
         code += f'extern "C" void {name}_all(int tiles, {arguments}) {{\n'
         code += f"    for (int k = 0; k < tiles * {tile * tile // lane_pixels}; k += 32)\n"
         code += "        emulation::run([&](int lane) {\n"
@@ -69,10 +69,10 @@ def call(function, *arguments):
 
 
 class EmulatedTiles:
-    """``splat_tiles`` on the CPU: the same lists, the same code for a warp, the same last kernel."""
+    """``compositor_cuda`` on the CPU: the same lists, the same code for a warp, the same last kernel."""
 
     def __init__(
-        self, folder: Path, tile: int = splat_tiles.TILE, lane_pixels: int = splat_tiles.LANE_PIXELS
+        self, folder: Path, tile: int = compositor_cuda.TILE, lane_pixels: int = compositor_cuda.LANE_PIXELS
     ):
         self.tile = tile
         self.library = library(folder, tile, lane_pixels)
@@ -82,7 +82,7 @@ class EmulatedTiles:
         # filled with a value that would be noticed: every pixel must be written
         pictures, alphas = splats.new_full((*shape, 3), 1e9), splats.new_full(shape, 1e9)
         transmittances, stops = splats.new_full(shape, 1e9), splats.new_full(shape, -1, dtype=torch.int32)
-        ids, starts = splat_tiles.lists(splats, depths, settings.width, settings.height, self.tile)
+        ids, starts = compositor_cuda.lists(splats, depths, settings.width, settings.height, self.tile)
         call(
             self.library.composite_patch_all, len(starts) - 1, settings.width, settings.height, splats, ids, starts,
             settings.alpha_min, settings.alpha_max, settings.transmittance_min, background, pictures, alphas,
@@ -100,7 +100,7 @@ class EmulatedTiles:
             starts, transmittances, stops, settings.alpha_min, settings.alpha_max, background, grad_pictures,
             grad_alphas, grad_splats,
         )  # fmt: skip
-        _, _, finish = splat_tiles.list_kernels()
+        _, _, finish = compositor_cuda.list_kernels()
         wp.launch(
             finish,
             dim=splats.shape[:2],

@@ -64,8 +64,8 @@ def test_framing_is_tight_and_holds_every_point(width, height):
 def test_projection_is_the_rasterizer_s():
     points = np.random.default_rng(2).uniform(0.3, 0.7, (50, 3))
     views = cameras.static_views(points, 7, 128, 96)
-    theirs = Cameras.from_opengl(
-        torch.from_numpy(views.c2w), torch.from_numpy(views.K).expand(7, 3, 3), views.width, views.height
+    theirs = Cameras(
+        torch.from_numpy(views.viewmats), torch.from_numpy(views.K).expand(7, 3, 3), views.width, views.height
     )
     pixels, depths = theirs.project(torch.from_numpy(points))
     assert (depths > 0).all()

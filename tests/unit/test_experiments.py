@@ -1,4 +1,4 @@
-"""Several bodies on one grid, painted solids, and densities that differ inside a body."""
+"""Several bodies on one grid, coloured solids, and densities that differ inside a body."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 import yaml
 
 from neuma_lib.config.settings import load, merged
-from neuma_lib.coupling.bodies import join, painted
+from neuma_lib.coupling.bodies import coloured_solid, join
 from neuma_lib.coupling.particle_binding import bind_two_pass
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.data.ground_truth import TrueBody, simulate_ground_truth
@@ -35,7 +35,7 @@ FLOATING = MPMModel(grid=16, dt=1e-3, gravity=(0.0, 0.0, 0.0))
 def solid(x: float, shape: str = "ball", count: int = 150) -> tuple:
     mesh = place(shape, 0.22, 0.5, (x, 0.5))
     points = torch.as_tensor(sample_volume(mesh, count, seed=3), dtype=torch.float32)
-    return mesh, points, painted(mesh, points, 1000.0, torch.full((len(points), 3), 0.5))
+    return mesh, points, coloured_solid(mesh, points, 1000.0, torch.full((len(points), 3), 0.5))
 
 
 def settings(**changes):
@@ -121,10 +121,10 @@ def test_a_joined_body_renders_and_binds_as_its_parts():
     check_apart([solid(0.3)[0], solid(0.7)[0]])
 
 
-def test_a_painted_solid_covers_its_outline_in_its_colour():
+def test_a_coloured_solid_covers_its_outline_in_its_colour():
     mesh = place("letter_N", None, 0.5, (0.5, 0.5))
     points = torch.as_tensor(sample_volume(mesh, 800, seed=0), dtype=torch.float32)
-    body = painted(mesh, points, 1000.0, torch.tensor([0.2, 0.6, 0.4]).expand(len(points), 3))
+    body = coloured_solid(mesh, points, 1000.0, torch.tensor([0.2, 0.6, 0.4]).expand(len(points), 3))
     assert float(body.vol0.sum()) == pytest.approx(mesh.volume, rel=1e-5)
     view = torch.eye(4)
     view[:3, :3] = torch.diag(torch.tensor([1.0, -1.0, -1.0]))

@@ -9,10 +9,9 @@ from emulated_tiles import COMPILER, EmulatedTiles
 from render_scenes import random_scene
 
 from neuma_lib.errors import InputError
-from neuma_lib.splatting import compositor_cuda as splat_tiles
-from neuma_lib.splatting import projection, rasterizer, torch_reference
+from neuma_lib.splatting import compositor_cuda, projection, rasterizer, torch_reference
 from neuma_lib.splatting.compositing import Settings
-from neuma_lib.splatting.rasterizer import Statistics, Workspace, rasterize
+from neuma_lib.splatting.rasterizer import RenderBuffers, Statistics, rasterize
 
 CUDA = pytest.param(
     "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -31,17 +30,15 @@ def build_folder(tmp_path_factory):
 @pytest.fixture(params=[EMULATED, CUDA])
 def render(request, monkeypatch, build_folder):
     """``rasterize`` in float32 with the tile compositor, on copies of float64 inputs that keep the graph."""
-    device = "cpu"
-    if request.param == "cuda":
-        device = "cuda"
-    else:
-        monkeypatch.setitem(rasterizer.COMPOSITORS, "pixels", EmulatedTiles(build_folder))
-    compositor = {"cuda": "tiles", "cpu": "pixels"}[device]
 
     def run(*arguments, **options):
         tensors, size = arguments[:6], arguments[6:]
-        on_device = (tensor.to(device, torch.float32) for tensor in tensors)
-        outputs = rasterize(*on_device, *size, compositor=compositor, **options)
+        if request.param == "cuda":
+            outputs = rasterize(*(tensor.float().cuda() for tensor in tensors), *size, **options)
+        else:
+            with monkeypatch.context() as patch:
+                patch.setitem(rasterizer.COMPOSITORS, "rows", EmulatedTiles(build_folder))
+                outputs = rasterize(*(tensor.float() for tensor in tensors), *size, **options)
         return tuple(output.to("cpu", torch.float64) for output in outputs)
 
     return run
@@ -147,7 +144,7 @@ def test_statistics(render):
 
 def project(scene, width, height, alpha_min=1 / 255, eps2d=0.3):
     settings = Settings(width, height, alpha_min, 0.99, 1e-4, eps2d)
-    return projection.project(*(tensor.float() for tensor in scene), settings, Workspace().empty)
+    return projection.project(*(tensor.float() for tensor in scene), settings, RenderBuffers().empty)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -156,7 +153,7 @@ def test_lists_hold_what_tiles_see_and_little_more(name, tile):
     make, width, height, options = SCENES[name]
     alpha_min = options.get("alpha_min", 1 / 255)
     splats, depths = project(make(), width, height, alpha_min, options.get("eps2d", 0.3))
-    ids, starts = splat_tiles.lists(splats, depths, width, height, tile)
+    ids, starts = compositor_cuda.lists(splats, depths, width, height, tile)
     x, y = torch.arange(width).double() + 0.5, torch.arange(height).double() + 0.5
     tiles_x, tiles_y = -(-width // tile), -(-height // tile)
     assert len(starts) == len(splats) * tiles_x * tiles_y + 1 and starts[-1] == len(ids)
@@ -185,9 +182,11 @@ def test_lists_hold_what_tiles_see_and_little_more(name, tile):
 
 
 def test_lists_of_no_splats():
-    ids, starts = splat_tiles.lists(torch.zeros(2, 0, 12), torch.zeros(2, 0), 20, 20, 16)
+    ids, starts = compositor_cuda.lists(torch.zeros(2, 0, 12), torch.zeros(2, 0), 20, 20, 16)
     assert len(ids) == 0 and torch.equal(starts, torch.zeros(9, dtype=torch.int32))
-    ids, starts = splat_tiles.lists(torch.zeros(2, 3, 12), torch.full((2, 3), projection.CULLED), 20, 20, 16)
+    ids, starts = compositor_cuda.lists(
+        torch.zeros(2, 3, 12), torch.full((2, 3), projection.CULLED), 20, 20, 16
+    )
     assert len(ids) == 0 and torch.equal(starts, torch.zeros(9, dtype=torch.int32))
 
 
@@ -198,7 +197,7 @@ def test_splats_that_are_no_numbers_stay_out():
     scene[1][0, 2] = float("inf")
     scene[2][3] = float("nan")
     splats, depths = project(scene, 37, 29)
-    ids, starts = splat_tiles.lists(splats, depths, 37, 29, 16)
+    ids, starts = compositor_cuda.lists(splats, depths, 37, 29, 16)
     assert not torch.isin(torch.arange(4, dtype=torch.int32), ids).any()
     assert torch.isfinite(splats.view(-1, 12)[ids.long()]).all()
 
@@ -206,7 +205,7 @@ def test_splats_that_are_no_numbers_stay_out():
 def test_errors_name_compositors_that_work():
     scene = random_scene(1, 10, 1, 16, 16, 1)
     for compositor in ("tiles", "gsplat", "columns"):
-        with pytest.raises(InputError, match="choose rows or pixels"):
+        with pytest.raises(InputError, match="choose rows, or leave"):
             rasterize(*scene, 16, 16, compositor=compositor)
 
 

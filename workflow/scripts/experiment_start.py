@@ -7,7 +7,7 @@ import torch
 import trimesh
 
 from neuma_lib.config.settings import pick
-from neuma_lib.coupling.bodies import join, painted
+from neuma_lib.coupling.bodies import coloured_solid, join
 from neuma_lib.data.blender.appearance import Appearance, colors_at
 from neuma_lib.geometry.shapes import place, shape
 from neuma_lib.geometry.volume import sample_volume
@@ -36,7 +36,7 @@ def main(inputs, output, params, run) -> None:
             mesh = place(entry["shape"], entry["size"], entry["height"], entry["center"])
             x0 = sample_volume(mesh, params.particles, seed=params.seed, method=params.sampling)
             colors = torch.from_numpy(colors_at(mesh, x0, look_of(entry)))
-            body = painted(mesh, torch.as_tensor(x0, dtype=torch.float32), 1.0, colors)
+            body = coloured_solid(mesh, torch.as_tensor(x0, dtype=torch.float32), 1.0, colors)
             v0 = entry["velocity"]
         bodies.append(body)
         meshes.append(mesh)
