@@ -175,10 +175,7 @@ def _loss_gradient(observation: Observation, images: torch.Tensor, part: slice) 
 
 
 def _roll(scene: BenchmarkScene, **options) -> Trajectory:
-    body = scene.body
-    return rollout(
-        scene.model, scene.law, body.x0, scene.v0, body.mass, body.vol0, skip_free_flight=False, **options
-    )
+    return rollout(scene.model, scene.law, scene.body.state(scene.v0), skip_free_flight=False, **options)
 
 
 def simulate_and_back(scene: BenchmarkScene, **options) -> None:

@@ -23,10 +23,11 @@ from neuma_lib.sim.memory import KEEP
 from neuma_lib.sim.model import MPMModel, as_bodies
 from neuma_lib.sim.rollout import RolloutFunction, rollout
 from neuma_lib.sim.simulation import Simulation
+from neuma_lib.sim.state import State
 from neuma_lib.splatting.rasterizer import rasterize
 
 
-def rollout_step_by_step(model, law, x, v, mass, vol0, frames):
+def rollout_step_by_step(model, law, state, frames):
     """Positions and deformation gradients at the frames, by a graph with a node per step.
 
     The same code as a rollout of one step after another: every node has its own buffers, keeps its state and
@@ -34,27 +35,28 @@ def rollout_step_by_step(model, law, x, v, mass, vol0, frames):
     """
     parts = law.weights()
     weights = [w for part in parts for w in part]
-    bodies = as_bodies(law, len(x))
-    eye = torch.eye(3, dtype=x.dtype, device=x.device).repeat(len(x), 1, 1)
-    state, seen = (x, v.repeat(len(x), 1), eye, torch.zeros_like(eye)), []
+    bodies = as_bodies(law, len(state.x))
+    now, seen = state.motion, []
     for n in range(1, frames[-1] + 1):
-        step = Simulation(model, bodies, {id(law): parts}, x, 1, n - 1, differentiable=True, keep="states")
-        step.set_mass(mass, vol0)
-        *after, _ = RolloutFunction.apply(step, [1], None, *state, *weights)
-        state = tuple(value[0] for value in after)
+        step = Simulation(
+            model, bodies, {id(law): parts}, state.x, 1, n - 1, differentiable=True, keep="states"
+        )
+        step.set_mass(state.mass, state.vol0)
+        *after, _ = RolloutFunction.apply(step, [1], None, *now, *weights)
+        now = tuple(value[0] for value in after)
         if n in frames:
-            seen.append((state[0], state[2]))
+            seen.append((now[0], now[2]))
     return torch.stack([x for x, _ in seen]), torch.stack([F for _, F in seen])
 
 
-def falling_cube(count: int, device: torch.device) -> tuple[torch.Tensor, ...]:
-    """Particles [m] just above the floor, velocity [m/s], masses [kg] and volumes [m^3]."""
+def falling_cube(count: int, device: torch.device) -> State:
+    """Particles just above the floor that fall with one velocity."""
     generator = torch.Generator().manual_seed(0)
     side = 0.3
     x = torch.rand(count, 3, generator=generator) * side + torch.tensor([0.35, 0.1, 0.35])
     vol0 = torch.full((count,), side**3 / count)
     v = torch.tensor([0.3, -2.0, 0.1])
-    return tuple(value.to(device) for value in (x, v, 1000 * vol0, vol0))
+    return State(*(value.to(device) for value in (x, v, 1000 * vol0, vol0)))
 
 
 def soft_law(device: torch.device) -> NeuralLaw:
@@ -133,12 +135,12 @@ def main() -> None:
     device = torch.device(args.device)
     model = MPMModel(args.grid, 1e-3)
     law = soft_law(device)
-    x0, v0, mass, vol0 = falling_cube(args.particles, device)
+    state = falling_cube(args.particles, device)
     frames = sorted({max(1, round(args.steps * (i + 1) / args.frames)) for i in range(args.frames)})
     options = dict(steps=args.steps, frames=frames, skip_free_flight=False)
 
     def simulate(keep="auto"):
-        path = rollout(model, law, x0, v0, mass, vol0, keep=keep, **options)
+        path = rollout(model, law, state, keep=keep, **options)
         return path.x, path.F
 
     def scalar(states):
@@ -149,11 +151,9 @@ def main() -> None:
         f"neural law, {device}; best of {args.repetitions} [ms]"
     )
     rows = {f"rollout, keep={keep}": lambda keep=keep: scalar(simulate(keep)) for keep in KEEP}
-    rows["one function per step"] = lambda: scalar(
-        rollout_step_by_step(model, law, x0, v0, mass, vol0, frames)
-    )
+    rows["one function per step"] = lambda: scalar(rollout_step_by_step(model, law, state, frames))
     if args.render:
-        render = picture(x0, args.gaussians, args.pixels)
+        render = picture(state.x, args.gaussians, args.pixels)
         rows[f"rollout + {args.gaussians} Gaussians at {args.pixels} px"] = lambda: scalar(
             [render(*simulate())]
         )

@@ -10,6 +10,7 @@ from torch import Tensor
 from neuma_lib.coupling.binding import Binding
 from neuma_lib.coupling.particle_gs import ParticleGS
 from neuma_lib.mechanics.density import Density, density_at
+from neuma_lib.sim.state import State
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians
 
@@ -44,6 +45,10 @@ class Reconstruction:
     def density(self) -> float:
         """Smallest mass density of a particle [kg/m^3], where waves are fastest."""
         return float((self.mass / self.vol0).min())
+
+    def state(self, v0: Tensor) -> State:
+        """The particles at t = 0, with velocities v0 [m/s], shape (N, 3) or (3,)."""
+        return State(self.x0, v0, self.mass, self.vol0)
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Reconstruction:
         """The same body in another precision or on another device."""

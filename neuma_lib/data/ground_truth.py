@@ -18,7 +18,7 @@ from neuma_lib.mechanics.density import Density, density_at
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import MPMModel, consecutive, each_its_own
 from neuma_lib.sim.rollout import rollout
-from neuma_lib.sim.state import Trajectory
+from neuma_lib.sim.state import State, Trajectory
 
 
 @dataclass(frozen=True)
@@ -106,10 +106,12 @@ def simulate_ground_truth(
         path = rollout(
             model,
             consecutive([body.law for body in bodies], counts),
-            torch.cat(solids).to(device),
-            each_its_own([body.velocity for body in bodies], counts).to(device),
-            mass.to(device),
-            vol0.to(device),
+            State(
+                torch.cat(solids).to(device),
+                each_its_own([body.velocity for body in bodies], counts).to(device),
+                mass.to(device),
+                vol0.to(device),
+            ),
             steps=max(frames),
             frames=frames,
             tracers=torch.cat(start).to(device),

@@ -62,9 +62,7 @@ def predict(
 
     def run(kept):
         with torch.no_grad():
-            return rollout(
-                model, law, body.x0, v0, body.mass, body.vol0, steps=kept[-1], frames=kept, tracers=tracers
-            )
+            return rollout(model, law, body.state(v0), steps=kept[-1], frames=kept, tracers=tracers)
 
     kept = list(frames)
     failed_at = None

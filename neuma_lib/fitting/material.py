@@ -306,10 +306,7 @@ class _Loop:
         path = rollout(
             self.model,
             self.law,
-            body.x0,
-            self.v0,
-            body.mass,
-            body.vol0,
+            body.state(self.v0),
             steps=frames[-1],
             frames=every_step(frames) if self.loss.total else frames,
             memory=None if self.settings.memory is None else self.settings.memory * 2**30,

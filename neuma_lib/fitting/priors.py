@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -32,6 +32,7 @@ from neuma_lib.mechanics.neural import LAYER_KEYS, PLASTIC_SCALE, SHAPES, Neural
 from neuma_lib.mechanics.singular_values import svd3
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State
 
 DENSITY = 1000.0
 """Density of every training cube [kg/m^3]."""
@@ -153,16 +154,11 @@ class Throw:
     """A cube of particles and its initial motion."""
 
     model: MPMModel
-    x0: Tensor
-    v0: Tensor
-    mass: Tensor
-    vol0: Tensor
+    state: State
     steps: int
 
     def run(self, law: Law, frames: list[int]):
-        return rollout(
-            self.model, law, self.x0, self.v0, self.mass, self.vol0, steps=self.steps, frames=frames
-        )
+        return rollout(self.model, law, self.state, steps=self.steps, frames=frames)
 
 
 def reference_law(spec: Mapping[str, Any], settings: RegressionSettings) -> Law:
@@ -197,14 +193,13 @@ def random_throw(law: Law, generator: torch.Generator, settings: RegressionSetti
     halved = float(uniform(0.0, 1.0)) < 0.5 and "dt" not in getattr(law.plasticity, "constants", {})
     dt = longest_step(law, settings) * (0.5 if halved else 1.0)
     count = len(local)
-    return Throw(
-        MPMModel(grid=settings.grid, dt=dt),
+    state = State(
         centre + local,
         v + torch.linalg.cross(omega.expand_as(local), local),
         torch.full((count,), DENSITY * side**3 / count),
         torch.full((count,), side**3 / count),
-        math.ceil(settings.duration / dt),
     )
+    return Throw(MPMModel(grid=settings.grid, dt=dt), state, math.ceil(settings.duration / dt))
 
 
 def random_rotations(count: int, generator: torch.Generator) -> Tensor:
@@ -427,11 +422,15 @@ def train_by_trajectory(
         total = 0.0
         for first in range(0, settings.steps, length):
             count = min(length, settings.steps - first)
+            start = {name: getattr(truth, name)[first] for name in ("x", "v", "F", "C")}
             path = rollout(
-                throw.model, law, truth.x[first], truth.v[first], throw.mass, throw.vol0,
-                F0=truth.F[first], C0=truth.C[first], steps=count, frames=range(1, count + 1),
+                throw.model,
+                law,
+                replace(throw.state, **start),
+                steps=count,
+                frames=range(1, count + 1),
                 skip_free_flight=False,
-            )  # fmt: skip
+            )
             loss = (path.x - truth.x[first + 1 : first + count + 1]).square().mean(dim=(1, 2)).sum()
             loss.backward()
             total += float(loss.detach())
@@ -456,7 +455,7 @@ def _nclaw_throw(settings: TrajectorySettings) -> Throw:
     v = torch.tensor([1.0, -1.5, -2.0]) + torch.linalg.cross(omega.expand_as(local), local)
     model = MPMModel(grid=settings.grid, dt=settings.dt, boundary="slip", wall_cells=3)
     mass = torch.full((len(local),), DENSITY * side**3 / len(local))
-    return Throw(model, 0.5 + local, v, mass, mass / DENSITY, settings.steps)
+    return Throw(model, State(0.5 + local, v, mass, mass / DENSITY), settings.steps)
 
 
 # ---------------------------------------------------------------------------------------------------- judging

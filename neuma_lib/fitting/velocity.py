@@ -226,9 +226,7 @@ class _Residuals:
         right, down, enlargement = NUISANCE_SCALE * nuisance
         axes = self.seen.cameras.viewmats[0, :3, :3]
         with torch.no_grad():
-            path = rollout(
-                self.model, self.law, body.x0, v0, body.mass, body.vol0, steps=frames[-1], frames=frames
-            )
+            path = rollout(self.model, self.law, body.state(v0), steps=frames[-1], frames=frames)
             centre = path.x.mean(dim=1, keepdim=True)
             x = centre + (1 + enlargement) * (path.x - centre) + right * axes[0] + down * axes[1]
             return self._renderer(x, (1 + enlargement) * path.F)

@@ -2,11 +2,12 @@
 
 from neuma_lib.sim.model import Body, MPMModel, consecutive, contact_clearance, each_its_own
 from neuma_lib.sim.rollout import rollout
-from neuma_lib.sim.state import Trajectory
+from neuma_lib.sim.state import State, Trajectory
 
 __all__ = [
     "Body",
     "MPMModel",
+    "State",
     "Trajectory",
     "consecutive",
     "contact_clearance",

@@ -11,35 +11,23 @@ import torch
 from torch import Tensor
 
 from neuma_lib.sim.model import Body, MPMModel, contact_clearance, law_weights
-from neuma_lib.sim.state import Trajectory
+from neuma_lib.sim.state import State, Trajectory
 
 _MARGIN = 1e-3  # distance from the zone of contact at which free flight ends [dx]
 
 
-def free_flight_steps(
-    model: MPMModel,
-    bodies: Sequence[Body],
-    x0: Tensor,
-    v0: Tensor,
-    mass: Tensor,
-    vol0: Tensor,
-    F0: Tensor | None,
-    C0: Tensor | None,
-    last: int,
-) -> int:
+def free_flight_steps(model: MPMModel, bodies: Sequence[Body], state: State, last: int) -> int:
     """Number of leading steps, at most `last`, in which nothing but gravity acts and nothing can deform."""
-    if torch.is_grad_enabled():
-        if v0.ndim == 2 and v0.requires_grad or any(t is not None and t.requires_grad for t in (F0, C0)):
-            return 0
+    x, v, F, C = state.x, state.v, state.F, state.C
+    if torch.is_grad_enabled() and (v.ndim == 2 and v.requires_grad or F.requires_grad or C.requires_grad):
+        return 0
     with torch.no_grad():
-        if v0.ndim == 2 and not (v0 == v0[0]).all():
+        if v.ndim == 2 and not (v == v[0]).all():
             return 0
-        if F0 is not None and not (F0 == torch.eye(3, dtype=F0.dtype, device=F0.device)).all():
+        if not (F == torch.eye(3, dtype=F.dtype, device=F.device)).all() or C.any():
             return 0
-        if C0 is not None and C0.any():
-            return 0
-        clear = _clear_of_walls(model, x0, v0 if v0.ndim == 1 else v0[0], last)
-        if clear and not all(_at_rest(model, body, x0, mass, vol0) for body in bodies):
+        clear = _clear_of_walls(model, x, v if v.ndim == 1 else v[0], last)
+        if clear and not all(_at_rest(model, body, state) for body in bodies):
             return 0
     return clear
 
@@ -54,8 +42,9 @@ def _clear_of_walls(model: MPMModel, x0: Tensor, v0: Tensor, last: int) -> int:
     return int(touching.int().argmax()) if touching.any() else last
 
 
-def _at_rest(model: MPMModel, body: Body, x0: Tensor, mass: Tensor, vol0: Tensor) -> bool:
+def _at_rest(model: MPMModel, body: Body, state: State) -> bool:
     """Whether the law leaves F = I as it is and without a stress that could be felt in a step."""
+    x0, mass, vol0 = state.x, state.mass, state.vol0
     eye = torch.eye(3, dtype=x0.dtype, device=x0.device)[None]
     elastic, plastic = law_weights(body.law, x0.dtype)
     tau = body.law.elasticity.evaluate(eye, elastic)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import accumulate
 
 import torch
@@ -76,10 +76,6 @@ class MPMModel:
     def free_range(self) -> tuple[float, float]:
         """Open interval of coordinates that no wall node influences [m]."""
         return (self.wall_cells + 0.5) * self.dx, 1.0 - (self.wall_cells + 1.5) * self.dx
-
-    def with_dt(self, dt: float) -> MPMModel:
-        """The same model with another time step [s]."""
-        return replace(self, dt=dt)
 
     def courant(self, law: Law, rho: float) -> float:
         """Courant number c dt / dx for the wave speed of the law at F = I and a density rho [kg/m^3]."""

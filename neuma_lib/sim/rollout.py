@@ -1,7 +1,7 @@
 """The one entry to the simulator, for ground truth, velocity estimation, training and evaluation alike.
 
 Callers differ in law, start and set of frames only. The gradient is one reverse loop over the stored states,
-not a graph of steps: autograd sees one function from (x0, v0, F0, C0, weights of the laws) to the frames.
+not a graph of steps: autograd sees one function from (x, v, F, C, weights of the laws) to the frames.
 """
 
 from __future__ import annotations
@@ -18,19 +18,14 @@ from neuma_lib.sim.free_flight import ballistic, free_flight_steps
 from neuma_lib.sim.memory import KEEP
 from neuma_lib.sim.model import Body, MPMModel, as_bodies, law_weights
 from neuma_lib.sim.simulation import Simulation
-from neuma_lib.sim.state import Trajectory
+from neuma_lib.sim.state import State, Trajectory
 
 
 def rollout(
     model: MPMModel,
     law: Law | Sequence[Body],
-    x0: Tensor,
-    v0: Tensor,
-    mass: Tensor,
-    vol0: Tensor,
+    state: State,
     *,
-    F0: Tensor | None = None,
-    C0: Tensor | None = None,
     steps: int,
     frames: Sequence[int],
     tracers: Tensor | None = None,
@@ -41,24 +36,19 @@ def rollout(
 ) -> Trajectory:
     """Simulate particles and return their states at the frames.
 
-    Differentiable with respect to the weights of the laws, x0, v0, F0 and C0; masses, volumes and tracers
-    carry no gradient. Device and precision (float32 or float64) are those of x0.
+    Differentiable with respect to the weights of the laws and to x, v, F and C of the state; masses, volumes and
+    tracers carry no gradient.
 
     Args:
         model: grid, time step, gravity and walls.
         law: material of all particles, or bodies that each have a law and a range of particles on one grid.
-        x0: initial positions [m], shape (N, 3).
-        v0: initial velocities [m/s], shape (N, 3), or (3,) for one common velocity.
-        mass: particle masses [kg], shape (N,).
-        vol0: initial particle volumes [m^3], shape (N,).
-        F0: initial deformation gradients, shape (N, 3, 3); identity if None.
-        C0: initial affine velocities [1/s], shape (N, 3, 3); zero if None.
+        state: N particles at the start.
         steps: number of time steps; the simulation ends at the last frame, which must not lie beyond.
         frames: steps whose states are returned, strictly increasing, 0 is the start.
         tracers: positions of passive points that follow the grid's velocity [m], shape (M, 3).
         skip_free_flight: take the steps before the first contact in closed form while the state is undeformed
             and moves with one velocity: equal to simulating them, to round-off, in value and gradient. Not
-            used where a gradient could deform the state (v0 of shape (N, 3), F0 or C0 that require it).
+            used where a gradient could deform the state (v of shape (N, 3), F or C that require it).
         keep: what the gradient keeps a step: "states" (x, v, C, F; the rest is computed again), "all", or
             "auto", which also keeps what fits a fixed amount of memory. Same gradient, other speed.
         memory: most bytes that the gradient may keep; where that is too little for the states of all steps, these
@@ -66,20 +56,19 @@ def rollout(
         scatter: how particles are added to nodes, see `scatter.SCATTERS`; None takes the fastest way.
 
     Raises:
-        InputError: shapes, precision, frames, a particle that starts outside the grid, bodies that misfit.
+        InputError: frames, tracers, a particle that starts outside the grid, bodies that misfit.
         NonFiniteError: a particle became non-finite or crossed a cell in a step; has `step` and `particle`.
     """
     frames = _checked_frames(frames, steps)
-    bodies = as_bodies(law, len(x0))
-    _check_particles(model, x0, v0, mass, vol0, F0, C0, tracers)
+    bodies = as_bodies(law, len(state.x))
+    _check_inside(model, state.x)
+    if tracers is not None and (tracers.ndim != 2 or tracers.shape[1] != 3 or tracers.dtype != state.x.dtype):
+        raise InputError(f"tracers: give positions of shape (M, 3) as {state.x.dtype}")
     if keep not in KEEP:
         raise InputError(f"keep = {keep!r}: choose one of {', '.join(KEEP)}")
 
-    flight = 0
-    if skip_free_flight:
-        flight = free_flight_steps(model, bodies, x0, v0, mass, vol0, F0, C0, frames[-1])
-    eye = torch.eye(3, dtype=x0.dtype, device=x0.device).expand(len(x0), 3, 3)
-    start = (x0, v0.expand_as(x0), eye if F0 is None else F0, torch.zeros_like(eye) if C0 is None else C0)
+    flight = free_flight_steps(model, bodies, state, frames[-1]) if skip_free_flight else 0
+    start = state.motion
     seen = sum(n < flight for n in frames)
     parts = []
     if seen:
@@ -90,7 +79,19 @@ def rollout(
             start = (landed.x[0], landed.v[0], start[2], start[3])
             tracers = None if tracers is None else landed.tracers[0]
         parts.append(
-            _simulate(model, bodies, start, mass, vol0, tracers, flight, frames[seen:], keep, memory, scatter)
+            _simulate(
+                model,
+                bodies,
+                start,
+                state.mass,
+                state.vol0,
+                tracers,
+                flight,
+                frames[seen:],
+                keep,
+                memory,
+                scatter,
+            )
         )
     return parts[0] if len(parts) == 1 else _joined(*parts)
 
@@ -163,52 +164,14 @@ def _checked_frames(frames: Sequence[int], steps: int) -> tuple[int, ...]:
     return frames
 
 
-def _check_particles(
-    model: MPMModel,
-    x0: Tensor,
-    v0: Tensor,
-    mass: Tensor,
-    vol0: Tensor,
-    F0: Tensor | None,
-    C0: Tensor | None,
-    tracers: Tensor | None,
-) -> None:
-    """Shapes, precision, device, and the values that a user can get wrong."""
-    if x0.ndim != 2 or x0.shape[1] != 3 or len(x0) == 0:
-        raise InputError(f"x0 has shape {tuple(x0.shape)}: give positions of at least one particle, (N, 3)")
-    if x0.dtype not in (torch.float32, torch.float64):
-        raise InputError(f"x0 is {x0.dtype}: use float32 or float64")
-    N = len(x0)
-    shapes = {
-        "v0": (v0, [(N, 3), (3,)]),
-        "mass": (mass, [(N,)]),
-        "vol0": (vol0, [(N,)]),
-        "F0": (F0, [(N, 3, 3)]),
-        "C0": (C0, [(N, 3, 3)]),
-    }
-    for name, (value, allowed) in shapes.items():
-        if value is None:
-            continue
-        if tuple(value.shape) not in allowed:
-            expected = " or ".join(map(str, allowed))
-            raise InputError(f"{name} has shape {tuple(value.shape)}: expected {expected}")
-        if value.dtype != x0.dtype or value.device != x0.device:
-            raise InputError(
-                f"{name} is {value.dtype} on {value.device}, x0 is {x0.dtype} on {x0.device}: give both alike"
-            )
-        if not torch.isfinite(value).all():
-            raise InputError(f"{name} has a value that is not finite")
-    for name, value in (("mass", mass), ("vol0", vol0)):
-        if not (value > 0).all():
-            raise InputError(f"{name} must be positive for every particle")
-    if tracers is not None and (tracers.ndim != 2 or tracers.shape[1] != 3 or tracers.dtype != x0.dtype):
-        raise InputError(f"tracers: give positions of shape (M, 3) as {x0.dtype}")
+def _check_inside(model: MPMModel, x0: Tensor) -> None:
+    """Every particle must see three nodes along each axis."""
     low, high = model.stencil_range
     outside = ~((x0 >= low) & (x0 <= high)).all(dim=1)
     if outside.any():
         p = int(outside.nonzero()[0])
         place = ", ".join(f"{value:.4g}" for value in x0[p].tolist())
         raise InputError(
-            f"{int(outside.sum())} of {N} particles start outside the grid (first: {p}, at {place} m): place "
-            f" the object within [{low:.4g}, {high:.4g}] m on every axis"
+            f"{int(outside.sum())} of {len(x0)} particles start outside the grid (first: {p}, at {place} m): place "
+            f"the object within [{low:.4g}, {high:.4g}] m on every axis"
         )

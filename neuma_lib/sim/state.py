@@ -1,4 +1,4 @@
-"""States of the particles at the frames that somebody asked for."""
+"""The particles that a rollout starts from, and their states at the frames that it returns."""
 
 from __future__ import annotations
 
@@ -7,6 +7,65 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+
+from neuma_lib.errors import InputError
+
+
+@dataclass(frozen=True)
+class State:
+    """N particles at one time. Their device and precision (float32 or float64) are those of x.
+
+    Attributes:
+        x: positions [m], shape (N, 3).
+        v: velocities [m/s], shape (N, 3), or (3,): one velocity that all particles share.
+        mass: particle masses [kg], shape (N,).
+        vol0: particle volumes in the undeformed body [m^3], shape (N,).
+        F: elastic deformation gradients, shape (N, 3, 3); None makes it the identity.
+        C: APIC affine velocities [1/s], shape (N, 3, 3); None makes it zero.
+
+    Raises:
+        InputError: shapes, precisions or devices that do not fit, a value that is not finite, a mass or a volume
+            that is not positive.
+    """
+
+    x: Tensor
+    v: Tensor
+    mass: Tensor
+    vol0: Tensor
+    F: Tensor | None = None
+    C: Tensor | None = None
+
+    def __post_init__(self):
+        x = self.x
+        if x.ndim != 2 or x.shape[1] != 3 or len(x) == 0:
+            raise InputError(f"x has shape {tuple(x.shape)}: give positions of at least one particle, (N, 3)")
+        if x.dtype not in (torch.float32, torch.float64):
+            raise InputError(f"x is {x.dtype}: use float32 or float64")
+        N = len(x)
+        eye = torch.eye(3, dtype=x.dtype, device=x.device).expand(N, 3, 3)
+        if self.F is None:
+            object.__setattr__(self, "F", eye)
+        if self.C is None:
+            object.__setattr__(self, "C", torch.zeros_like(eye))
+        shapes = {"x": [(N, 3)], "v": [(N, 3), (3,)], "mass": [(N,)], "vol0": [(N,)]}
+        for name, allowed in (shapes | {"F": [(N, 3, 3)], "C": [(N, 3, 3)]}).items():
+            value = getattr(self, name)
+            if tuple(value.shape) not in allowed:
+                expected = " or ".join(map(str, allowed))
+                raise InputError(f"{name} has shape {tuple(value.shape)}: expected {expected}")
+            if value.dtype != x.dtype or value.device != x.device:
+                raise InputError(
+                    f"{name} is {value.dtype} on {value.device}, x is {x.dtype} on {x.device}: give both alike"
+                )
+            if not torch.isfinite(value).all():
+                raise InputError(f"{name} has a value that is not finite")
+            if name in ("mass", "vol0") and not (value > 0).all():
+                raise InputError(f"{name} must be positive for every particle")
+
+    @property
+    def motion(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """What changes in time: x, v (N, 3), F and C."""
+        return self.x, self.v.expand_as(self.x), self.F, self.C
 
 
 @dataclass(frozen=True)

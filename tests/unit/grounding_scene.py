@@ -62,10 +62,7 @@ def observe(body: Reconstruction, v0, frames, spec=TRUTH, model=MODEL, size: int
         path = rollout(
             model,
             analytic_law(spec, model.dt).to(body.x0.device),
-            body.x0,
-            torch.as_tensor(v0).to(body.x0),
-            body.mass,
-            body.vol0,
+            body.state(torch.as_tensor(v0).to(body.x0)),
             steps=frames[-1],
             frames=frames,
         )

@@ -16,6 +16,7 @@ from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.sim.model import Body
 from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State
 from neuma_lib.splatting.observation import Observation
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -30,7 +31,8 @@ def throw(law, device, dtype):
     trained = [p for p in law.parameters() if p.requires_grad]
     x0 = body.x0.to(device).requires_grad_()
     v0 = torch.tensor([0.3, -2.0, 0.1], dtype=dtype, device=device, requires_grad=True)
-    path = rollout(MODEL, law, x0, v0, body.mass.to(device), body.vol0.to(device), steps=STEPS, frames=FRAMES)
+    state = State(x0, v0, body.mass.to(device), body.vol0.to(device))
+    path = rollout(MODEL, law, state, steps=STEPS, frames=FRAMES)
     weight = torch.linspace(0.5, 1.5, path.x.numel(), dtype=dtype, device=device).reshape(path.x.shape)
     grads = torch.autograd.grad((weight * path.x.square()).sum(), [x0, v0, *trained])
     return path.x.detach().cpu().double(), [g.cpu().double() for g in grads]
@@ -77,7 +79,7 @@ def drop():
     law.attach_adaptor(rank=4, seed=1)
     law = law.to("cuda")
     v0 = torch.tensor([0.3, -2.0, 0.1], device="cuda")
-    return law, (MODEL, law, body.x0, v0, body.mass, body.vol0)
+    return law, (MODEL, law, body.state(v0))
 
 
 def gradient(law, arguments, **options):
@@ -120,7 +122,7 @@ def test_graphs_replay_what_was_launched(drop, options):
 def test_graphs_of_one_body_survive_a_rollout_of_two(drop):
     """Other weights at other places in between: nothing recorded may read the old ones."""
     law, arguments = drop
-    count = len(arguments[2])
+    count = len(arguments[2].x)
     pair = [Body(law, 0, count // 2), Body(copy.deepcopy(law), count // 2, count)]
     x, grad = gradient(law, arguments)
     for _ in range(4):

@@ -147,14 +147,10 @@ def test_bodies_far_apart_move_as_they_do_alone():
     frames, both = (0, 60, 120), join(bodies)
     counts = [len(body.x0) for body in bodies]
     v0 = each_its_own(velocities, counts)
-    together = rollout(
-        model, consecutive(laws, counts), both.x0, v0, both.mass, both.vol0, steps=120, frames=frames
-    )
+    together = rollout(model, consecutive(laws, counts), both.state(v0), steps=120, frames=frames)
     start = 0
     for body, law, velocity in zip(bodies, laws, velocities, strict=True):
-        alone = rollout(
-            model, law, body.x0, torch.tensor(velocity), body.mass, body.vol0, steps=120, frames=frames
-        )
+        alone = rollout(model, law, body.state(torch.tensor(velocity)), steps=120, frames=frames)
         part = together.x[:, start : start + len(body.x0)]
         torch.testing.assert_close(part, alone.x, atol=2e-6, rtol=0)
         start += len(body.x0)

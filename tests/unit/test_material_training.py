@@ -18,6 +18,7 @@ from neuma_lib.fitting.material import (
 )
 from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State
 
 FRAMES = (0, 20, 40, 60)
 V0 = torch.tensor([0.0, -1.5, 0.0], dtype=torch.float64)
@@ -50,7 +51,7 @@ def test_gradient_of_the_whole_chain_from_adaptor_to_image_loss(problem):
             p.add_(0.05 * torch.randn(p.shape, generator=generator, dtype=p.dtype))
 
     def value():
-        path = rollout(MODEL, law, body.x0, V0, body.mass, body.vol0, steps=60, frames=FRAMES)
+        path = rollout(MODEL, law, body.state(V0), steps=60, frames=FRAMES)
         return loss(path).mean()
 
     grads = torch.autograd.grad(value(), parameters)
@@ -142,9 +143,8 @@ def test_nothing_to_train_is_an_input_error(problem):
 def test_particles_supervise_through_the_same_loop(problem):
     body, pixels = problem
     with torch.no_grad():
-        path = rollout(
-            MODEL, stiff_random_law(), body.x0, V0, body.mass, body.vol0 * 0.5, steps=60, frames=FRAMES
-        )
+        softer = State(body.x0, V0, body.mass, body.vol0 * 0.5)
+        path = rollout(MODEL, stiff_random_law(), softer, steps=60, frames=FRAMES)
     result = train((body, ParticleLoss(FRAMES, path.x)))
     assert result.best_loss < result.history.loss[0]
 

@@ -95,7 +95,7 @@ def test_throws_stay_in_the_box_and_hit_its_floor():
     for _ in range(4):
         throw = random_throw(law, generator, settings)
         low, high = throw.model.free_range
-        assert bool(((throw.x0 > low) & (throw.x0 < high)).all())
+        assert bool(((throw.state.x > low) & (throw.state.x < high)).all())
         assert throw.model.courant(law, 1000.0) <= 0.5 + 1e-3
         elastic, trial = visited_stretches(throw, law)
         assert elastic.shape[1] == trial.shape[1] == 3

@@ -11,6 +11,7 @@ from neuma_lib.errors import InputError
 from neuma_lib.sim import memory as storage
 from neuma_lib.sim.model import Body, MPMModel
 from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State
 
 IN_THE_AIR = MPMModel(14, DT)
 ON_A_STICKY_FLOOR = MPMModel(14, DT, boundary={"y_min": "sticky"})  # stops its nodes always: no switch
@@ -40,7 +41,7 @@ def random_loss(seed=0):
 def simulate(model, law, start, mass, vol0, frames, **options):
     """States (x, v, F, C) at the frames."""
     x, v, F, C = start
-    path = rollout(model, law, x, v, mass, vol0, F0=F, C0=C, steps=frames[-1], frames=frames, **options)
+    path = rollout(model, law, State(x, v, mass, vol0, F, C), steps=frames[-1], frames=frames, **options)
     return path.x, path.v, path.F, path.C
 
 
@@ -245,7 +246,8 @@ def test_gradient_through_a_skipped_flight(frames):
     def grads(skip):
         x = x0.clone().requires_grad_()
         v = torch.tensor([0.3, -2.0, 0.1], dtype=torch.float64, requires_grad=True)
-        path = rollout(model, law, x, v, mass, vol0, steps=frames[-1], frames=frames, skip_free_flight=skip)
+        state = State(x, v, mass, vol0)
+        path = rollout(model, law, state, steps=frames[-1], frames=frames, skip_free_flight=skip)
         loss = random_loss()((path.x, path.v, path.F, path.C))
         return torch.autograd.grad(loss, (x, v, *parameters), materialize_grads=True)
 

@@ -26,9 +26,7 @@ def paths(body, spec):
     """The same motion at the frames, and with its total deformation."""
 
     def run(frames):
-        return rollout(
-            MODEL, analytic_law(spec), body.x0, V0, body.mass, body.vol0, steps=FRAMES[-1], frames=frames
-        )
+        return rollout(MODEL, analytic_law(spec), body.state(V0), steps=FRAMES[-1], frames=frames)
 
     return run(FRAMES), total_deformation(run(every_step(FRAMES)), MODEL.dt, FRAMES)
 

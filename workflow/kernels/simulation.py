@@ -7,6 +7,7 @@ import torch
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State
 
 SPEC = {
     "elasticity": {"name": "hencky", "E": 1e4, "nu": 0.2},
@@ -23,10 +24,7 @@ def compile_kernels(device: torch.device) -> None:
         path = rollout(
             MPMModel(grid=8, dt=1e-3),
             analytic_law(SPEC),
-            x,
-            v0,
-            1e3 * vol0,
-            vol0,
+            State(x, v0, 1e3 * vol0, vol0),
             steps=2,
             frames=(0, 2),
             tracers=x[:2] + 0.01,
