@@ -24,7 +24,7 @@ JUDGED = "chamfer_excess"
 
 TRAINING_DIVERGED, ROLLOUT_DIVERGED = "†", "‡"
 FOOTNOTES = {
-    TRAINING_DIVERGED: "The training diverged; its last good state is shown.",
+    TRAINING_DIVERGED: "The training diverged; its best state is shown.",
     ROLLOUT_DIVERGED: "The predicted motion became non-finite; later frames hold the last finite state.",
 }
 """Signs behind numbers, and what they mean."""

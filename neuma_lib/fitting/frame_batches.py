@@ -13,14 +13,14 @@ import torch
 from torch import Tensor
 
 
-def parts(count: int, size: int) -> Iterator[slice]:
+def frame_batches(count: int, size: int) -> Iterator[slice]:
     """Consecutive ranges of at most ``size`` frames that cover ``count``, as equal in length as can be."""
     pieces = max(1, -(-count // size))
     edges = [piece * count // pieces for piece in range(pieces + 1)]
     return (slice(first, last) for first, last in zip(edges, edges[1:], strict=False))
 
 
-def framewise(function: Callable[..., Tensor], size: int, *states: Tensor) -> Tensor:
+def evaluate_in_batches(function: Callable[..., Tensor], size: int, *states: Tensor) -> Tensor:
     """``function`` of T frames, evaluated on ``size`` frames at a time; differentiable in the states, once.
 
     Args:
@@ -33,17 +33,19 @@ def framewise(function: Callable[..., Tensor], size: int, *states: Tensor) -> Te
         All values, shape (T,).
     """
     if torch.is_grad_enabled() and any(state.requires_grad for state in states):
-        return _Framewise.apply(function, size, *states)
-    return torch.cat([function(part, *(s[part] for s in states)) for part in parts(len(states[0]), size)])
+        return _EvaluateInBatches.apply(function, size, *states)
+    return torch.cat(
+        [function(part, *(s[part] for s in states)) for part in frame_batches(len(states[0]), size)]
+    )
 
 
-class _Framewise(torch.autograd.Function):
+class _EvaluateInBatches(torch.autograd.Function):
     @staticmethod
     def forward(ctx, function, size, *states):
         wanted = [i for i, needed in enumerate(ctx.needs_input_grad[2:]) if needed]
         grads: list[Tensor | None] = [None] * len(states)
         values = []
-        for part in parts(len(states[0]), size):
+        for part in frame_batches(len(states[0]), size):
             value, found = _value_and_gradients(function, part, states, wanted)
             values.append(value)
             for i, grad in zip(wanted, found, strict=True):

@@ -25,9 +25,10 @@ from torch import Tensor
 
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
-from neuma_lib.fitting.frame_batches import framewise
+from neuma_lib.fitting.frame_batches import evaluate_in_batches
 from neuma_lib.fitting.image_loss import mean_squared_error
 from neuma_lib.geometry.chamfer import chamfer_loss
+from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
@@ -59,8 +60,8 @@ class PixelLoss:
         body: what is rendered.
         observation: the video.
         covariance_gradient: whether gradients reach the deformation gradients through the covariances.
-        frames_per_batch: frames rendered at a time, forward and backward (`framewise`); None: as many as a render of
-            moderate memory allows. The value does not depend on it.
+        frames_per_batch: frames rendered at a time, forward and backward; None: as many as a render of moderate memory
+            allows. The value does not depend on it.
         total: whether the total deformation stretches the Gaussians, not its elastic part.
     """
 
@@ -78,7 +79,7 @@ class PixelLoss:
         self._batch = self.frames_per_batch or self._renderer.frames_per_batch
 
     def __call__(self, path: Trajectory) -> Tensor:
-        return framewise(self._losses, self._batch, path.x, path.F)
+        return evaluate_in_batches(self._losses, self._batch, path.x, path.F)
 
     def _losses(self, part: slice, x: Tensor, F: Tensor) -> Tensor:
         return mean_squared_error(self._renderer(x, F), self.observation.stored(part))
@@ -116,10 +117,10 @@ class MaterialSettings:
         frame_weight_start: d of the frame weights d^k at the first iteration; it rises to 1 over the first third.
         frame_weight_periods: k counts this many equal parts of the video, so that early frames are fitted first.
         warm_up: iterations over which the rates rise linearly from zero.
-        recovery_growth: after a return to the last good state the rates are halved; each accepted iteration
-            multiplies them by this, up to their full size.
+        recovery_growth: after a return to the best state the rates are halved; each accepted iteration multiplies
+            them by this, up to their full size.
         diverged_ratio: a loss above this multiple of the best one so far (at equal frame weights) counts as diverged.
-        max_recoveries: after so many returns to the last good state training ends there, marked as unstable.
+        max_recoveries: after more returns to the best state than this, training ends there, marked as unstable.
         checkpoint_every: iterations between checkpoints.
         memory: most GiB for what a rollout's gradient keeps; with less, steps are computed again, see `rollout`.
             null: no limit.
@@ -168,7 +169,7 @@ class TrainedMaterial:
     def summary(self) -> str:
         """One line for people."""
         first = self.history.loss[0]
-        note = "" if self.stable else "; UNSTABLE: last good state kept"
+        note = "" if self.stable else "; UNSTABLE: best state kept"
         moves = f", {len(self.history.recoveries)} recoveries" if self.history.recoveries else ""
         return (
             f"loss {first:.3e} -> {self.best_loss:.3e} (x{first / max(self.best_loss, 1e-30):.1f} lower) "
@@ -231,14 +232,6 @@ def train_material(
     )
 
 
-class Checkpoint(Protocol):
-    """A place that keeps one state of the loop across kills (`neuma_lib.io.checkpoint`)."""
-
-    def load(self) -> dict | None: ...
-
-    def save(self, state: dict) -> None: ...
-
-
 class _Loop:
     """The state of training, and one step of it."""
 
@@ -258,27 +251,27 @@ class _Loop:
         )
         self.iteration, self.lr_scale, self.ended = 0, 1.0, False
         self.history, self.first_loss = History(), None
-        self.best = {"loss": math.inf, "iteration": 0, "law": copy.deepcopy(law.state_dict())}
-        self.good: dict | None = None
+        self.best = {"loss": math.inf, "iteration": 0, **self._snapshot()}
 
     def advance(self) -> None:
-        """One accepted optimiser step, or a return to the last good state."""
+        """One accepted optimiser step, or a return to the best state."""
         started = time.perf_counter()
         try:
             frame_losses = self._frame_losses()
             value = float(frame_losses.detach().mean())
             if not math.isfinite(value):
                 raise NonFiniteError("material", f"the loss is not finite at iteration {self.iteration}")
-            if value > self.settings.diverged_ratio * max(self.best["loss"], 1e-12) and self.good is not None:
+            if value > self.settings.diverged_ratio * max(self.best["loss"], 1e-12):
                 raise NonFiniteError(
                     "material", f"loss {value:.3e} against a best of {self.best['loss']:.3e}"
                 )
+            # Taken before the backward pass, which changes the accumulated gradients, but kept only if it succeeds.
+            best = self._better_state(value)
             norms, weighted = self._backward(frame_losses)
         except NonFiniteError as error:
             self._recover(error)
             return
-        self._keep_if_best(value)
-        self.good = self._snapshot()
+        self.best = best
         self._step()
         self.history.loss.append(value)
         self.history.weighted_loss.append(weighted)
@@ -299,7 +292,7 @@ class _Loop:
         except NonFiniteError:
             return
         if math.isfinite(value):
-            self._keep_if_best(value)
+            self.best = self._better_state(value)
 
     def _frame_losses(self) -> Tensor:
         body, frames = self.body, self.loss.frames
@@ -342,29 +335,42 @@ class _Loop:
             group["lr"] = group["base_lr"] * self.lr_scale * schedule
         self.optimizer.step()
 
-    def _keep_if_best(self, value: float) -> None:
+    def _better_state(self, value: float) -> dict:
+        """The present state if its loss is the lowest so far, else the best one."""
         if value < self.best["loss"]:
-            law = copy.deepcopy(self.law.state_dict())
-            self.best = {"loss": value, "iteration": self.iteration, "law": law}
+            return {"loss": value, "iteration": self.iteration, **self._snapshot()}
+        return self.best
 
     def _snapshot(self) -> dict:
+        """Copies of what an optimiser step changes or depends on."""
         return {
             "law": copy.deepcopy(self.law.state_dict()),
             "optimizer": copy.deepcopy(self.optimizer.state_dict()),
+            "gradients": [None if p.grad is None else p.grad.clone() for p in self._parameters()],
         }
 
+    def _restore(self, state: dict) -> None:
+        self.law.load_state_dict(state["law"])
+        self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
+        for parameter, gradient in zip(self._parameters(), state["gradients"], strict=True):
+            # Counts where gradients are not zeroed; a checkpoint may come from another device.
+            parameter.grad = None if gradient is None else gradient.to(parameter, copy=True)
+
     def _recover(self, error: NonFiniteError) -> None:
-        """Return to the state before the diverging step, with half the learning rate."""
-        if self.good is None:
+        """Return to the best state as a whole (law, optimizer, gradients), with half the learning rates.
+
+        Not to the state before the diverging step: its loss may already have grown to almost `diverged_ratio` times
+        the best one. The schedules of rates and frame weights go on, so the number of iterations stays bounded.
+        """
+        if not math.isfinite(self.best["loss"]):
             raise error
         self.lr_scale /= 2
-        self.law.load_state_dict(self.best["law"])
-        self.optimizer.load_state_dict(copy.deepcopy(self.good["optimizer"]))
-        self.optimizer.zero_grad(set_to_none=True)
+        self._restore(self.best)
         entry = {"iteration": self.iteration, "reason": str(error), "lr_scale": self.lr_scale}
         self.history.recoveries.append(entry)
         self.log(
-            f"iteration {self.iteration}: {error}; back to the last good state, rates x{self.lr_scale:g}"
+            f"iteration {self.iteration}: {error}; back to the best state, that of iteration"
+            f" {self.best['iteration']}, rates x{self.lr_scale:g}"
         )
         if len(self.history.recoveries) > self.settings.max_recoveries:
             self.ended = True
@@ -378,21 +384,15 @@ class _Loop:
             "first_loss": self.first_loss,
             "history": copy.deepcopy(self.history.__dict__),
             "best": copy.deepcopy(self.best),
-            "good": copy.deepcopy(self.good),
-            "gradients": [None if p.grad is None else p.grad.clone() for p in self._parameters()],
             **self._snapshot(),
         }
 
     def load_state_dict(self, state: dict) -> None:
         """Continue from a `state_dict`."""
-        for key in ("iteration", "lr_scale", "ended", "first_loss", "best", "good"):
+        for key in ("iteration", "lr_scale", "ended", "first_loss", "best"):
             setattr(self, key, state[key])
         self.history = History(**state["history"])
-        self.law.load_state_dict(state["law"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        for parameter, gradient in zip(self._parameters(), state["gradients"], strict=True):
-            # Counts where gradients are not zeroed; a checkpoint may come from another device.
-            parameter.grad = None if gradient is None else gradient.to(parameter)
+        self._restore(state)
 
     def _parameters(self) -> list[torch.nn.Parameter]:
         return [p for parameters in self.nets.values() for p in parameters]

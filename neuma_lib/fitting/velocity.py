@@ -22,7 +22,7 @@ from torch import Tensor
 
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
-from neuma_lib.fitting.frame_batches import parts
+from neuma_lib.fitting.frame_batches import frame_batches
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import MPMModel, contact_clearance
 from neuma_lib.sim.rollout import rollout
@@ -215,7 +215,7 @@ class _Residuals:
         return _Linearisation(curvature.cpu().numpy(), scores.cpu().numpy(), cost, rms)
 
     def _parts(self):
-        return parts(len(self.seen.frames), self._renderer.frames_per_batch)
+        return frame_batches(len(self.seen.frames), self._renderer.frames_per_batch)
 
     def _residual(self, unknowns: np.ndarray, part: slice) -> Tensor:
         return self._render(unknowns, part) - self.seen.colours(part)

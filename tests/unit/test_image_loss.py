@@ -12,7 +12,7 @@ from test_binding import random_gaussians, random_particles
 from neuma_lib.coupling.deformation import deform
 from neuma_lib.coupling.particle_binding import bind
 from neuma_lib.errors import InputError
-from neuma_lib.fitting.frame_batches import framewise, parts
+from neuma_lib.fitting.frame_batches import evaluate_in_batches, frame_batches
 from neuma_lib.fitting.image_loss import mean_squared_error
 from neuma_lib.fitting.material import PixelLoss
 from neuma_lib.sim.state import Trajectory
@@ -141,7 +141,7 @@ def test_states_of_other_particles_are_refused():
 
 @pytest.mark.parametrize(("count", "size"), [(1, 1), (7, 3), (8, 4), (33, 8), (5, 100)])
 def test_parts_cover_all_frames_evenly(count, size):
-    found = list(parts(count, size))
+    found = list(frame_batches(count, size))
     assert [i for part in found for i in range(count)[part]] == list(range(count))
     lengths = [part.stop - part.start for part in found]
     assert max(lengths) <= size and max(lengths) - min(lengths) <= 1
@@ -159,7 +159,7 @@ def test_frames_in_parts_give_the_value_and_gradient_of_all_at_once(size):
 
     weight = normal(9, seed=9)
     whole = function(slice(None), x, F, unused)
-    split = framewise(function, size, x, F, unused)
+    split = evaluate_in_batches(function, size, x, F, unused)
     assert torch.allclose(split, whole, rtol=1e-14)
     expected = torch.autograd.grad(whole, (x, F), weight)
     found = torch.autograd.grad(split, (x, F, unused), weight, allow_unused=True, retain_graph=True)
@@ -169,7 +169,7 @@ def test_frames_in_parts_give_the_value_and_gradient_of_all_at_once(size):
     again = torch.autograd.grad(split, (x, F), weight)
     assert torch.equal(again[0], found[0]) and torch.equal(again[1], found[1])
     with torch.no_grad():
-        assert torch.equal(framewise(function, size, x, F, unused), split)
+        assert torch.equal(evaluate_in_batches(function, size, x, F, unused), split)
 
 
 def test_nothing_of_a_part_outlives_it():
@@ -190,7 +190,7 @@ def test_nothing_of_a_part_outlives_it():
             return grad[:, None].expand(-1, 2)
 
     x = torch.ones(6, 2, requires_grad=True)
-    framewise(lambda _, x: Held.apply(x), 2, x).sum().backward()
+    evaluate_in_batches(lambda _, x: Held.apply(x), 2, x).sum().backward()
     assert len(alive) == 3 and torch.equal(x.grad, torch.ones(6, 2))
 
 

@@ -1,6 +1,7 @@
 """The training loop: gradients of the whole chain, progress, recovery, and resuming."""
 
 import copy
+import dataclasses
 
 import numpy as np
 import pytest
@@ -91,16 +92,17 @@ def test_training_lowers_the_loss_and_moves_the_adaptor_only(problem):
 
 
 class MemoryCheckpoint:
+    """Keeps every state that it is given; interrupts after ``fail_after`` of them."""
+
     def __init__(self, fail_after=None):
-        self.state, self.saves, self.fail_after = None, 0, fail_after
+        self.states, self.fail_after = [], fail_after
 
     def load(self):
-        return copy.deepcopy(self.state)
+        return copy.deepcopy(self.states[-1]) if self.states else None
 
     def save(self, state):
-        self.state = copy.deepcopy(state)
-        self.saves += 1
-        if self.saves == self.fail_after:
+        self.states.append(copy.deepcopy(state))
+        if len(self.states) == self.fail_after:
             raise KeyboardInterrupt
 
 
@@ -110,19 +112,56 @@ def test_a_killed_run_resumes_to_the_same_bits(problem):
     with pytest.raises(KeyboardInterrupt):
         train(problem, checkpoint=keep)
     resumed = train(problem, checkpoint=keep).law.adaptor_state()
-    assert keep.saves == 4
+    assert len(keep.states) == 4
     for name, value in whole.items():
         assert torch.equal(value, resumed[name]), name
 
 
-def test_a_diverging_step_returns_to_the_last_good_state(problem):
-    messages = []
+class ScriptedLoss:
+    """A loss whose value at the n-th call is multiplied by the n-th factor."""
+
+    def __init__(self, loss, factors):
+        self.loss, self.factors = loss, list(factors)
+        self.frames, self.total = loss.frames, loss.total
+
+    def __call__(self, path):
+        return self.factors.pop(0) * self.loss(path)
+
+
+@pytest.mark.parametrize("zero_gradients", [True, False])
+def test_recovery_returns_to_the_best_state_as_a_whole(problem, zero_gradients):
+    """Law, optimizer and accumulated gradients are those of the best iteration, which was not the last good one; the
+    step from there is shorter than the first time."""
     body, loss = problem
-    wild = MaterialSettings(iterations=8, lr_elastic=50.0, lr_plastic=5.0, max_recoveries=3)
+    keep, messages = MemoryCheckpoint(), []
+    # iteration 0 accepted; 1 the best; 2 worse, but accepted; 3 diverged; 3 again, from the best state
+    scripted = ScriptedLoss(loss, [1.0, 0.1, 0.2, 100.0, 0.1, 0.1])
+    settings = dataclasses.replace(SETTINGS, iterations=4, checkpoint_every=1, zero_gradients=zero_gradients)
+    train_material(
+        MODEL, stiff_random_law(), body, V0, scripted, settings, checkpoint=keep, log=messages.append
+    )
+    best, after_best, _, recovered, again = keep.states  # each is the state after its iteration's step
+    assert [len(state["history"]["recoveries"]) for state in keep.states] == [0, 0, 0, 1, 1]
+    assert recovered["lr_scale"] == 0.5 and "back to the best state, that of iteration 1" in messages[0]
+    for key in ("law", "optimizer", "gradients"):
+        torch.testing.assert_close(recovered[key], best[key], rtol=0, atol=0)
+
+    def step(state):
+        return sum(float((state["law"][k] - w).square().sum()) for k, w in best["law"].items()) ** 0.5
+
+    assert 0 < step(again) < step(after_best)
+
+
+def test_training_ends_marked_after_too_many_recoveries(problem):
+    messages = []
+    wild = MaterialSettings(
+        iterations=8, lr_elastic=50.0, lr_plastic=5.0, max_recoveries=3, recovery_growth=1.0
+    )
+    body, loss = problem
     law = stiff_random_law()
     result = train_material(MODEL, law, body, V0, loss, wild, log=messages.append)
-    assert result.history.recoveries and any("last good state" in m for m in messages)
-    assert result.history.recoveries[0]["lr_scale"] == 0.5
+    assert len(result.history.recoveries) == len(messages) == 4 and not result.stable
+    assert [entry["lr_scale"] for entry in result.history.recoveries] == [0.5, 0.25, 0.125, 0.0625]
     assert np.isfinite(result.best_loss) and result.best_loss <= result.history.loss[0]
     assert all(torch.isfinite(p).all() for p in law.parameters())
 
