@@ -20,7 +20,7 @@ for figure, kind in DATA_FILES.items():
             pdf=f"{FIGURES}/{figure}.pdf",
         params:
             figure=figure,
-            drawing=code_digest(ROOT / "neuma_lib" / "evaluation" / "figures" / f"{figure}.py", ROOT),
+            drawing=code_digest(ROOT / "neuma_lib" / "evaluation" / "figures" / f"{figure}.py"),
         script:
             "../scripts/figure.py"
 
