@@ -18,7 +18,10 @@ class AppearanceConfig(Section):
     colors: dict[str, str] = Field(
         description="part of the shape -> sRGB colour '#rrggbb'; 'body' for all others"
     )
-    accent: str = Field("", description="colour of the soft patches; empty: a darker shade of the part's own")
+    accent: str = Field(
+        "",
+        description="colour of the soft patches on the body; other parts, and all if empty, get a darker shade",
+    )
     contrast: float = Field(0.5, ge=0, le=1, description="strength of the patches")
     scale: float = Field(0.045, gt=0, description="size of the patches [m]")
     seed: int = Field(0, description="seed of the patches")

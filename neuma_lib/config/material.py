@@ -67,7 +67,7 @@ class MaterialConfig(Section):
     recovery_growth: float = Field(
         1.1,
         ge=1,
-        description="after a return to the last good state the rates are halved; each accepted iteration multiplies "
+        description="after a return to the best state the rates are halved; each accepted iteration multiplies "
         "them by this, up to their full size",
     )
     diverged_ratio: float = Field(
@@ -78,7 +78,7 @@ class MaterialConfig(Section):
     max_recoveries: int = Field(
         6,
         ge=0,
-        description="after so many returns to the last good state training ends there, marked as unstable",
+        description="after more returns to the best state than this, training ends there, marked as unstable",
     )
     checkpoint_every: int = Field(10, ge=1, description="iterations between checkpoints")
     memory: float | None = Field(
