@@ -20,7 +20,6 @@ include: "workflow/rules/evaluation.smk"
 include: "workflow/rules/experiments.smk"
 include: "workflow/rules/metrics.smk"
 include: "workflow/rules/paper.smk"
-include: "workflow/rules/figure_inputs.smk"
 include: "workflow/rules/figures.smk"
 
 

@@ -1,10 +1,4 @@
-"""Measures of motion and of images (paper Sec. 4.1), and the Chamfer distance as a loss.
-
-The Chamfer distance of two point sets is the mean squared distance to the nearest point of the other set,
-summed over both directions, times 1e4. Between filled volumes it also holds a sampling floor, the distance
-of two samplings of one and the same body, which falls with the density of the points: see
-`neuma_lib.evaluation.motion`.
-"""
+"""Measures of motion and of images (paper Sec. 4.1); the Chamfer distance is in `neuma_lib.geometry.chamfer`."""
 
 from __future__ import annotations
 
@@ -22,22 +16,16 @@ def tracer_rmse(a: Tensor, b: Tensor) -> Tensor:
     return (a.double() - b.double()).square().sum(-1).mean(-1).sqrt().cpu()
 
 
-def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio [dB] of images in [0, 1], (H, W, 3); mask (H, W) keeps the pixels that
-    count.
+def mean_height(x: np.ndarray | Tensor, mass: np.ndarray | Tensor) -> list[float]:
+    """Height of the centre of mass [m] at T times, of particles x (T, N, 3) [m] of masses (N,)."""
+    mass = np.asarray(mass, np.float64)
+    return (np.asarray(x, np.float64)[..., 1] @ (mass / mass.sum())).tolist()
 
-    Raises:
-        InputError: shapes differ, or the mask keeps nothing.
-    """
-    image, reference = np.asarray(image, np.float64), np.asarray(reference, np.float64)
-    if image.shape != reference.shape:
-        raise InputError(f"psnr: images of shapes {image.shape} and {reference.shape} do not match")
-    error = (image - reference) ** 2
-    if mask is not None:
-        if not np.any(mask):
-            raise InputError("psnr: the mask is empty, so no pixel can be measured")
-        error = error[np.asarray(mask, bool)]
-    mse = float(error.mean())
+
+def psnr(image: np.ndarray, reference: np.ndarray) -> float:
+    """Peak signal-to-noise ratio [dB] of images in [0, 1], (H, W, 3). Raises InputError when shapes differ."""
+    image, reference = _alike("psnr", image, reference)
+    mse = float(((image - reference) ** 2).mean())
     return float("inf") if mse == 0 else -10.0 * np.log10(mse)
 
 
@@ -47,9 +35,7 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> float:
     Raises:
         InputError: shapes differ, or a side is shorter than the window's 11 pixels.
     """
-    image, reference = np.asarray(image, np.float64), np.asarray(reference, np.float64)
-    if image.shape != reference.shape:
-        raise InputError(f"ssim: images of shapes {image.shape} and {reference.shape} do not match")
+    image, reference = _alike("ssim", image, reference)
     if min(image.shape[:2]) < 11:
         raise InputError(f"ssim: an image of {image.shape[:2]} pixels is smaller than the window of 11")
     return float(
@@ -63,3 +49,11 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> float:
             use_sample_covariance=False,
         )
     )
+
+
+def _alike(name: str, image: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Both as float64. Raises InputError when their shapes differ."""
+    image, reference = np.asarray(image, np.float64), np.asarray(reference, np.float64)
+    if image.shape != reference.shape:
+        raise InputError(f"{name}: images of shapes {image.shape} and {reference.shape} do not match")
+    return image, reference

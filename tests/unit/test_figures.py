@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import ast
+import json
 import re
-import subprocess
-import sys
 from importlib import import_module
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
 
 import matplotlib
 import numpy as np
@@ -22,18 +23,22 @@ from matplotlib.textpath import TextPath
 from PIL import Image
 
 from neuma_lib.errors import InputError
-from neuma_lib.evaluation.figures import style
-from neuma_lib.evaluation.figures.grid import TITLE, broken
-from neuma_lib.evaluation.figures.panels import Panels, load_panels, save_panels
-from neuma_lib.evaluation.figures.pictures import (
-    cropped,
-    evenly,
-    frontal,
-    magnified,
-    mean_height,
-    monotone_frames,
+from neuma_lib.evaluation.figures import (
+    ablation_gradients,
+    ch_dist_curve,
+    image_quality,
 )
-from neuma_lib.evaluation.response import Visited, largest_shear_stress, sheared, uniaxial, yielding
+from neuma_lib.evaluation.figures.lora_alphav import monotone_frames
+from neuma_lib.evaluation.material_point import Visited, largest_shear_stress, sheared, uniaxial, yielding
+from neuma_lib.evaluation.plotting import style
+from neuma_lib.evaluation.plotting.image_grid import (
+    TITLE,
+    ImageGrid,
+    broken,
+    load_image_grid,
+    save_image_grid,
+)
+from neuma_lib.evaluation.plotting.rendering import cropped, evenly, frontal, magnified
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.spheres import draw_spheres
@@ -45,7 +50,7 @@ TITLES = {method: f"NeuMA {method[6:]}" for method in METHODS}
 SCENES = ["BouncyBall", "JellyDuck", "RubberPawn", "ClayCat", "SandFish", "HoneyBottle"]
 
 
-def pictures(rows: int, columns: int, numbers: dict, row_titles=None, column_titles=None) -> Panels:
+def pictures(rows: int, columns: int, numbers: dict, row_titles=None, column_titles=None) -> ImageGrid:
     """Coloured discs on white."""
     generator = np.random.default_rng(0)
     y, x = np.mgrid[:60, :48]
@@ -53,7 +58,7 @@ def pictures(rows: int, columns: int, numbers: dict, row_titles=None, column_tit
     for row in images:
         for image in row:
             image[(x - 24) ** 2 + (y - 40) ** 2 < 200] = generator.integers(0, 200, 3)
-    return Panels(
+    return ImageGrid(
         images,
         tuple(row_titles or (f"NeuMA w/o {i}" for i in range(rows))),
         tuple(column_titles or (f"{64 * j} ms" for j in range(columns))),
@@ -162,21 +167,18 @@ DATA = {
 }
 
 
-def drawing(name: str):
+def drawn(name: str) -> Figure:
     return import_module(f"neuma_lib.evaluation.figures.{name}").draw(DATA[name]())
 
 
 @pytest.mark.parametrize("name", DATA)
-def test_figure_is_ready_for_print(name, tmp_path):
-    figure = drawing(name)
-    png, pdf = tmp_path / "figure.png", tmp_path / "figure.pdf"
-    style.save(figure, png, pdf)
-    assert pdf.read_bytes().startswith(b"%PDF")
-    with Image.open(png) as image:
-        assert image.width in (round(style.PAGE * style.DPI), round(style.COLUMN * style.DPI))
-        assert len(image.convert("L").getcolors(1 << 20)) > 10  # not empty
+def test_figure_is_ready_for_print(name):
+    figure = drawn(name)
     width, height = figure.get_size_inches()
-    assert height < 9
+    assert width in (style.PAGE, style.COLUMN) and height < 9
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    assert len(np.unique(np.asarray(canvas.buffer_rgba())[..., 1])) > 10  # not empty
     texts = [t for t in figure.findobj(Text) if t.get_text().strip() and t.get_visible()]
     assert texts and min(text.get_fontsize() for text in texts) >= 6
     ticks = {
@@ -185,42 +187,87 @@ def test_figure_is_ready_for_print(name, tmp_path):
         for axis in (axes.xaxis, axes.yaxis)
         for label in [*axis.get_ticklabels(which="both"), axis.offsetText]
     }
-    renderer = FigureCanvasAgg(figure).get_renderer()
     for text in set(texts) - ticks:
-        box, page = text.get_window_extent(renderer), figure.bbox
+        box, page = text.get_window_extent(canvas.get_renderer()), figure.bbox
         inside = box.x0 > -1 and box.y0 > -1 and box.x1 < page.x1 + 1 and box.y1 < page.y1 + 1
         assert inside, f"{name}: '{text.get_text()}' leaves the page"
 
 
-@pytest.mark.parametrize("name", ["ch_dist_curve", "main_res"])
+@pytest.mark.parametrize("name", ["ablation_gradients", "uneven_mass"])
 def test_same_data_same_bytes(name, tmp_path):
-    for folder in "ab":
-        (tmp_path / folder).mkdir()
-        style.save(drawing(name), tmp_path / folder / "figure.png", tmp_path / folder / "figure.pdf")
-    for kind in ("png", "pdf"):
-        first, second = ((tmp_path / folder / f"figure.{kind}").read_bytes() for folder in "ab")
-        assert first == second
-
-
-def test_user_settings_of_matplotlib_do_not_matter():
+    """Also under other settings of matplotlib, in the resolution of print; nothing but the figure is written."""
+    style.save(drawn(name), tmp_path / "a.png", tmp_path / "a.pdf")
     with matplotlib.rc_context({"font.size": 30, "lines.linewidth": 9}):
-        figure = drawing("ch_dist_curve")
-    assert figure.axes[0].title.get_fontsize() == style.SETTINGS["axes.titlesize"]
+        style.save(drawn(name), tmp_path / "b.png", tmp_path / "b.pdf")
+    for kind in ("png", "pdf"):
+        assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()
+    assert (tmp_path / "a.pdf").read_bytes().startswith(b"%PDF")
+    with Image.open(tmp_path / "a.png") as image:
+        assert image.width == round(style.PAGE * style.DPI)
+    assert len(list(tmp_path.iterdir())) == 4
 
 
 def test_every_figure_has_caption_rule_and_test():
-    rules = "".join(
-        (ROOT / f"workflow/rules/{name}.smk").read_text() for name in ("figure_inputs", "figures")
+    rules = (ROOT / "workflow/rules/figures.smk").read_text()
+    listed = set(re.findall(r'^    "(\w+)": \{$', rules, re.MULTILINE))
+    modules = [
+        path for path in (ROOT / "neuma_lib/evaluation/figures").glob("*.py") if path.stem != "__init__"
+    ]
+    assert {path.stem for path in modules} == listed == set(DATA)
+    for path in modules:
+        caption = ast.get_docstring(ast.parse(path.read_text()))
+        assert re.search(r"Paper: fig:\w+|Not in the paper", " ".join(caption.split())), path.stem
+
+
+# ---- numbers from results
+
+
+def results(folder: Path, name: str, content) -> list[str]:
+    """JSON files of two methods on two scenes, method by method; `content` gives that of one from its number."""
+    files = [folder / f"{name}{k}.json" for k in range(4)]
+    for k, file in enumerate(files):
+        file.write_text(json.dumps(content(k)))
+    return [str(file) for file in files]
+
+
+def test_every_number_is_of_its_method_and_scene(tmp_path):
+    titles, scenes = {"nclaw": "NCLaw", "neuma": "NeuMA"}, ["A", "B"]
+    motion = results(
+        tmp_path,
+        "motion",
+        lambda k: {
+            "frames": [0, 2],
+            "chamfer_per_frame": [k, 10 * k],
+            "chamfer_floor_per_frame": [k / 10, k],
+            "chamfer_excess": k + 0.1,
+            "tracer_rmse_mm": k + 0.2,
+        },
     )
-    modules = {path.stem for path in (ROOT / "neuma_lib/evaluation/figures").glob("*.py")} - {
-        "__init__",
-        "grid",
+    images = results(tmp_path, "images", lambda k: {m: k + len(m) for m in image_quality.MEASURES})
+    histories = results(tmp_path, "history", lambda k: {"loss": [4.0, 1.0], "best_loss": 4.0 * k})
+
+    said = []
+    curves = ch_dist_curve.data(
+        SimpleNamespace(metrics=motion),
+        SimpleNamespace(titles=titles, scenes={"A": 0.5, "B": 0.25}),
+        said.append,
+    )
+    assert curves["titles"] == titles
+    assert curves["scenes"]["B"] == {
+        "time": [0.0, 0.5],
+        "floor": [0.1, 1],
+        "chamfer": {"nclaw": [1, 10], "neuma": [3, 30]},
     }
-    listed = set(re.findall(r'^    "(\w+)": "(?:json|h5)",$', rules, re.MULTILINE))
-    assert modules == listed == set(DATA)
-    for name in modules:
-        assert (ROOT / f"workflow/report/{name}.rst").read_text().strip()
-        assert f"rule {name}_data:" in rules
+    params = SimpleNamespace(titles=titles, scenes=scenes)
+    quality = image_quality.data(SimpleNamespace(metrics=images), params, said.append)
+    assert quality["ssim"] == {"nclaw": {"A": 4, "B": 5}, "neuma": {"A": 6, "B": 7}}
+    choices = ablation_gradients.data(
+        SimpleNamespace(histories=histories, metrics=motion, image_metrics=images), params, said.append
+    )
+    assert choices["loss"] == {"nclaw": {"A": 0, "B": 1}, "neuma": {"A": 2, "B": 3}}
+    assert choices["tracer_rmse_mm"]["neuma"] == {"A": 2.2, "B": 3.2}
+    assert choices["psnr"]["nclaw"] == {"A": 4, "B": 5}
+    assert len(said) == 3
 
 
 # ---- style
@@ -334,25 +381,19 @@ def test_monotone_frames_are_counted_where_the_motions_part():
     assert monotone_frames(heights[::-1]) == (2, 3)
 
 
-def test_mean_height_is_that_of_the_centre_of_mass():
-    x = np.zeros((2, 2, 3))
-    x[1, :, 1] = [1.0, 4.0]
-    assert mean_height(x, np.array([2.0, 1.0])) == pytest.approx([0.0, 2.0])
-
-
 def test_evenly_keeps_the_ends():
     assert evenly(5, 33) == [0, 8, 16, 24, 32]
     assert evenly(5, 3) == [0, 1, 2]
 
 
-def test_panels_survive_the_disk(tmp_path):
-    panels = pictures(2, 3, {"weights": [0.5], "name": "ΔM"})
-    save_panels(tmp_path / "a.h5", panels)
-    again = load_panels(tmp_path / "a.h5")
-    assert (again.images == panels.images).all()
-    assert (again.rows, again.columns, again.numbers) == (panels.rows, panels.columns, panels.numbers)
+def test_pictures_and_titles_survive_the_disk(tmp_path):
+    grid = pictures(2, 3, {"weights": [0.5], "name": "ΔM"})
+    save_image_grid(tmp_path / "a.h5", grid)
+    again = load_image_grid(tmp_path / "a.h5")
+    assert (again.images == grid.images).all()
+    assert (again.rows, again.columns, again.numbers) == (grid.rows, grid.columns, grid.numbers)
     with pytest.raises(InputError, match="titles"):
-        Panels(panels.images, ("one",), panels.columns)
+        ImageGrid(grid.images, ("one",), grid.columns)
 
 
 # ---- tests of material points
@@ -381,7 +422,8 @@ def test_small_shear_follows_the_shear_modulus():
 
 
 def test_yielding_ends_on_the_plateau():
-    shear, stress = yielding(analytic_law(MISES), rate=20.0, dt=5e-4, steps=60)
+    stress = yielding(analytic_law(MISES), rate=20.0, dt=5e-4, steps=60)
+    shear = 20.0 * 5e-4 * torch.arange(61, dtype=torch.float64)
     elastic = shear < 0.9 * YIELD / 2**0.5 / MU
     assert torch.allclose(stress[elastic], MU * shear[elastic], rtol=1e-2)
     assert stress[-1] == pytest.approx(YIELD / 2**0.5, rel=2e-2)
@@ -399,20 +441,3 @@ def test_visited_range_of_known_states():
     F = torch.eye(3).repeat(10, 1, 1)
     F[:, 0, 1] = 1e-3
     assert largest_shear_stress(analytic_law(HENCKY), F) == pytest.approx(MU * 1e-3, rel=1e-2)
-
-
-# ---- the workflow
-
-
-def test_all_figures_plan(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-m", "snakemake", "--configfile", "tests/workflow/tiny.yaml", "--cores", "1",
-          "--dry-run", "--quiet",         "rules", "--nolock", "--forceall", "figures"],
-        cwd=ROOT, text=True, capture_output=True, timeout=120,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
-
-
-def test_save_writes_nothing_else(tmp_path):
-    style.save(Figure(figsize=(1, 1)), tmp_path / "a.png", tmp_path / "a.pdf")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.pdf", "a.png"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import shutil
 import subprocess
@@ -35,12 +36,28 @@ setTimeout(next, 700);
 
 
 @pytest.fixture(scope="module")
-def report(tmp_path_factory):
-    """The report of a small run."""
-    if BROWSER is None:
-        pytest.skip("no browser: apt-get install chromium")
+def project(tmp_path_factory):
+    """A small run."""
     project = copied(tmp_path_factory.mktemp("project"), tmp_path_factory.mktemp("kernels"))
     project.run(*TARGETS)
+    return project
+
+
+def test_an_edit_of_a_figure_makes_this_figure_again(project):
+    module = project.root / "neuma_lib/evaluation/figures/main_res.py"
+    original = module.read_text()
+    module.write_text(original.replace('"""', '"""Another caption. ', 1))
+    assert project.plan(*TARGETS) == {}
+    module.write_text(original + "\nEDITED = True\n")
+    assert project.plan(*TARGETS) == {"main_res": 1}
+    module.write_text(original)
+
+
+@pytest.fixture(scope="module")
+def report(project):
+    """Its report."""
+    if BROWSER is None:
+        pytest.skip("no browser: apt-get install chromium")
     project.run("--report", "report.html", "--", *TARGETS)
     return project.root / "report.html"
 
@@ -74,5 +91,6 @@ def test_report_shows_a_figure_with_its_caption(report):
     assert (content < 200).any(-1).mean() > 0.005  # the figure is there, not an empty page
     page = browse(report, '[["Figures", null], ["main_res", 1]]', "--dump-dom")
     shown = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
-    caption = (ROOT / "workflow/report/main_res.rst").read_text().split(":")[0]
+    module = ast.parse((ROOT / "neuma_lib/evaluation/figures/main_res.py").read_text())
+    caption = ast.get_docstring(module).split(":")[0]
     assert caption in " ".join(shown.split())

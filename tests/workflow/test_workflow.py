@@ -349,6 +349,11 @@ def test_all_tables_can_be_planned(finished):
     assert plan["chamfer_table"] >= 4 and plan["prior"] == 7
 
 
+def test_all_figures_can_be_planned(finished):
+    modules = (ROOT / "neuma_lib/evaluation/figures").glob("[!_]*.py")
+    assert {module.stem for module in modules} <= set(finished.plan("--forceall", "figures"))
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
 def test_without_the_gpu_that_is_asked_for_nothing_is_begun(kernels, tmp_path):
     project = copied(tmp_path, kernels)

@@ -1,22 +1,24 @@
-"""Draw one figure from its data file."""
+"""Make one figure: gather its data, and draw it from the file that holds them."""
 
 from importlib import import_module
-from pathlib import Path
 
-from neuma_lib.evaluation.figures.panels import load_panels
-from neuma_lib.evaluation.figures.style import save
-from neuma_lib.io.files import read_json
+from neuma_lib.evaluation.plotting.image_grid import ImageGrid, load_image_grid, save_image_grid
+from neuma_lib.evaluation.plotting.style import save
+from neuma_lib.io.files import read_json, write_json
 from workflow.stage import stage
 
 
-def main(name: str, data_file: str, output, run) -> None:
-    data = load_panels(data_file) if Path(data_file).suffix == ".h5" else read_json(data_file)
-    figure = import_module(f"neuma_lib.evaluation.figures.{name}").draw(data)
+def main(name: str, inputs, output, params, run) -> None:
+    module = import_module(f"neuma_lib.evaluation.figures.{name}")
+    data = module.data(inputs, params, run.say)
+    in_pictures = isinstance(data, ImageGrid)
+    (save_image_grid if in_pictures else write_json)(output.data, data)
+    figure = module.draw((load_image_grid if in_pictures else read_json)(output.data))
     save(figure, output.png, output.pdf)
     width, height = figure.get_size_inches()
     run.say(f"{width:.1f} x {height:.1f} in: {output.png}")
 
 
 if __name__ == "__main__":
-    with stage(f"figure {snakemake.params.figure}", snakemake.log[0]) as run:
-        main(snakemake.params.figure, snakemake.input.data, snakemake.output, run)
+    with stage(f"figure {snakemake.rule}", snakemake.log[0]) as run:
+        main(snakemake.rule, snakemake.input, snakemake.output, snakemake.params, run)

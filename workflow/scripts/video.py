@@ -21,9 +21,8 @@ def main(inputs, video_file: str, params, run) -> None:
     panels, quality = [], []
     with torch.no_grad():
         for part, images in renderer.batches(x, F):
-            predicted, seen = images[:, 0], observation.colours(part)[:, 0]
-            quality += [float(psnr(p, s)) for p, s in zip(predicted, seen, strict=True)]
-            pair = [seen.cpu().numpy(), predicted.cpu().numpy()]
+            pair = [video.cpu().numpy() for video in (observation.colours(part)[:, 0], images[:, 0])]
+            quality += [psnr(predicted, seen) for seen, predicted in zip(*pair, strict=True)]
             panels.append(side_by_side(pair, ["observation", "prediction"], magnify=params.magnify))
     video = np.concatenate(panels)
     with atomic(video_file) as partial:

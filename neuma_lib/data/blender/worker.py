@@ -6,6 +6,7 @@ Prints the number of finished images, a line each, on standard output; Blender's
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 import sys
 import tempfile
@@ -49,12 +50,12 @@ def main(path: str) -> None:
     report = _quiet_stdout()
     with np.load(path) as file:
         job = dict(file)
-    threads = int(job["threads"])
-    claimed = _claim_cores(threads)
+    settings = json.loads(str(job["settings"]))
+    claimed = _claim_cores(settings["threads"])
     from neuma_lib.data.blender import cycles
 
     folder = Path(path).parent
-    cycles.start(*(int(s) for s in job["size"]), int(job["samples"]), threads)
+    cycles.start(settings, *(int(s) for s in job["size"]))
     body = cycles.Body(job)
     camera = cycles.add_camera(float(job["focal"]), int(job["size"][0]))
     shown = None

@@ -1,13 +1,19 @@
-"""Choices in the gradient and in the covariances that the paper leaves open, on three scenes (not in the paper)."""
+"""Choices that the paper leaves open, on three scenes: image gradients through means and covariances (NeuMA) or through
+means only (as in the authors' released code); gradients zeroed before every iteration or accumulated (as in the
+released loop); covariances stretched by the elastic deformation (paper) or by the total one, plastic flow included. Not
+in the paper.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from operator import itemgetter
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from neuma_lib.evaluation.figures import style
+from neuma_lib.evaluation.plotting import style
+from neuma_lib.evaluation.results import read_results
 
 MEASURES = {
     "loss": "best training loss\nrelative to the prior's",
@@ -18,13 +24,25 @@ MEASURES = {
 MARKERS = "osDv^P"
 
 
+def data(inputs, params, say) -> dict:
+    """``scenes`` in order, ``titles`` {variant: name} and for each of `MEASURES` {variant: {scene: value}}."""
+    values = {
+        "loss": (inputs.histories, lambda history: history["best_loss"] / history["loss"][0]),
+        "chamfer_excess": (inputs.metrics, itemgetter("chamfer_excess")),
+        "tracer_rmse_mm": (inputs.metrics, itemgetter("tracer_rmse_mm")),
+        "psnr": (inputs.image_metrics, itemgetter("psnr")),
+    }
+    measures = {
+        name: read_results(files, params.titles, params.scenes, value)
+        for name, (files, value) in values.items()
+    }
+    say(f"{len(params.titles)} variants on {len(params.scenes)} scenes")
+    return {"scenes": params.scenes, "titles": params.titles, **measures}
+
+
 @style.styled
 def draw(data: Mapping) -> Figure:
-    """Draw one panel a measure; every variant has a point in every scene.
-
-    Args:
-        data: ``scenes`` in order, ``titles`` {variant: name} and for each of `MEASURES` {variant: {scene: value}}.
-    """
+    """One panel a measure; every variant has a point in every scene."""
     scenes, titles = data["scenes"], data["titles"]
     figure = style.new_figure(style.PAGE, 2.1)
     panels = figure.subplots(1, len(MEASURES))

@@ -1,4 +1,7 @@
-"""Chamfer distance over time, a panel a scene (paper, fig:ch_dist_curve)."""
+"""Chamfer distance between predicted and true motion over time, all methods and scenes, measured on dense passive
+tracers. Grey: below the sampling floor, the distance of two samplings of the truth itself, nothing can be measured. All
+curves start there, because motion before contact is the same for every material. Paper: fig:ch_dist_curve.
+"""
 
 from __future__ import annotations
 
@@ -7,19 +10,31 @@ from collections.abc import Mapping
 
 from matplotlib.figure import Figure
 
-from neuma_lib.evaluation.figures import style
+from neuma_lib.evaluation.plotting import style
+from neuma_lib.evaluation.results import read_results
 
 COLUMNS = 3
 
 
+def data(inputs, params, say) -> dict:
+    """``titles`` {method: name} and ``scenes`` {scene: {time [s], floor, chamfer {method: values}}} [1e-4 m^2]."""
+    metrics = read_results(inputs.metrics, params.titles, params.scenes)
+    first = metrics[next(iter(params.titles))]
+    scenes = {
+        scene: {
+            "time": [dt * step for step in first[scene]["frames"]],
+            "floor": first[scene]["chamfer_floor_per_frame"],
+            "chamfer": {method: row[scene]["chamfer_per_frame"] for method, row in metrics.items()},
+        }
+        for scene, dt in params.scenes.items()
+    }
+    say(f"{len(params.titles)} methods on {len(scenes)} scenes")
+    return {"titles": params.titles, "scenes": scenes}
+
+
 @style.styled
 def draw(data: Mapping) -> Figure:
-    """Draw the curves.
-
-    Args:
-        data: ``titles`` {method: name} and ``scenes`` {scene: {time [s], floor, chamfer {method: values}}}, distances
-            in 1e-4 m^2.
-    """
+    """One panel a scene."""
     scenes = data["scenes"]
     columns = min(COLUMNS, len(scenes))
     rows = math.ceil(len(scenes) / columns)

@@ -1,45 +1,77 @@
-"""Prediction beyond the video: renders, and the mean height against the truth (paper, fig:ext_time)."""
+"""Prediction three times as long as the video: particles of the truth, renders of the prior and of NeuMA, and the mean
+height of the body over time. Grey: the part that was observed. Paper: fig:ext_time.
+"""
 
 from __future__ import annotations
 
 import numpy as np
+import torch
 from matplotlib.figure import Figure
 
-from neuma_lib.evaluation.figures import style
-from neuma_lib.evaluation.figures.grid import image_grid, picture_height, place
-from neuma_lib.evaluation.figures.panels import Panels
+from neuma_lib.evaluation.metrics import mean_height
+from neuma_lib.evaluation.plotting import style
+from neuma_lib.evaluation.plotting.image_grid import GAP, ImageGrid, draw_images, place
+from neuma_lib.evaluation.plotting.rendering import (
+    cropped,
+    evenly,
+    frontal,
+    milliseconds,
+    particle_pictures,
+    renders,
+    sphere_radius,
+)
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.particles import load_body
 
 LEFT, TOP, CURVE = 0.92, 0.2, 1.3
 
 
-@style.styled
-def draw(panels: Panels) -> Figure:
-    """Draw a row a method above the curves of all.
+def data(inputs, params, say) -> ImageGrid:
+    """Columns are times, rows the truth and the methods.
 
-    Args:
-        panels: columns are times. Numbers: ``observed`` [s], ``time`` [s], ``titles`` and ``heights`` [m] by method,
-            "truth" among them.
+    Numbers: ``observed`` [s], ``time`` [s], ``titles`` and ``heights`` [m] by method, "truth" among them.
     """
-    numbers = panels.numbers
+    names = ("x", "mass", "vol0", "frames")
+    truth, attributes = read_arrays(inputs.truth, required=names, only=names)
+    body = load_body(inputs.binding, inputs.gaussians, params.density)
+    shown = evenly(params.shown, len(truth["frames"]))
+    paths = [read_arrays(file, required=("x", "F"))[0] for file in inputs.rollouts]
+    everywhere = [arrays["x"].reshape(-1, 3) for arrays in (truth, *paths)]
+    cameras = frontal(np.concatenate(everywhere), params.size, params.size)
+    rows = [particle_pictures(truth["x"][shown], style.TRUE_PARTICLES, sphere_radius(truth["vol0"]), cameras)]
+    heights = {"truth": mean_height(truth["x"], truth["mass"])}
+    for method, arrays in zip(params.titles, paths, strict=True):
+        rows.append(renders(body, cameras, *(torch.from_numpy(arrays[name][shown]) for name in ("x", "F"))))
+        heights[method] = mean_height(arrays["x"], body.mass)
+    dt = attributes["dt"]
+    numbers = {
+        "observed": params.observed,
+        "time": [dt * int(step) for step in truth["frames"]],
+        "titles": {"truth": "Truth", **params.titles},
+        "heights": heights,
+    }
+    (images,) = cropped([np.stack(rows)])
+    far = max(abs(a - b) for a, b in zip(heights["truth"], heights["neuma"], strict=True))
+    say(f"mean height within {1e3 * far:.1f} mm of the truth")
+    columns = tuple(milliseconds(truth["frames"][shown], dt))
+    return ImageGrid(images, ("Truth (particles)", *params.titles.values()), columns, numbers)
+
+
+@style.styled
+def draw(grid: ImageGrid) -> Figure:
+    """A row a method above the curves of all."""
+    numbers = grid.numbers
     width = style.PAGE - LEFT - 0.02
-    height = picture_height(panels.images, len(panels.columns), width)
-    below = TOP + len(panels.rows) * (height + 0.02) + 0.12
+    below = TOP + len(grid.rows) * (grid.height(width) + GAP) + 0.12
     figure = style.new_canvas(style.PAGE, below + CURVE + 0.36)
-    image_grid(figure, panels.images, LEFT, TOP, width, panels.rows, panels.columns)
+    draw_images(figure, grid.images, LEFT, TOP, width, grid.rows, grid.columns)
     axes = place(figure, LEFT, below, width, CURVE)
     time, seen = 1e3 * np.asarray(numbers["time"]), 1e3 * numbers["observed"]
     axes.axvspan(0, seen, color=style.LIGHT, linewidth=0)
     for method, heights in numbers["heights"].items():
         axes.plot(time, heights, label=numbers["titles"][method], **style.look(method).line)
-    axes.text(seen / 2, 0.03, "observed", transform=axes.get_xaxis_transform(), ha="center", va="bottom")
-    axes.text(
-        (seen + time[-1]) / 2,
-        0.03,
-        "predicted",
-        transform=axes.get_xaxis_transform(),
-        ha="center",
-        va="bottom",
-    )
+    for middle, text in ((seen / 2, "observed"), ((seen + time[-1]) / 2, "predicted")):
+        axes.text(middle, 0.03, text, transform=axes.get_xaxis_transform(), ha="center", va="bottom")
     axes.set(xlabel="time [ms]", ylabel="mean height [m]", xlim=(0, time[-1]))
     axes.margins(y=0.15)
     axes.legend(loc="upper right", ncols=len(numbers["heights"]))

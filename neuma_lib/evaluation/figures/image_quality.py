@@ -1,13 +1,19 @@
-"""Quality of rendered images against the observation, views that training did not see (paper, fig:image_quality)."""
+"""Quality of renders against the observation: PSNR, SSIM (higher is better) and LPIPS with the VGG and Alex networks
+(lower is better), in views that training did not see, averaged over all frames, on the bounding box of the object plus
+a margin. Grey column: mean over the scenes. NCLaw is the prior rendered by Particle-GS (the paper's NCLaw+R). Paper:
+fig:image_quality.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from operator import itemgetter
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from neuma_lib.evaluation.figures import style
+from neuma_lib.evaluation.plotting import style
+from neuma_lib.evaluation.results import read_results
 
 MEASURES = {
     "psnr": "PSNR [dB] ↑",
@@ -19,13 +25,17 @@ SPREAD = 0.62
 """Part of a scene's slot over which the methods stand side by side."""
 
 
+def data(inputs, params, say) -> dict:
+    """``titles`` {method: name}, ``scenes`` in order, and a {method: {scene: value}} for each of `MEASURES`."""
+    cells = inputs.metrics, params.titles, params.scenes
+    values = {measure: read_results(*cells, itemgetter(measure)) for measure in MEASURES}
+    say(f"{len(params.titles)} methods on {len(params.scenes)} scenes")
+    return {"titles": params.titles, "scenes": params.scenes, **values}
+
+
 @style.styled
 def draw(data: Mapping) -> Figure:
-    """Draw one row a measure; every method has a point in every scene, and one for the mean over scenes.
-
-    Args:
-        data: ``titles`` {method: name}, ``scenes`` in order, and a {method: {scene: value}} for each of `MEASURES`.
-    """
+    """One row a measure; every method has a point in every scene, and one for the mean over scenes."""
     scenes, titles = list(data["scenes"]), data["titles"]
     figure = style.new_figure(style.PAGE, 0.4 + 1.15 * len(MEASURES))
     panels = figure.subplots(len(MEASURES), 1, sharex=True)

@@ -1,29 +1,100 @@
-"""Between prior and observation: the adaptor with weights from 0 to 1 and a little beyond (paper, fig:lora_alphav)."""
+"""Between prior and observation: the adaptor with weight w, from the prior (w = 0) to the trained law (w = 1) and a
+little beyond (dashed). Left: renders; right: mean height of the body over time, dots: the truth. A motion that becomes
+non-finite, which can happen beyond 1, is held at its last finite frame. Paper: fig:lora_alphav.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import matplotlib
 import numpy as np
+import torch
 from matplotlib.figure import Figure
 
-from neuma_lib.evaluation.figures import style
-from neuma_lib.evaluation.figures.grid import image_grid, note, picture_height, place
-from neuma_lib.evaluation.figures.panels import Panels
+from neuma_lib.device import choose_device
+from neuma_lib.evaluation.metrics import mean_height
+from neuma_lib.evaluation.motion import predict
+from neuma_lib.evaluation.plotting import style
+from neuma_lib.evaluation.plotting.image_grid import GAP, ImageGrid, draw_images, note, place
+from neuma_lib.evaluation.plotting.rendering import (
+    cropped,
+    evenly,
+    magnified,
+    milliseconds,
+    observed,
+    renders,
+)
+from neuma_lib.io.files import read_json
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.images import load_observation
+from neuma_lib.io.laws import load_law
+from neuma_lib.io.particles import load_body
+from neuma_lib.sim.model import MPMModel
 
 LEFT, LEGEND, TITLE, PICTURES, CURVES, BETWEEN = 0.5, 0.2, 0.34, 4.0, 1.85, 0.38
+APART = 0.002
+"""Before contact all motions are the same; their heights count from this distance on [m]."""
+
+
+def data(inputs, params, say) -> ImageGrid:
+    """Rows scene by scene; columns are the weights and the observation.
+
+    Numbers: ``weights`` and ``scenes`` {scene: {rows, time [s], heights [m] a weight, truth [m]}}.
+    """
+    device = choose_device(params.device)
+    blocks, rows, scenes = [], [], {}
+    inside = [k for k, weight in enumerate(params.weights) if 0 <= weight <= 1]
+    for k, (scene, setting) in enumerate(params.scenes.items()):
+        model = MPMModel(**setting["simulation"])
+        video = load_observation(inputs.transforms[k], [params.view])
+        body = load_body(inputs.binding[k], inputs.gaussians[k], setting["density"]).to(torch.float32, device)
+        law = load_law(inputs.prior[k], inputs.adaptor[k]).to(device)
+        v0 = torch.tensor(read_json(inputs.velocity[k])["v0"], dtype=torch.float32, device=device)
+        truth, _ = read_arrays(inputs.truth[k], required=("x", "mass"), only=("x", "mass"))
+        shown = evenly(params.shown, len(video.frames))[1:]  # the start is the same for all
+        cameras = magnified(video.cameras, params.magnify).to(device)
+        columns, heights = [], []
+        for weight in params.weights:
+            law.set_adaptor_weight(weight)
+            path, diverged = predict(model, law, body, v0, video.frames)
+            columns.append(renders(body, cameras, path.x[shown], path.F[shown]))
+            heights.append(mean_height(path.x.cpu(), body.mass.cpu()))
+            if diverged:
+                say(f"{scene}: w = {weight:g} diverged at step {diverged}")
+        monotone, parted = monotone_frames([heights[k] for k in inside])
+        say(f"{scene}: between 0 and 1, height monotone in w in {monotone} of {parted} frames after contact")
+        columns.append(observed(video, shown, params.magnify))
+        blocks.append(np.stack(columns, axis=1))
+        rows += milliseconds([video.frames[i] for i in shown], model.dt)
+        scenes[scene] = {
+            "rows": len(shown),
+            "time": [model.dt * step for step in video.frames],
+            "heights": heights,
+            "truth": mean_height(truth["x"], truth["mass"]),
+        }
+    titles = [f"$w$ = {weight:g}" for weight in params.weights] + ["observed"]
+    numbers = {"weights": params.weights, "scenes": scenes}
+    images = np.concatenate(cropped(blocks, guides=[block[:, [*inside, -1]] for block in blocks]))
+    return ImageGrid(images, tuple(rows), tuple(titles), numbers)
+
+
+def monotone_frames(heights: Sequence[Sequence[float]]) -> tuple[int, int]:
+    """In how many frames heights (W, T) [m] rise or fall with every step of the weight, and of how many.
+
+    Counted are frames whose heights are more than `APART` from each other.
+    """
+    steps = np.diff(heights, axis=0)
+    parted = np.ptp(heights, axis=0) > APART
+    monotone = (steps >= 0).all(axis=0) | (steps <= 0).all(axis=0)
+    return int((monotone & parted).sum()), int(parted.sum())
 
 
 @style.styled
-def draw(panels: Panels) -> Figure:
-    """Draw for each scene a column a weight, a row a time, and the mean heights beside them.
-
-    Args:
-        panels: rows scene by scene; columns are the weights and the observation. Numbers: ``weights`` and ``scenes``
-            {scene: {rows, time [s], heights [m] a weight, truth [m]}}.
-    """
-    numbers = panels.numbers
-    height = picture_height(panels.images, len(panels.columns), PICTURES)
-    heights = [scene["rows"] * (height + 0.02) for scene in numbers["scenes"].values()]
+def draw(grid: ImageGrid) -> Figure:
+    """For each scene a column a weight, a row a time, and the mean heights beside them."""
+    numbers = grid.numbers
+    heights = [scene["rows"] * (grid.height(PICTURES) + GAP) for scene in numbers["scenes"].values()]
     blocks = [max(h, 1.3) + TITLE + BETWEEN for h in heights]
     figure = style.new_canvas(style.PAGE, LEGEND + sum(blocks) + 0.03)
     weights = numbers["weights"]
@@ -32,9 +103,7 @@ def draw(panels: Panels) -> Figure:
     for (name, scene), block in zip(numbers["scenes"].items(), blocks):
         part = slice(first, first + scene["rows"])
         note(figure, LEFT, top + 0.09, name, fontweight="bold")
-        image_grid(
-            figure, panels.images[part], LEFT, top + TITLE, PICTURES, panels.rows[part], panels.columns
-        )
+        draw_images(figure, grid.images[part], LEFT, top + TITLE, PICTURES, grid.rows[part], grid.columns)
         left = LEFT + PICTURES + 0.42
         axes = place(figure, left, top + 0.08, CURVES, block - 0.08 - BETWEEN)
         time = 1e3 * np.asarray(scene["time"])

@@ -1,32 +1,60 @@
-"""Renders over time: the observation, NeuMA and its ablations (paper, fig:main_res)."""
+"""Renders over time: the observation as it was filmed, the prior (NCLaw), NeuMA and its ablations, at the same times
+and from the training view. Renders have a higher resolution than the video. Paper: fig:main_res.
+"""
 
 from __future__ import annotations
 
+import numpy as np
 from matplotlib.figure import Figure
 
-from neuma_lib.evaluation.figures import style
-from neuma_lib.evaluation.figures.grid import image_grid, note, picture_height
-from neuma_lib.evaluation.figures.panels import Panels
+from neuma_lib.evaluation.plotting import style
+from neuma_lib.evaluation.plotting.image_grid import GAP, ImageGrid, draw_images, note
+from neuma_lib.evaluation.plotting.rendering import (
+    cropped,
+    evenly,
+    magnified,
+    milliseconds,
+    observed,
+    renders,
+)
+from neuma_lib.io.images import load_observation
+from neuma_lib.io.particles import load_body, load_motion
 
 LEFT, TOP, BETWEEN = 0.92, 0.3, 0.06
 
 
-@style.styled
-def draw(panels: Panels) -> Figure:
-    """Draw one block of columns a scene.
+def data(inputs, params, say) -> ImageGrid:
+    """A row for the observation and each method; ``groups`` in the numbers: (scene, its columns) in order."""
+    blocks, times, groups = [], [], []
+    rollouts = iter(inputs.rollouts)
+    for k, (scene, setting) in enumerate(params.scenes.items()):
+        video = load_observation(inputs.transforms[k], [params.view])
+        body = load_body(inputs.binding[k], inputs.gaussians[k], setting["density"])
+        shown = evenly(params.shown, len(video.frames))
+        cameras = magnified(video.cameras, params.magnify)
+        rows = [observed(video, shown, params.magnify)]
+        for _ in params.titles:
+            rows.append(renders(body, cameras, *(state[shown] for state in load_motion(next(rollouts)))))
+        blocks.append(np.stack(rows))
+        times += milliseconds([video.frames[i] for i in shown], setting["dt"])
+        groups.append((scene, len(shown)))
+    images = np.concatenate(cropped(blocks), axis=1)
+    say(f"{images.shape[0]} x {images.shape[1]} pictures")
+    return ImageGrid(images, ("Observation", *params.titles.values()), tuple(times), {"groups": groups})
 
-    Args:
-        panels: a row for the observation and each method; ``groups`` in the numbers: (scene, its columns) in order.
-    """
-    groups = panels.numbers["groups"]
-    width = (style.PAGE - LEFT - BETWEEN * (len(groups) - 1)) / len(panels.columns)
-    height = picture_height(panels.images, 1, width)
-    figure = style.new_canvas(style.PAGE, TOP + len(panels.rows) * (height + 0.02) + 0.03)
+
+@style.styled
+def draw(grid: ImageGrid) -> Figure:
+    """One block of columns a scene."""
+    groups = grid.numbers["groups"]
+    width = (style.PAGE - LEFT - BETWEEN * (len(groups) - 1)) / len(grid.columns)
+    height = grid.height(width, columns=1)
+    figure = style.new_canvas(style.PAGE, TOP + len(grid.rows) * (height + GAP) + 0.03)
     left, first = LEFT, 0
     for scene, count in groups:
         part = slice(first, first + count)
         note(figure, left + count * width / 2, 0.09, scene, ha="center", fontweight="bold")
-        rows = panels.rows if first == 0 else ()
-        image_grid(figure, panels.images[:, part], left, TOP, count * width, rows, panels.columns[part])
+        rows = grid.rows if first == 0 else ()
+        draw_images(figure, grid.images[:, part], left, TOP, count * width, rows, grid.columns[part])
         left, first = left + count * width + BETWEEN, first + count
     return figure

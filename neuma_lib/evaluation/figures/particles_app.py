@@ -1,21 +1,51 @@
-"""Simulated particles of all variants against the true ones (paper, fig:particles_app)."""
+"""Simulated particles of one scene under all methods, against the particles of the ground truth. Times run to the
+right; colours are those of the methods in all figures. Paper: fig:particles_app.
+"""
 
 from __future__ import annotations
 
+import numpy as np
 from matplotlib.figure import Figure
 
-from neuma_lib.evaluation.figures import style
-from neuma_lib.evaluation.figures.grid import image_grid, picture_height
-from neuma_lib.evaluation.figures.panels import Panels
+from neuma_lib.evaluation.plotting import style
+from neuma_lib.evaluation.plotting.image_grid import GAP, ImageGrid, draw_images
+from neuma_lib.evaluation.plotting.rendering import (
+    cropped,
+    evenly,
+    frontal,
+    milliseconds,
+    particle_pictures,
+    sphere_radius,
+)
+from neuma_lib.io.hdf5 import read_arrays
 
 LEFT, TOP = 0.92, 0.18
 
 
+def data(inputs, params, say) -> ImageGrid:
+    """A row for the truth and each method, a column a time."""
+    truth, _ = read_arrays(inputs.truth, required=("x", "vol0"), only=("x", "vol0", "frames"))
+    bound, _ = read_arrays(inputs.binding, only=("vol0",))
+    shown = evenly(params.shown, len(truth["x"]))
+    paths = {"truth": truth["x"][shown]}
+    for method, file in zip(params.titles, inputs.rollouts, strict=True):
+        paths[method] = read_arrays(file, required=("x",), only=("x",))[0]["x"][shown]
+    cameras = frontal(np.concatenate([x.reshape(-1, 3) for x in paths.values()]), params.size, params.size)
+    rows = []
+    for method, x in paths.items():
+        color = style.TRUE_PARTICLES if method == "truth" else style.look(method).color
+        vol0 = truth["vol0"] if method == "truth" else bound["vol0"]
+        rows.append(particle_pictures(x, color, sphere_radius(vol0), cameras))
+    (images,) = cropped([np.stack(rows)])
+    say(f"{images.shape[0]} x {images.shape[1]} pictures")
+    columns = tuple(milliseconds(truth["frames"][shown], params.dt))
+    return ImageGrid(images, ("Truth", *params.titles.values()), columns)
+
+
 @style.styled
-def draw(panels: Panels) -> Figure:
-    """Draw a row a method and a column a time."""
+def draw(grid: ImageGrid) -> Figure:
+    """A row a method and a column a time."""
     width = style.PAGE - LEFT - 0.02
-    height = picture_height(panels.images, len(panels.columns), width)
-    figure = style.new_canvas(style.PAGE, TOP + len(panels.rows) * (height + 0.02) + 0.03)
-    image_grid(figure, panels.images, LEFT, TOP, width, panels.rows, panels.columns)
+    figure = style.new_canvas(style.PAGE, TOP + len(grid.rows) * (grid.height(width) + GAP) + 0.03)
+    draw_images(figure, grid.images, LEFT, TOP, width, grid.rows, grid.columns)
     return figure

@@ -1,45 +1,82 @@
-"""An object of two densities: told to the reconstruction, and not told (paper, fig:uneven_mass)."""
+"""A cat of two densities. Top: the particles of NeuMA with the densities that it is told; below: the observation, and
+predictions of methods that know the two densities or assume one. Bars: Chamfer distance; dashed: its sampling floor.
+The paper reports 1.33, with a floor of its own. Paper: fig:uneven_mass.
+"""
 
 from __future__ import annotations
 
+import numpy as np
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from neuma_lib.evaluation.figures import style
-from neuma_lib.evaluation.figures.grid import image_grid, note, picture_height, place
-from neuma_lib.evaluation.figures.panels import Panels
+from neuma_lib.evaluation.plotting import style
+from neuma_lib.evaluation.plotting.image_grid import GAP, ImageGrid, draw_images, note, place
+from neuma_lib.evaluation.plotting.rendering import (
+    cropped,
+    evenly,
+    magnified,
+    milliseconds,
+    observed,
+    particle_pictures,
+    renders,
+    sphere_radius,
+)
+from neuma_lib.io.files import read_json
+from neuma_lib.io.images import load_observation
+from neuma_lib.io.particles import load_body, load_motion
 
 LEFT, TOP, BARS = 0.98, 0.2, 1.25
 PAPER = 1.33
 """Chamfer distance of the paper [1e-4 m^2], which contains a sampling floor of its own."""
 
 
-@style.styled
-def draw(panels: Panels) -> Figure:
-    """Draw rows of pictures and the Chamfer distance of each prediction beside its row.
+def data(inputs, params, say) -> ImageGrid:
+    """Columns are times. Numbers: ``rows`` {method: row}, ``chamfer`` {method: 1e-4 m^2}, ``floor``."""
+    (setting,) = params.scene.values()
+    video = load_observation(inputs.transforms[0], [params.view])
+    body = load_body(inputs.binding[0], inputs.gaussians[0], setting["density"])
+    shown = evenly(params.shown, len(video.frames))
+    cameras = magnified(video.cameras, params.magnify)
+    motions = [[state[shown] for state in load_motion(file)] for file in inputs.rollouts]
+    density = (body.mass / body.vol0).numpy()
+    heavy = density > 0.5 * (density.min() + density.max())
+    colors = np.where(heavy[:, None], to_rgb(style.ORANGE), to_rgb(style.SKY))
+    told, _ = motions[list(params.titles).index("neuma")]
+    pictures = [particle_pictures(told, colors, sphere_radius(body.vol0), cameras)]
+    pictures.append(observed(video, shown, params.magnify))
+    pictures += [renders(body, cameras, *motion) for motion in motions]
+    rows = [f"NeuMA's particles:\n{density.max():.0f} (orange) and\n{density.min():.0f} kg/m³", "Observation"]
+    metrics = dict(zip(params.titles, map(read_json, inputs.metrics), strict=True))
+    numbers = {
+        "rows": {method: 2 + k for k, method in enumerate(params.titles)},
+        "chamfer": {method: m["chamfer"] for method, m in metrics.items()},
+        "floor": next(iter(metrics.values()))["chamfer_floor"],
+    }
+    say(", ".join(f"{method}: Chamfer {value:.2f}" for method, value in numbers["chamfer"].items()))
+    (images,) = cropped([np.stack(pictures)])
+    columns = tuple(milliseconds([video.frames[i] for i in shown], setting["dt"]))
+    return ImageGrid(images, (*rows, *params.titles.values()), columns, numbers)
 
-    Args:
-        panels: columns are times. Numbers: ``rows`` {method: row}, ``chamfer`` {method: 1e-4 m^2}, ``floor``.
-    """
-    numbers = panels.numbers
+
+@style.styled
+def draw(grid: ImageGrid) -> Figure:
+    """Rows of pictures and the Chamfer distance of each prediction beside its row."""
+    numbers = grid.numbers
     width = style.PAGE - LEFT - BARS - 0.2
-    height = picture_height(panels.images, len(panels.columns), width)
-    figure = style.new_canvas(style.PAGE, TOP + len(panels.rows) * (height + 0.02) + 0.36)
-    image_grid(figure, panels.images, LEFT, TOP, width, panels.rows, panels.columns)
-    axes = place(figure, LEFT + width + 0.1, TOP, BARS, len(panels.rows) * (height + 0.02))
+    high = len(grid.rows) * (grid.height(width) + GAP)
+    figure = style.new_canvas(style.PAGE, TOP + high + 0.36)
+    draw_images(figure, grid.images, LEFT, TOP, width, grid.rows, grid.columns)
+    axes = place(figure, LEFT + width + 0.1, TOP, BARS, high)
     for method, value in numbers["chamfer"].items():
-        axes.barh(
-            numbers["rows"][method],
-            value,
-            height=0.4,
-            color=style.SKY if "+" in method else style.look(method).color,
-        )
-        axes.text(value, numbers["rows"][method], f" {value:.2f}", ha="left", va="center")
+        row, color = numbers["rows"][method], style.SKY if "+" in method else style.look(method).color
+        axes.barh(row, value, height=0.4, color=color)
+        axes.text(value, row, f" {value:.2f}", ha="left", va="center")
     axes.axvline(numbers["floor"], color=style.BLACK, linewidth=0.8, linestyle=(0, (2, 1)))
     axes.text(numbers["floor"], -0.42, " floor", ha="left", va="top", fontsize=6.5)
     axes.set_xscale("log")
     axes.set_xlim(0.5 * numbers["floor"], 3 * max(numbers["chamfer"].values()))
     axes.xaxis.set_major_formatter("{x:g}")
-    axes.set(ylim=(len(panels.rows) - 0.5, -0.5), xlabel="Chamfer distance [10⁻⁴ m²]", yticks=[])
+    axes.set(ylim=(len(grid.rows) - 0.5, -0.5), xlabel="Chamfer distance [10⁻⁴ m²]", yticks=[])
     axes.spines["left"].set_visible(False)
     note(figure, LEFT + width + 0.1, 0.1, f"paper: {PAPER} with its floor", fontsize=6.5)
     return figure

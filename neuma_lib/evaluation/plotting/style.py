@@ -8,7 +8,7 @@ nothing is lost in black and white.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -119,17 +119,13 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def new_canvas(width: float, height: float) -> Figure:
-    """An empty figure of a size in print [in] whose parts are placed by hand (`figures.grid`)."""
+    """An empty figure of a size in print [in] whose parts are placed by hand (`image_grid`)."""
     return Figure(figsize=(width, height))
 
 
-def legend_above(figure: Figure, axes: Axes, columns: int, handles: Iterable | None = None) -> None:
+def legend_above(figure: Figure, axes: Axes, columns: int) -> None:
     """One legend for all panels, above them."""
-    found, labels = axes.get_legend_handles_labels()
-    if handles is not None:
-        found = list(handles)
-        labels = [handle.get_label() for handle in found]
-    figure.legend(found, labels, loc="outside upper center", ncols=columns)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=columns)
 
 
 def save(figure: Figure, *paths: str | Path) -> None:

@@ -1,4 +1,4 @@
-"""Pictures for figures: renders at higher magnification than the training images, particles, and their crops."""
+"""Pictures for figures: frames of the video, renders at a higher magnification, particles, and their crops."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ _WHITE = 250
 """A colour at least this light is background."""
 _BATCH = 4
 """Frames that are rendered at a time."""
+_UNIT_BALL_RADIUS = 0.62
+"""Radius of the ball of volume 1: (3 / (4 pi))^(1/3)."""
 
 
 def magnified(cameras: Cameras, factor: int) -> Cameras:
@@ -37,16 +39,13 @@ def frontal(points: np.ndarray, width: int, height: int) -> Cameras:
     )
 
 
-def as_bytes(images: Tensor | np.ndarray) -> np.ndarray:
-    """Colours in [0, 1] as uint8; bytes stay what they are."""
-    images = images.detach().cpu().numpy() if isinstance(images, Tensor) else np.asarray(images)
-    if images.dtype == np.uint8:
-        return images
-    return (255 * images.clip(0, 1)).round().astype(np.uint8)
+def as_bytes(images: Tensor) -> np.ndarray:
+    """Colours in [0, 1] as uint8."""
+    return (255 * images.detach().cpu().numpy().clip(0, 1)).round().astype(np.uint8)
 
 
 def renders(body: Reconstruction, cameras: Cameras, x: Tensor, F: Tensor) -> np.ndarray:
-    """Splatted Gaussians of particle states x (T, N, 3) [m], F (T, N, 3, 3) in the first view: uint8 (T, H, W, 3)."""
+    """Splatted Gaussians of states x (T, N, 3) [m] and F (T, N, 3, 3) in the first view: uint8 (T, H, W, 3)."""
     with torch.no_grad():
         parts = [images[:, 0] for _, images in body.particle_gs(cameras[0]).batches(x, F, size=_BATCH)]
     return as_bytes(torch.cat(parts))
@@ -68,37 +67,14 @@ def particle_pictures(
         radius: of the spheres [m].
     """
     colors = np.asarray(to_rgb(color) if isinstance(color, str) else color)
-    viewmat, K = cameras.viewmats[0].double().cpu().numpy(), cameras.Ks[0].double().cpu().numpy()
-    return np.stack(
-        [
-            draw_spheres(
-                np.asarray(frame, np.float64), colors, radius, viewmat, K, cameras.width, cameras.height
-            )
-            for frame in x
-        ]
-    )
+    viewmat, K = (matrices[0].double().cpu().numpy() for matrices in (cameras.viewmats, cameras.Ks))
+    camera = viewmat, K, cameras.width, cameras.height
+    return np.stack([draw_spheres(np.asarray(frame, np.float64), colors, radius, *camera) for frame in x])
 
 
 def sphere_radius(vol0: np.ndarray | Tensor) -> float:
-    """Radius [m] of spheres that fill particles of mean volume ``vol0`` (N,) [m^3] without visible gaps."""
-    return 0.62 * float(np.asarray(vol0).mean()) ** (1 / 3)
-
-
-def mean_height(x: np.ndarray | Tensor, mass: np.ndarray | Tensor) -> list[float]:
-    """Height of the centre of mass [m] at T times, of particles x (T, N, 3) [m] of masses (N,)."""
-    mass = np.asarray(mass, np.float64)
-    return (np.asarray(x, np.float64)[..., 1] @ (mass / mass.sum())).tolist()
-
-
-def monotone_frames(heights: Sequence[Sequence[float]], apart: float = 0.002) -> tuple[int, int]:
-    """In how many frames heights (W, T) [m] rise or fall with every step of the weight, and of how many.
-
-    Counted are frames whose heights are more than ``apart`` [m] from each other: before contact all are the same.
-    """
-    steps = np.diff(heights, axis=0)
-    parted = np.ptp(heights, axis=0) > apart
-    monotone = (steps >= 0).all(axis=0) | (steps <= 0).all(axis=0)
-    return int((monotone & parted).sum()), int(parted.sum())
+    """Radius [m] of a sphere of the mean of particle volumes ``vol0`` (N,) [m^3]."""
+    return _UNIT_BALL_RADIUS * float(np.asarray(vol0).mean()) ** (1 / 3)
 
 
 def evenly(count: int, total: int) -> list[int]:
@@ -137,16 +113,10 @@ def cropped(
     width = max(right - left for _, _, left, right in boxes) + 2 * pad
     cut = []
     for images, (_, bottom, left, right) in zip(groups, boxes, strict=True):
-        first_row = bottom + pad - height  # bodies stand on the lower edge
-        first_column = (left + right - width) // 2
+        # Indices in the padded picture; bodies stand on the lower edge.
+        row = bottom + pad
+        column = (left + right - width) // 2 + width
         border = [(0, 0)] * (images.ndim - 3) + [(height, height), (width, width), (0, 0)]
         padded = np.pad(images, border, constant_values=255)
-        cut.append(
-            padded[
-                ...,
-                first_row + height : first_row + 2 * height,
-                first_column + width : first_column + 2 * width,
-                :,
-            ]
-        )
+        cut.append(padded[..., row : row + height, column : column + width, :])
     return cut

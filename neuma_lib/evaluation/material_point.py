@@ -1,4 +1,4 @@
-"""Tests of a material point: what a law answers to prescribed deformations, without any grid or body."""
+"""Tests of a material point: the stress of a law under prescribed deformations, without grid and body."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from neuma_lib.mechanics.law import Law
 
 OUTER = 0.005
 """Part of the visited states that is left out at either end of a range, as outliers."""
+_COMPRESSED = 0.05
+"""Quantile of the volume ratio at which shear is tested."""
 _NEWTON_STEPS, _LARGEST_STEP, _DIFFERENCE = 30, 0.05, 1e-6
 """Of the search for traction-free sides, in stretches."""
 
@@ -23,7 +25,7 @@ class Visited:
         stretch: range of the principal stretches.
         shear: range of the elastic shear, the amount gamma of the simple shear that has the same ratio of largest and
             smallest stretch; both signs, as a shear is as strong either way.
-        pressed: volume ratio J that a twentieth of the states undercut: under pressure, as shear in a fall mostly is.
+        pressed: 5th percentile of the volume ratio J, at most 1: a compressed state, as shear in an impact mostly is.
     """
 
     stretch: tuple[float, float]
@@ -41,7 +43,7 @@ class Visited:
         return cls(
             stretch=(_quantile(sigma[:, 2], OUTER), _quantile(sigma[:, 0], 1 - OUTER)),
             shear=(-shear, shear),
-            pressed=min(_quantile(J, 0.05), 1.0),
+            pressed=min(_quantile(J, _COMPRESSED), 1.0),
         )
 
 
@@ -89,7 +91,7 @@ def sheared(law: Law, shear: Tensor, J: float = 1.0) -> Tensor:
     return _stress(law, J ** (1 / 3) * F)[:, 0, 1]
 
 
-def yielding(law: Law, rate: float, dt: float, steps: int, J: float = 1.0) -> tuple[Tensor, Tensor]:
+def yielding(law: Law, rate: float, dt: float, steps: int, J: float = 1.0) -> Tensor:
     """Simple shear at a constant rate with elastic law and return map, step by step as in a simulation.
 
     Args:
@@ -99,7 +101,7 @@ def yielding(law: Law, rate: float, dt: float, steps: int, J: float = 1.0) -> tu
         J: volume ratio of the start.
 
     Returns:
-        Total shear and shear Kirchhoff stress [Pa], shape (n + 1,) each, the start included.
+        Shear Kirchhoff stress [Pa] at the total shears 0, rate dt, ..., n rate dt, shape (n + 1,).
     """
     F = J ** (1 / 3) * torch.eye(3, dtype=torch.float64)[None]
     increment = torch.eye(3, dtype=torch.float64)
@@ -109,7 +111,7 @@ def yielding(law: Law, rate: float, dt: float, steps: int, J: float = 1.0) -> tu
     for _ in range(steps):
         F = law.plasticity.evaluate(increment @ F, tuple(weights))
         stresses.append(_stress(law, F)[0, 0, 1])
-    return rate * dt * torch.arange(steps + 1, dtype=torch.float64), torch.stack(stresses)
+    return torch.stack(stresses)
 
 
 def _stress(law: Law, F: Tensor) -> Tensor:

@@ -1,0 +1,135 @@
+"""Pictures in rows and columns: the data file of a figure, and where they are placed on its page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.textpath import TextPath
+
+from neuma_lib.errors import InputError
+from neuma_lib.io.hdf5 import read_arrays, write_arrays
+
+GAP = 0.02
+"""Between pictures [in]."""
+TITLE = 6.5
+"""Size of the titles of rows and columns [pt]."""
+_TITLE_DISTANCE = 0.04
+"""Of a row's title from its pictures, relative to the width of one."""
+
+
+@dataclass(frozen=True)
+class ImageGrid:
+    """Pictures of one size in rows and columns, with the numbers that stand beside them.
+
+    Attributes:
+        images: colours 0 to 255, uint8, shape (R, C, H, W, 3).
+        rows: R titles.
+        columns: C titles.
+        numbers: whatever else the figure shows: plain numbers, lists and texts by name.
+    """
+
+    images: np.ndarray
+    rows: tuple[str, ...]
+    columns: tuple[str, ...]
+    numbers: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self):
+        expected = (len(self.rows), len(self.columns))
+        if self.images.ndim != 5 or self.images.shape[:2] != expected or self.images.dtype != np.uint8:
+            raise InputError(
+                f"{self.images.dtype} pictures of shape {self.images.shape} for {expected} titles; expected"
+                " uint8 (rows, columns, H, W, 3)"
+            )
+
+    def height(self, width: float, columns: int | None = None) -> float:
+        """Height [in] of a picture where ``columns`` of them (all, if None) and their gaps fill ``width`` [in]."""
+        count = columns or len(self.columns)
+        return _picture_width(width, count) * self.images.shape[-3] / self.images.shape[-2]
+
+
+def save_image_grid(path: str | Path, grid: ImageGrid) -> None:
+    """Write pictures and titles to HDF5."""
+    text = {name: json.dumps(getattr(grid, name)) for name in ("rows", "columns", "numbers")}
+    write_arrays(path, {"images": grid.images}, text)
+
+
+def load_image_grid(path: str | Path) -> ImageGrid:
+    """Read pictures and titles. Raises InputError when the file is no data file of a figure."""
+    arrays, attributes = read_arrays(path, required=("images",))
+    missing = [name for name in ("rows", "columns", "numbers") if name not in attributes]
+    if missing:
+        raise InputError(f"{path} has no {', '.join(missing)}: it is not the data of a figure; make it again")
+    rows, columns, numbers = (json.loads(attributes[name]) for name in ("rows", "columns", "numbers"))
+    return ImageGrid(arrays["images"], tuple(rows), tuple(columns), numbers)
+
+
+def place(figure: Figure, left: float, top: float, width: float, height: float, **options) -> Axes:
+    """Axes whose upper left corner lies at (left, top) inches from that of the figure."""
+    full_width, full_height = figure.get_size_inches()
+    box = (left / full_width, 1 - (top + height) / full_height, width / full_width, height / full_height)
+    return figure.add_axes(box, **options)
+
+
+def draw_images(
+    figure: Figure,
+    images: np.ndarray,
+    left: float,
+    top: float,
+    width: float,
+    rows: Sequence[str] = (),
+    columns: Sequence[str] = (),
+) -> None:
+    """Draw pictures (R, C, H, W, 3) below and right of (left, top) [in].
+
+    Args:
+        width: of the pictures together [in].
+        rows: titles left of the pictures, broken where they are wider than `left`.
+        columns: titles above them.
+    """
+    each = _picture_width(width, images.shape[1])
+    height = each * images.shape[2] / images.shape[3]
+    for i, row in enumerate(images):
+        for j, image in enumerate(row):
+            axes = place(figure, left + j * (each + GAP), top + i * (height + GAP), each, height)
+            axes.imshow(image, interpolation="antialiased", aspect="auto")
+            axes.set_axis_off()
+            options = {"transform": axes.transAxes, "fontsize": TITLE}
+            if i == 0 and j < len(columns):
+                axes.text(0.5, 1.02, columns[j], ha="center", va="bottom", **options)
+            if j == 0 and i < len(rows):
+                title = broken(rows[i], left - _TITLE_DISTANCE * each - GAP)
+                axes.text(-_TITLE_DISTANCE, 0.5, title, ha="right", va="center", **options)
+
+
+def broken(text: str, width: float) -> str:
+    """The text with lines broken at spaces so that none is wider than `width` [in], unless a word is."""
+    lines: list[str] = []
+    for line in text.split("\n"):
+        words = line.split(" ")
+        lines.append(words[0])
+        for word in words[1:]:
+            longer = f"{lines[-1]} {word}"
+            if TextPath((0, 0), longer, size=TITLE).get_extents().width <= 72 * width:
+                lines[-1] = longer
+            else:
+                lines.append(word)
+    return "\n".join(lines)
+
+
+def note(figure: Figure, left: float, top: float, text: str, **options) -> None:
+    """Text at (left, top) inches from the upper left corner."""
+    width, height = figure.get_size_inches()
+    figure.text(
+        left / width, 1 - top / height, text, **{"ha": "left", "va": "center", "fontsize": 7, **options}
+    )
+
+
+def _picture_width(width: float, columns: int) -> float:
+    return (width - GAP * (columns - 1)) / columns
