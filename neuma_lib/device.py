@@ -8,9 +8,12 @@ otherwise Warp's own per-user cache is used.
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
 
 import torch
 import warp as wp
@@ -64,6 +67,16 @@ def _without_driver_warning() -> Iterator[None]:
         os.dup2(kept, 2)
         os.close(kept)
         os.close(nowhere)
+
+
+@cache
+def native_source(module: str, suffix: str = ".cu") -> dict[str, str]:
+    """C++ or CUDA text beside a module (its ``__file__``), for `wp.func_native`: parts by name.
+
+    A line ``//// name`` opens a part; what stands before the first is a comment.
+    """
+    _, *parts = re.split(r"^//// (\w+)\n", Path(module).with_suffix(suffix).read_text(), flags=re.MULTILINE)
+    return dict(zip(parts[::2], parts[1::2], strict=True))
 
 
 def warp_stream(device: torch.device) -> wp.Stream | None:

@@ -1,0 +1,165 @@
+// Text of the kernels that begin with the SVD of 3x3 matrices: a pack of matrices, one a SIMD lane on the CPU and one a
+// thread on a GPU. The module replaces REAL, CPU_WIDTH and SWEEPS.
+
+// Opens a kernel: the type `Pack`, its size `WIDTH`, and the macros LANE and SQRT.
+//// pack
+    typedef REAL Real;
+#if defined(__CUDA_ARCH__)
+    typedef Real Pack;
+    const int WIDTH = 1;
+    #define LANE(x, l) (x)
+    #define SQRT(x) sqrt(x)
+#else
+    typedef Real Pack __attribute__((vector_size(CPU_WIDTH * sizeof(Real))));
+    const int WIDTH = CPU_WIDTH;
+    #define LANE(x, l) (x)[l]
+    #define SQRT(x) __builtin_elementwise_sqrt(x)
+#endif
+    const int first = block * WIDTH;
+    const int used = n - first < WIDTH ? n - first : WIDTH;
+
+//// load
+    Pack a[9];
+    for (int l = 0; l < WIDTH; ++l) {
+        const Real* p = (const Real*)F.data + 9 * (first + (l < used ? l : 0));
+        for (int k = 0; k < 9; ++k) LANE(a[k], l) = p[k];
+    }
+
+// Turns `Pack a[9]` (row-major, scaled in place) into the columns u0, u1, u2 and v0, v1, v2 and into s[3]. Cyclic Jacobi
+// on A^T A gives V; one one-sided Jacobi sweep on A V restores the relative accuracy that squaring A has cost; then sort,
+// and orthonormalise A V. Rotations only, and u2 = u0 x u1: det U = det V = +1.
+//// svd
+    const Real TINY = sizeof(Real) == 4 ? Real(1e-36) : Real(1e-300);
+    Pack zero = a[0];
+    for (int l = 0; l < WIDTH; ++l) LANE(zero, l) = Real(0);
+    const Pack one = zero + Real(1);
+    Pack scale = zero;
+    for (int k = 0; k < 9; ++k) {
+        const Pack x = a[k] < Real(0) ? -a[k] : a[k];
+        scale = x > scale ? x : scale;
+    }
+    scale = scale > TINY ? scale : one;
+    for (int k = 0; k < 9; ++k) a[k] = a[k] / scale;
+
+    auto dot = [](const Pack* x, const Pack* y) { return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]; };
+    // cosine and sine of the rotation that diagonalises [[app, apq], [apq, aqq]], of angle at most 45 degrees
+    auto angle = [&](const Pack& app, const Pack& aqq, const Pack& apq, Pack& c, Pack& sn) {
+        const Pack d = aqq - app;
+        const Pack p2 = apq + apq;
+        const Pack h = SQRT(d * d + p2 * p2);
+        const Pack den = (d < Real(0) ? -d : d) + h;
+        const Pack q = (h + h) * den;
+        const Pack inv = one / SQRT(q > TINY ? q : one);
+        c = q > TINY ? den * inv : one;
+        sn = q > TINY ? p2 * inv : zero;
+        sn = d < Real(0) ? -sn : sn;
+    };
+    auto turn = [](const Pack& c, const Pack& sn, Pack* x, Pack* y) {
+        for (int k = 0; k < 3; ++k) {
+            const Pack t = c * x[k] - sn * y[k];
+            y[k] = sn * x[k] + c * y[k];
+            x[k] = t;
+        }
+    };
+    Pack v0[3] = {one, zero, zero}, v1[3] = {zero, one, zero}, v2[3] = {zero, zero, one};
+    {
+        Pack s00 = a[0] * a[0] + a[3] * a[3] + a[6] * a[6];
+        Pack s11 = a[1] * a[1] + a[4] * a[4] + a[7] * a[7];
+        Pack s22 = a[2] * a[2] + a[5] * a[5] + a[8] * a[8];
+        Pack s01 = a[0] * a[1] + a[3] * a[4] + a[6] * a[7];
+        Pack s02 = a[0] * a[2] + a[3] * a[5] + a[6] * a[8];
+        Pack s12 = a[1] * a[2] + a[4] * a[5] + a[7] * a[8];
+        auto jacobi = [&](Pack& app, Pack& aqq, Pack& apq, Pack& arp, Pack& arq, Pack* vp, Pack* vq) {
+            Pack c, sn;
+            angle(app, aqq, apq, c, sn);
+            const Pack shift = sn / c * apq;
+            app = app - shift;
+            aqq = aqq + shift;
+            apq = zero;
+            const Pack t = c * arp - sn * arq;
+            arq = sn * arp + c * arq;
+            arp = t;
+            turn(c, sn, vp, vq);
+        };
+        for (int sweep = 0; sweep < SWEEPS; ++sweep) {
+            jacobi(s00, s11, s01, s02, s12, v0, v1);
+            jacobi(s00, s22, s02, s01, s12, v0, v2);
+            jacobi(s11, s22, s12, s01, s02, v1, v2);
+        }
+    }
+    Pack u0[3], u1[3], u2[3];
+    for (int k = 0; k < 3; ++k) {
+        u0[k] = a[3 * k] * v0[0] + a[3 * k + 1] * v0[1] + a[3 * k + 2] * v0[2];
+        u1[k] = a[3 * k] * v1[0] + a[3 * k + 1] * v1[1] + a[3 * k + 2] * v1[2];
+        u2[k] = a[3 * k] * v2[0] + a[3 * k + 1] * v2[1] + a[3 * k + 2] * v2[2];
+    }
+    auto polish = [&](Pack* bp, Pack* bq, Pack* vp, Pack* vq) {
+        Pack c, sn;
+        angle(dot(bp, bp), dot(bq, bq), dot(bp, bq), c, sn);
+        turn(c, sn, bp, bq);
+        turn(c, sn, vp, vq);
+    };
+    polish(u0, u1, v0, v1);
+    polish(u0, u2, v0, v2);
+    polish(u1, u2, v1, v2);
+
+    Pack n0 = dot(u0, u0), n1 = dot(u1, u1), n2 = dot(u2, u2);
+    auto order = [](Pack& np, Pack& nq, Pack* bp, Pack* bq, Pack* vp, Pack* vq) {
+        const auto swap = np < nq;
+        for (int k = 0; k < 3; ++k) {
+            Pack t = swap ? bq[k] : bp[k];
+            bq[k] = swap ? -bp[k] : bq[k];
+            bp[k] = t;
+            t = swap ? vq[k] : vp[k];
+            vq[k] = swap ? -vp[k] : vq[k];
+            vp[k] = t;
+        }
+        const Pack t = swap ? nq : np;
+        nq = swap ? np : nq;
+        np = t;
+    };
+    order(n0, n1, u0, u1, v0, v1);
+    order(n0, n2, u0, u2, v0, v2);
+    order(n1, n2, u1, u2, v1, v2);
+
+    Pack s[3];
+    s[0] = SQRT(n0);
+    const auto null = s[0] <= TINY;
+    for (int k = 0; k < 3; ++k) u0[k] = null ? (k == 0 ? one : zero) : u0[k] / (null ? one : s[0]);
+    const Pack overlap = dot(u0, u1);
+    for (int k = 0; k < 3; ++k) u1[k] = u1[k] - overlap * u0[k];
+    s[1] = SQRT(dot(u1, u1));
+    const auto flat = s[1] <= s[0] * TINY;  // rank one: any direction orthogonal to u0 serves
+    const auto steep = u0[0] * u0[0] > Real(0.5);
+    Pack e[3] = {steep ? zero : one, steep ? one : zero, zero};
+    const Pack along = dot(u0, e);
+    for (int k = 0; k < 3; ++k) e[k] = e[k] - along * u0[k];
+    const Pack length = SQRT(dot(e, e));
+    for (int k = 0; k < 3; ++k) u1[k] = flat ? e[k] / length : u1[k] / (flat ? one : s[1]);
+    const Pack b2[3] = {u2[0], u2[1], u2[2]};
+    u2[0] = u0[1] * u1[2] - u0[2] * u1[1];
+    u2[1] = u0[2] * u1[0] - u0[0] * u1[2];
+    u2[2] = u0[0] * u1[1] - u0[1] * u1[0];
+    s[2] = dot(u2, b2);
+    for (int k = 0; k < 3; ++k) s[k] = s[k] * scale;
+
+//// store
+    for (int l = 0; l < used; ++l) {
+        const int i = first + l;
+        Real* pu = (Real*)U.data + 9 * i;
+        Real* pv = (Real*)Vh.data + 9 * i;
+        Real* ps = (Real*)sigma.data + 3 * i;
+        for (int k = 0; k < 3; ++k) {
+            pu[3 * k] = LANE(u0[k], l);
+            pu[3 * k + 1] = LANE(u1[k], l);
+            pu[3 * k + 2] = LANE(u2[k], l);
+            pv[k] = LANE(v0[k], l);
+            pv[3 + k] = LANE(v1[k], l);
+            pv[6 + k] = LANE(v2[k], l);
+            ps[k] = LANE(s[k], l);
+        }
+    }
+
+//// end
+#undef LANE
+#undef SQRT
