@@ -1,83 +1,164 @@
-// Runs the text of a CUDA kernel on the CPU: every thread of a block is a fiber, and the collective instructions
-// follow the PTX ISA lane by lane. Shared memory starts as NaN, and addresses are checked. Slow and obvious.
+// Runs the text of a CUDA kernel on the CPU: every thread of a block is a fiber, and the instructions of a warp follow
+// the PTX ISA lane by lane. Warps and their lanes run in random order, each as far as it can, so a forgotten barrier
+// gives wrong results (unless a vote or shuffle stands in its place, which wait here too); dynamic shared memory starts
+// as NaN, its addresses are checked, and lanes of a warp that wait at different lines are an error. Slow and obvious.
 #pragma once
+#include <ucontext.h>
+
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
 #include <functional>
+#include <memory>
 #include <vector>
-#include <ucontext.h>
 
+using std::max;
+using std::min;
+
+namespace {
 namespace emulator {
 
-const int THREADS = 128, WARP = 32;
-std::vector<char> memory;
-char* shared;
-int pool_bytes;
-
-struct Index {
-    int x;
-};
-Index block, grid, current;
-ucontext_t scheduler, fibers[THREADS];
-bool finished[THREADS];
-
-void yield() { swapcontext(&fibers[current.x], &scheduler); }
+const int WARP = 32, STACK = 1 << 18;
 
 struct Barrier {
-    int size, arrived = 0;
-    long generation = 0;
-    void wait()
-    {
-        const long mine = generation;
-        if (++arrived == size) {
-            arrived = 0;
-            ++generation;
-        }
-        while (generation == mine) yield();
-    }
+    int size, arrived;
+    long generation;
 };
-Barrier whole {THREADS}, warps[THREADS / WARP] = {{WARP}, {WARP}, {WARP}, {WARP}};
-
-// What a lane hands to the others of its warp. Two sets in turn: none is overwritten while another lane reads it.
+// What a lane hands to the others of its warp, and where: the line of the call.
 struct Slot {
     unsigned a[4], b[2], value;
     const char* address;
+    int line;
 };
-Slot slots[2][THREADS];
-long calls[THREADS];
+struct Thread {
+    ucontext_t context;
+    std::unique_ptr<char[]> stack;
+    bool finished;
+    long calls;
+};
+struct Index {
+    int x;
+};
 
-template <class Fill> Slot* exchange(Fill fill)
-{
-    const int me = current.x;
-    Slot* set = slots[calls[me]++ % 2];
-    fill(set[me]);
-    warps[me / WARP].wait();
-    return set + me / WARP * WARP;
-}
+std::vector<Thread> threads;
+std::vector<Slot> slots[2];  // in turn: none is overwritten while another lane reads it
+std::vector<Barrier> warps;
+Barrier whole;
+Index block, grid, current;
+ucontext_t scheduler;
+std::function<void()> kernel;
+char* shared;
+int shared_size;
+const char* failure;
+
+void yield() { swapcontext(&threads[current.x].context, &scheduler); }
 
 [[noreturn]] void fail(const char* what)
 {
     fprintf(stderr, "block %d thread %d: %s\n", block.x, current.x, what);
-    exit(1);
+    failure = what;
+    for (;;) yield();
 }
 
-float half_of(unsigned pair, int which)
+void wait(Barrier& barrier)
 {
-    const uint16_t bits = pair >> (16 * which);
-    _Float16 x;
-    memcpy(&x, &bits, 2);
-    return float(x);
+    const long mine = barrier.generation;
+    if (++barrier.arrived == barrier.size) {
+        barrier.arrived = 0;
+        ++barrier.generation;
+    }
+    while (barrier.generation == mine) yield();
 }
+
+// Waits for the lanes of the warp; what each of them brought.
+template <class Fill> const Slot* exchange(int line, Fill fill)
+{
+    const int me = current.x;
+    std::vector<Slot>& set = slots[threads[me].calls++ % 2];
+    set[me].line = line;
+    fill(set[me]);
+    wait(warps[me / WARP]);
+    const Slot* lanes = &set[me / WARP * WARP];
+    for (int l = 0; l < WARP; ++l)
+        if (lanes[l].line != line) fail("lanes of a warp wait at different lines");
+    return lanes;
+}
+
+void enter()
+{
+    kernel();
+    threads[current.x].finished = true;
+    for (;;) yield();
+}
+
+// Runs `body` on `blocks` blocks of `size` threads, a multiple of 32. Whether that failed.
+bool launch(int blocks, int size, int shared_bytes, std::function<void()> body)
+{
+    const int alignment = 128;
+    std::vector<char> memory(shared_bytes + alignment);
+    shared = (char*)((uintptr_t(memory.data()) + alignment - 1) / alignment * alignment);
+    shared_size = shared_bytes;
+    kernel = body;
+    failure = nullptr;
+    grid.x = blocks;
+    threads.resize(size);
+    for (auto& set : slots) set.resize(size);
+    for (Thread& thread : threads)
+        if (!thread.stack) thread.stack.reset(new char[STACK]);
+    srand(0);
+    for (block.x = 0; block.x < blocks; ++block.x) {
+        memset(shared, 0xff, shared_bytes);
+        whole = {size, 0, 0};
+        warps.assign(size / WARP, {WARP, 0, 0});
+        for (Thread& thread : threads) {
+            thread.finished = false;
+            thread.calls = 0;
+            getcontext(&thread.context);
+            thread.context.uc_stack.ss_sp = thread.stack.get();
+            thread.context.uc_stack.ss_size = STACK;
+            makecontext(&thread.context, enter, 0);
+        }
+        // One warp, chosen at random, runs until it waits for the others, its lanes in another order every time.
+        for (int left = size, idle = 0; left > 0;) {
+            const int warp = rand() % (size / WARP);
+            for (long before = -1; before != warps[warp].generation;) {
+                before = warps[warp].generation;
+                const int stride = 2 * (rand() % WARP) + 1, offset = rand() % WARP;
+                for (int i = 0; i < WARP; ++i) {
+                    current.x = WARP * warp + (i * stride + offset) % WARP;
+                    Thread& thread = threads[current.x];
+                    if (thread.finished) continue;
+                    swapcontext(&scheduler, &thread.context);
+                    if (failure) return true;
+                    left -= thread.finished;
+                    idle = thread.finished ? 0 : idle;
+                }
+            }
+            if (++idle > 100000) {
+                fprintf(stderr, "block %d: threads wait for one another\n", block.x);
+                return true;
+            }
+        }
+    }
+    return false;
+}
+
+template <class To, class From> To bits(From x)
+{
+    static_assert(sizeof(To) == sizeof(From), "as many bits");
+    To y;
+    memcpy(&y, &x, sizeof y);
+    return y;
+}
+
+float half_of(unsigned pair, int which) { return float(bits<_Float16>(uint16_t(pair >> (16 * which)))); }
 
 unsigned pack(float x0, float x1)
 {
-    const _Float16 x[2] = {_Float16(x0), _Float16(x1)};
-    unsigned pair;
-    memcpy(&pair, x, 4);
-    return pair;
+    return bits<uint16_t>(_Float16(x0)) | unsigned(bits<uint16_t>(_Float16(x1))) << 16;
 }
 
 float towards_zero(double x)
@@ -89,7 +170,7 @@ float towards_zero(double x)
 // mma.m16n8k16: tensor cores truncate what they accumulate
 void mma(float* c, const unsigned* a, const unsigned* b)
 {
-    const Slot* lanes = exchange([&](Slot& s) {
+    const Slot* lanes = exchange(__LINE__, [&](Slot& s) {
         memcpy(s.a, a, 16);
         memcpy(s.b, b, 8);
     });
@@ -110,9 +191,9 @@ void mma(float* c, const unsigned* a, const unsigned* b)
 // ldmatrix.x4: lane l holds the address of row l % 8 of matrix l / 8
 void matrices(unsigned* r, const char* address, bool transposed)
 {
-    if (address < shared || address + 16 > shared + pool_bytes) fail("ldmatrix outside of shared memory");
+    if (address < shared || address + 16 > shared + shared_size) fail("ldmatrix outside of shared memory");
     if ((address - shared) % 16) fail("ldmatrix at an address that is no multiple of 16");
-    const Slot* lanes = exchange([&](Slot& s) { s.address = address; });
+    const Slot* lanes = exchange(__LINE__, [&](Slot& s) { s.address = address; });
     const int lane = current.x % WARP, group = lane / 4, member = lane % 4;
     for (int i = 0; i < 4; ++i) {
         uint16_t halves[2];
@@ -124,115 +205,73 @@ void matrices(unsigned* r, const char* address, bool transposed)
     }
 }
 
+const Slot* gather(unsigned value, int line)
+{
+    return exchange(line, [&](Slot& s) { s.value = value; });
+}
+
 unsigned warp_max(unsigned x)
 {
-    const Slot* lanes = exchange([&](Slot& s) { s.value = x; });
+    const Slot* lanes = gather(x, __LINE__);
     unsigned largest = 0;
-    for (int l = 0; l < WARP; ++l) largest = lanes[l].value > largest ? lanes[l].value : largest;
+    for (int l = 0; l < WARP; ++l) largest = max(largest, lanes[l].value);
     return largest;
 }
 
-std::function<void()> kernel;
-
-void run_thread()
+unsigned ballot(bool value, int line)
 {
-    kernel();
-    finished[current.x] = true;
-    yield();
+    const Slot* lanes = gather(value, line);
+    unsigned mask = 0;
+    for (int l = 0; l < WARP; ++l) mask |= lanes[l].value << l;
+    return mask;
 }
 
-void launch(int blocks, int shared_bytes, std::function<void()> body)
+template <class T> T shuffle(T value, int step, int line)
 {
-    const size_t stack = 1 << 18;
-    std::vector<char> stacks(stack * THREADS);
-    memory.assign(shared_bytes + 128, char(0xff));
-    shared = (char*)((uintptr_t(memory.data()) + 127) / 128 * 128);
-    pool_bytes = shared_bytes;
-    kernel = body;
-    grid.x = blocks;
-    for (block.x = 0; block.x < blocks; ++block.x) {
-        memset(shared, 0xff, shared_bytes);
-        for (int i = 0; i < THREADS; ++i) {
-            finished[i] = false;
-            getcontext(&fibers[i]);
-            fibers[i].uc_stack.ss_sp = &stacks[stack * i];
-            fibers[i].uc_stack.ss_size = stack;
-            makecontext(&fibers[i], run_thread, 0);
-        }
-        // One warp, chosen at random, runs until it waits for the others, its lanes in another order every time: what
-        // lacks a barrier goes wrong.
-        for (int left = THREADS, idle = 0; left > 0;) {
-            const int warp = rand() % (THREADS / WARP);
-            for (long before = -1; before != warps[warp].generation;) {
-                before = warps[warp].generation;
-                const int stride = 2 * (rand() % WARP) + 1, offset = rand() % WARP;
-                for (int i = 0; i < WARP; ++i) {
-                    current.x = WARP * warp + (i * stride + offset) % WARP;
-                    if (finished[current.x]) continue;
-                    swapcontext(&scheduler, &fibers[current.x]);
-                    left -= finished[current.x];
-                    idle = finished[current.x] ? 0 : idle;
-                }
-            }
-            if (++idle > 1000000) fail("threads wait for one another");
-        }
-    }
-}
-
-template <class T> std::vector<T> read(const char* folder, const char* name)
-{
-    char path[4096];
-    snprintf(path, sizeof path, "%s/%s", folder, name);
-    FILE* file = fopen(path, "rb");
-    if (!file) fail(path);
-    fseek(file, 0, SEEK_END);
-    std::vector<T> data(ftell(file) / sizeof(T));
-    rewind(file);
-    if (fread(data.data(), sizeof(T), data.size(), file) != data.size()) fail(path);
-    fclose(file);
-    return data;
-}
-
-void write(const char* folder, const char* name, const std::vector<float>& data)
-{
-    char path[4096];
-    snprintf(path, sizeof path, "%s/%s", folder, name);
-    FILE* file = fopen(path, "wb");
-    if (!file || fwrite(data.data(), 4, data.size(), file) != data.size()) fail(path);
-    fclose(file);
+    return bits<T>(gather(bits<unsigned>(value), line)[current.x % WARP ^ step].value);
 }
 
 }  // namespace emulator
 
-#define threadIdx emulator::current
-#define blockIdx emulator::block
-#define gridDim emulator::grid
-#define __syncthreads() emulator::whole.wait()
-#define __syncwarp() emulator::warps[emulator::current.x / emulator::WARP].wait()
-
-struct uint4 {
-    unsigned x, y, z, w;
-};
 struct float2 {
     float x, y;
 };
-inline uint4 make_uint4(unsigned x, unsigned y, unsigned z, unsigned w) { return {x, y, z, w}; }
-inline float2 make_float2(float x, float y) { return {x, y}; }
-inline unsigned max(unsigned a, unsigned b) { return a > b ? a : b; }
-inline unsigned __float_as_uint(float x)
-{
-    unsigned bits;
-    memcpy(&bits, &x, 4);
-    return bits;
-}
-inline float __uint_as_float(unsigned bits)
-{
-    float x;
-    memcpy(&x, &bits, 4);
-    return x;
-}
+struct alignas(16) float4 {
+    float x, y, z, w;
+};
+struct uint4 {
+    unsigned x, y, z, w;
+};
+float2 make_float2(float x, float y) { return {x, y}; }
+float4 make_float4(float x, float y, float z, float w) { return {x, y, z, w}; }
+uint4 make_uint4(unsigned x, unsigned y, unsigned z, unsigned w) { return {x, y, z, w}; }
+unsigned __float_as_uint(float x) { return emulator::bits<unsigned>(x); }
+float __uint_as_float(unsigned x) { return emulator::bits<float>(x); }
+int __float_as_int(float x) { return emulator::bits<int>(x); }
+float __int_as_float(int x) { return emulator::bits<float>(x); }
+int __ffs(unsigned x) { return x ? __builtin_ctz(x) + 1 : 0; }
+int __clz(unsigned x) { return x ? __builtin_clz(x) : 32; }
+float __fdividef(float a, float b) { return a / b; }
+void atomicAdd(float* at, float value) { *at += value; }
 
-// Stands for the text ``CUDA`` of neuma_lib.mechanics.neural_fused
+// A Warp array, as far as the kernels use it.
+template <class T> struct Array {
+    T* data;
+};
+
+}  // namespace
+
+#define __shared__ static
+#define threadIdx emulator::current
+#define blockIdx emulator::block
+#define gridDim emulator::grid
+#define __syncthreads() emulator::wait(emulator::whole)
+#define __syncwarp() (void)emulator::gather(0, __LINE__)
+#define __ballot_sync(mask, value) emulator::ballot(value, __LINE__)
+#define __any_sync(mask, value) (emulator::ballot(value, __LINE__) != 0)
+#define __shfl_xor_sync(mask, value, step) emulator::shuffle(value, step, __LINE__)
+
+// Stands for the part "machine" of neural_fused.cu
 #define EMULATED_MACHINE                                                                                             \
     const int thread = threadIdx.x, lane = thread & 31, warp = thread >> 5;                                          \
     char* const pool = emulator::shared;                                                                             \

@@ -1,48 +1,14 @@
 """The fused kernels of the neural law agree with their twin; on a CPU the same kernel text runs in an emulation."""
 
-import shutil
-import subprocess
-from pathlib import Path
-
-import numpy as np
 import pytest
 import torch
+from emulated_cuda import COMPILER, EmulatedLaws
 
 from neuma_lib.mechanics import neural_fused as fused
 from neuma_lib.mechanics.neural import neural_law
 
-COMPILER = shutil.which("g++")
 KINDS = ("elasticity", "plasticity")
 REGIMES = ("near identity", "large strain", "inverted")
-
-PROGRAM = """
-#include "cuda_emulator.h"
-typedef uint64_t Address;
-%(functions)s
-int main(int, char** argv)
-{
-    const char* folder = argv[1];
-    const bool elastic = argv[2][0] == 'e', backward = argv[3][0] == '1';
-    const int blocks = atoi(argv[4]), bytes = atoi(argv[5]);
-    const float factor = atof(argv[6]);
-    auto F = emulator::read<float>(folder, "F"), W0 = emulator::read<float>(folder, "W0"),
-         W1 = emulator::read<float>(folder, "W1"), W2 = emulator::read<float>(folder, "W2"),
-         g = emulator::read<float>(folder, "g");
-    std::vector<float> result(F.size()), sums(backward ? blocks * 5504 : 0, NAN);
-    const int n = F.size() / 9;
-    auto at = [](std::vector<float>& x) { return Address(x.data()); };
-    emulator::launch(blocks, bytes, [&] {
-        if (backward)
-            (elastic ? vjp_elasticity : vjp_plasticity)(
-                at(F), at(W0), at(W1), at(W2), at(g), factor, n, at(result), at(sums));
-        else
-            (elastic ? evaluate_elasticity : evaluate_plasticity)(
-                at(F), at(W0), at(W1), at(W2), factor, n, at(result));
-    });
-    emulator::write(folder, "result", result);
-    emulator::write(folder, "sums", sums);
-}
-"""
 
 
 def deformations(regime, n, seed=0):
@@ -86,50 +52,9 @@ def distance(a, b):
 
 @pytest.fixture(scope="module")
 def emulated(tmp_path_factory):
-    """A function (part, F, g, blocks) -> result, grad_F and gradients of the weights, of the emulated kernels."""
     if COMPILER is None:
         pytest.skip("needs g++")
-    folder = tmp_path_factory.mktemp("emulated")
-    arguments = "Address F, Address W0, Address W1, Address W2"
-    functions = []
-    for kind in KINDS:
-        forward, backward = (fused.source(kind, which, "EMULATED_MACHINE\n") for which in (False, True))
-        functions.append(
-            f"void evaluate_{kind}({arguments}, float factor, int n, Address out)\n{{\n{forward}\n}}\n"
-            f"void vjp_{kind}({arguments}, Address grad_out, float factor, int n, Address grad_F, Address partials)\n"
-            f"{{\n{backward}\n}}\n"
-        )
-    (folder / "program.cpp").write_text(PROGRAM % {"functions": "".join(functions)})
-    command = [
-        COMPILER,
-        "-std=c++17",
-        "-O1",
-        "-w",
-        "-I",
-        str(Path(__file__).parent),
-        "program.cpp",
-        "-o",
-        "program",
-    ]
-    subprocess.run(command, cwd=folder, check=True)
-
-    def run(part, F, g, blocks):
-        arrays = dict(zip(("F", "W0", "W1", "W2", "g"), (F, *part.weights(), g), strict=True))
-        for name, value in arrays.items():
-            value.detach().float().numpy().tofile(folder / name)
-        found = []
-        for backward, size in ((0, fused.EVALUATE_BYTES), (1, fused.VJP_BYTES)):
-            size -= fused.ALIGNMENT
-            options = [part.kind, str(backward), str(blocks), str(size), str(part.scale)]
-            subprocess.run([folder / "program", str(folder), *options], check=True)
-            result = np.fromfile(folder / "result", np.float32).reshape(-1, 3, 3)
-            found.append(torch.from_numpy(result).double())
-        sums = torch.from_numpy(np.fromfile(folder / "sums", np.float32)).double().reshape(blocks, -1).sum(0)
-        shapes = [w.shape for w in part.weights()]
-        parts = sums.split([s.numel() for s in shapes])
-        return [*found, *(x.reshape(s) for x, s in zip(parts, shapes, strict=True))]
-
-    return run
+    return EmulatedLaws(tmp_path_factory.mktemp("emulated"))
 
 
 @pytest.mark.parametrize("kind", KINDS)

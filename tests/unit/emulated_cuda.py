@@ -1,0 +1,156 @@
+"""The CUDA code of the fused laws and of the tile compositor, compiled for the CPU by ``cuda_emulator.h``."""
+
+import ctypes
+import functools
+import shutil
+import subprocess
+from pathlib import Path
+
+import torch
+import warp as wp
+
+from neuma_lib.mechanics import neural_fused
+from neuma_lib.splatting import compositor_cuda
+from neuma_lib.splatting.arrays import plain, target
+
+COMPILER = shutil.which("g++")
+
+
+class _Array(ctypes.Structure):
+    _fields_ = [("data", ctypes.c_void_p)]
+
+
+@functools.cache
+def _library(folder: Path, name: str, bodies: tuple[tuple[str, str, str], ...]) -> ctypes.CDLL:
+    """Kernels (name, parameters, body), each as a function (blocks, threads, bytes of shared memory, parameters)."""
+    code = '#include "cuda_emulator.h"\n'
+    for kernel, parameters, body in bodies:
+        names = ", ".join(part.split()[-1] for part in parameters.split(","))
+        code += f"static void {kernel}_body({parameters})\n{{\n{body}\n}}\n"
+        code += f'extern "C" int {kernel}(int blocks, int threads, int bytes, {parameters})\n'
+        code += f"{{\n    return emulator::launch(blocks, threads, bytes, [&] {{ {kernel}_body({names}); }});\n}}\n"
+    path = folder / name
+    path.with_suffix(".cpp").write_text(code)
+    options = [
+        "-std=c++17",
+        "-O1",
+        "-ffp-contract=off",
+        "-shared",
+        "-fPIC",
+        "-w",
+        f"-I{Path(__file__).parent}",
+    ]
+    subprocess.run([COMPILER, *options, "-o", path.with_suffix(".so"), path.with_suffix(".cpp")], check=True)
+    return ctypes.CDLL(str(path.with_suffix(".so")))
+
+
+def _launch(function, blocks: int, threads: int, shared: int, *arguments) -> None:
+    """Numbers are handed over as C's int and float, tensors as the struct ``Array``."""
+
+    def value(x):
+        if isinstance(x, torch.Tensor):
+            assert x.is_contiguous()
+            return _Array(x.data_ptr())
+        return ctypes.c_int(x) if isinstance(x, int) else ctypes.c_float(x)
+
+    assert function(*map(value, (blocks, threads, shared, *arguments))) == 0, (
+        "the emulation failed, see stderr"
+    )
+
+
+class EmulatedTiles:
+    """``compositor_cuda`` on the CPU: the same lists, the same code for a warp, the same last kernel."""
+
+    parameters = {
+        "forward": "int width, int height, Array<float> splats, Array<int> ids, Array<int> starts, float alpha_min,"
+        " float alpha_max, float transmittance_min, Array<float> background, Array<float> pictures,"
+        " Array<float> alphas, Array<float> transmittances, Array<int> stops",
+        "backward": "int width, int height, Array<float> splats, Array<int> ids, Array<int> starts,"
+        " Array<float> transmittances, Array<int> stops, float alpha_min, float alpha_max, Array<float> background,"
+        " Array<float> grad_pictures, Array<float> grad_alphas, Array<float> grad_splats",
+    }
+
+    def __init__(
+        self, folder: Path, tile: int = compositor_cuda.TILE, lane_pixels: int = compositor_cuda.LANE_PIXELS
+    ):
+        self.tile, self.threads = tile, tile * tile // lane_pixels
+        place = "const int tile = blockIdx.x, thread = threadIdx.x;\n"
+        bodies = tuple(
+            (name, parameters, place + compositor_cuda.source(name, tile, lane_pixels))
+            for name, parameters in self.parameters.items()
+        )
+        self.library = _library(folder, f"tiles{tile}x{lane_pixels}", bodies)
+
+    def composite(self, splats, depths, background, settings, empty):
+        shape = (*depths.shape[:1], settings.height, settings.width)
+        # filled with a value that would be noticed: every pixel must be written
+        pictures, alphas = splats.new_full((*shape, 3), 1e9), splats.new_full(shape, 1e9)
+        transmittances, stops = splats.new_full(shape, 1e9), splats.new_full(shape, -1, dtype=torch.int32)
+        ids, starts = compositor_cuda.lists(splats, depths, settings.width, settings.height, self.tile)
+        _launch(
+            self.library.forward, len(starts) - 1, self.threads, 0, settings.width, settings.height, splats, ids,
+            starts, settings.alpha_min, settings.alpha_max, settings.transmittance_min, background, pictures, alphas,
+            transmittances, stops,
+        )  # fmt: skip
+        return pictures, alphas, (ids, starts, transmittances, stops)
+
+    def composite_adjoint(
+        self, splats, kept, background, settings, grad_pictures, grad_alphas, grad_splats, empty
+    ):
+        ids, starts, transmittances, stops = kept
+        grad_splats.zero_()
+        _launch(
+            self.library.backward, len(starts) - 1, self.threads, 0, settings.width, settings.height, splats, ids,
+            starts, transmittances, stops, settings.alpha_min, settings.alpha_max, background, grad_pictures,
+            grad_alphas, grad_splats,
+        )  # fmt: skip
+        _, _, finish = compositor_cuda.list_kernels()
+        wp.launch(
+            finish,
+            dim=splats.shape[:2],
+            inputs=[plain(splats)],
+            outputs=[plain(grad_splats)],
+            **target(splats),
+        )
+
+
+class EmulatedLaws:
+    """The kernels of ``neural_fused`` on the CPU, for any number of blocks."""
+
+    def __init__(self, folder: Path):
+        arrays = "Array<float> F_, Array<float> W0_, Array<float> W1_, Array<float> W2_"
+        forward = f"{arrays}, float factor, int n, Array<float> out_"
+        backward = f"{arrays}, Array<float> grad_out_, float factor, int n, Array<float> grad_F_"
+        backward += ", Array<float> partials_"
+
+        def body(kind, is_backward, parameters):
+            # the kernels take addresses
+            names = [part.split()[-1] for part in parameters.split(",") if "Array" in part]
+            addresses = "".join(f"    const uint64_t {n[:-1]} = uint64_t({n}.data);\n" for n in names)
+            return addresses + neural_fused.source(kind, is_backward, "EMULATED_MACHINE\n")
+
+        bodies = [
+            (f"{name}_{kind}", parameters, body(kind, name == "vjp", parameters))
+            for kind in ("elasticity", "plasticity")
+            for name, parameters in (("evaluate", forward), ("vjp", backward))
+        ]
+        self.library = _library(folder, "laws", tuple(bodies))
+
+    def __call__(self, part, F, g, blocks: int) -> list[torch.Tensor]:
+        """Result, gradient of F (n, 3, 3) and gradients of the weights, in float64; computed in float32."""
+        F, g, *weights = (x.detach().float().contiguous() for x in (F, g, *part.weights()))
+        result, grad_F = torch.empty_like(F), torch.empty_like(F)
+        partials = torch.full((blocks, neural_fused.WEIGHTS), torch.nan)
+        common = (F, *weights)
+        sizes = (
+            size - neural_fused.ALIGNMENT for size in (neural_fused.EVALUATE_BYTES, neural_fused.VJP_BYTES)
+        )
+        calls = (
+            ("evaluate", (*common, float(part.scale), len(F), result)),
+            ("vjp", (*common, g, float(part.scale), len(F), grad_F, partials)),
+        )
+        for size, (name, arguments) in zip(sizes, calls, strict=True):
+            function = getattr(self.library, f"{name}_{part.kind}")
+            _launch(function, blocks, neural_fused.ROWS, size, *arguments)
+        sums = partials.double().sum(0).split([w.numel() for w in weights])
+        return [result.double(), grad_F.double(), *(x.view_as(w) for x, w in zip(sums, weights, strict=True))]
