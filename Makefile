@@ -29,6 +29,7 @@ lint: env
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/snakefmt --check Snakefile workflow
+	$(BIN)/lint-imports --no-cache
 	$(BIN)/snakemake --lint
 
 # A killed Snakemake leaves its lock behind.

@@ -20,8 +20,9 @@ import torch
 
 from benchmarks.scene import SMALL, BenchmarkScene, Size, make_scene
 from benchmarks.timing import arithmetic, bandwidth, device_name, peak_memory, seconds, seconds_a_call
+from neuma_lib.config.material import MaterialConfig
 from neuma_lib.fitting.image_loss import mean_squared_error
-from neuma_lib.fitting.material import MaterialSettings, PixelLoss, train_material
+from neuma_lib.fitting.material import PixelLoss, train_material
 from neuma_lib.sim.model import as_bodies
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.simulation import Simulation
@@ -188,7 +189,7 @@ def simulate_and_back(scene: BenchmarkScene, **options) -> None:
 def iterations(scene: BenchmarkScene, count: int) -> list[float]:
     """Wall time of each of some training iterations [s], by the training loop itself."""
     loss = PixelLoss(scene.body, scene.observation)
-    settings = MaterialSettings(iterations=count, lr_elastic=1e-4, lr_plastic=1e-5)
+    settings = MaterialConfig(iterations=count, lr_elastic=1e-4, lr_plastic=1e-5)
     trained = train_material(scene.model, scene.law, scene.body, scene.v0, loss, settings, log=lambda _: None)
     return trained.history.seconds
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from workflow.provenance import code_digest
 
 RESOURCES = {"gpu": 0, "mem_mb": 4000, "runtime": 60}  # GPUs, MB, minutes
+SCRIPTS = Path(__file__).resolve().parent / "scripts"
 CONDA = "../../envs/conda.yaml"  # relative to the files of the rules
 
 
@@ -38,8 +39,7 @@ def complete(workflow, results: str) -> None:
         if not said.conda_env:
             rule.conda_env = CONDA
         if "code" not in rule.params.keys():
-            root = Path(workflow.basedir)
-            rule.set_params(code=code_digest(root / "workflow" / "scripts" / Path(rule.script).name, root))
+            rule.set_params(code=code_digest(SCRIPTS / Path(rule.script).name))
         resources = type(rule.resources).from_mapping(dict(RESOURCES))
         resources.update(said.resources[1] if said.resources else {})
         resources.update(workflow.resource_settings._parsed_overwrite_resources.get(rule.name, {}))

@@ -1,42 +1,34 @@
-"""Typed settings of the whole pipeline: one home, one type, one default and one line of explanation each.
+"""All settings: `load` turns the merged YAML that the user gave into a `Config`.
 
-`load` turns the merged YAML that the user gave into a `Config`; unknown keys, wrong types and impossible values are
-an `InputError` that names the key by its path. The sections stand in `neuma_lib.config.sections`; a stage receives
-the complete section (all defaults filled in) as plain numbers.
-
+Each stage has a module of its own beside this one, so that what is computed again after an edit is what uses it.
 ``docs/settings.md`` is generated from all this by `neuma_lib.config.page`.
 """
 
 from __future__ import annotations
 
-import copy
-import difflib
-import typing
-from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from neuma_lib.config.blocks import Section
-from neuma_lib.config.sections import (
-    BindingConfig,
-    DatasetConfig,
-    EvaluationConfig,
-    ExperimentConfig,
-    FiguresConfig,
-    GaussiansConfig,
-    GeometryConfig,
-    MaterialConfig,
-    MethodConfig,
-    PriorsConfig,
-    SceneConfig,
-    SimulationConfig,
-    TableConfig,
-    VelocityConfig,
-)
+from neuma_lib.config.base import Section
+from neuma_lib.config.binding import BindingConfig
+from neuma_lib.config.dataset import DatasetConfig
+from neuma_lib.config.evaluation import EvaluationConfig
+from neuma_lib.config.experiments import ExperimentConfig
+from neuma_lib.config.figures import FiguresConfig
+from neuma_lib.config.gaussians import GaussiansConfig
+from neuma_lib.config.geometry import GeometryConfig
+from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.methods import MethodConfig, parse_method, variant_title
+from neuma_lib.config.priors import PriorsConfig
+from neuma_lib.config.scenes import SceneConfig
+from neuma_lib.config.simulation import SimulationConfig
+from neuma_lib.config.tables import TableConfig
+from neuma_lib.config.validation import hint, validate
+from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.errors import InputError
 
 
@@ -70,64 +62,50 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Config:
+        """Names of scenes, experiments, priors and methods exist; what scenes and methods change fits its section."""
         for name, scene in self.scenes.items():
             if "/" not in scene.prior and "." not in scene.prior and scene.prior not in self.priors.laws:
+                laws = self.priors.laws
                 raise ValueError(
-                    f"scenes.{name}.prior: no prior '{scene.prior}' in priors.laws"
-                    + _close(scene.prior, self.priors.laws)
+                    f"scenes.{name}.prior: no prior '{scene.prior}' in priors.laws{hint(scene.prior, laws)}"
                 )
-            _overridden(self.material, scene.material, f"scenes.{name}.material")
+            _changed(self.material, scene.material, f"scenes.{name}.material")
         for name, method in self.methods.items():
-            _overridden(self.material, method.material, f"methods.{name}.material")
-        for name, experiment in self.experiments.items():
-            for k, body in enumerate(experiment.bodies):
-                if body.scene not in self.scenes:
-                    where = f"experiments.{name}.bodies.{k}.scene"
-                    raise ValueError(f"{where}: no scene '{body.scene}'{_close(body.scene, self.scenes)}")
-        self._check_figures()
-        for name, table in self.tables.items():
-            for kind, known in (("scenes", self.scenes), ("experiments", self.experiments)):
-                for column in getattr(table, kind):
-                    if column not in known:
-                        where = f"tables.{name}.{kind}"
-                        raise ValueError(f"{where}: no {kind[:-1]} '{column}'{_close(column, known)}")
+            _changed(self.material, method.material, f"methods.{name}.material")
+        for where, kind, name in self._mentioned():
+            known = self.scenes if kind == "scene" else self.experiments
+            if name not in known:
+                raise ValueError(f"{where}: no {kind} '{name}'{hint(name, known)}")
+        for table in self.tables.values():
             for method in (*table.methods, *table.titles):
                 parse_method(method, self.methods)
         return self
 
-    def _check_figures(self) -> None:
-        """That what figures show exists; names of scenes matter only where there are scenes."""
-        drawn = self.figures
-        scenes = {
-            "particles_app": [drawn.particles_app],
-            "pipeline": [drawn.pipeline],
-            **{key: getattr(drawn, key) for key in ("main_res", "lora_alphav")},
-            **{key: getattr(drawn, key) for key in ("gradient_analysis", "material_response")},
-        }
-        experiments = {
-            "letters": drawn.letters,
-            "meetings": drawn.meetings,
-            "ext_time": [drawn.ext_time] if drawn.ext_time else [],
-        }
-        for chosen, known, kind in (
-            (scenes if self.scenes else {}, self.scenes, "scene"),
-            (experiments, self.experiments, "experiment"),
-        ):
-            for key, names in chosen.items():
-                for name in names:
-                    if name not in known:
-                        raise ValueError(f"figures.{key}: no {kind} '{name}'{_close(name, known)}")
+    def _mentioned(self) -> Iterator[tuple[str, str, str]]:
+        """Where a scene or an experiment is mentioned: path of the key, "scene" or "experiment", name."""
+        for name, experiment in self.experiments.items():
+            for k, body in enumerate(experiment.bodies):
+                yield f"experiments.{name}.bodies.{k}.scene", "scene", body.scene
+        # The default figures show scenes of the benchmark: their names matter only where there are scenes.
+        for key, kind in FiguresConfig.SHOWN.items():
+            value = getattr(self.figures, key) if kind == "experiment" or self.scenes else ()
+            for name in filter(None, [value] if isinstance(value, str) else value):
+                yield f"figures.{key}", kind, name
+        for name, table in self.tables.items():
+            for kind in ("scene", "experiment"):
+                for column in getattr(table, f"{kind}s"):
+                    yield f"tables.{name}.{kind}s", kind, column
 
     def scene(self, name: str) -> SceneConfig:
         """The scene of that name."""
         if name not in self.scenes:
-            raise InputError(f"no scene '{name}' in {self.scenes_file}{_close(name, self.scenes)}")
+            raise InputError(f"no scene '{name}' in {self.scenes_file}{hint(name, self.scenes)}")
         return self.scenes[name]
 
     def experiment(self, name: str) -> ExperimentConfig:
         """The experiment of that name."""
         if name not in self.experiments:
-            raise InputError(f"no experiment '{name}'{_close(name, self.experiments)}")
+            raise InputError(f"no experiment '{name}'{hint(name, self.experiments)}")
         return self.experiments[name]
 
     def experiment_bodies(self, name: str) -> list[dict[str, Any]]:
@@ -169,14 +147,14 @@ class Config(Section):
     def method_title(self, method: str) -> str:
         """Name of a method or variant for tables, for example "NeuMA, rank 4"."""
         base, variant = parse_method(method, self.methods)
-        return ", ".join([self.methods[base].title, *(f"{k} {_scalar_text(v)}" for k, v in variant.items())])
+        return variant_title(self.methods[base].title, variant)
 
     def method_prior(self, scene: str, method: str) -> str:
         """The prior that a method starts from: the scene's, unless the variant names another."""
         _, variant = parse_method(method, self.methods)
         prior = str(variant.get("prior", self.scene(scene).prior))
         if "prior" in variant and prior not in self.priors.laws:
-            raise InputError(f"{method}: no prior '{prior}' in priors.laws{_close(prior, self.priors.laws)}")
+            raise InputError(f"{method}: no prior '{prior}' in priors.laws{hint(prior, self.priors.laws)}")
         return prior
 
     def method_material(self, scene: str, method: str) -> MaterialConfig:
@@ -189,35 +167,8 @@ class Config(Section):
             (self.methods[base].material, f"methods.{base}.material"),
             (variant, method),
         ):
-            section = _overridden(section, changes, origin)
+            section = _changed(section, changes, origin)
         return section
-
-
-def parse_method(text: str, methods: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Split a method's folder name, ``neuma+rank=4+seed=2``, into its base and its settings.
-
-    Keys are those of the section ``material``, and ``prior``. Values are YAML scalars; a comma makes a list.
-
-    Raises:
-        InputError: unknown method or key, a repeated key, or a piece without '='.
-    """
-    base, *pieces = text.split("+")
-    if base not in methods:
-        raise InputError(f"no method '{base}'{_close(base, methods)}")
-    variant: dict[str, Any] = {}
-    known = [*MaterialConfig.model_fields, "prior"]
-    for piece in pieces:
-        key, equals, value = piece.partition("=")
-        if not equals or not key or not value:
-            raise InputError(f"method '{text}': write variants as +key=value, not '+{piece}'")
-        if key not in known:
-            raise InputError(f"method '{text}': no setting '{key}'{_close(key, known)}")
-        if key in variant:
-            raise InputError(f"method '{text}': '{key}' is given twice")
-        kind = typing.get_origin(MaterialConfig.model_fields[key].annotation) if key != "prior" else None
-        values = [yaml.safe_load(v) for v in value.split(",")]
-        variant[key] = values if kind is tuple else yaml.safe_load(value)
-    return base, variant
 
 
 def load(raw: Mapping[str, Any], root: str | Path = ".") -> Config:
@@ -230,20 +181,8 @@ def load(raw: Mapping[str, Any], root: str | Path = ".") -> Config:
     Raises:
         InputError: names every offending key by its path and suggests close matches.
     """
-    raw = copy.deepcopy(dict(raw))
     scenes_file = Path(root) / str(raw.get("scenes_file", Config.model_fields["scenes_file"].default))
-    scenes = read_yaml(scenes_file)
-    raw["scenes"] = merged(scenes, raw.get("scenes") or {})
-    return validate(Config, raw)
-
-
-def validate(kind: type, raw: Any, origin: str = "") -> Any:
-    """Build a section, with errors that name keys by their path below ``origin``."""
-    try:
-        return kind.model_validate(raw)
-    except ValidationError as error:
-        lines = [_explain(kind, problem, origin) for problem in error.errors()]
-        raise InputError("settings: " + "\n          ".join(lines)) from None
+    return validate(Config, {**raw, "scenes": merged(read_yaml(scenes_file), raw.get("scenes") or {})})
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
@@ -271,76 +210,5 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
     return result
 
 
-def pick(kind: type, section: Section | Mapping[str, Any], **others: Any) -> Any:
-    """Build the dataclass ``kind`` from the fields of the same names; ``others`` are given by hand."""
-    values = (
-        section
-        if isinstance(section, Mapping)
-        else {k: getattr(section, k) for k in type(section).model_fields}
-    )
-    return kind(
-        **{f.name: values[f.name] for f in fields(kind) if f.name in values and f.name not in others},
-        **others,
-    )
-
-
-def from_mapping(kind: type, values: Mapping[str, Any], origin: str) -> Any:
-    """Build the dataclass ``kind`` from a block of settings, blocks inside it too; lists become tuples.
-
-    Raises:
-        InputError: an unknown key, named by its path below ``origin``.
-    """
-    known = {f.name: f for f in fields(kind)}
-    built = {}
-    for key, value in values.items():
-        if key not in known:
-            raise InputError(f"settings: {origin}.{key}: unknown key{_close(key, known)}")
-        if isinstance(value, Mapping) and is_dataclass(known[key].default):
-            value = from_mapping(type(known[key].default), value, f"{origin}.{key}")
-        built[key] = tuple(value) if isinstance(value, list) else value
-    return kind(**built)
-
-
-def _overridden(section: MaterialConfig, changes: Mapping[str, Any], origin: str) -> MaterialConfig:
-    return validate(type(section), merged(section.plain(), changes), origin)
-
-
-def _close(word: str, known: Any) -> str:
-    """A hint: the close matches, or all that there is."""
-    matches = difflib.get_close_matches(str(word), [str(k) for k in known], n=2, cutoff=0.6)
-    if matches:
-        return f"; did you mean {' or '.join(matches)}?"
-    return f"; known: {', '.join(map(str, known))}" if known else ""
-
-
-def _scalar_text(value: Any) -> str:
-    return ",".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
-
-
-def _explain(kind: type, problem: Mapping[str, Any], origin: str) -> str:
-    where = [str(p) for p in problem["loc"]]
-    path = ".".join([origin, *where] if origin else where)
-    if problem["type"] == "extra_forbidden":
-        siblings = _keys_at(kind, problem["loc"][:-1])
-        return f"{path}: unknown key{_close(where[-1], siblings)}"
-    if problem["type"] == "missing":
-        return f"{path}: this key is missing"
-    message = problem["msg"].removeprefix("Value error, ").removeprefix("settings: ")
-    if not path:
-        return message
-    given = problem.get("input")
-    return f"{path}: {message}" + (f" (given: {given!r})" if not isinstance(given, Mapping) else "")
-
-
-def _keys_at(kind: type, where: tuple) -> list[str]:
-    """Keys of the section at a path, for suggestions."""
-    for step in where:
-        if isinstance(kind, type) and issubclass(kind, BaseModel):
-            if step not in kind.model_fields:
-                return []
-            kind = kind.model_fields[step].annotation
-        elif typing.get_origin(kind) is dict:
-            kind = typing.get_args(kind)[1]
-        else:
-            return []
-    return list(kind.model_fields) if isinstance(kind, type) and issubclass(kind, BaseModel) else []
+def _changed(section: MaterialConfig, changes: Mapping[str, Any], origin: str) -> MaterialConfig:
+    return validate(MaterialConfig, {**section.plain(), **changes}, origin)

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from neuma_lib.config.gaussians import GaussiansConfig
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.geometry.visual_hull import Hull, visual_hull
 from neuma_lib.splatting.cameras import Cameras
@@ -24,75 +25,6 @@ from neuma_lib.splatting.rasterizer import RenderBuffers, Statistics, rasterize
 from neuma_lib.splatting.spherical_harmonics import coefficient_count, rgb_to_sh0
 
 WHITE = (1.0, 1.0, 1.0)
-
-
-@dataclass(frozen=True)
-class Densification:
-    """When and where kernels are added and removed.
-
-    Attributes:
-        start, stop: fractions of the iterations between which kernels are added.
-        every: iterations between two rounds.
-        max_count: kernels at most.
-        growth: largest fraction of kernels added in a round.
-        split_scale: a kernel whose largest standard deviation exceeds this many times that of the start is
-            split in two, a smaller one is cloned.
-        min_opacity: kernels below are removed at each round.
-    """
-
-    start: float = 0.1
-    stop: float = 0.6
-    every: int = 100
-    max_count: int = 2000
-    growth: float = 0.15
-    split_scale: float = 1.0
-    min_opacity: float = 0.02
-
-
-@dataclass(frozen=True)
-class GaussianFitSettings:
-    """Settings of ``fit_gaussians``.
-
-    Attributes:
-        iterations: optimiser steps, each on ``batch`` views.
-        batch: views a step.
-        initial_count: kernels at the start.
-        interior: fraction of them placed inside the hull, the others lie near its surface.
-        initial_opacity: opacity at the start, and for good of kernels that no camera ever sees.
-        hull_resolution: voxels along the longest side of the hull's bounding box.
-        sh_degree: highest SH degree, 0 to 3.
-        ssim_weight: share of SSIM in the image loss, the rest is L1.
-        anisotropy_weight, max_anisotropy: weight of the regulariser and the ratio of longest to shortest axis
-            above which it acts.
-        min_scale, max_scale: limits of the standard deviations as fractions of the mean spacing of the start.
-        rate_means: learning rate of the centres in mean spacings of the start; falls to a hundredth.
-        rate_scales, rate_quats, rate_opacities, rate_colours, rate_harmonics: the others; fall to a tenth.
-        cull_opacity: kernels at most this opaque are removed at the end (paper: 0.02).
-        held_out: every how many-th view is kept for measurement only; 0 for none.
-        densification: rounds of adding and removing kernels.
-    """
-
-    iterations: int = 1500
-    batch: int = 1
-    initial_count: int = 1000
-    interior: float = 0.15
-    initial_opacity: float = 0.9
-    hull_resolution: int = 64
-    sh_degree: int = 1
-    ssim_weight: float = 0.2
-    anisotropy_weight: float = 0.1
-    max_anisotropy: float = 4.0
-    min_scale: float = 0.1
-    max_scale: float = 2.0
-    rate_means: float = 0.02
-    rate_scales: float = 0.02
-    rate_quats: float = 0.01
-    rate_opacities: float = 0.05
-    rate_colours: float = 0.02
-    rate_harmonics: float = 0.002
-    cull_opacity: float = 0.02
-    held_out: int = 10
-    densification: Densification = Densification()
 
 
 @dataclass
@@ -126,7 +58,7 @@ EPS2D = 0.3
 def fit_gaussians(
     images: Tensor,
     cameras: Cameras,
-    settings: GaussianFitSettings | None = None,
+    settings: GaussiansConfig,
     seed: int = 0,
     progress: Callable[[int, float], None] | None = None,
 ) -> tuple[Gaussians, GaussianFitReport]:
@@ -135,7 +67,7 @@ def fit_gaussians(
     Args:
         images: (V, H, W, 4) RGBA with straight alpha in [0, 1]; alpha shows the object alone.
         cameras: their V cameras.
-        settings: see GaussianFitSettings.
+        settings: hyper-parameters.
         seed: of everything random; the same seed gives the same kernels on a CPU.
         progress: called with (iteration, loss) after each iteration.
 
@@ -146,7 +78,6 @@ def fit_gaussians(
         InputError: shapes disagree, or a mask is empty.
         NonFiniteError: the loss is not finite.
     """
-    settings = settings or GaussianFitSettings()
     images = images.to(cameras.viewmats.dtype)
     _check(images, cameras)
     generator = torch.Generator().manual_seed(seed)
@@ -218,7 +149,7 @@ def evaluate(gaussians: Gaussians, images: Tensor, cameras: Cameras, views: list
 
 
 def _initial_gaussians(
-    hull: Hull, images: Tensor, cameras: Cameras, settings: GaussianFitSettings, generator: torch.Generator
+    hull: Hull, images: Tensor, cameras: Cameras, settings: GaussiansConfig, generator: torch.Generator
 ) -> tuple[Gaussians, float]:
     """Isotropic kernels, most near the hull's surface, and their mean spacing [m]."""
     solid = hull.occupied.float()[None, None]
@@ -293,7 +224,7 @@ def _mean_colours(points: Tensor, images: Tensor, cameras: Cameras) -> Tensor:
 class _Kernels:
     """Parameters, their Adam state, and the rounds of densification."""
 
-    def __init__(self, start: Gaussians, spacing: float, settings: GaussianFitSettings):
+    def __init__(self, start: Gaussians, spacing: float, settings: GaussiansConfig):
         self.settings, self.spacing = settings, spacing
         self.parameters = {
             "means": start.means.clone(),

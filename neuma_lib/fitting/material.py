@@ -23,6 +23,7 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor
 
+from neuma_lib.config.material import MaterialConfig
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.frame_batches import evaluate_in_batches
@@ -102,47 +103,6 @@ class ParticleLoss:
         return chamfer_loss(path.x, self.targets)
 
 
-@dataclass(frozen=True)
-class MaterialSettings:
-    """Hyper-parameters of the training loop.
-
-    Attributes:
-        iterations: optimiser steps, one full rollout each.
-        lr_elastic, lr_plastic: learning rates of the two networks.
-        lr_floor: fraction of the learning rates that the cosine schedule ends at.
-        betas: Adam's averaging factors.
-        zero_gradients: false adds every iteration's gradient to the clipped ones before it, as the authors' released
-            loop does.
-        gradient_clip: largest gradient norm of each network; the loss is divided by its first value before.
-        frame_weight_start: d of the frame weights d^k at the first iteration; it rises to 1 over the first third.
-        frame_weight_periods: k counts this many equal parts of the video, so that early frames are fitted first.
-        warm_up: iterations over which the rates rise linearly from zero.
-        recovery_growth: after a return to the best state the rates are halved; each accepted iteration multiplies
-            them by this, up to their full size.
-        diverged_ratio: a loss above this multiple of the best one so far (at equal frame weights) counts as diverged.
-        max_recoveries: after more returns to the best state than this, training ends there, marked as unstable.
-        checkpoint_every: iterations between checkpoints.
-        memory: most GiB for what a rollout's gradient keeps; with less, steps are computed again, see `rollout`.
-            null: no limit.
-    """
-
-    iterations: int = 50
-    lr_elastic: float = 0.01
-    lr_plastic: float = 0.0005
-    lr_floor: float = 0.05
-    betas: tuple[float, float] = (0.9, 0.99)
-    zero_gradients: bool = True
-    gradient_clip: float = 1.0
-    frame_weight_start: float = 0.5
-    frame_weight_periods: int = 5
-    warm_up: int = 5
-    recovery_growth: float = 1.1
-    diverged_ratio: float = 5.0
-    max_recoveries: int = 6
-    checkpoint_every: int = 10
-    memory: float | None = None
-
-
 @dataclass
 class History:
     """Training curves, one entry an accepted iteration; ``seconds`` is the wall time that it took [s]."""
@@ -177,7 +137,7 @@ class TrainedMaterial:
         )
 
 
-def frame_weights(iteration: int, count: int, settings: MaterialSettings) -> Tensor:
+def frame_weights(iteration: int, count: int, settings: MaterialConfig) -> Tensor:
     """Weights of the frames, shape (count,): d^k, k the part of the video; d rises to 1 over a third of training."""
     rise = min(1.0, iteration / max(1.0, settings.iterations / 3))
     d = settings.frame_weight_start + (1 - settings.frame_weight_start) * rise
@@ -191,7 +151,7 @@ def train_material(
     body: Reconstruction,
     v0: Tensor,
     loss: TrajectoryLoss,
-    settings: MaterialSettings,
+    settings: MaterialConfig,
     *,
     checkpoint: Checkpoint | None = None,
     progress: Callable[[int, int, float], None] | None = None,
@@ -205,7 +165,7 @@ def train_material(
         body: particles at the start.
         v0: initial velocity [m/s], shape (3,).
         loss: per-frame loss of a trajectory.
-        settings: hyper-parameters.
+        settings: hyper-parameters, from ``iterations`` on and ``lr_scale``.
         checkpoint: where to keep the state of the loop, so that a killed run goes on; None keeps none.
         progress: called with (iteration, iterations, loss).
         log: receives a line for every recovery from a diverging step.
@@ -244,7 +204,10 @@ class _Loop:
         }
         if not any(self.nets.values()):
             raise InputError("the law has no trainable parameters: attach an adaptor before training")
-        rates = {"elastic": settings.lr_elastic, "plastic": settings.lr_plastic}
+        rates = {
+            "elastic": settings.lr_scale * settings.lr_elastic,
+            "plastic": settings.lr_scale * settings.lr_plastic,
+        }
         self.optimizer = torch.optim.Adam(
             [{"params": p, "lr": rates[k], "base_lr": rates[k]} for k, p in self.nets.items() if p],
             betas=settings.betas,

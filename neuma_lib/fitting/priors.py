@@ -15,14 +15,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import gelu
 
-from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.config.priors import RegressionConfig, TrajectoryConfig
+from neuma_lib.errors import NonFiniteError
 from neuma_lib.fitting.soap import SOAP
 from neuma_lib.geometry.chamfer import chamfer_sequence
 from neuma_lib.mechanics.analytic import analytic_law
@@ -40,73 +41,9 @@ DENSITY = 1000.0
 Progress = Callable[[int, int, float | None], None]
 
 
-@dataclass(frozen=True)
-class RegressionSettings:
-    """Regression on pairs (F -> tau) and (F_trial -> F).
-
-    Attributes:
-        throws: cubes simulated with the analytic law.
-        side_particles: particles along a cube's edge.
-        grid: grid nodes along the box.
-        duration: length of a throw [s].
-        dt: longest time step [s]; shortened to a Courant number of 0.5.
-        samples: pairs a network is fitted to, in each round.
-        noise_low, noise_high: range of the log-uniform size of the random log strains.
-        rounds: rounds of data; from the second on, states that the networks' own rollouts visit are added.
-        iterations: SOAP iterations a network, in each round.
-        batch: pairs an iteration.
-        learning_rate: SOAP's step, warmed up and decayed to zero by a cosine in each round.
-        floor: targets smaller than this fraction of the median visited one are fitted in absolute terms.
-    """
-
-    throws: int = 8
-    side_particles: int = 8
-    grid: int = 20
-    duration: float = 0.45
-    dt: float = 1e-3
-    samples: int = 131072
-    noise_low: float = 1e-3
-    noise_high: float = 0.3
-    rounds: int = 2
-    iterations: int = 2500
-    batch: int = 1024
-    learning_rate: float = 2e-2
-    floor: float = 0.3
-
-
-@dataclass(frozen=True)
-class TrajectorySettings:
-    """NCLaw's training on the positions of one thrown cube.
-
-    Attributes:
-        epochs: passes over the trajectory, one optimiser step each.
-        steps: time steps of the trajectory.
-        dt: time step [s].
-        side_particles: particles along the cube's edge.
-        grid: grid nodes along the box.
-        reset_first, reset_last: steps from one reset to the true state to the next, first and last epoch.
-        learning_rate_elastic, learning_rate_plastic: of Adam, decayed to zero by a cosine.
-        gradient_clip: largest norm of each network's gradient.
-    """
-
-    epochs: int = 300
-    steps: int = 1000
-    dt: float = 5e-4
-    side_particles: int = 10
-    grid: int = 20
-    reset_first: int = 25
-    reset_last: int = 200
-    learning_rate_elastic: float = 1.0
-    learning_rate_plastic: float = 0.1
-    gradient_clip: float = 0.1
-
-
-METHODS = {"regression": RegressionSettings, "trajectory": TrajectorySettings}
-
-
 def train_prior(
     spec: Mapping[str, Any],
-    settings: Mapping[str, Any] | None = None,
+    settings: RegressionConfig | TrajectoryConfig,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> tuple[NeuralLaw, dict[str, Any]]:
@@ -114,8 +51,7 @@ def train_prior(
 
     Args:
         spec: the analytic law, see :func:`neuma_lib.mechanics.analytic.analytic_law`.
-        settings: ``method`` ("regression" or "trajectory") and fields of :class:`RegressionSettings` or
-            :class:`TrajectorySettings`.
+        settings: of one of the two ways, which chooses the way.
         seed: of throws, noise, initial weights and batches.
         progress: called with (iterations done, iterations in all, loss).
 
@@ -124,24 +60,14 @@ def train_prior(
         throws, see :func:`judge`.
 
     Raises:
-        InputError: unknown method, setting or material.
+        InputError: unknown material.
         NonFiniteError: training or a rollout diverged.
     """
-    values = dict(settings or {})
-    method = values.pop("method", "regression")
-    if method not in METHODS:
-        raise InputError(f"priors.method: {method!r} is unknown; choose from {', '.join(METHODS)}")
-    known = [f.name for f in fields(METHODS[method])]
-    unknown = sorted(set(values) - set(known))
-    if unknown:
-        raise InputError(
-            f"priors.{method}: unknown {', '.join(unknown)}; the settings are {', '.join(known)}"
-        )
-    chosen = METHODS[method](**values)
-    train = train_by_regression if method == "regression" else train_by_trajectory
-    law, report = train(spec, chosen, seed, progress or (lambda done, total, loss: None))
-    report["method"] = method
-    how = chosen if method == "regression" else RegressionSettings(grid=chosen.grid, dt=chosen.dt)
+    regression = isinstance(settings, RegressionConfig)
+    train = train_by_regression if regression else train_by_trajectory
+    law, report = train(spec, settings, seed, progress or (lambda done, total, loss: None))
+    report["method"] = "regression" if regression else "trajectory"
+    how = settings if regression else RegressionConfig(grid=settings.grid, dt=settings.dt)
     report.update(judge(law, spec, how, seed))
     return law, report
 
@@ -161,17 +87,17 @@ class Throw:
         return rollout(self.model, law, self.state, steps=self.steps, frames=frames)
 
 
-def reference_law(spec: Mapping[str, Any], settings: RegressionSettings) -> Law:
+def reference_law(spec: Mapping[str, Any], settings: RegressionConfig) -> Law:
     """The analytic law, which knows the longest time step that suits it if it depends on the rate."""
     law = analytic_law(spec, dt=settings.dt)
     return analytic_law(spec, dt=longest_step(law, settings))
 
 
-def longest_step(law: Law, settings: RegressionSettings) -> float:
+def longest_step(law: Law, settings: RegressionConfig) -> float:
     return min(settings.dt, 0.5 / (settings.grid * law.wave_speed(DENSITY)))
 
 
-def random_throw(law: Law, generator: torch.Generator, settings: RegressionSettings) -> Throw:
+def random_throw(law: Law, generator: torch.Generator, settings: RegressionConfig) -> Throw:
     """A cube of random size, place, orientation, velocity and spin.
 
     Half of the throws take half the time step, so that the trial states of both are seen; not if the law
@@ -235,7 +161,7 @@ def visited_stretches(throw: Throw, law: Law, every: int = 8) -> tuple[Tensor, T
 
 
 def train_by_regression(
-    spec: Mapping[str, Any], settings: RegressionSettings, seed: int, progress: Progress
+    spec: Mapping[str, Any], settings: RegressionConfig, seed: int, progress: Progress
 ) -> tuple[NeuralLaw, dict[str, Any]]:
     generator = torch.Generator().manual_seed(seed)
     reference = reference_law(spec, settings)
@@ -295,7 +221,7 @@ def plastic_errors(
     return errors
 
 
-def sample_deformations(pool: Tensor, settings: RegressionSettings, generator: torch.Generator) -> Tensor:
+def sample_deformations(pool: Tensor, settings: RegressionConfig, generator: torch.Generator) -> Tensor:
     """Deformation gradients diag(sigma) V^T around visited stretches, (samples, 3, 3).
 
     Half of the stretches, the first, are as visited; most others get random log strains added, a tenth of all
@@ -343,7 +269,7 @@ class Network:
         self,
         z: Tensor,
         X: Tensor,
-        settings: RegressionSettings,
+        settings: RegressionConfig,
         generator: torch.Generator,
         progress: Callable[[int, float], None],
     ) -> float:
@@ -400,7 +326,7 @@ def _law_of(networks: Mapping[str, Network]) -> NeuralLaw:
 
 
 def train_by_trajectory(
-    spec: Mapping[str, Any], settings: TrajectorySettings, seed: int, progress: Progress
+    spec: Mapping[str, Any], settings: TrajectoryConfig, seed: int, progress: Progress
 ) -> tuple[NeuralLaw, dict[str, Any]]:
     throw = _nclaw_throw(settings)
     truth = throw.run(analytic_law(spec, dt=settings.dt), list(range(settings.steps + 1)))
@@ -446,7 +372,7 @@ def train_by_trajectory(
     return law, {"loss": history}
 
 
-def _nclaw_throw(settings: TrajectorySettings) -> Throw:
+def _nclaw_throw(settings: TrajectoryConfig) -> Throw:
     """NCLaw's training throw: a cube of side 0.5 m in the middle of a slippery box."""
     side, n = 0.5, settings.side_particles
     ticks = side * ((torch.arange(n) + 0.5) / n - 0.5)
@@ -464,7 +390,7 @@ def _nclaw_throw(settings: TrajectorySettings) -> Throw:
 def judge(
     law: Law,
     spec: Mapping[str, Any],
-    settings: RegressionSettings | None = None,
+    settings: RegressionConfig,
     seed: int = 0,
     throws: int = 3,
     frames: int = 20,
@@ -476,7 +402,6 @@ def judge(
         of corresponding particles [m], means over frames and throws; ``rmse_worst``, the worst frame's [m].
     """
     generator = torch.Generator().manual_seed(10_000 + seed)
-    settings = settings or RegressionSettings()
     chamfers, errors = [], []
     reference = reference_law(spec, settings)
     for _ in range(throws):

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.frame_batches import frame_batches
@@ -94,11 +95,7 @@ def estimate_velocity(
     law: Law,
     body: Reconstruction,
     observation: Observation,
-    *,
-    ridge: float = 0.0,
-    initial_frames: int = 3,
-    iterations: int = 30,
-    difference: float = 0.02,
+    settings: VelocityConfig,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> VelocityEstimate:
     """Estimate one velocity for the whole body from the frames before its first contact.
@@ -108,12 +105,7 @@ def estimate_velocity(
         law: the prior material (before contact it does not matter which).
         body: reconstructed particles and kernels.
         observation: the video; frames from contact on are ignored.
-        ridge: strength of the quadratic penalty on the velocity along the viewing direction of the first camera,
-            relative to the curvature of the best determined axis. 0 switches it off.
-        initial_frames: frames used for the first estimate (frame 0 included), which then tells how many more
-            come before contact.
-        iterations: largest number of Levenberg-Marquardt steps for each set of frames.
-        difference: half width of the central differences [m/s].
+        settings: hyper-parameters; its ``views`` are those of the observation.
         progress: called with (step, steps, loss).
 
     Raises:
@@ -129,12 +121,12 @@ def estimate_velocity(
         raise InputError("the body touches a wall in the first frame: the video must start before contact")
     axes = observation.cameras.viewmats[0, :3, :3].cpu().numpy()
     unknowns = np.zeros(6)  # velocity [m/s], and the nuisance in units of NUISANCE_SCALE
-    used = list(range(min(initial_frames, len(observation.frames))))
+    used = list(range(min(settings.initial_frames, len(observation.frames))))
     accepted = 0
     for _ in range(6):
         seen = observation.select(used)
-        residuals = _Residuals(model, law, body, seen, difference)
-        unknowns, fit, steps = _levenberg_marquardt(residuals, unknowns, axes, ridge, iterations, progress)
+        residuals = _Residuals(model, law, body, seen, settings.difference)
+        unknowns, fit, steps = _levenberg_marquardt(residuals, unknowns, axes, settings, progress)
         accepted += steps
         wider = _frames_before_contact(model, body, observation, unknowns[:3])
         if wider == used or len(wider) < 2:
@@ -151,7 +143,7 @@ def estimate_velocity(
         nuisance=NUISANCE_SCALE * unknowns[3:],
         loss=fit.rms,
         iterations=accepted,
-        ridge=ridge,
+        ridge=settings.ridge,
     )
 
 
@@ -251,20 +243,19 @@ def _levenberg_marquardt(
     residuals: _Residuals,
     start: np.ndarray,
     axes: np.ndarray,
-    ridge: float,
-    iterations: int,
+    settings: VelocityConfig,
     progress: Callable[[int, int, float], None] | None,
 ) -> tuple[np.ndarray, _Linearisation, int]:
     """Minimise |r(u)|^2 + ridge * curvature * (depth . v)^2: the unknowns, their surroundings, accepted steps."""
 
     def penalty(H):
         P = np.zeros((6, 6))
-        P[:3, :3] = ridge * np.linalg.eigvalsh(H[:3, :3])[-1] * np.outer(axes[2], axes[2])
+        P[:3, :3] = settings.ridge * np.linalg.eigvalsh(H[:3, :3])[-1] * np.outer(axes[2], axes[2])
         return P
 
     u, damping, accepted = start, 1e-3, 0
     fit = residuals.linearise(u)
-    for iteration in range(iterations):
+    for iteration in range(settings.iterations):
         H = fit.curvature
         P = penalty(H)
         step = -np.linalg.solve(H + P + damping * np.diag(np.diag(H)), fit.slope + P @ u)
@@ -275,7 +266,7 @@ def _levenberg_marquardt(
         else:
             damping *= 8
         if progress:
-            progress(iteration + 1, iterations, fit.rms)
+            progress(iteration + 1, settings.iterations, fit.rms)
         if np.linalg.norm(step) < 1e-5 or damping > 1e6:
             break
     return u, fit, accepted

@@ -10,9 +10,7 @@ dent seen only by its shading, stays filled. The Gaussians say where to look.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -23,6 +21,7 @@ from scipy.spatial import cKDTree
 from skimage.measure import find_contours, marching_cubes
 from torch import Tensor
 
+from neuma_lib.config.geometry import SurfaceConfig
 from neuma_lib.errors import InputError
 from neuma_lib.geometry.volume import check_mesh
 from neuma_lib.splatting.cameras import Cameras
@@ -37,30 +36,6 @@ _BAND = 6.0
 """Distance from a contour [px] up to which it is measured to a small part of a pixel."""
 _CONTOUR_STEPS = 8
 """Points on each segment of a contour; a segment is at most a pixel's diagonal long."""
-
-
-@dataclass(frozen=True)
-class SurfaceSettings:
-    """Settings of `reconstruct`.
-
-    Attributes:
-        resolution: voxels along the longest side of the body.
-        matte_level: coverage at which a pixel counts as half inside.
-        smoothing: rounds of smoothing of the mesh, each of which moves it in and out again (Taubin), against
-            the noise of the mattes; the volume is kept.
-    """
-
-    resolution: int = 96
-    matte_level: float = 0.5
-    smoothing: int = 5
-
-    def __post_init__(self):
-        if self.resolution < 16:
-            raise InputError(f"geometry.surface.resolution = {self.resolution}: choose 16 or more")
-        if not 0.0 < self.matte_level < 1.0:
-            raise InputError(f"geometry.surface.matte_level = {self.matte_level}: choose between 0 and 1")
-        if self.smoothing < 0:
-            raise InputError(f"geometry.surface.smoothing = {self.smoothing}: choose 0 or more")
 
 
 @dataclass(frozen=True)
@@ -84,7 +59,7 @@ def reconstruct(
     gaussians: Gaussians,
     cameras: Cameras,
     images: Tensor,
-    settings: SurfaceSettings | Mapping[str, Any] | None = None,
+    settings: SurfaceConfig,
 ) -> trimesh.Trimesh:
     """Surface of the body that the views show (paper, section 3.2, where a multi-view method makes it).
 
@@ -92,16 +67,14 @@ def reconstruct(
         gaussians: static reconstruction; its extent bounds the search, and is widened if the body is larger.
         cameras: V views.
         images: RGBA with straight alpha in [0, 1], shape (V, H, W, 4).
-        settings: a `SurfaceSettings` or a mapping of its fields.
+        settings: resolution and smoothing.
 
     Returns:
         Watertight mesh in the world frame [m], one body without inner cavities, oriented outwards.
 
     Raises:
-        InputError: images that do not fit the cameras, an empty matte, mattes that share no point of space,
-            or an unknown setting.
+        InputError: images that do not fit the cameras, an empty matte, mattes that share no point of space.
     """
-    settings = _settings(settings)
     if tuple(images.shape) != (len(cameras), cameras.height, cameras.width, 4):
         raise InputError(
             f"surface: images {tuple(images.shape)} do not fit {len(cameras)} cameras of "
@@ -131,16 +104,6 @@ def reconstruct(
         _smooth(mesh, settings.smoothing)
     check_mesh(mesh, "surface")
     return mesh
-
-
-def _settings(given: SurfaceSettings | Mapping[str, Any] | None) -> SurfaceSettings:
-    if isinstance(given, SurfaceSettings):
-        return given
-    names = [field.name for field in fields(SurfaceSettings)]
-    unknown = sorted(set(given or {}) - set(names))
-    if unknown:
-        raise InputError(f"geometry.surface.{unknown[0]}: no such setting; there are {', '.join(names)}")
-    return SurfaceSettings(**(given or {}))
 
 
 def _silhouettes(alpha: Tensor, level: float) -> Tensor:

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from neuma_lib.data.blender.appearance import Appearance, colors_at, smooth_noise, to_linear
+from neuma_lib.config.blender import AppearanceConfig
+from neuma_lib.data.blender.appearance import colors_at, smooth_noise, to_linear
 from neuma_lib.data.blender.bodies import make_body
 from neuma_lib.data.blender.libraries import explain_import_error
 from neuma_lib.data.blender.scene import (
     Grains,
-    RenderSettings,
     Surface,
     render_dynamic,
     render_images,
@@ -87,16 +87,18 @@ def test_noise_is_smooth_and_fills_its_range():
 def test_colors_name_what_is_wrong():
     mesh = shapes.build("duck", 0.3, 32)
     with pytest.raises(InputError, match="no part.*beek.*its parts are body"):
-        colors_at(mesh, mesh.vertices, Appearance({"body": "#ffffff", "beek": "#000000"}))
+        colors_at(mesh, mesh.vertices, AppearanceConfig(colors={"body": "#ffffff", "beek": "#000000"}))
     with pytest.raises(InputError, match="'body'"):
-        colors_at(mesh, mesh.vertices, Appearance({"beak": "#000000"}))
+        colors_at(mesh, mesh.vertices, AppearanceConfig(colors={"beak": "#000000"}))
     with pytest.raises(InputError, match="#rrggbb"):
-        colors_at(mesh, mesh.vertices, Appearance({"body": "yellow"}))
+        colors_at(mesh, mesh.vertices, AppearanceConfig(colors={"body": "yellow"}))
 
 
 def test_parts_have_their_colours():
     mesh = shapes.build("pawn", 0.4, 48)
-    colors = colors_at(mesh, mesh.vertices, Appearance({"body": "#0000ff", "foot": "#ff0000"}, contrast=0.0))
+    colors = colors_at(
+        mesh, mesh.vertices, AppearanceConfig(colors={"body": "#0000ff", "foot": "#ff0000"}, contrast=0.0)
+    )
     y = mesh.vertices[:, 1]
     np.testing.assert_allclose(
         colors[y > y.max() - 0.05], np.broadcast_to([0, 0, 1.0], (sum(y > y.max() - 0.05), 3))
@@ -118,7 +120,9 @@ def test_grains_stay_inside_the_rest_surface():
     rng = np.random.default_rng(5)
     points = rng.uniform(mesh.bounds[0], mesh.bounds[1], (30000, 3))
     points = points[shapes.depth(mesh, points) > 0]
-    body = make_body("grains", mesh, Appearance({"body": "#c9a86a"}), points[None], points[None])
+    body = make_body(
+        mesh, AppearanceConfig(kind="grains", colors={"body": "#c9a86a"}), points[None], points[None]
+    )
     assert shapes.depth(mesh, body.centres[0]).min() > 0.75 * body.radius
     assert len(body.colors) == body.centres.shape[1]
 
@@ -131,17 +135,13 @@ def test_liquid_surface_is_closed_and_holds_the_volume():
     rng = np.random.default_rng(6)
     points = rng.uniform(mesh.bounds[0], mesh.bounds[1], (30000, 3))
     points = points[shapes.depth(mesh, points) > 0]
-    body = make_body("liquid", mesh, Appearance({"body": "#d98f24"}), points[None], points[None])
+    body = make_body(
+        mesh, AppearanceConfig(kind="liquid", colors={"body": "#d98f24"}), points[None], points[None]
+    )
     vertices, faces, colors = body.surfaces[0]
     surface = trimesh.Trimesh(vertices, faces, process=False)
     assert surface.is_watertight and len(colors) == len(vertices)
     np.testing.assert_allclose(surface.volume, mesh.volume, rtol=0.03)
-
-
-def test_unknown_kind_is_named():
-    mesh = shapes.build("ball", 0.2, 16)
-    with pytest.raises(InputError, match="'foam'.*solid, grains, liquid"):
-        make_body("foam", mesh, Appearance({"body": "#ffffff"}), np.zeros((1, 10, 3)))
 
 
 # ------------------------------------------------------------------------------------------- Blender
@@ -166,7 +166,7 @@ def test_failing_import_reaches_the_user(tmp_path, monkeypatch):
     body = Grains(np.full((1, 1, 3), 0.5), 0.1, np.ones((1, 3)))
     views = cameras.framing(cameras.ring_directions(1), np.array([[0.4] * 3, [0.6] * 3]), 16, 16)
     with pytest.raises(InputError, match="libsm6"):
-        render_static(body, views, tmp_path / "out")
+        render_static(body, views, tmp_path / "out", 4)
     assert list((tmp_path / "out").iterdir()) == []
 
 
@@ -179,7 +179,7 @@ def test_renders_agree_with_the_cameras(tmp_path):
     body = Grains(points[None], 0.012, np.ones((5, 3)))
     corners = np.array([[0.25] * 3, [0.75] * 3])
     views = cameras.framing(cameras.ring_directions(4)[[0, 1, 3]], corners, 144, 128, fill=1.0)
-    render_static(body, views, tmp_path, RenderSettings(samples=64))
+    render_static(body, views, tmp_path, 64)
     images = read_image_set(tmp_path / "transforms.json")
     np.testing.assert_allclose(images.viewmats, views.viewmats, atol=1e-9)
     np.testing.assert_allclose(images.Ks[0], views.K, atol=1e-9)
@@ -200,7 +200,7 @@ def test_renders_agree_with_the_cameras(tmp_path):
 @needs_blender
 def test_same_job_same_bytes_and_moving_mesh(tmp_path):
     mesh = shapes.place("ball", 0.08, 0.4, (0.5, 0.5), 40)
-    colors = colors_at(mesh, mesh.vertices, Appearance({"body": "#f4c534"}))
+    colors = colors_at(mesh, mesh.vertices, AppearanceConfig(colors={"body": "#f4c534"}))
     moved = np.stack([mesh.vertices, mesh.vertices + [0.05, -0.1, 0.0]])
     body = Surface(moved, mesh.faces, colors)
     views = cameras.video_views(body.points, 2, 48, 48)
@@ -213,7 +213,8 @@ def test_same_job_same_bytes_and_moving_mesh(tmp_path):
             [0, 8],
             1e-3,
             tmp_path / folder,
-            RenderSettings(samples=4),
+            4,
+            1,
             lambda k, n: done.append((k, n)),
         )
     assert done == [(k, 4) for k in (1, 2, 3, 4)] * 2
@@ -244,8 +245,8 @@ def test_colours_on_the_image_are_those_of_the_surface(tmp_path):
         cameras.static_views(body.points, 6, 48, 48),
         [(0, k) for k in range(6)],
         tmp_path,
-        RenderSettings(samples=8),
         [f"{k}.png" for k in range(6)],
+        8,
     )
     import imageio.v3 as imageio
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from neuma_lib.config import settings
+from neuma_lib.config.methods import parse_method
 from neuma_lib.config.page import settings_markdown
 from neuma_lib.errors import InputError
 
@@ -76,19 +77,16 @@ def test_invalid_yaml_names_the_file(tmp_path):
 
 def test_numbers_without_a_point_are_numbers(raw):
     """YAML 1.1 reads 1e5 as text."""
-    change = {
-        "priors": {"laws": {"jelly": {"elasticity": {"name": "fixed_corotated", "E": "1e5", "nu": 0.2}}}}
-    }
+    elasticity = {"name": "fixed_corotated", "E": "1e5", "nu": 0.2}
+    change = {"priors": {"laws": {"jelly": {"elasticity": elasticity}}}}
     jelly = settings.load(settings.merged(raw, change), ROOT).priors.laws["jelly"]
-    assert jelly.elasticity["E"] == 1e5
+    assert jelly.plain()["elasticity"] == {**elasticity, "E": 1e5}
 
 
 class TestVariants:
     def test_parse(self, loaded):
-        assert settings.parse_method("neuma", loaded.methods) == ("neuma", {})
-        base, variant = settings.parse_method(
-            "neuma+rank=4+lr_elastic=0.1+views=0,2+prior=sand", loaded.methods
-        )
+        assert parse_method("neuma", loaded.methods) == ("neuma", {})
+        base, variant = parse_method("neuma+rank=4+lr_elastic=0.1+views=0,2+prior=sand", loaded.methods)
         assert base == "neuma"
         assert variant == {"rank": 4, "lr_elastic": 0.1, "views": [0, 2], "prior": "sand"}
 
@@ -104,7 +102,7 @@ class TestVariants:
     )
     def test_mistakes(self, loaded, name, message):
         with pytest.raises(InputError, match=message):
-            settings.parse_method(name, loaded.methods)
+            parse_method(name, loaded.methods)
 
     def test_layers_section_scene_method_variant(self, raw):
         layers = {

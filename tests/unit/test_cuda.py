@@ -8,8 +8,10 @@ import torch
 from grounding_scene import MODEL, TRUTH, ball, camera, observe
 from sim_scenes import make_law
 
+from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.coupling import reconstruction as observation
-from neuma_lib.fitting.material import MaterialSettings, PixelLoss, train_material
+from neuma_lib.fitting.material import PixelLoss, train_material
 from neuma_lib.fitting.velocity import estimate_velocity
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.mechanics.analytic import analytic_law
@@ -174,7 +176,7 @@ def train(device, settings, checkpoint=None):
 
 
 def test_training_runs_on_the_gpu():
-    result = train("cuda", MaterialSettings(iterations=5))
+    result = train("cuda", MaterialConfig(iterations=5))
     assert result.best_loss < result.history.loss[0]
     assert len(result.history.seconds) == 5
 
@@ -189,7 +191,7 @@ class Killed(Checkpoint):
 
 @pytest.mark.parametrize("device", ["cuda", "cpu"])
 def test_a_training_killed_on_the_gpu_resumes_on_either_device(tmp_path, device):
-    settings = MaterialSettings(iterations=6, checkpoint_every=3)
+    settings = MaterialConfig(iterations=6, checkpoint_every=3)
     whole = train("cuda", settings)
     with pytest.raises(KeyboardInterrupt):
         train("cuda", settings, Killed(tmp_path / "state.pt", {}))
@@ -210,7 +212,7 @@ def test_velocity_from_bytes_agrees():
         opaque = torch.ones_like(seen.images[..., :1])
         pixels = (255 * torch.cat([seen.images, opaque], -1).clamp(0, 1)).round().to(torch.uint8)
         law = analytic_law(TRUTH, MODEL.dt).to(device)
-        found[device] = estimate_velocity(MODEL, law, body, replace(seen, images=pixels))
+        found[device] = estimate_velocity(MODEL, law, body, replace(seen, images=pixels), VelocityConfig())
     # single precision on the GPU, double on the CPU: far below what the images leave open
     assert (abs(found["cuda"].v0 - found["cpu"].v0) < 0.25 * found["cpu"].std).all()
     assert (abs(found["cuda"].std - found["cpu"].std) < 0.1 * found["cpu"].std).all()

@@ -8,18 +8,19 @@ import raycast
 import torch
 from skimage.metrics import structural_similarity
 
+from neuma_lib.config.gaussians import DensificationConfig, GaussiansConfig
 from neuma_lib.errors import InputError
 from neuma_lib.fitting import gaussians as fitting
-from neuma_lib.fitting.gaussians import Densification, GaussianFitSettings, fit_gaussians
+from neuma_lib.fitting.gaussians import fit_gaussians
 from neuma_lib.geometry.visual_hull import visual_hull
 
 SIZE = 64
-SMALL = GaussianFitSettings(
+SMALL = GaussiansConfig(
     iterations=400,
     initial_count=500,
     hull_resolution=40,
     held_out=8,
-    densification=Densification(every=40, max_count=700),
+    densification=DensificationConfig(every=40, max_count=700),
 )
 
 
@@ -70,7 +71,9 @@ def test_visual_hull_holds_the_body(duck):
 
 
 def test_same_seed_same_bytes(duck):
-    short = dataclasses.replace(SMALL, iterations=60, densification=Densification(every=10, max_count=600))
+    short = SMALL.model_copy(
+        update=dict(iterations=60, densification=DensificationConfig(every=10, max_count=600))
+    )
     a, b = (fit_gaussians(*duck, short, seed=5)[0] for _ in range(2))
     for field in dataclasses.fields(a):
         assert getattr(a, field.name).numpy().tobytes() == getattr(b, field.name).numpy().tobytes()
@@ -81,14 +84,14 @@ def test_background_and_transparent_colours_do_not_matter(duck):
     images, cameras = duck
     painted = images.clone()
     painted[..., :3][images[..., 3] == 0] = 0.77
-    short = dataclasses.replace(SMALL, iterations=5)
+    short = SMALL.model_copy(update=dict(iterations=5))
     a, b = (fit_gaussians(pictures, cameras, short, seed=5)[1] for pictures in (images, painted))
     assert a.losses == b.losses and a.psnr == b.psnr
 
 
 def test_progress_and_degree(duck):
     seen = []
-    settings = dataclasses.replace(SMALL, iterations=4, sh_degree=0)
+    settings = SMALL.model_copy(update=dict(iterations=4, sh_degree=0))
     gaussians, _ = fit_gaussians(
         *duck, settings, progress=lambda iteration, loss: seen.append((iteration, loss))
     )

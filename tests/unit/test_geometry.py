@@ -11,12 +11,14 @@ import trimesh
 from scipy.spatial import cKDTree
 from silhouettes import cameras_around, mattes
 
+from neuma_lib.config.geometry import SurfaceConfig
 from neuma_lib.errors import InputError
 from neuma_lib.geometry import shapes
-from neuma_lib.geometry.surface import SurfaceSettings, reconstruct
+from neuma_lib.geometry.surface import reconstruct
 from neuma_lib.geometry.volume import inside, sample_tracers, sample_volume, volume_iou
 from neuma_lib.splatting.gaussians import Gaussians
 
+SURFACE = SurfaceConfig()
 SIX = ("ball", "duck", "pawn", "cat", "bottle", "fish")
 
 
@@ -51,7 +53,7 @@ def test_surface_of_six_bodies(bodies, name, capsys):
     images = mattes(truth, cameras)
     covered = images[..., 3].numpy()
     images[..., 3] = torch.as_tensor(np.random.default_rng(0).binomial(16, covered) / 16)
-    mesh = reconstruct(some_gaussians(truth), cameras, images, {"resolution": 64})
+    mesh = reconstruct(some_gaussians(truth), cameras, images, SurfaceConfig(resolution=64))
     assert mesh.is_watertight and mesh.volume > 0 and mesh.body_count == 1
     overlap = volume_iou(mesh, truth, resolution=48)
     with capsys.disabled():
@@ -66,7 +68,7 @@ def test_surface_of_a_sphere_is_finer_than_pixels():
     truth = trimesh.creation.icosphere(4, 0.15)
     cameras = cameras_around(truth, fill=0.6)
     images = mattes(truth, cameras)
-    mesh = reconstruct(some_gaussians(truth), cameras, images, {"resolution": 48, "smoothing": 0})
+    mesh = reconstruct(some_gaussians(truth), cameras, images, SurfaceConfig(resolution=48, smoothing=0))
     pixel = float(0.3 / images[0, ..., 3].sum(1).max())
     radii = np.linalg.norm(mesh.vertices, axis=1)
     assert abs(radii.mean() - 0.15) < 0.1 * pixel
@@ -78,10 +80,10 @@ def test_surface_depends_on_the_gaussians_only_for_where_to_look(bodies):
     truth = bodies["duck"]
     cameras = cameras_around(truth, views=20, size=64)
     images = mattes(truth, cameras)
-    plain = reconstruct(some_gaussians(truth), cameras, images)
-    floaters = reconstruct(some_gaussians(truth, outliers=3), cameras, images)
+    plain = reconstruct(some_gaussians(truth), cameras, images, SURFACE)
+    floaters = reconstruct(some_gaussians(truth, outliers=3), cameras, images, SURFACE)
     everything = some_gaussians(truth)
-    partial = reconstruct(everything[everything.means[:, 0] > 0.1], cameras, images)
+    partial = reconstruct(everything[everything.means[:, 0] > 0.1], cameras, images, SURFACE)
     assert volume_iou(plain, floaters, 48) > 0.98
     assert volume_iou(plain, partial, 48) > 0.98
 
@@ -91,7 +93,7 @@ def test_smoothing_does_not_shrink(bodies):
     cameras = cameras_around(truth, views=20, size=64)
     images = mattes(truth, cameras)
     rough, smooth = (
-        reconstruct(some_gaussians(truth), cameras, images, SurfaceSettings(smoothing=n)) for n in (0, 20)
+        reconstruct(some_gaussians(truth), cameras, images, SurfaceConfig(smoothing=n)) for n in (0, 20)
     )
     assert smooth.area < rough.area
     assert smooth.volume == pytest.approx(rough.volume, rel=2e-3)
@@ -102,7 +104,7 @@ def test_surface_of_two_parts_keeps_the_larger():
     small = trimesh.creation.icosphere(3, 0.03).apply_translation([0.2, 0, 0])
     both = trimesh.util.concatenate([large, small])
     cameras = cameras_around(both, views=30, size=64)
-    mesh = reconstruct(some_gaussians(both), cameras, mattes(both, cameras))
+    mesh = reconstruct(some_gaussians(both), cameras, mattes(both, cameras), SURFACE)
     assert mesh.body_count == 1 and volume_iou(mesh, large, 48) > 0.93
 
 
@@ -111,7 +113,7 @@ def test_same_input_gives_the_same_surface():
     cameras = cameras_around(truth, views=10, size=48)
     images = mattes(truth, cameras)
     first, second = (
-        reconstruct(some_gaussians(truth), cameras, images, {"resolution": 32}) for _ in range(2)
+        reconstruct(some_gaussians(truth), cameras, images, SurfaceConfig(resolution=32)) for _ in range(2)
     )
     assert np.array_equal(first.vertices, second.vertices) and np.array_equal(first.faces, second.faces)
 
@@ -128,7 +130,7 @@ def test_empty_mask_is_named(scene):
     images = images.clone()
     images[2, ..., 3] = 0.0
     with pytest.raises(InputError, match="mask of view 2 is empty"):
-        reconstruct(gaussians, cameras, images)
+        reconstruct(gaussians, cameras, images, SURFACE)
 
 
 def test_poses_of_other_images_are_noticed(scene):
@@ -136,25 +138,21 @@ def test_poses_of_other_images_are_noticed(scene):
     shifted = cameras.viewmats.clone()
     shifted[1, 0, 3] += 0.3
     with pytest.raises(InputError, match="no point of space lies inside all masks"):
-        reconstruct(gaussians, dataclasses.replace(cameras, viewmats=shifted), images)
+        reconstruct(gaussians, dataclasses.replace(cameras, viewmats=shifted), images, SURFACE)
 
 
 def test_other_bad_input_of_the_surface_is_named(scene):
     gaussians, cameras, images = scene
     with pytest.raises(InputError, match="do not fit 4 cameras"):
-        reconstruct(gaussians, cameras, images[..., :3])
-    with pytest.raises(InputError, match="geometry.surface.resolutoin"):
-        reconstruct(gaussians, cameras, images, {"resolutoin": 64})
-    with pytest.raises(InputError, match="geometry.surface.resolution"):
-        reconstruct(gaussians, cameras, images, {"resolution": 4})
+        reconstruct(gaussians, cameras, images[..., :3], SURFACE)
     with pytest.raises(InputError, match="alpha of view 0"):
-        reconstruct(gaussians, cameras, torch.full_like(images, float("nan")))
+        reconstruct(gaussians, cameras, torch.full_like(images, float("nan")), SURFACE)
     with pytest.raises(InputError, match="no Gaussians"):
-        reconstruct(gaussians[:0], cameras, images)
+        reconstruct(gaussians[:0], cameras, images, SURFACE)
     full = images.clone()
     full[..., 3] = 1.0
     with pytest.raises(InputError, match="covers the whole frame"):
-        reconstruct(gaussians, cameras, full)
+        reconstruct(gaussians, cameras, full, SURFACE)
 
 
 def test_inside_of_a_torus_is_its_closed_form():

@@ -1,17 +1,16 @@
 """The training loop: gradients of the whole chain, progress, recovery, and resuming."""
 
 import copy
-import dataclasses
 
 import numpy as np
 import pytest
 import torch
 from grounding_scene import MODEL, ball, camera, observe
 
+from neuma_lib.config.material import MaterialConfig
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.material import (
-    MaterialSettings,
     ParticleLoss,
     PixelLoss,
     frame_weights,
@@ -71,7 +70,7 @@ def test_gradient_of_the_whole_chain_from_adaptor_to_image_loss(problem):
     assert (values[0] - values[1]) / (2 * h) == pytest.approx(slope, rel=1e-5)
 
 
-SETTINGS = MaterialSettings(iterations=12, lr_elastic=0.02, lr_plastic=0.002, checkpoint_every=3)
+SETTINGS = MaterialConfig(iterations=12, lr_elastic=0.02, lr_plastic=0.002, checkpoint_every=3)
 
 
 def train(problem, law=None, settings=SETTINGS, **options):
@@ -136,7 +135,9 @@ def test_recovery_returns_to_the_best_state_as_a_whole(problem, zero_gradients):
     keep, messages = MemoryCheckpoint(), []
     # iteration 0 accepted; 1 the best; 2 worse, but accepted; 3 diverged; 3 again, from the best state
     scripted = ScriptedLoss(loss, [1.0, 0.1, 0.2, 100.0, 0.1, 0.1])
-    settings = dataclasses.replace(SETTINGS, iterations=4, checkpoint_every=1, zero_gradients=zero_gradients)
+    settings = SETTINGS.model_copy(
+        update={"iterations": 4, "checkpoint_every": 1, "zero_gradients": zero_gradients}
+    )
     train_material(
         MODEL, stiff_random_law(), body, V0, scripted, settings, checkpoint=keep, log=messages.append
     )
@@ -154,7 +155,7 @@ def test_recovery_returns_to_the_best_state_as_a_whole(problem, zero_gradients):
 
 def test_training_ends_marked_after_too_many_recoveries(problem):
     messages = []
-    wild = MaterialSettings(
+    wild = MaterialConfig(
         iterations=8, lr_elastic=50.0, lr_plastic=5.0, max_recoveries=3, recovery_growth=1.0
     )
     body, loss = problem
@@ -203,7 +204,7 @@ def test_gaussians_can_be_the_particles(problem):
 
 
 def test_frame_weights_start_with_early_frames_and_end_uniform():
-    settings = MaterialSettings(iterations=90)
+    settings = MaterialConfig(iterations=90)
     first, last = frame_weights(0, 10, settings), frame_weights(60, 10, settings)
     assert first.tolist() == [1, 1, 0.5, 0.5, 0.25, 0.25, 0.125, 0.125, 0.0625, 0.0625]
     assert last.tolist() == [1] * 10

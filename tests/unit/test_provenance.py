@@ -1,91 +1,86 @@
 """The code digest changes when, and only when, something that a script reaches changes."""
 
-import textwrap
+import os
 from pathlib import Path
 
 import pytest
 
-from workflow.provenance import code_digest, fingerprint, reached_modules
+from workflow.provenance import Sources, fingerprint
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = ROOT / "workflow" / "scripts"
-READERS = "import json\ndef read_a(): return helper()\ndef helper(): return 1\ndef read_b(): return 2\n"
+FILES = {
+    "sample/__init__.py": "",
+    "sample/render/__init__.py": "from sample.render.fast import draw\nfrom sample.render.cam import Cam\n",
+    "sample/render/fast.py": "from . import kernels\ndef draw(): return kernels.k()\n",
+    "sample/render/kernels.py": "def k(): return 1\n",
+    "sample/render/kernels.cu": "__global__ void k() {}\n",
+    "sample/render/cam.py": "class Cam: pass\n",
+    "sample/other.py": "from sample.render.cam import Cam\n",
+    "script.py": "from sample.render.fast import draw\nfrom sample.render import fast\n",
+}
 
 
 @pytest.fixture
-def project(tmp_path):
+def project(tmp_path, monkeypatch):
     """A small package in the place of the library, and a script."""
 
     def write(name, text):
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(textwrap.dedent(text))
-        return path
+        path.write_text(text)
+        os.utime(path, ns=(1, 1))  # times of files mean nothing
 
-    write("neuma_lib/__init__.py", "")
-    write(
-        "neuma_lib/render/__init__.py",
-        "from neuma_lib.splatting.fast import draw\nfrom neuma_lib.splatting.cam import Cam\n",
-    )
-    write("neuma_lib/render/fast.py", "from . import kernels\ndef draw(): return kernels.k()\n")
-    write("neuma_lib/render/kernels.py", "def k(): return 1\n")
-    write("neuma_lib/render/cam.py", "class Cam: pass\n")
-    write("neuma_lib/other.py", "x = 1\n")
-    write(
-        "neuma_lib/io.py",
-        READERS,
-    )
-    write("script.py", "from neuma_lib.splatting import draw\nfrom neuma_lib.io.files import read_a\n")
-    write.root = tmp_path
+    for name, text in FILES.items():
+        write(name, text)
+    monkeypatch.syspath_prepend(tmp_path)
+    write.script = tmp_path / "script.py"
     return write
 
 
-def digest(project, script="script.py"):
-    return code_digest(project.root / script, project.root)
+def reached(project):
+    return Sources("sample").reached(project.script)
 
 
-def test_reaches_through_packages_and_relative_imports(project):
-    modules = reached_modules(project.root / "script.py", project.root)
-    assert {"neuma_lib.splatting.fast", "neuma_lib.splatting.kernels", "neuma_lib.io.files"} <= set(modules)
-    assert "neuma_lib.splatting.cam" not in modules and "neuma_lib.other" not in modules
+def digest(project):
+    return Sources("sample").digest(project.script)
+
+
+def test_reaches_modules_through_packages_and_relative_imports(project):
+    assert reached(project) == ["sample.render.fast", "sample.render.kernels"]
+
+
+@pytest.mark.parametrize(
+    "line", ["import sample.render", "from sample.render import draw", "def main(): import sample.render"]
+)
+def test_what_a_package_imports_itself_counts_where_it_is_used(project, line):
+    project("script.py", line)
+    assert reached(project) == [f"sample.render{end}" for end in ("", ".cam", ".fast", ".kernels")]
 
 
 @pytest.mark.parametrize(
     ("file", "text", "changes"),
     [
-        ("neuma_lib/render/kernels.py", "def k(): return 2\n", True),
-        ("neuma_lib/render/kernels.py", '"""Documented."""\n\ndef k():\n    """One."""\n    return 1  # one\n', False),
-        ("neuma_lib/render/cam.py", "class Cam: x = 1\n", False),
-        ("neuma_lib/other.py", "x = 2\n", False),
-        ("neuma_lib/io.py", READERS.replace("return 2", "return 3"), False),
-        ("neuma_lib/io.py", READERS.replace("return 1", "return 9"), True),
-        ("script.py", "from neuma_lib.splatting import draw\nfrom neuma_lib.io.files import read_a\nprint(1)\n", True),
+        ("sample/render/kernels.py", "def k(): return 2\n", True),
+        ("sample/render/kernels.py", '"""Documented."""\n\ndef k():\n    """One."""\n    return 1  # one\n', False),
+        ("sample/render/kernels.cu", "__global__ void k() { return; }\n", True),
+        ("sample/render/cam.py", "class Cam: x = 1\n", False),
+        ("sample/render/__init__.py", "", False),
+        ("sample/other.py", "x = 2\n", False),
+        ("script.py", FILES["script.py"] + "# the end\n", False),
+        ("script.py", FILES["script.py"] + "print(1)\n", True),
+        ("script.py", FILES["script.py"] + "def main():\n    import sample.other\n", True),
     ],
 )  # fmt: skip
 def test_changes_that_count(project, file, text, changes):
     before = digest(project)
-    path = project(file, text)
-    import os
-
-    os.utime(path, ns=(1, 1))
+    project(file, text)
     assert (digest(project) != before) == changes
-
-
-def test_imports_inside_functions_count(project):
-    project("script.py", "def main():\n    import neuma_lib.other\n")
-    before = digest(project)
-    project("neuma_lib/other.py", "x = 5\n")
-    assert digest(project) != before
-
-
-def test_whole_package_import_reaches_all_of_it(project):
-    project("script.py", "import neuma_lib.splatting as r\nr.draw()\n")
-    assert "neuma_lib.splatting.cam" in reached_modules(project.root / "script.py", project.root)
 
 
 class TestThisProject:
     def reached(self, script):
-        return set(reached_modules(SCRIPTS / f"{script}.py", ROOT))
+        return set(Sources().reached(SCRIPTS / f"{script}.py"))
 
     @pytest.mark.parametrize("script", ["gaussians", "velocity", "material", "video"])
     def test_what_renders_depends_on_the_rasterizer(self, script):

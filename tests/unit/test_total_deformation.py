@@ -4,8 +4,9 @@ import pytest
 import torch
 from grounding_scene import MODEL, ball, observe
 
+from neuma_lib.config.material import MaterialConfig
 from neuma_lib.errors import InputError
-from neuma_lib.fitting.material import MaterialSettings, PixelLoss, train_material
+from neuma_lib.fitting.material import PixelLoss, train_material
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.sim.rollout import rollout
@@ -61,7 +62,7 @@ def learning_law():
 
 def trained(body, iterations=3, total=False, **options):
     loss = PixelLoss(body, observe(body, V0, FRAMES), total=total)
-    settings = MaterialSettings(iterations=iterations, **options)
+    settings = MaterialConfig(iterations=iterations, **options)
     return train_material(MODEL, learning_law(), body, V0, loss, settings, log=lambda _: None)
 
 

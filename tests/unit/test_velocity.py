@@ -5,6 +5,7 @@ import pytest
 import torch
 from grounding_scene import MODEL, PRIOR, ball, observe
 
+from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.coupling.particle_gs import ParticleGS
 from neuma_lib.errors import InputError
 from neuma_lib.fitting.velocity import estimate_velocity
@@ -15,7 +16,9 @@ FRAMES = (0, 4, 8, 12, 16, 20, 40)
 
 
 def estimate(body, observation, **options):
-    return estimate_velocity(MODEL, analytic_law(PRIOR, MODEL.dt), body, observation, **options)
+    return estimate_velocity(
+        MODEL, analytic_law(PRIOR, MODEL.dt), body, observation, VelocityConfig(**options)
+    )
 
 
 def test_recovers_an_oblique_throw_from_its_own_renders():

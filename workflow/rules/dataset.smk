@@ -10,7 +10,7 @@ rule kernels:
         gpu=EITHER_GPU,
     params:
         device=EITHER_DEVICE,
-        code=lambda wildcards: code_digest(ROOT / "workflow" / "kernels" / f"{wildcards.group}.py", ROOT),
+        code=lambda wildcards: code_digest(ROOT / "workflow" / "kernels" / f"{wildcards.group}.py"),
     script:
         "../scripts/kernels.py"
 

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 import trimesh
 
-from neuma_lib.config.settings import pick
+from neuma_lib.config.blender import AppearanceConfig
 from neuma_lib.coupling.bodies import coloured_solid, join
-from neuma_lib.data.blender.appearance import Appearance, colors_at
+from neuma_lib.data.blender.appearance import colors_at
 from neuma_lib.geometry.shapes import place, shape
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import read_json, write_json
@@ -18,11 +18,11 @@ from neuma_lib.io.particles import load_body, save_binding
 from workflow.stage import stage
 
 
-def look_of(entry: dict) -> Appearance:
+def look_of(entry: dict) -> AppearanceConfig:
     """The look of the body's scene, as far as its own shape has the parts that are coloured there."""
     known = shape(entry["shape"]).part_names
     colors = {name: value for name, value in entry["appearance"]["colors"].items() if name in known}
-    return pick(Appearance, entry["appearance"], colors=colors)
+    return AppearanceConfig(**{**entry["appearance"], "colors": colors})
 
 
 def main(inputs, output, params, run) -> None:

@@ -2,9 +2,9 @@
 
 from dataclasses import asdict
 
-from neuma_lib.config.settings import from_mapping
+from neuma_lib.config.gaussians import GaussiansConfig
 from neuma_lib.device import choose_device
-from neuma_lib.fitting.gaussians import GaussianFitSettings, fit_gaussians
+from neuma_lib.fitting.gaussians import fit_gaussians
 from neuma_lib.io.files import write_json
 from neuma_lib.io.gaussians import save_gaussians
 from neuma_lib.io.images import load_views
@@ -14,7 +14,7 @@ from workflow.stage import stage
 def main(transforms: str, output, params, run) -> None:
     device = choose_device(params.device)
     images, cameras = load_views(transforms)
-    settings = from_mapping(GaussianFitSettings, params.fit, "gaussians")
+    settings = GaussiansConfig(**params.fit)
     gaussians, report = fit_gaussians(
         images.to(device),
         cameras.to(device=device),

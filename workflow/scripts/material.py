@@ -4,10 +4,10 @@ from dataclasses import asdict
 
 import torch
 
-from neuma_lib.config.settings import pick
+from neuma_lib.config.material import MaterialConfig
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.device import choose_device
-from neuma_lib.fitting.material import MaterialSettings, ParticleLoss, PixelLoss, train_material
+from neuma_lib.fitting.material import ParticleLoss, PixelLoss, train_material
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.hdf5 import read_arrays
@@ -20,38 +20,32 @@ from workflow.stage import stage
 
 
 def main(inputs, output, params, run) -> None:
-    settings = params.material
+    settings = MaterialConfig(**params.material)
     device = choose_device(params.device)
     law = load_law(inputs.prior).to(device)
-    law.attach_adaptor(settings["rank"], settings["alpha"], settings["seed"])
+    law.attach_adaptor(settings.rank, settings.alpha, settings.seed)
     body = load_body(inputs.binding, inputs.gaussians, params.density).to(torch.float32, device)
-    if settings["carrier"] == "gaussians":
+    if settings.carrier == "gaussians":
         body = Reconstruction.of_gaussians(body.gaussians, float(body.vol0.sum()), params.density)
     v0 = torch.tensor(read_json(inputs.velocity)["v0"], dtype=torch.float32, device=device)
-    video = load_observation(inputs.transforms, settings["views"]).to(torch.float32, device)
-    if settings["supervision"] == "particles":
+    video = load_observation(inputs.transforms, settings.views).to(torch.float32, device)
+    if settings.supervision == "particles":
         truth, _ = read_arrays(inputs.truth, required=("x", "frames"), only=("x", "frames"))
         targets = torch.from_numpy(truth["x"]).to(device)
         loss = ParticleLoss(tuple(truth["frames"].tolist()), targets)
     else:
-        total = settings["covariance_from"] == "total"
-        loss = PixelLoss(body, video, settings["covariance_gradient"], total=total)
+        total = settings.covariance_from == "total"
+        loss = PixelLoss(body, video, settings.covariance_gradient, total=total)
     files = {name: str(file) for name, file in inputs.items() if name != "kernels" and isinstance(file, str)}
-    stamp = {"simulation": params.simulation, "density": params.density, **settings}
+    stamp = {"simulation": params.simulation, "density": params.density, **params.material}
     checkpoint = Checkpoint(params.checkpoint, fingerprint(stamp, files, params.code))
-    scale = settings["lr_scale"]
     trained = train_material(
         MPMModel(**params.simulation),
         law,
         body,
         v0,
         loss,
-        pick(
-            MaterialSettings,
-            settings,
-            lr_elastic=scale * settings["lr_elastic"],
-            lr_plastic=scale * settings["lr_plastic"],
-        ),
+        settings,
         checkpoint=checkpoint,
         progress=run.progress,
         log=run.say,
@@ -65,7 +59,7 @@ def main(inputs, output, params, run) -> None:
     del curves["seconds"]  # the same settings give the same file
     write_json(output.history, {**report, **curves})
     save_adaptor(
-        output.adaptor, trained.law, settings["rank"], settings["alpha"], {"settings": settings, **report}
+        output.adaptor, trained.law, settings.rank, settings.alpha, {"settings": params.material, **report}
     )
     checkpoint.remove()
     run.say(trained.summary())

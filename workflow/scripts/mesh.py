@@ -1,5 +1,6 @@
 """Reconstruct a watertight surface from Gaussians and views."""
 
+from neuma_lib.config.geometry import SurfaceConfig
 from neuma_lib.geometry.surface import reconstruct
 from neuma_lib.io.gaussians import load_gaussians
 from neuma_lib.io.images import load_views
@@ -9,7 +10,7 @@ from workflow.stage import stage
 
 def main(inputs, mesh_file: str, params, run) -> None:
     images, cameras = load_views(inputs.transforms)
-    mesh = reconstruct(load_gaussians(inputs.gaussians), cameras, images, params.surface)
+    mesh = reconstruct(load_gaussians(inputs.gaussians), cameras, images, SurfaceConfig(**params.surface))
     write_mesh(mesh_file, mesh.vertices, mesh.faces)
     run.say(f"{len(mesh.faces)} faces, watertight: {mesh.is_watertight}, volume {1e3 * mesh.volume:.3f} l")
 

@@ -1,5 +1,6 @@
 """Train a neural constitutive law on an analytic one."""
 
+from neuma_lib.config.priors import RegressionConfig, TrajectoryConfig
 from neuma_lib.fitting.priors import train_prior
 from neuma_lib.io.files import write_json
 from neuma_lib.io.weights import write_weights
@@ -7,9 +8,8 @@ from workflow.stage import stage
 
 
 def main(name: str, output, params, run) -> None:
-    law, report = train_prior(
-        params.law, {"method": params.method, **params.options}, params.seed, run.progress
-    )
+    kind = {"regression": RegressionConfig, "trajectory": TrajectoryConfig}[params.method]
+    law, report = train_prior(params.law, kind(**params.options), params.seed, run.progress)
     write_weights(
         output.weights, law.prior_state(), {"prior": name, "law": params.law, "method": params.method}
     )

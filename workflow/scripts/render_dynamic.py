@@ -2,10 +2,9 @@
 
 from pathlib import Path
 
-from neuma_lib.config.settings import pick
-from neuma_lib.data.blender.appearance import Appearance
+from neuma_lib.config.blender import AppearanceConfig, ImagesConfig
 from neuma_lib.data.blender.bodies import make_body
-from neuma_lib.data.blender.scene import RenderSettings, render_dynamic
+from neuma_lib.data.blender.scene import render_dynamic
 from neuma_lib.geometry.shapes import place
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.splatting.viewpoints import video_views
@@ -13,16 +12,16 @@ from workflow.stage import stage
 
 
 def main(particles_file: str, transforms: str, params, run) -> None:
-    scene, images = params.scene, params.images
+    scene, images = params.scene, ImagesConfig(**params.images)
     names = ("x", "tracers", "frames")
     arrays, attributes = read_arrays(particles_file, only=names, required=names)
     mesh = place(scene["shape"], scene["size"], scene["height"], scene["center"])
-    look = pick(Appearance, scene["appearance"])
-    body = make_body(scene["appearance"]["kind"], mesh, look, arrays["x"], arrays["tracers"])
-    views = video_views(body.points, images["views"], images["width"], images["height"])
-    settings = RenderSettings(samples=images["samples"], threads=params.threads)
+    look = AppearanceConfig(**scene["appearance"])
+    body = make_body(mesh, look, arrays["x"], arrays["tracers"])
+    views = video_views(body.points, images.views, images.width, images.height)
     steps = arrays["frames"].tolist()
-    render_dynamic(body, views, steps, attributes["dt"], Path(transforms).parent, settings, run.progress)
+    folder = Path(transforms).parent
+    render_dynamic(body, views, steps, attributes["dt"], folder, images.samples, params.threads, run.progress)
     run.say(f"{len(views)} views, {len(steps)} frames of {views.width}x{views.height} px")
 
 

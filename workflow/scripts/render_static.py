@@ -2,10 +2,9 @@
 
 from pathlib import Path
 
-from neuma_lib.config.settings import pick
-from neuma_lib.data.blender.appearance import Appearance
+from neuma_lib.config.blender import AppearanceConfig, ImagesConfig
 from neuma_lib.data.blender.bodies import make_body
-from neuma_lib.data.blender.scene import RenderSettings, render_static
+from neuma_lib.data.blender.scene import render_static
 from neuma_lib.geometry.shapes import place
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.splatting.viewpoints import static_views
@@ -13,14 +12,13 @@ from workflow.stage import stage
 
 
 def main(particles_file: str, transforms: str, params, run) -> None:
-    scene, images = params.scene, params.images
+    scene, images = params.scene, ImagesConfig(**params.images)
     arrays, _ = read_arrays(particles_file, only=("x", "tracers"), required=("x", "tracers"))
     mesh = place(scene["shape"], scene["size"], scene["height"], scene["center"])
-    look = pick(Appearance, scene["appearance"])
-    body = make_body(scene["appearance"]["kind"], mesh, look, arrays["x"][:1], arrays["tracers"][:1])
-    views = static_views(body.points, images["views"], images["width"], images["height"])
-    settings = RenderSettings(samples=images["samples"], threads=params.threads)
-    render_static(body, views, Path(transforms).parent, settings, run.progress)
+    look = AppearanceConfig(**scene["appearance"])
+    body = make_body(mesh, look, arrays["x"][:1], arrays["tracers"][:1])
+    views = static_views(body.points, images.views, images.width, images.height)
+    render_static(body, views, Path(transforms).parent, images.samples, params.threads, run.progress)
     run.say(f"{len(views)} views of {views.width}x{views.height} px")
 
 

@@ -2,6 +2,7 @@
 
 import torch
 
+from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.device import choose_device
 from neuma_lib.fitting.velocity import estimate_velocity
 from neuma_lib.io.files import write_json
@@ -13,15 +14,15 @@ from workflow.stage import stage
 
 
 def main(inputs, velocity_file: str, params, run) -> None:
-    options = dict(params.velocity)
+    settings = VelocityConfig(**params.velocity)
     device = choose_device(params.device)
     model, law = MPMModel(**params.simulation), load_law(inputs.prior).to(device)
     body = load_body(inputs.binding, inputs.gaussians, params.density).to(torch.float32, device)
-    video = load_observation(inputs.transforms, options.pop("views")).to(torch.float32, device)
-    estimate = estimate_velocity(model, law, body, video, **options, progress=run.progress)
+    video = load_observation(inputs.transforms, settings.views).to(torch.float32, device)
+    estimate = estimate_velocity(model, law, body, video, settings, run.progress)
     free = estimate
-    if options["ridge"]:
-        free = estimate_velocity(model, law, body, video, **{**options, "ridge": 0.0})
+    if settings.ridge:
+        free = estimate_velocity(model, law, body, video, settings.model_copy(update={"ridge": 0.0}))
         run.say(f"without the ridge: {free.summary()}")
     write_json(velocity_file, {**estimate.as_dict(), "without_ridge": free.as_dict()})
     run.say(estimate.summary())

@@ -5,36 +5,15 @@ The same function colours mesh vertices, sand grains and the surface of a liquid
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-
 import numpy as np
 import trimesh
 
+from neuma_lib.config.blender import AppearanceConfig
 from neuma_lib.errors import InputError
 from neuma_lib.geometry import shapes
 
 BORDER = 0.008
 """Width of the borders between parts [m]."""
-
-
-@dataclass(frozen=True)
-class Appearance:
-    """What an object looks like.
-
-    Attributes:
-        colors: part name -> sRGB colour "#rrggbb"; parts that are not named take the colour of ``body``.
-        accent: sRGB colour of the soft patches on ``body``; other parts, and all if "", get a darker shade.
-        contrast: 0 is plain, 1 is full patches of the accent colour.
-        scale: size of the patches [m].
-        seed: of the noise.
-    """
-
-    colors: Mapping[str, str]
-    accent: str = ""
-    contrast: float = 0.5
-    scale: float = 0.045
-    seed: int = 0
 
 
 def parse_color(text: str) -> np.ndarray:
@@ -70,7 +49,7 @@ def smooth_noise(points: np.ndarray, scale: float, seed: int) -> np.ndarray:
     return total
 
 
-def colors_at(mesh: trimesh.Trimesh, points: np.ndarray, appearance: Appearance) -> np.ndarray:
+def colors_at(mesh: trimesh.Trimesh, points: np.ndarray, appearance: AppearanceConfig) -> np.ndarray:
     """sRGB colours (n, 3) in [0, 1] at rest positions (n, 3) [m] in the frame of a mesh from ``shapes.build``.
 
     Raises:

@@ -6,47 +6,39 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from neuma_lib.data.blender.appearance import Appearance, colors_at
+from neuma_lib.config.blender import AppearanceConfig
+from neuma_lib.data.blender.appearance import colors_at
 from neuma_lib.data.blender.scene import Grains, Liquid, Surface
-from neuma_lib.errors import InputError
 from neuma_lib.geometry.shapes import depth
 from neuma_lib.geometry.skinning import carry, skinning_matrix
 
-KINDS = ("solid", "grains", "liquid")
 MOST_GRAINS = 30_000
 MOST_DROPS = 12_000  # points that a liquid's surface is made from
 
 
 def make_body(
-    kind: str,
     mesh: trimesh.Trimesh,
-    appearance: Appearance,
+    appearance: AppearanceConfig,
     x: np.ndarray,
     tracers: np.ndarray | None = None,
 ) -> Surface | Grains | Liquid:
     """What Blender shows.
 
     Args:
-        kind: "solid", "grains" or "liquid".
         mesh: the true shape where the motion starts, from ``shapes.build`` [m].
-        appearance: colours by rest position.
+        appearance: the kind of body, and its colours by rest position.
         x: particle positions, frame 0 at rest in the mesh [m], shape (T, N, 3).
         tracers: passive points of the same motion (T, M, 3) [m]; where they are given, grains and the liquid's
             surface are made from some of them, because they are finer than the particles.
-
-    Raises:
-        InputError: another kind.
     """
     x = np.asarray(x, dtype=np.float64)
-    if kind == "solid":
+    if appearance.kind == "solid":
         vertices = carry(skinning_matrix(mesh.vertices, x[0]), x)
         return Surface(vertices, np.asarray(mesh.faces), colors_at(mesh, mesh.vertices, appearance))
     points = x if tracers is None else np.asarray(tracers)
-    if kind == "grains":
+    if appearance.kind == "grains":
         return _grains(mesh, appearance, _some(points, MOST_GRAINS))
-    if kind == "liquid":
-        return _liquid(mesh, appearance, _some(points, MOST_DROPS))
-    raise InputError(f"appearance.kind: {kind!r} is not known; choose one of {', '.join(KINDS)}")
+    return _liquid(mesh, appearance, _some(points, MOST_DROPS))
 
 
 def _some(points: np.ndarray, most: int) -> np.ndarray:
@@ -56,14 +48,14 @@ def _some(points: np.ndarray, most: int) -> np.ndarray:
     return points.astype(np.float64)
 
 
-def _grains(mesh: trimesh.Trimesh, appearance: Appearance, points: np.ndarray) -> Grains:
+def _grains(mesh: trimesh.Trimesh, appearance: AppearanceConfig, points: np.ndarray) -> Grains:
     """Balls somewhat wider than the spacing of their centres; none stands out of the rest surface."""
     radius = 0.65 * float((mesh.volume / points.shape[1]) ** (1 / 3))
     points = points[:, depth(mesh, points[0]) > 0.8 * radius]
     return Grains(points, radius, colors_at(mesh, points[0], appearance))
 
 
-def _liquid(mesh: trimesh.Trimesh, appearance: Appearance, points: np.ndarray) -> Liquid:
+def _liquid(mesh: trimesh.Trimesh, appearance: AppearanceConfig, points: np.ndarray) -> Liquid:
     """A surface around the points of every frame; the one at rest holds the true shape's volume within 2 %."""
     spacing = float((mesh.volume / points.shape[1]) ** (1 / 3))
     rest_colors = colors_at(mesh, points[0], appearance)

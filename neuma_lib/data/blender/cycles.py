@@ -9,23 +9,29 @@ import numpy as np
 from mathutils import Matrix, Vector
 
 SENSOR = 36.0  # width of the camera's sensor [mm]; only its ratio to the lens matters
+SEED = 0
+"""Seed of the sampler; the same seed gives the same bytes."""
+AMBIENT = 0.82
+"""Radiance of the uniform surroundings; it colours the surface the same wherever it turns."""
+KEY = 0.35
+"""Strength of one wide soft light from above the frontal camera, which gives the form its shade."""
 
 
-def start(settings: dict, width: int, height: int) -> None:
+def start(width: int, height: int, samples: int, threads: int) -> None:
     """An empty scene with the renderer's settings and the light."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     render, cycles = scene.render, scene.cycles
     render.engine = "CYCLES"
     cycles.device = "CPU"
-    cycles.samples = settings["samples"]
-    cycles.seed = settings["seed"]
+    cycles.samples = samples
+    cycles.seed = SEED
     cycles.use_adaptive_sampling = False
     cycles.use_denoising = True
     cycles.denoiser = "OPENIMAGEDENOISE"
     cycles.denoising_prefilter = "FAST"
     cycles.max_bounces = 3
-    render.threads_mode, render.threads = "FIXED", settings["threads"]
+    render.threads_mode, render.threads = "FIXED", threads
     render.use_persistent_data = True
     render.film_transparent = True
     render.resolution_x, render.resolution_y, render.resolution_percentage = width, height, 100
@@ -39,10 +45,10 @@ def start(settings: dict, width: int, height: int) -> None:
     world.use_nodes = True
     background = world.node_tree.nodes["Background"]
     background.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
-    background.inputs["Strength"].default_value = settings["ambient"]
+    background.inputs["Strength"].default_value = AMBIENT
     scene.world = world
     key = bpy.data.lights.new("key", "SUN")
-    key.energy = settings["key"] * np.pi * 0.5
+    key.energy = KEY * np.pi * 0.5
     key.angle = np.radians(90.0)
     lamp = bpy.data.objects.new("key", key)
     towards = Vector((0.35, 0.8, 0.5)).normalized()

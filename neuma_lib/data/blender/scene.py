@@ -7,14 +7,13 @@ collects the images, which appear in the target folder only when all of them are
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,25 +26,6 @@ from neuma_lib.io.images import write_transforms
 from neuma_lib.splatting.viewpoints import Views
 
 Progress = Callable[[int, int], None]
-
-
-@dataclass(frozen=True)
-class RenderSettings:
-    """How Cycles renders.
-
-    Attributes:
-        samples: samples a pixel, denoised (the alpha channel is not: 8 are usable, 16 clean).
-        seed: of the sampler; the same seed gives the same bytes.
-        threads: CPU cores that the process may use.
-        ambient: radiance of the uniform surroundings; it colours the surface the same wherever it turns.
-        key: strength of one wide soft light from above the frontal camera, which gives the form its shade.
-    """
-
-    samples: int = 16
-    seed: int = 0
-    threads: int = 1
-    ambient: float = 0.82
-    key: float = 0.35
 
 
 @dataclass(frozen=True)
@@ -149,8 +129,9 @@ def render_images(
     views: Views,
     shots: Sequence[tuple[int, int]],
     out_dir: str | Path,
-    settings: RenderSettings,
     names: Sequence[str],
+    samples: int,
+    threads: int = 1,
     progress: Progress | None = None,
 ) -> None:
     """Render shots to RGBA PNG files.
@@ -160,8 +141,9 @@ def render_images(
         views: cameras.
         shots: (frame, camera) of each image; shots of one frame should stand together.
         out_dir: folder of the images, created; images of the same names are replaced.
-        settings: of the renderer.
         names: file name of each shot.
+        samples: samples a pixel, denoised (the alpha channel is not: 8 are usable, 16 clean).
+        threads: CPU cores that Blender may use.
         progress: called with the number of finished images and of all.
 
     Raises:
@@ -181,7 +163,8 @@ def render_images(
             focal=views.focal,
             size=np.array([views.width, views.height]),
             shots=np.asarray(shots, dtype=np.int64).reshape(-1, 2),
-            settings=json.dumps(asdict(settings)),
+            samples=samples,
+            threads=threads,
         )
         _run(job, len(shots), progress)
         for index, name in enumerate(names):
@@ -237,14 +220,14 @@ def render_static(
     geometry: Surface | Grains | Liquid,
     views: Views,
     out_dir: str | Path,
-    settings: RenderSettings | None = None,
+    samples: int,
+    threads: int = 1,
     progress: Progress | None = None,
 ) -> None:
     """Render frame 0 from every camera, and write transforms.json: files ``s_<view>.png``."""
-    names = [f"s_{view:03d}.png" for view in range(len(views))]
-    _render_set(
-        geometry, views, [(0, v) for v in range(len(views))], names, [0], [0.0], out_dir, settings, progress
-    )
+    shots = [(0, view) for view in range(len(views))]
+    names = [f"s_{view:03d}.png" for _, view in shots]
+    _render_set(geometry, views, shots, names, [0], [0.0], out_dir, samples, threads, progress)
 
 
 def render_dynamic(
@@ -253,7 +236,8 @@ def render_dynamic(
     steps: Sequence[int],
     dt: float,
     out_dir: str | Path,
-    settings: RenderSettings | None = None,
+    samples: int,
+    threads: int = 1,
     progress: Progress | None = None,
 ) -> None:
     """Render every frame from every camera, and write transforms.json: files ``d_<view>_<step>.png``.
@@ -267,14 +251,14 @@ def render_dynamic(
     shots = [(frame, view) for frame in range(len(geometry)) for view in range(len(views))]
     names = [f"d_{view}_{steps[frame]:04d}.png" for frame, view in shots]
     times = [float(step) * dt for step in steps]
-    _render_set(geometry, views, shots, names, steps, times, out_dir, settings, progress)
+    _render_set(geometry, views, shots, names, steps, times, out_dir, samples, threads, progress)
 
 
-def _render_set(geometry, views, shots, names, steps, times, out_dir, settings, progress) -> None:
+def _render_set(geometry, views, shots, names, steps, times, out_dir, samples, threads, progress) -> None:
     out_dir = Path(out_dir)
     # A folder without transforms.json is an unfinished one.
     (out_dir / "transforms.json").unlink(missing_ok=True)
-    render_images(geometry, views, shots, out_dir, settings or RenderSettings(), names, progress)
+    render_images(geometry, views, shots, out_dir, names, samples, threads, progress)
     frames = [
         {
             "file_path": name,

@@ -6,7 +6,6 @@ Prints the number of finished images, a line each, on standard output; Blender's
 from __future__ import annotations
 
 import fcntl
-import json
 import os
 import sys
 import tempfile
@@ -50,12 +49,12 @@ def main(path: str) -> None:
     report = _quiet_stdout()
     with np.load(path) as file:
         job = dict(file)
-    settings = json.loads(str(job["settings"]))
-    claimed = _claim_cores(settings["threads"])
+    threads = int(job["threads"])
+    claimed = _claim_cores(threads)
     from neuma_lib.data.blender import cycles
 
     folder = Path(path).parent
-    cycles.start(settings, *(int(s) for s in job["size"]))
+    cycles.start(*(int(s) for s in job["size"]), int(job["samples"]), threads)
     body = cycles.Body(job)
     camera = cycles.add_camera(float(job["focal"]), int(job["size"][0]))
     shown = None

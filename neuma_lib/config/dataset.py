@@ -1,0 +1,60 @@
+"""Settings of ground truths and their images."""
+
+from __future__ import annotations
+
+from pydantic import Field, model_validator
+
+from neuma_lib.config.base import Section
+from neuma_lib.config.blender import ImagesConfig
+
+
+class PackingConfig(Section):
+    """How much of a ground truth travels in a packed dataset; all tracers do."""
+
+    particles: int = Field(
+        30_000,
+        gt=0,
+        description="particles kept, drawn at random, with volumes and masses scaled to the same total",
+    )
+    deformations: int = Field(1000, gt=0, description="those of them whose deformation gradient is kept")
+
+
+class DatasetConfig(Section):
+    """Ground truth and its images."""
+
+    particles: int = Field(
+        8000, gt=0, description="ground-truth particles, at least four times the reconstruction's"
+    )
+    seed: int = Field(1000, description="seed of the ground truth, apart from the reconstruction's")
+    steps: int | None = Field(None, gt=0, description="steps of every video; null: those of its scene")
+    frames: int | None = Field(
+        25, ge=2, description="frames of a video, evenly from step 0 to the last, for scenes that list none"
+    )
+    stride: int | None = Field(
+        None, ge=1, description="steps between two frames; in place of frames, which is null then"
+    )
+    tracers: int = Field(100_000, gt=0, description="passive tracers that measure the motion of the truth")
+    static: ImagesConfig = Field(ImagesConfig(views=50), description="views on a sphere at t = 0")
+    dynamic: ImagesConfig = Field(
+        ImagesConfig(views=3, width=96, height=96), description="videos, view 0 frontal"
+    )
+    packed: str | None = Field(
+        None,
+        min_length=1,
+        description="folder of packed datasets, `<scene>.images.zip` and `<scene>.truth.zip`, to unpack in place of "
+        "simulating and rendering; null: the dataset is made here",
+    )
+    packing: PackingConfig = Field(PackingConfig(), description="what the target `packed` keeps")
+
+    @model_validator(mode="after")
+    def _one_rule_for_frames(self) -> DatasetConfig:
+        if (self.frames is None) == (self.stride is None):
+            raise ValueError("give either frames or stride, and null for the other")
+        return self
+
+    def frame_steps(self, steps: int) -> tuple[int, ...]:
+        """Steps of the frames of a video of ``steps`` steps."""
+        if self.stride is not None:
+            return tuple(range(0, steps + 1, self.stride))
+        count = min(self.frames, steps + 1)
+        return tuple(round(i * steps / max(count - 1, 1)) for i in range(count))

@@ -1,0 +1,57 @@
+"""Methods and their variants: sets of options over the same code."""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Mapping
+from typing import Any
+
+import yaml
+from pydantic import Field
+
+from neuma_lib.config.base import Section
+from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.validation import hint
+from neuma_lib.errors import InputError
+
+
+class MethodConfig(Section):
+    """A method is a set of options over the same code."""
+
+    title: str = Field(description="name in tables")
+    material: dict[str, Any] = Field(
+        {}, description="settings of the section material that the method changes"
+    )
+
+
+def parse_method(text: str, methods: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Split a method's folder name, ``neuma+rank=4+seed=2``, into its base and its settings.
+
+    Keys are those of the section ``material``, and ``prior``. Values are YAML scalars; a comma makes a list.
+
+    Raises:
+        InputError: unknown method or key, a repeated key, or a piece without '='.
+    """
+    base, *pieces = text.split("+")
+    if base not in methods:
+        raise InputError(f"no method '{base}'{hint(base, methods)}")
+    variant: dict[str, Any] = {}
+    known = [*MaterialConfig.model_fields, "prior"]
+    for piece in pieces:
+        key, equals, value = piece.partition("=")
+        if not equals or not key or not value:
+            raise InputError(f"method '{text}': write variants as +key=value, not '+{piece}'")
+        if key not in known:
+            raise InputError(f"method '{text}': no setting '{key}'{hint(key, known)}")
+        if key in variant:
+            raise InputError(f"method '{text}': '{key}' is given twice")
+        field = MaterialConfig.model_fields.get(key)
+        is_list = field is not None and typing.get_origin(field.annotation) is tuple
+        variant[key] = [yaml.safe_load(v) for v in value.split(",")] if is_list else yaml.safe_load(value)
+    return base, variant
+
+
+def variant_title(base: str, variant: Mapping[str, Any]) -> str:
+    """Name of a variant for tables, for example "NeuMA, rank 4", from the title of its base."""
+    texts = {key: ",".join(map(str, v)) if isinstance(v, list) else v for key, v in variant.items()}
+    return ", ".join([base, *(f"{key} {text}" for key, text in texts.items())])

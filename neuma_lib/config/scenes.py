@@ -1,0 +1,70 @@
+"""Settings of a scene: a benchmark."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from neuma_lib.config.base import Section, Vector
+from neuma_lib.config.blender import AppearanceConfig
+from neuma_lib.config.laws import LawConfig
+
+
+class SplitDensityConfig(Section):
+    """Two mass densities on either side of a plane."""
+
+    axis: Literal["x", "y", "z"] = Field("x", description="axis that the plane is normal to")
+    at: float = Field(0.5, description="where the plane cuts the axis [m]")
+    below: float = Field(gt=0, description="density on the side of smaller coordinates [kg/m^3]")
+    above: float = Field(gt=0, description="density on the other side [kg/m^3]")
+
+
+class SuppliedConfig(Section):
+    """Image sets that were made elsewhere: a transforms.json, or a list in the layout of the authors' release."""
+
+    static: str | None = Field(None, description="views at t = 0; null: rendered by Blender")
+    dynamic: str | None = Field(
+        None, description="videos with the frames that the scene's settings name; null: rendered by Blender"
+    )
+
+
+class SceneConfig(Section):
+    """A benchmark: what is thrown, of what, how, and what is believed about it."""
+
+    shape: str = Field(description="name of the shape: ball, duck, pawn, cat, bottle, fish or letter_X")
+    size: float | None = Field(
+        None, gt=0, description="longest side of the bounding box [m]; null: the shape's own"
+    )
+    height: float = Field(description="y of the bounding box's centre at the start [m]")
+    center: tuple[float, float] = Field((0.5, 0.5), description="x and z of the bounding box's centre [m]")
+    velocity: Vector = Field(description="initial velocity [m/s]")
+    density: Annotated[float, Field(gt=0)] | SplitDensityConfig = Field(
+        1000.0,
+        description="mass density rho [kg/m^3], or two of them at t = 0: {axis: x, at: 0.5, below: 800, above: 1200}",
+    )
+    law: LawConfig = Field(description="the true material, known to the ground truth only")
+    dt: float = Field(gt=0, description="time step [s]")
+    steps: int = Field(gt=0, description="simulated steps of the video")
+    frames: tuple[int, ...] | None = Field(
+        None,
+        description="steps of the video's frames, ascending from 0; null: as dataset.frames or dataset.stride say",
+    )
+    prior: str = Field(description="name in priors.laws, or path of a .safetensors or a released .pt file")
+    appearance: AppearanceConfig = Field(description="how Blender shows it")
+    images: SuppliedConfig = Field(
+        SuppliedConfig(), description="files of its images, where Blender makes none"
+    )
+    story: str = Field("", description="in which way the prior is wrong, in words")
+    material: dict[str, Any] = Field(
+        {}, description="settings of the section material that this scene overrides"
+    )
+
+    @model_validator(mode="after")
+    def _frames_ascend(self) -> SceneConfig:
+        frames = self.frames
+        if frames is not None and (
+            list(frames) != sorted(set(frames)) or not frames or frames[0] != 0 or frames[-1] > self.steps
+        ):
+            raise ValueError("frames must ascend from 0 to at most 'steps' without repeats")
+        return self

@@ -1,0 +1,19 @@
+"""Settings of the simulator."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from neuma_lib.config.base import Section, Vector
+
+
+class SimulationConfig(Section):
+    """The material point method."""
+
+    particles: int = Field(2000, gt=0, description="particles of the reconstructed body")
+    grid: int = Field(24, ge=8, description="grid nodes along each side of the unit cube")
+    gravity: Vector = Field((0.0, -9.8, 0.0), description="acceleration [m/s^2]")
+    boundary: str | dict[str, str] = Field(
+        "no_slip", description="condition of the walls: no_slip, slip or sticky, or one a wall (x_min, ...)"
+    )
+    wall_cells: int = Field(1, ge=1, description="thickness of the walls in cells")

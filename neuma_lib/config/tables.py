@@ -1,0 +1,28 @@
+"""Settings of the tables."""
+
+from __future__ import annotations
+
+from pydantic import Field, model_validator
+
+from neuma_lib.config.base import Section
+
+
+class TableConfig(Section):
+    """Rows and columns of a table of the paper."""
+
+    scenes: tuple[str, ...] = Field((), description="columns, in order")
+    experiments: tuple[str, ...] = Field((), description="columns after the scenes, in order")
+    methods: tuple[str, ...] = Field((), description="rows, in order; variants such as neuma+rank=4 too")
+    titles: dict[str, str] = Field({}, description="names of rows other than the methods' own, by method")
+    seeds: int = Field(
+        1,
+        ge=1,
+        description="runs of each method that draws an adaptor at random, as method+seed=k; with several, mean and "
+        "standard deviation are shown",
+    )
+
+    @model_validator(mode="after")
+    def _has_columns(self) -> TableConfig:
+        if not self.scenes and not self.experiments:
+            raise ValueError("give at least one scene or experiment, a column each")
+        return self

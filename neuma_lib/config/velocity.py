@@ -1,0 +1,24 @@
+"""Settings of the estimate of the initial velocity."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from neuma_lib.config.base import Section
+
+
+class VelocityConfig(Section):
+    """Initial velocity from the frames before contact."""
+
+    views: tuple[int, ...] = Field((0,), min_length=1, description="views of the video that are used")
+    ridge: float = Field(
+        0.0,
+        ge=0,
+        description="penalty on the velocity along the viewing direction of the first view, relative to the curvature "
+        "of the best determined axis; 0: none",
+    )
+    initial_frames: int = Field(
+        3, ge=2, description="frames of the first estimate, which tells how many more come before contact"
+    )
+    iterations: int = Field(30, ge=1, description="most Levenberg-Marquardt steps for a set of frames")
+    difference: float = Field(0.02, gt=0, description="half width of the central differences [m/s]")
