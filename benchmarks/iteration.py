@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,11 +24,12 @@ from benchmarks.timing import arithmetic, bandwidth, device_name, peak_memory, s
 from neuma_lib.config.material import MaterialConfig
 from neuma_lib.fitting.image_loss import mean_squared_error
 from neuma_lib.fitting.material import PixelLoss, train_material
+from neuma_lib.sim.memory import MemoryPlan
 from neuma_lib.sim.model import as_bodies
 from neuma_lib.sim.rollout import rollout
-from neuma_lib.sim.simulation import Simulation
+from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import Trajectory
-from neuma_lib.sim.workspace import SORT_EVERY, WorkspaceLease
+from neuma_lib.sim.workspace import SORT_EVERY, free_pool
 from neuma_lib.splatting import torch_reference
 from neuma_lib.splatting.observation import Observation
 from neuma_lib.splatting.rasterizer import rasterize
@@ -66,14 +68,12 @@ def simulation_parts(scene: BenchmarkScene, device: torch.device) -> list[Part]:
     middle = size.steps // 2
     with torch.no_grad():
         path = _roll(scene, steps=middle, frames=(middle,))
-    weights = law.weights()
-    flat = [w.detach() for part in weights for w in part]
-    elastic, plastic = flat[:3], flat[3:]
     bodies = as_bodies(law, N)
-    sim = Simulation(
-        scene.model, bodies, {id(law): weights}, scene.body.x0, 2, 0, differentiable=True, keep="all"
-    )
-    sim.set_mass(scene.body.mass, scene.body.vol0)
+    weights, slices = gather_weights(bodies, torch.float32)
+    flat = [w.detach() for w in weights]
+    elastic, plastic = flat[:3], flat[3:]
+    plan = MemoryPlan(segment=2, caches_steps=True, law_cache_bytes=math.inf)
+    sim = Simulation(scene.model, bodies, slices, scene.body.state(scene.v0), steps=2, plan=plan)
     sim.run((path.x[0], path.v[0], path.F[0], path.C[0]), flat, (2,))
     ws = sim.workspace
     F, F_trial, tau = ws.F[0], ws.F_trial[0], ws.tau[0]
@@ -256,7 +256,7 @@ def report(scene: BenchmarkScene, device: torch.device, batch: int) -> list[str]
     parts = [*simulation_parts(scene, device), *rendering_parts(scene, device, batch)]
     simulation = seconds(lambda: simulate_and_back(scene), device)
     bounded = seconds(lambda: simulate_and_back(scene, memory=memory_of_states(size) / 2), device, 3)
-    WorkspaceLease.forget()  # so that the peak is that of training alone
+    free_pool()  # so that the peak is that of training alone
     times = []
     memory = peak_memory(lambda: times.extend(iterations(scene, 8)), device)
     whole = min(times[3:])

@@ -11,6 +11,7 @@ differentiable simulator. The best of several repetitions counts: other load onl
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from collections.abc import Callable
 
@@ -19,10 +20,10 @@ import torch
 from neuma_lib.coupling.deformation import deform
 from neuma_lib.coupling.particle_binding import bind
 from neuma_lib.mechanics.neural import NeuralLaw, neural_law
-from neuma_lib.sim.memory import KEEP
+from neuma_lib.sim.memory import MemoryPlan
 from neuma_lib.sim.model import MPMModel, as_bodies
 from neuma_lib.sim.rollout import RolloutFunction, rollout
-from neuma_lib.sim.simulation import Simulation
+from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import State
 from neuma_lib.splatting.rasterizer import rasterize
 
@@ -33,15 +34,11 @@ def rollout_step_by_step(model, law, state, frames):
     The same code as a rollout of one step after another: every node has its own buffers, keeps its state and
     computes the rest again. The adaptor is merged once, as in the rollout.
     """
-    parts = law.weights()
-    weights = [w for part in parts for w in part]
     bodies = as_bodies(law, len(state.x))
+    weights, slices = gather_weights(bodies, state.x.dtype)
     now, seen = state.motion, []
     for n in range(1, frames[-1] + 1):
-        step = Simulation(
-            model, bodies, {id(law): parts}, state.x, 1, n - 1, differentiable=True, keep="states"
-        )
-        step.set_mass(state.mass, state.vol0)
+        step = Simulation(model, bodies, slices, state, 1, n - 1, MemoryPlan(1, False, 0))
         *after, _ = RolloutFunction.apply(step, [1], None, *now, *weights)
         now = tuple(value[0] for value in after)
         if n in frames:
@@ -139,8 +136,8 @@ def main() -> None:
     frames = sorted({max(1, round(args.steps * (i + 1) / args.frames)) for i in range(args.frames)})
     options = dict(steps=args.steps, frames=frames, skip_free_flight=False)
 
-    def simulate(keep="auto"):
-        path = rollout(model, law, state, keep=keep, **options)
+    def simulate(**more):
+        path = rollout(model, law, state, **options, **more)
         return path.x, path.F
 
     def scalar(states):
@@ -150,7 +147,11 @@ def main() -> None:
         f"{args.particles} particles, {args.grid}^3 grid, {args.steps} steps, {len(frames)} frames, "
         f"neural law, {device}; best of {args.repetitions} [ms]"
     )
-    rows = {f"rollout, keep={keep}": lambda keep=keep: scalar(simulate(keep)) for keep in KEEP}
+    rows = {
+        "rollout": lambda: scalar(simulate()),
+        "rollout, states kept only": lambda: scalar(simulate(cache_bytes=0)),
+        "rollout, everything kept": lambda: scalar(simulate(cache_bytes=math.inf)),
+    }
     rows["one function per step"] = lambda: scalar(rollout_step_by_step(model, law, state, frames))
     if args.render:
         render = picture(state.x, args.gaussians, args.pixels)
@@ -162,7 +163,7 @@ def main() -> None:
     for name, (ahead, back) in best.items():
         columns = "".join(f"{1e3 * t:10.1f}" for t in (ahead, back, ahead + back))
         print(f"{name:36}{columns}{1e3 * (ahead + back) / args.steps:10.2f}")
-    ratio = sum(best["one function per step"]) / sum(best["rollout, keep=auto"])
+    ratio = sum(best["one function per step"]) / sum(best["rollout"])
     print(f"one function per step / rollout: {ratio:.2f}")
 
 

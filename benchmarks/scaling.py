@@ -22,7 +22,7 @@ import torch
 from benchmarks.iteration import iterations, simulate_and_back
 from benchmarks.scene import SMALL, Size, make_scene
 from benchmarks.timing import device_name, peak_memory, seconds
-from neuma_lib.sim.workspace import WorkspaceLease
+from neuma_lib.sim.workspace import free_pool
 
 SWEEPS = {
     "particles": (5_000, 10_000, 30_000, 60_000, 120_000, 240_000),
@@ -74,7 +74,7 @@ def measure(
 
 def forget(device: torch.device) -> None:
     """Give all memory back, so that the next size does not pay for this one."""
-    WorkspaceLease.forget()
+    free_pool()
     gc.collect()
     if device.type == "cuda":
         torch.cuda.empty_cache()

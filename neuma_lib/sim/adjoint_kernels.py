@@ -34,9 +34,9 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         c: GridConstants,
         now: wp.int32,
         after: wp.int32,
-        kept: wp.int32,
+        cached: wp.int32,
         side: wp.int32,
-        epoch: wp.int32,
+        sort: wp.int32,
         order: wp.array2d(dtype=wp.int32),
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
@@ -54,7 +54,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         p = wp.tid()
         alive = p < grad_x.shape[0]
         if wp.static(ordered):
-            p = order[epoch, wp.min(p, grad_x.shape[0] - 1)]
+            p = order[sort, wp.min(p, grad_x.shape[0] - 1)]
         xp = x[now, p]
         bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
         run = run_of(wp.where(alive, (bi * c.n + bj) * c.n + bk, -1))
@@ -80,7 +80,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
             for j in range(3):
                 row = ((bi + i) * c.n + bj + j) * c.n + bk
                 deposit(grad_grid_rows, side, row, (wi[i] * wj[j]) * (wp.outer(wk, u_ij) + slope_k), run)
-                nodes = grid_v_rows[kept, row]
+                nodes = grid_v_rows[cached, row]
                 vu = nodes * u_ij + wp.cw_mul(step_k, nodes * column(D, 2))
                 vu_w, vu_s = wp.dot(vu, wk), wp.dot(vu, sk)
                 moving += vec3(si[i] * wj[j] * vu_w, wi[i] * sj[j] * vu_w, wi[i] * wj[j] * vu_s)
@@ -92,7 +92,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
     @kernel
     def grid_adjoint(
         c: GridConstants,
-        kept: wp.int32,
+        cached: wp.int32,
         side: wp.int32,
         grid: wp.array2d(dtype=vec4),
         grad_grid: wp.array2d(dtype=vec4),
@@ -102,7 +102,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         The other side of `grad_grid` is cleared for the step before this one.
         """
         node = wp.tid()
-        mv = grid[kept, node]
+        mv = grid[cached, node]
         if mv[3] > real(0.0):
             v = vec3(mv[0], mv[1], mv[2]) / mv[3]
             g = grad_grid[side, node]
@@ -114,7 +114,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
     def p2g_adjoint(
         c: GridConstants,
         now: wp.int32,
-        kept: wp.int32,
+        cached: wp.int32,
         side: wp.int32,
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
@@ -141,7 +141,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         # The scattered q_i = (m v + A d_i, m), as in p2g.
         m = mass[p]
         stress = real(4.0) * c.dt * c.inv_dx * c.inv_dx * vol0[p]
-        A = c.dx * (m * C[now, p] - stress * tau[kept, p])
+        A = c.dx * (m * C[now, p] - stress * tau[cached, p])
         q0 = m * v[now, p] - A * f
         q_i = vec4(q0[0], q0[1], q0[2], m)
         step_k = vec3(real(0.0), real(1.0), real(2.0))

@@ -4,14 +4,14 @@ MLS-MPM (Hu et al. 2018) with quadratic B-splines and the affine velocity C of A
 the order and letters of the paper's Algorithm 2 (appendix "Introduction to the Material Point Method"). Their
 adjoints are in `adjoint_kernels`.
 
-Memory: arrays of particles have a leading axis of slots. A rollout that will be differentiated gives each
-step a slot of its own, any other alternates between two. A grid node is a 4-vector, momentum and mass
+Memory: the first axis of an array counts steps; ``now`` and ``after`` are the indices of the states before and after
+the step in hand, ``cached`` that of its stress and grid (`Workspace`). A grid node is a 4-vector, momentum and mass
 (``grid``) or velocity and 1 where there is mass (``grid_v``). A particle sees 3 x 3 rows of three nodes that
 lie side by side in memory, so kernels read and write ``rows``: a view of the grid whose element b is the
 matrix (3 x 4) of nodes b, b + 1 and b + 2. Sums over the last axis of the stencil are products with a row.
 
 Order: where a scatter to the grid wants neighbours side by side (`scatter`), thread i takes particle
-``order[epoch, i]``, the particles sorted by cell a few steps ago. A gather is faster in the order of memory.
+``order[sort, i]``, the particles sorted by cell a few steps ago. A gather is faster in the order of memory.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -29,8 +29,8 @@ start_warp()
 NO_SLIP, SLIP, STICKY = 0, 1, 2
 """Codes of the boundary conditions in ``GridConstants.walls``."""
 
-NEVER = 2**62
-"""Value of a fault flag while nothing has gone wrong."""
+NO_FAULT = 2**62
+"""Value of a fault flag as long as nothing has gone wrong."""
 
 
 @functools.cache
@@ -171,8 +171,8 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
     def p2g(
         c: GridConstants,
         now: wp.int32,
-        kept: wp.int32,
-        epoch: wp.int32,
+        cached: wp.int32,
+        sort: wp.int32,
         order: wp.array2d(dtype=wp.int32),
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
@@ -186,14 +186,14 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         p = wp.tid()
         alive = p < mass.shape[0]
         if wp.static(ordered):
-            p = order[epoch, wp.min(p, mass.shape[0] - 1)]
+            p = order[sort, wp.min(p, mass.shape[0] - 1)]
         xp = x[now, p]
         bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
         run = run_of(wp.where(alive, (bi * c.n + bj) * c.n + bk, -1))
         f = xp * c.inv_dx - vec3(real(bi), real(bj), real(bk))
         wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
         m = mass[p]
-        A = c.dx * (m * C[now, p] - (real(4.0) * c.dt * c.inv_dx * c.inv_dx * vol0[p]) * tau[kept, p])
+        A = c.dx * (m * C[now, p] - (real(4.0) * c.dt * c.inv_dx * c.inv_dx * vol0[p]) * tau[cached, p])
         # q = (m v + A d, m) grows by a column of A from node to node.
         q0 = m * v[now, p] - A * f
         q_i = vec4(q0[0], q0[1], q0[2], m)
@@ -202,30 +202,30 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
             q_ij = q_i
             for j in range(3):
                 row = ((bi + i) * c.n + bj + j) * c.n + bk
-                deposit(grid_rows, kept, row, (wi[i] * wj[j]) * (wp.outer(wk, q_ij) + slope_k), run)
+                deposit(grid_rows, cached, row, (wi[i] * wj[j]) * (wp.outer(wk, q_ij) + slope_k), run)
                 q_ij += column(A, 1)
             q_i += column(A, 0)
 
     @kernel
     def grid_update(
-        c: GridConstants, kept: wp.int32, grid: wp.array2d(dtype=vec4), grid_v: wp.array2d(dtype=vec4)
+        c: GridConstants, cached: wp.int32, grid: wp.array2d(dtype=vec4), grid_v: wp.array2d(dtype=vec4)
     ):
         """v_i = (m v)_i / m_i + dt g where there is mass, then the walls; nothing is added to the mass."""
         node = wp.tid()
-        mv = grid[kept, node]
+        mv = grid[cached, node]
         result = vec4()
         if mv[3] > real(0.0):
             v = vec3(mv[0], mv[1], mv[2]) / mv[3] + c.dt * c.gravity
             v = wp.cw_mul(v, wall_mask(c, node, v))
             result = vec4(v[0], v[1], v[2], real(1.0))
-        grid_v[kept, node] = result
+        grid_v[cached, node] = result
 
     @kernel
     def g2p(
         c: GridConstants,
         now: wp.int32,
         after: wp.int32,
-        kept: wp.int32,
+        cached: wp.int32,
         step: wp.int32,
         grid_v_rows: wp.array2d(dtype=mat34),
         x: wp.array2d(dtype=vec3),
@@ -247,7 +247,7 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         total, B_i, B_j, B_k = vec4(), vec4(), vec4(), vec4()  # sum w v, columns of sum w v d^T / dx
         for i in range(3):
             for j in range(3):
-                nodes = grid_v_rows[kept, ((bi + i) * c.n + bj + j) * c.n + bk]
+                nodes = grid_v_rows[cached, ((bi + i) * c.n + bj + j) * c.n + bk]
                 along_k = wk * nodes
                 total += (wi[i] * wj[j]) * along_k
                 B_i += (wd_i[i] * wj[j]) * along_k
@@ -260,7 +260,7 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         x[after, p] = moved(c, xp, v_new)
         v[after, p] = v_new
         C[after, p] = C_new
-        F_trial[kept, p] = F[now, p] + c.dt * (C_new * F[now, p])
+        F_trial[cached, p] = F[now, p] + c.dt * (C_new * F[now, p])
         # Faults keep the first (step, particle). A clamped position would hide both of them.
         here = wp.int64(step) * wp.int64(2147483648) + wp.int64(p)
         if not (wp.isfinite(v_new) and wp.isfinite(C_new)):
@@ -273,18 +273,18 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         c: GridConstants,
         now: wp.int32,
         after: wp.int32,
-        kept: wp.int32,
+        cached: wp.int32,
         C: wp.array2d(dtype=mat33),
         F: wp.array2d(dtype=mat33),
         F_trial: wp.array2d(dtype=mat33),
     ):
         """F_trial = (I + dt C) F, exactly as in g2p, for a reverse loop that kept only the states."""
         p = wp.tid()
-        F_trial[kept, p] = F[now, p] + c.dt * (C[after, p] * F[now, p])
+        F_trial[cached, p] = F[now, p] + c.dt * (C[after, p] * F[now, p])
 
     @kernel
     def advect_tracers(
-        c: GridConstants, kept: wp.int32, grid_v_rows: wp.array2d(dtype=mat34), x: wp.array(dtype=vec3)
+        c: GridConstants, cached: wp.int32, grid_v_rows: wp.array2d(dtype=mat34), x: wp.array(dtype=vec3)
     ):
         """x += dt v, v interpolated over the nodes that carry mass; a tracer that sees none of them stays."""
         p = wp.tid()
@@ -295,7 +295,7 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         total = vec4()
         for i in range(3):
             for j in range(3):
-                total += (wi[i] * wj[j]) * (wk * grid_v_rows[kept, ((bi + i) * c.n + bj + j) * c.n + bk])
+                total += (wi[i] * wj[j]) * (wk * grid_v_rows[cached, ((bi + i) * c.n + bj + j) * c.n + bk])
         if total[3] > real(0.0):
             x[p] = moved(c, xp, vec3(total[0], total[1], total[2]) / total[3])
 

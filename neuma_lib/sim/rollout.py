@@ -15,9 +15,9 @@ from torch.autograd.function import once_differentiable
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.free_flight import ballistic, free_flight_steps
-from neuma_lib.sim.memory import KEEP
-from neuma_lib.sim.model import Body, MPMModel, as_bodies, law_weights
-from neuma_lib.sim.simulation import Simulation
+from neuma_lib.sim.memory import DEFAULT_CACHE_BYTES, plan_memory
+from neuma_lib.sim.model import Body, MPMModel, as_bodies
+from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import State, Trajectory
 
 
@@ -30,8 +30,8 @@ def rollout(
     frames: Sequence[int],
     tracers: Tensor | None = None,
     skip_free_flight: bool = True,
-    keep: str = "auto",
     memory: float | None = None,
+    cache_bytes: float | None = None,
     scatter: str | None = None,
 ) -> Trajectory:
     """Simulate particles and return their states at the frames.
@@ -49,10 +49,10 @@ def rollout(
         skip_free_flight: take the steps before the first contact in closed form while the state is undeformed
             and moves with one velocity: equal to simulating them, to round-off, in value and gradient. Not
             used where a gradient could deform the state (v of shape (N, 3), F or C that require it).
-        keep: what the gradient keeps a step: "states" (x, v, C, F; the rest is computed again), "all", or
-            "auto", which also keeps what fits a fixed amount of memory. Same gradient, other speed.
         memory: most bytes that the gradient may keep; where that is too little for the states of all steps, these
             are computed a second time, segment by segment. None: no limit. Same gradient, slower.
+        cache_bytes: bytes that the gradient may spend to keep stresses, grids and what the laws computed, beyond
+            the states of the steps; 0 computes these again. None: `memory.DEFAULT_CACHE_BYTES`. Same gradient.
         scatter: how particles are added to nodes, see `scatter.SCATTERS`; None takes the fastest way.
 
     Raises:
@@ -64,34 +64,21 @@ def rollout(
     _check_inside(model, state.x)
     if tracers is not None and (tracers.ndim != 2 or tracers.shape[1] != 3 or tracers.dtype != state.x.dtype):
         raise InputError(f"tracers: give positions of shape (M, 3) as {state.x.dtype}")
-    if keep not in KEEP:
-        raise InputError(f"keep = {keep!r}: choose one of {', '.join(KEEP)}")
 
-    flight = free_flight_steps(model, bodies, state, frames[-1]) if skip_free_flight else 0
+    first = free_flight_steps(model, bodies, state, frames[-1]) if skip_free_flight else 0
     start = state.motion
-    seen = sum(n < flight for n in frames)
+    in_flight = sum(n < first for n in frames)
     parts = []
-    if seen:
-        parts.append(ballistic(model, start, tracers, frames[:seen]))
-    if seen < len(frames):
-        if flight:
-            landed = ballistic(model, start, tracers, (flight,))
+    if in_flight:
+        parts.append(ballistic(model, start, tracers, frames[:in_flight]))
+    if in_flight < len(frames):
+        if first:
+            landed = ballistic(model, start, tracers, (first,))
             start = (landed.x[0], landed.v[0], start[2], start[3])
             tracers = None if tracers is None else landed.tracers[0]
+        plan = dict(memory=memory, cache_bytes=cache_bytes)
         parts.append(
-            _simulate(
-                model,
-                bodies,
-                start,
-                state.mass,
-                state.vol0,
-                tracers,
-                flight,
-                frames[seen:],
-                keep,
-                memory,
-                scatter,
-            )
+            _simulate(model, bodies, state, start, tracers, first, frames[in_flight:], scatter, **plan)
         )
     return parts[0] if len(parts) == 1 else _joined(*parts)
 
@@ -99,27 +86,24 @@ def rollout(
 def _simulate(
     model: MPMModel,
     bodies: tuple[Body, ...],
+    state: State,
     start: tuple[Tensor, ...],
-    mass: Tensor,
-    vol0: Tensor,
     tracers: Tensor | None,
     first: int,
     frames: tuple[int, ...],
-    keep: str,
-    memory: float | None,
     scatter: str | None,
+    memory: float | None,
+    cache_bytes: float | None,
 ) -> Trajectory:
-    """Step from the state `start` at step `first` to the last frame."""
-    laws = {id(body.law): body.law for body in bodies}
-    weights = {key: law_weights(law, start[0].dtype) for key, law in laws.items()}
-    flat = [w for elastic, plastic in weights.values() for w in (*elastic, *plastic)]
-    inputs = (*start, *flat)
-    differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
-    steps = frames[-1] - first
-    simulation = Simulation(
-        model, bodies, weights, start[0], steps, first, differentiable, keep, memory, scatter
-    )
-    simulation.set_mass(mass, vol0)
+    """Step from (x, v, F, C) at step `first` to the last frame."""
+    x, steps = state.x, frames[-1] - first
+    weights, slices = gather_weights(bodies, x.dtype)
+    inputs = (*start, *weights)
+    plan = None
+    if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
+        cache_bytes = DEFAULT_CACHE_BYTES[x.device.type] if cache_bytes is None else cache_bytes
+        plan = plan_memory(steps, len(x), model.grid**3, x.element_size(), cache_bytes, memory)
+    simulation = Simulation(model, bodies, slices, state, steps, first, plan, scatter)
     path = RolloutFunction.apply(simulation, [n - first for n in frames], tracers, *inputs)
     return Trajectory(frames, *path)
 

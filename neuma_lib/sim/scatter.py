@@ -58,7 +58,7 @@ _DEPOSIT = """
             }
     }
     if (run >> 16) {
-        float* node = (float*)((char*)rows.data + (size_t)slot * rows.strides[0] + (size_t)row * rows.strides[1]);
+        float* node = (float*)((char*)rows.data + (size_t)index * rows.strides[0] + (size_t)row * rows.strides[1]);
         #pragma unroll
         for (int k = 0; k < 3; ++k, node += 4) {
 #if VECTOR && defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
@@ -88,8 +88,8 @@ def scatter_functions(dtype: torch.dtype, scatter: str, components: int) -> Simp
 
     Returns:
         ``run_of(cell)``, called once by all threads of a warp with the particle's cell (-1: no particle), and
-        ``deposit(rows, slot, row, value, run)``, which adds the matrix ``value`` (3 x 4) to three nodes from
-        ``row`` on in a slot of the grid, likewise called by all threads of a warp.
+        ``deposit(rows, index, row, value, run)``, which adds the matrix ``value`` (3 x 4) to three nodes from
+        ``row`` on in a index of the grid, likewise called by all threads of a warp.
     """
     real = {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
     mat34 = wp.types.matrix(shape=(3, 4), dtype=real)
@@ -101,9 +101,9 @@ def scatter_functions(dtype: torch.dtype, scatter: str, components: int) -> Simp
 
         @wp.func
         def deposit(
-            rows: wp.array2d(dtype=mat34), slot: wp.int32, row: wp.int32, value: mat34, run: wp.int32
+            rows: wp.array2d(dtype=mat34), index: wp.int32, row: wp.int32, value: mat34, run: wp.int32
         ):
-            wp.atomic_add(rows, slot, row, value)
+            wp.atomic_add(rows, index, row, value)
 
         return SimpleNamespace(run_of=run_of, deposit=deposit)
 
@@ -117,7 +117,7 @@ def scatter_functions(dtype: torch.dtype, scatter: str, components: int) -> Simp
 
     @wp.func_native(snippet)
     def deposit_run(
-        rows: wp.array2d(dtype=mat34), slot: wp.int32, row: wp.int32, value: mat34, run: wp.int32
+        rows: wp.array2d(dtype=mat34), index: wp.int32, row: wp.int32, value: mat34, run: wp.int32
     ): ...
 
     return SimpleNamespace(run_of=run_of_lanes, deposit=deposit_run)

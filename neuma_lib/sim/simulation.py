@@ -15,30 +15,43 @@ import torch
 from torch import Tensor
 
 from neuma_lib.errors import NonFiniteError
-from neuma_lib.mechanics.law import Weights
-from neuma_lib.sim.kernels import NEVER
-from neuma_lib.sim.memory import plan_storage
-from neuma_lib.sim.model import Body, MPMModel
+from neuma_lib.mechanics.law import Constitutive
+from neuma_lib.sim.kernels import NO_FAULT
+from neuma_lib.sim.memory import MemoryPlan
+from neuma_lib.sim.model import Body, MPMModel, law_weights
 from neuma_lib.sim.scatter import scatter_for
-from neuma_lib.sim.workspace import Layout, Workspace, WorkspaceLease
+from neuma_lib.sim.state import State
+from neuma_lib.sim.workspace import Workspace, WorkspaceSize, pooled_workspace
+
+PARTS = ("elasticity", "plasticity")
+
+
+def gather_weights(
+    bodies: Sequence[Body], dtype: torch.dtype
+) -> tuple[list[Tensor], dict[tuple[int, str], slice]]:
+    """Weights of all laws in one list, and where those of each part stand in it, by (id(law), part)."""
+    weights, slices = [], {}
+    for law in {id(body.law): body.law for body in bodies}.values():
+        for part, own in zip(PARTS, law_weights(law, dtype), strict=True):
+            slices[id(law), part] = slice(len(weights), len(weights) + len(own))
+            weights += own
+    return weights, slices
 
 
 class Simulation:
-    """The loop over the steps, forward and in reverse, on a leased workspace.
+    """The loop over the steps, forward and in reverse, in buffers that belong to it while it lives.
 
-    The steps are taken in segments. All states of a segment are in the workspace together if the rollout is to
-    be differentiated; otherwise only the last one, and segments end at the frames. On a GPU a segment, there and
+    The steps are taken in segments. All states of a segment are in memory together if the rollout is to be
+    differentiated; otherwise only the last one, and segments end at the frames. On a GPU a segment, there and
     back, is a CUDA graph, replayed from the third time on (`GraphCache`).
 
     Args:
         model, bodies: as in `rollout`.
-        law_weights: weights of the elasticity and of the plasticity of each distinct law, by id(law). Only
-            their order and number is used; values come with each call.
-        like: a tensor of shape (N, 3) that gives count, precision and device.
+        weight_slices: second result of `gather_weights`; the weights themselves come with each call.
+        state: gives the number of particles, their masses and volumes, precision and device.
         steps: number of steps.
         first: number of the first step, for messages.
-        differentiable: store what `run_adjoint` needs.
-        keep, memory: see `rollout`.
+        plan: what to keep for `run_adjoint`; None if that will not be called.
         scatter: how particles are added to nodes, one of `scatter.SCATTERS`; None takes the fastest.
     """
 
@@ -46,52 +59,35 @@ class Simulation:
         self,
         model: MPMModel,
         bodies: Sequence[Body],
-        law_weights: dict[int, tuple[Weights, Weights]],
-        like: Tensor,
+        weight_slices: dict[tuple[int, str], slice],
+        state: State,
         steps: int,
-        first: int,
-        differentiable: bool,
-        keep: str,
-        memory: float | None = None,
+        first: int = 0,
+        plan: MemoryPlan | None = None,
         scatter: str | None = None,
     ):
-        self.model, self.bodies = model, bodies
-        self.steps, self.first, self.differentiable = steps, first, differentiable
-        self._weight_slices = _weight_slices(law_weights)
-        on_gpu = like.device.type == "cuda"
-        size = dict(steps=steps, particles=len(like), nodes=model.grid**3, itemsize=like.element_size())
-        storage = plan_storage(**size, keep=keep, memory=memory if differentiable else None, on_gpu=on_gpu)
-        self._segment = storage.segment
-        self._keeps = differentiable and storage.keeps
-        self._cache_bytes = storage.cache_bytes if self._keeps else 0
-        self._cached: set[tuple[str, int, int]] = set()
-        self._loaded = 0  # segment whose states are in the workspace
-        self._lease = WorkspaceLease(
-            Layout(
-                model=model,
-                particles=len(like),
-                dtype=like.dtype,
-                device=like.device,
-                states=self._segment + 1 if differentiable else 2,
-                kept=self._segment if self._keeps else 1,
-                marks=-(-steps // self._segment) if differentiable and self._segment < steps else 0,
-                differentiable=differentiable,
-                scatter=scatter or scatter_for(like.device, like.dtype),
-            )
+        self.model, self.bodies, self.steps, self.first, self.plan = model, bodies, steps, first, plan
+        x = state.x
+        size = WorkspaceSize(
+            model, len(x), x.dtype, x.device, scatter=scatter or scatter_for(x.device, x.dtype)
         )
-        parts = [getattr(body.law, part) for body in bodies for part in ("elasticity", "plasticity")]
-        self._replays = on_gpu and all(part.capturable for part in parts)
-        self._setup = tuple((b.start, b.stop) for b in bodies), tuple(part.graph_key() for part in parts)
-
-    @property
-    def workspace(self) -> Workspace:
-        """Buffers of this simulation."""
-        return self._lease.workspace
-
-    def set_mass(self, mass: Tensor, vol0: Tensor) -> None:
-        """Particle masses [kg] and initial volumes [m^3], shape (N,)."""
-        self.workspace.mass.copy_(mass)
-        self.workspace.vol0.copy_(vol0)
+        if plan:
+            size = size._replace(
+                n_states=plan.segment + 1,
+                n_cached_steps=plan.segment if plan.caches_steps else 1,
+                n_checkpoints=-(-steps // plan.segment) if plan.segment < steps else 0,
+                differentiable=True,
+            )
+        self.workspace = pooled_workspace(size, user=self)
+        self.workspace.mass.copy_(state.mass.detach())
+        self.workspace.vol0.copy_(state.vol0.detach())
+        self._law_cache_bytes = plan.law_cache_bytes if plan else 0
+        self._cached: set[tuple] = set()  # evaluations of laws whose caches are filled
+        self._segment_in_memory = 0
+        self._weight_slices = weight_slices
+        laws = [getattr(body.law, part) for body in bodies for part in PARTS]
+        self._uses_graphs = x.device.type == "cuda" and all(law.capturable for law in laws)
+        self._graph_key = tuple((b.start, b.stop) for b in bodies), tuple(law.graph_key() for law in laws)
 
     def run(
         self,
@@ -106,46 +102,46 @@ class Simulation:
         result = tuple(value.new_empty(len(frames), *value.shape) for value in start)
         for state, value in zip(states, start, strict=True):
             state[0].copy_(value)
-        if self._replays:
+        if self._uses_graphs:
             ws.load_weights(weights)
             weights = ws.weights
-        paths = None if tracers is None else _Paths(ws, tracers, frames)
+        passive = None if tracers is None else _Tracers(ws, tracers, frames)
         faults = [ws.faults.clone()]
         self._copy_frames(0, [0], frames, result)
-        ended = 0
+        last = 0  # where the last state of the segment before is
         for index, (first, steps) in enumerate(self._segments(frames)):
-            if ended:
-                for state in states:
-                    state[0].copy_(state[ended])
-            for mark, state in zip(ws.marks, states, strict=True):
-                if len(mark):
-                    mark[index].copy_(state[0])
-            if paths is None:
-                self._do(("forward", steps), lambda steps=steps: self._advance(steps, weights))
+            for state in states if last else ():
+                state[0].copy_(state[last])
+            for checkpoint, state in zip(ws.checkpoints, states, strict=True):
+                if len(checkpoint):
+                    checkpoint[index].copy_(state[0])
+            if passive is None:
+                self._launch(("forward", steps), lambda steps=steps: self._advance(steps, weights))
             else:
-                self._advance(steps, weights, lambda n, first=first: paths.follow(n, first))
-            ended, self._loaded = ws.state(steps), index
-            self._copy_frames(first, range(1, steps + 1) if self.differentiable else [steps], frames, result)
-            faults.append(torch.where(ws.faults < NEVER, ws.faults + (first << 31), ws.faults))
-            ws.faults.fill_(NEVER)
+                self._advance(steps, weights, lambda n, first=first: passive.move(n, first))
+            last, self._segment_in_memory = ws.at(steps), index
+            self._copy_frames(first, range(1, steps + 1) if self.plan else [steps], frames, result)
+            faults.append(torch.where(ws.faults < NO_FAULT, ws.faults + (first << 31), ws.faults))
+            ws.faults.fill_(NO_FAULT)
         self._raise_faults(torch.stack(faults).amin(0), result[2][-1])
-        return *result, None if paths is None else paths.seen
+        return *result, None if passive is None else passive.seen
 
     def step(self, n: int, weights: Sequence[Tensor]) -> None:
         """State n to state n + 1."""
         ws = self.workspace
+        cached = ws.cached_at(n)
         ws.sort(n)
-        self._evaluate("elasticity", n, ws.F[ws.state(n)], weights, ws.tau[ws.kept(n)])
+        self._evaluate("elasticity", n, ws.F[ws.at(n)], weights, ws.tau[cached])
         ws.transfer_to_grid(n)
         ws.transfer_to_particles(n)
-        self._evaluate("plasticity", n, ws.F_trial[ws.kept(n)], weights, ws.F[ws.state(n + 1)])
+        self._evaluate("plasticity", n, ws.F_trial[cached], weights, ws.F[ws.at(n + 1)])
 
     def run_adjoint(
         self, weights: Sequence[Tensor], frames: Sequence[int], grads: Sequence[Tensor | None]
     ) -> tuple[tuple[Tensor, ...], list[Tensor]]:
         """Gradients of x, v, F, C at the frames to those of the start (x, v, F, C) and of the weights."""
         ws = self.workspace
-        if self._replays:
+        if self._uses_graphs:
             weights, grad_weights = ws.weights, ws.grad_weights
         else:
             grad_weights = [torch.zeros_like(w) for w in weights]
@@ -153,22 +149,22 @@ class Simulation:
         for total in (*totals, *grad_weights):
             total.zero_()
         for index, (first, steps) in reversed(list(enumerate(self._segments(frames)))):
-            if index != self._loaded:
-                for mark, state in zip(ws.marks, (ws.x, ws.v, ws.F, ws.C), strict=True):
-                    state[0].copy_(mark[index])
-                self._do(("forward", steps), lambda steps=steps: self._advance(steps, weights))
-                self._loaded = index
+            if index != self._segment_in_memory:
+                for checkpoint, state in zip(ws.checkpoints, (ws.x, ws.v, ws.F, ws.C), strict=True):
+                    state[0].copy_(checkpoint[index])
+                self._launch(("forward", steps), lambda steps=steps: self._advance(steps, weights))
+                self._segment_in_memory = index
             here = [f for f, n in enumerate(frames) if first < n <= first + steps]
             at = tuple(frames[f] - first for f in here)
             part = slice(here[0], here[-1] + 1) if here else slice(0)
-            seeds = [None if grad is None else grad[part] for grad in grads]
-            name = ("adjoint", steps, at, tuple(seed is not None for seed in seeds))
-            if self._replays:
-                seeds = ws.load_seeds(name, seeds)
-            self._do(
+            added = [None if grad is None else grad[part] for grad in grads]
+            name = ("adjoint", steps, at, tuple(grad is not None for grad in added))
+            if self._uses_graphs:
+                added = ws.load_frame_grads(name, added)
+            self._launch(
                 name,
-                lambda steps=steps, at=at, seeds=seeds: self._go_back(
-                    steps, at, seeds, weights, grad_weights
+                lambda steps=steps, at=at, added=added: self._go_back(
+                    steps, at, added, weights, grad_weights
                 ),
             )
         if frames[0] == 0:
@@ -180,9 +176,10 @@ class Simulation:
     def step_adjoint(self, n: int, weights: Sequence[Tensor], grad_weights: Sequence[Tensor]) -> None:
         """Gradients of state n + 1, in the workspace, to those of state n; those of the weights are added."""
         ws = self.workspace
-        F, F_trial = ws.F[ws.state(n)], ws.F_trial[ws.kept(n)]
-        if not self._keeps:
-            self._evaluate("elasticity", n, F, weights, ws.tau[ws.kept(n)], cache=True)
+        cached = ws.cached_at(n)
+        F, F_trial = ws.F[ws.at(n)], ws.F_trial[cached]
+        if not self.plan.caches_steps:
+            self._evaluate("elasticity", n, F, weights, ws.tau[cached], fill_cache=True)
             ws.transfer_to_grid(n)
             ws.trial_deformation(n)
         self._vjp("plasticity", n, F_trial, weights, ws.grad_F, ws.grad_F_trial, grad_weights)
@@ -192,16 +189,16 @@ class Simulation:
 
     def _segments(self, frames: Sequence[int]) -> list[tuple[int, int]]:
         """First step and number of steps of each segment."""
-        if self.differentiable:
-            borders = [*range(0, self.steps, self._segment), self.steps]
+        if self.plan:
+            borders = [*range(0, self.steps, self.plan.segment), self.steps]
         else:
             borders = sorted({0, *frames, self.steps})
         return [(a, b - a) for a, b in zip(borders, borders[1:], strict=False)]
 
-    def _do(self, name: Hashable, launches: Callable[[], None]) -> None:
+    def _launch(self, name: Hashable, launches: Callable[[], None]) -> None:
         """Launch, by a graph where these are used."""
-        if self._replays:
-            self.workspace.graphs.run((name, self._setup), launches)
+        if self._uses_graphs:
+            self.workspace.graphs.run((name, self._graph_key), launches)
         else:
             launches()
 
@@ -219,11 +216,11 @@ class Simulation:
         self,
         steps: int,
         at: Sequence[int],
-        seeds: Sequence[Tensor | None],
+        added: Sequence[Tensor | None],
         weights: Sequence[Tensor],
         grad_weights: Sequence[Tensor],
     ) -> None:
-        """All steps of a segment in reverse, adding the seeds, gradients of the states after steps `at`."""
+        """All steps of a segment in reverse, adding the gradients of the states after the steps `at` on the way."""
         ws = self.workspace
         totals = (ws.grad_x, ws.grad_v, ws.grad_F, ws.grad_C)
         frame_of = {n: index for index, n in enumerate(at)}
@@ -231,9 +228,9 @@ class Simulation:
         with ws.stream():
             for n in range(steps, 0, -1):
                 if n in frame_of:
-                    for total, seed in zip(totals, seeds, strict=True):
-                        if seed is not None:
-                            total.add_(seed[frame_of[n]])
+                    for total, grad in zip(totals, added, strict=True):
+                        if grad is not None:
+                            total.add_(grad[frame_of[n]])
                 self.step_adjoint(n - 1, weights, grad_weights)
 
     def _copy_frames(
@@ -242,28 +239,27 @@ class Simulation:
         """States after some steps of the segment that starts at step `first`, where they are frames."""
         ws = self.workspace
         frame_of = {n: index for index, n in enumerate(frames)}
-        here = [(frame_of[first + n], ws.state(n)) for n in steps if first + n in frame_of]
+        here = [(frame_of[first + n], ws.at(n)) for n in steps if first + n in frame_of]
         if here:
             part = slice(here[0][0], here[-1][0] + 1)
-            slots = torch.tensor([slot for _, slot in here], device=ws.layout.device)
+            places = torch.tensor([place for _, place in here], device=ws.size.device)
             for values, state in zip(result, (ws.x, ws.v, ws.F, ws.C), strict=True):
-                torch.index_select(state, 0, slots, out=values[part])
+                torch.index_select(state, 0, places, out=values[part])
 
     def _evaluate(
-        self, part: str, n: int, F: Tensor, weights: Sequence[Tensor], out: Tensor, cache: bool = False
+        self, part: str, n: int, F: Tensor, weights: Sequence[Tensor], out: Tensor, fill_cache: bool = False
     ) -> None:
-        """Elasticity or plasticity of every body; caches what the adjoint needs if asked to or if it fits."""
-        for index, body in enumerate(self.bodies):
-            here = slice(body.start, body.stop)
-            law, own = getattr(body.law, part), self._own(part, body, weights)
-            if cache or self._cache_bytes > 0:
-                key = self._cache_key(part, n, body)
-                caches = self.workspace.caches
-                _, caches[key] = law.evaluate_with_cache(F[here], own, out[here], caches.get(key))
-                self._cached.add((part, n, index))
-                self._cache_bytes -= _bytes(caches[key])
+        """Elasticity or plasticity of every body; what `_vjp` needs is cached if asked for or if it fits."""
+        for law, here, own, key in self._laws(part, n):
+            if fill_cache or self._law_cache_bytes > 0:
+                caches = self.workspace.law_caches
+                _, caches[key] = law.evaluate_with_cache(
+                    F[here], tuple(weights[own]), out[here], caches.get(key)
+                )
+                self._cached.add(key)
+                self._law_cache_bytes -= _bytes(caches[key])
             else:
-                law.evaluate(F[here], own, out[here])
+                law.evaluate(F[here], tuple(weights[own]), out[here])
 
     def _vjp(
         self,
@@ -276,34 +272,36 @@ class Simulation:
         grad_weights: Sequence[Tensor],
     ) -> None:
         """Adjoint of `_evaluate`; sets grad_F and adds to grad_weights."""
-        for index, body in enumerate(self.bodies):
-            here = slice(body.start, body.stop)
-            cached = (part, n, index) in self._cached
-            getattr(body.law, part).vjp(
+        for law, here, own, key in self._laws(part, n):
+            law.vjp(
                 F[here],
-                self._own(part, body, weights),
+                tuple(weights[own]),
                 grad_out[here],
-                cache=self.workspace.caches[self._cache_key(part, n, body)] if cached else None,
+                cache=self.workspace.law_caches[key] if key in self._cached else None,
                 grad_F=grad_F[here],
-                grad_weights=self._own(part, body, grad_weights),
+                grad_weights=tuple(grad_weights[own]),
             )
 
-    def _cache_key(self, part: str, n: int, body: Body) -> tuple:
-        """Name of a cache that any law of the same type and range of particles can use again."""
-        return type(getattr(body.law, part)), body.start, body.stop, self.workspace.kept(n)
+    def _laws(self, part: str, n: int) -> list[tuple[Constitutive, slice, slice, tuple]]:
+        """Of every body: its law, its particles, its place among the weights, and the name of its cache in step n.
 
-    def _own(self, part: str, body: Body, values: Sequence[Tensor]) -> Weights:
-        """Those of the flat list of weights (or of their gradients) that belong to a part of a body's law."""
-        return tuple(values[self._weight_slices[id(body.law), part]])
+        Any law of the same type and with the same particles can use a cache again.
+        """
+        found = []
+        for body in self.bodies:
+            law = getattr(body.law, part)
+            key = (type(law), body.start, body.stop, self.workspace.cached_at(n))
+            found.append((law, slice(body.start, body.stop), self._weight_slices[id(body.law), part], key))
+        return found
 
     def _raise_faults(self, faults: Tensor, F: Tensor) -> None:
         """Raise if a velocity on the way or the last F (N, 3, 3) is not what a stable simulation gives."""
         not_finite, too_fast = faults.tolist()
-        if min(not_finite, too_fast) == NEVER and not torch.isfinite(F).all():
+        if min(not_finite, too_fast) == NO_FAULT and not torch.isfinite(F).all():
             particle = int((~torch.isfinite(F).flatten(1).all(dim=1)).nonzero()[0])
             not_finite = (self.steps - 1) << 31 | particle
         fault = min(not_finite, too_fast)
-        if fault == NEVER:
+        if fault == NO_FAULT:
             return
         step, particle = self.first + (fault >> 31) + 1, fault & (1 << 31) - 1
         law = next(body.law for body in self.bodies if body.start <= particle < body.stop)
@@ -318,34 +316,24 @@ class Simulation:
         )
 
 
-class _Paths:
-    """Tracers (M, 3) on their way, and where they were at the frames, `seen` (T, M, 3)."""
+class _Tracers:
+    """Passive points (M, 3) that move with the grid, and where they were at the frames, `seen` (T, M, 3)."""
 
     def __init__(self, ws: Workspace, tracers: Tensor, frames: Sequence[int]):
         self._ws, self._frame_of = ws, {n: index for index, n in enumerate(frames)}
-        self._now = tracers.detach().clone(memory_format=torch.contiguous_format)
-        self._launch = ws.tracer_launch(self._now)
-        self.seen = self._now.new_empty(len(frames), *self._now.shape)
-        self._look(0)
+        self._x = tracers.detach().clone(memory_format=torch.contiguous_format)
+        self._launch = ws.tracer_launch(self._x)
+        self.seen = self._x.new_empty(len(frames), *self._x.shape)
+        self._note(0)
 
-    def follow(self, n: int, first: int) -> None:
+    def move(self, n: int, first: int) -> None:
         """Move with the nodes of step n of the segment that starts at step `first`."""
         self._ws.move_tracers(self._launch, n)
-        self._look(first + n + 1)
+        self._note(first + n + 1)
 
-    def _look(self, step: int) -> None:
+    def _note(self, step: int) -> None:
         if step in self._frame_of:
-            self.seen[self._frame_of[step]].copy_(self._now)
-
-
-def _weight_slices(law_weights: dict[int, tuple[Weights, Weights]]) -> dict[tuple[int, str], slice]:
-    """Where the weights of each law's parts stand in the flat list."""
-    slices, at = {}, 0
-    for key, parts in law_weights.items():
-        for name, part in zip(("elasticity", "plasticity"), parts, strict=True):
-            slices[key, name] = slice(at, at + len(part))
-            at += len(part)
-    return slices
+            self.seen[self._frame_of[step]].copy_(self._x)
 
 
 def _bytes(cache: Any) -> int:

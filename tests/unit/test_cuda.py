@@ -101,7 +101,7 @@ def test_sums_over_runs_of_particles_equal_single_additions(drop, scatter):
     assert relative(grad_runs, grad) < 1e-3
 
 
-@pytest.mark.parametrize("options", [{}, {"keep": "states"}, {"memory": 2.0e6}])
+@pytest.mark.parametrize("options", [{}, {"cache_bytes": 0}, {"memory": 2.0e6}])
 def test_graphs_replay_what_was_launched(drop, options):
     """The first call launches, the second records, later ones replay: also with other weights and a new loss."""
     law, arguments = drop

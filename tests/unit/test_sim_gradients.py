@@ -8,7 +8,7 @@ import torch
 from sim_scenes import DT, cube, make_law, strained
 
 from neuma_lib.errors import InputError
-from neuma_lib.sim import memory as storage
+from neuma_lib.sim.memory import MemoryPlan, plan_memory
 from neuma_lib.sim.model import Body, MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
@@ -115,9 +115,9 @@ def corner():
     return model, (x, *strained(x)), mass, vol0
 
 
-@pytest.mark.parametrize("keep", ["states", "all"])
+@pytest.mark.parametrize("cache_bytes", [0, math.inf])
 @pytest.mark.parametrize("name", ["von_mises", "drucker_prager", "fluid", "neural"])
-def test_equals_torch_twin(name, keep):
+def test_equals_torch_twin(name, cache_bytes):
     """States and gradients of 15 steps, at walls of every kind and with plastic flow, to 1e-9."""
     model, start, mass, vol0 = corner()
     law = make_law(name)
@@ -127,7 +127,7 @@ def test_equals_torch_twin(name, keep):
     states = simulate(model, law, start, mass, vol0, frames)
     for a, b in zip(states, simulate_slowly(model, law, start, mass, vol0, frames), strict=True):
         assert (a - b).abs().max() < 1e-9 * b.abs().max()
-    _, grads = gradients(model, law, start, mass, vol0, frames, parameters, keep=keep)
+    _, grads = gradients(model, law, start, mass, vol0, frames, parameters, cache_bytes=cache_bytes)
     _, expected = gradients(model, law, start, mass, vol0, frames, parameters, run=simulate_slowly)
     for a, b in zip(grads, expected, strict=True):
         assert (a - b).abs().max() < 1e-9 * b.abs().max()
@@ -161,38 +161,36 @@ def test_several_bodies_equal_torch_twin():
         assert (a - b).abs().max() < 1e-9 * b.abs().max()
 
 
-def test_what_is_kept_does_not_change_the_gradient(monkeypatch):
-    """All, states only, and a budget that is spent half-way give the same bytes."""
+def test_what_is_cached_does_not_change_the_gradient():
+    """Everything, nothing but states, and an amount that is spent half-way give the same bytes."""
     start, mass, vol0 = scene(0.2)
     law = make_law("neural")
     parameters = trainable(law)
     model = MPMModel(14, DT)
-
-    def run(keep):
-        return gradients(model, law, start, mass, vol0, (3, 12), parameters, keep=keep)[1]
-
-    everything = run("all")
     step_bytes = 8 * (18 * COUNT + 8 * model.grid**3)
-    monkeypatch.setitem(storage.KEEP, "auto", 12 * step_bytes + 7 * 2000 * COUNT)
-    for keep in ("states", "auto"):
-        for a, b in zip(run(keep), everything, strict=True):
-            assert torch.equal(a, b)
+    half_way = 12 * step_bytes + 7 * 2000 * COUNT
+    everything, *others = (
+        gradients(model, law, start, mass, vol0, (3, 12), parameters, cache_bytes=cache_bytes)[1]
+        for cache_bytes in (math.inf, 0, half_way)
+    )
+    for grads in others:
+        assert all(torch.equal(a, b) for a, b in zip(grads, everything, strict=True))
 
 
-@pytest.mark.parametrize("keep,segment", [("states", 5), ("all", 4), ("all", 2)])
-def test_segments_do_not_change_the_gradient(keep, segment):
+@pytest.mark.parametrize("cache_bytes,segment", [(0, 5), (math.inf, 4), (math.inf, 2)])
+def test_checkpoints_do_not_change_the_gradient(cache_bytes, segment):
     """With little memory the steps are computed again, segment by segment: the same bytes, also the second time."""
     x, mass, vol0 = cube(2000, side=0.25, centre=(0.5, 0.2, 0.5))
     start, steps = (x, *strained(x)), 13
     law = make_law("neural")
     parameters = trainable(law)
     model, frames = MPMModel(14, DT), (0, 3, 7, steps)
-    _, expected = gradients(model, law, start, mass, vol0, frames, parameters, keep=keep)
+    _, expected = gradients(model, law, start, mass, vol0, frames, parameters, cache_bytes=cache_bytes)
     state, step = 8 * 24 * len(x), 8 * (18 * len(x) + 8 * model.grid**3)
-    memory = state * (segment + 1 + math.ceil(steps / segment)) + step * (segment if keep == "all" else 1)
-    planned = storage.plan_storage(steps, len(x), model.grid**3, 8, keep, memory, on_gpu=False)
-    assert planned == storage.Storage(segment, keep == "all", 0)
-    loss = random_loss()(simulate(model, law, start, mass, vol0, frames, keep=keep, memory=memory))
+    memory = state * (segment + 1 + math.ceil(steps / segment)) + step * (segment if cache_bytes else 1)
+    options = dict(memory=memory, cache_bytes=cache_bytes)
+    assert plan_memory(steps, len(x), model.grid**3, 8, **options) == MemoryPlan(segment, cache_bytes > 0, 0)
+    loss = random_loss()(simulate(model, law, start, mass, vol0, frames, **options))
     for _ in range(2):
         grads = torch.autograd.grad(loss, parameters, retain_graph=True)
         for a, b in zip(grads, expected[-len(grads) :], strict=True):
@@ -211,7 +209,7 @@ def test_backward_twice():
     law = make_law("neural")
     parameters = trainable(law)
     model = MPMModel(14, DT)
-    loss = random_loss()(simulate(model, law, start, mass, vol0, (3, 12), keep="all"))
+    loss = random_loss()(simulate(model, law, start, mass, vol0, (3, 12), cache_bytes=math.inf))
     first = torch.autograd.grad(loss, parameters, retain_graph=True)
     random_loss()(simulate(model, law, start, mass, vol0, (3, 12))).backward()
     for a, b in zip(first, torch.autograd.grad(loss, parameters), strict=True):

@@ -20,7 +20,7 @@ from neuma_lib.mechanics.law import Law, Plasticity
 from neuma_lib.sim.model import WALLS, Body, MPMModel, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
-from neuma_lib.sim.workspace import Layout, Workspace
+from neuma_lib.sim.workspace import Workspace, WorkspaceSize
 
 WEIGHTLESS = MPMModel(16, DT, gravity=(0.0, 0.0, 0.0))
 EPS = {torch.float32: 1.2e-7, torch.float64: 2.2e-16}
@@ -57,7 +57,7 @@ def test_p2g_conserves_mass_and_momentum():
     """Whatever C and tau are: the weights sum to 1 and the weighted offsets to 0."""
     x, mass, vol0 = cube(side=0.5)
     v, _, C = strained(x)
-    ws = Workspace(Layout(WEIGHTLESS, len(x), x.dtype, x.device, states=2, kept=1, differentiable=False))
+    ws = Workspace(WorkspaceSize(WEIGHTLESS, len(x), x.dtype, x.device))
     for buffer, value in ((ws.x, x), (ws.v, v), (ws.C, C), (ws.tau, 1e4 * C)):
         buffer[0].copy_(value)
     ws.mass.copy_(mass)
@@ -249,7 +249,7 @@ def test_same_start_same_bytes():
 
     first = run(300)
     run(200)
-    run(300, keep="states")
+    run(300, cache_bytes=0)
     for a, b in zip(first, run(300), strict=True):
         assert torch.equal(a, b)
 
@@ -297,7 +297,6 @@ def test_wrong_model_is_named(settings, words):
         (dict(vol0=lambda x: x), ["vol0", "(300, 3)"]),
         (dict(frames=lambda x: (3, 2)), ["frames", "strictly increasing"]),
         (dict(frames=lambda x: (0, 21)), ["frames", "21", "20 steps"]),
-        (dict(keep=lambda x: "some"), ["keep", "states"]),
         (dict(tracers=lambda x: x[:, :2]), ["tracers", "(M, 3)"]),
         (dict(law=lambda x: [Body(make_law("hencky"), 0, 299)]), ["299", "300"]),
         (dict(law=lambda x: [Body(make_law("hencky"), 0, 200), Body(make_law("hencky"), 199, 300)]), ["200"]),
