@@ -33,7 +33,7 @@ from neuma_lib.errors import InputError
 
 
 class Config(Section):
-    """Everything."""
+    """All settings."""
 
     data_root: str = Field("data", description="folder of generated or supplied inputs")
     results_root: str = Field("results", description="folder of everything computed")
@@ -182,7 +182,10 @@ def load(raw: Mapping[str, Any], root: str | Path = ".") -> Config:
         InputError: names every offending key by its path and suggests close matches.
     """
     scenes_file = Path(root) / str(raw.get("scenes_file", Config.model_fields["scenes_file"].default))
-    return validate(Config, {**raw, "scenes": merged(read_yaml(scenes_file), raw.get("scenes") or {})})
+    scenes, changes = read_yaml(scenes_file), raw.get("scenes") or {}
+    return validate(
+        Config, {**raw, "scenes": merged(scenes, changes) if isinstance(changes, Mapping) else changes}
+    )
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:

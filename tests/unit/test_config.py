@@ -1,10 +1,13 @@
 """Settings: mistakes are found by path, variants mean what they say, the documentation follows the types."""
 
+import json
 from pathlib import Path
 
+import grimp
 import pytest
 
 from neuma_lib.config import settings
+from neuma_lib.config.base import Section
 from neuma_lib.config.methods import parse_method
 from neuma_lib.config.page import settings_markdown
 from neuma_lib.errors import InputError
@@ -55,6 +58,38 @@ def test_default_settings_are_valid(loaded):
         ({"dataset": {"stride": 4}}, r"dataset: give either frames or stride"),
         ({"dataset": {"frames": None}}, r"dataset: give either frames or stride"),
         ({"scenes": {"BouncyBall": {"images": {"video": "x"}}}}, r"BouncyBall\.images\.video: unknown key"),
+        (
+            {"gaussians": {"densification": {"evry": 3}}},
+            r"gaussians\.densification\.evry: unknown key; did you mean every",
+        ),
+        (
+            {"priors": {"regression": {"iteration": 3}}},
+            r"priors\.regression\.iteration: .*did you mean iterations",
+        ),
+        ({"priors": {"method": "guessing"}}, r"priors\.method: .*'regression' or 'trajectory'.*'guessing'"),
+        (
+            {"priors": {"laws": {"jelly": {"elasticity": {"E": "stiff"}}}}},
+            r"priors\.laws\.jelly\.elasticity\.E: .*number.*'stiff'",
+        ),
+        ({"priors": {"laws": {"mud": {}}}}, r"priors\.laws\.mud\.elasticity: this key is missing"),
+        (
+            {"priors": {"laws": {"mud": {"elasticity": {"E": 1e5}}}}},
+            r"laws\.mud\.elasticity\.name: this key is missing",
+        ),
+        (
+            {"scenes": {"BouncyBall": {"appearance": {"kind": "foam"}}}},
+            r"BouncyBall\.appearance\.kind: .*'solid', 'grains' or 'liquid'.*'foam'",
+        ),
+        ({"scenes": 3}, r"scenes: .*dictionary.*3"),
+        (
+            {"experiments": {"longer_bouncy": {"bodies": [{"scene": "BouncyBall", "shap": "ball"}]}}},
+            r"experiments\.longer_bouncy\.bodies\.0\.shap: unknown key; did you mean shape",
+        ),
+        ({"figures": {"main_res": ["BouncyBal"]}}, r"figures\.main_res: no scene 'BouncyBal'; did you mean"),
+        (
+            {"figures": {"ext_time": "longer"}},
+            r"figures\.ext_time: no experiment 'longer'; did you mean longer_",
+        ),
         ({"scenes_file": "nowhere.yaml"}, r"nowhere\.yaml does not exist"),
     ],
 )
@@ -179,6 +214,29 @@ class TestScaleOfThePaper:
         assert all(getattr(light, name) == getattr(paper, name) for name in same)
         roots = [getattr(c, root) for c in (loaded, paper, light) for root in ("data_root", "results_root")]
         assert len(set(roots)) == 6
+
+
+def test_plain_values_build_the_section_again(loaded):
+    """What a rule hands to its script, as text in between, gives the same settings."""
+    assert settings.Config(**json.loads(json.dumps(loaded.plain()))) == loaded
+
+
+def test_a_stage_depends_on_its_own_settings_alone_and_settings_on_no_torch():
+    """So an edit of the figures' settings does not fit the Gaussians anew, and a plan is made in no time."""
+    graph = grimp.build_graph("neuma_lib", include_external_packages=True)
+    reached = graph.find_upstream_modules("neuma_lib.fitting.gaussians")
+    assert {m for m in reached if m.startswith("neuma_lib.config")} == {
+        "neuma_lib.config.base",
+        "neuma_lib.config.gaussians",
+    }
+    below = graph.find_upstream_modules("neuma_lib.config", as_package=True)
+    assert {m for m in below if m.startswith("neuma_lib")} == {"neuma_lib.errors"}
+    assert "pydantic" in below and not below & {"torch", "warp"}
+
+
+def test_every_section_and_key_is_explained():
+    for kind in Section.__subclasses__():
+        assert kind.__doc__ and all(entry.description for entry in kind.model_fields.values()), kind.__name__
 
 
 def test_settings_page_is_up_to_date():
