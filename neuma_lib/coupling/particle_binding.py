@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.special import chdtri
 from torch import Tensor
 
+from neuma_lib.config.binding import BindingConfig
 from neuma_lib.coupling.binding import Binding
 from neuma_lib.errors import InputError
 
@@ -34,8 +35,7 @@ def bind(
     means: Tensor,
     covars: Tensor,
     particles: Tensor,
-    confidence: float = 0.95,
-    max_neighbours: int | None = 10,
+    settings: BindingConfig | None = None,
 ) -> Binding:
     """Bind every Gaussian to the particles inside its confidence ellipsoid (paper, Algorithm 1).
 
@@ -47,19 +47,17 @@ def bind(
         means: Gaussian centres [m], shape (G, 3).
         covars: Gaussian covariances [m^2], shape (G, 3, 3).
         particles: particle positions [m], shape (N, 3).
-        confidence: probability that defines the ellipsoid, in (0, 1).
-        max_neighbours: most particles in a row; None for the paper's Algorithm 1 without a limit.
+        settings: confidence of the ellipsoid and most particles in a row; None for the defaults.
 
     Returns:
         Binding of shape (G, N) on the device and with the dtype of ``means``; rows may be empty
         (``Binding.orphans``).
 
     Raises:
-        InputError: shapes that do not fit, non-finite values, a covariance that is not positive definite,
-            or a setting outside its range.
+        InputError: shapes that do not fit, non-finite values, a covariance that is not positive definite.
     """
     centres, shapes, points = _checked(means, covars, particles)
-    rows, columns = _pairs_inside(centres, shapes, points, _threshold(confidence), max_neighbours)
+    rows, columns = _pairs_inside(centres, shapes, points, settings or BindingConfig())
     return _binding_from_pairs(rows, columns, (len(centres), len(points)), means)
 
 
@@ -68,9 +66,7 @@ def bind_two_pass(
     covars: Tensor,
     particles: Tensor,
     volumes: Tensor | float,
-    confidence: float = 0.95,
-    max_neighbours: int | None = 10,
-    equal_mass: bool = False,
+    settings: BindingConfig | None = None,
 ) -> tuple[Binding, Tensor, int, Tensor]:
     """Bind twice, so that no Gaussian is left without a particle (paper, section 3.4).
 
@@ -81,10 +77,10 @@ def bind_two_pass(
     positive.
 
     Args:
-        means, covars, particles, confidence, max_neighbours: as in ``bind``.
+        means, covars, particles: as in ``bind``.
         volumes: particle volumes [m^3], shape (N,), or the object's volume [m^3], to be spread evenly.
-        equal_mass: give all N + M particles the object's volume / (N + M), as the paper does. The total
-            stays, the centre of mass moves.
+        settings: as in ``bind``; ``equal_mass`` gives all N + M particles the object's volume / (N + M), as the
+            paper does: the total stays, the centre of mass moves.
 
     Returns:
         Tuple of the binding (G, N + M), the particles with the M added ones at the end (N + M, 3), the
@@ -95,16 +91,16 @@ def bind_two_pass(
     """
     centres, shapes, points = _checked(means, covars, particles)
     shares = _checked_volumes(volumes, len(points))
-    threshold = _threshold(confidence)
-    rows, columns = _pairs_inside(centres, shapes, points, threshold, max_neighbours)
+    settings = settings or BindingConfig()
+    rows, columns = _pairs_inside(centres, shapes, points, settings)
     orphans = np.flatnonzero(np.bincount(rows, minlength=len(centres)) == 0)
     added = centres[orphans]
 
     if len(orphans):
         # Every Gaussian is bound anew: an added particle may lie inside its neighbours' ellipsoids as well.
         together = np.concatenate([points, added])
-        rows, columns = _pairs_inside(centres, shapes, together, threshold, max_neighbours)
-        if equal_mass:
+        rows, columns = _pairs_inside(centres, shapes, together, settings)
+        if settings.equal_mass:
             shares = np.full(len(together), shares.sum() / len(together))
         else:
             shares = _share_volumes(points, shares, added)
@@ -116,14 +112,6 @@ def bind_two_pass(
         len(orphans),
         torch.as_tensor(shares, dtype=particles.dtype, device=particles.device),
     )
-
-
-def _threshold(confidence: float) -> float:
-    if not 0.0 < confidence < 1.0:
-        raise InputError(
-            f"binding.confidence = {confidence}: choose a probability between 0 and 1, such as 0.95"
-        )
-    return float(chdtri(3, 1.0 - confidence))
 
 
 def _checked(means: Tensor, covars: Tensor, particles: Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -174,7 +162,7 @@ def _whitening(shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _pairs_inside(
-    centres: np.ndarray, shapes: np.ndarray, points: np.ndarray, threshold: float, most: int | None
+    centres: np.ndarray, shapes: np.ndarray, points: np.ndarray, settings: BindingConfig
 ) -> tuple[np.ndarray, np.ndarray]:
     """All pairs (Gaussian, particle) of Algorithm 1, sorted by Gaussian, then by particle.
 
@@ -183,8 +171,7 @@ def _pairs_inside(
     found: the smallest Mahalanobis distance at a Euclidean distance r is r^2 / lambda_max. Otherwise it is
     asked again with more. The result is exact; only how much is read depends on the guess.
     """
-    if most is not None and most < 1:
-        raise InputError(f"binding.max_neighbours = {most}: choose 1 or more, or none for no limit")
+    threshold, most = float(chdtri(3, 1.0 - settings.confidence)), settings.max_neighbours
     whitening, largest = _whitening(shapes)
     tree = cKDTree(points)
     pending = np.arange(len(centres))

@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy.stats import chi2
 
+from neuma_lib.config.binding import BindingConfig
 from neuma_lib.coupling.particle_binding import bind, bind_two_pass
 from neuma_lib.errors import InputError
 
@@ -47,7 +48,7 @@ def algorithm_1(means, covars, particles, confidence=0.95, max_neighbours=None):
 def test_matches_the_dense_algorithm(size, anisotropy, max_neighbours):
     means, covars = random_gaussians(150, seed=1, size=size, anisotropy=anisotropy)
     particles = random_particles(700, seed=2)
-    sparse = bind(means, covars, particles, max_neighbours=max_neighbours)
+    sparse = bind(means, covars, particles, BindingConfig(max_neighbours=max_neighbours))
     dense = algorithm_1(means, covars, particles, max_neighbours=max_neighbours)
     torch.testing.assert_close(sparse.dense(), dense, rtol=1e-14, atol=0)
 
@@ -66,7 +67,7 @@ def test_confidence_widens_the_ellipsoid():
     particles = random_particles(500, seed=6)
     for confidence in (0.5, 0.99):
         torch.testing.assert_close(
-            bind(means, covars, particles, confidence, None).dense(),
+            bind(means, covars, particles, BindingConfig(confidence=confidence, max_neighbours=None)).dense(),
             algorithm_1(means, covars, particles, confidence),
         )
 
@@ -77,7 +78,7 @@ def test_ties_go_to_the_smaller_index():
         torch.zeros(1, 3, dtype=torch.float64),
         torch.eye(3, dtype=torch.float64)[None],
         particles,
-        max_neighbours=2,
+        BindingConfig(max_neighbours=2),
     )
     assert binding.indices.tolist() == [0, 1]
 
@@ -87,7 +88,9 @@ def test_two_passes_leave_no_gaussian_empty_and_rows_sum_to_one(equal_mass):
     means, covars = random_gaussians(300, seed=7, size=0.01)
     particles = random_particles(500, seed=8)
     first = bind(means, covars, particles)
-    binding, enlarged, added, volumes = bind_two_pass(means, covars, particles, 0.1, equal_mass=equal_mass)
+    binding, enlarged, added, volumes = bind_two_pass(
+        means, covars, particles, 0.1, BindingConfig(equal_mass=equal_mass)
+    )
     assert added == len(first.orphans) > 0
     assert binding.shape == (300, 500 + added) and enlarged.shape == (500 + added, 3)
     torch.testing.assert_close(enlarged[500:], means[first.orphans])
@@ -117,7 +120,9 @@ def test_added_particles_keep_mass_and_centre_of_mass(dtype, tolerance, outside)
 
 def test_equal_mass_is_the_papers():
     means, covars = random_gaussians(200, seed=12, size=0.01)
-    _, _, added, volumes = bind_two_pass(means, covars, random_particles(300, seed=13), 0.2, equal_mass=True)
+    _, _, added, volumes = bind_two_pass(
+        means, covars, random_particles(300, seed=13), 0.2, BindingConfig(equal_mass=True)
+    )
     torch.testing.assert_close(volumes, torch.full_like(volumes, 0.2 / (300 + added)))
 
 
@@ -181,8 +186,6 @@ def test_paper_scale_needs_seconds(capsys):
 @pytest.mark.parametrize(
     "change, words",
     [
-        (dict(confidence=95), "binding.confidence"),
-        (dict(max_neighbours=0), "binding.max_neighbours"),
         (dict(particles=torch.zeros(0, 3)), "particles"),
         (dict(particles=torch.full((5, 3), float("nan"))), "particle 0 is not finite"),
         (dict(covars=torch.zeros(4, 3, 3)), "not positive definite"),

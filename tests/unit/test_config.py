@@ -38,6 +38,7 @@ def test_default_settings_are_valid(loaded):
         ({"material": {"lr_elastc": 1}}, r"material\.lr_elastc: unknown key; did you mean lr_elastic"),
         ({"material": {"iterations": "many"}}, r"material\.iterations: .*integer.*'many'"),
         ({"material": {"rank": 0}}, r"material\.rank: .*greater than or equal to 1"),
+        ({"binding": {"confidence": 95}}, r"binding\.confidence: .*less than 1 \(given: 95\)"),
         ({"dataset": {"static": {"veiws": 3}}}, r"dataset\.static\.veiws: unknown key; did you mean views"),
         (
             {"scenes": {"BouncyBall": {"hieght": 1}}},

@@ -2,6 +2,7 @@
 
 import torch
 
+from neuma_lib.config.binding import BindingConfig
 from neuma_lib.coupling.particle_binding import bind_two_pass
 from neuma_lib.io.gaussians import load_gaussians
 from neuma_lib.io.hdf5 import read_arrays
@@ -13,7 +14,8 @@ def main(inputs, binding_file: str, params, run) -> None:
     gaussians = load_gaussians(inputs.gaussians)
     arrays, _ = read_arrays(inputs.particles, required=("x", "vol0"))
     x, vol0 = torch.from_numpy(arrays["x"]), torch.from_numpy(arrays["vol0"])
-    matrix, x, added, vol0 = bind_two_pass(gaussians.means, gaussians.covars(), x, vol0, **params.binding)
+    settings = BindingConfig(**params.binding)
+    matrix, x, added, vol0 = bind_two_pass(gaussians.means, gaussians.covars(), x, vol0, settings)
     save_binding(binding_file, matrix, x, vol0, {"added": added})
     mean = float(matrix.counts.double().mean())
     run.say(
