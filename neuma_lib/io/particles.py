@@ -19,67 +19,78 @@ from neuma_lib.mechanics.density import Density, density_at
 from neuma_lib.sim.model import each_its_own
 
 
-def save_binding(
-    path: str | Path, binding: Binding, x: torch.Tensor, vol0: torch.Tensor, attributes: Mapping[str, Any]
+def save_particles(
+    path: str | Path, x: torch.Tensor, vol0: torch.Tensor, attributes: Mapping[str, Any]
 ) -> None:
-    """Write a binding with the particles that it binds to: x (N, 3) [m], vol0 (N,) [m^3]."""
-    arrays = {
-        "indptr": binding.indptr,
-        "indices": binding.indices,
-        "values": binding.values,
-        "x": x,
-        "vol0": vol0,
-    }
-    arrays = {name: tensor.cpu().numpy() for name, tensor in arrays.items()}
-    write_arrays(path, arrays, {"gaussians": binding.shape[0], "particles": binding.shape[1], **attributes})
+    """Write the particles of a body: x (N, 3) [m], vol0 (N,) [m^3]."""
+    write_arrays(path, {"x": x.cpu().numpy(), "vol0": vol0.cpu().numpy()}, attributes)
 
 
-def load_body(binding: str | Path, gaussians: str | Path, density: Density) -> Reconstruction:
-    """The reconstructed body: bound particles with their volumes, and the Gaussians that they carry.
+def load_particles(path: str | Path) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+    """Particles of a body: x (N, 3) [m], vol0 (N,) [m^3], attributes of the file."""
+    arrays, attributes = read_arrays(path, required=("x", "vol0"))
+    return torch.from_numpy(arrays["x"]), torch.from_numpy(arrays["vol0"]), attributes
+
+
+def save_binding(path: str | Path, binding: Binding) -> None:
+    """Write a binding matrix."""
+    arrays = {name: getattr(binding, name).cpu().numpy() for name in ("indptr", "indices", "values")}
+    write_arrays(path, arrays, {"gaussians": binding.shape[0], "particles": binding.shape[1]})
+
+
+def load_body(
+    particles: str | Path, binding: str | Path, gaussians: str | Path, density: Density
+) -> Reconstruction:
+    """The reconstructed body: particles with their volumes, and the Gaussians that they carry.
 
     Args:
-        binding, gaussians: files of a scene, or of an experiment.
+        particles, binding, gaussians: files of a scene, or of an experiment.
         density: what is known of it, or believed.
 
     Raises:
-        InputError: the binding was made for other Gaussians.
+        InputError: the binding was made for other Gaussians or particles.
     """
-    kernels = load_gaussians(gaussians)
-    arrays, attributes = read_arrays(binding, required=("indptr", "indices", "values", "x", "vol0"))
-    if attributes.get("gaussians") != len(kernels):
-        raise InputError(
-            f"{binding} binds {attributes.get('gaussians')} Gaussians, {gaussians} has {len(kernels)}: run the rule"
-            " binding again"
-        )
-    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
-    shape = (len(kernels), len(arrays["x"]))
+    splats = load_gaussians(gaussians)
+    x0, vol0, _ = load_particles(particles)
+    arrays, attributes = read_arrays(binding, required=("indptr", "indices", "values"))
+    for kind, file, count in (("gaussians", gaussians, len(splats)), ("particles", particles, len(x0))):
+        if attributes.get(kind) != count:
+            raise InputError(
+                f"{binding} is of {attributes.get(kind)} {kind}, {file} has {count}: run the rule binding again"
+            )
     return Reconstruction(
-        x0=tensors["x"],
-        vol0=tensors["vol0"],
-        mass=tensors["vol0"] * density_at(tensors["x"], density),
-        gaussians=kernels,
-        binding=Binding(tensors["indptr"], tensors["indices"], tensors["values"], shape),
+        x0=x0,
+        vol0=vol0,
+        mass=vol0 * density_at(x0, density),
+        gaussians=splats,
+        binding=Binding(
+            **{name: torch.from_numpy(array) for name, array in arrays.items()}, shape=(len(splats), len(x0))
+        ),
     )
 
 
 def load_start(
-    binding: str | Path, gaussians: str | Path, velocity: str | Path, densities: Sequence[Density]
+    particles: str | Path,
+    binding: str | Path,
+    gaussians: str | Path,
+    velocity: str | Path,
+    densities: Sequence[Density],
 ) -> tuple[Reconstruction, torch.Tensor, list[int]]:
     """What a prediction starts from: the reconstructed bodies of a scene (one) or of an experiment.
 
     Args:
-        binding, gaussians, velocity: files of the scene or experiment.
+        particles, binding, gaussians, velocity: files of the scene or experiment.
         densities: of each body.
 
     Returns:
         All bodies as one, velocities of the particles [m/s] (N, 3), and the particle count of each body.
     """
-    together = load_body(binding, gaussians, 1.0)
+    together = load_body(particles, binding, gaussians, 1.0)
     found = read_json(velocity)
     parts = found.get("bodies", [{**found, "particles": len(together.x0)}])
     counts = [part["particles"] for part in parts]
     if sum(counts) != len(together.x0) or len(densities) != len(counts):
-        raise InputError(f"{velocity} is of other bodies than {binding}: make both again")
+        raise InputError(f"{velocity} is of other bodies than {particles}: make both again")
     density = [density_at(x, d) for x, d in zip(together.x0.split(counts), densities, strict=True)]
     body = replace(together, mass=together.vol0 * torch.cat(density))
     return body, each_its_own([part["v0"] for part in parts], counts), counts

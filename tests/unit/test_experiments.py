@@ -19,7 +19,7 @@ from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.volume import check_apart, sample_volume
 from neuma_lib.io.files import write_json
 from neuma_lib.io.gaussians import save_gaussians
-from neuma_lib.io.particles import load_start, save_binding
+from neuma_lib.io.particles import load_start, save_binding, save_particles
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.density import density_at
 from neuma_lib.sim.model import MPMModel, consecutive, each_its_own
@@ -180,10 +180,11 @@ def test_a_start_has_the_densities_and_velocities_of_its_bodies(tmp_path):
     both = join([solid(0.3)[2], solid(0.7)[2]])
     half = len(both.x0) // 2
     save_gaussians(tmp_path / "g.ply", both.gaussians)
-    save_binding(tmp_path / "b.h5", both.binding, both.x0, both.vol0, {})
+    save_binding(tmp_path / "b.h5", both.binding)
+    save_particles(tmp_path / "p.h5", both.x0, both.vol0, {})
     starts = [{"v0": [1.0, 0, 0], "particles": half}, {"v0": [0, 0, 2.0], "particles": len(both.x0) - half}]
-    files = [tmp_path / name for name in ("b.h5", "g.ply", "v.json")]
-    write_json(files[2], {"bodies": starts})
+    files = [tmp_path / name for name in ("p.h5", "b.h5", "g.ply", "v.json")]
+    write_json(files[-1], {"bodies": starts})
     body, v0, counts = load_start(*files, [1000.0, {**SPLIT, "axis": "y"}])
     assert counts == [half, len(both.x0) - half]
     assert v0[:half].unique(dim=0).tolist() == [[1, 0, 0]] and v0[half:].unique(dim=0).tolist() == [[0, 0, 2]]
@@ -191,6 +192,6 @@ def test_a_start_has_the_densities_and_velocities_of_its_bodies(tmp_path):
     assert set(density[:half].tolist()) == {1000.0} and set(density[half:].tolist()) == {500.0, 1500.0}
     with pytest.raises(InputError, match="other bodies"):
         load_start(*files, [1000.0])
-    write_json(files[2], {"v0": [0, 1.0, 0]})
+    write_json(files[-1], {"v0": [0, 1.0, 0]})
     _, v0, counts = load_start(*files, [1000.0])
     assert counts == [len(both.x0)] and v0.unique(dim=0).tolist() == [[0, 1, 0]]

@@ -4,9 +4,10 @@
 rule binding:
     input:
         gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
-        particles=f"{RESULTS}/{{scene}}/particles.h5",
+        sampled=f"{RESULTS}/{{scene}}/sampled_particles.h5",
     output:
         binding=f"{RESULTS}/{{scene}}/binding.h5",
+        particles=f"{RESULTS}/{{scene}}/particles.h5",
     params:
         binding=SETTINGS.binding.plain(),
     script:

@@ -195,11 +195,19 @@ def material_prior(wildcards):
     return prior_file(SETTINGS.method_prior(wildcards.scene, wildcards.method))
 
 
-@checked
-def true_particles(wildcards):
-    """Ground truth, for the particle-supervised ablation alone."""
-    material = SETTINGS.method_material(wildcards.scene, wildcards.method)
-    return f"{DATA}/{wildcards.scene}/particles.h5" if material.supervision == "particles" else []
+def supervised_by(kind, file):
+    """A function of wildcards: a file of the scene's data, where the method is supervised by what is in it."""
+
+    @checked
+    def choose(wildcards):
+        material = SETTINGS.method_material(wildcards.scene, wildcards.method)
+        return f"{DATA}/{wildcards.scene}/{file}" if material.supervision == kind else []
+
+    return choose
+
+
+training_video = supervised_by("pixels", "dynamic/transforms.json")
+training_particles = supervised_by("particles", "particles.h5")  # ground truth, in one ablation
 
 
 @checked

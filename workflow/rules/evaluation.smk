@@ -6,7 +6,7 @@ rule initial_state:
         truth=f"{DATA}/{{scene}}/particles.h5",
         gaussians=f"{RESULTS}/{{scene}}/gaussians.json",
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
-        binding=f"{RESULTS}/{{scene}}/binding.h5",
+        particles=f"{RESULTS}/{{scene}}/particles.h5",
         velocity=f"{RESULTS}/{{scene}}/velocity.json",
     output:
         report=f"{RESULTS}/{{scene}}/initial_state.json",
@@ -23,6 +23,7 @@ rule evaluation:
         truth=f"{DATA}/{{scene}}/particles.h5",
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
         gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
+        particles=f"{RESULTS}/{{scene}}/particles.h5",
         binding=f"{RESULTS}/{{scene}}/binding.h5",
         velocity=f"{RESULTS}/{{scene}}/velocity.json",
         prior=material_prior,
@@ -49,6 +50,7 @@ rule video:
         kernels=kernels("rendering"),
         transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
         gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
+        particles=f"{RESULTS}/{{scene}}/particles.h5",
         binding=f"{RESULTS}/{{scene}}/binding.h5",
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
     output:

@@ -22,11 +22,13 @@ rule experiment_truth:
 
 rule experiment_start:
     input:
+        particles=reconstructed_files("particles.h5"),
         binding=reconstructed_files("binding.h5"),
         gaussians=reconstructed_files("gaussians.ply"),
         mesh=reconstructed_files("mesh.ply"),
         velocity=reconstructed_files("velocity.json"),
     output:
+        particles=f"{RESULTS}/experiments/{{experiment}}/particles.h5",
         binding=f"{RESULTS}/experiments/{{experiment}}/binding.h5",
         gaussians=f"{RESULTS}/experiments/{{experiment}}/gaussians.ply",
         mesh=f"{RESULTS}/experiments/{{experiment}}/mesh.ply",
@@ -48,6 +50,7 @@ rule experiment:
         truth=f"{DATA}/experiments/{{experiment}}/particles.h5",
         mesh=f"{RESULTS}/experiments/{{experiment}}/mesh.ply",
         gaussians=f"{RESULTS}/experiments/{{experiment}}/gaussians.ply",
+        particles=f"{RESULTS}/experiments/{{experiment}}/particles.h5",
         binding=f"{RESULTS}/experiments/{{experiment}}/binding.h5",
         velocity=f"{RESULTS}/experiments/{{experiment}}/velocity.json",
         prior=of_each_body(material_prior),

@@ -13,14 +13,14 @@ rule mesh:
         "../scripts/mesh.py"
 
 
-rule particles:
+rule sampled_particles:
     input:
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
     output:
-        particles=f"{RESULTS}/{{scene}}/particles.h5",
+        particles=f"{RESULTS}/{{scene}}/sampled_particles.h5",
     params:
         wanted=SETTINGS.simulation.particles,
         sampling=SETTINGS.geometry.sampling,
         seed=SETTINGS.seed,
     script:
-        "../scripts/particles.py"
+        "../scripts/sampled_particles.py"

@@ -4,12 +4,13 @@
 rule material:
     input:
         kernels=kernels("laws", "rendering"),
-        transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
+        transforms=training_video,
         gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
+        particles=f"{RESULTS}/{{scene}}/particles.h5",
         binding=f"{RESULTS}/{{scene}}/binding.h5",
         velocity=f"{RESULTS}/{{scene}}/velocity.json",
         prior=material_prior,
-        truth=true_particles,
+        truth=training_particles,
     output:
         adaptor=f"{RESULTS}/{{scene}}/{{method}}/adaptor.safetensors",
         history=f"{RESULTS}/{{scene}}/{{method}}/history.json",

@@ -14,6 +14,7 @@ rule image_metrics:
         weights=f"{DATA}/weights/lpips.safetensors",
         transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
         gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
+        particles=f"{RESULTS}/{{scene}}/particles.h5",
         binding=f"{RESULTS}/{{scene}}/binding.h5",
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
     output:

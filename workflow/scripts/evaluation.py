@@ -31,7 +31,9 @@ def main(inputs, output, params, run) -> None:
         inputs.truth, only=("tracers", "tracers_again"), required=("tracers", "tracers_again")
     )
     tracers = sample_tracers(read_mesh(inputs.mesh), params.tracers, seed=params.seed)
-    body, v0, counts = load_start(inputs.binding, inputs.gaussians, inputs.velocity, params.densities)
+    body, v0, counts = load_start(
+        inputs.particles, inputs.binding, inputs.gaussians, inputs.velocity, params.densities
+    )
     laws = [load_law(prior, adaptor).to(device) for prior, adaptor in zip_longest(priors, adaptors)]
     start = (
         MPMModel(**params.simulation),

@@ -14,7 +14,7 @@ from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.gaussians import save_gaussians
 from neuma_lib.io.mesh import read_mesh, write_mesh
-from neuma_lib.io.particles import load_body, save_binding
+from neuma_lib.io.particles import load_body, save_binding, save_particles
 from workflow.stage import stage
 
 
@@ -26,12 +26,13 @@ def look_of(entry: dict) -> AppearanceConfig:
 
 
 def main(inputs, output, params, run) -> None:
-    reconstructed: Iterator = zip(inputs.binding, inputs.gaussians, inputs.mesh, inputs.velocity, strict=True)
+    names = ("particles", "binding", "gaussians", "mesh", "velocity")
+    reconstructed: Iterator = zip(*(getattr(inputs, name) for name in names), strict=True)
     bodies, meshes, starts = [], [], []
     for entry in params.bodies:
         if entry["reconstructed"]:
-            binding, gaussians, surface, velocity = next(reconstructed)
-            body, mesh, v0 = load_body(binding, gaussians, 1.0), read_mesh(surface), read_json(velocity)["v0"]
+            *parts, surface, velocity = next(reconstructed)
+            body, mesh, v0 = load_body(*parts, 1.0), read_mesh(surface), read_json(velocity)["v0"]
         else:
             mesh = place(entry["shape"], entry["size"], entry["height"], entry["center"])
             x0 = sample_volume(mesh, params.particles, seed=params.seed, method=params.sampling)
@@ -45,7 +46,8 @@ def main(inputs, output, params, run) -> None:
         )
     together, surface = join(bodies), trimesh.util.concatenate(meshes)
     save_gaussians(output.gaussians, together.gaussians)
-    save_binding(output.binding, together.binding, together.x0, together.vol0, {})
+    save_particles(output.particles, together.x0, together.vol0, {})
+    save_binding(output.binding, together.binding)
     write_mesh(output.mesh, np.asarray(surface.vertices), np.asarray(surface.faces))
     write_json(output.velocity, {"bodies": starts})
     run.say(f"{len(bodies)} bodies, {len(together.x0)} particles, {len(together.gaussians)} Gaussians")

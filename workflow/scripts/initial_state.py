@@ -5,15 +5,15 @@ import numpy as np
 from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.volume import volume_iou
 from neuma_lib.io.files import read_json, write_json
-from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.mesh import read_mesh
+from neuma_lib.io.particles import load_particles
 from workflow.stage import stage
 
 
 def main(inputs, report_file: str, params, run) -> None:
     scene = params.scene
     fit, velocity = read_json(inputs.gaussians), read_json(inputs.velocity)
-    binding, attributes = read_arrays(inputs.binding, only=("vol0",))
+    x0, _, attributes = load_particles(inputs.particles)
     mesh, true_mesh = (
         read_mesh(inputs.mesh),
         place(scene["shape"], scene["size"], scene["height"], scene["center"]),
@@ -30,7 +30,7 @@ def main(inputs, report_file: str, params, run) -> None:
         "volume_iou": float(volume_iou(mesh, true_mesh)),
         "volume_ratio": float(mesh.volume / true_mesh.volume),
         "particles_asked": params.particles,
-        "particles": int(attributes["particles"]) - added,
+        "particles": len(x0) - added,
         "particles_added": added,
         "velocity": velocity["v0"],
         "velocity_true": scene["velocity"],

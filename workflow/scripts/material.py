@@ -24,16 +24,17 @@ def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
     law = load_law(inputs.prior).to(device)
     law.attach_adaptor(settings.rank, settings.alpha, settings.seed)
-    body = load_body(inputs.binding, inputs.gaussians, params.density).to(torch.float32, device)
+    body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density)
+    body = body.to(torch.float32, device)
     if settings.carrier == "gaussians":
         body = Reconstruction.of_gaussians(body.gaussians, float(body.vol0.sum()), params.density)
     v0 = torch.tensor(read_json(inputs.velocity)["v0"], dtype=torch.float32, device=device)
-    video = load_observation(inputs.transforms, settings.views).to(torch.float32, device)
     if settings.supervision == "particles":
         truth, _ = read_arrays(inputs.truth, required=("x", "frames"), only=("x", "frames"))
         targets = torch.from_numpy(truth["x"]).to(device)
         loss = ParticleLoss(tuple(truth["frames"].tolist()), targets)
     else:
+        video = load_observation(inputs.transforms, settings.views).to(torch.float32, device)
         total = settings.covariance_from == "total"
         loss = PixelLoss(body, video, settings.covariance_gradient, total=total)
     files = {name: str(file) for name, file in inputs.items() if name != "kernels" and isinstance(file, str)}

@@ -17,7 +17,8 @@ def main(inputs, velocity_file: str, params, run) -> None:
     settings = VelocityConfig(**params.velocity)
     device = choose_device(params.device)
     model, law = MPMModel(**params.simulation), load_law(inputs.prior).to(device)
-    body = load_body(inputs.binding, inputs.gaussians, params.density).to(torch.float32, device)
+    body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density)
+    body = body.to(torch.float32, device)
     video = load_observation(inputs.transforms, settings.views).to(torch.float32, device)
     estimate = estimate_velocity(model, law, body, video, settings, run.progress)
     free = estimate

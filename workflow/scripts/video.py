@@ -15,7 +15,8 @@ from workflow.stage import stage
 def main(inputs, video_file: str, params, run) -> None:
     device = choose_device(params.device)
     observation = load_observation(inputs.transforms, [params.view]).to(torch.float32, device)
-    body = load_body(inputs.binding, inputs.gaussians, params.density).to(torch.float32, device)
+    body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density)
+    body = body.to(torch.float32, device)
     x, F = load_motion(inputs.rollout)
     renderer = body.particle_gs(observation.cameras)
     panels, quality = [], []

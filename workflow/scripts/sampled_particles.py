@@ -19,5 +19,5 @@ def main(mesh_file: str, particles_file: str, params, run) -> None:
 
 
 if __name__ == "__main__":
-    with stage(f"particles {snakemake.wildcards.scene}", snakemake.log[0]) as run:
+    with stage(f"sampled_particles {snakemake.wildcards.scene}", snakemake.log[0]) as run:
         main(snakemake.input.mesh, snakemake.output.particles, snakemake.params, run)
