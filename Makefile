@@ -34,7 +34,7 @@ lint: env
 
 # A killed Snakemake leaves its lock behind.
 unlock: env
-	@$(BIN)/python workflow/unlock.py
+	@$(BIN)/python -m workflow.unlock
 
 env: $(READY)
 

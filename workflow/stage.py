@@ -1,10 +1,11 @@
-"""What a stage tells: its log file, a line of progress on the terminal, and errors in plain words.
+"""What a stage tells: its log file, its progress on the terminal, and errors in plain words.
 
-`stage` wraps the work of a script. Inside it, `print` and warnings reach the terminal, everything also goes to the
-log, and an exception ends the process with one message on the terminal, its traceback in the log.
+`stage` wraps the work of a script. What the script says goes to the terminal and to the log; so do warnings of the
+library, while those of Python go to the log alone. An exception ends the process with one line on the terminal and
+its traceback in the log.
 
-Several stages may run at once on one terminal. Only one of them draws a line that moves (it holds a lock on the
-terminal); the others, and all of them when the output is no terminal, print a plain line now and then.
+Several stages may run at once on one terminal. Only one of them, which holds a lock on it, draws a moving bar; the
+others, and all of them where there is no terminal, print a plain line now and then.
 """
 
 from __future__ import annotations
@@ -13,24 +14,29 @@ import fcntl
 import logging
 import os
 import sys
-import time
-import traceback
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TextIO
 
+from tqdm import tqdm
+
 from neuma_lib.errors import InputError, NonFiniteError
-from workflow.owner import stop_with_owner
+from workflow.manager import end_with_snakemake
 
 PLAIN_INTERVAL = 15.0  # seconds between plain lines
-MOVING_INTERVAL = 0.2  # seconds between redraws of the moving line
+MOVING_INTERVAL = 0.2  # seconds between redraws of the moving bar
+STATE = "{n_fmt}/{total_fmt}{postfix}, {remaining} left"
+WIDTH, ROWS = 80, 24  # of a terminal that does not tell
+LOG_FORMAT = "[%(asctime)s] %(message)s"
+
+_LOGGER = logging.getLogger("neuma_lib.stage")
 
 
 @contextmanager
 def stage(name: str, log: str | Path | None = None, stream: TextIO | None = None) -> Iterator[Stage]:
-    """Run a stage: ``with stage("material BouncyBall/neuma", snakemake.log[0]) as run: ...``.
+    """Run a stage: ``with stage("material BouncyBall/neuma", snakemake.log[0]) as run: ...``. One a process.
 
     Args:
         name: what is done, for messages.
@@ -40,136 +46,103 @@ def stage(name: str, log: str | Path | None = None, stream: TextIO | None = None
     Raises:
         SystemExit: in place of any exception of the block, after it was reported.
     """
-    stop_with_owner()
-    run = Stage(name, log, stream or sys.stderr)
+    end_with_snakemake()
+    run, root = Stage(name, stream or sys.stderr), logging.getLogger()
+    handlers: list[logging.Handler] = [_Terminal(run)]
+    if log:
+        Path(log).parent.mkdir(parents=True, exist_ok=True)
+        handlers.append(logging.FileHandler(log, "w"))
+        handlers[-1].setFormatter(logging.Formatter(LOG_FORMAT))
+    for handler in handlers:
+        root.addHandler(handler)
+    logging.getLogger("neuma_lib").setLevel(logging.INFO)
+    logging.captureWarnings(True)
     try:
-        with warnings.catch_warnings():
-            warnings.showwarning = lambda message, kind, *_: run.detail(f"{kind.__name__}: {message}")
-            yield run
+        yield run
     except (Exception, KeyboardInterrupt) as error:
-        run.fail(error)
+        _LOGGER.error("ERROR: %s%s", _plain(error), f" (more in {log})" if log else "", exc_info=error)
         raise SystemExit(1) from None
     finally:
+        logging.captureWarnings(False)
         run.close()
+        for handler in handlers:
+            root.removeHandler(handler)
+            handler.close()
 
 
 class Stage:
     """A running stage; made by `stage`."""
 
-    def __init__(self, name: str, log: str | Path | None, stream: TextIO):
-        self.name, self._stream = name, stream
-        self._log_path = Path(log) if log else None
-        self._log = None
-        if self._log_path:
-            self._log_path.parent.mkdir(parents=True, exist_ok=True)
-            self._log = self._log_path.open("w", buffering=1)
-        self._started = time.monotonic()
-        self._lock = _terminal_lock(stream)
-        self._shown = 0.0
-        self._handler = _ToLog(self)
-        logging.getLogger("neuma_lib").addHandler(self._handler)
-        logging.getLogger("neuma_lib").setLevel(logging.INFO)
-
-    def detail(self, text: str) -> None:
-        """A line for the log file only."""
-        if self._log:
-            self._log.write(f"[{time.monotonic() - self._started:8.1f} s] {text}\n")
+    def __init__(self, name: str, stream: TextIO):
+        self.name, self.stream = name, stream
+        self._terminal = _locked_terminal(stream)
+        self._bar: tqdm | None = None
 
     def say(self, text: str) -> None:
         """A line for the terminal and the log: what was made, and how good it is."""
-        self.detail(text)
-        self._line(text)
+        _LOGGER.info(text)
 
     def progress(self, done: int, total: int, loss: float | None = None) -> None:
         """Show how far the work is, with the loss and the time left."""
-        now = time.monotonic()
-        moving = self._lock is not None
-        if now - self._shown < (MOVING_INTERVAL if moving else PLAIN_INTERVAL) and done < total:
-            return
-        if not moving and self._shown == 0.0 and now - self._started < PLAIN_INTERVAL:
-            return  # short stages need no plain lines
-        if not hasattr(self, "_first"):
-            self._first = (now, done)
-        self._shown = now
-        text = self._progress_text(done, total, loss, now)
-        if moving:
-            self._stream.write(f"\r\x1b[K{self.name}  {text}")
-            self._stream.flush()
-            self._moving_line = True
-        else:
-            self._line(text)
-        if not moving or done >= total:
-            self.detail(text)
-
-    def _progress_text(self, done: int, total: int, loss: float | None, now: float) -> str:
-        parts = [f"{done}/{total}"]
+        if self._bar is None:
+            moving = self._terminal is not None
+            interval = MOVING_INTERVAL if moving else PLAIN_INTERVAL
+            # Where the bar cannot move, what it draws becomes lines.
+            lines = SimpleNamespace(
+                write=lambda text: text.strip() and self.say(text.strip()), flush=lambda: None
+            )
+            self._bar = tqdm(
+                total=total,
+                initial=done,
+                desc=self.name,
+                file=self.stream if moving else lines,
+                mininterval=interval,
+                delay=interval,  # short stages need no lines
+                miniters=0,
+                leave=False,
+                ncols=os.get_terminal_size(self._terminal.fileno()).columns or WIDTH if moving else None,
+                nrows=ROWS,
+                bar_format=("{desc}  {bar:24}  " if moving else "") + STATE,
+            )
         if loss is not None:
-            parts.append(f"loss {loss:.4g}")
-        since, before = self._first
-        if done > before:
-            left = (now - since) / (done - before) * (total - done)
-            parts.append(f"{_duration(left)} left" if done < total else f"{_duration(now - self._started)}")
-        if self._lock is not None:
-            filled = round(24 * done / max(total, 1))
-            parts.insert(0, "█" * filled + "·" * (24 - filled))
-        return "  ".join(parts)
-
-    def fail(self, error: BaseException) -> None:
-        """Report an exception: its message on the terminal, its traceback in the log."""
-        self.detail("".join(traceback.format_exception(error)).rstrip())
-        if isinstance(error, InputError | NonFiniteError):
-            text = str(error)
-        elif isinstance(error, KeyboardInterrupt):
-            text = "interrupted; run the same command again to go on"
-        else:
-            text = f"{type(error).__name__}: {error}"
-        where = f" (more in {self._log_path})" if self._log_path else ""
-        self._line(f"ERROR: {text}{where}")
+            self._bar.set_postfix_str(f"loss {loss:.4g}", refresh=False)
+        self._bar.update(done - self._bar.n)
 
     def close(self) -> None:
-        """Give terminal and log back."""
-        if getattr(self, "_moving_line", False):
-            self._stream.write("\r\x1b[K")
-        logging.getLogger("neuma_lib").removeHandler(self._handler)
-        if self._lock is not None:
-            os.close(self._lock)
-            self._lock = None
-        if self._log:
-            self._log.close()
-            self._log = None
-
-    def _line(self, text: str) -> None:
-        clear = "\r\x1b[K" if self._stream.isatty() else ""
-        self._stream.write(f"{clear}{self.name}: {text}\n")
-        self._stream.flush()
-        self._moving_line = False
+        """Give the terminal back."""
+        if self._bar is not None:
+            self._bar.close()
+        if self._terminal is not None:
+            self._terminal.close()
 
 
-class _ToLog(logging.Handler):
-    """Sends the library's log records to the stage's log, warnings to the terminal as well."""
+class _Terminal(logging.Handler):
+    """Shows what the stage says, and what the library warns of, above the moving bar."""
 
     def __init__(self, run: Stage):
         super().__init__()
         self._run = run
 
     def emit(self, record: logging.LogRecord) -> None:
-        (self._run.say if record.levelno >= logging.WARNING else self._run.detail)(record.getMessage())
+        warned = record.name.startswith("neuma_lib") and record.levelno >= logging.WARNING
+        if warned or record.name == _LOGGER.name:
+            tqdm.write(f"{self._run.name}: {record.getMessage()}", file=self._run.stream)
+            self._run.stream.flush()
 
 
-def _terminal_lock(stream: TextIO) -> int | None:
-    """An open, locked descriptor of the terminal behind ``stream``; None if it is none or another stage has it."""
+def _locked_terminal(stream: TextIO) -> TextIO | None:
+    """The terminal behind a stream, opened and locked; None if there is none or another stage has it."""
     try:
-        descriptor = os.open(os.ttyname(stream.fileno()), os.O_RDWR | os.O_NOCTTY)
-    except (OSError, ValueError, AttributeError):
+        terminal = open(os.ttyname(stream.fileno()))
+        fcntl.flock(terminal, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (OSError, ValueError):
         return None
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(descriptor)
-        return None
-    return descriptor
+    return terminal
 
 
-def _duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes}:{rest:02d}" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
+def _plain(error: BaseException) -> str:
+    if isinstance(error, InputError | NonFiniteError):
+        return str(error)
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted; run the same command again to go on"
+    return f"{type(error).__name__}: {error}"

@@ -1,5 +1,6 @@
 """A stage tells what it does on any terminal, alone or beside others, and why it failed."""
 
+import fcntl
 import io
 import os
 import pty
@@ -13,7 +14,6 @@ from pathlib import Path
 import pytest
 
 from neuma_lib.errors import InputError, NonFiniteError
-from workflow import owner
 from workflow import stage as progress
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -48,45 +48,42 @@ def test_a_bar_with_loss_and_time_left(terminal, tmp_path):
         run.progress(5, 10, 0.25)
         text = written()
         run.say("loss 0.5 -> 0.25")
-    assert "\r\x1b[Kmaterial Ball  " in text and re.search(r"5/10  loss 0.25  0:0\d left", text)
-    assert "█" * 12 + "·" * 12 in text
+    assert "\rmaterial Ball  " in text and re.search(r"5/10, loss 0.25, 00:0\d left", text)
+    assert "█" * 12 + " " * 12 in text
+    assert "\rmaterial Ball: loss 0.5 -> 0.25\r\n" in written()
     assert "loss 0.5 -> 0.25" in (tmp_path / "material.log").read_text()
 
 
-def test_two_stages_on_one_terminal_share_it(terminal, monkeypatch):
-    """One draws a line that moves; the other prints whole lines, each on a line of its own."""
+def test_of_two_stages_on_one_terminal_the_second_prints_lines(terminal, monkeypatch):
     monkeypatch.setattr(progress, "PLAIN_INTERVAL", 0.0)
     stream, written = terminal
-    with progress.stage("first", None, stream) as first:
+    with open(os.ttyname(stream.fileno())) as first:
+        fcntl.flock(first, fcntl.LOCK_EX)
         with progress.stage("second", None, stream) as second:
-            first.progress(1, 4)
             second.progress(1, 4, 2.0)
             second.progress(2, 4, 1.0)
         text = written()
-        assert text.count("█") > 0
-        assert "\r\x1b[Ksecond: 1/4  loss 2\r\n" in text and "second: 2/4  loss 1" in text
-        assert "second  " not in text
+        assert re.search(r"^second: 2/4, loss 1, 00:00 left\r\n", text, re.MULTILINE) and "█" not in text
     with progress.stage("third", None, stream) as third:
         third.progress(1, 4)
-        assert "\r\x1b[Kthird  " in written(), "the terminal is free again"
+        time.sleep(2 * progress.MOVING_INTERVAL)
+        third.progress(2, 4)
+        assert "\rthird  █" in written(), "the terminal is free again"
 
 
-def test_plain_lines_now_and_then_where_there_is_no_terminal(monkeypatch):
-    stream = io.StringIO()
-    with progress.stage("gaussians Ball", None, stream) as run:
-        for i in range(1000):
-            run.progress(i + 1, 1000, 1.0)
-    assert (
-        stream.getvalue().count("\n") <= 2
-        and "\r" not in stream.getvalue()
-        and "\x1b" not in stream.getvalue()
-    )
+def test_plain_lines_now_and_then_where_there_is_no_terminal(monkeypatch, tmp_path):
+    def lines():
+        stream = io.StringIO()
+        with progress.stage("gaussians Ball", tmp_path / "log", stream) as run:
+            for i in range(5):
+                run.progress(i + 1, 5, 1.0)
+        assert not {"\r", "\x1b"} & set(stream.getvalue())
+        return stream.getvalue().splitlines()
+
+    assert lines() == [], "short stages need none"
     monkeypatch.setattr(progress, "PLAIN_INTERVAL", 0.0)
-    stream = io.StringIO()
-    with progress.stage("gaussians Ball", None, stream) as run:
-        for i in range(5):
-            run.progress(i + 1, 5, 1.0)
-    assert stream.getvalue().count("\n") == 5
+    assert len(lines()) >= 4 and lines()[-1].startswith("gaussians Ball: 5/5, loss 1, ")
+    assert "5/5, loss 1" in (tmp_path / "log").read_text()
 
 
 @pytest.mark.parametrize(
@@ -115,24 +112,23 @@ def test_warnings_go_to_the_log(tmp_path):
     assert stream.getvalue() == ""
 
 
-def test_work_ends_with_its_owner():
-    """A process that is killed outright takes along the stages that it owns, and no others."""
+def test_a_script_ends_with_its_snakemake(tmp_path):
+    """A Snakemake that is killed outright takes along what runs below it, through processes between; nothing else."""
     sleep = "import time; time.sleep(60)"
-    work = (
-        f"from workflow.owner import stop_with_owner; stop_with_owner(); print('ready', flush=True); {sleep}"
+    script = (
+        "from workflow.manager import end_with_snakemake; end_with_snakemake();"
+        f"print('ready', flush=True); {sleep}"
     )
-    start = (
-        "import subprocess, sys; from workflow.owner import claim; claim();"
-        f"subprocess.Popen([sys.executable, '-c', {work!r}]); {sleep}"
-    )
-    environment = {k: v for k, v in os.environ.items() if k != owner.VARIABLE}
-    options = dict(cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True)
-    boss = subprocess.Popen([sys.executable, "-c", start], **options)
-    free = subprocess.Popen([sys.executable, "-c", work], **options)
+    snakemake = tmp_path / "snakemake"
+    between = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {script!r}])"
+    snakemake.write_text(f"import subprocess, sys; subprocess.run([sys.executable, '-c', {between!r}])")
+    options = dict(cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    boss = subprocess.Popen([sys.executable, str(snakemake)], **options)
+    free = subprocess.Popen([sys.executable, "-c", script], **options)
     assert boss.stdout.readline() == "ready\n" and free.stdout.readline() == "ready\n"
     boss.kill()
     boss.wait()
-    # The pipe closes when the last process that holds it, the stage, has ended.
+    # The pipe closes when the last process that holds it has ended.
     assert boss.stdout.read() == ""
     assert free.poll() is None
     free.kill()

@@ -12,7 +12,6 @@ sys.path.insert(0, str(ROOT))
 from neuma_lib.config.settings import load
 from neuma_lib.errors import InputError
 from workflow.defaults import complete
-from workflow.owner import claim
 from workflow.provenance import code_digest
 
 try:
@@ -39,7 +38,6 @@ os.environ.update(
         **{name: os.environ.get(name, "1") for name in THREAD_LIMITS},
     }
 )
-claim()  # a killed Snakemake takes its scripts with it
 
 
 # Runs when all jobs are known and none has started, and not in a dry run. A cluster's nodes are not this machine.
