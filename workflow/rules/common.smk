@@ -68,6 +68,18 @@ wildcard_constraints:
     group="simulation|laws|rendering",
 
 
+def body_files(folder):
+    """Files of a reconstructed body: the particles that are simulated, the Gaussians, and what binds them."""
+    names = {"particles": "particles.h5", "binding": "binding.h5", "gaussians": "gaussians.ply"}
+    return {name: f"{RESULTS}/{folder}/{file}" for name, file in names.items()}
+
+
+def each_of(bodies):
+    """Files by name of several bodies."""
+    bodies = [body_files(folder) for folder in bodies]
+    return {name: [body[name] for body in bodies] for name in body_files("")}
+
+
 def kernels(*groups):
     """Files that say that groups of Warp kernels are compiled; `laws` brings `simulation` with it."""
     return [f"{KERNELS}/{group}.ready" for group in groups]

@@ -19,12 +19,10 @@ rule initial_state:
 
 rule evaluation:
     input:
+        **body_files("{scene}"),
         kernels=kernels("laws"),
         truth=f"{DATA}/{{scene}}/particles.h5",
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
-        gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
-        particles=f"{RESULTS}/{{scene}}/particles.h5",
-        binding=f"{RESULTS}/{{scene}}/binding.h5",
         velocity=f"{RESULTS}/{{scene}}/velocity.json",
         prior=material_prior,
         adaptor=trained_adaptor,
@@ -47,11 +45,9 @@ rule evaluation:
 
 rule video:
     input:
+        **body_files("{scene}"),
         kernels=kernels("rendering"),
         transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
-        gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
-        particles=f"{RESULTS}/{{scene}}/particles.h5",
-        binding=f"{RESULTS}/{{scene}}/binding.h5",
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
     output:
         video=f"{RESULTS}/{{scene}}/{{method}}/video.mp4",

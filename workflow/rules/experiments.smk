@@ -46,12 +46,10 @@ rule experiment_start:
 
 rule experiment:
     input:
+        **body_files("experiments/{experiment}"),
         kernels=kernels("laws"),
         truth=f"{DATA}/experiments/{{experiment}}/particles.h5",
         mesh=f"{RESULTS}/experiments/{{experiment}}/mesh.ply",
-        gaussians=f"{RESULTS}/experiments/{{experiment}}/gaussians.ply",
-        particles=f"{RESULTS}/experiments/{{experiment}}/particles.h5",
-        binding=f"{RESULTS}/experiments/{{experiment}}/binding.h5",
         velocity=f"{RESULTS}/experiments/{{experiment}}/velocity.json",
         prior=of_each_body(material_prior),
         adaptor=of_each_body(trained_adaptor),

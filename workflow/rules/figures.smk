@@ -50,8 +50,7 @@ def filmed(scenes):
     return {
         "kernels": kernels("rendering"),
         "transforms": [f"{DATA}/{scene}/dynamic/transforms.json" for scene in scenes],
-        "gaussians": [f"{RESULTS}/{scene}/gaussians.ply" for scene in scenes],
-        "binding": [f"{RESULTS}/{scene}/binding.h5" for scene in scenes],
+        **each_of(scenes),
     }
 
 
@@ -132,7 +131,7 @@ FIGURES = {
         "kind": "h5",
         "input": {
             "truth": f"{DATA}/{DRAWN.particles_app}/particles.h5",
-            "binding": f"{RESULTS}/{DRAWN.particles_app}/binding.h5",
+            "particles": f"{RESULTS}/{DRAWN.particles_app}/particles.h5",
             "rollouts": of_methods([DRAWN.particles_app], METHODS, "rollout.h5"),
         },
         "params": {
@@ -165,8 +164,7 @@ FIGURES = {
         "input": {
             "kernels": kernels("rendering"),
             "rollouts": of_experiments("neuma/rollout.h5"),
-            "gaussians": of_experiments("gaussians.ply"),
-            "binding": of_experiments("binding.h5"),
+            **each_of(f"experiments/{name}" for name in SHOWN_EXPERIMENTS),
         },
         "params": {
             "letters": lambda wildcards: [
@@ -183,8 +181,7 @@ FIGURES = {
         "input": {
             "kernels": kernels("rendering"),
             "truth": f"{DATA}/experiments/{DRAWN.ext_time}/particles.h5",
-            "gaussians": f"{RESULTS}/experiments/{DRAWN.ext_time}/gaussians.ply",
-            "binding": f"{RESULTS}/experiments/{DRAWN.ext_time}/binding.h5",
+            **body_files(f"experiments/{DRAWN.ext_time}"),
             "rollouts": [f"{RESULTS}/experiments/{DRAWN.ext_time}/{m}/rollout.h5" for m in PREDICTED],
         },
         "params": {

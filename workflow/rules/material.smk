@@ -3,11 +3,9 @@
 
 rule material:
     input:
+        **body_files("{scene}"),
         kernels=kernels("laws", "rendering"),
         transforms=training_video,
-        gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
-        particles=f"{RESULTS}/{{scene}}/particles.h5",
-        binding=f"{RESULTS}/{{scene}}/binding.h5",
         velocity=f"{RESULTS}/{{scene}}/velocity.json",
         prior=material_prior,
         truth=training_particles,

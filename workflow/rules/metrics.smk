@@ -10,12 +10,10 @@ rule lpips_weights:
 
 rule image_metrics:
     input:
+        **body_files("{scene}"),
         kernels=kernels("rendering"),
         weights=f"{DATA}/weights/lpips.safetensors",
         transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
-        gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
-        particles=f"{RESULTS}/{{scene}}/particles.h5",
-        binding=f"{RESULTS}/{{scene}}/binding.h5",
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
     output:
         metrics=f"{RESULTS}/{{scene}}/{{method}}/image_metrics.json",

@@ -3,11 +3,9 @@
 
 rule velocity:
     input:
+        **body_files("{scene}"),
         kernels=kernels("laws", "rendering"),
         transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
-        gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
-        particles=f"{RESULTS}/{{scene}}/particles.h5",
-        binding=f"{RESULTS}/{{scene}}/binding.h5",
         prior=lambda wildcards: prior_file(SETTINGS.scenes[wildcards.scene].prior),
     output:
         velocity=f"{RESULTS}/{{scene}}/velocity.json",

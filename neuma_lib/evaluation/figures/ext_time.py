@@ -33,7 +33,7 @@ def data(inputs, params, say) -> ImageGrid:
     """
     names = ("x", "mass", "vol0", "frames")
     truth, attributes = read_arrays(inputs.truth, required=names, only=names)
-    body = load_body(inputs.binding, inputs.gaussians, params.density)
+    body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density)
     shown = evenly(params.shown, len(truth["frames"]))
     paths = [read_arrays(file, required=("x", "F"))[0] for file in inputs.rollouts]
     everywhere = [arrays["x"].reshape(-1, 3) for arrays in (truth, *paths)]

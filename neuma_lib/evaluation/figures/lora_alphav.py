@@ -48,7 +48,8 @@ def data(inputs, params, say) -> ImageGrid:
     for k, (scene, setting) in enumerate(params.scenes.items()):
         model = MPMModel(**setting["simulation"])
         video = load_observation(inputs.transforms[k], [params.view])
-        body = load_body(inputs.binding[k], inputs.gaussians[k], setting["density"]).to(torch.float32, device)
+        body = load_body(inputs.particles[k], inputs.binding[k], inputs.gaussians[k], setting["density"])
+        body = body.to(torch.float32, device)
         law = load_law(inputs.prior[k], inputs.adaptor[k]).to(device)
         v0 = torch.tensor(read_json(inputs.velocity[k])["v0"], dtype=torch.float32, device=device)
         truth, _ = read_arrays(inputs.truth[k], required=("x", "mass"), only=("x", "mass"))

@@ -29,7 +29,7 @@ def data(inputs, params, say) -> ImageGrid:
     rollouts = iter(inputs.rollouts)
     for k, (scene, setting) in enumerate(params.scenes.items()):
         video = load_observation(inputs.transforms[k], [params.view])
-        body = load_body(inputs.binding[k], inputs.gaussians[k], setting["density"])
+        body = load_body(inputs.particles[k], inputs.binding[k], inputs.gaussians[k], setting["density"])
         shown = evenly(params.shown, len(video.frames))
         cameras = magnified(video.cameras, params.magnify)
         rows = [observed(video, shown, params.magnify)]

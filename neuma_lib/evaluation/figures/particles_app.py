@@ -25,7 +25,7 @@ LEFT, TOP = 0.92, 0.18
 def data(inputs, params, say) -> ImageGrid:
     """A row for the truth and each method, a column a time."""
     truth, _ = read_arrays(inputs.truth, required=("x", "vol0"), only=("x", "vol0", "frames"))
-    bound, _ = read_arrays(inputs.binding, only=("vol0",))
+    simulated, _ = read_arrays(inputs.particles, required=("vol0",), only=("vol0",))
     shown = evenly(params.shown, len(truth["x"]))
     paths = {"truth": truth["x"][shown]}
     for method, file in zip(params.titles, inputs.rollouts, strict=True):
@@ -34,7 +34,7 @@ def data(inputs, params, say) -> ImageGrid:
     rows = []
     for method, x in paths.items():
         color = style.TRUE_PARTICLES if method == "truth" else style.look(method).color
-        vol0 = truth["vol0"] if method == "truth" else bound["vol0"]
+        vol0 = truth["vol0"] if method == "truth" else simulated["vol0"]
         rows.append(particle_pictures(x, color, sphere_radius(vol0), cameras))
     (images,) = cropped([np.stack(rows)])
     say(f"{images.shape[0]} x {images.shape[1]} pictures")

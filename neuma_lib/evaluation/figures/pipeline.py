@@ -64,7 +64,7 @@ def data(inputs, params, say) -> ImageGrid:
     Numbers: ``first``, titles of the pictures of the first row; ``heads``, what happens before each row.
     """
     video = load_observation(inputs.transforms[0], [params.view])
-    body = load_body(inputs.binding[0], inputs.gaussians[0], params.scene["density"])
+    body = load_body(inputs.particles[0], inputs.binding[0], inputs.gaussians[0], params.scene["density"])
     law = load_law(inputs.prior[0], inputs.adaptor[0])
     cameras = magnified(video.cameras, params.magnify)
     third = len(video.frames) // 3  # before it, the body only falls

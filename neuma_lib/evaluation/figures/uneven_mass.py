@@ -34,7 +34,7 @@ def data(inputs, params, say) -> ImageGrid:
     """Columns are times. Numbers: ``rows`` {method: row}, ``chamfer`` {method: 1e-4 m^2}, ``floor``."""
     (setting,) = params.scene.values()
     video = load_observation(inputs.transforms[0], [params.view])
-    body = load_body(inputs.binding[0], inputs.gaussians[0], setting["density"])
+    body = load_body(inputs.particles[0], inputs.binding[0], inputs.gaussians[0], setting["density"])
     shown = evenly(params.shown, len(video.frames))
     cameras = magnified(video.cameras, params.magnify)
     motions = [[state[shown] for state in load_motion(file)] for file in inputs.rollouts]

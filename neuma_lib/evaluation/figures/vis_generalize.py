@@ -28,7 +28,8 @@ def data(inputs, params, say) -> ImageGrid:
     Numbers: ``letters``, the count of rows of (a); ``materials``, one a letter; ``times``, column titles of (b).
     """
     paths = [read_arrays(file, required=("x", "F", "frames")) for file in inputs.rollouts]
-    bodies = [load_body(*files, DENSITY) for files in zip(inputs.binding, inputs.gaussians, strict=True)]
+    reconstructed = zip(inputs.particles, inputs.binding, inputs.gaussians, strict=True)
+    bodies = [load_body(*files, DENSITY) for files in reconstructed]
     letters, count = len(params.letters), len(params.letters) or params.shown
     points = np.concatenate([arrays["x"].reshape(-1, 3) for arrays, _ in paths[:letters] or paths])
     wide, high = np.ptp(points, axis=0)[:2]
