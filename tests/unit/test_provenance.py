@@ -87,7 +87,8 @@ class TestThisProject:
         assert "neuma_lib.splatting.rasterizer" in self.reached(script)
 
     @pytest.mark.parametrize(
-        "script", ["ground_truth", "prior", "sampled_particles", "render_static", "render_dynamic", "chamfer_table"]
+        "script",
+        ["ground_truth", "prior", "sampled_particles", "render_static", "render_dynamic", "chamfer_table"],
     )
     def test_what_does_not_render_is_free_of_it(self, script):
         assert "neuma_lib.splatting.rasterizer" not in self.reached(script)
