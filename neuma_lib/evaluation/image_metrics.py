@@ -20,36 +20,36 @@ VISIBLE = 0.05
 MEASURES = ("psnr", "ssim", "lpips_vgg", "lpips_alex")
 
 
-def object_window(visible: np.ndarray, margin: float, smallest: int = SMALLEST) -> tuple[slice, slice]:
-    """Rows and columns of the part of an image that is compared.
+def object_window(visible: np.ndarray, margin: float) -> tuple[slice, slice]:
+    """Rows and columns of the part of an image that is compared: at least `SMALLEST` pixels each, inside the image.
 
     Args:
         visible: pixels of the object, observed or predicted, shape (H, W).
         margin: the bounding box grows by this fraction of its longer side on each side.
-        smallest: fewest pixels along a side; the box grows about its middle, and stays inside the image.
 
     Raises:
-        InputError: nothing is visible, or the image is smaller than `smallest`.
+        InputError: nothing is visible, or the image is smaller than `SMALLEST`.
     """
     if not visible.any():
         raise InputError(
             "image metrics: the object is neither in the observed frame nor in the predicted one"
         )
-    if min(visible.shape) < smallest:
-        raise InputError(f"image metrics need images of {smallest} pixels a side, not {visible.shape}")
+    if min(visible.shape) < SMALLEST:
+        raise InputError(f"image metrics need images of {SMALLEST} pixels a side, not {visible.shape}")
     spans = [np.flatnonzero(visible.any(axis=axis)) for axis in (1, 0)]
-    grow = round(margin * max(len(range(s[0], s[-1] + 1)) for s in spans))
+    grow = round(margin * max(int(s[-1] - s[0]) + 1 for s in spans))
     return tuple(
-        _span(int(s[0]) - grow, int(s[-1]) + 1 + grow, size, smallest)
+        _span(int(s[0]) - grow, int(s[-1]) + 1 + grow, size)
         for s, size in zip(spans, visible.shape, strict=True)
     )
 
 
-def _span(start: int, stop: int, size: int, smallest: int) -> slice:
-    missing = max(0, smallest - (stop - start))
+def _span(start: int, stop: int, size: int) -> slice:
+    """The span cut to an image of `size` pixels, grown about its middle where it is shorter than `SMALLEST`."""
+    missing = max(0, SMALLEST - (stop - start))
     start, stop = max(0, start - missing // 2), min(size, stop + missing - missing // 2)
     # What was cut at one border is given back at the other.
-    start, stop = max(0, min(start, stop - smallest)), min(size, max(stop, start + smallest))
+    start, stop = max(0, min(start, stop - SMALLEST)), min(size, max(stop, start + SMALLEST))
     return slice(start, stop)
 
 

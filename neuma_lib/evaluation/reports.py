@@ -5,10 +5,22 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from neuma_lib.evaluation.paper import BENCHMARKS, BENCHMARKS_LABEL
+
+
+def as_csv(rows: Iterable[Iterable[Any]]) -> str:
+    """Lines of comma-separated values."""
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows(rows)
+    return out.getvalue()
+
+
+def as_line(cells: Iterable[Any]) -> str:
+    """A line of a Markdown table."""
+    return f"| {' | '.join(map(str, cells))} |"
 
 
 def report_table(
@@ -21,15 +33,12 @@ def report_table(
         columns: quantity -> heading in the Markdown table, in order.
         corner: heading of the first column.
     """
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([corner, *columns])
-    lines = [f"| {corner} | {' | '.join(columns.values())} |", f"|---|{'---:|' * len(columns)}"]
+    lines = [as_line([corner, *columns.values()]), f"|---|{'---:|' * len(columns)}"]
     for name, row in rows.items():
-        writer.writerow([name, *(row[key] for key in columns)])
         cells = [f"{row[key]:d}" if isinstance(row[key], int) else f"{row[key]:.4g}" for key in columns]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return out.getvalue(), "\n".join(lines) + "\n"
+        lines.append(as_line([name, *cells]))
+    values = ([name, *(row[key] for key in columns)] for name, row in rows.items())
+    return as_csv([[corner, *columns], *values]), "\n".join(lines) + "\n"
 
 
 def learning_rate_table(rows: Sequence[Mapping]) -> tuple[str, str, dict[str, float]]:
@@ -43,37 +52,35 @@ def learning_rate_table(rows: Sequence[Mapping]) -> tuple[str, str, dict[str, fl
         CSV, Markdown, and for each method the factor whose best training loss, relative to the loss of the prior and
         averaged over the scenes geometrically, is lowest.
     """
-    header = (
-        "method",
-        "lr_scale",
-        "scene",
-        "loss of the prior",
-        "best loss",
-        "ratio",
-        "recoveries",
-        "stable",
-        "excess",
-    )
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(header)
-    lines = [f"| {' | '.join(header)} |", f"|{'---|' * len(header)}"]
+    table: list[tuple] = [
+        (
+            "method",
+            "lr_scale",
+            "scene",
+            "loss of the prior",
+            "best loss",
+            "ratio",
+            "recoveries",
+            "stable",
+            "excess",
+        )
+    ]
     logs: dict[str, dict[float, list[float]]] = {}
     for row in rows:
         first, best = row["loss"][0], row["best_loss"]
         logs.setdefault(row["method"], {}).setdefault(row["lr_scale"], []).append(math.log(best / first))
-        cells = (
+        table.append((
             row["method"], f"{row['lr_scale']:g}", row["scene"], f"{first:.3e}", f"{best:.3e}", f"{best / first:.4f}",
             len(row["recoveries"]), "yes" if row["stable"] else "no", f"{row['chamfer_excess']:.3f}",
-        )  # fmt: skip
-        writer.writerow(cells)
-        lines.append(f"| {' | '.join(map(str, cells))} |")
+        ))  # fmt: skip
     chosen = {
         method: min(scales, key=lambda scale: sum(scales[scale]) / len(scales[scale]))
         for method, scales in logs.items()
     }
-    lines += ["", "Best by training loss: " + ", ".join(f"{m} ×{s:g}" for m, s in chosen.items()) + "."]
-    return out.getvalue(), "\n".join(lines) + "\n", chosen
+    header, *lines = map(as_line, table)
+    verdict = "Best by training loss: " + ", ".join(f"{m} ×{s:g}" for m, s in chosen.items()) + "."
+    text = [header, f"|{'---|' * len(table[0])}", *lines, "", verdict, ""]
+    return as_csv(table), "\n".join(text), chosen
 
 
 def benchmark_table(scenes: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:
@@ -99,10 +106,7 @@ def benchmark_table(scenes: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:
         "plasticity": "Plasticity",
         "prior": "Prior",
     }
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(header)
-    lines = [f"| {' | '.join(header.values())} |", f"|{'---|' * len(header)}"]
+    table, lines = [list(header)], [as_line(header.values()), f"|{'---|' * len(header)}"]
     same, other = [], []
     for name, scene in scenes.items():
         printed = BENCHMARKS.get(name, {})
@@ -113,12 +117,12 @@ def benchmark_table(scenes: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:
             **{key: _constant(scene[key]) for key in ("density", "prior")},
             **{part: _constant(scene["law"][part]) for part in ("elasticity", "plasticity")},
         }
-        writer.writerow(row[key] for key in header)
+        table.append([row[key] for key in header])
         if printed:
             apart = {k: _constant(printed[k]) for k in ("dt", "velocity", "height") if printed[k] != scene[k]}
             row |= {key: f"{row[key]} (*paper: {value}*)" for key, value in apart.items()}
             (other if apart else same).append(name)
-        lines.append(f"| {' | '.join(str(row[key]) for key in header)} |")
+        lines.append(as_line(row[key] for key in header))
     verdict = []
     if same:
         verdict.append(
@@ -128,7 +132,7 @@ def benchmark_table(scenes: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:
         verdict.append(f"They differ from it for {', '.join(other)}; the paper's numbers stand in brackets.")
     text = ["# Table 4: the benchmarks", "", *lines, "", " ".join(verdict)]
     text += ["", "The paper does not publish materials, sizes and densities: those are ours.", ""]
-    return out.getvalue(), "\n".join(text)
+    return as_csv(table), "\n".join(text)
 
 
 def _constant(value: Any) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,6 +10,7 @@ import numpy as np
 
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.paper import Claim, PaperTable
+from neuma_lib.evaluation.reports import as_csv, as_line
 
 QUANTITIES = {
     "chamfer": "Chamfer distance (1e-4 m², mean over the sequence)",
@@ -87,25 +86,19 @@ class Table:
                 return row
         raise InputError(f"table: no row {quantity} of {method}")
 
-    def values(self, quantity: str, method: str) -> dict[str, float]:
-        """Means of one row by column, with "Average"."""
-        return dict(zip([*self.columns, "Average"], self.row(quantity, method).mean.tolist(), strict=True))
-
     def csv(self) -> str:
         """Comma-separated values: quantity, method, title, one column a scene, Average, diverged.
 
         With several seeds, a row ``<quantity>_std`` follows each row of means.
         """
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
-        writer.writerow(["quantity", "method", "title", *self.columns, "Average", "diverged"])
+        lines = [["quantity", "method", "title", *self.columns, "Average", "diverged"]]
         for row in self.rows:
             diverged = " ".join(c for c in self.columns if (row.method, c) in self.marks)
             for suffix, values in (("", row.mean), ("_std", row.std)):
                 if values is not None:
                     cells = [f"{v:.4f}" for v in values]
-                    writer.writerow([row.quantity + suffix, row.method, row.title, *cells, diverged])
-        return out.getvalue()
+                    lines.append([row.quantity + suffix, row.method, row.title, *cells, diverged])
+        return as_csv(lines)
 
     def markdown(self) -> str:
         """One Markdown table a quantity, the paper's numbers below the Chamfer distances, and what holds of it."""
@@ -182,13 +175,13 @@ class Table:
 
     def _header(self) -> str:
         names = [*self.columns.values(), "Average"]
-        return f"| Method | {' | '.join(names)} |\n|---|{'---:|' * len(names)}"
+        return f"{as_line(['Method', *names])}\n|---|{'---:|' * len(names)}"
 
     def _line(self, row: Row) -> str:
         marks = [*(self.marks.get((row.method, column), "") for column in self.columns), ""]
         spread = [""] * len(marks) if row.std is None else [f" ± {s:.2f}" for s in row.std]
         cells = [f"{v:.2f}{s}{mark}" for v, s, mark in zip(row.mean, spread, marks, strict=True)]
-        return f"| {row.title} | {' | '.join(cells)} |"
+        return as_line([row.title, *cells])
 
     def _paper_lines(self, rows: Sequence[Row]) -> list[str]:
         """The paper's rows of the methods shown, if it has all the columns."""
