@@ -1,8 +1,9 @@
-"""One reader and one writer for every artifact.
+"""Text and JSON, checksums, and writing safely.
 
-Writers are atomic (a temporary name in the same folder, then a rename) and deterministic: the same arrays give the
-same bytes, without dates, host names or paths. Readers check what they read; a damaged or foreign file is an
-`InputError` that names the file, what is wrong with it and what to do.
+Writers of this package are atomic (a temporary name in the same folder, then a rename) and deterministic: the same
+arrays give the same bytes, without dates, host names or paths. Readers check what they read before they allocate
+memory for it; a damaged or foreign file is an `InputError` of one line that names the file, what is wrong with it and
+what to do.
 
 Lengths are metres, times seconds, masses kilograms; arrays are numpy.
 """
@@ -15,7 +16,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from neuma_lib.errors import InputError
 
@@ -48,16 +49,26 @@ def write_json(path: str | Path, data: Any) -> None:
 
 
 def read_json(path: str | Path) -> Any:
-    """Read JSON. Raises InputError when the file is missing or is not JSON."""
+    """Read JSON. Raises InputError when the file is missing or is not JSON (NaN and Infinity are not)."""
+    return parse_json(existing(path).read_bytes(), path)
+
+
+def parse_json(content: str | bytes, where: str | Path) -> Any:
+    """Value of a JSON text. Raises InputError, which names ``where``, when it is not JSON or nested too deep."""
     try:
-        return json.loads(existing(path).read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        return json.loads(content, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:  # a decode error of text or of JSON is a ValueError
         raise InputError(
-            f"{path} is not valid JSON ({error}): delete it and run the workflow again"
+            f"{where} is not valid JSON ({one_line(error)}): delete it and run the workflow again"
         ) from None
 
 
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not a number of JSON")
+
+
 def existing(path: str | Path) -> Path:
+    """The path of a file. Raises InputError where there is none."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path} does not exist: run the stage that makes it, or correct the path")
@@ -67,3 +78,9 @@ def existing(path: str | Path) -> Path:
 def sha256_file(path: str | Path) -> str:
     """Hex digest of a file's bytes."""
     return hashlib.sha256(existing(path).read_bytes()).hexdigest()
+
+
+def one_line(error: object, limit: int = 200) -> str:
+    """Text of an error or a value of a file, on one line and not longer than ``limit``, to quote in a message."""
+    text = " ".join("".join(c if c.isprintable() else " " for c in str(error)).split())
+    return text if len(text) <= limit else f"{text[:limit]}..."

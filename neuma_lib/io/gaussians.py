@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import atomic, existing
 from neuma_lib.io.ply import read_ply, write_ply
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.spherical_harmonics import MAX_DEGREE, coefficient_count
@@ -39,8 +38,7 @@ def save_gaussians(path: str | Path, gaussians: Gaussians) -> None:
     rows = np.empty(G, dtype=[(name, "<f4") for name in columns])
     for name, column in columns.items():
         rows[name] = column
-    with atomic(path) as partial:
-        write_ply(partial, rows)
+    write_ply(path, rows)
 
 
 def load_gaussians(path: str | Path) -> Gaussians:
@@ -49,7 +47,7 @@ def load_gaussians(path: str | Path) -> Gaussians:
     Raises:
         InputError: missing properties (they are listed), or values that are not finite.
     """
-    rows, _ = read_ply(existing(path))
+    rows, _ = read_ply(path)
     names = set(rows.dtype.names)
     groups = {
         "means": ["x", "y", "z"],

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from math import prod
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import atomic, existing
+from neuma_lib.io.files import atomic, existing, one_line
 
 QUANTITIES = {
     "x": ("m", "particle positions, shape (T, N, 3), or (N, 3) where there is one state"),
@@ -30,6 +32,9 @@ QUANTITIES = {
     "images": ("1", "pictures of a figure, colours 0 to 255, shape (rows, columns, H, W, 3)"),
 }
 
+MAX_RATIO = 1032
+"""Most bytes that one byte of a deflate stream can stand for (zlib's own bound)."""
+
 
 def write_arrays(
     path: str | Path, arrays: Mapping[str, Any], attributes: Mapping[str, Any] | None = None
@@ -40,8 +45,6 @@ def write_arrays(
         arrays: quantity name -> array; None entries are left out.
         attributes: numbers and texts; anything else is stored as JSON text.
     """
-    import h5py
-
     with atomic(path) as partial, h5py.File(partial, "w", track_order=True) as file:
         for name, array in arrays.items():
             if array is None:
@@ -61,26 +64,71 @@ def read_arrays(
 
     Args:
         required: names that must be there.
-        only: names to read (others stay on disk); None reads everything.
+        only: names to read (others stay on disk); None reads all of `QUANTITIES` that the file has.
 
     Raises:
-        InputError: missing or damaged file, missing quantity, or a value that is not finite.
+        InputError: missing or damaged file, missing quantity, something else under its name (a group, a link, texts),
+            a value that is not finite, or more claimed than stored.
     """
-    import h5py
-
     path = existing(path)
     try:
         with h5py.File(path, "r") as file:
-            missing = [name for name in required if name not in file]
-            if missing:
-                raise InputError(f"{path} has no dataset {', '.join(missing)} (it has {', '.join(file)})")
-            arrays = {name: file[name][()] for name in file if only is None or name in only}
-            attributes = dict(file.attrs.items())
-    except OSError as error:
+            if missing := [name for name in required if name not in file.keys()]:
+                found = one_line(", ".join(file.keys()))
+                raise InputError(f"{path} has no dataset {', '.join(missing)} (it has {found})")
+            # keys in the file's order; a lookup would follow links
+            names = [name for name in file.keys() if name in (QUANTITIES if only is None else only)]
+            arrays = {name: _checked(path, file, name)[()] for name in names}
+            attributes = {key: _attribute(path, file, key) for key in file.attrs}
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError, MemoryError) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(
-            f"{path} cannot be read as HDF5 ({error}): delete it and run the workflow again"
+            f"{path} cannot be read as HDF5 ({one_line(error)}): delete it and run the workflow again"
         ) from None
     for name, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise InputError(f"{path}: dataset {name} holds values that are not finite: make the file again")
-    return arrays, {k: v.item() if isinstance(v, np.generic) else v for k, v in attributes.items()}
+    return arrays, attributes
+
+
+def _checked(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
+    """A dataset that is safe to read: numbers that are stored in this file, as many as its shape says."""
+    link = file.get(name, getlink=True)
+    if not isinstance(link, h5py.HardLink):
+        raise InputError(
+            f"{path}: {name} is a {type(link).__name__}, not a dataset of this file: make the file again"
+        )
+    data = file[name]
+    if (
+        not isinstance(data, h5py.Dataset)
+        or data.shape is None
+        or data.dtype.kind not in "fiu"
+        or data.dtype.subdtype
+    ):
+        raise InputError(f"{path}: {name} is not an array of numbers: make the file again")
+    if data.is_virtual or data.external:
+        raise InputError(f"{path}: the values of {name} are in other files: make the file again")
+    stored = data.id.get_storage_size()
+    chunks = prod(-(-length // chunk) for length, chunk in zip(data.shape, data.chunks)) if data.chunks else 0
+    if (
+        stored > path.stat().st_size
+        or data.nbytes > MAX_RATIO * stored
+        or (data.chunks is None and data.nbytes > stored)
+        or (data.chunks and data.id.get_num_chunks() < chunks)
+    ):
+        raise InputError(
+            f"{path}: {name} claims {data.nbytes} bytes (shape {data.shape}) and stores {stored} of"
+            f" {path.stat().st_size} in the file: make the file again"
+        )
+    return data
+
+
+def _attribute(path: Path, file: h5py.File, key: str) -> Any:
+    """A number or a text."""
+    shape = file.attrs.get_id(key).shape
+    value = file.attrs[key] if shape == () else None
+    value = value.item() if isinstance(value, np.generic) else value
+    if not isinstance(value, str | int | float):
+        raise InputError(f"{path}: attribute {one_line(key)} is not a number or a text: make the file again")
+    return value

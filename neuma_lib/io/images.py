@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import read_json, sha256_file, write_json
-from neuma_lib.io.released import released_frames
+from neuma_lib.io.files import one_line, read_json, sha256_file, write_json
+from neuma_lib.io.released import image_name, matrix_of_numbers, released_frames
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.observation import Observation
 
@@ -69,6 +72,10 @@ class ImageSet:
         return steps[0], index, index[0]
 
 
+FORMATS = ("PNG", "JPEG", "WEBP")
+"""Image formats that are read, by Pillow's names; others have decoders that are less tried."""
+MAX_PIXELS = 2**26
+"""Most pixels of an image that is read: 8192 x 8192, 256 MiB of RGBA."""
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -118,26 +125,30 @@ def read_transforms(path: str | Path) -> dict[str, Any]:
     Raises:
         InputError: names the file, the frame and the missing or wrong entry.
     """
-    data = read_json(path)
+    return checked_transforms(read_json(path), path)
+
+
+def checked_transforms(data: Any, path: str | Path) -> dict[str, Any]:
+    """What a transforms.json holds, if it is one (see `read_transforms`); ``path`` is for messages."""
     if isinstance(data, list):
         data = {"frames": released_frames(data, path)}
-    if not isinstance(data, dict) or not data.get("frames"):
+    frames = data.get("frames") if isinstance(data, dict) else None
+    if not isinstance(frames, list) or not frames:
         raise InputError(f"{path}: the list 'frames' is missing or empty")
-    for i, frame in enumerate(data["frames"]):
-        if "file_path" not in frame:
-            raise InputError(f"{path}: frame {i} has no file_path")
-        _check_intrinsics({**data, **frame}, f"{path}: frame {i} ({frame['file_path']})")
-        matrix = np.asarray(frame.get("transform_matrix", ()), dtype=object)
-        if matrix.shape != (4, 4):
-            raise InputError(
-                f"{path}: frame {i} ({frame['file_path']}) needs a 4x4 transform_matrix (camera to world)"
-            )
-        matrix = matrix.astype(np.float64)
-        rotation = matrix[:3, :3]
-        if not np.isfinite(matrix).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
-            raise InputError(
-                f"{path}: the transform_matrix of frame {i} ({frame['file_path']}) is not a rigid motion"
-            )
+    for i, frame in enumerate(frames):
+        where = f"{path}: frame {i} ({image_name(frame, f'{path}: frame {i}')})"
+        _check_intrinsics({**data, **frame}, where)
+        for key in ("view", "step"):
+            if type(frame.get(key, 0)) is not int:
+                raise InputError(f"{where}: {key} must be a whole number, not {one_line(repr(frame[key]))}")
+        if not isinstance(frame.get("sha256"), str | None):
+            raise InputError(f"{where}: sha256 must be a text")
+        pose = matrix_of_numbers(frame.get("transform_matrix"))
+        if pose.shape != (4, 4):
+            raise InputError(f"{where} needs a 4x4 transform_matrix of numbers (camera to world)")
+        rotation = pose[:3, :3]
+        if not np.isfinite(pose).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
+            raise InputError(f"{where}: the transform_matrix is not a rigid motion")
     return data
 
 
@@ -148,8 +159,10 @@ def _check_intrinsics(values: Mapping[str, Any], where: str) -> None:
         )
     for key in ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x"):
         value = values.get(key, 1)
-        if not (isinstance(value, int | float) and math.isfinite(value) and value > 0):
-            raise InputError(f"{where}: {key} must be a positive number, not {value!r}")
+        if type(value) not in (int, float) or not (0 < value < math.inf):
+            raise InputError(f"{where}: {key} must be a positive number, not {one_line(repr(value))}")
+    if values.get("w", 1) * values.get("h", 1) > MAX_PIXELS:
+        raise InputError(f"{where}: {values['w']} x {values['h']} are more than {MAX_PIXELS} pixels (w, h)")
 
 
 def _intrinsic_matrix(values: Mapping[str, Any], width: int, height: int) -> np.ndarray:
@@ -171,30 +184,21 @@ def read_image_set(path: str | Path, views: Sequence[int] | None = None) -> Imag
     data = read_transforms(path)
     folder = Path(path).parent
     chosen = [
-        (i, frame)
-        for i, frame in enumerate(data["frames"])
-        if views is None or int(frame.get("view", i)) in views
+        (i, frame) for i, frame in enumerate(data["frames"]) if views is None or frame.get("view", i) in views
     ]
     if not chosen:
         raise InputError(f"{path}: no frame belongs to the views {list(views or ())}")
-    images = _read_all(
-        [(_image_file(folder, frame["file_path"], path), frame.get("sha256")) for _, frame in chosen]
-    )
-    height, width = images.shape[1:3]
     merged = [{**data, **frame} for _, frame in chosen]
-    for values in merged:
-        if (int(values.get("w", width)), int(values.get("h", height))) != (width, height):
-            raise InputError(
-                f"{path}: w, h of {values['file_path']} are {values['w']}x{values['h']}, the image is {width}x{height}:"
-                " correct the intrinsics"
-            )
+    files = [_image_file(folder, frame["file_path"], path) for _, frame in chosen]
+    images = _read_all(files, merged, path)
+    height, width = images.shape[1:3]
     poses = np.array([frame["transform_matrix"] for _, frame in chosen], dtype=np.float64)
     return ImageSet(
         images=images,
         viewmats=np.linalg.inv(poses @ OPENGL_TO_OPENCV),
         Ks=np.stack([_intrinsic_matrix(values, width, height) for values in merged]),
-        views=np.array([int(frame.get("view", i)) for i, frame in chosen]),
-        steps=np.array([int(frame.get("step", 0)) for _, frame in chosen]),
+        views=np.array([frame.get("view", i) for i, frame in chosen]),
+        steps=np.array([frame.get("step", 0) for _, frame in chosen]),
         names=tuple(frame["file_path"] for _, frame in chosen),
     )
 
@@ -209,18 +213,23 @@ def _image_file(folder: Path, name: str, listed_in: str | Path) -> Path:
     )
 
 
-def _read_all(files: Sequence[tuple[Path, str | None]]) -> np.ndarray:
+def _read_all(files: Sequence[Path], frames: Sequence[Mapping[str, Any]], path: str | Path) -> np.ndarray:
     """Images of one size (K, H, W, 4), on all cores: decoding and checksums run outside Python's lock."""
-    first = _read_rgba(*files[0])
+    with _open_image(files[0].read_bytes(), files[0]) as image:
+        width, height = image.size
+    for values in frames:
+        if (values.get("w", width), values.get("h", height)) != (width, height):
+            raise InputError(
+                f"{path}: w, h of {values['file_path']} are {values.get('w')}x{values.get('h')}, the image is"
+                f" {width}x{height}: correct the intrinsics"
+            )
+    # the first is decoded before memory is taken for all
+    first = _read_rgba(files[0], frames[0].get("sha256"), (width, height))
     images = np.empty((len(files), *first.shape), dtype=np.uint8)
     images[0] = first
 
     def read(row: int) -> None:
-        image = _read_rgba(*files[row])
-        if image.shape != first.shape:
-            sizes = (f"{i.shape[1]}x{i.shape[0]}" for i in (image, first))
-            raise InputError("{} is {}, others {}".format(files[row][0], *sizes))
-        images[row] = image
+        images[row] = _read_rgba(files[row], frames[row].get("sha256"), (width, height))
 
     with ThreadPoolExecutor() as pool:
         for _ in pool.map(read, range(1, len(files))):
@@ -228,24 +237,36 @@ def _read_all(files: Sequence[tuple[Path, str | None]]) -> np.ndarray:
     return images
 
 
-def _read_rgba(path: Path, sha256: str | None) -> np.ndarray:
-    from PIL import Image
+def _open_image(content: bytes, name: str | Path) -> Image.Image:
+    """An image whose header is read and whose pixels are not; of one of `FORMATS`, and not too large."""
+    try:
+        image = Image.open(BytesIO(content), formats=FORMATS)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise InputError(f"{name} is not a readable {', '.join(FORMATS)} image ({one_line(error)})") from None
+    if image.width * image.height > MAX_PIXELS:
+        raise InputError(f"{name} claims {image.width}x{image.height} pixels, more than {MAX_PIXELS}")
+    return image
 
-    if sha256 is not None and sha256_file(path) != sha256:
+
+def _read_rgba(path: Path, sha256: str | None, size: tuple[int, int]) -> np.ndarray:
+    content = path.read_bytes()
+    if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
         raise InputError(
             f"{path} is damaged or was changed: its sha256 differs from the one in transforms.json; render it again"
         )
-    try:
-        with Image.open(path) as image:
+    with _open_image(content, path) as image:
+        if image.size != size:
+            raise InputError("{} is {}x{}, others {}x{}".format(path, *image.size, *size))
+        if image.mode in ("I;16", "I"):
+            raise InputError(f"{path} has 16 bits a channel: convert it to 8-bit RGBA")
+        try:
             image.load()
-            if image.mode in ("I;16", "I"):
-                raise InputError(f"{path} has 16 bits a channel: convert it to 8-bit RGBA")
             has_alpha = "A" in image.mode or "transparency" in image.info
             pixels = np.asarray(image.convert("RGBA"))
-    except (OSError, SyntaxError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path} is not a readable image, perhaps truncated ({error}): replace it") from None
+        except (OSError, SyntaxError, ValueError) as error:
+            raise InputError(
+                f"{path} is not a readable image, perhaps truncated ({one_line(error)}): replace it"
+            ) from None
     if not has_alpha:
         raise InputError(f"{path} has no alpha channel: the object's mask must be stored as alpha (RGBA)")
     if not (pixels[..., 3] > 127).any():

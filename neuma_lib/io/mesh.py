@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import trimesh
 
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import atomic, existing
 from neuma_lib.io.ply import read_ply, write_ply
 
 
@@ -25,19 +24,16 @@ def write_mesh(
     if colors is not None:
         for i, channel in enumerate(("red", "green", "blue")):
             rows[channel] = colors[:, i]
-    with atomic(path) as partial:
-        write_ply(partial, rows, faces)
+    write_ply(path, rows, faces)
 
 
-def read_mesh(path: str | Path, watertight: bool = True) -> Any:
-    """Read a triangle mesh as `trimesh.Trimesh` in metres.
+def read_mesh(path: str | Path, watertight: bool = True) -> trimesh.Trimesh:
+    """Read a triangle mesh in metres.
 
     Raises:
         InputError: missing properties, values that are not finite, or holes where ``watertight`` is asked for.
     """
-    import trimesh
-
-    rows, faces = read_ply(existing(path))
+    rows, faces = read_ply(path)
     missing = [axis for axis in "xyz" if axis not in rows.dtype.names]
     if missing or faces is None or len(faces) == 0:
         raise InputError(

@@ -2,7 +2,7 @@
 
 ``<scene>/data_dynamic.json`` and ``eval_dynamic.json`` are lists of {``file_path``, ``c2w``, ``intrinsic``} over RGBA
 images named ``<letter>_<view>_<step>.png``. This module turns such a list into the content of our transforms.json;
-`neuma_lib.io.files` reads either.
+`neuma_lib.io.images` reads either.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 from neuma_lib.errors import InputError
 
-_NAME = re.compile(r"[a-z]+_(\d+)_(\d+)$", re.IGNORECASE)
+_NAME = re.compile(r"[a-z]+_(\d{1,9})_(\d{1,9})$", re.IGNORECASE)
 
 
 def released_frames(entries: Sequence[Mapping[str, Any]], path: str | Path) -> list[dict[str, Any]]:
@@ -32,20 +32,27 @@ def released_frames(entries: Sequence[Mapping[str, Any]], path: str | Path) -> l
     """
     frames = []
     for i, entry in enumerate(entries):
-        if not isinstance(entry, Mapping) or "file_path" not in entry:
-            raise InputError(f"{path}: entry {i} has no file_path: is this a list of images?")
-        where = f"{path}: entry {i} ({entry['file_path']})"
-        pose = _matrix(entry, "c2w", [(4, 4), (3, 4)], where)
-        K = _matrix(entry, "intrinsic", [(3, 3)], where)
-        if np.abs(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1]).max() > 1e-9:
+        name = image_name(entry, f"{path}: entry {i}")
+        where = f"{path}: entry {i} ({name})"
+        pose, K = matrix_of_numbers(entry.get("c2w")), matrix_of_numbers(entry.get("intrinsic"))
+        if pose.shape not in [(4, 4), (3, 4)]:
+            raise InputError(f"{where}: c2w must be a 4x4 matrix of numbers")
+        if K.shape != (3, 3):
+            raise InputError(f"{where}: intrinsic must be a 3x3 matrix of numbers")
+        if not np.abs(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1]).max() <= 1e-9:
             raise InputError(f"{where}: intrinsic is not that of a pinhole camera without skew")
-        named = _NAME.fullmatch(Path(entry["file_path"]).stem)
+        named = _NAME.fullmatch(Path(name).stem)
         view, step = map(int, named.groups()) if named else (i, 0)
         frames.append(
             {
-                "file_path": entry["file_path"],
+                "file_path": name,
                 "transform_matrix": [*pose[:3].tolist(), [0.0, 0.0, 0.0, 1.0]],
-                **{"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]},
+                **{
+                    "fl_x": K[0, 0].item(),
+                    "fl_y": K[1, 1].item(),
+                    "cx": K[0, 2].item(),
+                    "cy": K[1, 2].item(),
+                },
                 "view": view,
                 "step": step,
             }
@@ -53,12 +60,18 @@ def released_frames(entries: Sequence[Mapping[str, Any]], path: str | Path) -> l
     return frames
 
 
-def _matrix(entry: Mapping[str, Any], key: str, shapes: Sequence[tuple[int, int]], where: str) -> np.ndarray:
-    """A matrix of numbers of one of the shapes."""
+def image_name(entry: Any, where: str) -> str:
+    """The ``file_path`` of an entry of a list of images. Raises InputError where it has none."""
+    name = entry.get("file_path") if isinstance(entry, Mapping) else None
+    if not isinstance(name, str) or not name or not name.isprintable():
+        raise InputError(f"{where} has no file_path that is a text: is this a list of images?")
+    return name
+
+
+def matrix_of_numbers(value: Any) -> np.ndarray:
+    """Nested lists of numbers as float64; an empty array for anything else."""
     try:
-        matrix = np.asarray(entry.get(key), dtype=np.float64)
-    except (TypeError, ValueError):
-        matrix = np.empty(0)
-    if matrix.shape not in shapes:
-        raise InputError(f"{where}: {key} must be a {shapes[0][0]}x{shapes[0][1]} matrix of numbers")
-    return matrix
+        matrix = np.asarray(value)
+        return matrix.astype(np.float64) if matrix.dtype.kind in "fiu" else np.empty(0)
+    except (TypeError, ValueError, OverflowError, RecursionError):
+        return np.empty(0)
