@@ -41,7 +41,7 @@ class DatasetConfig(Section):
     packed: str | None = Field(
         None,
         min_length=1,
-        description="folder of packed datasets, `<scene>.images.zip` and `<scene>.truth.zip`, to unpack in place of "
+        description="folder of packed datasets, `<scene>.images.zip` and `<scene>.truth.h5`, to unpack in place of "
         "simulating and rendering; null: the dataset is made here",
     )
     packing: PackingConfig = Field(PackingConfig(), description="what the target `packed` keeps")

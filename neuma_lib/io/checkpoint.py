@@ -13,7 +13,8 @@ from typing import Any
 import torch
 
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import atomic
+from neuma_lib.io.files import atomic, one_line
+from neuma_lib.io.weights import read_torch
 
 
 class Checkpoint:
@@ -45,13 +46,11 @@ class Checkpoint:
             return None
         remedy = f"remove it to start again:  rm '{self.path}'"
         try:
-            content = torch.load(self.path, map_location="cpu", weights_only=True)
-            found, generators, state = content["fingerprint"], content["generators"], content["state"]
-        except Exception as error:  # torch raises many kinds for a damaged file
-            raise InputError(
-                f"checkpoint {self.path} cannot be read ({type(error).__name__}); {remedy}"
-            ) from None
-        names = sorted(set(found) | set(self.fingerprint))
+            content = dict(read_torch(self.path))
+            found, generators, state = (content[key] for key in ("fingerprint", "generators", "state"))
+            names = sorted({*found.keys(), *self.fingerprint})
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise InputError(f"checkpoint {self.path} cannot be read ({one_line(error)}); {remedy}") from None
         changed = [
             f"{k} (was {found.get(k, 'absent')}, is {self.fingerprint.get(k, 'absent')})"
             for k in names
@@ -59,8 +58,8 @@ class Checkpoint:
         ]
         if changed:
             raise InputError(
-                f"checkpoint {self.path} belongs to another run: {', '.join(changed)} changed since; go back to the"
-                f" former settings to resume it, or {remedy}"
+                f"checkpoint {self.path} belongs to another run: {one_line(', '.join(changed), 500)} changed since;"
+                f" go back to the former settings to resume it, or {remedy}"
             )
         _restore_generators(generators)
         return state

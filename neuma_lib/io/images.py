@@ -215,7 +215,7 @@ def _image_file(folder: Path, name: str, listed_in: str | Path) -> Path:
 
 def _read_all(files: Sequence[Path], frames: Sequence[Mapping[str, Any]], path: str | Path) -> np.ndarray:
     """Images of one size (K, H, W, 4), on all cores: decoding and checksums run outside Python's lock."""
-    with _open_image(files[0].read_bytes(), files[0]) as image:
+    with open_image(files[0].read_bytes(), files[0]) as image:
         width, height = image.size
     for values in frames:
         if (values.get("w", width), values.get("h", height)) != (width, height):
@@ -237,7 +237,7 @@ def _read_all(files: Sequence[Path], frames: Sequence[Mapping[str, Any]], path: 
     return images
 
 
-def _open_image(content: bytes, name: str | Path) -> Image.Image:
+def open_image(content: bytes, name: str | Path) -> Image.Image:
     """An image whose header is read and whose pixels are not; of one of `FORMATS`, and not too large."""
     try:
         image = Image.open(BytesIO(content), formats=FORMATS)
@@ -254,7 +254,7 @@ def _read_rgba(path: Path, sha256: str | None, size: tuple[int, int]) -> np.ndar
         raise InputError(
             f"{path} is damaged or was changed: its sha256 differs from the one in transforms.json; render it again"
         )
-    with _open_image(content, path) as image:
+    with open_image(content, path) as image:
         if image.size != size:
             raise InputError("{} is {}x{}, others {}x{}".format(path, *image.size, *size))
         if image.mode in ("I;16", "I"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import pickle
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from neuma_lib.errors import InputError
-from neuma_lib.io.weights import read_weights, write_weights
+from neuma_lib.io.files import one_line
+from neuma_lib.io.weights import read_torch, read_weights, write_weights
 from neuma_lib.mechanics.neural import NeuralLaw, neural_law
 
 
@@ -37,19 +38,22 @@ def load_prior(path: str | Path, device: torch.device | str = "cpu") -> NeuralLa
     try:
         return neural_law(state, name=path.stem).to(device)
     except InputError as error:
-        raise InputError(f"prior {path}: {error}") from None
+        raise InputError(f"prior {path}: {one_line(error)}") from None
 
 
 def _released(path: Path) -> dict[str, Tensor]:
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError) as error:
-        raise InputError(f"prior {path}: not a readable torch file of plain tensors ({error})") from None
+    content = read_torch(path)
     parts = {}
     for part in ("elasticity", "plasticity"):
         if not isinstance(content, dict) or not isinstance(content.get(part), dict):
             raise InputError(f"prior {path}: expected a dict with elasticity and plasticity")
         parts.update({f"{part}.{key}": value for key, value in content[part].items()})
+    for key, value in parts.items():
+        # an expanded tensor is larger than its memory
+        if not isinstance(value, Tensor) or value.numel() * value.element_size() > path.stat().st_size:
+            raise InputError(f"prior {path}: {one_line(key)} is not a tensor that the file holds")
+        if not bool(value.isfinite().all()):
+            raise InputError(f"prior {path}: {one_line(key)} is not finite")
     return parts
 
 
@@ -69,5 +73,16 @@ def load_law(prior: str | Path, adaptor: str | Path | None = None) -> NeuralLaw:
             raise InputError(
                 f"{adaptor} has no rank and alpha in its metadata: it is not an adaptor of this project"
             )
-        law.load_adaptor_state(tensors, rank=metadata["rank"], alpha=metadata["alpha"])
+        rank, alpha = metadata["rank"], metadata["alpha"]
+        largest = max((length for tensor in tensors.values() for length in tensor.shape), default=0)
+        if rank is not None and not (type(rank) is int and 0 < rank <= largest):
+            raise InputError(
+                f"{adaptor}: the rank {one_line(rank)} in its metadata is not that of its tensors"
+            )
+        if type(alpha) not in (int, float) or not math.isfinite(alpha):
+            raise InputError(f"{adaptor}: alpha must be a number, not {one_line(alpha)}")
+        try:
+            law.load_adaptor_state(tensors, rank=rank, alpha=alpha)
+        except InputError as error:
+            raise InputError(f"{adaptor}: {one_line(error)}") from None
     return law

@@ -1,40 +1,48 @@
-"""A scene's dataset as two small files that travel: its images, without loss, and the ground truth that is compared.
+"""A scene's dataset as two files that travel: its images, without loss, and the ground truth that is compared.
 
-Images: each is cropped to the box of what differs from its background (the colour of its first pixel) and kept as
-lossless WebP, with its camera, step and time. Unpacked, every pixel of RGBA is what it was, hidden colours too; this is
-checked against a digest of the pixels.
+Images: a ZIP archive with a folder a set: transforms.json and lossless WebP images, hidden colours included. Unpacking
+copies them; the sha256 of each file is in transforms.json.
 
-Ground truth: positions as multiples of 2^-14 m (61 um: at most 31 um off along an axis, 1e-9 m^2 in the mean square),
-elastic deformation gradients as multiples of 2^-16, everything else exactly. All tracers stay; of the particles a
-random part does, with volumes and masses scaled up to the same total. Velocities are left out.
+Ground truth: HDF5 with positions as multiples of 2^-14 m (61 um: at most 31 um off along an axis, 1e-9 m^2 in the mean
+square), elastic deformation gradients as multiples of 2^-16, everything else exactly. All tracers stay; of the
+particles a random part does, with volumes and masses scaled up to the same total. Velocities are left out.
 
-Both are ZIP archives with a ``manifest.json``, so any archive program opens them; the same data give the same bytes.
+The same data give the same bytes.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
+import re
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 from PIL import Image
 
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import atomic
+from neuma_lib.io.files import atomic, one_line, parse_json, write_json
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
-from neuma_lib.io.images import read_image_set, read_transforms, write_transforms
+from neuma_lib.io.images import checked_transforms, open_image, read_image_set, read_transforms
 
-VERSION = 1
-IMAGES, TRUTH = "NeuMA images", "NeuMA ground truth"
+FORMAT = "NeuMA ground truth 2"
+"""Kind and version of a packed ground truth, an attribute of the file."""
+VERSION = ("v110", "v110")
+"""Of HDF5, 1.10 of 2016."""
 STEPS = {"x": 2.0**-14, "tracers": 2.0**-14, "tracers_again": 2.0**-14, "F": 2.0**-16}
 """What a quantity is rounded to multiples of [m; F: 1]; others are kept exactly."""
+WEBP = {"lossless": True, "exact": True, "quality": 75, "method": 4}
+"""Exact keeps the colours of transparent pixels; more effort saves 1.5 % in three times the time."""
+MAX_TRANSFORMS = 2**24
+"""Largest transforms.json that is unpacked [bytes]: 20,000 frames. Deflate could hide a gigabyte in a megabyte."""
+IMAGE_NAME = re.compile(r"[\w-][\w.-]{0,99}\.webp", re.ASCII)
+"""Names that an unpacked image may have: no folder, no hidden file, nothing but an image."""
 
 Progress = Callable[[int, int], None]
 
@@ -53,29 +61,29 @@ def pack_images(path: str | Path, sets: Mapping[str, str | Path], progress: Prog
     Raises:
         InputError: as `neuma_lib.io.images.read_image_set`; or two images of a set have the same name.
     """
-    manifest: dict[str, Any] = {"sets": {}}
     found = {name: (read_transforms(file), read_image_set(file).images) for name, file in sets.items()}
-    for name, (transforms, _) in found.items():
-        stems = [Path(frame["file_path"]).stem for frame in transforms["frames"]]
-        if len(set(stems)) < len(stems):
-            twice = next(stem for stem in stems if stems.count(stem) > 1)
-            raise InputError(f"{sets[name]} lists several images named {twice}: rename them")
     total, done = sum(len(images) for _, images in found.values()), 0
-    with _writing(path, IMAGES, manifest) as archive:
+    with atomic(path) as partial, zipfile.ZipFile(partial, "w") as archive:
         for name, (transforms, images) in found.items():
             frames = []
             for frame, image in zip(transforms["frames"], images, strict=True):
-                box, crop = _cropped(image)
-                member, stem = io.BytesIO(), Path(frame["file_path"]).stem
-                Image.fromarray(crop).save(member, "WEBP", lossless=True, exact=True, quality=75, method=4)
-                _write_member(archive, f"{name}/{stem}.webp", member.getvalue())
-                kept = {key: value for key, value in frame.items() if key not in ("file_path", "sha256")}
-                own = {"box": box, "background": image[0, 0].tolist(), "pixels": _digest(image)}
-                frames.append({"file_path": f"{stem}.png", **kept, **own})
+                member = f"{Path(frame['file_path']).stem}.webp"
+                if not IMAGE_NAME.fullmatch(member) or member in (f["file_path"] for f in frames):
+                    raise InputError(
+                        f"{sets[name]}: {member} is listed twice or no plain name: rename the image"
+                    )
+                content = BytesIO()
+                Image.fromarray(image).save(content, "WEBP", **WEBP)
+                archive.writestr(zipfile.ZipInfo(f"{name}/{member}"), content.getvalue())
+                digest = hashlib.sha256(content.getvalue()).hexdigest()
+                frames.append({**frame, "file_path": member, "sha256": digest})
                 done += 1
                 if progress is not None:
                     progress(done, total)
-            manifest["sets"][name] = {**transforms, "size": images.shape[2:0:-1], "frames": frames}
+            text = json.dumps({**transforms, "frames": frames}, allow_nan=False)
+            # ZipInfo: without the time of day
+            member = zipfile.ZipInfo(f"{name}/transforms.json")
+            archive.writestr(member, text, zipfile.ZIP_DEFLATED, 9)
 
 
 def unpack_images(
@@ -84,7 +92,7 @@ def unpack_images(
     steps: Mapping[str, Sequence[int]] | None = None,
     progress: Progress | None = None,
 ) -> None:
-    """Write packed images as PNG files beside the transforms.json that each set gets.
+    """Write packed images beside the transforms.json that each set gets.
 
     Args:
         path: of the packed file.
@@ -93,61 +101,85 @@ def unpack_images(
         progress: called with the number of written images and of all.
 
     Raises:
-        InputError: the file is missing, damaged, foreign, of another version or of other steps.
+        InputError: the file is missing, damaged, foreign or of other steps; or another image has the name of one.
     """
-    with _reading(path, IMAGES) as (archive, manifest):
-        packed = {name: manifest["sets"][name] for name in sets if name in manifest["sets"]}
-        if missing := [name for name in sets if name not in packed]:
-            raise InputError(f"{path} has no images {', '.join(missing)}: pack the scene again")
-        for name, wanted in (steps or {}).items():
-            _check_steps(path, sorted({frame.get("step", 0) for frame in packed[name]["frames"]}), wanted)
-        total, done = sum(len(transforms["frames"]) for transforms in packed.values()), 0
-        for name, target in sets.items():
-            transforms, target = packed[name], Path(target)
-            # a folder without transforms.json is an unfinished one
-            target.unlink(missing_ok=True)
-            frames = []
-            for frame in transforms["frames"]:
-                image = _restored(path, archive, name, frame, transforms["size"])
-                with atomic(target.parent / frame["file_path"]) as partial:
-                    Image.fromarray(image).save(partial, "PNG")
-                own = ("box", "background", "pixels")
-                frames.append({key: value for key, value in frame.items() if key not in own})
-                done += 1
-                if progress is not None:
-                    progress(done, total)
-            shared = {key: value for key, value in transforms.items() if key not in ("frames", "size")}
-            write_transforms(target, shared, frames)
-            read_transforms(target)
+    _check_there(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(info.compress_size for info in archive.infolist()) > Path(path).stat().st_size:
+                raise InputError(f"{path} is damaged: its members overlap or are cut off: copy it again")
+            packed = {name: _packed_set(path, archive, name) for name in sets}
+            for name, wanted in (steps or {}).items():
+                _check_steps(path, sorted({frame.get("step", 0) for frame in packed[name]["frames"]}), wanted)
+            total, done = sum(len(transforms["frames"]) for transforms in packed.values()), 0
+            for name, target in sets.items():
+                target = Path(target)
+                # a folder without transforms.json is an unfinished one
+                target.unlink(missing_ok=True)
+                for frame in packed[name]["frames"]:
+                    _unpack_image(
+                        path, archive, f"{name}/{frame['file_path']}", frame["sha256"], target.parent
+                    )
+                    done += 1
+                    if progress is not None:
+                        progress(done, total)
+                write_json(target, packed[name])
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError, OSError) as error:
+        # what a reader finds wrong has no errno; a full disk does, and is not the file's fault
+        if isinstance(error, InputError) or getattr(error, "errno", None):
+            raise
+        raise InputError(
+            f"{path} is damaged, truncated or no packed dataset ({one_line(error)}): copy it again, or pack the scene"
+            " again"
+        ) from None
 
 
-def _cropped(image: np.ndarray) -> tuple[list[int], np.ndarray]:
-    """Box (left, top, right, bottom) of all that differs from the first pixel, and the image inside."""
-    different = (image != image[0, 0]).any(axis=2)
-    rows, columns = np.flatnonzero(different.any(axis=1)), np.flatnonzero(different.any(axis=0))
-    top, bottom, left, right = (*rows[[0, -1]], *columns[[0, -1]]) if len(rows) else (0, 0, 0, 0)
-    box = [int(left), int(top), int(right) + 1, int(bottom) + 1]
-    return box, np.ascontiguousarray(image[box[1] : box[3], box[0] : box[2]])
+def _packed_set(path: str | Path, archive: zipfile.ZipFile, name: str) -> dict[str, Any]:
+    """The transforms.json of a set, whose images are all in the archive under names that are safe to write."""
+    member = f"{name}/transforms.json"
+    if member not in archive.namelist():
+        raise InputError(
+            f"{path} has no {member}: it is no packed dataset of this version: pack the scene again"
+        )
+    where = f"{path}: {member}"
+    transforms = checked_transforms(parse_json(_content(path, archive, member, MAX_TRANSFORMS), where), where)
+    names = set()
+    for frame in transforms["frames"]:
+        image = frame["file_path"]
+        if not IMAGE_NAME.fullmatch(image) or image in names:
+            raise InputError(f"{where}: {image} is listed twice or no plain image name: do not use this file")
+        if f"{name}/{image}" not in archive.NameToInfo or not frame.get("sha256"):
+            raise InputError(f"{path} lacks the image {name}/{image}, or its sha256: copy it again")
+        names.add(image)
+    return transforms
 
 
-def _restored(path, archive, name: str, frame: Mapping[str, Any], size: Sequence[int]) -> np.ndarray:
-    """A whole image (H, W, 4), with the pixels that were packed."""
-    file = frame["file_path"]
-    if Path(file).name != file:
-        raise InputError(f"{path} names an image outside its folder ({file}): do not use this file")
-    with Image.open(io.BytesIO(archive.read(f"{name}/{Path(file).stem}.webp"))) as webp:
-        crop = np.asarray(webp.convert("RGBA"))
-    left, top, right, bottom = frame["box"]
-    image = np.empty((size[1], size[0], 4), dtype=np.uint8)
-    image[:] = frame["background"]
-    image[top:bottom, left:right] = crop
-    if _digest(image) != frame["pixels"]:
-        raise InputError(f"{path}: the pixels of {name}/{file} are not those that were packed: copy it again")
-    return image
+def _content(path: str | Path, archive: zipfile.ZipFile, member: str, limit: int) -> bytes:
+    """Bytes of a member, which are at most ``limit``, whatever its header says."""
+    info = archive.getinfo(member)
+    # the other methods of ZIP have no bound on what a block of them unpacks to
+    if info.file_size > limit or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise InputError(
+            f"{path}: {member} is larger than {limit} bytes or oddly compressed: do not use this file"
+        )
+    return archive.read(info)
 
 
-def _digest(image: np.ndarray) -> str:
-    return hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest()
+def _unpack_image(path: str | Path, archive: zipfile.ZipFile, member: str, sha256: str, folder: Path) -> None:
+    # an image is stored: its size is that of its part of the archive
+    content = _content(path, archive, member, archive.getinfo(member).compress_size)
+    if hashlib.sha256(content).hexdigest() != sha256:
+        raise InputError(f"{path}: {member} is not what was packed: copy the file again")
+    open_image(content, f"{path}: {member}").close()
+    target = folder / Path(member).name
+    if target.exists() or target.is_symlink():
+        if not target.is_file() or target.read_bytes() != content:
+            raise InputError(
+                f"{target} is there already, with other content than in {path}: remove its folder"
+            )
+        return
+    with atomic(target) as partial:
+        partial.write_bytes(content)
 
 
 # ----------------------------------------------------------------------------------------------- ground truth
@@ -174,20 +206,17 @@ def pack_truth(
     for name in ("vol0", "mass"):
         arrays[name] = (scale * arrays[name][chosen].astype(np.float64)).astype(np.float32)
     arrays["x"], arrays["F"] = arrays["x"][:, chosen], arrays["F"][:, np.sort(drawn[:deformations])]
-    attributes["packed"] = json.dumps(
-        {"particles": len(chosen), "of": count, "rounded_to": {name: STEPS[name] for name in STEPS}}
-    )
-    manifest = {
-        "attributes": attributes,
-        "arrays": {
-            name: {"shape": arrays[name].shape, "dtype": arrays[name].dtype.str, "step": STEPS.get(name)}
-            for name in names
-        },
-    }
-    with _writing(path, TRUTH, manifest) as archive:
+    attributes["packed"] = json.dumps({"particles": len(chosen), "of": count, "rounded_to": STEPS})
+    # this version of the format has checksums of all but the data, which gzip adds
+    with atomic(path) as partial, h5py.File(partial, "w", track_order=True, libver=VERSION) as file:
+        file.attrs.update({"format": FORMAT, **attributes})
         for name in names:
-            data = _encoded(arrays[name], STEPS.get(name))
-            _write_member(archive, name, data, zipfile.ZIP_BZIP2)
+            array, options = arrays[name], {"compression": "gzip", "compression_opts": 9, "shuffle": True}
+            if name in STEPS:
+                # a chunk a component: its values are of one size
+                shape = array.shape
+                array, options["chunks"] = _encoded(array, STEPS[name]), (*shape[:2], *[1] * (len(shape) - 2))
+            file.create_dataset(name, data=array, track_times=False, **options)
 
 
 def unpack_truth(
@@ -207,84 +236,50 @@ def unpack_truth(
     Raises:
         InputError: the file is missing, damaged, foreign, of another version or of other steps.
     """
-    with _reading(path, TRUTH) as (archive, manifest):
-        arrays = {
-            name: _decoded(archive.read(name), kind["shape"], np.dtype(kind["dtype"]), kind["step"])
-            for name, kind in manifest["arrays"].items()
-        }
-        if steps is not None:
-            _check_steps(path, arrays["frames"].tolist(), steps)
-        if dt is not None and manifest["attributes"]["dt"] != dt:
-            raise InputError(
-                f"{path} was simulated with dt = {manifest['attributes']['dt']} s, the scene has {dt} s: use the"
-                " settings that it was made with, or pack the scene again"
-            )
-        write_arrays(particles_file, arrays, manifest["attributes"])
+    _check_there(path)
+    names = ("frames", "time", "vol0", "mass", "x", "F", "tracers", "tracers_again")
+    arrays, attributes = read_arrays(path, only=names)
+    if (found := attributes.pop("format", None)) != FORMAT:
+        raise InputError(
+            f"{path} holds {one_line(found)}, not {FORMAT}: give the other file, or pack the scene again"
+        )
+    if missing := [name for name in names if name not in arrays]:
+        raise InputError(
+            f"{path} has no dataset {', '.join(missing)}: copy it again, or pack the scene again"
+        )
+    if steps is not None:
+        _check_steps(path, arrays["frames"].tolist(), steps)
+    if dt is not None and attributes.get("dt") != dt:
+        raise InputError(
+            f"{path} was simulated with dt = {attributes.get('dt')} s, the scene has {dt} s: use the"
+            " settings that it was made with, or pack the scene again"
+        )
+    for name, step in STEPS.items():
+        if arrays[name].dtype != np.uint32 or arrays[name].ndim < 3:
+            raise InputError(f"{path}: {name} is not packed as {FORMAT} says: pack the scene again")
+        arrays[name] = _decoded(arrays[name], step)
+    write_arrays(particles_file, {name: arrays[name] for name in names}, attributes)
 
 
-def _encoded(array: np.ndarray, step: float | None) -> bytes:
-    """Bytes that compress well: differences in time of whole multiples of ``step``, the lowest bytes of all first."""
-    if step is None:
-        return array.astype(array.dtype.newbyteorder("<")).tobytes()
-    whole = np.rint(array.reshape(len(array), array.shape[1], -1) / step).astype(np.int32)
-    change = np.diff(whole, axis=0, prepend=np.int32(0))
-    unsigned = ((change << 1) ^ (change >> 31)).astype("<u4")  # small numbers of both signs become small
-    by_component = np.ascontiguousarray(np.moveaxis(unsigned, 2, 0))
-    return by_component.view(np.uint8).reshape(-1, 4).T.tobytes()
+def _encoded(array: np.ndarray, step: float) -> np.ndarray:
+    """Whole multiples of ``step`` as what a particle's change in time differs by from its neighbour's (T, N, ...)."""
+    whole = np.rint(array / step).astype(np.int32)
+    for axis in (0, 1):
+        whole = np.diff(whole, axis=axis, prepend=np.int32(0))
+    return ((whole << 1) ^ (whole >> 31)).astype(np.uint32)  # small numbers of both signs become small
 
 
-def _decoded(data: bytes, shape: Sequence[int], dtype: np.dtype, step: float | None) -> np.ndarray:
+def _decoded(code: np.ndarray, step: float) -> np.ndarray:
     """The array that `_encoded` was given, up to half a step."""
-    if step is None:
-        return np.frombuffer(data, dtype=dtype.newbyteorder("<")).reshape(shape).astype(dtype)
-    planes = np.frombuffer(data, dtype=np.uint8).reshape(4, -1)
-    unsigned = np.ascontiguousarray(planes.T).view("<u4").reshape(-1, *shape[:2])
-    change = (unsigned >> 1).astype(np.int32) ^ -(unsigned & 1).astype(np.int32)
-    whole = np.moveaxis(np.cumsum(change, axis=1, dtype=np.int32), 0, 2)
-    return (whole * step).astype(dtype).reshape(shape)
+    whole = (code >> 1).astype(np.int32) ^ -(code & 1).astype(np.int32)
+    for axis in (1, 0):
+        whole = np.cumsum(whole, axis=axis, dtype=np.int32)
+    return (whole * step).astype(np.float32)
 
 
-# --------------------------------------------------------------------------------------------------- archives
-
-
-@contextmanager
-def _writing(path: str | Path, kind: str, manifest: Mapping[str, Any]) -> Iterator[zipfile.ZipFile]:
-    """An archive to fill; ``manifest`` is written last, as it is then."""
-    with atomic(path) as partial, zipfile.ZipFile(partial, "w") as archive:
-        yield archive
-        text = json.dumps({"format": kind, "version": VERSION, **manifest}, allow_nan=False)
-        _write_member(archive, "manifest.json", text.encode(), zipfile.ZIP_DEFLATED)
-
-
-def _write_member(archive: zipfile.ZipFile, name: str, data: bytes, compression=zipfile.ZIP_STORED) -> None:
-    archive.writestr(zipfile.ZipInfo(name), data, compression, 9)  # ZipInfo: without the time of day
-
-
-@contextmanager
-def _reading(path: str | Path, kind: str) -> Iterator[tuple[zipfile.ZipFile, dict[str, Any]]]:
-    """An open archive and its manifest; whatever is wrong with the file becomes an InputError."""
+def _check_there(path: str | Path) -> None:
     if not Path(path).is_file():
         raise InputError(f"{path} does not exist: put the packed file there, or set dataset.packed: null")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            manifest = json.loads(archive.read("manifest.json"))
-            if manifest.get("format") != kind:
-                raise InputError(
-                    f"{path} holds {manifest.get('format')!r}, not {kind!r}: give the other file"
-                )
-            if manifest["version"] != VERSION:
-                raise InputError(
-                    f"{path} has version {manifest['version']} of the format, this program reads {VERSION}: pack the"
-                    " scene again with this version of the program"
-                )
-            yield archive, manifest
-    except (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError, TypeError, OSError) as error:
-        # what a reader finds wrong has no errno; a full disk does, and is not the file's fault
-        if isinstance(error, InputError) or getattr(error, "errno", None):
-            raise
-        raise InputError(
-            f"{path} is damaged, truncated or no packed dataset ({error}): copy it again, or pack the scene again"
-        ) from None
 
 
 def _check_steps(path: str | Path, found: Sequence[int], wanted: Sequence[int]) -> None:

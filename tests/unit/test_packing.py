@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import zipfile
 
 import numpy as np
 import pytest
@@ -83,7 +82,8 @@ def assert_same_images(first, second):
             assert np.array_equal(getattr(a, name), getattr(b, name)), name
         data = [json.loads(file.read_text()) for file in (ours, theirs)]
         for frame in (frame for transforms in data for frame in transforms["frames"]):
-            del frame["sha256"]  # of the PNG file, whose compression may differ
+            del frame["sha256"]  # of the file: packed images are WebP
+            frame["file_path"] = frame["file_path"].removesuffix(".png").removesuffix(".webp")
         assert data[0] == data[1]
 
 
@@ -112,7 +112,7 @@ class TestImages:
         list_images(sets(scene)["dynamic"], listed)
         pack_images(tmp_path / "images.zip", {"dynamic": listed})
         unpack_images(tmp_path / "images.zip", {"dynamic": tmp_path / "unpacked" / "transforms.json"})
-        assert (tmp_path / "unpacked" / "d_1_0040.png").is_file()
+        assert (tmp_path / "unpacked" / "d_1_0040.webp").is_file()
 
     def test_other_steps_are_refused(self, scene, tmp_path):
         pack_images(tmp_path / "images.zip", sets(scene))
@@ -120,31 +120,12 @@ class TestImages:
             unpack_images(tmp_path / "images.zip", sets(tmp_path / "out"), {"dynamic": (0, 1, 2)})
         assert not (tmp_path / "out").exists()
 
-    def test_an_image_outside_its_folder_is_refused(self, scene, tmp_path):
-        pack_images(tmp_path / "images.zip", sets(scene))
-        edit_manifest(
-            tmp_path / "images.zip", lambda m: m["sets"]["static"]["frames"][0].update(file_path="../a.png")
-        )
-        with pytest.raises(InputError, match="outside its folder"):
-            unpack_images(tmp_path / "images.zip", sets(tmp_path / "out"))
-
-    def test_other_pixels_are_noticed(self, scene, tmp_path):
-        pack_images(tmp_path / "images.zip", sets(scene))
-        edit_manifest(
-            tmp_path / "images.zip", lambda m: m["sets"]["static"]["frames"][2].update(background=[2] * 4)
-        )
-        with pytest.raises(
-            InputError, match=r"pixels of static/d_2_0000\.png are not those that were packed"
-        ):
-            unpack_images(tmp_path / "images.zip", sets(tmp_path / "out"))
-        assert not (tmp_path / "out/static/transforms.json").exists()
-
 
 class TestTruth:
     def test_within_half_a_step(self, scene, tmp_path):
         before, _ = read_arrays(scene / "particles.h5")
-        pack_truth(tmp_path / "truth.zip", scene / "particles.h5", particles=60, deformations=20, seed=1)
-        unpack_truth(tmp_path / "truth.zip", tmp_path / "particles.h5", FRAMES, 2e-3)
+        pack_truth(tmp_path / "truth.h5", scene / "particles.h5", particles=60, deformations=20, seed=1)
+        unpack_truth(tmp_path / "truth.h5", tmp_path / "particles.h5", FRAMES, 2e-3)
         after, attributes = read_arrays(tmp_path / "particles.h5")
         for name, array in after.items():
             if name != "F":
@@ -157,8 +138,8 @@ class TestTruth:
 
     def test_a_part_of_the_particles_has_all_the_mass(self, scene, tmp_path):
         before, _ = read_arrays(scene / "particles.h5")
-        pack_truth(tmp_path / "truth.zip", scene / "particles.h5", particles=25, deformations=5, seed=1)
-        unpack_truth(tmp_path / "truth.zip", tmp_path / "particles.h5")
+        pack_truth(tmp_path / "truth.h5", scene / "particles.h5", particles=25, deformations=5, seed=1)
+        unpack_truth(tmp_path / "truth.h5", tmp_path / "particles.h5")
         after, _ = read_arrays(tmp_path / "particles.h5")
         assert after["x"].shape[1] == len(after["mass"]) == 25
         for name in ("mass", "vol0"):
@@ -174,20 +155,10 @@ class TestTruth:
         ],
     )
     def test_another_simulation_is_refused(self, scene, tmp_path, wanted, message):
-        pack_truth(tmp_path / "truth.zip", scene / "particles.h5", particles=25, deformations=5, seed=1)
+        pack_truth(tmp_path / "truth.h5", scene / "particles.h5", particles=25, deformations=5, seed=1)
         with pytest.raises(InputError, match=message):
-            unpack_truth(tmp_path / "truth.zip", tmp_path / "particles.h5", **wanted)
+            unpack_truth(tmp_path / "truth.h5", tmp_path / "particles.h5", **wanted)
         assert not (tmp_path / "particles.h5").exists()
-
-
-def edit_manifest(path, change):
-    with zipfile.ZipFile(path) as archive:
-        members = {info.filename: archive.read(info) for info in archive.infolist()}
-    manifest = json.loads(members["manifest.json"])
-    change(manifest)
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, data in {**members, "manifest.json": json.dumps(manifest)}.items():
-            archive.writestr(name, data)
 
 
 def spoil(path, damage):
@@ -197,51 +168,46 @@ def spoil(path, damage):
     elif damage == "truncated":
         path.write_bytes(data[: len(data) // 2])
     elif damage == "flipped":
-        middle = len(data) // 3
-        path.write_bytes(data[:middle] + bytes([data[middle] ^ 0x55]) + data[middle + 1 :])
+        # in a member: the start of an archive, the middle of HDF5 (whose start is its own metadata)
+        place = len(data) // (3 if path.suffix == ".zip" else 2)
+        path.write_bytes(
+            data[:place] + bytes(b ^ 0x55 for b in data[place : place + 64]) + data[place + 64 :]
+        )
     elif damage == "foreign":
         path.write_text("no archive")
-    elif damage == "other version":
-        edit_manifest(path, lambda manifest: manifest.update(version=99))
-    elif damage == "incomplete":
-        edit_manifest(
-            path, lambda manifest: [manifest.pop(key) for key in ("sets", "arrays") if key in manifest]
-        )
 
 
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
         ("missing", "does not exist: put the packed file there, or set dataset.packed: null"),
-        ("truncated", "damaged, truncated or no packed dataset .*copy it again, or pack the scene again"),
-        ("flipped", "damaged, truncated or no packed dataset"),
-        ("foreign", "damaged, truncated or no packed dataset"),
-        ("other version", "version 99 of the format, this program reads 1: pack the scene again"),
-        ("incomplete", "damaged, truncated or no packed dataset"),
+        ("truncated", "damaged|cannot be read as HDF5"),
+        ("flipped", "damaged|not what was packed|cannot be read as HDF5"),
+        ("foreign", "damaged|cannot be read as HDF5"),
     ],
 )
-@pytest.mark.parametrize("kind", ["images", "truth"])
+@pytest.mark.parametrize("kind", ["images.zip", "truth.h5"])
 def test_a_damaged_file_is_named(scene, tmp_path, kind, damage, message):
-    file = tmp_path / f"Ball.{kind}.zip"
-    if kind == "images":
+    file = tmp_path / f"Ball.{kind}"
+    if kind == "images.zip":
         pack_images(file, sets(scene))
     else:
         pack_truth(file, scene / "particles.h5", particles=50, deformations=50, seed=1)
     spoil(file, damage)
-    with pytest.raises(InputError, match=rf"Ball\.{kind}\.zip.*{message}"):
-        if kind == "images":
+    with pytest.raises(InputError, match=rf"Ball\.{kind}.*({message})"):
+        if kind == "images.zip":
             unpack_images(file, sets(tmp_path / "out"))
         else:
             unpack_truth(file, tmp_path / "out" / "particles.h5")
     assert not list(tmp_path.glob("out/dynamic/transforms.json")) + list(tmp_path.glob("out/**/*.h5"))
 
 
-def test_images_and_truth_are_told_apart(scene, tmp_path):
+def test_files_of_another_kind_are_refused(scene, tmp_path):
     pack_images(tmp_path / "images.zip", sets(scene))
-    with pytest.raises(
-        InputError, match="holds 'NeuMA images', not 'NeuMA ground truth': give the other file"
-    ):
+    with pytest.raises(InputError, match=r"images\.zip cannot be read as HDF5"):
         unpack_truth(tmp_path / "images.zip", tmp_path / "particles.h5")
+    with pytest.raises(InputError, match=r"holds None, not NeuMA ground truth 2: give the other file"):
+        unpack_truth(scene / "particles.h5", tmp_path / "particles.h5")
 
 
 def test_workflow_packs_and_takes_a_packed_dataset_without_blender(scene, tmp_path):
@@ -252,7 +218,7 @@ def test_workflow_packs_and_takes_a_packed_dataset_without_blender(scene, tmp_pa
     project.run("--allowed-rules", "pack_images", "pack_truth", "packed", "--", "packed")
     assert {file.name for file in (project.root / "tiny/data/packed").iterdir()} == {
         "BouncyBall.images.zip",
-        "BouncyBall.truth.zip",
+        "BouncyBall.truth.h5",
     }
     (project.root / "tiny/data/packed").rename(project.root / "dropped")
     shutil.rmtree(project.root / "tiny")

@@ -18,7 +18,7 @@ if SETTINGS.dataset.packed is None:
         input:
             particles=f"{DATA}/{{scene}}/particles.h5",
         output:
-            packed=f"{PACKED}/{{scene}}.truth.zip",
+            packed=f"{PACKED}/{{scene}}.truth.h5",
         resources:
             mem_mb=truth_memory,
         params:
@@ -30,14 +30,14 @@ if SETTINGS.dataset.packed is None:
     rule packed:
         input:
             lambda wildcards: expand(
-                f"{PACKED}/{{scene}}.{{part}}.zip", scene=SCENES, part=["images", "truth"]
+                f"{PACKED}/{{scene}}.{{part}}", scene=SCENES, part=["images.zip", "truth.h5"]
             ),
 
 else:
 
     rule unpack_truth:
         input:
-            packed=f"{PACKED}/{{scene}}.truth.zip",
+            packed=f"{PACKED}/{{scene}}.truth.h5",
         output:
             particles=f"{DATA}/{{scene}}/particles.h5",
         wildcard_constraints:
