@@ -1,38 +1,20 @@
-"""Particle-driven motion of Gaussian kernels (paper Sec. 3.3, Particle-GS)."""
+"""Particle-driven motion of Gaussians (paper Sec. 3.3, Particle-GS)."""
 
 from __future__ import annotations
-
-from typing import Protocol, runtime_checkable
 
 import torch
 import warp as wp
 
+from neuma_lib.coupling.binding import Binding
 from neuma_lib.coupling.deformation_kernels import kernels
 from neuma_lib.errors import InputError
 from neuma_lib.splatting.arrays import matrices, plain, target, vectors
 
 
-class AppliesToParticles(Protocol):
-    """The part of a binding that is used here: rows average the particles bound to each Gaussian."""
-
-    def apply(self, field: torch.Tensor) -> torch.Tensor: ...
-
-
-@runtime_checkable
-class SparseBinding(AppliesToParticles, Protocol):
-    """A binding whose rows and columns can be walked, as `neuma_lib.coupling.binding.Binding`."""
-
-    shape: tuple[int, int]
-
-    def rows(self, dtype: torch.dtype) -> tuple[torch.Tensor, ...]: ...
-
-    def columns(self, dtype: torch.dtype) -> tuple[torch.Tensor, ...]: ...
-
-
 def deform(
     means: torch.Tensor,
     covars: torch.Tensor,
-    binding: AppliesToParticles,
+    binding: Binding,
     x0: torch.Tensor,
     x: torch.Tensor,
     F: torch.Tensor,
@@ -42,13 +24,12 @@ def deform(
     """Move and stretch Gaussians with the particles that they are bound to.
 
     x_t = x_0 + B (p_t - p_0); F_bar = B F_t; A_t = F_bar A_0 F_bar^T. The first is the sum of the paper's
-    increments, because B does not change. With a `Binding` and kernels that are not optimised themselves, one kernel
-    does all of it (`deformation_kernels`); otherwise these three equations are evaluated as they stand.
+    increments, because B does not change. Differentiable with respect to x and F, not to what is at rest.
 
     Args:
         means: (G, 3) Gaussian centres at rest [m].
         covars: (G, 3, 3) covariances at rest [m^2].
-        binding: B (G x N, rows sum to 1), anything with ``apply((T, N, ...)) -> (T, G, ...)``.
+        binding: B (G x N, rows sum to 1).
         x0: (N, 3) particle positions at rest [m].
         x: (T, N, 3) particle positions of the frames [m].
         F: (T, N, 3, 3) their deformation gradients.
@@ -61,16 +42,12 @@ def deform(
     Raises:
         InputError: numbers of particles, Gaussians or frames that disagree.
     """
-    F = F if covariance_gradient else F.detach()
-    at_rest = (means, covars, x0)
-    if not isinstance(binding, SparseBinding) or any(value.requires_grad for value in at_rest):
-        F_bar = binding.apply(F)
-        return means + binding.apply(x - x0), F_bar @ covars @ F_bar.mT
     _check_shapes(binding, means, covars, x0, x, F)
-    return _Deform.apply(binding, *(value.contiguous() for value in at_rest), x, F)
+    at_rest = (value.contiguous() for value in (means, covars, x0))
+    return _Deform.apply(binding, *at_rest, x, F if covariance_gradient else F.detach())
 
 
-def _check_shapes(binding: SparseBinding, means, covars, x0, x, F) -> None:
+def _check_shapes(binding: Binding, means, covars, x0, x, F) -> None:
     G, N = binding.shape
     T = len(x)
     expected = {
@@ -93,10 +70,10 @@ def _check_shapes(binding: SparseBinding, means, covars, x0, x, F) -> None:
 
 
 class _Deform(torch.autograd.Function):
-    """The fused deformation; gradients with respect to x and F only."""
+    """`deform` by the kernels of `deformation_kernels`."""
 
     @staticmethod
-    def forward(ctx, binding: SparseBinding, means, covars, x0, x, F):
+    def forward(ctx, binding: Binding, means, covars, x0, x, F):
         T, G = len(x), len(means)
         x, F = x.contiguous(), F.contiguous()
         carry, _, _ = kernels(x.dtype)

@@ -50,8 +50,7 @@ def bind(
         settings: confidence of the ellipsoid and most particles in a row; None for the defaults.
 
     Returns:
-        Binding of shape (G, N) on the device and with the dtype of ``means``; rows may be empty
-        (``Binding.orphans``).
+        Binding of shape (G, N) on the device and with the dtype of ``means``; rows may be empty.
 
     Raises:
         InputError: shapes that do not fit, non-finite values, a covariance that is not positive definite.

@@ -1,4 +1,4 @@
-"""Random Gaussian scenes shared by the rasterizer's tests."""
+"""Random Gaussian scenes, and bindings as dense matrices."""
 
 import torch
 
@@ -24,3 +24,10 @@ def random_scene(frames, count, views, width, height, coefficients, scale=0.03, 
     K = torch.tensor([[1.6 * width, 0, 0.52 * width], [0, 1.5 * width, 0.48 * height], [0, 0, 1]])
     Ks = K.double().expand(views, 3, 3).contiguous()
     return [tensor.to(dtype) for tensor in (means, covars, opacities, sh, viewmats, Ks)]
+
+
+def dense(binding):
+    """The matrix B, shape (G, N)."""
+    matrix = torch.zeros(binding.shape, dtype=binding.values.dtype, device=binding.values.device)
+    matrix[torch.repeat_interleave(binding.counts), binding.indices] = binding.values
+    return matrix

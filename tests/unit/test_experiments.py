@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from render_scenes import dense
 
 from neuma_lib.config.settings import load, merged
 from neuma_lib.coupling.bodies import coloured_solid, join
@@ -111,7 +112,7 @@ def test_a_joined_body_renders_and_binds_as_its_parts():
     both = join([left, right])
     split = len(left.x0)
     torch.testing.assert_close(
-        both.binding.dense(), torch.block_diag(left.binding.dense(), right.binding.dense())
+        dense(both.binding), torch.block_diag(dense(left.binding), dense(right.binding))
     )
     assert torch.equal(both.mass, torch.cat([left.mass, right.mass]))
     assert torch.equal(both.gaussians.sh()[split:], right.gaussians.sh())

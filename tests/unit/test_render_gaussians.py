@@ -1,22 +1,14 @@
-"""Gaussian kernels, their harmonics, and their deformation by particles."""
+"""Gaussians, their harmonics, and their deformation by particles."""
 
 import pytest
 import torch
+from render_scenes import dense
 
+from neuma_lib.coupling.binding import Binding
 from neuma_lib.coupling.deformation import deform
 from neuma_lib.errors import InputError
 from neuma_lib.splatting import spherical_harmonics as harmonics
 from neuma_lib.splatting.gaussians import Gaussians, rotations
-
-
-class DenseBinding:
-    """A dense row-stochastic matrix with the interface of ``binding.Binding``."""
-
-    def __init__(self, matrix):
-        self.matrix = matrix
-
-    def apply(self, field):
-        return torch.einsum("gn,tn...->tg...", self.matrix, field)
 
 
 def some_gaussians(count=7, coefficients=4, seed=0):
@@ -94,7 +86,10 @@ def deformation_case(seed=0, frames=3, particles=11):
     generator = torch.Generator().manual_seed(seed)
     gaussians = some_gaussians(seed=seed)
     matrix = torch.rand(len(gaussians), particles, generator=generator, dtype=torch.float64)
-    binding = DenseBinding(matrix / matrix.sum(dim=1, keepdim=True))
+    every = torch.arange(matrix.numel() + 1)
+    binding = Binding(
+        every[::particles], every[:-1] % particles, (matrix / matrix.sum(dim=1, keepdim=True)).flatten(), matrix.shape
+    )  # fmt: skip
     x0 = torch.rand(particles, 3, generator=generator, dtype=torch.float64)
     x = x0 + 0.1 * torch.randn(frames, particles, 3, generator=generator, dtype=torch.float64)
     F = torch.eye(3) + 0.2 * torch.randn(frames, particles, 3, 3, generator=generator, dtype=torch.float64)
@@ -109,7 +104,7 @@ def test_affine_motion_carries_gaussians_exactly():
     covars0 = gaussians.covars()
     F = A.expand(1, len(x0), 3, 3)
     means, covars = deform(gaussians.means, covars0, binding, x0, (x0 @ A.T + b)[None], F)
-    anchors = binding.apply(x0[None])[0]
+    anchors = dense(binding) @ x0
     assert torch.allclose(means[0] - gaussians.means, anchors @ A.T + b - anchors)
     assert torch.allclose(covars[0], A @ covars0 @ A.T)
 

@@ -1,7 +1,5 @@
 """Singular values and rotations of 3x3 matrices: to round-off forward, safe at repeated values backward."""
 
-import math
-
 import pytest
 import torch
 
@@ -154,7 +152,9 @@ def test_rotation_follows_a_turned_body():
     Q, F = rotations(200, 7), families()["random"][:200]
     R, sigma = rotation_and_singular_values(F)
     R_turned, sigma_turned = rotation_and_singular_values(Q @ F)
-    clear = (sigma[:, 1] + sigma[:, 2]) > 0.05
-    assert math.isclose(float(clear.float().mean()), 1.0, abs_tol=0.2)
-    torch.testing.assert_close(R_turned[clear], (Q @ R)[clear])
-    torch.testing.assert_close(sigma_turned, sigma)
+    gap = 0.05  # between the two smallest singular values, with sign: rounding turns R by eps |F| over it
+    clear = (sigma[:, 1] + sigma[:, 2]) > gap
+    assert int(clear.sum()) > 160
+    rounding = 2 * ROUNDINGS * torch.finfo(F.dtype).eps * float(sigma.max())
+    assert float((R_turned - Q @ R)[clear].abs().max()) < rounding / gap
+    assert float((sigma_turned - sigma).abs().max()) < rounding
