@@ -1,4 +1,4 @@
-"""Particle-GS (paper Sec. 3.3): Gaussian kernels carried by simulated particles and splatted into images."""
+"""Particle-GS (paper Sec. 3.3): Gaussians carried by simulated particles and splatted into images."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class ParticleGS:
     """Renders the states of bound particles: ``images = particle_gs(x, F)``.
 
     Args:
-        gaussians: static kernels at t = 0, G of them.
+        gaussians: static Gaussians at t = 0, G of them.
         binding: row-stochastic (G, N) binding matrix of Algorithm 1.
         x0: particle positions at t = 0 [m], shape (N, 3).
         cameras: V views.
-        background: colour behind the kernels.
+        background: colour behind the Gaussians.
         covariance_gradient: whether gradients reach the particles through the covariances as well as the means.
-        eps2d: variance that a pixel adds to a splat [px^2]; kernels of `fit_gaussians` hold it already.
+        eps2d: variance that a pixel adds to a splat [px^2]; Gaussians of `fit_gaussians` hold it already.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class ParticleGS:
             self._sh = gaussians.sh()
 
     def deformed(self, x: Tensor, F: Tensor) -> tuple[Tensor, Tensor]:
-        """Kernel means (T, G, 3) and covariances (T, G, 3, 3) for particle states x (T, N, 3) and F (T, N, 3, 3)."""
+        """Means (T, G, 3) and covariances (T, G, 3, 3) for particle states x (T, N, 3) and F (T, N, 3, 3)."""
         return deform(
             self.gaussians.means,
             self._covars0,
@@ -63,7 +63,7 @@ class ParticleGS:
         return self.splatted(*self.deformed(x, F))
 
     def splatted(self, means: Tensor, covars: Tensor) -> Tensor:
-        """Images (T, V, H, W, 3) of deformed kernels, means (T, G, 3) [m] and covariances (T, G, 3, 3) [m^2]."""
+        """Images (T, V, H, W, 3) of deformed Gaussians, means (T, G, 3) [m] and covariances (T, G, 3, 3) [m^2]."""
         images, _ = rasterize(
             means,
             covars,
@@ -80,7 +80,7 @@ class ParticleGS:
 
     @property
     def frames_per_batch(self) -> int:
-        """Frames to render together, forward and backward: estimated by the bytes of images and projected kernels."""
+        """Frames to render together, forward and backward: estimated by the bytes of images and projected Gaussians."""
         pixels = self.cameras.width * self.cameras.height
         per_view = (14 * pixels + 60 * len(self.gaussians)) * self.x0.element_size()
         return max(1, int(_BATCH_BYTES[self.x0.device.type] / (per_view * len(self.cameras))))
@@ -88,7 +88,7 @@ class ParticleGS:
     def batches(self, x: Tensor, F: Tensor, size: int | None = None) -> Iterator[tuple[slice, Tensor]]:
         """Render ``size`` frames at a time (None: `frames_per_batch`): yields (slice of frames, images).
 
-        States may be on another device than the kernels, so that memory there stays bounded too.
+        States may be on another device than the Gaussians, so that memory there stays bounded too.
         """
         size = size or self.frames_per_batch
         for start in range(0, len(x), size):

@@ -23,7 +23,7 @@ class Reconstruction:
         x0: particle positions [m], shape (N, 3).
         vol0: particle volumes [m^3], shape (N,).
         mass: particle masses [kg], shape (N,).
-        gaussians: static kernels, G of them.
+        gaussians: static Gaussians, G of them.
         binding: (G, N) binding matrix.
     """
 
@@ -35,7 +35,7 @@ class Reconstruction:
 
     @classmethod
     def of_gaussians(cls, gaussians: Gaussians, volume: float, density: Density) -> Reconstruction:
-        """The kernels as particles (the paper's w/o Bind), one each, with equal shares of the volume [m^3]."""
+        """The Gaussians as particles (the paper's w/o Bind), one each, with equal shares of the volume [m^3]."""
         count = len(gaussians.means)
         vol0 = torch.full_like(gaussians.means[:, 0], volume / count)
         mass = vol0 * density_at(gaussians.means, density)

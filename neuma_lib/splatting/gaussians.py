@@ -1,4 +1,4 @@
-"""The Gaussian kernels of a static object (paper Sec. 3.3: x, alpha, A, c)."""
+"""The Gaussians of a static object (paper Sec. 3.3: x, alpha, A, c)."""
 
 from __future__ import annotations
 
@@ -70,11 +70,11 @@ class Gaussians:
         return covariances(self.quats, self.scales)
 
     def absorbing_blur(self, cameras: Cameras, eps2d: float) -> Gaussians:
-        """The kernels with the blur of the cameras' pixels as a part of their own size.
+        """The Gaussians with the blur of the cameras' pixels as a part of their own size.
 
-        Splatting widens every projected kernel by a pixel's variance ``eps2d`` [px^2]. Kernels that were fitted
+        Splatting widens every projected Gaussian by a pixel's variance ``eps2d`` [px^2]. Gaussians that were fitted
         under one set of cameras would therefore look larger through cameras with larger pixels, by up to a pixel
-        at the silhouette. Here each kernel grows by what ``eps2d`` was worth in the mean camera, in metres; rendered
+        at the silhouette. Here each Gaussian grows by what ``eps2d`` was worth in the mean camera, in metres; rendered
         with ``eps2d=0`` they look the same through those cameras, and keep their size through all others (the idea
         of Mip-Splatting's 3D smoothing filter, Yu et al. 2024).
         """

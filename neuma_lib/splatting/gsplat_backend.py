@@ -4,7 +4,7 @@ gsplat is imported at the first call only. Projection, colours, blur, near plane
 conventions as ours. Constants that gsplat fixes in its kernels:
 
 - alpha counts from 1/255 on, as our default;
-- alpha is limited to 0.999, ours to 0.99 by default: images differ where a kernel is more opaque than that;
+- alpha is limited to 0.999, ours to 0.99 by default: images differ where a Gaussian is more opaque than that;
 - a pixel ends where its transmittance would become 1e-4 or less, ours where it would fall below 1e-4;
 - a splat ends 3.33 standard deviations from its centre, which is where an opacity of 1 reaches 1/255.
 """
