@@ -29,6 +29,8 @@ _SHARING_NEIGHBOURS = 16
 """Particles among which an added particle's volume is collected."""
 _LARGEST_SHARE = 0.5
 """Part of a particle's volume that all added particles together may take from it."""
+_UNBALANCED = 1e-9
+"""Residual, relative to the neighbours' distance, above which no shares balance an added particle."""
 
 
 def bind(
@@ -73,7 +75,7 @@ def bind_two_pass(
     binds all Gaussians to the enlarged set. The added particles crowd at the surface. By default each takes
     its volume from the particles around it, in proportions whose barycentre is its own position, which
     leaves total volume and centre of mass (at one density) unchanged to round-off and every volume
-    positive.
+    positive. Where these particles lie in one plane the barycentre is the nearest point of the plane.
 
     Args:
         means, covars, particles: as in ``bind``.
@@ -225,7 +227,7 @@ def _binding_from_pairs(
 
 
 def _share_volumes(points: np.ndarray, volumes: np.ndarray, added: np.ndarray) -> np.ndarray:
-    """Volumes of the particles and of those added, with the sum and the first moment of the former alone.
+    """Positive volumes of the particles and of those added, with the sum and the first moment of the former alone.
 
     Added particle m at q takes ``w_m f_mj`` from its neighbour j, where ``sum_j f_mj = 1`` and
     ``sum_j f_mj p_j = q`` (the smallest such f; negative, hence a gift, where q lies outside its
@@ -243,13 +245,17 @@ def _share_volumes(points: np.ndarray, volumes: np.ndarray, added: np.ndarray) -
     wanted = np.array([1.0, 0.0, 0.0, 0.0])
     fractions = np.linalg.pinv(system, rcond=1e-8) @ wanted
     residual = np.abs(np.einsum("mak,mk->ma", system, fractions) - wanted).max(1)
+    # Neighbours in one plane cannot balance a particle off it: they balance its projection onto the plane, so that
+    # the centre of mass moves a little, but no particle is without volume (a rollout has no use for such a one).
+    off = residual > _UNBALANCED
+    centre = offsets[off].mean(1)
+    within = np.linalg.pinv(np.swapaxes(offsets[off] - centre[:, None], 1, 2), rcond=1e-8)
+    fractions[off] = 1 / size - np.einsum("mka,ma->mk", within, centre)
 
     taken = np.maximum(fractions, 0.0)
     demand = np.bincount(neighbours.ravel(), taken.ravel(), minlength=len(points))
     with np.errstate(divide="ignore"):
         offer = np.where(taken > 0, (volumes / demand)[neighbours], np.inf).min(1)
     weight = np.minimum(volumes[neighbours].mean(1) * size / (size + 1), _LARGEST_SHARE * offer)
-    # Neighbours in one plane cannot balance a particle off it: it then rides along without volume.
-    weight[residual > 1e-9] = 0.0
     given = np.bincount(neighbours.ravel(), (weight[:, None] * fractions).ravel(), minlength=len(points))
     return np.concatenate([volumes - given, weight])

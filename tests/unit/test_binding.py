@@ -13,6 +13,10 @@ from neuma_lib.config.binding import BindingConfig
 from neuma_lib.coupling import particle_binding
 from neuma_lib.coupling.particle_binding import bind, bind_two_pass
 from neuma_lib.errors import InputError
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State
 
 
 def random_gaussians(count, seed, spread=1.0, size=0.05, anisotropy=1.0, dtype=torch.float64):
@@ -112,11 +116,30 @@ def test_added_particles_keep_mass_and_centre_of_mass(dtype, tolerance, outside)
     before = torch.rand(2000, generator=torch.Generator().manual_seed(11), dtype=dtype) + 0.5
     _, enlarged, added, after = bind_two_pass(means, covars, particles, before)
     assert added > 500
-    assert after.min() >= 0 and (after[:2000] >= 0.49 * before).all()
+    assert after.min() > 0 and (after[:2000] >= 0.49 * before).all()
     before, after, particles, enlarged = (a.double() for a in (before, after, particles, enlarged))
     torch.testing.assert_close(after.sum(), before.sum(), rtol=tolerance, atol=0)
     centre = (before @ particles) / before.sum()
     torch.testing.assert_close((after @ enlarged) / after.sum(), centre, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("count", [2, 200], ids=["fewer than its neighbours would be", "many"])
+def test_a_particle_off_the_plane_of_its_neighbours_has_a_volume(count):
+    """No shares balance it there: the centre of mass stays in the plane's directions, and a rollout takes the body."""
+    particles = 0.4 + random_particles(count, seed=22, spread=0.2)
+    particles[:, 2] = 0.5
+    means = torch.tensor([[0.5, 0.5, 0.53], [0.45, 0.48, 0.42]], dtype=torch.float64)
+    covars = 1e-6 * torch.eye(3, dtype=torch.float64).expand(2, 3, 3)
+    _, enlarged, added, volumes = bind_two_pass(means, covars, particles, 1e-3)
+    assert added == 2 and volumes.min() > 0
+    torch.testing.assert_close(volumes.sum(), torch.tensor(1e-3, dtype=torch.float64), rtol=1e-13, atol=0)
+    if count == 200:
+        centre = 1e3 * volumes @ enlarged
+        torch.testing.assert_close(centre[:2], particles.mean(0)[:2], rtol=0, atol=1e-13)
+    law = analytic_law({"elasticity": {"name": "hencky", "E": 5e4, "nu": 0.3}})
+    state = State(enlarged, torch.zeros(3, dtype=torch.float64), 1000 * volumes, volumes)
+    path = rollout(MPMModel(16, 1e-3), law, state, steps=2, frames=(2,), skip_free_flight=False)
+    assert torch.isfinite(path.x).all()
 
 
 def test_equal_mass_is_the_papers():
