@@ -20,6 +20,7 @@ from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import Body, MPMModel, as_bodies
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import Trajectory
+from neuma_lib.sim.total_deformation import every_step, total_deformation
 
 
 @dataclass(frozen=True)
@@ -30,11 +31,13 @@ class Evaluation:
         path: predicted particle states at the frames.
         tracers: tracers that started in the reconstructed shape [m], shape (T, M, 3).
         metrics: plain numbers and lists for ``metrics.json``.
+        F_total: total deformation gradients (`total_deformation`), shape (T, N, 3, 3); None if not asked for.
     """
 
     path: Trajectory
     tracers: Tensor
     metrics: dict
+    F_total: Tensor | None = None
 
     def summary(self) -> str:
         """One line for people."""
@@ -95,6 +98,7 @@ def evaluate(
     truth: Tensor,
     truth_again: Tensor,
     tracers: Tensor,
+    total: bool = False,
 ) -> Evaluation:
     """Chamfer distance over the sequence, its sampling floor, and the tracer error from identical starts.
 
@@ -107,9 +111,12 @@ def evaluate(
         truth: tracers of the ground truth [m], shape (T, M, 3).
         truth_again: tracers of the ground truth from another sampling of the shape, shape (T, M, 3).
         tracers: start positions inside the reconstructed shape [m], shape (M', 3).
+        total: also compute the total deformation.
     """
     starts = torch.cat([tracers, truth[0].to(tracers)])
-    path, failed_at = predict(model, law, body, v0, frames, starts)
+    path, failed_at = predict(model, law, body, v0, every_step(frames) if total else frames, starts)
+    F_total = total_deformation(path, model.dt, frames).F if total else None
+    path = path.at(frames) if total else path
     predicted, same_start = path.tracers[:, : len(tracers)], path.tracers[:, len(tracers) :]
     chamfer = chamfer_sequence(predicted, truth)
     floor = chamfer_sequence(truth_again, truth)
@@ -131,4 +138,4 @@ def evaluate(
         ),
         "diverged_at_step": failed_at,
     }
-    return Evaluation(path, predicted, metrics)
+    return Evaluation(path, predicted, metrics, F_total)

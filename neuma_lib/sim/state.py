@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -87,6 +87,19 @@ class Trajectory:
     F: Tensor
     C: Tensor
     tracers: Tensor | None = None
+
+    def at(self, frames: Sequence[int]) -> Trajectory:
+        """The states at some of the frames. Those after the last one here repeat the one before them.
+
+        Raises:
+            InputError: a frame is missing, or all lie after the last one here.
+        """
+        index = {n: i for i, n in reversed(list(enumerate(self.frames)))}
+        reached = tuple(n for n in frames if n <= self.frames[-1])
+        if not reached or not index.keys() >= set(reached):
+            raise InputError(f"the trajectory has not all of the frames {list(frames)}")
+        found = replace(self._each(lambda value: value[[index[n] for n in reached]]), frames=reached)
+        return found.hold_last(len(frames) - len(reached)) if len(reached) < len(frames) else found
 
     def hold_last(self, count: int) -> Trajectory:
         """The same with the last frame repeated `count` times, for a rollout that stopped early."""

@@ -43,13 +43,4 @@ def total_deformation(path: Trajectory, dt: float, frames: Sequence[int]) -> Tra
             F = F + dt * (path.C[step] @ F)
         if step in wanted:
             found.append(F)
-    index = list(frames)
-    return replace(
-        path,
-        frames=tuple(frames),
-        x=path.x[index],
-        v=path.v[index],
-        F=torch.stack(found),
-        C=path.C[index],
-        tracers=None,
-    )
+    return replace(path.at(frames), F=torch.stack(found), tracers=None)

@@ -6,6 +6,7 @@ from grounding_scene import MODEL, ball, observe
 
 from neuma_lib.config.material import MaterialConfig
 from neuma_lib.errors import InputError
+from neuma_lib.evaluation import motion
 from neuma_lib.fitting.material import PixelLoss, train_material
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.neural import neural_law
@@ -50,6 +51,31 @@ def test_keeps_what_has_flowed(body):
 def test_needs_every_step(body):
     with pytest.raises(InputError, match="every_step"):
         total_deformation(paths(body, ELASTIC)[0], MODEL.dt, FRAMES)
+
+
+def test_evaluation_follows_it_in_one_simulation(body, monkeypatch):
+    """Same states and metrics as without it, and the total deformation of a rollout of its own, to the bit."""
+    law, runs = analytic_law(PLASTIC), []
+    monkeypatch.setattr(
+        motion, "rollout", lambda *args, **options: runs.append(1) or rollout(*args, **options)
+    )
+    tracers = body.x0[:20]
+    truth = tracers.expand(len(FRAMES), -1, -1)
+    elastic = motion.evaluate(MODEL, law, body, V0, FRAMES, truth, truth, tracers)
+    total = motion.evaluate(MODEL, law, body, V0, FRAMES, truth, truth, tracers, total=True)
+    assert len(runs) == 2 and elastic.F_total is None
+    assert total.metrics == elastic.metrics and torch.equal(total.tracers, elastic.tracers)
+    assert total.path.frames == FRAMES and torch.equal(total.path.F, elastic.path.F)
+    assert torch.equal(total.F_total, paths(body, PLASTIC)[1].F)
+
+
+def test_frames_of_a_rollout_that_stopped_early(body):
+    held = paths(body, ELASTIC)[0].hold_last(2)
+    wanted = held.at((0, 60, 90, 120))
+    assert wanted.frames == (0, 60, 60, 60)
+    assert torch.equal(wanted.x, held.x[[0, 2, 2, 2]])
+    with pytest.raises(InputError, match="frames"):
+        held.at((0, 31))
 
 
 def learning_law():

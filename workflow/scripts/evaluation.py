@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from neuma_lib.device import choose_device
-from neuma_lib.evaluation.motion import evaluate, predict
+from neuma_lib.evaluation.motion import evaluate
 from neuma_lib.geometry.volume import sample_tracers
 from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
@@ -15,7 +15,6 @@ from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_start
 from neuma_lib.io.weights import read_weights
 from neuma_lib.sim.model import MPMModel, consecutive
-from neuma_lib.sim.total_deformation import every_step, total_deformation
 from workflow.stage import stage
 
 
@@ -35,24 +34,20 @@ def main(inputs, output, params, run) -> None:
         inputs.particles, inputs.binding, inputs.gaussians, inputs.velocity, params.densities
     )
     laws = [load_law(prior, adaptor).to(device) for prior, adaptor in zip_longest(priors, adaptors)]
-    start = (
+    evaluation = evaluate(
         MPMModel(**params.simulation),
         consecutive(laws, counts),
         body.to(torch.float32, device),
         v0.to(device),
-    )
-    evaluation = evaluate(
-        *start,
         params.frames,
         torch.from_numpy(truth["tracers"]).to(device),
         torch.from_numpy(truth["tracers_again"]).to(device),
         torch.as_tensor(np.asarray(tracers), dtype=torch.float32, device=device),
+        total=params.get("covariance_from") == "total",
     )
     path = {name: getattr(evaluation.path, name).cpu().numpy() for name in ("x", "F")}
-    if params.get("covariance_from") == "total":
-        every, _ = predict(*start, every_step(params.frames))
-        total = total_deformation(every, params.simulation["dt"], params.frames)
-        path["F_total"] = total.F.cpu().numpy()
+    if evaluation.F_total is not None:
+        path["F_total"] = evaluation.F_total.cpu().numpy()
     write_arrays(
         output.rollout, {**path, "frames": np.asarray(params.frames)}, {"dt": params.simulation["dt"]}
     )
