@@ -19,6 +19,7 @@ from pathlib import Path
 
 import torch
 
+from benchmarks import torch_simulation
 from benchmarks.scene import SMALL, BenchmarkScene, Size, make_scene
 from benchmarks.timing import arithmetic, bandwidth, device_name, peak_memory, seconds, seconds_a_call
 from neuma_lib.config.material import MaterialConfig
@@ -33,7 +34,6 @@ from neuma_lib.sim.workspace import SORT_EVERY, free_pool
 from neuma_lib.splatting import torch_reference
 from neuma_lib.splatting.observation import Observation
 from neuma_lib.splatting.rasterizer import rasterize
-from tests import sim_twin
 
 NETWORK = 2 * (13 * 64 + 64 * 64 + 64 * 9)
 """Operations of one network for one particle, forward."""
@@ -196,14 +196,10 @@ def iterations(scene: BenchmarkScene, count: int) -> list[float]:
 
 def twin_step(scene: BenchmarkScene, device: torch.device, steps: int = 5) -> float:
     """Time of a step and its gradient by the plain torch twin [s]."""
-    body = scene.body
-    eye = torch.eye(3, device=device).expand(len(body.x0), 3, 3)
-    v0 = scene.v0.expand_as(body.x0)
+    state = scene.body.state(scene.v0)
 
     def work():
-        x, *_ = sim_twin.rollout(
-            scene.model, scene.law, body.x0, v0, body.mass, body.vol0, eye, torch.zeros_like(eye), (steps,)
-        )
+        x, *_ = torch_simulation.rollout(scene.model, scene.law, state, (steps,))
         scene.law.zero_grad()
         x.square().mean().backward()
 

@@ -1,4 +1,4 @@
-"""The simulator once more in plain torch, for comparison: slow, obvious, differentiated by autograd."""
+"""The simulator in plain torch, differentiated by autograd: what speed and, in the tests, values are compared with."""
 
 import torch
 
@@ -63,13 +63,13 @@ def evaluate(bodies, part, F):
     return torch.cat([getattr(body.law, part)(F[body.start : body.stop]) for body in bodies])
 
 
-def rollout(model, law, x0, v0, mass, vol0, F0, C0, frames):
-    """States (x, v, F, C) at the frames, each of shape (T, N, ...)."""
-    bodies = as_bodies(law, len(x0))
-    state, seen = (x0, v0, F0, C0), []
+def rollout(model, law, state, frames):
+    """States (x, v, F, C) of a `State` at the frames, each of shape (T, N, ...)."""
+    bodies = as_bodies(law, len(state.x))
+    now, seen = state.motion, []
     for n in range(frames[-1] + 1):
         if n in frames:
-            seen.append(state)
+            seen.append(now)
         if n < frames[-1]:
-            state = step(model, bodies, *state, mass, vol0)
+            now = step(model, bodies, *now, state.mass, state.vol0)
     return tuple(torch.stack(values) for values in zip(*seen, strict=True))

@@ -17,59 +17,11 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from neuma_lib.device import start_warp
+from neuma_lib.device import native_source, start_warp
 
 start_warp()
 
 SCATTERS = ("atomic", "runs", "runs_scalar")
-
-# Bits of a run, as a thread sees it: 0-7 the lane after its last member, 8-15 how many halving steps its warp's
-# longest run needs, 16 whether this thread is the first member, which adds the sum.
-_RUN = """
-    const unsigned all = 0xffffffffu;
-    const int lane = threadIdx.x & 31;
-    const int before = __shfl_up_sync(all, cell, 1);
-    const bool first = lane == 0 || before != cell;
-    const unsigned firsts = __ballot_sync(all, first);
-    const unsigned later = lane == 31 ? 0u : firsts >> (lane + 1);
-    const int stop = later ? lane + __ffs(later) : 32;
-    int steps = 0;
-    for (int d = 1; d < 32; d *= 2)
-        if (__any_sync(all, lane + d < stop)) ++steps;
-    return stop | (steps << 8) | ((first && cell >= 0) ? 1 << 16 : 0);
-"""
-
-_DEPOSIT = """
-    const unsigned all = 0xffffffffu;
-    const int lane = threadIdx.x & 31;
-    const int stop = run & 0xff;
-    const int steps = (run >> 8) & 0xff;
-    float sum[3][4];
-    for (int k = 0; k < 3; ++k)
-        for (int a = 0; a < 4; ++a) sum[k][a] = value.data[k][a];
-    for (int s = 0, d = 1; s < steps; ++s, d *= 2) {
-        const bool same = lane + d < stop;
-        #pragma unroll
-        for (int k = 0; k < 3; ++k)
-            #pragma unroll
-            for (int a = 0; a < COMPONENTS; ++a) {
-                const float other = __shfl_down_sync(all, sum[k][a], d);
-                sum[k][a] += same ? other : 0.0f;
-            }
-    }
-    if (run >> 16) {
-        float* node = (float*)((char*)rows.data + (size_t)index * rows.strides[0] + (size_t)row * rows.strides[1]);
-        #pragma unroll
-        for (int k = 0; k < 3; ++k, node += 4) {
-#if VECTOR && defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
-            asm volatile("red.global.add.v4.f32 [%0], {%1, %2, %3, %4};"
-                         :: "l"(node), "f"(sum[k][0]), "f"(sum[k][1]), "f"(sum[k][2]), "f"(sum[k][3]) : "memory");
-#else
-            for (int a = 0; a < COMPONENTS; ++a) atomicAdd(node + a, sum[k][a]);
-#endif
-        }
-    }
-"""
 
 
 def scatter_for(device: torch.device, dtype: torch.dtype) -> str:
@@ -110,9 +62,10 @@ def scatter_functions(dtype: torch.dtype, scatter: str, components: int) -> Simp
     if dtype != torch.float32:
         raise ValueError(f"scatter {scatter!r} is for float32, not {dtype}")
     vector = "1" if scatter == "runs" else "0"
-    snippet = _DEPOSIT.replace("COMPONENTS", str(components)).replace("VECTOR", vector)
+    parts = native_source(__file__)
+    snippet = parts["deposit"].replace("COMPONENTS", str(components)).replace("VECTOR", vector)
 
-    @wp.func_native(_RUN)
+    @wp.func_native(parts["run"])
     def run_of_lanes(cell: wp.int32) -> wp.int32: ...
 
     @wp.func_native(snippet)

@@ -32,7 +32,6 @@ SPECS = {
         "plasticity": {"name": "viscous_flow", "viscosity": 10.0},
     },
 }
-SYMMETRIC = tuple(SPECS)
 EVERY_LAW = (*SPECS, "neural")
 
 
@@ -93,8 +92,12 @@ def linear_momentum(mass, v):
     return (mass[:, None] * v).sum(dim=0)
 
 
+def axial(A):
+    """Vector a with a x d = (A - A^T) d / 2 for every d, doubled; A (N, 3, 3) -> (N, 3)."""
+    return torch.stack([A[:, 2, 1] - A[:, 1, 2], A[:, 0, 2] - A[:, 2, 0], A[:, 1, 0] - A[:, 0, 1]], dim=1)
+
+
 def angular_momentum(model, mass, x, v, C):
     """Sum of x cross m v and of APIC's part m (dx^2 / 4) axial(C) [kg m^2/s], shape (3,)."""
-    axial = torch.stack([C[:, 2, 1] - C[:, 1, 2], C[:, 0, 2] - C[:, 2, 0], C[:, 1, 0] - C[:, 0, 1]], dim=1)
     orbit = torch.linalg.cross(x, v)
-    return (mass[:, None] * (orbit + model.dx**2 / 4 * axial)).sum(dim=0)
+    return (mass[:, None] * (orbit + model.dx**2 / 4 * axial(C))).sum(dim=0)

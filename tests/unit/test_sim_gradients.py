@@ -3,10 +3,10 @@
 import math
 
 import pytest
-import sim_twin
 import torch
 from sim_scenes import DT, cube, make_law, strained
 
+from benchmarks import torch_simulation
 from neuma_lib.errors import InputError
 from neuma_lib.sim.memory import MemoryPlan, plan_memory
 from neuma_lib.sim.model import Body, MPMModel
@@ -48,7 +48,7 @@ def simulate(model, law, start, mass, vol0, frames, **options):
 def simulate_slowly(model, law, start, mass, vol0, frames):
     """The same by the torch twin."""
     x, v, F, C = start
-    return sim_twin.rollout(model, law, x, v, mass, vol0, F, C, frames)
+    return torch_simulation.rollout(model, law, State(x, v, mass, vol0, F, C), frames)
 
 
 def trainable(law):

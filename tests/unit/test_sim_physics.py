@@ -6,8 +6,8 @@ from sim_scenes import (
     DENSITY,
     DT,
     EVERY_LAW,
-    SYMMETRIC,
     angular_momentum,
+    axial,
     cube,
     linear_momentum,
     make_law,
@@ -68,46 +68,40 @@ def test_p2g_conserves_mass_and_momentum():
     torch.testing.assert_close(total[:3], linear_momentum(mass, v), rtol=1e-10, atol=1e-12)
 
 
-def spin_a_cube(name):
-    """Momenta at the start and the end of 100 steps of a deforming, spinning cube without gravity."""
+@pytest.mark.parametrize("name", EVERY_LAW)
+def test_momenta_of_a_spinning_cube(name):
+    """Linear momentum stays; the angular one changes by -dt sum vol0 axial(tau) a step. Both hold to round-off.
+
+    P2G adds -dt vol0 (4/dx^2) w_i tau d_i to node i, and sum_i w_i d_i d_i^T = dx^2/4 I. The stress of an analytic
+    law is symmetric, that of a network, R X F^T, is not quite.
+    """
+    steps, law = 100, make_law(name)
     x0, mass, vol0 = cube(side=0.25)
     v0, C0 = spinning(x0, omega=(8.0, -5.0, 10.0), velocity=(0.2, -0.1, 0.3))
     F0 = torch.linalg.matrix_exp(0.03 * torch.tensor([[1.0, 0.5, 0], [0.5, -1.5, 0], [0, 0, 0.5]]).double())
-    F0 = F0.expand(len(x0), 3, 3)
-    path = rollout(WEIGHTLESS, make_law(name), State(x0, v0, mass, vol0, F0, C0), steps=100, frames=(0, 100))
+    state = State(x0, v0, mass, vol0, F0.expand(len(x0), 3, 3), C0)
+    path = rollout(WEIGHTLESS, law, state, steps=steps, frames=range(steps + 1))
     assert contact_clearance(WEIGHTLESS, path.x).min() > 0
-    linear = [linear_momentum(mass, v) for v in path.v]
-    about = [x - x0.mean(dim=0) for x in path.x]
-    spin = [angular_momentum(WEIGHTLESS, mass, *state) for state in zip(about, path.v, path.C, strict=True)]
-    return linear, spin, path
-
-
-@pytest.mark.parametrize("name", SYMMETRIC)
-def test_momenta_of_symmetric_laws(name):
-    linear, spin, path = spin_a_cube(name)
-    assert (path.F[1] - path.F[0]).abs().max() > 1e-3  # it does deform
+    assert (path.F[-1] - path.F[0]).abs().max() > 1e-3  # it does deform
+    linear = [linear_momentum(mass, path.v[n]) for n in (0, -1)]
     torch.testing.assert_close(linear[1], linear[0], rtol=1e-11, atol=0)
-    torch.testing.assert_close(spin[1], spin[0], rtol=0, atol=1e-11 * float(spin[0].norm()))
-
-
-def test_momenta_of_a_neural_law(record_property):
-    """Linear momentum is exact. R X F^T is not quite symmetric: the drift of the angular one is reported."""
-    linear, spin, path = spin_a_cube("neural")
-    torch.testing.assert_close(linear[1], linear[0], rtol=1e-11, atol=0)
-    drift = float((spin[1] - spin[0]).norm() / spin[0].norm())
-    tau = make_law("neural").elasticity(path.F[1])
-    asymmetry = float((tau - tau.mT).norm() / (tau + tau.mT).norm())
-    record_property("angular_momentum_drift", drift)
-    record_property("stress_asymmetry", asymmetry)
-    print(f"100 steps: |dL| / |L| = {drift:.1e}, |tau - tau^T| / |tau + tau^T| = {asymmetry:.1e}")
-    assert 0 < asymmetry < 0.01
-    assert 0 < drift < 0.01
+    spin = [
+        angular_momentum(WEIGHTLESS, mass, path.x[n] - x0.mean(dim=0), path.v[n], path.C[n]) for n in (0, -1)
+    ]
+    torque = -sum((vol0[:, None] * axial(law.elasticity(F))).sum(dim=0) for F in path.F[:-1])
+    torch.testing.assert_close(spin[1] - spin[0], DT * torque, rtol=0, atol=1e-11 * float(spin[0].norm()))
+    if name == "neural":
+        assert DT * torque.norm() > 1e-6 * spin[0].norm()  # there is something to see
 
 
 @pytest.mark.parametrize("condition", ["no_slip", "slip", "sticky"])
 @pytest.mark.parametrize("wall", WALLS)
 def test_thrown_at_a_wall(wall, condition):
-    """The body stops and stays inside; its motion along the wall lasts if the wall is slippery."""
+    """The body stays inside and turns; its motion along the wall lasts if the wall is slippery.
+
+    It arrives after 0.018 s and is thrown back when a wave has crossed it twice, 2 side / c = 0.049 s later. A wall
+    that does not hold only takes momentum that points into it, and no wall gives energy.
+    """
     axis, side = WALLS.index(wall) // 2, 1 if wall.endswith("max") else -1
     model = MPMModel(16, DT, gravity=(0.0, 0.0, 0.0), boundary=condition)
     centre = [0.5, 0.5, 0.5]
@@ -116,13 +110,17 @@ def test_thrown_at_a_wall(wall, condition):
     v0 = torch.full((3,), 0.2, dtype=x0.dtype)
     v0[axis] = 3.0 * side
     path = rollout(
-        model, make_law("fixed_corotated"), State(x0, v0, mass, vol0), steps=120, frames=range(0, 121, 10)
+        model, make_law("fixed_corotated"), State(x0, v0, mass, vol0), steps=120, frames=range(121)
     )
     low, high = model.stencil_range
     assert path.x.min() >= low and path.x.max() <= high
     assert contact_clearance(model, path.x).min() < 0  # it did arrive
+    toward = side * path.v[..., axis].mean(dim=1)
+    assert -v0.norm() <= toward[-1] < 0
+    assert path.v[-1].square().mean() <= v0.square().mean()
+    if condition != "sticky":
+        assert (toward.diff() < 1e-12).all()
     mean = path.v[-1].mean(dim=0)
-    assert mean[axis] * side < 1.0
     along = [a for a in range(3) if a != axis]
     if condition == "slip":
         torch.testing.assert_close(mean[along], v0[along], rtol=1e-10, atol=0)
@@ -219,7 +217,11 @@ def test_bodies_apart_do_not_feel_each_other():
 
 
 def test_bodies_collide():
-    """Momentum passes from one body to the other, and none is lost."""
+    """Momentum passes from one body to the other, and none is lost.
+
+    Both have mass m, and 80 steps are longer than a wave takes to cross one twice, 2 side / c = 0.049 s. When they part
+    again the body that was hit is faster than their common centre, 1 m/s, and not faster than the other was, 2 m/s.
+    """
     left, mass, vol0 = cube(200, side=0.2, centre=(0.36, 0.5, 0.5))
     right = left + torch.tensor([0.28, 0.0, 0.0], dtype=left.dtype)
     v0 = torch.zeros(400, 3, dtype=left.dtype)
@@ -228,7 +230,7 @@ def test_bodies_collide():
     masses = mass.repeat(2)
     state = State(torch.cat([left, right]), v0, masses, vol0.repeat(2))
     path = rollout(WEIGHTLESS, bodies, state, steps=80, frames=(0, 80))
-    assert path.v[-1, 200:, 0].mean() > 0.5
+    assert 1.0 < path.v[-1, 200:, 0].mean() < 2.0
     torch.testing.assert_close(
         linear_momentum(masses, path.v[-1]), linear_momentum(masses, v0), rtol=0, atol=1e-12
     )
