@@ -108,18 +108,19 @@ def scene_setting(*names):
     return choose
 
 
-def scenes_with(part, origin):
-    """Pattern of the scenes whose part ('static', 'dynamic', 'truth') is 'made', 'supplied' by the user or 'packed'.
+def origin_of(part, scene):
+    """Whether a part ('static', 'dynamic', 'truth') of a scene is 'made', 'supplied' by the user or 'packed'.
 
-    Each file has one maker. A truth is not supplied: that of a scene with a video of the user's is simulated.
+    A truth is not supplied: that of a scene with a video of the user's is simulated.
     """
+    if getattr(SETTINGS.scenes[scene].images, "dynamic" if part == "truth" else part):
+        return "made" if part == "truth" else "supplied"
+    return "packed" if SETTINGS.dataset.packed else "made"
 
-    def origin_in(scene):
-        if getattr(scene.images, "dynamic" if part == "truth" else part):
-            return "made" if part == "truth" else "supplied"
-        return "packed" if SETTINGS.dataset.packed else "made"
 
-    return "|".join(n for n, scene in SETTINGS.scenes.items() if origin_in(scene) == origin) or "none"
+def scenes_with(part, origin):
+    """Pattern of the scenes whose part is of an origin: each file has one maker."""
+    return "|".join(scene for scene in SETTINGS.scenes if origin_of(part, scene) == origin) or "none"
 
 
 def truth_memory(wildcards):
@@ -164,6 +165,27 @@ def table_runs(table):
 def table_files(table, name):
     """A file of every run behind a table, in the order of `table_runs`."""
     return [f"{run['folder']}/{name}" for run in table_runs(table)]
+
+
+def table_benchmarks(table):
+    """Benchmark files of all work behind the scenes of a table, stage by stage."""
+    runs = [run for run in table_runs(table) if run["column"] == run["scene"]]
+    scenes = list(dict.fromkeys(run["scene"] for run in runs))
+    names = [Path(run["folder"]).name for run in runs]  # of methods, with their seeds
+    pairs = [SimpleNamespace(scene=run["scene"], method=name) for run, name in zip(runs, names)]
+    priors = {SETTINGS.scenes[scene].prior for scene in scenes}
+    priors |= {SETTINGS.method_prior(pair.scene, pair.method) for pair in pairs}
+    makers = {"made": "render", "supplied": "supplied", "packed": "unpack"}
+    jobs = [("kernels", {"group": group}) for group in ("simulation", "laws", "rendering")]
+    jobs += [("prior", {"prior": prior}) for prior in sorted(priors & set(SETTINGS.priors.laws))]
+    for scene in scenes:
+        truth = "ground_truth" if origin_of("truth", scene) == "made" else "unpack_truth"
+        images = [f"{makers[origin_of(part, scene)]}_{part}" for part in ("static", "dynamic")]
+        stages = [truth, *images, "gaussians", "mesh", "sampled_particles", "binding", "velocity"]
+        jobs += [(name, {"scene": scene}) for name in stages]
+    jobs += [("material", vars(pair)) for pair in pairs if trained_adaptor(pair)]
+    jobs += [("evaluation", vars(pair)) for pair in pairs] + [("chamfer_table", {"table": table})]
+    return [getattr(rules, name).benchmark.format(**wildcards) for name, wildcards in jobs]
 
 
 def table_cells(table):

@@ -60,12 +60,10 @@ rule learning_rates:
 
 rule timings:
     input:
-        table=f"{RESULTS}/table1.csv",
+        benchmarks=lambda wildcards: table_benchmarks("table1"),
     output:
         csv=report(f"{RESULTS}/timings.csv", caption="../report/timings.rst", category="Run times"),
         markdown=f"{RESULTS}/timings.md",
-    params:
-        benchmarks=f"{RESULTS}/benchmarks",
     script:
         "../scripts/timings.py"
 

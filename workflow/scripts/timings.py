@@ -1,4 +1,4 @@
-"""Seconds of every stage and scene, from Snakemake's benchmark files."""
+"""Seconds of every stage behind Table 1, from Snakemake's benchmark files."""
 
 from pathlib import Path
 
@@ -7,9 +7,9 @@ from neuma_lib.io.files import write_text
 from workflow.stage import stage
 
 
-def main(folder: str, output, run) -> None:
+def main(files: list[str], output, run) -> None:
     rows: dict[str, dict[str, float]] = {}
-    for file in sorted(Path(folder).rglob("*.tsv")):
+    for file in map(Path, files):
         header, values = (line.split("\t") for line in file.read_text().splitlines()[:2])
         measured = dict(zip(header, values, strict=True))
         seconds, memory = float(measured["s"]), measured["max_rss"]
@@ -38,4 +38,4 @@ def main(folder: str, output, run) -> None:
 
 if __name__ == "__main__":
     with stage("timings", snakemake.log[0]) as run:
-        main(snakemake.params.benchmarks, snakemake.output, run)
+        main(list(snakemake.input.benchmarks), snakemake.output, run)
