@@ -1,13 +1,10 @@
 """A packed dataset is what was packed, pixel by pixel, or an error that says what to do; the workflow takes it."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
-import yaml
 from PIL import Image
-from test_workflow import copied
 
 from neuma_lib.errors import InputError
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
@@ -208,26 +205,3 @@ def test_files_of_another_kind_are_refused(scene, tmp_path):
         unpack_truth(tmp_path / "images.zip", tmp_path / "particles.h5")
     with pytest.raises(InputError, match=r"holds None, not NeuMA ground truth 2: give the other file"):
         unpack_truth(scene / "particles.h5", tmp_path / "particles.h5")
-
-
-def test_workflow_packs_and_takes_a_packed_dataset_without_blender(scene, tmp_path):
-    project = copied(tmp_path / "project", tmp_path / "kernels")
-    data = project.root / "tiny/data/BouncyBall"
-    shutil.copytree(scene, data)
-    # With no other rule allowed, the files at hand count as the dataset.
-    project.run("--allowed-rules", "pack_images", "pack_truth", "packed", "--", "packed")
-    assert {file.name for file in (project.root / "tiny/data/packed").iterdir()} == {
-        "BouncyBall.images.zip",
-        "BouncyBall.truth.h5",
-    }
-    (project.root / "tiny/data/packed").rename(project.root / "dropped")
-    shutil.rmtree(project.root / "tiny")
-    settings = yaml.safe_load((project.root / "tests/workflow/tiny.yaml").read_text())
-    settings["dataset"]["packed"] = "dropped"
-    (project.root / "tests/workflow/tiny.yaml").write_text(yaml.safe_dump(settings))
-    project.run("dataset")
-    assert_same_images(scene, data)
-    assert read_arrays(data / "particles.h5")[0]["tracers"].shape == (len(FRAMES), 100, 3)
-    plan = project.plan("tiny/results/table1.csv")
-    assert "gaussians" in plan
-    assert not {"ground_truth", "render_static", "render_dynamic", "unpack_truth"} & set(plan)

@@ -5,9 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
-import yaml
 from PIL import Image
-from test_workflow import copied
 
 from neuma_lib.errors import InputError
 from neuma_lib.io.images import list_images, load_observation, read_image_set
@@ -96,20 +94,3 @@ def test_listed_images_stay_where_they_are(tmp_path):
     image.write_bytes(image.read_bytes() + b"\0")
     with pytest.raises(InputError, match="was changed"):
         read_image_set(listed)
-
-
-def test_workflow_takes_supplied_images_in_place_of_blenders(tmp_path):
-    project = copied(tmp_path / "project", tmp_path / "kernels")
-    images = {kind: str(write_release(tmp_path / kind, kind=kind)) for kind in ("static", "dynamic")}
-    settings = yaml.safe_load((project.root / "tests/workflow/tiny.yaml").read_text())
-    settings["scenes"]["BouncyBall"]["images"] = images
-    (project.root / "tests/workflow/tiny.yaml").write_text(yaml.safe_dump(settings))
-    targets = [f"tiny/data/BouncyBall/{kind}/transforms.json" for kind in images]
-    assert project.plan(f"{targets[0]}") == {"supplied_static": 1}
-    output = project.run(*targets)
-    assert "6 images of 32x30 px, 2 views" in output
-    for kind, target in zip(images, targets, strict=True):
-        ours, theirs = read_image_set(project.root / target), read_image_set(images[kind])
-        assert (ours.images == theirs.images).all() and (ours.viewmats == theirs.viewmats).all()
-    others = project.plan("tiny/data/ClayCat/static/transforms.json")
-    assert others["render_static"] == 1 and "supplied_static" not in others

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from test_workflow import ROOT, copied
+from project import ROOT, copied
 
 pytestmark = pytest.mark.slow
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -15,101 +13,12 @@ from pathlib import Path
 
 import pytest
 import torch
-import yaml
+from project import ROOT, SCENE, TABLE, Project, copied
 
 from neuma_lib.evaluation.lpips import expected_shapes
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.weights import write_weights
-
-ROOT = Path(__file__).resolve().parents[2]
-PARTS = (
-    "Snakefile",
-    "Makefile",
-    "pyproject.toml",
-    "config",
-    "envs",
-    "neuma_lib",
-    "profiles",
-    "workflow",
-    "tests/workflow/tiny.yaml",
-)
-TABLE = "tiny/results/table1.csv"
-SCENE = "tiny/results/BouncyBall"
-
-
-class Project:
-    """A copy of the working tree in a folder of its own."""
-
-    def __init__(self, root: Path):
-        self.root = root
-
-    def command(self, *words: str) -> list[str]:
-        return [
-            sys.executable,
-            "-m",
-            "snakemake",
-            "--configfile",
-            "tests/workflow/tiny.yaml",
-            "--cores",
-            "2",
-            *words,
-        ]
-
-    def run(self, *words: str, succeeds: bool = True) -> str:
-        """Run Snakemake; its output."""
-        done = subprocess.run(
-            self.command(*words),
-            cwd=self.root,
-            text=True,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            timeout=900,
-        )
-        assert (done.returncode == 0) == succeeds, done.stdout[-4000:]
-        return done.stdout
-
-    def plan(self, *words: str) -> dict[str, int]:
-        """Rules that Snakemake would run, with the number of their jobs."""
-        text = self.run("--dry-run", *words)
-        stats = re.search(r"^job +count\n[- ]+\n(.*?)^total", text, re.MULTILINE | re.DOTALL)
-        assert stats or "Nothing to be done" in text, text[-4000:]
-        return {line.split()[0]: int(line.split()[1]) for line in stats[1].splitlines()} if stats else {}
-
-    def start(self, *words: str) -> subprocess.Popen:
-        """Start Snakemake as the leader of a process group of its own."""
-        with open(self.root / "started.log", "w") as log:
-            return subprocess.Popen(
-                self.command(*words),
-                cwd=self.root,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
-
-    def processes(self, script: str) -> list[int]:
-        """Running Python processes of a script of this copy."""
-        found = []
-        for process in Path("/proc").glob("[0-9]*"):
-            try:
-                here = (process / "cwd").resolve() == self.root
-                words = (process / "cmdline").read_bytes().split(b"\0")
-            except OSError:
-                continue
-            if here and b"python" in words[0] and any(w.endswith(f".{script}.py".encode()) for w in words):
-                found.append(int(process.name))
-        return found
-
-    def artifacts(self) -> dict[str, str]:
-        """Digests of all data and results; logs and benchmarks are no artifacts."""
-        files = [f for f in (self.root / "tiny").rglob("*") if f.is_file()]
-        kept = {str(f.relative_to(self.root)): f for f in files if not {"logs", "benchmarks"} & set(f.parts)}
-        return {name: hashlib.sha256(f.read_bytes()).hexdigest() for name, f in sorted(kept.items())}
-
-    def clone(self, root: Path) -> Project:
-        """A copy of the project as it stands, with everything computed and Snakemake's records."""
-        shutil.copytree(self.root, root)
-        return Project(root.resolve())
 
 
 def wait_for(condition, seconds: float = 60.0):
@@ -119,42 +28,6 @@ def wait_for(condition, seconds: float = 60.0):
         assert time.monotonic() < end, "waited in vain"
         time.sleep(0.02)
     return value
-
-
-def copied(folder: Path, kernels: Path, origin: Path = ROOT) -> Project:
-    """A copy of the sources at ``origin`` in a folder of its own."""
-    for part in PARTS:
-        source, target = origin / part, folder / part
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if source.is_dir():
-            shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"))
-        else:
-            shutil.copy2(source, target)
-    settings = yaml.safe_load((ROOT / "tests" / "workflow" / "tiny.yaml").read_text())
-    (folder / "tests" / "workflow" / "tiny.yaml").write_text(
-        yaml.safe_dump({**settings, "kernel_cache": str(kernels)})
-    )
-    return Project(folder.resolve())
-
-
-@pytest.fixture(scope="module")
-def kernels(tmp_path_factory):
-    """A kernel cache that all copies share."""
-    return tmp_path_factory.mktemp("kernels")
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory, kernels):
-    """A copy in which Table 1 has been made from nothing. Tests leave it as they found it."""
-    project = copied(tmp_path_factory.mktemp("project"), kernels)
-    project.output = project.run(TABLE, f"{SCENE}/initial_state.json", f"{SCENE}/neuma/video.mp4")
-    return project
-
-
-@pytest.fixture
-def clone(finished, tmp_path):
-    """A finished copy to spoil."""
-    return finished.clone(tmp_path / "clone")
 
 
 # ---- from nothing to a table
@@ -190,7 +63,15 @@ def test_same_seed_same_bytes_in_another_folder(finished, kernels, tmp_path):
     first, second = finished.artifacts(), again.artifacts()
     assert first == second
     assert {Path(name).name for name in first} >= {
-        *("particles.h5", "transforms.json", "gaussians.ply", "mesh.ply", "binding.h5", "velocity.json"),
+        *(
+            "particles.h5",
+            "sampled_particles.h5",
+            "transforms.json",
+            "gaussians.ply",
+            "mesh.ply",
+            "binding.h5",
+            "velocity.json",
+        ),
         *(
             "jelly.safetensors",
             "adaptor.safetensors",
@@ -220,7 +101,7 @@ def test_touching_reruns_nothing(clone):
 
 
 def test_comments_and_docstrings_rerun_nothing(clone):
-    for name in ("neuma_lib/render/rasterizer.py", "workflow/scripts/material.py"):
+    for name in ("neuma_lib/splatting/rasterizer.py", "workflow/scripts/material.py"):
         file = clone.root / name
         file.write_text(re.sub(r'^"""', '"""Reworded. ', file.read_text(), count=1) + "\n# a remark\n")
     assert clone.plan(TABLE) == {}
@@ -241,7 +122,7 @@ def test_a_training_parameter_reruns_training_and_evaluation_only(clone):
 
 
 def test_editing_the_rasterizer_reruns_what_renders(clone):
-    file = clone.root / "neuma_lib" / "render" / "rasterizer.py"
+    file = clone.root / "neuma_lib" / "splatting" / "rasterizer.py"
     original = file.read_text()
     file.write_text(original + "\nEDITED = True\n")
     plan = clone.plan(TABLE)
@@ -268,23 +149,27 @@ def test_editing_the_rasterizer_reruns_what_renders(clone):
     ("file", "runs", "spared"),
     [
         (
-            "neuma_lib/evaluation/evaluate.py",
+            "neuma_lib/evaluation/motion.py",
             {"evaluation", "chamfer_table"},
             {"material", "velocity", "ground_truth"},
         ),
         ("neuma_lib/evaluation/tables.py", {"chamfer_table"}, {"evaluation"}),
         (
-            "neuma_lib/binding.py",
+            "neuma_lib/coupling/particle_binding.py",
             {"binding", "velocity", "material", "evaluation"},
             {"gaussians", "mesh", "prior"},
         ),
         (
-            "neuma_lib/blender/cycles.py",
+            "neuma_lib/data/blender/cycles.py",
             {"render_static", "render_dynamic", "gaussians"},
             {"ground_truth", "prior"},
         ),
         ("neuma_lib/sim/rollout.py", {"ground_truth", "prior", "material"}, set()),
-        ("workflow/scripts/binding.py", {"binding", "velocity", "evaluation"}, {"particles", "gaussians"}),
+        (
+            "workflow/scripts/binding.py",
+            {"binding", "velocity", "evaluation"},
+            {"sampled_particles", "gaussians"},
+        ),
     ],
 )
 def test_edits_rerun_what_depends_on_them(clone, file, runs, spared):

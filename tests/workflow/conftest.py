@@ -1,0 +1,24 @@
+"""What the tests of the workflow share: one finished run."""
+
+import pytest
+from project import SCENE, TABLE, copied
+
+
+@pytest.fixture(scope="session")
+def kernels(tmp_path_factory):
+    """A kernel cache that all copies share."""
+    return tmp_path_factory.mktemp("kernels")
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory, kernels):
+    """A copy in which Table 1 has been made from nothing. Tests leave it as they found it."""
+    project = copied(tmp_path_factory.mktemp("project"), kernels)
+    project.output = project.run(TABLE, f"{SCENE}/initial_state.json", f"{SCENE}/neuma/video.mp4")
+    return project
+
+
+@pytest.fixture
+def clone(finished, tmp_path):
+    """A finished copy to spoil."""
+    return finished.clone(tmp_path / "clone")
