@@ -59,6 +59,10 @@ def read_torch(path: str | Path) -> Any:
             members = archive.infolist()
             if sum(member.file_size for member in members) > path.stat().st_size:
                 raise InputError(f"{path} claims more data than it has bytes: do not use this file")
+            # the one type that torch lets a file make at a size of its choice
+            pickles = [archive.read(member) for member in members if member.filename.endswith(".pkl")]
+            if any(b"bytearray" in content for content in pickles):
+                raise InputError(f"{path} holds a bytearray, not only plain tensors: do not use this file")
         return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds for a damaged file
         if isinstance(error, InputError):

@@ -428,6 +428,13 @@ class Command:
         return print, ("unpickled",)
 
 
+class Zeros:
+    """Takes memory when it is unpickled, which torch permits."""
+
+    def __reduce__(self):
+        return bytearray, (HUGE,)
+
+
 def torch_file(content):
     file = BytesIO()
     torch.save(content, file)
@@ -454,6 +461,7 @@ TORCH = {
     "text": b"no weights",
     "a pickle": pickle.dumps({"elasticity": Command()}),
     "a command": torch_file({"elasticity": Command(), "plasticity": Command()}),
+    "zeros on request": torch_file({"elasticity": Zeros()}),
     "a list": torch_file([1, 2]),
     "a tensor": torch_file(torch.zeros(3)),
     "parts that are numbers": torch_file({"elasticity": 5, "plasticity": 5}),
