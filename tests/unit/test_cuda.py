@@ -10,7 +10,6 @@ from sim_scenes import make_law
 
 from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.velocity import VelocityConfig
-from neuma_lib.coupling import reconstruction as observation
 from neuma_lib.fitting.material import PixelLoss, train_material
 from neuma_lib.fitting.velocity import estimate_velocity
 from neuma_lib.io.checkpoint import Checkpoint
@@ -19,6 +18,7 @@ from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.sim.model import Body
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
+from neuma_lib.splatting import observation
 from neuma_lib.splatting.observation import Observation
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
