@@ -3,22 +3,23 @@
 Meshes are `trimesh.Trimesh` in metres, watertight and oriented outwards; points are float64 arrays.
 """
 
-from __future__ import annotations
-
+# No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
 from collections.abc import Sequence
 from itertools import combinations
 from typing import Literal
 
 import numpy as np
 import trimesh
+import warp as wp
 from numpy.typing import NDArray
 
+from neuma_lib.device import start_warp
 from neuma_lib.errors import InputError
+
+start_warp()
 
 Array = NDArray[np.float64]
 
-_CHUNK_PAIRS = 2_000_000
-"""Point-triangle pairs tested at one time."""
 _ATTEMPTS = 12
 """Samplings tried for a count near the wanted one."""
 _COUNT_TOLERANCE = 0.01
@@ -48,8 +49,8 @@ def check_mesh(mesh: trimesh.Trimesh, name: str = "mesh") -> None:
 def inside(mesh: trimesh.Trimesh, points: Array) -> NDArray[np.bool_]:
     """Which points lie inside a closed mesh.
 
-    A ray from each point along +z counts the faces that it leaves and enters through. Overlapping closed
-    parts count as one body.
+    Decided by Warp's winding numbers in single precision, on the CPU so that every machine fills a body alike. Parts
+    that overlap count as one body; a point within about 1e-7 of the mesh's size of its surface may go either way.
 
     Args:
         mesh: watertight, oriented outwards [m].
@@ -58,7 +59,30 @@ def inside(mesh: trimesh.Trimesh, points: Array) -> NDArray[np.bool_]:
     Returns:
         True inside, shape (P,).
     """
-    return _Columns(mesh).inside(np.asarray(points, dtype=np.float64))
+    found = ((points >= mesh.bounds[0]) & (points <= mesh.bounds[1])).all(axis=1)
+    near = np.flatnonzero(found)
+    centre, diagonal = mesh.bounds.mean(axis=0), float(np.linalg.norm(mesh.extents))
+    body = wp.Mesh(
+        wp.array(mesh.vertices - centre, dtype=wp.vec3, device="cpu"),
+        wp.array(mesh.faces.ravel(), dtype=wp.int32, device="cpu"),
+        support_winding_number=True,
+    )
+    signs = wp.empty(len(near), dtype=wp.float32, device="cpu")
+    queries = wp.array(points[near] - centre, dtype=wp.vec3, device="cpu")
+    wp.launch(_winding_signs, len(near), [body.id, queries, diagonal], [signs], device="cpu")
+    found[near] = signs.numpy() < 0
+    return found
+
+
+@wp.kernel(enable_backward=False)
+def _winding_signs(
+    mesh: wp.uint64,
+    points: wp.array(dtype=wp.vec3),
+    reach: wp.float32,  # larger than the distance of any point to the mesh
+    signs: wp.array(dtype=wp.float32),  # out: -1 inside, 1 outside
+):
+    i = wp.tid()
+    signs[i] = wp.mesh_query_point_sign_winding_number(mesh, points[i], reach).sign
 
 
 def check_apart(meshes: Sequence[trimesh.Trimesh]) -> None:
@@ -70,75 +94,6 @@ def check_apart(meshes: Sequence[trimesh.Trimesh]) -> None:
     for (i, a), (j, b) in combinations(enumerate(meshes), 2):
         if inside(a, b.vertices).any() or inside(b, a.vertices).any():
             raise InputError(f"bodies {i} and {j} overlap at the start: move one of them (height, center)")
-
-
-class _Columns:
-    """Faces of a mesh, sorted into the columns of a grid over (x, y)."""
-
-    def __init__(self, mesh: trimesh.Trimesh):
-        corners = np.asarray(mesh.vertices, dtype=np.float64)[mesh.faces]
-        edges_xy = corners[:, 1:, :2] - corners[:, :1, :2]
-        self.doubled_area = edges_xy[:, 0, 0] * edges_xy[:, 1, 1] - edges_xy[:, 0, 1] * edges_xy[:, 1, 0]
-        corners = corners[self.doubled_area != 0.0]
-        self.doubled_area = self.doubled_area[self.doubled_area != 0.0]
-        self.corners = corners
-        low, high = corners[..., :2].min(axis=1), corners[..., :2].max(axis=1)
-        self.origin = low.min(axis=0)
-        extent = float((high.max(axis=0) - self.origin).max())
-        # About as many columns as faces seen from above: few faces a column, few columns a face.
-        self.side = int(np.clip(np.sqrt(len(corners) / 2), 1, 512))
-        self.width = extent / self.side * (1 + 1e-9)
-        first, last = self._column(low), self._column(high)
-        spans = last - first + 1
-        copies = spans.prod(axis=1)
-        face = np.repeat(np.arange(len(corners)), copies)
-        slot = np.arange(len(face)) - np.repeat(np.cumsum(copies) - copies, copies)
-        column = first[face] + np.stack([slot // spans[face, 1], slot % spans[face, 1]], axis=1)
-        key = column[:, 0] * self.side + column[:, 1]
-        self.faces = face[np.argsort(key, kind="stable")]
-        self.start = np.concatenate([[0], np.cumsum(np.bincount(key, minlength=self.side**2))])
-
-    def _column(self, xy: Array) -> NDArray[np.int64]:
-        return np.clip(((xy - self.origin) / self.width).astype(np.int64), 0, self.side - 1)
-
-    def inside(self, points: Array) -> NDArray[np.bool_]:
-        relative = (points[:, :2] - self.origin) / self.width
-        near = np.flatnonzero(((relative >= 0) & (relative <= self.side)).all(axis=1))
-        column = self._column(points[near, :2])
-        key = column[:, 0] * self.side + column[:, 1]
-        candidates = self.start[key + 1] - self.start[key]
-        winding = np.zeros(len(points))
-        chunks = np.cumsum(candidates) // _CHUNK_PAIRS
-        for part in np.split(np.arange(len(near)), np.flatnonzero(np.diff(chunks)) + 1):
-            count = candidates[part]
-            point = np.repeat(near[part], count)
-            slot = np.arange(len(point)) - np.repeat(np.cumsum(count) - count, count)
-            face = self.faces[np.repeat(self.start[key[part]], count) + slot]
-            winding += np.bincount(point, self._crossings(points[point], face), minlength=len(points))
-        return winding > 0.5
-
-    def _crossings(self, points: Array, face: NDArray[np.int64]) -> Array:
-        """+1 where the upward ray of a point leaves through the face, -1 where it enters, 0 elsewhere.
-
-        The side of a point with respect to an edge is computed from the edge's ends in one order for both
-        faces that share it, and a point on the edge belongs to one side: exactly one of the two faces is hit.
-        """
-        corners = self.corners[face]
-        x, y = points[:, 0], points[:, 1]
-        weights = np.empty((3, len(points)))
-        orientation = np.sign(self.doubled_area[face])
-        hit = np.ones(len(points), dtype=bool)
-        for k in range(3):
-            a, b = corners[:, (k + 1) % 3, :2], corners[:, (k + 2) % 3, :2]
-            swap = (a[:, 0] > b[:, 0]) | ((a[:, 0] == b[:, 0]) & (a[:, 1] > b[:, 1]))
-            low, high = np.where(swap[:, None], b, a), np.where(swap[:, None], a, b)
-            side = (high[:, 0] - low[:, 0]) * (y - low[:, 1]) - (high[:, 1] - low[:, 1]) * (x - low[:, 0])
-            direction = np.where(swap, -1.0, 1.0) * orientation
-            hit &= np.where(side >= 0, 1.0, -1.0) == direction
-            weights[k] = side * direction
-        total = weights.sum(axis=0)
-        height = np.einsum("kp,pk->p", weights, corners[:, :, 2]) / np.where(total > 0, total, 1.0)
-        return np.where(hit & (height > points[:, 2]), orientation, 0.0)
 
 
 def sample_volume(
@@ -165,14 +120,13 @@ def sample_volume(
     if method not in ("jittered", "uniform"):
         raise InputError(f"volume sampling: unknown method {method!r}; choose jittered or uniform")
     rng = np.random.default_rng(seed)
-    columns = _Columns(mesh)
     if method == "uniform":
-        return _uniform(columns, mesh, count, rng)
+        return _uniform(mesh, count, rng)
     best = np.empty((0, 3))
     spacing = float(np.cbrt(mesh.volume / count))
     for _ in range(_ATTEMPTS):
         points = _jittered_grid(mesh.bounds, spacing, rng)
-        points = points[columns.inside(points)]
+        points = points[inside(mesh, points)]
         if abs(len(points) - count) < abs(len(best) - count):
             best = points
         if abs(len(best) - count) <= _COUNT_TOLERANCE * count:
@@ -198,14 +152,14 @@ def _jittered_grid(bounds: Array, spacing: float, rng: np.random.Generator) -> A
     return origin + spacing * (cells + rng.random(cells.shape))
 
 
-def _uniform(columns: _Columns, mesh: trimesh.Trimesh, count: int, rng: np.random.Generator) -> Array:
+def _uniform(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator) -> Array:
     """Independent points by rejection from the bounding box."""
     filled = float(mesh.volume / np.prod(mesh.extents))
     found: list[Array] = []
     while sum(map(len, found)) < count:
         tries = int((count - sum(map(len, found))) / filled * 1.05) + 16
         points = mesh.bounds[0] + rng.random((tries, 3)) * mesh.extents
-        found.append(points[columns.inside(points)])
+        found.append(points[inside(mesh, points)])
     return np.concatenate(found)[:count]
 
 
