@@ -7,16 +7,10 @@ import torch
 from safetensors.torch import save
 
 from neuma_lib.config.priors import RegressionConfig, TrajectoryConfig
-from neuma_lib.fitting.priors import (
-    random_rotations,
-    random_throw,
-    reference_law,
-    sample_deformations,
-    targets,
-    train_by_trajectory,
-    train_prior,
-    visited_stretches,
-)
+from neuma_lib.fitting.prior_regression import Network, sample_deformations, targets, train_by_regression
+from neuma_lib.fitting.prior_throws import random_rotations, random_throw, reference_law, visited_stretches
+from neuma_lib.fitting.prior_training import judge, train_prior
+from neuma_lib.fitting.prior_trajectory import train_by_trajectory
 from neuma_lib.fitting.soap import SOAP
 from neuma_lib.mechanics.neural import PLASTIC_SCALE
 from neuma_lib.mechanics.singular_values import svd3
@@ -118,21 +112,36 @@ def tiny_plasticine():
     return train_prior(PLASTICINE, TINY, seed=3)
 
 
-def test_regression_learns(tiny_plasticine):
+def test_networks_beat_the_best_linear_map_of_their_features(tiny_plasticine):
+    """The same relative error, minimised in closed form, is ten times that of the networks at least."""
+    reference, generator = reference_law(PLASTICINE, TINY), torch.Generator().manual_seed(0)
+    visited = visited_stretches(random_throw(reference, generator, TINY), reference)
+    for part, pool in zip(("elasticity", "plasticity"), visited, strict=True):
+        z, X = targets(reference, part, sample_deformations(pool, TINY, generator))
+        X = X / Network(z, X, generator).unit_out
+        root = (X.square().sum(1) + TINY.floor**2).rsqrt()[:, None]
+        best = torch.linalg.lstsq(root * z, root * X).solution
+        linear = float((root * (z @ best - X)).square().sum(1).mean())
+        assert tiny_plasticine[1]["loss"][part][-1] < 0.1 * linear
+
+
+def test_trained_law_is_nearer_to_its_law_than_an_elastic_one(tiny_plasticine):
+    """A hundredth of the Chamfer distance of the same law without its return map, and its speed of sound."""
     law, report = tiny_plasticine
-    loss = report["loss"]
-    assert loss["elasticity"][-1] < 0.1  # the untrained network has 1 or more
-    assert loss["plasticity"][-1] < 0.7
-    assert report["chamfer"] < 0.5
+    elastic = {**PLASTICINE, "plasticity": {"name": "identity"}}
+    assert report["chamfer"] < 0.01 * judge(reference_law(elastic, TINY), PLASTICINE, TINY, seed=3)["chamfer"]
     assert law.wave_speed(1000.0) == pytest.approx(
-        reference_law(PLASTICINE, RegressionConfig()).wave_speed(1000.0), rel=0.1
+        reference_law(PLASTICINE, TINY).wave_speed(1000.0), rel=0.1
     )
 
 
-def test_same_seed_same_bytes(tiny_plasticine):
-    again, report = train_prior(PLASTICINE, TINY, seed=3)
-    assert save(again.prior_state()) == save(tiny_plasticine[0].prior_state())
-    assert report == tiny_plasticine[1]
+def test_same_seed_same_bytes():
+    short = TINY.model_copy(update={"iterations": 20})
+    (law, report), (again, same) = (
+        train_by_regression(PLASTICINE, short, 3, lambda *_: None) for _ in range(2)
+    )
+    assert save(law.prior_state()) == save(again.prior_state())
+    assert report == same
 
 
 def test_trained_law_is_objective_and_free_of_stress_at_rest(tiny_plasticine):

@@ -1,7 +1,7 @@
 """Train a neural constitutive law on an analytic one."""
 
 from neuma_lib.config.priors import RegressionConfig, TrajectoryConfig
-from neuma_lib.fitting.priors import train_prior
+from neuma_lib.fitting.prior_training import train_prior
 from neuma_lib.io.files import write_json
 from neuma_lib.io.weights import write_weights
 from workflow.stage import stage

@@ -1,0 +1,93 @@
+"""Priors: neural constitutive laws trained on published analytic ones (the paper's M_0, NCLaw).
+
+Two ways lead from an analytic law to a pair of networks, `neuma_lib.fitting.prior_regression` (default, seconds) and
+`neuma_lib.fitting.prior_trajectory` (NCLaw's). Either way the result is judged by its rollout against the law's, on
+throws that training has not seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from neuma_lib.config.priors import RegressionConfig, TrajectoryConfig
+from neuma_lib.errors import NonFiniteError
+from neuma_lib.fitting.prior_regression import train_by_regression
+from neuma_lib.fitting.prior_throws import Progress, random_throw, reference_law
+from neuma_lib.fitting.prior_trajectory import train_by_trajectory
+from neuma_lib.geometry.chamfer import chamfer_sequence
+from neuma_lib.mechanics.law import Law
+from neuma_lib.mechanics.neural import NeuralLaw
+
+_JUDGE_SEEDS = 10_000
+"""Added to a prior's seed: the throws that judge it are not those that it was trained on."""
+
+
+def train_prior(
+    spec: Mapping[str, Any],
+    settings: RegressionConfig | TrajectoryConfig,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> tuple[NeuralLaw, dict[str, Any]]:
+    """Train a neural law on an analytic one.
+
+    Args:
+        spec: the analytic law, see :func:`neuma_lib.mechanics.analytic.analytic_law`.
+        settings: of one of the two ways, which chooses the way.
+        seed: of throws, noise, initial weights and batches.
+        progress: called with (iterations done, iterations in all, loss).
+
+    Returns:
+        the law, and a report of plain numbers: losses, and how its rollout differs from its law's on unseen
+        throws, see :func:`judge`.
+
+    Raises:
+        InputError: unknown material.
+        NonFiniteError: training or a rollout diverged.
+    """
+    regression = isinstance(settings, RegressionConfig)
+    train = train_by_regression if regression else train_by_trajectory
+    law, report = train(spec, settings, seed, progress or (lambda done, total, loss: None))
+    report["method"] = "regression" if regression else "trajectory"
+    how = settings if regression else RegressionConfig(grid=settings.grid, dt=settings.dt)
+    report.update(judge(law, spec, how, seed))
+    return law, report
+
+
+def judge(
+    law: Law,
+    spec: Mapping[str, Any],
+    settings: RegressionConfig,
+    seed: int = 0,
+    throws: int = 3,
+    frames: int = 20,
+) -> dict[str, float]:
+    """How far a law's rollouts are from those of the analytic law, on throws of their own.
+
+    Returns:
+        ``chamfer`` (mean squared nearest-neighbour distance, both directions summed [1e-4 m^2]) and ``rmse``
+        of corresponding particles [m], means over frames and throws; ``rmse_worst``, the worst frame's [m].
+    """
+    generator = torch.Generator().manual_seed(_JUDGE_SEEDS + seed)
+    chamfers, errors = [], []
+    reference = reference_law(spec, settings)
+    for _ in range(throws):
+        throw = random_throw(reference, generator, settings)
+        steps = [round(i * throw.steps / frames) for i in range(1, frames + 1)]
+        try:
+            with torch.no_grad():
+                seen, truth = throw.run(law, steps), throw.run(reference, steps)
+        except NonFiniteError as error:
+            raise NonFiniteError(
+                "prior", f"the trained law is unstable ({error.detail}); train it longer"
+            ) from error
+        errors.append((seen.x - truth.x).square().sum(-1).mean(-1).sqrt())
+        chamfers.append(float(chamfer_sequence(seen.x, truth.x).mean()))
+    rmse = torch.stack(errors)
+    return {
+        "chamfer": sum(chamfers) / throws,
+        "rmse": float(rmse.mean()),
+        "rmse_worst": float(rmse.max()),
+    }
