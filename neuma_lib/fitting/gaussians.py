@@ -1,8 +1,8 @@
-"""Static Gaussian kernels from posed RGBA images (paper Sec. 3.1 and supplement, 3D Gaussian Splatting).
+"""Static Gaussians from posed RGBA images (paper Sec. 3.1 and supplement, 3D Gaussian Splatting).
 
 Start: points sampled in the visual hull of the alpha masks, coloured from the images. Loss: L1 and SSIM over
 a random background, which makes alpha a fourth supervised channel, plus the anisotropy regulariser of
-PhysGaussian. Kernels with large screen-space gradients are cloned or split up to a fixed number; transparent
+PhysGaussian. Gaussians with large screen-space gradients are cloned or split up to a fixed number; transparent
 ones are removed, at the end those with an opacity of at most 0.02, as in the paper.
 """
 
@@ -18,13 +18,11 @@ from torch import Tensor
 
 from neuma_lib.config.gaussians import GaussiansConfig
 from neuma_lib.errors import InputError, NonFiniteError
-from neuma_lib.geometry.visual_hull import Hull, visual_hull
+from neuma_lib.geometry.visual_hull import Hull, check_masks, visual_hull
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians, covariances, rotations
 from neuma_lib.splatting.rasterizer import RenderBuffers, Statistics, rasterize
 from neuma_lib.splatting.spherical_harmonics import coefficient_count, rgb_to_sh0
-
-WHITE = (1.0, 1.0, 1.0)
 
 
 @dataclass
@@ -33,8 +31,8 @@ class GaussianFitReport:
 
     Attributes:
         losses: training loss of every iteration.
-        count: kernels returned.
-        culled: kernels removed by the final opacity cull.
+        count: Gaussians returned.
+        culled: Gaussians removed by the final opacity cull.
         held_out: indices of the views kept for measurement.
         psnr: mean PSNR [dB] of the held-out views, full frame over white.
         psnr_object: the same inside the object (pixels with alpha above 1/2).
@@ -53,6 +51,22 @@ class GaussianFitReport:
 
 EPS2D = 0.3
 """Variance that a pixel adds to a splat during the fit [px^2], as usual in Gaussian splatting."""
+_SHEET_PACKING = 1.15
+"""Squared spacing over the area a point, hexagonally packed sheet: 2 / sqrt(3), rounded."""
+_VOLUME_PACKING = 1.41
+"""Cubed spacing over the volume a point, close packing of spheres: sqrt(2), rounded."""
+_START_SCALE = 0.5
+"""Standard deviation at the start over the spacing."""
+_COLOUR_DEPTHS = 0.05
+"""Depth [fraction of the mean depth] over which the weight of a farther camera falls by e in the first colours."""
+_BETAS, _EPS = (0.9, 0.99), 1e-15
+"""Adam's averaging factors and its smallest denominator (3DGS takes 0.9, 0.999; fits here are 20 times shorter)."""
+_MEANS_DECAY, _RATE_DECAY = 0.01, 0.1
+"""Last over first learning rate: of the centres (as 3DGS), of all else."""
+_SPLIT_SHRINK = 1.6
+"""Standard deviation of a Gaussian over those that it is split into, as in 3DGS."""
+_CLONE_OFFSET = 0.5
+"""Distance of a small Gaussian's clone over that of a large one's, both in random standard deviations."""
 
 
 def fit_gaussians(
@@ -62,20 +76,20 @@ def fit_gaussians(
     seed: int = 0,
     progress: Callable[[int, float], None] | None = None,
 ) -> tuple[Gaussians, GaussianFitReport]:
-    """Fit Gaussian kernels to images of an object.
+    """Fit Gaussians to images of an object.
 
     Args:
         images: (V, H, W, 4) RGBA with straight alpha in [0, 1]; alpha shows the object alone.
         cameras: their V cameras.
         settings: hyper-parameters.
-        seed: of everything random; the same seed gives the same kernels on a CPU.
+        seed: of everything random; the same seed gives the same Gaussians on a CPU.
         progress: called with (iteration, loss) after each iteration.
 
     Returns:
-        The kernels, without gradient and with the pixels' blur absorbed (render them with ``eps2d=0``), and a report.
+        The Gaussians, without gradient and with the pixels' blur absorbed (render them with ``eps2d=0``), and a report.
 
     Raises:
-        InputError: shapes disagree, or a mask is empty.
+        InputError: shapes disagree, a mask is empty or covers the frame, or masks and poses contradict each other.
         NonFiniteError: the loss is not finite.
     """
     images = images.to(cameras.viewmats.dtype)
@@ -88,7 +102,7 @@ def fit_gaussians(
 
     hull = visual_hull(images[fitted, ..., 3], cameras[fitted], settings.hull_resolution)
     start, spacing = _initial_gaussians(hull, images[fitted], cameras[fitted], settings, generator)
-    kernels = _Kernels(start, spacing, settings)
+    fit = _Fit(start, spacing, settings)
 
     losses: list[float] = []
     order: list[int] = []
@@ -101,18 +115,18 @@ def fit_gaussians(
                 order = [fitted[i] for i in torch.randperm(len(fitted), generator=generator).tolist()]
             views.append(order.pop())
         background = torch.rand(3, generator=generator).to(images)
-        loss = kernels.step(images[views], cameras[views], background, iteration / settings.iterations)
+        loss = fit.step(images[views], cameras[views], background, iteration / settings.iterations)
         losses.append(loss)
         if not math.isfinite(loss):
             raise NonFiniteError(
                 "gaussians", f"loss is {loss} in iteration {iteration}; lower the learning rates"
             )
         if first <= iteration < last and (iteration + 1) % rules.every == 0:
-            kernels.densify(generator)
+            fit.densify(generator)
         if progress is not None:
             progress(iteration, loss)
 
-    everything = kernels.gaussians()
+    everything = fit.gaussians()
     gaussians = everything.cull(settings.cull_opacity).absorbing_blur(cameras, EPS2D)
     psnr, psnr_object = evaluate(gaussians, images, cameras, held_out)
     train_psnr, train_psnr_object = evaluate(gaussians, images, cameras, fitted)
@@ -151,16 +165,16 @@ def evaluate(gaussians: Gaussians, images: Tensor, cameras: Cameras, views: list
 def _initial_gaussians(
     hull: Hull, images: Tensor, cameras: Cameras, settings: GaussiansConfig, generator: torch.Generator
 ) -> tuple[Gaussians, float]:
-    """Isotropic kernels, most near the hull's surface, and their mean spacing [m]."""
+    """Isotropic Gaussians, most near the hull's surface, and their mean spacing [m]."""
     solid = hull.occupied.float()[None, None]
     eroded = -torch.nn.functional.max_pool3d(-torch.nn.functional.pad(solid, (1,) * 6), 3, stride=1)
     shell = hull.occupied & (eroded[0, 0] < 0.5)
     inner = hull.occupied & ~shell
     wanted_inside = round(settings.interior * settings.initial_count) if inner.any() else 0
     wanted = ((shell, settings.initial_count - wanted_inside), (inner, wanted_inside))
-    # a shell voxel stands for about one voxel^2 of surface; spacings of a packed sheet and volume
-    surface_spacing = hull.voxel * math.sqrt(1.15 * float(shell.sum()) / wanted[0][1])
-    volume_spacing = hull.voxel * (1.41 * float(inner.sum()) / max(wanted_inside, 1)) ** (1 / 3)
+    # a shell voxel stands for about one voxel^2 of surface
+    surface_spacing = hull.voxel * math.sqrt(_SHEET_PACKING * float(shell.sum()) / wanted[0][1])
+    volume_spacing = hull.voxel * (_VOLUME_PACKING * float(inner.sum()) / max(wanted_inside, 1)) ** (1 / 3)
     means, spacings = [], []
     for (voxels, count), spacing in zip(wanted, (surface_spacing, volume_spacing), strict=True):
         candidates = voxels.nonzero().to(hull.origin)
@@ -177,7 +191,7 @@ def _initial_gaussians(
     gaussians = Gaussians(
         means=means,
         quats=identity,
-        scales=(0.5 * spacing[:, None]).expand(-1, 3).clone(),
+        scales=(_START_SCALE * spacing[:, None]).expand(-1, 3).clone(),
         opacities=torch.full_like(spacing, settings.initial_opacity),
         sh0=rgb_to_sh0(_mean_colours(means, images, cameras))[:, None],
         shN=torch.zeros(count, higher, 3).to(means),
@@ -217,45 +231,47 @@ def _mean_colours(points: Tensor, images: Tensor, cameras: Cameras) -> Tensor:
     view = torch.arange(len(cameras), device=points.device)[:, None].expand_as(column)
     rgba = images[view, row, column]
     # a point on the surface is hidden from half of the cameras; those in front of it are the nearest
-    weights = rgba[..., 3] * torch.softmax(-depths / (0.05 * depths.mean()), dim=0)
+    weights = rgba[..., 3] * torch.softmax(-depths / (_COLOUR_DEPTHS * depths.mean()), dim=0)
     return (weights[..., None] * rgba[..., :3]).sum(0) / weights.sum(0)[:, None].clamp_min(1e-6)
 
 
-class _Kernels:
-    """Parameters, their Adam state, and the rounds of densification."""
+class _Fit:
+    """Parameters of the Gaussians, the optimizer, and the rounds of densification."""
 
     def __init__(self, start: Gaussians, spacing: float, settings: GaussiansConfig):
         self.settings, self.spacing = settings, spacing
-        self.parameters = {
-            "means": start.means.clone(),
-            "scales": start.scales.log(),
-            "quats": start.quats.clone(),
-            "opacities": torch.logit(start.opacities),
-            "sh0": start.sh0.clone(),
-            "shN": start.shN.clone(),
+        parameters = {  # value at the start, learning rate, its decay
+            "means": (start.means.clone(), settings.rate_means * spacing, _MEANS_DECAY),
+            "scales": (start.scales.log(), settings.rate_scales, _RATE_DECAY),
+            "quats": (start.quats.clone(), settings.rate_quats, _RATE_DECAY),
+            "opacities": (torch.logit(start.opacities), settings.rate_opacities, _RATE_DECAY),
+            "sh0": (start.sh0.clone(), settings.rate_colours, _RATE_DECAY),
+            "shN": (start.shN.clone(), settings.rate_harmonics, _RATE_DECAY),
         }
-        self.rates = {
-            "means": settings.rate_means * spacing,
-            "scales": settings.rate_scales,
-            "quats": settings.rate_quats,
-            "opacities": settings.rate_opacities,
-            "sh0": settings.rate_colours,
-            "shN": settings.rate_harmonics,
-        }
-        self.first_moments = {name: torch.zeros_like(value) for name, value in self.parameters.items()}
-        self.second_moments = {name: torch.zeros_like(value) for name, value in self.parameters.items()}
-        self.steps = 0
+        self.optimizer = torch.optim.Adam(
+            [
+                {"name": name, "params": [value.requires_grad_()], "first_lr": rate, "decay": decay}
+                for name, (value, rate, decay) in parameters.items()
+            ],
+            betas=_BETAS,
+            eps=_EPS,
+        )
         self.buffers = RenderBuffers()
         self.statistics = Statistics()
         self._reset_statistics()
 
-    def _reset_statistics(self) -> None:
-        self.gradients = torch.zeros_like(self.parameters["opacities"])
-        self.views = torch.zeros_like(self.parameters["opacities"])
+    def parameters(self) -> dict[str, Tensor]:
+        """Means, log scales, quaternions, logits of the opacities, colours: leaves of the gradient."""
+        return {group["name"]: group["params"][0] for group in self.optimizer.param_groups}
 
+    def _reset_statistics(self) -> None:
+        self.gradients = torch.zeros_like(self.parameters()["opacities"])
+        self.views = torch.zeros_like(self.gradients)
+
+    @torch.no_grad()
     def gaussians(self) -> Gaussians:
-        """The kernels as they are now."""
-        p = self.parameters
+        """The Gaussians as they are now."""
+        p = self.parameters()
         quats = torch.nn.functional.normalize(p["quats"], dim=-1)
         opacities = torch.sigmoid(p["opacities"])
         return Gaussians(
@@ -264,13 +280,12 @@ class _Kernels:
 
     def step(self, images: Tensor, cameras: Cameras, background: Tensor, done: float) -> float:
         """One Adam step on (B, H, W, 4) images; ``done`` in [0, 1) is the part of the schedule behind us."""
-        settings = self.settings
-        leaves = {name: value.requires_grad_() for name, value in self.parameters.items() if value.numel()}
+        settings, p = self.settings, self.parameters()
         pictures, _ = rasterize(
-            leaves["means"][None],
-            covariances(leaves["quats"], leaves["scales"].exp())[None],
-            torch.sigmoid(leaves["opacities"]),
-            torch.cat([leaves["sh0"], leaves["shN"]], dim=1) if "shN" in leaves else leaves["sh0"],
+            p["means"][None],
+            covariances(p["quats"], p["scales"].exp())[None],
+            torch.sigmoid(p["opacities"]),
+            torch.cat([p["sh0"], p["shN"]], dim=1),
             cameras.viewmats,
             cameras.Ks,
             cameras.width,
@@ -283,37 +298,29 @@ class _Kernels:
         alpha = images[..., 3:]
         targets = images[..., :3] * alpha + (1 - alpha) * background
         loss = image_loss(pictures[0], targets, settings.ssim_weight)
-        spread = leaves["scales"].amax(dim=1) - leaves["scales"].amin(dim=1)
+        spread = p["scales"].amax(dim=1) - p["scales"].amin(dim=1)
         ratio = spread.clamp_min(math.log(settings.max_anisotropy)).exp()
         loss = loss + settings.anisotropy_weight * (ratio - settings.max_anisotropy).mean()
-        gradients = dict(zip(leaves, torch.autograd.grad(loss, list(leaves.values())), strict=True))
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["first_lr"] * group["decay"] ** done
+        self.optimizer.step()
+        low, high = (math.log(part * self.spacing) for part in (settings.min_scale, settings.max_scale))
+        with torch.no_grad():
+            p["scales"].clamp_(low, high)
         self.gradients += self.statistics.screen_gradients
         self.views += self.statistics.views
-        with torch.no_grad():
-            self._adam(gradients, done)
         return float(loss.detach())
 
-    def _adam(self, gradients: dict[str, Tensor], done: float, beta1=0.9, beta2=0.99, eps=1e-15) -> None:
-        self.steps += 1
-        correction1, correction2 = 1 - beta1**self.steps, 1 - beta2**self.steps
-        for name, gradient in gradients.items():
-            value = self.parameters[name].requires_grad_(False)
-            m, v = self.first_moments[name], self.second_moments[name]
-            m.lerp_(gradient, 1 - beta1)
-            v.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
-            rate = self.rates[name] * (0.01 if name == "means" else 0.1) ** done
-            value.addcdiv_(m, (v / correction2).sqrt_().add_(eps), value=-rate / correction1)
-        low, high = (
-            math.log(part * self.spacing) for part in (self.settings.min_scale, self.settings.max_scale)
-        )
-        self.parameters["scales"].clamp_(low, high)
-
+    @torch.no_grad()
     def densify(self, generator: torch.Generator) -> None:
-        """Remove transparent kernels, then clone or split those whose screen-space gradients are largest."""
+        """Remove transparent Gaussians, then clone or split those whose screen-space gradients are largest."""
         rules = self.settings.densification
         score = self.gradients / self.views.clamp_min(1)
-        keep = torch.sigmoid(self.parameters["opacities"]) > rules.min_opacity
-        self._select(keep)
+        p = self.parameters()
+        keep = torch.sigmoid(p["opacities"]) > rules.min_opacity
+        self._replace({name: value[keep] for name, value in p.items()}, lambda moment: moment[keep])
         score = score[keep]
         count = len(score)
         added = min(rules.max_count - count, int(rules.growth * count), int((score > 0).sum()))
@@ -322,32 +329,38 @@ class _Kernels:
             self._multiply(chosen, generator)
         self._reset_statistics()
 
-    def _select(self, keep: Tensor) -> None:
-        for table in (self.parameters, self.first_moments, self.second_moments):
-            for name in table:
-                table[name] = table[name][keep]
+    def _replace(self, values: dict[str, Tensor], edit: Callable[[Tensor], Tensor]) -> None:
+        """Put other values in the place of the parameters; ``edit`` makes their moments from the former ones."""
+        for group in self.optimizer.param_groups:
+            state = self.optimizer.state.pop(group["params"][0])
+            state["exp_avg"], state["exp_avg_sq"] = edit(state["exp_avg"]), edit(state["exp_avg_sq"])
+            group["params"] = [values[group["name"]].requires_grad_()]
+            self.optimizer.state[group["params"][0]] = state
 
     def _multiply(self, chosen: Tensor, generator: torch.Generator) -> None:
-        """Give each chosen kernel a twin; both shrink if it is large, else they share its alpha."""
-        p = self.parameters
+        """Give each chosen Gaussian a twin; both shrink if it is large, else they share its alpha."""
+        p = {name: value.clone() for name, value in self.parameters().items()}
         scales = p["scales"][chosen].exp()
-        large = scales.amax(dim=1) > self.settings.densification.split_scale * self.spacing * 0.5
+        limit = self.settings.densification.split_scale * self.spacing * _START_SCALE
+        large = scales.amax(dim=1) > limit
         normal = torch.randn(len(chosen), 3, generator=generator).to(scales)
         offsets = (rotations(p["quats"][chosen]) @ (scales * normal)[..., None])[..., 0]
-        offsets = torch.where(large[:, None], offsets, 0.5 * offsets)
+        offsets = torch.where(large[:, None], offsets, _CLONE_OFFSET * offsets)
         opacities = 1 - (1 - torch.sigmoid(p["opacities"][chosen])).sqrt()
         p["opacities"][chosen] = torch.where(large, p["opacities"][chosen], torch.logit(opacities))
         p["scales"][chosen] = torch.where(
-            large[:, None], p["scales"][chosen] - math.log(1.6), p["scales"][chosen]
+            large[:, None], p["scales"][chosen] - math.log(_SPLIT_SHRINK), p["scales"][chosen]
         )
         twins = {name: value[chosen] for name, value in p.items()}
         p["means"][chosen] -= 0.5 * offsets
         twins["means"] = twins["means"] + 0.5 * offsets
-        for name in p:
-            p[name] = torch.cat([p[name], twins[name]])
-            for moments in (self.first_moments, self.second_moments):
-                moments[name][chosen] = 0
-                moments[name] = torch.cat([moments[name], torch.zeros_like(twins[name])])
+
+        def edit(moment: Tensor) -> Tensor:
+            """Both twins start without a past."""
+            moment[chosen] = 0
+            return torch.cat([moment, torch.zeros_like(moment[chosen])])
+
+        self._replace({name: torch.cat([p[name], twins[name]]) for name in p}, edit)
 
 
 def image_loss(pictures: Tensor, targets: Tensor, ssim_weight: float) -> Tensor:
@@ -387,8 +400,4 @@ def _check(images: Tensor, cameras: Cameras) -> None:
         raise InputError(
             f"gaussians: images have shape {tuple(images.shape)}, the cameras ask for {expected}"
         )
-    empty = [i for i in range(len(images)) if not (images[i, ..., 3] > 0.5).any()]
-    if empty:
-        raise InputError(
-            f"gaussians: the mask (alpha) of view {empty[0]} is empty; remove the view or mend its mask"
-        )
+    check_masks(images[..., 3])

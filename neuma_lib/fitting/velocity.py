@@ -5,7 +5,7 @@ Jacobian instead of a thousand gradient steps. One camera sees motion along its 
 that axis is determined far worse than the other two, and a ridge acts on it alone. The paper regularises the same
 weakness by a penalty on |v_x| and |v_z|, which would also pull an oblique throw towards the vertical.
 
-What the static kernels get wrong is the same in every frame: a body that is rendered one percent too large looks one
+What the static Gaussians get wrong is the same in every frame: a body that is rendered one percent too large looks one
 percent too near. Taken for motion, that would be half a metre per second in depth. A constant shift of the rendered
 body is therefore estimated beside the velocity, and thrown away.
 """
@@ -103,7 +103,7 @@ def estimate_velocity(
     Args:
         model: simulator constants.
         law: the prior material (before contact it does not matter which).
-        body: reconstructed particles and kernels.
+        body: reconstructed particles and Gaussians.
         observation: the video; frames from contact on are ignored.
         settings: hyper-parameters; its ``views`` are those of the observation.
         progress: called with (step, steps, loss).

@@ -1,11 +1,7 @@
-"""A watertight surface of a static object from its silhouettes, around the Gaussians fitted to the same
-views.
+"""A watertight surface of a static object from its silhouettes: the zero level of the visual hull's signed distance.
 
-The body is carved (space carving, visual hull): a point belongs to it when every camera sees it inside the
-silhouette. Each alpha matte becomes a signed distance to its half-covered contour, which is known to a
-small part of a pixel; the least of the back-projected distances over the views is close to the signed
-distance of the hull, so the surface lies more finely than pixels or voxels. What no silhouette shows, a
-dent seen only by its shading, stays filled. The Gaussians say where to look.
+The surface lies more finely than pixels or voxels (see `neuma_lib.geometry.visual_hull`). What no silhouette shows, a
+dent seen only by its shading, stays filled. The Gaussians fitted to the same views say where to look.
 """
 
 from __future__ import annotations
@@ -17,12 +13,12 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.spatial import cKDTree
-from skimage.measure import find_contours, marching_cubes
+from skimage.measure import marching_cubes
 from torch import Tensor
 
 from neuma_lib.config.geometry import SurfaceConfig
 from neuma_lib.errors import InputError
+from neuma_lib.geometry.visual_hull import NO_COMMON_SPACE, contour_distances, distance_inside
 from neuma_lib.geometry.volume import check_mesh
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians
@@ -30,12 +26,7 @@ from neuma_lib.splatting.gaussians import Gaussians
 Array = NDArray[np.float64]
 
 _COARSE_RESOLUTION = 32
-"""Voxels along the longest side of the first look, which finds the body's box and the band around its
-surface."""
-_BAND = 6.0
-"""Distance from a contour [px] up to which it is measured to a small part of a pixel."""
-_CONTOUR_STEPS = 8
-"""Points on each segment of a contour; a segment is at most a pixel's diagonal long."""
+"""Voxels along the longest side of the first look, which finds the body's box and the band around its surface."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +71,10 @@ def reconstruct(
             f"surface: images {tuple(images.shape)} do not fit {len(cameras)} cameras of "
             f"{cameras.width} x {cameras.height} pixels; expected RGBA (views, height, width, 4)"
         )
-    alpha = images[..., 3].detach().to("cpu", torch.float64)
     cameras = cameras.to("cpu", torch.float64)
-    silhouettes = _silhouettes(alpha, settings.matte_level)
+    contours = contour_distances(images[..., 3], settings.matte_level)
 
-    coarse, distance = _locate(gaussians, silhouettes, cameras)
+    coarse, distance = _locate(gaussians, contours, cameras)
     reach = 2.0 * coarse.spacing
     near = np.argwhere(distance > -coarse.spacing)
     lower = coarse.origin + (near.min(axis=0) - 1) * coarse.spacing
@@ -97,7 +87,7 @@ def reconstruct(
     )
     band = np.flatnonzero(np.abs(field.ravel()) < reach)
     points = np.stack(np.unravel_index(band, field.shape), axis=1) * grid.spacing + grid.origin
-    field.ravel()[band] = _distance_inside(points, silhouettes, cameras)
+    field.ravel()[band] = distance_inside(torch.from_numpy(points), contours, cameras).numpy()
 
     mesh = _polygonise(_one_solid_body(field), grid)
     if settings.smoothing:
@@ -106,67 +96,7 @@ def reconstruct(
     return mesh
 
 
-def _silhouettes(alpha: Tensor, level: float) -> Tensor:
-    """Signed distances [px] at the pixel centres to the contours of the mattes, positive inside, (V, H,
-    W)."""
-    distances = []
-    for view, matte in enumerate(alpha.numpy()):
-        if not np.isfinite(matte).all():
-            raise InputError(f"surface: the alpha of view {view} holds values that are not finite")
-        if not (matte > level).any():
-            raise InputError(
-                f"surface: the mask of view {view} is empty (no alpha above {level}); remove the view or "
-                "make its matte again"
-            )
-        if (matte > level).all():
-            raise InputError(
-                f"surface: the mask of view {view} covers the whole frame, so it shows no outline; images "
-                "need an alpha matte of the object"
-            )
-        distances.append(_distance_to_contour(matte, level))
-    return torch.from_numpy(np.stack(distances))
-
-
-def _distance_to_contour(matte: Array, level: float) -> Array:
-    """Signed distance [px] from pixel centres to the level line of a matte (H, W), positive inside.
-
-    The matte is continued beyond the frame as it is at its edge, where a body may be cut off. Distances of more than
-    `_BAND` pixels are those to the nearest pixel on the other side, right to about half a pixel: a surface lies where
-    distances vanish, and the nearest of a circle's many points is dear to find from its middle.
-    """
-    inside = matte > level
-    distance = np.where(
-        inside, ndimage.distance_transform_edt(inside) - 0.5, 0.5 - ndimage.distance_transform_edt(~inside)
-    )
-    contours = find_contours(np.pad(matte, 1, mode="edge"), level)
-    along = np.arange(_CONTOUR_STEPS)[:, None, None] / _CONTOUR_STEPS
-    pieces = [((1 - along) * line[:-1] + along * line[1:]).reshape(-1, 2) for line in contours]
-    near = np.abs(distance) < _BAND
-    exact, _ = cKDTree(np.concatenate(pieces)).query(np.argwhere(near) + 1.0)
-    distance[near] = np.where(inside[near], exact, -exact)
-    return distance
-
-
-def _distance_inside(points: Array, silhouettes: Tensor, cameras: Cameras) -> Array:
-    """Least distance [m] of points (P, 3) to the silhouette cones, negative outside one, (P,).
-
-    A distance in the image is turned into metres at the point's depth. Points behind a camera are outside.
-    """
-    positions = torch.from_numpy(points)
-    size = torch.tensor([cameras.width, cameras.height], dtype=torch.float64)
-    least = torch.full((len(points),), float("inf"), dtype=torch.float64)
-    for view in range(len(cameras)):
-        pixels, depth = cameras[view].project(positions)
-        where = (2.0 * pixels / size - 1.0).nan_to_num(nan=2.0)[None]
-        distance = torch.nn.functional.grid_sample(
-            silhouettes[view][None, None], where, mode="bilinear", padding_mode="border", align_corners=False
-        )
-        distance = distance[0, 0, 0] * depth[0] / cameras.Ks[view, 0, 0]
-        least = torch.minimum(least, torch.where(depth[0] > 0, distance, -depth[0].abs() - 1e-3))
-    return least.numpy()
-
-
-def _locate(gaussians: Gaussians, silhouettes: Tensor, cameras: Cameras) -> tuple[_Grid, Array]:
+def _locate(gaussians: Gaussians, contours: Tensor, cameras: Cameras) -> tuple[_Grid, Array]:
     """Coarse lattice that holds the whole body, and the distances on it.
 
     Starts at the box of the Gaussians, and is doubled while the body reaches its walls.
@@ -181,8 +111,8 @@ def _locate(gaussians: Gaussians, silhouettes: Tensor, cameras: Cameras) -> tupl
     for _ in range(6):
         margin = 0.05 * float((upper - lower).max())
         grid = _Grid.around(lower - margin, upper + margin, _COARSE_RESOLUTION)
-        points = np.stack(np.meshgrid(*grid.axes(), indexing="ij"), axis=-1).reshape(-1, 3)
-        distance = _distance_inside(points, silhouettes, cameras).reshape(tuple(grid.counts))
+        points = torch.cartesian_prod(*map(torch.from_numpy, grid.axes()))
+        distance = distance_inside(points, contours, cameras).numpy().reshape(tuple(grid.counts))
         interior = np.zeros(distance.shape, dtype=bool)
         interior[1:-1, 1:-1, 1:-1] = True
         if (distance > -grid.spacing).any() and not (distance[~interior] > 0).any():
@@ -191,13 +121,10 @@ def _locate(gaussians: Gaussians, silhouettes: Tensor, cameras: Cameras) -> tupl
         lower, upper = middle - 2 * half, middle + 2 * half
     if (distance > -grid.spacing).any():
         raise InputError(
-            "surface: the masks do not bound a body; more views from other directions, or masks that the "
+            "masks: they do not bound a body; more views from other directions, or masks that the "
             "frame does not cut, are needed"
         )
-    raise InputError(
-        "surface: no point of space lies inside all masks; check that they show the object alone and that "
-        "the camera poses belong to these images"
-    )
+    raise InputError(f"masks: {NO_COMMON_SPACE}")
 
 
 def _one_solid_body(field: Array) -> Array:
@@ -206,9 +133,7 @@ def _one_solid_body(field: Array) -> Array:
     bodies, count = ndimage.label(field > 0)
     if count == 0:
         raise InputError(
-            "surface: no point of space lies inside all masks; check that they show the object alone and "
-            "that the camera poses belong to these images (a body thinner than a voxel needs a higher "
-            "geometry.surface.resolution)"
+            f"masks: {NO_COMMON_SPACE} (a body thinner than a voxel needs a higher geometry.surface.resolution)"
         )
     largest = 1 + int(np.argmax(np.bincount(bodies.ravel())[1:]))
     filled = ndimage.binary_fill_holes(bodies == largest)

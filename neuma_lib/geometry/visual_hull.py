@@ -1,14 +1,36 @@
-"""Visual hull: the part of space that every silhouette covers."""
+"""Visual hull: the part of space that every silhouette covers (space carving).
+
+Each alpha matte becomes a signed distance to its half-covered contour, which is known to a small part of a pixel; the
+least of the back-projected distances over the views is close to the signed distance of the hull.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
+from skimage.measure import find_contours
 from torch import Tensor
 
 from neuma_lib.errors import InputError
 from neuma_lib.splatting.cameras import Cameras
+
+MATTE_LEVEL = 0.5
+"""Coverage at which a pixel counts as half inside."""
+NO_COMMON_SPACE = (
+    "no point of space lies inside all masks; check that they show the object alone and that the camera poses belong to"
+    " these images"
+)
+_BAND = 6.0
+"""Distance from a contour [px] up to which it is measured to a small part of a pixel."""
+_CONTOUR_STEPS = 8
+"""Points on each segment of a contour; a segment is at most a pixel's diagonal long."""
+_FIELD_OF_VIEW = 0.75
+"""Half side of the searched cube over the width that the nearest camera sees at the cube's centre."""
 
 
 @dataclass
@@ -26,62 +48,126 @@ class Hull:
     voxel: float
 
 
+def check_masks(masks: Tensor, level: float = MATTE_LEVEL) -> None:
+    """Make sure that every view shows an outline.
+
+    Raises:
+        InputError: a mask (of (V, H, W) alpha) that is not finite, empty, or covers the frame; names the view.
+    """
+    for view, mask in enumerate(masks):
+        if not torch.isfinite(mask).all():
+            raise InputError(f"masks: the alpha of view {view} holds values that are not finite")
+        if not (mask > level).any():
+            raise InputError(
+                f"masks: the mask of view {view} is empty (no alpha above {level}); remove the view or make its matte"
+                " again"
+            )
+        if (mask > level).all():
+            raise InputError(
+                f"masks: the mask of view {view} covers the whole frame, so it shows no outline; images need an alpha"
+                " matte of the object"
+            )
+
+
+def contour_distances(masks: Tensor, level: float = MATTE_LEVEL) -> Tensor:
+    """Signed distances [px] at the pixel centres to the contours of the masks, positive inside, float64 on the CPU.
+
+    Args:
+        masks: alpha in [0, 1], shape (V, H, W).
+        level: alpha on the contour.
+
+    Raises:
+        InputError: see `check_masks`.
+    """
+    check_masks(masks, level)
+    mattes = masks.detach().to("cpu", torch.float64).numpy()
+    return torch.from_numpy(np.stack([_distance_to_contour(matte, level) for matte in mattes]))
+
+
+def _distance_to_contour(matte: NDArray[np.float64], level: float) -> NDArray[np.float64]:
+    """Signed distance [px] from pixel centres to the level line of a matte (H, W), positive inside.
+
+    The matte is continued beyond the frame as it is at its edge, where a body may be cut off. Distances of more than
+    `_BAND` pixels are those to the nearest pixel on the other side, right to about half a pixel: the surface lies where
+    distances vanish, and the search for the nearest contour point is expensive deep inside.
+    """
+    inside = matte > level
+    distance = np.where(
+        inside, ndimage.distance_transform_edt(inside) - 0.5, 0.5 - ndimage.distance_transform_edt(~inside)
+    )
+    contours = find_contours(np.pad(matte, 1, mode="edge"), level)
+    along = np.arange(_CONTOUR_STEPS)[:, None, None] / _CONTOUR_STEPS
+    pieces = [((1 - along) * line[:-1] + along * line[1:]).reshape(-1, 2) for line in contours]
+    near = np.abs(distance) < _BAND
+    exact, _ = cKDTree(np.concatenate(pieces)).query(np.argwhere(near) + 1.0)
+    distance[near] = np.where(inside[near], exact, -exact)
+    return distance
+
+
+def distance_inside(points: Tensor, contours: Tensor, cameras: Cameras) -> Tensor:
+    """Least signed distance [m] of points to the silhouette cones, negative outside one, shape (P,).
+
+    A distance in the image is turned into metres at the point's depth. Points behind a camera are outside.
+
+    Args:
+        points: positions [m], float64, shape (P, 3).
+        contours: result of `contour_distances`, shape (V, H, W).
+        cameras: V cameras in float64.
+    """
+    size = torch.tensor([cameras.width, cameras.height], dtype=torch.float64)
+    least = torch.full((len(points),), float("inf"), dtype=torch.float64)
+    for view in range(len(cameras)):
+        pixels, depth = cameras[view].project(points)
+        where = (2.0 * pixels / size - 1.0).nan_to_num(nan=2.0)[None]
+        distance = torch.nn.functional.grid_sample(
+            contours[view][None, None], where, mode="bilinear", padding_mode="border", align_corners=False
+        )
+        distance = distance[0, 0, 0] * depth[0] / cameras.Ks[view, 0, 0]
+        least = torch.minimum(least, torch.where(depth[0] > 0, distance, -depth[0].abs() - 1e-3))
+    return least
+
+
 def visual_hull(masks: Tensor, cameras: Cameras, resolution: int) -> Hull:
     """Space seen inside the object's silhouette by every camera.
 
     Args:
-        masks: (V, H, W) alpha in [0, 1].
+        masks: alpha in [0, 1], shape (V, H, W).
         cameras: V cameras; the object is wholly in view of at least one.
         resolution: voxels along the longest side of the hull's bounding box.
 
+    Returns:
+        The voxels whose centres are inside, or less than half a voxel outside, with the cameras' device and type.
+
     Raises:
-        InputError: no voxel lies in all silhouettes, so poses and masks contradict each other.
+        InputError: see `check_masks`, or no voxel lies in all silhouettes, so poses and masks contradict each other.
     """
+    kind, cameras = cameras.viewmats, cameras.to("cpu", torch.float64)
+    contours = contour_distances(masks)
     # the point nearest to all optical axes, and a cube around it as large as the cameras' field of view there
     eyes, axes = cameras.positions, cameras.viewmats[:, 2, :3]
-    projectors = torch.eye(3, dtype=eyes.dtype, device=eyes.device) - axes[:, :, None] * axes[:, None, :]
+    projectors = torch.eye(3, dtype=eyes.dtype) - axes[:, :, None] * axes[:, None, :]
     # a little regularisation keeps parallel axes solvable
-    system = projectors.sum(0) + 1e-6 * torch.eye(3, dtype=eyes.dtype, device=eyes.device)
+    system = projectors.sum(0) + 1e-6 * torch.eye(3, dtype=eyes.dtype)
     centre = torch.linalg.solve(system, (projectors @ eyes[..., None]).sum(0)[:, 0] + 1e-6 * eyes.mean(0))
-    reach = (eyes - centre).norm(dim=-1) * 0.75 * max(cameras.width, cameras.height) / cameras.Ks[:, 0, 0]
-    lower, upper = centre - reach.min(), centre + reach.min()
+    widths = (eyes - centre).norm(dim=-1) * max(cameras.width, cameras.height) / cameras.Ks[:, 0, 0]
+    reach = _FIELD_OF_VIEW * widths.min()
+    lower, upper = centre - reach, centre + reach
     for size in (resolution // 2, resolution, resolution):
         voxel = float((upper - lower).max()) / size
         counts = ((upper - lower) / voxel).ceil().clamp_min(1).long().tolist()
-        axes3 = [lower[k] + (torch.arange(n, device=eyes.device) + 0.5) * voxel for k, n in enumerate(counts)]
-        centres = torch.stack(torch.meshgrid(*axes3, indexing="ij"), dim=-1).reshape(-1, 3).to(eyes.dtype)
-        occupied = _inside_masks(centres, masks, cameras, voxel).reshape(counts)
-        if not occupied.any():
-            raise InputError(
-                "gaussians: no point of space lies inside all masks; check that they show the object alone "
-                "and that the camera poses belong to these images"
-            )
+        ticks = [
+            lower[k] + (torch.arange(n, dtype=torch.float64) + 0.5) * voxel for k, n in enumerate(counts)
+        ]
+        centres = torch.cartesian_prod(*ticks)
+        inside = torch.arange(len(centres))
+        for view in range(len(cameras)):  # most points are outside of the first few already
+            seen = slice(view, view + 1)
+            inside = inside[distance_inside(centres[inside], contours[seen], cameras[seen]) > -0.5 * voxel]
+        if len(inside) == 0:
+            raise InputError(f"masks: {NO_COMMON_SPACE}")
+        occupied = torch.zeros(counts, dtype=torch.bool)
+        occupied.view(-1)[inside] = True
         found = occupied.nonzero()
         origin = lower
         lower, upper = origin + (found.amin(0) - 1) * voxel, origin + (found.amax(0) + 2) * voxel
-    return Hull(occupied, origin, voxel)
-
-
-def _inside_masks(points: Tensor, masks: Tensor, cameras: Cameras, margin: float) -> Tensor:
-    """Whether points (P, 3) project into every mask, up to half of ``margin`` [m] outside its edge."""
-    inside = torch.ones(len(points), dtype=torch.bool, device=points.device)
-    for view in range(len(cameras)):
-        remaining = inside.nonzero()[:, 0]
-        if len(remaining) == 0:
-            break
-        pixels, depths = cameras[view].project(points[remaining])
-        # a mask widened by the voxel's half size keeps voxels that the silhouette's edge crosses
-        radius = int(float(0.5 * margin * cameras.Ks[view, 0, 0] / depths.median().clamp_min(margin)) + 0.5)
-        mask = masks[view][None, None]
-        if radius > 0:
-            mask = torch.nn.functional.max_pool2d(mask, 2 * radius + 1, stride=1, padding=radius)
-        column, row = (pixels[0].floor().long()).unbind(-1)
-        visible = (
-            (column >= 0) & (column < cameras.width) & (row >= 0) & (row < cameras.height) & (depths[0] > 0)
-        )
-        column, row = column.clamp(0, cameras.width - 1), row.clamp(0, cameras.height - 1)
-        # outside the frame is outside the object, unless the frame cuts the object's mask
-        edges = masks[view][0], masks[view][-1], masks[view][:, 0], masks[view][:, -1]
-        cut = any(bool((edge > 0.5).any()) for edge in edges)
-        inside[remaining] = torch.where(visible, mask[0, 0][row, column] > 0.1, cut)
-    return inside
+    return Hull(occupied.to(kind.device), origin.to(kind), voxel)

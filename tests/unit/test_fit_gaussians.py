@@ -1,4 +1,4 @@
-"""Static fit of Gaussian kernels: visual hull, loss, quality on a held-out view, determinism, bad input."""
+"""Static fit of Gaussians: visual hull, loss, quality on a held-out view, determinism, bad input."""
 
 import dataclasses
 
@@ -42,7 +42,7 @@ def test_held_out_views_are_reproduced(fit):
     assert np.mean(report.losses[-30:]) < 0.3 * np.mean(report.losses[:30])
 
 
-def test_kernels_are_usable_for_binding(fit):
+def test_gaussians_are_usable_for_binding(fit):
     """Inside or on the body, not needles, not transparent, as many as allowed."""
     gaussians, report = fit
     assert report.count == len(gaussians) <= 700
@@ -54,7 +54,7 @@ def test_kernels_are_usable_for_binding(fit):
     assert torch.allclose(gaussians.quats.norm(dim=1), torch.ones(len(gaussians)))
 
 
-def test_some_kernels_fill_the_inside(fit):
+def test_some_gaussians_fill_the_inside(fit):
     assert (raycast.distance(fit[0].means) < -0.03).sum() >= 20
 
 

@@ -45,9 +45,8 @@ def some_gaussians(mesh, count=300, seed=0, outliers=0):
 
 
 @pytest.mark.parametrize("name", SIX)
-def test_surface_of_six_bodies(bodies, name, capsys):
-    """50 views of 128 px with the noise of 16 samples a pixel: watertight, one body, volume IoU at least
-    0.93."""
+def test_surface_of_six_bodies(bodies, name):
+    """50 views of 128 px with the noise of 16 samples a pixel: watertight, one body, volume IoU at least 0.93."""
     truth = bodies[name]
     cameras = cameras_around(truth)
     images = mattes(truth, cameras)
@@ -55,12 +54,7 @@ def test_surface_of_six_bodies(bodies, name, capsys):
     images[..., 3] = torch.as_tensor(np.random.default_rng(0).binomial(16, covered) / 16)
     mesh = reconstruct(some_gaussians(truth), cameras, images, SurfaceConfig(resolution=64))
     assert mesh.is_watertight and mesh.volume > 0 and mesh.body_count == 1
-    overlap = volume_iou(mesh, truth, resolution=48)
-    with capsys.disabled():
-        print(
-            f"\n{name}: volume IoU {overlap:.3f}, volume {mesh.volume / truth.volume:.3f} of the true", end=""
-        )
-    assert overlap >= 0.93
+    assert volume_iou(mesh, truth, resolution=48) >= 0.93
 
 
 def test_surface_of_a_sphere_is_finer_than_pixels():
@@ -174,6 +168,16 @@ def test_inside_counts_rays_through_edges_and_corners_once():
     assert found[clearly_in].all() and not found[clearly_out].any()
 
 
+def test_inside_of_a_letter_spares_its_holes():
+    """Beyond a cell of the mesh, membership is the sign of the solid's own distance."""
+    letter = shapes.build("letter_B", 0.3, resolution=48)
+    assert letter.euler_number == -2  # two holes
+    points = np.random.default_rng(2).uniform(*letter.bounds, (20_000, 3))
+    depth, cell = shapes.depth(letter, points), 0.4 / 48
+    found = inside(letter, points)
+    assert found[depth > cell].all() and not found[depth < -cell].any()
+
+
 def test_inside_of_overlapping_parts_is_their_union():
     parts = [trimesh.creation.icosphere(3, 0.1).apply_translation([x, 0, 0]) for x in (0.0, 0.1)]
     points = np.array([[0.05, 0, 0], [-0.09, 0, 0], [0.19, 0, 0], [0.0, 0.099, 0.05]])
@@ -181,7 +185,7 @@ def test_inside_of_overlapping_parts_is_their_union():
 
 
 @pytest.mark.parametrize("method", ["jittered", "uniform"])
-@pytest.mark.parametrize("count", [500, 2000, 20_000])
+@pytest.mark.parametrize("count", [500, 20_000])
 def test_volume_samples_have_the_wanted_count_and_lie_inside(bodies, method, count):
     for name, mesh in bodies.items():
         points = sample_volume(mesh, count, seed=3, method=method)
