@@ -136,7 +136,7 @@ def test_trained_law_is_nearer_to_its_law_than_an_elastic_one(tiny_plasticine):
 
 
 def test_same_seed_same_bytes():
-    short = TINY.model_copy(update={"iterations": 20})
+    short = TINY.model_copy(update={"iterations": 40})
     (law, report), (again, same) = (
         train_by_regression(PLASTICINE, short, 3, lambda *_: None) for _ in range(2)
     )
