@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -82,3 +82,23 @@ def native_source(module: str, suffix: str = ".cu") -> dict[str, str]:
 def warp_stream(device: torch.device) -> wp.Stream | None:
     """Warp's view of torch's current stream, so that kernels queue in order with torch; None on the CPU."""
     return None if device.type == "cpu" else wp.stream_from_torch(torch.cuda.current_stream(device))
+
+
+def launch(kernel: wp.Kernel, dim: int | Sequence[int], *arguments, block_dim: int = 256) -> None:
+    """Queue a Warp kernel on the device of its first tensor, in order with torch.
+
+    Tensors become arrays of what the kernel takes: numbers, or the vectors or matrices in their last dimensions.
+    """
+    device = next(a.device for a in arguments if isinstance(a, torch.Tensor))
+    inputs = [  # descriptors instead of Warp's array objects: these would cost more time than the launch
+        wp.from_torch(a, p.type.dtype, requires_grad=False, return_ctype=True) if torch.is_tensor(a) else a
+        for a, p in zip(arguments, kernel.adj.args)
+    ]
+    wp.launch(
+        kernel,
+        dim=dim,
+        inputs=inputs,
+        block_dim=block_dim,
+        device=wp.device_from_torch(device),
+        stream=warp_stream(device),
+    )

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import torch
-import warp as wp
 
 from neuma_lib.coupling.binding import Binding
 from neuma_lib.coupling.deformation_kernels import kernels
-from neuma_lib.errors import InputError
-from neuma_lib.splatting.arrays import matrices, plain, target, vectors
+from neuma_lib.device import launch
+from neuma_lib.splatting.arrays import check_tensors
 
 
 def deform(
@@ -42,31 +41,18 @@ def deform(
     Raises:
         InputError: numbers of particles, Gaussians or frames that disagree.
     """
-    _check_shapes(binding, means, covars, x0, x, F)
-    at_rest = (value.contiguous() for value in (means, covars, x0))
-    return _Deform.apply(binding, *at_rest, x, F if covariance_gradient else F.detach())
-
-
-def _check_shapes(binding: Binding, means, covars, x0, x, F) -> None:
-    G, N = binding.shape
-    T = len(x)
+    T, (G, N) = len(x), binding.shape
     expected = {
-        "means": (means, (G, 3)),
-        "covars": (covars, (G, 3, 3)),
-        "x0": (x0, (N, 3)),
         "x": (x, (T, N, 3)),
         "F": (F, (T, N, 3, 3)),
+        "x0": (x0, (N, 3)),
+        "means": (means, (G, 3)),
+        "covars": (covars, (G, 3, 3)),
     }
-    for name, (value, shape) in expected.items():
-        if tuple(value.shape) != shape:
-            raise InputError(
-                f"deform: {name} has shape {tuple(value.shape)}, expected {shape} for a binding of {G} Gaussians to"
-                f" {N} particles. Rerun the binding stage if either changed."
-            )
-        if value.dtype != x.dtype or value.device != x.device:
-            raise InputError(
-                f"deform: {name} is {value.dtype} on {value.device}, x is {x.dtype} on {x.device}: give both alike"
-            )
+    advice = f" for a binding of {G} Gaussians to {N} particles. Rerun the binding stage if either changed."
+    check_tensors("deform", expected, advice)
+    at_rest = (value.contiguous() for value in (means, covars, x0))
+    return _Deform.apply(binding, *at_rest, x, F if covariance_gradient else F.detach())
 
 
 class _Deform(torch.autograd.Function):
@@ -75,20 +61,13 @@ class _Deform(torch.autograd.Function):
     @staticmethod
     def forward(ctx, binding: Binding, means, covars, x0, x, F):
         T, G = len(x), len(means)
-        x, F = x.contiguous(), F.contiguous()
         carry, _, _ = kernels(x.dtype)
         moved, stretched = x.new_empty(T, G, 3), x.new_empty(T, G, 3, 3)
         F_bar = torch.empty_like(stretched) if ctx.needs_input_grad[5] else None
-        wp.launch(
-            carry,
-            dim=(T, G),
-            inputs=[
-                *map(plain, binding.rows(x.dtype)), vectors(means), matrices(covars), vectors(x0), vectors(x),
-                matrices(F),
-            ],
-            outputs=[vectors(moved), matrices(stretched), None if F_bar is None else matrices(F_bar)],
-            **target(x),
-        )  # fmt: skip
+        rows = binding.rows(x.dtype)
+        launch(
+            carry, (T, G), *rows, means, covars, x0, x.contiguous(), F.contiguous(), moved, stretched, F_bar
+        )
         ctx.save_for_backward(covars, F_bar)
         ctx.binding = binding
         return moved, stretched
@@ -100,23 +79,10 @@ class _Deform(torch.autograd.Function):
         T, N = len(grad_moved), ctx.binding.shape[1]
         grad_moved = grad_moved.contiguous()
         _, stretch_adjoint, carry_adjoint = kernels(grad_moved.dtype)
-        grad_x, grad_F, to_F = grad_moved.new_empty(T, N, 3), None, (None, None)
+        grad_x, grad_F, grad_F_bar = grad_moved.new_empty(T, N, 3), None, None
         if F_bar is not None:
             grad_F_bar, grad_F = torch.empty_like(F_bar), grad_moved.new_empty(T, N, 3, 3)
-            to_F = matrices(grad_F_bar), matrices(grad_F)
-            wp.launch(
-                stretch_adjoint,
-                dim=F_bar.shape[:2],
-                inputs=[matrices(covars), matrices(F_bar), matrices(grad_stretched.contiguous())],
-                outputs=[to_F[0]],
-                **target(grad_moved),
-            )
+            launch(stretch_adjoint, F_bar.shape[:2], covars, F_bar, grad_stretched.contiguous(), grad_F_bar)
         columns = ctx.binding.columns(grad_moved.dtype)
-        wp.launch(
-            carry_adjoint,
-            dim=(T, N),
-            inputs=[*map(plain, columns), vectors(grad_moved), to_F[0]],
-            outputs=[vectors(grad_x), to_F[1]],
-            **target(grad_moved),
-        )
+        launch(carry_adjoint, (T, N), *columns, grad_moved, grad_F_bar, grad_x, grad_F)
         return None, None, None, None, grad_x, grad_F

@@ -11,9 +11,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from neuma_lib.device import start_warp
+from neuma_lib.device import launch, start_warp
 from neuma_lib.errors import InputError
-from neuma_lib.splatting.arrays import plain, target, vectors
 
 start_warp()
 
@@ -52,13 +51,7 @@ class _SquaredError(torch.autograd.Function):
         lanes = 1 if images.device.type == "cpu" else min(_GPU_LANES, pixels)
         sums = images.new_empty(T, lanes, dtype=torch.float64)
         squared_error, _ = kernels(images.dtype)
-        wp.launch(
-            squared_error,
-            dim=(T, lanes),
-            inputs=_pair(images, observed),
-            outputs=[plain(sums)],
-            **target(images),
-        )
+        launch(squared_error, (T, lanes), *_pair(images, observed), sums)
         ctx.save_for_backward(images, observed)
         ctx.lanes = lanes
         return (sums.sum(1) / (3 * pixels)).to(images.dtype)
@@ -70,20 +63,14 @@ class _SquaredError(torch.autograd.Function):
         grad_images = torch.empty_like(images)
         scale = grad * (2 * len(images) / images.numel())
         _, adjoint = kernels(images.dtype)
-        wp.launch(
-            adjoint,
-            dim=(len(images), ctx.lanes),
-            inputs=[*_pair(images, observed), plain(scale), ctx.lanes],
-            outputs=[vectors(grad_images.view(len(images), -1, 3))],
-            **target(images),
-        )
+        to_images = grad_images.view(len(images), -1, 3)
+        launch(adjoint, (len(images), ctx.lanes), *_pair(images, observed), scale, ctx.lanes, to_images)
         return grad_images, None
 
 
-def _pair(images: Tensor, observed: Tensor) -> list[wp.array]:
-    """Colours (T, P) as vectors, and pixels (T, P) as one integer each."""
-    packed = observed.view(torch.int32).view(len(observed), -1)
-    return [vectors(images.view(len(images), -1, 3)), plain(packed)]
+def _pair(images: Tensor, observed: Tensor) -> tuple[Tensor, Tensor]:
+    """Colours (T, P, 3), and pixels (T, P) as one integer each."""
+    return images.view(len(images), -1, 3), observed.view(torch.int32).view(len(observed), -1)
 
 
 @functools.cache

@@ -6,31 +6,29 @@ features (sigma - 1, F^T F - I, det F - 1); its symmetrised output X gives
 - elasticity: P = R X, tau = P F^T;
 - plasticity: F = F_trial + 1e-3 R X.
 
-In float32 on a recent GPU the kernels of :mod:`neural_fused` do the work; what is here serves everything else, and is
-their slow twin.
-
 Without bias, zero features give zero output: any rotation is free of stress; and R makes both maps objective.
+
+In float32 on a recent GPU the kernels of :mod:`neural_fused` do the work; this module serves everything else, and is
+their slow twin.
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Hashable
-from dataclasses import dataclass, field
 
 import torch
-import warp as wp
 from torch import Tensor, nn
 from torch.nn.functional import gelu, pad
 
-from neuma_lib.device import warp_stream
+from neuma_lib.device import launch
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics import neural_fused
 from neuma_lib.mechanics.adaptor import Adaptor
 from neuma_lib.mechanics.law import Constitutive, Elasticity, Law, Plasticity, Weights
 from neuma_lib.mechanics.neural_kernels import FEATURES, feature_kernel, output_kernels
 from neuma_lib.mechanics.singular_values import rotation_and_singular_values
-from neuma_lib.mechanics.singular_values_kernels import pack_count, warp_types
+from neuma_lib.mechanics.singular_values_kernels import pack_count
 
 WIDTH = 64
 SHAPES = ((WIDTH, FEATURES), (WIDTH, WIDTH), (9, WIDTH))
@@ -50,56 +48,24 @@ def features(F: Tensor, sigma: Tensor) -> Tensor:
     return torch.cat([sigma - 1, gram, torch.linalg.det(F)[:, None] - 1], dim=1)
 
 
-@dataclass
 class _Forward:
-    """Activations of up to ``rows`` matrices: what the adjoint needs of a forward pass."""
+    """What the adjoint needs of a forward pass over the rows F (n, 3, 3)."""
 
-    z: Tensor
-    R: Tensor
-    Vh: Tensor
-    a0: Tensor
-    h0: Tensor
-    a1: Tensor
-    h1: Tensor
-    Y: Tensor
-    views: dict[str, wp.array] = field(default_factory=dict)
-
-    @classmethod
-    def like(cls, F: Tensor) -> _Forward:
+    def __init__(self, F: Tensor):
         n = len(F)
-        state = cls(
-            F.new_empty(n, FEATURES),
-            torch.empty_like(F),
-            torch.empty_like(F),
-            *(F.new_empty(n, WIDTH) for _ in range(4)),
-            torch.empty_like(F),
-        )
-        real, _, mat33 = warp_types(F.dtype)
-        state.views = {name: wp.from_torch(getattr(state, name), dtype=mat33) for name in ("R", "Vh", "Y")}
-        state.views["z"] = wp.from_torch(state.z, dtype=real)
-        return state
+        self.z = F.new_empty(n, FEATURES)
+        self.R, self.Vh, self.Y = (torch.empty_like(F) for _ in range(3))
+        self.a0, self.h0, self.a1, self.h1 = (F.new_empty(n, WIDTH) for _ in range(4))
 
 
-@dataclass
 class _Backward:
-    """Scratch of the adjoint of one chunk. grad_z has columns of padding."""
+    """Scratch of the adjoint over the rows F; grad_z has columns of padding."""
 
-    grad_Y: Tensor
-    grad_h: Tensor
-    grad_a: Tensor
-    grad_z: Tensor
-    views: dict[str, wp.array]
-
-    @classmethod
-    def like(cls, F: Tensor) -> _Backward:
+    def __init__(self, F: Tensor):
         n = len(F)
-        real, _, mat33 = warp_types(F.dtype)
-        grad_Y, grad_z = torch.empty_like(F), F.new_empty(n, PADDED)
-        views = {
-            "grad_Y": wp.from_torch(grad_Y, dtype=mat33),
-            "grad_z": wp.from_torch(grad_z[:, :FEATURES], dtype=real),
-        }
-        return cls(grad_Y, F.new_empty(n, WIDTH), F.new_empty(n, WIDTH), grad_z, views)
+        self.grad_Y = torch.empty_like(F)
+        self.grad_h, self.grad_a = F.new_empty(n, WIDTH), F.new_empty(n, WIDTH)
+        self.grad_z = F.new_empty(n, PADDED)
 
 
 class _Scratch(threading.local):
@@ -113,7 +79,7 @@ class _Scratch(threading.local):
         if key not in self.buffers:
             if len(self.buffers) > 32:  # those of a GPU stay: recorded graphs hold their addresses
                 self.buffers = {k: buffer for k, buffer in self.buffers.items() if k[-1].type != "cpu"}
-            self.buffers[key] = kind.like(F)
+            self.buffers[key] = kind(F)
         return self.buffers[key]
 
 
@@ -169,7 +135,7 @@ class NeuralConstitutive(Constitutive):
     def evaluate_with_cache(self, F, weights, out=None, cache=None):
         if self.uses_fused(F):
             return self.evaluate(F, weights, out), None
-        cache = cache or [_Forward.like(F[rows]) for rows in _chunks(F)]
+        cache = cache or [_Forward(F[rows]) for rows in _chunks(F)]
         return self._evaluate(F, weights, out, cache), cache
 
     @torch.no_grad()
@@ -179,29 +145,19 @@ class NeuralConstitutive(Constitutive):
         result, _, _ = output_kernels(F.dtype, self.kind)
         for index, rows in enumerate(_chunks(F)):
             state = states[index] if states else _scratch.get(_Forward, F[rows])
-            F_view = self._network(F[rows], weights, state)
-            _launch(
-                result, F[rows], F_view, state.views["R"], state.views["Y"], self.scale, _matrices(out[rows])
-            )
+            self._network(F[rows], weights, state)
+            launch(result, len(state.z), F[rows], state.R, state.Y, self.scale, out[rows])
         return out
 
-    def _network(self, F: Tensor, weights: Weights, state: _Forward) -> wp.array:
-        """Fill ``state`` from the rows F; returns Warp's view of F."""
-        F_view, views = _matrices(F), state.views
-        wp.launch(
-            feature_kernel(F.dtype),
-            dim=pack_count(len(F), F.device),
-            inputs=[F_view, views["z"], views["R"], views["Vh"], len(F)],
-            device=F_view.device,
-            stream=warp_stream(F.device),
-        )
+    def _network(self, F: Tensor, weights: Weights, state: _Forward) -> None:
+        """Fill ``state`` from the rows F."""
+        launch(feature_kernel(F.dtype), pack_count(len(F), F.device), F, state.z, state.R, state.Vh, len(F))
         W0, W1, W2 = weights
         torch.mm(state.z, W0.mT, out=state.a0)
         aten.gelu.out(state.a0, out=state.h0)
         torch.mm(state.h0, W1.mT, out=state.a1)
         aten.gelu.out(state.a1, out=state.h1)
         torch.mm(state.h1, W2.mT, out=state.Y.view(-1, 9))
-        return F_view
 
     @torch.no_grad()
     def vjp(self, F, weights, grad_out, cache=None, grad_F=None, grad_weights=None):
@@ -216,16 +172,12 @@ class NeuralConstitutive(Constitutive):
         W0, W1, W2 = weights
         padded_W0 = pad(W0, (0, PADDED - FEATURES))
         for index, rows in enumerate(_chunks(F)):
+            part, g = F[rows], grad_out[rows]
+            state = _scratch.get(_Forward, part) if cache is None else cache[index]
             if cache is None:
-                state = _scratch.get(_Forward, F[rows])
-                F_view = self._network(F[rows], weights, state)
-            else:
-                state = cache[index]
-                F_view = _matrices(F[rows])
-            back = _scratch.get(_Backward, F[rows])
-            g = _matrices(grad_out[rows])
-            views = state.views
-            _launch(output_adjoint, F[rows], F_view, views["R"], g, self.scale, back.views["grad_Y"])
+                self._network(part, weights, state)
+            back = _scratch.get(_Backward, part)
+            launch(output_adjoint, len(part), part, state.R, g, self.scale, back.grad_Y)
             grad_Y = back.grad_Y.view(-1, 9)
             grad_weights[2].addmm_(grad_Y.mT, state.h1)
             torch.mm(grad_Y, W2, out=back.grad_h)
@@ -235,9 +187,9 @@ class NeuralConstitutive(Constitutive):
             aten.gelu_backward.grad_input(back.grad_h, state.a0, grad_input=back.grad_a)
             grad_weights[0].add_((state.z.mT @ back.grad_a).mT)  # this order of the product is the fast one
             torch.mm(back.grad_a, padded_W0, out=back.grad_z)
-            _launch(
-                input_adjoint, F[rows], F_view, views["R"], views["Vh"], views["z"], views["Y"], g,
-                back.views["grad_z"], self.scale, _matrices(grad_F[rows]),
+            launch(
+                input_adjoint, len(part), part, state.R, state.Vh, state.z, state.Y, g,
+                back.grad_z[:, :FEATURES], self.scale, grad_F[rows],
             )  # fmt: skip
         return grad_F, grad_weights
 
@@ -245,14 +197,6 @@ class NeuralConstitutive(Constitutive):
 def _chunks(F: Tensor) -> list[slice]:
     size = CPU_ROWS if F.device.type == "cpu" else max(len(F), 1)
     return [slice(i, min(i + size, len(F))) for i in range(0, len(F), size)]
-
-
-def _matrices(x: Tensor) -> wp.array:
-    return wp.from_torch(x, dtype=warp_types(x.dtype)[2], requires_grad=False)
-
-
-def _launch(kernel, F: Tensor, *inputs) -> None:
-    wp.launch(kernel, dim=len(F), inputs=inputs, device=inputs[0].device, stream=warp_stream(F.device))
 
 
 class NeuralElasticity(NeuralConstitutive, Elasticity):
@@ -292,9 +236,7 @@ class NeuralLaw(Law):
             part.adaptor.weight = float(weight)
 
     def adaptor_state(self) -> dict[str, Tensor]:
-        """The adaptor's tensors by name ("elasticity.A.0", ...), detached; the inverse of
-        :meth:`load_adaptor_state`.
-        """
+        """The adaptor's tensors by name ("elasticity.A.0", ...), for :meth:`load_adaptor_state`."""
         return {
             f"{name}.{key}": value.detach().clone()
             for name, part in self.parts.items()

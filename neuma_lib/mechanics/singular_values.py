@@ -11,11 +11,10 @@ F = I, ours by round-off (``benchmarks/singular_values.py``, figures in ``docs/r
 from __future__ import annotations
 
 import torch
-import warp as wp
 from torch import Tensor
 
-from neuma_lib.device import warp_stream
-from neuma_lib.mechanics.singular_values_kernels import pack_count, svd_kernel, warp_types
+from neuma_lib.device import launch
+from neuma_lib.mechanics.singular_values_kernels import pack_count, svd_kernel
 
 
 def svd3(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -29,16 +28,8 @@ def svd3(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """
     F = F.detach().contiguous()
     U, sigma, Vh = torch.empty_like(F), F.new_empty(F.shape[:-1]), torch.empty_like(F)
-    _, vec3, mat33 = warp_types(F.dtype)
-    arrays = [wp.from_torch(x, dtype=t) for x, t in ((F, mat33), (U, mat33), (sigma, vec3), (Vh, mat33))]
     if len(F):
-        wp.launch(
-            svd_kernel(F.dtype),
-            dim=pack_count(len(F), F.device),
-            inputs=[*arrays, len(F)],
-            device=arrays[0].device,
-            stream=warp_stream(F.device),
-        )
+        launch(svd_kernel(F.dtype), pack_count(len(F), F.device), F, U, sigma, Vh, len(F))
     return U, sigma, Vh
 
 

@@ -1,31 +1,24 @@
-"""Torch tensors as the arguments of Warp kernels."""
+"""Checks of the tensors that Warp kernels work on."""
 
 from __future__ import annotations
 
-import torch
-import warp as wp
+from collections.abc import Mapping
 
-from neuma_lib.device import warp_stream
+from torch import Tensor
 
-
-def plain(tensor: torch.Tensor) -> wp.array:
-    """A tensor as an array of numbers."""
-    return wp.from_torch(tensor, requires_grad=False)
+from neuma_lib.errors import InputError
 
 
-def vectors(tensor: torch.Tensor) -> wp.array:
-    """A (..., 3) tensor as an array of vectors."""
-    real = wp.dtype_from_torch(tensor.dtype)
-    return wp.from_torch(tensor, dtype=wp.types.vector(3, real), requires_grad=False)
-
-
-def matrices(tensor: torch.Tensor) -> wp.array:
-    """A (..., n, n) tensor as an array of matrices."""
-    real = wp.dtype_from_torch(tensor.dtype)
-    size = tensor.shape[-1]
-    return wp.from_torch(tensor, dtype=wp.types.matrix((size, size), real), requires_grad=False)
-
-
-def target(tensor: torch.Tensor) -> dict:
-    """Arguments of ``wp.launch`` that queue a kernel on the tensor's device, in order with torch."""
-    return {"device": wp.device_from_torch(tensor.device), "stream": warp_stream(tensor.device)}
+def check_tensors(
+    user: str, expected: Mapping[str, tuple[Tensor, tuple[int, ...]]], advice: str = ""
+) -> None:
+    """Raise InputError unless each tensor has its expected shape and the dtype and device of the first."""
+    first, (like, _) = next(iter(expected.items()))
+    for name, (value, shape) in expected.items():
+        if tuple(value.shape) != shape:
+            raise InputError(f"{user}: {name} has shape {tuple(value.shape)}, expected {shape}{advice}")
+        if value.dtype != like.dtype or value.device != like.device:
+            raise InputError(
+                f"{user}: {name} is {value.dtype} on {value.device}, {first} is {like.dtype} on {like.device}: "
+                "give all alike"
+            )

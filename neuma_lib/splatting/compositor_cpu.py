@@ -15,8 +15,7 @@ import functools
 import torch
 import warp as wp
 
-from neuma_lib.device import native_source, start_warp
-from neuma_lib.splatting.arrays import plain, target
+from neuma_lib.device import launch, native_source, start_warp
 from neuma_lib.splatting.compositing import Settings, depth_order
 from neuma_lib.splatting.projection import SPLAT_SIZE
 
@@ -33,17 +32,11 @@ def composite(splats, depths, background, settings: Settings, empty):
     pictures, alphas = empty("pictures", (*shape, 3), splats), empty("alphas", shape, splats)
     planes = (shape[0], FORWARD_PLANES, settings.height, padded_width(settings.width))
     kept = (*depth_order(depths), empty("planes", planes, splats))
-    order, seen, planes = map(plain, kept)
+    order, seen, planes = kept
     kernel, _ = kernels(splats.dtype)
-    wp.launch(
-        kernel,
-        dim=shape[0],
-        inputs=[
-            plain(splats), order, seen, settings.alpha_min, settings.alpha_max, settings.transmittance_min,
-            plain(background),
-        ],
-        outputs=[planes, plain(pictures), plain(alphas)],
-        **target(splats),
+    launch(
+        kernel, shape[0], splats, order, seen, settings.alpha_min, settings.alpha_max, settings.transmittance_min,
+        background, planes, pictures, alphas,
     )  # fmt: skip
     return pictures, alphas, kept
 
@@ -53,17 +46,11 @@ def composite_adjoint(
 ):
     """See ``compositing``."""
     order, seen, planes = kept
-    scratch = empty("scratch", (planes.shape[0], BACKWARD_PLANES, *planes.shape[2:]), splats)
+    scratch = empty("scratch", (len(planes), BACKWARD_PLANES, *planes.shape[2:]), splats)
     _, kernel = kernels(splats.dtype)
-    wp.launch(
-        kernel,
-        dim=planes.shape[0],
-        inputs=[
-            plain(splats), plain(order), plain(seen), settings.alpha_min, settings.alpha_max, plain(background),
-            plain(planes), plain(grad_pictures), plain(grad_alphas),
-        ],
-        outputs=[plain(scratch), plain(grad_splats)],
-        **target(splats),
+    launch(
+        kernel, len(planes), splats, order, seen, settings.alpha_min, settings.alpha_max, background, planes,
+        grad_pictures, grad_alphas, scratch, grad_splats,
     )  # fmt: skip
 
 

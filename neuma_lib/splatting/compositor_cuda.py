@@ -30,9 +30,8 @@ import re
 import torch
 import warp as wp
 
-from neuma_lib.device import native_source, start_warp
+from neuma_lib.device import launch, native_source, start_warp
 from neuma_lib.errors import InputError
-from neuma_lib.splatting.arrays import plain, target
 from neuma_lib.splatting.compositing import Settings
 from neuma_lib.splatting.projection import CULLED, SPLAT_SIZE
 
@@ -51,16 +50,9 @@ def composite(splats, depths, background, settings: Settings, empty):
     ids, starts = lists(splats, depths, settings.width, settings.height, TILE)
     kept = (ids, starts, empty("transmittances", shape, splats), empty("stops", shape, splats, torch.int32))
     kernel, _, threads = kernels(TILE, LANE_PIXELS)
-    wp.launch(
-        kernel,
-        dim=(len(starts) - 1) * threads,
-        block_dim=threads,
-        inputs=[
-            plain(splats), plain(ids), plain(starts), settings.alpha_min, settings.alpha_max,
-            settings.transmittance_min, plain(background),
-        ],
-        outputs=[plain(pictures), plain(alphas), *map(plain, kept[2:])],
-        **target(splats),
+    launch(
+        kernel, (len(starts) - 1) * threads, splats, ids, starts, settings.alpha_min, settings.alpha_max,
+        settings.transmittance_min, background, pictures, alphas, *kept[2:], block_dim=threads,
     )  # fmt: skip
     return pictures, alphas, kept
 
@@ -69,28 +61,15 @@ def composite_adjoint(
     splats, kept, background, settings: Settings, grad_pictures, grad_alphas, grad_splats, empty
 ):
     """See ``compositing``."""
-    ids, starts, *_ = kept
+    _, starts, *_ = kept
     grad_splats.zero_()
     _, kernel, threads = kernels(TILE, LANE_PIXELS)
-    wp.launch(
-        kernel,
-        dim=(len(starts) - 1) * threads,
-        block_dim=threads,
-        inputs=[
-            plain(splats), *map(plain, kept), settings.alpha_min, settings.alpha_max, plain(background),
-            plain(grad_pictures), plain(grad_alphas),
-        ],
-        outputs=[plain(grad_splats)],
-        **target(splats),
+    launch(
+        kernel, (len(starts) - 1) * threads, splats, *kept, settings.alpha_min, settings.alpha_max, background,
+        grad_pictures, grad_alphas, grad_splats, block_dim=threads,
     )  # fmt: skip
     _, _, finish = list_kernels()
-    wp.launch(
-        finish,
-        dim=splats.shape[:2],
-        inputs=[plain(splats)],
-        outputs=[plain(grad_splats)],
-        **target(splats),
-    )
+    launch(finish, splats.shape[:2], splats, grad_splats)
 
 
 def lists(
@@ -115,8 +94,8 @@ def lists(
     count_tiles, list_tiles, _ = list_kernels()
     order = torch.argsort(depths.view(-1), stable=True)
     sizes = depths.new_empty(len(order), dtype=torch.int32)
-    geometry = [plain(order), plain(splats), plain(depths), width, height, tile]
-    wp.launch(count_tiles, dim=len(order), inputs=geometry, outputs=[plain(sizes)], **target(splats))
+    geometry = (order, splats, depths, width, height, tile)
+    launch(count_tiles, len(order), *geometry, sizes)
     ends = torch.cumsum(sizes, dim=0, dtype=torch.int64)
     total = int(ends[-1]) if len(ends) else 0
     if max(total, len(order), tiles * tile**2) >= 2**31:
@@ -127,13 +106,7 @@ def lists(
     if total == 0:
         return sizes.new_empty(0), sizes.new_zeros(tiles + 1)
     keys, ids = sizes.new_empty(total), sizes.new_empty(total)
-    wp.launch(
-        list_tiles,
-        dim=len(order),
-        inputs=[*geometry, plain(sizes), plain(ends)],
-        outputs=[plain(keys), plain(ids)],
-        **target(splats),
-    )
+    launch(list_tiles, len(order), *geometry, sizes, ends, keys, ids)
     keys, permutation = torch.sort(keys, stable=True)
     limits = torch.arange(tiles + 1, dtype=torch.int32, device=keys.device)
     return ids[permutation], torch.searchsorted(keys, limits, out_int32=True)

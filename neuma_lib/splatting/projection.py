@@ -15,14 +15,14 @@ import functools
 import torch
 import warp as wp
 
-from neuma_lib.device import start_warp
-from neuma_lib.splatting.arrays import matrices, plain, target, vectors
+from neuma_lib.device import launch, start_warp
 from neuma_lib.splatting.spherical_harmonics import SH_C0, SH_C1, SH_C2, SH_C3
 
 start_warp()
 
 SPLAT_SIZE = 12
 NEAR_PLANE = 0.01
+"""Depth [m] below which a Gaussian is culled."""
 REACH_SLACK = 0.02
 """Added to the reach so that rounding never cuts a pixel off: the compositors test alpha itself."""
 UNLIMITED = 1.0e20
@@ -32,8 +32,8 @@ CULLED = 1.0e30
 
 
 def for_device(sh: torch.Tensor) -> torch.Tensor:
-    """The same harmonics (G, K, 3), on CUDA stored coefficient by coefficient: neighbouring threads, which work on
-    neighbouring Gaussians, then read neighbouring numbers. On a CPU a Gaussian's coefficients stay together."""
+    """The same harmonics (G, K, 3); on CUDA stored coefficient by coefficient, so that neighbouring threads, which
+    work on neighbouring Gaussians, read neighbouring numbers."""
     return sh.transpose(0, 1).contiguous().transpose(0, 1) if sh.is_cuda else sh.contiguous()
 
 
@@ -46,15 +46,9 @@ def project(means, covars, opacities, sh, viewmats, Ks, settings, empty) -> tupl
     shape = (len(means) * len(viewmats), means.shape[1])
     splats, depths = empty("splats", (*shape, SPLAT_SIZE), means), empty("depths", shape, means)
     kernel, _, _ = kernels(means.dtype)
-    wp.launch(
-        kernel,
-        dim=shape,
-        inputs=[
-            vectors(means), matrices(covars), plain(opacities), vectors(sh), matrices(viewmats), matrices(Ks),
-            float(settings.width), float(settings.height), settings.eps2d, settings.alpha_min,
-        ],
-        outputs=[plain(splats), plain(depths)],
-        **target(means),
+    launch(
+        kernel, shape, means, covars, opacities, sh, viewmats, Ks, settings.width, settings.height, settings.eps2d,
+        settings.alpha_min, splats, depths,
     )  # fmt: skip
     return splats, depths
 
@@ -65,15 +59,9 @@ def geometry_adjoint(
     """Gradients of means (T, G, 3) and covariances (T, G, 3, 3) from those of the splats."""
     grad_means, grad_covars = torch.empty_like(means), torch.empty_like(covars)
     _, kernel, _ = kernels(means.dtype)
-    wp.launch(
-        kernel,
-        dim=means.shape[:2],
-        inputs=[
-            vectors(means), matrices(covars), vectors(sh), matrices(viewmats), matrices(Ks),
-            float(settings.width), float(settings.height), plain(splats), plain(depths), plain(grad_splats),
-        ],
-        outputs=[vectors(grad_means), matrices(grad_covars)],
-        **target(means),
+    launch(
+        kernel, means.shape[:2], means, covars, sh, viewmats, Ks, settings.width, settings.height, splats, depths,
+        grad_splats, grad_means, grad_covars,
     )  # fmt: skip
     return grad_means, grad_covars
 
@@ -82,13 +70,7 @@ def appearance_adjoint(means, sh, viewmats, splats, depths, grad_splats) -> tupl
     """Gradients of opacities (G,) and harmonics (G, K, 3) from those of the splats, summed over all images."""
     grad_opacities, grad_sh = means.new_empty(len(sh)), torch.empty_like(sh)
     _, _, kernel = kernels(means.dtype)
-    wp.launch(
-        kernel,
-        dim=len(sh),
-        inputs=[vectors(means), matrices(viewmats), plain(splats), plain(depths), plain(grad_splats)],
-        outputs=[plain(grad_opacities), vectors(grad_sh)],
-        **target(means),
-    )
+    launch(kernel, len(sh), means, viewmats, splats, depths, grad_splats, grad_opacities, grad_sh)
     return grad_opacities, grad_sh
 
 
@@ -96,10 +78,9 @@ def appearance_adjoint(means, sh, viewmats, splats, depths, grad_splats) -> tupl
 def kernels(dtype: torch.dtype):
     """``(project, geometry_adjoint, appearance_adjoint)`` Warp kernels for float32 or float64.
 
-    The adjoint is in two parts because training a material needs the first only: ``geometry_adjoint`` gives the
-    gradients of means and covariances, with a thread for every Gaussian of a frame; ``appearance_adjoint`` those of
-    opacities and harmonics, with a thread for every Gaussian, which sums over all images without atomics. Loops over
-    harmonics have a constant length and a test inside, so that they unroll and the coefficients stay in registers.
+    The adjoint is in two parts because training a material needs the first only, with a thread for every Gaussian of
+    a frame; in the second a thread sums over all images of a Gaussian, so without atomics. Loops over harmonics have a
+    constant length and a test inside, so that they unroll and the coefficients stay in registers.
     """
     real = wp.dtype_from_torch(dtype)
     vec3 = wp.types.vector(3, real)

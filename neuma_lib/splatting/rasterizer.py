@@ -17,6 +17,7 @@ import torch
 
 from neuma_lib.errors import InputError
 from neuma_lib.splatting import compositor_cpu, compositor_cuda, gsplat_backend, projection
+from neuma_lib.splatting.arrays import check_tensors
 from neuma_lib.splatting.compositing import Settings
 
 Compositor = Literal["rows", "tiles", "gsplat"]
@@ -134,14 +135,7 @@ def check_shapes(means, covars, opacities, sh, viewmats, Ks) -> None:
         "viewmats": (viewmats, (V, 4, 4)),
         "Ks": (Ks, (V, 3, 3)),
     }
-    for name, (tensor, shape) in expected.items():
-        if tuple(tensor.shape) != shape:
-            raise InputError(f"rasterize: {name} has shape {tuple(tensor.shape)}, expected {shape}")
-        if tensor.dtype != means.dtype or tensor.device != means.device:
-            raise InputError(
-                f"rasterize: {name} is {tensor.dtype} on {tensor.device}, "
-                f"means are {means.dtype} on {means.device}"
-            )
+    check_tensors("rasterize", expected)
     if means.dtype not in (torch.float32, torch.float64):
         raise InputError(f"rasterize: dtype {means.dtype} is not supported, use float32 or float64")
     if sh.shape[1] not in (1, 4, 9, 16):

@@ -7,11 +7,10 @@ import subprocess
 from pathlib import Path
 
 import torch
-import warp as wp
 
+from neuma_lib.device import launch
 from neuma_lib.mechanics import neural_fused
 from neuma_lib.splatting import compositor_cuda
-from neuma_lib.splatting.arrays import plain, target
 
 COMPILER = shutil.which("g++")
 
@@ -105,13 +104,7 @@ class EmulatedTiles:
             grad_alphas, grad_splats,
         )  # fmt: skip
         _, _, finish = compositor_cuda.list_kernels()
-        wp.launch(
-            finish,
-            dim=splats.shape[:2],
-            inputs=[plain(splats)],
-            outputs=[plain(grad_splats)],
-            **target(splats),
-        )
+        launch(finish, splats.shape[:2], splats, grad_splats)
 
 
 class EmulatedLaws:
