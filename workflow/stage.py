@@ -14,7 +14,7 @@ import fcntl
 import logging
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -68,6 +68,13 @@ def stage(name: str, log: str | Path | None = None, stream: TextIO | None = None
         for handler in handlers:
             root.removeHandler(handler)
             handler.close()
+
+
+def run_script(main: Callable, snakemake) -> None:
+    """Run ``main(input, output, params, run)`` of a script as the stage of its rule and wildcards."""
+    name = " ".join(filter(None, [snakemake.rule, "/".join(snakemake.wildcards)]))
+    with stage(name, snakemake.log[0]) as run:
+        main(snakemake.input, snakemake.output, snakemake.params, run)
 
 
 class Stage:

@@ -9,6 +9,7 @@ rule kernels:
     resources:
         gpu=EITHER_GPU,
     params:
+        group=lambda wildcards: wildcards.group,
         device=EITHER_DEVICE,
         code=lambda wildcards: code_digest(ROOT / "workflow" / "kernels" / f"{wildcards.group}.py"),
     script:

@@ -280,6 +280,7 @@ for figure, made_of in FIGURES.items():
             **{"mem_mb": 6000, **made_of.get("resources", {})},
         params:
             **made_of["params"],
+            figure=figure,
             module=code_digest(figure_module(figure)),
         script:
             "../scripts/figure.py"

@@ -13,6 +13,7 @@ rule chamfer_table:
         csv=report(f"{RESULTS}/{{table}}.csv", caption="../report/chamfer_table.rst", category="Tables"),
         markdown=f"{RESULTS}/{{table}}.md",
     params:
+        name=lambda wildcards: wildcards.table,
         cells=lambda wildcards: table_cells(wildcards.table),
         titles=lambda wildcards: table_titles(wildcards.table),
         columns=lambda wildcards: table_columns(wildcards.table),

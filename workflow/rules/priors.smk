@@ -10,6 +10,7 @@ rule prior:
     resources:
         gpu=GPU,
     params:
+        name=lambda wildcards: wildcards.prior,
         law=lambda wildcards: SETTINGS.priors.laws[wildcards.prior].plain(),
         method=SETTINGS.priors.method,
         options=SETTINGS.priors.plain()[SETTINGS.priors.method],

@@ -2,16 +2,14 @@
 
 from neuma_lib.evaluation.reports import benchmark_table
 from neuma_lib.io.files import write_text
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
-def main(output, params, run) -> None:
+def main(inputs, output, params, run) -> None:
     csv, markdown = benchmark_table(params.scenes)
     write_text(output.csv, csv)
     write_text(output.markdown, markdown)
     run.say(f"{len(params.scenes)} benchmarks: {output.markdown}")
 
 
-if __name__ == "__main__":
-    with stage("table4", snakemake.log[0]) as run:
-        main(snakemake.output, snakemake.params, run)
+run_script(main, snakemake)

@@ -4,7 +4,7 @@ from neuma_lib.config.binding import BindingConfig
 from neuma_lib.coupling.particle_binding import bind_two_pass
 from neuma_lib.io.gaussians import load_gaussians
 from neuma_lib.io.particles import load_particles, save_binding, save_particles
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
@@ -20,6 +20,4 @@ def main(inputs, output, params, run) -> None:
     )
 
 
-if __name__ == "__main__":
-    with stage(f"binding {snakemake.wildcards.scene}", snakemake.log[0]) as run:
-        main(snakemake.input, snakemake.output, snakemake.params, run)
+run_script(main, snakemake)

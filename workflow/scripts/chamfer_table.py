@@ -3,14 +3,14 @@
 from neuma_lib.evaluation.paper import PAPER
 from neuma_lib.evaluation.tables import chamfer_table
 from neuma_lib.io.files import read_json, write_text
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
-def main(name: str, metric_files: list[str], output, params, run) -> None:
+def main(inputs, output, params, run) -> None:
     metrics: dict[str, dict[str, list]] = {}
-    for (method, column), file in zip(params.cells, metric_files, strict=True):
+    for (method, column), file in zip(params.cells, list(inputs.metrics), strict=True):
         metrics.setdefault(method, {}).setdefault(column, []).append(read_json(file))
-    table = chamfer_table(metrics, params.titles, params.columns, PAPER.get(name))
+    table = chamfer_table(metrics, params.titles, params.columns, PAPER.get(params.name))
     write_text(output.csv, table.csv())
     write_text(output.markdown, table.markdown())
     run.say(f"{len(params.titles)} methods, {len(params.columns)} columns: {output.markdown}")
@@ -18,12 +18,4 @@ def main(name: str, metric_files: list[str], output, params, run) -> None:
         run.say(verdict)
 
 
-if __name__ == "__main__":
-    with stage(snakemake.wildcards.table, snakemake.log[0]) as run:
-        main(
-            snakemake.wildcards.table,
-            list(snakemake.input.metrics),
-            snakemake.output,
-            snakemake.params,
-            run,
-        )
+run_script(main, snakemake)

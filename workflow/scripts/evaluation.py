@@ -15,7 +15,7 @@ from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_start
 from neuma_lib.io.weights import read_weights
 from neuma_lib.sim.model import MPMModel, consecutive
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
 def listed(files) -> list[str]:
@@ -56,6 +56,4 @@ def main(inputs, output, params, run) -> None:
     run.say(evaluation.summary())
 
 
-if __name__ == "__main__":
-    with stage(f"{snakemake.rule} {'/'.join(snakemake.wildcards)}", snakemake.log[0]) as run:
-        main(snakemake.input, snakemake.output, snakemake.params, run)
+run_script(main, snakemake)

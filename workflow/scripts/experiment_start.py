@@ -15,7 +15,7 @@ from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.gaussians import save_gaussians
 from neuma_lib.io.mesh import read_mesh, write_mesh
 from neuma_lib.io.particles import load_body, save_binding, save_particles
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
 def look_of(entry: dict) -> AppearanceConfig:
@@ -53,6 +53,4 @@ def main(inputs, output, params, run) -> None:
     run.say(f"{len(bodies)} bodies, {len(together.x0)} particles, {len(together.gaussians)} Gaussians")
 
 
-if __name__ == "__main__":
-    with stage(f"{snakemake.rule} {'/'.join(snakemake.wildcards)}", snakemake.log[0]) as run:
-        main(snakemake.input, snakemake.output, snakemake.params, run)
+run_script(main, snakemake)

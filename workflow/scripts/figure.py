@@ -5,11 +5,11 @@ from importlib import import_module
 from neuma_lib.evaluation.plotting.image_grid import ImageGrid, load_image_grid, save_image_grid
 from neuma_lib.evaluation.plotting.style import save
 from neuma_lib.io.files import read_json, write_json
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
-def main(name: str, inputs, output, params, run) -> None:
-    module = import_module(f"neuma_lib.evaluation.figures.{name}")
+def main(inputs, output, params, run) -> None:
+    module = import_module(f"neuma_lib.evaluation.figures.{params.figure}")
     data = module.data(inputs, params, run.say)
     in_pictures = isinstance(data, ImageGrid)
     (save_image_grid if in_pictures else write_json)(output.data, data)
@@ -19,6 +19,4 @@ def main(name: str, inputs, output, params, run) -> None:
     run.say(f"{width:.1f} x {height:.1f} in: {output.png}")
 
 
-if __name__ == "__main__":
-    with stage(f"figure {snakemake.rule}", snakemake.log[0]) as run:
-        main(snakemake.rule, snakemake.input, snakemake.output, snakemake.params, run)
+run_script(main, snakemake)

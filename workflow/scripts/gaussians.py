@@ -8,12 +8,12 @@ from neuma_lib.fitting.gaussians import fit_gaussians
 from neuma_lib.io.files import write_json
 from neuma_lib.io.gaussians import save_gaussians
 from neuma_lib.io.images import load_views
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
-def main(transforms: str, output, params, run) -> None:
+def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
-    images, cameras = load_views(transforms)
+    images, cameras = load_views(inputs.transforms)
     settings = GaussiansConfig(**params.fit)
     gaussians, report = fit_gaussians(
         images.to(device),
@@ -30,6 +30,4 @@ def main(transforms: str, output, params, run) -> None:
     )
 
 
-if __name__ == "__main__":
-    with stage(f"gaussians {snakemake.wildcards.scene}", snakemake.log[0]) as run:
-        main(snakemake.input.transforms, snakemake.output, snakemake.params, run)
+run_script(main, snakemake)

@@ -8,10 +8,10 @@ from neuma_lib.geometry.shapes import place
 from neuma_lib.io.hdf5 import write_arrays
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.model import MPMModel
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
-def main(output, params, run) -> None:
+def main(inputs, output, params, run) -> None:
     model = MPMModel(**params.simulation)
     bodies = [
         TrueBody(
@@ -48,6 +48,4 @@ def main(output, params, run) -> None:
     )
 
 
-if __name__ == "__main__":
-    with stage(f"{snakemake.rule} {'/'.join(snakemake.wildcards)}", snakemake.log[0]) as run:
-        main(snakemake.output, snakemake.params, run)
+run_script(main, snakemake)

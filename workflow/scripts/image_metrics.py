@@ -12,7 +12,7 @@ from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_observation
 from neuma_lib.io.particles import load_body, load_motion
 from neuma_lib.io.weights import read_weights
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
 def measure_view(body, observation, x, F, networks, margin) -> list[dict[str, float]]:
@@ -58,8 +58,4 @@ def main(inputs, output, params, run) -> None:
     )
 
 
-if __name__ == "__main__":
-    with stage(
-        f"image_metrics {snakemake.wildcards.scene}/{snakemake.wildcards.method}", snakemake.log[0]
-    ) as run:
-        main(snakemake.input, snakemake.output, snakemake.params, run)
+run_script(main, snakemake)

@@ -7,10 +7,10 @@ from neuma_lib.geometry.volume import volume_iou
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_particles
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
-def main(inputs, report_file: str, params, run) -> None:
+def main(inputs, output, params, run) -> None:
     scene = params.scene
     fit, velocity = read_json(inputs.gaussians), read_json(inputs.velocity)
     x0, _, attributes = load_particles(inputs.particles)
@@ -39,7 +39,7 @@ def main(inputs, report_file: str, params, run) -> None:
         "velocity_error_depth_without_ridge": float(np.asarray(velocity["camera_axes"])[2] @ free),
         "velocity_std_depth": velocity["std_camera"][2],
     }
-    write_json(report_file, report)
+    write_json(output.report, report)
     run.say(
         f"PSNR {report['psnr']:.1f} dB, volume IoU {report['volume_iou']:.3f}, {report['particles']} particles"
         f" (+{added}), velocity error {report['velocity_error_in_plane_percent']:.2f} % in plane,"
@@ -47,6 +47,4 @@ def main(inputs, report_file: str, params, run) -> None:
     )
 
 
-if __name__ == "__main__":
-    with stage(f"initial_state {snakemake.wildcards.scene}", snakemake.log[0]) as run:
-        main(snakemake.input, snakemake.output.report, snakemake.params, run)
+run_script(main, snakemake)

@@ -2,7 +2,7 @@
 
 from neuma_lib.evaluation.reports import report_table
 from neuma_lib.io.files import read_json, write_text
-from workflow.stage import stage
+from workflow.stage import run_script
 
 COLUMNS = {
     "psnr": "PSNR held out [dB]",
@@ -18,14 +18,14 @@ COLUMNS = {
 }
 
 
-def main(report_files: list[str], output, params, run) -> None:
-    reports = {scene: read_json(file) for scene, file in zip(params.scenes, report_files, strict=True)}
+def main(inputs, output, params, run) -> None:
+    reports = {
+        scene: read_json(file) for scene, file in zip(params.scenes, list(inputs.reports), strict=True)
+    }
     csv, markdown = report_table(reports, COLUMNS, "scene")
     write_text(output.csv, csv)
     write_text(output.markdown, markdown)
     run.say(f"{len(reports)} scenes: {output.markdown}")
 
 
-if __name__ == "__main__":
-    with stage("initial_states", snakemake.log[0]) as run:
-        main(list(snakemake.input.reports), snakemake.output, snakemake.params, run)
+run_script(main, snakemake)

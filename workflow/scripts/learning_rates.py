@@ -2,7 +2,7 @@
 
 from neuma_lib.evaluation.reports import learning_rate_table
 from neuma_lib.io.files import read_json, write_text
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
@@ -14,6 +14,4 @@ def main(inputs, output, params, run) -> None:
     run.say("best: " + ", ".join(f"{method} x{scale:g}" for method, scale in best.items()))
 
 
-if __name__ == "__main__":
-    with stage("learning_rates", snakemake.log[0]) as run:
-        main(snakemake.input, snakemake.output, snakemake.params, run)
+run_script(main, snakemake)

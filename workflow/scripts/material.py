@@ -16,7 +16,7 @@ from neuma_lib.io.laws import load_law, save_adaptor
 from neuma_lib.io.particles import load_body
 from neuma_lib.sim.model import MPMModel
 from workflow.provenance import fingerprint
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
@@ -66,6 +66,4 @@ def main(inputs, output, params, run) -> None:
     run.say(trained.summary())
 
 
-if __name__ == "__main__":
-    with stage(f"material {snakemake.wildcards.scene}/{snakemake.wildcards.method}", snakemake.log[0]) as run:
-        main(snakemake.input, snakemake.output, snakemake.params, run)
+run_script(main, snakemake)

@@ -4,19 +4,17 @@ from neuma_lib.config.priors import RegressionConfig, TrajectoryConfig
 from neuma_lib.fitting.prior_training import train_prior
 from neuma_lib.io.files import write_json
 from neuma_lib.io.weights import write_weights
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
-def main(name: str, output, params, run) -> None:
+def main(inputs, output, params, run) -> None:
     kind = {"regression": RegressionConfig, "trajectory": TrajectoryConfig}[params.method]
     law, report = train_prior(params.law, kind(**params.options), params.seed, run.progress)
     write_weights(
-        output.weights, law.prior_state(), {"prior": name, "law": params.law, "method": params.method}
+        output.weights, law.prior_state(), {"prior": params.name, "law": params.law, "method": params.method}
     )
     write_json(output.report, report)
     run.say(f"rollout against its law: Chamfer {report['chamfer']:.4f}e-4 m^2")
 
 
-if __name__ == "__main__":
-    with stage(f"prior {snakemake.wildcards.prior}", snakemake.log[0]) as run:
-        main(snakemake.wildcards.prior, snakemake.output, snakemake.params, run)
+run_script(main, snakemake)

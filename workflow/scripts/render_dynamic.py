@@ -8,23 +8,21 @@ from neuma_lib.data.blender.scene import render_dynamic
 from neuma_lib.geometry.shapes import place
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.splatting.viewpoints import video_views
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
-def main(particles_file: str, transforms: str, params, run) -> None:
+def main(inputs, output, params, run) -> None:
     scene, images = params.scene, ImagesConfig(**params.images)
     names = ("x", "tracers", "frames")
-    arrays, attributes = read_arrays(particles_file, only=names, required=names)
+    arrays, attributes = read_arrays(inputs.particles, only=names, required=names)
     mesh = place(scene["shape"], scene["size"], scene["height"], scene["center"])
     look = AppearanceConfig(**scene["appearance"])
     body = make_body(mesh, look, arrays["x"], arrays["tracers"])
     views = video_views(body.points, images.views, images.width, images.height)
     steps = arrays["frames"].tolist()
-    folder = Path(transforms).parent
+    folder = Path(output.transforms).parent
     render_dynamic(body, views, steps, attributes["dt"], folder, images.samples, params.threads, run.progress)
     run.say(f"{len(views)} views, {len(steps)} frames of {views.width}x{views.height} px")
 
 
-if __name__ == "__main__":
-    with stage(f"render_dynamic {snakemake.wildcards.scene}", snakemake.log[0]) as run:
-        main(snakemake.input.particles, snakemake.output.transforms, snakemake.params, run)
+run_script(main, snakemake)

@@ -8,20 +8,18 @@ from neuma_lib.data.blender.scene import render_static
 from neuma_lib.geometry.shapes import place
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.splatting.viewpoints import static_views
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
-def main(particles_file: str, transforms: str, params, run) -> None:
+def main(inputs, output, params, run) -> None:
     scene, images = params.scene, ImagesConfig(**params.images)
-    arrays, _ = read_arrays(particles_file, only=("x", "tracers"), required=("x", "tracers"))
+    arrays, _ = read_arrays(inputs.particles, only=("x", "tracers"), required=("x", "tracers"))
     mesh = place(scene["shape"], scene["size"], scene["height"], scene["center"])
     look = AppearanceConfig(**scene["appearance"])
     body = make_body(mesh, look, arrays["x"][:1], arrays["tracers"][:1])
     views = static_views(body.points, images.views, images.width, images.height)
-    render_static(body, views, Path(transforms).parent, images.samples, params.threads, run.progress)
+    render_static(body, views, Path(output.transforms).parent, images.samples, params.threads, run.progress)
     run.say(f"{len(views)} views of {views.width}x{views.height} px")
 
 
-if __name__ == "__main__":
-    with stage(f"render_static {snakemake.wildcards.scene}", snakemake.log[0]) as run:
-        main(snakemake.input.particles, snakemake.output.transforms, snakemake.params, run)
+run_script(main, snakemake)

@@ -1,15 +1,15 @@
 """Take images that were made elsewhere, in our layout or in that of the authors' release."""
 
 from neuma_lib.io.images import list_images
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
-def main(source: str, transforms: str, run) -> None:
-    images = list_images(source, transforms)
+def main(inputs, output, params, run) -> None:
+    images = list_images(inputs.images, output.transforms)
     views = len(set(images.views.tolist()))
-    run.say(f"{len(images.names)} images of {images.width}x{images.height} px, {views} views, from {source}")
+    run.say(
+        f"{len(images.names)} images of {images.width}x{images.height} px, {views} views, from {inputs.images}"
+    )
 
 
-if __name__ == "__main__":
-    with stage(f"{snakemake.rule} {snakemake.wildcards.scene}", snakemake.log[0]) as run:
-        main(snakemake.input.images, snakemake.output.transforms, run)
+run_script(main, snakemake)

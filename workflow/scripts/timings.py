@@ -4,12 +4,12 @@ from pathlib import Path
 
 from neuma_lib.evaluation.reports import report_table
 from neuma_lib.io.files import write_text
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
-def main(files: list[str], output, run) -> None:
+def main(inputs, output, params, run) -> None:
     rows: dict[str, dict[str, float]] = {}
-    for file in map(Path, files):
+    for file in map(Path, list(inputs.benchmarks)):
         header, values = (line.split("\t") for line in file.read_text().splitlines()[:2])
         measured = dict(zip(header, values, strict=True))
         seconds, memory = float(measured["s"]), measured["max_rss"]
@@ -36,6 +36,4 @@ def main(files: list[str], output, run) -> None:
     run.say(f"{rows['total']['seconds']:.0f} s of work in {rows['total']['runs']} runs: {output.markdown}")
 
 
-if __name__ == "__main__":
-    with stage("timings", snakemake.log[0]) as run:
-        main(list(snakemake.input.benchmarks), snakemake.output, run)
+run_script(main, snakemake)

@@ -1,14 +1,12 @@
 """Unpack the ground truth of a scene."""
 
 from neuma_lib.io.packed import unpack_truth
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
-def main(packed: str, particles_file: str, params, run) -> None:
-    unpack_truth(packed, particles_file, params.steps, params.dt)
-    run.say(f"unpacked from {packed}")
+def main(inputs, output, params, run) -> None:
+    unpack_truth(inputs.packed, output.particles, params.steps, params.dt)
+    run.say(f"unpacked from {inputs.packed}")
 
 
-if __name__ == "__main__":
-    with stage(f"unpack_truth {snakemake.wildcards.scene}", snakemake.log[0]) as run:
-        main(snakemake.input.packed, snakemake.output.particles, snakemake.params, run)
+run_script(main, snakemake)

@@ -10,10 +10,10 @@ from neuma_lib.io.images import load_observation
 from neuma_lib.io.laws import load_law
 from neuma_lib.io.particles import load_body
 from neuma_lib.sim.model import MPMModel
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
-def main(inputs, velocity_file: str, params, run) -> None:
+def main(inputs, output, params, run) -> None:
     settings = VelocityConfig(**params.velocity)
     device = choose_device(params.device)
     model, law = MPMModel(**params.simulation), load_law(inputs.prior).to(device)
@@ -25,10 +25,8 @@ def main(inputs, velocity_file: str, params, run) -> None:
     if settings.ridge:
         free = estimate_velocity(model, law, body, video, settings.model_copy(update={"ridge": 0.0}))
         run.say(f"without the ridge: {free.summary()}")
-    write_json(velocity_file, {**estimate.as_dict(), "without_ridge": free.as_dict()})
+    write_json(output.velocity, {**estimate.as_dict(), "without_ridge": free.as_dict()})
     run.say(estimate.summary())
 
 
-if __name__ == "__main__":
-    with stage(f"velocity {snakemake.wildcards.scene}", snakemake.log[0]) as run:
-        main(snakemake.input, snakemake.output.velocity, snakemake.params, run)
+run_script(main, snakemake)

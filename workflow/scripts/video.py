@@ -9,10 +9,10 @@ from neuma_lib.evaluation.video import side_by_side, write_mp4
 from neuma_lib.io.files import atomic
 from neuma_lib.io.images import load_observation
 from neuma_lib.io.particles import load_body, load_motion
-from workflow.stage import stage
+from workflow.stage import run_script
 
 
-def main(inputs, video_file: str, params, run) -> None:
+def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
     observation = load_observation(inputs.transforms, [params.view]).to(torch.float32, device)
     body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density)
@@ -26,11 +26,9 @@ def main(inputs, video_file: str, params, run) -> None:
             quality += [psnr(predicted, seen) for seen, predicted in zip(*pair, strict=True)]
             panels.append(side_by_side(pair, ["observation", "prediction"], magnify=params.magnify))
     video = np.concatenate(panels)
-    with atomic(video_file) as partial:
+    with atomic(output.video) as partial:
         write_mp4(partial, video, params.frame_rate)
     run.say(f"{len(video)} frames, PSNR {sum(quality) / len(quality):.1f} dB on average")
 
 
-if __name__ == "__main__":
-    with stage(f"video {snakemake.wildcards.scene}/{snakemake.wildcards.method}", snakemake.log[0]) as run:
-        main(snakemake.input, snakemake.output.video, snakemake.params, run)
+run_script(main, snakemake)
