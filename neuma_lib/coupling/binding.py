@@ -27,16 +27,9 @@ class Binding:
 
     @classmethod
     def identity(cls, count: int, like: Tensor) -> Binding:
-        """Every Gaussian is its own particle (the paper's "w/o Bind"), on the device of ``like``.
-
-        Args:
-            count: Gaussians, which are the particles too.
-            like: tensor whose device and floating type the weights take.
-        """
+        """Each of ``count`` Gaussians is its own particle (the paper's "w/o Bind"); device and dtype of ``like``."""
         index = torch.arange(count + 1, device=like.device)
-        return cls(
-            index, index[:-1].clone(), torch.ones(count, dtype=like.dtype, device=like.device), (count, count)
-        )
+        return cls(index, index[:-1].clone(), like.new_ones(count), (count, count))
 
     @property
     def counts(self) -> Tensor:
@@ -45,12 +38,8 @@ class Binding:
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Binding:
         """The same matrix on another device or with weights of another floating type."""
-        return Binding(
-            self.indptr.to(device),
-            self.indices.to(device),
-            self.values.to(device=device, dtype=dtype),
-            self.shape,
-        )
+        values = self.values.to(device=device, dtype=dtype)
+        return Binding(self.indptr.to(device), self.indices.to(device), values, self.shape)
 
     def rows(self, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
         """B in compressed rows for a kernel: indptr and indices as int32, weights of the given dtype; made once."""

@@ -1,11 +1,8 @@
 """Gaussian-particle binding: Algorithm 1 of the paper as a sparse matrix.
 
-Row i of the binding matrix B (G, N) holds the weights of the particles that carry Gaussian i: the particles
-inside its confidence ellipsoid, at most ``max_neighbours`` of them, equally weighted, so that every
-non-empty row sums to 1. Gaussians then follow the particles by ``x_t = x_0 + B (p_t - p_0)`` and ``F_bar =
-B F`` (paper, section 3.3).
-
-The dense G x N matrix is never formed, and the ellipsoid test touches only particles near each Gaussian.
+Row i of the binding matrix B (G, N) holds the weights of the particles that carry Gaussian i, so that Gaussians follow
+the particles by ``x_t = x_0 + B (p_t - p_0)`` and ``F_bar = B F`` (paper, section 3.3). The dense matrix is never
+formed, and the ellipsoid test touches only particles near each Gaussian.
 """
 
 from __future__ import annotations
@@ -21,8 +18,7 @@ from neuma_lib.coupling.binding import Binding
 from neuma_lib.errors import InputError
 
 _FIRST_QUERY = 32
-"""Nearest particles asked for at first; Gaussians that need more are asked again with four times as
-many."""
+"""Nearest particles asked for at first; Gaussians that need more are asked again with four times as many."""
 _CHUNK_ENTRIES = 2_000_000
 """Gaussian-particle pairs held at one time, which bounds the memory of a search whatever its input."""
 _SHARING_NEIGHBOURS = 16
@@ -33,12 +29,7 @@ _UNBALANCED = 1e-9
 """Residual, relative to the neighbours' distance, above which no shares balance an added particle."""
 
 
-def bind(
-    means: Tensor,
-    covars: Tensor,
-    particles: Tensor,
-    settings: BindingConfig | None = None,
-) -> Binding:
+def bind(means: Tensor, covars: Tensor, particles: Tensor, settings: BindingConfig | None = None) -> Binding:
     """Bind every Gaussian to the particles inside its confidence ellipsoid (paper, Algorithm 1).
 
     Particle j belongs to Gaussian i when ``(p_j - x_i)^T A_i^-1 (p_j - x_i) <= chi2_3(confidence)``; of
@@ -71,11 +62,10 @@ def bind_two_pass(
 ) -> tuple[Binding, Tensor, int, Tensor]:
     """Bind twice, so that no Gaussian is left without a particle (paper, section 3.4).
 
-    Gaussians that the first pass leaves empty get a particle of their own at their centre; the second pass
-    binds all Gaussians to the enlarged set. The added particles crowd at the surface. By default each takes
-    its volume from the particles around it, in proportions whose barycentre is its own position, which
-    leaves total volume and centre of mass (at one density) unchanged to round-off and every volume
-    positive. Where these particles lie in one plane the barycentre is the nearest point of the plane.
+    Gaussians that the first pass leaves empty get a particle of their own at their centre; the second pass binds all
+    Gaussians to the enlarged set. By default each added particle takes its volume from those around it, in proportions
+    whose barycentre is its own position: total volume and centre of mass (at one density) are unchanged to round-off
+    and every volume is positive. Where the others lie in one plane the barycentre is the nearest point of the plane.
 
     Args:
         means, covars, particles: as in ``bind``.
@@ -84,8 +74,7 @@ def bind_two_pass(
             paper does: the total stays, the centre of mass moves.
 
     Returns:
-        Tuple of the binding (G, N + M), the particles with the M added ones at the end (N + M, 3), the
-        added count M, and the volumes (N + M,).
+        the binding (G, N + M), the particles with the M added ones at the end (N + M, 3), M, the volumes (N + M,).
 
     Raises:
         InputError: as ``bind``; volumes that are not positive or do not fit the particles.

@@ -48,15 +48,8 @@ class ParticleGS:
 
     def deformed(self, x: Tensor, F: Tensor) -> tuple[Tensor, Tensor]:
         """Means (T, G, 3) and covariances (T, G, 3, 3) for particle states x (T, N, 3) and F (T, N, 3, 3)."""
-        return deform(
-            self.gaussians.means,
-            self._covars0,
-            self.binding,
-            self.x0,
-            x,
-            F,
-            covariance_gradient=self.covariance_gradient,
-        )
+        at_rest = (self.gaussians.means, self._covars0, self.binding, self.x0)
+        return deform(*at_rest, x, F, covariance_gradient=self.covariance_gradient)
 
     def __call__(self, x: Tensor, F: Tensor) -> Tensor:
         """Images (T, V, H, W, 3) in [0, 1] of the particle states x (T, N, 3) [m] and F (T, N, 3, 3)."""
@@ -64,18 +57,11 @@ class ParticleGS:
 
     def splatted(self, means: Tensor, covars: Tensor) -> Tensor:
         """Images (T, V, H, W, 3) of deformed Gaussians, means (T, G, 3) [m] and covariances (T, G, 3, 3) [m^2]."""
+        views = self.cameras
         images, _ = rasterize(
-            means,
-            covars,
-            self.gaussians.opacities,
-            self._sh,
-            self.cameras.viewmats,
-            self.cameras.Ks,
-            self.cameras.width,
-            self.cameras.height,
-            background=self.background,
-            eps2d=self.eps2d,
-        )
+            means, covars, self.gaussians.opacities, self._sh, views.viewmats, views.Ks, views.width, views.height,
+            background=self.background, eps2d=self.eps2d,
+        )  # fmt: skip
         return images
 
     @property

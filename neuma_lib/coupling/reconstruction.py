@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -53,14 +53,7 @@ class Reconstruction:
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Reconstruction:
         """The same body in another precision or on another device."""
         kind = dict(dtype=dtype, device=device)
-        return replace(
-            self,
-            x0=self.x0.to(**kind),
-            vol0=self.vol0.to(**kind),
-            mass=self.mass.to(**kind),
-            gaussians=self.gaussians.to(**kind),
-            binding=self.binding.to(**kind),
-        )
+        return Reconstruction(*(getattr(self, field.name).to(**kind) for field in fields(self)))
 
     def particle_gs(self, cameras: Cameras, **options) -> ParticleGS:
         """The renderer of this body for the given cameras."""

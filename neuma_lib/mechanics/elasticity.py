@@ -1,8 +1,7 @@
 """Analytic elasticities: deformation gradient F -> Kirchhoff stress tau = P F^T [Pa].
 
-Each law is given by its principal Kirchhoff stresses as a function of the principal stretches sigma, with
-Lamé parameters mu, lam and J = sigma_1 sigma_2 sigma_3. All are symmetric, objective and stress-free at F =
-R.
+Each law is given by its principal Kirchhoff stresses as a function of the principal stretches sigma, with Lamé
+parameters mu, lam and J = sigma_1 sigma_2 sigma_3. All are symmetric, objective and stress-free at F = R.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """Isotropic tensor functions through singular values, and the constants of analytic laws.
 
-Every analytic law here is isotropic: with F = U diag(sigma) V^T it is known by three principal values
-y(sigma), as a stress U diag(y) U^T or as a deformation U diag(y) V^T. Their adjoints need divided differences
-of y, which are finite at equal singular values; :func:`_apart` evaluates them without a branch by keeping the
-two values at least eps^(1/3) apart (error eps^(2/3), because the quotient is an even function of the
-distance).
+Every analytic law here is isotropic: with F = U diag(sigma) V^T it is given by three principal values y(sigma), as a
+stress U diag(y) U^T or as a deformation U diag(y) V^T. Their adjoints need divided differences of y, which are finite
+at equal singular values; :func:`_apart` evaluates them without a branch by keeping the two values at least eps^(1/3)
+apart (error eps^(2/3), because the quotient is an even function of the distance).
 """
 
 from __future__ import annotations
@@ -26,12 +25,8 @@ PAIRS = ((0, 1), (0, 2), (1, 2))
 
 
 def _apart(sigma: Tensor, function: PrincipalFunction) -> tuple[Tensor, Tensor]:
-    """For each pair (i, j) of :data:`PAIRS`: sigma_i, sigma_j moved apart about their mean, and y_i, y_j
-    there.
-
-    Returns:
-        two tensors (N, 3 pairs, 2).
-    """
+    """For each pair (i, j) of :data:`PAIRS`: sigma_i, sigma_j moved apart about their mean, and y_i, y_j there; both
+    (N, 3 pairs, 2)."""
     least = torch.finfo(sigma.dtype).eps ** (1 / 3)
     moved = sigma[:, None].repeat(1, 3, 1)
     for pair, (i, j) in enumerate(PAIRS):
@@ -51,14 +46,20 @@ def _symmetric(pairs: Tensor) -> Tensor:
     return torch.stack([zero, a, b, a, zero, c, b, c, zero], dim=1).reshape(-1, 3, 3)
 
 
+def _decomposed(ctx, F: Tensor, function: PrincipalFunction) -> tuple[Tensor, Tensor, Tensor]:
+    """U, sigma, Vh of F, kept for backward together with the function."""
+    parts = svd3(F)
+    ctx.function = function
+    ctx.save_for_backward(*parts)
+    return parts
+
+
 class _Stress(torch.autograd.Function):
     """(F, y) -> U diag(y) U^T; the gradient to F is that of U at fixed y."""
 
     @staticmethod
     def forward(ctx, F, y, function):
-        U, sigma, Vh = svd3(F)
-        ctx.function = function
-        ctx.save_for_backward(U, sigma, Vh)
+        U, _, _ = _decomposed(ctx, F, function)
         return (U * y[:, None]) @ U.mT
 
     @staticmethod
@@ -74,15 +75,11 @@ class _Stress(torch.autograd.Function):
 
 
 class _Deformation(torch.autograd.Function):
-    """(F, y) -> U diag(y) V^T, and F itself where y equals sigma; the gradient to F is that of U, V at fixed
-    y.
-    """
+    """(F, y) -> U diag(y) V^T, and F itself where y equals sigma; the gradient to F is that of U, V at fixed y."""
 
     @staticmethod
     def forward(ctx, F, y, function):
-        U, sigma, Vh = svd3(F)
-        ctx.function = function
-        ctx.save_for_backward(U, sigma, Vh)
+        U, sigma, Vh = _decomposed(ctx, F, function)
         unchanged = (y == sigma).all(dim=1)
         return torch.where(unchanged[:, None, None], F, (U * y[:, None]) @ Vh)
 
@@ -134,39 +131,33 @@ POISSON = Constant("1", -1.0, 0.5)
 class Constants(nn.Module):
     """Mix-in that checks and holds a law's constants.
 
-    A constant given as a number is fixed. One given as a tensor that requires a gradient becomes one of the
-    law's ``weights()``, in the order of ``constants``: so an analytic law can be fitted like a neural one.
+    A constant given as a number is fixed. A tensor that requires a gradient becomes one of the law's ``weights()``, in
+    the order of ``constants``: so an analytic law can be fitted like a neural one.
     """
 
     constants: dict[str, Constant] = {}
 
     def __init__(self, **values: float | Tensor):
         super().__init__()
+        law = type(self).__name__
         unknown = sorted(set(values) - set(self.constants))
         if unknown:
-            raise InputError(
-                f"{type(self).__name__} has no constant {', '.join(unknown)}; "
-                f"it has {', '.join(self.constants) or 'none'}"
-            )
+            names = ", ".join(self.constants) or "none"
+            raise InputError(f"{law} has no constant {', '.join(unknown)}; it has {names}")
         self.values: dict[str, float | Tensor] = {}
         for name, constant in self.constants.items():
             value = values.get(name, constant.default)
             if value is None:
-                raise InputError(f"{type(self).__name__} needs the constant {name} [{constant.unit}]")
-            if not isinstance(value, Tensor):
-                try:
-                    value = float(value)
-                except (TypeError, ValueError):
-                    raise InputError(
-                        f"{type(self).__name__}.{name} must be a number, not {value!r}"
-                    ) from None
-            number = float(value.detach()) if isinstance(value, Tensor) else value
+                raise InputError(f"{law} needs the constant {name} [{constant.unit}]")
+            try:
+                number = float(value.detach() if isinstance(value, Tensor) else value)
+            except (TypeError, ValueError):
+                raise InputError(f"{law}.{name} must be a number, not {value!r}") from None
             if not constant.admits(number):
                 raise InputError(
-                    f"{type(self).__name__}.{name} = {number:g} must lie between {constant.low:g} and "
-                    f"{constant.high:g} {constant.unit}"
+                    f"{law}.{name} = {number:g} must lie between {constant.low:g} and {constant.high:g} {constant.unit}"
                 )
-            self.values[name] = value
+            self.values[name] = value if isinstance(value, Tensor) else number
 
     def _fitted(self) -> list[str]:
         return [n for n, v in self.values.items() if isinstance(v, Tensor) and v.requires_grad]
@@ -177,9 +168,6 @@ class Constants(nn.Module):
     def with_weights(self, weights: tuple[Tensor, ...]) -> dict[str, float | Tensor]:
         """All constants, with the given weights in place of the fitted ones."""
         return {**self.values, **dict(zip(self._fitted(), weights, strict=True))}
-
-    def extra_repr(self) -> str:
-        return ", ".join(f"{name}={float(value):g}" for name, value in self.values.items())
 
 
 def lame(E: float | Tensor, nu: float | Tensor) -> tuple[float | Tensor, float | Tensor]:

@@ -1,12 +1,11 @@
 """The two interfaces that analytic and neural constitutive laws share.
 
-A material model of the paper (Sec. 3.2) is a pair: an *elasticity* that turns the deformation gradient into a
-stress, and a *plasticity* that projects the trial deformation gradient back to the admissible elastic region.
-Both are functions ``F, weights -> (N, 3, 3)`` with a hand-callable adjoint, so that a rollout can be
-differentiated by one explicit reverse loop and needs no autograd graph.
+A material model of the paper (Sec. 3.2) is a pair: an *elasticity*, from the deformation gradient to a stress, and a
+*plasticity*, which projects the trial deformation gradient back to the admissible elastic region. Both have an adjoint
+that is called by hand, so that a rollout is differentiated by one explicit reverse loop without an autograd graph.
 
-The weights are an argument and not read from the module: the rollout asks for them once (``law.weights()``,
-where LoRA is merged), uses the same tensors at every step and returns their gradients to autograd once.
+The weights are an argument: the rollout asks for them once (``law.weights()``, where LoRA is merged), uses the same
+tensors at every step and returns their gradients to autograd once.
 """
 
 from __future__ import annotations
@@ -36,10 +35,7 @@ class Constitutive(nn.Module):
         return self
 
     def weights(self) -> Weights:
-        """Tensors that a rollout differentiates, as a differentiable function of the module's parameters.
-
-        Empty for an analytic law with fixed constants.
-        """
+        """Tensors that a rollout differentiates, as a differentiable function of the parameters; () if all is fixed."""
         return ()
 
     def response(self, F: Tensor, weights: Weights) -> Tensor:
@@ -59,11 +55,10 @@ class Constitutive(nn.Module):
     def evaluate_with_cache(
         self, F: Tensor, weights: Weights, out: Tensor | None = None, cache: Any = None
     ) -> tuple[Tensor, Any]:
-        """As `evaluate`, and an opaque cache that spares `vjp` the recomputation.
+        """As `evaluate`, and an opaque cache that spares `vjp` the recomputation; None where a law keeps nothing.
 
-        The cache owns its memory, so that several can be kept. One that this method returned for as many rows
-        and that is no longer needed can be given back as `cache` to be filled again. None where a law keeps
-        nothing.
+        The cache owns its memory, so that several can be kept. One that is no longer needed can be given back as
+        `cache`, for as many rows, to be filled again.
         """
         return self.evaluate(F, weights, out), None
 
@@ -79,8 +74,7 @@ class Constitutive(nn.Module):
         """Vector-Jacobian product at F.
 
         Args:
-            F: (N, 3, 3), as given to :meth:`evaluate`.
-            weights: as given to :meth:`evaluate`.
+            F, weights: as given to :meth:`evaluate`.
             grad_out: (N, 3, 3) gradient of a scalar with respect to the result.
             cache: from :meth:`evaluate_with_cache` at the same F and weights; None recomputes.
             grad_F: (N, 3, 3) buffer that receives the first result if given.
@@ -129,9 +123,8 @@ class Law(nn.Module):
     def longitudinal_modulus(self) -> float:
         """Largest eigenvalue of the acoustic tensor Q_ik = n_j (d tau_ij / d F_kl) n_l at F = I over n [Pa].
 
-        For an isotropic law this is the P-wave modulus, lam + 2 mu. Measured by one-sided differences in
-        float64 along 26 directions n (a neural law need not be isotropic, and sorted singular values have a
-        kink at F = I).
+        For an isotropic law this is the P-wave modulus, lam + 2 mu. Measured by one-sided differences in float64 along
+        26 directions n (a neural law need not be isotropic, and sorted singular values have a kink at F = I).
         """
         step = 1e-5
         ticks = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)

@@ -112,15 +112,9 @@ def evaluate_kernel(kind: str):
 
     @wp.func_native(source(kind, backward=False))
     def evaluate_rows(
-        F: wp.uint64,
-        W0: wp.uint64,
-        W1: wp.uint64,
-        W2: wp.uint64,
-        factor: float,
-        n: int,
-        out: wp.uint64,
+        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, factor: float, n: int, out: wp.uint64,
         shared: wp.tile(dtype=wp.uint8, shape=(EVALUATE_BYTES,)),
-    ): ...
+    ): ...  # fmt: skip
 
     @wp.kernel(
         enable_backward=False, module="unique", launch_bounds=(ROWS, BLOCKS_PER_PROCESSOR), grid_stride=False
@@ -140,32 +134,17 @@ def vjp_kernel(kind: str):
 
     @wp.func_native(source(kind, backward=True))
     def vjp_rows(
-        F: wp.uint64,
-        W0: wp.uint64,
-        W1: wp.uint64,
-        W2: wp.uint64,
-        grad_out: wp.uint64,
-        factor: float,
-        n: int,
-        grad_F: wp.uint64,
-        partials: wp.uint64,
-        shared: wp.tile(dtype=wp.uint8, shape=(VJP_BYTES,)),
-    ): ...
+        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, grad_out: wp.uint64, factor: float, n: int,
+        grad_F: wp.uint64, partials: wp.uint64, shared: wp.tile(dtype=wp.uint8, shape=(VJP_BYTES,)),
+    ): ...  # fmt: skip
 
     @wp.kernel(
         enable_backward=False, module="unique", launch_bounds=(ROWS, BLOCKS_PER_PROCESSOR), grid_stride=False
     )
     def neural_vjp(
-        F: wp.uint64,
-        W0: wp.uint64,
-        W1: wp.uint64,
-        W2: wp.uint64,
-        grad_out: wp.uint64,
-        factor: float,
-        n: int,
-        grad_F: wp.uint64,
-        partials: wp.uint64,
-    ):
+        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, grad_out: wp.uint64, factor: float, n: int,
+        grad_F: wp.uint64, partials: wp.uint64,
+    ):  # fmt: skip
         shared = wp.tile_empty(shape=(VJP_BYTES,), dtype=wp.uint8, storage="shared")
         vjp_rows(F, W0, W1, W2, grad_out, factor, n, grad_F, partials, shared)
 

@@ -1,8 +1,6 @@
-"""Kernels around the networks of :mod:`neuma_lib.mechanics.neural`: features before, stress or return map
-after.
+"""Kernels around the networks of :mod:`neuma_lib.mechanics.neural`: features before, stress or return map after.
 
-The networks themselves are three matrix products, which torch does best. X = sym(Y) is the symmetrised
-output.
+The networks themselves are three matrix products, which torch does best. X = sym(Y) is the symmetrised output.
 """
 
 from functools import cache
@@ -26,22 +24,15 @@ def feature_kernel(dtype: torch.dtype):
 
     @wp.func_native(snippet(LOAD, GRAM, SVD, _STORE, dtype=dtype))
     def feature_pack(
-        F: wp.array(dtype=mat33),
-        z: wp.array2d(dtype=real),
-        R: wp.array(dtype=mat33),
-        Vh: wp.array(dtype=mat33),
-        block: int,
-        n: int,
-    ): ...
+        F: wp.array(dtype=mat33), z: wp.array2d(dtype=real), R: wp.array(dtype=mat33), Vh: wp.array(dtype=mat33),
+        block: int, n: int,
+    ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module="unique")
     def features(
-        F: wp.array(dtype=mat33),
-        z: wp.array2d(dtype=real),
-        R: wp.array(dtype=mat33),
-        Vh: wp.array(dtype=mat33),
+        F: wp.array(dtype=mat33), z: wp.array2d(dtype=real), R: wp.array(dtype=mat33), Vh: wp.array(dtype=mat33),
         n: int,
-    ):
+    ):  # fmt: skip
         feature_pack(F, z, R, Vh, wp.tid(), n)
 
     return features
@@ -49,8 +40,7 @@ def feature_kernel(dtype: torch.dtype):
 
 @cache
 def output_kernels(dtype: torch.dtype, kind: str):
-    """Kernels (result, output adjoint, input adjoint) of one dtype, for ``kind`` "elasticity" or
-    "plasticity".
+    """Kernels (result, output adjoint, input adjoint) of one dtype, for ``kind`` "elasticity" or "plasticity".
 
     elasticity: tau = P F^T, P = R X; plasticity: F + scale R X. With g the gradient of the result,
 
@@ -75,12 +65,9 @@ def output_kernels(dtype: torch.dtype, kind: str):
 
     @wp.kernel(enable_backward=False, module="unique")
     def result(
-        F: wp.array(dtype=mat33),
-        R: wp.array(dtype=mat33),
-        Y: wp.array(dtype=mat33),
-        scale: real,
+        F: wp.array(dtype=mat33), R: wp.array(dtype=mat33), Y: wp.array(dtype=mat33), scale: real,
         out: wp.array(dtype=mat33),
-    ):
+    ):  # fmt: skip
         i = wp.tid()
         P = R[i] * symmetric(Y[i])
         if wp.static(elastic):
@@ -90,27 +77,18 @@ def output_kernels(dtype: torch.dtype, kind: str):
 
     @wp.kernel(enable_backward=False, module="unique")
     def output_adjoint(
-        F: wp.array(dtype=mat33),
-        R: wp.array(dtype=mat33),
-        g: wp.array(dtype=mat33),
-        scale: real,
+        F: wp.array(dtype=mat33), R: wp.array(dtype=mat33), g: wp.array(dtype=mat33), scale: real,
         grad_Y: wp.array(dtype=mat33),
-    ):
+    ):  # fmt: skip
         i = wp.tid()
         grad_Y[i] = symmetric(wp.transpose(R[i]) * gradient_of_P(F[i], g[i], scale))
 
     @wp.kernel(enable_backward=False, module="unique")
     def input_adjoint(
-        F: wp.array(dtype=mat33),
-        R: wp.array(dtype=mat33),
-        Vh: wp.array(dtype=mat33),
-        z: wp.array2d(dtype=real),
-        Y: wp.array(dtype=mat33),
-        g: wp.array(dtype=mat33),
-        grad_z: wp.array2d(dtype=real),
-        scale: real,
+        F: wp.array(dtype=mat33), R: wp.array(dtype=mat33), Vh: wp.array(dtype=mat33), z: wp.array2d(dtype=real),
+        Y: wp.array(dtype=mat33), g: wp.array(dtype=mat33), grad_z: wp.array2d(dtype=real), scale: real,
         grad_F: wp.array(dtype=mat33),
-    ):
+    ):  # fmt: skip
         i = wp.tid()
         Fi = F[i]
         Ri = R[i]

@@ -49,8 +49,7 @@ class Identity(Constants, Plasticity):
 
 
 class VonMises(AnalyticPlasticity):
-    """Yield where |dev eps| > yield_stress / (2 mu), eps the logarithmic strain; return along dev eps to the
-    surface.
+    """Yield where |dev eps| > yield_stress / (2 mu), eps the logarithmic strain; return along dev eps to the surface.
 
     With Hencky elasticity this bounds the norm of the deviatoric Kirchhoff stress by ``yield_stress`` [Pa].
     """
@@ -68,8 +67,7 @@ class VonMises(AnalyticPlasticity):
 class DruckerPrager(AnalyticPlasticity):
     """Granular flow (Klar et al. 2016): shear is bounded by friction times pressure; no tension.
 
-    ``friction_angle`` in degrees; ``cohesion`` is the volumetric log strain per axis that is borne in
-    tension.
+    ``friction_angle`` in degrees; ``cohesion`` is the volumetric log strain per axis that is borne in tension.
     """
 
     constants = {
@@ -108,9 +106,8 @@ class FluidProjection(AnalyticPlasticity):
 class ViscousFlow(AnalyticPlasticity):
     """Viscous relaxation of the deviatoric logarithmic strain, by one implicit step of length ``dt`` [s].
 
-    The strain beyond the yield stress decays at the rate mu / viscosity; with Hencky elasticity the shear
-    stress of a steady flow is then exactly viscosity times shear rate (a Bingham fluid if ``yield_stress`` >
-    0).
+    The strain beyond the yield stress decays at the rate mu / viscosity; with Hencky elasticity the shear stress of a
+    steady flow is then exactly viscosity times shear rate (a Bingham fluid if ``yield_stress`` > 0).
     """
 
     constants = {

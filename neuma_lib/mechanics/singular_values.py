@@ -38,31 +38,14 @@ def away_from_zero(x: Tensor, floor: Tensor | float) -> Tensor:
     return torch.where(x < 0, x.clamp(max=-floor), x.clamp(min=floor))
 
 
-def rotation_singular_values_vjp(
-    U: Tensor, sigma: Tensor, Vh: Tensor, grad_R: Tensor, grad_sigma: Tensor
-) -> Tensor:
-    """Adjoint of F -> (R, sigma).
-
-    With dF' = U^T dF V the singular values move by diag dF' and R by U K' Vh, where K'_ij = (dF'_ij - dF'_ji)
-    / (sigma_i + sigma_j); no difference of singular values occurs. R itself is singular where sigma_i +
-    sigma_j = 0 (an element turned inside out along two axes): there the quotient is bounded instead of
-    infinite.
-
-    Args:
-        U, sigma, Vh: (N, 3, 3), (N, 3), (N, 3, 3) from :func:`svd3`.
-        grad_R: (N, 3, 3); grad_sigma: (N, 3).
-
-    Returns:
-        gradient with respect to F, (N, 3, 3).
-    """
-    M = U.mT @ grad_R @ Vh.mT
-    floor = torch.finfo(sigma.dtype).eps ** 0.5
-    total = away_from_zero(sigma[:, :, None] + sigma[:, None, :], floor)
-    K = (M - M.mT) / total + torch.diag_embed(grad_sigma)
-    return U @ K @ Vh
-
-
 class _RotationAndSingularValues(torch.autograd.Function):
+    """F -> (R, sigma).
+
+    With dF' = U^T dF V the singular values move by diag dF' and R by U K' Vh, where K'_ij = (dF'_ij - dF'_ji) /
+    (sigma_i + sigma_j); no difference of singular values occurs. R itself is singular where sigma_i + sigma_j = 0 (an
+    element turned inside out along two axes): there the quotient is bounded instead of infinite.
+    """
+
     @staticmethod
     def forward(ctx, F):
         U, sigma, Vh = svd3(F)
@@ -72,13 +55,17 @@ class _RotationAndSingularValues(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_R, grad_sigma):
-        return rotation_singular_values_vjp(*ctx.saved_tensors, grad_R, grad_sigma)
+        U, sigma, Vh = ctx.saved_tensors
+        M = U.mT @ grad_R @ Vh.mT
+        floor = torch.finfo(sigma.dtype).eps ** 0.5
+        total = away_from_zero(sigma[:, :, None] + sigma[:, None, :], floor)
+        K = (M - M.mT) / total + torch.diag_embed(grad_sigma)
+        return U @ K @ Vh
 
 
 def rotation_and_singular_values(F: Tensor) -> tuple[Tensor, Tensor]:
     """Rotation R (N, 3, 3) and singular values (N, 3) of F (N, 3, 3), differentiable once.
 
-    The gradient of symmetric functions of sigma is exact everywhere, that of a single sigma where it is
-    distinct.
+    The gradient of symmetric functions of sigma is exact everywhere, that of a single sigma where it is distinct.
     """
     return _RotationAndSingularValues.apply(F)

@@ -52,22 +52,15 @@ def svd_kernel(dtype: torch.dtype):
 
     @wp.func_native(snippet(LOAD, SVD, STORE, dtype=dtype))
     def svd_pack(
-        F: wp.array(dtype=mat33),
-        U: wp.array(dtype=mat33),
-        sigma: wp.array(dtype=vec3),
-        Vh: wp.array(dtype=mat33),
-        block: int,
-        n: int,
-    ): ...
+        F: wp.array(dtype=mat33), U: wp.array(dtype=mat33), sigma: wp.array(dtype=vec3), Vh: wp.array(dtype=mat33),
+        block: int, n: int,
+    ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module="unique")
     def svd3(
-        F: wp.array(dtype=mat33),
-        U: wp.array(dtype=mat33),
-        sigma: wp.array(dtype=vec3),
-        Vh: wp.array(dtype=mat33),
+        F: wp.array(dtype=mat33), U: wp.array(dtype=mat33), sigma: wp.array(dtype=vec3), Vh: wp.array(dtype=mat33),
         n: int,
-    ):
+    ):  # fmt: skip
         svd_pack(F, U, sigma, Vh, wp.tid(), n)
 
     return svd3

@@ -1,13 +1,12 @@
 """Splat-major compositing on a CPU: splats in depth order, each over the exact rows and columns it touches.
 
-A GPU gives every pixel a thread that walks the splats; on one core it is cheaper to let every splat walk its
-pixels, because there are no tile lists and every load is contiguous. Pixels keep colour, transmittance T and
-the rank at which they became opaque; the reverse pass walks the splats backwards and recovers the earlier
-transmittance by dividing by 1 - alpha.
+On one core it is cheaper to loop over splats and then their pixels than the other way round, as a GPU does: no tile
+lists, and every load is contiguous. Pixels keep colour, transmittance T and the rank at which they became opaque; the
+reverse pass goes through the splats backwards and recovers the earlier transmittance by dividing by 1 - alpha.
 
-Rows are processed eight pixels at a time with the vector types of Clang, which Warp embeds on every platform,
-so these kernels are native snippets. Planes have padded rows (``padded_width``): lanes right of the image
-compute values that nobody reads, and their image gradient is zero.
+Rows are processed eight pixels at a time with the vector types of Clang, which Warp embeds on every platform, so
+these kernels are native snippets. Planes have padded rows (``padded_width``): lanes right of the image compute values
+that nobody reads, and their image gradient is zero.
 """
 
 import functools

@@ -47,23 +47,14 @@ class Gaussians:
 
     def __getitem__(self, index) -> Gaussians:
         """Some of the Gaussians: a boolean mask, an index tensor or a slice."""
-        return Gaussians(
-            **{field.name: getattr(self, field.name)[index] for field in dataclasses.fields(self)}
-        )
+        return Gaussians(*(getattr(self, field.name)[index] for field in dataclasses.fields(self)))
 
     def to(self, device=None, dtype: torch.dtype | None = None) -> Gaussians:
-        return Gaussians(
-            **{field.name: getattr(self, field.name).to(device, dtype) for field in dataclasses.fields(self)}
-        )
+        return Gaussians(*(getattr(self, field.name).to(device, dtype) for field in dataclasses.fields(self)))
 
     def sh(self) -> torch.Tensor:
         """(G, K, 3) all harmonics."""
         return torch.cat([self.sh0, self.shN], dim=1)
-
-    @property
-    def degree(self) -> int:
-        """Highest SH degree."""
-        return int(round((self.shN.shape[1] + 1) ** 0.5)) - 1
 
     def covars(self) -> torch.Tensor:
         """(G, 3, 3) covariances A_0 = R S^2 R^T [m^2]."""
@@ -72,11 +63,10 @@ class Gaussians:
     def absorbing_blur(self, cameras: Cameras, eps2d: float) -> Gaussians:
         """The Gaussians with the blur of the cameras' pixels as a part of their own size.
 
-        Splatting widens every projected Gaussian by a pixel's variance ``eps2d`` [px^2]. Gaussians that were fitted
-        under one set of cameras would therefore look larger through cameras with larger pixels, by up to a pixel
-        at the silhouette. Here each Gaussian grows by what ``eps2d`` was worth in the mean camera, in metres; rendered
-        with ``eps2d=0`` they look the same through those cameras, and keep their size through all others (the idea
-        of Mip-Splatting's 3D smoothing filter, Yu et al. 2024).
+        Splatting widens every projected Gaussian by a pixel's variance ``eps2d`` [px^2], so Gaussians that were fitted
+        through some cameras would look larger through cameras with larger pixels. Here each grows by ``eps2d`` in
+        metres at the mean camera; rendered with ``eps2d=0`` they look the same through those cameras, and keep their
+        size through all others (the idea of Mip-Splatting's 3D smoothing filter, Yu et al. 2024).
         """
         _, depth = cameras.project(self.means)
         focal = cameras.Ks[:, 0, 0].to(depth)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Literal
 
@@ -55,11 +55,9 @@ class RenderBuffers:
         return buffer
 
 
-class _FreshBuffers:
+def _fresh(name: str, shape: Sequence[int], like: torch.Tensor, dtype=None) -> torch.Tensor:
     """Allocates every time: results of several calls may be alive together."""
-
-    def empty(self, name: str, shape: Sequence[int], like: torch.Tensor, dtype=None) -> torch.Tensor:
-        return torch.empty(shape, dtype=dtype or like.dtype, device=like.device)
+    return torch.empty(shape, dtype=dtype or like.dtype, device=like.device)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +65,7 @@ class _Options:
     settings: Settings
     compositor: ModuleType
     statistics: Statistics | None
-    buffers: RenderBuffers | _FreshBuffers
+    empty: Callable[..., torch.Tensor]
 
 
 class _Rasterize(torch.autograd.Function):
@@ -77,7 +75,7 @@ class _Rasterize(torch.autograd.Function):
         means, covars, opacities, viewmats, Ks, background = (
             x.detach().contiguous() for x in (means, covars, opacities, viewmats, Ks, background)
         )
-        settings, empty = options.settings, options.buffers.empty
+        settings, empty = options.settings, options.empty
         splats, depths = projection.project(means, covars, opacities, sh, viewmats, Ks, settings, empty)
         pictures, alphas, kept = options.compositor.composite(splats, depths, background, settings, empty)
         ctx.save_for_backward(means, covars, sh, viewmats, Ks, background, splats, depths, *kept)
@@ -90,7 +88,7 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx, grad_pictures, grad_alphas):
         means, covars, sh, viewmats, Ks, background, splats, depths, *kept = ctx.saved_tensors
         options: _Options = ctx.options
-        settings, empty = options.settings, options.buffers.empty
+        settings, empty = options.settings, options.empty
         width, height = settings.width, settings.height
         grad_pictures = grad_pictures.contiguous().view(-1, height, width, 3)
         grad_alphas = grad_alphas.contiguous().view(-1, height, width)
@@ -215,17 +213,12 @@ def rasterize(
             f"rasterize: compositor {compositor!r} does not work with {means.dtype} on {means.device}; "
             f"choose {' or '.join(name for name, can in works.items() if can)}, or leave it out"
         )
-    settings = Settings(
-        int(width),
-        int(height),
-        float(alpha_min),
-        float(alpha_max),
-        float(transmittance_min),
-        float(eps2d),
-    )
+    thresholds = map(float, (alpha_min, alpha_max, transmittance_min, eps2d))
+    settings = Settings(int(width), int(height), *thresholds)
     if compositor == "gsplat":
         if statistics is not None:
             raise InputError("rasterize: compositor 'gsplat' fills no statistics, leave one of the two out")
         return gsplat_backend.rasterize(means, covars, opacities, sh, viewmats, Ks, background, settings)
-    options = _Options(settings, COMPOSITORS[compositor], statistics, buffers or _FreshBuffers())
+    empty = _fresh if buffers is None else buffers.empty
+    options = _Options(settings, COMPOSITORS[compositor], statistics, empty)
     return _Rasterize.apply(means, covars, opacities, sh, viewmats, Ks, background, options)

@@ -1,7 +1,6 @@
 """Real spherical harmonics up to degree 3, in the order and sign of 3D Gaussian splatting files.
 
-``BASIS`` is the one place that holds the coefficients: the torch functions here use it directly and the Warp
-kernels of ``projection.py`` are written from the same polynomials.
+The Warp kernels of ``projection.py`` are written from the polynomials of ``basis``, with the same coefficients.
 """
 
 import math

@@ -90,34 +90,26 @@ def ring_directions(count: int) -> np.ndarray:
 
 
 def framing(
-    directions: np.ndarray,
-    points: np.ndarray,
-    width: int,
-    height: int,
-    *,
-    fill: float = 0.92,
-    common_distance: bool = True,
+    directions: np.ndarray, points: np.ndarray, width: int, height: int, *, fill: float = 0.92
 ) -> Views:
-    """Cameras in the given directions, as near as they may be with every point in the frame.
+    """Cameras in the given directions, at one distance, as near as they may be with every point in the frame.
 
     Args:
         directions: unit vectors from the middle of the points' box to the cameras, shape (V, 3).
         points: everything that has to be seen [m], shape (n, 3), over all frames of a video.
         width, height: image size [px].
         fill: fraction of the half frame that the outermost point may reach.
-        common_distance: all cameras stand at one distance; otherwise each as near as it can.
     """
     points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     tangent = np.tan(np.radians(FIELD_OF_VIEW) / 2) * np.array([1.0, height / width]) * fill
-    distances = []
+    distance = -np.inf
     for direction in directions:
         axes = look_at(centre + direction, centre)[:3, :3]
         local = (points - centre) @ axes
         # |x| <= tangent * depth, where depth = distance - local z.
-        distances.append((np.abs(local[:, :2]) / tangent + local[:, 2:]).max())
-    distances = [max(distances)] * len(distances) if common_distance else distances
-    poses = [look_at(centre + d * u, centre) for d, u in zip(distances, directions, strict=True)]
+        distance = max(distance, (np.abs(local[:, :2]) / tangent + local[:, 2:]).max())
+    poses = [look_at(centre + distance * direction, centre) for direction in directions]
     focal = width / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
     return Views(np.stack(poses), float(focal), width, height)
 

@@ -19,8 +19,8 @@ PRIOR = {"elasticity": {"name": "fixed_corotated", "E": 1e5, "nu": 0.2}, "plasti
 RADIUS = 0.13
 
 
-def ball(height: float = 0.3, count: int = 300, gaussians: int = 120, seed: int = 0, dtype=torch.float64):
-    """A ball of particles with coloured kernels on and in it."""
+def ball(height: float = 0.3, count: int = 300, n_gaussians: int = 120, seed: int = 0, dtype=torch.float64):
+    """A ball of particles with coloured Gaussians on and in it."""
     g = torch.Generator().manual_seed(seed)
 
     def inside(n):
@@ -30,18 +30,18 @@ def ball(height: float = 0.3, count: int = 300, gaussians: int = 120, seed: int 
             dim=1, keepdim=True
         )
 
-    kernels = Gaussians(
-        means=inside(gaussians),
-        quats=torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(gaussians, 1),
-        scales=torch.full((gaussians, 3), 0.022, dtype=torch.float64),
-        opacities=torch.full((gaussians,), 0.7, dtype=torch.float64),
-        sh0=1.5 * torch.randn(gaussians, 1, 3, generator=g, dtype=torch.float64),
-        shN=torch.zeros(gaussians, 0, 3, dtype=torch.float64),
+    gaussians = Gaussians(
+        means=inside(n_gaussians),
+        quats=torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(n_gaussians, 1),
+        scales=torch.full((n_gaussians, 3), 0.022, dtype=torch.float64),
+        opacities=torch.full((n_gaussians,), 0.7, dtype=torch.float64),
+        sh0=1.5 * torch.randn(n_gaussians, 1, 3, generator=g, dtype=torch.float64),
+        shN=torch.zeros(n_gaussians, 0, 3, dtype=torch.float64),
     )
     volume = 4 / 3 * torch.pi * RADIUS**3
     particles = inside(count)
-    binding, x0, _, vol0 = bind_two_pass(kernels.means, kernels.covars(), particles, volume / count)
-    return Reconstruction(x0, vol0, 1000 * vol0, kernels, binding).to(dtype)
+    binding, x0, _, vol0 = bind_two_pass(gaussians.means, gaussians.covars(), particles, volume / count)
+    return Reconstruction(x0, vol0, 1000 * vol0, gaussians, binding).to(dtype)
 
 
 def camera(size: int = 32, dtype=torch.float64) -> Cameras:
