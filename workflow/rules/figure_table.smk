@@ -1,0 +1,260 @@
+"""What figures are made of: files, parameters and resources of each. figures.smk makes their rules."""
+
+import ast
+
+DRAWN = SETTINGS.figures
+COMPARED = SETTINGS.tables["table1"] if "table1" in SETTINGS.tables else None
+METHODS = list(COMPARED.methods if COMPARED else SETTINGS.methods)
+TITLES = table_titles("table1") if COMPARED else {method: SETTINGS.method_title(method) for method in METHODS}
+PREDICTED = ["nclaw", "neuma"]
+SHOWN_EXPERIMENTS = [*DRAWN.letters, *DRAWN.meetings]
+
+
+# ---- what figures are made of
+
+
+def of_methods(scenes, methods, name):
+    """A file of every scene under every method, scene by scene."""
+    return [f"{RESULTS}/{scene}/{method}/{name}" for scene in scenes for method in methods]
+
+
+def of_cells(table, name):
+    """A file of every cell of a table, method by method; none if there is no such table."""
+    methods = SETTINGS.tables[table].methods if table in SETTINGS.tables else ()
+    return [f"{RESULTS}/{scene}/{method}/{name}" for method in methods for scene in scenes_of(table)]
+
+
+def of_experiments(name):
+    return [f"{RESULTS}/experiments/{experiment}/{name}" for experiment in SHOWN_EXPERIMENTS]
+
+
+def scenes_of(table):
+    return list(SETTINGS.tables[table].scenes) if table in SETTINGS.tables else []
+
+
+def titles_of(table):
+    return table_titles(table) if table in SETTINGS.tables else {}
+
+
+def truths_of(scenes):
+    return [f"{DATA}/{scene}/particles.h5" for scene in scenes]
+
+
+def priors_of(scenes):
+    """The priors that NeuMA starts from."""
+    return [prior_file(SETTINGS.method_prior(scene, "neuma")) for scene in scenes]
+
+
+def filmed(scenes):
+    """What renders of scenes beside their videos need."""
+    return {
+        "kernels": kernels("rendering"),
+        "transforms": [f"{DATA}/{scene}/dynamic/transforms.json" for scene in scenes],
+        **each_of(scenes),
+    }
+
+
+def learned(scenes):
+    """The laws of scenes before and after training."""
+    return {
+        "kernels": kernels("laws"),
+        "prior": priors_of(scenes),
+        "adaptor": of_methods(scenes, ["neuma"], "adaptor.safetensors"),
+    }
+
+
+def scene_constants(scenes):
+    """What rollouts and material tests of scenes need to know."""
+    plain = {scene: SETTINGS.scene(scene).plain() for scene in scenes}
+    return {
+        scene: {name: values[name] for name in ("dt", "density", "law")}
+        | {"simulation": simulator(values["dt"])}
+        for scene, values in plain.items()
+    }
+
+
+def video_length(scene):
+    """Time of the last frame of a scene's video [s]."""
+    return SETTINGS.scene(scene).dt * SETTINGS.frame_steps(scene)[-1]
+
+
+def wrong_laws(scene):
+    """Which laws of a scene's prior differ from the truth, in words."""
+    truth = SETTINGS.scene(scene).law.plain()
+    prior = SETTINGS.priors.laws.get(SETTINGS.scene(scene).prior)
+    believed = prior.plain() if prior else {}
+    names = {"elasticity": "elastic", "plasticity": "plastic"}
+    return " and ".join(name for part, name in names.items() if believed.get(part) != truth[part]) or "none"
+
+
+def caption(figure):
+    """A figure's caption in the report: the docstring of its module."""
+    return ast.get_docstring(ast.parse(figure_module(figure).read_text()))
+
+
+def figure_module(figure):
+    return ROOT / "neuma_lib" / "evaluation" / "figures" / f"{figure}.py"
+
+
+# ---- the figures: kind of the data file, inputs and parameters of `data`, resources other than the default
+
+IN_VIEW = {"view": DRAWN.view, "magnify": DRAWN.magnify}
+
+FIGURES = {
+    "ch_dist_curve": {
+        "kind": "json",
+        "input": {"metrics": of_cells("table1", "metrics.json")},
+        "params": {
+            "titles": TITLES,
+            "scenes": {scene: SETTINGS.scene(scene).dt for scene in scenes_of("table1")},
+        },
+    },
+    "image_quality": {
+        "kind": "json",
+        "input": {"metrics": of_cells("table1", "image_metrics.json")},
+        "params": {"titles": TITLES, "scenes": scenes_of("table1")},
+    },
+    "main_res": {
+        "kind": "h5",
+        "input": {
+            **filmed(DRAWN.main_res),
+            "rollouts": of_methods(DRAWN.main_res, METHODS, "rollout.h5"),
+        },
+        "params": {
+            "titles": TITLES,
+            "scenes": scene_constants(DRAWN.main_res),
+            "shown": DRAWN.shown,
+            **IN_VIEW,
+        },
+    },
+    "particles_app": {
+        "kind": "h5",
+        "input": {
+            "truth": f"{DATA}/{DRAWN.particles_app}/particles.h5",
+            "particles": f"{RESULTS}/{DRAWN.particles_app}/particles.h5",
+            "rollouts": of_methods([DRAWN.particles_app], METHODS, "rollout.h5"),
+        },
+        "params": {
+            "titles": TITLES,
+            "dt": SETTINGS.scene(DRAWN.particles_app).dt,
+            "shown": DRAWN.shown + 3,
+            "size": DRAWN.size,
+        },
+    },
+    "lora_alphav": {
+        "kind": "h5",
+        "input": {
+            **filmed(DRAWN.lora_alphav),
+            **learned(DRAWN.lora_alphav),
+            "kernels": kernels("laws", "rendering"),
+            "truth": truths_of(DRAWN.lora_alphav),
+            "velocity": [f"{RESULTS}/{scene}/velocity.json" for scene in DRAWN.lora_alphav],
+        },
+        "params": {
+            "scenes": scene_constants(DRAWN.lora_alphav),
+            "weights": list(DRAWN.weights),
+            "shown": DRAWN.shown - 1,
+            "device": SETTINGS.device,
+            **IN_VIEW,
+        },
+        "resources": {"gpu": GPU, "mem_mb": 8000},
+    },
+    "vis_generalize": {
+        "kind": "h5",
+        "input": {
+            "kernels": kernels("rendering"),
+            "rollouts": of_experiments("neuma/rollout.h5"),
+            **each_of(f"experiments/{name}" for name in SHOWN_EXPERIMENTS),
+        },
+        "params": {
+            "letters": lambda wildcards: [
+                {"letter": body["shape"].removeprefix("letter_"), "material": body["scene"]}
+                for body in (SETTINGS.experiment_bodies(name)[0] for name in DRAWN.letters)
+            ],
+            "others": lambda wildcards: {name: SETTINGS.experiment(name).title for name in DRAWN.meetings},
+            "shown": DRAWN.shown - 1,
+            "size": DRAWN.size,
+        },
+    },
+    "ext_time": {
+        "kind": "h5",
+        "input": {
+            "kernels": kernels("rendering"),
+            "truth": f"{DATA}/experiments/{DRAWN.ext_time}/particles.h5",
+            **body_files(f"experiments/{DRAWN.ext_time}"),
+            "rollouts": [f"{RESULTS}/experiments/{DRAWN.ext_time}/{m}/rollout.h5" for m in PREDICTED],
+        },
+        "params": {
+            "titles": {method: SETTINGS.method_title(method) for method in PREDICTED},
+            "density": lambda wildcards: SETTINGS.experiment_bodies(DRAWN.ext_time)[0]["density"],
+            "observed": lambda wildcards: video_length(SETTINGS.experiment(DRAWN.ext_time).bodies[0].scene),
+            "shown": DRAWN.shown + 4,
+            "size": DRAWN.size,
+        },
+    },
+    "gradient_analysis": {
+        "kind": "json",
+        "input": {
+            **learned(DRAWN.gradient_analysis),
+            "history": of_methods(DRAWN.gradient_analysis, ["neuma"], "history.json"),
+        },
+        "params": {"scenes": {scene: wrong_laws(scene) for scene in DRAWN.gradient_analysis}},
+    },
+    "uneven_mass": {
+        "kind": "h5",
+        "input": {
+            **filmed(scenes_of("uneven_mass")),
+            "rollouts": of_cells("uneven_mass", "rollout.h5"),
+            "metrics": of_cells("uneven_mass", "metrics.json"),
+        },
+        "params": {
+            "titles": titles_of("uneven_mass"),
+            "scene": scene_constants(scenes_of("uneven_mass")),
+            "shown": DRAWN.shown,
+            **IN_VIEW,
+        },
+    },
+    "pipeline": {
+        "kind": "h5",
+        "input": {
+            **filmed([DRAWN.pipeline]),
+            **learned([DRAWN.pipeline]),
+            "kernels": kernels("laws", "rendering"),
+            "static": f"{DATA}/{DRAWN.pipeline}/static/transforms.json",
+            "mesh": f"{RESULTS}/{DRAWN.pipeline}/mesh.ply",
+            "rollout": f"{RESULTS}/{DRAWN.pipeline}/neuma/rollout.h5",
+        },
+        "params": {
+            "scene": scene_constants([DRAWN.pipeline])[DRAWN.pipeline],
+            "views": SETTINGS.dataset.static.views,
+            **IN_VIEW,
+        },
+    },
+    "material_response": {
+        "kind": "json",
+        "input": {
+            **learned(DRAWN.material_response),
+            "truth": truths_of(DRAWN.material_response),
+        },
+        "params": {
+            "scenes": scene_constants(DRAWN.material_response),
+            "rate": DRAWN.shear_rate,
+            "total_shear": DRAWN.total_shear,
+        },
+    },
+    "ablation_gradients": {
+        "kind": "json",
+        "input": {
+            "histories": of_cells("ablation_gradients", "history.json"),
+            "metrics": of_cells("ablation_gradients", "metrics.json"),
+            "image_metrics": of_cells("ablation_gradients", "image_metrics.json"),
+        },
+        "params": {
+            "titles": titles_of("ablation_gradients"),
+            "scenes": scenes_of("ablation_gradients"),
+        },
+    },
+}
+
+# Read by report/figure.rst. They are no parameters, as an edit of a caption need not draw the figure again.
+config["captions"] = {figure: caption(figure) for figure in FIGURES}
