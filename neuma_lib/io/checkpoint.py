@@ -32,7 +32,12 @@ class Checkpoint:
 
     def save(self, state: Mapping[str, Any]) -> None:
         """Replace the state: weights, optimiser, scheduler, iteration; the generators' states are added."""
-        content = {"fingerprint": self.fingerprint, "generators": _generator_states(), "state": dict(state)}
+        generators: dict[str, Any] = {
+            "torch": torch.get_rng_state()
+        }  # the library uses no global one of numpy
+        if torch.cuda.is_available():
+            generators["cuda"] = torch.cuda.get_rng_state_all()
+        content = {"fingerprint": self.fingerprint, "generators": generators, "state": dict(state)}
         with atomic(self.path) as partial:
             torch.save(content, partial)
 
@@ -51,33 +56,17 @@ class Checkpoint:
             names = sorted({*found.keys(), *self.fingerprint})
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"checkpoint {self.path} cannot be read ({one_line(error)}); {remedy}") from None
-        changed = [
-            f"{k} (was {found.get(k, 'absent')}, is {self.fingerprint.get(k, 'absent')})"
-            for k in names
-            if found.get(k) != self.fingerprint.get(k)
-        ]
-        if changed:
+        pairs = {k: (found.get(k, "absent"), self.fingerprint.get(k, "absent")) for k in names}
+        if changed := [f"{k} (was {was}, is {now})" for k, (was, now) in pairs.items() if was != now]:
             raise InputError(
                 f"checkpoint {self.path} belongs to another run: {one_line(', '.join(changed), 500)} changed since;"
                 f" go back to the former settings to resume it, or {remedy}"
             )
-        _restore_generators(generators)
+        torch.set_rng_state(generators["torch"])
+        if "cuda" in generators and torch.cuda.is_available():
+            torch.cuda.set_rng_state_all(generators["cuda"][: torch.cuda.device_count()])
         return state
 
     def remove(self) -> None:
         """Forget the state: the result is written."""
         self.path.unlink(missing_ok=True)
-
-
-def _generator_states() -> dict[str, Any]:
-    """Torch's generators; numpy's global one is not used in this library."""
-    states = {"torch": torch.get_rng_state()}
-    if torch.cuda.is_available():
-        states["cuda"] = torch.cuda.get_rng_state_all()
-    return states
-
-
-def _restore_generators(states: Mapping[str, Any]) -> None:
-    torch.set_rng_state(states["torch"])
-    if "cuda" in states and torch.cuda.is_available():
-        torch.cuda.set_rng_state_all(states["cuda"][: torch.cuda.device_count()])

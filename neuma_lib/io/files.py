@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -55,24 +56,52 @@ def read_json(path: str | Path) -> Any:
 
 def parse_json(content: str | bytes, where: str | Path) -> Any:
     """Value of a JSON text. Raises InputError, which names ``where``, when it is not JSON or nested too deep."""
-    try:
+    with reading(where, "JSON"):
         return json.loads(content, parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:  # a decode error of text or of JSON is a ValueError
-        raise InputError(
-            f"{where} is not valid JSON ({one_line(error)}): delete it and run the workflow again"
-        ) from None
 
 
 def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is not a number of JSON")
 
 
-def existing(path: str | Path) -> Path:
+@contextmanager
+def reading(where: str | Path, kind: str) -> Iterator[None]:
+    """Whatever the block raises becomes an `InputError` that says that ``where`` cannot be read as ``kind``.
+
+    What reads a damaged or foreign file raises errors of many kinds. The block must only read: a full disk is no fault
+    of the file.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = one_line(error) or type(error).__name__
+        raise InputError(
+            f"{where} cannot be read as {kind} ({reason}): replace it, or make it again"
+        ) from None
+
+
+def existing(path: str | Path, remedy: str = "run the stage that makes it, or correct the path") -> Path:
     """The path of a file. Raises InputError where there is none."""
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path} does not exist: run the stage that makes it, or correct the path")
+        raise InputError(f"{path} does not exist: {remedy}")
     return path
+
+
+def zip_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, limit: int) -> bytes:
+    """Bytes of a member of an archive, at most ``limit``; neither its header nor its content can ask for more memory.
+
+    Raises ValueError or what zipfile raises for a larger or damaged one.
+    """
+    # the other methods of ZIP have no bound on what a block of them unpacks to
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.file_size > limit:
+        raise ValueError(f"{info.filename} is larger than {limit} bytes or oddly compressed")
+    with archive.open(info) as file:
+        return file.read(
+            info.file_size + 1
+        )  # read() would unpack all that is there, whatever the header claims
 
 
 def sha256_file(path: str | Path) -> str:

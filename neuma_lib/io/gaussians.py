@@ -18,10 +18,7 @@ REST_COUNTS = [3 * (coefficient_count(degree) - 1) for degree in range(MAX_DEGRE
 
 
 def save_gaussians(path: str | Path, gaussians: Gaussians) -> None:
-    """Write Gaussians in the layout of the 3DGS release, which every splat viewer opens.
-
-    Scales are stored as logarithms, opacities as logits, the higher harmonics channel by channel.
-    """
+    """Write Gaussians as every splat viewer opens them: scales as logarithms, opacities as logits, SH by channel."""
     arrays = {f.name: getattr(gaussians, f.name).detach().cpu().numpy() for f in fields(gaussians)}
     means, quats, scales, opacities, sh0, shN = arrays.values()
     G, rest = len(means), shN.shape[1] * 3
@@ -49,41 +46,36 @@ def load_gaussians(path: str | Path) -> Gaussians:
     """
     rows, _ = read_ply(path)
     names = set(rows.dtype.names)
+    rest = sum(name.startswith("f_rest_") for name in names)
     groups = {
         "means": ["x", "y", "z"],
         "sh0": [f"f_dc_{i}" for i in range(3)],
         "opacities": ["opacity"],
         "scales": [f"scale_{i}" for i in range(3)],
         "quats": [f"rot_{i}" for i in range(4)],
+        "shN": [f"f_rest_{i}" for i in range(rest)],
     }
-    missing = [name for group in groups.values() for name in group if name not in names]
-    if missing:
+    if missing := [name for group in groups.values() for name in group if name not in names]:
         raise InputError(
-            f"{path} misses the properties {', '.join(missing)}: it is not a 3D Gaussian splatting file"
+            f"{path} misses the properties {', '.join(missing)}: it is no 3D Gaussian splatting file"
         )
-    rest = sum(name.startswith("f_rest_") for name in names)
-    if rest not in REST_COUNTS or any(f"f_rest_{i}" not in names for i in range(rest)):
+    if rest not in REST_COUNTS:
         raise InputError(
-            f"{path}: {rest} f_rest_* properties are not a whole number of SH degrees (0, 9, 24 or 45)"
+            f"{path}: {rest} f_rest_* properties are not those of whole SH degrees {REST_COUNTS}"
         )
-
-    def stack(columns):
-        if not columns:
-            return np.zeros((len(rows), 0), np.float32)
-        return np.stack([rows[c] for c in columns], axis=1).astype(np.float32)
-
-    raw = {key: stack(columns) for key, columns in groups.items()}
-    raw["shN"] = stack([f"f_rest_{i}" for i in range(rest)])
-    for key, array in raw.items():
-        bad = ~np.isfinite(array).all(axis=1)
-        if bad.any():
+    raw = {}
+    for key, columns in groups.items():
+        raw[key] = np.zeros((len(rows), len(columns)), np.float32)
+        for i, column in enumerate(columns):
+            raw[key][:, i] = rows[column]
+        if (bad := ~np.isfinite(raw[key]).all(axis=1)).any():
             raise InputError(
-                f"{path}: {key} of Gaussian {int(np.argmax(bad))} is not finite: fit the Gaussians again"
+                f"{path}: {key} of Gaussian {np.argmax(bad)} is not finite: fit the Gaussians again"
             )
     norm = np.linalg.norm(raw["quats"], axis=1, keepdims=True)
     if (norm == 0).any():
         raise InputError(
-            f"{path}: the rotation of Gaussian {int(np.argmin(norm))} is zero: fit the Gaussians again"
+            f"{path}: the rotation of Gaussian {np.argmin(norm)} is zero: fit the Gaussians again"
         )
     arrays = {
         "means": raw["means"],

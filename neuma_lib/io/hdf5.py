@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import atomic, existing, one_line
+from neuma_lib.io.files import atomic, existing, one_line, reading
 
 QUANTITIES = {
     "x": ("m", "particle positions, shape (T, N, 3), or (N, 3) where there is one state"),
@@ -32,27 +32,37 @@ QUANTITIES = {
     "images": ("1", "pictures of a figure, colours 0 to 255, shape (rows, columns, H, W, 3)"),
 }
 
+COMPRESSION = {"compression": "gzip", "compression_opts": 6, "shuffle": True}
+"""Level 9 takes three times as long for 1.4 % less."""
+CHECKED_VERSION = ("v110", "v110")
+"""Of HDF5, 1.10 of 2016: it has checksums of all but the data, which gzip adds."""
 MAX_RATIO = 1032
 """Most bytes that one byte of a deflate stream can stand for (zlib's own bound)."""
 
 
 def write_arrays(
-    path: str | Path, arrays: Mapping[str, Any], attributes: Mapping[str, Any] | None = None
+    path: str | Path,
+    arrays: Mapping[str, Any],
+    attributes: Mapping[str, Any] | None = None,
+    compress: bool = False,
 ) -> None:
     """Write named quantities (see `QUANTITIES`) to HDF5, each with its unit, and file attributes.
 
     Args:
         arrays: quantity name -> array; None entries are left out.
         attributes: numbers and texts; anything else is stored as JSON text.
+        compress: without loss, every component of vectors and matrices on its own, with checksums.
     """
-    with atomic(path) as partial, h5py.File(partial, "w", track_order=True) as file:
+    libver = CHECKED_VERSION if compress else None
+    with atomic(path) as partial, h5py.File(partial, "w", track_order=True, libver=libver) as file:
         for name, array in arrays.items():
             if array is None:
                 continue
-            unit, description = QUANTITIES[name]
-            data = file.create_dataset(name, data=np.asarray(array), track_times=False)
-            data.attrs["unit"] = unit
-            data.attrs["description"] = description
+            array, options = np.asarray(array), dict(COMPRESSION) if compress else {}
+            if compress and array.ndim > 2:
+                options["chunks"] = (*array.shape[:2], *[1] * (array.ndim - 2))  # values of one size
+            data = file.create_dataset(name, data=array, track_times=False, **options)
+            data.attrs["unit"], data.attrs["description"] = QUANTITIES[name]
         for key, value in (attributes or {}).items():
             file.attrs[key] = value if isinstance(value, str | int | float) else json.dumps(value)
 
@@ -71,64 +81,47 @@ def read_arrays(
             a value that is not finite, or more claimed than stored.
     """
     path = existing(path)
-    try:
-        with h5py.File(path, "r") as file:
-            if missing := [name for name in required if name not in file.keys()]:
-                found = one_line(", ".join(file.keys()))
-                raise InputError(f"{path} has no dataset {', '.join(missing)} (it has {found})")
-            # keys in the file's order; a lookup would follow links
-            names = [name for name in file.keys() if name in (QUANTITIES if only is None else only)]
-            arrays = {name: _checked(path, file, name)[()] for name in names}
-            attributes = {key: _attribute(path, file, key) for key in file.attrs}
-    except (OSError, RuntimeError, KeyError, TypeError, ValueError, MemoryError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"{path} cannot be read as HDF5 ({one_line(error)}): delete it and run the workflow again"
-        ) from None
-    for name, array in arrays.items():
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise InputError(f"{path}: dataset {name} holds values that are not finite: make the file again")
-    return arrays, attributes
+    with reading(path, "HDF5"), h5py.File(path, "r") as file:
+        if missing := [name for name in required if name not in file.keys()]:
+            found = one_line(", ".join(file.keys()))
+            raise InputError(f"{path} has no dataset {', '.join(missing)} (it has {found})")
+        # keys in the file's order; a lookup would follow links
+        names = [name for name in file.keys() if name in (QUANTITIES if only is None else only)]
+        arrays = {name: _checked(file, name, path.stat().st_size)[()] for name in names}
+        for name, array in arrays.items():
+            if array.dtype.kind == "f" and not np.isfinite(array).all():
+                raise ValueError(f"{name} holds values that are not finite")
+        return arrays, {key: _attribute(file, key) for key in file.attrs}
 
 
-def _checked(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
-    """A dataset that is safe to read: numbers that are stored in this file, as many as its shape says."""
+def _checked(file: h5py.File, name: str, size: int) -> h5py.Dataset:
+    """A dataset that is safe to read: numbers that are stored in this file of ``size`` bytes, as many as it claims."""
     link = file.get(name, getlink=True)
     if not isinstance(link, h5py.HardLink):
-        raise InputError(
-            f"{path}: {name} is a {type(link).__name__}, not a dataset of this file: make the file again"
-        )
+        raise ValueError(f"{name} is a {type(link).__name__}, not a dataset of this file")
     data = file[name]
-    if (
-        not isinstance(data, h5py.Dataset)
-        or data.shape is None
-        or data.dtype.kind not in "fiu"
-        or data.dtype.subdtype
-    ):
-        raise InputError(f"{path}: {name} is not an array of numbers: make the file again")
+    numeric = isinstance(data, h5py.Dataset) and data.dtype.kind in "fiu" and not data.dtype.subdtype
+    if not numeric or data.shape is None:
+        raise ValueError(f"{name} is not an array of numbers")
     if data.is_virtual or data.external:
-        raise InputError(f"{path}: the values of {name} are in other files: make the file again")
+        raise ValueError(f"the values of {name} are in other files")
     stored = data.id.get_storage_size()
-    chunks = prod(-(-length // chunk) for length, chunk in zip(data.shape, data.chunks)) if data.chunks else 0
-    if (
-        stored > path.stat().st_size
-        or data.nbytes > MAX_RATIO * stored
-        or (data.chunks is None and data.nbytes > stored)
-        or (data.chunks and data.id.get_num_chunks() < chunks)
-    ):
-        raise InputError(
-            f"{path}: {name} claims {data.nbytes} bytes (shape {data.shape}) and stores {stored} of"
-            f" {path.stat().st_size} in the file: make the file again"
+    if data.chunks:
+        chunks = prod(-(-length // chunk) for length, chunk in zip(data.shape, data.chunks))
+        held = data.nbytes <= MAX_RATIO * stored and data.id.get_num_chunks() >= chunks
+    else:
+        held = data.nbytes <= stored
+    if not held or stored > size:
+        raise ValueError(
+            f"{name} claims {data.nbytes} bytes (shape {data.shape}) and stores {stored} of {size} in the file"
         )
     return data
 
 
-def _attribute(path: Path, file: h5py.File, key: str) -> Any:
+def _attribute(file: h5py.File, key: str) -> Any:
     """A number or a text."""
-    shape = file.attrs.get_id(key).shape
-    value = file.attrs[key] if shape == () else None
+    value = file.attrs[key] if file.attrs.get_id(key).shape == () else None
     value = value.item() if isinstance(value, np.generic) else value
     if not isinstance(value, str | int | float):
-        raise InputError(f"{path}: attribute {one_line(key)} is not a number or a text: make the file again")
+        raise ValueError(f"attribute {one_line(key)} is not a number or a text")
     return value

@@ -17,7 +17,7 @@ import torch
 from PIL import Image
 
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import one_line, read_json, sha256_file, write_json
+from neuma_lib.io.files import one_line, read_json, reading, sha256_file, write_json
 from neuma_lib.io.released import image_name, matrix_of_numbers, released_frames
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.observation import Observation
@@ -33,7 +33,6 @@ class ImageSet:
         Ks: intrinsics [px], pixel centres at +0.5, shape (K, 3, 3).
         views: camera number of each image, shape (K,).
         steps: simulation step of each image, shape (K,).
-        names: file names.
     """
 
     images: np.ndarray
@@ -41,7 +40,6 @@ class ImageSet:
     Ks: np.ndarray
     views: np.ndarray
     steps: np.ndarray
-    names: tuple[str, ...]
 
     @property
     def width(self) -> int:
@@ -61,9 +59,8 @@ class ImageSet:
         for view in views:
             chosen = np.flatnonzero(self.views == view)
             if len(chosen) == 0:
-                raise InputError(
-                    f"view {view} is not among the filmed views {sorted(set(self.views.tolist()))}"
-                )
+                filmed = sorted(set(self.views.tolist()))
+                raise InputError(f"view {view} is not among the filmed views {filmed}")
             columns.append(chosen[np.argsort(self.steps[chosen], kind="stable")])
         steps = [tuple(self.steps[c].tolist()) for c in columns]
         if any(s != steps[0] for s in steps):
@@ -183,23 +180,20 @@ def read_image_set(path: str | Path, views: Sequence[int] | None = None) -> Imag
     """
     data = read_transforms(path)
     folder = Path(path).parent
-    chosen = [
-        (i, frame) for i, frame in enumerate(data["frames"]) if views is None or frame.get("view", i) in views
-    ]
-    if not chosen:
+    frames = [{**data, "view": i, "step": 0, **frame} for i, frame in enumerate(data["frames"])]
+    frames = [frame for frame in frames if views is None or frame["view"] in views]
+    if not frames:
         raise InputError(f"{path}: no frame belongs to the views {list(views or ())}")
-    merged = [{**data, **frame} for _, frame in chosen]
-    files = [_image_file(folder, frame["file_path"], path) for _, frame in chosen]
-    images = _read_all(files, merged, path)
+    files = [_image_file(folder, frame["file_path"], path) for frame in frames]
+    images = _read_all(files, frames, path)
     height, width = images.shape[1:3]
-    poses = np.array([frame["transform_matrix"] for _, frame in chosen], dtype=np.float64)
+    poses = np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64)
     return ImageSet(
         images=images,
         viewmats=np.linalg.inv(poses @ OPENGL_TO_OPENCV),
-        Ks=np.stack([_intrinsic_matrix(values, width, height) for values in merged]),
-        views=np.array([frame.get("view", i) for i, frame in chosen]),
-        steps=np.array([frame.get("step", 0) for _, frame in chosen]),
-        names=tuple(frame["file_path"] for _, frame in chosen),
+        Ks=np.stack([_intrinsic_matrix(frame, width, height) for frame in frames]),
+        views=np.array([frame["view"] for frame in frames]),
+        steps=np.array([frame["step"] for frame in frames]),
     )
 
 
@@ -208,8 +202,8 @@ def _image_file(folder: Path, name: str, listed_in: str | Path) -> Path:
         if candidate.is_file():
             return candidate
     raise InputError(
-        f"{folder / name} is missing although {listed_in} lists it: remove the frame from the list, or render it again"
-        f" with `snakemake --cores 2 --forcerun render_static render_dynamic`"
+        f"{folder / name} is missing although {listed_in} lists it: remove it from the list, or render it again with"
+        f" `snakemake --cores 2 --forcerun render_static render_dynamic`"
     )
 
 
@@ -217,11 +211,12 @@ def _read_all(files: Sequence[Path], frames: Sequence[Mapping[str, Any]], path: 
     """Images of one size (K, H, W, 4), on all cores: decoding and checksums run outside Python's lock."""
     with open_image(files[0].read_bytes(), files[0]) as image:
         width, height = image.size
-    for values in frames:
-        if (values.get("w", width), values.get("h", height)) != (width, height):
+    for frame in frames:
+        w, h = frame.get("w", width), frame.get("h", height)
+        if (w, h) != (width, height):
+            name = frame["file_path"]
             raise InputError(
-                f"{path}: w, h of {values['file_path']} are {values.get('w')}x{values.get('h')}, the image is"
-                f" {width}x{height}: correct the intrinsics"
+                f"{path}: w, h of {name} are {w}x{h}, the image is {width}x{height}: correct them"
             )
     # the first is decoded before memory is taken for all
     first = _read_rgba(files[0], frames[0].get("sha256"), (width, height))
@@ -232,47 +227,37 @@ def _read_all(files: Sequence[Path], frames: Sequence[Mapping[str, Any]], path: 
         images[row] = _read_rgba(files[row], frames[row].get("sha256"), (width, height))
 
     with ThreadPoolExecutor() as pool:
-        for _ in pool.map(read, range(1, len(files))):
-            pass
+        list(pool.map(read, range(1, len(files))))
     return images
 
 
-def open_image(content: bytes, name: str | Path) -> Image.Image:
-    """An image whose header is read and whose pixels are not; of one of `FORMATS`, and not too large."""
-    try:
+def open_image(content: bytes, where: str | Path, sha256: str | None = None) -> Image.Image:
+    """An image with its header read, not its pixels: of one of `FORMATS`, not too large, of this checksum if given."""
+    if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
+        raise InputError(
+            f"{where} is damaged or was changed: its sha256 differs from the one in transforms.json; make it again"
+        )
+    with reading(where, "an image"):
         image = Image.open(BytesIO(content), formats=FORMATS)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(f"{name} is not a readable {', '.join(FORMATS)} image ({one_line(error)})") from None
-    if image.width * image.height > MAX_PIXELS:
-        raise InputError(f"{name} claims {image.width}x{image.height} pixels, more than {MAX_PIXELS}")
-    return image
+        if image.width * image.height > MAX_PIXELS:
+            raise ValueError(f"{image.width}x{image.height} pixels are more than {MAX_PIXELS}")
+        return image
 
 
 def _read_rgba(path: Path, sha256: str | None, size: tuple[int, int]) -> np.ndarray:
-    content = path.read_bytes()
-    if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
-        raise InputError(
-            f"{path} is damaged or was changed: its sha256 differs from the one in transforms.json; render it again"
-        )
-    with open_image(content, path) as image:
+    with open_image(path.read_bytes(), path, sha256) as image:
         if image.size != size:
             raise InputError("{} is {}x{}, others {}x{}".format(path, *image.size, *size))
         if image.mode in ("I;16", "I"):
             raise InputError(f"{path} has 16 bits a channel: convert it to 8-bit RGBA")
-        try:
+        with reading(path, "an image"):
             image.load()
             has_alpha = "A" in image.mode or "transparency" in image.info
             pixels = np.asarray(image.convert("RGBA"))
-        except (OSError, SyntaxError, ValueError) as error:
-            raise InputError(
-                f"{path} is not a readable image, perhaps truncated ({one_line(error)}): replace it"
-            ) from None
     if not has_alpha:
         raise InputError(f"{path} has no alpha channel: the object's mask must be stored as alpha (RGBA)")
     if not (pixels[..., 3] > 127).any():
-        raise InputError(
-            f"{path}: the mask (alpha) is empty, the object is not in the picture: remove this frame"
-        )
+        raise InputError(f"{path}: the mask (alpha) is empty, nothing is in the picture: remove this frame")
     return pixels
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import one_line
+from neuma_lib.io.files import existing, one_line
 from neuma_lib.io.weights import read_torch, read_weights, write_weights
 from neuma_lib.mechanics.neural import NeuralLaw, neural_law
 
@@ -26,9 +26,7 @@ def load_prior(path: str | Path, device: torch.device | str = "cpu") -> NeuralLa
     Raises:
         InputError: no such file, another format, missing weights or other shapes.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"prior {path}: no such file")
+    path = existing(path)
     if path.suffix == ".safetensors":
         state, _ = read_weights(path)
     elif path.suffix in (".pt", ".pth"):
@@ -71,7 +69,7 @@ def load_law(prior: str | Path, adaptor: str | Path | None = None) -> NeuralLaw:
         tensors, metadata = read_weights(adaptor)
         if "rank" not in metadata or "alpha" not in metadata:
             raise InputError(
-                f"{adaptor} has no rank and alpha in its metadata: it is not an adaptor of this project"
+                f"{adaptor} has no rank and alpha in its metadata: it is no adaptor of this project"
             )
         rank, alpha = metadata["rank"], metadata["alpha"]
         largest = max((length for tensor in tensors.values() for length in tensor.shape), default=0)

@@ -15,15 +15,12 @@ def write_mesh(
     path: str | Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray | None = None
 ) -> None:
     """Write a triangle mesh: vertices (N, 3) [m], faces (M, 3), optional colours (N, 3) in [0, 255]."""
-    kind = [(axis, "<f4") for axis in "xyz"] + (
-        [(c, "u1") for c in ("red", "green", "blue")] if colors is not None else []
-    )
-    rows = np.empty(len(vertices), dtype=kind)
-    for i, axis in enumerate("xyz"):
-        rows[axis] = vertices[:, i]
+    columns = [(axis, "<f4", vertices[:, i]) for i, axis in enumerate("xyz")]
     if colors is not None:
-        for i, channel in enumerate(("red", "green", "blue")):
-            rows[channel] = colors[:, i]
+        columns += [(channel, "u1", colors[:, i]) for i, channel in enumerate(("red", "green", "blue"))]
+    rows = np.empty(len(vertices), dtype=[(name, kind) for name, kind, _ in columns])
+    for name, _, column in columns:
+        rows[name] = column
     write_ply(path, rows, faces)
 
 
@@ -36,21 +33,16 @@ def read_mesh(path: str | Path, watertight: bool = True) -> trimesh.Trimesh:
     rows, faces = read_ply(path)
     missing = [axis for axis in "xyz" if axis not in rows.dtype.names]
     if missing or faces is None or len(faces) == 0:
-        raise InputError(
-            f"{path} is not a triangle mesh: {'no faces' if not missing else 'no ' + ', '.join(missing)}"
-        )
+        raise InputError(f"{path} is not a triangle mesh: it has no {', '.join(missing) or 'faces'}")
     vertices = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
-    bad = ~np.isfinite(vertices).all(axis=1)
-    if bad.any():
-        raise InputError(
-            f"{path}: vertex {int(np.argmax(bad))} of {len(bad)} is not finite: repair or rebuild the mesh"
-        )
+    if (bad := ~np.isfinite(vertices).all(axis=1)).any():
+        raise InputError(f"{path}: vertex {np.argmax(bad)} of {len(bad)} is not finite: rebuild the mesh")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"{path}: a face names a vertex that does not exist: rebuild the mesh")
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     if watertight and not mesh.is_watertight:
         raise InputError(
-            f"{path} is not watertight, so it has no inside: close its holes (a mesh repair tool) first"
+            f"{path} is not watertight, so it has no inside: close its holes (a mesh repair tool)"
         )
     if watertight and mesh.volume <= 0:
         raise InputError(f"{path} has a volume of {mesh.volume:.3g} m^3: its faces point inwards, flip them")

@@ -41,14 +41,9 @@ def save_binding(path: str | Path, binding: Binding) -> None:
 def load_body(
     particles: str | Path, binding: str | Path, gaussians: str | Path, density: Density
 ) -> Reconstruction:
-    """The reconstructed body: particles with their volumes, and the Gaussians that they carry.
+    """The reconstructed body of a scene or experiment: particles with their volumes, and the Gaussians they carry.
 
-    Args:
-        particles, binding, gaussians: files of a scene, or of an experiment.
-        density: what is known of it, or believed.
-
-    Raises:
-        InputError: the binding was made for other Gaussians or particles.
+    Raises InputError where the binding was made for other Gaussians or particles.
     """
     splats = load_gaussians(gaussians)
     x0, vol0, _ = load_particles(particles)
@@ -77,10 +72,6 @@ def load_start(
     densities: Sequence[Density],
 ) -> tuple[Reconstruction, torch.Tensor, list[int]]:
     """What a prediction starts from: the reconstructed bodies of a scene (one) or of an experiment.
-
-    Args:
-        particles, binding, gaussians, velocity: files of the scene or experiment.
-        densities: of each body.
 
     Returns:
         All bodies as one, velocities of the particles [m/s] (N, 3), and the particle count of each body.

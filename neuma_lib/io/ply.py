@@ -6,10 +6,9 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
+from plyfile import PlyData, PlyElement, PlyListProperty
 
-from neuma_lib.errors import InputError
-from neuma_lib.io.files import atomic, existing, one_line
+from neuma_lib.io.files import atomic, existing, reading
 
 MAX_HEADER = 2**16
 """Longest header that is read [bytes]; one of 3D Gaussian splatting takes 1.5 kB."""
@@ -36,70 +35,57 @@ def read_ply(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
             triangles.
     """
     path = existing(path)
-    try:
-        with path.open("rb") as file:
-            corners = _check_header(path, file.read(MAX_HEADER))
-            file.seek(0)
-            # A fixed length lets binary faces be read at once, not one by one.
-            data = PlyData.read(file, known_list_len={"face": dict.fromkeys(corners, 3)})
-            elements = {element.name: np.array(element.data) for element in data}
-    except PlyParseError as error:
-        if "unexpected list length" in str(error):
-            raise InputError(f"{path}: only triangles are supported, face {error.row} is not one") from None
-        raise InputError(f"{path} is no PLY file, or truncated or damaged ({one_line(error)})") from None
-    except (ValueError, TypeError, OverflowError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path} is no PLY file, or truncated or damaged ({one_line(error)})") from None
-    if "vertex" not in elements:
-        raise InputError(f"{path} has no vertices")
-    if "face" not in elements:
-        return elements["vertex"], None
-    faces = elements["face"][corners[0]]
-    if data.text:  # each face is an array of its own
-        if wrong := [i for i, face in enumerate(faces) if len(face) != 3]:
-            raise InputError(f"{path}: only triangles are supported, face {wrong[0]} is not one")
-        faces = np.array(list(faces)).reshape(-1, 3)
-    return elements["vertex"], faces.astype(np.int64)
+    with reading(path, "PLY of triangles"), path.open("rb") as file:
+        corners = _checked_header(file.read(MAX_HEADER), path.stat().st_size)
+        file.seek(0)
+        # a fixed length lets binary faces be read at once, not one by one
+        data = PlyData.read(file, known_list_len={"face": dict.fromkeys(corners, 3)})
+        elements = {element.name: np.array(element.data) for element in data}
+        if "face" not in elements:
+            return elements["vertex"], None
+        faces = elements["face"][corners[0]]
+        if data.text:  # each face is an array of its own
+            if wrong := [i for i, face in enumerate(faces) if len(face) != 3]:
+                raise ValueError(f"face {wrong[0]} is not a triangle")
+            faces = np.array(list(faces)).reshape(-1, 3)
+        return elements["vertex"], faces.astype(np.int64)
 
 
-def _check_header(path: Path, head: bytes) -> list[str]:
-    """Refuse what plyfile would allocate for on the header's word; returns the face's list properties."""
+def _checked_header(head: bytes, size: int) -> list[str]:
+    """The list properties of faces, of a header that claims no more than a file of ``size`` bytes can hold."""
     header, end, rest = head.partition(b"end_header")
     if not head.startswith(b"ply") or not end:
-        raise InputError(f"{path} is not a PLY file: no header in its first {MAX_HEADER} bytes")
+        raise ValueError(f"no header in its first {MAX_HEADER} bytes")
     if rest[:1] not in (b"\n", b"\r"):
-        raise InputError(f"{path}: no new line after end_header")
+        raise ValueError("no new line after end_header")
     data = PlyData._parse_header(
         BytesIO(head)
     )  # plyfile, which is pinned, has no public way to read only this
+    if "vertex" not in data:
+        raise ValueError("no vertices")
     claimed, corners = 0, []
     for element in data:
         lists = [p for p in element.properties if isinstance(p, PlyListProperty)]
         if element.count < 0 or not element.properties:
-            raise InputError(
-                f"{path}: element {element.name} has {element.count} rows and "
-                f"{len(element.properties)} properties"
-            )
-        if lists and (element.name != "face" or len(lists) > 1 or lists[0].name not in TRIANGLES):
-            raise InputError(
-                f"{path}: element {element.name} has the list {lists[-1].name}: only triangles are supported"
+            raise ValueError(
+                f"element {element.name} has {element.count} rows and {len(element.properties)} properties"
             )
         if element.name == "face":
             corners = [p.name for p in lists]
-            if not corners:
-                raise InputError(f"{path}: the faces have no list {TRIANGLES[0]}")
+            if len(corners) != 1 or corners[0] not in TRIANGLES:
+                raise ValueError(f"its faces have the lists {corners}, not {TRIANGLES[0]}")
+        elif lists:
+            raise ValueError(f"element {element.name} has the list {lists[0].name}")
         for p in element.properties:
             if data.text:
-                size = 2  # a digit and a separator
+                claimed += 2 * element.count  # a digit and a separator
             elif p in lists:
-                size = np.dtype(p.len_dtype).itemsize + 3 * np.dtype(p.val_dtype).itemsize
+                claimed += (
+                    np.dtype(p.len_dtype).itemsize + 3 * np.dtype(p.val_dtype).itemsize
+                ) * element.count
             else:
-                size = np.dtype(p.val_dtype).itemsize
-            claimed += element.count * size
-    held = path.stat().st_size - len(header) - len(end)
-    if claimed > held:
-        raise InputError(
-            f"{path} is truncated or damaged: its header claims {claimed} bytes, {held - 1} follow"
-        )
+                claimed += np.dtype(p.val_dtype).itemsize * element.count
+    held = size - len(header) - len(end) - 1
+    if claimed > held + 1:  # the last number of a text needs no separator
+        raise ValueError(f"its header claims {claimed} bytes, {held} follow")
     return corners

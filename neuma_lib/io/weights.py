@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import save_file
 
-from neuma_lib.errors import InputError
-from neuma_lib.io.files import atomic, existing, one_line, parse_json
+from neuma_lib.io.files import atomic, existing, parse_json, reading, zip_member
 
 
 def write_weights(path: str | Path, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
@@ -30,21 +29,15 @@ def read_weights(path: str | Path) -> tuple[dict[str, torch.Tensor], dict[str, A
         InputError: missing, truncated or foreign file, or weights that are not finite.
     """
     path = existing(path)
-    try:
-        with safe_open(path, framework="pt", device="cpu") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            text = (file.metadata() or {}).get("neuma", "{}")
-    except (SafetensorError, OSError) as error:
-        raise InputError(
-            f"{path} is not a readable safetensors file ({one_line(error)}): make it again"
-        ) from None
-    metadata = parse_json(text, f"{path}: its metadata")
-    if not isinstance(metadata, dict):
-        raise InputError(f"{path}: its metadata is no JSON object: make it again")
-    for name, tensor in tensors.items():
-        if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
-            raise InputError(f"{path}: {one_line(name)} is not finite: train again")
-    return tensors, metadata
+    with reading(path, "safetensors"), safe_open(path, framework="pt", device="cpu") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        metadata = parse_json((file.metadata() or {}).get("neuma", "{}"), f"{path}: its metadata")
+        if not isinstance(metadata, dict):
+            raise ValueError("its metadata is no JSON object")
+        for name, tensor in tensors.items():
+            if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
+                raise ValueError(f"{name} is not finite")
+        return tensors, metadata
 
 
 def read_torch(path: str | Path) -> Any:
@@ -54,18 +47,14 @@ def read_torch(path: str | Path) -> Any:
         InputError: missing, damaged or foreign file, or one that would need more memory than it has bytes.
     """
     path = existing(path)
-    try:
+    with reading(path, "a torch file of plain tensors"):
+        size = path.stat().st_size
         with zipfile.ZipFile(path) as archive:  # torch writes uncompressed ZIP archives since 1.6
             members = archive.infolist()
-            if sum(member.file_size for member in members) > path.stat().st_size:
-                raise InputError(f"{path} claims more data than it has bytes: do not use this file")
-            # the one type that torch lets a file make at a size of its choice
-            pickles = [archive.read(member) for member in members if member.filename.endswith(".pkl")]
-            if any(b"bytearray" in content for content in pickles):
-                raise InputError(f"{path} holds a bytearray, not only plain tensors: do not use this file")
+            if sum(member.file_size for member in members) > size:
+                raise ValueError("it claims more data than it has bytes")
+            pickles = [zip_member(archive, info, size) for info in members if info.filename.endswith(".pkl")]
+        # the one type that torch lets a file make at a size of its choice
+        if any(b"bytearray" in content for content in pickles):
+            raise ValueError("it holds a bytearray, not only plain tensors")
         return torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises many kinds for a damaged file
-        if isinstance(error, InputError):
-            raise
-        reason = f"{type(error).__name__}: {one_line(error, 120)}"
-        raise InputError(f"{path} is not a readable torch file of plain tensors ({reason})") from None

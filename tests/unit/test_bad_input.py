@@ -330,6 +330,16 @@ def json_bomb(path):
         archive.writestr("static/transforms.json", bytes(HUGE), zipfile.ZIP_DEFLATED, 1)
 
 
+def denied(archive):
+    """The same archive with headers that claim 9 bytes where there are 64 MiB."""
+    return archive.replace(struct.pack("<L", HUGE), struct.pack("<L", 9))
+
+
+def denied_bomb(path):
+    json_bomb(path)
+    path.write_bytes(denied(path.read_bytes()))
+
+
 def bzip2_bomb(path):
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("static/transforms.json", bytes(2**24), zipfile.ZIP_BZIP2, 9)
@@ -371,7 +381,7 @@ def packed(tmp_path):
 
 
 def unpack(path):
-    unpack_images(path, {"static": path.parent / "out" / "transforms.json"})
+    unpack_images(path, "static", path.parent / "out" / "transforms.json")
 
 
 @pytest.mark.parametrize("change", ARCHIVES.values(), ids=ARCHIVES)
@@ -380,7 +390,9 @@ def test_archives(packed, change):
     refused(unpack, packed)
 
 
-@pytest.mark.parametrize("write", [json_bomb, bzip2_bomb, lambda p: p.write_bytes(b"PK\5\6" + bytes(18))])
+@pytest.mark.parametrize(
+    "write", [json_bomb, denied_bomb, bzip2_bomb, lambda p: p.write_bytes(b"PK\5\6" + bytes(18))]
+)
 def test_lists_in_archives(tmp_path, write):
     write(tmp_path / "bad.zip")
     refused(unpack, tmp_path / "bad.zip")
@@ -441,12 +453,12 @@ def torch_file(content):
     return file.getvalue()
 
 
-def deflated(content):
+def deflated(content, part="/data/"):
     """The same archive, but with 64 MiB in a few bytes."""
     file = BytesIO()
     with zipfile.ZipFile(BytesIO(torch_file(content))) as old, zipfile.ZipFile(file, "w") as new:
         for info in old.infolist():
-            data = bytes(HUGE) if "/data/" in info.filename else old.read(info)
+            data = bytes(HUGE) if part in info.filename else old.read(info)
             new.writestr(info.filename, data, zipfile.ZIP_DEFLATED)
     return file.getvalue()
 
@@ -471,6 +483,7 @@ TORCH = {
     "weights without memory": torch_file(law_parts(torch.zeros(1, dtype=torch.float64).expand(2**20, 2**20))),
     "truncated": torch_file(law_parts(torch.zeros(64, 64)))[:-200],
     "64 MiB deflated": deflated(law_parts(torch.zeros(2))),
+    "64 MiB deflated, which its header denies": denied(deflated(law_parts(torch.zeros(2)), "data.pkl")),
     "an ordered list": torch_file(OrderedDict(a=1)),
 }
 

@@ -523,9 +523,9 @@ def test_prior_files_round_trip(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("absent.pt", None, "no such file"),
-        ("text.pt", b"not a checkpoint", "not a readable"),
-        ("text.safetensors", b"neither", "not a readable"),
+        ("absent.pt", None, "does not exist"),
+        ("text.pt", b"not a checkpoint", "cannot be read as"),
+        ("text.safetensors", b"neither", "cannot be read as"),
         ("weights.npz", b"", "expected .safetensors or .pt"),
         ("list.pt", [1, 2], "expected a dict"),
         ("half.pt", {"elasticity": {}, "plasticity": {}}, "missing"),

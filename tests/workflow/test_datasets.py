@@ -16,7 +16,7 @@ def test_workflow_packs_and_takes_a_packed_dataset_without_blender(scene, tmp_pa
     data = project.root / "tiny/data/BouncyBall"
     shutil.copytree(scene, data)
     # With no other rule allowed, the files at hand count as the dataset.
-    project.run("--allowed-rules", "pack_images", "pack_truth", "packed", "--", "packed")
+    project.run("--allowed-rules", "pack", "packed", "--", "packed")
     assert {file.name for file in (project.root / "tiny/data/packed").iterdir()} == {
         "BouncyBall.images.zip",
         "BouncyBall.truth.h5",

@@ -8,7 +8,7 @@ from project import SCENE, copied
 SUPERVISED = "neuma_particle_supervision"  # the one method that trains on the truth
 # Blender films the truth, a dataset is packed of it, evaluation measures against it, and these figures show it.
 MAY_READ_THE_TRUTH = {
-    *("render_static", "render_dynamic", "pack_truth", "initial_state", "evaluation", "experiment"),
+    *("render_static", "render_dynamic", "pack", "initial_state", "evaluation", "experiment"),
     *("particles_app", "lora_alphav", "ext_time", "material_response"),
 }
 

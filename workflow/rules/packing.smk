@@ -5,33 +5,25 @@ PACKED = (SETTINGS.dataset.packed or f"{DATA}/packed").rstrip("/")
 
 if SETTINGS.dataset.packed is None:
 
-    rule pack_images:
+    rule pack:
         input:
             static=f"{DATA}/{{scene}}/static/transforms.json",
             dynamic=f"{DATA}/{{scene}}/dynamic/transforms.json",
-        output:
-            packed=f"{PACKED}/{{scene}}.images.zip",
-        script:
-            "../scripts/pack_images.py"
-
-    rule pack_truth:
-        input:
             particles=f"{DATA}/{{scene}}/particles.h5",
         output:
-            packed=f"{PACKED}/{{scene}}.truth.h5",
+            images=f"{PACKED}/{{scene}}.images.zip",
+            truth=f"{PACKED}/{{scene}}.truth.h5",
         resources:
             mem_mb=truth_memory,
         params:
             packing=SETTINGS.dataset.packing.plain(),
             seed=SETTINGS.dataset.seed,
         script:
-            "../scripts/pack_truth.py"
+            "../scripts/pack.py"
 
     rule packed:
         input:
-            lambda wildcards: expand(
-                f"{PACKED}/{{scene}}.{{part}}", scene=SCENES, part=["images.zip", "truth.h5"]
-            ),
+            lambda wildcards: expand(rules.pack.output, scene=SCENES),
 
 else:
 
@@ -45,10 +37,11 @@ else:
         resources:
             mem_mb=truth_memory,
         params:
+            part="truth",
             steps=frame_steps,
             dt=scene_setting("dt"),
         script:
-            "../scripts/unpack_truth.py"
+            "../scripts/unpack.py"
 
     rule unpack_static:
         input:
@@ -61,7 +54,7 @@ else:
             part="static",
             steps=[0],
         script:
-            "../scripts/unpack_images.py"
+            "../scripts/unpack.py"
 
     use rule unpack_static as unpack_dynamic with:
         output:

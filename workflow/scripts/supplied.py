@@ -8,7 +8,7 @@ def main(inputs, output, params, run) -> None:
     images = list_images(inputs.images, output.transforms)
     views = len(set(images.views.tolist()))
     run.say(
-        f"{len(images.names)} images of {images.width}x{images.height} px, {views} views, from {inputs.images}"
+        f"{len(images.images)} images of {images.width}x{images.height} px, {views} views, from {inputs.images}"
     )
 
 
