@@ -86,15 +86,14 @@ def simulate_ground_truth(
             large for a law.
     """
     check_apart([body.mesh for body in bodies])
-    solids = [
-        torch.as_tensor(sample_volume(b.mesh, particles, seed=seed), dtype=torch.float32) for b in bodies
-    ]
-    shares = [
-        torch.full((len(x),), float(b.mesh.volume) / len(x)) for b, x in zip(bodies, solids, strict=True)
-    ]
-    densities = [density_at(x, b.density) for b, x in zip(bodies, solids, strict=True)]
-    for body, density in zip(bodies, densities, strict=True):
+    solids, shares, densities = [], [], []
+    for body in bodies:
+        x = torch.as_tensor(sample_volume(body.mesh, particles, seed=seed), dtype=torch.float32)
+        density = density_at(x, body.density)
         model.check_courant(body.law, float(density.min()))
+        solids.append(x)
+        shares.append(torch.full((len(x),), float(body.mesh.volume) / len(x)))
+        densities.append(density)
     together = trimesh.util.concatenate([body.mesh for body in bodies])
     start = [
         torch.as_tensor(sample_tracers(together, tracers, seed=seed + 1 + k), dtype=torch.float32)

@@ -18,9 +18,11 @@ def as_csv(rows: Iterable[Iterable[Any]]) -> str:
     return out.getvalue()
 
 
-def as_line(cells: Iterable[Any]) -> str:
-    """A line of a Markdown table."""
-    return f"| {' | '.join(map(str, cells))} |"
+def as_markdown(header: Sequence[Any], rows: Iterable[Iterable[Any]], numbers: bool = False) -> list[str]:
+    """Lines of a Markdown table; with ``numbers`` all columns but the first are set flush right."""
+    rule = "---:|" if numbers else "---|"
+    lines = [f"| {' | '.join(map(str, cells))} |" for cells in (header, *rows)]
+    return [lines[0], f"|---|{rule * (len(header) - 1)}", *lines[1:]]
 
 
 def report_table(
@@ -33,11 +35,9 @@ def report_table(
         columns: quantity -> heading in the Markdown table, in order.
         corner: heading of the first column.
     """
-    lines = [as_line([corner, *columns.values()]), f"|---|{'---:|' * len(columns)}"]
-    for name, row in rows.items():
-        cells = [f"{row[key]:d}" if isinstance(row[key], int) else f"{row[key]:.4g}" for key in columns]
-        lines.append(as_line([name, *cells]))
-    values = ([name, *(row[key] for key in columns)] for name, row in rows.items())
+    values = [[name, *(row[key] for key in columns)] for name, row in rows.items()]
+    cells = [[v if isinstance(v, int | str) else f"{v:.4g}" for v in row] for row in values]
+    lines = as_markdown([corner, *columns.values()], cells, numbers=True)
     return as_csv([[corner, *columns], *values]), "\n".join(lines) + "\n"
 
 
@@ -52,19 +52,10 @@ def learning_rate_table(rows: Sequence[Mapping]) -> tuple[str, str, dict[str, fl
         CSV, Markdown, and for each method the factor whose best training loss, relative to the loss of the prior and
         averaged over the scenes geometrically, is lowest.
     """
-    table: list[tuple] = [
-        (
-            "method",
-            "lr_scale",
-            "scene",
-            "loss of the prior",
-            "best loss",
-            "ratio",
-            "recoveries",
-            "stable",
-            "excess",
-        )
-    ]
+    header = (
+        "method", "lr_scale", "scene", "loss of the prior", "best loss", "ratio", "recoveries", "stable", "excess",
+    )  # fmt: skip
+    table = []
     logs: dict[str, dict[float, list[float]]] = {}
     for row in rows:
         first, best = row["loss"][0], row["best_loss"]
@@ -77,10 +68,9 @@ def learning_rate_table(rows: Sequence[Mapping]) -> tuple[str, str, dict[str, fl
         method: min(scales, key=lambda scale: sum(scales[scale]) / len(scales[scale]))
         for method, scales in logs.items()
     }
-    header, *lines = map(as_line, table)
     verdict = "Best by training loss: " + ", ".join(f"{m} ×{s:g}" for m, s in chosen.items()) + "."
-    text = [header, f"|{'---|' * len(table[0])}", *lines, "", verdict, ""]
-    return as_csv(table), "\n".join(text), chosen
+    text = [*as_markdown(header, table), "", verdict, ""]
+    return as_csv([header, *table]), "\n".join(text), chosen
 
 
 def benchmark_table(scenes: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:
@@ -106,33 +96,35 @@ def benchmark_table(scenes: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:
         "plasticity": "Plasticity",
         "prior": "Prior",
     }
-    table, lines = [list(header)], [as_line(header.values()), f"|{'---|' * len(header)}"]
-    same, other = [], []
+    table, shown, same, other = [], [], [], []
     for name, scene in scenes.items():
         printed = BENCHMARKS.get(name, {})
         row = {
             "benchmark": name,
             "dynamics": printed.get("dynamics", ""),
-            **{key: _constant(scene[key]) for key in ("shape", "dt", "velocity", "height", "steps", "size")},
-            **{key: _constant(scene[key]) for key in ("density", "prior")},
-            **{part: _constant(scene["law"][part]) for part in ("elasticity", "plasticity")},
+            **{key: _constant(value) for key, value in (scene | scene["law"]).items() if key in header},
         }
         table.append([row[key] for key in header])
         if printed:
             apart = {k: _constant(printed[k]) for k in ("dt", "velocity", "height") if printed[k] != scene[k]}
             row |= {key: f"{row[key]} (*paper: {value}*)" for key, value in apart.items()}
             (other if apart else same).append(name)
-        lines.append(as_line(row[key] for key in header))
+        shown.append([row[key] for key in header])
     verdict = []
     if same:
-        verdict.append(
-            f"Step size, velocity and height are the paper's ({BENCHMARKS_LABEL}) for {', '.join(same)}."
-        )
+        agree = f"Step size, velocity and height are the paper's ({BENCHMARKS_LABEL}) for {', '.join(same)}."
+        verdict.append(agree)
     if other:
         verdict.append(f"They differ from it for {', '.join(other)}; the paper's numbers stand in brackets.")
-    text = ["# Table 4: the benchmarks", "", *lines, "", " ".join(verdict)]
+    text = [
+        "# Table 4: the benchmarks",
+        "",
+        *as_markdown(list(header.values()), shown),
+        "",
+        " ".join(verdict),
+    ]
     text += ["", "The paper does not publish materials, sizes and densities: those are ours.", ""]
-    return as_csv(table), "\n".join(text)
+    return as_csv([header, *table]), "\n".join(text)
 
 
 def _constant(value: Any) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.paper import Claim, PaperTable
-from neuma_lib.evaluation.reports import as_csv, as_line
+from neuma_lib.evaluation.reports import as_csv, as_markdown
 
 QUANTITIES = {
     "chamfer": "Chamfer distance (1e-4 m², mean over the sequence)",
@@ -104,25 +104,23 @@ class Table:
         """One Markdown table a quantity, the paper's numbers below the Chamfer distances, and what holds of it."""
         paper = self.paper
         parts = [f"# {paper.heading}", ""] if paper else []
-        printed: list[str] = []
+        printed: list[Row] = []
         for quantity, heading in QUANTITIES.items():
             rows = [row for row in self.rows if row.quantity == quantity]
-            lines = [self._line(row) for row in rows]
             if quantity == "chamfer":
-                lines += [self._line(row) for row in self.rows if row.quantity == "chamfer_floor"]
-                printed = self._paper_lines(rows)
-                lines += printed
-            parts += [f"**{heading}**", "", self._header(), *lines, ""]
+                printed = self._paper_rows(rows)
+                rows += [row for row in self.rows if row.quantity == "chamfer_floor"] + printed
+            header = ["Method", *self.columns.values(), "Average"]
+            parts += [f"**{heading}**", "", *as_markdown(header, map(self._cells, rows), numbers=True), ""]
         if any(len(row.runs) > 1 for row in self.rows):
             parts += [
-                "± is the standard deviation over seeds, for methods that draw their adaptor at random.",
-                "",
+                "± is the standard deviation over seeds, for methods that draw their adaptor at random."
             ]
+            parts += [""]
         for sign, note in FOOTNOTES.items():
             if any(sign in signs for signs in self.marks.values()):
                 parts += [f"{sign} {note}", ""]
-        verdicts = self.verdicts()
-        if verdicts:
+        if verdicts := self.verdicts():
             parts += ["**What holds**", "", *(f"- {line}" for line in verdicts), ""]
         parts += [
             "The floor is the distance between two samplings of the true motion with the same number "
@@ -173,24 +171,15 @@ class Table:
         means = [[sum(row) / len(row) for row in group] for group in groups]
         return f" Paper, floors included: {max(means[0]):.2f} against {min(means[1]):.2f}."
 
-    def _header(self) -> str:
-        names = [*self.columns.values(), "Average"]
-        return f"{as_line(['Method', *names])}\n|---|{'---:|' * len(names)}"
-
-    def _line(self, row: Row) -> str:
+    def _cells(self, row: Row) -> list[str]:
         marks = [*(self.marks.get((row.method, column), "") for column in self.columns), ""]
         spread = [""] * len(marks) if row.std is None else [f" ± {s:.2f}" for s in row.std]
-        cells = [f"{v:.2f}{s}{mark}" for v, s, mark in zip(row.mean, spread, marks, strict=True)]
-        return as_line([row.title, *cells])
+        return [row.title, *(f"{v:.2f}{s}{m}" for v, s, m in zip(row.mean, spread, marks, strict=True))]
 
-    def _paper_lines(self, rows: Sequence[Row]) -> list[str]:
+    def _paper_rows(self, rows: Sequence[Row]) -> list[Row]:
         """The paper's rows of the methods shown, if it has all the columns."""
-        lines = []
-        for row in rows:
-            printed = self.paper.row(row.method, list(self.columns)) if self.paper else None
-            if printed is not None:
-                lines.append(self._line(Row("chamfer", "", f"*paper: {row.title}*", np.array([printed]))))
-        return lines
+        printed = {row.title: self.paper and self.paper.row(row.method, list(self.columns)) for row in rows}
+        return [Row("chamfer", "", f"*paper: {t}*", np.array([v])) for t, v in printed.items() if v]
 
 
 def chamfer_table(
@@ -216,7 +205,7 @@ def chamfer_table(
         )
     table = Table(dict(columns), paper)
 
-    def row(quantity: str, method: str, title: str, name: str | None = None) -> Row:
+    def row(quantity: str, method: str, title: str) -> Row:
         seeds = min(len(metrics.get(method, {}).get(column, ())) for column in columns)
         runs = [
             [_number(quantity, method, column, metrics[method][column][k]) for column in columns]
@@ -225,12 +214,12 @@ def chamfer_table(
         if not runs:
             missing = next(column for column in columns if not metrics.get(method, {}).get(column))
             raise InputError(f"table: there is no metrics.json of {method} on {missing}")
-        return Row(quantity, name or method, title, np.array(runs))
+        return Row(quantity, method, title, np.array(runs))
 
     for quantity in QUANTITIES:
         table.rows += [row(quantity, method, title) for method, title in titles.items()]
-    first = row("chamfer_floor", next(iter(titles)), "Sampling floor", "floor")
-    table.rows.append(Row(first.quantity, first.method, first.title, first.runs[:1]))
+    floor = row("chamfer_floor", next(iter(titles)), "Sampling floor").runs[:1]
+    table.rows.append(Row("chamfer_floor", "floor", "Sampling floor", floor))
     for method in titles:
         for column in columns:
             runs = metrics[method][column]

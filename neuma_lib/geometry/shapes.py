@@ -27,9 +27,7 @@ from neuma_lib.errors import InputError
 
 Array = np.ndarray
 Distance = Callable[[Array], Array]
-
-NAMES = ("ball", "duck", "pawn", "cat", "bottle", "fish")
-"""Solids with a name of their own; ``letter_A`` ... ``letter_Z`` exist besides."""
+Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -45,18 +43,18 @@ class Shape:
 
     parts: dict[str, Distance]
     blend: float
-    lower: tuple[float, float, float]
-    upper: tuple[float, float, float]
+    lower: Vector
+    upper: Vector
     paint: dict[str, Distance] = field(default_factory=dict)
 
     @property
     def part_names(self) -> tuple[str, ...]:
-        """Names that an appearance can colour; the order is the one of :meth:`part_index`."""
+        """Names that an appearance can colour; the order is the one of :meth:`part_weights`."""
         return tuple(self.parts) + tuple(name for name in self.paint if name not in self.parts)
 
     def distance(self, points: Array) -> Array:
         """Approximate signed distance (n,) [nominal m] of points (n,3); negative inside."""
-        return smooth_union(self.blend, *(part(points) for part in self.parts.values()))
+        return union(self.blend, *self.parts.values())(points)
 
     def part_weights(self, points: Array, softness: float) -> Array:
         """How far points (n,3) belong to each of :attr:`part_names`: weights (n, parts) that sum to 1.
@@ -73,36 +71,35 @@ class Shape:
             weights[:, self.part_names.index(name)] += cover[:, 0]
         return weights
 
-    def part_index(self, points: Array) -> Array:
-        """Index (n,) into :attr:`part_names` of the part that points (n,3) belong to most."""
-        return self.part_weights(points, 1e-6).argmax(axis=1)
-
 
 # --- primitives: points (n,3) -> signed distance (n,) ------------------------------------------------------------
 
 
-def smooth_union(width: float, *distances: Array) -> Array:
-    """Polynomial smooth minimum, rounding the seams of a union over ``width`` [m]."""
-    result = distances[0]
-    for distance in distances[1:]:
-        overlap = np.maximum(width - np.abs(result - distance), 0.0) / max(width, 1e-12)
-        result = np.minimum(result, distance) - 0.25 * width * overlap**2
-    return result
+def union(width: float, *parts: Distance) -> Distance:
+    """Union of parts, its seams rounded over ``width`` [m] by a polynomial smooth minimum."""
+
+    def distance(p: Array) -> Array:
+        result = parts[0](p)
+        for part in parts[1:]:
+            other = part(p)
+            overlap = np.maximum(width - np.abs(result - other), 0.0) / max(width, 1e-12)
+            result = np.minimum(result, other) - 0.25 * width * overlap**2
+        return result
+
+    return distance
 
 
 def _vector(*values: float) -> Array:
     return np.asarray(values, dtype=np.float64)
 
 
-def sphere(centre: tuple[float, float, float], radius: float) -> Distance:
+def sphere(centre: Vector, radius: float) -> Distance:
     """Ball of one radius [m]."""
     c = _vector(*centre)
     return lambda p: np.linalg.norm(p - c, axis=1) - radius
 
 
-def ellipsoid(
-    centre: tuple[float, float, float], radii: tuple[float, float, float], tilt: float = 0.0
-) -> Distance:
+def ellipsoid(centre: Vector, radii: Vector, tilt: float = 0.0) -> Distance:
     """Ellipsoid, turned by ``tilt`` [degrees] about z; first-order distance, good near the surface."""
     c, r = _vector(*centre), _vector(*radii)
     cos, sin = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
@@ -117,9 +114,7 @@ def ellipsoid(
     return distance
 
 
-def tapered_capsule(
-    start: tuple[float, float, float], stop: tuple[float, float, float], r_start: float, r_stop: float
-) -> Distance:
+def tapered_capsule(start: Vector, stop: Vector, r_start: float, r_stop: float) -> Distance:
     """Segment with a radius that changes linearly from one end to the other [m]."""
     a, b = _vector(*start), _vector(*stop)
     axis = b - a
@@ -131,10 +126,9 @@ def tapered_capsule(
     return distance
 
 
-def revolved(profile: Distance, centre: tuple[float, float] = (0.0, 0.0)) -> Distance:
-    """Solid of revolution about a vertical axis from a 2-D distance over (radius, y)."""
-    cx, cz = centre
-    return lambda p: profile(np.stack([np.hypot(p[:, 0] - cx, p[:, 2] - cz), p[:, 1]], axis=1))
+def revolved(profile: Distance) -> Distance:
+    """Solid of revolution about the vertical axis from a 2-D distance over (radius, y)."""
+    return lambda p: profile(np.stack([np.hypot(p[:, 0], p[:, 2]), p[:, 1]], axis=1))
 
 
 def polygon(corners: list[tuple[float, float]], rounding: float = 0.0) -> Distance:
@@ -169,14 +163,14 @@ def extruded(profile: Distance, half_depth: float, rounding: float) -> Distance:
     return distance
 
 
-def mirrored(part: Distance) -> Distance:
-    """The part and its mirror image in the plane z = 0: the part is given for z >= 0."""
-    return lambda p: part(np.stack([p[:, 0], p[:, 1], np.abs(p[:, 2])], axis=1))
-
-
 def mirrored_x(part: Distance) -> Distance:
     """The part and its mirror image in the plane x = 0: the part is given for x >= 0."""
-    return lambda p: part(np.stack([np.abs(p[:, 0]), p[:, 1], p[:, 2]], axis=1))
+    return lambda p: part(np.abs(p, where=[True, False, False], out=p.copy()))
+
+
+def mirrored_z(part: Distance) -> Distance:
+    """The part and its mirror image in the plane z = 0: the part is given for z >= 0."""
+    return lambda p: part(np.abs(p, where=[False, False, True], out=p.copy()))
 
 
 def turned(part: Distance, degrees: float) -> Distance:
@@ -185,11 +179,6 @@ def turned(part: Distance, degrees: float) -> Distance:
     return lambda p: part(
         np.stack([cos * p[:, 0] - sin * p[:, 2], p[:, 1], sin * p[:, 0] + cos * p[:, 2]], axis=1)
     )
-
-
-def union(width: float, *parts: Distance) -> Distance:
-    """Smooth union of parts as a part."""
-    return lambda p: smooth_union(width, *(part(p) for part in parts))
 
 
 # --- the solids --------------------------------------------------------------------------------------------------
@@ -215,18 +204,16 @@ def _ball() -> Shape:
         # Divided by the slope of the difference at its zero, to be metres.
         return (0.93 * np.linalg.norm(p, axis=1) - np.abs(p @ axis)) / np.sqrt(1.0 - 0.93**2)
 
-    def second_colour(p: Array) -> Array:
-        return np.minimum(panel(0)(p), panel(3)(p))
-
-    def third_colour(p: Array) -> Array:
-        return np.minimum(panel(1)(p), panel(4)(p))
-
     return Shape(
         parts={"body": sphere((0, 0, 0), 0.13)},
         blend=0.0,
         lower=(-0.14,) * 3,
         upper=(0.14,) * 3,
-        paint={"second": second_colour, "third": third_colour, "caps": caps},
+        paint={
+            "second": union(0.0, panel(0), panel(3)),
+            "third": union(0.0, panel(1), panel(4)),
+            "caps": caps,
+        },
     )
 
 
@@ -239,14 +226,14 @@ def _duck() -> Shape:
         tapered_capsule((-0.10, 0.02, 0.0), (-0.185, 0.105, 0.0), 0.075, 0.032),
         tapered_capsule((0.06, 0.05, 0.0), (0.075, 0.16, 0.0), 0.085, 0.07),
     )
-    wing = mirrored(ellipsoid((-0.035, 0.02, 0.105), (0.085, 0.052, 0.032), tilt=-14.0))
+    wing = mirrored_z(ellipsoid((-0.035, 0.02, 0.105), (0.085, 0.052, 0.032), tilt=-14.0))
     head = sphere((0.085, 0.185, 0.0), 0.092)
     beak = union(
         0.02,
         ellipsoid((0.185, 0.172, 0.0), (0.052, 0.024, 0.048), tilt=8.0),
         ellipsoid((0.172, 0.152, 0.0), (0.042, 0.020, 0.040), tilt=-6.0),
     )
-    eye = mirrored(sphere((0.135, 0.215, 0.070), 0.0235))
+    eye = mirrored_z(sphere((0.135, 0.215, 0.070), 0.0235))
     return Shape(
         parts={
             "body": turned(union(0.03, body, head), -turn),
@@ -323,7 +310,7 @@ def _cat() -> Shape:
         upper=(0.21, 0.37, 0.16),
         paint={
             "stripes": stripes,
-            "white": lambda p: np.minimum(np.minimum(white(p) - 0.004, paws(p)), tail_tip(p)),
+            "white": union(0.0, lambda p: white(p) - 0.004, paws, tail_tip),
             "inner_ear": inner_ear,
             "eyes": eyes,
             "nose": nose,
@@ -343,7 +330,7 @@ def _bottle() -> Shape:
     def label(p: Array) -> Array:
         return np.abs(p[:, 1] - 0.135) - 0.062
 
-    def stripe(p: Array) -> Array:
+    def emblem(p: Array) -> Array:
         hexagon = np.maximum(np.abs(p[:, 1] - 0.135), 0.866 * np.abs(p[:, 0]) + 0.5 * np.abs(p[:, 1] - 0.135))
         return np.where(np.abs(p[:, 2]) > 0.05, hexagon - 0.040, 1.0)
 
@@ -352,7 +339,7 @@ def _bottle() -> Shape:
         blend=0.008,
         lower=(-0.13, -0.01, -0.13),
         upper=(0.13, 0.46, 0.13),
-        paint={"label": label, "emblem": stripe},
+        paint={"label": label, "emblem": emblem},
     )
 
 
@@ -375,10 +362,10 @@ def _fish() -> Shape:
         half_depth=0.029,
         rounding=0.02,
     )
-    side_fin = mirrored(tapered_capsule((0.06, -0.025, 0.060), (0.0, -0.050, 0.092), 0.032, 0.024))
-    eye = mirrored(sphere((0.128, 0.030, 0.052), 0.026))
-    pupil = mirrored(sphere((0.134, 0.030, 0.060), 0.0165))
-    mouth = mirrored(ellipsoid((0.178, -0.026, 0.0), (0.030, 0.007, 0.06), tilt=12.0))
+    side_fin = mirrored_z(tapered_capsule((0.06, -0.025, 0.060), (0.0, -0.050, 0.092), 0.032, 0.024))
+    eye = mirrored_z(sphere((0.128, 0.030, 0.052), 0.026))
+    pupil = mirrored_z(sphere((0.134, 0.030, 0.060), 0.0165))
+    mouth = mirrored_z(ellipsoid((0.178, -0.026, 0.0), (0.030, 0.007, 0.06), tilt=12.0))
 
     def stripes(p: Array) -> Array:
         wave = p[:, 0] - 0.9 * p[:, 1] ** 2 / 0.1
@@ -432,14 +419,9 @@ def _letter(character: str) -> Shape:
     )
 
 
-_MAKERS: dict[str, Callable[[], Shape]] = {
-    "ball": _ball,
-    "duck": _duck,
-    "pawn": _pawn,
-    "cat": _cat,
-    "bottle": _bottle,
-    "fish": _fish,
-}
+_MAKERS = {"ball": _ball, "duck": _duck, "pawn": _pawn, "cat": _cat, "bottle": _bottle, "fish": _fish}
+NAMES = tuple(_MAKERS)
+"""Solids with a name of their own; ``letter_A`` ... ``letter_Z`` exist besides."""
 
 
 @cache
@@ -469,8 +451,8 @@ def build(name: str, size: float | None = None, resolution: int = 96) -> trimesh
         resolution: cells along the longest side.
 
     Returns:
-        A watertight mesh [m], faces outward, its bounding box centred at the origin, with the vertex attribute
-        ``part`` (indices into ``shape(name).part_names``) and what :func:`to_nominal` needs.
+        A watertight mesh [m], faces outward, its bounding box centred at the origin, with what :func:`to_nominal`
+        needs.
 
     Raises:
         InputError: unknown name, or a size or resolution that is not positive.
@@ -497,7 +479,6 @@ def build(name: str, size: float | None = None, resolution: int = 96) -> trimesh
     centre = mesh.bounds.mean(axis=0)
     scale = 1.0 if size is None else size / np.ptp(nominal, axis=0).max()
     result = trimesh.Trimesh((nominal - centre) * scale, mesh.faces, process=False)
-    result.vertex_attributes["part"] = solid.part_index(nominal)
     result.metadata.update(shape=name, scale=float(scale), centre=centre.tolist())
     return result
 

@@ -12,7 +12,6 @@ from neuma_lib.data.blender.appearance import colors_at, smooth_noise, to_linear
 from neuma_lib.data.blender.bodies import make_body
 from neuma_lib.data.blender.libraries import explain_import_error
 from neuma_lib.data.blender.scene import (
-    Grains,
     Surface,
     render_dynamic,
     render_images,
@@ -123,8 +122,8 @@ def test_grains_stay_inside_the_rest_surface():
     body = make_body(
         mesh, AppearanceConfig(kind="grains", colors={"body": "#c9a86a"}), points[None], points[None]
     )
-    assert shapes.depth(mesh, body.centres[0]).min() > 0.75 * body.radius
-    assert len(body.colors) == body.centres.shape[1]
+    assert shapes.depth(mesh, body.vertices[0]).min() > 0.75 * body.radius
+    assert len(body.colors) == body.vertices.shape[1]
 
 
 def test_liquid_surface_is_closed_and_holds_the_volume():
@@ -163,7 +162,7 @@ def test_failing_import_reaches_the_user(tmp_path, monkeypatch):
         "raise ImportError('libSM.so.6: cannot open shared object file: No such file')"
     )
     monkeypatch.setenv("PYTHONPATH", str(broken))
-    body = Grains(np.full((1, 1, 3), 0.5), 0.1, np.ones((1, 3)))
+    body = Surface(np.full((1, 1, 3), 0.5), np.zeros((0, 3), int), np.ones((1, 3)), 0.1)
     views = cameras.framing(cameras.ring_directions(1), np.array([[0.4] * 3, [0.6] * 3]), 16, 16)
     with pytest.raises(InputError, match="libsm6"):
         render_static(body, views, tmp_path / "out", 4)
@@ -176,7 +175,7 @@ def test_renders_agree_with_the_cameras(tmp_path):
     points = np.array(
         [[0.5, 0.5, 0.5], [0.3, 0.62, 0.45], [0.68, 0.4, 0.6], [0.36, 0.33, 0.62], [0.62, 0.7, 0.36]]
     )
-    body = Grains(points[None], 0.012, np.ones((5, 3)))
+    body = Surface(points[None], np.zeros((0, 3), int), np.ones((5, 3)), 0.012)
     corners = np.array([[0.25] * 3, [0.75] * 3])
     views = cameras.framing(cameras.ring_directions(4)[[0, 1, 3]], corners, 144, 128, fill=1.0)
     render_static(body, views, tmp_path, 64)

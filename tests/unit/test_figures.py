@@ -39,9 +39,9 @@ from neuma_lib.evaluation.plotting.image_grid import (
     save_image_grid,
 )
 from neuma_lib.evaluation.plotting.rendering import cropped, evenly, frontal, magnified
+from neuma_lib.evaluation.plotting.spheres import draw_spheres
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.splatting.cameras import Cameras
-from neuma_lib.splatting.spheres import draw_spheres
 
 ROOT = Path(__file__).resolve().parents[2]
 SETTINGS = yaml.safe_load((ROOT / "config/config.yaml").read_text())

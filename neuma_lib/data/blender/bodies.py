@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from neuma_lib.config.blender import AppearanceConfig
 from neuma_lib.data.blender.appearance import colors_at
-from neuma_lib.data.blender.scene import Grains, Liquid, Surface
+from neuma_lib.data.blender.scene import Liquid, Surface
 from neuma_lib.geometry.shapes import depth
 from neuma_lib.geometry.skinning import carry, skinning_matrix
 
@@ -21,7 +21,7 @@ def make_body(
     appearance: AppearanceConfig,
     x: np.ndarray,
     tracers: np.ndarray | None = None,
-) -> Surface | Grains | Liquid:
+) -> Surface | Liquid:
     """What Blender shows.
 
     Args:
@@ -36,9 +36,8 @@ def make_body(
         vertices = carry(skinning_matrix(mesh.vertices, x[0]), x)
         return Surface(vertices, np.asarray(mesh.faces), colors_at(mesh, mesh.vertices, appearance))
     points = x if tracers is None else np.asarray(tracers)
-    if appearance.kind == "grains":
-        return _grains(mesh, appearance, _some(points, MOST_GRAINS))
-    return _liquid(mesh, appearance, _some(points, MOST_DROPS))
+    make, most = (_grains, MOST_GRAINS) if appearance.kind == "grains" else (_liquid, MOST_DROPS)
+    return make(mesh, appearance, _some(points, most))
 
 
 def _some(points: np.ndarray, most: int) -> np.ndarray:
@@ -48,11 +47,11 @@ def _some(points: np.ndarray, most: int) -> np.ndarray:
     return points.astype(np.float64)
 
 
-def _grains(mesh: trimesh.Trimesh, appearance: AppearanceConfig, points: np.ndarray) -> Grains:
+def _grains(mesh: trimesh.Trimesh, appearance: AppearanceConfig, points: np.ndarray) -> Surface:
     """Balls somewhat wider than the spacing of their centres; none stands out of the rest surface."""
     radius = 0.65 * float((mesh.volume / points.shape[1]) ** (1 / 3))
     points = points[:, depth(mesh, points[0]) > 0.8 * radius]
-    return Grains(points, radius, colors_at(mesh, points[0], appearance))
+    return Surface(points, np.zeros((0, 3), int), colors_at(mesh, points[0], appearance), radius)
 
 
 def _liquid(mesh: trimesh.Trimesh, appearance: AppearanceConfig, points: np.ndarray) -> Liquid:

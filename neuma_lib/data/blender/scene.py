@@ -2,7 +2,7 @@
 
 The parent (this module) never imports bpy: it writes one job file, starts ``neuma_lib.data.blender.worker`` and
 collects the images, which appear in the target folder only when all of them are there. What is rendered is a
-:class:`Surface` (the mesh of a solid, moved), :class:`Grains` (sand) or a :class:`Liquid` (a new surface a frame).
+`Surface` (the mesh of a solid, or grains of sand, moved) or a `Liquid` (a new surface a frame).
 """
 
 from __future__ import annotations
@@ -30,24 +30,26 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Surface:
-    """One mesh whose vertices move.
+    """A mesh whose vertices move, or balls of one size that do.
 
     Attributes:
-        vertices: positions [m], shape (T, n, 3).
-        faces: vertex indices, shape (m, 3).
-        colors: sRGB vertex colours in [0, 1], shape (n, 3).
+        vertices: positions [m], shape (T, n, 3); the balls' centres.
+        faces: vertex indices, shape (m, 3); none of balls.
+        colors: sRGB colours of the vertices in [0, 1], shape (n, 3).
+        radius: of the balls [m]; 0 for a mesh.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     colors: np.ndarray
+    radius: float = 0.0
 
     def __len__(self) -> int:
         return len(self.vertices)
 
     @property
     def points(self) -> np.ndarray:
-        """Everything that has to be in the frame (k, 3) [m]."""
+        """What has to be in the frame (k, 3) [m]; the radius of balls is left to the frame's margin."""
         return self.vertices.reshape(-1, 3)
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -58,41 +60,6 @@ class Surface:
             "vertex_start": np.arange(frames + 1) * count,
             "faces": self.faces.astype(np.int32),
             "face_start": np.array([0, len(self.faces)]),
-            "colors": to_linear(self.colors).astype(np.float32),
-            "radius": np.array(0.0),
-        }
-
-
-@dataclass(frozen=True)
-class Grains:
-    """Balls of one size that move.
-
-    Attributes:
-        centres: positions [m], shape (T, n, 3).
-        radius: [m].
-        colors: sRGB colours in [0, 1], shape (n, 3).
-    """
-
-    centres: np.ndarray
-    radius: float
-    colors: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.centres)
-
-    @property
-    def points(self) -> np.ndarray:
-        """Everything that has to be in the frame (k, 3) [m]; the grains' radius is left to the frame's margin."""
-        return self.centres.reshape(-1, 3)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """As of :class:`Surface`, without faces."""
-        frames, count = self.centres.shape[:2]
-        return {
-            "vertices": self.points.astype(np.float32),
-            "vertex_start": np.arange(frames + 1) * count,
-            "faces": np.zeros((0, 3), np.int32),
-            "face_start": np.array([0, 0]),
             "colors": to_linear(self.colors).astype(np.float32),
             "radius": np.array(float(self.radius)),
         }
@@ -109,23 +76,24 @@ class Liquid:
 
     @property
     def points(self) -> np.ndarray:
-        """Everything that has to be in the frame (k, 3) [m]."""
-        return np.concatenate([s[0] for s in self.surfaces])
+        """What has to be in the frame (k, 3) [m]."""
+        return np.concatenate([vertices for vertices, _, _ in self.surfaces])
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """As of :class:`Surface`, with faces and colours of every frame."""
+        """As of `Surface`, with faces and colours of every frame."""
+        _, faces, colors = (np.concatenate(parts) for parts in zip(*self.surfaces, strict=True))
         return {
             "vertices": self.points.astype(np.float32),
-            "vertex_start": np.cumsum([0, *(len(s[0]) for s in self.surfaces)]),
-            "faces": np.concatenate([s[1] for s in self.surfaces]).astype(np.int32),
-            "face_start": np.cumsum([0, *(len(s[1]) for s in self.surfaces)]),
-            "colors": to_linear(np.concatenate([s[2] for s in self.surfaces])).astype(np.float32),
+            "vertex_start": np.cumsum([0, *(len(vertices) for vertices, _, _ in self.surfaces)]),
+            "faces": faces.astype(np.int32),
+            "face_start": np.cumsum([0, *(len(faces) for _, faces, _ in self.surfaces)]),
+            "colors": to_linear(colors).astype(np.float32),
             "radius": np.array(0.0),
         }
 
 
 def render_images(
-    geometry: Surface | Grains | Liquid,
+    geometry: Surface | Liquid,
     views: Views,
     shots: Sequence[tuple[int, int]],
     out_dir: str | Path,
@@ -209,15 +177,14 @@ def _run(job: Path, total: int, progress: Progress | None) -> None:
             raise
     if process.returncode:
         words = log.read_text(errors="replace")
-        hint = explain_import_error(words)
-        if hint:
+        if hint := explain_import_error(words):
             raise InputError(hint)
         tail = "\n".join(words.strip().splitlines()[-12:])
         raise RuntimeError(f"Blender ended with status {process.returncode}:\n{tail}")
 
 
 def render_static(
-    geometry: Surface | Grains | Liquid,
+    geometry: Surface | Liquid,
     views: Views,
     out_dir: str | Path,
     samples: int,
@@ -231,7 +198,7 @@ def render_static(
 
 
 def render_dynamic(
-    geometry: Surface | Grains | Liquid,
+    geometry: Surface | Liquid,
     views: Views,
     steps: Sequence[int],
     dt: float,
@@ -254,11 +221,10 @@ def render_dynamic(
     _render_set(geometry, views, shots, names, steps, times, out_dir, samples, threads, progress)
 
 
-def _render_set(geometry, views, shots, names, steps, times, out_dir, samples, threads, progress) -> None:
-    out_dir = Path(out_dir)
-    # A folder without transforms.json is an unfinished one.
-    (out_dir / "transforms.json").unlink(missing_ok=True)
-    render_images(geometry, views, shots, out_dir, names, samples, threads, progress)
+def _render_set(geometry, views, shots, names, steps, times, out_dir, *options) -> None:
+    transforms = Path(out_dir, "transforms.json")
+    transforms.unlink(missing_ok=True)  # a folder without it is an unfinished one
+    render_images(geometry, views, shots, out_dir, names, *options)
     frames = [
         {
             "file_path": name,
@@ -269,12 +235,5 @@ def _render_set(geometry, views, shots, names, steps, times, out_dir, samples, t
         }
         for name, (frame, view) in zip(names, shots, strict=True)
     ]
-    intrinsics = {
-        "w": views.width,
-        "h": views.height,
-        "fl_x": views.focal,
-        "fl_y": views.focal,
-        "cx": views.width / 2,
-        "cy": views.height / 2,
-    }
-    write_transforms(out_dir / "transforms.json", intrinsics, frames)
+    lens = {"fl_x": views.focal, "fl_y": views.focal, "cx": views.width / 2, "cy": views.height / 2}
+    write_transforms(transforms, {"w": views.width, "h": views.height, **lens}, frames)

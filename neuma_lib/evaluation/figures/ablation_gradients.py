@@ -32,10 +32,8 @@ def data(inputs, params, say) -> dict:
         "tracer_rmse_mm": (inputs.metrics, itemgetter("tracer_rmse_mm")),
         "psnr": (inputs.image_metrics, itemgetter("psnr")),
     }
-    measures = {
-        name: read_results(files, params.titles, params.scenes, value)
-        for name, (files, value) in values.items()
-    }
+    cells = params.titles, params.scenes
+    measures = {name: read_results(files, *cells, value) for name, (files, value) in values.items()}
     say(f"{len(params.titles)} variants on {len(params.scenes)} scenes")
     return {"scenes": params.scenes, "titles": params.titles, **measures}
 

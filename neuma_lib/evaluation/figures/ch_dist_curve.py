@@ -46,9 +46,8 @@ def draw(data: Mapping) -> Figure:
         time = [1e3 * t for t in values["time"]]
         for method, title in data["titles"].items():
             axes.plot(time, values["chamfer"][method], label=title, **style.look(method).line)
-        axes.fill_between(
-            time, values["floor"], 1e-6, color=style.LIGHT, linewidth=0, label="below the sampling floor"
-        )
+        below = {"color": style.LIGHT, "linewidth": 0, "label": "below the sampling floor"}
+        axes.fill_between(time, values["floor"], 1e-6, **below)
         lowest = min(min(values["floor"]), *(min(c) for c in values["chamfer"].values()))
         axes.set(yscale="log", title=scene, xlim=(0, time[-1]))
         axes.set_ylim(bottom=0.6 * lowest)

@@ -9,17 +9,8 @@ import torch
 from matplotlib.figure import Figure
 
 from neuma_lib.evaluation.metrics import mean_height
-from neuma_lib.evaluation.plotting import style
+from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.evaluation.plotting.image_grid import GAP, ImageGrid, draw_images, place
-from neuma_lib.evaluation.plotting.rendering import (
-    cropped,
-    evenly,
-    frontal,
-    milliseconds,
-    particle_pictures,
-    renders,
-    sphere_radius,
-)
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.particles import load_body
 
@@ -34,14 +25,20 @@ def data(inputs, params, say) -> ImageGrid:
     names = ("x", "mass", "vol0", "frames")
     truth, attributes = read_arrays(inputs.truth, required=names, only=names)
     body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density)
-    shown = evenly(params.shown, len(truth["frames"]))
+    shown = rendering.evenly(params.shown, len(truth["frames"]))
     paths = [read_arrays(file, required=("x", "F"))[0] for file in inputs.rollouts]
     everywhere = [arrays["x"].reshape(-1, 3) for arrays in (truth, *paths)]
-    cameras = frontal(np.concatenate(everywhere), params.size, params.size)
-    rows = [particle_pictures(truth["x"][shown], style.TRUE_PARTICLES, sphere_radius(truth["vol0"]), cameras)]
+    cameras = rendering.frontal(np.concatenate(everywhere), params.size, params.size)
+    rows = [
+        rendering.particle_pictures(
+            truth["x"][shown], style.TRUE_PARTICLES, rendering.sphere_radius(truth["vol0"]), cameras
+        )
+    ]
     heights = {"truth": mean_height(truth["x"], truth["mass"])}
     for method, arrays in zip(params.titles, paths, strict=True):
-        rows.append(renders(body, cameras, *(torch.from_numpy(arrays[name][shown]) for name in ("x", "F"))))
+        rows.append(
+            rendering.renders(body, cameras, *(torch.from_numpy(arrays[name][shown]) for name in ("x", "F")))
+        )
         heights[method] = mean_height(arrays["x"], body.mass)
     dt = attributes["dt"]
     numbers = {
@@ -50,10 +47,10 @@ def data(inputs, params, say) -> ImageGrid:
         "titles": {"truth": "Truth", **params.titles},
         "heights": heights,
     }
-    (images,) = cropped([np.stack(rows)])
+    (images,) = rendering.cropped([np.stack(rows)])
     far = max(abs(a - b) for a, b in zip(heights["truth"], heights["neuma"], strict=True))
     say(f"mean height within {1e3 * far:.1f} mm of the truth")
-    columns = tuple(milliseconds(truth["frames"][shown], dt))
+    columns = tuple(rendering.milliseconds(truth["frames"][shown], dt))
     return ImageGrid(images, ("Truth (particles)", *params.titles.values()), columns, numbers)
 
 

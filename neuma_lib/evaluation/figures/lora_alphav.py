@@ -15,21 +15,11 @@ from matplotlib.figure import Figure
 from neuma_lib.device import choose_device
 from neuma_lib.evaluation.metrics import mean_height
 from neuma_lib.evaluation.motion import predict
-from neuma_lib.evaluation.plotting import style
+from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.evaluation.plotting.image_grid import GAP, ImageGrid, draw_images, note, place
-from neuma_lib.evaluation.plotting.rendering import (
-    cropped,
-    evenly,
-    magnified,
-    milliseconds,
-    observed,
-    renders,
-)
 from neuma_lib.io.files import read_json
 from neuma_lib.io.hdf5 import read_arrays
-from neuma_lib.io.images import load_observation
 from neuma_lib.io.laws import load_law
-from neuma_lib.io.particles import load_body
 from neuma_lib.sim.model import MPMModel
 
 LEFT, LEGEND, TITLE, PICTURES, CURVES, BETWEEN = 0.5, 0.2, 0.34, 4.0, 1.85, 0.38
@@ -47,27 +37,25 @@ def data(inputs, params, say) -> ImageGrid:
     inside = [k for k, weight in enumerate(params.weights) if 0 <= weight <= 1]
     for k, (scene, setting) in enumerate(params.scenes.items()):
         model = MPMModel(**setting["simulation"])
-        video = load_observation(inputs.transforms[k], [params.view])
-        body = load_body(inputs.particles[k], inputs.binding[k], inputs.gaussians[k], setting["density"])
-        body = body.to(torch.float32, device)
+        video, body, cameras = rendering.film(inputs, params, k, setting["density"])
+        body, cameras = body.to(torch.float32, device), cameras.to(device)
         law = load_law(inputs.prior[k], inputs.adaptor[k]).to(device)
         v0 = torch.tensor(read_json(inputs.velocity[k])["v0"], dtype=torch.float32, device=device)
         truth, _ = read_arrays(inputs.truth[k], required=("x", "mass"), only=("x", "mass"))
-        shown = evenly(params.shown, len(video.frames))[1:]  # the start is the same for all
-        cameras = magnified(video.cameras, params.magnify).to(device)
+        shown = rendering.evenly(params.shown, len(video.frames))[1:]  # the start is the same for all
         columns, heights = [], []
         for weight in params.weights:
             law.set_adaptor_weight(weight)
             path, diverged = predict(model, law, body, v0, video.frames)
-            columns.append(renders(body, cameras, path.x[shown], path.F[shown]))
+            columns.append(rendering.renders(body, cameras, path.x[shown], path.F[shown]))
             heights.append(mean_height(path.x.cpu(), body.mass.cpu()))
             if diverged:
                 say(f"{scene}: w = {weight:g} diverged at step {diverged}")
         monotone, parted = monotone_frames([heights[k] for k in inside])
         say(f"{scene}: between 0 and 1, height monotone in w in {monotone} of {parted} frames after contact")
-        columns.append(observed(video, shown, params.magnify))
+        columns.append(rendering.observed(video, shown, params.magnify))
         blocks.append(np.stack(columns, axis=1))
-        rows += milliseconds([video.frames[i] for i in shown], model.dt)
+        rows += rendering.milliseconds([video.frames[i] for i in shown], model.dt)
         scenes[scene] = {
             "rows": len(shown),
             "time": [model.dt * step for step in video.frames],
@@ -76,7 +64,7 @@ def data(inputs, params, say) -> ImageGrid:
         }
     titles = [f"$w$ = {weight:g}" for weight in params.weights] + ["observed"]
     numbers = {"weights": params.weights, "scenes": scenes}
-    images = np.concatenate(cropped(blocks, guides=[block[:, [*inside, -1]] for block in blocks]))
+    images = np.concatenate(rendering.cropped(blocks, guides=[block[:, [*inside, -1]] for block in blocks]))
     return ImageGrid(images, tuple(rows), tuple(titles), numbers)
 
 
@@ -115,13 +103,8 @@ def draw(grid: ImageGrid) -> Figure:
         axes.set(xlabel="time [ms]", ylabel="mean height [m]", xlim=(0, time[-1]))
         axes.grid(axis="y")
         if first == 0:
-            figure.legend(
-                *axes.get_legend_handles_labels(),
-                loc="upper center",
-                ncols=len(weights) + 1,
-                columnspacing=1.2,
-                handlelength=1.6,
-                borderaxespad=0.1,
-            )
+            spacing = {"columnspacing": 1.2, "handlelength": 1.6, "borderaxespad": 0.1}
+            shown = axes.get_legend_handles_labels()
+            figure.legend(*shown, loc="upper center", ncols=len(weights) + 1, **spacing)
         top, first = top + block, first + scene["rows"]
     return figure

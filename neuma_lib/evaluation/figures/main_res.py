@@ -7,18 +7,9 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from neuma_lib.evaluation.plotting import style
+from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.evaluation.plotting.image_grid import GAP, ImageGrid, draw_images, note
-from neuma_lib.evaluation.plotting.rendering import (
-    cropped,
-    evenly,
-    magnified,
-    milliseconds,
-    observed,
-    renders,
-)
-from neuma_lib.io.images import load_observation
-from neuma_lib.io.particles import load_body, load_motion
+from neuma_lib.io.particles import load_motion
 
 LEFT, TOP, BETWEEN = 0.92, 0.3, 0.06
 
@@ -28,17 +19,17 @@ def data(inputs, params, say) -> ImageGrid:
     blocks, times, groups = [], [], []
     rollouts = iter(inputs.rollouts)
     for k, (scene, setting) in enumerate(params.scenes.items()):
-        video = load_observation(inputs.transforms[k], [params.view])
-        body = load_body(inputs.particles[k], inputs.binding[k], inputs.gaussians[k], setting["density"])
-        shown = evenly(params.shown, len(video.frames))
-        cameras = magnified(video.cameras, params.magnify)
-        rows = [observed(video, shown, params.magnify)]
+        video, body, cameras = rendering.film(inputs, params, k, setting["density"])
+        shown = rendering.evenly(params.shown, len(video.frames))
+        rows = [rendering.observed(video, shown, params.magnify)]
         for _ in params.titles:
-            rows.append(renders(body, cameras, *(state[shown] for state in load_motion(next(rollouts)))))
+            rows.append(
+                rendering.renders(body, cameras, *(state[shown] for state in load_motion(next(rollouts))))
+            )
         blocks.append(np.stack(rows))
-        times += milliseconds([video.frames[i] for i in shown], setting["dt"])
+        times += rendering.milliseconds([video.frames[i] for i in shown], setting["dt"])
         groups.append((scene, len(shown)))
-    images = np.concatenate(cropped(blocks), axis=1)
+    images = np.concatenate(rendering.cropped(blocks), axis=1)
     say(f"{images.shape[0]} x {images.shape[1]} pictures")
     return ImageGrid(images, ("Observation", *params.titles.values()), tuple(times), {"groups": groups})
 

@@ -7,16 +7,8 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from neuma_lib.evaluation.plotting import style
+from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.evaluation.plotting.image_grid import GAP, ImageGrid, draw_images
-from neuma_lib.evaluation.plotting.rendering import (
-    cropped,
-    evenly,
-    frontal,
-    milliseconds,
-    particle_pictures,
-    sphere_radius,
-)
 from neuma_lib.io.hdf5 import read_arrays
 
 LEFT, TOP = 0.92, 0.18
@@ -26,19 +18,21 @@ def data(inputs, params, say) -> ImageGrid:
     """A row for the truth and each method, a column a time."""
     truth, _ = read_arrays(inputs.truth, required=("x", "vol0"), only=("x", "vol0", "frames"))
     simulated, _ = read_arrays(inputs.particles, required=("vol0",), only=("vol0",))
-    shown = evenly(params.shown, len(truth["x"]))
+    shown = rendering.evenly(params.shown, len(truth["x"]))
     paths = {"truth": truth["x"][shown]}
     for method, file in zip(params.titles, inputs.rollouts, strict=True):
         paths[method] = read_arrays(file, required=("x",), only=("x",))[0]["x"][shown]
-    cameras = frontal(np.concatenate([x.reshape(-1, 3) for x in paths.values()]), params.size, params.size)
+    cameras = rendering.frontal(
+        np.concatenate([x.reshape(-1, 3) for x in paths.values()]), params.size, params.size
+    )
     rows = []
     for method, x in paths.items():
         color = style.TRUE_PARTICLES if method == "truth" else style.look(method).color
         vol0 = truth["vol0"] if method == "truth" else simulated["vol0"]
-        rows.append(particle_pictures(x, color, sphere_radius(vol0), cameras))
-    (images,) = cropped([np.stack(rows)])
+        rows.append(rendering.particle_pictures(x, color, rendering.sphere_radius(vol0), cameras))
+    (images,) = rendering.cropped([np.stack(rows)])
     say(f"{images.shape[0]} x {images.shape[1]} pictures")
-    columns = tuple(milliseconds(truth["frames"][shown], params.dt))
+    columns = tuple(rendering.milliseconds(truth["frames"][shown], params.dt))
     return ImageGrid(images, ("Truth", *params.titles.values()), columns)
 
 

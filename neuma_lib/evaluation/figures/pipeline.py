@@ -17,23 +17,12 @@ from PIL import Image
 from torch import Tensor
 
 from neuma_lib.coupling.reconstruction import Reconstruction
-from neuma_lib.evaluation.plotting import style
+from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.evaluation.plotting.image_grid import ImageGrid, draw_images, note
-from neuma_lib.evaluation.plotting.rendering import (
-    as_bytes,
-    cropped,
-    evenly,
-    magnified,
-    milliseconds,
-    observed,
-    particle_pictures,
-    renders,
-    sphere_radius,
-)
-from neuma_lib.io.images import load_observation, load_views
+from neuma_lib.io.images import load_views
 from neuma_lib.io.laws import load_law
 from neuma_lib.io.mesh import read_mesh
-from neuma_lib.io.particles import load_body, load_motion
+from neuma_lib.io.particles import load_motion
 from neuma_lib.mechanics.law import Law
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians
@@ -63,40 +52,35 @@ def data(inputs, params, say) -> ImageGrid:
 
     Numbers: ``first``, titles of the pictures of the first row; ``heads``, what happens before each row.
     """
-    video = load_observation(inputs.transforms[0], [params.view])
-    body = load_body(inputs.particles[0], inputs.binding[0], inputs.gaussians[0], params.scene["density"])
+    video, body, cameras = rendering.film(inputs, params, 0, params.scene["density"])
     law = load_law(inputs.prior[0], inputs.adaptor[0])
-    cameras = magnified(video.cameras, params.magnify)
     third = len(video.frames) // 3  # before it, the body only falls
-    shown = [third + i for i in evenly(SHOWN, len(video.frames) - third)]
+    shown = [third + i for i in rendering.evenly(SHOWN, len(video.frames) - third)]
     x, F = (state[shown] for state in load_motion(inputs.rollout))
 
-    seen = observed(video, shown, params.magnify)
-    rendered = renders(body, cameras, x, F)
+    seen = rendering.observed(video, shown, params.magnify)
+    rendered = rendering.renders(body, cameras, x, F)
     stressed, strongest = _stressed_particles(law, body, x, F, cameras)
-    start = [
-        _gaussians(body.gaussians, cameras),
-        _surface(read_mesh(inputs.mesh), cameras),
-        _particles(body, _NEUTRAL, cameras),
-        _particles(body, _carried_colors(body), cameras),
-    ]
+    start = [_gaussians(body.gaussians, cameras), _surface(read_mesh(inputs.mesh), cameras)]
+    for colors in (_NEUTRAL, _carried_colors(body)):
+        radius = rendering.sphere_radius(body.vol0)
+        start.append(rendering.particle_pictures(body.x0[None], colors, radius, cameras)[0])
     motion = np.stack([stressed, rendered, seen, _difference(rendered, seen)])
-    still, motion = cropped([np.stack(start), motion])
+    still, motion = rendering.cropped([np.stack(start), motion])
     views, _ = load_views(inputs.static, list(range(4)))
-    first = np.concatenate([_montage(as_bytes(over_white(views)), *still.shape[1:3])[None], still])
+    first = np.concatenate([_montage(rendering.as_bytes(over_white(views)), *still.shape[1:3])[None], still])
     rows = ("I\ninitial\nstate", "II\nsimulation", "III\nrendering", "\nobservation", "\ndifference")
     numbers = {
-        "first": ["views at the start", "Gaussian kernels", "surface", "particles", "binding"],
+        "first": ["views at the start", "Gaussians", "surface", "particles", "binding"],
         "heads": [
-            f"{params.views} views → kernels, surface, particles; each kernel is bound to the particles inside it",
-            "material point method with M = M₀ + ΔM;"
-            f" colour: von Mises stress, 0 to {1e-3 * strongest:.0f} kPa",
-            "particles carry kernels, kernels are splatted",
+            f"{params.views} views → Gaussians, surface, particles; each Gaussian is bound to the particles inside it",
+            f"material point method with M = M₀ + ΔM; colour: von Mises stress, 0 to {1e-3 * strongest:.0f} kPa",
+            "particles carry Gaussians, Gaussians are splatted",
             "one video",
             "squared and summed: the loss",
         ],
     }
-    columns = tuple(milliseconds([video.frames[i] for i in shown], params.scene["dt"]))
+    columns = tuple(rendering.milliseconds([video.frames[i] for i in shown], params.scene["dt"]))
     images = np.concatenate([first[None], motion])
     say(f"{images.shape[0]} x {images.shape[1]} pictures")
     return ImageGrid(images, rows, columns, numbers)
@@ -104,7 +88,7 @@ def data(inputs, params, say) -> ImageGrid:
 
 def _montage(images: np.ndarray, height: int, width: int) -> np.ndarray:
     """Four pictures (4, H, W, 3) as one (height, width, 3), white around them."""
-    (images,) = cropped([images], margin=0.0)
+    (images,) = rendering.cropped([images], margin=0.0)
     both = np.concatenate([np.concatenate(list(images[i : i + 2]), axis=1) for i in (0, 2)], axis=0)
     factor = min(height / both.shape[0], width / both.shape[1])
     inner = round(both.shape[1] * factor), round(both.shape[0] * factor)
@@ -137,12 +121,7 @@ def _splat(means: Tensor, covars: Tensor, opacities: Tensor, sh: Tensor, cameras
             means[None], covars[None], opacities, sh, cameras.viewmats, cameras.Ks, cameras.width, cameras.height,
             background=(1.0, 1.0, 1.0), eps2d=0.0,
         )  # fmt: skip
-    return as_bytes(images[0, 0])
-
-
-def _particles(body: Reconstruction, colors: np.ndarray, cameras: Cameras) -> np.ndarray:
-    """Particles at the start in colours (3,) or (N, 3): uint8 (H, W, 3)."""
-    return particle_pictures(body.x0[None], colors, sphere_radius(body.vol0), cameras)[0]
+    return rendering.as_bytes(images[0, 0])
 
 
 def _carried_colors(body: Reconstruction) -> np.ndarray:
@@ -175,8 +154,10 @@ def _stressed_particles(
     stress = (1.5 * deviator.square().sum((1, 2))).sqrt().reshape(x.shape[:2]).numpy()
     strongest = float(np.quantile(stress[1:], _STRONGEST))
     colors = matplotlib.colormaps[style.RAMP](0.1 + 0.9 * np.clip(stress / strongest, 0, 1))[..., :3]
-    radius = sphere_radius(body.vol0)
-    pictures = [particle_pictures(state[None], c, radius, cameras)[0] for state, c in zip(x, colors)]
+    radius = rendering.sphere_radius(body.vol0)
+    pictures = [
+        rendering.particle_pictures(state[None], c, radius, cameras)[0] for state, c in zip(x, colors)
+    ]
     return np.stack(pictures), strongest
 
 
@@ -221,15 +202,6 @@ def _arrow(figure: Figure, start, end, color: str = style.GREY, bend: float = 0.
     """An arrow between two points, inches from the upper left corner."""
     width, height = figure.get_size_inches()
     ends = [(x / width, 1 - y / height) for x, y in (start, end)]
-    figure.add_artist(
-        FancyArrowPatch(
-            *ends,
-            arrowstyle="-|>",
-            mutation_scale=7,
-            color=color,
-            linewidth=1.0,
-            connectionstyle=f"arc3,rad={bend}",
-            transform=figure.transFigure,
-            zorder=5,
-        )
-    )
+    look = {"arrowstyle": "-|>", "mutation_scale": 7, "color": color, "linewidth": 1.0, "zorder": 5}
+    curve = f"arc3,rad={bend}"
+    figure.add_artist(FancyArrowPatch(*ends, connectionstyle=curve, transform=figure.transFigure, **look))

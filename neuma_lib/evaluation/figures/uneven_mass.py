@@ -9,21 +9,10 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from neuma_lib.evaluation.plotting import style
+from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.evaluation.plotting.image_grid import GAP, ImageGrid, draw_images, note, place
-from neuma_lib.evaluation.plotting.rendering import (
-    cropped,
-    evenly,
-    magnified,
-    milliseconds,
-    observed,
-    particle_pictures,
-    renders,
-    sphere_radius,
-)
 from neuma_lib.io.files import read_json
-from neuma_lib.io.images import load_observation
-from neuma_lib.io.particles import load_body, load_motion
+from neuma_lib.io.particles import load_motion
 
 LEFT, TOP, BARS = 0.98, 0.2, 1.25
 PAPER = 1.33
@@ -33,18 +22,16 @@ PAPER = 1.33
 def data(inputs, params, say) -> ImageGrid:
     """Columns are times. Numbers: ``rows`` {method: row}, ``chamfer`` {method: 1e-4 m^2}, ``floor``."""
     (setting,) = params.scene.values()
-    video = load_observation(inputs.transforms[0], [params.view])
-    body = load_body(inputs.particles[0], inputs.binding[0], inputs.gaussians[0], setting["density"])
-    shown = evenly(params.shown, len(video.frames))
-    cameras = magnified(video.cameras, params.magnify)
+    video, body, cameras = rendering.film(inputs, params, 0, setting["density"])
+    shown = rendering.evenly(params.shown, len(video.frames))
     motions = [[state[shown] for state in load_motion(file)] for file in inputs.rollouts]
     density = (body.mass / body.vol0).numpy()
     heavy = density > 0.5 * (density.min() + density.max())
     colors = np.where(heavy[:, None], to_rgb(style.ORANGE), to_rgb(style.SKY))
     told, _ = motions[list(params.titles).index("neuma")]
-    pictures = [particle_pictures(told, colors, sphere_radius(body.vol0), cameras)]
-    pictures.append(observed(video, shown, params.magnify))
-    pictures += [renders(body, cameras, *motion) for motion in motions]
+    pictures = [rendering.particle_pictures(told, colors, rendering.sphere_radius(body.vol0), cameras)]
+    pictures.append(rendering.observed(video, shown, params.magnify))
+    pictures += [rendering.renders(body, cameras, *motion) for motion in motions]
     rows = [f"NeuMA's particles:\n{density.max():.0f} (orange) and\n{density.min():.0f} kg/m³", "Observation"]
     metrics = dict(zip(params.titles, map(read_json, inputs.metrics), strict=True))
     numbers = {
@@ -53,8 +40,8 @@ def data(inputs, params, say) -> ImageGrid:
         "floor": next(iter(metrics.values()))["chamfer_floor"],
     }
     say(", ".join(f"{method}: Chamfer {value:.2f}" for method, value in numbers["chamfer"].items()))
-    (images,) = cropped([np.stack(pictures)])
-    columns = tuple(milliseconds([video.frames[i] for i in shown], setting["dt"]))
+    (images,) = rendering.cropped([np.stack(pictures)])
+    columns = tuple(rendering.milliseconds([video.frames[i] for i in shown], setting["dt"]))
     return ImageGrid(images, (*rows, *params.titles.values()), columns, numbers)
 
 

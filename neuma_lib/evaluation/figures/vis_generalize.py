@@ -9,9 +9,8 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from neuma_lib.evaluation.plotting import style
+from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.evaluation.plotting.image_grid import GAP, ImageGrid, draw_images, note
-from neuma_lib.evaluation.plotting.rendering import evenly, frontal, milliseconds, renders
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.particles import load_body
 
@@ -37,23 +36,25 @@ def data(inputs, params, say) -> ImageGrid:
 
     def filmed(k: int, cameras, shown) -> np.ndarray:
         arrays, _ = paths[k]
-        return renders(bodies[k], cameras, *(torch.from_numpy(arrays[name][shown]) for name in ("x", "F")))
+        return rendering.renders(
+            bodies[k], cameras, *(torch.from_numpy(arrays[name][shown]) for name in ("x", "F"))
+        )
 
     rows, titles, times = [], [], []
     if letters:
         steps = [len(arrays["x"]) for arrays, _ in paths[:letters]]
-        cameras = frontal(points, width, height)
-        columns = [filmed(k, cameras, evenly(params.shown, steps[k])) for k in range(letters)]
+        cameras = rendering.frontal(points, width, height)
+        columns = [filmed(k, cameras, rendering.evenly(params.shown, steps[k])) for k in range(letters)]
         rows += list(np.stack(columns, axis=1))
         last = min(len(column) for column in columns) - 1
         titles += [f"{100 * i / last:.0f} % of\nthe sequence" for i in range(last + 1)]
     split = len(rows)
     for k, title in enumerate(params.others.values(), start=letters):
         arrays, attributes = paths[k]
-        shown = evenly(count, len(arrays["x"]))
-        rows.append(filmed(k, frontal(arrays["x"], width, height), shown))
+        shown = rendering.evenly(count, len(arrays["x"]))
+        rows.append(filmed(k, rendering.frontal(arrays["x"], width, height), shown))
         titles.append(title)
-        times.append(milliseconds(arrays["frames"][shown], attributes["dt"]))
+        times.append(rendering.milliseconds(arrays["frames"][shown], attributes["dt"]))
     numbers = {
         "letters": split,
         "materials": [entry["material"] for entry in params.letters],

@@ -10,9 +10,12 @@ from matplotlib.colors import to_rgb
 from torch import Tensor
 
 from neuma_lib.coupling.reconstruction import Reconstruction
+from neuma_lib.evaluation.plotting.spheres import draw_spheres
+from neuma_lib.io.images import load_observation
+from neuma_lib.io.particles import load_body
+from neuma_lib.mechanics.density import Density
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.observation import Observation
-from neuma_lib.splatting.spheres import draw_spheres
 from neuma_lib.splatting.viewpoints import video_views
 
 _WHITE = 250
@@ -29,6 +32,13 @@ def magnified(cameras: Cameras, factor: int) -> Cameras:
     return Cameras(
         cameras.viewmats, cameras.Ks * scale[:, None], cameras.width * factor, cameras.height * factor
     )
+
+
+def film(inputs, params, k: int, density: Density) -> tuple[Observation, Reconstruction, Cameras]:
+    """A figure's scene ``k``: its video in one view, the body, and the camera at the magnification of the figure."""
+    video = load_observation(inputs.transforms[k], [params.view])
+    body = load_body(inputs.particles[k], inputs.binding[k], inputs.gaussians[k], density)
+    return video, body, magnified(video.cameras, params.magnify)
 
 
 def frontal(points: np.ndarray, width: int, height: int) -> Cameras:
