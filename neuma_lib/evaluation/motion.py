@@ -66,27 +66,19 @@ def predict(
     Returns:
         The trajectory at the frames, and the step at which it became non-finite (None: it did not).
     """
-
-    def run(kept):
-        with torch.no_grad():
-            return rollout(model, law, body.state(v0), steps=kept[-1], frames=kept, tracers=tracers)
-
-    kept = list(frames)
-    failed_at = None
+    kept, failed_at = list(frames), None
     while True:
         try:
-            path = run(kept)
+            with torch.no_grad():
+                path = rollout(model, law, body.state(v0), steps=kept[-1], frames=kept, tracers=tracers)
             break
         except NonFiniteError as error:
-            step = getattr(error, "step", None)
-            failed_at = step if failed_at is None else failed_at
-            kept = [n for n in kept if step is None or n < step] if step is not None else kept[:-1]
+            failed_at = error.step if failed_at is None else failed_at
+            kept = kept[:-1] if error.step is None else [n for n in kept if n < error.step]
             if not kept:
                 raise
     missing = len(frames) - len(kept)
-    if missing:
-        path = path.hold_last(missing)
-    return path, failed_at
+    return path.hold_last(missing) if missing else path, failed_at
 
 
 def evaluate(

@@ -61,7 +61,7 @@ def prior(law: str) -> str:
     return f"neuma+prior={law}"
 
 
-I, II, III, IV, V = WRONG_PRIORS = tuple(  # noqa: E741 - the paper's numbering
+I, II, III, IV, V = (  # noqa: E741 - the paper's numbering
     prior(law)
     for law in (
         "stvk_von_mises",
@@ -72,6 +72,7 @@ I, II, III, IV, V = WRONG_PRIORS = tuple(  # noqa: E741 - the paper's numbering
     )
 )
 _GROUNDING = ("RubberPawn", "ClayCat")
+_TOLD_AGAINST_ASSUMED = ("neuma",), ("neuma+assumed_density=1000",)
 _GENERALISATION = ("letter_N_rubber", "letter_N_clay")
 
 PAPER = {
@@ -158,8 +159,7 @@ PAPER = {
         {"neuma": (1.33,)},
         (
             Claim(
-                "knowing the densities is no worse than assuming one",
-                *(("neuma",), ("neuma+assumed_density=1000",), (), False),
+                "knowing the densities is no worse than assuming one", *_TOLD_AGAINST_ASSUMED, by_paper=False
             ),
         ),
     ),

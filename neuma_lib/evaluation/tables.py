@@ -178,8 +178,10 @@ class Table:
 
     def _paper_rows(self, rows: Sequence[Row]) -> list[Row]:
         """The paper's rows of the methods shown, if it has all the columns."""
-        printed = {row.title: self.paper and self.paper.row(row.method, list(self.columns)) for row in rows}
-        return [Row("chamfer", "", f"*paper: {t}*", np.array([v])) for t, v in printed.items() if v]
+        if not self.paper:
+            return []
+        printed = [(row.title, self.paper.row(row.method, list(self.columns))) for row in rows]
+        return [Row("chamfer", "", f"*paper: {title}*", np.array([v])) for title, v in printed if v]
 
 
 def chamfer_table(

@@ -29,7 +29,7 @@ def side_by_side(panels: Sequence[np.ndarray], labels: Sequence[str], magnify: i
         uint8 video (T, H', W', 3) with even sides, as video codecs want them.
 
     Raises:
-        InputError: no panels, panels that differ in length or height, or labels that do not match them.
+        InputError: no panels or frames, panels that differ in length or height, or labels that do not match them.
     """
     panels = [_as_bytes(panel) for panel in panels]
     if len({panel.shape[:2] for panel in panels}) != 1:
@@ -43,43 +43,25 @@ def side_by_side(panels: Sequence[np.ndarray], labels: Sequence[str], magnify: i
             _heading(label, pixels.shape[2]), (len(pixels), _LABEL_HEIGHT, *pixels.shape[2:])
         )
         columns.append(np.concatenate([head, pixels], axis=1))
-    return _even(np.concatenate(columns, axis=2))
+    video = np.concatenate(columns, axis=2)
+    height, width = video.shape[1:3]
+    return np.pad(video, [(0, 0), (0, height % 2), (0, width % 2), (0, 0)], mode="edge")
 
 
 def write_mp4(path: str | Path, video: np.ndarray, frame_rate: float) -> None:
-    """Encode a video as H.264; the same frames give the same bytes.
-
-    Args:
-        path: file to write, with the ending mp4.
-        video: uint8, or floats in [0, 1], shape (T, H, W, 3).
-        frame_rate: frames a second.
-
-    Raises:
-        InputError: no frames, or another shape.
-    """
-    video = _even(_as_bytes(video))
-    if len(video) == 0:
-        raise InputError(f"{path}: there are no frames to write")
-    with imageio.get_writer(
-        path,
-        format="FFMPEG",
-        mode="I",
-        fps=frame_rate,
-        codec="libx264",
-        macro_block_size=2,
-        output_params=["-crf", "18", "-preset", "medium", *_REPEATABLE],
-    ) as writer:
+    """Encode frames (T, H, W, 3) of `side_by_side` as H.264; the same frames give the same bytes."""
+    quality = ["-crf", "18", "-preset", "medium"]
+    options = {"fps": frame_rate, "codec": "libx264", "output_params": [*quality, *_REPEATABLE]}
+    with imageio.get_writer(path, format="FFMPEG", mode="I", macro_block_size=2, **options) as writer:
         for frame in video:
             writer.append_data(frame)
 
 
 def _as_bytes(video: np.ndarray) -> np.ndarray:
-    """A video as uint8; floats are taken to be in [0, 1]."""
+    """A video in [0, 1] as uint8."""
     video = np.asarray(video)
-    if video.ndim != 4 or video.shape[3] != 3:
+    if video.ndim != 4 or video.shape[3] != 3 or len(video) == 0:
         raise InputError(f"video: shape {video.shape}; expected frames (T, H, W, 3)")
-    if video.dtype == np.uint8:
-        return video
     if not np.isfinite(video).all():
         raise InputError("video: a frame holds values that are not finite")
     return (np.clip(video, 0, 1) * 255).round().astype(np.uint8)
@@ -89,8 +71,3 @@ def _heading(label: str, width: int) -> np.ndarray:
     head = Image.new("RGB", (width, _LABEL_HEIGHT), "white")
     ImageDraw.Draw(head).text((4, 2), label, fill="black", font=ImageFont.load_default(size=12))
     return np.asarray(head)
-
-
-def _even(video: np.ndarray) -> np.ndarray:
-    height, width = video.shape[1:3]
-    return np.pad(video, [(0, 0), (0, height % 2), (0, width % 2), (0, 0)], mode="edge")

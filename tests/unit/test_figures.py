@@ -155,7 +155,7 @@ DATA = {
     "pipeline": lambda: pictures(
         5,
         5,
-        {"first": ["views", "kernels", "surface", "particles", "binding"], "heads": ["text"] * 5},
+        {"first": ["views", "Gaussians", "surface", "particles", "binding"], "heads": ["text"] * 5},
         row_titles=["I\ninitial\nstate", "II\nsimulation", "III\nrendering", "\nobservation", "\ndifference"],
     ),  # fmt: skip
     "material_response": lambda: {scene: response() for scene in SCENES},

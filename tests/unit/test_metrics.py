@@ -289,7 +289,12 @@ def test_video_shows_both_panels_and_is_the_same_every_time(film, tmp_path):
     assert (tmp_path / "first.mp4").read_bytes() == (tmp_path / "second.mp4").read_bytes()
     read = np.stack(imageio.mimread(tmp_path / "first.mp4"))
     assert read.shape == video.shape
-    assert np.abs(read.astype(float) - video).mean() < 8
+    # The step of H.264 at QP 18, 0.625 * 2^(18 / 6), is 5 levels: its orthonormal transform leaves pixels at most half
+    # of that off in quadratic mean. Blocks of 2 x 2 equal pixels lose nothing to the coarser colour planes.
+    apart = [[np.sqrt(np.square(a - b).mean()) for b in video.astype(float)] for a in read.astype(float)]
+    assert max(np.diag(apart)) < 2.5
+    # A frame more or less would be noticed: neighbours are further apart.
+    assert (np.argmin(apart, axis=1) == range(10)).all() and np.diag(apart, 1).min() > 5
 
 
 def test_learning_rate_is_chosen_by_the_geometric_mean_of_the_training_loss():
@@ -308,12 +313,12 @@ def test_learning_rate_is_chosen_by_the_geometric_mean_of_the_training_loss():
     assert "neuma ×0.5" in markdown
 
 
-def test_unusable_videos_are_named(film, tmp_path):
+def test_unusable_videos_are_named(film):
     with pytest.raises(InputError, match="differ in length"):
         side_by_side([film, film[:5]], ["a", "b"])
     with pytest.raises(InputError, match="1 labels for 2"):
         side_by_side([film, film], ["a"])
     with pytest.raises(InputError, match="expected frames"):
-        write_mp4(tmp_path / "a.mp4", film[0], 12)
+        side_by_side([film[0]], ["a"])
     with pytest.raises(InputError, match="not finite"):
-        write_mp4(tmp_path / "a.mp4", film * np.nan, 12)
+        side_by_side([film * np.nan], ["a"])
