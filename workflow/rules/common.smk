@@ -65,7 +65,7 @@ wildcard_constraints:
     method=f"({'|'.join(SETTINGS.methods) or 'none'})([+][^/]*)?",
     experiment="|".join(SETTINGS.experiments) or "none",
     table="|".join(CHAMFER_TABLES) or "none",
-    group="simulation|laws|rendering",
+    group="geometry|simulation|laws|rendering",
 
 
 def body_files(folder):
@@ -176,7 +176,7 @@ def table_benchmarks(table):
     priors = {SETTINGS.scenes[scene].prior for scene in scenes}
     priors |= {SETTINGS.method_prior(pair.scene, pair.method) for pair in pairs}
     makers = {"made": "render", "supplied": "supplied", "packed": "unpack"}
-    jobs = [("kernels", {"group": group}) for group in ("simulation", "laws", "rendering")]
+    jobs = [("kernels", {"group": group}) for group in ("geometry", "simulation", "laws", "rendering")]
     jobs += [("prior", {"prior": prior}) for prior in sorted(priors & set(SETTINGS.priors.laws))]
     for scene in scenes:
         truth = "ground_truth" if origin_of("truth", scene) == "made" else "unpack_truth"

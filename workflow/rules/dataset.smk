@@ -18,7 +18,7 @@ rule kernels:
 
 rule ground_truth:
     input:
-        kernels=kernels("simulation"),
+        kernels=kernels("geometry", "simulation"),
     output:
         particles=f"{DATA}/{{scene}}/particles.h5",
     wildcard_constraints:

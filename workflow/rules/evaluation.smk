@@ -3,6 +3,7 @@
 
 rule initial_state:
     input:
+        kernels=kernels("geometry"),
         truth=f"{DATA}/{{scene}}/particles.h5",
         gaussians=f"{RESULTS}/{{scene}}/gaussians.json",
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
@@ -20,7 +21,7 @@ rule initial_state:
 rule evaluation:
     input:
         **body_files("{scene}"),
-        kernels=kernels("laws"),
+        kernels=kernels("geometry", "laws"),
         truth=f"{DATA}/{{scene}}/particles.h5",
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
         velocity=f"{RESULTS}/{{scene}}/velocity.json",

@@ -3,7 +3,7 @@
 
 rule experiment_truth:
     input:
-        kernels=kernels("simulation"),
+        kernels=kernels("geometry", "simulation"),
     output:
         particles=f"{DATA}/experiments/{{experiment}}/particles.h5",
     resources:
@@ -22,6 +22,7 @@ rule experiment_truth:
 
 rule experiment_start:
     input:
+        kernels=kernels("geometry"),
         particles=reconstructed_files("particles.h5"),
         binding=reconstructed_files("binding.h5"),
         gaussians=reconstructed_files("gaussians.ply"),
@@ -47,7 +48,7 @@ rule experiment_start:
 rule experiment:
     input:
         **body_files("experiments/{experiment}"),
-        kernels=kernels("laws"),
+        kernels=kernels("geometry", "laws"),
         truth=f"{DATA}/experiments/{{experiment}}/particles.h5",
         mesh=f"{RESULTS}/experiments/{{experiment}}/mesh.ply",
         velocity=f"{RESULTS}/experiments/{{experiment}}/velocity.json",

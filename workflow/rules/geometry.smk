@@ -15,6 +15,7 @@ rule mesh:
 
 rule sampled_particles:
     input:
+        kernels=kernels("geometry"),
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
     output:
         particles=f"{RESULTS}/{{scene}}/sampled_particles.h5",
