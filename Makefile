@@ -20,10 +20,12 @@ all dataset: env unlock
 	$(SNAKEMAKE) $@
 
 test: env
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -m "not slow" -n $(CORES) tests/unit
+	$(BIN)/python -m pytest -m "not slow" tests/workflow
 
 test-all: env
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n $(CORES) tests/unit
+	$(BIN)/python -m pytest tests/workflow
 
 lint: env
 	$(BIN)/ruff check .
