@@ -122,7 +122,10 @@ def distance_inside(points: Tensor, contours: Tensor, cameras: Cameras) -> Tenso
         distance = torch.nn.functional.grid_sample(
             contours[view][None, None], where, mode="bilinear", padding_mode="border", align_corners=False
         )
-        distance = distance[0, 0, 0] * depth[0] / cameras.Ks[view, 0, 0]
+        # beyond the frame the contour is at least as far again, unless the frame cuts the body off
+        beyond = (pixels[0] - pixels[0].clamp(min=torch.zeros(2, dtype=torch.float64), max=size)).norm(dim=-1)
+        distance = torch.where(distance[0, 0, 0] < 0, distance[0, 0, 0] - beyond, distance[0, 0, 0])
+        distance = distance * depth[0] / cameras.Ks[view, 0, 0]
         least = torch.minimum(least, torch.where(depth[0] > 0, distance, -depth[0].abs() - 1e-3))
     return least
 

@@ -15,6 +15,7 @@ from neuma_lib.config.geometry import SurfaceConfig
 from neuma_lib.errors import InputError
 from neuma_lib.geometry import shapes
 from neuma_lib.geometry.surface import reconstruct
+from neuma_lib.geometry.visual_hull import visual_hull
 from neuma_lib.geometry.volume import inside, sample_tracers, sample_volume, volume_iou
 from neuma_lib.splatting.gaussians import Gaussians
 
@@ -91,6 +92,16 @@ def test_smoothing_does_not_shrink(bodies):
     )
     assert smooth.area < rough.area
     assert smooth.volume == pytest.approx(rough.volume, rel=2e-3)
+
+
+def test_nothing_beyond_the_frame_is_in_the_hull():
+    """A body that nearly fills small images, a coarse grid: the edge of the frame is near its outline everywhere."""
+    ball = trimesh.creation.icosphere(3, 0.13)
+    cameras = cameras_around(ball, views=12, size=40, fill=0.98)
+    hull = visual_hull(mattes(ball, cameras)[..., 3], cameras, 24)
+    centres = hull.origin + (hull.occupied.nonzero() + 0.5) * hull.voxel
+    # twelve cones touch the ball; between them the hull bulges out by less than 1 / cos(38 degrees)
+    assert float(centres.norm(dim=1).max()) < 0.13 / np.cos(np.radians(38)) + hull.voxel
 
 
 def test_surface_of_two_parts_keeps_the_larger():
