@@ -1,4 +1,4 @@
-"""Static Gaussian kernels from the views at t = 0 (paper Sec. 3.1)."""
+"""Static Gaussians from the views at t = 0 (paper Sec. 3.1)."""
 
 
 rule gaussians:
