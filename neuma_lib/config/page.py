@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import typing
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
@@ -92,7 +93,7 @@ def _default_text(value: Any) -> str:
         return "see below"
     if value in ("", {}):
         return ""
-    plain = list(value) if isinstance(value, tuple) else value
+    plain = json.loads(json.dumps(value))  # lists for tuples, and YAML needs no anchors for equal ones
     return f"`{yaml.safe_dump(plain, default_flow_style=True, width=1000).removesuffix('...' + chr(10)).strip()}`"
 
 

@@ -32,6 +32,9 @@ class SuppliedConfig(Section):
 class SceneConfig(Section):
     """A benchmark: what is thrown, of what, how, and what is believed about it."""
 
+    like: str | None = Field(
+        None, description="scene whose settings stand wherever this one has none of its own; null: none"
+    )
     shape: str = Field(description="name of the shape: ball, duck, pawn, cat, bottle, fish or letter_X")
     size: float | None = Field(
         None, gt=0, description="longest side of the bounding box [m]; null: the shape's own"
@@ -39,6 +42,9 @@ class SceneConfig(Section):
     height: float = Field(description="y of the bounding box's centre at the start [m]")
     center: tuple[float, float] = Field((0.5, 0.5), description="x and z of the bounding box's centre [m]")
     velocity: Vector = Field(description="initial velocity [m/s]")
+    spin: Vector = Field(
+        (0.0, 0.0, 0.0), description="initial angular velocity about the centre of mass, world axes [rad/s]"
+    )
     density: Annotated[float, Field(gt=0)] | SplitDensityConfig = Field(
         1000.0,
         description="mass density rho [kg/m^3], or two of them at t = 0: {axis: x, at: 0.5, below: 800, above: 1200}",

@@ -24,6 +24,7 @@ from neuma_lib.config.geometry import GeometryConfig
 from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.methods import MethodConfig, parse_method, variant_title
 from neuma_lib.config.priors import PriorsConfig
+from neuma_lib.config.random_scenes import RandomConfig, draw_scenes
 from neuma_lib.config.scenes import SceneConfig
 from neuma_lib.config.simulation import SimulationConfig
 from neuma_lib.config.tables import TableConfig
@@ -46,6 +47,7 @@ class Config(Section):
     )
     seed: int = Field(0, description="seed of every stage that has none of its own")
     scenes: dict[str, SceneConfig] = Field({}, description="benchmarks by name")
+    random: RandomConfig = Field(RandomConfig(), description="scenes drawn at random, beside those by name")
     dataset: DatasetConfig = Field(DatasetConfig(), description="ground truth and images")
     simulation: SimulationConfig = Field(SimulationConfig(), description="material point method")
     priors: PriorsConfig = Field(PriorsConfig(), description="pre-trained laws")
@@ -101,6 +103,11 @@ class Config(Section):
         if name not in self.scenes:
             raise InputError(f"no scene '{name}' in {self.scenes_file}{hint(name, self.scenes)}")
         return self.scenes[name]
+
+    @property
+    def random_scenes(self) -> list[str]:
+        """Names of the scenes drawn at random, in order."""
+        return [name for name in self.scenes if name.startswith(self.random.prefix)]
 
     def experiment(self, name: str) -> ExperimentConfig:
         """The experiment of that name."""
@@ -175,17 +182,45 @@ def load(raw: Mapping[str, Any], root: str | Path = ".") -> Config:
     """Validate merged settings.
 
     Args:
-        raw: the YAML as nested dicts. ``scenes_file`` (relative to ``root``) is read, and ``scenes`` changes it.
+        raw: the YAML as nested dicts. ``scenes_file`` (relative to ``root``) is read, random scenes are drawn, and
+            ``scenes`` changes both.
         root: folder of the project.
 
     Raises:
         InputError: names every offending key by its path and suggests close matches.
     """
     scenes_file = Path(root) / str(raw.get("scenes_file", Config.model_fields["scenes_file"].default))
-    scenes, changes = read_yaml(scenes_file), raw.get("scenes") or {}
-    return validate(
-        Config, {**raw, "scenes": merged(scenes, changes) if isinstance(changes, Mapping) else changes}
-    )
+    scenes, changes = {**read_yaml(scenes_file), **_random_scenes(raw)}, raw.get("scenes") or {}
+    if isinstance(changes, Mapping):
+        changes = _complete(merged(scenes, changes))
+    return validate(Config, {**raw, "scenes": changes})
+
+
+def _random_scenes(raw: Mapping[str, Any]) -> dict[str, Any]:
+    """Random scenes; none where the settings behind them have mistakes, which are reported with all others."""
+    kinds = {"random": RandomConfig, "priors": PriorsConfig, "simulation": SimulationConfig}
+    try:
+        random, priors, simulation = (validate(kind, raw.get(key, {}), key) for key, kind in kinds.items())
+    except InputError:
+        return {}
+    return draw_scenes(random, priors.laws, simulation.grid, simulation.gravity)
+
+
+def _complete(scenes: Mapping[str, Any]) -> dict[str, Any]:
+    """Scenes of which those that are like another one have its settings where they have none of their own."""
+
+    def complete(name: str, asked: tuple[str, ...] = ()) -> Any:
+        scene = scenes[name]
+        like = scene.get("like") if isinstance(scene, Mapping) else None
+        if like is None:
+            return scene
+        if like not in scenes:
+            raise InputError(f"settings: scenes.{name}.like: no scene '{like}'{hint(like, scenes)}")
+        if like in (name, *asked):
+            raise InputError(f"settings: scenes.{name}.like: {like} is in turn like {name}")
+        return merged(complete(like, (name, *asked)), scene)
+
+    return {name: complete(name) for name in scenes}
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:

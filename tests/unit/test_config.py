@@ -190,6 +190,28 @@ class TestFrames:
         assert self.frames(raw, own, frames=None, stride=10, steps=40) == (0, 7, 9)
 
 
+class TestLike:
+    def test_a_scene_like_another_has_its_settings_and_its_own(self, raw):
+        change = {"Soft": {"like": "UnevenCat", "law": {"elasticity": {"E": 1e5}}}, "ClayCat": {"size": 0.3}}
+        loaded = settings.load(settings.merged(raw, {"scenes": change}), ROOT)
+        soft, cat = loaded.scene("Soft"), loaded.scene("ClayCat")
+        assert (soft.size, soft.law.plasticity, soft.dt) == (0.3, cat.law.plasticity, cat.dt)
+        assert soft.density == loaded.scene("UnevenCat").density
+        assert soft.law.elasticity.plain() == {**cat.law.elasticity.plain(), "E": 1e5}
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"New": {"like": "ClayCatt"}}, r"scenes\.New\.like: no scene 'ClayCatt'; did you mean ClayCat"),
+            ({"A": {"like": "B"}, "B": {"like": "A"}}, r"scenes\.B\.like: A is in turn like B"),
+            ({"A": {"like": "A"}}, r"scenes\.A\.like: A is in turn like A"),
+        ],
+    )
+    def test_mistakes(self, raw, change, message):
+        with pytest.raises(InputError, match=message):
+            settings.load(settings.merged(raw, {"scenes": change}), ROOT)
+
+
 class TestScaleOfThePaper:
     def overlay(self, raw, *names):
         for name in names:

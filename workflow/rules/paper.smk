@@ -2,7 +2,8 @@
 
 from neuma_lib.evaluation.paper import PAPER
 
-SCENES = list(SETTINGS.tables["table1"].scenes) if "table1" in SETTINGS.tables else list(SETTINGS.scenes)
+NAMED_SCENES = [scene for scene in SETTINGS.scenes if scene not in SETTINGS.random_scenes]
+SCENES = list(SETTINGS.tables["table1"].scenes) if "table1" in SETTINGS.tables else NAMED_SCENES
 BENCHMARK_SCENES = list(SETTINGS.tables["table4"].scenes) if "table4" in SETTINGS.tables else SCENES
 
 
@@ -36,12 +37,12 @@ rule benchmark_table:
 
 rule initial_states:
     input:
-        reports=expand(f"{RESULTS}/{{scene}}/initial_state.json", scene=SETTINGS.scenes),
+        reports=expand(f"{RESULTS}/{{scene}}/initial_state.json", scene=NAMED_SCENES),
     output:
         csv=report(f"{RESULTS}/initial_states.csv", caption="../report/initial_states.rst", category="Tables"),
         markdown=f"{RESULTS}/initial_states.md",
     params:
-        scenes=list(SETTINGS.scenes),
+        scenes=NAMED_SCENES,
     script:
         "../scripts/initial_states.py"
 

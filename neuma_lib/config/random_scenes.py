@@ -1,0 +1,319 @@
+"""Scenes drawn at random: bodies, throws and materials that nobody chose, for a benchmark that nothing was tuned on.
+
+Draw k depends on the seed, on k, and on the settings that `draw_scenes` takes, so that more draws leave it as it is.
+Only `numpy.random.Generator.random` is used, whose stream numpy keeps, and numbers are rounded to three digits, so that
+every machine draws the same scenes.
+"""
+
+from __future__ import annotations
+
+import colorsys
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+
+import numpy as np
+from pydantic import AfterValidator, ConfigDict, Field, PositiveFloat, model_validator
+
+from neuma_lib.config.base import Section, Vector
+from neuma_lib.config.laws import LawConfig
+from neuma_lib.errors import InputError
+
+Item = TypeVar("Item")
+
+
+class Outline(NamedTuple):
+    """What a draw has to know of a shape. Settings do not know `geometry.shapes`; a test compares the two.
+
+    Attributes:
+        sides: of the bounding box, the longest is 1.
+        mass_centre: centre of mass seen from the box's centre, in the same unit.
+        parts: what can be coloured.
+    """
+
+    sides: Vector
+    mass_centre: Vector
+    parts: tuple[str, ...]
+
+
+SHAPES = {
+    "ball": Outline((1, 1, 1), (0, 0, 0), ("body", "second", "third", "caps")),
+    "duck": Outline((1, 0.9329, 0.7156), (-0.003, -0.076, 0.037), ("body", "wing", "beak", "eye")),
+    "pawn": Outline((0.6235, 1, 0.6235), (0, -0.123, 0), ("body", "foot", "collar")),
+    "cat": Outline(
+        (0.8716, 1, 0.6639),
+        (-0.06, -0.112, 0.018),
+        ("body", "thighs", "tail", "stripes", "white", "inner_ear", "eyes", "nose"),
+    ),
+    "bottle": Outline((0.5205, 1, 0.5205), (0, -0.11, 0), ("body", "cap", "label", "emblem")),
+    "fish": Outline(
+        (1, 0.664, 0.5764),
+        (0.032, -0.007, 0),
+        ("body", "fins", "side_fins", "stripes", "eye", "pupil", "mouth"),
+    ),
+}
+FLAWS = {
+    "outside": "start outside the box",
+    "early": "touch the ground before the velocity can be seen",
+    "late": "touch the ground too late or never",
+    "wall": "touch another wall before the ground",
+    "unstable": "need a smaller time step",
+}
+"""Why a draw is rejected."""
+
+ATTEMPTS = 1000
+MARGIN = 0.02  # least distance of the bounding box from the walls at the start [m]
+STEPS = 32  # the steps of a video are a multiple of this, so that its frames are evenly spaced
+MOMENTS = 200  # of a video at which contact is looked for
+DENSITY = 1000.0  # [kg/m^3]
+
+
+def _ascending(pair: tuple[float, float]) -> tuple[float, float]:
+    if pair[0] > pair[1]:
+        raise ValueError("give the smaller bound first")
+    return pair
+
+
+Range = Annotated[tuple[float, float], AfterValidator(_ascending)]
+PositiveRange = Annotated[tuple[PositiveFloat, PositiveFloat], AfterValidator(_ascending)]
+
+
+class DrawnPart(Section):
+    """One of the two parts of a law: its name, and the ranges that its constants are drawn from, log-uniformly."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, PositiveRange]
+
+    name: str = Field(description="name of the elastic law or the return map")
+
+    @property
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """Lowest and highest value of each constant."""
+        return self.__pydantic_extra__ or {}
+
+
+class FamilyConfig(Section):
+    """A family of materials."""
+
+    prior: str = Field(
+        description="the prior that somebody who sees such a body would choose, see priors.laws"
+    )
+    look: Literal["solid", "grains", "liquid"] = Field("solid", description="how Blender shows it")
+    elasticity: DrawnPart = Field(
+        description="name, and lowest and highest value of each constant, for example E: [3e4, 3e5]"
+    )
+    plasticity: DrawnPart = Field(DrawnPart(name="identity"), description="the same of the return map")
+
+    @model_validator(mode="after")
+    def _has_a_wave_speed(self) -> FamilyConfig:
+        ranges = self.elasticity.ranges
+        if not {"E", "nu"} <= set(ranges) or ranges["nu"][1] >= 0.5:
+            raise ValueError("elasticity: give ranges of E and nu, and nu below 0.5")
+        return self
+
+
+class RandomConfig(Section):
+    """Scenes drawn at random, named after their draw, for example random7_03_duck_von_mises."""
+
+    count: int = Field(0, ge=0, description="number of scenes; more of them leave the first ones as they are")
+    seed: int = Field(0, ge=0, description="seed of the draws")
+    methods: tuple[str, ...] = Field(
+        ("nclaw", "neuma", "true_law"),
+        min_length=2,
+        description="rows of results/random.csv: the prior, the method that is judged, and others to be shown",
+    )
+    families: dict[str, FamilyConfig] = Field(
+        {}, description="materials by name; of as many scenes in a row as there are, each gets another one"
+    )
+    shapes: tuple[Literal[tuple(SHAPES)], ...] = Field(
+        tuple(SHAPES), min_length=1, description="shapes, dealt in the same way"
+    )
+    size: PositiveRange = Field((0.24, 0.4), description="longest side of the bounding box [m]")
+    height: Range = Field((0.2, 0.7), description="y of the bounding box's centre at the start [m]")
+    center: Range = Field((0.35, 0.65), description="x and z of the bounding box's centre [m]")
+    velocity: tuple[Range, Range, Range] = Field(
+        ((-0.8, 0.8), (-1.8, -0.4), (-0.8, 0.8)), description="initial velocity along x, y and z [m/s]"
+    )
+    spin: Range = Field(
+        (1.0, 5.0), description="initial angular speed about an axis of any direction [rad/s]"
+    )
+    duration: PositiveRange = Field((0.26, 0.34), description="length of the video [s]")
+    contact: Range = Field(
+        (0.2, 0.5),
+        description="first touch of the ground as a part of the video; six of 33 frames come before 0.2",
+    )
+    dt: tuple[PositiveFloat, ...] = Field(
+        (1e-3, 5e-4), min_length=1, description="time steps, of which the largest stable one is taken [s]"
+    )
+    courant: float = Field(
+        0.6,
+        gt=0,
+        le=0.8,
+        description="largest Courant number of the true law and the prior on the reconstruction's grid; below the "
+        "limit of 0.8, as training may stiffen a law",
+    )
+
+    @property
+    def prefix(self) -> str:
+        """What the names of the scenes begin with."""
+        return f"random{self.seed}_"
+
+
+def draw_scenes(
+    settings: RandomConfig, priors: Mapping[str, LawConfig], grid: int, gravity: Vector
+) -> dict[str, dict[str, Any]]:
+    """Settings of random scenes by name.
+
+    Args:
+        settings: how many, and from what.
+        priors: laws of the priors by name.
+        grid: nodes along an edge of the reconstruction's grid.
+        gravity: acceleration [m/s^2].
+
+    Raises:
+        InputError: there are no families, or no draw of a scene can be used.
+    """
+    if settings.count and not settings.families:
+        raise InputError("settings: random.families: give at least one family of materials")
+    found = {}
+    for k in range(settings.count):
+        family = _dealt(sorted(settings.families), settings.seed, 0, k)
+        shape = _dealt(settings.shapes, settings.seed, 1, k)
+        laws = [law.plain() for name, law in priors.items() if name == settings.families[family].prior]
+        rng = np.random.default_rng([settings.seed, 2, k])
+        flaws: Counter[str] = Counter()
+        for _ in range(ATTEMPTS):
+            scene = _drawn(rng, settings, shape, settings.families[family])
+            dt = _largest_stable(settings, [scene["law"], *laws], grid)
+            flaw = "unstable" if dt is None else _flaw(settings, scene, gravity)
+            if flaw is None:
+                break
+            flaws[flaw] += 1
+        else:
+            counted = ", ".join(f"{number} {FLAWS[flaw]}" for flaw, number in flaws.most_common())
+            raise InputError(
+                f"settings: random: no draw of a {shape} of the family {family} can be used; of {ATTEMPTS}, "
+                f"{counted}: change the ranges"
+            )
+        scene |= {"dt": dt, "steps": STEPS * max(1, round(scene.pop("duration") / dt / STEPS))}
+        scene["appearance"] = _appearance(settings, k, shape, family)
+        found[f"{settings.prefix}{k:02d}_{shape}_{family}"] = scene
+    return found
+
+
+def _dealt(items: Sequence[Item], seed: int, deck: int, k: int) -> Item:
+    """The k-th of the items that are dealt from one shuffled deck after the other."""
+    number, place = divmod(k, len(items))
+    return items[np.argsort(np.random.default_rng([seed, deck, number]).random(len(items)))[place]]
+
+
+def _drawn(
+    rng: np.random.Generator, settings: RandomConfig, shape: str, family: FamilyConfig
+) -> dict[str, Any]:
+    """A scene without time step and look, good or not."""
+
+    def uniform(bounds: tuple[float, float]) -> float:
+        return _rounded(bounds[0] + (bounds[1] - bounds[0]) * rng.random())
+
+    def part(drawn: DrawnPart) -> dict[str, Any]:
+        ranges = sorted(drawn.ranges.items())
+        constants = {key: _rounded(low * (high / low) ** rng.random()) for key, (low, high) in ranges}
+        return {"name": drawn.name, **constants}
+
+    return {
+        "shape": shape,
+        "size": uniform(settings.size),
+        "height": uniform(settings.height),
+        "center": [uniform(settings.center), uniform(settings.center)],
+        "velocity": [uniform(bounds) for bounds in settings.velocity],
+        "spin": [_rounded(uniform(settings.spin) * n) for n in _direction(rng)],
+        "duration": uniform(settings.duration),
+        "law": {"elasticity": part(family.elasticity), "plasticity": part(family.plasticity)},
+        "density": DENSITY,
+        "prior": family.prior,
+        "story": f"drawn at random with seed {settings.seed}",
+    }
+
+
+def _direction(rng: np.random.Generator) -> list[float]:
+    """A unit vector, all directions equally likely (Archimedes: its height is uniform)."""
+    up, turn = 2 * rng.random() - 1, 2 * math.pi * rng.random()
+    flat = math.sqrt(1 - up**2)
+    return [flat * math.cos(turn), up, flat * math.sin(turn)]
+
+
+def _rounded(value: float) -> float:
+    """Three significant digits: readable, and free of the last bits in which machines differ."""
+    return float(f"{value:.3g}")
+
+
+def _largest_stable(settings: RandomConfig, laws: Sequence[Mapping], grid: int) -> float | None:
+    """The largest time step [s] that is stable for all laws, by the speed of pressure waves at small strains."""
+    moduli = [
+        part["E"] * (1 - part["nu"]) / ((1 + part["nu"]) * (1 - 2 * part["nu"]))
+        for part in (law["elasticity"] for law in laws)
+        if {"E", "nu"} <= set(part)
+    ]
+    speed = math.sqrt(max(moduli) / DENSITY)
+    return max((dt for dt in settings.dt if speed * dt * grid <= settings.courant), default=None)
+
+
+def _flaw(settings: RandomConfig, scene: Mapping[str, Any], gravity: Vector) -> str | None:
+    """Why a scene cannot be used, one of `FLAWS`; None: it can be.
+
+    Before contact the body falls and turns. It lies inside its bounding box, and fills about the ellipsoid in that
+    box: the ground is touched no sooner than by the turning box, and not much later than by the ellipsoid.
+    """
+    outline = SHAPES[scene["shape"]]
+    half = scene["size"] * np.array(outline.sides) / 2
+    offset = scene["size"] * np.array(outline.mass_centre)
+    middle = np.array([scene["center"][0], scene["height"], scene["center"][1]])
+    if (middle - half < MARGIN).any() or (middle + half > 1 - MARGIN).any():
+        return "outside"
+    t = np.linspace(0, scene["duration"], MOMENTS + 1)[:, None]
+    turned = _rotations(np.array(scene["spin"]), t[:, 0])
+    flight = middle + offset + t * np.array(scene["velocity"]) + t**2 / 2 * np.array(gravity)
+    middle = flight - turned @ offset
+    box, ellipsoid = np.abs(turned * half).sum(axis=2), np.linalg.norm(turned * half, axis=2)
+    earliest, latest = settings.contact
+    if _first((middle - box)[:, 1] <= 0) < earliest * MOMENTS:
+        return "early"
+    landing = _first((middle - ellipsoid)[:, 1] <= 0)
+    if landing > latest * MOMENTS:
+        return "late"
+    touched = np.concatenate([(middle - box)[:, ::2] <= 0, middle + box >= 1], axis=1)
+    return "wall" if _first(touched.any(axis=1)) <= landing else None
+
+
+def _rotations(spin: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Rotations after the times t (T,) [s] of an angular velocity [rad/s], shape (T, 3, 3) (Rodrigues)."""
+    speed = float(np.linalg.norm(spin))
+    if speed == 0:
+        return np.broadcast_to(np.eye(3), (len(t), 3, 3))
+    x, y, z = spin / speed
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle = speed * t[:, None, None]
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)
+
+
+def _first(true: np.ndarray) -> float:
+    """Index of the first true value; infinity if there is none."""
+    return int(true.argmax()) if true.any() else math.inf
+
+
+def _appearance(settings: RandomConfig, k: int, shape: str, family: str) -> dict[str, Any]:
+    """Colours: parts that can be told apart, and patches, by which the motion is seen."""
+    rng = np.random.default_rng([settings.seed, 3, k])
+
+    def colour() -> str:
+        hue, saturation, value = rng.random(), 0.35 + 0.45 * rng.random(), 0.45 + 0.5 * rng.random()
+        return "#" + "".join(f"{round(255 * c):02x}" for c in colorsys.hsv_to_rgb(hue, saturation, value))
+
+    return {
+        "kind": settings.families[family].look,
+        "colors": {part: colour() for part in SHAPES[shape].parts},
+        "accent": colour(),
+        "contrast": _rounded(0.35 + 0.25 * rng.random()),
+        "seed": k,
+    }

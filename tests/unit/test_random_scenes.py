@@ -1,0 +1,190 @@
+"""Random scenes: every draw can be used, all machines draw the same ones, and every reason to reject one occurs."""
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from neuma_lib.config import settings
+from neuma_lib.config.random_scenes import DENSITY, FLAWS, SHAPES, draw_scenes
+from neuma_lib.errors import InputError
+from neuma_lib.geometry import shapes
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.sim.model import MPMModel
+
+ROOT = Path(__file__).resolve().parents[2]
+GRAVITY = (0.0, -9.8, 0.0)
+SEEDS = range(8)
+
+
+@pytest.fixture(scope="module")
+def raw():
+    return settings.read_yaml(ROOT / "config" / "config.yaml")
+
+
+@pytest.fixture(scope="module")
+def loaded(raw):
+    return settings.load(raw, ROOT)
+
+
+def drawn(loaded, grid=24, **changes):
+    chosen = loaded.random.model_validate({**loaded.random.plain(), **changes})
+    return draw_scenes(chosen, loaded.priors.laws, grid, GRAVITY)
+
+
+@pytest.fixture(scope="module")
+def many(loaded):
+    """Draws of several seeds with their time step, by name."""
+    found = {}
+    for seed in SEEDS:
+        found |= drawn(loaded, seed=seed, count=12)
+    return found
+
+
+def test_settings_know_the_shapes():
+    """Sides, centre of mass and colours of the shapes as geometry makes them."""
+    assert set(SHAPES) == set(shapes.NAMES)
+    for name, outline in SHAPES.items():
+        mesh = shapes.build(name, size=1.0)
+        np.testing.assert_allclose(mesh.extents, outline.sides, atol=1e-3)
+        np.testing.assert_allclose(mesh.center_mass, outline.mass_centre, atol=2e-3)
+        assert set(outline.parts) == set(shapes.shape(name).part_names)
+
+
+def test_they_are_ordinary_scenes(loaded):
+    names = loaded.random_scenes
+    assert len(names) == loaded.random.count == 12 and set(names) <= set(loaded.scenes)
+    for k, name in enumerate(names):
+        scene = loaded.scene(name)
+        family = name.split("_", 3)[3]
+        assert name == f"random7_{k:02d}_{scene.shape}_{family}"
+        assert scene.prior == loaded.random.families[family].prior
+        assert scene.appearance.kind == loaded.random.families[family].look
+        assert all(scene.spin) and scene.steps % 32 == 0
+
+
+def test_every_block_has_every_family_and_shape_once(loaded):
+    names = list(drawn(loaded, count=18))
+    for start in (0, 6, 12):
+        block = [name.split("_", 3) for name in names[start : start + 6]]
+        assert {words[2] for words in block} == set(SHAPES)
+        assert {words[3] for words in block} == set(loaded.random.families)
+
+
+def test_more_draws_leave_the_first_ones_as_they_are(loaded):
+    few, more = drawn(loaded, count=5), drawn(loaded, count=40)
+    assert [*more][:5] == [*few] and all(more[name] == few[name] for name in few)
+
+
+def test_draws_do_not_depend_on_the_order_of_keys(loaded):
+    families = loaded.random.plain()["families"]
+    turned = {
+        name: {**family, "elasticity": dict(reversed(family["elasticity"].items()))}
+        for name, family in reversed(families.items())
+    }
+    assert drawn(loaded, families=turned) == drawn(loaded)
+
+
+def test_every_machine_draws_the_same(loaded):
+    text = json.dumps(drawn(loaded), sort_keys=True)
+    assert hashlib.sha256(text.encode()).hexdigest()[:16] == "9ccd2f814a104e9e"
+
+
+def test_other_seeds_draw_other_scenes(many):
+    assert len({json.dumps(scene["velocity"]) for scene in many.values()}) == len(many)
+
+
+def test_constants_lie_in_their_ranges(loaded, many):
+    for name, scene in many.items():
+        family = loaded.random.families[name.split("_", 3)[3]]
+        for part in ("elasticity", "plasticity"):
+            ranges, constants = getattr(family, part).ranges, dict(scene["law"][part])
+            assert constants.pop("name") == getattr(family, part).name
+            assert set(constants) == set(ranges)
+            for key, (low, high) in ranges.items():
+                assert low * 0.995 <= constants[key] <= high * 1.005  # three digits
+
+
+def test_both_the_true_law_and_the_prior_are_stable(loaded, many):
+    for scene in many.values():
+        model = MPMModel(grid=24, dt=scene["dt"])
+        for law in (scene["law"], loaded.priors.laws[scene["prior"]].plain()):
+            # The modulus is measured by differences of 1e-5, which leaves that order of relative error.
+            assert model.courant(analytic_law(law, dt=scene["dt"]), DENSITY) <= 0.6 * (1 + 1e-3)
+
+
+def test_bodies_start_inside_and_land_in_time(loaded, many):
+    """Of the turning mesh itself: six frames of 33 before contact, and the ground no later than half the video.
+
+    The ellipsoid that tells the latest contact does not fill every corner of a body: 5 % of the video later.
+    """
+    bodies = {name: shapes.build(name, resolution=32) for name in SHAPES}
+    for name, scene in many.items():
+        mesh = bodies[scene["shape"]]
+        points = mesh.vertices * scene["size"] / mesh.extents.max()
+        heart = mesh.center_mass * scene["size"] / mesh.extents.max()
+        middle = np.array([scene["center"][0], scene["height"], scene["center"][1]])
+        assert ((middle + points > 0) & (middle + points < 1)).all()
+        touched = None
+        for frame in range(33):
+            t = frame / 32 * scene["dt"] * scene["steps"]
+            turn = Rotation.from_rotvec(t * np.array(scene["spin"])).as_matrix()
+            x = middle + heart + (points - heart) @ turn.T
+            x = x + t * np.array(scene["velocity"]) + t**2 / 2 * np.array(GRAVITY)
+            if x[:, 1].min() <= 0:
+                touched = frame
+                break
+            assert ((x[:, [0, 2]] > 0) & (x[:, [0, 2]] < 1)).all(), name
+        assert touched is not None and 6 <= touched <= 0.55 * 33, (name, touched)
+
+
+REACHES = {
+    "outside": {"height": [0.01, 0.02]},
+    "early": {"velocity": [[0, 0], [-9, -8], [0, 0]], "height": [0.3, 0.35]},
+    "late": {"velocity": [[0, 0], [2, 3], [0, 0]], "height": [0.5, 0.6]},
+    "wall": {
+        "velocity": [[5, 6], [-1, -0.5], [0, 0]],
+        "center": [0.7, 0.75],
+        "size": [0.2, 0.21],
+        "contact": [0, 1],
+    },
+    "unstable": {"dt": [0.1]},
+}
+
+
+@pytest.mark.parametrize("flaw", FLAWS)
+def test_every_reason_to_reject_a_draw_is_said(loaded, flaw):
+    with pytest.raises(InputError, match=f"random: no draw of a .* of 1000, [0-9]+ {FLAWS[flaw]}"):
+        drawn(loaded, count=1, **REACHES[flaw])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"size": [0.4, 0.2]}, r"random\.size: give the smaller bound first"),
+        ({"shapes": ["bal"]}, r"random\.shapes\.0: .*'ball'"),
+        ({"famlies": {}}, r"random\.famlies: unknown key; did you mean families"),
+        (
+            {"families": {"mud": {"prior": "sand", "elasticity": {"name": "hencky", "E": [1e5, 2e5]}}}},
+            r"random\.families\.mud: elasticity: give ranges of E and nu",
+        ),
+        ({"families": {"hencky": {"prior": "jely"}}}, r"no prior 'jely' in priors\.laws; did you mean jelly"),
+    ],
+)
+def test_mistakes_are_named(raw, change, message):
+    with pytest.raises(InputError, match=message):
+        settings.load(settings.merged(raw, {"random": change}), ROOT)
+
+
+def test_a_family_is_needed(loaded):
+    with pytest.raises(InputError, match=r"random\.families: give at least one"):
+        drawn(loaded, families={})
+
+
+def test_settings_change_a_random_scene_as_any_other(raw, loaded):
+    name = loaded.random_scenes[3]
+    changed = settings.load(settings.merged(raw, {"scenes": {name: {"size": 0.3}}}), ROOT).scene(name)
+    assert changed == loaded.scene(name).model_copy(update={"size": 0.3})
