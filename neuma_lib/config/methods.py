@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typing
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 from pydantic import Field
@@ -19,6 +19,15 @@ class MethodConfig(Section):
     """A method is a set of options over the same code."""
 
     title: str = Field(description="name in tables")
+    note: str | None = Field(None, description="what a reader must know of its numbers; stands below tables")
+    trained_as: str | None = Field(
+        None, description="method whose trained law it takes, with its settings; null: its own training"
+    )
+    judged_on: Literal["particles", "carrier"] = Field(
+        "particles",
+        description="what is simulated when it is judged: the particles of the body's volume, or the carrier of its "
+        "training (`material.carrier`)",
+    )
     material: dict[str, Any] = Field(
         {}, description="settings of the section material that the method changes"
     )

@@ -74,6 +74,14 @@ class Config(Section):
             _changed(self.material, scene.material, f"scenes.{name}.material")
         for name, method in self.methods.items():
             _changed(self.material, method.material, f"methods.{name}.material")
+            own = [known for known, entry in self.methods.items() if entry.trained_as is None]
+            if method.trained_as not in (None, *own):
+                unknown = f"no method '{method.trained_as}' with a training of its own"
+                raise ValueError(f"methods.{name}.trained_as: {unknown}{hint(method.trained_as, own)}")
+            if method.trained_as and method.material:
+                raise ValueError(
+                    f"methods.{name}.material: that of '{method.trained_as}' counts; leave it out"
+                )
         for where, kind, name in self._mentioned():
             known = self.scenes if kind == "scene" else self.experiments
             if name not in known:
@@ -156,6 +164,23 @@ class Config(Section):
         base, variant = parse_method(method, self.methods)
         return variant_title(self.methods[base].title, variant)
 
+    def method_training(self, method: str) -> str:
+        """The method or variant whose training gives a method's law: itself, unless it takes another's."""
+        base, *variant = method.split("+")
+        parse_method(method, self.methods)
+        return "+".join([self.methods[base].trained_as or base, *variant])
+
+    def judged_carrier(self, scene: str, method: str) -> str:
+        """What is simulated when a method is judged, as in ``material.carrier``."""
+        base, _ = parse_method(method, self.methods)
+        carrier = self.methods[base].judged_on == "carrier"
+        return self.method_material(scene, method).carrier if carrier else "binding"
+
+    def method_note(self, method: str) -> str | None:
+        """What a reader must know of a method's numbers, if anything."""
+        base, _ = parse_method(method, self.methods)
+        return self.methods[base].note
+
     def method_prior(self, scene: str, method: str) -> str:
         """The prior that a method starts from: the scene's, unless the variant names another."""
         _, variant = parse_method(method, self.methods)
@@ -166,7 +191,7 @@ class Config(Section):
 
     def method_material(self, scene: str, method: str) -> MaterialConfig:
         """Effective material settings: the section, changed by the scene, then the method, then its variant."""
-        base, variant = parse_method(method, self.methods)
+        base, variant = parse_method(self.method_training(method), self.methods)
         variant.pop("prior", None)
         section = self.material
         for changes, origin in (

@@ -68,12 +68,14 @@ class Table:
         paper: the table of the paper that it stands beside, if any.
         rows: in order.
         marks: (method, column) -> signs of `FOOTNOTES`, for runs that diverged.
+        notes: method -> what a reader must know of its numbers.
     """
 
     columns: dict[str, str]
     paper: PaperTable | None = None
     rows: list[Row] = field(default_factory=list)
     marks: dict[tuple[str, str], str] = field(default_factory=dict)
+    notes: Mapping[str, str] = field(default_factory=dict)
 
     def row(self, quantity: str, method: str) -> Row:
         """One row.
@@ -120,6 +122,8 @@ class Table:
         for sign, note in FOOTNOTES.items():
             if any(sign in signs for signs in self.marks.values()):
                 parts += [f"{sign} {note}", ""]
+        for method, note in self.notes.items():
+            parts += [f"{self._note_sign(method)} {note}", ""]
         if verdicts := self.verdicts():
             parts += ["**What holds**", "", *(f"- {line}" for line in verdicts), ""]
         parts += [
@@ -174,7 +178,12 @@ class Table:
     def _cells(self, row: Row) -> list[str]:
         marks = [*(self.marks.get((row.method, column), "") for column in self.columns), ""]
         spread = [""] * len(marks) if row.std is None else [f" ± {s:.2f}" for s in row.std]
-        return [row.title, *(f"{v:.2f}{s}{m}" for v, s, m in zip(row.mean, spread, marks, strict=True))]
+        title = f"{row.title} {self._note_sign(row.method)}".rstrip()
+        return [title, *(f"{v:.2f}{s}{m}" for v, s, m in zip(row.mean, spread, marks, strict=True))]
+
+    def _note_sign(self, method: str) -> str:
+        """The sign behind the title of a method that has a note, else nothing."""
+        return f"({list(self.notes).index(method) + 1})" if method in self.notes else ""
 
     def _paper_rows(self, rows: Sequence[Row]) -> list[Row]:
         """The paper's rows of the methods shown, if it has all the columns."""
@@ -189,6 +198,7 @@ def chamfer_table(
     titles: Mapping[str, str],
     columns: Mapping[str, str],
     paper: PaperTable | None = None,
+    notes: Mapping[str, str] | None = None,
 ) -> Table:
     """A table of distances with floor, excess and tracer error. Any method may have a row; none is implied.
 
@@ -197,6 +207,7 @@ def chamfer_table(
         titles: method -> name in the table, in the order of the rows.
         columns: scene or experiment -> heading, in order.
         paper: what to show beside it.
+        notes: method -> what a reader must know of its numbers.
 
     Raises:
         InputError: a method lacks a column, or a column a finite value.
@@ -205,7 +216,7 @@ def chamfer_table(
         raise InputError(
             "table: there are no methods, or no scenes and experiments; see tables in the configuration"
         )
-    table = Table(dict(columns), paper)
+    table = Table(dict(columns), paper, notes=notes or {})
 
     def row(quantity: str, method: str, title: str) -> Row:
         seeds = min(len(metrics.get(method, {}).get(column, ())) for column in columns)

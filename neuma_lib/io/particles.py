@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -17,6 +17,9 @@ from neuma_lib.io.gaussians import load_gaussians
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.mechanics.density import Density, density_at
 from neuma_lib.sim.model import each_its_own
+
+Carrier = Literal["binding", "gaussians"]
+"""What moves a body's Gaussians: bound volume particles, or themselves."""
 
 
 def save_particles(
@@ -39,10 +42,15 @@ def save_binding(path: str | Path, binding: Binding) -> None:
 
 
 def load_body(
-    particles: str | Path, binding: str | Path, gaussians: str | Path, density: Density
+    particles: str | Path,
+    binding: str | Path,
+    gaussians: str | Path,
+    density: Density,
+    carrier: Carrier = "binding",
 ) -> Reconstruction:
     """The reconstructed body of a scene or experiment: particles with their volumes, and the Gaussians they carry.
 
+    With ``carrier="gaussians"`` the Gaussians are the particles, with equal shares of the same volume.
     Raises InputError where the binding was made for other Gaussians or particles.
     """
     splats = load_gaussians(gaussians)
@@ -53,6 +61,8 @@ def load_body(
             raise InputError(
                 f"{binding} is of {attributes.get(kind)} {kind}, {file} has {count}: run the rule binding again"
             )
+    if carrier == "gaussians":
+        return Reconstruction.of_gaussians(splats, float(vol0.sum()), density)
     return Reconstruction(
         x0=x0,
         vol0=vol0,
@@ -70,15 +80,26 @@ def load_start(
     gaussians: str | Path,
     velocity: str | Path,
     densities: Sequence[Density],
+    carrier: Carrier = "binding",
 ) -> tuple[Reconstruction, torch.Tensor, list[int]]:
     """What a prediction starts from: the reconstructed bodies of a scene (one) or of an experiment.
 
     Returns:
         All bodies as one, velocities of the particles [m/s] (N, 3), and the particle count of each body.
+
+    Raises:
+        InputError: files of different bodies, or several whose Gaussians are to be the particles.
     """
-    together = load_body(particles, binding, gaussians, 1.0)
+    together = load_body(particles, binding, gaussians, 1.0, carrier)
     found = read_json(velocity)
     parts = found.get("bodies", [{**found, "particles": len(together.x0)}])
+    if carrier == "gaussians":
+        if len(parts) > 1:
+            raise InputError(
+                f"{velocity} is of {len(parts)} bodies: the Gaussians can be the particles of one body only; choose a "
+                "method that is judged on particles"
+            )
+        parts = [{**parts[0], "particles": len(together.x0)}]
     counts = [part["particles"] for part in parts]
     if sum(counts) != len(together.x0) or len(densities) != len(counts):
         raise InputError(f"{velocity} is of other bodies than {particles}: make both again")

@@ -158,6 +158,30 @@ class TestVariants:
         assert chosen["neuma_without_binding"].carrier == "gaussians"
         assert chosen["neuma_without_adaptor"].rank is None
 
+    def test_a_method_may_take_the_law_of_another(self, loaded):
+        own, base = "neuma_without_binding_own", "neuma_without_binding"
+        assert loaded.method_training(f"{own}+lr_scale=1") == f"{base}+lr_scale=1"
+        assert loaded.method_training(base) == base
+        materials = [loaded.method_material("BouncyBall", f"{name}+lr_scale=1") for name in (own, base)]
+        assert materials[0] == materials[1]
+        carriers = {name: loaded.judged_carrier("BouncyBall", name) for name in (own, base, "neuma")}
+        assert carriers == {own: "gaussians", base: "binding", "neuma": "binding"}
+
+    @pytest.mark.parametrize(
+        ("method", "message"),
+        [
+            ({"trained_as": "neumo"}, "no method 'neumo' with a training of its own; did you mean neuma"),
+            ({"trained_as": "neuma_without_binding_own"}, "with a training of its own"),
+            (
+                {"trained_as": "neuma", "material": {"rank": 4}},
+                r"methods\.new\.material: that of 'neuma' counts",
+            ),
+        ],
+    )
+    def test_a_law_that_is_not_there_to_take(self, raw, method, message):
+        with pytest.raises(InputError, match=message):
+            settings.load(settings.merged(raw, {"methods": {"new": {"title": "new", **method}}}), ROOT)
+
     def test_prior(self, loaded):
         assert loaded.method_prior("BouncyBall", "neuma") == "jelly"
         assert loaded.method_prior("BouncyBall", "neuma+prior=sand") == "sand"

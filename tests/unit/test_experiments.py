@@ -193,6 +193,12 @@ def test_a_start_has_the_densities_and_velocities_of_its_bodies(tmp_path):
     assert set(density[:half].tolist()) == {1000.0} and set(density[half:].tolist()) == {500.0, 1500.0}
     with pytest.raises(InputError, match="other bodies"):
         load_start(*files, [1000.0])
+    with pytest.raises(InputError, match="of one body only"):
+        load_start(*files, [1000.0, 1000.0], "gaussians")
     write_json(files[-1], {"v0": [0, 1.0, 0]})
     _, v0, counts = load_start(*files, [1000.0])
     assert counts == [len(both.x0)] and v0.unique(dim=0).tolist() == [[0, 1, 0]]
+    splats, _, counts = load_start(*files, [500.0], "gaussians")
+    assert counts == [len(both.gaussians)]
+    torch.testing.assert_close(splats.x0, both.gaussians.means)
+    torch.testing.assert_close(splats.mass.sum(), 500.0 * both.vol0.sum())

@@ -156,6 +156,12 @@ def test_table_is_open_for_more_methods():
     assert "| PAC-NeRF | 3.50 |" in text and "| *paper: PAC-NeRF* | 516.30 |" in text and "| 114.80 |" in text
 
 
+def test_a_note_stands_below_the_table_and_its_sign_behind_the_row():
+    metrics = {method: {scene: [run(3.0)] for scene in SCENES} for method in TITLES}
+    text = chamfer_table(metrics, TITLES, SCENES, notes={"neuma": "Mind this."}).markdown()
+    assert text.count("| NeuMA (1) |") == 3 and "| NCLaw |" in text and "\n(1) Mind this.\n" in text
+
+
 def test_paper_averages_are_those_printed_there():
     printed = {
         "table1": {"pac_nerf": 114.80, "nclaw": 12.18, "neuma": 1.31, "neuma_particle_supervision": 1.51,

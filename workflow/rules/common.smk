@@ -183,7 +183,8 @@ def table_benchmarks(table):
         images = [f"{makers[origin_of(part, scene)]}_{part}" for part in ("static", "dynamic")]
         stages = [truth, *images, "gaussians", "mesh", "sampled_particles", "binding", "velocity"]
         jobs += [(name, {"scene": scene}) for name in stages]
-    jobs += [("material", vars(pair)) for pair in pairs if trained_adaptor(pair)]
+    trained = [(pair.scene, SETTINGS.method_training(pair.method)) for pair in pairs if trained_adaptor(pair)]
+    jobs += [("material", {"scene": scene, "method": method}) for scene, method in dict.fromkeys(trained)]
     jobs += [("evaluation", vars(pair)) for pair in pairs] + [("chamfer_table", {"table": table})]
     return [getattr(rules, name).benchmark.format(**wildcards) for name, wildcards in jobs]
 
@@ -209,6 +210,12 @@ def table_titles(table):
     """Row names of a table by method."""
     chosen = SETTINGS.tables[table]
     return {method: chosen.titles.get(method) or SETTINGS.method_title(method) for method in chosen.methods}
+
+
+def table_notes(table):
+    """What readers must know of the rows of a table, by method."""
+    notes = {method: SETTINGS.method_note(method) for method in SETTINGS.tables[table].methods}
+    return {method: note for method, note in notes.items() if note}
 
 
 def table_columns(table):
@@ -244,9 +251,16 @@ training_particles = supervised_by("particles", "particles.h5")  # ground truth,
 
 @checked
 def trained_adaptor(wildcards):
-    """The adaptor, where the method trains one."""
-    material = SETTINGS.method_material(wildcards.scene, wildcards.method)
-    return f"{RESULTS}/{wildcards.scene}/{wildcards.method}/adaptor.safetensors" if material.train else []
+    """The adaptor, where there is one: of the method itself, or of the one whose law it takes."""
+    if not SETTINGS.method_material(wildcards.scene, wildcards.method).train:
+        return []
+    method = SETTINGS.method_training(wildcards.method)
+    return f"{RESULTS}/{wildcards.scene}/{method}/adaptor.safetensors"
+
+
+@checked
+def judged_carrier(wildcards):
+    return SETTINGS.judged_carrier(wildcards.scene, wildcards.method)
 
 
 @checked

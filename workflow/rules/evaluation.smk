@@ -36,6 +36,7 @@ rule evaluation:
         simulation=simulation_settings,
         densities=lambda wildcards: [method_density(wildcards)],
         covariance_from=lambda wildcards: material_settings(wildcards)["covariance_from"],
+        carrier=judged_carrier,
         frames=frame_steps,
         tracers=SETTINGS.evaluation.tracers,
         seed=SETTINGS.seed,
@@ -56,6 +57,7 @@ rule video:
         gpu=GPU,
     params:
         density=scene_setting("density"),
+        carrier=judged_carrier,
         view=SETTINGS.evaluation.video_view,
         frame_rate=SETTINGS.evaluation.frame_rate,
         magnify=SETTINGS.evaluation.video_magnify,

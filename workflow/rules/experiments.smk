@@ -62,6 +62,7 @@ rule experiment:
     params:
         simulation=experiment_simulation,
         densities=of_each_body(method_density),
+        carrier=lambda wildcards: of_each_body(judged_carrier)(wildcards)[0],
         frames=experiment_frames,
         tracers=SETTINGS.evaluation.tracers,
         seed=SETTINGS.seed,

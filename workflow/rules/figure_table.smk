@@ -4,8 +4,10 @@ import ast
 
 DRAWN = SETTINGS.figures
 COMPARED = SETTINGS.tables["table1"] if "table1" in SETTINGS.tables else None
-METHODS = list(COMPARED.methods if COMPARED else SETTINGS.methods)
-TITLES = table_titles("table1") if COMPARED else {method: SETTINGS.method_title(method) for method in METHODS}
+# A law that is judged twice is shown once, on the particles that all methods share.
+METHODS = [m for m in (COMPARED or SETTINGS).methods if SETTINGS.method_training(m) == m]
+NAMES = table_titles("table1") if COMPARED else {}
+TITLES = {method: NAMES.get(method) or SETTINGS.method_title(method) for method in METHODS}
 PREDICTED = ["nclaw", "neuma"]
 SHOWN_EXPERIMENTS = [*DRAWN.letters, *DRAWN.meetings]
 
@@ -20,7 +22,7 @@ def of_methods(scenes, methods, name):
 
 def of_cells(table, name):
     """A file of every cell of a table, method by method; none if there is no such table."""
-    methods = SETTINGS.tables[table].methods if table in SETTINGS.tables else ()
+    methods = METHODS if table == "table1" else titles_of(table)
     return [f"{RESULTS}/{scene}/{method}/{name}" for method in methods for scene in scenes_of(table)]
 
 

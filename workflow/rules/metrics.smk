@@ -21,6 +21,7 @@ rule image_metrics:
         gpu=GPU,
     params:
         density=scene_setting("density"),
+        carrier=judged_carrier,
         views=evaluation_views,
         margin=SETTINGS.evaluation.margin,
         device=SETTINGS.device,

@@ -18,6 +18,7 @@ rule chamfer_table:
         cells=lambda wildcards: table_cells(wildcards.table),
         titles=lambda wildcards: table_titles(wildcards.table),
         columns=lambda wildcards: table_columns(wildcards.table),
+        notes=lambda wildcards: table_notes(wildcards.table),
         caption=lambda wildcards: (
             PAPER[wildcards.table].caption if wildcards.table in PAPER else wildcards.table
         ),

@@ -30,9 +30,8 @@ def main(inputs, output, params, run) -> None:
         inputs.truth, only=("tracers", "tracers_again"), required=("tracers", "tracers_again")
     )
     tracers = sample_tracers(read_mesh(inputs.mesh), params.tracers, seed=params.seed)
-    body, v0, counts = load_start(
-        inputs.particles, inputs.binding, inputs.gaussians, inputs.velocity, params.densities
-    )
+    files = [inputs[name] for name in ("particles", "binding", "gaussians", "velocity")]
+    body, v0, counts = load_start(*files, params.densities, params.carrier)
     laws = [load_law(prior, adaptor).to(device) for prior, adaptor in zip_longest(priors, adaptors)]
     evaluation = evaluate(
         MPMModel(**params.simulation),

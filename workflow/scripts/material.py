@@ -5,7 +5,6 @@ from dataclasses import asdict
 import torch
 
 from neuma_lib.config.material import MaterialConfig
-from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.device import choose_device
 from neuma_lib.fitting.material import ParticleLoss, PixelLoss, train_material
 from neuma_lib.io.checkpoint import Checkpoint
@@ -24,10 +23,8 @@ def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
     law = load_law(inputs.prior).to(device)
     law.attach_adaptor(settings.rank, settings.alpha, settings.seed)
-    body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density)
+    body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density, settings.carrier)
     body = body.to(torch.float32, device)
-    if settings.carrier == "gaussians":
-        body = Reconstruction.of_gaussians(body.gaussians, float(body.vol0.sum()), params.density)
     v0 = torch.tensor(read_json(inputs.velocity)["v0"], dtype=torch.float32, device=device)
     if settings.supervision == "particles":
         truth, _ = read_arrays(inputs.truth, required=("x", "frames"), only=("x", "frames"))
