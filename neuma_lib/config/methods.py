@@ -11,8 +11,7 @@ from pydantic import Field
 
 from neuma_lib.config.base import Section
 from neuma_lib.config.material import MaterialConfig
-from neuma_lib.config.validation import hint
-from neuma_lib.errors import InputError
+from neuma_lib.config.variants import split_variant
 
 
 class MethodConfig(Section):
@@ -41,19 +40,9 @@ def parse_method(text: str, methods: Mapping[str, Any]) -> tuple[str, dict[str, 
     Raises:
         InputError: unknown method or key, a repeated key, or a piece without '='.
     """
-    base, *pieces = text.split("+")
-    if base not in methods:
-        raise InputError(f"no method '{base}'{hint(base, methods)}")
+    base, given = split_variant(text, methods, [*MaterialConfig.model_fields, "prior"], "method")
     variant: dict[str, Any] = {}
-    known = [*MaterialConfig.model_fields, "prior"]
-    for piece in pieces:
-        key, equals, value = piece.partition("=")
-        if not equals or not key or not value:
-            raise InputError(f"method '{text}': write variants as +key=value, not '+{piece}'")
-        if key not in known:
-            raise InputError(f"method '{text}': no setting '{key}'{hint(key, known)}")
-        if key in variant:
-            raise InputError(f"method '{text}': '{key}' is given twice")
+    for key, value in given.items():
         field = MaterialConfig.model_fields.get(key)
         is_list = field is not None and typing.get_origin(field.annotation) is tuple
         variant[key] = [yaml.safe_load(v) for v in value.split(",")] if is_list else yaml.safe_load(value)

@@ -29,6 +29,7 @@ from neuma_lib.config.scenes import SceneConfig
 from neuma_lib.config.simulation import SimulationConfig
 from neuma_lib.config.tables import TableConfig
 from neuma_lib.config.validation import hint, validate
+from neuma_lib.config.variants import DRAWN, folder, parse_chain
 from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.errors import InputError
 
@@ -65,6 +66,15 @@ class Config(Section):
     @model_validator(mode="after")
     def _consistent(self) -> Config:
         """Names of scenes, experiments, priors and methods exist; what scenes and methods change fits its section."""
+        for kind in ("scenes", "experiments", "methods", "priors.laws"):
+            names = self.priors.laws if kind == "priors.laws" else getattr(self, kind)
+            for name in names:
+                if "+" in name or "/" in name:
+                    raise ValueError(
+                        f"{kind}.{name}: it names a folder, and + begins a variant; leave out + and /"
+                    )
+        for name in self.scenes.keys() & self.experiments.keys():
+            raise ValueError(f"experiments.{name}: a scene has this name")
         for name, scene in self.scenes.items():
             if "/" not in scene.prior and "." not in scene.prior and scene.prior not in self.priors.laws:
                 laws = self.priors.laws
@@ -106,11 +116,15 @@ class Config(Section):
                 for column in getattr(table, f"{kind}s"):
                     yield f"tables.{name}.{kind}s", kind, column
 
+    def chain(self, name: str) -> tuple[str, dict[str, int]]:
+        """Base and seeds of the folder of a scene or an experiment, for example ``BouncyBall+seed=1``."""
+        if name.partition("+")[0] in self.experiments:
+            return parse_chain(name, self.experiments, "experiment")
+        return parse_chain(name, self.scenes, "scene")
+
     def scene(self, name: str) -> SceneConfig:
-        """The scene of that name."""
-        if name not in self.scenes:
-            raise InputError(f"no scene '{name}' in {self.scenes_file}{hint(name, self.scenes)}")
-        return self.scenes[name]
+        """The scene of that name, or of a chain's folder."""
+        return self.scenes[parse_chain(name, self.scenes, "scene")[0]]
 
     @property
     def random_scenes(self) -> list[str]:
@@ -118,10 +132,8 @@ class Config(Section):
         return [name for name in self.scenes if name.startswith(self.random.prefix)]
 
     def experiment(self, name: str) -> ExperimentConfig:
-        """The experiment of that name."""
-        if name not in self.experiments:
-            raise InputError(f"no experiment '{name}'{hint(name, self.experiments)}")
-        return self.experiments[name]
+        """The experiment of that name, or of a chain's folder."""
+        return self.experiments[parse_chain(name, self.experiments, "experiment")[0]]
 
     def experiment_bodies(self, name: str) -> list[dict[str, Any]]:
         """Complete plain descriptions of an experiment's bodies: those of their scenes, placed where it says.
@@ -147,12 +159,30 @@ class Config(Section):
         assumed = self.method_material(scene, method).assumed_density
         return self.scene(scene).plain()["density"] if assumed is None else assumed
 
-    def seeded(self, table: str, method: str, scene: str) -> list[str]:
-        """The runs behind a cell of a table: the method itself, and variants of other seeds if it has several."""
-        material = self.method_material(scene, method)
-        random = material.train and material.rank is not None
-        others = range(1, self.tables[table].seeds) if random else ()
-        return [method, *(f"{method}+seed={k}" for k in others)]
+    def body_scenes(self, column: str) -> list[str]:
+        """Folders of the scenes whose laws the bodies of a scene or experiment have, in its chain."""
+        base, seeds = self.chain(column)
+        if base in self.scenes:
+            return [column]
+        return [folder(body.scene, seeds) for body in self.experiments[base].bodies]
+
+    def run_folder(self, column: str, method: str) -> str:
+        """The one home, below the results' or the experiments' folder, of a method's run in a chain.
+
+        Args:
+            column: scene or experiment, or folder of a chain of it.
+            method: method or variant. One that draws no adaptor is the same for all of its seeds.
+        """
+        base, seeds = self.chain(column)
+        chosen = [self.method_material(scene, method) for scene in self.body_scenes(column)]
+        adaptor = any(material.train and material.rank is not None for material in chosen)
+        return f"{folder(base, seeds, DRAWN if adaptor else DRAWN[:-1])}/{method}"
+
+    def runs(self, table: str, method: str, column: str) -> list[str]:
+        """Folders of the runs behind a cell of a table, in the order of its chains, each once."""
+        chosen = self.tables[table]
+        chains = (folder(column, dict.fromkeys(chosen.vary, k)) for k in range(chosen.seeds))
+        return list(dict.fromkeys(self.run_folder(chain, method) for chain in chains))
 
     def frame_steps(self, name: str) -> tuple[int, ...]:
         """Steps of the frames of a scene's video."""
@@ -190,7 +220,10 @@ class Config(Section):
         return prior
 
     def method_material(self, scene: str, method: str) -> MaterialConfig:
-        """Effective material settings: the section, changed by the scene, then the method, then its variant."""
+        """Effective material settings: the section, changed by the scene, then the method, then its variant.
+
+        The seed of the scene's chain is added to the one that these give.
+        """
         base, variant = parse_method(self.method_training(method), self.methods)
         variant.pop("prior", None)
         section = self.material
@@ -200,7 +233,7 @@ class Config(Section):
             (variant, method),
         ):
             section = _changed(section, changes, origin)
-        return section
+        return section.model_copy(update={"seed": section.seed + self.chain(scene)[1]["adaptor"]})
 
 
 def load(raw: Mapping[str, Any], root: str | Path = ".") -> Config:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field, model_validator
 
 from neuma_lib.config.base import Section
+from neuma_lib.config.variants import DRAWN
 
 
 class TableConfig(Section):
@@ -17,8 +20,11 @@ class TableConfig(Section):
     seeds: int = Field(
         1,
         ge=1,
-        description="runs of each method that draws an adaptor at random, as method+seed=k; with several, mean and "
+        description="chains behind every number, in the folders `Scene`, `Scene+seed=1`, ...; with several, mean and "
         "standard deviation are shown",
+    )
+    vary: tuple[Literal[DRAWN], ...] = Field(
+        DRAWN, min_length=1, description="what the chains draw anew; what they share is computed once"
     )
 
     @model_validator(mode="after")

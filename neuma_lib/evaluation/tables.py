@@ -115,10 +115,7 @@ class Table:
             header = ["Method", *self.columns.values(), "Average"]
             parts += [f"**{heading}**", "", *as_markdown(header, map(self._cells, rows), numbers=True), ""]
         if any(len(row.runs) > 1 for row in self.rows):
-            parts += [
-                "± is the standard deviation over seeds, for methods that draw their adaptor at random."
-            ]
-            parts += [""]
+            parts += ["± is the standard deviation over chains of other seeds.", ""]
         for sign, note in FOOTNOTES.items():
             if any(sign in signs for signs in self.marks.values()):
                 parts += [f"{sign} {note}", ""]

@@ -10,6 +10,7 @@ from neuma_lib.config import settings
 from neuma_lib.config.base import Section
 from neuma_lib.config.methods import parse_method
 from neuma_lib.config.page import settings_markdown
+from neuma_lib.config.variants import DRAWN, folder, parse_chain
 from neuma_lib.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -55,6 +56,13 @@ def test_default_settings_are_valid(loaded):
         ({"methods": {"neuma": {"material": {"rnk": 4}}}}, r"methods\.neuma\.material\.rnk: unknown key"),
         ({"tables": {"table1": {"scenes": ["BouncyBal"]}}}, r"no scene 'BouncyBal'; did you mean BouncyBall"),
         ({"tables": {"table1": {"methods": ["neuma+rnk=4"]}}}, r"no setting 'rnk'; did you mean rank"),
+        ({"tables": {"table1": {"vary": ["particle"]}}}, r"tables\.table1\.vary\.0: .*'particles'"),
+        ({"tables": {"table1": {"scenes": ["BouncyBall+seed=1"]}}}, r"no scene 'BouncyBall\+seed=1'"),
+        ({"methods": {"neuma+x": {"title": "x"}}}, r"methods\.neuma\+x: .*leave out \+ and /"),
+        (
+            {"experiments": {"ClayCat": {"title": "x", "bodies": [{"scene": "ClayCat"}], "steps": 9}}},
+            r"experiments\.ClayCat: a scene has this name",
+        ),
         ({"scenes": {"New": {"shape": "ball"}}}, r"scenes\.New\.height: this key is missing"),
         ({"dataset": {"stride": 4}}, r"dataset: give either frames or stride"),
         ({"dataset": {"frames": None}}, r"dataset: give either frames or stride"),
@@ -191,6 +199,70 @@ class TestVariants:
     def test_wrong_value_names_the_variant(self, loaded):
         with pytest.raises(InputError, match=r"neuma\+rank=x\.rank"):
             loaded.method_material("BouncyBall", "neuma+rank=x")
+
+
+class TestChains:
+    def runs(self, raw, method, column="ClayCat", **table):
+        change = {"tables": {"table1": {"seeds": 3, **table}}}
+        return settings.load(settings.merged(raw, change), ROOT).runs("table1", method, column)
+
+    @pytest.mark.parametrize("seeds", [(0, 0, 0, 0), (1, 1, 1, 1), (0, 0, 0, 2), (1, 2, 3, 0), (0, 11, 0, 0)])
+    def test_names_say_the_seeds(self, seeds):
+        chosen = dict(zip(DRAWN, seeds))
+        assert parse_chain(folder("A", chosen), ["A"], "scene") == ("A", chosen)
+
+    def test_what_depends_on_equal_seeds_has_one_name(self):
+        assert folder("A", {}) == "A" and folder("A", dict.fromkeys(DRAWN, 2)) == "A+seed=2"
+        assert folder("A", {"gaussians": 1}) == "A+gaussians_seed=1"
+        assert folder("A", {"gaussians": 1, "adaptor": 5}, ["gaussians"]) == "A+seed=1"
+        assert folder("A", {"adaptor": 5}, ["prior", "gaussians"]) == "A"
+
+    def test_one_seed_may_differ_from_the_common_one(self):
+        _, seeds = parse_chain("A+seed=2+prior_seed=0", ["A"], "scene")
+        assert seeds == {"prior": 0, "gaussians": 2, "particles": 2, "adaptor": 2}
+
+    @pytest.mark.parametrize(
+        ("name", "message"),
+        [
+            ("B+seed=1", "no scene 'B'"),
+            ("A+sed=1", "no setting 'sed'; did you mean seed"),
+            ("A+seed=-1", "seed must be a whole number from 0, not '-1'"),
+            ("A+seed=1+seed=1", "'seed' is given twice"),
+            ("A+seed", r"write variants as \+key=value"),
+        ],
+    )
+    def test_mistakes(self, name, message):
+        with pytest.raises(InputError, match=message):
+            parse_chain(name, ["A"], "scene")
+
+    def test_every_row_of_a_table_has_all_chains(self, raw, loaded):
+        for method in loaded.tables["table1"].methods:
+            expected = [f"ClayCat{chain}/{method}" for chain in ("", "+seed=1", "+seed=2")]
+            assert self.runs(raw, method) == expected
+
+    def test_what_does_not_vary_has_one_run(self, raw):
+        assert self.runs(raw, "nclaw", vary=["adaptor"]) == ["ClayCat/nclaw"]
+        # The base weights are no draw of the adaptor's.
+        assert self.runs(raw, "neuma_without_adaptor", vary=["adaptor"]) == ["ClayCat/neuma_without_adaptor"]
+        expected = [f"ClayCat{chain}/neuma" for chain in ("", "+adaptor_seed=1", "+adaptor_seed=2")]
+        assert self.runs(raw, "neuma", vary=["adaptor"]) == expected
+        # Without an adaptor all that is drawn has seed 1: one home with the whole chain.
+        assert self.runs(raw, "nclaw", vary=DRAWN[:3])[1] == "ClayCat+seed=1/nclaw"
+
+    def test_bodies_of_an_experiment_are_of_its_chain(self, raw, loaded):
+        assert loaded.body_scenes("fish_into_duck+seed=1") == ["SandFish+seed=1", "JellyDuck+seed=1"]
+        assert self.runs(raw, "nclaw", "letter_N_sand")[2] == "letter_N_sand+seed=2/nclaw"
+        assert loaded.experiment("letter_N_sand+seed=1") == loaded.experiment("letter_N_sand")
+
+    def test_a_chain_changes_seeds_alone(self, raw):
+        loaded = settings.load(settings.merged(raw, {"material": {"seed": 10}}), ROOT)
+        plain = loaded.method_material("ClayCat", "neuma")
+        other = loaded.method_material("ClayCat+seed=2", "neuma")
+        assert (plain.seed, other.seed) == (10, 12)
+        assert other.model_copy(update={"seed": 10}) == plain
+        assert loaded.method_material("ClayCat+seed=2", "neuma+seed=5").seed == 7
+        assert loaded.method_material("ClayCat+prior_seed=2", "neuma") == plain
+        assert loaded.scene("ClayCat+seed=2") == loaded.scene("ClayCat")
 
 
 class TestFrames:

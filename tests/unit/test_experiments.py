@@ -83,14 +83,10 @@ def test_mistakes_in_experiments_and_tables_are_named():
         settings(scenes={"ClayCat": {"density": {"below": 1.0}}})
 
 
-def test_what_a_method_believes_of_the_density_and_how_often_it_runs():
-    found = settings(tables={"table1": {"seeds": 3}})
+def test_what_a_method_believes_of_the_density():
+    found = settings()
     assert found.method_density("UnevenCat", "neuma") == found.scene("UnevenCat").plain()["density"]
     assert found.method_density("UnevenCat", "neuma+assumed_density=900") == 900
-    assert found.seeded("table1", "neuma", "ClayCat") == ["neuma", "neuma+seed=1", "neuma+seed=2"]
-    # Nothing is drawn at random where nothing is trained, or the base weights are.
-    assert found.seeded("table1", "nclaw", "ClayCat") == ["nclaw"]
-    assert found.seeded("table1", "neuma_without_adaptor", "ClayCat") == ["neuma_without_adaptor"]
 
 
 def test_densities_on_both_sides_of_a_plane():

@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from project import SCENE, copied
+from project import SCENE, TABLE, copied
 
 SUPERVISED = "neuma_particle_supervision"  # the one method that trains on the truth
 # Blender films the truth, a dataset is packed of it, evaluation measures against it, and these figures show it.
@@ -45,8 +45,61 @@ def test_only_evaluation_and_figures_of_it_and_one_ablation_read_the_truth(proje
     assert not any(file.endswith("transforms.json") for file in supervised)
 
 
-def test_timings_read_the_benchmark_of_every_job_behind_them(project):
-    graph = jobs(project.run("--dry-run", "tiny/results/timings.csv"))
+CHAINS = ("--config", "tables={table1: {seeds: 3}}", "--")
+DATA_RULES = ("kernels", "ground_truth", "render_static", "render_dynamic")
+
+
+def test_three_chains_share_their_data_and_nothing_else(project):
+    one, three = project.plan(TABLE), project.plan(*CHAINS, TABLE)
+    shared = {*DATA_RULES, "chamfer_table", "total"}
+    assert {"prior", "gaussians", "sampled_particles", "velocity", "material", "evaluation"} <= set(one)
+    assert three == {rule: count if rule in shared else 3 * count for rule, count in one.items()}
+    graph = jobs(project.run("--dry-run", *CHAINS, TABLE))
+    made = [file for *_, outputs in graph for file in outputs]
+    assert len(made) == len(set(made))
+    for rule, read, outputs in graph:
+        computed = {file for file in read if file.startswith("tiny/results/")}
+        if "+seed=2" in outputs[0]:
+            assert all("+seed=2" in file for file in computed), (rule, computed)
+        elif rule != "chamfer_table":
+            assert not any("+seed=2" in file for file in computed), (rule, computed)
+
+
+@pytest.mark.parametrize(
+    ("drawn", "anew"),
+    [
+        ("adaptor", {"material": 2}),
+        ("prior", {"prior": 2, "velocity": 2, "material": 2}),
+        ("particles", {"sampled_particles": 2, "binding": 2, "velocity": 2, "material": 2}),
+        (
+            "gaussians",
+            dict.fromkeys(["gaussians", "mesh", "sampled_particles", "binding", "velocity", "material"], 2),
+        ),
+    ],
+)
+def test_what_varies_alone_repeats_what_depends_on_it(project, drawn, anew):
+    one = project.plan(TABLE)
+    three = project.plan("--config", f"tables={{table1: {{seeds: 3, vary: [{drawn}]}}}}", "--", TABLE)
+    evaluations = 2 if drawn == "adaptor" else 4  # the prior's motion has no adaptor
+    total = {"total": sum(anew.values()) + evaluations}
+    more = {**anew, **total, "evaluation": evaluations}
+    assert three == {rule: count + more.get(rule, 0) for rule, count in one.items()}
+
+
+def test_an_experiment_follows_the_chains_of_its_scenes(project):
+    graph = jobs(
+        project.run("--dry-run", "tiny/results/experiments/letter_and_ball+seed=1/neuma/metrics.json")
+    )
+    read = {rule: files for rule, files, _ in graph}
+    assert f"{SCENE}+seed=1/neuma/adaptor.safetensors" in read["experiment"]
+    assert "tiny/results/priors/jelly+seed=1.safetensors" in read["experiment"]
+    assert "tiny/data/experiments/letter_and_ball/particles.h5" in read["experiment"]
+    assert f"{SCENE}+seed=1/velocity.json" in read["experiment_start"]
+
+
+@pytest.mark.parametrize("chains", [(), CHAINS], ids=["one chain", "three chains"])
+def test_timings_read_the_benchmark_of_every_job_behind_them(project, chains):
+    graph = jobs(project.run("--dry-run", *chains, "tiny/results/timings.csv"))
     (read,) = [read for rule, read, _ in graph if rule == "timings"]
     assert len(read) == len(set(read)) == len(graph) - 1
     assert all(file.startswith("tiny/results/benchmarks/") for file in read)

@@ -221,9 +221,25 @@ def test_laws_are_put_to_use_on_other_bodies_and_images_are_measured(clone):
     assert measured["psnr"] > 8 and measured["lpips_vgg"] != 0
 
 
-def test_seeds_and_assumed_densities_are_runs_of_their_own(finished):
-    plan = finished.plan("--config", "tables={table1: {seeds: 3}}", "--", TABLE)
-    assert plan == {"material": 2, "evaluation": 2, "chamfer_table": 1}
+def test_a_chain_of_another_seed_draws_everything_anew(clone):
+    before = clone.artifacts()
+    clone.run("--config", "tables={table1: {seeds: 2}}", "--", TABLE)
+    after = clone.artifacts()
+    assert all(after[name] == digest for name, digest in before.items() if "table1" not in name)
+    chains = {name: name.replace("BouncyBall/", "BouncyBall+seed=1/") for name in before if SCENE in name}
+    chains["tiny/results/priors/jelly.safetensors"] = "tiny/results/priors/jelly+seed=1.safetensors"
+    made = {name: other for name, other in chains.items() if other in after}
+    assert {Path(name).name for name in made} >= {
+        *("jelly.safetensors", "gaussians.ply", "mesh.ply", "particles.h5", "velocity.json"),
+        *("adaptor.safetensors", "rollout.h5", "metrics.json"),
+    }
+    assert [name for name, other in made.items() if after[name] == after[other]] == []
+    header, *rows = (clone.root / TABLE).read_text().splitlines()
+    spreads = {row.split(",")[1] for row in rows if row.startswith("chamfer_std,")}
+    assert spreads == {"nclaw", "neuma"}
+
+
+def test_assumed_densities_are_runs_of_their_own(finished):
     plan = finished.plan(f"{SCENE}/neuma+assumed_density=900/metrics.json")
     assert plan == {"material": 1, "evaluation": 1}
 
@@ -316,9 +332,16 @@ def test_mistyped_key(finished):
     assert "Traceback (most recent call last)" not in output
 
 
-def test_mistyped_variant(finished):
-    output = finished.run(f"{SCENE}/neuma+rnk=3/metrics.json", succeeds=False)
-    assert "no setting 'rnk'; did you mean rank" in output
+@pytest.mark.parametrize(
+    ("file", "message"),
+    [
+        (f"{SCENE}/neuma+rnk=3/metrics.json", "no setting 'rnk'; did you mean rank"),
+        (f"{SCENE}+sed=3/gaussians.ply", "no setting 'sed'; did you mean seed"),
+    ],
+)
+def test_mistyped_variant(finished, file, message):
+    output = finished.run(file, succeeds=False)
+    assert message in output
     assert "Traceback (most recent call last)" not in output
 
 

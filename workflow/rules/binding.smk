@@ -3,8 +3,8 @@
 
 rule binding:
     input:
-        gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
-        sampled=f"{RESULTS}/{{scene}}/sampled_particles.h5",
+        gaussians=of_chain("gaussians.ply"),
+        sampled=of_chain("sampled_particles.h5"),
     output:
         binding=f"{RESULTS}/{{scene}}/binding.h5",
         particles=f"{RESULTS}/{{scene}}/particles.h5",

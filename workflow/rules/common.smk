@@ -10,6 +10,7 @@ ROOT = Path(workflow.basedir).resolve()
 sys.path.insert(0, str(ROOT))
 
 from neuma_lib.config.settings import load
+from neuma_lib.config.variants import folder
 from neuma_lib.errors import InputError
 from workflow.defaults import complete
 from workflow.provenance import code_digest
@@ -60,24 +61,12 @@ CHAMFER_TABLES = [name for name in SETTINGS.tables if name not in ("table4", "le
 
 
 wildcard_constraints:
-    scene="|".join(SETTINGS.scenes),
-    prior="|".join(SETTINGS.priors.laws) or "none",
+    scene=f"({'|'.join(SETTINGS.scenes) or 'none'})([+][^/]*)?",
+    prior=f"({'|'.join(SETTINGS.priors.laws) or 'none'})([+]seed=[1-9][0-9]*)?",
     method=f"({'|'.join(SETTINGS.methods) or 'none'})([+][^/]*)?",
-    experiment="|".join(SETTINGS.experiments) or "none",
+    experiment=f"({'|'.join(SETTINGS.experiments) or 'none'})([+][^/]*)?",
     table="|".join(CHAMFER_TABLES) or "none",
     group="geometry|simulation|laws|rendering",
-
-
-def body_files(folder):
-    """Files of a reconstructed body: the particles that are simulated, the Gaussians, and what binds them."""
-    names = {"particles": "particles.h5", "binding": "binding.h5", "gaussians": "gaussians.ply"}
-    return {name: f"{RESULTS}/{folder}/{file}" for name, file in names.items()}
-
-
-def each_of(bodies):
-    """Files by name of several bodies."""
-    bodies = [body_files(folder) for folder in bodies]
-    return {name: [body[name] for body in bodies] for name in body_files("")}
 
 
 def kernels(*groups):
@@ -95,6 +84,74 @@ def checked(function):
             raise WorkflowError(str(error)) from None
 
     return call
+
+
+# What a chain's seeds change in a file of a scene or an experiment (config/variants.py); runs of methods have
+# `Config.run_folder`.
+DRAWN_IN = {
+    **dict.fromkeys(["gaussians.ply", "gaussians.json", "mesh.ply"], ["gaussians"]),
+    **dict.fromkeys(["sampled_particles.h5", "particles.h5", "binding.h5"], ["gaussians", "particles"]),
+    "velocity.json": ["prior", "gaussians", "particles"],
+}
+
+
+def home(name, file):
+    """The one path of a file of a scene or experiment in a chain."""
+    base, seeds = SETTINGS.chain(name)
+    if base in SETTINGS.scenes:
+        return f"{RESULTS}/{folder(base, seeds, DRAWN_IN[file])}/{file}"
+    # Solids are filled with particles; where a scene's own object is among them, all that led to its start counts.
+    rebuilt = any(body.shape is None for body in SETTINGS.experiments[base].bodies)
+    drawn = DRAWN_IN["velocity.json"] if rebuilt else ["particles"]
+    return f"{RESULTS}/experiments/{folder(base, seeds, drawn)}/{file}"
+
+
+def of_chain(file):
+    """A function of wildcards: a file of the scene or experiment in its chain."""
+    return checked(lambda wildcards: home(subject(wildcards), file))
+
+
+def of_scene(file):
+    """A function of wildcards: a file of the scene's or experiment's data, which all its chains share."""
+
+    @checked
+    def choose(wildcards):
+        base, _ = SETTINGS.chain(subject(wildcards))
+        return f"{DATA}/{base if base in SETTINGS.scenes else f'experiments/{base}'}/{file}"
+
+    return choose
+
+
+def seed_of(drawn):
+    """A function of wildcards: the seed of what a scene or experiment draws in its chain."""
+    return checked(lambda wildcards: SETTINGS.seed + SETTINGS.chain(subject(wildcards))[1][drawn])
+
+
+def subject(wildcards):
+    """The scene or experiment, with the seeds of its chain, that a job is about."""
+    return getattr(wildcards, "scene", None) or wildcards.experiment
+
+
+# The rules that reconstruct a scene, and a file of each.
+MAKERS = {
+    "gaussians": "gaussians.ply",
+    "mesh": "mesh.ply",
+    "sampled_particles": "sampled_particles.h5",
+    "binding": "binding.h5",
+    "velocity": "velocity.json",
+}
+# Files of a reconstructed body: the particles that are simulated, the Gaussians, and what binds them.
+BODY = {"particles": "particles.h5", "binding": "binding.h5", "gaussians": "gaussians.ply"}
+
+
+def body_files():
+    """Functions of wildcards: the files of the body of a scene or experiment, by name."""
+    return {name: of_chain(file) for name, file in BODY.items()}
+
+
+def each_of(bodies):
+    """Files by name of the bodies of several scenes or experiments."""
+    return {name: [home(body, file) for body in bodies] for name, file in BODY.items()}
 
 
 def scene_setting(*names):
@@ -144,21 +201,27 @@ def simulator(dt):
     return {"dt": dt, **{name: section[name] for name in ("grid", "gravity", "boundary", "wall_cells")}}
 
 
-def prior_file(name):
-    """The file of a prior: made here if it is a name in the settings, the user's own if it is a path."""
-    return f"{RESULTS}/priors/{name}.safetensors" if name in SETTINGS.priors.laws else name
+def prior_file(scene, method=None):
+    """The prior of a scene, or of a method there, in its chain: made here, or the user's own if it is a path."""
+    name = SETTINGS.method_prior(scene, method) if method else SETTINGS.scene(scene).prior
+    if name not in SETTINGS.priors.laws:
+        return name
+    return f"{RESULTS}/priors/{folder(name, SETTINGS.chain(scene)[1], ['prior'])}.safetensors"
 
 
 def table_runs(table):
-    """Every run behind a table, row by row: its method (without the seed), column, and folder."""
+    """Every run behind a table, row by row and chain by chain: its method, column, folder of the scene, and folder."""
     chosen = SETTINGS.tables[table]
-    columns = [(scene, scene, scene) for scene in chosen.scenes]
-    columns += [(n, SETTINGS.experiments[n].bodies[0].scene, f"experiments/{n}") for n in chosen.experiments]
     return [
-        {"method": method, "column": column, "scene": scene, "folder": f"{RESULTS}/{folder}/{run}"}
+        {
+            "method": method,
+            "column": column,
+            "scene": run.partition("/")[0] if column in chosen.scenes else None,
+            "folder": f"{RESULTS}/{run}" if column in chosen.scenes else f"{RESULTS}/experiments/{run}",
+        }
         for method in chosen.methods
-        for column, scene, folder in columns
-        for run in SETTINGS.seeded(table, method, scene)
+        for column in (*chosen.scenes, *chosen.experiments)
+        for run in SETTINGS.runs(table, method, column)
     ]
 
 
@@ -168,25 +231,24 @@ def table_files(table, name):
 
 
 def table_benchmarks(table):
-    """Benchmark files of all work behind the scenes of a table, stage by stage."""
-    runs = [run for run in table_runs(table) if run["column"] == run["scene"]]
-    scenes = list(dict.fromkeys(run["scene"] for run in runs))
-    names = [Path(run["folder"]).name for run in runs]  # of methods, with their seeds
-    pairs = [SimpleNamespace(scene=run["scene"], method=name) for run, name in zip(runs, names)]
-    priors = {SETTINGS.scenes[scene].prior for scene in scenes}
-    priors |= {SETTINGS.method_prior(pair.scene, pair.method) for pair in pairs}
+    """Benchmark files of all work behind the scenes of a table, in all chains."""
+    pairs = [SimpleNamespace(**run) for run in table_runs(table) if run["scene"]]
     makers = {"made": "render", "supplied": "supplied", "packed": "unpack"}
     jobs = [("kernels", {"group": group}) for group in ("geometry", "simulation", "laws", "rendering")]
-    jobs += [("prior", {"prior": prior}) for prior in sorted(priors & set(SETTINGS.priors.laws))]
-    for scene in scenes:
+    for pair in pairs:
+        scene, _ = SETTINGS.chain(pair.scene)
+        priors = [Path(prior_file(pair.scene, method)) for method in (None, pair.method)]
+        jobs += [("prior", {"prior": file.stem}) for file in priors if file.parent == Path(RESULTS, "priors")]
         truth = "ground_truth" if origin_of("truth", scene) == "made" else "unpack_truth"
         images = [f"{makers[origin_of(part, scene)]}_{part}" for part in ("static", "dynamic")]
-        stages = [truth, *images, "gaussians", "mesh", "sampled_particles", "binding", "velocity"]
-        jobs += [(name, {"scene": scene}) for name in stages]
+        jobs += [(rule, {"scene": scene}) for rule in (truth, *images)]
+        jobs += [(rule, {"scene": Path(home(pair.scene, file)).parent.name}) for rule, file in MAKERS.items()]
     trained = [(pair.scene, SETTINGS.method_training(pair.method)) for pair in pairs if trained_adaptor(pair)]
-    jobs += [("material", {"scene": scene, "method": method}) for scene, method in dict.fromkeys(trained)]
-    jobs += [("evaluation", vars(pair)) for pair in pairs] + [("chamfer_table", {"table": table})]
-    return [getattr(rules, name).benchmark.format(**wildcards) for name, wildcards in jobs]
+    jobs += [("material", {"scene": scene, "method": method}) for scene, method in trained]
+    jobs += [("evaluation", vars(pair)) for pair in pairs]
+    jobs += [("chamfer_table", {"table": table})]
+    files = [getattr(rules, name).benchmark.format(**wildcards) for name, wildcards in jobs]
+    return list(dict.fromkeys(files))
 
 
 def table_cells(table):
@@ -200,7 +262,7 @@ def learning_rate_cells(table):
         {
             "method": run["method"].partition("+")[0],
             "lr_scale": SETTINGS.method_material(run["scene"], run["method"]).lr_scale,
-            "scene": run["scene"],
+            "scene": run["column"],
         }
         for run in table_runs(table)
     ]
@@ -231,7 +293,7 @@ def material_settings(wildcards):
 
 @checked
 def material_prior(wildcards):
-    return prior_file(SETTINGS.method_prior(wildcards.scene, wildcards.method))
+    return prior_file(wildcards.scene, wildcards.method)
 
 
 def supervised_by(kind, file):
@@ -240,7 +302,7 @@ def supervised_by(kind, file):
     @checked
     def choose(wildcards):
         material = SETTINGS.method_material(wildcards.scene, wildcards.method)
-        return f"{DATA}/{wildcards.scene}/{file}" if material.supervision == kind else []
+        return of_scene(file)(wildcards) if material.supervision == kind else []
 
     return choose
 
@@ -254,8 +316,8 @@ def trained_adaptor(wildcards):
     """The adaptor, where there is one: of the method itself, or of the one whose law it takes."""
     if not SETTINGS.method_material(wildcards.scene, wildcards.method).train:
         return []
-    method = SETTINGS.method_training(wildcards.method)
-    return f"{RESULTS}/{wildcards.scene}/{method}/adaptor.safetensors"
+    run = SETTINGS.run_folder(wildcards.scene, SETTINGS.method_training(wildcards.method))
+    return f"{RESULTS}/{run}/adaptor.safetensors"
 
 
 @checked
@@ -306,8 +368,9 @@ def reconstructed_files(name):
 
     @checked
     def choose(wildcards):
-        bodies = SETTINGS.experiment_bodies(wildcards.experiment)
-        return [f"{RESULTS}/{body['scene']}/{name}" for body in bodies if body["reconstructed"]]
+        bodies = SETTINGS.experiment(wildcards.experiment).bodies
+        scenes = SETTINGS.body_scenes(wildcards.experiment)
+        return [home(scene, name) for body, scene in zip(bodies, scenes) if body.shape is None]
 
     return choose
 
@@ -317,8 +380,8 @@ def of_each_body(function):
 
     @checked
     def choose(wildcards):
-        bodies = SETTINGS.experiment(wildcards.experiment).bodies
-        found = [function(SimpleNamespace(scene=body.scene, method=wildcards.method)) for body in bodies]
+        scenes = SETTINGS.body_scenes(wildcards.experiment)
+        found = [function(SimpleNamespace(scene=scene, method=wildcards.method)) for scene in scenes]
         return [value for value in found if value != []]
 
     return choose

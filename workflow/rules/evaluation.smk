@@ -4,11 +4,11 @@
 rule initial_state:
     input:
         kernels=kernels("geometry"),
-        truth=f"{DATA}/{{scene}}/particles.h5",
-        gaussians=f"{RESULTS}/{{scene}}/gaussians.json",
-        mesh=f"{RESULTS}/{{scene}}/mesh.ply",
-        particles=f"{RESULTS}/{{scene}}/particles.h5",
-        velocity=f"{RESULTS}/{{scene}}/velocity.json",
+        truth=of_scene("particles.h5"),
+        gaussians=of_chain("gaussians.json"),
+        mesh=of_chain("mesh.ply"),
+        particles=of_chain("particles.h5"),
+        velocity=of_chain("velocity.json"),
     output:
         report=f"{RESULTS}/{{scene}}/initial_state.json",
     params:
@@ -20,11 +20,11 @@ rule initial_state:
 
 rule evaluation:
     input:
-        **body_files("{scene}"),
+        **body_files(),
         kernels=kernels("geometry", "laws"),
-        truth=f"{DATA}/{{scene}}/particles.h5",
-        mesh=f"{RESULTS}/{{scene}}/mesh.ply",
-        velocity=f"{RESULTS}/{{scene}}/velocity.json",
+        truth=of_scene("particles.h5"),
+        mesh=of_chain("mesh.ply"),
+        velocity=of_chain("velocity.json"),
         prior=material_prior,
         adaptor=trained_adaptor,
     output:
@@ -47,9 +47,9 @@ rule evaluation:
 
 rule video:
     input:
-        **body_files("{scene}"),
+        **body_files(),
         kernels=kernels("rendering"),
-        transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
+        transforms=of_scene("dynamic/transforms.json"),
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
     output:
         video=f"{RESULTS}/{{scene}}/{{method}}/video.mp4",

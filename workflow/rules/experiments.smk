@@ -6,6 +6,8 @@ rule experiment_truth:
         kernels=kernels("geometry", "simulation"),
     output:
         particles=f"{DATA}/experiments/{{experiment}}/particles.h5",
+    wildcard_constraints:
+        experiment="|".join(SETTINGS.experiments) or "none",
     resources:
         gpu=EITHER_GPU,
     params:
@@ -40,18 +42,18 @@ rule experiment_start:
         ),
         particles=SETTINGS.simulation.particles,
         sampling=SETTINGS.geometry.sampling,
-        seed=SETTINGS.seed,
+        seed=seed_of("particles"),
     script:
         "../scripts/experiment_start.py"
 
 
 rule experiment:
     input:
-        **body_files("experiments/{experiment}"),
+        **body_files(),
         kernels=kernels("geometry", "laws"),
-        truth=f"{DATA}/experiments/{{experiment}}/particles.h5",
-        mesh=f"{RESULTS}/experiments/{{experiment}}/mesh.ply",
-        velocity=f"{RESULTS}/experiments/{{experiment}}/velocity.json",
+        truth=of_scene("particles.h5"),
+        mesh=of_chain("mesh.ply"),
+        velocity=of_chain("velocity.json"),
         prior=of_each_body(material_prior),
         adaptor=of_each_body(trained_adaptor),
     output:

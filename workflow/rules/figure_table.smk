@@ -44,7 +44,7 @@ def truths_of(scenes):
 
 def priors_of(scenes):
     """The priors that NeuMA starts from."""
-    return [prior_file(SETTINGS.method_prior(scene, "neuma")) for scene in scenes]
+    return [prior_file(scene, "neuma") for scene in scenes]
 
 
 def filmed(scenes):
@@ -166,7 +166,7 @@ FIGURES = {
         "input": {
             "kernels": kernels("rendering"),
             "rollouts": of_experiments("neuma/rollout.h5"),
-            **each_of(f"experiments/{name}" for name in SHOWN_EXPERIMENTS),
+            **each_of(SHOWN_EXPERIMENTS),
         },
         "params": {
             "letters": lambda wildcards: [
@@ -183,7 +183,7 @@ FIGURES = {
         "input": {
             "kernels": kernels("rendering"),
             "truth": f"{DATA}/experiments/{DRAWN.ext_time}/particles.h5",
-            **body_files(f"experiments/{DRAWN.ext_time}"),
+            **{name: home(DRAWN.ext_time, file) for name, file in BODY.items()},
             "rollouts": [f"{RESULTS}/experiments/{DRAWN.ext_time}/{m}/rollout.h5" for m in PREDICTED],
         },
         "params": {

@@ -4,7 +4,7 @@
 rule gaussians:
     input:
         kernels=kernels("rendering"),
-        transforms=f"{DATA}/{{scene}}/static/transforms.json",
+        transforms=of_scene("static/transforms.json"),
     output:
         gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
         report=f"{RESULTS}/{{scene}}/gaussians.json",
@@ -12,7 +12,7 @@ rule gaussians:
         gpu=GPU,
     params:
         fit=SETTINGS.gaussians.plain(),
-        seed=SETTINGS.seed,
+        seed=seed_of("gaussians"),
         device=SETTINGS.device,
     script:
         "../scripts/gaussians.py"

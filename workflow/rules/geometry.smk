@@ -3,8 +3,8 @@
 
 rule mesh:
     input:
-        transforms=f"{DATA}/{{scene}}/static/transforms.json",
-        gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
+        transforms=of_scene("static/transforms.json"),
+        gaussians=of_chain("gaussians.ply"),
     output:
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
     params:
@@ -16,12 +16,12 @@ rule mesh:
 rule sampled_particles:
     input:
         kernels=kernels("geometry"),
-        mesh=f"{RESULTS}/{{scene}}/mesh.ply",
+        mesh=of_chain("mesh.ply"),
     output:
         particles=f"{RESULTS}/{{scene}}/sampled_particles.h5",
     params:
         wanted=SETTINGS.simulation.particles,
         sampling=SETTINGS.geometry.sampling,
-        seed=SETTINGS.seed,
+        seed=seed_of("particles"),
     script:
         "../scripts/sampled_particles.py"

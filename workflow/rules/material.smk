@@ -3,10 +3,10 @@
 
 rule material:
     input:
-        **body_files("{scene}"),
+        **body_files(),
         kernels=kernels("laws", "rendering"),
         transforms=training_video,
-        velocity=f"{RESULTS}/{{scene}}/velocity.json",
+        velocity=of_chain("velocity.json"),
         prior=material_prior,
         truth=training_particles,
     output:

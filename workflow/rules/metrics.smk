@@ -10,10 +10,10 @@ rule lpips_weights:
 
 rule image_metrics:
     input:
-        **body_files("{scene}"),
+        **body_files(),
         kernels=kernels("rendering"),
         weights=f"{DATA}/weights/lpips.safetensors",
-        transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
+        transforms=of_scene("dynamic/transforms.json"),
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
     output:
         metrics=f"{RESULTS}/{{scene}}/{{method}}/image_metrics.json",

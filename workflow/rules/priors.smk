@@ -10,11 +10,11 @@ rule prior:
     resources:
         gpu=GPU,
     params:
-        name=lambda wildcards: wildcards.prior,
-        law=lambda wildcards: SETTINGS.priors.laws[wildcards.prior].plain(),
+        name=lambda wildcards: wildcards.prior.partition("+")[0],
+        law=lambda wildcards: SETTINGS.priors.laws[wildcards.prior.partition("+")[0]].plain(),
         method=SETTINGS.priors.method,
         options=SETTINGS.priors.plain()[SETTINGS.priors.method],
-        seed=SETTINGS.priors.seed,
+        seed=lambda wildcards: SETTINGS.priors.seed + int(wildcards.prior.partition("+seed=")[2] or 0),
         device=SETTINGS.device,
     script:
         "../scripts/prior.py"

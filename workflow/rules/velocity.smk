@@ -3,10 +3,10 @@
 
 rule velocity:
     input:
-        **body_files("{scene}"),
+        **body_files(),
         kernels=kernels("laws", "rendering"),
-        transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
-        prior=lambda wildcards: prior_file(SETTINGS.scenes[wildcards.scene].prior),
+        transforms=of_scene("dynamic/transforms.json"),
+        prior=lambda wildcards: prior_file(wildcards.scene),
     output:
         velocity=f"{RESULTS}/{{scene}}/velocity.json",
     resources:
