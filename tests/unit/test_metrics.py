@@ -219,7 +219,7 @@ def test_several_seeds_give_mean_and_standard_deviation():
     text = table.markdown()
     # Excesses of the seeds average 1.5, 2 and 4.
     assert "| NeuMA | 2.00 ± 1.00 | 3.00 ± 1.73 | 2.50 ± 1.32 |" in text
-    assert "| NCLaw | 5.00 | 7.00 | 6.00 |" in text and "± is the standard deviation over seeds" in text
+    assert "| NCLaw | 5.00 | 7.00 | 6.00 |" in text and "± is the standard deviation over chains" in text
     rows = {(r["quantity"], r["method"]): r for r in csv.DictReader(io.StringIO(table.csv()))}
     assert float(rows["chamfer_excess_std", "neuma"]["Average"]) == pytest.approx(1.3229, abs=1e-4)
     assert ("chamfer_excess_std", "nclaw") not in rows and ("chamfer_floor_std", "floor") not in rows
