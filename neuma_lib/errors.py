@@ -15,11 +15,20 @@ class NonFiniteError(ArithmeticError):
         detail: what is known of the place (iteration, step, particle) and what to try.
         step: simulation step at which it happened, if known.
         particle: first particle that it happened to, if known.
+        happened: what did, in words that follow "a particle".
     """
 
-    def __init__(self, stage: str, detail: str, step: int | None = None, particle: int | None = None):
+    def __init__(
+        self,
+        stage: str,
+        detail: str,
+        step: int | None = None,
+        particle: int | None = None,
+        happened: str = "became non-finite",
+    ):
         super().__init__(f"{stage}: {detail}")
         self.stage = stage
         self.detail = detail
         self.step = step
         self.particle = particle
+        self.happened = happened

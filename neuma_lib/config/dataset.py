@@ -25,7 +25,11 @@ class DatasetConfig(Section):
     particles: int = Field(
         8000, gt=0, description="ground-truth particles, at least four times the reconstruction's"
     )
-    seed: int = Field(1000, description="seed of the ground truth, apart from the reconstruction's")
+    seed: int = Field(
+        1000,
+        description="seed of the ground truth's particles; the next two draw its tracers. Apart from those of the "
+        "reconstruction: seed, and the chains after it",
+    )
     steps: int | None = Field(None, gt=0, description="steps of every video; null: those of its scene")
     frames: int | None = Field(
         25, ge=2, description="frames of a video, evenly from step 0 to the last, for scenes that list none"

@@ -10,9 +10,14 @@ from neuma_lib.config.base import Section
 class EvaluationConfig(Section):
     """Rollout of the learned law and its measures."""
 
-    tracers: int = Field(100_000, gt=0, description="passive tracers in the prediction")
+    tracers: int = Field(
+        100_000, gt=0, description="passive tracers in the prediction, as many as dataset.tracers"
+    )
     views: tuple[int, ...] | None = Field(
-        None, min_length=1, description="views of the image metrics; null: those that training does not see"
+        None,
+        min_length=1,
+        description="views of the image metrics; null: those that training does not see. Where there are none, the "
+        "training views are taken, and results and figures say so",
     )
     margin: float = Field(
         0.1,

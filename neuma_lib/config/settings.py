@@ -33,6 +33,9 @@ from neuma_lib.config.variants import DRAWN, folder, parse_chain
 from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.errors import InputError
 
+TRUTH_DRAWS = ("the particles", "the tracers", "the second tracers")
+"""What the seeds dataset.seed, dataset.seed + 1 and dataset.seed + 2 draw, see `neuma_lib.data.ground_truth`."""
+
 
 class Config(Section):
     """All settings."""
@@ -99,6 +102,24 @@ class Config(Section):
         for table in self.tables.values():
             for method in (*table.methods, *table.titles):
                 parse_method(method, self.methods)
+        return self
+
+    @model_validator(mode="after")
+    def _floor_means_something(self) -> Config:
+        """Truth and prediction are sampled alike, but independently: else the sampling floor is none of theirs."""
+        if self.evaluation.tracers != self.dataset.tracers:
+            raise ValueError(
+                f"evaluation.tracers: {self.evaluation.tracers} in the prediction and dataset.tracers: "
+                f"{self.dataset.tracers} in the truth: the sampling floor is that of equal counts, set both alike"
+            )
+        drawn = range(self.seed, self.seed + max((table.seeds for table in self.tables.values()), default=1))
+        of_truth = {self.dataset.seed + k: what for k, what in enumerate(TRUTH_DRAWS)}
+        for seed in of_truth.keys() & set(drawn):
+            raise ValueError(
+                f"dataset.seed: {self.dataset.seed} draws {of_truth[seed]} of the truth with the seed {seed}, "
+                f"which the reconstruction has too (seed: {self.seed}, and the chains of tables.*.seeds after it): "
+                "such samplings are not independent, move dataset.seed away"
+            )
         return self
 
     def _mentioned(self) -> Iterator[tuple[str, str, str]]:

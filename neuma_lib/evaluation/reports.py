@@ -46,14 +46,14 @@ def learning_rate_table(rows: Sequence[Mapping]) -> tuple[str, str, dict[str, fl
 
     Args:
         rows: one run each, with method, scene, lr_scale, loss (its history), best_loss, stable, recoveries and
-            chamfer_excess.
+            tracer_rmse_mm.
 
     Returns:
         CSV, Markdown, and for each method the factor whose best training loss, relative to the loss of the prior and
         averaged over the scenes geometrically, is lowest.
     """
     header = (
-        "method", "lr_scale", "scene", "loss of the prior", "best loss", "ratio", "recoveries", "stable", "excess",
+        "method", "lr_scale", "scene", "loss of the prior", "best loss", "ratio", "recoveries", "stable", "RMSE (mm)",
     )  # fmt: skip
     table = []
     logs: dict[str, dict[float, list[float]]] = {}
@@ -62,7 +62,7 @@ def learning_rate_table(rows: Sequence[Mapping]) -> tuple[str, str, dict[str, fl
         logs.setdefault(row["method"], {}).setdefault(row["lr_scale"], []).append(math.log(best / first))
         table.append((
             row["method"], f"{row['lr_scale']:g}", row["scene"], f"{first:.3e}", f"{best:.3e}", f"{best / first:.4f}",
-            len(row["recoveries"]), "yes" if row["stable"] else "no", f"{row['chamfer_excess']:.3f}",
+            len(row["recoveries"]), "yes" if row["stable"] else "no", f"{row['tracer_rmse_mm']:.2f}",
         ))  # fmt: skip
     chosen = {
         method: min(scales, key=lambda scale: sum(scales[scale]) / len(scales[scale]))

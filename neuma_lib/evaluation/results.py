@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from neuma_lib.io.files import read_json
@@ -22,3 +22,8 @@ def read_results(
     """
     files = iter(files)
     return {method: {scene: value(read_json(next(files))) for scene in scenes} for method in methods}
+
+
+def seen_in_training(metrics: Mapping[str, Mapping[str, Any]], scenes: Iterable[str]) -> list[str]:
+    """Scenes whose images were measured in a view of the training, from {method: {scene: image_metrics.json}}."""
+    return [s for s in scenes if any(row[s]["views_seen_in_training"] for row in metrics.values())]

@@ -1,4 +1,8 @@
-"""Tables of Chamfer distances from metrics: CSV for programs, Markdown for people, the paper's numbers beside ours."""
+"""Tables of errors from metrics: CSV for programs, Markdown for people, the paper's numbers beside, and what holds.
+
+The tracer RMSE comes first and decides. The Chamfer distance, the paper's measure, comes second, as it is, with its
+sampling floor (`neuma_lib.evaluation.motion` says what it does not see).
+"""
 
 from __future__ import annotations
 
@@ -9,24 +13,33 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from neuma_lib.errors import InputError
-from neuma_lib.evaluation.paper import Claim, PaperTable
+from neuma_lib.evaluation.paper import BALL_FLOOR, Claim, PaperTable
 from neuma_lib.evaluation.reports import as_csv, as_markdown
 
 QUANTITIES = {
+    "tracer_rmse_mm": "Tracer RMSE from identical start points (mm)",
+    "tracer_error_p95_mm": "95 %",
+    "tracer_rmse_last_mm": "Last frame",
     "chamfer": "Chamfer distance (1e-4 m², mean over the sequence)",
     "chamfer_excess": "Excess over the sampling floor (1e-4 m²)",
-    "tracer_rmse_mm": "Tracer RMSE from identical start points (mm)",
 }
-"""What is shown of each run, by its name in metrics.json."""
-JUDGED = "chamfer_excess"
-"""Quantity that claims are judged by: distances of other scenes and other floors cannot be compared."""
+"""What is written of each run, by its name in metrics.json, in the order of the CSV; and its heading, if it has one."""
+JUDGED = "tracer_rmse_mm"
+"""Quantity that claims are judged by: it sees all motion and has no floor."""
+YARDSTICKS = ("true_law",)
+"""Methods that know the truth and do not compete for the lowest error."""
+MIN_CHAINS = 3
+"""Fewer runs give no spread to judge by."""
 
 TRAINING_DIVERGED, ROLLOUT_DIVERGED = "†", "‡"
 FOOTNOTES = {
     TRAINING_DIVERGED: "The training diverged; its best state is shown.",
-    ROLLOUT_DIVERGED: "The predicted motion became non-finite; later frames hold the last finite state.",
+    ROLLOUT_DIVERGED: "A predicted motion broke off; its later frames hold the last sound state, from which the error "
+    "is too small. Averages with it are marked too.",
 }
 """Signs behind numbers, and what they mean."""
+
+HOLDS, MIXED, FAILS = "holds", "mixed", "does not hold"
 
 
 @dataclass(frozen=True)
@@ -37,7 +50,7 @@ class Row:
         quantity: its name in metrics.json.
         method: name of the method, or "floor".
         title: name in the table.
-        runs: one line a seed, one column a scene or experiment, shape (S, C).
+        runs: one line a chain, one column a scene or experiment, shape (S, C).
     """
 
     quantity: str
@@ -47,16 +60,45 @@ class Row:
 
     @property
     def mean(self) -> np.ndarray:
-        """Means over the seeds with the average over all columns behind them, shape (C + 1,)."""
+        """Means over the chains with the average over all columns behind them, shape (C + 1,)."""
         return self._averaged().mean(axis=0)
 
     @property
     def std(self) -> np.ndarray | None:
-        """Standard deviations over the seeds (of the average too), shape (C + 1,); None with a single seed."""
+        """Standard deviations over the chains (of the average too), shape (C + 1,); None with a single one."""
         return self._averaged().std(axis=0, ddof=1) if len(self.runs) > 1 else None
+
+    @property
+    def median(self) -> float:
+        """Median over all runs, chains and columns together."""
+        return float(np.median(self.runs))
+
+    def over(self, columns: Sequence[int]) -> Row:
+        """The same of some columns."""
+        return Row(self.quantity, self.method, self.title, self.runs[:, columns])
 
     def _averaged(self) -> np.ndarray:
         return np.concatenate([self.runs, self.runs.mean(axis=1, keepdims=True)], axis=1)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of a claim.
+
+    Attributes:
+        claim: the claim.
+        word: "holds", "mixed" or "does not hold".
+        here: our numbers, and what keeps it from holding.
+        paper: the paper's Chamfer distances, or why there are none.
+    """
+
+    claim: Claim
+    word: str
+    here: str
+    paper: str
+
+    def __str__(self) -> str:
+        return f"{self.word.capitalize()}: {self.claim.text}. {self.here}."
 
 
 @dataclass
@@ -68,6 +110,7 @@ class Table:
         paper: the table of the paper that it stands beside, if any.
         rows: in order.
         marks: (method, column) -> signs of `FOOTNOTES`, for runs that diverged.
+        failures: what happened in each prediction that broke off.
         notes: method -> what a reader must know of its numbers.
     """
 
@@ -75,6 +118,7 @@ class Table:
     paper: PaperTable | None = None
     rows: list[Row] = field(default_factory=list)
     marks: dict[tuple[str, str], str] = field(default_factory=dict)
+    failures: list[str] = field(default_factory=list)
     notes: Mapping[str, str] = field(default_factory=dict)
 
     def row(self, quantity: str, method: str) -> Row:
@@ -88,52 +132,56 @@ class Table:
                 return row
         raise InputError(f"table: no row {quantity} of {method}")
 
-    def csv(self) -> str:
-        """Comma-separated values: quantity, method, title, one column a scene, Average, diverged.
+    def wins(self) -> dict[str, int]:
+        """In how many columns each method has the lowest mean of `JUDGED`; those of `YARDSTICKS` are left out."""
+        rows = [r for r in self._rows(JUDGED) if r.method.partition("+")[0] not in YARDSTICKS]
+        means = np.array([row.mean[:-1] for row in rows])
+        return (
+            {}
+            if not rows
+            else {row.method: int((m <= means.min(axis=0)).sum()) for row, m in zip(rows, means, strict=True)}
+        )
 
-        With several seeds, a row ``<quantity>_std`` follows each row of means.
+    def csv(self) -> str:
+        """Comma-separated values: quantity, method, title, one column a scene, Average, Median, wins, diverged.
+
+        With several chains, a row ``<quantity>_std`` follows each row of means.
         """
-        lines = [["quantity", "method", "title", *self.columns, "Average", "diverged"]]
+        wins = self.wins()
+        lines = [["quantity", "method", "title", *self.columns, "Average", "Median", "wins", "diverged"]]
         for row in self.rows:
             diverged = " ".join(c for c in self.columns if (row.method, c) in self.marks)
-            for suffix, values in (("", row.mean), ("_std", row.std)):
+            best = wins.get(row.method, "") if row.quantity == JUDGED else ""
+            ends = ("", row.mean, [f"{row.median:.4f}", best]), ("_std", row.std, ["", ""])
+            for suffix, values, end in ends:
                 if values is not None:
                     cells = [f"{v:.4f}" for v in values]
-                    lines.append([row.quantity + suffix, row.method, row.title, *cells, diverged])
+                    lines.append([row.quantity + suffix, row.method, row.title, *cells, *end, diverged])
         return as_csv(lines)
 
     def markdown(self) -> str:
-        """One Markdown table a quantity, the paper's numbers below the Chamfer distances, and what holds of it."""
-        paper = self.paper
-        parts = [f"# {paper.heading}", ""] if paper else []
-        printed: list[Row] = []
-        for quantity, heading in QUANTITIES.items():
-            rows = [row for row in self.rows if row.quantity == quantity]
-            if quantity == "chamfer":
-                printed = self._paper_rows(rows)
-                rows += [row for row in self.rows if row.quantity == "chamfer_floor"] + printed
-            header = ["Method", *self.columns.values(), "Average"]
-            parts += [f"**{heading}**", "", *as_markdown(header, map(self._cells, rows), numbers=True), ""]
-        if any(len(row.runs) > 1 for row in self.rows):
-            parts += ["± is the standard deviation over chains of other seeds.", ""]
+        """The RMSE of all methods, their Chamfer distances with the paper's, and what holds of the paper's claims."""
+        parts = [f"# {self.paper.heading}", ""] if self.paper else []
+        parts += [*self._errors(), *self._distances()]
+        if chains := max(len(row.runs) for row in self.rows) - 1:
+            parts += [
+                f"± is the standard deviation over {chains + 1} chains; behind an average, of their averages.",
+                "",
+            ]
         for sign, note in FOOTNOTES.items():
             if any(sign in signs for signs in self.marks.values()):
                 parts += [f"{sign} {note}", ""]
+        parts += [*(f"- {failure}" for failure in self.failures), ""] if self.failures else []
         for method, note in self.notes.items():
             parts += [f"{self._note_sign(method)} {note}", ""]
         if verdicts := self.verdicts():
-            parts += ["**What holds**", "", *(f"- {line}" for line in verdicts), ""]
-        parts += [
-            "The floor is the distance between two samplings of the true motion with the same number "
-            "of tracers. The paper's distances contain a floor of their own, set by its 30,000 particles: "
-            "compare excesses, not distances. Its scenes have the same starts but materials that it does not "
-            "publish." + (f" Its numbers are those of {paper.label}." if printed else ""),
-            "",
-        ]
+            rows = [[v.claim.text, f"**{v.word}**", v.here, v.paper] for v in verdicts]
+            head = ["claim", "verdict", "RMSE here (mm)", "Chamfer distance in the paper"]
+            parts += ["**What holds**", "", *as_markdown(head, rows), "", RULE, ""]
         return "\n".join(parts)
 
-    def verdicts(self) -> list[str]:
-        """A sentence for each claim whose rows and columns are here: whether it holds, with the numbers."""
+    def verdicts(self) -> list[Verdict]:
+        """A verdict on each claim whose rows and columns are here."""
         claims = self.paper.claims if self.paper else ()
         methods = {row.method for row in self.rows}
         return [
@@ -142,52 +190,145 @@ class Table:
             if {*claim.better, *claim.worse} <= methods and set(claim.columns) <= set(self.columns)
         ]
 
-    def _verdict(self, claim: Claim) -> str:
+    def _rows(self, quantity: str) -> list[Row]:
+        return [row for row in self.rows if row.quantity == quantity]
+
+    def _errors(self) -> list[str]:
+        """The table of tracer errors."""
+        wins, heads, rows = self.wins(), ["Average"], []
+        several = len(self.columns) > 1
+        heads += ["Median"] if several else []
+        heads += [QUANTITIES["tracer_error_p95_mm"], QUANTITIES["tracer_rmse_last_mm"]]
+        compared = len(wins) > 1
+        for row in self._rows(JUDGED):
+            others = [self.row(name, row.method) for name in ("tracer_error_p95_mm", "tracer_rmse_last_mm")]
+            sign = self._average_mark(row)
+            cells = [f"{shown(row.median, 1)}{sign}"] if several else []
+            cells += [f"{shown(other.mean[-1], 1)}{sign}" for other in others]
+            best = f"{wins[row.method]} of {len(self.columns)}" if row.method in wins else ""
+            rows.append([*self._cells(row, 1), *cells, *([best] if compared else [])])
+        header = ["Method", *self.columns.values(), *heads, *(["Best in"] if compared else [])]
+        note = "95 %: the distance that 95 % of all tracers, over all frames, stay below. Last frame: the RMSE in it."
+        if several:
+            note += " Both are averages over the columns; the median is that of all runs of a row."
+        if compared:
+            note += " Best in: columns in which a row has the lowest mean."
+        return [f"**{QUANTITIES[JUDGED]}**", "", *as_markdown(header, rows, numbers=True), "", note, ""]
+
+    def _distances(self) -> list[str]:
+        """The table of Chamfer distances, the paper's below ours, and its floor."""
+        rows, printed = [], False
+        for row in self._rows("chamfer"):
+            rows.append(self._cells(row, 2))
+            values = self.paper.row(row.method, list(self.columns)) if self.paper else None
+            if values:
+                printed = True
+                rows.append(["*paper*", *(f"*{v:.2f}*" for v in (*values, sum(values) / len(values)))])
+        rows += [self._cells(row, 2) for row in self._rows("chamfer_floor")]
+        header = ["Method", *self.columns.values(), "Average"]
+        note = (
+            "The floor is the distance between two samplings of the true motion with as many tracers. The distance "
+            "sees outlines alone, so small errors of the motion hardly show in it."
+        )
+        if printed:
+            note += (
+                f" The paper's numbers ({self.paper.label}) are of materials that it does not publish, and contain a "
+                "floor of its own, set by its particles."
+            )
+            note += f" {BALL_FLOOR}" if "BouncyBall" in self.columns else ""
+        return [f"**{QUANTITIES['chamfer']}**", "", *as_markdown(header, rows, numbers=True), "", note, ""]
+
+    def _verdict(self, claim: Claim) -> Verdict:
+        """Whether a claim holds, is mixed or does not hold.
+
+        The burden of proof is on the claim, "these methods are closer than those". It *holds* only if all of this is
+        so: the average error is lower; it is lower in more than half of the columns; the intervals mean ± standard
+        deviation over the chains, of the averages as they stand in the table, do not overlap; there are `MIN_CHAINS`
+        chains at least; and no prediction of the methods said to be closer broke off, since a motion that is held
+        counts less than its error. (For three chains of equal spread, no overlap is t > 2.4, which chance gives in
+        4 of 100 cases.) It *does not hold* if neither the average nor the majority of columns is on its side. All
+        else is *mixed*; with a single run a claim can be no more. "No worse" is judged as "closer": that a difference
+        was not seen does not show that there is none.
+        """
         columns = claim.columns or tuple(self.columns)
         index = [list(self.columns).index(column) for column in columns]
+        better, worse = (
+            [self.row(JUDGED, m).over(index) for m in group] for group in (claim.better, claim.worse)
+        )
+        high, low = max(better, key=lambda r: r.mean[-1]), min(worse, key=lambda r: r.mean[-1])
+        average = bool(high.mean[-1] < low.mean[-1])
+        columnwise = [np.stack([row.mean[:-1] for row in rows]) for rows in (better, worse)]
+        lower = int((columnwise[0].max(axis=0) < columnwise[1].min(axis=0)).sum())
+        majority = 2 * lower > len(columns)
+        fewest = min(len(row.runs) for row in (*better, *worse))
+        if not (average or majority):
+            word, why = FAILS, ""
+        else:
+            doubts = [] if average else ["not on average"]
+            doubts += [] if majority else ["not in most columns"]
+            if fewest < MIN_CHAINS:
+                doubts.append(f"{fewest} run{'s' if fewest > 1 else ''}, no spread to judge by")
+            elif average and max(r.mean[-1] + r.std[-1] for r in better) >= min(
+                r.mean[-1] - r.std[-1] for r in worse
+            ):
+                doubts.append("the ± overlap")
+            signs = [self.marks.get((m, c), "") for m in claim.better for c in columns]
+            if any(ROLLOUT_DIVERGED in sign for sign in signs):
+                doubts.append("a prediction broke off")
+            word, why = (MIXED, f"; {', '.join(doubts)}") if doubts else (HOLDS, "")
+        here = f"{spread(high)} ({high.title}) against {spread(low)} ({low.title})"
+        return Verdict(
+            claim, word, f"{here}, lower in {lower} of {len(columns)}{why}", self._of_paper(claim, columns)
+        )
 
-        def means(method: str) -> np.ndarray:
-            return self.row(JUDGED, method).mean[index]
-
-        highest = max(claim.better, key=lambda method: means(method).mean())
-        lowest = min(claim.worse, key=lambda method: means(method).mean())
-        ours = [float(means(method).mean()) for method in (highest, lowest)]
-        per_column = [np.stack([means(m) for m in group]) for group in (claim.better, claim.worse)]
-        lower = int((per_column[0].max(axis=0) <= per_column[1].min(axis=0)).sum())
-        titles = [self.row(JUDGED, method).title for method in (highest, lowest)]
-        said = f"{'Holds' if ours[0] <= ours[1] else 'Does not hold'}: {claim.text.rstrip('.')}."
-        said += f" Excess {ours[0]:.3f} ({titles[0]}) against {ours[1]:.3f} ({titles[1]}) on average;"
-        said += f" it is so in {lower} of {len(columns)} columns."
-        return said + self._paper_verdict(claim, columns)
-
-    def _paper_verdict(self, claim: Claim, columns: Sequence[str]) -> str:
+    def _of_paper(self, claim: Claim, columns: Sequence[str]) -> str:
         """The same comparison with the paper's distances."""
         if not claim.by_paper:
-            return " The paper does not compare these."
+            return "not compared there"
         groups = [
             [self.paper.row(method, columns) for method in group] for group in (claim.better, claim.worse)
         ]
         if any(row is None for group in groups for row in group):
             return ""
         means = [[sum(row) / len(row) for row in group] for group in groups]
-        return f" Paper, floors included: {max(means[0]):.2f} against {min(means[1]):.2f}."
+        return f"{max(means[0]):.2f} against {min(means[1]):.2f}"
 
-    def _cells(self, row: Row) -> list[str]:
-        marks = [*(self.marks.get((row.method, column), "") for column in self.columns), ""]
-        spread = [""] * len(marks) if row.std is None else [f" ± {s:.2f}" for s in row.std]
+    def _average_mark(self, row: Row) -> str:
+        signs = "".join(self.marks.get((row.method, column), "") for column in self.columns)
+        return "".join(sign for sign in FOOTNOTES if sign in signs)
+
+    def _cells(self, row: Row, digits: int) -> list[str]:
+        marks = [
+            *(self.marks.get((row.method, column), "") for column in self.columns),
+            self._average_mark(row),
+        ]
+        spreads = [""] * len(marks) if row.std is None else [f" ± {shown(s, digits)}" for s in row.std]
+        cells = zip(row.mean, spreads, marks, strict=True)
         title = f"{row.title} {self._note_sign(row.method)}".rstrip()
-        return [title, *(f"{v:.2f}{s}{m}" for v, s, m in zip(row.mean, spread, marks, strict=True))]
+        return [title, *(f"{shown(v, digits)}{s}{m}" for v, s, m in cells)]
 
     def _note_sign(self, method: str) -> str:
         """The sign behind the title of a method that has a note, else nothing."""
         return f"({list(self.notes).index(method) + 1})" if method in self.notes else ""
 
-    def _paper_rows(self, rows: Sequence[Row]) -> list[Row]:
-        """The paper's rows of the methods shown, if it has all the columns."""
-        if not self.paper:
-            return []
-        printed = [(row.title, self.paper.row(row.method, list(self.columns))) for row in rows]
-        return [Row("chamfer", "", f"*paper: {title}*", np.array([v])) for title, v in printed if v]
+
+RULE = (
+    "A claim *holds* if its methods are lower on average and in most columns, the intervals mean ± standard deviation "
+    f"of the averages do not overlap, there are at least {MIN_CHAINS} chains, and no prediction of these broke off. It "
+    "*does not hold* if neither the average nor most columns are on its side; else it is *mixed*."
+)
+"""`Table._verdict` for people."""
+
+
+def shown(value: float, digits: int) -> str:
+    """A number with some digits; one that would be zero is "< 0.01" (with two of them)."""
+    text = f"{value:.{digits}f}"
+    return text if float(text) else f"< {10**-digits:.{digits}f}"
+
+
+def spread(row: Row) -> str:
+    """The average of a row's columns with its standard deviation over the chains, if there are several."""
+    return shown(row.mean[-1], 1) + ("" if row.std is None else f" ± {shown(row.std[-1], 1)}")
 
 
 def chamfer_table(
@@ -197,10 +338,10 @@ def chamfer_table(
     paper: PaperTable | None = None,
     notes: Mapping[str, str] | None = None,
 ) -> Table:
-    """A table of distances with floor, excess and tracer error. Any method may have a row; none is implied.
+    """A table of tracer errors and distances. Any method may have a row; none is implied.
 
     Args:
-        metrics: method -> scene or experiment -> content of its metrics.json, one a seed.
+        metrics: method -> scene or experiment -> content of its metrics.json, one a chain.
         titles: method -> name in the table, in the order of the rows.
         columns: scene or experiment -> heading, in order.
         paper: what to show beside it.
@@ -216,10 +357,10 @@ def chamfer_table(
     table = Table(dict(columns), paper, notes=notes or {})
 
     def row(quantity: str, method: str, title: str) -> Row:
-        seeds = min(len(metrics.get(method, {}).get(column, ())) for column in columns)
+        chains = min(len(metrics.get(method, {}).get(column, ())) for column in columns)
         runs = [
             [_number(quantity, method, column, metrics[method][column][k]) for column in columns]
-            for k in range(seeds)
+            for k in range(chains)
         ]
         if not runs:
             missing = next(column for column in columns if not metrics.get(method, {}).get(column))
@@ -230,14 +371,28 @@ def chamfer_table(
         table.rows += [row(quantity, method, title) for method, title in titles.items()]
     floor = row("chamfer_floor", next(iter(titles)), "Sampling floor").runs[:1]
     table.rows.append(Row("chamfer_floor", "floor", "Sampling floor", floor))
-    for method in titles:
-        for column in columns:
+    for method, title in titles.items():
+        for column, heading in columns.items():
             runs = metrics[method][column]
             signs = TRAINING_DIVERGED if any(run.get("stable") is False for run in runs) else ""
-            signs += ROLLOUT_DIVERGED if any(run.get("diverged_at_step") is not None for run in runs) else ""
+            for k, run in enumerate(runs):
+                if failure := run.get("diverged"):
+                    signs += ROLLOUT_DIVERGED if ROLLOUT_DIVERGED not in signs else ""
+                    chain = f", chain {k + 1} of {len(runs)}" if len(runs) > 1 else ""
+                    table.failures.append(f"{title} on {heading}{chain}: {_told(failure, run)}")
             if signs:
                 table.marks[method, column] = signs
     return table
+
+
+def _told(failure: Mapping, run: Mapping) -> str:
+    """What happened in a prediction that broke off, and when that began."""
+    gain = run["energy_gain_after_step"]
+    began = f"it had more energy than at the start after step {gain}"
+    if gain is None:
+        began = "no frame before had more energy than the start"
+    what = f"particle {failure['particle']} {failure['happened']} at step {failure['step']} of {run['frames'][-1]}"
+    return f"{what}; {began}."
 
 
 def _number(quantity: str, method: str, column: str, run: Mapping) -> float:

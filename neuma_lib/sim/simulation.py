@@ -313,6 +313,7 @@ class Simulation:
             "MPMModel.check_courant), a slower start, or the last good weights with a lower rate",
             step=step,
             particle=particle,
+            happened=happened,
         )
 
 

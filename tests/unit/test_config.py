@@ -65,6 +65,16 @@ def test_default_settings_are_valid(loaded):
         ),
         ({"scenes": {"New": {"shape": "ball"}}}, r"scenes\.New\.height: this key is missing"),
         ({"dataset": {"stride": 4}}, r"dataset: give either frames or stride"),
+        (
+            {"evaluation": {"tracers": 5}},
+            r"evaluation\.tracers: 5 in the prediction and dataset\.tracers: 100000 in the truth",
+        ),
+        ({"seed": 1000}, r"dataset\.seed: 1000 draws the particles of the truth with the seed 1000"),
+        ({"dataset": {"seed": -1}}, r"dataset\.seed: -1 draws the tracers of the truth with the seed 0"),
+        (
+            {"dataset": {"seed": 1}, "tables": {"table2": {"seeds": 4}}},
+            r"dataset\.seed: 1 draws .* of the truth with the seed [123]",
+        ),
         ({"dataset": {"frames": None}}, r"dataset: give either frames or stride"),
         ({"scenes": {"BouncyBall": {"images": {"video": "x"}}}}, r"BouncyBall\.images\.video: unknown key"),
         (

@@ -8,7 +8,7 @@ import pytest
 import torch
 from grounding_scene import MODEL, PRIOR, RADIUS, TRUTH, ball
 
-from neuma_lib.errors import NonFiniteError
+from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.evaluation.motion import evaluate, predict
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Elasticity, Law
@@ -62,7 +62,7 @@ def test_the_true_law_from_another_sampling_is_as_good_as_the_sampling_allows():
     assert abs(found["chamfer_excess"]) < sampling + displaced < wrong["chamfer_excess"]
     in_flight = [a - b for a, b in zip(found["chamfer_per_frame"], found["chamfer_floor_per_frame"])][:2]
     assert max(map(abs, in_flight)) < sampling
-    assert found["diverged_at_step"] is None
+    assert found["diverged_at_step"] is found["diverged"] is found["energy_gain_after_step"] is None
 
 
 def test_a_known_shift_of_the_truth_is_the_error():
@@ -77,6 +77,11 @@ def test_a_known_shift_of_the_truth_is_the_error():
     found = evaluation.metrics
     assert found["tracer_rmse_mm_per_frame"] == pytest.approx([0, 5, 5, 5], abs=1e-9)
     assert found["tracer_rmse_mm"] == pytest.approx(5 * math.sqrt(3 / 4), rel=1e-9)
+    assert (
+        found["tracer_error_p95_mm"]
+        == pytest.approx(found["tracer_rmse_last_mm"])
+        == pytest.approx(5, rel=1e-9)
+    )
     # 25 mm^2 in both directions, in units of 1e-4 m^2: for the prediction, and for the floor that is shifted too.
     assert found["chamfer_per_frame"] == pytest.approx([0, 0.5, 0.5, 0.5], rel=1e-9, abs=1e-12)
     assert found["chamfer_floor_per_frame"] == found["chamfer_per_frame"]
@@ -110,7 +115,9 @@ def test_a_motion_that_diverges_is_held_and_marked():
     (truth,) = true_tracers(body, frames, tracers)
     evaluation = evaluate(MODEL, Law(FailsOnce(6), LAW.plasticity), body, V0, frames, truth, truth, tracers)
     path, found = evaluation.path, evaluation.metrics
-    assert found["diverged_at_step"] == 6 and "DIVERGED at step 6" in evaluation.summary()
+    assert found["diverged_at_step"] == 6
+    assert found["diverged"] == {"happened": "became non-finite", "step": 6, "particle": 0}
+    assert evaluation.summary().endswith("DIVERGED: a particle became non-finite at step 6")
     assert path.frames == (0, 4, 4, 4) and len(found["chamfer_per_frame"]) == 4
     sound, _ = predict(MODEL, LAW, body, V0, [0, 4])
     for name in ("x", "F", "tracers"):
@@ -124,6 +131,32 @@ def test_a_motion_that_diverges_is_held_and_marked():
     assert errors[3] == pytest.approx(float(expected)) and errors[3] > errors[2] > 1
 
 
+class Repelling(Elasticity):
+    """The true elasticity with its sign turned: what is deformed is driven further."""
+
+    def response(self, F, weights):
+        return -LAW.elasticity.response(F, weights)
+
+
+def test_a_motion_that_explodes_had_too_much_energy_before():
+    """Which fault it was is told from a number that is no more; the energy, a frame or more before it."""
+    frames, body = list(range(0, 61, 2)), ball(height=ON_THE_FLOOR)
+    tracers = in_ball(50, 0, ON_THE_FLOOR)
+    (truth,) = true_tracers(body, frames, tracers)
+    found = evaluate(MODEL, Law(Repelling(), LAW.plasticity), body, V0, frames, truth, truth, tracers).metrics
+    failure = found["diverged"]
+    assert failure["happened"] != "became non-finite" and failure["step"] == found["diverged_at_step"]
+    assert 0 <= found["energy_gain_after_step"] < failure["step"] - 2
+    sound = evaluate(MODEL, LAW, body, V0, frames, truth, truth, tracers).metrics
+    assert sound["diverged"] is sound["energy_gain_after_step"] is None
+
+
+def test_a_floor_of_other_counts_is_refused():
+    (truth, again) = true_tracers(ball(), IN_FLIGHT, in_ball(40, 0), in_ball(40, 1))
+    with pytest.raises(InputError, match=r"40 and 40 tracers, the prediction 50: .*evaluation\.tracers"):
+        evaluate(MODEL, LAW, ball(), V0, IN_FLIGHT, truth, again, in_ball(50, 2))
+
+
 def test_a_motion_without_a_finite_frame_is_an_error():
     with pytest.raises(NonFiniteError, match="step 2"):
         predict(MODEL, Law(FailsOnce(2), LAW.plasticity), ball(height=ON_THE_FLOOR), V0, [4, 8])
@@ -131,7 +164,7 @@ def test_a_motion_without_a_finite_frame_is_an_error():
 
 def test_a_motion_that_stays_finite_is_the_rollout():
     frames, body = [0, 10, 40], ball()
-    path, diverged = predict(MODEL, LAW, body, V0, frames)
+    path, failure = predict(MODEL, LAW, body, V0, frames)
     with torch.no_grad():
         expected = rollout(MODEL, LAW, body.state(V0), steps=40, frames=frames)
-    assert diverged is None and torch.equal(path.x, expected.x) and torch.equal(path.F, expected.F)
+    assert failure is None and torch.equal(path.x, expected.x) and torch.equal(path.F, expected.F)

@@ -88,6 +88,7 @@ DATA = {
             scene: {
                 "time": np.linspace(0, 0.25, 20).tolist(),
                 "floor": [0.1] * 20,
+                "rmse": {method: curves() for method in METHODS},
                 "chamfer": {method: curves() for method in METHODS},
             }
             for scene in SCENES
@@ -96,6 +97,7 @@ DATA = {
     "image_quality": lambda: {
         "titles": TITLES,
         "scenes": SCENES,
+        "seen": SCENES[1:3],
         "psnr": cells(20, 35, METHODS, SCENES),
         "ssim": cells(0.8, 1, METHODS, SCENES),
         "lpips_vgg": cells(0, 0.2, METHODS, SCENES),
@@ -147,6 +149,7 @@ DATA = {
         5,
         {
             "rows": {"neuma": 2, "neuma+assumed_density=1000": 3},
+            "rmse": {"neuma": 3.0, "neuma+assumed_density=1000": 20.0},
             "chamfer": {"neuma": 0.3, "neuma+assumed_density=1000": 2.0},
             "floor": 0.1,
         },
@@ -162,7 +165,8 @@ DATA = {
     "ablation_gradients": lambda: {
         "scenes": SCENES[:3],
         "titles": {"a": "NeuMA", "b": "gradients not zeroed"},
-        **{name: cells(0, 1, "ab", SCENES) for name in ("loss", "chamfer_excess", "tracer_rmse_mm", "psnr")},
+        "seen": SCENES[:1],
+        **{name: cells(0, 1, "ab", SCENES) for name in ablation_gradients.MEASURES},
     },
 }
 
@@ -239,11 +243,18 @@ def test_every_number_is_of_its_method_and_scene(tmp_path):
             "frames": [0, 2],
             "chamfer_per_frame": [k, 10 * k],
             "chamfer_floor_per_frame": [k / 10, k],
-            "chamfer_excess": k + 0.1,
+            "tracer_rmse_mm_per_frame": [k, k + 1],
+            "chamfer": k + 0.1,
             "tracer_rmse_mm": k + 0.2,
         },
     )
-    images = results(tmp_path, "images", lambda k: {m: k + len(m) for m in image_quality.MEASURES})
+    images = results(
+        tmp_path,
+        "images",
+        lambda k: (
+            {m: k + len(m) for m in image_quality.MEASURES} | {"views_seen_in_training": [0] * (k == 3)}
+        ),
+    )
     histories = results(tmp_path, "history", lambda k: {"loss": [4.0, 1.0], "best_loss": 4.0 * k})
 
     said = []
@@ -256,10 +267,12 @@ def test_every_number_is_of_its_method_and_scene(tmp_path):
     assert curves["scenes"]["B"] == {
         "time": [0.0, 0.5],
         "floor": [0.1, 1],
+        "rmse": {"nclaw": [1, 2], "neuma": [3, 4]},
         "chamfer": {"nclaw": [1, 10], "neuma": [3, 30]},
     }
     params = SimpleNamespace(titles=titles, scenes=scenes)
     quality = image_quality.data(SimpleNamespace(metrics=images), params, said.append)
+    assert quality["seen"] == ["B"], "a method has no other view of it"
     assert quality["ssim"] == {"nclaw": {"A": 4, "B": 5}, "neuma": {"A": 6, "B": 7}}
     choices = ablation_gradients.data(
         SimpleNamespace(histories=histories, metrics=motion, image_metrics=images), params, said.append

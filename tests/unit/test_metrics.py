@@ -4,25 +4,22 @@ from __future__ import annotations
 
 import csv
 import io
-from pathlib import Path
+import math
 
 import imageio.v2 as imageio
 import numpy as np
 import pytest
 import torch
-import yaml
+import trimesh
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from neuma_lib.config.settings import load
 from neuma_lib.errors import InputError, NonFiniteError
-from neuma_lib.evaluation.metrics import mean_height, psnr, ssim, tracer_rmse
-from neuma_lib.evaluation.paper import PAPER, Claim, PaperTable
+from neuma_lib.evaluation.metrics import mean_height, mechanical_energy, psnr, ssim, tracer_errors
+from neuma_lib.evaluation.paper import BALL_PARTICLES, BALL_RADIUS, PAPER
 from neuma_lib.evaluation.reports import benchmark_table, learning_rate_table, report_table
-from neuma_lib.evaluation.tables import chamfer_table
 from neuma_lib.evaluation.video import side_by_side, write_mp4
 from neuma_lib.geometry.chamfer import chamfer, chamfer_loss, chamfer_sequence
-
-ROOT = Path(__file__).resolve().parents[2]
+from neuma_lib.geometry.volume import sample_volume
 
 
 def points(*shape, seed=0):
@@ -79,9 +76,96 @@ def test_chamfer_loss_names_what_is_wrong():
 def test_tracer_error_of_a_shift_is_its_length():
     path = points(4, 30)
     shift = torch.tensor([3e-3, 0.0, 4e-3], dtype=torch.float64)
-    torch.testing.assert_close(tracer_rmse(path + shift, path), torch.full((4,), 5e-3, dtype=torch.float64))
+    found = tracer_errors(path + shift, path)
+    assert found.pop("tracer_rmse_mm_per_frame") == pytest.approx([5] * 4)
+    assert list(found.values()) == pytest.approx([5] * 3)
     with pytest.raises(InputError, match="do not match"):
-        tracer_rmse(path, path[:, 1:])
+        tracer_errors(path, path[:, 1:])
+
+
+def test_tracer_error_over_points_and_frames():
+    """Point k of frame t is off by t k mm: errors of all points in all frames count alike."""
+    t, k = torch.meshgrid(torch.arange(10.0), torch.arange(10.0), indexing="ij")
+    off = torch.zeros(10, 10, 3)
+    off[..., 1] = 1e-3 * t * k
+    found = tracer_errors(points(10, 10) + off, points(10, 10))
+    squares = np.arange(10.0) ** 2
+    assert found["tracer_rmse_mm"] == pytest.approx(squares.mean())
+    assert found["tracer_rmse_last_mm"] == pytest.approx(9 * math.sqrt(squares.mean()))
+    assert found["tracer_error_p95_mm"] == pytest.approx(np.quantile((t * k).numpy(), 0.95))
+
+
+def test_energy_of_a_throw_is_that_of_its_parabola():
+    g, mass, time = torch.tensor([0.5, -9.8, 0.0]), torch.tensor([2.0, 3.0]), torch.linspace(0, 0.3, 4)
+    v0, x0 = points(2, seed=1), points(2, seed=2)
+    v = v0 + time[:, None, None].double() * g
+    x = x0 + time[:, None, None] * v0 + 0.5 * time[:, None, None] ** 2 * g
+    energy = mechanical_energy(x, v, mass, g.tolist())
+    torch.testing.assert_close(energy, energy[:1].expand(4), rtol=1e-6, atol=0)
+    # At rest in the lowest corner there is none: least x, since gravity points along it, and so on.
+    at_rest = mechanical_energy(torch.tensor([[[1.0, 0, 0]]]), torch.zeros(1, 1, 3), mass[:1], g.tolist())
+    assert float(at_rest) == pytest.approx(0, abs=1e-6)
+
+
+# ---- what the Chamfer distance of filled bodies sees
+
+RADIUS, POINTS = 0.13, 20_000
+
+
+def mean_square_nearest(volume: float, count: int) -> float:
+    """Mean squared distance [m^2] to the nearest of random points of a density: r^3 is exponentially distributed."""
+    return math.gamma(5 / 3) * (3 * volume / (4 * math.pi * count)) ** (2 / 3)
+
+
+def ball_points(count: int, radius: float, seed: int, method: str = "uniform") -> np.ndarray:
+    return sample_volume(trimesh.creation.icosphere(5, radius), count, seed, method)
+
+
+def test_the_papers_distance_on_its_ball_is_its_floor():
+    """The paper's 1.19 lies between two samplings of the very same ball, on jittered grids and independent."""
+    floors = {
+        method: chamfer(*(ball_points(BALL_PARTICLES, BALL_RADIUS, seed, method) for seed in (0, 1)))
+        for method in ("jittered", "uniform")
+    }
+    assert floors["jittered"] < PAPER["table1"].row("neuma", ["BouncyBall"])[0] < floors["uniform"]
+    assert [round(floor, 1) for floor in floors.values()] == [1.1, 1.3]
+    volume = 4 / 3 * math.pi * BALL_RADIUS**3
+    inside = 2e4 * mean_square_nearest(volume, BALL_PARTICLES)
+    # Points within a spacing of the surface, 3 s / R of all, see half of the space at worst, r^2 times 2^(2/3). Three
+    # standard deviations of the mean, of r^2 that deviates by 0.68 of it, two directions with neighbours in common.
+    spacing, sampling = (volume / BALL_PARTICLES) ** (1 / 3), 3 * 0.68 * math.sqrt(2 / BALL_PARTICLES)
+    cut = 3 * spacing / BALL_RADIUS * (2 ** (2 / 3) - 1)
+    assert 1 - sampling < floors["uniform"] / inside < (1 + cut) * (1 + sampling)
+
+
+def test_a_ball_that_has_turned_is_the_same_to_the_chamfer_distance():
+    truth, again = ball_points(POINTS, RADIUS, 0), ball_points(POINTS, RADIUS, 1)
+    turned = again[:, [2, 1, 0]] * [1, 1, -1]  # by 90 degrees about the vertical axis
+    error = tracer_errors(torch.from_numpy(turned)[None], torch.from_numpy(again)[None])["tracer_rmse_mm"]
+    # Distances from the axis rho have mean rho^2 = 2 R^2 / 5 and mean rho^4 = 8 R^4 / 35.
+    assert error == pytest.approx(
+        2e3 * math.sin(math.pi / 4) * RADIUS * math.sqrt(2 / 5), rel=3 * 0.33 / math.sqrt(POINTS)
+    )
+    floor = chamfer(again, truth)
+    assert abs(chamfer(turned, truth) - floor) < 3 * 0.68 * floor * math.sqrt(2 / POINTS)
+
+
+@pytest.mark.parametrize("shift", [0.02, 0.04])
+def test_chamfer_excess_of_a_small_motion_is_of_third_order(shift):
+    """Only points that leave the outline are noticed: crescents of depth d cos(angle), squared distance to the surface.
+
+    Over the front half of a ball both directions give d^3 / (4 R). The nearest sample is further away than the surface,
+    by a distance h in quadratic mean (half of the space is empty there), which adds d^2 h / R + 3 d h^2 / (2 R); within
+    the body those points had their part of the floor.
+    """
+    truth, again = ball_points(POINTS, RADIUS, 0), ball_points(POINTS, RADIUS, 1)
+    floor = 1e-4 * chamfer(again, truth)
+    excess = 1e-4 * chamfer(again + [0, shift, 0], truth) - floor
+    h = math.sqrt(2 ** (2 / 3) * mean_square_nearest(4 / 3 * math.pi * RADIUS**3, POINTS))
+    sampling = 3 * 0.68 * floor * math.sqrt(2 / POINTS)
+    cubic, crescent = shift**3 / (4 * RADIUS), 3 * shift / (4 * RADIUS)
+    assert cubic - crescent * floor - sampling < excess
+    assert excess < cubic + shift**2 * h / RADIUS + 2 * crescent * h**2 + sampling
 
 
 def test_mean_height_is_that_of_the_centre_of_mass():
@@ -115,143 +199,6 @@ def test_unusable_points_and_images_are_named():
         psnr(np.zeros((4, 4, 3)), np.zeros((4, 5, 3)))
     with pytest.raises(InputError, match="smaller than the window"):
         ssim(np.zeros((8, 20, 3)), np.zeros((8, 20, 3)))
-
-
-def run(value, **extra):
-    return {
-        "chamfer": value + 0.5, "chamfer_floor": 0.5, "chamfer_excess": value, "tracer_rmse_mm": 10 * value,
-        "diverged_at_step": None, "stable": True, **extra,
-    }  # fmt: skip
-
-
-TITLES = {"nclaw": "NCLaw", "neuma": "NeuMA"}
-SCENES = {scene: scene for scene in PAPER["table1"].columns}
-
-
-def test_table_has_the_papers_rows_and_columns():
-    metrics = {
-        method: {scene: [run(k + i)] for i, scene in enumerate(SCENES)}
-        for k, method in ((10, "nclaw"), (1, "neuma"))
-    }
-    table = chamfer_table(metrics, TITLES, SCENES, PAPER["table1"])
-    rows = list(csv.DictReader(io.StringIO(table.csv())))
-    assert [(r["quantity"], r["method"]) for r in rows] == [
-        (quantity, method)
-        for quantity in ("chamfer", "chamfer_excess", "tracer_rmse_mm")
-        for method in TITLES
-    ] + [("chamfer_floor", "floor")]
-    assert list(rows[0])[3:-1] == [*SCENES, "Average"]
-    assert float(rows[1]["Average"]) == pytest.approx(np.mean([1.5 + i for i in range(6)]))
-    assert table.row("chamfer_excess", "nclaw").mean[list(SCENES).index("SandFish")] == 14
-    text = table.markdown()
-    assert (
-        "| *paper: NCLaw* | 56.13 |" in text and "| 12.18 |" in text and "| Sampling floor | 0.50 |" in text
-    )
-    assert "PAC-NeRF" not in text and "†" not in text and "‡" not in text and "±" not in text
-
-
-def test_table_is_open_for_more_methods():
-    metrics = {"pac_nerf": {scene: [run(3.0)] for scene in SCENES}}
-    text = chamfer_table(metrics, {"pac_nerf": "PAC-NeRF"}, SCENES, PAPER["table1"]).markdown()
-    assert "| PAC-NeRF | 3.50 |" in text and "| *paper: PAC-NeRF* | 516.30 |" in text and "| 114.80 |" in text
-
-
-def test_a_note_stands_below_the_table_and_its_sign_behind_the_row():
-    metrics = {method: {scene: [run(3.0)] for scene in SCENES} for method in TITLES}
-    text = chamfer_table(metrics, TITLES, SCENES, notes={"neuma": "Mind this."}).markdown()
-    assert text.count("| NeuMA (1) |") == 3 and "| NCLaw |" in text and "\n(1) Mind this.\n" in text
-
-
-def test_paper_averages_are_those_printed_there():
-    printed = {
-        "table1": {"pac_nerf": 114.80, "nclaw": 12.18, "neuma": 1.31, "neuma_particle_supervision": 1.51,
-                   "neuma_without_binding": 6.60, "neuma_without_adaptor": 1.79},
-        "table5": {"neuma+rank=4": 1.18, "neuma+rank=8": 1.10, "neuma": 1.04, "neuma+rank=24": 1.05},
-    }  # fmt: skip
-    for table, averages in printed.items():
-        assert set(averages) == set(PAPER[table].rows)
-        for method, average in averages.items():
-            assert np.mean(PAPER[table].rows[method]) == pytest.approx(average, abs=7e-3), method
-
-
-def test_tables_of_the_paper_are_whole():
-    settings = load(yaml.safe_load((ROOT / "config" / "config.yaml").read_text()), ROOT)
-    for name, paper in PAPER.items():
-        table = settings.tables[name]
-        assert tuple(paper.columns) == (*table.scenes, *table.experiments)
-        assert set(paper.rows) - {"pac_nerf"} <= set(table.methods)
-        for claim in paper.claims:
-            assert {*claim.better, *claim.worse} <= set(table.methods)
-            assert set(claim.columns) <= set(paper.columns)
-        assert all(len(row) == len(paper.columns) for row in paper.rows.values())
-
-
-def test_diverged_runs_are_marked_and_explained():
-    metrics = {
-        "nclaw": {"BouncyBall": [run(5.0)], "Other": [run(4.0, diverged_at_step=80)]},
-        "neuma": {"BouncyBall": [run(1.0, stable=False)], "Other": [run(2.0)]},
-    }
-    table = chamfer_table(metrics, TITLES, {"BouncyBall": "Ball", "Other": "Other"}, PAPER["table1"])
-    text = table.markdown()
-    assert "| Method | Ball | Other | Average |" in text
-    assert "| NCLaw | 5.50 | 4.50‡ | 5.00 |" in text and "| NeuMA | 1.50† | 2.50 | 2.00 |" in text
-    assert "† The training diverged" in text and "‡ The predicted motion became non-finite" in text
-    assert "paper: NeuMA" not in text, "the paper has no such column"
-    rows = list(csv.DictReader(io.StringIO(table.csv())))
-    assert rows[0]["diverged"] == "Other" and rows[1]["diverged"] == "BouncyBall"
-
-
-def test_a_missing_or_broken_cell_is_named():
-    column = {"BouncyBall": "BouncyBall"}
-    with pytest.raises(InputError, match="no metrics.json of neuma on BouncyBall"):
-        chamfer_table({"nclaw": {"BouncyBall": [run(1.0)]}}, TITLES, column)
-    broken = {"nclaw": {"BouncyBall": [run(float("nan"))]}}
-    with pytest.raises(InputError, match="nclaw on BouncyBall is nan"):
-        chamfer_table(broken, {"nclaw": "NCLaw"}, column)
-
-
-def test_several_seeds_give_mean_and_standard_deviation():
-    metrics = {
-        "nclaw": {"a": [run(5.0)], "b": [run(7.0)]},
-        "neuma": {"a": [run(1.0), run(2.0), run(3.0)], "b": [run(2.0), run(2.0), run(5.0)]},
-    }
-    table = chamfer_table(metrics, TITLES, {"a": "a", "b": "b"})
-    text = table.markdown()
-    # Excesses of the seeds average 1.5, 2 and 4.
-    assert "| NeuMA | 2.00 ± 1.00 | 3.00 ± 1.73 | 2.50 ± 1.32 |" in text
-    assert "| NCLaw | 5.00 | 7.00 | 6.00 |" in text and "± is the standard deviation over chains" in text
-    rows = {(r["quantity"], r["method"]): r for r in csv.DictReader(io.StringIO(table.csv()))}
-    assert float(rows["chamfer_excess_std", "neuma"]["Average"]) == pytest.approx(1.3229, abs=1e-4)
-    assert ("chamfer_excess_std", "nclaw") not in rows and ("chamfer_floor_std", "floor") not in rows
-
-
-def test_claims_are_judged_by_the_numbers():
-    paper = PaperTable(
-        "tab:x",
-        "X",
-        "x",
-        ("a", "b"),
-        {"neuma": (1.0, 2.0), "nclaw": (3.0, 3.0), "other": (2.0, 5.0)},
-        (
-            Claim("NeuMA is best, w/ P.S.", ("neuma",), ("nclaw", "other")),
-            Claim("others are best", ("nclaw", "other"), ("neuma",), ("b",)),
-            Claim("nobody prints this", ("neuma",), ("nclaw",), by_paper=False),
-            Claim("of a row that is not here", ("neuma",), ("pac_nerf",)),
-        ),
-    )
-    excesses = {"neuma": (1.0, 2.0), "nclaw": (4.0, 1.0), "other": (5.0, 6.0)}
-    metrics = {m: {c: [run(v)] for c, v in zip("ab", values)} for m, values in excesses.items()}
-    titles = TITLES | {"other": "Other"}
-    table = chamfer_table(metrics, titles, {"a": "a", "b": "b"}, paper)
-    best, others, unprinted = table.verdicts()
-    assert best == (
-        "Holds: NeuMA is best, w/ P.S. Excess 1.500 (NeuMA) against 2.500 (NCLaw) on average; it is so in"
-        " 1 of 2 columns. Paper, floors included: 1.50 against 3.00."
-    )
-    assert others.startswith("Does not hold: others are best. Excess 6.000 (Other) against 2.000 (NeuMA)")
-    assert others.endswith("in 0 of 1 columns. Paper, floors included: 5.00 against 2.00.")
-    assert unprinted.startswith("Holds") and unprinted.endswith("The paper does not compare these.")
-    assert f"- {best}\n" in table.markdown()
 
 
 def test_benchmarks_stand_beside_the_papers():
@@ -304,13 +251,13 @@ def test_video_shows_both_panels_and_is_the_same_every_time(film, tmp_path):
 
 
 def test_learning_rate_is_chosen_by_the_geometric_mean_of_the_training_loss():
-    def run(scale, scene, best, excess):
+    def run(scale, scene, best, error):
         return {
             "method": "neuma", "lr_scale": scale, "scene": scene, "loss": [1.0, best], "best_loss": best,
-            "stable": True, "recoveries": [], "chamfer_excess": excess,
+            "stable": True, "recoveries": [], "tracer_rmse_mm": error,
         }  # fmt: skip
 
-    # The arithmetic mean and the excess, which knows the truth, would both choose the other factor.
+    # The arithmetic mean and the RMSE, which knows the truth, would both choose the other factor.
     rows = [run(0.5, "a", 0.001, 9), run(0.5, "b", 0.3, 9), run(1.0, "a", 0.1, 1), run(1.0, "b", 0.1, 1)]
     table, markdown, best = learning_rate_table(rows)
     assert best == {"neuma": 0.5}

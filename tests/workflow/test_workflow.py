@@ -38,9 +38,9 @@ def test_table_from_nothing(finished):
     assert table[0].startswith("quantity,method,title,BouncyBall,Average")
     rows = {tuple(line.split(",")[:2]) for line in table[1:]}
     assert {
-        ("chamfer", "nclaw"),
+        ("tracer_rmse_mm", "nclaw"),
+        ("tracer_error_p95_mm", "neuma"),
         ("chamfer", "neuma"),
-        ("chamfer_excess", "neuma"),
         ("chamfer_floor", "floor"),
     } <= rows
     assert "| NeuMA |" in (finished.root / "tiny/results/table1.md").read_text()
@@ -214,10 +214,11 @@ def test_laws_are_put_to_use_on_other_bodies_and_images_are_measured(clone):
     assert 0.05 < fallen < 0.45 < 2.0 * 0.18 + 0.5 * 9.8 * 0.18**2
     header, *rows = (clone.root / "tiny/results/table2.csv").read_text().splitlines()
     assert header.startswith("quantity,method,title,letter_and_ball,Average")
-    assert rows[0].startswith("chamfer,nclaw,the prior,") and len(rows) == 7
+    assert rows[0].startswith("tracer_rmse_mm,nclaw,the prior,") and len(rows) == 11
     assert "BouncyBall" in (clone.root / "tiny/results/table4.csv").read_text()
     measured = json.loads((clone.root / SCENE / "neuma" / "image_metrics.json").read_text())
-    assert measured["views"] == [1] and len(measured["ssim_per_frame"]) == 7
+    assert measured["views"] == [1] and measured["views_seen_in_training"] == []
+    assert len(measured["ssim_per_frame"]) == 7
     assert measured["psnr"] > 8 and measured["lpips_vgg"] != 0
 
 

@@ -332,7 +332,10 @@ def method_density(wildcards):
 
 @checked
 def evaluation_views(wildcards):
-    """Views that image metrics are taken in: those that are asked for, or those that training does not see."""
+    """Views that image metrics are taken in: those that are asked for, or those that training does not see.
+
+    Where training sees all views, these: image metrics and figures then say so.
+    """
     seen = SETTINGS.method_material(wildcards.scene, wildcards.method).views
     unseen = [view for view in range(SETTINGS.dataset.dynamic.views) if view not in seen]
     return list(SETTINGS.evaluation.views or unseen or seen)

@@ -23,6 +23,7 @@ rule image_metrics:
         density=scene_setting("density"),
         carrier=judged_carrier,
         views=evaluation_views,
+        training_views=lambda wildcards: material_settings(wildcards)["views"],
         margin=SETTINGS.evaluation.margin,
         device=SETTINGS.device,
     script:

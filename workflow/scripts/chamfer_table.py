@@ -1,4 +1,4 @@
-"""A table of Chamfer distances from the metrics behind it."""
+"""A table of tracer errors and Chamfer distances from the metrics behind it."""
 
 from neuma_lib.evaluation.paper import PAPER
 from neuma_lib.evaluation.tables import chamfer_table
@@ -15,7 +15,7 @@ def main(inputs, output, params, run) -> None:
     write_text(output.markdown, table.markdown())
     run.say(f"{len(params.titles)} methods, {len(params.columns)} columns: {output.markdown}")
     for verdict in table.verdicts():
-        run.say(verdict)
+        run.say(str(verdict))
 
 
 run_script(main, snakemake)

@@ -1,4 +1,4 @@
-"""Compare a method's renders with the observation, in views that its training did not see."""
+"""Compare a method's renders with the observation, in views that its training did not see if there are any."""
 
 import numpy as np
 import torch
@@ -48,12 +48,15 @@ def main(inputs, output, params, run) -> None:
             table.append(measure_view(body, observation, x, F, networks, params.margin))
         run.progress(k + 1, len(params.views), float(np.mean([m["psnr"] for m in table[-1]])))
     per_frame = {name: np.mean([[m[name] for m in frames] for frames in table], axis=0) for name in MEASURES}
-    report = {"views": params.views, "frames": arrays["frames"].tolist(), "margin": params.margin}
+    seen = sorted(set(params.views) & set(params.training_views))
+    report = {"views": params.views, "views_seen_in_training": seen}
+    report |= {"frames": arrays["frames"].tolist(), "margin": params.margin}
     report |= {name: float(values.mean()) for name, values in per_frame.items()}
     report |= {f"{name}_per_frame": values.tolist() for name, values in per_frame.items()}
     write_json(output.metrics, report)
+    views = ", ".join(map(str, params.views)) + (" (SEEN IN TRAINING)" if seen else "")
     run.say(
-        f"views {', '.join(map(str, params.views))}: PSNR {report['psnr']:.1f} dB, SSIM {report['ssim']:.3f},"
+        f"views {views}: PSNR {report['psnr']:.1f} dB, SSIM {report['ssim']:.3f},"
         f" LPIPS {report['lpips_vgg']:.3f} (VGG) {report['lpips_alex']:.3f} (Alex)"
     )
 

@@ -14,7 +14,9 @@ def main(inputs, output, params, run) -> None:
         output.weights, law.prior_state(), {"prior": params.name, "law": params.law, "method": params.method}
     )
     write_json(output.report, report)
-    run.say(f"rollout against its law: Chamfer {report['chamfer']:.4f}e-4 m^2")
+    run.say(
+        f"rollout against its law: RMSE {1e3 * report['rmse']:.2f} mm, Chamfer {report['chamfer']:.4f}e-4 m^2"
+    )
 
 
 run_script(main, snakemake)

@@ -13,29 +13,33 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from neuma_lib.evaluation.plotting import style
-from neuma_lib.evaluation.results import read_results
+from neuma_lib.evaluation.results import read_results, seen_in_training
 
 MEASURES = {
-    "loss": "best training loss\nrelative to the prior's",
-    "chamfer_excess": "excess Chamfer distance\n[10⁻⁴ m²]",
     "tracer_rmse_mm": "tracer RMSE [mm]",
+    "chamfer": "Chamfer distance\n[10⁻⁴ m²]",
     "psnr": "PSNR, views not seen\nin training [dB]",
+    "loss": "best training loss\nrelative to the prior's",
 }
 MARKERS = "osDv^P"
 
 
 def data(inputs, params, say) -> dict:
-    """``scenes`` in order, ``titles`` {variant: name} and for each of `MEASURES` {variant: {scene: value}}."""
+    """``scenes`` in order, ``titles`` {variant: name} and for each of `MEASURES` {variant: {scene: value}}.
+
+    ``seen``: scenes whose images were measured in a training view, for want of others.
+    """
     values = {
-        "loss": (inputs.histories, lambda history: history["best_loss"] / history["loss"][0]),
-        "chamfer_excess": (inputs.metrics, itemgetter("chamfer_excess")),
         "tracer_rmse_mm": (inputs.metrics, itemgetter("tracer_rmse_mm")),
+        "chamfer": (inputs.metrics, itemgetter("chamfer")),
         "psnr": (inputs.image_metrics, itemgetter("psnr")),
+        "loss": (inputs.histories, lambda history: history["best_loss"] / history["loss"][0]),
     }
     cells = params.titles, params.scenes
     measures = {name: read_results(files, *cells, value) for name, (files, value) in values.items()}
+    seen = seen_in_training(read_results(inputs.image_metrics, *cells), params.scenes)
     say(f"{len(params.titles)} variants on {len(params.scenes)} scenes")
-    return {"scenes": params.scenes, "titles": params.titles, **measures}
+    return {"scenes": params.scenes, "titles": params.titles, "seen": seen, **measures}
 
 
 @style.styled
@@ -56,7 +60,8 @@ def draw(data: Mapping) -> Figure:
                 clip_on=False,
             )
         axes.set(title=label, xlim=(-0.5, len(scenes) - 0.5))
-        axes.set_xticks(range(len(scenes)), scenes, rotation=30, ha="right")
+        labels = style.scene_labels(scenes, data["seen"]) if measure == "psnr" else scenes
+        axes.set_xticks(range(len(scenes)), labels, rotation=30, ha="right")
         if measure != "psnr":
             axes.set_ylim(bottom=0)
         axes.grid(axis="y")

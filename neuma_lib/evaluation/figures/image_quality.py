@@ -1,7 +1,7 @@
 """Quality of renders against the observation: PSNR, SSIM (higher is better) and LPIPS with the VGG and Alex networks
-(lower is better), in views that training did not see, averaged over all frames, on the bounding box of the object plus
-a margin. Grey column: mean over the scenes. NCLaw is the prior rendered by Particle-GS (the paper's NCLaw+R). Paper:
-fig:image_quality.
+(lower is better), averaged over all frames, on the bounding box of the object plus a margin, in views that training did
+not see; a scene without such a view says so. Grey column: mean over the scenes. NCLaw is the prior rendered by
+Particle-GS (the paper's NCLaw+R). Paper: fig:image_quality.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from neuma_lib.evaluation.plotting import style
-from neuma_lib.evaluation.results import read_results
+from neuma_lib.evaluation.results import read_results, seen_in_training
 
 MEASURES = {
     "psnr": "PSNR [dB] ↑",
@@ -26,11 +26,15 @@ SPREAD = 0.62
 
 
 def data(inputs, params, say) -> dict:
-    """``titles`` {method: name}, ``scenes`` in order, and a {method: {scene: value}} for each of `MEASURES`."""
+    """``titles`` {method: name}, ``scenes`` in order, and a {method: {scene: value}} for each of `MEASURES`.
+
+    ``seen``: scenes that have no view that a method's training did not see.
+    """
     cells = inputs.metrics, params.titles, params.scenes
     values = {measure: read_results(*cells, itemgetter(measure)) for measure in MEASURES}
+    seen = seen_in_training(read_results(*cells), params.scenes)
     say(f"{len(params.titles)} methods on {len(params.scenes)} scenes")
-    return {"titles": params.titles, "scenes": params.scenes, **values}
+    return {"titles": params.titles, "scenes": params.scenes, "seen": seen, **values}
 
 
 @style.styled
@@ -51,7 +55,7 @@ def draw(data: Mapping) -> Figure:
         axes.grid(axis="y")
         for edge in range(len(scenes) - 1):
             axes.axvline(edge + 0.5, color=style.LIGHT, linewidth=0.5)
-    panels[-1].set_xticks(range(len(scenes) + 1), [*scenes, "average"])
+    panels[-1].set_xticks(range(len(scenes) + 1), [*style.scene_labels(scenes, data["seen"]), "average"])
     figure.align_ylabels(panels)
     style.legend_above(figure, panels[0], len(titles))
     return figure

@@ -46,11 +46,11 @@ def data(inputs, params, say) -> ImageGrid:
         columns, heights = [], []
         for weight in params.weights:
             law.set_adaptor_weight(weight)
-            path, diverged = predict(model, law, body, v0, video.frames)
+            path, failure = predict(model, law, body, v0, video.frames)
             columns.append(rendering.renders(body, cameras, path.x[shown], path.F[shown]))
             heights.append(mean_height(path.x.cpu(), body.mass.cpu()))
-            if diverged:
-                say(f"{scene}: w = {weight:g} diverged at step {diverged}")
+            if failure:
+                say(f"{scene}: w = {weight:g}: a particle {failure.happened} at step {failure.step}")
         monotone, parted = monotone_frames([heights[k] for k in inside])
         say(f"{scene}: between 0 and 1, height monotone in w in {monotone} of {parted} frames after contact")
         columns.append(rendering.observed(video, shown, params.magnify))

@@ -8,7 +8,7 @@ nothing is lost in black and white.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -121,6 +121,11 @@ def new_figure(width: float, height: float) -> Figure:
 def new_canvas(width: float, height: float) -> Figure:
     """An empty figure of a size in print [in] whose parts are placed by hand (`image_grid`)."""
     return Figure(figsize=(width, height))
+
+
+def scene_labels(scenes: Iterable[str], seen: Collection[str]) -> list[str]:
+    """Names of scenes, with a remark where images were measured in a view that training saw."""
+    return [f"{scene}\n(training view)" if scene in seen else scene for scene in scenes]
 
 
 def legend_above(figure: Figure, axes: Axes, columns: int) -> None:
