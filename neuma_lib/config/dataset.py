@@ -19,11 +19,27 @@ class PackingConfig(Section):
     deformations: int = Field(1000, gt=0, description="those of them whose deformation gradient is kept")
 
 
+class TruthConfig(Section):
+    """How finely the ground truth of one scene is simulated."""
+
+    grid: int | None = Field(None, ge=8, description="its grid; null: dataset.grid")
+    dt: float | None = Field(None, gt=0, description="its time step [s]; null: dataset.dt")
+    particles: int | None = Field(None, gt=0, description="its particles; null: dataset.particles")
+
+
 class DatasetConfig(Section):
     """Ground truth and its images."""
 
     particles: int = Field(
         8000, gt=0, description="ground-truth particles, at least four times the reconstruction's"
+    )
+    grid: int | None = Field(
+        None, ge=8, description="grid nodes of the ground truth along each side; null: simulation.grid"
+    )
+    dt: float | None = Field(
+        None,
+        gt=0,
+        description="time step of the ground truth [s], which goes evenly into the scene's; null: the scene's",
     )
     seed: int = Field(
         1000,

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 import yaml
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from neuma_lib.config.base import Section
 from neuma_lib.config.material import MaterialConfig
@@ -18,6 +18,10 @@ class MethodConfig(Section):
     """A method is a set of options over the same code."""
 
     title: str = Field(description="name in tables")
+    law: Literal["learned", "true"] = Field(
+        "learned",
+        description="true: the scene's own law on the reconstruction, the yardstick; nothing is learned",
+    )
     note: str | None = Field(None, description="what a reader must know of its numbers; stands below tables")
     trained_as: str | None = Field(
         None, description="method whose trained law it takes, with its settings; null: its own training"
@@ -30,6 +34,12 @@ class MethodConfig(Section):
     material: dict[str, Any] = Field(
         {}, description="settings of the section material that the method changes"
     )
+
+    @model_validator(mode="after")
+    def _true_laws_are_not_trained(self) -> MethodConfig:
+        if self.law == "true" and self.material.get("train", True):
+            raise ValueError("law: the true law is not trained, set material: {train: false}")
+        return self
 
 
 def parse_method(text: str, methods: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:

@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 
 from neuma_lib.config.base import Section, Vector
 from neuma_lib.config.blender import AppearanceConfig
+from neuma_lib.config.dataset import TruthConfig
 from neuma_lib.config.laws import LawConfig
 
 
@@ -50,7 +51,11 @@ class SceneConfig(Section):
         description="mass density rho [kg/m^3], or two of them at t = 0: {axis: x, at: 0.5, below: 800, above: 1200}",
     )
     law: LawConfig = Field(description="the true material, known to the ground truth only")
-    dt: float = Field(gt=0, description="time step [s]")
+    truth: TruthConfig = Field(
+        TruthConfig(),
+        description="how finely its ground truth is simulated, where it has settings of its own",
+    )
+    dt: float = Field(gt=0, description="time step of the reconstruction, which frames are counted in [s]")
     steps: int = Field(gt=0, description="simulated steps of the video")
     frames: tuple[int, ...] | None = Field(
         None,

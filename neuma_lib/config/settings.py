@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 
 from neuma_lib.config.base import Section
 from neuma_lib.config.binding import BindingConfig
-from neuma_lib.config.dataset import DatasetConfig
+from neuma_lib.config.dataset import DatasetConfig, TruthConfig
 from neuma_lib.config.evaluation import EvaluationConfig
 from neuma_lib.config.experiments import ExperimentConfig
 from neuma_lib.config.figures import FiguresConfig
@@ -85,6 +85,7 @@ class Config(Section):
                     f"scenes.{name}.prior: no prior '{scene.prior}' in priors.laws{hint(scene.prior, laws)}"
                 )
             _changed(self.material, scene.material, f"scenes.{name}.material")
+            self.scene_truth(name)
         for name, method in self.methods.items():
             _changed(self.material, method.material, f"methods.{name}.material")
             own = [known for known, entry in self.methods.items() if entry.trained_as is None]
@@ -99,6 +100,10 @@ class Config(Section):
             known = self.scenes if kind == "scene" else self.experiments
             if name not in known:
                 raise ValueError(f"{where}: no {kind} '{name}'{hint(name, known)}")
+        for name in self.experiments:
+            self.experiment_truth(name)
+        for method in self.random.methods if self.random.count else ():
+            parse_method(method, self.methods)
         for table in self.tables.values():
             for method in (*table.methods, *table.titles):
                 parse_method(method, self.methods)
@@ -152,6 +157,12 @@ class Config(Section):
         """Names of the scenes drawn at random, in order."""
         return [name for name in self.scenes if name.startswith(self.random.prefix)]
 
+    @property
+    def plain_scenes(self) -> list[str]:
+        """Names of the scenes that are neither drawn at random nor have a truth of their own fineness."""
+        drawn = self.random_scenes
+        return [name for name, s in self.scenes.items() if name not in drawn and s.truth == TruthConfig()]
+
     def experiment(self, name: str) -> ExperimentConfig:
         """The experiment of that name, or of a chain's folder."""
         return self.experiments[parse_chain(name, self.experiments, "experiment")[0]]
@@ -174,6 +185,35 @@ class Config(Section):
         """Time step of an experiment [s]."""
         experiment = self.experiment(name)
         return experiment.dt or min(self.scene(body.scene).dt for body in experiment.bodies)
+
+    def scene_truth(self, name: str) -> TruthConfig:
+        """How finely the ground truth of a scene is simulated, with nothing left open."""
+        scene = self.scene(name)
+        return self._truth(scene.truth, scene.dt, f"scenes.{name}")
+
+    def experiment_truth(self, name: str) -> TruthConfig:
+        """The same of an experiment, which has no settings of its own."""
+        return self._truth(TruthConfig(), self.experiment_dt(name), f"experiments.{name}")
+
+    def _truth(self, own: TruthConfig, dt: float, origin: str) -> TruthConfig:
+        step = own.dt or self.dataset.dt or dt
+        substeps = round(dt / step)
+        if substeps < 1 or abs(dt / step - substeps) > 1e-6 * substeps:
+            key = f"{origin}.truth.dt" if own.dt else "dataset.dt"
+            raise InputError(
+                f"{key}: a truth's frames are those of the reconstruction, so that {step:g} s must go evenly into its "
+                f"time step, {dt:g} s in {origin}"
+            )
+        return TruthConfig(
+            grid=own.grid or self.dataset.grid or self.simulation.grid,
+            dt=step,
+            particles=own.particles or self.dataset.particles,
+        )
+
+    def true_law(self, scene: str, method: str) -> dict[str, Any] | None:
+        """The scene's own law, where this is what a method evaluates."""
+        base, _ = parse_method(method, self.methods)
+        return self.scene(scene).law.plain() if self.methods[base].law == "true" else None
 
     def method_density(self, scene: str, method: str) -> float | dict[str, Any]:
         """Density that a method takes the scene's body to have: the scene's, unless it assumes another."""

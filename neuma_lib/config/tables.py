@@ -17,6 +17,9 @@ class TableConfig(Section):
     experiments: tuple[str, ...] = Field((), description="columns after the scenes, in order")
     methods: tuple[str, ...] = Field((), description="rows, in order; variants such as neuma+rank=4 too")
     titles: dict[str, str] = Field({}, description="names of rows other than the methods' own, by method")
+    on_request: bool = Field(
+        False, description="true: made when it is asked for by name, not by the targets `tables` and `all`"
+    )
     seeds: int = Field(
         1,
         ge=1,

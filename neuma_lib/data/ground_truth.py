@@ -1,7 +1,9 @@
 """Ground truth of a synthetic benchmark: known shapes of known materials, simulated by the same MPM.
 
-Only evaluation and the particle-supervised ablation may read what this module makes. It uses more particles than the
-reconstruction, another seed and an analytic law, so that no later stage can meet its own discretisation again.
+Only evaluation and the particle-supervised ablation may read what this module makes. It differs from the
+reconstruction in its particles (more, of another seed) and its law (analytic). Integrator and walls are the same and
+so are, by default, grid and time step: as in the paper, a law is judged in the discretisation that it was learned in.
+`dataset.grid`, `dataset.dt` and `scenes.<name>.truth` make a truth that is finer.
 """
 
 from __future__ import annotations

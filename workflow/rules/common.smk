@@ -182,7 +182,7 @@ def scenes_with(part, origin):
 
 def truth_memory(wildcards):
     """Memory that a ground truth takes [MB]: twice the particles (x, v, F, C) and tracers of all frames."""
-    bytes_a_frame = 96 * SETTINGS.dataset.particles + 24 * SETTINGS.dataset.tracers
+    bytes_a_frame = 96 * truth_settings(wildcards).particles + 24 * SETTINGS.dataset.tracers
     return 2000 + 2 * len(SETTINGS.frame_steps(wildcards.scene)) * bytes_a_frame // 10**6
 
 
@@ -195,10 +195,28 @@ def simulation_settings(wildcards):
     return simulator(SETTINGS.scene(wildcards.scene).dt)
 
 
-def simulator(dt):
-    """Constants of the simulator with a time step [s]."""
-    section = SETTINGS.simulation.plain()
+def simulator(dt, grid=None):
+    """Constants of the simulator with a time step [s], on the reconstruction's grid unless another is given."""
+    section = SETTINGS.simulation.plain() | ({"grid": grid} if grid else {})
     return {"dt": dt, **{name: section[name] for name in ("grid", "gravity", "boundary", "wall_cells")}}
+
+
+@checked
+def truth_settings(wildcards):
+    """How finely the ground truth of a scene or experiment is simulated."""
+    if hasattr(wildcards, "scene"):
+        return SETTINGS.scene_truth(wildcards.scene)
+    return SETTINGS.experiment_truth(wildcards.experiment)
+
+
+def truth_simulation(wildcards):
+    """Constants of the simulator for the ground truth of a scene or experiment."""
+    truth = truth_settings(wildcards)
+    return simulator(truth.dt, truth.grid)
+
+
+def truth_particles(wildcards):
+    return truth_settings(wildcards).particles
 
 
 def prior_file(scene, method=None):
@@ -293,7 +311,16 @@ def material_settings(wildcards):
 
 @checked
 def material_prior(wildcards):
+    """The law that a method starts from; none where it takes the true one."""
+    if SETTINGS.true_law(wildcards.scene, wildcards.method):
+        return []
     return prior_file(wildcards.scene, wildcards.method)
+
+
+@checked
+def true_law(wildcards):
+    """The scene's own law, where this is what a method evaluates."""
+    return SETTINGS.true_law(wildcards.scene, wildcards.method) or []
 
 
 def supervised_by(kind, file):

@@ -28,9 +28,10 @@ rule ground_truth:
         mem_mb=truth_memory,
     params:
         bodies=scene_bodies,
-        simulation=simulation_settings,
+        simulation=truth_simulation,
+        dt=scene_setting("dt"),
         frames=frame_steps,
-        particles=SETTINGS.dataset.particles,
+        particles=truth_particles,
         tracers=SETTINGS.dataset.tracers,
         seed=SETTINGS.dataset.seed,
         device=EITHER_DEVICE,

@@ -35,6 +35,7 @@ rule evaluation:
     params:
         simulation=simulation_settings,
         densities=lambda wildcards: [method_density(wildcards)],
+        laws=lambda wildcards: [law for law in [true_law(wildcards)] if law],
         covariance_from=lambda wildcards: material_settings(wildcards)["covariance_from"],
         carrier=judged_carrier,
         frames=frame_steps,

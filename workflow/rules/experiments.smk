@@ -12,9 +12,10 @@ rule experiment_truth:
         gpu=EITHER_GPU,
     params:
         bodies=experiment_bodies("shape", "size", "height", "center", "velocity", "density", "law"),
-        simulation=experiment_simulation,
+        simulation=truth_simulation,
+        dt=lambda wildcards: SETTINGS.experiment_dt(wildcards.experiment),
         frames=experiment_frames,
-        particles=SETTINGS.dataset.particles,
+        particles=truth_particles,
         tracers=SETTINGS.dataset.tracers,
         seed=SETTINGS.dataset.seed,
         device=EITHER_DEVICE,
@@ -64,6 +65,7 @@ rule experiment:
     params:
         simulation=experiment_simulation,
         densities=of_each_body(method_density),
+        laws=of_each_body(true_law),
         carrier=lambda wildcards: of_each_body(judged_carrier)(wildcards)[0],
         frames=experiment_frames,
         tracers=SETTINGS.evaluation.tracers,

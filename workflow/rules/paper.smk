@@ -2,8 +2,7 @@
 
 from neuma_lib.evaluation.paper import PAPER
 
-NAMED_SCENES = [scene for scene in SETTINGS.scenes if scene not in SETTINGS.random_scenes]
-SCENES = list(SETTINGS.tables["table1"].scenes) if "table1" in SETTINGS.tables else NAMED_SCENES
+SCENES = list(SETTINGS.tables["table1"].scenes) if "table1" in SETTINGS.tables else SETTINGS.plain_scenes
 BENCHMARK_SCENES = list(SETTINGS.tables["table4"].scenes) if "table4" in SETTINGS.tables else SCENES
 
 
@@ -38,12 +37,12 @@ rule benchmark_table:
 
 rule initial_states:
     input:
-        reports=expand(f"{RESULTS}/{{scene}}/initial_state.json", scene=NAMED_SCENES),
+        reports=expand(f"{RESULTS}/{{scene}}/initial_state.json", scene=SETTINGS.plain_scenes),
     output:
         csv=report(f"{RESULTS}/initial_states.csv", caption="../report/initial_states.rst", category="Tables"),
         markdown=f"{RESULTS}/initial_states.md",
     params:
-        scenes=NAMED_SCENES,
+        scenes=SETTINGS.plain_scenes,
     script:
         "../scripts/initial_states.py"
 
@@ -80,9 +79,12 @@ rule dataset:
         ),
 
 
+TABLES = [table for table in CHAMFER_TABLES if not SETTINGS.tables[table].on_request]
+
+
 rule tables:
     input:
-        expand(f"{RESULTS}/{{table}}.{{kind}}", table=[*CHAMFER_TABLES, "table4"], kind=["csv", "md"]),
+        expand(f"{RESULTS}/{{table}}.{{kind}}", table=[*TABLES, "table4"], kind=["csv", "md"]),
         rules.initial_states.output,
         rules.timings.output,
 

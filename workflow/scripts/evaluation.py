@@ -1,4 +1,4 @@
-"""Roll learned laws out from the estimated start and compare them with the ground truth."""
+"""Roll learned laws, or the true ones, out from the estimated start and compare them with the ground truth."""
 
 from itertools import zip_longest
 
@@ -14,6 +14,7 @@ from neuma_lib.io.laws import load_law
 from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_start
 from neuma_lib.io.weights import read_weights
+from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.model import MPMModel, consecutive
 from workflow.stage import run_script
 
@@ -32,10 +33,11 @@ def main(inputs, output, params, run) -> None:
     tracers = sample_tracers(read_mesh(inputs.mesh), params.tracers, seed=params.seed)
     files = [inputs[name] for name in ("particles", "binding", "gaussians", "velocity")]
     body, v0, counts = load_start(*files, params.densities, params.carrier)
-    laws = [load_law(prior, adaptor).to(device) for prior, adaptor in zip_longest(priors, adaptors)]
+    laws = [analytic_law(law, dt=params.simulation["dt"]) for law in params.laws]
+    laws = laws or [load_law(prior, adaptor) for prior, adaptor in zip_longest(priors, adaptors)]
     evaluation = evaluate(
         MPMModel(**params.simulation),
-        consecutive(laws, counts),
+        consecutive([law.to(device) for law in laws], counts),
         body.to(torch.float32, device),
         v0.to(device),
         params.frames,

@@ -22,10 +22,11 @@ def main(inputs, output, params, run) -> None:
         )
         for body in params.bodies
     ]
+    substeps = round(params.dt / model.dt)  # frames are counted in steps of the reconstruction
     truth = simulate_ground_truth(
         model,
         bodies,
-        params.frames,
+        [substeps * n for n in params.frames],
         particles=params.particles,
         tracers=params.tracers,
         seed=params.seed,
@@ -33,14 +34,14 @@ def main(inputs, output, params, run) -> None:
     )
     arrays = {name: getattr(truth.path, name).numpy() for name in ("x", "v", "F")}
     arrays |= {
-        "frames": np.asarray(truth.frames),
-        "time": np.asarray(truth.frames) * model.dt,
+        "frames": np.asarray(params.frames),
+        "time": np.asarray(params.frames) * params.dt,
         **{name: getattr(truth, name).numpy() for name in ("vol0", "mass", "tracers", "tracers_again")},
     }
     write_arrays(
         output.particles,
         arrays,
-        {"dt": model.dt, "bodies": params.bodies, "simulation": params.simulation},
+        {"dt": params.dt, "bodies": params.bodies, "simulation": params.simulation},
     )
     count, lowest = arrays["x"].shape[1], float(arrays["x"][..., 1].min())
     run.say(
