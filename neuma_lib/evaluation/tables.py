@@ -26,7 +26,8 @@ QUANTITIES = {
 """What is written of each run, by its name in metrics.json, in the order of the CSV; and its heading, if it has one."""
 JUDGED = "tracer_rmse_mm"
 """Quantity that claims are judged by: it sees all motion and has no floor."""
-YARDSTICKS = ("true_law",)
+TRUE_LAW = "true_law"
+YARDSTICKS = (TRUE_LAW,)
 """Methods that know the truth and do not compete for the lowest error."""
 MIN_CHAINS = 3
 """Fewer runs give no spread to judge by."""
@@ -172,6 +173,7 @@ class Table:
             if any(sign in signs for signs in self.marks.values()):
                 parts += [f"{sign} {note}", ""]
         parts += [*(f"- {failure}" for failure in self.failures), ""] if self.failures else []
+        parts += [self.absorbed(), ""] if self.absorbed() else []
         for method, note in self.notes.items():
             parts += [f"{self._note_sign(method)} {note}", ""]
         if verdicts := self.verdicts():
@@ -189,6 +191,32 @@ class Table:
             for claim in claims
             if {*claim.better, *claim.worse} <= methods and set(claim.columns) <= set(self.columns)
         ]
+
+    def absorbed(self) -> str | None:
+        """How far learned laws are closer to the truth than the true law itself; None if that has no row."""
+        if not any(row.method == TRUE_LAW for row in self.rows):
+            return None
+        true = self.row(JUDGED, TRUE_LAW).mean[:-1]
+        closer = []
+        for row in self._rows(JUDGED):
+            gain = true - row.mean[:-1]
+            broken = [ROLLOUT_DIVERGED in self.marks.get((row.method, column), "") for column in self.columns]
+            where = (gain > 0) & ~np.array(broken)
+            if where.any() and row.method.partition("+")[0] not in YARDSTICKS:
+                closer += [
+                    f"{row.title} in {where.sum()} of {len(where)} columns (there by {gain[where].mean():.1f} of "
+                    f"{true[where].mean():.1f} mm on average)"
+                ]
+        return (
+            "The true law, simulated as the reconstruction is, shows what error remains when the law is right: that of "
+            "start, particles, grid and time step. "
+            + (
+                f"Closer to the truth than it: {'; '.join(closer)}. "
+                if closer
+                else "None is closer than it. "
+            )
+            + "What a law gains over the true one is no knowledge of the material: it has absorbed discretisation."
+        )
 
     def _rows(self, quantity: str) -> list[Row]:
         return [row for row in self.rows if row.quantity == quantity]

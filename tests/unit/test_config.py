@@ -318,6 +318,66 @@ class TestLike:
             settings.load(settings.merged(raw, {"scenes": change}), ROOT)
 
 
+class TestFinerTruth:
+    def loaded(self, raw, **changes):
+        return settings.load(settings.merged(raw, changes), ROOT)
+
+    def values(self, truth):
+        return truth.grid, truth.dt, truth.particles
+
+    def test_it_is_as_fine_as_simulation_and_scene_by_default(self, raw, loaded):
+        assert self.values(loaded.scene_truth("BouncyBall")) == (24, 1e-3, 8000)
+        assert self.values(loaded.experiment_truth("letter_N_sand")) == (24, 5e-4, 8000)
+
+    def test_settings_of_all_truths_and_of_one(self, raw):
+        finer = {"grid": 40, "dt": 2.5e-4, "particles": 9000}
+        loaded = self.loaded(raw, dataset=finer, scenes={"ClayCat": {"truth": {"grid": 50}}})
+        assert self.values(loaded.scene_truth("BouncyBall+seed=2")) == (40, 2.5e-4, 9000)
+        assert self.values(loaded.scene_truth("ClayCat")) == (50, 2.5e-4, 9000)
+        assert self.values(loaded.experiment_truth("letter_N_clay")) == (40, 2.5e-4, 9000)
+        assert loaded.frame_steps("BouncyBall") == self.loaded(raw).frame_steps("BouncyBall")
+
+    def test_recorded_ones_are_twice_as_fine_and_asked_for_by_name(self, loaded):
+        table = loaded.tables["finer_truth"]
+        assert table.on_request and set(loaded.tables["table1"].methods) < set(table.methods)
+        for name, scene in zip(table.scenes, loaded.tables["table1"].scenes, strict=True):
+            finer, plain = loaded.scene_truth(name), loaded.scene_truth(scene)
+            assert finer.grid == 2 * plain.grid and finer.particles == 8 * plain.particles
+            assert plain.dt == 2 * finer.dt
+            assert loaded.scene(name).law == loaded.scene(scene).law
+        assert not {*table.scenes, *loaded.random_scenes} & set(loaded.plain_scenes)
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            (
+                {"dataset": {"dt": 3e-4}},
+                r"dataset\.dt: .* 0\.0003 s must go evenly into .* 0\.001 s in scenes\.B",
+            ),
+            ({"dataset": {"dt": 2e-3}}, r"dataset\.dt: .* 0\.002 s must go evenly"),
+            (
+                {"scenes": {"ClayCat": {"truth": {"dt": 1e-3}}}},
+                r"scenes\.ClayCat\.truth\.dt: .* must go evenly",
+            ),
+            ({"scenes": {"ClayCat": {"truth": {"gird": 9}}}}, r"truth\.gird: unknown key; did you mean grid"),
+            (
+                {"methods": {"true_law": {"material": {"train": True}}}},
+                r"true_law: law: the true law is not tr",
+            ),
+        ],
+    )
+    def test_mistakes(self, raw, change, message):
+        with pytest.raises(InputError, match=message):
+            self.loaded(raw, **change)
+
+    def test_the_true_law_is_a_method(self, loaded):
+        law = loaded.scene("SandFish").law.plain()
+        assert loaded.true_law("SandFish+seed=1", "true_law") == law and not loaded.true_law(
+            "SandFish", "neuma"
+        )
+        assert not loaded.method_material("SandFish", "true_law").train
+
+
 class TestScaleOfThePaper:
     def overlay(self, raw, *names):
         for name in names:

@@ -75,6 +75,21 @@ def test_a_note_stands_below_the_table_and_its_sign_behind_the_row():
     assert text.count("| NeuMA (1) |") == 2 and "| NCLaw |" in text and "\n(1) Mind this.\n" in text
 
 
+def test_what_a_law_gains_over_the_true_one_is_told():
+    values = {"nclaw": (9.0, 9.0, 1.0), "neuma": (2.0, 3.0, 9.0), "true_law": (4.0, 6.0, 5.0)}
+    metrics = {
+        method: {column: [run(value)] for column, value in zip("abc", row)} for method, row in values.items()
+    }
+    metrics["nclaw"]["c"] = [run(1.0, **BROKEN)]
+    columns = {column: column for column in "abc"}
+    table = chamfer_table(metrics, {**TITLES, "true_law": "True law"}, columns)
+    assert "than it: NeuMA in 2 of 3 columns (there by 2.5 of 5.0 mm on average). What" in table.markdown()
+    del metrics["neuma"]
+    table = chamfer_table(metrics, {"nclaw": "NCLaw", "true_law": "True law"}, columns)
+    assert "None is closer than it." in table.absorbed()
+    assert chamfer_table(metrics, {"nclaw": "NCLaw"}, columns).absorbed() is None
+
+
 def test_a_method_that_knows_the_truth_wins_nothing():
     metrics = {m: {"a": [run(value)]} for m, value in (("neuma", 2.0), ("true_law", 1.0), ("nclaw", 3.0))}
     table = chamfer_table(metrics, {**TITLES, "true_law": "True law"}, {"a": "a"})

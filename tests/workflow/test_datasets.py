@@ -49,3 +49,25 @@ def test_workflow_takes_supplied_images_in_place_of_blenders(tmp_path):
         assert (ours.images == theirs.images).all() and (ours.viewmats == theirs.viewmats).all()
     others = project.plan("tiny/data/ClayCat/static/transforms.json")
     assert others["render_static"] == 1 and "supplied_static" not in others
+
+
+def test_a_finer_truth_has_the_same_frames_and_one_as_fine_the_same_bytes(kernels, tmp_path):
+    """tiny.yaml's truth has 14 nodes, a step of 2e-3 s and 800 particles."""
+    project = copied(tmp_path / "project", kernels)
+    file = project.root / "tiny/data/BouncyBall/particles.h5"
+
+    def truth(*settings):
+        project.run(
+            "--config", f"dataset={{{', '.join(settings)}}}", "--", "tiny/data/BouncyBall/particles.h5"
+        )
+        return file.read_bytes(), read_arrays(file)
+
+    plain, (arrays, attributes) = truth("seed: 1000")
+    assert truth("grid: 14", "dt: 2.0e-3")[0] == plain
+    _, (finer, said) = truth("grid: 28", "dt: 1.0e-3", "particles: 3000")
+    assert (finer["frames"] == arrays["frames"]).all() and (finer["time"] == arrays["time"]).all()
+    assert said["dt"] == attributes["dt"] and finer["x"].shape[1] > 3 * arrays["x"].shape[1]
+    # Before contact both fall alike; v follows gravity exactly at each step, x lags by at most g t dt / 2.
+    fall = [a["tracers"].mean(axis=1)[:4] for a in (arrays, finer)]
+    assert abs(fall[0] - fall[1]).max() < 9.8 * arrays["time"][3] * 1e-3 / 2 + 1e-5
+    assert abs(fall[0] - fall[1]).max() > 0

@@ -240,6 +240,17 @@ def test_a_chain_of_another_seed_draws_everything_anew(clone):
     assert spreads == {"nclaw", "neuma"}
 
 
+def test_the_true_law_is_evaluated_without_training_or_prior(clone):
+    target = f"{SCENE}/true_law/metrics.json"
+    assert clone.plan(target) == {"evaluation": 1}
+    assert "priors/" not in clone.run("--dry-run", target)
+    clone.run(target)
+    true, prior = (
+        json.loads((clone.root / SCENE / m / "metrics.json").read_text()) for m in ("true_law", "nclaw")
+    )
+    assert 0 < true["tracer_rmse_mm"] < prior["tracer_rmse_mm"] and true["stable"]
+
+
 def test_assumed_densities_are_runs_of_their_own(finished):
     plan = finished.plan(f"{SCENE}/neuma+assumed_density=900/metrics.json")
     assert plan == {"material": 1, "evaluation": 1}
