@@ -56,15 +56,14 @@ def test_a_finer_truth_has_the_same_frames_and_one_as_fine_the_same_bytes(kernel
     project = copied(tmp_path / "project", kernels)
     file = project.root / "tiny/data/BouncyBall/particles.h5"
 
-    def truth(*settings):
-        project.run(
-            "--config", f"dataset={{{', '.join(settings)}}}", "--", "tiny/data/BouncyBall/particles.h5"
-        )
+    def truth(settings):
+        own = f"scenes={{BouncyBall: {{truth: {{{settings}}}}}}}"
+        project.run("--config", own, "--", "tiny/data/BouncyBall/particles.h5")
         return file.read_bytes(), read_arrays(file)
 
-    plain, (arrays, attributes) = truth("seed: 1000")
-    assert truth("grid: 14", "dt: 2.0e-3")[0] == plain
-    _, (finer, said) = truth("grid: 28", "dt: 1.0e-3", "particles: 3000")
+    plain, (arrays, attributes) = truth("")
+    assert truth("grid: 14, dt: 2.0e-3")[0] == plain
+    _, (finer, said) = truth("grid: 28, dt: 1.0e-3, particles: 3000")
     assert (finer["frames"] == arrays["frames"]).all() and (finer["time"] == arrays["time"]).all()
     assert said["dt"] == attributes["dt"] and finer["x"].shape[1] > 3 * arrays["x"].shape[1]
     # Before contact both fall alike; v follows gravity exactly at each step, x lags by at most g t dt / 2.
