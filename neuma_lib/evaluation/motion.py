@@ -130,6 +130,7 @@ def evaluate(
     truth_again: Tensor,
     tracers: Tensor,
     total: bool = False,
+    floor: Tensor | None = None,
 ) -> Evaluation:
     """Tracer error from identical starts, Chamfer distance over the sequence, and its sampling floor.
 
@@ -143,6 +144,7 @@ def evaluate(
         truth_again: tracers of the ground truth from another sampling of the shape, shape (T, M'', 3).
         tracers: start positions inside the reconstructed shape [m], shape (M', 3).
         total: also compute the total deformation.
+        floor: Chamfer distances of the truth's two samplings, the same for all laws, shape (T,); None: measured here.
 
     Raises:
         InputError: other counts than a sampling's tolerance allows, with which the floor is not that of the distance.
@@ -160,7 +162,7 @@ def evaluate(
     path = path.at(frames) if total else path
     predicted, same_start = path.tracers[:, : len(tracers)], path.tracers[:, len(tracers) :]
     chamfer = chamfer_sequence(predicted, truth)
-    floor = chamfer_sequence(truth_again, truth)
+    floor = chamfer_sequence(truth_again, truth) if floor is None else floor
     density = body.mass / body.vol0
     metrics = {
         **tracer_errors(same_start, truth),

@@ -26,6 +26,8 @@ QUANTITIES = {
     "mass": ("kg", "particle masses, shape (N,)"),
     "tracers": ("m", "positions of passive tracers, shape (T, M, 3)"),
     "tracers_again": ("m", "passive tracers of another sampling of the same body, shape (T, M, 3)"),
+    "starts": ("m", "start positions of passive tracers, shape (M, 3)"),
+    "floor": ("1e-4 m^2", "Chamfer distances of two samplings of the true body at the frames, shape (T,)"),
     "indptr": ("1", "row starts of a sparse matrix, shape (rows + 1,)"),
     "indices": ("1", "columns of a sparse matrix, shape (entries,)"),
     "values": ("1", "entries of a sparse matrix, shape (entries,)"),

@@ -9,6 +9,7 @@ SUPERVISED = "neuma_particle_supervision"  # the one method that trains on the t
 # Blender films the truth, a dataset is packed of it, evaluation measures against it, and these figures show it.
 MAY_READ_THE_TRUTH = {
     *("render_static", "render_dynamic", "pack", "initial_state", "evaluation", "experiment"),
+    *("tracers", "experiment_tracers"),
     *("particles_app", "lora_alphav", "ext_time", "material_response"),
 }
 
@@ -73,7 +74,9 @@ def test_three_chains_share_their_data_and_nothing_else(project):
         ("particles", {"sampled_particles": 2, "binding": 2, "velocity": 2, "material": 2}),
         (
             "gaussians",
-            dict.fromkeys(["gaussians", "mesh", "sampled_particles", "binding", "velocity", "material"], 2),
+            dict.fromkeys(
+                ["gaussians", "mesh", "tracers", "sampled_particles", "binding", "velocity", "material"], 2
+            ),
         ),
     ],
 )

@@ -89,7 +89,7 @@ def checked(function):
 # What a chain's seeds change in a file of a scene or an experiment (config/variants.py); runs of methods have
 # `Config.run_folder`.
 DRAWN_IN = {
-    **dict.fromkeys(["gaussians.ply", "gaussians.json", "mesh.ply"], ["gaussians"]),
+    **dict.fromkeys(["gaussians.ply", "gaussians.json", "mesh.ply", "tracers.h5"], ["gaussians"]),
     **dict.fromkeys(["sampled_particles.h5", "particles.h5", "binding.h5"], ["gaussians", "particles"]),
     "velocity.json": ["prior", "gaussians", "particles"],
 }
@@ -132,13 +132,14 @@ def subject(wildcards):
     return getattr(wildcards, "scene", None) or wildcards.experiment
 
 
-# The rules that reconstruct a scene, and a file of each.
+# The rules that reconstruct a scene and prepare its evaluation, and a file of each.
 MAKERS = {
     "gaussians": "gaussians.ply",
     "mesh": "mesh.ply",
     "sampled_particles": "sampled_particles.h5",
     "binding": "binding.h5",
     "velocity": "velocity.json",
+    "tracers": "tracers.h5",
 }
 # Files of a reconstructed body: the particles that are simulated, the Gaussians, and what binds them.
 BODY = {"particles": "particles.h5", "binding": "binding.h5", "gaussians": "gaussians.ply"}

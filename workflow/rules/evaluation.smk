@@ -18,12 +18,26 @@ rule initial_state:
         "../scripts/initial_state.py"
 
 
+rule tracers:
+    input:
+        kernels=kernels("geometry"),
+        truth=of_scene("particles.h5"),
+        mesh=of_chain("mesh.ply"),
+    output:
+        tracers=f"{RESULTS}/{{scene}}/tracers.h5",
+    params:
+        tracers=SETTINGS.evaluation.tracers,
+        seed=SETTINGS.seed,
+    script:
+        "../scripts/tracers.py"
+
+
 rule evaluation:
     input:
         **body_files(),
-        kernels=kernels("geometry", "laws"),
+        kernels=kernels("laws"),
         truth=of_scene("particles.h5"),
-        mesh=of_chain("mesh.ply"),
+        tracers=of_chain("tracers.h5"),
         velocity=of_chain("velocity.json"),
         prior=material_prior,
         adaptor=trained_adaptor,
@@ -39,8 +53,6 @@ rule evaluation:
         covariance_from=lambda wildcards: material_settings(wildcards)["covariance_from"],
         carrier=judged_carrier,
         frames=frame_steps,
-        tracers=SETTINGS.evaluation.tracers,
-        seed=SETTINGS.seed,
         device=SETTINGS.device,
     script:
         "../scripts/evaluation.py"

@@ -48,12 +48,17 @@ rule experiment_start:
         "../scripts/experiment_start.py"
 
 
+use rule tracers as experiment_tracers with:
+    output:
+        tracers=f"{RESULTS}/experiments/{{experiment}}/tracers.h5",
+
+
 rule experiment:
     input:
         **body_files(),
-        kernels=kernels("geometry", "laws"),
+        kernels=kernels("laws"),
         truth=of_scene("particles.h5"),
-        mesh=of_chain("mesh.ply"),
+        tracers=of_chain("tracers.h5"),
         velocity=of_chain("velocity.json"),
         prior=of_each_body(material_prior),
         adaptor=of_each_body(trained_adaptor),
@@ -68,8 +73,6 @@ rule experiment:
         laws=of_each_body(true_law),
         carrier=lambda wildcards: of_each_body(judged_carrier)(wildcards)[0],
         frames=experiment_frames,
-        tracers=SETTINGS.evaluation.tracers,
-        seed=SETTINGS.seed,
         device=SETTINGS.device,
     script:
         "../scripts/evaluation.py"

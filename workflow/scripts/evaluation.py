@@ -7,11 +7,9 @@ import torch
 
 from neuma_lib.device import choose_device
 from neuma_lib.evaluation.motion import evaluate
-from neuma_lib.geometry.volume import sample_tracers
 from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.io.laws import load_law
-from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_start
 from neuma_lib.io.weights import read_weights
 from neuma_lib.mechanics.analytic import analytic_law
@@ -30,7 +28,7 @@ def main(inputs, output, params, run) -> None:
     truth, _ = read_arrays(
         inputs.truth, only=("tracers", "tracers_again"), required=("tracers", "tracers_again")
     )
-    tracers = sample_tracers(read_mesh(inputs.mesh), params.tracers, seed=params.seed)
+    measure, _ = read_arrays(inputs.tracers, required=("starts", "floor"))
     files = [inputs[name] for name in ("particles", "binding", "gaussians", "velocity")]
     body, v0, counts = load_start(*files, params.densities, params.carrier)
     laws = [analytic_law(law, dt=params.simulation["dt"]) for law in params.laws]
@@ -43,8 +41,9 @@ def main(inputs, output, params, run) -> None:
         params.frames,
         torch.from_numpy(truth["tracers"]).to(device),
         torch.from_numpy(truth["tracers_again"]).to(device),
-        torch.as_tensor(np.asarray(tracers), dtype=torch.float32, device=device),
+        torch.from_numpy(measure["starts"]).to(device),
         total=params.get("covariance_from") == "total",
+        floor=torch.from_numpy(measure["floor"]),
     )
     path = {name: getattr(evaluation.path, name).cpu().numpy() for name in ("x", "F")}
     if evaluation.F_total is not None:
