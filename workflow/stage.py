@@ -13,6 +13,8 @@ from __future__ import annotations
 import fcntl
 import logging
 import os
+import re
+import resource
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -32,6 +34,8 @@ WIDTH, ROWS = 80, 24  # of a terminal that does not tell
 LOG_FORMAT = "[%(asctime)s] %(message)s"
 
 _LOGGER = logging.getLogger("neuma_lib.stage")
+_SECONDS_LOGGER = logging.getLogger("neuma_lib.seconds")  # for the log alone
+_SECONDS = "core seconds: {:.2f} to start, {:.2f} of work"
 
 
 @contextmanager
@@ -73,8 +77,23 @@ def stage(name: str, log: str | Path | None = None, stream: TextIO | None = None
 def run_script(main: Callable, snakemake) -> None:
     """Run ``main(input, output, params, run)`` of a script as the stage of its rule and wildcards."""
     name = " ".join(filter(None, [snakemake.rule, "/".join(snakemake.wildcards)]))
+    started = _core_seconds()  # of the interpreter and all imports
     with stage(name, snakemake.log[0]) as run:
         main(snakemake.input, snakemake.output, snakemake.params, run)
+        _SECONDS_LOGGER.info(_SECONDS.format(started, _core_seconds() - started))
+
+
+def core_seconds(log: str | Path) -> tuple[float, float] | None:
+    """Core seconds [s] that a script took to start and to work, from its log; None if it did not get to its end."""
+    said = re.escape(_SECONDS).replace(r"\{:\.2f\}", r"([\d.]+)")
+    found = re.findall(said, Path(log).read_text()) if Path(log).exists() else []
+    return tuple(map(float, found[-1])) if found else None
+
+
+def _core_seconds() -> float:
+    """Seconds that all threads of this process and its finished children have kept a core busy."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(usage.ru_utime + usage.ru_stime for usage in used)
 
 
 class Stage:

@@ -249,8 +249,8 @@ def table_files(table, name):
     return [f"{run['folder']}/{name}" for run in table_runs(table)]
 
 
-def table_benchmarks(table):
-    """Benchmark files of all work behind the scenes of a table, in all chains."""
+def table_records(table):
+    """Benchmark file and log of each job behind the scenes of a table, in all chains."""
     pairs = [SimpleNamespace(**run) for run in table_runs(table) if run["scene"]]
     makers = {"made": "render", "supplied": "supplied", "packed": "unpack"}
     jobs = [("kernels", {"group": group}) for group in ("geometry", "simulation", "laws", "rendering")]
@@ -266,8 +266,9 @@ def table_benchmarks(table):
     jobs += [("material", {"scene": scene, "method": method}) for scene, method in trained]
     jobs += [("evaluation", vars(pair)) for pair in pairs]
     jobs += [("chamfer_table", {"table": table})]
-    files = [getattr(rules, name).benchmark.format(**wildcards) for name, wildcards in jobs]
-    return list(dict.fromkeys(files))
+    made = [(getattr(rules, name), wildcards) for name, wildcards in jobs]
+    files = [(rule.benchmark, str(rule.log[0]), wildcards) for rule, wildcards in made]
+    return list(dict.fromkeys(tuple(file.format(**w) for file in pair) for *pair, w in files))
 
 
 def table_cells(table):

@@ -62,10 +62,12 @@ rule learning_rates:
 
 rule timings:
     input:
-        benchmarks=lambda wildcards: table_benchmarks("table1"),
+        benchmarks=lambda wildcards: [benchmark for benchmark, _ in table_records("table1")],
     output:
         csv=report(f"{RESULTS}/timings.csv", caption="../report/timings.rst", category="Run times"),
         markdown=f"{RESULTS}/timings.md",
+    params:
+        logs=lambda wildcards: [log for _, log in table_records("table1")],
     script:
         "../scripts/timings.py"
 
