@@ -74,6 +74,7 @@ I, II, III, IV, V = (  # noqa: E741 - the paper's numbering
 )
 _GROUNDING = ("RubberPawn", "ClayCat")
 _TOLD_AGAINST_ASSUMED = ("neuma",), ("neuma+assumed_density=1000",)
+_CHOICES = ("BouncyBall", "RubberPawn", "ClayCat")
 _GENERALISATION = ("letter_N_rubber", "letter_N_clay")
 
 PAPER = {
@@ -161,6 +162,25 @@ PAPER = {
         (
             Claim(
                 "knowing the densities is no worse than assuming one", *_TOLD_AGAINST_ASSUMED, by_paper=False
+            ),
+        ),
+    ),
+    "ablation_gradients": PaperTable(
+        "",
+        "Choices that the paper leaves open",
+        "NeuMA with other gradients and covariances",
+        _CHOICES,
+        claims=(
+            Claim(
+                "gradients through the covariances help",
+                *(("neuma",), ("neuma+covariance_gradient=false",), _CHOICES, False),
+            ),
+            Claim(
+                "zeroing the gradients helps", ("neuma",), ("neuma+zero_gradients=false",), _CHOICES, False
+            ),
+            Claim(
+                "covariances from the total deformation help",
+                *(("neuma+covariance_from=total",), ("neuma",), _CHOICES, False),
             ),
         ),
     ),

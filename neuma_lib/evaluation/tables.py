@@ -40,6 +40,8 @@ FOOTNOTES = {
 }
 """Signs behind numbers, and what they mean."""
 
+VERDICTS = ("claim", "verdict", "RMSE here (mm)", "Chamfer distance in the paper")
+"""Columns of the table of verdicts."""
 HOLDS, MIXED, FAILS = "holds", "mixed", "does not hold"
 
 
@@ -178,8 +180,7 @@ class Table:
             parts += [f"{self._note_sign(method)} {note}", ""]
         if verdicts := self.verdicts():
             rows = [[v.claim.text, f"**{v.word}**", v.here, v.paper] for v in verdicts]
-            head = ["claim", "verdict", "RMSE here (mm)", "Chamfer distance in the paper"]
-            parts += ["**What holds**", "", *as_markdown(head, rows), "", RULE, ""]
+            parts += ["**What holds**", "", *as_markdown(VERDICTS, rows), "", RULE, ""]
         return "\n".join(parts)
 
     def verdicts(self) -> list[Verdict]:

@@ -1,0 +1,93 @@
+"""Pages get their numbers from recorded tables and figures, and nothing else of them changes."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+from test_tables import METHODS, run
+
+from docs import record
+from neuma_lib.evaluation.paper import PAPER
+from neuma_lib.evaluation.plotting.image_grid import ImageGrid, save_image_grid
+from neuma_lib.evaluation.tables import chamfer_table
+from neuma_lib.io.files import write_json
+
+PAGE = "# Title\n\nBefore.\n\n<!-- {0} -->\nold\n<!-- /{0} -->\n\nAfter.\n"
+
+
+@pytest.fixture
+def project(tmp_path):
+    """A run with a table 1 of two methods in three chains, and data of three figures."""
+    scenes = {scene: scene for scene in PAPER["table1"].columns}
+    metrics = {
+        method: {scene: [run(error + k) for k in range(3)] for scene in scenes}
+        for method, error in (("nclaw", 50), ("neuma", 5))
+    }
+    titles = {method: METHODS[method] for method in metrics}
+    table = chamfer_table(metrics, titles, scenes, PAPER["table1"])
+    figures = tmp_path / "results/figures"
+    figures.mkdir(parents=True)
+    (tmp_path / "results/table1.md").write_text(table.markdown())
+    (tmp_path / "results/table1.csv").write_text(table.csv())
+    cells = {"neuma": {"A": 0.25, "B": 0.75}}
+    quality = dict.fromkeys(record.image_quality.MEASURES, cells)
+    write_json(figures / "image_quality.json", {"titles": {"neuma": "NeuMA"}, "seen": ["B"], **quality})
+    norms = {"elastic": [1.0, 3.0, 2.0], "plastic": [0.5]}
+    change = {"elastic": 0.068, "plastic": 0.011}
+    write_json(
+        figures / "gradient_analysis.json", {"A": {"norms": norms, "change": change, "wrong": "elastic"}}
+    )
+    heights = [[1.0, 0.9, 0.5], [1.0, 0.9, 0.6], [1.0, 0.9, 0.4], [1.0, 0.0, 0.0]]
+    grid = ImageGrid(
+        np.zeros((1, 1, 2, 2, 3), np.uint8),
+        ("",),
+        ("",),
+        {"weights": [0, 0.5, 1, 2], "scenes": {"A": {"heights": heights}}},
+    )
+    save_image_grid(figures / "lora_alphav.h5", grid)
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "README.md").write_text(PAGE.format("table1"))
+    places = PAGE.format("verdicts") + PAGE.format("figures").partition("Before.")[2]
+    (tmp_path / "docs/README.md").write_text(places)
+    return tmp_path
+
+
+def recorded(project, monkeypatch) -> tuple[str, str]:
+    """The two pages after a recording."""
+    where = ["--results", "results", "--out", "docs", "--readme", "README.md", "--machine", "a machine"]
+    monkeypatch.chdir(project)
+    monkeypatch.setattr(sys, "argv", ["record", *where, "--commit", "abc"])
+    record.main()
+    return (project / "README.md").read_text(), (project / "docs/README.md").read_text()
+
+
+def test_pages_are_filled_from_tables_and_figures(project, monkeypatch):
+    readme, page = recorded(project, monkeypatch)
+    assert readme.startswith("# Title\n\nBefore.\n") and readme.endswith("<!-- /table1 -->\n\nAfter.\n")
+    assert "old" not in readme and "| NeuMA | 6.0 ± 1.0 |" in readme and "commit abc, a machine" in readme
+    assert readme.index("Tracer RMSE") < readme.index("| *paper* | *56.13* |") and "# Table 1" not in readme
+    expected = (
+        "| [table1](table1.md) | NeuMA is closer than its prior | **holds** | 6.0 ± 1.0 (NeuMA) against 51.0 ± 1.0"
+        " (NCLaw), lower in 6 of 6 | 1.31 against 12.18 |\n<!-- /verdicts -->"
+    )
+    assert expected in page, "other claims are about methods that were not run"
+    assert "| NeuMA | 0.5 | 0.5 | 0.5 | 0.5 |" in page and "Training saw the views of B." in page
+    assert "| A | elastic | 2 | 0.5 | 6.8 % | 1.1 % |" in page
+    # Heights part in the last frame only, and there 0.6 is no step from 0.5 to 0.4.
+    assert "0 of 1 (A)" in page
+    assert recorded(project, monkeypatch) == (readme, page)
+
+
+def test_a_page_without_its_place_is_named(project, monkeypatch):
+    (project / "README.md").write_text("nothing\n")
+    with pytest.raises(SystemExit, match="0 places <!-- table1 -->"):
+        recorded(project, monkeypatch)
+
+
+def test_the_pages_of_the_project_have_their_places():
+    for page, names in (("README.md", ["table1"]), ("docs/results/README.md", ["verdicts", "figures"])):
+        text = (record.Path(__file__).parents[2] / page).read_text()
+        for name in names:
+            assert record.filled(record.filled(text, name, "a"), name, "b").count("\nb\n") == 1
