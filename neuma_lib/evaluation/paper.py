@@ -88,12 +88,21 @@ PAPER = {
             "nclaw": (56.13, 6.32, 3.31, 2.45, 2.61, 2.26),
             "neuma": (1.19, 3.03, 1.27, 1.00, 0.65, 0.73),
             "neuma_particle_supervision": (1.45, 3.74, 1.25, 1.00, 0.80, 0.84),
-            "neuma_without_binding": (3.34, 28.42, 4.62, 1.26, 0.97, 1.01),
+            # Judged on the Gaussians that it was trained with; on the particles that all share: no experiment of it.
+            "neuma_without_binding_own": (3.34, 28.42, 4.62, 1.26, 0.97, 1.01),
             "neuma_without_adaptor": (1.87, 3.63, 1.42, 1.36, 1.21, 1.23),
         },
         (
             Claim("NeuMA is closer than its prior", ("neuma",), ("nclaw",)),
-            Claim("NeuMA is closer than w/o Bind", ("neuma",), ("neuma_without_binding",)),
+            Claim(
+                "NeuMA is closer than w/o Bind on its own particles",
+                ("neuma",),
+                ("neuma_without_binding_own",),
+            ),
+            Claim(
+                "NeuMA is closer than w/o Bind on the particles that all share",
+                *(("neuma",), ("neuma_without_binding",), (), False),
+            ),
             Claim("NeuMA is closer than w/o ΔM", ("neuma",), ("neuma_without_adaptor",)),
             Claim("NeuMA is closer than w/ P.S.", ("neuma",), ("neuma_particle_supervision",)),
         ),

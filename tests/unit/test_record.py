@@ -66,7 +66,7 @@ def recorded(project, monkeypatch) -> tuple[str, str]:
 def test_pages_are_filled_from_tables_and_figures(project, monkeypatch):
     readme, page = recorded(project, monkeypatch)
     assert readme.startswith("# Title\n\nBefore.\n") and readme.endswith("<!-- /table1 -->\n\nAfter.\n")
-    assert "old" not in readme and "| NeuMA | 6.0 ± 1.0 |" in readme and "commit abc, a machine" in readme
+    assert "\nold\n" not in readme and "| NeuMA | 6.0 ± 1.0 |" in readme and "commit abc, a machine" in readme
     assert readme.index("Tracer RMSE") < readme.index("| *paper* | *56.13* |") and "# Table 1" not in readme
     expected = (
         "| [table1](table1.md) | NeuMA is closer than its prior | **holds** | 6.0 ± 1.0 (NeuMA) against 51.0 ± 1.0"
