@@ -190,7 +190,9 @@ def iterations(scene: BenchmarkScene, count: int) -> list[float]:
     """Wall time of each of some training iterations [s], by the training loop itself."""
     loss = PixelLoss(scene.body, scene.observation)
     settings = MaterialConfig(iterations=count, lr_elastic=1e-4, lr_plastic=1e-5)
-    trained = train_material(scene.model, scene.law, scene.body, scene.v0, loss, settings, log=lambda _: None)
+    trained = train_material(
+        scene.model, scene.law, scene.body.state(scene.v0), loss, settings, log=lambda _: None
+    )
     return trained.history.seconds
 
 

@@ -26,10 +26,15 @@ class BodyConfig(Section):
         None, description="x and z of the bounding box's centre [m]; null: the scene's"
     )
     velocity: Vector | None = Field(None, description="initial velocity [m/s]; null: the scene's")
+    spin: Vector | None = Field(
+        None, description="initial angular velocity about the centre of mass [rad/s]; null: the scene's"
+    )
 
     @model_validator(mode="after")
     def _placed_only_with_a_shape(self) -> BodyConfig:
-        placed = [key for key in ("size", "height", "center", "velocity") if getattr(self, key) is not None]
+        placed = [
+            key for key in ("size", "height", "center", "velocity", "spin") if getattr(self, key) is not None
+        ]
         if self.shape is None and placed:
             raise ValueError(
                 f"{', '.join(placed)}: a reconstructed object starts as in its scene; name a shape"

@@ -175,7 +175,7 @@ class Config(Section):
         found = []
         for body in self.experiment(name).bodies:
             scene = self.scene(body.scene).plain()
-            keys = ("shape", "size", "height", "center", "velocity", "density", "law", "appearance")
+            keys = ("shape", "size", "height", "center", "velocity", "spin", "density", "law", "appearance")
             own = {key: value for key, value in body.plain().items() if value is not None}
             own |= {"size": body.size} if body.shape is not None else {}
             found.append({**{key: scene[key] for key in keys}, **own, "reconstructed": body.shape is None})

@@ -1,4 +1,4 @@
-"""Settings of the estimate of the initial velocity."""
+"""Settings of the estimate of the initial velocity and spin."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from neuma_lib.config.base import Section
 
 
 class VelocityConfig(Section):
-    """Initial velocity from the frames before contact."""
+    """Initial velocity and spin from the frames before contact."""
 
     views: tuple[int, ...] = Field((0,), min_length=1, description="views of the video that are used")
     ridge: float = Field(
@@ -21,4 +21,8 @@ class VelocityConfig(Section):
         3, ge=2, description="frames of the first estimate, which tells how many more come before contact"
     )
     iterations: int = Field(30, ge=1, description="most Levenberg-Marquardt steps for a set of frames")
-    difference: float = Field(0.02, gt=0, description="half width of the central differences [m/s]")
+    difference: float = Field(
+        0.02,
+        gt=0,
+        description="half width of the central differences [m/s], of the spin as the speed of the particles",
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import torch
@@ -41,14 +42,14 @@ class Reconstruction:
         mass = vol0 * density_at(gaussians.means, density)
         return cls(gaussians.means, vol0, mass, gaussians, Binding.identity(count, gaussians.means))
 
-    @property
-    def density(self) -> float:
-        """Smallest mass density of a particle [kg/m^3], where waves are fastest."""
-        return float((self.mass / self.vol0).min())
-
-    def state(self, v0: Tensor) -> State:
-        """The particles at t = 0, with velocities v0 [m/s], shape (N, 3) or (3,)."""
-        return State(self.x0, v0, self.mass, self.vol0)
+    def state(
+        self,
+        v0: Sequence[float] | Tensor,
+        spin: Sequence[float] | Tensor = (0.0, 0.0, 0.0),
+        centre: Sequence[float] | Tensor | None = None,
+    ) -> State:
+        """The particles at t = 0 with the velocity v0 [m/s] and the spin [rad/s] of `State.thrown`."""
+        return State.thrown(self.x0, self.mass, self.vol0, v0, spin, centre)
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Reconstruction:
         """The same body in another precision or on another device."""

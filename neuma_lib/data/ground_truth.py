@@ -18,7 +18,7 @@ from torch import Tensor
 from neuma_lib.geometry.volume import check_apart, sample_tracers, sample_volume
 from neuma_lib.mechanics.density import Density, density_at
 from neuma_lib.mechanics.law import Law
-from neuma_lib.sim.model import MPMModel, consecutive, each_its_own
+from neuma_lib.sim.model import MPMModel, consecutive
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
@@ -32,12 +32,14 @@ class TrueBody:
         law: analytic material.
         velocity: initial velocity [m/s].
         density: mass density [kg/m^3], see `neuma_lib.mechanics.density`.
+        spin: initial angular velocity about the centre of mass [rad/s].
     """
 
     mesh: trimesh.Trimesh
     law: Law
     velocity: Sequence[float]
     density: Density = 1000.0
+    spin: Sequence[float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -88,31 +90,24 @@ def simulate_ground_truth(
             large for a law.
     """
     check_apart([body.mesh for body in bodies])
-    solids, shares, densities = [], [], []
+    solids = []
     for body in bodies:
         x = torch.as_tensor(sample_volume(body.mesh, particles, seed=seed), dtype=torch.float32)
         density = density_at(x, body.density)
         model.check_courant(body.law, float(density.min()))
-        solids.append(x)
-        shares.append(torch.full((len(x),), float(body.mesh.volume) / len(x)))
-        densities.append(density)
-    together = trimesh.util.concatenate([body.mesh for body in bodies])
+        vol0 = torch.full((len(x),), float(body.mesh.volume) / len(x))
+        solids.append(State.thrown(x, vol0 * density, vol0, body.velocity, body.spin))
+    surface = trimesh.util.concatenate([body.mesh for body in bodies])
     start = [
-        torch.as_tensor(sample_tracers(together, tracers, seed=seed + 1 + k), dtype=torch.float32)
+        torch.as_tensor(sample_tracers(surface, tracers, seed=seed + 1 + k), dtype=torch.float32)
         for k in range(2)
     ]
-    counts = [len(x) for x in solids]
-    vol0, mass = torch.cat(shares), torch.cat(shares) * torch.cat(densities)
+    together = State.joined(solids)
     with torch.no_grad():
         path = rollout(
             model,
-            consecutive([body.law for body in bodies], counts),
-            State(
-                torch.cat(solids).to(device),
-                each_its_own([body.velocity for body in bodies], counts).to(device),
-                mass.to(device),
-                vol0.to(device),
-            ),
+            consecutive([body.law for body in bodies], [len(solid.x) for solid in solids]),
+            together.to(device),
             steps=max(frames),
             frames=frames,
             tracers=torch.cat(start).to(device),
@@ -123,6 +118,6 @@ def simulate_ground_truth(
         path=path,
         tracers=path.tracers[:, :split],
         tracers_again=path.tracers[:, split:],
-        vol0=vol0,
-        mass=mass,
+        vol0=together.vol0,
+        mass=together.mass,
     )

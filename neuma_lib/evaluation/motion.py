@@ -14,14 +14,13 @@ from dataclasses import asdict, dataclass
 import torch
 from torch import Tensor
 
-from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.evaluation.metrics import mechanical_energy, tracer_errors
 from neuma_lib.geometry.chamfer import chamfer_sequence
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import Body, MPMModel, as_bodies
 from neuma_lib.sim.rollout import rollout
-from neuma_lib.sim.state import Trajectory
+from neuma_lib.sim.state import State, Trajectory
 from neuma_lib.sim.total_deformation import every_step, total_deformation
 
 COUNT_TOLERANCE = 0.1
@@ -76,14 +75,14 @@ class Evaluation:
 def predict(
     model: MPMModel,
     law: Law | Sequence[Body],
-    body: Reconstruction,
-    v0: Tensor,
+    start: State,
     frames: Sequence[int],
     tracers: Tensor | None = None,
 ) -> tuple[Trajectory, Failure | None]:
     """Rollout of a law; one that becomes unstable is held at its last sound frame.
 
     Args:
+        start: particles and their initial motion.
         frames: simulation steps of the frames, T of them.
         tracers: start positions of passive tracers [m], shape (M, 3).
 
@@ -94,7 +93,7 @@ def predict(
     while True:
         try:
             with torch.no_grad():
-                path = rollout(model, law, body.state(v0), steps=kept[-1], frames=kept, tracers=tracers)
+                path = rollout(model, law, start, steps=kept[-1], frames=kept, tracers=tracers)
             break
         except NonFiniteError as error:
             failure = failure or Failure(error.happened, error.step, error.particle)
@@ -105,15 +104,15 @@ def predict(
     return path.hold_last(missing) if missing else path, failure
 
 
-def energy_gain_after(model: MPMModel, body: Reconstruction, v0: Tensor, path: Trajectory) -> int | None:
+def energy_gain_after(model: MPMModel, start: State, path: Trajectory) -> int | None:
     """The last step of a path up to which no more energy was seen than at the start; None if there never was more.
 
     A body without a motor turns its kinetic and gravitational energy into others and back, and never has more of it
     than at the start: one that does, by `ENERGY_TOLERANCE`, has begun to go wrong. Seen at the path's frames.
     """
-    start = body.state(v0).motion
-    allowed = (1 + ENERGY_TOLERANCE) * mechanical_energy(start[0], start[1], body.mass, model.gravity)
-    more = mechanical_energy(path.x, path.v, body.mass, model.gravity) > allowed
+    x, v, *_ = start.motion
+    allowed = (1 + ENERGY_TOLERANCE) * mechanical_energy(x, v, start.mass, model.gravity)
+    more = mechanical_energy(path.x, path.v, start.mass, model.gravity) > allowed
     if not more.any():
         return None
     first = int(more.nonzero()[0])
@@ -123,8 +122,7 @@ def energy_gain_after(model: MPMModel, body: Reconstruction, v0: Tensor, path: T
 def evaluate(
     model: MPMModel,
     law: Law | Sequence[Body],
-    body: Reconstruction,
-    v0: Tensor,
+    start: State,
     frames: Sequence[int],
     truth: Tensor,
     truth_again: Tensor,
@@ -137,8 +135,7 @@ def evaluate(
     Args:
         model: simulator constants.
         law: material to judge, or several with their ranges of particles.
-        body: reconstructed particles.
-        v0: estimated velocity [m/s], shape (3,) or (N, 3).
+        start: reconstructed particles with the estimated initial motion.
         frames: simulation steps, T of them.
         truth: tracers of the ground truth [m], shape (T, M, 3).
         truth_again: tracers of the ground truth from another sampling of the shape, shape (T, M'', 3).
@@ -156,14 +153,13 @@ def evaluate(
             "that of equal counts. Set evaluation.tracers to the dataset.tracers that the truth was made with"
         )
     starts = torch.cat([tracers, truth[0].to(tracers)])
-    path, failure = predict(model, law, body, v0, every_step(frames) if total else frames, starts)
-    gained = energy_gain_after(model, body, v0, path)
+    path, failure = predict(model, law, start, every_step(frames) if total else frames, starts)
+    gained = energy_gain_after(model, start, path)
     F_total = total_deformation(path, model.dt, frames).F if total else None
     path = path.at(frames) if total else path
     predicted, same_start = path.tracers[:, : len(tracers)], path.tracers[:, len(tracers) :]
     chamfer = chamfer_sequence(predicted, truth)
     floor = chamfer_sequence(truth_again, truth) if floor is None else floor
-    density = body.mass / body.vol0
     metrics = {
         **tracer_errors(same_start, truth),
         "chamfer": float(chamfer.mean()),
@@ -174,8 +170,8 @@ def evaluate(
         "chamfer_per_frame": [float(c) for c in chamfer],
         "chamfer_floor_per_frame": [float(c) for c in floor],
         "courant": max(
-            model.courant(part.law, float(density[part.start : part.stop].min()))
-            for part in as_bodies(law, len(density))
+            model.courant(part.law, float(start.density[part.start : part.stop].min()))
+            for part in as_bodies(law, len(start.x))
         ),
         "energy_gain_after_step": gained,
         "diverged_at_step": failure and failure.step,

@@ -33,7 +33,7 @@ from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
-from neuma_lib.sim.state import Trajectory
+from neuma_lib.sim.state import State, Trajectory
 from neuma_lib.sim.total_deformation import every_step, total_deformation
 from neuma_lib.splatting.observation import Observation
 
@@ -148,8 +148,7 @@ def frame_weights(iteration: int, count: int, settings: MaterialConfig) -> Tenso
 def train_material(
     model: MPMModel,
     law: Law,
-    body: Reconstruction,
-    v0: Tensor,
+    start: State,
     loss: TrajectoryLoss,
     settings: MaterialConfig,
     *,
@@ -162,8 +161,7 @@ def train_material(
     Args:
         model: simulator constants.
         law: prior with an adaptor; its parameters that require gradients are optimised, in place.
-        body: particles at the start.
-        v0: initial velocity [m/s], shape (3,).
+        start: particles with their initial motion.
         loss: per-frame loss of a trajectory.
         settings: hyper-parameters, from ``iterations`` on and ``lr_scale``.
         checkpoint: where to keep the state of the loop, so that a killed run goes on; None keeps none.
@@ -174,8 +172,8 @@ def train_material(
         NonFiniteError: the very first rollout is not finite, so there is no good state to return to.
         InputError: the law has nothing to train, or is too stiff for the time step.
     """
-    model.check_courant(law, body.density)
-    loop = _Loop(model, law, body, v0, loss, settings, log)
+    model.check_courant(law, float(start.density.min()))
+    loop = _Loop(model, law, start, loss, settings, log)
     if checkpoint is not None and (state := checkpoint.load()) is not None:
         loop.load_state_dict(state)
         log(f"resumed at iteration {loop.iteration} of {settings.iterations}")
@@ -195,8 +193,8 @@ def train_material(
 class _Loop:
     """The state of training, and one step of it."""
 
-    def __init__(self, model, law, body, v0, loss, settings, log):
-        self.model, self.law, self.body, self.v0 = model, law, body, v0
+    def __init__(self, model, law, start, loss, settings, log):
+        self.model, self.law, self.start = model, law, start
         self.loss, self.settings, self.log = loss, settings, log
         self.nets = {
             "elastic": [p for p in law.elasticity.parameters() if p.requires_grad],
@@ -258,11 +256,11 @@ class _Loop:
             self.best = self._better_state(value)
 
     def _frame_losses(self) -> Tensor:
-        body, frames = self.body, self.loss.frames
+        frames = self.loss.frames
         path = rollout(
             self.model,
             self.law,
-            body.state(self.v0),
+            self.start,
             steps=frames[-1],
             frames=every_step(frames) if self.loss.total else frames,
             memory=None if self.settings.memory is None else self.settings.memory * 2**30,

@@ -1,20 +1,21 @@
-"""Initial velocity from the frames before contact (paper Sec. 3.1), through renderer and simulator.
+"""Initial velocity and spin from the frames before contact (paper Sec. 3.1), through renderer and simulator.
 
-The unknown is one 3-vector, so the image residuals r(v0) are minimised by Levenberg-Marquardt with a numerical
-Jacobian instead of a thousand gradient steps. One camera sees motion along its own axis only as a change of size:
-that axis is determined far worse than the other two, and a ridge acts on it alone. The paper regularises the same
-weakness by a penalty on |v_x| and |v_z|, which would also pull an oblique throw towards the vertical.
+The unknowns are the velocity of the centre of mass and the angular velocity about it, so the image residuals are
+minimised by Levenberg-Marquardt with a numerical Jacobian instead of a thousand gradient steps. One camera sees motion
+along its own axis only as a change of size: that axis is determined far worse than the other two, and a ridge acts on
+it alone. The paper regularises the same weakness by a penalty on |v_x| and |v_z|, which would also pull an oblique
+throw towards the vertical.
 
 What the static Gaussians get wrong is the same in every frame: a body that is rendered one percent too large looks one
 percent too near. Taken for motion, that would be half a metre per second in depth. A constant shift of the rendered
-body is therefore estimated beside the velocity, and thrown away.
+body is therefore estimated beside the motion, and thrown away.
 """
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -27,10 +28,14 @@ from neuma_lib.fitting.frame_batches import frame_batches
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import MPMModel, contact_clearance
 from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import Trajectory, cross_matrix
 from neuma_lib.splatting.observation import Observation
 
 NUISANCE_SCALE = 0.02
 """Unit of the constant shift [m] and of the relative enlargement: about 1 m/s over a few frames."""
+UNKNOWNS = 9
+"""Velocity and spin (world axes), shift to the right and down, enlargement."""
+_ROUNDS = 8  # sets of frames that are tried
 _TILE = 12  # side [px] of the image tiles whose residuals are taken as correlated
 
 
@@ -39,10 +44,14 @@ class VelocityEstimate:
     """Result of `estimate_velocity`.
 
     Attributes:
-        v0: initial velocity [m/s], shape (3,).
+        v0: initial velocity of the centre [m/s], shape (3,).
+        spin: angular velocity about the centre [rad/s], shape (3,).
+        centre: centre of mass of the particles [m], shape (3,).
         std: estimated standard deviation along each world axis [m/s], shape (3,), without the ridge's help.
         axes: rows are the camera's right, down and viewing direction in world axes, shape (3, 3).
         std_camera: standard deviation along those axes [m/s], shape (3,).
+        spin_std: standard deviation of the spin along each world axis [rad/s], shape (3,).
+        spin_std_camera: standard deviation of the spin about the camera's axes [rad/s], shape (3,).
         information: curvature of the loss along the camera's axes relative to the best determined one, shape (3,).
         frames: steps of the frames that were used.
         nuisance: what was estimated along: constant shift of the rendered body to the right and down [m], and its
@@ -53,9 +62,13 @@ class VelocityEstimate:
     """
 
     v0: np.ndarray
+    spin: np.ndarray
+    centre: np.ndarray
     std: np.ndarray
     axes: np.ndarray
     std_camera: np.ndarray
+    spin_std: np.ndarray
+    spin_std_camera: np.ndarray
     information: np.ndarray
     frames: tuple[int, ...]
     nuisance: np.ndarray
@@ -67,10 +80,14 @@ class VelocityEstimate:
         """Plain numbers and lists, for JSON."""
         return {
             "v0": self.v0.tolist(),
-            "unit": "m/s",
+            "angular_velocity": self.spin.tolist(),
+            "centre": self.centre.tolist(),
+            "units": {"v0": "m/s", "angular_velocity": "rad/s", "centre": "m"},
             "std": self.std.tolist(),
             "camera_axes": self.axes.tolist(),
             "std_camera": self.std_camera.tolist(),
+            "angular_velocity_std": self.spin_std.tolist(),
+            "angular_velocity_std_camera": self.spin_std_camera.tolist(),
             "information_camera": self.information.tolist(),
             "frames": list(self.frames),
             "nuisance": self.nuisance.tolist(),
@@ -82,10 +99,13 @@ class VelocityEstimate:
     def summary(self) -> str:
         """One line for people: the estimate, how sure, and what holds the depth axis."""
         v, s, i = self.v0, self.std_camera, self.information
+        w, t = self.spin, self.spin_std_camera
         held = f"ridge {self.ridge:g} on depth" if self.ridge else "no regularisation"
         return (
             f"v0 = ({v[0]:+.3f}, {v[1]:+.3f}, {v[2]:+.3f}) m/s from {len(self.frames)} frames before contact; "
             f"std right {s[0]:.3f}, down {s[1]:.3f}, depth {s[2]:.3f} m/s; "
+            f"spin ({w[0]:+.2f}, {w[1]:+.2f}, {w[2]:+.2f}) rad/s, "
+            f"std about these axes {t[0]:.2f}, {t[1]:.2f}, {t[2]:.2f} rad/s; "
             f"information {i[0]:.2f}, {i[1]:.2f}, {i[2]:.3f}; {held}"
         )
 
@@ -120,31 +140,107 @@ def estimate_velocity(
     if float(contact_clearance(model, body.x0)) <= 0:
         raise InputError("the body touches a wall in the first frame: the video must start before contact")
     axes = observation.cameras.viewmats[0, :3, :3].cpu().numpy()
-    unknowns = np.zeros(6)  # velocity [m/s], and the nuisance in units of NUISANCE_SCALE
-    used = list(range(min(settings.initial_frames, len(observation.frames))))
-    accepted = 0
-    for _ in range(6):
-        seen = observation.select(used)
-        residuals = _Residuals(model, law, body, seen, settings.difference)
+    flight = _Flight(model, law, body, observation.frames)
+    unknowns, accepted = np.zeros(UNKNOWNS), 0
+    used = min(settings.initial_frames, len(observation.frames))
+    for _ in range(_ROUNDS):
+        seen = observation.select(list(range(used)))
+        residuals = _Residuals(flight, seen, settings.difference)
         unknowns, fit, steps = _levenberg_marquardt(residuals, unknowns, axes, settings, progress)
         accepted += steps
-        wider = _frames_before_contact(model, body, observation, unknowns[:3])
-        if wider == used or len(wider) < 2:
+        # No more than twice as many at a time: a spin from three frames says little about thirty.
+        clear = flight.frames_before_contact(*flight.motion(unknowns), 2 * used)
+        if clear == used or clear < 2:
             break
-        used = wider
-    std, std_camera, information = _uncertainty(fit, axes)
+        used = clear
+    v0, spin = (vector.cpu().numpy() for vector in flight.motion(unknowns))
+    covariance, information = _uncertainty(fit, axes)
+    covariance *= np.outer(flight.units, flight.units)
+    std, spin_std, std_camera, spin_std_camera = (
+        np.sqrt(np.diag(turn @ covariance[part, part] @ turn.T))
+        for turn in (np.eye(3), axes)
+        for part in (slice(0, 3), slice(3, 6))
+    )
     return VelocityEstimate(
-        v0=unknowns[:3],
+        v0=v0,
+        spin=spin,
+        centre=flight.centre.cpu().numpy(),
         std=std,
         axes=axes,
         std_camera=std_camera,
+        spin_std=spin_std,
+        spin_std_camera=spin_std_camera,
         information=information,
         frames=seen.frames,
-        nuisance=NUISANCE_SCALE * unknowns[3:],
+        nuisance=NUISANCE_SCALE * unknowns[6:],
         loss=fit.rms,
         iterations=accepted,
         ridge=settings.ridge,
     )
+
+
+class _Flight:
+    """Free flight of the body: the motion that the simulator makes of a spin, carried along a parabola.
+
+    The spinning is simulated without weight in the middle of the cube, far from walls: in free flight the centre of
+    mass follows its parabola whatever the body does about it.
+
+    Attributes:
+        centre: centre of mass [m], shape (3,).
+        units: of the unknowns, shape (9,): 1 m/s, the spin that moves the particles by 1 m/s about their centre (root
+            mean square), and `NUISANCE_SCALE`. So all have effects of the same order on the images.
+    """
+
+    def __init__(self, model: MPMModel, law: Law, body: Reconstruction, frames: tuple[int, ...]):
+        self.model, self.law, self.body, self.frames = model, law, body, frames
+        self.centre = body.mass @ body.x0 / body.mass.sum()
+        gyration = ((body.x0 - self.centre).square().sum(1) @ body.mass / body.mass.sum()).sqrt()
+        self.units = np.repeat([1.0, 1.0 / float(gyration), NUISANCE_SCALE], 3)
+        box = torch.stack([body.x0.amin(dim=0), body.x0.amax(dim=0)])
+        self._to_middle = 0.5 - box.mean(dim=0)
+        self._in_middle = replace(body, x0=body.x0 + self._to_middle)
+        self._weightless = replace(model, gravity=(0.0, 0.0, 0.0))
+        self._last: tuple[list[float], Trajectory] | None = None
+
+    def motion(self, unknowns: np.ndarray) -> tuple[Tensor, Tensor]:
+        """Velocity [m/s] and spin [rad/s] of scaled unknowns."""
+        return torch.as_tensor((self.units * unknowns)[:6]).to(self.body.x0).split(3)
+
+    def __call__(
+        self, v0: Tensor, spin: Tensor, frames: tuple[int, ...], near: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Positions (T, N, 3) [m] and deformation gradients (T, N, 3, 3) of the particles at the frames.
+
+        Simulated is the spin `near` by, and the result turned rigidly by the angle between both. What a change of the
+        spin does beyond this, by stretching the body and by unequal moments of inertia, is smaller by a factor of the
+        angle that the body turns, and central differences are spared a simulation each.
+        """
+        path = self._spinning(near, frames)
+        dt, g = self.model.dt, torch.tensor(self.model.gravity).to(v0)
+        n = torch.tensor(frames).to(v0)[:, None, None]
+        centre = self.centre + self._to_middle
+        turn = torch.linalg.matrix_exp(n * dt * cross_matrix(spin)) @ torch.linalg.matrix_exp(
+            -n * dt * cross_matrix(near)
+        )
+        x = (path.x - centre) @ turn.mT + self.centre
+        return x + n * dt * v0 + g * dt**2 * n * (n + 1) / 2, turn[:, None] @ path.F
+
+    def frames_before_contact(self, v0: Tensor, spin: Tensor, most: int) -> int:
+        """How many of the first `most` frames come before the body touches a wall."""
+        x, _ = self(v0, spin, self.frames[:most], spin)
+        touching = contact_clearance(self.model, x) <= 0
+        return int(touching.int().argmax()) if touching.any() else len(x)
+
+    def _spinning(self, spin: Tensor, frames: tuple[int, ...]) -> Trajectory:
+        """The body that spins in the middle of the cube."""
+        key = spin.tolist()
+        if self._last is None or self._last[0] != key or self._last[1].frames[-1] < frames[-1]:
+            wanted = [n for n in self.frames if n <= frames[-1]]
+            start = self._in_middle.state(torch.zeros_like(spin), spin)
+            with torch.no_grad():
+                path = rollout(self._weightless, self.law, start, steps=wanted[-1], frames=wanted)
+            self._last = (key, path)
+        return self._last[1].at(frames)
 
 
 @dataclass(frozen=True)
@@ -152,8 +248,8 @@ class _Linearisation:
     """The least-squares problem around some unknowns: residuals r, Jacobian J, summed up over all pixels.
 
     Attributes:
-        curvature: J^T J, shape (6, 6).
-        scores: J^T r of every tile of the image, summed over the frames, shape (tiles, 6).
+        curvature: J^T J, shape (9, 9).
+        scores: J^T r of every tile of the image, summed over the frames, shape (tiles, 9).
         cost: r^T r.
         rms: root mean square of r.
     """
@@ -165,7 +261,7 @@ class _Linearisation:
 
     @property
     def slope(self) -> np.ndarray:
-        """J^T r, shape (6,)."""
+        """J^T r, shape (9,)."""
         return self.scores.sum(axis=0)
 
 
@@ -173,14 +269,12 @@ class _Linearisation:
 class _Residuals:
     """Rendered minus observed colours as a function of the unknowns. A few frames at a time are in memory."""
 
-    model: MPMModel
-    law: Law
-    body: Reconstruction
+    flight: _Flight
     seen: Observation
     difference: float
 
     def __post_init__(self):
-        self._renderer = self.body.particle_gs(self.seen.cameras)
+        self._renderer = self.flight.body.particle_gs(self.seen.cameras)
 
     def cost(self, unknowns: np.ndarray) -> float:
         """Sum of squares."""
@@ -195,8 +289,8 @@ class _Residuals:
             r = self._residual(unknowns, part)
             J = torch.stack(
                 [
-                    self._render(unknowns + e, part) - self._render(unknowns - e, part)
-                    for e in self.difference * np.eye(6)
+                    self._render(unknowns + e, part, unknowns) - self._render(unknowns - e, part, unknowns)
+                    for e in self.difference * np.eye(UNKNOWNS)
                 ]
             ) / (2 * self.difference)
             cost = cost + r.square().sum().double()
@@ -212,16 +306,16 @@ class _Residuals:
     def _residual(self, unknowns: np.ndarray, part: slice) -> Tensor:
         return self._render(unknowns, part) - self.seen.colours(part)
 
-    def _render(self, unknowns: np.ndarray, part: slice) -> Tensor:
-        body, frames = self.body, self.seen.frames[part]
-        v0, nuisance = torch.as_tensor(unknowns).to(body.x0).split(3)
-        right, down, enlargement = NUISANCE_SCALE * nuisance
+    def _render(self, unknowns: np.ndarray, part: slice, near: np.ndarray | None = None) -> Tensor:
+        v0, spin = self.flight.motion(unknowns)
+        right, down, enlargement = NUISANCE_SCALE * torch.as_tensor(unknowns[6:]).to(v0)
         axes = self.seen.cameras.viewmats[0, :3, :3]
         with torch.no_grad():
-            path = rollout(self.model, self.law, body.state(v0), steps=frames[-1], frames=frames)
-            centre = path.x.mean(dim=1, keepdim=True)
-            x = centre + (1 + enlargement) * (path.x - centre) + right * axes[0] + down * axes[1]
-            return self._renderer(x, (1 + enlargement) * path.F)
+            base = spin if near is None else self.flight.motion(near)[1]
+            x, F = self.flight(v0, spin, self.seen.frames[part], base)
+            centre = x.mean(dim=1, keepdim=True)
+            x = centre + (1 + enlargement) * (x - centre) + right * axes[0] + down * axes[1]
+            return self._renderer(x, (1 + enlargement) * F)
 
     def _checked(self, cost: Tensor, unknowns: np.ndarray) -> float:
         value = float(cost)
@@ -249,7 +343,7 @@ def _levenberg_marquardt(
     """Minimise |r(u)|^2 + ridge * curvature * (depth . v)^2: the unknowns, their surroundings, accepted steps."""
 
     def penalty(H):
-        P = np.zeros((6, 6))
+        P = np.zeros((UNKNOWNS, UNKNOWNS))
         P[:3, :3] = settings.ridge * np.linalg.eigvalsh(H[:3, :3])[-1] * np.outer(axes[2], axes[2])
         return P
 
@@ -272,34 +366,15 @@ def _levenberg_marquardt(
     return u, fit, accepted
 
 
-def _frames_before_contact(
-    model: MPMModel, body: Reconstruction, observation: Observation, v0: np.ndarray
-) -> list[int]:
-    """Indices of the leading frames in which the body, flying freely with v0, is clear of every wall."""
-    clear = []
-    g, v = (torch.as_tensor(vector).to(body.x0) for vector in (model.gravity, v0))
-    for index, n in enumerate(observation.frames):
-        x = body.x0 + n * model.dt * v + g * model.dt**2 * n * (n + 1) / 2
-        if float(contact_clearance(model, x)) <= 0:
-            break
-        clear.append(index)
-    return clear
-
-
-def _uncertainty(fit: _Linearisation, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Standard deviations of an unregularised fit whose residuals are correlated inside tiles of the image.
+def _uncertainty(fit: _Linearisation, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance (9, 9) of an unregularised fit whose residuals are correlated inside tiles of the image, and the
+    information on the velocity along the camera's axes (3,).
 
     Residuals come from what the static reconstruction cannot show, not from independent pixel noise: scores are
     summed over each tile in all frames before their outer products are added (the cluster-robust covariance
-    H^-1 (sum_c g_c g_c^T) H^-1). The curvature that is left for the velocity when the nuisance is free is the Schur
+    H^-1 (sum_c g_c g_c^T) H^-1). The curvature that is left for the velocity when the rest is free is the Schur
     complement of H.
     """
     inverse = np.linalg.pinv(fit.curvature)
-    covariance = (inverse @ (fit.scores.T @ fit.scores) @ inverse)[:3, :3]
-    in_camera = axes @ covariance @ axes.T
     curvature = 1 / np.diag(axes @ inverse[:3, :3] @ axes.T)
-    return (
-        np.sqrt(np.diag(covariance)),
-        np.sqrt(np.diag(in_camera)),
-        curvature / curvature.max(),
-    )
+    return inverse @ (fit.scores.T @ fit.scores) @ inverse, curvature / curvature.max()

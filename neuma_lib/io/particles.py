@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +15,7 @@ from neuma_lib.io.files import read_json
 from neuma_lib.io.gaussians import load_gaussians
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.mechanics.density import Density, density_at
-from neuma_lib.sim.model import each_its_own
+from neuma_lib.sim.state import State
 
 Carrier = Literal["binding", "gaussians"]
 """What moves a body's Gaussians: bound volume particles, or themselves."""
@@ -74,6 +73,16 @@ def load_body(
     )
 
 
+INITIAL_MOTION = ("v0", "angular_velocity", "centre")
+"""Keys of a motion in velocity.json: velocity of the centre [m/s], angular velocity about it [rad/s], centre [m]."""
+
+
+def thrown(body: Reconstruction, velocity: str | Path) -> State:
+    """A reconstructed body with the initial motion that was estimated for it."""
+    found = read_json(velocity)
+    return body.state(*(found[key] for key in INITIAL_MOTION))
+
+
 def load_start(
     particles: str | Path,
     binding: str | Path,
@@ -81,31 +90,33 @@ def load_start(
     velocity: str | Path,
     densities: Sequence[Density],
     carrier: Carrier = "binding",
-) -> tuple[Reconstruction, torch.Tensor, list[int]]:
+) -> tuple[State, list[int]]:
     """What a prediction starts from: the reconstructed bodies of a scene (one) or of an experiment.
 
     Returns:
-        All bodies as one, velocities of the particles [m/s] (N, 3), and the particle count of each body.
+        All bodies in motion, one after the other, and the particle count of each.
 
     Raises:
         InputError: files of different bodies, or several whose Gaussians are to be the particles.
     """
     together = load_body(particles, binding, gaussians, 1.0, carrier)
+    x0, vol0 = together.x0, together.vol0
     found = read_json(velocity)
-    parts = found.get("bodies", [{**found, "particles": len(together.x0)}])
+    parts = found.get("bodies", [{**found, "particles": len(x0)}])
     if carrier == "gaussians":
         if len(parts) > 1:
             raise InputError(
                 f"{velocity} is of {len(parts)} bodies: the Gaussians can be the particles of one body only; choose a "
                 "method that is judged on particles"
             )
-        parts = [{**parts[0], "particles": len(together.x0)}]
+        parts = [{**parts[0], "particles": len(x0)}]
     counts = [part["particles"] for part in parts]
-    if sum(counts) != len(together.x0) or len(densities) != len(counts):
+    if sum(counts) != len(x0) or len(densities) != len(counts):
         raise InputError(f"{velocity} is of other bodies than {particles}: make both again")
-    density = [density_at(x, d) for x, d in zip(together.x0.split(counts), densities, strict=True)]
-    body = replace(together, mass=together.vol0 * torch.cat(density))
-    return body, each_its_own([part["v0"] for part in parts], counts), counts
+    return State.joined([
+        State.thrown(x, vol * density_at(x, density), vol, *(part[key] for key in INITIAL_MOTION))
+        for x, vol, density, part in zip(x0.split(counts), vol0.split(counts), densities, parts, strict=True)
+    ]), counts  # fmt: skip
 
 
 def load_motion(rollout: str | Path) -> tuple[torch.Tensor, torch.Tensor]:

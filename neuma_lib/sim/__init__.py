@@ -1,6 +1,6 @@
 """Differentiable material point method: one rollout for data, fitting and evaluation."""
 
-from neuma_lib.sim.model import Body, MPMModel, consecutive, contact_clearance, each_its_own
+from neuma_lib.sim.model import Body, MPMModel, consecutive, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
@@ -11,6 +11,5 @@ __all__ = [
     "Trajectory",
     "consecutive",
     "contact_clearance",
-    "each_its_own",
     "rollout",
 ]

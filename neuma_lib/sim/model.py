@@ -140,11 +140,6 @@ def consecutive(laws: Sequence[Law], counts: Sequence[int]) -> tuple[Body, ...]:
     return tuple(Body(law, end - n, end) for law, n, end in zip(laws, counts, ends, strict=True))
 
 
-def each_its_own(values: Sequence[Sequence[float]], counts: Sequence[int]) -> Tensor:
-    """One row of values a body, repeated for each of its particles: shape (N, K), float32."""
-    return torch.tensor(values, dtype=torch.float32).repeat_interleave(torch.tensor(counts), dim=0)
-
-
 def contact_clearance(model: MPMModel, x: Tensor) -> Tensor:
     """Smallest distance [m] of particles x (..., N, 3) to the zone that feels a wall; <= 0 in contact."""
     low, high = model.free_range

@@ -62,10 +62,61 @@ class State:
             if name in ("mass", "vol0") and not (value > 0).all():
                 raise InputError(f"{name} must be positive for every particle")
 
+    @classmethod
+    def thrown(
+        cls,
+        x: Tensor,
+        mass: Tensor,
+        vol0: Tensor,
+        velocity: Sequence[float] | Tensor,
+        spin: Sequence[float] | Tensor = (0.0, 0.0, 0.0),
+        centre: Sequence[float] | Tensor | None = None,
+    ) -> State:
+        """Particles that start as one rigid body, v = velocity + spin x (x - centre).
+
+        C is the gradient of that field, [spin]_x, which the grid needs to keep the angular momentum. A body without
+        spin has one velocity for all particles: it can fly in closed form.
+
+        Args:
+            x, mass, vol0: see `State`.
+            velocity: of the centre [m/s], shape (3,).
+            spin: angular velocity [rad/s], shape (3,).
+            centre: point that moves with `velocity` [m], shape (3,); None: the centre of mass.
+        """
+        velocity, spin = (torch.as_tensor(vector).to(x) for vector in (velocity, spin))
+        if not spin.any():
+            return cls(x, velocity, mass, vol0)
+        if centre is None:
+            centre = mass @ x / mass.sum()
+        C = cross_matrix(spin)
+        v = velocity + (x - torch.as_tensor(centre).to(x)) @ C.mT
+        return cls(x, v, mass, vol0, C=C.expand(len(x), 3, 3))
+
+    @classmethod
+    def joined(cls, bodies: Sequence[State]) -> State:
+        """The particles of several bodies, one after the other."""
+        x, v, F, C = (torch.cat(parts) for parts in zip(*(body.motion for body in bodies), strict=True))
+        mass, vol0 = (torch.cat([getattr(body, name) for body in bodies]) for name in ("mass", "vol0"))
+        return cls(x, v, mass, vol0, F, C)
+
+    def to(self, device: torch.device | str) -> State:
+        """The same on another device."""
+        return State(*(getattr(self, name).to(device) for name in ("x", "v", "mass", "vol0", "F", "C")))
+
+    @property
+    def density(self) -> Tensor:
+        """Mass densities of the undeformed particles [kg/m^3], shape (N,)."""
+        return self.mass / self.vol0
+
     @property
     def motion(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """What changes in time: x, v (N, 3), F and C."""
         return self.x, self.v.expand_as(self.x), self.F, self.C
+
+
+def cross_matrix(a: Tensor) -> Tensor:
+    """[a]_x, the matrix (3, 3) that multiplies a vector b to a x b; a of shape (3,)."""
+    return torch.linalg.cross(a.expand(3, 3), torch.eye(3, dtype=a.dtype, device=a.device)).mT
 
 
 @dataclass(frozen=True)

@@ -55,14 +55,16 @@ def camera(size: int = 32, dtype=torch.float64) -> Cameras:
     return Cameras(view, K, size, size)
 
 
-def observe(body: Reconstruction, v0, frames, spec=TRUTH, model=MODEL, size: int = 32) -> Observation:
+def observe(
+    body: Reconstruction, v0, frames, spec=TRUTH, model=MODEL, size: int = 32, spin=(0.0, 0.0, 0.0)
+) -> Observation:
     """Video of the ball under an analytic law, made where the ball is."""
     cameras = camera(size, body.x0.dtype).to(body.x0.device)
     with torch.no_grad():
         path = rollout(
             model,
             analytic_law(spec, model.dt).to(body.x0.device),
-            body.state(torch.as_tensor(v0).to(body.x0)),
+            body.state(v0, spin),
             steps=frames[-1],
             frames=frames,
         )

@@ -172,7 +172,9 @@ def train(device, settings, checkpoint=None):
     law.attach_adaptor(rank=4, seed=1)
     v0 = torch.tensor([0.0, -1.5, 0.0], device=device)
     loss = PixelLoss(body, observe(body, v0, (0, 20, 40)), frames_per_batch=2)
-    return train_material(MODEL, law, body, v0, loss, settings, checkpoint=checkpoint, log=lambda _: None)
+    return train_material(
+        MODEL, law, body.state(v0), loss, settings, checkpoint=checkpoint, log=lambda _: None
+    )
 
 
 def test_training_runs_on_the_gpu():

@@ -23,8 +23,9 @@ from neuma_lib.io.gaussians import save_gaussians
 from neuma_lib.io.particles import load_start, save_binding, save_particles
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.density import density_at
-from neuma_lib.sim.model import MPMModel, consecutive, each_its_own
+from neuma_lib.sim.model import MPMModel, consecutive
 from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State
 from neuma_lib.splatting.cameras import Cameras
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -143,11 +144,12 @@ def test_bodies_far_apart_move_as_they_do_alone():
     velocities = [[0.0, -3.0, 0.0], [0.0, -2.0, 0.0]]
     frames, both = (0, 60, 120), join(bodies)
     counts = [len(body.x0) for body in bodies]
-    v0 = each_its_own(velocities, counts)
-    together = rollout(model, consecutive(laws, counts), both.state(v0), steps=120, frames=frames)
+    start = State.joined([body.state(v0) for body, v0 in zip(bodies, velocities, strict=True)])
+    assert torch.equal(start.x, both.x0) and torch.equal(start.mass, both.mass)
+    together = rollout(model, consecutive(laws, counts), start, steps=120, frames=frames)
     start = 0
     for body, law, velocity in zip(bodies, laws, velocities, strict=True):
-        alone = rollout(model, law, body.state(torch.tensor(velocity)), steps=120, frames=frames)
+        alone = rollout(model, law, body.state(velocity), steps=120, frames=frames)
         part = together.x[:, start : start + len(body.x0)]
         torch.testing.assert_close(part, alone.x, atol=2e-6, rtol=0)
         start += len(body.x0)
@@ -173,28 +175,43 @@ def test_colliding_bodies_of_different_mass_exchange_momentum():
     assert left == pytest.approx(0.5, abs=0.04)
 
 
-def test_a_start_has_the_densities_and_velocities_of_its_bodies(tmp_path):
+def test_a_start_has_the_densities_and_motions_of_its_bodies(tmp_path):
     both = join([solid(0.3)[2], solid(0.7)[2]])
     half = len(both.x0) // 2
     save_gaussians(tmp_path / "g.ply", both.gaussians)
     save_binding(tmp_path / "b.h5", both.binding)
     save_particles(tmp_path / "p.h5", both.x0, both.vol0, {})
-    starts = [{"v0": [1.0, 0, 0], "particles": half}, {"v0": [0, 0, 2.0], "particles": len(both.x0) - half}]
+    still, pivot = {"angular_velocity": [0, 0, 0], "centre": None}, [0.6, 0.5, 0.5]
+    starts = [
+        {"v0": [1.0, 0, 0], **still, "particles": half},
+        {
+            "v0": [0, 0, 2.0],
+            "angular_velocity": [0, 3.0, 0],
+            "centre": pivot,
+            "particles": len(both.x0) - half,
+        },
+    ]
     files = [tmp_path / name for name in ("p.h5", "b.h5", "g.ply", "v.json")]
     write_json(files[-1], {"bodies": starts})
-    body, v0, counts = load_start(*files, [1000.0, {**SPLIT, "axis": "y"}])
+    start, counts = load_start(*files, [1000.0, {**SPLIT, "axis": "y"}])
     assert counts == [half, len(both.x0) - half]
-    assert v0[:half].unique(dim=0).tolist() == [[1, 0, 0]] and v0[half:].unique(dim=0).tolist() == [[0, 0, 2]]
-    density = (body.mass / body.vol0).round()
+    assert start.v[:half].unique(dim=0).tolist() == [[1, 0, 0]] and not start.C[:half].any()
+    arm = start.x[half:] - torch.tensor(pivot)
+    turning = torch.stack([3 * arm[:, 2], torch.zeros(len(arm)), 2 - 3 * arm[:, 0]], dim=1)
+    torch.testing.assert_close(start.v[half:], turning)
+    torch.testing.assert_close(
+        (start.C[half:] @ arm[:, :, None])[..., 0], turning - torch.tensor([0, 0, 2.0])
+    )
+    density = start.density.round()
     assert set(density[:half].tolist()) == {1000.0} and set(density[half:].tolist()) == {500.0, 1500.0}
     with pytest.raises(InputError, match="other bodies"):
         load_start(*files, [1000.0])
     with pytest.raises(InputError, match="of one body only"):
         load_start(*files, [1000.0, 1000.0], "gaussians")
-    write_json(files[-1], {"v0": [0, 1.0, 0]})
-    _, v0, counts = load_start(*files, [1000.0])
-    assert counts == [len(both.x0)] and v0.unique(dim=0).tolist() == [[0, 1, 0]]
-    splats, _, counts = load_start(*files, [500.0], "gaussians")
+    write_json(files[-1], {"v0": [0, 1.0, 0], **still})
+    start, counts = load_start(*files, [1000.0])
+    assert counts == [len(both.x0)] and start.v.unique(dim=0).tolist() == [[0, 1, 0]]
+    splats, counts = load_start(*files, [500.0], "gaussians")
     assert counts == [len(both.gaussians)]
-    torch.testing.assert_close(splats.x0, both.gaussians.means)
+    torch.testing.assert_close(splats.x, both.gaussians.means)
     torch.testing.assert_close(splats.mass.sum(), 500.0 * both.vol0.sum())

@@ -76,7 +76,7 @@ SETTINGS = MaterialConfig(iterations=12, lr_elastic=0.02, lr_plastic=0.002, chec
 def train(problem, law=None, settings=SETTINGS, **options):
     body, loss = problem
     law = law or stiff_random_law()
-    return train_material(MODEL, law, body, V0, loss, settings, log=lambda _: None, **options)
+    return train_material(MODEL, law, body.state(V0), loss, settings, log=lambda _: None, **options)
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ def test_recovery_returns_to_the_best_state_as_a_whole(problem, zero_gradients):
         update={"iterations": 4, "checkpoint_every": 1, "zero_gradients": zero_gradients}
     )
     train_material(
-        MODEL, stiff_random_law(), body, V0, scripted, settings, checkpoint=keep, log=messages.append
+        MODEL, stiff_random_law(), body.state(V0), scripted, settings, checkpoint=keep, log=messages.append
     )
     best, after_best, _, recovered, again = keep.states  # each is the state after its iteration's step
     assert [len(state["history"]["recoveries"]) for state in keep.states] == [0, 0, 0, 1, 1]
@@ -162,7 +162,7 @@ def test_training_ends_marked_after_too_many_recoveries(problem):
     )
     body, loss = problem
     law = stiff_random_law()
-    result = train_material(MODEL, law, body, V0, loss, wild, log=messages.append)
+    result = train_material(MODEL, law, body.state(V0), loss, wild, log=messages.append)
     assert len(result.history.recoveries) == len(messages) == 4 and not result.stable
     assert [entry["lr_scale"] for entry in result.history.recoveries] == [0.5, 0.25, 0.125, 0.0625]
     assert np.isfinite(result.best_loss) and result.best_loss <= result.history.loss[0]

@@ -61,8 +61,8 @@ def test_evaluation_follows_it_in_one_simulation(body, monkeypatch):
     )
     tracers = body.x0[:20]
     truth = tracers.expand(len(FRAMES), -1, -1)
-    elastic = motion.evaluate(MODEL, law, body, V0, FRAMES, truth, truth, tracers)
-    total = motion.evaluate(MODEL, law, body, V0, FRAMES, truth, truth, tracers, total=True)
+    elastic = motion.evaluate(MODEL, law, body.state(V0), FRAMES, truth, truth, tracers)
+    total = motion.evaluate(MODEL, law, body.state(V0), FRAMES, truth, truth, tracers, total=True)
     assert len(runs) == 2 and elastic.F_total is None
     assert total.metrics == elastic.metrics and torch.equal(total.tracers, elastic.tracers)
     assert total.path.frames == FRAMES and torch.equal(total.path.F, elastic.path.F)
@@ -89,7 +89,7 @@ def learning_law():
 def trained(body, iterations=3, total=False, **options):
     loss = PixelLoss(body, observe(body, V0, FRAMES), total=total)
     settings = MaterialConfig(iterations=iterations, **options)
-    return train_material(MODEL, learning_law(), body, V0, loss, settings, log=lambda _: None)
+    return train_material(MODEL, learning_law(), body.state(V0), loss, settings, log=lambda _: None)
 
 
 def test_training_with_the_total_deformation_learns(body):

@@ -372,7 +372,7 @@ def evaluation_views(wildcards):
 
 def scene_bodies(wildcards):
     """What the ground truth of a scene simulates."""
-    keys = ("shape", "size", "height", "center", "velocity", "density", "law")
+    keys = ("shape", "size", "height", "center", "velocity", "spin", "density", "law")
     return [scene_setting(*keys)(wildcards)]
 
 

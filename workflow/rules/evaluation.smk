@@ -12,7 +12,7 @@ rule initial_state:
     output:
         report=f"{RESULTS}/{{scene}}/initial_state.json",
     params:
-        scene=scene_setting("shape", "size", "height", "center", "velocity", "density"),
+        scene=scene_setting("shape", "size", "height", "center", "velocity", "spin", "density"),
         particles=SETTINGS.simulation.particles,
     script:
         "../scripts/initial_state.py"

@@ -11,7 +11,7 @@ rule experiment_truth:
     resources:
         gpu=EITHER_GPU,
     params:
-        bodies=experiment_bodies("shape", "size", "height", "center", "velocity", "density", "law"),
+        bodies=experiment_bodies("shape", "size", "height", "center", "velocity", "spin", "density", "law"),
         simulation=truth_simulation,
         dt=lambda wildcards: SETTINGS.experiment_dt(wildcards.experiment),
         frames=experiment_frames,
@@ -39,7 +39,7 @@ rule experiment_start:
         velocity=f"{RESULTS}/experiments/{{experiment}}/velocity.json",
     params:
         bodies=experiment_bodies(
-            "scene", "reconstructed", "shape", "size", "height", "center", "velocity", "appearance"
+            "scene", "reconstructed", "shape", "size", "height", "center", "velocity", "spin", "appearance"
         ),
         particles=SETTINGS.simulation.particles,
         sampling=SETTINGS.geometry.sampling,

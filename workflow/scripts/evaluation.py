@@ -30,14 +30,13 @@ def main(inputs, output, params, run) -> None:
     )
     measure, _ = read_arrays(inputs.tracers, required=("starts", "floor"))
     files = [inputs[name] for name in ("particles", "binding", "gaussians", "velocity")]
-    body, v0, counts = load_start(*files, params.densities, params.carrier)
+    start, counts = load_start(*files, params.densities, params.carrier)
     laws = [analytic_law(law, dt=params.simulation["dt"]) for law in params.laws]
     laws = laws or [load_law(prior, adaptor) for prior, adaptor in zip_longest(priors, adaptors)]
     evaluation = evaluate(
         MPMModel(**params.simulation),
         consecutive([law.to(device) for law in laws], counts),
-        body.to(torch.float32, device),
-        v0.to(device),
+        start.to(device),
         params.frames,
         torch.from_numpy(truth["tracers"]).to(device),
         torch.from_numpy(truth["tracers_again"]).to(device),

@@ -14,7 +14,7 @@ from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.gaussians import save_gaussians
 from neuma_lib.io.mesh import read_mesh, write_mesh
-from neuma_lib.io.particles import load_body, save_binding, save_particles
+from neuma_lib.io.particles import INITIAL_MOTION, load_body, save_binding, save_particles
 from workflow.stage import run_script
 
 
@@ -32,18 +32,18 @@ def main(inputs, output, params, run) -> None:
     for entry in params.bodies:
         if entry["reconstructed"]:
             *parts, surface, velocity = next(reconstructed)
-            body, mesh, v0 = load_body(*parts, 1.0), read_mesh(surface), read_json(velocity)["v0"]
+            body, mesh, found = load_body(*parts, 1.0), read_mesh(surface), read_json(velocity)
         else:
             mesh = place(entry["shape"], entry["size"], entry["height"], entry["center"])
             x0 = sample_volume(mesh, params.particles, seed=params.seed, method=params.sampling)
             colors = torch.from_numpy(colors_at(mesh, x0, look_of(entry)))
             body = coloured_solid(mesh, torch.as_tensor(x0, dtype=torch.float32), 1.0, colors)
-            v0 = entry["velocity"]
+            found = {"v0": entry["velocity"], "angular_velocity": entry["spin"], "centre": None}
         bodies.append(body)
         meshes.append(mesh)
-        starts.append(
-            {"scene": entry["scene"], "v0": v0, "particles": len(body.x0), "gaussians": len(body.gaussians)}
-        )
+        motion = {key: found[key] for key in INITIAL_MOTION}
+        counts = {"particles": len(body.x0), "gaussians": len(body.gaussians)}
+        starts.append({"scene": entry["scene"], **motion, **counts})
     together, surface = join(bodies), trimesh.util.concatenate(meshes)
     save_gaussians(output.gaussians, together.gaussians)
     save_particles(output.particles, together.x0, together.vol0, {})

@@ -19,6 +19,7 @@ def main(inputs, output, params, run) -> None:
             analytic_law(body["law"], dt=model.dt),
             body["velocity"],
             body["density"],
+            body["spin"],
         )
         for body in params.bodies
     ]

@@ -15,6 +15,8 @@ COLUMNS = {
     "velocity_error_depth": "error in depth [m/s]",
     "velocity_error_depth_without_ridge": "without ridge [m/s]",
     "velocity_std_depth": "estimated std in depth [m/s]",
+    "angular_velocity_error_viewing_percent": "spin error about the viewing axis [%]",
+    "angular_velocity_error_percent": "spin error [%]",
 }
 
 

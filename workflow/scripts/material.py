@@ -8,11 +8,11 @@ from neuma_lib.config.material import MaterialConfig
 from neuma_lib.device import choose_device
 from neuma_lib.fitting.material import ParticleLoss, PixelLoss, train_material
 from neuma_lib.io.checkpoint import Checkpoint
-from neuma_lib.io.files import read_json, write_json
+from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_observation
 from neuma_lib.io.laws import load_law, save_adaptor
-from neuma_lib.io.particles import load_body
+from neuma_lib.io.particles import load_body, thrown
 from neuma_lib.sim.model import MPMModel
 from workflow.provenance import fingerprint
 from workflow.stage import run_script
@@ -25,7 +25,6 @@ def main(inputs, output, params, run) -> None:
     law.attach_adaptor(settings.rank, settings.alpha, settings.seed)
     body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density, settings.carrier)
     body = body.to(torch.float32, device)
-    v0 = torch.tensor(read_json(inputs.velocity)["v0"], dtype=torch.float32, device=device)
     if settings.supervision == "particles":
         truth, _ = read_arrays(inputs.truth, required=("x", "frames"), only=("x", "frames"))
         targets = torch.from_numpy(truth["x"]).to(device)
@@ -40,8 +39,7 @@ def main(inputs, output, params, run) -> None:
     trained = train_material(
         MPMModel(**params.simulation),
         law,
-        body,
-        v0,
+        thrown(body, inputs.velocity),
         loss,
         settings,
         checkpoint=checkpoint,

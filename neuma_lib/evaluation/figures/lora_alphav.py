@@ -17,9 +17,9 @@ from neuma_lib.evaluation.metrics import mean_height
 from neuma_lib.evaluation.motion import predict
 from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.evaluation.plotting.image_grid import GAP, ImageGrid, draw_images, note, place
-from neuma_lib.io.files import read_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.laws import load_law
+from neuma_lib.io.particles import thrown
 from neuma_lib.sim.model import MPMModel
 
 LEFT, LEGEND, TITLE, PICTURES, CURVES, BETWEEN = 0.5, 0.2, 0.34, 4.0, 1.85, 0.38
@@ -40,13 +40,13 @@ def data(inputs, params, say) -> ImageGrid:
         video, body, cameras = rendering.film(inputs, params, k, setting["density"])
         body, cameras = body.to(torch.float32, device), cameras.to(device)
         law = load_law(inputs.prior[k], inputs.adaptor[k]).to(device)
-        v0 = torch.tensor(read_json(inputs.velocity[k])["v0"], dtype=torch.float32, device=device)
+        start = thrown(body, inputs.velocity[k])
         truth, _ = read_arrays(inputs.truth[k], required=("x", "mass"), only=("x", "mass"))
         shown = rendering.evenly(params.shown, len(video.frames))[1:]  # the start is the same for all
         columns, heights = [], []
         for weight in params.weights:
             law.set_adaptor_weight(weight)
-            path, failure = predict(model, law, body, v0, video.frames)
+            path, failure = predict(model, law, start, video.frames)
             columns.append(rendering.renders(body, cameras, path.x[shown], path.F[shown]))
             heights.append(mean_height(path.x.cpu(), body.mass.cpu()))
             if failure:
