@@ -174,7 +174,8 @@ class Table:
         for sign, note in FOOTNOTES.items():
             if any(sign in signs for signs in self.marks.values()):
                 parts += [f"{sign} {note}", ""]
-        parts += [*(f"- {failure}" for failure in self.failures), ""] if self.failures else []
+        if told := [*self.failures, *self.outliers()]:
+            parts += [*(f"- {line}" for line in told), ""]
         parts += [self.absorbed(), ""] if self.absorbed() else []
         for method, note in self.notes.items():
             parts += [f"{self._note_sign(method)} {note}", ""]
@@ -191,6 +192,17 @@ class Table:
             self._verdict(claim)
             for claim in claims
             if {*claim.better, *claim.worse} <= methods and set(claim.columns) <= set(self.columns)
+        ]
+
+    def outliers(self) -> list[str]:
+        """Runs whose `JUDGED` is more than twice the mean of their method's chains in the column, a sentence each."""
+        return [
+            f"{row.title} on {heading}, chain {k + 1} of {len(row.runs)}: {row.runs[k, c]:.1f} mm, more than twice the "
+            "mean of its chains."
+            for row in self._rows(JUDGED)
+            for c, heading in enumerate(self.columns.values())
+            for k in range(len(row.runs))
+            if row.runs[k, c] > 2 * row.mean[c]
         ]
 
     def absorbed(self) -> str | None:

@@ -181,6 +181,16 @@ def test_several_chains_give_mean_and_standard_deviation():
     assert ("chamfer_floor_std", "floor") not in rows
 
 
+def test_a_chain_above_twice_the_mean_of_its_cell_is_named():
+    metrics = {
+        "nclaw": {"a": [run(5.0)] * 3, "b": [run(1.0), run(1.0), run(3.0)]},
+        "neuma": {"a": [run(1.0), run(9.0), run(1.0)], "b": [run(2.0)] * 3},
+    }
+    table = chamfer_table(metrics, TITLES, {"a": "A", "b": "b"})
+    assert table.outliers() == ["NeuMA on A, chain 2 of 3: 9.0 mm, more than twice the mean of its chains."]
+    assert f"\n- {table.outliers()[0]}\n" in table.markdown()
+
+
 # ---- verdicts
 
 METHODS = {**TITLES, "other": "Other"}
