@@ -159,6 +159,10 @@ class RandomConfig(Section):
         """What the names of the scenes begin with."""
         return f"random{self.seed}_"
 
+    def family(self, name: str) -> str:
+        """The family of a scene, from its name."""
+        return name.removeprefix(self.prefix).split("_", 2)[2]
+
 
 def draw_scenes(
     settings: RandomConfig, priors: Mapping[str, LawConfig], grid: int, gravity: Vector

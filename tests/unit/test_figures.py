@@ -45,7 +45,7 @@ from neuma_lib.splatting.cameras import Cameras
 
 ROOT = Path(__file__).resolve().parents[2]
 SETTINGS = yaml.safe_load((ROOT / "config/config.yaml").read_text())
-METHODS = [name for name in style.METHODS if name not in ("truth", "pac_nerf", "spring_gaus")]
+METHODS = [name for name in style.METHODS if name in SETTINGS["tables"]["table1"]["methods"]]
 TITLES = {method: f"NeuMA {method[6:]}" for method in METHODS}
 SCENES = ["BouncyBall", "JellyDuck", "RubberPawn", "ClayCat", "SandFish", "HoneyBottle"]
 
@@ -162,6 +162,13 @@ DATA = {
         row_titles=["I\ninitial\nstate", "II\nsimulation", "III\nrendering", "\nobservation", "\ndifference"],
     ),  # fmt: skip
     "material_response": lambda: {scene: response() for scene in SCENES},
+    "random_scenes": lambda: {
+        "titles": ["NCLaw", "NeuMA"],
+        "families": {
+            family: {f"random7_0{k}_ball_{family}": [[10.0 * (k + 1), 5.0], k == 2]}
+            for k, family in enumerate(SETTINGS["random"]["families"])
+        },
+    },
     "ablation_gradients": lambda: {
         "scenes": SCENES[:3],
         "titles": {"a": "NeuMA", "b": "gradients not zeroed"},

@@ -1,6 +1,8 @@
 """Random scenes: every draw can be used, all machines draw the same ones, and every reason to reject one occurs."""
 
+import csv
 import hashlib
+import io
 import json
 from pathlib import Path
 
@@ -11,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from neuma_lib.config import settings
 from neuma_lib.config.random_scenes import DENSITY, FLAWS, SHAPES, draw_scenes
 from neuma_lib.errors import InputError
+from neuma_lib.evaluation.random_scenes import RandomScene, failure, random_table
 from neuma_lib.geometry import shapes
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.model import MPMModel
@@ -188,3 +191,60 @@ def test_settings_change_a_random_scene_as_any_other(raw, loaded):
     name = loaded.random_scenes[3]
     changed = settings.load(settings.merged(raw, {"scenes": {name: {"size": 0.3}}}), ROOT).scene(name)
     assert changed == loaded.scene(name).model_copy(update={"size": 0.3})
+
+
+# ---- the table
+
+
+def result(name, prior, judged, true=3.0, failed=None, depth=0.1, plane=1.0):
+    start = {
+        "velocity_error_in_plane_percent": plane,
+        "velocity_error_depth": depth,
+        "velocity_std_depth": 0.1,
+        "angular_velocity_error_camera": [0.2, -0.6, 0.01],
+        "angular_velocity_std_camera": [0.1, 0.2, 0.1],
+        "angular_velocity_error_viewing_percent": 0.5,
+        "angular_velocity_error_percent": 8.0,
+    }
+    rmse = {"nclaw": prior, "neuma": judged, "true_law": true}
+    return RandomScene(name, "ball", "hencky", "jelly", rmse, failed or {}, start)
+
+
+METHODS = {"nclaw": "NCLaw", "neuma": "NeuMA", "true_law": "True law"}
+
+
+def test_table_and_sentences_count_scenes():
+    scenes = [
+        result("random7_00_ball_hencky", 8.0, 2.0),
+        result("random7_01_ball_hencky", 16.0, 4.0, depth=-0.3),
+        result("random7_02_ball_hencky", 1.0, 2.0, failed={"neuma": "its training diverged"}, plane=3.0),
+    ]
+    table, text, sentences = random_table(scenes, METHODS, 7)
+    rows = list(csv.DictReader(io.StringIO(table)))
+    assert [row["scene"] for row in rows] == [scene.name for scene in scenes]
+    assert [float(row["ratio"]) for row in rows] == [0.25, 0.25, 2.0]
+    assert float(rows[1]["velocity_error_depth_in_std"]) == pytest.approx(3.0)
+    assert float(rows[0]["spin_error_in_std"]) == pytest.approx(3.0)
+    assert rows[2]["failures"] == "NeuMA: its training diverged" and not rows[0]["failures"]
+    assert sentences[0] == (
+        "NeuMA is better than NCLaw on 2 of 3; medians 8.0 mm (NCLaw), 2.0 mm (NeuMA), 3.0 mm (True law); "
+        "RMSE 0.50 times as large (geometric mean)."
+    )
+    assert sentences[1] == "Something failed on 1 of 3."
+    assert "Velocity in plane within 2 % on 2 of 3, spin in plane on 3 of 3." in text
+    assert "within 2 estimated standard deviations on 2 of 3, spin about every axis on 0 of 3." in text
+    assert "than the true law, simulated as the reconstruction is, on 2 of 3" in text
+    assert "Nothing was tuned on the scenes of this seed" in text
+    assert "Scenes for tuning; those that are reported are of seed 7" in random_table(scenes, METHODS, 1)[1]
+
+
+def test_a_table_needs_scenes():
+    with pytest.raises(InputError, match=r"set random\.count"):
+        random_table([], METHODS, 7)
+
+
+def test_failures_are_told():
+    broken = {"happened": "became non-finite", "step": 8, "particle": 1}
+    assert failure({"diverged": None, "stable": True}) is None
+    assert failure({"diverged": None, "stable": False}) == "its training diverged"
+    assert failure({"diverged": broken, "stable": True}) == "a particle became non-finite in step 8"

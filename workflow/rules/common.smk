@@ -228,6 +228,20 @@ def prior_file(scene, method=None):
     return f"{RESULTS}/priors/{folder(name, SETTINGS.chain(scene)[1], ['prior'])}.safetensors"
 
 
+def random_scenes():
+    """What tables of random scenes say of each."""
+    plain = {name: SETTINGS.scene(name) for name in SETTINGS.random_scenes}
+    return {
+        name: {"shape": scene.shape, "family": SETTINGS.random.family(name), "prior": scene.prior}
+        for name, scene in plain.items()
+    }
+
+
+def random_files(methods, name):
+    """A file of every random scene under some methods, method by method."""
+    return [f"{RESULTS}/{scene}/{method}/{name}" for method in methods for scene in SETTINGS.random_scenes]
+
+
 def table_runs(table):
     """Every run behind a table, row by row and chain by chain: its method, column, folder of the scene, and folder."""
     chosen = SETTINGS.tables[table]

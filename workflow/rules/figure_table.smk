@@ -98,7 +98,8 @@ def figure_module(figure):
     return ROOT / "neuma_lib" / "evaluation" / "figures" / f"{figure}.py"
 
 
-# ---- the figures: kind of the data file, inputs and parameters of `data`, resources other than the default
+# ---- the figures: kind of the data file, inputs and parameters of `data`, resources other than the default, and
+# whether they are left out of the target `figures`
 
 IN_VIEW = {"view": DRAWN.view, "magnify": DRAWN.magnify}
 
@@ -255,6 +256,15 @@ FIGURES = {
             "titles": titles_of("ablation_gradients"),
             "scenes": scenes_of("ablation_gradients"),
         },
+    },
+    "random_scenes": {
+        "kind": "json",
+        "input": {"metrics": random_files(SETTINGS.random.methods[:2], "metrics.json")},
+        "params": {
+            "titles": {method: SETTINGS.method_title(method) for method in SETTINGS.random.methods[:2]},
+            "scenes": random_scenes(),
+        },
+        "on_request": True,
     },
 }
 

@@ -28,4 +28,8 @@ for figure, made_of in FIGURES.items():
 
 rule figures:
     input:
-        expand(f"{RESULTS}/figures/{{figure}}.{{kind}}", figure=FIGURES, kind=["png", "pdf"]),
+        expand(
+            f"{RESULTS}/figures/{{figure}}.{{kind}}",
+            figure=[name for name, made_of in FIGURES.items() if not made_of.get("on_request")],
+            kind=["png", "pdf"],
+        ),

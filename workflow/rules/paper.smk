@@ -47,6 +47,27 @@ rule initial_states:
         "../scripts/initial_states.py"
 
 
+rule random_table:
+    input:
+        metrics=random_files(SETTINGS.random.methods, "metrics.json"),
+        starts=expand(f"{RESULTS}/{{scene}}/initial_state.json", scene=SETTINGS.random_scenes),
+    output:
+        csv=report(f"{RESULTS}/random.csv", caption="../report/random.rst", category="Tables"),
+        markdown=f"{RESULTS}/random.md",
+    params:
+        scenes=random_scenes(),
+        titles={method: SETTINGS.method_title(method) for method in SETTINGS.random.methods},
+        seed=SETTINGS.random.seed,
+    script:
+        "../scripts/random_table.py"
+
+
+rule random:
+    input:
+        rules.random_table.output,
+        expand(f"{RESULTS}/figures/random_scenes.{{kind}}", kind=["png", "pdf"]),
+
+
 rule learning_rates:
     input:
         histories=lambda wildcards: table_files("learning_rates", "history.json"),
