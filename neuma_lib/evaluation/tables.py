@@ -138,12 +138,8 @@ class Table:
     def wins(self) -> dict[str, int]:
         """In how many columns each method has the lowest mean of `JUDGED`; those of `YARDSTICKS` are left out."""
         rows = [r for r in self._rows(JUDGED) if r.method.partition("+")[0] not in YARDSTICKS]
-        means = np.array([row.mean[:-1] for row in rows])
-        return (
-            {}
-            if not rows
-            else {row.method: int((m <= means.min(axis=0)).sum()) for row, m in zip(rows, means, strict=True)}
-        )
+        lowest = np.min([row.mean[:-1] for row in rows], axis=0) if rows else 0
+        return {row.method: int((row.mean[:-1] <= lowest).sum()) for row in rows}
 
     def csv(self) -> str:
         """Comma-separated values: quantity, method, title, one column a scene, Average, Median, wins, diverged.
