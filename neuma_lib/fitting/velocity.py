@@ -36,7 +36,9 @@ NUISANCE_SCALE = 0.02
 UNKNOWNS = 9
 """Velocity and spin (world axes), shift to the right and down, enlargement."""
 _ROUNDS = 8  # sets of frames that are tried
-_TILE = 12  # side [px] of the image tiles whose residuals are taken as correlated
+_LEAST_GAIN = 1e-6  # part of the squares that a step saves, or the fit has ended: well inside the uncertainty
+_SHOWN = 1e-6  # part of the curvature in a block that shows the body
+_BLOCKS = 4  # blocks along a side of the image that the uncertainty leaves out in turn
 
 
 @dataclass(frozen=True)
@@ -248,16 +250,21 @@ class _Linearisation:
     """The least-squares problem around some unknowns: residuals r, Jacobian J, summed up over all pixels.
 
     Attributes:
-        curvature: J^T J, shape (9, 9).
-        scores: J^T r of every tile of the image, summed over the frames, shape (tiles, 9).
+        curvatures: J^T J of every block of the image, summed over the frames, shape (blocks, 9, 9).
+        scores: J^T r of every block, shape (blocks, 9).
         cost: r^T r.
         rms: root mean square of r.
     """
 
-    curvature: np.ndarray
+    curvatures: np.ndarray
     scores: np.ndarray
     cost: float
     rms: float
+
+    @property
+    def curvature(self) -> np.ndarray:
+        """J^T J, shape (9, 9)."""
+        return self.curvatures.sum(axis=0)
 
     @property
     def slope(self) -> np.ndarray:
@@ -284,7 +291,7 @@ class _Residuals:
 
     def linearise(self, unknowns: np.ndarray) -> _Linearisation:
         """Sums of the residuals and of their central differences."""
-        cost, curvature, scores = 0.0, 0.0, 0.0
+        cost, curvatures, scores = 0.0, 0.0, 0.0
         for part in self._parts():
             r = self._residual(unknowns, part)
             J = torch.stack(
@@ -294,11 +301,12 @@ class _Residuals:
                 ]
             ) / (2 * self.difference)
             cost = cost + r.square().sum().double()
-            curvature = curvature + (J.flatten(1) @ J.flatten(1).T).double()
-            scores = scores + torch.stack([_tile_sums(column * r) for column in J], dim=1).double()
+            columns = torch.stack([_in_blocks(column) for column in J], dim=2)  # (blocks, pixels, 9)
+            curvatures = curvatures + (columns.mT @ columns).double()
+            scores = scores + (columns.mT @ _in_blocks(r)[..., None])[..., 0].double()
         cost = self._checked(cost, unknowns)
         rms = float(np.sqrt(cost / (len(self.seen.frames) * r[0].numel())))
-        return _Linearisation(curvature.cpu().numpy(), scores.cpu().numpy(), cost, rms)
+        return _Linearisation(curvatures.cpu().numpy(), scores.cpu().numpy(), cost, rms)
 
     def _parts(self):
         return frame_batches(len(self.seen.frames), self._renderer.frames_per_batch)
@@ -326,11 +334,13 @@ class _Residuals:
         return value
 
 
-def _tile_sums(values: Tensor) -> Tensor:
-    """Sums of (T, V, H, W, C) over the frames, the channels and the pixels of each tile, shape (V * tiles,)."""
-    picture = values.sum(dim=(0, 4))
-    sums = torch.nn.functional.avg_pool2d(picture[:, None], _TILE, ceil_mode=True, divisor_override=1)
-    return sums.flatten()
+def _in_blocks(values: Tensor) -> Tensor:
+    """Values (T, V, H, W, C) by the block of the image that they lie in, shape (V * blocks, values)."""
+    T, V, H, W, C = values.shape
+    tall, wide = -(-H // _BLOCKS), -(-W // _BLOCKS)
+    full = torch.nn.functional.pad(values, (0, 0, 0, wide * _BLOCKS - W, 0, tall * _BLOCKS - H))
+    split = full.reshape(T, V, _BLOCKS, tall, _BLOCKS, wide, C)
+    return split.permute(1, 2, 4, 0, 3, 5, 6).reshape(V * _BLOCKS**2, -1)
 
 
 def _levenberg_marquardt(
@@ -354,27 +364,37 @@ def _levenberg_marquardt(
         P = penalty(H)
         step = -np.linalg.solve(H + P + damping * np.diag(np.diag(H)), fit.slope + P @ u)
         trial = u + step
-        if residuals.cost(trial) + trial @ P @ trial < fit.cost + u @ P @ u:
+        before, after = fit.cost + u @ P @ u, residuals.cost(trial) + trial @ P @ trial
+        if after < before:
             u, damping, accepted = trial, max(damping / 5, 1e-9), accepted + 1
             fit = residuals.linearise(u)
         else:
             damping *= 8
         if progress:
             progress(iteration + 1, settings.iterations, fit.rms)
-        if np.linalg.norm(step) < 1e-5 or damping > 1e6:
+        if np.linalg.norm(step) < 1e-5 or damping > 1e6 or 0 <= before - after < _LEAST_GAIN * before:
             break
     return u, fit, accepted
 
 
 def _uncertainty(fit: _Linearisation, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Covariance (9, 9) of an unregularised fit whose residuals are correlated inside tiles of the image, and the
+    """Covariance (9, 9) of an unregularised fit whose residuals are correlated over blocks of the image, and the
     information on the velocity along the camera's axes (3,).
 
-    Residuals come from what the static reconstruction cannot show, not from independent pixel noise: scores are
-    summed over each tile in all frames before their outer products are added (the cluster-robust covariance
-    H^-1 (sum_c g_c g_c^T) H^-1). The curvature that is left for the velocity when the rest is free is the Schur
-    complement of H.
+    Residuals come from what the static reconstruction cannot show (outline, shading, what turns into view), not from
+    independent pixel noise: they last over all frames and reach over a good part of the body. So the blocks of the
+    image are left out in turn, each in all frames, and the covariance is that of the jackknife,
+    (n - 1)/n sum_b d_b d_b^T, where d_b = (H - H_b)^-1 g_b is how the estimate moves without block b. n counts the
+    blocks that show the body. Unlike the sandwich H^-1 (sum_b g_b g_b^T) H^-1, this is not too small where few blocks
+    decide (CR3 of cluster-robust regression: MacKinnon and White 1985; Cameron and Miller 2015). The curvature that is
+    left for the velocity when the rest is free is the Schur complement of H.
     """
-    inverse = np.linalg.pinv(fit.curvature)
-    curvature = 1 / np.diag(axes @ inverse[:3, :3] @ axes.T)
-    return inverse @ (fit.scores.T @ fit.scores) @ inverse, curvature / curvature.max()
+    H = fit.curvature
+    shares = np.trace(fit.curvatures, axis1=1, axis2=2) / np.trace(H)
+    moved = np.array(
+        [np.linalg.pinv(H - part) @ g for part, g in zip(fit.curvatures, fit.scores, strict=True)]
+    )
+    n = max(2, int((shares > _SHOWN).sum()))
+    inverse = np.linalg.pinv(H)
+    information = 1 / np.diag(axes @ inverse[:3, :3] @ axes.T)
+    return (n - 1) / n * moved.T @ moved, information / information.max()

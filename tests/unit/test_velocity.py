@@ -79,17 +79,23 @@ def test_another_sampling_of_the_body_gives_the_plane_within_two_percent():
     assert np.abs(found.v0 - v0)[:2].max() < 0.02 * np.linalg.norm(v0)
 
 
-def test_uncertainty_covers_the_error_of_noisy_images():
+@pytest.mark.parametrize("correlated", [False, True], ids=["pixel noise", "patches that last"])
+def test_uncertainty_covers_the_error_of_noisy_images(correlated):
+    """Independent noise, and patches of 8 px that stay where they are over all frames."""
     body = ball()
     v0 = np.array([0.5, -1.2, 0.4])
     clean = observe(body, v0, FRAMES, size=64)
     noise = torch.Generator().manual_seed(3)
     errors, stds = [], []
     for _ in range(4):
-        noisy = clean.colours() + 0.05 * torch.randn(clean.images.shape, generator=noise, dtype=torch.float64)
+        shape = (1, 1, 8, 8, 3) if correlated else clean.images.shape
+        drawn = 0.05 * torch.randn(shape, generator=noise, dtype=torch.float64)
+        if correlated:
+            drawn = drawn.repeat_interleave(8, dim=2).repeat_interleave(8, dim=3)
+        noisy = clean.colours() + drawn
         found = estimate(body, type(clean)(clean.frames, noisy, clean.cameras), ridge=0.0)
-        errors.append(found.v0 - v0)
-        stds.append(found.std)
+        errors.append([*(found.v0 - v0), *found.spin])
+        stds.append([*found.std, *found.spin_std])
     ratio = np.sqrt(np.mean(np.square(errors), 0)) / np.mean(stds, 0)
     assert (ratio < 3).all() and (ratio > 0.2).all()
 
