@@ -7,10 +7,11 @@ from neuma_lib.sim.model import as_bodies
 
 def step(model, bodies, x, v, F, C, mass, vol0):
     """One step of the paper's Algorithm 2 with all 27 nodes of a particle as one axis."""
-    n, dx, dt = model.grid, model.dx, model.dt
+    n, dx, dt = model.nodes, model.dx, model.dt
     tau = evaluate(bodies, "elasticity", F)
-    base = (x.detach() / dx - 0.5).int()
-    f = x / dx - base
+    cells = x / dx - model.first_node
+    base = (cells.detach() - 0.5).int()
+    f = cells - base
     w = torch.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2], dim=1)
     ticks = torch.arange(3)
     offset = torch.cartesian_prod(ticks, ticks, ticks).to(x.device)
@@ -31,18 +32,20 @@ def step(model, bodies, x, v, F, C, mass, vol0):
 
     v = torch.einsum("pi,pia->pa", weight, grid_v[flat])
     C = (4 / dx**2) * torch.einsum("pi,pia,pib->pab", weight, grid_v[flat], d)
-    x = (x + dt * v).clamp(*model.stencil_range)
+    x = x + dt * v
+    if model.clamps:
+        x = x.clamp(*model.stencil_range)
     F = evaluate(bodies, "plasticity", F + dt * C @ F)
     return x, v, F, C
 
 
 def walls(model, grid_v):
     """Conditions on the wall nodes of a grid of velocities (n, n, n, 3), one wall after the other."""
-    n, cells = model.grid, model.wall_cells
+    n, thickness = model.nodes, model.wall_nodes
     for wall, condition in enumerate(model.boundary):
         axis, upper = divmod(wall, 2)
         index = torch.arange(n, device=grid_v.device)
-        inside = (index >= n - cells) if upper else (index < cells)
+        inside = (index >= n - thickness) if upper else (index < thickness)
         shape = [1, 1, 1]
         shape[axis] = n
         inside = inside.reshape(shape).expand(n, n, n)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from neuma_lib.config.base import Section, Vector
@@ -11,9 +13,13 @@ class SimulationConfig(Section):
     """The material point method."""
 
     particles: int = Field(2000, gt=0, description="particles of the reconstructed body")
-    grid: int = Field(24, ge=8, description="grid nodes along each side of the unit cube")
+    grid: int = Field(24, ge=8, description="grid cells along each side of the unit cube")
     gravity: Vector = Field((0.0, -9.8, 0.0), description="acceleration [m/s^2]")
     boundary: str | dict[str, str] = Field(
         "no_slip", description="condition of the walls: no_slip, slip or sticky, or one a wall (x_min, ...)"
     )
-    wall_cells: int = Field(1, ge=1, description="thickness of the walls in cells")
+    walls: Literal["outside", "released"] = Field(
+        "outside",
+        description="wall nodes outside the cube, so that bodies rest at y = 0; or inside it, and particles clamped, "
+        "as in the authors' code",
+    )

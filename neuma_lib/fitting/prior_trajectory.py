@@ -75,6 +75,6 @@ def _nclaw_throw(settings: TrajectoryConfig) -> Throw:
     local = torch.cartesian_prod(ticks, ticks, ticks)
     omega = torch.full((3,), 4.0)
     v = torch.tensor([1.0, -1.5, -2.0]) + torch.linalg.cross(omega.expand_as(local), local)
-    model = MPMModel(grid=settings.grid, dt=settings.dt, boundary="slip", wall_cells=3)
+    model = MPMModel(settings.grid, settings.dt, boundary="slip", walls="released", wall_cells=3)
     mass = torch.full((len(local),), DENSITY * side**3 / len(local))
     return Throw(model, State(0.5 + local, v, mass, mass / DENSITY), settings.steps)

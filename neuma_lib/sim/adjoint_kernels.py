@@ -23,7 +23,8 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
     ordered = scatter != "atomic"
     run_of, deposit = vars(scatter_functions(dtype, scatter, 3)).values()
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
-    base_node, weights, slopes = functions.base_node, functions.weights, functions.slopes
+    base_node, from_base = functions.base_node, functions.from_base
+    weights, slopes = functions.weights, functions.slopes
     column, offsets, wall_mask = functions.column, functions.offsets, functions.wall_mask
     moved_mask = functions.moved_mask
     module = f"neuma_lib.sim.adjoint_{str(dtype).removeprefix('torch.')}_{scatter}"
@@ -58,7 +59,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         xp = x[now, p]
         bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
         run = run_of(wp.where(alive, (bi * c.n + bj) * c.n + bk, -1))
-        f = xp * c.inv_dx - vec3(real(bi), real(bj), real(bk))
+        f = from_base(c, xp, bi, bj, bk)
         wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
         si, sj, sk = slopes(f[0]), slopes(f[1]), slopes(f[2])
         # F_trial = (I + dt C) F and x = x + dt v pass their gradients on to C, F and v.
@@ -132,7 +133,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         p = wp.tid()
         xp = x[now, p]
         bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
-        f = xp * c.inv_dx - vec3(real(bi), real(bj), real(bk))
+        f = from_base(c, xp, bi, bj, bk)
         wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
         si, sj, sk = slopes(f[0]), slopes(f[1]), slopes(f[2])
         wd_i = wp.cw_mul(wi, offsets(f[0]))

@@ -49,14 +49,17 @@ def warp_types(dtype: torch.dtype) -> SimpleNamespace:
     @wp.struct
     class GridConstants:
         n: wp.int32  # nodes along an edge
-        wall_cells: wp.int32  # thickness of the walls [nodes]
+        wall_nodes: wp.int32  # nodes of a wall, from either end of the grid
         walls: types.walls  # condition on x_min, x_max, y_min, y_max, z_min, z_max
+        first: real  # coordinate of node 0 [dx]
         dx: real  # node spacing [m]
         inv_dx: real
         dt: real  # [s]
         gravity: types.vec3  # [m/s^2]
-        x_low: real  # a quadratic stencil fits the grid for x_low <= x <= x_high [m]
-        x_high: real
+        clamp_low: real  # particles are moved to at least and at most these coordinates [m]
+        clamp_high: real
+        leave_low: real  # a particle beyond these coordinates has left the grid [m]
+        leave_high: real
 
     types.GridConstants = GridConstants
     return types
@@ -71,7 +74,12 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
     @wp.func
     def base_node(c: GridConstants, x: real):
         """First of the three nodes that see coordinate x; clamped, so that no fault indexes outside."""
-        return wp.clamp(wp.int32(x * c.inv_dx - real(0.5)), 0, c.n - 3)
+        return wp.clamp(wp.int32(x * c.inv_dx - (c.first + real(0.5))), 0, c.n - 3)
+
+    @wp.func
+    def from_base(c: GridConstants, x: vec3, i: wp.int32, j: wp.int32, k: wp.int32):
+        """Distance of x from the node (i, j, k) [dx]."""
+        return x * c.inv_dx - vec3(real(i) + c.first, real(j) + c.first, real(k) + c.first)
 
     @wp.func
     def weights(f: real):
@@ -107,10 +115,10 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
             i = place % c.n
             place = place / c.n
             for side in range(2):
-                inside = i < c.wall_cells
+                inside = i < c.wall_nodes
                 towards = v[a] < real(0.0)
                 if side == 1:
-                    inside = i >= c.n - c.wall_cells
+                    inside = i >= c.n - c.wall_nodes
                     towards = v[a] > real(0.0)
                 if inside:
                     condition = c.walls[2 * a + side]
@@ -122,20 +130,21 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
 
     @wp.func
     def moved(c: GridConstants, x: vec3, v: vec3):
-        """Position after a step, kept where the stencil exists: soft bodies are pressed past the last."""
-        return wp.max(wp.min(x + c.dt * v, vec3(c.x_high)), vec3(c.x_low))
+        """Position after a step, kept where the stencil exists if the walls are the released simulator's."""
+        return wp.max(wp.min(x + c.dt * v, vec3(c.clamp_high)), vec3(c.clamp_low))
 
     @wp.func
     def moved_mask(c: GridConstants, x_new: vec3):
         """Derivative of `moved` with respect to its unclamped argument: 0 for each component at a bound."""
         mask = vec3()
         for a in range(3):
-            if x_new[a] > c.x_low and x_new[a] < c.x_high:
+            if x_new[a] > c.clamp_low and x_new[a] < c.clamp_high:
                 mask[a] = real(1.0)
         return mask
 
     return SimpleNamespace(
         base_node=base_node,
+        from_base=from_base,
         weights=weights,
         slopes=slopes,
         offsets=offsets,
@@ -155,7 +164,8 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
     ordered = scatter != "atomic"
     run_of, deposit = vars(scatter_functions(dtype, scatter, 4)).values()
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
-    base_node, weights, offsets = functions.base_node, functions.weights, functions.offsets
+    base_node, from_base = functions.base_node, functions.from_base
+    weights, offsets = functions.weights, functions.offsets
     column, wall_mask, moved = functions.column, functions.wall_mask, functions.moved
     module = f"neuma_lib.sim.forward_{str(dtype).removeprefix('torch.')}_{scatter}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
@@ -190,7 +200,7 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         xp = x[now, p]
         bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
         run = run_of(wp.where(alive, (bi * c.n + bj) * c.n + bk, -1))
-        f = xp * c.inv_dx - vec3(real(bi), real(bj), real(bk))
+        f = from_base(c, xp, bi, bj, bk)
         wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
         m = mass[p]
         A = c.dx * (m * C[now, p] - (real(4.0) * c.dt * c.inv_dx * c.inv_dx * vol0[p]) * tau[cached, p])
@@ -239,7 +249,7 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         p = wp.tid()
         xp = x[now, p]
         bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
-        f = xp * c.inv_dx - vec3(real(bi), real(bj), real(bk))
+        f = from_base(c, xp, bi, bj, bk)
         wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
         wd_i = wp.cw_mul(wi, offsets(f[0]))
         wd_j = wp.cw_mul(wj, offsets(f[1]))
@@ -257,7 +267,8 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         C_new = (real(4.0) * c.inv_dx) * mat33(
             B_i[0], B_j[0], B_k[0], B_i[1], B_j[1], B_k[1], B_i[2], B_j[2], B_k[2]
         )
-        x[after, p] = moved(c, xp, v_new)
+        x_new = moved(c, xp, v_new)
+        x[after, p] = x_new
         v[after, p] = v_new
         C[after, p] = C_new
         F_trial[cached, p] = F[now, p] + c.dt * (C_new * F[now, p])
@@ -267,6 +278,8 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
             wp.atomic_min(faults, 0, here)
         elif c.dt * wp.max(wp.abs(v_new)) > c.dx:
             wp.atomic_min(faults, 1, here)
+        elif wp.min(x_new) < c.leave_low or wp.max(x_new) > c.leave_high:
+            wp.atomic_min(faults, 2, here)
 
     @kernel
     def trial_deformation(
@@ -290,7 +303,7 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         p = wp.tid()
         xp = x[p]
         bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
-        f = xp * c.inv_dx - vec3(real(bi), real(bj), real(bk))
+        f = from_base(c, xp, bi, bj, bk)
         wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
         total = vec4()
         for i in range(3):

@@ -15,6 +15,9 @@ from neuma_lib.mechanics.law import Law, Weights
 
 WALLS = ("x_min", "x_max", "y_min", "y_max", "z_min", "z_max")
 CONDITIONS = ("no_slip", "slip", "sticky")
+FORMS = ("outside", "released")
+_OUTSIDE = 2
+"""Nodes outside the cube at either end of an axis, all of them wall nodes, for the form of that name."""
 COURANT_LIMIT = 0.8
 """Largest stable c dt / dx. Between 1.0 and 1.2 a rollout still looks finite while its gradients explode."""
 
@@ -23,18 +26,28 @@ COURANT_LIMIT = 0.8
 class MPMModel:
     """Constants of the material point method on the unit cube.
 
-    Node i of an axis lies at i dx, for i = 0 ... grid - 1, with dx = 1 / grid. Particles are free where their
-    stencil sees no wall node, ``(wall_cells + 0.5) dx < x < 1 - (wall_cells + 1.5) dx``. The stencil itself
-    exists for ``0.5 dx <= x <= 1 - 1.5 dx``, which no particle leaves.
+    Nodes lie at whole multiples of dx = 1 / grid. A particle is free where its stencil of three nodes along an axis
+    sees no wall node, which it does within 1.5 dx of one. Half a cell beyond the first wall node it sees wall nodes
+    only and stands still. There are two forms of walls:
+
+    - "outside": the first wall nodes are one cell outside the cube, at -dx and 1 + dx, and behind each is a second
+      one, which completes the stencil as far as a particle can come. So contact begins half a cell inside the cube,
+      and a body rests with its lowest particles at y = 0, within 0.4 cells: soft ones below, stiff ones above. Only
+      their velocity ever moves particles.
+    - "released": as in the authors' code. Nodes are 0 ... grid - 1, the first and the last ``wall_cells`` of them are
+      walls, contact begins ``wall_cells + 0.5`` cells (at the far end one more) inside the cube, and particles
+      are clamped to where their stencil exists, 0.5 dx to 1 - 1.5 dx. With one wall cell the clamp presses a
+      permanent crease into soft bodies, because their deformation gradients know nothing of it.
 
     Attributes:
-        grid: nodes along an edge of the cube.
+        grid: cells along an edge of the cube.
         dt: time step [s].
         gravity: acceleration [m/s^2], y is up.
         boundary: condition of the walls, one name for all or one a wall (keys `WALLS`, others are "no_slip").
             "no_slip" stops a wall node whose velocity points into the wall, "slip" only removes the component
             that points into the wall, "sticky" stops wall nodes always.
-        wall_cells: thickness of the walls [nodes].
+        walls: form of the walls, one of `FORMS`.
+        wall_cells: thickness of released walls [nodes].
 
     Raises:
         InputError: a value is out of range or unknown.
@@ -44,20 +57,24 @@ class MPMModel:
     dt: float
     gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)
     boundary: str | Mapping[str, str] | tuple[str, ...] = "no_slip"
+    walls: str = "outside"
     wall_cells: int = 1
 
     def __post_init__(self):
         if not isinstance(self.grid, int) or self.grid < 6:
-            raise InputError(f"grid = {self.grid!r}: give the number of nodes along an edge, at least 6")
+            raise InputError(f"grid = {self.grid!r}: give the number of cells along an edge, at least 6")
         if not (isinstance(self.dt, (int, float)) and math.isfinite(self.dt) and self.dt > 0):
             raise InputError(f"dt = {self.dt!r}: give a positive time step in seconds")
         gravity = tuple(float(g) for g in self.gravity)
         if len(gravity) != 3 or not all(math.isfinite(g) for g in gravity):
             raise InputError(f"gravity = {self.gravity!r}: give three finite accelerations in m/s^2")
-        if not isinstance(self.wall_cells, int) or not 1 <= self.wall_cells <= (self.grid - 4) // 2:
-            most = (self.grid - 4) // 2
+        if self.walls not in FORMS:
+            raise InputError(f"walls = {self.walls!r} is unknown; choose one of {', '.join(FORMS)}")
+        most = (self.grid - 4) // 2 if self.walls == "released" else 1
+        if not isinstance(self.wall_cells, int) or not 1 <= self.wall_cells <= most:
             raise InputError(
-                f"wall_cells = {self.wall_cells!r}: give a whole number from 1 to {most} on this grid"
+                f"wall_cells = {self.wall_cells!r}: give a whole number from 1 to {most} with {self.walls} walls on "
+                "this grid"
             )
         object.__setattr__(self, "gravity", gravity)
         object.__setattr__(self, "boundary", _six_conditions(self.boundary))
@@ -68,14 +85,38 @@ class MPMModel:
         return 1.0 / self.grid
 
     @property
+    def clamps(self) -> bool:
+        """Whether particles are moved back to where their stencil exists."""
+        return self.walls == "released"
+
+    @property
+    def wall_nodes(self) -> int:
+        """Wall nodes at either end of an axis."""
+        return self.wall_cells if self.walls == "released" else _OUTSIDE
+
+    @property
+    def first_node(self) -> int:
+        """Coordinate of the first node of an axis [dx]."""
+        return 0 if self.walls == "released" else -_OUTSIDE
+
+    @property
+    def nodes(self) -> int:
+        """Nodes along an edge of the grid."""
+        return self.grid if self.walls == "released" else self.grid + 1 + 2 * _OUTSIDE
+
+    @property
     def stencil_range(self) -> tuple[float, float]:
         """Closed interval of coordinates whose three nodes all exist [m]."""
-        return 0.5 * self.dx, 1.0 - 1.5 * self.dx
+        if self.walls == "released":
+            return 0.5 * self.dx, 1.0 - 1.5 * self.dx
+        return (0.5 - _OUTSIDE) * self.dx, 1.0 + (_OUTSIDE - 0.5) * self.dx
 
     @property
     def free_range(self) -> tuple[float, float]:
         """Open interval of coordinates that no wall node influences [m]."""
-        return (self.wall_cells + 0.5) * self.dx, 1.0 - (self.wall_cells + 1.5) * self.dx
+        if self.walls == "released":
+            return (self.wall_cells + 0.5) * self.dx, 1.0 - (self.wall_cells + 1.5) * self.dx
+        return 0.5 * self.dx, 1.0 - 0.5 * self.dx
 
     def courant(self, law: Law, rho: float) -> float:
         """Courant number c dt / dx for the wave speed of the law at F = I and a density rho [kg/m^3]."""

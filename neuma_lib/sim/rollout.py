@@ -102,7 +102,7 @@ def _simulate(
     plan = None
     if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
         cache_bytes = DEFAULT_CACHE_BYTES[x.device.type] if cache_bytes is None else cache_bytes
-        plan = plan_memory(steps, len(x), model.grid**3, x.element_size(), cache_bytes, memory)
+        plan = plan_memory(steps, len(x), model.nodes**3, x.element_size(), cache_bytes, memory)
     simulation = Simulation(model, bodies, slices, state, steps, first, plan, scatter)
     path = RolloutFunction.apply(simulation, [n - first for n in frames], tracers, *inputs)
     return Trajectory(frames, *path)

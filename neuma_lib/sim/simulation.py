@@ -296,16 +296,20 @@ class Simulation:
 
     def _raise_faults(self, faults: Tensor, F: Tensor) -> None:
         """Raise if a velocity on the way or the last F (N, 3, 3) is not what a stable simulation gives."""
-        not_finite, too_fast = faults.tolist()
-        if min(not_finite, too_fast) == NO_FAULT and not torch.isfinite(F).all():
+        not_finite, too_fast, left = faults.tolist()
+        if min(not_finite, too_fast, left) == NO_FAULT and not torch.isfinite(F).all():
             particle = int((~torch.isfinite(F).flatten(1).all(dim=1)).nonzero()[0])
             not_finite = (self.steps - 1) << 31 | particle
-        fault = min(not_finite, too_fast)
+        fault = min(not_finite, too_fast, left)
         if fault == NO_FAULT:
             return
         step, particle = self.first + (fault >> 31) + 1, fault & (1 << 31) - 1
         law = next(body.law for body in self.bodies if body.start <= particle < body.stop)
-        happened = "moved by more than a cell in a step" if too_fast < not_finite else "became non-finite"
+        happened = {
+            not_finite: "became non-finite",
+            too_fast: "moved by more than a cell in a step",
+            left: "left the grid",
+        }[fault]
         raise NonFiniteError(
             "rollout",
             f"particle {particle} (law {law.name!r}) {happened} at step {step}, t = "

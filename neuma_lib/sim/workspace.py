@@ -5,6 +5,7 @@ Nothing here is allocated per step: launches are recorded on fixed memory and on
 
 from __future__ import annotations
 
+import math
 import threading
 import weakref
 from collections.abc import Hashable, Iterator, Sequence
@@ -26,6 +27,9 @@ SORT_EVERY = 16
 
 BLOCK = 64
 """Threads of a block on a GPU: 30,000 particles are few, so small blocks spread better over the processors."""
+
+LEAVING = 1e-3
+"""How far a particle may be beyond the last stencil by round-off [dx]: there the weights still sum to 1."""
 
 _CONDITION_CODES = {"no_slip": kernels.NO_SLIP, "slip": kernels.SLIP, "sticky": kernels.STICKY}
 
@@ -54,10 +58,11 @@ class Workspace:
         x, v: positions [m] and velocities [m/s], shape (n_states, N, 3).
         C, F: affine velocities [1/s] and deformation gradients, shape (n_states, N, 3, 3).
         tau, F_trial: Kirchhoff stresses [Pa] and trial deformation gradients, shape (n_cached_steps, N, 3, 3).
-        grid: momentum [kg m/s] and mass [kg] of the nodes, shape (n_cached_steps, grid^3, 4).
-        grid_v: velocity [m/s] of the nodes and 1 where there is mass, shape (n_cached_steps, grid^3, 4).
+        grid: momentum [kg m/s] and mass [kg] of the nodes, shape (n_cached_steps, nodes^3, 4).
+        grid_v: velocity [m/s] of the nodes and 1 where there is mass, shape (n_cached_steps, nodes^3, 4).
         mass, vol0: particle masses [kg] and initial volumes [m^3], shape (N,).
-        faults: first step and particle of a non-finite value and of one outside the grid, shape (2,).
+        faults: first step and particle of a non-finite value, of one that crossed a cell in a step and of one
+            that left the grid, shape (3,).
         order: particles sorted by cell, every `SORT_EVERY` steps, shape (n_sorts, N).
         checkpoints: x, v, F and C at the start of each segment, shape (n_checkpoints, ...).
         grad_*: gradients of the above for one step, without the first axis. grad_grid has two sides that steps
@@ -75,14 +80,14 @@ class Workspace:
         self.weights: list[Tensor] = []
         self.grad_weights: list[Tensor] = []
         self._frame_grads: dict[Hashable, list[Tensor | None]] = {}
-        N, nodes = size.particles, size.model.grid**3
+        N, nodes = size.particles, size.model.nodes**3
         states, cached = size.n_states, size.n_cached_steps
         self.x, self.v = self._vectors(states, N), self._vectors(states, N)
         self.C, self.F = self._matrices(states, N), self._matrices(states, N)
         self.tau, self.F_trial = self._matrices(cached, N), self._matrices(cached, N)
         self.grid, self.grid_v = self._nodes(cached, nodes), self._nodes(cached, nodes)
         self.mass, self.vol0 = self._scalars(N), self._scalars(N)
-        self.faults = self._buffer((2,), None, torch.int64)
+        self.faults = self._buffer((3,), None, torch.int64)
         self.checkpoints = tuple(
             value.new_empty(size.n_checkpoints, *value.shape[1:])
             for value in (self.x, self.v, self.F, self.C)
@@ -237,7 +242,7 @@ class Workspace:
 
     def _record_forward(self) -> None:
         k = forward_kernels(self.size.dtype, self.size.scatter)
-        N, nodes = self.size.particles, self.size.model.grid**3
+        N, nodes = self.size.particles, self.size.model.nodes**3
         rows, rows_v = self._rows(self.grid), self._rows(self.grid_v)
         if self.sorts:
             self._cells = self._record(k.cells, N, 0, self.x, self.cells)
@@ -254,7 +259,7 @@ class Workspace:
 
     def _record_adjoint(self) -> None:
         k = adjoint_kernels(self.size.dtype, self.size.scatter)
-        N, nodes = self.size.particles, self.size.model.grid**3
+        N, nodes = self.size.particles, self.size.model.nodes**3
         rows_v, grad_rows = self._rows(self.grid_v), self._rows(self.grad_grid)
         self._g2p_adjoint = self._record(
             k.g2p_adjoint, self._scattering_threads, 0, 0, 0, 0, 0, self.order,
@@ -308,9 +313,11 @@ def _run(launch: wp.Launch, *indices: int) -> None:
 def _grid_constants(model: MPMModel, dtype: torch.dtype):
     t = warp_types(dtype)
     c = t.GridConstants()
-    c.n, c.wall_cells = model.grid, model.wall_cells
+    c.n, c.wall_nodes, c.first = model.nodes, model.wall_nodes, model.first_node
     c.walls = t.walls(*(_CONDITION_CODES[condition] for condition in model.boundary))
     c.dx, c.inv_dx, c.dt = model.dx, float(model.grid), model.dt
     c.gravity = t.vec3(*model.gravity)
-    c.x_low, c.x_high = model.stencil_range
+    low, high = model.stencil_range
+    c.clamp_low, c.clamp_high = (low, high) if model.clamps else (-math.inf, math.inf)
+    c.leave_low, c.leave_high = low - LEAVING * model.dx, high + LEAVING * model.dx
     return c

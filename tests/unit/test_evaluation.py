@@ -37,7 +37,7 @@ def true_tracers(body, frames, *starts, law=LAW) -> list[torch.Tensor]:
 
 
 def test_the_true_law_from_another_sampling_is_as_good_as_the_sampling_allows():
-    particles, tracers, frames = 1500, 500, [0, 20, 40, 60, 80]
+    particles, tracers, frames = 1500, 500, [0, 20, 50, 75, 100]
     truth, again = true_tracers(
         ball(count=particles, seed=0), frames, in_ball(tracers, 10), in_ball(tracers, 11)
     )

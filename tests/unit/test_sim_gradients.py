@@ -9,12 +9,15 @@ from sim_scenes import DT, cube, make_law, strained
 from benchmarks import torch_simulation
 from neuma_lib.errors import InputError
 from neuma_lib.sim.memory import MemoryPlan, plan_memory
-from neuma_lib.sim.model import Body, MPMModel
+from neuma_lib.sim.model import Body, MPMModel, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 
 IN_THE_AIR = MPMModel(14, DT)
 ON_A_STICKY_FLOOR = MPMModel(14, DT, boundary={"y_min": "sticky"})  # stops its nodes always: no switch
+ON_A_RELEASED_FLOOR = MPMModel(14, DT, boundary={"y_min": "sticky"}, walls="released")
+TOUCHING = 0.12
+"""Height [m] at which the cube of `scene` is in the floor."""
 COUNT = 60
 
 
@@ -83,7 +86,11 @@ def assert_slopes_match(function, points, grads, sizes):
         assert abs(difference - slope) < 1e-6 * max(abs(slope), scale), (index, difference, slope)
 
 
-@pytest.mark.parametrize("model, height", [(IN_THE_AIR, 0.5), (ON_A_STICKY_FLOOR, 0.2)], ids=["air", "floor"])
+@pytest.mark.parametrize(
+    "model, height",
+    [(IN_THE_AIR, 0.5), (ON_A_STICKY_FLOOR, TOUCHING), (ON_A_RELEASED_FLOOR, 0.2)],
+    ids=["air", "floor", "released"],
+)
 @pytest.mark.parametrize("steps", [1, 20])
 @pytest.mark.parametrize("name", ["fixed_corotated", "hencky", "neo_hookean", "viscous_flow", "neural"])
 def test_finite_differences(name, steps, model, height):
@@ -107,19 +114,39 @@ def test_finite_differences(name, steps, model, height):
     assert_slopes_match(value, points, grads, sizes)
 
 
-def corner():
+@pytest.mark.parametrize("boundary", ["no_slip", "slip", "sticky"])
+def test_finite_differences_through_a_bounce(boundary):
+    """From free flight to the way back, with respect to x0, v0, F0 and C0; nodes start and stop on the way."""
+    x, mass, vol0 = cube(COUNT, side=0.25, centre=(0.5, 0.19, 0.5))
+    v = torch.tensor([0.3, -2.0, 0.1], dtype=x.dtype).repeat(COUNT, 1)
+    start = (x, v, torch.eye(3, dtype=x.dtype).repeat(COUNT, 1, 1), torch.zeros(COUNT, 3, 3, dtype=x.dtype))
+    model, law, frames = MPMModel(14, DT, boundary=boundary), make_law("hencky"), (0, 40, 100)
+    path = simulate(model, law, start, mass, vol0, frames)
+    assert contact_clearance(model, path[0][0]) > 0 > contact_clearance(model, path[0][1])
+    assert boundary == "sticky" or path[1][2, :, 1].mean() > 0.5
+    _, grads = gradients(model, law, start, mass, vol0, frames)
+
+    def value(points):
+        return random_loss()(simulate(model, law, points, mass, vol0, frames))
+
+    assert_slopes_match(value, list(start), grads, [1e-6] * 4)
+
+
+def corner(walls="outside"):
     """A model whose walls differ, and a cube in the corner where three of them meet."""
     boundary = {"y_min": "no_slip", "x_min": "slip", "z_min": "sticky"}
-    model = MPMModel(14, DT, boundary=boundary, wall_cells=2)
-    x, mass, vol0 = cube(COUNT, side=0.25, centre=(0.22, 0.22, 0.22))
+    thickness = {"wall_cells": 2} if walls == "released" else {}
+    model = MPMModel(14, DT, boundary=boundary, walls=walls, **thickness)
+    x, mass, vol0 = cube(COUNT, side=0.25, centre=3 * (0.22 if walls == "released" else TOUCHING,))
     return model, (x, *strained(x)), mass, vol0
 
 
+@pytest.mark.parametrize("walls", ["outside", "released"])
 @pytest.mark.parametrize("cache_bytes", [0, math.inf])
 @pytest.mark.parametrize("name", ["von_mises", "drucker_prager", "fluid", "neural"])
-def test_equals_torch_twin(name, cache_bytes):
+def test_equals_torch_twin(name, cache_bytes, walls):
     """States and gradients of 15 steps, at walls of every kind and with plastic flow, to 1e-9."""
-    model, start, mass, vol0 = corner()
+    model, start, mass, vol0 = corner(walls)
     law = make_law(name)
     parameters = trainable(law) if name == "neural" else []
     frames = (0, 4, 15)
@@ -134,8 +161,8 @@ def test_equals_torch_twin(name, cache_bytes):
 
 
 def test_pressed_against_the_end_of_the_grid():
-    """Particles that stop where the stencil ends: states and gradients of the torch twin."""
-    model = MPMModel(14, 2e-3, boundary="slip")
+    """Particles that the released walls clamp where the stencil ends: states and gradients of the torch twin."""
+    model = MPMModel(14, 2e-3, boundary="slip", walls="released")
     x, mass, vol0 = cube(COUNT, side=0.2, centre=(0.5, 0.18, 0.5))
     _, F, C = strained(x)
     v = torch.tensor([0.3, -8.0, 0.1], dtype=x.dtype).repeat(COUNT, 1)
@@ -163,11 +190,11 @@ def test_several_bodies_equal_torch_twin():
 
 def test_what_is_cached_does_not_change_the_gradient():
     """Everything, nothing but states, and an amount that is spent half-way give the same bytes."""
-    start, mass, vol0 = scene(0.2)
+    start, mass, vol0 = scene(TOUCHING)
     law = make_law("neural")
     parameters = trainable(law)
     model = MPMModel(14, DT)
-    step_bytes = 8 * (18 * COUNT + 8 * model.grid**3)
+    step_bytes = 8 * (18 * COUNT + 8 * model.nodes**3)
     half_way = 12 * step_bytes + 7 * 2000 * COUNT
     everything, *others = (
         gradients(model, law, start, mass, vol0, (3, 12), parameters, cache_bytes=cache_bytes)[1]
@@ -180,16 +207,16 @@ def test_what_is_cached_does_not_change_the_gradient():
 @pytest.mark.parametrize("cache_bytes,segment", [(0, 5), (math.inf, 4), (math.inf, 2)])
 def test_checkpoints_do_not_change_the_gradient(cache_bytes, segment):
     """With little memory the steps are computed again, segment by segment: the same bytes, also the second time."""
-    x, mass, vol0 = cube(2000, side=0.25, centre=(0.5, 0.2, 0.5))
+    x, mass, vol0 = cube(2000, side=0.25, centre=(0.5, TOUCHING, 0.5))
     start, steps = (x, *strained(x)), 13
     law = make_law("neural")
     parameters = trainable(law)
-    model, frames = MPMModel(14, DT), (0, 3, 7, steps)
+    model, frames = MPMModel(9, DT), (0, 3, 7, steps)
     _, expected = gradients(model, law, start, mass, vol0, frames, parameters, cache_bytes=cache_bytes)
-    state, step = 8 * 24 * len(x), 8 * (18 * len(x) + 8 * model.grid**3)
+    state, step = 8 * 24 * len(x), 8 * (18 * len(x) + 8 * model.nodes**3)
     memory = state * (segment + 1 + math.ceil(steps / segment)) + step * (segment if cache_bytes else 1)
     options = dict(memory=memory, cache_bytes=cache_bytes)
-    assert plan_memory(steps, len(x), model.grid**3, 8, **options) == MemoryPlan(segment, cache_bytes > 0, 0)
+    assert plan_memory(steps, len(x), model.nodes**3, 8, **options) == MemoryPlan(segment, cache_bytes > 0, 0)
     loss = random_loss()(simulate(model, law, start, mass, vol0, frames, **options))
     for _ in range(2):
         grads = torch.autograd.grad(loss, parameters, retain_graph=True)
@@ -198,14 +225,14 @@ def test_checkpoints_do_not_change_the_gradient(cache_bytes, segment):
 
 
 def test_too_little_memory():
-    start, mass, vol0 = scene(0.2)
+    start, mass, vol0 = scene(TOUCHING)
     with pytest.raises(InputError, match="memory = .* is too little for 13 steps of .* particles"):
         gradients(MPMModel(14, DT), make_law("neural"), start, mass, vol0, (13,), memory=1000)
 
 
 def test_backward_twice():
     """A graph that is retained can be used again, also after other rollouts."""
-    start, mass, vol0 = scene(0.2)
+    start, mass, vol0 = scene(TOUCHING)
     law = make_law("neural")
     parameters = trainable(law)
     model = MPMModel(14, DT)
@@ -237,7 +264,7 @@ def test_frames_add_up():
 def test_gradient_through_a_skipped_flight(frames):
     """Closed form and simulation have the same gradient with respect to x0, one common v0 and the weights."""
     model = MPMModel(14, 2e-3)
-    x0, mass, vol0 = cube(COUNT, side=0.25, centre=(0.5, 0.3, 0.5))
+    x0, mass, vol0 = cube(COUNT, side=0.25, centre=(0.5, 0.2, 0.5))
     law = make_law("neural")
     parameters = trainable(law)
 
@@ -254,7 +281,7 @@ def test_gradient_through_a_skipped_flight(frames):
 
 
 def test_float32_gradients_are_those_of_float64():
-    start, mass, vol0 = scene(0.2)
+    start, mass, vol0 = scene(TOUCHING)
     grads = {}
     for dtype in (torch.float32, torch.float64):
         law = make_law("neural", dtype)

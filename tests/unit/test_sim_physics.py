@@ -322,7 +322,9 @@ def test_courant_number_names_the_largest_step():
         (dict(dt=-1.0), ["dt"]),
         (dict(dt=float("nan")), ["dt"]),
         (dict(gravity=(0.0, -9.8)), ["gravity"]),
-        (dict(wall_cells=0), ["wall_cells"]),
+        (dict(walls="padded"), ["padded", "outside, released"]),
+        (dict(walls="released", wall_cells=0), ["wall_cells"]),
+        (dict(wall_cells=2), ["wall_cells", "outside"]),
     ],
 )
 def test_wrong_model_is_named(settings, words):
@@ -334,7 +336,7 @@ def test_wrong_model_is_named(settings, words):
 @pytest.mark.parametrize(
     "change, words",
     [
-        (dict(x=lambda x: x + 0.4), ["outside the grid", "m on every axis"]),
+        (dict(x=lambda x: x + 0.5), ["outside the grid", "m on every axis"]),
         (dict(x=lambda x: x * float("nan")), ["x has", "not finite"]),
         (dict(x=lambda x: x[:, :2]), ["x has shape", "(N, 3)"]),
         (dict(v=lambda x: x[:5]), ["v has", "(300, 3) or (3,)"]),

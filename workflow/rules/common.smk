@@ -199,7 +199,7 @@ def simulation_settings(wildcards):
 def simulator(dt, grid=None):
     """Constants of the simulator with a time step [s], on the reconstruction's grid unless another is given."""
     section = SETTINGS.simulation.plain() | ({"grid": grid} if grid else {})
-    return {"dt": dt, **{name: section[name] for name in ("grid", "gravity", "boundary", "wall_cells")}}
+    return {"dt": dt, **{name: section[name] for name in ("grid", "gravity", "boundary", "walls")}}
 
 
 @checked
