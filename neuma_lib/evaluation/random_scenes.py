@@ -144,6 +144,6 @@ def _summary(scenes: Sequence[RandomScene], titles: Mapping[str, str]) -> list[s
         closer = count(lambda s: s.rmse[judged] < s.rmse[TRUE_LAW])
         found.append(
             f"{titles[judged]} is closer to the truth than the true law, simulated as the reconstruction is, on "
-            f"{closer}: there it has absorbed discretisation."
+            f"{closer}: there it has absorbed discretisation, or errors of the start."
         )
     return found

@@ -224,7 +224,8 @@ class Table:
                 if closer
                 else "None is closer than it. "
             )
-            + "What a law gains over the true one is no knowledge of the material: it has absorbed discretisation."
+            + "What a law gains over the true one is no knowledge of the material: it has absorbed "
+            "discretisation, or errors of the start."
         )
 
     def _rows(self, quantity: str) -> list[Row]:
