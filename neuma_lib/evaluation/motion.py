@@ -34,7 +34,7 @@ class Failure:
     """Where a prediction ended before its last frame.
 
     Attributes:
-        happened: what a particle did: "became non-finite", "moved by more than a cell in a step".
+        happened: what a particle did: "became non-finite", "moved by more than a cell in a step", "left the grid".
         step: simulation step in which it did.
         particle: the first particle that did.
     """

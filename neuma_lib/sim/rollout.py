@@ -57,7 +57,8 @@ def rollout(
 
     Raises:
         InputError: frames, tracers, a particle that starts outside the grid, bodies that misfit.
-        NonFiniteError: a particle became non-finite or crossed a cell in a step; has `step` and `particle`.
+        NonFiniteError: a particle became non-finite, crossed a cell in a step or left the grid; has
+            `step` and `particle`.
     """
     frames = _checked_frames(frames, steps)
     bodies = as_bodies(law, len(state.x))
