@@ -164,7 +164,7 @@ def test_particle_gs_agrees():
 
 def train(device, settings, checkpoint=None):
     """Fit a stiff random law to the video of a soft ball in contact."""
-    body = ball(dtype=torch.float32).to(torch.float32, device)
+    body = ball(height=0.2, dtype=torch.float32).to(torch.float32, device)
     law = neural_law(seed=5)
     with torch.no_grad():
         law.elasticity.base[2].mul_(3e4 / max(law.longitudinal_modulus(), 1.0))
