@@ -13,13 +13,14 @@ body is therefore estimated beside the motion, and thrown away.
 A body that spins stretches, and the prior, which is wrong, does not say how far: a part that is held by nothing flies
 straight on, a rigid body keeps its size. Seen by one camera, growth is approach: honey that is taken for sand seems to
 recede by half a metre per second. So the difference between loose and rigid flight is added with a factor of its own,
-the looseness, which is 0 if the prior is right and expected within +-1.
+the looseness, which is 0 if the prior is right and expected within +-1; and beside it as much of a shrinking along the
+axis of the spin, by which a fluid keeps its volume.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,9 +39,9 @@ from neuma_lib.splatting.observation import Observation
 
 NUISANCE_SCALE = 0.02
 """Unit of the constant shift [m] and of the relative enlargement: about 1 m/s over a few frames."""
-UNKNOWNS = 10
-"""Velocity and spin (world axes), shift to the right and down, enlargement, looseness (`_Flight`)."""
-_LOOSENESS = 9  # its place among the unknowns
+UNKNOWNS = 11
+"""Velocity and spin (world axes), shift to the right and down, enlargement, looseness and shrinking (`_Flight`)."""
+_STRETCH = slice(9, 11)  # places of the last two
 _ROUNDS = 8  # sets of frames that are tried
 _LEAST_GAIN = 1e-6  # part of the squares that a step saves, or the fit has ended: well inside the uncertainty
 _LEAST_COST = 1e-12  # of images that agree exactly: a body at rest must not make the equations singular
@@ -64,7 +65,7 @@ class VelocityEstimate:
         information: curvature of the loss along the camera's axes relative to the best determined one, shape (3,).
         frames: steps of the frames that were used.
         nuisance: what was estimated along: constant shift of the rendered body to the right and down [m], its
-            relative enlargement, and its looseness, shape (4,).
+            relative enlargement, its looseness and its shrinking, shape (5,).
         loss: root mean square image residual at the estimate.
         iterations: accepted Levenberg-Marquardt steps.
         ridge: the ridge that was used (0: none).
@@ -196,15 +197,15 @@ class _Flight:
 
     Attributes:
         centre: centre of mass [m], shape (3,).
-        units: of the unknowns, shape (10,): 1 m/s, the spin that moves the particles by 1 m/s about their centre (root
-            mean square), `NUISANCE_SCALE`, and 1. So all have effects of the same order on the images.
+        units: of the unknowns, shape (11,): 1 m/s, the spin that moves the particles by 1 m/s about their centre (root
+            mean square), `NUISANCE_SCALE`, 1 and 1. So all have effects of the same order on the images.
     """
 
     def __init__(self, model: MPMModel, law: Law, body: Reconstruction, frames: tuple[int, ...]):
         self.model, self.law, self.body, self.frames = model, law, body, frames
         self.centre = body.mass @ body.x0 / body.mass.sum()
         gyration = ((body.x0 - self.centre).square().sum(1) @ body.mass / body.mass.sum()).sqrt()
-        self.units = np.append(np.repeat([1.0, 1.0 / float(gyration), NUISANCE_SCALE], 3), 1.0)
+        self.units = np.append(np.repeat([1.0, 1.0 / float(gyration), NUISANCE_SCALE], 3), [1.0, 1.0])
         box = torch.stack([body.x0.amin(dim=0), body.x0.amax(dim=0)])
         self._to_middle = 0.5 - box.mean(dim=0)
         self._in_middle = replace(body, x0=body.x0 + self._to_middle)
@@ -216,14 +217,20 @@ class _Flight:
         return torch.as_tensor((self.units * unknowns)[:6]).to(self.body.x0).split(3)
 
     def __call__(
-        self, v0: Tensor, spin: Tensor, frames: tuple[int, ...], near: Tensor, looseness: float = 0.0
+        self,
+        v0: Tensor,
+        spin: Tensor,
+        frames: tuple[int, ...],
+        near: Tensor,
+        stretch: Sequence[float] = (0.0, 0.0),
     ) -> tuple[Tensor, Tensor]:
         """Positions (T, N, 3) [m] and deformation gradients (T, N, 3, 3) of the particles at the frames.
 
         Simulated is the spin `near` by, and the result turned rigidly by the angle between both. What a change of the
         spin does beyond this, by stretching the body and by unequal moments of inertia, is smaller by a factor of the
-        angle that the body turns, and central differences are spared a simulation each. `looseness` times the
-        difference between loose flight, x0 + t omega x x0, and rigid flight is added to both.
+        angle that the body turns, and central differences are spared a simulation each. Added to both is
+        `stretch`: the looseness times the difference between loose flight, x0 + t omega x x0, and rigid flight, and
+        the shrinking times -(t^2 / 2) omega omega^T x0.
         """
         path = self._spinning(near, frames)
         dt, g = self.model.dt, torch.tensor(self.model.gravity).to(v0)
@@ -234,9 +241,9 @@ class _Flight:
         )
         x, F = (path.x - centre) @ turn.mT, turn[:, None] @ path.F
         rate = n * dt * cross_matrix(spin)
-        spread = torch.eye(3).to(rate) + rate - torch.linalg.matrix_exp(rate)
-        x = x + looseness * (self.body.x0 - self.centre) @ spread.mT
-        F = F + looseness * spread[:, None]
+        loose = torch.eye(3).to(rate) + rate - torch.linalg.matrix_exp(rate)
+        added = stretch[0] * loose - stretch[1] / 2 * (n * dt) ** 2 * torch.outer(spin, spin)
+        x, F = x + (self.body.x0 - self.centre) @ added.mT, F + added[:, None]
         return x + self.centre + n * dt * v0 + g * dt**2 * n * (n + 1) / 2, F
 
     def frames_before_contact(self, v0: Tensor, spin: Tensor, most: int) -> int:
@@ -262,8 +269,8 @@ class _Linearisation:
     """The least-squares problem around some unknowns: residuals r, Jacobian J, summed up over all pixels.
 
     Attributes:
-        curvatures: J^T J of every block of the image, summed over the frames, shape (blocks, 10, 10).
-        scores: J^T r of every block, shape (blocks, 10).
+        curvatures: J^T J of every block of the image, summed over the frames, shape (blocks, 11, 11).
+        scores: J^T r of every block, shape (blocks, 11).
         cost: r^T r.
         rms: root mean square of r.
     """
@@ -275,18 +282,20 @@ class _Linearisation:
 
     @property
     def curvature(self) -> np.ndarray:
-        """J^T J, shape (10, 10)."""
+        """J^T J, shape (11, 11)."""
         return self.curvatures.sum(axis=0)
 
     @property
     def prior(self) -> np.ndarray:
-        """Curvature that holds the looseness at 0 +- 1, shape (10, 10). The residuals of a block of the image count
-        as one, since they are correlated."""
-        return np.diag(np.eye(UNKNOWNS)[_LOOSENESS]) * max(self.cost, _LEAST_COST) / _BLOCKS**2
+        """Curvature that holds looseness and shrinking at 0 +- 1, shape (11, 11). The residuals of a block of the
+        image count as one, since they are correlated."""
+        held = np.zeros(UNKNOWNS)
+        held[_STRETCH] = max(self.cost, _LEAST_COST) / _BLOCKS**2
+        return np.diag(held)
 
     @property
     def slope(self) -> np.ndarray:
-        """J^T r, shape (10,)."""
+        """J^T r, shape (11,)."""
         return self.scores.sum(axis=0)
 
 
@@ -319,7 +328,7 @@ class _Residuals:
                 ]
             ) / (2 * self.difference)
             cost = cost + r.square().sum().double()
-            columns = torch.stack([_in_blocks(column) for column in J], dim=2)  # (blocks, pixels, 10)
+            columns = torch.stack([_in_blocks(column) for column in J], dim=2)  # (blocks, pixels, 11)
             curvatures = curvatures + (columns.mT @ columns).double()
             scores = scores + (columns.mT @ _in_blocks(r)[..., None])[..., 0].double()
         cost = self._checked(cost, unknowns)
@@ -334,11 +343,11 @@ class _Residuals:
 
     def _render(self, unknowns: np.ndarray, part: slice, near: np.ndarray | None = None) -> Tensor:
         v0, spin = self.flight.motion(unknowns)
-        right, down, enlargement, looseness = torch.as_tensor(self.flight.units * unknowns).to(v0)[6:]
+        right, down, enlargement, *stretch = torch.as_tensor(self.flight.units * unknowns).to(v0)[6:]
         axes = self.seen.cameras.viewmats[0, :3, :3]
         with torch.no_grad():
             base = spin if near is None else self.flight.motion(near)[1]
-            x, F = self.flight(v0, spin, self.seen.frames[part], base, looseness)
+            x, F = self.flight(v0, spin, self.seen.frames[part], base, stretch)
             centre = x.mean(dim=1, keepdim=True)
             x = centre + (1 + enlargement) * (x - centre) + right * axes[0] + down * axes[1]
             return self._renderer(x, (1 + enlargement) * F)
@@ -396,7 +405,7 @@ def _levenberg_marquardt(
 
 
 def _uncertainty(fit: _Linearisation, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Covariance (10, 10) of an unregularised fit whose residuals are correlated over blocks of the image, and the
+    """Covariance (11, 11) of an unregularised fit whose residuals are correlated over blocks of the image, and the
     information on the velocity along the camera's axes (3,).
 
     Residuals come from what the static reconstruction cannot show (outline, shading, what turns into view), not from
@@ -404,9 +413,9 @@ def _uncertainty(fit: _Linearisation, axes: np.ndarray) -> tuple[np.ndarray, np.
     image are left out in turn, each in all frames, and the covariance is that of the jackknife,
     (n - 1)/n sum_b d_b d_b^T, where d_b = (H - H_b)^-1 g_b is how the estimate moves without block b. n counts the
     blocks that show the body. Unlike the sandwich H^-1 (sum_b g_b g_b^T) H^-1, this is not too small where few blocks
-    decide (CR3 of cluster-robust regression: MacKinnon and White 1985; Cameron and Miller 2015). Where the looseness is
-    held by its prior, the error of that, 1, is passed on. The curvature that is left for the velocity when the rest is
-    free is the Schur complement of H.
+    decide (CR3 of cluster-robust regression: MacKinnon and White 1985; Cameron and Miller 2015). Where looseness and
+    shrinking are held at 0, the error of that, 1, is passed on. The curvature that is left for the velocity when the
+    rest is free is the Schur complement of H.
     """
     H, P = fit.curvature, fit.prior
     shares = np.trace(fit.curvatures, axis1=1, axis2=2) / np.trace(H)
@@ -415,6 +424,6 @@ def _uncertainty(fit: _Linearisation, axes: np.ndarray) -> tuple[np.ndarray, np.
     )
     n = max(2, int((shares > _SHOWN).sum()))
     inverse = np.linalg.pinv(H + P)
-    by_prior = (inverse @ P)[:, _LOOSENESS]
+    by_prior = (inverse @ P)[:, _STRETCH]
     information = 1 / np.diag(axes @ inverse[:3, :3] @ axes.T)
-    return (n - 1) / n * moved.T @ moved + np.outer(by_prior, by_prior), information / information.max()
+    return (n - 1) / n * moved.T @ moved + by_prior @ by_prior.T, information / information.max()
