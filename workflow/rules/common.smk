@@ -10,7 +10,7 @@ ROOT = Path(workflow.basedir).resolve()
 sys.path.insert(0, str(ROOT))
 
 from neuma_lib.config.settings import load
-from neuma_lib.config.variants import folder
+from neuma_lib.config.variants import folder, parse_chain
 from neuma_lib.errors import InputError
 from workflow.defaults import complete
 from workflow.provenance import code_digest
@@ -240,6 +240,11 @@ def random_scenes():
 def random_files(methods, name):
     """A file of every random scene under some methods, method by method."""
     return [f"{RESULTS}/{scene}/{method}/{name}" for method in methods for scene in SETTINGS.random_scenes]
+
+
+def prior_chain(wildcards):
+    """Name of a prior, and the seeds of its chain."""
+    return parse_chain(wildcards.prior, SETTINGS.priors.laws, "prior")
 
 
 def table_runs(table):

@@ -10,11 +10,11 @@ rule prior:
     resources:
         gpu=GPU,
     params:
-        name=lambda wildcards: wildcards.prior.partition("+")[0],
-        law=lambda wildcards: SETTINGS.priors.laws[wildcards.prior.partition("+")[0]].plain(),
+        name=lambda wildcards: prior_chain(wildcards)[0],
+        law=lambda wildcards: SETTINGS.priors.laws[prior_chain(wildcards)[0]].plain(),
         method=SETTINGS.priors.method,
         options=SETTINGS.priors.plain()[SETTINGS.priors.method],
-        seed=lambda wildcards: SETTINGS.priors.seed + int(wildcards.prior.partition("+seed=")[2] or 0),
+        seed=lambda wildcards: SETTINGS.priors.seed + prior_chain(wildcards)[1]["prior"],
         device=SETTINGS.device,
     script:
         "../scripts/prior.py"

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from neuma_lib.evaluation.plotting import style
 from neuma_lib.evaluation.random_scenes import failure
@@ -44,6 +45,10 @@ def draw(data: Mapping) -> Figure:
             axes.plot(*zip(*broken), "x", color=style.BLACK, markersize=6)
     prior, judged = data["titles"]
     axes.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high), aspect="equal")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
     axes.set(xlabel=f"{prior}: tracer RMSE [mm]", ylabel=f"{judged}: tracer RMSE [mm]")
     axes.grid()
     style.legend_above(figure, axes, 2)
