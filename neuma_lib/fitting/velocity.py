@@ -132,7 +132,7 @@ def estimate_velocity(
 
     Args:
         model: simulator constants.
-        law: the prior material (before contact it does not matter which).
+        law: the prior material; before contact it matters only by how far a spinning body stretches.
         body: reconstructed particles and Gaussians.
         observation: the video; frames from contact on are ignored.
         settings: hyper-parameters; its ``views`` are those of the observation.
