@@ -13,8 +13,8 @@ body is therefore estimated beside the motion, and thrown away.
 A body that spins stretches, and the prior, which is wrong, does not say how far: a part that is held by nothing flies
 straight on, a rigid body keeps its size. Seen by one camera, growth is approach: honey that is taken for sand seems to
 recede by half a metre per second. So the difference between loose and rigid flight is added with a factor of its own,
-the looseness, which is 0 if the prior is right and expected within +-1; and beside it as much of a shrinking along the
-axis of the spin, by which a fluid keeps its volume.
+the looseness, which is 0 if the prior is right and expected within +-1; and beside it a shrinking along the axis of the
+spin, by which a fluid keeps its volume while it spreads.
 """
 
 from __future__ import annotations

@@ -16,16 +16,6 @@ from neuma_lib.errors import InputError
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.fixture(scope="module")
-def raw():
-    return settings.read_yaml(ROOT / "config" / "config.yaml")
-
-
-@pytest.fixture(scope="module")
-def loaded(raw):
-    return settings.load(raw, ROOT)
-
-
 def test_default_settings_are_valid(loaded):
     assert loaded.tables["table1"].scenes[0] == "BouncyBall"
     assert loaded.dataset.particles >= 4 * loaded.simulation.particles

@@ -23,16 +23,6 @@ GRAVITY = (0.0, -9.8, 0.0)
 SEEDS = range(8)
 
 
-@pytest.fixture(scope="module")
-def raw():
-    return settings.read_yaml(ROOT / "config" / "config.yaml")
-
-
-@pytest.fixture(scope="module")
-def loaded(raw):
-    return settings.load(raw, ROOT)
-
-
 def drawn(loaded, grid=24, **changes):
     chosen = loaded.random.model_validate({**loaded.random.plain(), **changes})
     return draw_scenes(chosen, loaded.priors.laws, grid, GRAVITY)

@@ -62,6 +62,29 @@ def test_the_flight_that_is_fitted_is_the_simulated_one():
     assert (near - x).norm(dim=-1).max() < (0.1 * 3**0.5 * t) * float(spin.norm() * t) * RADIUS
 
 
+def test_what_nothing_holds_flies_straight_on():
+    """Looseness 1 turns the flight of a stiff body into that of free particles, but for the strain of the body.
+
+    The ball's centrifugal strain is below rho w^2 R^2 / E = 0.0049, which moves its surface by less than 0.7 mm; loose
+    and rigid flight are 1.1 mm apart at the last frame.
+    """
+    body = ball()
+    v0, spin = torch.tensor([0.5, -0.9, 0.4]).double(), torch.tensor([2.0, -3.0, 4.0]).double()
+    frames = (0, 6, 12)
+    flight = _Flight(MODEL, analytic_law(PRIOR, MODEL.dt), body, frames)
+    start = body.state(v0, spin)
+    x, F = flight(v0, spin, frames, spin, (1.0, 0.0))
+    for k, n in list(enumerate(frames))[1:]:
+        t, fallen = n * MODEL.dt, torch.tensor(MODEL.gravity) * MODEL.dt**2 * n * (n + 1) / 2
+        straight = body.x0 + t * start.v + fallen
+        assert (x[k] - straight).norm(dim=1).max() < 0.0049 * RADIUS
+        assert (F[k] - torch.eye(3) - t * start.C[0]).norm(dim=(-1, -2)).max() < 1e-2
+    # Shrinking acts along the axis alone.
+    shrunk = flight(v0, spin, frames, spin, (1.0, 1.0))[0][-1] - x[-1]
+    axis, r, t = spin / spin.norm(), body.x0 - flight.centre, frames[-1] * MODEL.dt
+    torch.testing.assert_close(shrunk, -(spin.norm() ** 2) * t**2 / 2 * (r @ axis)[:, None] * axis)
+
+
 def test_depth_is_the_weakest_axis_and_the_ridge_acts_on_it_alone():
     body = ball()
     v0 = np.array([0.5, -1.2, 0.4])
