@@ -1,6 +1,6 @@
 """Copy tables and figures of a run to docs/results, and fill the numbers of README.md and docs/results/README.md.
 
-python -m docs.record            # after: snakemake --cores 2 tables figures
+python -m docs.record            # after: snakemake --cores 2 tables figures random results/finer_truth.csv
 
 A table gets the machine, the commit and the date in its first line. On the two pages everything between `<!-- name -->`
 and `<!-- /name -->` is replaced by what is in the recorded tables and in the data of the figures; no verdict and no
@@ -15,30 +15,37 @@ import platform
 import re
 import shutil
 import subprocess
+from itertools import takewhile
 from pathlib import Path
 from statistics import mean, median
 
 from PIL import Image
 
 from neuma_lib.evaluation.figures import image_quality, lora_alphav
+from neuma_lib.evaluation.paper import PAPER
 from neuma_lib.evaluation.plotting.image_grid import load_image_grid
 from neuma_lib.evaluation.reports import as_markdown
-from neuma_lib.evaluation.tables import VERDICTS
+from neuma_lib.evaluation.tables import ABSORBED, VERDICTS
 from neuma_lib.io.files import read_json
 
-TABLES = (
-    "table1",
-    "table2",
-    "table3",
-    "table4",
-    "table5",
-    "uneven_mass",
-    "ablation_gradients",
-    "without_binding",
-    "initial_states",
-    "timings",
-    "learning_rates",
-)
+MADE_BY = {
+    "table1": "tables figures",
+    "table2": "tables figures",
+    "table3": "tables figures",
+    "table4": "tables figures",
+    "table5": "tables figures",
+    "uneven_mass": "tables figures",
+    "ablation_gradients": "tables figures",
+    "without_binding": "tables figures",
+    "finer_truth": "results/finer_truth.csv",
+    "random": "random",
+    "initial_states": "tables figures",
+    "timings": "tables figures",
+    "learning_rates": "results/learning_rates.csv",
+}
+"""Tables that are recorded, and the target of Snakemake that makes them."""
+VERDICT_HEAD = f"| {' | '.join(VERDICTS[:2])} |"
+"""How the head of a table of verdicts begins."""
 
 WIDTH = 1400
 """Of figures on a page [px]; in print they are larger."""
@@ -78,18 +85,34 @@ def without_heading(markdown: str) -> str:
 
 
 def verdicts(tables: dict[str, str]) -> str:
-    """The verdicts of all recorded tables as one Markdown table; `tables`: name -> its Markdown."""
-    header = f"| {' | '.join(VERDICTS)} |"
-    rows = []
+    """What recorded tables say of claims, as one Markdown table, and how far laws are closer than the true one.
+
+    Tables that are not recorded, or not with verdicts, are named.
+
+    Args:
+        tables: name -> its Markdown.
+    """
+    rows, absorbed = [], []
     for name, markdown in tables.items():
+        link = f"[{name}]({name}.md)"
         lines = iter(markdown.splitlines())
-        if header in lines:
-            next(lines)  # the rule below the header
-            for line in lines:
-                if not line.startswith("|"):
-                    break
-                rows.append([f"[{name}]({name}.md)", *line.strip("| ").split(" | ", len(VERDICTS) - 1)])
-    return "\n".join(as_markdown(["table", *VERDICTS], rows))
+        for line in lines:
+            if line.startswith(VERDICT_HEAD):
+                next(lines)  # the rule below the header
+                for row in takewhile(lambda line: line.startswith("|"), lines):
+                    cells = row[2:-2].split(" | ")
+                    rows.append([link, *cells, *["not compared there"] * (len(VERDICTS) - len(cells))])
+            elif line.startswith(ABSORBED):
+                absorbed += ["", f"{link}: {line}"]
+    header = ["table", *VERDICTS[:2], "here (RMSE in mm)", VERDICTS[3]]
+    lacking = {
+        "Not recorded": [f"{name} (`snakemake {MADE_BY[name]}`)" for name in MADE_BY if name not in tables],
+        "Recorded by an older version, without verdicts": [
+            name for name, text in tables.items() if name in PAPER and VERDICT_HEAD not in text
+        ],
+    }
+    said = [line for what, names in lacking.items() if names for line in ("", f"{what}: {', '.join(names)}.")]
+    return "\n".join([*as_markdown(header, rows), *absorbed, *said])
 
 
 def figure_numbers(folder: Path) -> str:
@@ -141,7 +164,7 @@ def main() -> None:
         "--machine", default=f"2 cores of {processor()}, no GPU", help="what the run was computed on"
     )
     parser.add_argument(
-        "--tables", nargs="*", default=TABLES, help="tables to copy; figures are always copied"
+        "--tables", nargs="*", default=tuple(MADE_BY), help="tables to copy; figures are always copied"
     )
     parser.add_argument("--commit", default=head(), help="code of the run")
     options = parser.parse_args()
@@ -149,12 +172,13 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     origin = (
         f"{datetime.date.today()}, commit {options.commit}, {options.machine},"
-        " default settings (`config/config.yaml`). Made by `snakemake tables figures` and `python -m docs.record`."
+        " default settings (`config/config.yaml`)."
     )
     for name in options.tables:
         source = results / f"{name}.md"
         if source.exists():
-            (out / f"{name}.md").write_text(f"{origin}\n\n{source.read_text()}")
+            made = f"Made by `snakemake {MADE_BY[name]}` and `python -m docs.record`."
+            (out / f"{name}.md").write_text(f"{origin} {made}\n\n{source.read_text()}")
             shutil.copyfile(source.with_suffix(".csv"), out / f"{name}.csv")
     for picture in sorted((results / "figures").glob("*.png")):
         (out / "figures").mkdir(exist_ok=True)
@@ -163,7 +187,7 @@ def main() -> None:
             small = image.convert("RGB").resize(size, Image.LANCZOS)
         small.save(out / "figures" / picture.name, optimize=True)
 
-    recorded = {name: (out / f"{name}.md").read_text() for name in TABLES if (out / f"{name}.md").exists()}
+    recorded = {name: (out / f"{name}.md").read_text() for name in MADE_BY if (out / f"{name}.md").exists()}
     readme, page = Path(options.readme), out / "README.md"
     if "table1" in options.tables and (results / "table1.md").exists():
         readme.write_text(filled(readme.read_text(), "table1", without_heading(recorded["table1"])))

@@ -76,6 +76,8 @@ _GROUNDING = ("RubberPawn", "ClayCat")
 _TOLD_AGAINST_ASSUMED = ("neuma",), ("neuma+assumed_density=1000",)
 _CHOICES = ("BouncyBall", "RubberPawn", "ClayCat")
 _GENERALISATION = ("letter_N_rubber", "letter_N_clay")
+_FINER = ("BouncyBall_finer", "JellyDuck_finer", "RubberPawn_finer", "ClayCat_finer", "SandFish_finer",
+          "HoneyBottle_finer")  # fmt: skip
 
 PAPER = {
     "table1": PaperTable(
@@ -190,6 +192,19 @@ PAPER = {
             Claim(
                 "covariances from the total deformation help",
                 *(("neuma+covariance_from=total",), ("neuma",), _CHOICES, False),
+            ),
+        ),
+    ),
+    "finer_truth": PaperTable(
+        "",
+        "Finer truths",
+        "Truths on a grid twice as fine, with half the step and eight times the particles",
+        _FINER,
+        claims=(
+            Claim("with finer truths, NeuMA is closer than its prior", ("neuma",), ("nclaw",), _FINER, False),
+            Claim(
+                "with finer truths, NeuMA is closer than w/o ΔM",
+                *(("neuma",), ("neuma_without_adaptor",), _FINER, False),
             ),
         ),
     ),

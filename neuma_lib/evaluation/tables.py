@@ -40,6 +40,9 @@ FOOTNOTES = {
 }
 """Signs behind numbers, and what they mean."""
 
+ABSORBED = "The true law, simulated as the reconstruction is"
+"""How the paragraph of `Table.absorbed` begins."""
+
 VERDICTS = ("claim", "verdict", "RMSE here (mm)", "Chamfer distance in the paper")
 """Columns of the table of verdicts."""
 HOLDS, MIXED, FAILS = "holds", "mixed", "does not hold"
@@ -217,7 +220,7 @@ class Table:
                     f"{true[where].mean():.1f} mm on average)"
                 ]
         return (
-            "The true law, simulated as the reconstruction is, shows what error remains when the law is right: that of "
+            f"{ABSORBED}, shows what error remains when the law is right: that of "
             "start, particles, grid and time step. "
             + (
                 f"Closer to the truth than it: {'; '.join(closer)}. "

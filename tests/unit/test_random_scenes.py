@@ -4,6 +4,7 @@ import csv
 import hashlib
 import io
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -229,6 +230,41 @@ def test_table_and_sentences_count_scenes():
     assert "than the true law, simulated as the reconstruction is, on 2 of 3" in text
     assert "Nothing was tuned on the scenes of this seed" in text
     assert "Scenes for tuning; those that are reported are of seed 7" in random_table(scenes, METHODS, 1)[1]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({}, ["holds", "holds", "holds", "holds"]),
+        ({"judged": 9.0}, ["does not hold", "holds", "holds", "holds"]),
+        ({"failed": {"nclaw": "its training diverged"}}, ["holds", "does not hold", "holds", "holds"]),
+        ({"plane": 2.1}, ["holds", "holds", "does not hold", "holds"]),
+        ({"depth": -0.21}, ["holds", "holds", "holds", "does not hold"]),
+    ],
+)
+def test_claims_hold_from_the_number_of_scenes_that_they_name(change, words):
+    """One scene more than a claim allows for changes its verdict, and no other."""
+    sound = {"prior": 8.0, "judged": 2.0}
+    excused = {"judged": 1, "failed": 0, "plane": 0, "depth": 2}
+    for more in (0, 1):
+        spoilt = sum(excused[key] + more for key in change)
+        scenes = [result(str(k), **sound | (change if k < spoilt else {})) for k in range(12)]
+        held = re.findall(r"random scenes \| \*\*(.*?)\*\*", random_table(scenes, METHODS, 7)[1])
+        assert held == (words if more else ["holds"] * 4)
+
+
+def test_claims_of_fewer_scenes_round_up():
+    text = random_table([result(str(k), 8.0, 2.0) for k in range(3)], METHODS, 7)[1]
+    assert (
+        "| NeuMA is closer than its prior on all of 3 random scenes | **holds** | 3 of 3, errors 0.25 to 0.25"
+        in text
+    )
+    text = random_table([result(str(k), 8.0, 2.0, depth=0.15) for k in range(24)], METHODS, 7)[1]
+    assert "closer than its prior on at least 22 of 24" in text
+    assert (
+        "standard deviations on at least 20 of 24 random scenes | **holds** | 24 of 24, at most 1.5 of them |"
+        in text
+    )
 
 
 def test_a_table_needs_scenes():

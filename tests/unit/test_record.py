@@ -6,11 +6,13 @@ import sys
 
 import numpy as np
 import pytest
-from test_tables import METHODS, run
+from test_random_scenes import METHODS, result
+from test_tables import run
 
 from docs import record
 from neuma_lib.evaluation.paper import PAPER
 from neuma_lib.evaluation.plotting.image_grid import ImageGrid, save_image_grid
+from neuma_lib.evaluation.random_scenes import random_table
 from neuma_lib.evaluation.tables import chamfer_table
 from neuma_lib.io.files import write_json
 
@@ -70,14 +72,52 @@ def test_pages_are_filled_from_tables_and_figures(project, monkeypatch):
     assert readme.index("Tracer RMSE") < readme.index("| *paper* | *56.13* |") and "# Table 1" not in readme
     expected = (
         "| [table1](table1.md) | NeuMA is closer than its prior | **holds** | 6.0 ± 1.0 (NeuMA) against 51.0 ± 1.0"
-        " (NCLaw), lower in 6 of 6 | 1.31 against 12.18 |\n<!-- /verdicts -->"
+        " (NCLaw), lower in 6 of 6 | 1.31 against 12.18 |\n\nNot recorded: table2"
     )
     assert expected in page, "other claims are about methods that were not run"
+    assert "Made by `snakemake tables figures` and `python -m docs.record`." in readme
     assert "| NeuMA | 0.5 | 0.5 | 0.5 | 0.5 |" in page and "Training saw the views of B." in page
     assert "| A | elastic | 2 | 0.5 | 6.8 % | 1.1 % |" in page
     # Heights part in the last frame only, and there 0.6 is no step from 0.5 to 0.4.
     assert "0 of 1 (A)" in page
     assert recorded(project, monkeypatch) == (readme, page)
+
+
+def test_random_scenes_and_finer_truths_have_their_verdicts(project, monkeypatch):
+    columns = {scene: scene for scene in PAPER["finer_truth"].columns}
+    errors = {"nclaw": 50.0, "neuma": 5.0, "true_law": 8.0}
+    metrics = {
+        method: {c: [run(error + k) for k in range(3)] for c in columns} for method, error in errors.items()
+    }
+    table = chamfer_table(metrics, METHODS, columns, PAPER["finer_truth"])
+    scenes = [result(str(k), 8.0, 2.0 if k else 9.0) for k in range(12)]
+    csv, markdown, _ = random_table(scenes, METHODS, 7)
+    for name, text, values in (("finer_truth", table.markdown(), table.csv()), ("random", markdown, csv)):
+        (project / f"results/{name}.md").write_text(text)
+        (project / f"results/{name}.csv").write_text(values)
+    _, page = recorded(project, monkeypatch)
+    assert (
+        "| [finer_truth](finer_truth.md) | with finer truths, NeuMA is closer than its prior | **holds** | 6.0 ± 1.0"
+        " (NeuMA) against 51.0 ± 1.0 (NCLaw), lower in 6 of 6 | not compared there |\n| [random](random.md) |"
+    ) in page
+    assert (
+        "| [random](random.md) | NeuMA is closer than its prior on at least 11 of 12 random scenes | **holds** |"
+        " 11 of 12, errors 0.25 to 1.12 times as large | not compared there |"
+    ) in page
+    assert page.count("| [random](random.md) |") == 4
+    closer = page[page.index("\n\n[finer_truth](finer_truth.md): The true law") :]
+    assert "than it: NeuMA in 6 of 6 columns (there by 3.0 of 9.0 mm on average)" in closer
+    assert "Made by `snakemake random` and" in (project / "docs/random.md").read_text()
+
+
+def test_tables_that_are_not_recorded_are_named(project, monkeypatch):
+    _, page = recorded(project, monkeypatch)
+    missing = page[page.index("Not recorded: ") :].partition(".\n")[0]
+    assert "finer_truth (`snakemake results/finer_truth.csv`), random (`snakemake random`)" in missing
+    assert "table1" not in missing and "finer_truth](" not in page and "random](" not in page
+    whole = dict.fromkeys(record.MADE_BY, f"{record.VERDICT_HEAD} here |\n|---|---|---|\n")
+    assert "ecorded" not in record.verdicts(whole)
+    assert "older version, without verdicts: table2." in record.verdicts(whole | {"table2": "- Holds: ..."})
 
 
 def test_a_page_without_its_place_is_named(project, monkeypatch):
