@@ -20,7 +20,25 @@ class VelocityConfig(Section):
     initial_frames: int = Field(
         3, ge=2, description="frames of the first estimate, which tells how many more come before contact"
     )
+    frames: int = Field(
+        16,
+        ge=2,
+        description="most frames that are compared, spread evenly over those before contact: what the static Gaussians "
+        "get wrong is alike in all of them, so that more say little more",
+    )
     iterations: int = Field(30, ge=1, description="most Levenberg-Marquardt steps for a set of frames")
+    angle_std: float = Field(
+        0.01,
+        ge=0,
+        description="standard deviation of the angle [rad] by which images seem to show a body turned that is not, "
+        "because the Gaussians do not shade it as the light does; over the time to contact it bounds the spin",
+    )
+    spin_significance: float = Field(
+        11.3,
+        ge=0,
+        description="squared distance of the spin from 0, in standard deviations, below which the body does not spin; "
+        "11.3 is exceeded by one percent of chi-squared variables with three degrees of freedom; 0: any spin is kept",
+    )
     difference: float = Field(
         0.02,
         gt=0,

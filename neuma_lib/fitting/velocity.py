@@ -15,6 +15,10 @@ straight on, a rigid body keeps its size. Seen by one camera, growth is approach
 recede by half a metre per second. So the difference between loose and rigid flight is added with a factor of its own,
 the looseness, which is 0 if the prior is right and expected within +-1; and beside it a shrinking along the axis of the
 spin, by which a fluid keeps its volume while it spreads.
+
+Most bodies do not spin. So the fit begins without spin, when free flight needs no simulation, and the spin joins in
+when the images ask for it: when one linearisation in all unknowns wants a spin that is larger than its uncertainty
+allows (a score test). A spin that is not told from 0 is 0, and its standard deviation says how large it may be.
 """
 
 from __future__ import annotations
@@ -22,6 +26,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -34,16 +39,20 @@ from neuma_lib.fitting.frame_batches import frame_batches
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import MPMModel, contact_clearance
 from neuma_lib.sim.rollout import rollout
-from neuma_lib.sim.state import Trajectory, cross_matrix
+from neuma_lib.sim.state import cross_matrix
 from neuma_lib.splatting.observation import Observation
 
 NUISANCE_SCALE = 0.02
 """Unit of the constant shift [m] and of the relative enlargement: about 1 m/s over a few frames."""
 UNKNOWNS = 11
 """Velocity and spin (world axes), shift to the right and down, enlargement, looseness and shrinking (`_Flight`)."""
-_STRETCH = slice(9, 11)  # places of the last two
-_ROUNDS = 8  # sets of frames that are tried
-_LEAST_GAIN = 1e-6  # part of the squares that a step saves, or the fit has ended: well inside the uncertainty
+_SPIN, _STRETCH = slice(3, 6), slice(9, 11)  # places of the spin, and of looseness and shrinking
+_STILL, _SPINNING = [0, 1, 2, 6, 7, 8], list(range(UNKNOWNS))
+"""Unknowns that are free if the body does not spin, and if it does."""
+_ROUNDS = 10  # sets of frames, and simulations of a spinning body
+_LEAST_GAIN = 1e-5  # part of the squares that a step may save at the end: a hundredth of the uncertainty
+_ROUGH_GAIN = 1e-3  # the same while more frames are to come
+_LEAST_TURN = 2e-3  # angle [rad] of a change of spin that calls for another simulation
 _LEAST_COST = 1e-12  # of images that agree exactly: a body at rest must not make the equations singular
 _SHOWN = 1e-6  # part of the curvature in a block that shows the body
 _BLOCKS = 4  # blocks along a side of the image that the uncertainty leaves out in turn
@@ -143,33 +152,51 @@ def estimate_velocity(
     """
     if len(observation.frames) < 2:
         raise InputError("velocity needs at least two frames of the training view before contact")
-    # Double precision is cheap on a CPU. The fast kernels of a GPU are in single, which differences of 0.02 m/s stand.
-    precision = torch.float64 if body.x0.device.type == "cpu" else torch.float32
-    body, observation = body.to(precision), observation.to(precision)
-    law = copy.deepcopy(law).to(precision)
+    precision = body.x0.dtype
+    observation, law = observation.to(precision), copy.deepcopy(law).to(precision)
     if float(contact_clearance(model, body.x0)) <= 0:
         raise InputError("the body touches a wall in the first frame: the video must start before contact")
     axes = observation.cameras.viewmats[0, :3, :3].cpu().numpy()
     flight = _Flight(model, law, body, observation.frames)
-    unknowns, accepted = np.zeros(UNKNOWNS), 0
-    used = min(settings.initial_frames, len(observation.frames))
+    minimise = partial(_levenberg_marquardt, axes=axes, settings=settings, progress=progress)
+    unknowns, free, accepted = np.zeros(UNKNOWNS), _STILL, 0
+    frames = observation.frames
+    first = min(settings.initial_frames, len(frames))
+    used, growing = first, first < len(frames)
     for _ in range(_ROUNDS):
-        seen = observation.select(list(range(used)))
-        residuals = _Residuals(flight, seen, settings.difference)
-        unknowns, fit, steps = _levenberg_marquardt(residuals, unknowns, axes, settings, progress)
-        accepted += steps
         # No more than twice as many at a time: a spin from three frames says little about thirty.
-        clear = flight.frames_before_contact(*flight.motion(unknowns), 2 * used)
-        if clear == used or clear < 2:
+        reach = min(2 * used, len(frames)) if growing else used
+        simulated = flight.simulate(unknowns, frames[:reach])
+        seen = observation.select(_spread(used, settings.frames))
+        residuals = _Residuals(flight, seen, settings.difference)
+        unknowns, fit, steps = minimise(residuals, unknowns, free, _ROUGH_GAIN if growing else _LEAST_GAIN)
+        accepted += steps
+        wanted, fit_there = fit.at_minimum(unknowns)
+        covariance, information = _uncertainty(fit_there, flight, seen.frames, axes, settings)
+        spins = _squared_distance(wanted, covariance) > settings.spin_significance
+        if spins and free is _STILL:
+            # From the first frames on: over many, grains that have turned are taken for their neighbours.
+            unknowns, free = np.zeros(UNKNOWNS), _SPINNING
+            used, growing = first, first < len(frames)
+            continue
+        turned = model.dt * seen.frames[-1] * np.linalg.norm((flight.units * (unknowns - simulated))[_SPIN])
+        clear = flight.frames_before_contact(unknowns, reach)
+        if clear < 2 or (clear == used and turned < _LEAST_TURN and not growing):
             break
-        used = clear
+        used, growing = clear, growing and clear == reach < len(frames)
+    if free is _SPINNING and not spins:
+        unknowns[_SPIN] = unknowns[_STRETCH] = 0.0
+        flight.simulate(unknowns, seen.frames)
+        unknowns, fit, steps = minimise(residuals, unknowns, _STILL, _LEAST_GAIN)
+        accepted += steps
+        _, fit_there = fit.at_minimum(unknowns)
+        covariance, information = _uncertainty(fit_there, flight, seen.frames, axes, settings)
     v0, spin = (vector.cpu().numpy() for vector in flight.motion(unknowns))
-    covariance, information = _uncertainty(fit, axes)
     covariance *= np.outer(flight.units, flight.units)
     std, spin_std, std_camera, spin_std_camera = (
         np.sqrt(np.diag(turn @ covariance[part, part] @ turn.T))
         for turn in (np.eye(3), axes)
-        for part in (slice(0, 3), slice(3, 6))
+        for part in (slice(0, 3), _SPIN)
     )
     return VelocityEstimate(
         v0=v0,
@@ -210,58 +237,55 @@ class _Flight:
         self._to_middle = 0.5 - box.mean(dim=0)
         self._in_middle = replace(body, x0=body.x0 + self._to_middle)
         self._weightless = replace(model, gravity=(0.0, 0.0, 0.0))
-        self._last: tuple[list[float], Trajectory] | None = None
+        self.simulate(np.zeros(UNKNOWNS), frames[:1])
 
     def motion(self, unknowns: np.ndarray) -> tuple[Tensor, Tensor]:
         """Velocity [m/s] and spin [rad/s] of scaled unknowns."""
         return torch.as_tensor((self.units * unknowns)[:6]).to(self.body.x0).split(3)
 
+    def simulate(self, unknowns: np.ndarray, frames: tuple[int, ...]) -> np.ndarray:
+        """Let the body spin in the middle of the cube until the last frame, as the unknowns (11,) say; returns them.
+
+        Without spin nothing is simulated: the body is at rest, as `rollout` takes it in free flight.
+        """
+        _, self._near = self.motion(unknowns)
+        start = self._in_middle.state(torch.zeros_like(self._near), self._near)
+        self._path = None
+        if self._near.any():
+            with torch.no_grad():
+                self._path = rollout(self._weightless, self.law, start, steps=frames[-1], frames=frames)
+        return unknowns
+
     def __call__(
-        self,
-        v0: Tensor,
-        spin: Tensor,
-        frames: tuple[int, ...],
-        near: Tensor,
-        stretch: Sequence[float] = (0.0, 0.0),
+        self, v0: Tensor, spin: Tensor, frames: tuple[int, ...], stretch: Sequence[float] = (0.0, 0.0)
     ) -> tuple[Tensor, Tensor]:
         """Positions (T, N, 3) [m] and deformation gradients (T, N, 3, 3) of the particles at the frames.
 
-        Simulated is the spin `near` by, and the result turned rigidly by the angle between both. What a change of the
-        spin does beyond this, by stretching the body and by unequal moments of inertia, is smaller by a factor of the
-        angle that the body turns, and central differences are spared a simulation each. Added to both is
+        What was simulated is turned rigidly by the angle between its spin and this one. What a change of the spin
+        does beyond this, by stretching the body and by unequal moments of inertia, is smaller by a factor of the
+        angle that the body turns, and the fit is spared a simulation at every try. Added to both is
         `stretch`: the looseness times the difference between loose flight, x0 + t omega x x0, and rigid flight, and
         the shrinking times -(t^2 / 2) omega omega^T x0.
         """
-        path = self._spinning(near, frames)
         dt, g = self.model.dt, torch.tensor(self.model.gravity).to(v0)
         n = torch.tensor(frames).to(v0)[:, None, None]
-        centre = self.centre + self._to_middle
-        turn = torch.linalg.matrix_exp(n * dt * cross_matrix(spin)) @ torch.linalg.matrix_exp(
-            -n * dt * cross_matrix(near)
-        )
-        x, F = (path.x - centre) @ turn.mT, turn[:, None] @ path.F
         rate = n * dt * cross_matrix(spin)
+        turn = torch.linalg.matrix_exp(rate) @ torch.linalg.matrix_exp(-n * dt * cross_matrix(self._near))
+        if self._path is None:
+            x, F = (self.body.x0 - self.centre) @ turn.mT, turn[:, None].expand(-1, len(self.body.x0), -1, -1)
+        else:
+            path = self._path.at(frames)
+            x, F = (path.x - self.centre - self._to_middle) @ turn.mT, turn[:, None] @ path.F
         loose = torch.eye(3).to(rate) + rate - torch.linalg.matrix_exp(rate)
         added = stretch[0] * loose - stretch[1] / 2 * (n * dt) ** 2 * torch.outer(spin, spin)
         x, F = x + (self.body.x0 - self.centre) @ added.mT, F + added[:, None]
         return x + self.centre + n * dt * v0 + g * dt**2 * n * (n + 1) / 2, F
 
-    def frames_before_contact(self, v0: Tensor, spin: Tensor, most: int) -> int:
+    def frames_before_contact(self, unknowns: np.ndarray, most: int) -> int:
         """How many of the first `most` frames come before the body touches a wall."""
-        x, _ = self(v0, spin, self.frames[:most], spin)
+        x, _ = self(*self.motion(unknowns), self.frames[:most])
         touching = contact_clearance(self.model, x) <= 0
         return int(touching.int().argmax()) if touching.any() else len(x)
-
-    def _spinning(self, spin: Tensor, frames: tuple[int, ...]) -> Trajectory:
-        """The body that spins in the middle of the cube."""
-        key = spin.tolist()
-        if self._last is None or self._last[0] != key or self._last[1].frames[-1] < frames[-1]:
-            wanted = [n for n in self.frames if n <= frames[-1]]
-            start = self._in_middle.state(torch.zeros_like(spin), spin)
-            with torch.no_grad():
-                path = rollout(self._weightless, self.law, start, steps=wanted[-1], frames=wanted)
-            self._last = (key, path)
-        return self._last[1].at(frames)
 
 
 @dataclass(frozen=True)
@@ -298,6 +322,15 @@ class _Linearisation:
         """J^T r, shape (11,)."""
         return self.scores.sum(axis=0)
 
+    def at_minimum(self, unknowns: np.ndarray) -> tuple[np.ndarray, _Linearisation]:
+        """Where the linearised problem around the unknowns (11,) has its minimum, and what it is there."""
+        step = -np.linalg.pinv(self.curvature + self.prior) @ (self.slope + self.prior @ unknowns)
+        return unknowns + step, replace(
+            self,
+            scores=self.scores + self.curvatures @ step,
+            cost=max(self.cost + 2 * self.slope @ step + step @ self.curvature @ step, 0.0),
+        )
+
 
 @dataclass
 class _Residuals:
@@ -316,19 +349,17 @@ class _Residuals:
             sum(self._residual(unknowns, part).square().sum().double() for part in self._parts()), unknowns
         )
 
-    def linearise(self, unknowns: np.ndarray) -> _Linearisation:
-        """Sums of the residuals and of their central differences."""
+    def linearise(self, unknowns: np.ndarray, free: Sequence[int] = _SPINNING) -> _Linearisation:
+        """Sums of the residuals and of their central differences, which are 0 for unknowns that are not free."""
         cost, curvatures, scores = 0.0, 0.0, 0.0
         for part in self._parts():
             r = self._residual(unknowns, part)
-            J = torch.stack(
-                [
-                    self._render(unknowns + e, part, unknowns) - self._render(unknowns - e, part, unknowns)
-                    for e in self.difference * np.eye(UNKNOWNS)
-                ]
-            ) / (2 * self.difference)
+            columns = torch.zeros(*_in_blocks(r).shape, UNKNOWNS).to(r)  # (blocks, pixels, 11)
+            for k in free:
+                e = self.difference * np.eye(UNKNOWNS)[k]
+                change = self._render(unknowns + e, part) - self._render(unknowns - e, part)
+                columns[..., k] = _in_blocks(change / (2 * self.difference))
             cost = cost + r.square().sum().double()
-            columns = torch.stack([_in_blocks(column) for column in J], dim=2)  # (blocks, pixels, 11)
             curvatures = curvatures + (columns.mT @ columns).double()
             scores = scores + (columns.mT @ _in_blocks(r)[..., None])[..., 0].double()
         cost = self._checked(cost, unknowns)
@@ -341,13 +372,12 @@ class _Residuals:
     def _residual(self, unknowns: np.ndarray, part: slice) -> Tensor:
         return self._render(unknowns, part) - self.seen.colours(part)
 
-    def _render(self, unknowns: np.ndarray, part: slice, near: np.ndarray | None = None) -> Tensor:
+    def _render(self, unknowns: np.ndarray, part: slice) -> Tensor:
         v0, spin = self.flight.motion(unknowns)
         right, down, enlargement, *stretch = torch.as_tensor(self.flight.units * unknowns).to(v0)[6:]
         axes = self.seen.cameras.viewmats[0, :3, :3]
         with torch.no_grad():
-            base = spin if near is None else self.flight.motion(near)[1]
-            x, F = self.flight(v0, spin, self.seen.frames[part], base, stretch)
+            x, F = self.flight(v0, spin, self.seen.frames[part], stretch)
             centre = x.mean(dim=1, keepdim=True)
             x = centre + (1 + enlargement) * (x - centre) + right * axes[0] + down * axes[1]
             return self._renderer(x, (1 + enlargement) * F)
@@ -370,14 +400,25 @@ def _in_blocks(values: Tensor) -> Tensor:
     return split.permute(1, 2, 4, 0, 3, 5, 6).reshape(V * _BLOCKS**2, -1)
 
 
+def _spread(count: int, most: int) -> list[int]:
+    """At most `most` of the first `count` frames, evenly spread, first and last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
+
+
 def _levenberg_marquardt(
     residuals: _Residuals,
     start: np.ndarray,
+    free: Sequence[int],
+    least_gain: float,
     axes: np.ndarray,
     settings: VelocityConfig,
     progress: Callable[[int, int, float], None] | None,
 ) -> tuple[np.ndarray, _Linearisation, int]:
-    """Minimise |r(u)|^2 + ridge * curvature * (depth . v)^2: the unknowns, their surroundings, accepted steps."""
+    """Minimise |r(u)|^2 + ridge * curvature * (depth . v)^2 over the free unknowns.
+
+    Returns:
+        The unknowns (11,), the linearisation in all of them, and the number of accepted steps.
+    """
 
     def penalty(H):
         P = np.zeros((UNKNOWNS, UNKNOWNS))
@@ -385,28 +426,39 @@ def _levenberg_marquardt(
         return P + fit.prior
 
     u, damping, accepted = start, 1e-3, 0
-    fit = residuals.linearise(u)
+    fit = residuals.linearise(u, free)
     for iteration in range(settings.iterations):
         H = fit.curvature
         P = penalty(H)
-        step = -np.linalg.solve(H + P + damping * np.diag(np.diag(H)), fit.slope + P @ u)
+        A, slope = (H + P)[np.ix_(free, free)], (fit.slope + P @ u)[free]
+        step = np.zeros(UNKNOWNS)
+        step[free] = -np.linalg.solve(A + damping * np.diag(np.diag(A)), slope)
+        if slope @ np.linalg.solve(A, slope) < least_gain * max(fit.cost, _LEAST_COST):
+            break
         trial = u + step
         before, after = fit.cost + u @ P @ u, residuals.cost(trial) + trial @ P @ trial
         if after < before:
             u, damping, accepted = trial, max(damping / 5, 1e-9), accepted + 1
-            fit = residuals.linearise(u)
+            fit = residuals.linearise(u, free)
         else:
             damping *= 8
         if progress:
             progress(iteration + 1, settings.iterations, fit.rms)
-        if np.linalg.norm(step) < 1e-5 or damping > 1e6 or 0 <= before - after < _LEAST_GAIN * before:
+        if damping > 1e6:
             break
-    return u, fit, accepted
+    return u, fit if free is _SPINNING else residuals.linearise(u), accepted
 
 
-def _uncertainty(fit: _Linearisation, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Covariance (11, 11) of an unregularised fit whose residuals are correlated over blocks of the image, and the
-    information on the velocity along the camera's axes (3,).
+def _squared_distance(unknowns: np.ndarray, covariance: np.ndarray) -> float:
+    """Squared Mahalanobis distance of the spin from 0, chi-squared with three degrees of freedom if there is none."""
+    return float(unknowns[_SPIN] @ np.linalg.solve(covariance[_SPIN, _SPIN], unknowns[_SPIN]))
+
+
+def _uncertainty(
+    fit: _Linearisation, flight: _Flight, frames: tuple[int, ...], axes: np.ndarray, settings: VelocityConfig
+) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance (11, 11) of an unregularised fit of all unknowns whose residuals are correlated over blocks of the
+    image, and the information on the velocity along the camera's axes (3,).
 
     Residuals come from what the static reconstruction cannot show (outline, shading, what turns into view), not from
     independent pixel noise: they last over all frames and reach over a good part of the body. So the blocks of the
@@ -416,6 +468,9 @@ def _uncertainty(fit: _Linearisation, axes: np.ndarray) -> tuple[np.ndarray, np.
     decide (CR3 of cluster-robust regression: MacKinnon and White 1985; Cameron and Miller 2015). Where looseness and
     shrinking are held at 0, the error of that, 1, is passed on. The curvature that is left for the velocity when the
     rest is free is the Schur complement of H.
+
+    What is wrong in every block alike, such as shading that stays with the light while the body turns, shows as a
+    turn by `angle_std`, which adds to the uncertainty of the spin.
     """
     H, P = fit.curvature, fit.prior
     shares = np.trace(fit.curvatures, axis1=1, axis2=2) / np.trace(H)
@@ -426,4 +481,7 @@ def _uncertainty(fit: _Linearisation, axes: np.ndarray) -> tuple[np.ndarray, np.
     inverse = np.linalg.pinv(H + P)
     by_prior = (inverse @ P)[:, _STRETCH]
     information = 1 / np.diag(axes @ inverse[:3, :3] @ axes.T)
-    return (n - 1) / n * moved.T @ moved + by_prior @ by_prior.T, information / information.max()
+    covariance = (n - 1) / n * moved.T @ moved + by_prior @ by_prior.T
+    duration = flight.model.dt * (frames[-1] - frames[0])
+    covariance[_SPIN, _SPIN] += np.diag((settings.angle_std / duration / flight.units[_SPIN]) ** 2)
+    return covariance, information / information.max()

@@ -8,7 +8,7 @@ from grounding_scene import MODEL, PRIOR, RADIUS, ball, observe
 from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.coupling.particle_gs import ParticleGS
 from neuma_lib.errors import InputError
-from neuma_lib.fitting.velocity import _Flight, estimate_velocity
+from neuma_lib.fitting.velocity import UNKNOWNS, _Flight, estimate_velocity
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.observation import Observation
@@ -22,12 +22,44 @@ def estimate(body, observation, **options):
     )
 
 
+def simulated(law, body, frames, spin):
+    """Free flight of the body, simulated with the spin [rad/s]."""
+    flight = _Flight(MODEL, law, body, frames)
+    unknowns = np.zeros(UNKNOWNS)
+    unknowns[3:6] = np.asarray(spin) / flight.units[3:6]
+    flight.simulate(unknowns, frames)
+    return flight
+
+
 def test_recovers_an_oblique_throw_from_its_own_renders():
     body = ball()
     v0 = np.array([0.5, -1.2, 0.4])
     found = estimate(body, observe(body, v0, FRAMES), ridge=0.0)
     assert np.abs(found.v0 - v0).max() < 1e-4
     assert found.frames[-1] < 60, "frames after contact must not be used"
+    assert not found.spin.any(), "a body that does not spin starts with one velocity"
+    kept = estimate(body, observe(body, v0, FRAMES), ridge=0.0, spin_significance=0.0)
+    assert np.abs(kept.v0 - v0).max() < 1e-4 and np.abs(kept.spin).max() < 1e-3
+
+
+def test_a_spin_below_its_uncertainty_is_none_and_one_above_is_found():
+    """The angle that images leave open, over the time to contact, divides both; depth does not suffer from either."""
+    body = ball()
+    v0, duration = np.array([0.5, -1.2, 0.4]), 20 * MODEL.dt
+    for angle, kept in ((0.01, False), (0.1, True)):
+        spin = np.array([0.0, angle / duration, 0.0])
+        found = estimate(body, observe(body, v0, FRAMES, spin=spin), angle_std=0.01)
+        assert found.spin.any() == kept
+        assert (np.abs(found.spin - spin) < 2 * found.spin_std).all()
+        assert (found.spin_std >= 0.01 / duration).all()
+        assert np.abs(found.v0 - v0).max() < 0.02
+
+
+def test_few_frames_are_spread_over_the_flight():
+    body = ball()
+    v0 = np.array([0.5, -1.2, 0.4])
+    found = estimate(body, observe(body, v0, FRAMES), frames=3)
+    assert found.frames == (0, 8, 20) and np.abs(found.v0 - v0).max() < 1e-4
 
 
 def test_recovers_a_spinning_throw_of_another_material():
@@ -50,14 +82,15 @@ def test_the_flight_that_is_fitted_is_the_simulated_one():
     body, law = ball(), analytic_law(PRIOR, MODEL.dt)
     v0, spin = torch.tensor([0.5, -0.9, 0.4]).double(), torch.tensor([2.0, -3.0, 4.0]).double()
     frames = (0, 4, 8, 12)
-    x, F = _Flight(MODEL, law, body, frames)(v0, spin, frames, spin)
+    flight = simulated(law, body, frames, spin)
+    x, F = flight(v0, spin, frames)
     with torch.no_grad():
         path = rollout(MODEL, law, body.state(v0, spin), steps=12, frames=frames)
     moved = (path.x - path.x[0]).norm(dim=-1).max()
     assert (x - path.x).norm(dim=-1).max() < 1e-3 * moved
     assert (F - path.F).norm(dim=(-1, -2)).max() < 1e-2
     # A spin from its neighbourhood is turned rigidly: an error of the angle between both times the angle turned.
-    near, _ = _Flight(MODEL, law, body, frames)(v0, spin, frames, spin + 0.1)
+    near, _ = simulated(law, body, frames, spin + 0.1)(v0, spin, frames)
     t = 12 * MODEL.dt
     assert (near - x).norm(dim=-1).max() < (0.1 * 3**0.5 * t) * float(spin.norm() * t) * RADIUS
 
@@ -71,16 +104,16 @@ def test_what_nothing_holds_flies_straight_on():
     body = ball()
     v0, spin = torch.tensor([0.5, -0.9, 0.4]).double(), torch.tensor([2.0, -3.0, 4.0]).double()
     frames = (0, 6, 12)
-    flight = _Flight(MODEL, analytic_law(PRIOR, MODEL.dt), body, frames)
+    flight = simulated(analytic_law(PRIOR, MODEL.dt), body, frames, spin)
     start = body.state(v0, spin)
-    x, F = flight(v0, spin, frames, spin, (1.0, 0.0))
+    x, F = flight(v0, spin, frames, (1.0, 0.0))
     for k, n in list(enumerate(frames))[1:]:
         t, fallen = n * MODEL.dt, torch.tensor(MODEL.gravity) * MODEL.dt**2 * n * (n + 1) / 2
         straight = body.x0 + t * start.v + fallen
         assert (x[k] - straight).norm(dim=1).max() < 0.0049 * RADIUS
         assert (F[k] - torch.eye(3) - t * start.C[0]).norm(dim=(-1, -2)).max() < 1e-2
     # Shrinking acts along the axis alone.
-    shrunk = flight(v0, spin, frames, spin, (1.0, 1.0))[0][-1] - x[-1]
+    shrunk = flight(v0, spin, frames, (1.0, 1.0))[0][-1] - x[-1]
     axis, r, t = spin / spin.norm(), body.x0 - flight.centre, frames[-1] * MODEL.dt
     torch.testing.assert_close(shrunk, -(spin.norm() ** 2) * t**2 / 2 * (r @ axis)[:, None] * axis)
 
@@ -116,7 +149,9 @@ def test_uncertainty_covers_the_error_of_noisy_images(correlated):
         if correlated:
             drawn = drawn.repeat_interleave(8, dim=2).repeat_interleave(8, dim=3)
         noisy = clean.colours() + drawn
-        found = estimate(body, type(clean)(clean.frames, noisy, clean.cameras), ridge=0.0)
+        # The spin is kept, and the Gaussians are perfect: nothing but the noise of the images is left.
+        options = dict(ridge=0.0, spin_significance=0.0, angle_std=0.0)
+        found = estimate(body, type(clean)(clean.frames, noisy, clean.cameras), **options)
         errors.append([*(found.v0 - v0), *found.spin])
         stds.append([*found.std, *found.spin_std])
     ratio = np.sqrt(np.mean(np.square(errors), 0)) / np.mean(stds, 0)
