@@ -22,7 +22,7 @@ except InputError as error:
 
 DATA = SETTINGS.data_root.rstrip("/")
 RESULTS = SETTINGS.results_root.rstrip("/")
-KERNELS = SETTINGS.kernel_cache.rstrip("/")
+KERNELS = f"{DATA}/kernels"  # what is known of them; they themselves are in SETTINGS.kernel_cache
 HAS_CUDA = shutil.which("nvidia-smi") is not None
 GPU = int({"cpu": False, "cuda": True, "auto": HAS_CUDA}[SETTINGS.device])
 # Kernels and ground truths are made with or without a GPU, so that its images can be rendered where none is.

@@ -1,11 +1,19 @@
 """Ground truth of the synthetic benchmarks and its images; and the compiled kernels that all simulations share."""
 
 
+# Marker, log and benchmark lie with the data and not in the cache, which folders may share: where one of them is
+# missing, Snakemake compiles, and then repeats all that depends on it, whether or not anything changed. (ancient() is
+# no way out: what depends on a job that runs is then left out, even if it has changed itself.) Without its cache a job
+# compiles what it needs.
 rule kernels:
     input:
         lambda wildcards: kernels("simulation") if wildcards.group == "laws" else [],
     output:
         ready=f"{KERNELS}/{{group}}.ready",
+    log:
+        f"{KERNELS}/logs/{{group}}/kernels.log",
+    benchmark:
+        f"{KERNELS}/benchmarks/{{group}}/kernels.tsv"
     resources:
         gpu=EITHER_GPU,
     params:
