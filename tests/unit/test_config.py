@@ -22,7 +22,9 @@ def test_default_settings_are_valid(loaded):
     assert loaded.dataset.seed != loaded.seed
 
 
-@pytest.mark.parametrize("files", [(), ("three_chains.yaml",), ("paper.yaml",), ("paper.yaml", "paper_light.yaml")])
+@pytest.mark.parametrize(
+    "files", [(), ("three_chains.yaml",), ("paper.yaml",), ("paper.yaml", "paper_light.yaml")]
+)
 def test_images_are_measured_in_at_least_two_views_that_training_does_not_see(raw, files):
     for file in files:
         raw = settings.merged(raw, settings.read_yaml(ROOT / "config" / file))
