@@ -1,4 +1,4 @@
-"""Measures of motion and of images (paper Sec. 4.1); the Chamfer distance is in `neuma_lib.geometry.chamfer`."""
+"""Measures of motion (paper Sec. 4.1); the Chamfer distance is in `neuma_lib.geometry.chamfer`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from skimage.metrics import structural_similarity
 from torch import Tensor
 
 from neuma_lib.errors import InputError
@@ -54,40 +53,3 @@ def mean_height(x: np.ndarray | Tensor, mass: np.ndarray | Tensor) -> list[float
     """Height of the centre of mass [m] at T times, of particles x (T, N, 3) [m] of masses (N,)."""
     mass = np.asarray(mass, np.float64)
     return (np.asarray(x, np.float64)[..., 1] @ (mass / mass.sum())).tolist()
-
-
-def psnr(image: np.ndarray, reference: np.ndarray) -> float:
-    """Peak signal-to-noise ratio [dB] of images in [0, 1], (H, W, 3). Raises InputError when shapes differ."""
-    image, reference = _alike("psnr", image, reference)
-    mse = float(((image - reference) ** 2).mean())
-    return float("inf") if mse == 0 else -10.0 * np.log10(mse)
-
-
-def ssim(image: np.ndarray, reference: np.ndarray) -> float:
-    """Structural similarity (Wang et al. 2004, Gaussian window of sigma 1.5) of images in [0, 1], (H, W, 3).
-
-    Raises:
-        InputError: shapes differ, or a side is shorter than the window's 11 pixels.
-    """
-    image, reference = _alike("ssim", image, reference)
-    if min(image.shape[:2]) < 11:
-        raise InputError(f"ssim: an image of {image.shape[:2]} pixels is smaller than the window of 11")
-    return float(
-        structural_similarity(
-            image,
-            reference,
-            channel_axis=-1,
-            data_range=1.0,
-            gaussian_weights=True,
-            sigma=1.5,
-            use_sample_covariance=False,
-        )
-    )
-
-
-def _alike(name: str, image: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both as float64. Raises InputError when their shapes differ."""
-    image, reference = np.asarray(image, np.float64), np.asarray(reference, np.float64)
-    if image.shape != reference.shape:
-        raise InputError(f"{name}: images of shapes {image.shape} and {reference.shape} do not match")
-    return image, reference

@@ -14,7 +14,8 @@ import trimesh
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from neuma_lib.errors import InputError, NonFiniteError
-from neuma_lib.evaluation.metrics import mean_height, mechanical_energy, psnr, ssim, tracer_errors
+from neuma_lib.evaluation.image_metrics import psnr, ssim
+from neuma_lib.evaluation.metrics import mean_height, mechanical_energy, tracer_errors
 from neuma_lib.evaluation.paper import BALL_PARTICLES, BALL_RADIUS, PAPER
 from neuma_lib.evaluation.reports import benchmark_table, learning_rate_table, report_table
 from neuma_lib.evaluation.video import side_by_side, write_mp4

@@ -51,11 +51,8 @@ def test_workflow_takes_supplied_images_in_place_of_blenders(tmp_path):
     assert others["render_static"] == 1 and "supplied_static" not in others
 
 
-def test_a_finer_truth_has_the_same_frames_and_one_as_fine_the_same_bytes(finished, kernels, tmp_path):
-    """tiny.yaml's truth has 14 nodes, a step of 2e-3 s and 800 particles.
-
-    `finished` comes first: a folder that finds kernels which another one compiled has no record of them.
-    """
+def test_a_finer_truth_has_the_same_frames_and_one_as_fine_the_same_bytes(kernels, tmp_path):
+    """tiny.yaml's truth has 14 nodes, a step of 2e-3 s and 800 particles."""
     project = copied(tmp_path / "project", kernels)
     file = project.root / "tiny/data/BouncyBall/particles.h5"
 

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from neuma_lib.device import choose_device
-from neuma_lib.evaluation.metrics import psnr
+from neuma_lib.evaluation.image_metrics import psnr
 from neuma_lib.evaluation.video import side_by_side, write_mp4
 from neuma_lib.io.files import atomic
 from neuma_lib.io.images import load_observation
