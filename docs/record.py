@@ -1,6 +1,7 @@
 """Copy tables and figures of a run to docs/results, and fill the numbers of README.md and docs/results/README.md.
 
 python -m docs.record            # after: snakemake --cores 2 tables figures random results/finer_truth.csv
+python -m docs.record --configfile config/three_chains.yaml     # after the same with this option
 
 A table gets the machine, the commit and the date in its first line. On the two pages everything between `<!-- name -->`
 and `<!-- /name -->` is replaced by what is in the recorded tables and in the data of the figures; no verdict and no
@@ -167,18 +168,20 @@ def main() -> None:
         "--tables", nargs="*", default=tuple(MADE_BY), help="tables to copy; figures are always copied"
     )
     parser.add_argument("--commit", default=head(), help="code of the run")
+    parser.add_argument("--configfile", help="settings of the run that lay over the defaults")
     options = parser.parse_args()
     results, out = Path(options.results), Path(options.out)
     out.mkdir(parents=True, exist_ok=True)
     origin = (
-        f"{datetime.date.today()}, commit {options.commit}, {options.machine},"
-        " default settings (`config/config.yaml`)."
+        f"{datetime.date.today()}, commit {options.commit}, {options.machine}, default settings (`config/config.yaml`)"
+        + (f" with `{options.configfile}`" if options.configfile else "")
     )
+    command = f"snakemake --configfile {options.configfile} --" if options.configfile else "snakemake"
     for name in options.tables:
         source = results / f"{name}.md"
         if source.exists():
-            made = f"Made by `snakemake {MADE_BY[name]}` and `python -m docs.record`."
-            (out / f"{name}.md").write_text(f"{origin} {made}\n\n{source.read_text()}")
+            made = f"Made by `{command} {MADE_BY[name]}` and `python -m docs.record`."
+            (out / f"{name}.md").write_text(f"{origin}. {made}\n\n{source.read_text()}")
             shutil.copyfile(source.with_suffix(".csv"), out / f"{name}.csv")
     for picture in sorted((results / "figures").glob("*.png")):
         (out / "figures").mkdir(exist_ok=True)

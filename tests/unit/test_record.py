@@ -56,11 +56,11 @@ def project(tmp_path):
     return tmp_path
 
 
-def recorded(project, monkeypatch) -> tuple[str, str]:
+def recorded(project, monkeypatch, *options) -> tuple[str, str]:
     """The two pages after a recording."""
     where = ["--results", "results", "--out", "docs", "--readme", "README.md", "--machine", "a machine"]
     monkeypatch.chdir(project)
-    monkeypatch.setattr(sys, "argv", ["record", *where, "--commit", "abc"])
+    monkeypatch.setattr(sys, "argv", ["record", *where, "--commit", "abc", *options])
     record.main()
     return (project / "README.md").read_text(), (project / "docs/README.md").read_text()
 
@@ -108,6 +108,12 @@ def test_random_scenes_and_finer_truths_have_their_verdicts(project, monkeypatch
     closer = page[page.index("\n\n[finer_truth](finer_truth.md): The true law") :]
     assert "than it: NeuMA in 6 of 6 columns (there by 3.0 of 9.0 mm on average)" in closer
     assert "Made by `snakemake random` and" in (project / "docs/random.md").read_text()
+
+
+def test_settings_of_the_run_are_told(project, monkeypatch):
+    readme, _ = recorded(project, monkeypatch, "--configfile", "config/three_chains.yaml")
+    assert "default settings (`config/config.yaml`) with `config/three_chains.yaml`. Made by" in readme
+    assert "`snakemake --configfile config/three_chains.yaml -- tables figures` and" in readme
 
 
 def test_tables_that_are_not_recorded_are_named(project, monkeypatch):
