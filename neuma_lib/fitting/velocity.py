@@ -16,9 +16,7 @@ recede by half a metre per second. So the difference between loose and rigid fli
 the looseness, which is 0 if the prior is right and expected within +-1; and beside it a shrinking along the axis of the
 spin, by which a fluid keeps its volume while it spreads.
 
-Most bodies do not spin. So the fit begins without spin, when free flight needs no simulation, and the spin joins in
-when the images ask for it: when one linearisation in all unknowns wants a spin that is larger than its uncertainty
-allows (a score test). A spin that is not told from 0 is 0, and its standard deviation says how large it may be.
+Many bodies do not spin. A spin that is not told from 0 is none, and its standard deviation says how large it may be.
 """
 
 from __future__ import annotations
@@ -47,12 +45,11 @@ NUISANCE_SCALE = 0.02
 UNKNOWNS = 11
 """Velocity and spin (world axes), shift to the right and down, enlargement, looseness and shrinking (`_Flight`)."""
 _SPIN, _STRETCH = slice(3, 6), slice(9, 11)  # places of the spin, and of looseness and shrinking
-_STILL, _SPINNING = [0, 1, 2, 6, 7, 8], list(range(UNKNOWNS))
-"""Unknowns that are free if the body does not spin, and if it does."""
+_ALL, _STILL = list(range(UNKNOWNS)), [0, 1, 2, 6, 7, 8]  # what is free, and what if the body does not spin
 _ROUNDS = 10  # sets of frames, and simulations of a spinning body
 _LEAST_GAIN = 1e-5  # part of the squares that a step may save at the end: a hundredth of the uncertainty
 _ROUGH_GAIN = 1e-3  # the same while more frames are to come
-_LEAST_TURN = 2e-3  # angle [rad] of a change of spin that calls for another simulation
+_LEAST_TURN = 5e-3  # angle [rad] of a change of spin that calls for another simulation
 _LEAST_COST = 1e-12  # of images that agree exactly: a body at rest must not make the equations singular
 _SHOWN = 1e-6  # part of the curvature in a block that shows the body
 _BLOCKS = 4  # blocks along a side of the image that the uncertainty leaves out in turn
@@ -159,38 +156,30 @@ def estimate_velocity(
     axes = observation.cameras.viewmats[0, :3, :3].cpu().numpy()
     flight = _Flight(model, law, body, observation.frames)
     minimise = partial(_levenberg_marquardt, axes=axes, settings=settings, progress=progress)
-    unknowns, free, accepted = np.zeros(UNKNOWNS), _STILL, 0
+    unknowns, accepted = np.zeros(UNKNOWNS), 0
     frames = observation.frames
-    first = min(settings.initial_frames, len(frames))
-    used, growing = first, first < len(frames)
+    used = min(settings.initial_frames, len(frames))
+    growing = used < len(frames)
     for _ in range(_ROUNDS):
         # No more than twice as many at a time: a spin from three frames says little about thirty.
         reach = min(2 * used, len(frames)) if growing else used
-        simulated = flight.simulate(unknowns, frames[:reach])
+        flight.simulate(unknowns, frames[:reach])
         seen = observation.select(_spread(used, settings.frames))
         residuals = _Residuals(flight, seen, settings.difference)
-        unknowns, fit, steps = minimise(residuals, unknowns, free, _ROUGH_GAIN if growing else _LEAST_GAIN)
+        unknowns, fit, steps = minimise(residuals, unknowns, _ALL, _ROUGH_GAIN if growing else _LEAST_GAIN)
         accepted += steps
-        wanted, fit_there = fit.at_minimum(unknowns)
-        covariance, information = _uncertainty(fit_there, flight, seen.frames, axes, settings)
-        spins = _squared_distance(wanted, covariance) > settings.spin_significance
-        if spins and free is _STILL:
-            # From the first frames on: over many, grains that have turned are taken for their neighbours.
-            unknowns, free = np.zeros(UNKNOWNS), _SPINNING
-            used, growing = first, first < len(frames)
-            continue
-        turned = model.dt * seen.frames[-1] * np.linalg.norm((flight.units * (unknowns - simulated))[_SPIN])
         clear = flight.frames_before_contact(unknowns, reach)
-        if clear < 2 or (clear == used and turned < _LEAST_TURN and not growing):
+        settled = clear == used and not growing and flight.turned(unknowns, seen.frames) < _LEAST_TURN
+        if clear < 2 or settled:
             break
         used, growing = clear, growing and clear == reach < len(frames)
-    if free is _SPINNING and not spins:
+    covariance, information = _uncertainty(fit, flight, seen.frames, axes, settings)
+    w = unknowns[_SPIN]
+    if w @ np.linalg.solve(covariance[_SPIN, _SPIN], w) <= settings.spin_significance:
         unknowns[_SPIN] = unknowns[_STRETCH] = 0.0
         flight.simulate(unknowns, seen.frames)
         unknowns, fit, steps = minimise(residuals, unknowns, _STILL, _LEAST_GAIN)
         accepted += steps
-        _, fit_there = fit.at_minimum(unknowns)
-        covariance, information = _uncertainty(fit_there, flight, seen.frames, axes, settings)
     v0, spin = (vector.cpu().numpy() for vector in flight.motion(unknowns))
     covariance *= np.outer(flight.units, flight.units)
     std, spin_std, std_camera, spin_std_camera = (
@@ -237,24 +226,31 @@ class _Flight:
         self._to_middle = 0.5 - box.mean(dim=0)
         self._in_middle = replace(body, x0=body.x0 + self._to_middle)
         self._weightless = replace(model, gravity=(0.0, 0.0, 0.0))
-        self.simulate(np.zeros(UNKNOWNS), frames[:1])
+        self._near, self._path = torch.zeros_like(self.centre), None
 
     def motion(self, unknowns: np.ndarray) -> tuple[Tensor, Tensor]:
         """Velocity [m/s] and spin [rad/s] of scaled unknowns."""
         return torch.as_tensor((self.units * unknowns)[:6]).to(self.body.x0).split(3)
 
-    def simulate(self, unknowns: np.ndarray, frames: tuple[int, ...]) -> np.ndarray:
-        """Let the body spin in the middle of the cube until the last frame, as the unknowns (11,) say; returns them.
+    def simulate(self, unknowns: np.ndarray, frames: tuple[int, ...]) -> None:
+        """Let the body spin in the middle of the cube as the unknowns say, unless what is known of it is good enough.
 
-        Without spin nothing is simulated: the body is at rest, as `rollout` takes it in free flight.
+        What is known at first is a body at rest: it needs no simulation.
         """
+        reached = self._path is None or self._path.frames[-1] >= frames[-1]
+        if reached and self.turned(unknowns, frames) < _LEAST_TURN:
+            return
         _, self._near = self.motion(unknowns)
-        start = self._in_middle.state(torch.zeros_like(self._near), self._near)
         self._path = None
         if self._near.any():
+            start = self._in_middle.state(torch.zeros_like(self._near), self._near)
             with torch.no_grad():
                 self._path = rollout(self._weightless, self.law, start, steps=frames[-1], frames=frames)
-        return unknowns
+
+    def turned(self, unknowns: np.ndarray, frames: tuple[int, ...]) -> float:
+        """Angle [rad] by which the spin of the unknowns and the simulated one come apart until the last frame."""
+        _, spin = self.motion(unknowns)
+        return float(frames[-1] * self.model.dt * (spin - self._near).norm())
 
     def __call__(
         self, v0: Tensor, spin: Tensor, frames: tuple[int, ...], stretch: Sequence[float] = (0.0, 0.0)
@@ -322,15 +318,6 @@ class _Linearisation:
         """J^T r, shape (11,)."""
         return self.scores.sum(axis=0)
 
-    def at_minimum(self, unknowns: np.ndarray) -> tuple[np.ndarray, _Linearisation]:
-        """Where the linearised problem around the unknowns (11,) has its minimum, and what it is there."""
-        step = -np.linalg.pinv(self.curvature + self.prior) @ (self.slope + self.prior @ unknowns)
-        return unknowns + step, replace(
-            self,
-            scores=self.scores + self.curvatures @ step,
-            cost=max(self.cost + 2 * self.slope @ step + step @ self.curvature @ step, 0.0),
-        )
-
 
 @dataclass
 class _Residuals:
@@ -349,7 +336,7 @@ class _Residuals:
             sum(self._residual(unknowns, part).square().sum().double() for part in self._parts()), unknowns
         )
 
-    def linearise(self, unknowns: np.ndarray, free: Sequence[int] = _SPINNING) -> _Linearisation:
+    def linearise(self, unknowns: np.ndarray, free: Sequence[int] = _ALL) -> _Linearisation:
         """Sums of the residuals and of their central differences, which are 0 for unknowns that are not free."""
         cost, curvatures, scores = 0.0, 0.0, 0.0
         for part in self._parts():
@@ -446,12 +433,7 @@ def _levenberg_marquardt(
             progress(iteration + 1, settings.iterations, fit.rms)
         if damping > 1e6:
             break
-    return u, fit if free is _SPINNING else residuals.linearise(u), accepted
-
-
-def _squared_distance(unknowns: np.ndarray, covariance: np.ndarray) -> float:
-    """Squared Mahalanobis distance of the spin from 0, chi-squared with three degrees of freedom if there is none."""
-    return float(unknowns[_SPIN] @ np.linalg.solve(covariance[_SPIN, _SPIN], unknowns[_SPIN]))
+    return u, fit if free is _ALL else residuals.linearise(u), accepted
 
 
 def _uncertainty(
