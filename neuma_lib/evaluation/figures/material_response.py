@@ -128,5 +128,5 @@ def _ticks(test: str, x: np.ndarray) -> list[float]:
         return [float(f"{1 + 0.6 * (x.min() - 1):.2g}"), 1.0]
     if test == "shear":
         end = float(f"{0.6 * x.max():.1g}")
-        return [-end, 0.0, end]
+        return [-end, 0.0, end] if len(f"{end:g}") <= 4 else [-end, end]
     return [0.0, float(f"{0.5 * x.max():.2g}"), float(f"{x.max():.2g}")]
