@@ -21,7 +21,7 @@ def analytic_law(spec: Mapping[str, Any], dt: float | None = None, name: str | N
     Args:
         spec: the two parts, each with its ``name`` and constants. A plasticity takes E and nu from the elasticity
             unless it has its own; a missing plasticity is the identity.
-        dt: time step [s], needed by rate-dependent plasticity (``viscous_flow``).
+        dt: time step [s], needed by rate-dependent plasticity (one with the constant ``dt``).
         name: for messages; made of the parts' names if not given.
 
     Raises:

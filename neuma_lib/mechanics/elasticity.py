@@ -1,18 +1,28 @@
 """Analytic elasticities: deformation gradient F -> Kirchhoff stress tau = P F^T [Pa].
 
-Each law is given by its principal Kirchhoff stresses as a function of the principal stretches sigma, with Lamé
-parameters mu, lam and J = sigma_1 sigma_2 sigma_3. All are symmetric, objective and stress-free at F = R.
+Each isotropic law is given by its principal Kirchhoff stresses as a function of the principal stretches sigma, with
+Lamé parameters mu, lam and J = sigma_1 sigma_2 sigma_3. All are symmetric, objective and stress-free at F = R.
+
+`Ogden`, `MooneyRivlin` and `FibreReinforced` serve as truths that no simpler law contains: with the same E and nu they
+agree with `Hencky` at small strains (the last one in its matrix), and part from it at those of an impact.
 """
 
 from __future__ import annotations
 
+import math
+
+import torch
 from torch import Tensor
 
-from neuma_lib.mechanics.isotropic import POISSON, YOUNG, Constants, isotropic_stress, lame
+from neuma_lib.mechanics.isotropic import POISSON, YOUNG, Constant, Constants, isotropic_stress, lame
 from neuma_lib.mechanics.law import Elasticity, Weights
 
 STRETCH_MIN = 0.05
 """Logarithms are of max(sigma, STRETCH_MIN), as in NCLaw, so that a crushed element keeps a finite stress."""
+
+FIBRE_EXPONENT_MAX = 8.0
+"""Bound on the exponent of the fibre term, so that a torn element keeps a finite stress; the term is e^8 = 3,000 times
+as stiff there as at rest."""
 
 
 class AnalyticElasticity(Constants, Elasticity):
@@ -20,17 +30,32 @@ class AnalyticElasticity(Constants, Elasticity):
 
     constants = {"E": YOUNG, "nu": POISSON}
 
-    def principal(self, sigma: Tensor, mu: float | Tensor, lam: float | Tensor) -> Tensor:
-        """Principal Kirchhoff stresses (N, 3) [Pa] of the principal stretches (N, 3)."""
+    def principal(
+        self, sigma: Tensor, mu: float | Tensor, lam: float | Tensor, **others: float | Tensor
+    ) -> Tensor:
+        """Principal Kirchhoff stresses (N, 3) [Pa] of the principal stretches (N, 3); ``others``: constants beside E
+        and nu."""
         raise NotImplementedError
 
     def response(self, F: Tensor, weights: Weights) -> Tensor:
-        mu, lam = lame(**self.with_weights(weights))
-        return isotropic_stress(F, lambda sigma: self.principal(sigma, mu, lam))
+        others = self.with_weights(weights)
+        mu, lam = lame(others.pop("E"), others.pop("nu"))
+        return isotropic_stress(F, lambda sigma: self.principal(sigma, mu, lam, **others))
 
 
 def _volume_ratio(sigma: Tensor) -> Tensor:
     return (sigma[:, 0] * sigma[:, 1] * sigma[:, 2])[:, None]
+
+
+def _isochoric_strain(sigma: Tensor) -> tuple[Tensor, Tensor]:
+    """Logarithms (N, 3) of the isochoric stretches sigma J^(-1/3), and log J (N, 1)."""
+    strain = sigma.clamp(min=STRETCH_MIN).log()
+    log_J = strain.sum(1, keepdim=True)
+    return strain - log_J / 3, log_J
+
+
+def _deviator(y: Tensor) -> Tensor:
+    return y - y.mean(1, keepdim=True)
 
 
 class FixedCorotated(AnalyticElasticity):
@@ -73,10 +98,80 @@ class Fluid(AnalyticElasticity):
         return (lam * J * (J - 1)).expand_as(sigma)
 
 
+class Ogden(AnalyticElasticity):
+    """One-term Ogden solid: tau_i = (2 mu / alpha) dev(s_i^alpha) + (lam + 2 mu / 3) log J, s_i = sigma_i J^(-1/3).
+
+    From the energy (2 mu / alpha^2) (sum_i s_i^alpha - 3) + (lam + 2 mu / 3) log(J)^2 / 2 (Ogden 1972). It stiffens
+    with strain: at alpha = 12, three times in pure shear to a stretch of 1.16. alpha -> 0 is `Hencky`.
+    """
+
+    # Above 20, powers of a crushed element's stretches overflow in float32.
+    constants = {"E": YOUNG, "nu": POISSON, "alpha": Constant("1", 0.0, 20.0)}
+
+    def principal(self, sigma, mu, lam, alpha):
+        strain, log_J = _isochoric_strain(sigma)
+        return 2 * mu / alpha * _deviator((alpha * strain).exp()) + (lam + 2 * mu / 3) * log_J
+
+
+class MooneyRivlin(AnalyticElasticity):
+    """tau = mu (1 - q) dev b - mu q dev b^-1 + (lam + 2 mu / 3) log J I with the isochoric b = J^(-2/3) F F^T.
+
+    From the energy C1 (I1 - 3) + C2 (I2 - 3) + (lam + 2 mu / 3) log(J)^2 / 2 of the isochoric invariants, where
+    C1 + C2 = mu / 2 and ``q`` = C2 / (C1 + C2): 0 is an isochoric neo-Hookean solid, 1 has the second invariant alone,
+    harder to press than to pull. Nearly incompressible with nu near 0.5.
+    """
+
+    constants = {"E": YOUNG, "nu": POISSON, "q": Constant("1", 0.0, 1.0, closed=True)}
+
+    def principal(self, sigma, mu, lam, q):
+        strain, log_J = _isochoric_strain(sigma)
+        shear = (1 - q) * _deviator((2 * strain).exp()) - q * _deviator((-2 * strain).exp())
+        return mu * shear + (lam + 2 * mu / 3) * log_J
+
+
+class FibreReinforced(Hencky):
+    """A `Hencky` matrix with one family of fibres along a (transversely isotropic), and a_F = F a, I4 = |a_F|^2:
+
+    tau = tau_matrix + (H / 2) (I4 - 1) exp(b (I4 - 1)^2) a_F (x) a_F
+
+    from the energy H / (8 b) (exp(b (I4 - 1)^2) - 1) (Holzapfel, Gasser and Ogden 2000; but fibres bear pressure too,
+    so that stress is smooth at rest). H = ``fibre_modulus`` [Pa] is what they add to Young's modulus along a at small
+    strains, b = ``fibre_exponent`` how they stiffen. a at F = I lies ``elevation`` degrees above the x-z plane, over
+    the direction ``azimuth`` degrees from x towards z.
+    """
+
+    constants = {
+        "E": YOUNG,
+        "nu": POISSON,
+        "fibre_modulus": Constant("Pa", 0.0, closed=True),
+        "fibre_exponent": Constant("1", 0.0, closed=True),
+        "azimuth": Constant("degrees", -180.0, 180.0, closed=True, default=0.0),
+        "elevation": Constant("degrees", -90.0, 90.0, closed=True, default=0.0),
+    }
+
+    def response(self, F: Tensor, weights: Weights) -> Tensor:
+        constants = self.with_weights(weights)
+        mu, lam = lame(constants["E"], constants["nu"])
+        turn, rise = (
+            torch.as_tensor(constants[key], dtype=F.dtype, device=F.device) * (math.pi / 180)
+            for key in ("azimuth", "elevation")
+        )
+        a = torch.stack([rise.cos() * turn.cos(), rise.sin(), rise.cos() * turn.sin()])
+        carried = F @ a
+        strain = (carried**2).sum(1) - 1
+        exponent = (constants["fibre_exponent"] * strain**2).clamp(max=FIBRE_EXPONENT_MAX)
+        tension = constants["fibre_modulus"] / 2 * strain * exponent.exp()
+        matrix = isotropic_stress(F, lambda sigma: self.principal(sigma, mu, lam))
+        return matrix + tension[:, None, None] * carried[:, :, None] * carried[:, None]
+
+
 ELASTICITIES: dict[str, type[AnalyticElasticity]] = {
     "fixed_corotated": FixedCorotated,
     "stvk": StVK,
     "hencky": Hencky,
     "neo_hookean": NeoHookean,
     "fluid": Fluid,
+    "ogden": Ogden,
+    "mooney_rivlin": MooneyRivlin,
+    "fibre_reinforced": FibreReinforced,
 }

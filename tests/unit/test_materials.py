@@ -19,12 +19,20 @@ from neuma_lib.mechanics.plasticity import DruckerPrager, FluidProjection, Visco
 
 E, NU = 1e5, 0.3
 MU, LAM = lame(E, NU)
+BESIDE_E_AND_NU = {
+    "ogden": {"alpha": 6.0},
+    "mooney_rivlin": {"q": 0.7},
+    "fibre_reinforced": {"fibre_modulus": 2e5, "fibre_exponent": 1.5},
+}
 PLASTICITIES = {
     "identity": {},
     "von_mises": {"yield_stress": 5e3},
     "drucker_prager": {"friction_angle": 25},
     "fluid_projection": {},
     "viscous_flow": {"viscosity": 10.0, "yield_stress": 1e3},
+    "crushable_foam": {"crush": 4e3, "tension": 1e3, "slope": 1.2, "relaxation": 2e-3},
+    "herschel_bulkley": {"consistency": 30.0, "exponent": 0.5, "yield_stress": 1e3},
+    "cohesive_drucker_prager": {"friction_angle": 35, "cohesion": 2e3, "dilation_angle": 10},
 }
 EYE = torch.eye(3, dtype=torch.float64)
 
@@ -43,8 +51,12 @@ def deformations(count: int = 400, size: float = 0.15, seed: int = 1) -> torch.T
     return (rotations(count, seed + 1) * strain.exp()[:, None]) @ rotations(count, seed + 2)
 
 
+def elastic_spec(name: str) -> dict:
+    return {"name": name, "E": E, "nu": NU, **BESIDE_E_AND_NU.get(name, {})}
+
+
 def elasticity(name: str):
-    return analytic_law({"elasticity": {"name": name, "E": E, "nu": NU}}).elasticity
+    return analytic_law({"elasticity": elastic_spec(name)}).elasticity
 
 
 def plasticity(name: str):
@@ -101,6 +113,17 @@ def uniaxial_stress(name: str, a: float) -> list[float]:
         return [(2 * MU + LAM) * math.log(a), LAM * math.log(a)]
     if name == "neo_hookean":  # tau = mu (b - I) + lam log J I
         return [MU * (a * a - 1) + LAM * math.log(a), LAM * math.log(a)]
+    if name in ("ogden", "mooney_rivlin"):  # isochoric stretches a^(2/3), a^(-1/3) twice
+        s, pressure = (a ** (2 / 3), a ** (-1 / 3)), (LAM + 2 * MU / 3) * math.log(a)
+        if name == "ogden":  # alpha = 6
+            shear = 2 * MU / 6 * (s[0] ** 6 - s[1] ** 6)
+        else:  # q = 0.7
+            shear = MU * (0.3 * (s[0] ** 2 - s[1] ** 2) - 0.7 * (s[0] ** -2 - s[1] ** -2))
+        return [2 / 3 * shear + pressure, -shear / 3 + pressure]
+    if name == "fibre_reinforced":  # Hencky, and the fibres along the axis
+        green = a * a - 1
+        fibre = 1e5 * green * math.exp(min(1.5 * green**2, 8)) * a * a
+        return [(2 * MU + LAM) * math.log(a) + fibre, LAM * math.log(a)]
     return [LAM * a * (a - 1)] * 2
 
 
@@ -119,15 +142,22 @@ def simple_shear_stress(name: str, k: float) -> torch.Tensor:
         green = (F.mT @ F - eye) / 2
         plane = F @ (2 * MU * green + LAM * green.trace() * eye) @ F.mT
         out_of_plane = LAM * float(green.trace())
-    elif (
-        name == "hencky"
-    ):  # principal log stretches +-asinh(k / 2), the larger one at atan(k/2 + sqrt(1+k^2/4))
+    elif name in ("hencky", "fibre_reinforced"):  # fibres along e_x are not strained
+        # principal log stretches +-asinh(k / 2), the larger one at atan(k/2 + sqrt(1+k^2/4))
         strain = math.asinh(k / 2)
         angle = math.atan2(1.0, math.sqrt(1 + k * k / 4) - k / 2)  # of the axis, from e_y side
         n = torch.tensor([math.sin(angle), math.cos(angle)], dtype=torch.float64)
         plane = 2 * MU * strain * (2 * torch.outer(n, n) - eye)
     elif name == "neo_hookean":
         plane = MU * (F @ F.mT - eye)
+    elif name in ("ogden", "mooney_rivlin"):
+        b = F @ F.mT
+        if name == "ogden":  # (2 mu / 6) dev b^3
+            plane, out_of_plane = MU / 3 * b @ b @ b, MU / 3
+        else:
+            plane, out_of_plane = MU * (0.3 * b - 0.7 * torch.linalg.inv(b)), MU * (0.3 - 0.7)
+        mean = (float(plane.trace()) + out_of_plane) / 3
+        plane, out_of_plane = plane - mean * eye, out_of_plane - mean
     tau = torch.zeros(3, 3, dtype=torch.float64)
     tau[:2, :2], tau[2, 2] = plane, out_of_plane
     return tau
@@ -153,8 +183,8 @@ def test_simple_shear_stress(name, k):
 
 @pytest.mark.parametrize("name", ELASTICITIES)
 def test_wave_speed_is_that_of_linear_elasticity(name):
-    law = analytic_law({"elasticity": {"name": name, "E": E, "nu": NU}})
-    modulus = LAM if name == "fluid" else LAM + 2 * MU
+    law = analytic_law({"elasticity": elastic_spec(name)})
+    modulus = LAM if name == "fluid" else LAM + 2 * MU + BESIDE_E_AND_NU.get(name, {}).get("fibre_modulus", 0)
     # one-sided differences of step 1e-5
     assert law.wave_speed(1000.0) == pytest.approx(math.sqrt(modulus / 1000.0), rel=1e-4)
 
@@ -196,7 +226,7 @@ def test_objectivity(name, dtype):
     assert float((turned - expected).abs().max()) < tolerance
 
 
-@pytest.mark.parametrize("name", [n for n in PARTS if not n.startswith("neural")])
+@pytest.mark.parametrize("name", [n for n in PARTS if not n.startswith(("neural", "fibre"))])
 def test_analytic_laws_are_isotropic(name):
     part = all_parts()[name]
     F, Q = deformations(), rotations(400, 21)
