@@ -18,9 +18,10 @@ class MethodConfig(Section):
     """A method is a set of options over the same code."""
 
     title: str = Field(description="name in tables")
-    law: Literal["learned", "true"] = Field(
+    law: Literal["learned", "true", "identified"] = Field(
         "learned",
-        description="true: the scene's own law on the reconstruction, the yardstick; nothing is learned",
+        description="true: the scene's own law on the reconstruction, the yardstick; identified: the analytic law that "
+        "the stage `identify` found in the video. Neither is trained",
     )
     note: str | None = Field(None, description="what a reader must know of its numbers; stands below tables")
     trained_as: str | None = Field(
@@ -36,9 +37,9 @@ class MethodConfig(Section):
     )
 
     @model_validator(mode="after")
-    def _true_laws_are_not_trained(self) -> MethodConfig:
-        if self.law == "true" and self.material.get("train", True):
-            raise ValueError("law: the true law is not trained, set material: {train: false}")
+    def _analytic_laws_are_not_trained(self) -> MethodConfig:
+        if self.law != "learned" and self.material.get("train", True):
+            raise ValueError(f"law: the {self.law} law is not trained, set material: {{train: false}}")
         return self
 
 

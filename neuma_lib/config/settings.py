@@ -21,6 +21,7 @@ from neuma_lib.config.experiments import ExperimentConfig
 from neuma_lib.config.figures import FiguresConfig
 from neuma_lib.config.gaussians import GaussiansConfig
 from neuma_lib.config.geometry import GeometryConfig
+from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.methods import MethodConfig, parse_method, variant_title
 from neuma_lib.config.priors import PriorsConfig
@@ -59,6 +60,7 @@ class Config(Section):
     geometry: GeometryConfig = Field(GeometryConfig(), description="mesh and particles")
     binding: BindingConfig = Field(BindingConfig(), description="Gaussians to particles")
     velocity: VelocityConfig = Field(VelocityConfig(), description="initial velocity")
+    identify: IdentifyConfig = Field(IdentifyConfig(), description="family and constants of the material")
     material: MaterialConfig = Field(MaterialConfig(), description="adaptation of the law")
     evaluation: EvaluationConfig = Field(EvaluationConfig(), description="measures and videos")
     figures: FiguresConfig = Field(FiguresConfig(), description="figures")
@@ -214,6 +216,10 @@ class Config(Section):
         """The scene's own law, where this is what a method evaluates."""
         base, _ = parse_method(method, self.methods)
         return self.scene(scene).law.plain() if self.methods[base].law == "true" else None
+
+    def is_identified(self, method: str) -> bool:
+        """Whether a method evaluates the analytic law that was identified in the video."""
+        return self.methods[parse_method(method, self.methods)[0]].law == "identified"
 
     def method_density(self, scene: str, method: str) -> float | dict[str, Any]:
         """Density that a method takes the scene's body to have: the scene's, unless it assumes another."""

@@ -34,6 +34,7 @@ from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.frame_batches import frame_batches
+from neuma_lib.fitting.least_squares import Linearisation, in_blocks, jackknife, levenberg_marquardt
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import MPMModel, contact_clearance
 from neuma_lib.sim.rollout import rollout
@@ -50,9 +51,6 @@ _ROUNDS = 10  # sets of frames, and simulations of a spinning body
 _LEAST_GAIN = 1e-5  # part of the squares that a step may save at the end: a hundredth of the uncertainty
 _ROUGH_GAIN = 1e-3  # the same while more frames are to come
 _LEAST_TURN = 5e-3  # angle [rad] of a change of spin that calls for another simulation
-_LEAST_COST = 1e-12  # of images that agree exactly: a body at rest must not make the equations singular
-_SHOWN = 1e-6  # part of the curvature in a block that shows the body
-_BLOCKS = 4  # blocks along a side of the image that the uncertainty leaves out in turn
 
 
 @dataclass(frozen=True)
@@ -155,7 +153,7 @@ def estimate_velocity(
         raise InputError("the body touches a wall in the first frame: the video must start before contact")
     axes = observation.cameras.viewmats[0, :3, :3].cpu().numpy()
     flight = _Flight(model, law, body, observation.frames)
-    minimise = partial(_levenberg_marquardt, axes=axes, settings=settings, progress=progress)
+    minimise = partial(_minimise, axes=axes, settings=settings, progress=progress)
     unknowns, accepted = np.zeros(UNKNOWNS), 0
     frames = observation.frames
     used = min(settings.initial_frames, len(frames))
@@ -284,41 +282,6 @@ class _Flight:
         return int(touching.int().argmax()) if touching.any() else len(x)
 
 
-@dataclass(frozen=True)
-class _Linearisation:
-    """The least-squares problem around some unknowns: residuals r, Jacobian J, summed up over all pixels.
-
-    Attributes:
-        curvatures: J^T J of every block of the image, summed over the frames, shape (blocks, 11, 11).
-        scores: J^T r of every block, shape (blocks, 11).
-        cost: r^T r.
-        rms: root mean square of r.
-    """
-
-    curvatures: np.ndarray
-    scores: np.ndarray
-    cost: float
-    rms: float
-
-    @property
-    def curvature(self) -> np.ndarray:
-        """J^T J, shape (11, 11)."""
-        return self.curvatures.sum(axis=0)
-
-    @property
-    def prior(self) -> np.ndarray:
-        """Curvature that holds looseness and shrinking at 0 +- 1, shape (11, 11). The residuals of a block of the
-        image count as one, since they are correlated."""
-        held = np.zeros(UNKNOWNS)
-        held[_STRETCH] = max(self.cost, _LEAST_COST) / _BLOCKS**2
-        return np.diag(held)
-
-    @property
-    def slope(self) -> np.ndarray:
-        """J^T r, shape (11,)."""
-        return self.scores.sum(axis=0)
-
-
 @dataclass
 class _Residuals:
     """Rendered minus observed colours as a function of the unknowns. A few frames at a time are in memory."""
@@ -336,22 +299,22 @@ class _Residuals:
             sum(self._residual(unknowns, part).square().sum().double() for part in self._parts()), unknowns
         )
 
-    def linearise(self, unknowns: np.ndarray, free: Sequence[int] = _ALL) -> _Linearisation:
+    def linearise(self, unknowns: np.ndarray, free: Sequence[int] = _ALL) -> Linearisation:
         """Sums of the residuals and of their central differences, which are 0 for unknowns that are not free."""
         cost, curvatures, scores = 0.0, 0.0, 0.0
         for part in self._parts():
             r = self._residual(unknowns, part)
-            columns = torch.zeros(*_in_blocks(r).shape, UNKNOWNS).to(r)  # (blocks, pixels, 11)
+            columns = torch.zeros(*in_blocks(r).shape, UNKNOWNS).to(r)  # (blocks, pixels, 11)
             for k in free:
                 e = self.difference * np.eye(UNKNOWNS)[k]
                 change = self._render(unknowns + e, part) - self._render(unknowns - e, part)
-                columns[..., k] = _in_blocks(change / (2 * self.difference))
+                columns[..., k] = in_blocks(change / (2 * self.difference))
             cost = cost + r.square().sum().double()
             curvatures = curvatures + (columns.mT @ columns).double()
-            scores = scores + (columns.mT @ _in_blocks(r)[..., None])[..., 0].double()
+            scores = scores + (columns.mT @ in_blocks(r)[..., None])[..., 0].double()
         cost = self._checked(cost, unknowns)
         rms = float(np.sqrt(cost / (len(self.seen.frames) * r[0].numel())))
-        return _Linearisation(curvatures.cpu().numpy(), scores.cpu().numpy(), cost, rms)
+        return Linearisation(curvatures.cpu().numpy(), scores.cpu().numpy(), cost, rms)
 
     def _parts(self):
         return frame_batches(len(self.seen.frames), self._renderer.frames_per_batch)
@@ -378,21 +341,19 @@ class _Residuals:
         return value
 
 
-def _in_blocks(values: Tensor) -> Tensor:
-    """Values (T, V, H, W, C) by the block of the image that they lie in, shape (V * blocks, values)."""
-    T, V, H, W, C = values.shape
-    tall, wide = -(-H // _BLOCKS), -(-W // _BLOCKS)
-    full = torch.nn.functional.pad(values, (0, 0, 0, wide * _BLOCKS - W, 0, tall * _BLOCKS - H))
-    split = full.reshape(T, V, _BLOCKS, tall, _BLOCKS, wide, C)
-    return split.permute(1, 2, 4, 0, 3, 5, 6).reshape(V * _BLOCKS**2, -1)
-
-
 def _spread(count: int, most: int) -> list[int]:
     """At most `most` of the first `count` frames, evenly spread, first and last among them."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
 
 
-def _levenberg_marquardt(
+def _held(fit: Linearisation) -> np.ndarray:
+    """Curvature that holds looseness and shrinking at 0 +- 1, shape (11, 11)."""
+    held = np.zeros(UNKNOWNS)
+    held[_STRETCH] = fit.block_cost
+    return np.diag(held)
+
+
+def _minimise(
     residuals: _Residuals,
     start: np.ndarray,
     free: Sequence[int],
@@ -400,70 +361,43 @@ def _levenberg_marquardt(
     axes: np.ndarray,
     settings: VelocityConfig,
     progress: Callable[[int, int, float], None] | None,
-) -> tuple[np.ndarray, _Linearisation, int]:
+) -> tuple[np.ndarray, Linearisation, int]:
     """Minimise |r(u)|^2 + ridge * curvature * (depth . v)^2 over the free unknowns.
 
     Returns:
         The unknowns (11,), the linearisation in all of them, and the number of accepted steps.
     """
 
-    def penalty(H):
+    def penalty(fit):
         P = np.zeros((UNKNOWNS, UNKNOWNS))
-        P[:3, :3] = settings.ridge * np.linalg.eigvalsh(H[:3, :3])[-1] * np.outer(axes[2], axes[2])
-        return P + fit.prior
+        P[:3, :3] = (
+            settings.ridge * np.linalg.eigvalsh(fit.curvature[:3, :3])[-1] * np.outer(axes[2], axes[2])
+        )
+        return P + _held(fit)
 
-    u, damping, accepted = start, 1e-3, 0
-    fit = residuals.linearise(u, free)
-    for iteration in range(settings.iterations):
-        H = fit.curvature
-        P = penalty(H)
-        A, slope = (H + P)[np.ix_(free, free)], (fit.slope + P @ u)[free]
-        step = np.zeros(UNKNOWNS)
-        step[free] = -np.linalg.solve(A + damping * np.diag(np.diag(A)), slope)
-        if slope @ np.linalg.solve(A, slope) < least_gain * max(fit.cost, _LEAST_COST):
-            break
-        trial = u + step
-        before, after = fit.cost + u @ P @ u, residuals.cost(trial) + trial @ P @ trial
-        if after < before:
-            u, damping, accepted = trial, max(damping / 5, 1e-9), accepted + 1
-            fit = residuals.linearise(u, free)
-        else:
-            damping *= 8
-        if progress:
-            progress(iteration + 1, settings.iterations, fit.rms)
-        if damping > 1e6:
-            break
+    u, fit, accepted = levenberg_marquardt(
+        residuals, start, free, penalty, least_gain, settings.iterations, progress
+    )
     return u, fit if free is _ALL else residuals.linearise(u), accepted
 
 
 def _uncertainty(
-    fit: _Linearisation, flight: _Flight, frames: tuple[int, ...], axes: np.ndarray, settings: VelocityConfig
+    fit: Linearisation, flight: _Flight, frames: tuple[int, ...], axes: np.ndarray, settings: VelocityConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Covariance (11, 11) of an unregularised fit of all unknowns whose residuals are correlated over blocks of the
-    image, and the information on the velocity along the camera's axes (3,).
+    """Covariance (11, 11) of an unregularised fit of all unknowns, by the jackknife over blocks of the image, and the
+    information on the velocity along the camera's axes (3,).
 
-    Residuals come from what the static reconstruction cannot show (outline, shading, what turns into view), not from
-    independent pixel noise: they last over all frames and reach over a good part of the body. So the blocks of the
-    image are left out in turn, each in all frames, and the covariance is that of the jackknife,
-    (n - 1)/n sum_b d_b d_b^T, where d_b = (H - H_b)^-1 g_b is how the estimate moves without block b. n counts the
-    blocks that show the body. Unlike the sandwich H^-1 (sum_b g_b g_b^T) H^-1, this is not too small where few blocks
-    decide (CR3 of cluster-robust regression: MacKinnon and White 1985; Cameron and Miller 2015). Where looseness and
-    shrinking are held at 0, the error of that, 1, is passed on. The curvature that is left for the velocity when the
-    rest is free is the Schur complement of H.
+    Where looseness and shrinking are held at 0, the error of that, 1, is passed on. The curvature that is left for
+    the velocity when the rest is free is the Schur complement of H.
 
     What is wrong in every block alike, such as shading that stays with the light while the body turns, shows as a
     turn by `angle_std`, which adds to the uncertainty of the spin.
     """
-    H, P = fit.curvature, fit.prior
-    shares = np.trace(fit.curvatures, axis1=1, axis2=2) / np.trace(H)
-    moved = np.array(
-        [np.linalg.pinv(H - part + P) @ g for part, g in zip(fit.curvatures, fit.scores, strict=True)]
-    )
-    n = max(2, int((shares > _SHOWN).sum()))
+    H, P = fit.curvature, _held(fit)
     inverse = np.linalg.pinv(H + P)
     by_prior = (inverse @ P)[:, _STRETCH]
     information = 1 / np.diag(axes @ inverse[:3, :3] @ axes.T)
-    covariance = (n - 1) / n * moved.T @ moved + by_prior @ by_prior.T
+    covariance = jackknife(fit, P) + by_prior @ by_prior.T
     duration = flight.model.dt * (frames[-1] - frames[0])
     covariance[_SPIN, _SPIN] += np.diag((settings.angle_std / duration / flight.units[_SPIN]) ** 2)
     return covariance, information / information.max()

@@ -364,6 +364,10 @@ class TestFinerTruth:
                 {"methods": {"true_law": {"material": {"train": True}}}},
                 r"true_law: law: the true law is not tr",
             ),
+            (
+                {"methods": {"constants": {"material": {"train": True}}}},
+                r"constants: law: the identified law is not trained",
+            ),
         ],
     )
     def test_mistakes(self, raw, change, message):
@@ -376,6 +380,11 @@ class TestFinerTruth:
             "SandFish", "neuma"
         )
         assert not loaded.method_material("SandFish", "true_law").train
+
+    def test_the_identified_law_is_a_method(self, loaded):
+        assert loaded.is_identified("constants") and not loaded.is_identified("neuma+rank=4")
+        assert loaded.true_law("SandFish", "constants") is None
+        assert loaded.method_material("SandFish", "constants").covariance_from == "total"
 
 
 class TestScaleOfThePaper:

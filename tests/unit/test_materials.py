@@ -371,6 +371,55 @@ def test_viscous_flow_is_newtonian_in_steady_shear():
     )
 
 
+def test_a_bingham_body_bears_its_yield_stress_and_flows_beyond_it():
+    """Steady shear: tau_xy = yield_stress / sqrt(2) + viscosity * shear rate, up to the elastic strain (6e-4 here)."""
+    viscosity, rate, dt, limit = 10.0, 1.0, 1e-4, 20.0
+    part = ViscousFlow(E=E, nu=NU, viscosity=viscosity, dt=dt, yield_stress=limit)
+    velocity_gradient = torch.zeros(3, 3, dtype=torch.float64)
+    velocity_gradient[0, 1] = rate
+    F = EYE[None].clone()
+    for _ in range(400):
+        F = part.evaluate((EYE + dt * velocity_gradient) @ F, ())
+    expected = limit / 2**0.5 + viscosity * rate
+    shear = float(Hencky(E=E, nu=NU).evaluate(F, ())[0, 0, 1])
+    assert shear == pytest.approx(expected, rel=4 * (expected / MU + rate * dt))
+
+
+def test_a_held_bingham_body_relaxes_to_its_yield_stress():
+    """|dev tau| - yield_stress = its first value * exp(-mu t / viscosity); the implicit step errs by mu dt / viscosity
+    times the exponent, halved."""
+    viscosity, dt, limit, steps = 400.0, 1e-4, 1e3, 100
+    part, law = ViscousFlow(E=E, nu=NU, viscosity=viscosity, dt=dt, yield_stress=limit), Hencky(E=E, nu=NU)
+    F = torch.diag(torch.tensor([1.1, 1.0, 0.95], dtype=torch.float64))[None]
+
+    def excess():
+        tau = law.evaluate(F, ())[0]
+        return float((tau - tau.trace() / 3 * EYE).norm()) - limit
+
+    first = excess()
+    for _ in range(steps):
+        F = part.evaluate(F, ())
+    rate = MU * dt / viscosity
+    assert excess() == pytest.approx(first / (1 + rate) ** steps, rel=1e-9)
+    assert excess() == pytest.approx(first * math.exp(-rate * steps), rel=1.01 * rate * (rate * steps) / 2)
+
+
+def test_limits_of_a_bingham_body():
+    """Without viscosity it is von Mises plastic, without yield stress a viscous fluid, with much viscosity elastic."""
+    F, stress = deformations(), 5e3
+
+    def returned(viscosity, yield_stress):
+        return ViscousFlow(E=E, nu=NU, viscosity=viscosity, dt=1e-3, yield_stress=yield_stress).evaluate(
+            F, ()
+        )
+
+    plastic = VonMises(E=E, nu=NU, yield_stress=stress).evaluate(F, ())
+    torch.testing.assert_close(returned(1e-12, stress), plastic, rtol=1e-9, atol=1e-9)
+    fluid = ViscousFlow(E=E, nu=NU, viscosity=20.0, dt=1e-3).evaluate(F, ())
+    torch.testing.assert_close(returned(20.0, 1e-9), fluid, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(returned(1e15, stress), F, rtol=1e-9, atol=1e-9)
+
+
 # ---------------------------------------------------------------------------------------------- adjoints
 
 

@@ -46,6 +46,19 @@ def test_only_evaluation_and_figures_of_it_and_one_ablation_read_the_truth(proje
     assert not any(file.endswith("transforms.json") for file in supervised)
 
 
+def test_identified_constants_need_the_video_and_no_training(project):
+    target = f"{SCENE}/constants/metrics.json"
+    graph = jobs(project.run("--dry-run", target, f"{SCENE}/identified.png"))
+    made = {rule: (read, outputs) for rule, read, outputs in graph}
+    read, outputs = made["identify"]
+    assert outputs == [f"{SCENE}/identified.json"] and "identified_page" in made and "material" not in made
+    assert any(file.endswith("transforms.json") for file in read)
+    assert not any("particles.h5" in file and "/data/" in file for file in read), "the truth"
+    assert f"{SCENE}/identified.json" in made["evaluation"][0]
+    chained = project.run("--dry-run", target.replace("/constants", "+seed=1/constants"))
+    assert f"{SCENE}+seed=1/identified.json" in chained
+
+
 CHAINS = ("--config", "tables={table1: {seeds: 3}}", "--")
 DATA_RULES = ("kernels", "ground_truth", "render_static", "render_dynamic")
 

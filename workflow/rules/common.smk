@@ -91,7 +91,7 @@ def checked(function):
 DRAWN_IN = {
     **dict.fromkeys(["gaussians.ply", "gaussians.json", "mesh.ply", "tracers.h5"], ["gaussians"]),
     **dict.fromkeys(["sampled_particles.h5", "particles.h5", "binding.h5"], ["gaussians", "particles"]),
-    "velocity.json": ["prior", "gaussians", "particles"],
+    **dict.fromkeys(["velocity.json", "identified.json"], ["prior", "gaussians", "particles"]),
 }
 
 
@@ -332,8 +332,8 @@ def material_settings(wildcards):
 
 @checked
 def material_prior(wildcards):
-    """The law that a method starts from; none where it takes the true one."""
-    if SETTINGS.true_law(wildcards.scene, wildcards.method):
+    """The law that a method starts from; none where it takes an analytic one."""
+    if SETTINGS.true_law(wildcards.scene, wildcards.method) or SETTINGS.is_identified(wildcards.method):
         return []
     return prior_file(wildcards.scene, wildcards.method)
 
@@ -342,6 +342,19 @@ def material_prior(wildcards):
 def true_law(wildcards):
     """The scene's own law, where this is what a method evaluates."""
     return SETTINGS.true_law(wildcards.scene, wildcards.method) or []
+
+
+@checked
+def identified_law(wildcards):
+    """The law that was identified in a scene's video, where this is what a method evaluates."""
+    return home(wildcards.scene, "identified.json") if SETTINGS.is_identified(wildcards.method) else []
+
+
+@checked
+def stock_law(wildcards):
+    """The analytic law that a scene's prior is trained on; none where the prior is a file of the user's."""
+    law = SETTINGS.priors.laws.get(SETTINGS.scene(wildcards.scene).prior)
+    return law.plain() if law else None
 
 
 def supervised_by(kind, file):

@@ -41,6 +41,7 @@ rule evaluation:
         velocity=of_chain("velocity.json"),
         prior=material_prior,
         adaptor=trained_adaptor,
+        identified=identified_law,
     output:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
         metrics=f"{RESULTS}/{{scene}}/{{method}}/metrics.json",

@@ -62,6 +62,7 @@ rule experiment:
         velocity=of_chain("velocity.json"),
         prior=of_each_body(material_prior),
         adaptor=of_each_body(trained_adaptor),
+        identified=of_each_body(identified_law),
     output:
         rollout=f"{RESULTS}/experiments/{{experiment}}/{{method}}/rollout.h5",
         metrics=f"{RESULTS}/experiments/{{experiment}}/{{method}}/metrics.json",

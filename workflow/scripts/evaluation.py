@@ -1,4 +1,4 @@
-"""Roll learned laws, or the true ones, out from the estimated start and compare them with the ground truth."""
+"""Roll learned laws, true or identified ones, out from the estimated start and compare them with the ground truth."""
 
 from itertools import zip_longest
 
@@ -7,7 +7,7 @@ import torch
 
 from neuma_lib.device import choose_device
 from neuma_lib.evaluation.motion import evaluate
-from neuma_lib.io.files import write_json
+from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.io.laws import load_law
 from neuma_lib.io.particles import load_start
@@ -31,7 +31,8 @@ def main(inputs, output, params, run) -> None:
     measure, _ = read_arrays(inputs.tracers, required=("starts", "floor"))
     files = [inputs[name] for name in ("particles", "binding", "gaussians", "velocity")]
     start, counts = load_start(*files, params.densities, params.carrier)
-    laws = [analytic_law(law, dt=params.simulation["dt"]) for law in params.laws]
+    specs = params.laws or [read_json(file)["law"] for file in listed(inputs.get("identified"))]
+    laws = [analytic_law(spec, dt=params.simulation["dt"]) for spec in specs]
     laws = laws or [load_law(prior, adaptor) for prior, adaptor in zip_longest(priors, adaptors)]
     evaluation = evaluate(
         MPMModel(**params.simulation),

@@ -1,0 +1,59 @@
+"""One page of what was identified in a video: families by the loss of held-out frames, and the best one's constants."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from neuma_lib.evaluation.plotting import style
+from neuma_lib.mechanics.combinations import named_combinations
+
+_BARS = 2  # standard deviations that error bars show
+_WIDEST = 1.5  # decades that an error bar may reach to either side: beyond it, nothing is known
+
+
+@style.styled
+def identified_page(found: Mapping[str, Any], truth: Mapping[str, Mapping[str, Any]] | None) -> Figure:
+    """Left: held-out loss of every family that was judged. Right: constants and ratios of the best one over their
+    values, with two standard deviations, and the truth as crosses.
+
+    Args:
+        found: content of identified.json.
+        truth: specification of the true law; None if unknown. Its constants are shown where the best family has them.
+    """
+    figure = style.new_figure(style.PAGE, 0.6 * style.COLUMN)
+    bars, constants = figure.subplots(1, 2)
+    judged = {name: fit for name, fit in found["families"].items() if "held_out_loss" in fit}
+    order = sorted(judged, key=lambda name: judged[name]["score"], reverse=True)
+    as_good = {found["family"]: style.BLACK} | dict.fromkeys(found["ties"], style.GREY)
+    losses = [judged[name]["held_out_loss"] for name in order]
+    bars.barh(order, losses, color=[as_good.get(name, style.LIGHT) for name in order])
+    given_up = [name for name in found["families"] if name not in judged]
+    title = f"given up: {', '.join(given_up)}" if given_up else "all families"
+    bars.set(xscale="log", xlabel="mean squared residual of held-out frames", title=title)
+
+    quantities = found["best"]["quantities"]
+    true = _true_values(truth) if truth else {}
+    for place, (name, entry) in enumerate(reversed(quantities.items())):
+        std = min(_BARS * entry["log_std"], _WIDEST * math.log(10))
+        reach = [[1 - math.exp(-std)], [math.exp(std) - 1]]
+        colour = style.BLACK if entry["determined"] else style.GREY
+        constants.errorbar([1], [place], xerr=reach, fmt="o", color=colour, capsize=2)
+        if name in true and true[name] > 0 and entry["value"] > 0:
+            constants.plot([true[name] / entry["value"]], [place], "x", color=style.SEQUENCE[0], zorder=3)
+    names = [f"{name} = {entry['value']:.3g}" for name, entry in quantities.items()]
+    constants.set_yticks(range(len(names)), names[::-1])
+    constants.set(xscale="log", xlabel="relative to what was found (cross: truth; grey: not determined)")
+    constants.axvline(1, color=style.LIGHT, zorder=0)
+    tied = f", tie with {', '.join(found['ties'])}" if found["ties"] else ""
+    constants.set_title(found["family"] + tied)
+    return figure
+
+
+def _true_values(truth: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """Constants and their combinations of a true law."""
+    values = {key: float(value) for part in truth.values() for key, value in part.items() if key != "name"}
+    return named_combinations(values) if {"E", "nu"} <= values.keys() else values

@@ -1,0 +1,536 @@
+"""The material in a video: the constants of every candidate family, and the family that predicts best.
+
+Each family is fitted by Levenberg-Marquardt through rollout and renderer: a handful of constants, whose Jacobian is a
+handful of rollouts. The residuals of sharp images have a basin a pixel wide; averaged over large squares, and over
+smaller ones in turn, they lead there from afar. Constants are unbounded logarithms and logits. A family starts from the
+best of its own guess, the scene's prior and what simpler families have found; one that falls far behind is given up.
+
+Families are fitted to the first frames and judged by the last ones, so that more constants do not win by themselves.
+What the video says of the constants of a family is told by the jackknife over blocks of the image, in combinations:
+of a flow that never springs back, the flow stress is seen and the stiffness is not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.coupling.reconstruction import Reconstruction
+from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.fitting.frame_batches import frame_batches
+from neuma_lib.fitting.least_squares import Linearisation, in_blocks, jackknife, levenberg_marquardt
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.combinations import Values, named_combinations, physical
+from neuma_lib.mechanics.elasticity import ELASTICITIES
+from neuma_lib.mechanics.isotropic import POISSON, Constant
+from neuma_lib.mechanics.law import Law
+from neuma_lib.mechanics.plasticity import PLASTICITIES
+from neuma_lib.sim.model import COURANT_LIMIT, MPMModel
+from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State
+from neuma_lib.sim.total_deformation import every_step, total_deformation
+from neuma_lib.splatting.observation import Observation
+
+_PARTS = {"elasticity": ELASTICITIES, "plasticity": PLASTICITIES}
+_AT_THE_LIMIT = 0.999  # of the stiffness that the time step bears, since constants are rounded
+_LAST_GAIN = 0.1  # of `least_gain`, in the last round
+_UNBOUNDED = 12.0  # logits beyond it are the bound, to six digits
+_LEAST_LOSS = 1e-12  # below it, held-out images agree exactly
+
+
+class Family:
+    """A kind of material with constants to be found.
+
+    Attributes:
+        name: for results.
+        spec: elasticity and plasticity by name, with guesses of all constants.
+        constants: the names of the constants, in order.
+        guess: their values in ``spec``.
+    """
+
+    def __init__(self, name: str, spec: Mapping[str, Mapping[str, Any]]):
+        self.name, self.spec = name, spec
+        self._admitted: dict[str, tuple[str, Constant]] = {}
+        self.guess: Values = {}
+        analytic_law(spec, dt=1.0, name=name)  # names unknown parts and constants, and those out of range
+        for part, known in _PARTS.items():
+            given = spec.get(part) or {"name": "identity"}
+            for key, value in given.items():
+                if key != "name":
+                    self._admitted[key] = (part, known[given["name"]].constants[key])
+                    self.guess[key] = float(value)
+        self.constants = tuple(self.guess)
+        if "E" not in self.guess or "nu" not in self.guess:
+            raise InputError(f"identify.families.{name}: give guesses of E and nu in its elasticity")
+
+    def contains(self, other: Family) -> bool:
+        """Whether a limit of the constants makes this family the other one, which has fewer."""
+        flows = self.spec["plasticity"]["name"] in ("von_mises", "viscous_flow")
+        same = self.spec["elasticity"]["name"] == other.spec["elasticity"]["name"]
+        return flows and same and set(other.constants) < set(self.constants)
+
+    def unbounded(self, values: Values) -> np.ndarray:
+        """Logarithms, and logits of what has two bounds, shape (k,)."""
+        return np.array([self._to(key, values[key]) for key in self.constants])
+
+    def values(self, unbounded: np.ndarray, model: MPMModel, density: float) -> Values:
+        """Constants of unbounded ones, with no more stiffness than the time step bears at the density [kg/m^3]."""
+        values = self.bounded(unbounded)
+        unit = analytic_law(self.law_spec({**values, "E": 1.0}), model.dt)
+        stiffest = _AT_THE_LIMIT * (COURANT_LIMIT / model.courant(unit, density)) ** 2
+        return {**values, "E": min(values["E"], stiffest)}
+
+    def bounded(self, unbounded: np.ndarray) -> Values:
+        """Constants of unbounded ones, however stiff."""
+        return {key: self._back(key, u) for key, u in zip(self.constants, unbounded, strict=True)}
+
+    def law_spec(self, values: Values) -> dict[str, dict[str, Any]]:
+        """Specification of a law, as `analytic_law` takes it."""
+        spec = {part: {"name": given["name"]} for part, given in self.spec.items()}
+        for key, value in values.items():
+            spec[self._admitted[key][0]][key] = value
+        return spec
+
+    def with_guesses(self, known: Values) -> Values:
+        """Known constants, where the family has them and they lie within its bounds, and guesses for the others."""
+        usable = {key: known[key] for key in self.constants if key in known and self._inside(key, known[key])}
+        return {**self.guess, **usable}
+
+    def _bounds(self, key: str) -> tuple[float, float]:
+        constant = self._admitted[key][1]
+        return (0.0, POISSON.high) if key == "nu" else (constant.low, constant.high)
+
+    def _inside(self, key: str, value: float) -> bool:
+        low, high = self._bounds(key)
+        return low < value < high
+
+    def _to(self, key: str, value: float) -> float:
+        low, high = self._bounds(key)
+        if not low < value < high:
+            raise InputError(
+                f"identify.families.{self.name}: {key} = {value:g} must lie between {low:g} and {high:g}"
+            )
+        return math.log(value - low) - (math.log(high - value) if math.isfinite(high) else 0.0)
+
+    def _back(self, key: str, u: float) -> float:
+        low, high = self._bounds(key)
+        if math.isfinite(high):
+            return low + (high - low) / (1 + math.exp(-min(max(u, -_UNBOUNDED), _UNBOUNDED)))
+        return low + math.exp(u)
+
+
+@dataclass
+class FamilyFit:
+    """What was found for a family.
+
+    Attributes:
+        family: the candidate.
+        values: its constants; those of the last start if every rollout diverged.
+        loss: mean squared residual of the fitted frames, at the last squares it came to; infinite if all diverged.
+        held_out: the same of the frames that were held out, at the finest squares.
+        score: logarithm of ``held_out`` plus the penalty on constants; smaller is better.
+        covariance: of the unbounded constants, shape (k, k).
+        refined: whether it came to the finest squares.
+        rollouts: simulations that it took.
+        steps: accepted Levenberg-Marquardt steps.
+    """
+
+    family: Family
+    values: Values
+    loss: float = math.inf
+    held_out: float = math.inf
+    score: float = math.inf
+    covariance: np.ndarray | None = None
+    refined: bool = False
+    rollouts: int = 0
+    steps: int = 0
+
+    def log_covariance(self, of: Callable[[Values], Values]) -> tuple[list[str], np.ndarray]:
+        """Names (m,) and covariance (m, m) of the logarithms of positive functions of the constants, to first order."""
+        u, h = self.family.unbounded(self.values), 1e-4
+        names = list(of(self.values))
+
+        def logs(point):
+            return np.log(list(of(self.family.bounded(point)).values()))
+
+        slope = np.stack([(logs(u + h * e) - logs(u - h * e)) / (2 * h) for e in np.eye(len(u))], axis=1)
+        return names, slope @ self.covariance @ slope.T
+
+    def as_dict(self, settings: IdentifyConfig) -> dict[str, Any]:
+        """Plain numbers, for JSON."""
+        plain = {"law": self.family.law_spec(self.values), "rollouts": self.rollouts, "steps": self.steps}
+        if not math.isfinite(self.loss):
+            return {**plain, "diverged": True}
+        plain |= {"diverged": False, "refined": self.refined, "loss": self.loss}
+        if math.isfinite(self.score):
+            plain |= {"held_out_loss": self.held_out, "score": self.score}
+        if self.covariance is not None:
+            names, covariance = self.log_covariance(lambda values: values)
+            stds = np.sqrt(np.diag(covariance))
+            plain["constants"] = {
+                key: {"value": self.values[key], "log_std": float(std)}
+                for key, std in zip(names, stds, strict=True)
+            }
+            plain["quantities"] = {
+                key: {"value": value, "log_std": std, "determined": std < settings.determined}
+                for key, value, std in self.quantities(settings)
+            }
+            plain["combinations"] = self.combinations(settings)
+        return plain
+
+    def quantities(self, settings: IdentifyConfig) -> list[tuple[str, float, float]]:
+        """Name, value and standard deviation of the logarithm of the named combinations."""
+        names, covariance = self.log_covariance(named_combinations)
+        stds = np.sqrt(np.diag(covariance) + settings.model_std**2)
+        return list(zip(names, named_combinations(self.values).values(), stds.tolist(), strict=True))
+
+    def combinations(self, settings: IdentifyConfig) -> list[dict[str, Any]]:
+        """Products of powers of the physical constants whose errors are independent, the best determined first."""
+        names, covariance = self.log_covariance(physical)
+        variances, axes = np.linalg.eigh(covariance)
+        logs = np.log(list(physical(self.values).values()))
+        found = []
+        for variance, axis in zip(variances, axes.T, strict=True):
+            axis = axis * np.sign(axis[np.abs(axis).argmax()])
+            std = math.sqrt(max(variance, 0.0) + settings.model_std**2)
+            found.append({
+                "powers": dict(zip(names, axis.tolist(), strict=True)),
+                "log_value": float(axis @ logs),
+                "log_std": std,
+                "determined": std < settings.determined,
+            })  # fmt: skip
+        return found
+
+
+@dataclass
+class Identified:
+    """Result of `identify`.
+
+    Attributes:
+        best: the family that is chosen, fitted again to all frames.
+        ties: names of families that are as good, the best one not among them.
+        fits: all candidates as they were judged, by name.
+        frames: steps of the frames that were fitted.
+        held_out: steps of the frames that were held out.
+    """
+
+    best: FamilyFit
+    ties: list[str]
+    fits: dict[str, FamilyFit]
+    frames: tuple[int, ...]
+    held_out: tuple[int, ...]
+    settings: IdentifyConfig = field(repr=False)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers, for JSON; ``law`` is what `analytic_law` takes."""
+        return {
+            "family": self.best.family.name,
+            "ties": self.ties,
+            "law": self.best.family.law_spec(self.best.values),
+            "says": self.summary(),
+            "best": self.best.as_dict(self.settings),
+            "families": {name: fit.as_dict(self.settings) for name, fit in self.fits.items()},
+            "frames": list(self.frames),
+            "held_out_frames": list(self.held_out),
+            "rollouts": self.best.rollouts + sum(fit.rollouts for fit in self.fits.values()),
+        }
+
+    def summary(self) -> str:
+        """One line for people: the family, its constants, and what is determined."""
+        fit = self.best
+        tied = f" (tie with {', '.join(self.ties)})" if self.ties else ""
+        values = ", ".join(f"{key} = {value:.4g}" for key, value in fit.values.items())
+        sure = {key: std < self.settings.determined for key, _, std in fit.quantities(self.settings)}
+        lists = [
+            f"{'determined' if wanted else 'not determined'}: {', '.join(names)}"
+            for wanted in (True, False)
+            if (names := [key for key, found in sure.items() if found == wanted])
+        ]
+        return f"{fit.family.name}{tied}: {values}; {'; '.join(lists)}"
+
+
+def identify(
+    model: MPMModel,
+    start: State,
+    body: Reconstruction,
+    observation: Observation,
+    settings: IdentifyConfig,
+    stock: Mapping[str, Mapping[str, Any]] | None = None,
+    progress: Callable[[int, int, float], None] | None = None,
+    log: Callable[[str], None] = lambda text: None,
+) -> Identified:
+    """Find the family and the constants of the material that a video shows.
+
+    Args:
+        model: simulator constants.
+        start: the body's particles with their initial motion.
+        body: reconstructed particles and Gaussians.
+        observation: the video; its views are those of the settings.
+        settings: candidates and hyper-parameters.
+        stock: specification of the law that the scene's prior was trained on: another start; None if unknown.
+        progress: called with (rounds done, rounds, mean squared residual).
+        log: receives a line for every family.
+
+    Raises:
+        InputError: fewer than four frames, no family, or one with unknown parts.
+        NonFiniteError: every family diverges from every start.
+    """
+    if len(observation.frames) < 4:
+        raise InputError("identify needs at least four frames of the training view, to fit and to judge by")
+    if not settings.families:
+        raise InputError("identify.families names no candidate: give at least one elasticity with E and nu")
+    families = [Family(name, law.plain()) for name, law in settings.families.items()]
+    families.sort(key=lambda family: len(family.constants))  # simpler ones give starts to the others
+    seen = observation.select(_spread(len(observation.frames), settings.frames))
+    fitted = min(len(seen.frames) - 1, max(2, round((1 - settings.held_out) * len(seen.frames))))
+    video = _Video(model, start, body, seen, settings)
+    stock_values = _constants(stock) if stock else {}
+    running: list[_Run] = []
+    rounds = len(settings.squares)
+    for family in families:
+        run = _Run(family, video, fitted, settings)
+        run.begin([family.with_guesses(values) for values in ({}, stock_values, *_found(running, family))])
+        running.append(run)
+    total = rounds * len(families)
+    for level in range(1, rounds):
+        if not any(run.alive for run in running):
+            break
+        least = min(run.fit.cost for run in running if run.alive)
+        for done, run in enumerate(running):
+            if run.alive and run.fit.cost <= settings.give_up * least:
+                run.refine(level)
+                if progress:
+                    progress(level * len(families) + done + 1, total, run.loss)
+            else:
+                run.alive = False
+    fits = {run.family.name: run.judged() for run in running}
+    for name, fit in fits.items():
+        log(
+            f"{name}: loss {fit.loss:.3e}, held out {fit.held_out:.3e}, {fit.rollouts} rollouts, "
+            + ", ".join(f"{key} {value:.4g}" for key, value in fit.values.items())
+        )
+    chosen, ties = _choice(list(fits.values()), settings)
+    final = _Run(chosen.family, video, len(seen.frames), settings)
+    final.begin([chosen.values], level=rounds - 1)
+    return Identified(final.judged(), ties, fits, seen.frames[:fitted], seen.frames[fitted:], settings)
+
+
+def _found(running: Sequence[_Run], family: Family) -> list[Values]:
+    """Constants that other families give to start from: those of the best one, and of the largest that it contains."""
+    alive = [run for run in running if run.alive]
+    inner = [run for run in alive if family.contains(run.family)]
+    size = max((len(run.family.constants) for run in inner), default=0)
+    best = sorted(alive, key=lambda run: run.fit.cost)[:1]
+    return [run.values for run in [*best, *(run for run in inner if len(run.family.constants) == size)]]
+
+
+def _choice(fits: Sequence[FamilyFit], settings: IdentifyConfig) -> tuple[FamilyFit, list[str]]:
+    """The family of the least score, and the names of those that are as good.
+
+    A family that contains the chosen one is no rival: its further constants gained nothing.
+    """
+    best = min(fits, key=lambda fit: fit.score)
+    if not math.isfinite(best.score):
+        raise NonFiniteError("identify", "every candidate diverges: give softer guesses in identify.families")
+    return best, [
+        fit.family.name
+        for fit in fits
+        if fit is not best and fit.score - best.score < settings.tie and not fit.family.contains(best.family)
+    ]
+
+
+def _constants(spec: Mapping[str, Mapping[str, Any]]) -> Values:
+    """All constants of a law's specification."""
+    return {key: float(value) for part in spec.values() for key, value in part.items() if key != "name"}
+
+
+def _spread(count: int, most: int) -> list[int]:
+    """At most `most` of `count` frames, evenly spread, first and last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
+
+
+class _Video:
+    """Simulated minus observed images, averaged over the finest squares, of laws."""
+
+    def __init__(
+        self, model: MPMModel, start: State, body: Reconstruction, seen: Observation, settings: IdentifyConfig
+    ):
+        self.model, self.start, self.frames = model, start, seen.frames
+        self.density = float(start.density.min())
+        self._total = settings.covariance_from == "total"
+        self._renderer = body.particle_gs(seen.cameras)
+        width = seen.cameras.width
+        sizes = [max(1, round(width / across)) for across in settings.squares]
+        self.finest = sizes[-1]
+        self.sizes = [max(1, round(size / self.finest)) for size in sizes]
+        """Edge of each round's squares in squares of the finest ones."""
+        parts = frame_batches(len(seen.frames), self._renderer.frames_per_batch)
+        self._observed = torch.cat([averaged(seen.colours(part), self.finest) for part in parts])
+
+    def residual(self, spec: Mapping[str, Mapping[str, Any]], count: int) -> Tensor | None:
+        """Residuals (count, V, H', W', 3) of the first frames; None if the rollout diverges."""
+        frames = self.frames[:count]
+        law = analytic_law(spec, self.model.dt).to(self.start.x.device)
+        try:
+            with torch.no_grad():
+                x, F = self._path(law, frames)
+                images = [
+                    averaged(self._renderer(x[part], F[part]), self.finest)
+                    for part in frame_batches(count, self._renderer.frames_per_batch)
+                ]
+        except NonFiniteError:
+            return None
+        residual = torch.cat(images) - self._observed[:count]
+        return residual if bool(residual.isfinite().all()) else None
+
+    def _path(self, law: Law, frames: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+        wanted = every_step(frames) if self._total else frames
+        path = rollout(self.model, law, self.start, steps=frames[-1], frames=wanted)
+        path = total_deformation(path, self.model.dt, frames) if self._total else path
+        return path.x, path.F
+
+
+def averaged(images: Tensor, size: int) -> Tensor:
+    """Images (T, V, H, W, C) averaged over squares of ``size`` pixels, those at the far edges over what is there."""
+    if size == 1:
+        return images
+    T, V = images.shape[:2]
+    flat = images.flatten(0, 1).movedim(-1, 1)
+    pooled = torch.nn.functional.avg_pool2d(flat, size, ceil_mode=True, count_include_pad=False)
+    return pooled.movedim(1, -1).unflatten(0, (T, V))
+
+
+class _Run:
+    """The fit of one family to the first frames; residuals and Jacobians serve all sizes of squares."""
+
+    def __init__(self, family: Family, video: _Video, count: int, settings: IdentifyConfig):
+        self.family, self.video, self.count, self.settings = family, video, count, settings
+        self.alive, self.refined, self.rollouts, self.steps = False, False, 0, 0
+        self.fit: Linearisation | None = None
+        self._origin, self._u, self._size = np.zeros(0), np.zeros(0), 1
+        self._images: dict[bytes, Tensor | None] = {}
+        self._columns: dict[bytes, list[Tensor]] = {}
+
+    @property
+    def values(self) -> Values:
+        return self._values(self._u)
+
+    @property
+    def loss(self) -> float:
+        """Mean squared residual at the present squares; infinite if nothing was simulated."""
+        return self.fit.rms**2 if self.fit else math.inf
+
+    def begin(self, starts: Sequence[Values], level: int = 0) -> None:
+        """Fit from the best of some starts, in a round."""
+        self._size = self.video.sizes[level]
+        tried = {tuple(values.values()): values for values in starts}
+        best, here = math.inf, np.zeros(len(self.family.constants))
+        for values in tried.values():
+            self._origin = self.family.unbounded(values)
+            residual = self._simulate(here)
+            if residual is not None and (cost := self._cost(residual)) < best:
+                best, origin, self._images = cost, self._origin, {here.tobytes(): residual}
+        self._u, self.alive = here, math.isfinite(best)
+        if self.alive:
+            self._origin = origin
+            self.refine(level)
+
+    def refine(self, level: int) -> None:
+        """Go on with a round's squares."""
+        self._size, last = self.video.sizes[level], level == len(self.video.sizes) - 1
+        self._u, self.fit, steps = levenberg_marquardt(
+            self,
+            self._u,
+            list(range(len(self._u))),
+            self._held,
+            self.settings.least_gain * (_LAST_GAIN if last else 1.0),
+            self.settings.iterations,
+            longest=self.settings.longest_step,
+        )
+        self.steps += steps
+        self.refined = last
+
+    def judged(self) -> FamilyFit:
+        """What was found, judged by the frames that were held out, if any."""
+        found = FamilyFit(self.family, self.values, self.loss, refined=self.refined, steps=self.steps)
+        if self.fit is not None and self.refined:
+            P = self._held(self.fit)
+            inverse = np.linalg.pinv(self.fit.curvature + P)
+            by_prior = inverse @ P * self.settings.spread
+            found.covariance = jackknife(self.fit, P) + by_prior @ by_prior.T
+            if self.count < len(self.video.frames):
+                found.held_out = self._held_out()
+                found.score = math.log(max(found.held_out, _LEAST_LOSS)) + self.settings.penalty * len(
+                    self._u
+                )
+        found.rollouts = self.rollouts
+        return found
+
+    def cost(self, unknowns: np.ndarray) -> float:
+        """Sum of squared residuals, infinite if the rollout diverges; unknowns are relative to the start."""
+        residual = self._residual(unknowns)
+        return math.inf if residual is None else self._cost(residual)
+
+    def _cost(self, residual: Tensor) -> float:
+        return float(self._seen(residual).square().sum(dtype=torch.float64))
+
+    def linearise(self, unknowns: np.ndarray, free: Sequence[int]) -> Linearisation:
+        """Sums of the residuals and of their forward differences."""
+        residual = self._residual(unknowns)
+        key = unknowns.tobytes()
+        self._images = {key: residual}  # where the fit stands; the next size of squares begins here
+        if key not in self._columns:
+            self._columns = {key: [self._column(unknowns, residual, k) for k in free]}
+        r = self._seen(residual)
+        columns = torch.stack([in_blocks(self._seen(c)) for c in self._columns[key]], dim=-1).double()
+        blocks = in_blocks(r).double()
+        cost = self._cost(residual)
+        return Linearisation(
+            (columns.mT @ columns).cpu().numpy(),
+            (columns.mT @ blocks[..., None])[..., 0].cpu().numpy(),
+            cost,
+            math.sqrt(cost / r.numel()),
+        )
+
+    def _column(self, unknowns: np.ndarray, residual: Tensor, k: int) -> Tensor:
+        """Forward difference; backward where there is no forward: a divergence, or the stiffest that dt bears."""
+        here = self._values(unknowns)
+        for h in (self.settings.difference, -self.settings.difference):
+            moved = unknowns + h * np.eye(len(unknowns))[k]
+            if self._values(moved) != here and (there := self._simulate(moved)) is not None:
+                return (there - residual) / h
+        return torch.zeros_like(residual)
+
+    def _held(self, fit: Linearisation) -> np.ndarray:
+        """Curvature that holds every constant at its start +- `spread`."""
+        return np.eye(len(self._origin)) * fit.block_cost / self.settings.spread**2
+
+    def _values(self, unknowns: np.ndarray) -> Values:
+        return self.family.values(self._origin + unknowns, self.video.model, self.video.density)
+
+    def _residual(self, unknowns: np.ndarray) -> Tensor | None:
+        key = unknowns.tobytes()
+        if key not in self._images:
+            # What was tried before is not accepted and never comes back.
+            self._images = dict([*list(self._images.items())[:1], (key, self._simulate(unknowns))])
+        return self._images[key]
+
+    def _simulate(self, unknowns: np.ndarray) -> Tensor | None:
+        self.rollouts += 1
+        return self.video.residual(self.family.law_spec(self._values(unknowns)), self.count)
+
+    def _seen(self, residual: Tensor) -> Tensor:
+        return averaged(residual, self._size)
+
+    def _held_out(self) -> float:
+        """Mean squared residual of the frames after those that are fitted; infinite if the rollout diverges there."""
+        self.rollouts += 1
+        residual = self.video.residual(self.family.law_spec(self.values), len(self.video.frames))
+        return math.inf if residual is None else float(residual[self.count :].double().square().mean())

@@ -1,0 +1,230 @@
+"""Family and constants found in a video whose truth is known: one of the candidates, as seen, and as uncertain."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from grounding_scene import MODEL, ball, observe
+
+from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.config.laws import LawConfig
+from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.evaluation.identified_page import identified_page
+from neuma_lib.fitting.identify import Family, FamilyFit, _choice, averaged, identify
+from neuma_lib.fitting.least_squares import Linearisation, jackknife, levenberg_marquardt
+from neuma_lib.io.files import write_json
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.combinations import named_combinations
+from neuma_lib.sim.model import COURANT_LIMIT
+from neuma_lib.splatting.observation import Observation
+
+V0 = (0.5, -1.5, 0.0)
+FRAMES = tuple(range(0, 181, 12))
+SQUARES = (4, 8, 32)
+DENSITY = 1000.0
+
+
+def law(elasticity: str, plasticity: str = "identity", E: float = 6e4, nu: float = 0.3, **constants) -> dict:
+    return {
+        "elasticity": {"name": elasticity, "E": E, "nu": nu},
+        "plasticity": {"name": plasticity, **constants},
+    }
+
+
+ELASTIC = law("hencky")
+PLASTIC = law("hencky", "von_mises", yield_stress=4e3)
+FLUID = law("hencky", "viscous_flow", viscosity=60)
+
+
+def settings(families: dict, **options) -> IdentifyConfig:
+    families = {name: LawConfig(**spec) for name, spec in families.items()}
+    return IdentifyConfig(families=families, squares=SQUARES, **options)
+
+
+def found_in(spec: dict, families: dict, noise=None, **options):
+    """What is identified in a video of the ball under a law."""
+    body = ball()
+    seen = observe(body, V0, FRAMES, spec)
+    if noise is not None:
+        seen = Observation(seen.frames, seen.images + noise(seen.images), seen.cameras)
+    return identify(
+        MODEL, body.state(V0), body, seen, settings(families, covariance_from="elastic", **options)
+    )
+
+
+def test_constants_and_family_of_the_truth_are_found():
+    """No noise and the truth among the candidates: constants to a percent, from four times too soft."""
+    families = {
+        "von_mises": PLASTIC | {"elasticity": {"name": "hencky", "E": 6e4, "nu": 0.3}},
+        "hencky": ELASTIC,
+    }
+    truth = law("hencky", E=1.5e4, nu=0.35)
+    found = found_in(truth, families)
+    assert found.best.family.name == "hencky" and found.ties == []
+    assert found.best.values["E"] == pytest.approx(1.5e4, rel=0.01)
+    assert found.best.values["nu"] == pytest.approx(0.35, abs=0.01)
+    assert found.frames + found.held_out == FRAMES and len(found.held_out) == 4
+    assert found.as_dict()["law"]["plasticity"] == {"name": "identity"}
+
+
+def test_a_plastic_body_is_no_elastic_one_and_is_pictured(tmp_path):
+    truth = law("hencky", "von_mises", E=6e4, nu=0.3, yield_stress=2e3)
+    found = found_in(truth, {"hencky": ELASTIC, "von_mises": PLASTIC})
+    assert found.best.family.name == "von_mises" and "hencky" not in found.ties
+    assert found.best.values["yield_stress"] == pytest.approx(2e3, rel=0.03)
+    content = found.as_dict()
+    write_json(tmp_path / "identified.json", content)  # refuses what is no number
+    quantities = content["best"]["quantities"]
+    assert quantities["yield_stress"]["determined"] and "yield_stress" in content["says"]
+    figure = identified_page(content, truth)
+    assert len(figure.axes) == 2 and len(figure.axes[1].get_yticklabels()) == len(quantities)
+
+
+def test_uncertainty_covers_the_error_of_patches_that_last():
+    """Patches of 8 px that stay over all frames, as a wrong texture does: truth within three standard deviations."""
+    generator = torch.Generator().manual_seed(3)
+
+    def patches(images):
+        T, V, H, W, C = images.shape
+        coarse = torch.randn(V, H // 8, W // 8, C, generator=generator, dtype=images.dtype)
+        shown = (images < 0.99).any(-1, keepdim=True)  # where the body is
+        return 0.05 * coarse.repeat_interleave(8, 1).repeat_interleave(8, 2) * shown
+
+    found = found_in(law("hencky", E=4e4, nu=0.3), {"hencky": ELASTIC}, noise=patches)
+    true = named_combinations({"E": 4e4, "nu": 0.3})
+    for name, value, std in found.best.quantities(found.settings):
+        assert abs(math.log(value / true[name])) < 3 * std, name
+        assert std >= found.settings.model_std
+
+
+def test_a_family_that_diverges_loses_and_alone_is_an_error(monkeypatch):
+    import neuma_lib.fitting.identify as module
+
+    def rollout(model, law, *args, **options):
+        if type(law.elasticity).__name__ == "NeoHookean":
+            raise NonFiniteError("rollout", "particle 0 is not finite")
+        return real(model, law, *args, **options)
+
+    real = module.rollout
+    monkeypatch.setattr(module, "rollout", rollout)
+    truth, wild = law("hencky", E=5e4), law("neo_hookean")
+    found = found_in(truth, {"hencky": ELASTIC, "neo_hookean": wild})
+    assert found.best.family.name == "hencky" and found.as_dict()["families"]["neo_hookean"]["diverged"]
+    with pytest.raises(NonFiniteError, match="softer"):
+        found_in(truth, {"neo_hookean": wild})
+
+
+def fits(**scores: float) -> list[FamilyFit]:
+    specs = {
+        "hencky": ELASTIC,
+        "von_mises": PLASTIC,
+        "drucker_prager": law("hencky", "drucker_prager", friction_angle=30),
+        "neo_hookean": law("neo_hookean"),
+    }
+    return [FamilyFit(Family(name, specs[name]), {}, score=score) for name, score in scores.items()]
+
+
+def test_near_scores_are_ties_unless_one_family_contains_the_chosen_one():
+    options = settings({"hencky": ELASTIC}, tie=0.1)
+    best, ties = _choice(fits(hencky=-8.0, von_mises=-7.95, neo_hookean=-7.95, drucker_prager=-7.8), options)
+    assert best.family.name == "hencky" and ties == ["neo_hookean"]
+    best, ties = _choice(fits(hencky=-7.95, von_mises=-8.0), options)
+    assert best.family.name == "von_mises" and ties == ["hencky"]
+    with pytest.raises(NonFiniteError, match="every candidate"):
+        _choice(fits(hencky=math.inf), options)
+
+
+def test_nesting_of_families():
+    bingham = Family("bingham", law("hencky", "viscous_flow", viscosity=50, yield_stress=1e3))
+    elastic, plastic, fluid = (Family("x", spec) for spec in (ELASTIC, PLASTIC, FLUID))
+    grains = Family("x", law("hencky", "drucker_prager", friction_angle=30))
+    assert bingham.contains(plastic) and bingham.contains(fluid) and bingham.contains(elastic)
+    assert plastic.contains(elastic) and not plastic.contains(fluid) and not plastic.contains(plastic)
+    assert not grains.contains(elastic), "sand bears no tension, whatever its friction"
+    assert not plastic.contains(Family("x", law("neo_hookean")))
+
+
+def test_unbounded_constants_return_and_stay_within_bounds_and_the_time_step():
+    family = Family("grains", law("hencky", "drucker_prager", E=3e4, nu=0.2, friction_angle=40))
+    values = {"E": 3e4, "nu": 0.2, "friction_angle": 40.0}
+    assert family.bounded(family.unbounded(values)) == pytest.approx(values, rel=1e-12)
+    for far in (-100.0, 100.0):
+        values = family.values(np.array([abs(far), far, far]), MODEL, DENSITY)
+        assert 0 < values["nu"] < 0.5 and 0 < values["friction_angle"] < 90
+        number = MODEL.check_courant(analytic_law(family.law_spec(values)), DENSITY)
+        assert number == pytest.approx(COURANT_LIMIT, rel=1e-3) or values["E"] < 1e-3
+
+
+def test_a_stock_law_gives_what_the_family_has():
+    family = Family("plastic", PLASTIC)
+    known = {"E": 1e5, "nu": -0.2, "friction_angle": 25.0}
+    assert family.with_guesses(known) == {"E": 1e5, "nu": 0.3, "yield_stress": 4e3}
+
+
+def test_combinations_are_those_of_the_covariance():
+    """Of a body whose E is open and nu sure, the ratio of both moduli is determined and their product is not."""
+    family = Family("hencky", ELASTIC)
+    fit = FamilyFit(family, {"E": 6e4, "nu": 0.3}, covariance=np.diag([0.25, 1e-12]))
+    options = settings({"hencky": ELASTIC}, model_std=0.02)
+    first, second = fit.combinations(options)
+    assert first["determined"] and not second["determined"]
+    assert second["powers"]["G"] == pytest.approx(second["powers"]["K"], abs=1e-4)  # log E moves both alike
+    assert second["log_std"] == pytest.approx(math.sqrt(2) * 0.5, rel=1e-2)
+    (_, E, std), *_ = fit.quantities(options)
+    assert E == 6e4 and std == pytest.approx(0.5, rel=1e-2)
+
+
+def test_images_are_averaged_over_squares():
+    images = torch.arange(2 * 3 * 5 * 5 * 3, dtype=torch.float64).reshape(2, 3, 5, 5, 3)
+    blurred = averaged(images, 2)
+    assert blurred.shape == (2, 3, 3, 3, 3)
+    torch.testing.assert_close(blurred[1, 2, 0, 1], images[1, 2, :2, 2:4].mean((0, 1)))
+    torch.testing.assert_close(blurred[1, 2, 2, 2], images[1, 2, 4, 4])  # the corner that is there
+    assert averaged(images, 1) is images
+
+
+def test_few_frames_and_unknown_constants_are_named():
+    body = ball()
+    with pytest.raises(InputError, match="four frames"):
+        identify(MODEL, body.state(V0), body, observe(body, V0, (0, 4, 8)), settings({"hencky": ELASTIC}))
+    with pytest.raises(InputError, match="no constant stiffness"):
+        Family("x", {"elasticity": {"name": "hencky", "E": 1e4, "nu": 0.3, "stiffness": 2}})
+    with pytest.raises(InputError, match="E and nu"):
+        Family("x", law("hencky", "von_mises", yield_stress=0.0) | {"elasticity": {"name": "fluid"}})
+
+
+class Line:
+    """Residuals a u - b of one frame, with sign changes of u beyond a wall."""
+
+    def __init__(self, a: np.ndarray, b: np.ndarray, wall: float = math.inf):
+        self.a, self.b, self.wall = a, b, wall
+
+    def cost(self, u):
+        return math.inf if u[0] > self.wall else float(((self.a @ u - self.b) ** 2).sum())
+
+    def linearise(self, u, free):
+        r = self.a @ u - self.b
+        columns = self.a.reshape(16, -1, self.a.shape[1])
+        scores = (columns.transpose(0, 2, 1) @ r.reshape(16, -1, 1))[..., 0]
+        return Linearisation(
+            columns.transpose(0, 2, 1) @ columns, scores, float(r @ r), float(np.sqrt(r @ r))
+        )
+
+
+def test_least_squares_of_a_line_and_its_jackknife():
+    """Independent noise: the jackknife's variance is that of linear regression, sigma^2 (A^T A)^-1, and infinite cost
+    is a wall that is not passed."""
+    generator = np.random.default_rng(0)
+    a, errors, stds = generator.standard_normal((1600, 2)), [], []
+    none = lambda fit: np.zeros((2, 2))  # noqa: E731
+    for _ in range(20):
+        b = a @ [2.0, -1.0] + 0.3 * generator.standard_normal(1600)
+        u, fit, _ = levenberg_marquardt(Line(a, b), np.zeros(2), [0, 1], none, 1e-12, 20)
+        errors.append(u - [2.0, -1.0])
+        stds.append(np.sqrt(np.diag(jackknife(fit, none(fit)))))
+    expected = 0.3 * np.sqrt(np.diag(np.linalg.inv(a.T @ a)))
+    np.testing.assert_allclose(np.mean(stds, axis=0), expected, rtol=0.25)
+    assert np.abs(errors).max() < 4 * expected.max()
+    u, *_ = levenberg_marquardt(Line(a, b, wall=1.5), np.zeros(2), [0, 1], none, 1e-12, 40)
+    assert 1.0 < u[0] <= 1.5

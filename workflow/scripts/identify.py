@@ -1,0 +1,28 @@
+"""Find the family and the constants of the material in the video."""
+
+import torch
+
+from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.device import choose_device
+from neuma_lib.fitting.identify import identify
+from neuma_lib.io.files import write_json
+from neuma_lib.io.images import load_observation
+from neuma_lib.io.particles import load_body, thrown
+from neuma_lib.sim.model import MPMModel
+from workflow.stage import run_script
+
+
+def main(inputs, output, params, run) -> None:
+    settings = IdentifyConfig(**params.identify)
+    device = choose_device(params.device)
+    body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density)
+    body = body.to(torch.float32, device)
+    video = load_observation(inputs.transforms, settings.views).to(torch.float32, device)
+    start = thrown(body, inputs.velocity)
+    model = MPMModel(**params.simulation)
+    found = identify(model, start, body, video, settings, params.stock, run.progress, run.say)
+    write_json(output.identified, found.as_dict())
+    run.say(found.summary())
+
+
+run_script(main, snakemake)
