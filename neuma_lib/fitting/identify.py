@@ -67,8 +67,10 @@ class Family:
                     self._admitted[key] = (part, known[given["name"]].constants[key])
                     self.guess[key] = float(value)
         self.constants = tuple(self.guess)
-        if "E" not in self.guess or "nu" not in self.guess:
-            raise InputError(f"identify.families.{name}: give guesses of E and nu in its elasticity")
+        if own := {"E", "nu", "dt"} & set(spec.get("plasticity") or ()):
+            raise InputError(
+                f"identify.families.{name}.plasticity: leave out {', '.join(sorted(own))}, which elasticity and scene say"
+            )
 
     def contains(self, other: Family) -> bool:
         """Whether a limit of the constants makes this family the other one, which has fewer."""
@@ -500,9 +502,10 @@ class _Run:
         )
 
     def _column(self, unknowns: np.ndarray, residual: Tensor, k: int) -> Tensor:
-        """Forward difference; backward where there is no forward: a divergence, or the stiffest that dt bears."""
-        here = self._values(unknowns)
-        for h in (self.settings.difference, -self.settings.difference):
+        """Forward difference; backward where there is no forward: a divergence, or the stiffest that dt bears, which
+        the last step may have passed."""
+        here, h = self._values(unknowns), self.settings.difference
+        for h in (h, -h, -h - self.settings.longest_step):
             moved = unknowns + h * np.eye(len(unknowns))[k]
             if self._values(moved) != here and (there := self._simulate(moved)) is not None:
                 return (there - residual) / h

@@ -20,7 +20,7 @@ from neuma_lib.sim.model import COURANT_LIMIT
 from neuma_lib.splatting.observation import Observation
 
 V0 = (0.5, -1.5, 0.0)
-FRAMES = tuple(range(0, 181, 12))
+FRAMES = tuple(range(0, 121, 8))
 SQUARES = (4, 8, 32)
 DENSITY = 1000.0
 
@@ -42,28 +42,28 @@ def settings(families: dict, **options) -> IdentifyConfig:
     return IdentifyConfig(families=families, squares=SQUARES, **options)
 
 
-def found_in(spec: dict, families: dict, noise=None, **options):
-    """What is identified in a video of the ball under a law."""
+def pixel_noise(images: torch.Tensor) -> torch.Tensor:
+    return 0.01 * torch.randn(images.shape, generator=torch.Generator().manual_seed(5), dtype=images.dtype)
+
+
+def found_in(spec: dict, families: dict, noise=pixel_noise, **options):
+    """What is identified in a noisy video of the ball under a law."""
     body = ball()
     seen = observe(body, V0, FRAMES, spec)
-    if noise is not None:
-        seen = Observation(seen.frames, seen.images + noise(seen.images), seen.cameras)
+    seen = Observation(seen.frames, seen.images + noise(seen.images), seen.cameras)
     return identify(
         MODEL, body.state(V0), body, seen, settings(families, covariance_from="elastic", **options)
     )
 
 
 def test_constants_and_family_of_the_truth_are_found():
-    """No noise and the truth among the candidates: constants to a percent, from four times too soft."""
-    families = {
-        "von_mises": PLASTIC | {"elasticity": {"name": "hencky", "E": 6e4, "nu": 0.3}},
-        "hencky": ELASTIC,
-    }
+    """The truth among the candidates, beside one that contains it: constants to 3 %, from four times too stiff."""
+    families = {"von_mises": PLASTIC, "hencky": ELASTIC}
     truth = law("hencky", E=1.5e4, nu=0.35)
     found = found_in(truth, families)
     assert found.best.family.name == "hencky" and found.ties == []
-    assert found.best.values["E"] == pytest.approx(1.5e4, rel=0.01)
-    assert found.best.values["nu"] == pytest.approx(0.35, abs=0.01)
+    assert found.best.values["E"] == pytest.approx(1.5e4, rel=0.03)
+    assert found.best.values["nu"] == pytest.approx(0.35, abs=0.02)
     assert found.frames + found.held_out == FRAMES and len(found.held_out) == 4
     assert found.as_dict()["law"]["plasticity"] == {"name": "identity"}
 
@@ -190,8 +190,9 @@ def test_few_frames_and_unknown_constants_are_named():
         identify(MODEL, body.state(V0), body, observe(body, V0, (0, 4, 8)), settings({"hencky": ELASTIC}))
     with pytest.raises(InputError, match="no constant stiffness"):
         Family("x", {"elasticity": {"name": "hencky", "E": 1e4, "nu": 0.3, "stiffness": 2}})
-    with pytest.raises(InputError, match="E and nu"):
-        Family("x", law("hencky", "von_mises", yield_stress=0.0) | {"elasticity": {"name": "fluid"}})
+    both = {"name": "von_mises", "yield_stress": 1e3, "nu": 0.2}
+    with pytest.raises(InputError, match="leave out nu"):
+        Family("x", ELASTIC | {"plasticity": both})
 
 
 class Line:
