@@ -69,7 +69,7 @@ class Family:
         self.constants = tuple(self.guess)
         if own := {"E", "nu", "dt"} & set(spec.get("plasticity") or ()):
             raise InputError(
-                f"identify.families.{name}.plasticity: leave out {', '.join(sorted(own))}, which elasticity and scene say"
+                f"identify.families.{name}.plasticity: leave out {', '.join(sorted(own))}: elasticity and scene say it"
             )
 
     def contains(self, other: Family) -> bool:
@@ -504,8 +504,8 @@ class _Run:
     def _column(self, unknowns: np.ndarray, residual: Tensor, k: int) -> Tensor:
         """Forward difference; backward where there is no forward: a divergence, or the stiffest that dt bears, which
         the last step may have passed."""
-        here, h = self._values(unknowns), self.settings.difference
-        for h in (h, -h, -h - self.settings.longest_step):
+        here, step = self._values(unknowns), self.settings.difference
+        for h in (step, -step, -step - self.settings.longest_step):
             moved = unknowns + h * np.eye(len(unknowns))[k]
             if self._values(moved) != here and (there := self._simulate(moved)) is not None:
                 return (there - residual) / h
