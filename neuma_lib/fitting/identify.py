@@ -24,108 +24,20 @@ from torch import Tensor
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.frame_batches import frame_batches
 from neuma_lib.fitting.least_squares import Linearisation, in_blocks, jackknife, levenberg_marquardt
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import Values, named_combinations, physical
-from neuma_lib.mechanics.elasticity import ELASTICITIES
-from neuma_lib.mechanics.isotropic import POISSON, Constant
 from neuma_lib.mechanics.law import Law
-from neuma_lib.mechanics.plasticity import PLASTICITIES
-from neuma_lib.sim.model import COURANT_LIMIT, MPMModel
+from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from neuma_lib.sim.total_deformation import every_step, total_deformation
 from neuma_lib.splatting.observation import Observation
 
-_PARTS = {"elasticity": ELASTICITIES, "plasticity": PLASTICITIES}
-_AT_THE_LIMIT = 0.999  # of the stiffness that the time step bears, since constants are rounded
 _LAST_GAIN = 0.1  # of `least_gain`, in the last round
-_UNBOUNDED = 12.0  # logits beyond it are the bound, to six digits
 _LEAST_LOSS = 1e-12  # below it, held-out images agree exactly
-
-
-class Family:
-    """A kind of material with constants to be found.
-
-    Attributes:
-        name: for results.
-        spec: elasticity and plasticity by name, with guesses of all constants.
-        constants: the names of the constants, in order.
-        guess: their values in ``spec``.
-    """
-
-    def __init__(self, name: str, spec: Mapping[str, Mapping[str, Any]]):
-        self.name, self.spec = name, spec
-        self._admitted: dict[str, tuple[str, Constant]] = {}
-        self.guess: Values = {}
-        analytic_law(spec, dt=1.0, name=name)  # names unknown parts and constants, and those out of range
-        for part, known in _PARTS.items():
-            given = spec.get(part) or {"name": "identity"}
-            for key, value in given.items():
-                if key != "name":
-                    self._admitted[key] = (part, known[given["name"]].constants[key])
-                    self.guess[key] = float(value)
-        self.constants = tuple(self.guess)
-        if own := {"E", "nu", "dt"} & set(spec.get("plasticity") or ()):
-            raise InputError(
-                f"identify.families.{name}.plasticity: leave out {', '.join(sorted(own))}: elasticity and scene say it"
-            )
-
-    def contains(self, other: Family) -> bool:
-        """Whether a limit of the constants makes this family the other one, which has fewer."""
-        flows = self.spec["plasticity"]["name"] in ("von_mises", "viscous_flow")
-        same = self.spec["elasticity"]["name"] == other.spec["elasticity"]["name"]
-        return flows and same and set(other.constants) < set(self.constants)
-
-    def unbounded(self, values: Values) -> np.ndarray:
-        """Logarithms, and logits of what has two bounds, shape (k,)."""
-        return np.array([self._to(key, values[key]) for key in self.constants])
-
-    def values(self, unbounded: np.ndarray, model: MPMModel, density: float) -> Values:
-        """Constants of unbounded ones, with no more stiffness than the time step bears at the density [kg/m^3]."""
-        values = self.bounded(unbounded)
-        unit = analytic_law(self.law_spec({**values, "E": 1.0}), model.dt)
-        stiffest = _AT_THE_LIMIT * (COURANT_LIMIT / model.courant(unit, density)) ** 2
-        return {**values, "E": min(values["E"], stiffest)}
-
-    def bounded(self, unbounded: np.ndarray) -> Values:
-        """Constants of unbounded ones, however stiff."""
-        return {key: self._back(key, u) for key, u in zip(self.constants, unbounded, strict=True)}
-
-    def law_spec(self, values: Values) -> dict[str, dict[str, Any]]:
-        """Specification of a law, as `analytic_law` takes it."""
-        spec = {part: {"name": given["name"]} for part, given in self.spec.items()}
-        for key, value in values.items():
-            spec[self._admitted[key][0]][key] = value
-        return spec
-
-    def with_guesses(self, known: Values) -> Values:
-        """Known constants, where the family has them and they lie within its bounds, and guesses for the others."""
-        usable = {key: known[key] for key in self.constants if key in known and self._inside(key, known[key])}
-        return {**self.guess, **usable}
-
-    def _bounds(self, key: str) -> tuple[float, float]:
-        constant = self._admitted[key][1]
-        return (0.0, POISSON.high) if key == "nu" else (constant.low, constant.high)
-
-    def _inside(self, key: str, value: float) -> bool:
-        low, high = self._bounds(key)
-        return low < value < high
-
-    def _to(self, key: str, value: float) -> float:
-        low, high = self._bounds(key)
-        if not low < value < high:
-            raise InputError(
-                f"identify.families.{self.name}: {key} = {value:g} must lie between {low:g} and {high:g}"
-            )
-        return math.log(value - low) - (math.log(high - value) if math.isfinite(high) else 0.0)
-
-    def _back(self, key: str, u: float) -> float:
-        low, high = self._bounds(key)
-        if math.isfinite(high):
-            return low + (high - low) / (1 + math.exp(-min(max(u, -_UNBOUNDED), _UNBOUNDED)))
-        return low + math.exp(u)
 
 
 @dataclass

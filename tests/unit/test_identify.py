@@ -11,7 +11,8 @@ from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.laws import LawConfig
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.evaluation.identified_page import identified_page
-from neuma_lib.fitting.identify import Family, FamilyFit, _choice, averaged, identify
+from neuma_lib.fitting.families import Family
+from neuma_lib.fitting.identify import FamilyFit, _choice, averaged, identify
 from neuma_lib.fitting.least_squares import Linearisation, jackknife, levenberg_marquardt
 from neuma_lib.io.files import write_json
 from neuma_lib.mechanics.analytic import analytic_law
