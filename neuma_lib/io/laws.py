@@ -1,4 +1,8 @@
-"""Files of neural laws: priors (our own ``.safetensors``, the released NCLaw / NeuMA ``.pt``) and adaptors."""
+"""Files of trainable laws: priors (our own ``.safetensors``, the released NCLaw / NeuMA ``.pt``) and adaptors.
+
+A ``.safetensors`` whose metadata have :data:`STRUCTURED` holds a structured law, with its base's names and constants
+there; any other is a pair of NCLaw networks. Whoever loads a law need not know which.
+"""
 
 from __future__ import annotations
 
@@ -13,30 +17,56 @@ from torch import Tensor
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import existing, one_line
 from neuma_lib.io.weights import read_torch, read_weights, write_weights
-from neuma_lib.mechanics.neural import NeuralLaw, neural_law
+from neuma_lib.mechanics.adaptor import AdaptableLaw
+from neuma_lib.mechanics.neural import neural_law
+from neuma_lib.mechanics.structured import StructuredLaw, structured_law
+
+STRUCTURED = "structured"
 
 
-def load_prior(path: str | Path, device: torch.device | str = "cpu") -> NeuralLaw:
-    """Neural law from a file.
+def save_prior(path: str | Path, law: AdaptableLaw, metadata: Mapping[str, Any]) -> None:
+    """Write a law's merged weights and, for a structured law, what it corrects: a file for `load_prior`."""
+    own = {STRUCTURED: law.specification()} if isinstance(law, StructuredLaw) else {}
+    write_weights(path, law.prior_state(), {**metadata, **own})
+
+
+def load_prior(path: str | Path, device: torch.device | str = "cpu") -> AdaptableLaw:
+    """Law from a file.
 
     Args:
-        path: ``.safetensors`` with a law's merged weights (`NeuralLaw.prior_state`), or ``.pt``: a dict with
-            ``elasticity`` and ``plasticity``, each with the three weights of an NCLaw network.
+        path: ``.safetensors`` of `save_prior`, or ``.pt``: a dict with ``elasticity`` and ``plasticity``, each with the
+            three weights of an NCLaw network.
 
     Raises:
-        InputError: no such file, another format, missing weights or other shapes.
+        InputError: no such file, another format, missing weights or other shapes, a base that there is none of.
     """
     path = existing(path)
+    metadata: Mapping[str, Any] = {}
     if path.suffix == ".safetensors":
-        state, _ = read_weights(path)
+        state, metadata = read_weights(path)
     elif path.suffix in (".pt", ".pth"):
         state = _released(path)
     else:
         raise InputError(f"prior {path}: expected .safetensors or .pt")
     try:
-        return neural_law(state, name=path.stem).to(device)
+        if STRUCTURED in metadata:
+            law = structured_law(_specification(metadata[STRUCTURED]), state=state, name=path.stem)
+        else:
+            law = neural_law(state, name=path.stem)
+        return law.to(device)
     except InputError as error:
         raise InputError(f"prior {path}: {one_line(error)}") from None
+
+
+def _specification(found: Any) -> dict[str, Any]:
+    """The base of a structured law, as its file has it."""
+    parts = [found.get(part) for part in ("elasticity", "plasticity")] if isinstance(found, dict) else [None]
+    if not all(isinstance(part, dict) for part in parts):
+        raise InputError(f"its metadata {STRUCTURED} must have an elasticity and a plasticity")
+    for key, value in ((key, value) for part in parts for key, value in part.items() if key != "name"):
+        if type(value) not in (int, float) or not math.isfinite(value):
+            raise InputError(f"its constant {one_line(key)} must be a number, not {one_line(value)}")
+    return found
 
 
 def _released(path: Path) -> dict[str, Tensor]:
@@ -56,13 +86,13 @@ def _released(path: Path) -> dict[str, Tensor]:
 
 
 def save_adaptor(
-    path: str | Path, law: NeuralLaw, rank: int | None, alpha: float, metadata: Mapping[str, Any]
+    path: str | Path, law: AdaptableLaw, rank: int | None, alpha: float, metadata: Mapping[str, Any]
 ) -> None:
     """Write the tensors of a law's adaptor, with what is needed to attach them again."""
     write_weights(path, law.adaptor_state(), {"rank": rank, "alpha": alpha, **metadata})
 
 
-def load_law(prior: str | Path, adaptor: str | Path | None = None) -> NeuralLaw:
+def load_law(prior: str | Path, adaptor: str | Path | None = None) -> AdaptableLaw:
     """A prior, with a trained adaptor attached if one is given."""
     law = load_prior(prior)
     if adaptor is not None:

@@ -3,7 +3,8 @@
 Every analytic law here is isotropic: with F = U diag(sigma) V^T it is given by three principal values y(sigma), as a
 stress U diag(y) U^T or as a deformation U diag(y) V^T. Their adjoints need divided differences of y, which are finite
 at equal singular values; :func:`_apart` evaluates them without a branch by keeping the two values at least eps^(1/3)
-apart (error eps^(2/3), because the quotient is an even function of the distance).
+apart (error eps^(2/3), because the quotient is an even function of the distance). A law that has them in closed form,
+to round-off, calls :func:`coaxial_stress` and :func:`coaxial_deformation` instead.
 """
 
 from __future__ import annotations
@@ -20,6 +21,10 @@ from neuma_lib.mechanics.singular_values import away_from_zero, rotation_and_sin
 
 PrincipalFunction = Callable[[Tensor], Tensor]
 """Singular values (N, 3) -> principal values (N, 3), equivariant under permutations."""
+
+Quotients = Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
+"""Singular values (N, 3) -> for each pair of :data:`PAIRS` the divided difference (y_i - y_j) / (sigma_i - sigma_j),
+y_i + y_j and sigma_i + sigma_j, (N, 3 pairs) each."""
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
 
@@ -46,10 +51,20 @@ def _symmetric(pairs: Tensor) -> Tensor:
     return torch.stack([zero, a, b, a, zero, c, b, c, zero], dim=1).reshape(-1, 3, 3)
 
 
-def _decomposed(ctx, F: Tensor, function: PrincipalFunction) -> tuple[Tensor, Tensor, Tensor]:
-    """U, sigma, Vh of F, kept for backward together with the function."""
+def _moving_apart(function: PrincipalFunction) -> Quotients:
+    """The quotients of a function of which only values are known."""
+
+    def quotients(sigma):
+        s, y = _apart(sigma, function)
+        return (y[..., 0] - y[..., 1]) / (s[..., 0] - s[..., 1]), y.sum(-1), s.sum(-1)
+
+    return quotients
+
+
+def _decomposed(ctx, F: Tensor, quotients: Quotients) -> tuple[Tensor, Tensor, Tensor]:
+    """U, sigma, Vh of F, kept for backward together with the quotients."""
     parts = svd3(F)
-    ctx.function = function
+    ctx.quotients = quotients
     ctx.save_for_backward(*parts)
     return parts
 
@@ -58,8 +73,8 @@ class _Stress(torch.autograd.Function):
     """(F, y) -> U diag(y) U^T; the gradient to F is that of U at fixed y."""
 
     @staticmethod
-    def forward(ctx, F, y, function):
-        U, _, _ = _decomposed(ctx, F, function)
+    def forward(ctx, F, y, quotients):
+        U, _, _ = _decomposed(ctx, F, quotients)
         return (U * y[:, None]) @ U.mT
 
     @staticmethod
@@ -67,9 +82,8 @@ class _Stress(torch.autograd.Function):
     def backward(ctx, grad):
         U, sigma, Vh = ctx.saved_tensors
         G = U.mT @ grad @ U
-        s, y = _apart(sigma, ctx.function)
-        floor = torch.finfo(s.dtype).eps
-        quotient = (y[..., 0] - y[..., 1]) / ((s[..., 0] - s[..., 1]) * away_from_zero(s.sum(-1), floor))
+        quotient, _, total = ctx.quotients(sigma)
+        quotient = quotient / away_from_zero(total, torch.finfo(sigma.dtype).eps)
         K = _symmetric(quotient) * (G + G.mT) * sigma[:, None]
         return U @ K @ Vh, G.diagonal(dim1=1, dim2=2), None
 
@@ -78,8 +92,8 @@ class _Deformation(torch.autograd.Function):
     """(F, y) -> U diag(y) V^T, and F itself where y equals sigma; the gradient to F is that of U, V at fixed y."""
 
     @staticmethod
-    def forward(ctx, F, y, function):
-        U, sigma, Vh = _decomposed(ctx, F, function)
+    def forward(ctx, F, y, quotients):
+        U, sigma, Vh = _decomposed(ctx, F, quotients)
         unchanged = (y == sigma).all(dim=1)
         return torch.where(unchanged[:, None, None], F, (U * y[:, None]) @ Vh)
 
@@ -88,24 +102,33 @@ class _Deformation(torch.autograd.Function):
     def backward(ctx, grad):
         U, sigma, Vh = ctx.saved_tensors
         G = U.mT @ grad @ Vh.mT
-        s, y = _apart(sigma, ctx.function)
-        floor = torch.finfo(s.dtype).eps
-        stretch = _symmetric((y[..., 0] - y[..., 1]) / (s[..., 0] - s[..., 1]))
-        turn = _symmetric(y.sum(-1) / away_from_zero(s.sum(-1), floor))
+        quotient, y_total, total = ctx.quotients(sigma)
+        stretch = _symmetric(quotient)
+        turn = _symmetric(y_total / away_from_zero(total, torch.finfo(sigma.dtype).eps))
         K = 0.5 * stretch * (G + G.mT) + 0.5 * turn * (G - G.mT)
         return U @ K @ Vh, G.diagonal(dim1=1, dim2=2), None
+
+
+def coaxial_stress(F: Tensor, y: Tensor, quotients: Quotients) -> Tensor:
+    """U diag(y) U^T, (N, 3, 3), for principal values y (N, 3) of F, differentiable in F and y."""
+    return _Stress.apply(F, y, quotients)
+
+
+def coaxial_deformation(F: Tensor, y: Tensor, quotients: Quotients) -> Tensor:
+    """U diag(y) V^T, (N, 3, 3), differentiable likewise; exactly F where y equals the singular values."""
+    return _Deformation.apply(F, y, quotients)
 
 
 def isotropic_stress(F: Tensor, function: PrincipalFunction) -> Tensor:
     """U diag(y(sigma)) U^T, (N, 3, 3), differentiable in F and in what ``function`` closes over."""
     _, sigma = rotation_and_singular_values(F) if F.requires_grad else (None, svd3(F)[1])
-    return _Stress.apply(F, function(sigma), function)
+    return coaxial_stress(F, function(sigma), _moving_apart(function))
 
 
 def isotropic_deformation(F: Tensor, function: PrincipalFunction) -> Tensor:
     """U diag(y(sigma)) V^T, (N, 3, 3), differentiable likewise; exactly F where y(sigma) equals sigma."""
     _, sigma = rotation_and_singular_values(F) if F.requires_grad else (None, svd3(F)[1])
-    return _Deformation.apply(F, function(sigma), function)
+    return coaxial_deformation(F, function(sigma), _moving_apart(function))
 
 
 @dataclass(frozen=True)

@@ -18,14 +18,14 @@ import threading
 from collections.abc import Hashable
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import gelu, pad
 
 from neuma_lib.device import launch
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics import neural_fused
-from neuma_lib.mechanics.adaptor import Adaptor
-from neuma_lib.mechanics.law import Constitutive, Elasticity, Law, Plasticity, Weights
+from neuma_lib.mechanics.adaptor import LAYER_KEYS, AdaptableConstitutive, AdaptableLaw
+from neuma_lib.mechanics.law import Elasticity, Plasticity, Weights
 from neuma_lib.mechanics.neural_kernels import FEATURES, feature_kernel, output_kernels
 from neuma_lib.mechanics.singular_values import rotation_and_singular_values
 from neuma_lib.mechanics.singular_values_kernels import pack_count
@@ -86,7 +86,7 @@ class _Scratch(threading.local):
 _scratch = _Scratch()
 
 
-class NeuralConstitutive(Constitutive):
+class NeuralConstitutive(AdaptableConstitutive):
     """A network with frozen base weights and, if one is attached, an adaptor."""
 
     kind: str
@@ -110,11 +110,7 @@ class NeuralConstitutive(Constitutive):
         shapes = tuple(tuple(w.shape) for w in weights)
         if shapes != SHAPES:
             raise InputError(f"a neural law has weights of shapes {SHAPES}, not {shapes}")
-        self.base = nn.ParameterList(nn.Parameter(w.detach().clone(), requires_grad=False) for w in weights)
-        self.adaptor: Adaptor | None = None
-
-    def weights(self) -> Weights:
-        return tuple(self.base) if self.adaptor is None else self.adaptor(tuple(self.base))
+        self.freeze(weights)
 
     def response(self, F: Tensor, weights: Weights) -> Tensor:
         R, sigma = rotation_and_singular_values(F)
@@ -213,63 +209,11 @@ class NeuralPlasticity(NeuralConstitutive, Plasticity):
     scale = PLASTIC_SCALE
 
 
-class NeuralLaw(Law):
+class NeuralLaw(AdaptableLaw):
     """A pair of networks; the adaptor, once attached, holds the only trainable parameters."""
 
     elasticity: NeuralElasticity
     plasticity: NeuralPlasticity
-
-    @property
-    def parts(self) -> dict[str, NeuralConstitutive]:
-        return {"elasticity": self.elasticity, "plasticity": self.plasticity}
-
-    def attach_adaptor(self, rank: int | None = 16, alpha: float = 16.0, seed: int = 0) -> None:
-        """Give both networks a fresh adaptor, zero at the start."""
-        for offset, part in enumerate(self.parts.values()):
-            part.adaptor = Adaptor(tuple(part.base), rank, alpha, seed=2 * seed + offset)
-
-    def set_adaptor_weight(self, weight: float) -> None:
-        """Interpolate between the prior (0) and the adapted law (1); also beyond."""
-        for part in self.parts.values():
-            if part.adaptor is None:
-                raise InputError("the law has no adaptor whose weight could be set")
-            part.adaptor.weight = float(weight)
-
-    def adaptor_state(self) -> dict[str, Tensor]:
-        """The adaptor's tensors by name ("elasticity.A.0", ...), for :meth:`load_adaptor_state`."""
-        return {
-            f"{name}.{key}": value.detach().clone()
-            for name, part in self.parts.items()
-            if part.adaptor is not None
-            for key, value in part.adaptor.state_dict().items()
-        }
-
-    def load_adaptor_state(
-        self, state: dict[str, Tensor], rank: int | None = 16, alpha: float = 16.0
-    ) -> None:
-        """Attach an adaptor with the given tensors.
-
-        Raises:
-            InputError: the tensors do not fit an adaptor of this rank.
-        """
-        self.attach_adaptor(rank, alpha)
-        for name, part in self.parts.items():
-            own = {key[len(name) + 1 :]: value for key, value in state.items() if key.startswith(name + ".")}
-            try:
-                part.adaptor.load_state_dict(own)
-            except RuntimeError as error:
-                raise InputError(f"adaptor of the {name} does not fit rank {rank}: {error}") from None
-
-    def prior_state(self) -> dict[str, Tensor]:
-        """Merged weights under the names of NCLaw's checkpoints, prefixed by the part."""
-        return {
-            f"{name}.{key}": weight.detach().clone().contiguous()
-            for name, part in self.parts.items()
-            for key, weight in zip(LAYER_KEYS, part.weights(), strict=True)
-        }
-
-
-LAYER_KEYS = ("layers.0.fc.weight", "layers.1.fc.weight", "final_layer.fc.weight")
 
 
 def neural_law(state: dict[str, Tensor] | None = None, name: str = "neural", seed: int = 0) -> NeuralLaw:

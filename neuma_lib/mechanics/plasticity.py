@@ -33,7 +33,7 @@ class AnalyticPlasticity(Constants, Plasticity):
         return isotropic_deformation(F, lambda sigma: self.principal(sigma, **constants))
 
 
-def _hencky_strain(sigma: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def hencky_strain(sigma: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Trace (N, 1), deviator (N, 3) and the deviator's norm (N, 1) of the logarithmic strain."""
     strain = sigma.clamp(min=STRETCH_MIN).log()
     trace = strain.sum(1, keepdim=True)
@@ -63,7 +63,7 @@ class VonMises(AnalyticPlasticity):
 
     def principal(self, sigma, E, nu, yield_stress):
         mu, _ = lame(E, nu)
-        trace, deviator, norm = _hencky_strain(sigma)
+        trace, deviator, norm = hencky_strain(sigma)
         limit = yield_stress / (2 * mu)
         returned = (trace / 3 + deviator * (limit / norm)).exp()
         return torch.where(norm > limit, returned, sigma)
@@ -82,16 +82,21 @@ class DruckerPrager(AnalyticPlasticity):
         "cohesion": Constant("1", 0.0, closed=True, default=0.0),
     }
 
-    def principal(self, sigma, E, nu, friction_angle, cohesion):
+    @staticmethod
+    def slope(E, nu, friction_angle, **_) -> float | Tensor:
+        """Slope of the cone in Hencky strain: norm of the deviator at yield over the negative trace."""
         mu, lam = lame(E, nu)
         if isinstance(friction_angle, Tensor):
             sine = torch.sin(friction_angle * (math.pi / 180))
         else:
             sine = math.sin(math.radians(friction_angle))
         alpha = math.sqrt(2 / 3) * 2 * sine / (3 - sine)
-        trace, deviator, norm = _hencky_strain(sigma)
+        return (3 * lam + 2 * mu) / (2 * mu) * alpha
+
+    def principal(self, sigma, E, nu, friction_angle, cohesion):
+        trace, deviator, norm = hencky_strain(sigma)
         pressed = trace - 3 * cohesion
-        excess = norm + (3 * lam + 2 * mu) / (2 * mu) * alpha * pressed
+        excess = norm + self.slope(E, nu, friction_angle) * pressed
         sheared = (trace / 3 + deviator * (1 - excess / norm)).exp()
         apex = torch.full_like(sigma, 1.0) * (
             cohesion.exp() if isinstance(cohesion, Tensor) else math.exp(cohesion)
@@ -125,7 +130,7 @@ class ViscousFlow(AnalyticPlasticity):
 
     def principal(self, sigma, E, nu, viscosity, dt, yield_stress):
         mu, _ = lame(E, nu)
-        trace, deviator, norm = _hencky_strain(sigma)
+        trace, deviator, norm = hencky_strain(sigma)
         limit = yield_stress / (2 * mu)
         relaxed = limit + (norm - limit) / (1 + mu * dt / viscosity)
         returned = (trace / 3 + deviator * (relaxed / norm)).exp()
