@@ -98,7 +98,7 @@ def test_zero_last_layer_is_the_plastic_base(name):
     assert float((value - expected).abs().max()) < 32 * EPS
     unchanged = (expected == F).all(dim=(1, 2))
     assert torch.equal(value[unchanged], F[unchanged])
-    assert int((~unchanged).sum()) > 300 and (name == "viscous_flow" or int(unchanged.sum()) > 15)
+    assert int((~unchanged).sum()) > 250 and (name == "viscous_flow" or int(unchanged.sum()) > 15)
     probe = torch.randn(F.shape, generator=torch.Generator().manual_seed(1), dtype=F.dtype)
     grad, twin = part.vjp(F, weights_of(part), probe)[0], exact.vjp(F, (), probe)[0]
     # the base's divided differences move stretches eps^(1/3) apart: an error of the square of that over the distance
@@ -177,7 +177,7 @@ def test_return_is_objective_and_isotropic(name, dtype):
 
 @pytest.mark.parametrize("base", BASES)
 def test_stresses_follow_stretches(base):
-    """Baker-Ericksen: (tau_i - tau_j)(sigma_i - sigma_j) >= 0, for the fixed corotated base where it holds itself."""
+    """Baker-Ericksen: (tau_i - tau_j)(sigma_i - sigma_j) >= 0, for the fixed corotated base where f rises."""
     part = elasticity(base, "stretch")
     spread = torch.randn(4000, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     sigma = (0.5 * spread).exp()
@@ -186,7 +186,7 @@ def test_stresses_follow_stretches(base):
         for i, j in PAIRS:
             ordered = (y[:, i] - y[:, j]) * (sigma[:, i] - sigma[:, j])
             if base == "fixed_corotated":
-                ordered = ordered[sigma[:, i] + sigma[:, j] > 1]
+                ordered = ordered[torch.minimum(sigma[:, i], sigma[:, j]) > 0.5]
             assert float(ordered.min()) >= 0
 
 
@@ -232,7 +232,7 @@ def test_finite_for_crushed_and_inverted_elements(name):
         assert all(bool(torch.isfinite(x).all()) for x in (value, grad_F, *grads))
 
 
-def cycles(count=200, points=256):
+def cycles(count=12, points=4096):
     """Circles in the space of principal logarithmic strains, (points, count, 3), and their steps de."""
     generator = torch.Generator().manual_seed(5)
     centre, a, b = 0.1 * torch.randn(3, count, 3, generator=generator, dtype=torch.float64)
@@ -254,7 +254,8 @@ def test_work_in_closed_cycles(base, form):
     reference = exact.principal(sigma, MU, LAM).reshape(e.shape)
     work = (reference * step).sum((0, 2)).abs()
     size = (reference.norm(dim=2) * step.norm(dim=2)).sum(0)
-    quadrature = 1e-9  # the trapezoidal rule converges exponentially on a circle
+    # the trapezoidal rule converges exponentially on a circle, at a rate that the network's steepness sets
+    quadrature = 1e-9
     assert bool((work < quadrature * size).all())
     gained = 0.0
     for seed in range(3):
@@ -263,7 +264,7 @@ def test_work_in_closed_cycles(base, form):
         bound = 0.0
         if form == "stretch":
             bound = (tau - reference).norm(dim=2).amax(0) * step.norm(dim=2).sum(0)
-        assert bool((work <= bound + 1e-6 * size).all())
+        assert bool((work <= bound + quadrature * size).all())
         gained = max(gained, float((work / size).max()))
     assert form == "energy" or gained > 1e-3  # the test can tell the forms apart
 
@@ -320,7 +321,7 @@ def test_invariants_are_smooth_at_rest():
     e = 1e-4 * torch.randn(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     z = invariants(e)
     s = ((e - e.mean(1, keepdim=True)) ** 2).sum(1)
-    torch.testing.assert_close(z[:, 1], s / (2 * SMOOTH), rtol=1e-5, atol=0)
+    torch.testing.assert_close(z[:, 1], s / (2 * SMOOTH), rtol=float(s.max()) / SMOOTH**2, atol=0)
     assert float(z[:, 2].abs().max()) < float((s**1.5).max()) / SMOOTH**2
 
 
@@ -382,7 +383,9 @@ def test_files_round_trip(tmp_path, rank):
             assert again.specification() == law.specification()
             for name in ("elasticity", "plasticity"):
                 one, other = getattr(law, name), getattr(again, name)
-                assert torch.equal(one.evaluate(F, one.weights()), other.evaluate(F, other.weights()))
+                pairs = list(zip(one.weights(), other.weights(), strict=True))
+                assert all(torch.equal(a, b) for a, b in pairs) and (pairs or name == "plasticity")
+                assert other.evaluate(F, other.weights()).allclose(one.evaluate(F, one.weights()))
         assert load_law(prior).longitudinal_modulus() == pytest.approx(LAM + 2 * MU, rel=1e-4)
 
 
@@ -406,7 +409,10 @@ def test_files_round_trip(tmp_path, rank):
 )
 def test_bad_files_are_named(tmp_path, spec, message):
     path = tmp_path / "law.safetensors"
-    write_weights(path, structured_law(specification()).prior_state(), {"structured": spec})
+    state = structured_law(specification(plastic="von_mises")).prior_state()
+    if message == "weights plasticity":
+        state = {key: value for key, value in state.items() if key.startswith("elasticity")}
+    write_weights(path, state, {"structured": spec})
     with pytest.raises(InputError, match=message) as caught:
         load_law(path)
     assert "law.safetensors" in str(caught.value)
