@@ -12,9 +12,9 @@ deviator is 2 mu dev f(sigma_i), become
 
 with k(n2) in (-1, 3). f_k rises where f does, so larger stretches have larger stresses wherever the base says so
 (Baker-Ericksen inequality: everywhere for ``hencky`` and ``neo_hookean``, among stretches above 1/2 for
-``fixed_corotated``, whose own f falls below that). For ``hencky``, f = log, this is dev tau = 2 G dev (sigma^k - 1) / k.
-There is no energy: a closed cycle does the work of the correction tau - tau_base alone, so at most its largest norm times the length of the cycle
-in e.
+``fixed_corotated``, whose own f falls below that). For ``hencky``, f = log, dev tau = 2 G dev (sigma^k - 1) / k. There
+is no energy: a closed cycle does the work of the correction tau - tau_base alone, so at most its largest norm times the
+length of the cycle in e.
 
 **Elasticity, form "energy".** tau_i = d psi / d e_i of psi = exp(n0) psi_volume + exp(n1) psi_shear, two non-negative
 parts of the base's energy: no cycle gains or loses energy, but stresses need not be ordered.
