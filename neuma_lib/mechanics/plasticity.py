@@ -163,7 +163,7 @@ class CrushableFoam(AnalyticPlasticity):
 
     def principal(self, sigma, E, nu, crush, tension, slope, dt, relaxation):
         mu, lam = lame(E, nu)
-        trace, deviator, norm = _hencky_strain(sigma)
+        trace, deviator, norm = hencky_strain(sigma)
         centre, half = (crush - tension) / 2, (crush + tension) / 2
         p, q = -(lam + 2 * mu / 3) * trace / half, math.sqrt(6) * mu * norm / (slope * half)
         # the ray r (p, q) meets the ellipse where a r^2 - 2 b r - c = 0
@@ -196,7 +196,7 @@ class HerschelBulkley(AnalyticPlasticity):
 
     def principal(self, sigma, E, nu, consistency, exponent, yield_stress, dt):
         mu, _ = lame(E, nu)
-        trace, deviator, norm = _hencky_strain(sigma)
+        trace, deviator, norm = hencky_strain(sigma)
         limit = yield_stress / (2 * mu)
         # in y = |dev eps| - limit: y + dt D = y_trial with D = (sqrt(2) mu y / k)^(1/m) / sqrt(2)
         power = 1 / exponent
@@ -270,7 +270,7 @@ class CohesiveDruckerPrager(AnalyticPlasticity):
         sine, alpha = sine_and_alpha(friction_angle)
         _, beta = sine_and_alpha(dilation_angle)
         strength = math.sqrt(2 / 3) * 6 * cohesion * (1 - sine**2).sqrt() / (3 - sine)
-        trace, deviator, norm = _hencky_strain(sigma)
+        trace, deviator, norm = hencky_strain(sigma)
         excess = 2 * mu * norm + 3 * bulk * alpha * trace - strength
         flow = excess / (2 * mu + 9 * bulk * alpha * beta)
         kept = flow.clamp(min=0).minimum(norm)  # what the branches not taken need to stay finite
