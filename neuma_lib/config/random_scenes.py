@@ -126,6 +126,12 @@ class RandomConfig(Section):
     families: dict[str, FamilyConfig] = Field(
         {}, description="materials by name; of as many scenes in a row as there are, each gets another one"
     )
+    outside: dict[str, FamilyConfig] = Field(
+        {}, description="materials by name that no law of `families` describes, see draw_from"
+    )
+    draw_from: Literal["families", "outside", "both"] = Field(
+        "families", description="what the materials of the scenes are drawn from"
+    )
     shapes: tuple[Literal[tuple(SHAPES)], ...] = Field(
         tuple(SHAPES), min_length=1, description="shapes, dealt in the same way"
     )
@@ -159,6 +165,14 @@ class RandomConfig(Section):
         """What the names of the scenes begin with."""
         return f"random{self.seed}_"
 
+    @property
+    def materials(self) -> dict[str, FamilyConfig]:
+        """The families that scenes are drawn from."""
+        return {
+            **(self.families if self.draw_from != "outside" else {}),
+            **(self.outside if self.draw_from != "families" else {}),
+        }
+
     def family(self, name: str) -> str:
         """The family of a scene, from its name."""
         return name.removeprefix(self.prefix).split("_", 2)[2]
@@ -178,17 +192,19 @@ def draw_scenes(
     Raises:
         InputError: there are no families, or no draw of a scene can be used.
     """
-    if settings.count and not settings.families:
-        raise InputError("settings: random.families: give at least one family of materials")
+    families = settings.materials
+    if settings.count and not families:
+        where = "families" if settings.draw_from == "both" else settings.draw_from
+        raise InputError(f"settings: random.{where}: give at least one family of materials")
     found = {}
     for k in range(settings.count):
-        family = _dealt(sorted(settings.families), settings.seed, 0, k)
+        family = _dealt(sorted(families), settings.seed, 0, k)
         shape = _dealt(settings.shapes, settings.seed, 1, k)
-        laws = [law.plain() for name, law in priors.items() if name == settings.families[family].prior]
+        laws = [law.plain() for name, law in priors.items() if name == families[family].prior]
         rng = np.random.default_rng([settings.seed, 2, k])
         flaws: Counter[str] = Counter()
         for _ in range(ATTEMPTS):
-            scene = _drawn(rng, settings, shape, settings.families[family])
+            scene = _drawn(rng, settings, shape, families[family])
             dt = _largest_stable(settings, [scene["law"], *laws], grid)
             flaw = "unstable" if dt is None else _flaw(settings, scene, gravity)
             if flaw is None:
@@ -254,8 +270,9 @@ def _rounded(value: float) -> float:
 
 def _largest_stable(settings: RandomConfig, laws: Sequence[Mapping], grid: int) -> float | None:
     """The largest time step [s] that is stable for all laws, by the speed of pressure waves at small strains."""
-    moduli = [
+    moduli = [  # of waves along the fibres, where there are some
         part["E"] * (1 - part["nu"]) / ((1 + part["nu"]) * (1 - 2 * part["nu"]))
+        + part.get("fibre_modulus", 0.0)
         for part in (law["elasticity"] for law in laws)
         if {"E", "nu"} <= set(part)
     ]
@@ -320,7 +337,7 @@ def _appearance(settings: RandomConfig, k: int, shape: str, family: str) -> dict
         return "#" + "".join(f"{round(255 * c):02x}" for c in colorsys.hsv_to_rgb(hue, saturation, value))
 
     return {
-        "kind": settings.families[family].look,
+        "kind": settings.materials[family].look,
         "colors": {part: colour() for part in SHAPES[shape].parts},
         "accent": colour(),
         "contrast": _rounded(0.35 + 0.25 * rng.random()),

@@ -161,9 +161,19 @@ class Config(Section):
 
     @property
     def plain_scenes(self) -> list[str]:
-        """Names of the scenes that are neither drawn at random nor have a truth of their own fineness."""
-        drawn = self.random_scenes
-        return [name for name, s in self.scenes.items() if name not in drawn and s.truth == TruthConfig()]
+        """Names of the scenes that are neither drawn at random, nor have a truth of their own fineness, nor belong to
+        tables on request alone."""
+        asked, shown = (
+            {
+                scene
+                for table in self.tables.values()
+                if table.on_request == on_request
+                for scene in table.scenes
+            }
+            for on_request in (True, False)
+        )
+        others = {*self.random_scenes, *(asked - shown)}
+        return [name for name, s in self.scenes.items() if name not in others and s.truth == TruthConfig()]
 
     def experiment(self, name: str) -> ExperimentConfig:
         """The experiment of that name, or of a chain's folder."""

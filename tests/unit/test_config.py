@@ -347,6 +347,20 @@ class TestFinerTruth:
             assert loaded.scene(name).law == loaded.scene(scene).law
         assert not {*table.scenes, *loaded.random_scenes} & set(loaded.plain_scenes)
 
+    def test_truths_outside_every_family_are_asked_for_by_name(self, loaded):
+        """No prior has their laws, no random scene of the default draw, and no other target makes them."""
+        table = loaded.tables["outside"]
+        assert table.on_request and not {*table.scenes} & set(loaded.plain_scenes)
+        assert not any(
+            {*table.scenes} & {*t.scenes} for name, t in loaded.tables.items() if name != "outside"
+        )
+        known = [*loaded.priors.laws.values()]
+        known += [loaded.scene(name).law for name in (*loaded.plain_scenes, *loaded.random_scenes)]
+        pairs = {(law.elasticity.name, law.plasticity.name) for law in known}
+        outside = [loaded.scene(name).law for name in table.scenes]
+        chosen = {(law.elasticity.name, law.plasticity.name) for law in outside}
+        assert len(chosen) == len(table.scenes) and not chosen & pairs
+
     @pytest.mark.parametrize(
         ("change", "message"),
         [

@@ -87,6 +87,20 @@ def test_every_machine_draws_the_same(loaded):
     assert hashlib.sha256(text.encode()).hexdigest()[:16] == "9ccd2f814a104e9e"
 
 
+def test_materials_outside_the_families_are_drawn_when_asked_for(loaded):
+    random = loaded.random
+    for draw_from, families in (
+        ("outside", {*random.outside}),
+        ("both", {*random.families, *random.outside}),
+    ):
+        scenes = drawn(loaded, draw_from=draw_from, count=len(families))
+        assert {name.split("_", 3)[3] for name in scenes} == families
+        for scene in scenes.values():
+            law = analytic_law(scene["law"], dt=scene["dt"])
+            assert MPMModel(grid=24, dt=scene["dt"]).courant(law, DENSITY) <= 0.6 * (1 + 1e-3)
+    assert not {*random.families} & {*random.outside}
+
+
 def test_other_seeds_draw_other_scenes(many):
     assert len({json.dumps(scene["velocity"]) for scene in many.values()}) == len(many)
 
@@ -179,6 +193,8 @@ def test_mistakes_are_named(raw, change, message):
 def test_a_family_is_needed(loaded):
     with pytest.raises(InputError, match=r"random\.families: give at least one"):
         drawn(loaded, families={})
+    with pytest.raises(InputError, match=r"random\.outside: give at least one"):
+        drawn(loaded, draw_from="outside", outside={})
 
 
 def test_settings_change_a_random_scene_as_any_other(raw, loaded):
