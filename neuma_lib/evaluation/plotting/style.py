@@ -55,7 +55,7 @@ METHODS = {
     "neuma_without_binding": Look(VERMILION, "v", (0, (5, 1, 1, 1))),
     "neuma_without_adaptor": Look(PURPLE, "D", (0, (2, 1))),
     "true_law": Look("#5b3a1e", "d", (0, (1, 2))),
-    "constants": Look("#7a7a00", "p", (0, (6, 2, 2, 2))),
+    "constants": Look("#330dcc", "p", (0, (6, 2, 2, 2))),
     "pac_nerf": Look(SKY, "P", (0, (5, 1, 1, 1, 1, 1))),
     "spring_gaus": Look(YELLOW, "X", (0, (3, 2))),
 }
