@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,6 +19,11 @@ def frame_batches(count: int, size: int) -> Iterator[slice]:
     pieces = max(1, -(-count // size))
     edges = [piece * count // pieces for piece in range(pieces + 1)]
     return (slice(first, last) for first, last in zip(edges, edges[1:], strict=False))
+
+
+def spread_frames(count: int, most: int) -> list[int]:
+    """At most ``most`` of ``count`` frames, evenly spread, first and last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
 
 
 def evaluate_in_batches(function: Callable[..., Tensor], size: int, *states: Tensor) -> Tensor:

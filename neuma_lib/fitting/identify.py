@@ -25,7 +25,7 @@ from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.families import Family
-from neuma_lib.fitting.frame_batches import frame_batches
+from neuma_lib.fitting.frame_batches import frame_batches, spread_frames
 from neuma_lib.fitting.least_squares import Linearisation, in_blocks, jackknife, levenberg_marquardt
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import Values, named_combinations, physical
@@ -202,7 +202,7 @@ def identify(
         raise InputError("identify.families names no candidate: give at least one elasticity with E and nu")
     families = [Family(name, law.plain()) for name, law in settings.families.items()]
     families.sort(key=lambda family: len(family.constants))  # simpler ones give starts to the others
-    seen = observation.select(_spread(len(observation.frames), settings.frames))
+    seen = observation.select(spread_frames(len(observation.frames), settings.frames))
     fitted = min(len(seen.frames) - 1, max(2, round((1 - settings.held_out) * len(seen.frames))))
     video = _Video(model, start, body, seen, settings)
     stock_values = _constants(stock) if stock else {}
@@ -263,11 +263,6 @@ def _choice(fits: Sequence[FamilyFit], settings: IdentifyConfig) -> tuple[Family
 def _constants(spec: Mapping[str, Mapping[str, Any]]) -> Values:
     """All constants of a law's specification."""
     return {key: float(value) for part in spec.values() for key, value in part.items() if key != "name"}
-
-
-def _spread(count: int, most: int) -> list[int]:
-    """At most `most` of `count` frames, evenly spread, first and last among them."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
 
 
 class _Video:

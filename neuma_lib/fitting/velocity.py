@@ -33,7 +33,7 @@ from torch import Tensor
 from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
-from neuma_lib.fitting.frame_batches import frame_batches
+from neuma_lib.fitting.frame_batches import frame_batches, spread_frames
 from neuma_lib.fitting.least_squares import Linearisation, in_blocks, jackknife, levenberg_marquardt
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import MPMModel, contact_clearance
@@ -162,7 +162,7 @@ def estimate_velocity(
         # No more than twice as many at a time: a spin from three frames says little about thirty.
         reach = min(2 * used, len(frames)) if growing else used
         flight.simulate(unknowns, frames[:reach])
-        seen = observation.select(_spread(used, settings.frames))
+        seen = observation.select(spread_frames(used, settings.frames))
         residuals = _Residuals(flight, seen, settings.difference)
         unknowns, fit, steps = minimise(residuals, unknowns, _ALL, _ROUGH_GAIN if growing else _LEAST_GAIN)
         accepted += steps
@@ -339,11 +339,6 @@ class _Residuals:
                 "velocity", f"rendered images are not finite at v0 = {unknowns[:3].tolist()}"
             )
         return value
-
-
-def _spread(count: int, most: int) -> list[int]:
-    """At most `most` of the first `count` frames, evenly spread, first and last among them."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
 
 
 def _held(fit: Linearisation) -> np.ndarray:
