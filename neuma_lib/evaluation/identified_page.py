@@ -7,11 +7,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from neuma_lib.evaluation.plotting import style
 from neuma_lib.mechanics.combinations import named_combinations
 
 _BARS = 2  # standard deviations that error bars show
+_RATIOS = (0.01, 0.1, 0.3, 0.5, 0.7, 1, 1.5, 2, 3, 10, 100)  # ticks
 _WIDEST = 1.5  # decades that an error bar may reach to either side: beyond it, nothing is known
 
 
@@ -25,15 +27,20 @@ def identified_page(found: Mapping[str, Any], truth: Mapping[str, Mapping[str, A
         truth: specification of the true law; None if unknown. Its constants are shown where the best family has them.
     """
     figure = style.new_figure(style.PAGE, 0.6 * style.COLUMN)
-    bars, constants = figure.subplots(1, 2)
+    losses, constants = figure.subplots(1, 2)
     judged = {name: fit for name, fit in found["families"].items() if "held_out_loss" in fit}
     order = sorted(judged, key=lambda name: judged[name]["score"], reverse=True)
     as_good = {found["family"]: style.BLACK} | dict.fromkeys(found["ties"], style.GREY)
-    losses = [judged[name]["held_out_loss"] for name in order]
-    bars.barh(order, losses, color=[as_good.get(name, style.LIGHT) for name in order])
+    for place, name in enumerate(order):
+        loss = judged[name]["held_out_loss"]
+        losses.plot([loss], [place], "o", color=as_good.get(name, style.SKY))
+        losses.annotate(f"{loss:.1e}", (loss, place), (0, 4), textcoords="offset points", ha="center")
+    losses.margins(0.15)
+    losses.set_yticks(range(len(order)), order)
     given_up = [name for name in found["families"] if name not in judged]
     title = f"given up: {', '.join(given_up)}" if given_up else "all families"
-    bars.set(xscale="log", xlabel="mean squared residual of held-out frames", title=title)
+    losses.set(xscale="log", xlabel="mean squared residual of held-out frames", title=title)
+    losses.xaxis.set_minor_formatter(NullFormatter())
 
     quantities = found["best"]["quantities"]
     true = _true_values(truth) if truth else {}
@@ -46,7 +53,11 @@ def identified_page(found: Mapping[str, Any], truth: Mapping[str, Mapping[str, A
             constants.plot([true[name] / entry["value"]], [place], "x", color=style.SEQUENCE[0], zorder=3)
     names = [f"{name} = {entry['value']:.3g}" for name, entry in quantities.items()]
     constants.set_yticks(range(len(names)), names[::-1])
-    constants.set(xscale="log", xlabel="relative to what was found (cross: truth; grey: not determined)")
+    constants.set(xscale="log", xlabel="over what was found\n(cross: truth, grey: not determined)")
+    low, high = constants.get_xlim()
+    shown = [tick for tick in _RATIOS if low < tick < high]
+    constants.set_xticks(shown, [f"{tick:g}" for tick in shown], minor=False)
+    constants.xaxis.set_minor_formatter(NullFormatter())
     constants.axvline(1, color=style.LIGHT, zorder=0)
     tied = f", tie with {', '.join(found['ties'])}" if found["ties"] else ""
     constants.set_title(found["family"] + tied)
