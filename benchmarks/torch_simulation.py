@@ -66,13 +66,18 @@ def evaluate(bodies, part, F):
     return torch.cat([getattr(body.law, part)(F[body.start : body.stop]) for body in bodies])
 
 
-def rollout(model, law, state, frames):
-    """States (x, v, F, C) of a `State` at the frames, each of shape (T, N, ...)."""
+def rollout(model, law, state, frames, total=False):
+    """States (x, v, F, C) of a `State` at the frames, with the total deformation after them if asked for.
+
+    Each has the shape (T, N, ...).
+    """
     bodies = as_bodies(law, len(state.x))
     now, seen = state.motion, []
+    F_total = (state.F,) if total else ()
     for n in range(frames[-1] + 1):
         if n in frames:
-            seen.append(now)
+            seen.append((*now, *F_total))
         if n < frames[-1]:
             now = step(model, bodies, *now, state.mass, state.vol0)
+            F_total = tuple(F + model.dt * now[3] @ F for F in F_total)
     return tuple(torch.stack(values) for values in zip(*seen, strict=True))

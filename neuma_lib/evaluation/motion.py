@@ -21,7 +21,6 @@ from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import Body, MPMModel, as_bodies
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
-from neuma_lib.sim.total_deformation import every_step, total_deformation
 
 COUNT_TOLERANCE = 0.1
 """Two jittered samplings of the same wanted count differ by at most this fraction: each keeps to 5 % of it."""
@@ -49,16 +48,14 @@ class Evaluation:
     """Result of `evaluate`.
 
     Attributes:
-        path: predicted particle states at the frames.
+        path: predicted particle states at the frames, with the total deformation if it was asked for.
         tracers: tracers that started in the reconstructed shape [m], shape (T, M, 3).
         metrics: plain numbers and lists for ``metrics.json``.
-        F_total: total deformation gradients (`total_deformation`), shape (T, N, 3, 3); None if not asked for.
     """
 
     path: Trajectory
     tracers: Tensor
     metrics: dict
-    F_total: Tensor | None = None
 
     def summary(self) -> str:
         """One line for people."""
@@ -78,6 +75,7 @@ def predict(
     start: State,
     frames: Sequence[int],
     tracers: Tensor | None = None,
+    total: bool = False,
 ) -> tuple[Trajectory, Failure | None]:
     """Rollout of a law; one that becomes unstable is held at its last sound frame.
 
@@ -85,6 +83,7 @@ def predict(
         start: particles and their initial motion.
         frames: simulation steps of the frames, T of them.
         tracers: start positions of passive tracers [m], shape (M, 3).
+        total: also carry the total deformation.
 
     Returns:
         The trajectory at the frames, and how it failed (None: it did not).
@@ -93,7 +92,7 @@ def predict(
     while True:
         try:
             with torch.no_grad():
-                path = rollout(model, law, start, steps=kept[-1], frames=kept, tracers=tracers)
+                path = rollout(model, law, start, steps=kept[-1], frames=kept, tracers=tracers, total=total)
             break
         except NonFiniteError as error:
             failure = failure or Failure(error.happened, error.step, error.particle)
@@ -140,7 +139,7 @@ def evaluate(
         truth: tracers of the ground truth [m], shape (T, M, 3).
         truth_again: tracers of the ground truth from another sampling of the shape, shape (T, M'', 3).
         tracers: start positions inside the reconstructed shape [m], shape (M', 3).
-        total: also compute the total deformation.
+        total: also carry the total deformation.
         floor: Chamfer distances of the truth's two samplings, the same for all laws, shape (T,); None: measured here.
 
     Raises:
@@ -153,10 +152,7 @@ def evaluate(
             "that of equal counts. Set evaluation.tracers to the dataset.tracers that the truth was made with"
         )
     starts = torch.cat([tracers, truth[0].to(tracers)])
-    path, failure = predict(model, law, start, every_step(frames) if total else frames, starts)
-    gained = energy_gain_after(model, start, path)
-    F_total = total_deformation(path, model.dt, frames).F if total else None
-    path = path.at(frames) if total else path
+    path, failure = predict(model, law, start, frames, starts, total)
     predicted, same_start = path.tracers[:, : len(tracers)], path.tracers[:, len(tracers) :]
     chamfer = chamfer_sequence(predicted, truth)
     floor = chamfer_sequence(truth_again, truth) if floor is None else floor
@@ -173,8 +169,8 @@ def evaluate(
             model.courant(part.law, float(start.density[part.start : part.stop].min()))
             for part in as_bodies(law, len(start.x))
         ),
-        "energy_gain_after_step": gained,
+        "energy_gain_after_step": energy_gain_after(model, start, path),
         "diverged_at_step": failure and failure.step,
         "diverged": failure and asdict(failure),
     }
-    return Evaluation(path, predicted, metrics, F_total)
+    return Evaluation(path, predicted, metrics)

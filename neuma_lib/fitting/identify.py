@@ -33,7 +33,6 @@ from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
-from neuma_lib.sim.total_deformation import every_step, total_deformation
 from neuma_lib.splatting.observation import Observation
 
 _LAST_GAIN = 0.1  # of `least_gain`, in the last round
@@ -300,10 +299,8 @@ class _Video:
         return residual if bool(residual.isfinite().all()) else None
 
     def _path(self, law: Law, frames: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-        wanted = every_step(frames) if self._total else frames
-        path = rollout(self.model, law, self.start, steps=frames[-1], frames=wanted)
-        path = total_deformation(path, self.model.dt, frames) if self._total else path
-        return path.x, path.F
+        path = rollout(self.model, law, self.start, steps=frames[-1], frames=frames, total=self._total)
+        return path.x, path.stretch
 
 
 def averaged(images: Tensor, size: int) -> Tensor:

@@ -34,7 +34,6 @@ from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
-from neuma_lib.sim.total_deformation import every_step, total_deformation
 from neuma_lib.splatting.observation import Observation
 
 
@@ -43,7 +42,7 @@ class TrajectoryLoss(Protocol):
 
     Attributes:
         frames: steps of the frames.
-        total: whether F of the trajectory shall be the total deformation instead of its elastic part.
+        total: whether it reads the total deformation of the trajectory.
     """
 
     frames: tuple[int, ...]
@@ -80,7 +79,7 @@ class PixelLoss:
         self._batch = self.frames_per_batch or self._renderer.frames_per_batch
 
     def __call__(self, path: Trajectory) -> Tensor:
-        return evaluate_in_batches(self._losses, self._batch, path.x, path.F)
+        return evaluate_in_batches(self._losses, self._batch, path.x, path.stretch)
 
     def _losses(self, part: slice, x: Tensor, F: Tensor) -> Tensor:
         return mean_squared_error(self._renderer(x, F), self.observation.stored(part))
@@ -262,10 +261,11 @@ class _Loop:
             self.law,
             self.start,
             steps=frames[-1],
-            frames=every_step(frames) if self.loss.total else frames,
+            frames=frames,
+            total=self.loss.total,
             memory=None if self.settings.memory is None else self.settings.memory * 2**30,
         )
-        return self.loss(total_deformation(path, self.model.dt, frames) if self.loss.total else path)
+        return self.loss(path)
 
     def _backward(self, frame_losses: Tensor) -> tuple[dict[str, float], float]:
         if self.first_loss is None:

@@ -18,7 +18,9 @@ from neuma_lib.sim.scatter import scatter_functions
 
 @functools.cache
 def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamespace:
-    """Kernels `g2p_adjoint`, `grid_adjoint` and `p2g_adjoint` for one precision and one way to scatter."""
+    """Kernels `g2p_adjoint`, `grid_adjoint`, `p2g_adjoint` and `total_adjoint` for one precision and one way to
+    scatter.
+    """
     t, functions = warp_types(dtype), grid_functions(dtype)
     ordered = scatter != "atomic"
     run_of, deposit = vars(scatter_functions(dtype, scatter, 3)).values()
@@ -169,4 +171,25 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         grad_tau[p] = -stress * g_A
         grad_x[p] = grad_x[p] + c.inv_dx * (moving - wp.transpose(A) * g)
 
-    return SimpleNamespace(g2p_adjoint=g2p_adjoint, grid_adjoint=grid_adjoint, p2g_adjoint=p2g_adjoint)
+    @kernel
+    def total_adjoint(
+        c: GridConstants,
+        now: wp.int32,
+        after: wp.int32,
+        C: wp.array2d(dtype=mat33),
+        F_total: wp.array2d(dtype=mat33),
+        grad_C: wp.array(dtype=mat33),
+        grad_F_total: wp.array(dtype=mat33),
+    ):
+        """In place: gradient of F_total after the step to those of C after it (added) and of F_total before it."""
+        p = wp.tid()
+        g = grad_F_total[p]
+        grad_C[p] = grad_C[p] + c.dt * (g * wp.transpose(F_total[now, p]))
+        grad_F_total[p] = g + c.dt * (wp.transpose(C[after, p]) * g)
+
+    return SimpleNamespace(
+        g2p_adjoint=g2p_adjoint,
+        grid_adjoint=grid_adjoint,
+        p2g_adjoint=p2g_adjoint,
+        total_adjoint=total_adjoint,
+    )

@@ -58,7 +58,7 @@ def ballistic(
     model: MPMModel, start: tuple[Tensor, ...], tracers: Tensor | None, frames: Sequence[int]
 ) -> Trajectory:
     """Free flight in closed form: x_n = x0 + n dt v0 + g dt^2 n (n + 1) / 2, v_n = v0 + n dt g."""
-    x0, v0, F0, C0 = start
+    x0, v0, *constant = start
     T = len(frames)
     n = torch.tensor(frames, dtype=torch.float64)[:, None, None]
     gravity = torch.tensor(model.gravity, dtype=torch.float64)
@@ -67,11 +67,13 @@ def ballistic(
         for t in (model.dt**2 * n * (n + 1) / 2 * gravity, model.dt * n * gravity)
     )
     elapsed = (model.dt * n).to(dtype=x0.dtype, device=x0.device)
+    F, C, *F_total = (value.expand(T, *value.shape) for value in constant)
     return Trajectory(
         tuple(frames),
         x0 + (elapsed * v0 + fall),
         v0 + gain,
-        F0.expand(T, *F0.shape),
-        C0.expand(T, *C0.shape),
+        F,
+        C,
         None if tracers is None else tracers + (elapsed * v0[0] + fall).detach(),
+        *F_total,
     )

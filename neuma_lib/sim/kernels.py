@@ -291,7 +291,10 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         F: wp.array2d(dtype=mat33),
         F_trial: wp.array2d(dtype=mat33),
     ):
-        """F_trial = (I + dt C) F, exactly as in g2p, for a reverse loop that kept only the states."""
+        """F_trial = (I + dt C) F, exactly as in g2p, for a reverse loop that kept only the states.
+
+        With the total deformation for both, and `after` for `cached`, it takes this one a step further.
+        """
         p = wp.tid()
         F_trial[cached, p] = F[now, p] + c.dt * (C[after, p] * F[now, p])
 

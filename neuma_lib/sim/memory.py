@@ -11,6 +11,7 @@ DEFAULT_CACHE_BYTES = {"cpu": 1 << 29, "cuda": 1 << 32}
 """Memory for intermediate values of the steps, beyond their states, if the caller names none."""
 
 _STATE_FLOATS = 24  # x, v, C, F of a particle
+_TOTAL_FLOATS = 9  # its total F, where that is carried
 _STEP_FLOATS = 18  # tau, F_trial of a particle
 _NODE_FLOATS = 8  # grid, grid_v of a node
 
@@ -33,7 +34,13 @@ class MemoryPlan:
 
 
 def plan_memory(
-    steps: int, particles: int, nodes: int, itemsize: int, cache_bytes: float, memory: float | None = None
+    steps: int,
+    particles: int,
+    nodes: int,
+    itemsize: int,
+    cache_bytes: float,
+    memory: float | None = None,
+    total: bool = False,
 ) -> MemoryPlan:
     """The fastest plan that fits.
 
@@ -42,11 +49,12 @@ def plan_memory(
         itemsize: bytes of a number.
         cache_bytes: most bytes for intermediate values if all states fit; 0: these are always computed again.
         memory: most bytes for states and intermediate values together; None: no limit for the states.
+        total: whether states hold the total deformation too.
 
     Raises:
         InputError: not even one step at a time fits into `memory`.
     """
-    state = itemsize * _STATE_FLOATS * particles
+    state = itemsize * (_STATE_FLOATS + total * _TOTAL_FLOATS) * particles
     step = itemsize * (_STEP_FLOATS * particles + _NODE_FLOATS * nodes)
     whole = state * (steps + 1) + step
     if memory is None or whole <= memory:

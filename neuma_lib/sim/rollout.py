@@ -1,7 +1,8 @@
 """The one entry to the simulator, for ground truth, velocity estimation, training and evaluation alike.
 
 Callers differ in law, start and set of frames only. The gradient is one reverse loop over the stored states,
-not a graph of steps: autograd sees one function from (x, v, F, C, weights of the laws) to the frames.
+not a graph of steps: autograd sees one function from (x, v, F, C, weights of the laws) to the frames. Where the total
+deformation is asked for, it is a fifth part of the state.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ def rollout(
     steps: int,
     frames: Sequence[int],
     tracers: Tensor | None = None,
+    total: bool = False,
     skip_free_flight: bool = True,
     memory: float | None = None,
     cache_bytes: float | None = None,
@@ -46,6 +48,8 @@ def rollout(
         steps: number of time steps; the simulation ends at the last frame, which must not lie beyond.
         frames: steps whose states are returned, strictly increasing, 0 is the start.
         tracers: positions of passive points that follow the grid's velocity [m], shape (M, 3).
+        total: also carry the total deformation: F_total = (I + dt C) F_total in every step, the product without the
+            plastic return, from F of the start on. Differentiable as F is.
         skip_free_flight: take the steps before the first contact in closed form while the state is undeformed
             and moves with one velocity: equal to simulating them, to round-off, in value and gradient. Not
             used where a gradient could deform the state (v of shape (N, 3), F or C that require it).
@@ -67,7 +71,7 @@ def rollout(
         raise InputError(f"tracers: give positions of shape (M, 3) as {state.x.dtype}")
 
     first = free_flight_steps(model, bodies, state, frames[-1]) if skip_free_flight else 0
-    start = state.motion
+    start = (*state.motion, state.F) if total else state.motion
     in_flight = sum(n < first for n in frames)
     parts = []
     if in_flight:
@@ -75,13 +79,13 @@ def rollout(
     if in_flight < len(frames):
         if first:
             landed = ballistic(model, start, tracers, (first,))
-            start = (landed.x[0], landed.v[0], start[2], start[3])
+            start = (landed.x[0], landed.v[0], *start[2:])
             tracers = None if tracers is None else landed.tracers[0]
         plan = dict(memory=memory, cache_bytes=cache_bytes)
         parts.append(
             _simulate(model, bodies, state, start, tracers, first, frames[in_flight:], scatter, **plan)
         )
-    return parts[0] if len(parts) == 1 else _joined(*parts)
+    return parts[0] if len(parts) == 1 else parts[0].followed_by(parts[1])
 
 
 def _simulate(
@@ -96,48 +100,40 @@ def _simulate(
     memory: float | None,
     cache_bytes: float | None,
 ) -> Trajectory:
-    """Step from (x, v, F, C) at step `first` to the last frame."""
-    x, steps = state.x, frames[-1] - first
+    """Step from (x, v, F, C), with F_total behind them or without, at step `first` to the last frame."""
+    x, steps, total = state.x, frames[-1] - first, len(start) == 5
     weights, slices = gather_weights(bodies, x.dtype)
     inputs = (*start, *weights)
     plan = None
     if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
         cache_bytes = DEFAULT_CACHE_BYTES[x.device.type] if cache_bytes is None else cache_bytes
-        plan = plan_memory(steps, len(x), model.nodes**3, x.element_size(), cache_bytes, memory)
-    simulation = Simulation(model, bodies, slices, state, steps, first, plan, scatter)
-    path = RolloutFunction.apply(simulation, [n - first for n in frames], tracers, *inputs)
-    return Trajectory(frames, *path)
+        plan = plan_memory(steps, len(x), model.nodes**3, x.element_size(), cache_bytes, memory, total)
+    simulation = Simulation(model, bodies, slices, state, steps, first, plan, scatter, total)
+    *states, seen = RolloutFunction.apply(simulation, [n - first for n in frames], tracers, *inputs)
+    return Trajectory(frames, *states[:4], seen, *states[4:])
 
 
 class RolloutFunction(torch.autograd.Function):
     """All steps as one function of the start and the weights."""
 
     @staticmethod
-    def forward(ctx, simulation, frames, tracers, x0, v0, F0, C0, *weights):
+    def forward(ctx, simulation, frames, tracers, *inputs):
+        count = len(simulation.workspace.states)
+        start, weights = inputs[:count], inputs[count:]
         ctx.simulation, ctx.frames = simulation, frames
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*weights)
-        result = simulation.run((x0, v0, F0, C0), weights, frames, tracers)
+        result = simulation.run(start, weights, frames, tracers)
         if tracers is not None:
             ctx.mark_non_differentiable(result[-1])
         return result
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, grad_x, grad_v, grad_F, grad_C, _):
-        grads = (grad_x, grad_v, grad_F, grad_C)
+    def backward(ctx, *grads):
+        *grads, _ = grads  # tracers carry none
         start, weights = ctx.simulation.run_adjoint(ctx.saved_tensors, ctx.frames, grads)
         return None, None, None, *start, *weights
-
-
-def _joined(first: Trajectory, second: Trajectory) -> Trajectory:
-    """One trajectory after the other."""
-    joined = {
-        name: torch.cat([getattr(first, name), getattr(second, name)])
-        for name in ("x", "v", "F", "C", "tracers")
-        if getattr(first, name) is not None
-    }
-    return Trajectory(first.frames + second.frames, **joined)
 
 
 def _checked_frames(frames: Sequence[int], steps: int) -> tuple[int, ...]:

@@ -3,6 +3,8 @@
 A step turns the state (x, v, C, F) at t into that at t + dt (paper Sec. 3.2 and Algorithm 2):
 
     tau = elasticity(F);   P2G, grid, G2P;   F = plasticity((I + dt C) F)
+
+The state may also carry the total deformation, with all that has flowed: F_total = (I + dt C) F_total.
 """
 
 from __future__ import annotations
@@ -53,6 +55,7 @@ class Simulation:
         first: number of the first step, for messages.
         plan: what to keep for `run_adjoint`; None if that will not be called.
         scatter: how particles are added to nodes, one of `scatter.SCATTERS`; None takes the fastest.
+        total: whether the state carries the total deformation.
     """
 
     def __init__(
@@ -65,12 +68,12 @@ class Simulation:
         first: int = 0,
         plan: MemoryPlan | None = None,
         scatter: str | None = None,
+        total: bool = False,
     ):
         self.model, self.bodies, self.steps, self.first, self.plan = model, bodies, steps, first, plan
         x = state.x
-        size = WorkspaceSize(
-            model, len(x), x.dtype, x.device, scatter=scatter or scatter_for(x.device, x.dtype)
-        )
+        scatter = scatter or scatter_for(x.device, x.dtype)
+        size = WorkspaceSize(model, len(x), x.dtype, x.device, total=total, scatter=scatter)
         if plan:
             size = size._replace(
                 n_states=plan.segment + 1,
@@ -96,9 +99,9 @@ class Simulation:
         frames: Sequence[int],
         tracers: Tensor | None = None,
     ) -> tuple[Tensor | None, ...]:
-        """From the start (x, v, F, C) through all steps; x, v, F, C and tracers at the frames."""
+        """From the start (x, v, F, C and maybe F_total) through all steps; the same and tracers at the frames."""
         ws = self.workspace
-        states = (ws.x, ws.v, ws.F, ws.C)
+        states = ws.states
         result = tuple(value.new_empty(len(frames), *value.shape) for value in start)
         for state, value in zip(states, start, strict=True):
             state[0].copy_(value)
@@ -139,18 +142,18 @@ class Simulation:
     def run_adjoint(
         self, weights: Sequence[Tensor], frames: Sequence[int], grads: Sequence[Tensor | None]
     ) -> tuple[tuple[Tensor, ...], list[Tensor]]:
-        """Gradients of x, v, F, C at the frames to those of the start (x, v, F, C) and of the weights."""
+        """Gradients of the states at the frames to those of the start and of the weights."""
         ws = self.workspace
         if self._uses_graphs:
             weights, grad_weights = ws.weights, ws.grad_weights
         else:
             grad_weights = [torch.zeros_like(w) for w in weights]
-        totals = (ws.grad_x, ws.grad_v, ws.grad_F, ws.grad_C)
+        totals = ws.grad_states
         for total in (*totals, *grad_weights):
             total.zero_()
         for index, (first, steps) in reversed(list(enumerate(self._segments(frames)))):
             if index != self._segment_in_memory:
-                for checkpoint, state in zip(ws.checkpoints, (ws.x, ws.v, ws.F, ws.C), strict=True):
+                for checkpoint, state in zip(ws.checkpoints, ws.states, strict=True):
                     state[0].copy_(checkpoint[index])
                 self._launch(("forward", steps), lambda steps=steps: self._advance(steps, weights))
                 self._segment_in_memory = index
@@ -222,7 +225,7 @@ class Simulation:
     ) -> None:
         """All steps of a segment in reverse, adding the gradients of the states after the steps `at` on the way."""
         ws = self.workspace
-        totals = (ws.grad_x, ws.grad_v, ws.grad_F, ws.grad_C)
+        totals = ws.grad_states
         frame_of = {n: index for index, n in enumerate(at)}
         ws.grad_grid.zero_()
         with ws.stream():
@@ -243,7 +246,7 @@ class Simulation:
         if here:
             part = slice(here[0][0], here[-1][0] + 1)
             places = torch.tensor([place for _, place in here], device=ws.size.device)
-            for values, state in zip(result, (ws.x, ws.v, ws.F, ws.C), strict=True):
+            for values, state in zip(result, ws.states, strict=True):
                 torch.index_select(state, 0, places, out=values[part])
 
     def _evaluate(

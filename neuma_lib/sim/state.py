@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -130,6 +130,7 @@ class Trajectory:
         F: elastic deformation gradients, shape (T, N, 3, 3).
         C: APIC affine velocities [1/s], shape (T, N, 3, 3).
         tracers: positions of passive tracers [m], shape (T, M, 3), or None.
+        F_total: total deformation gradients, what has flowed included, shape (T, N, 3, 3); None if not asked for.
     """
 
     frames: tuple[int, ...]
@@ -138,6 +139,7 @@ class Trajectory:
     F: Tensor
     C: Tensor
     tracers: Tensor | None = None
+    F_total: Tensor | None = None
 
     def at(self, frames: Sequence[int]) -> Trajectory:
         """The states at some of the frames. Those after the last one here repeat the one before them.
@@ -152,6 +154,11 @@ class Trajectory:
         found = replace(self._each(lambda value: value[[index[n] for n in reached]]), frames=reached)
         return found.hold_last(len(frames) - len(reached)) if len(reached) < len(frames) else found
 
+    @property
+    def stretch(self) -> Tensor:
+        """What stretches Gaussians, shape (T, N, 3, 3): the total deformation where it was asked for, else F."""
+        return self.F if self.F_total is None else self.F_total
+
     def hold_last(self, count: int) -> Trajectory:
         """The same with the last frame repeated `count` times, for a rollout that stopped early."""
         held = self._each(lambda value: torch.cat([value, value[-1:].expand(count, *value.shape[1:])]))
@@ -161,6 +168,15 @@ class Trajectory:
         """The same in main memory."""
         return self._each(torch.Tensor.cpu)
 
+    def followed_by(self, second: Trajectory) -> Trajectory:
+        """This trajectory and a later one with the same parts as one."""
+        joined = {name: torch.cat([value, getattr(second, name)]) for name, value in self._parts().items()}
+        return Trajectory(self.frames + second.frames, **joined)
+
     def _each(self, function: Callable[[Tensor], Tensor]) -> Trajectory:
-        values = {name: getattr(self, name) for name in ("x", "v", "F", "C", "tracers")}
-        return replace(self, **{name: function(value) for name, value in values.items() if value is not None})
+        return replace(self, **{name: function(value) for name, value in self._parts().items()})
+
+    def _parts(self) -> dict[str, Tensor]:
+        """The arrays that are there, by name."""
+        found = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in found.items() if isinstance(value, Tensor)}

@@ -45,6 +45,7 @@ class WorkspaceSize(NamedTuple):
     n_cached_steps: int = 1  # steps whose stress and grids are held
     n_checkpoints: int = 0  # segments, if there are several
     differentiable: bool = False
+    total: bool = False  # whether the total deformation is carried
     scatter: str = "atomic"  # one of `scatter.SCATTERS`
 
 
@@ -56,7 +57,9 @@ class Workspace:
 
     Attributes:
         x, v: positions [m] and velocities [m/s], shape (n_states, N, 3).
-        C, F: affine velocities [1/s] and deformation gradients, shape (n_states, N, 3, 3).
+        C, F: affine velocities [1/s] and elastic deformation gradients, shape (n_states, N, 3, 3).
+        F_total: total deformation gradients, shape (n_states, N, 3, 3), where they are carried.
+        states: x, v, F, C and, where it is carried, F_total; grad_states: their gradients.
         tau, F_trial: Kirchhoff stresses [Pa] and trial deformation gradients, shape (n_cached_steps, N, 3, 3).
         grid: momentum [kg m/s] and mass [kg] of the nodes, shape (n_cached_steps, nodes^3, 4).
         grid_v: velocity [m/s] of the nodes and 1 where there is mass, shape (n_cached_steps, nodes^3, 4).
@@ -64,7 +67,7 @@ class Workspace:
         faults: first step and particle of a non-finite value, of one that crossed a cell in a step and of one
             that left the grid, shape (3,).
         order: particles sorted by cell, every `SORT_EVERY` steps, shape (n_sorts, N).
-        checkpoints: x, v, F and C at the start of each segment, shape (n_checkpoints, ...).
+        checkpoints: the states at the start of each segment, shape (n_checkpoints, ...).
         grad_*: gradients of the above for one step, without the first axis. grad_grid has two sides that steps
             use in turn.
         law_caches: what the laws keep of their evaluations, held here so that the next rollout can overwrite it.
@@ -84,13 +87,16 @@ class Workspace:
         states, cached = size.n_states, size.n_cached_steps
         self.x, self.v = self._vectors(states, N), self._vectors(states, N)
         self.C, self.F = self._matrices(states, N), self._matrices(states, N)
+        self.states = (self.x, self.v, self.F, self.C)
+        if size.total:
+            self.F_total = self._matrices(states, N)
+            self.states += (self.F_total,)
         self.tau, self.F_trial = self._matrices(cached, N), self._matrices(cached, N)
         self.grid, self.grid_v = self._nodes(cached, nodes), self._nodes(cached, nodes)
         self.mass, self.vol0 = self._scalars(N), self._scalars(N)
         self.faults = self._buffer((3,), None, torch.int64)
         self.checkpoints = tuple(
-            value.new_empty(size.n_checkpoints, *value.shape[1:])
-            for value in (self.x, self.v, self.F, self.C)
+            value.new_empty(size.n_checkpoints, *value.shape[1:]) for value in self.states
         )
         self.sorts = size.scatter != "atomic"
         n_sorts = -(-max(states - 1, 1) // SORT_EVERY) if self.sorts and size.differentiable else 1
@@ -103,6 +109,10 @@ class Workspace:
             self.grad_C, self.grad_F = self._matrices(N), self._matrices(N)
             self.grad_F_trial, self.grad_tau = self._matrices(N), self._matrices(N)
             self.grad_F_elastic = self._matrices(N)
+            self.grad_states = (self.grad_x, self.grad_v, self.grad_F, self.grad_C)
+            if size.total:
+                self.grad_F_total = self._matrices(N)
+                self.grad_states += (self.grad_F_total,)
             self.grad_grid = self._nodes(2, nodes)
             self._record_adjoint()
 
@@ -159,8 +169,11 @@ class Workspace:
         _run(self._grid_update, cached)
 
     def transfer_to_particles(self, step: int) -> None:
-        """Velocities of the nodes to x, v and C after the step, and to F_trial."""
-        _run(self._g2p, self.at(step), self.at(step + 1), self.cached_at(step), step)
+        """Velocities of the nodes to x, v, C and the total deformation after the step, and to F_trial."""
+        now, after = self.at(step), self.at(step + 1)
+        _run(self._g2p, now, after, self.cached_at(step), step)
+        if self.size.total:
+            _run(self._total, now, after, after)
 
     def trial_deformation(self, step: int) -> None:
         """F_trial of a step again, from the F before and the C after it."""
@@ -179,11 +192,13 @@ class Workspace:
     def transfer_adjoint(self, step: int) -> None:
         """Gradients of the state after a step and of F_trial to those of the state before it and of tau.
 
-        grad_x, grad_v and grad_C hold the former on entry and the latter on return; grad_F is set to the part
-        that comes through F_trial. Steps run downwards after `grad_grid` was cleared once.
+        grad_x, grad_v, grad_C and grad_F_total hold the former on entry and the latter on return; grad_F is set to
+        the part that comes through F_trial. Steps run downwards after `grad_grid` was cleared once.
         """
         now, after, cached = self.at(step), self.at(step + 1), self.cached_at(step)
         side = step % 2
+        if self.size.total:
+            _run(self._total_adjoint, now, after)
         _run(self._g2p_adjoint, now, after, cached, side, self.sorted_at(step))
         _run(self._grid_adjoint, cached, side)
         _run(self._p2g_adjoint, now, cached, side)
@@ -256,6 +271,9 @@ class Workspace:
             rows_v, self.x, self.v, self.C, self.F, self.F_trial, self.faults,
         )  # fmt: skip
         self._trial = self._record(k.trial_deformation, N, 0, 0, 0, self.C, self.F, self.F_trial)
+        if self.size.total:
+            F_total = self.F_total
+            self._total = self._record(k.trial_deformation, N, 0, 0, 0, self.C, F_total, F_total)
 
     def _record_adjoint(self) -> None:
         k = adjoint_kernels(self.size.dtype, self.size.scatter)
@@ -272,6 +290,10 @@ class Workspace:
             self.x, self.v, self.C, self.tau, self.mass, self.vol0, grad_rows,
             self.grad_x, self.grad_v, self.grad_C, self.grad_tau,
         )  # fmt: skip
+        if self.size.total:
+            self._total_adjoint = self._record(
+                k.total_adjoint, N, 0, 0, self.C, self.F_total, self.grad_C, self.grad_F_total
+            )
 
 
 _POOL_SIZE = 2  # one in use by the graph of the last iteration, one for the next

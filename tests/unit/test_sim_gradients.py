@@ -28,30 +28,30 @@ def scene(centre_y=0.5):
 
 
 def random_loss(seed=0):
-    """A fixed random linear function of x, v, F and C at all frames, with comparable parts."""
+    """A fixed random linear function of x, v, F, C and the total F at all frames, with comparable parts."""
 
     def loss(states):
         generator = torch.Generator().manual_seed(seed)
-        total = 0.0
-        for values, scale in zip(states, (10.0, 1.0, 1.0, 0.1), strict=True):
+        value = 0.0
+        for values, scale in zip(states, (10.0, 1.0, 1.0, 0.1, 1.0), strict=False):
             weights = torch.randn(values.shape, generator=generator, dtype=torch.float64)
-            total = total + scale * (weights.to(values) * values).sum()
-        return total
+            value = value + scale * (weights.to(values) * values).sum()
+        return value
 
     return loss
 
 
 def simulate(model, law, start, mass, vol0, frames, **options):
-    """States (x, v, F, C) at the frames."""
+    """States (x, v, F, C) at the frames, and the total F if ``total=True``."""
     x, v, F, C = start
     path = rollout(model, law, State(x, v, mass, vol0, F, C), steps=frames[-1], frames=frames, **options)
-    return path.x, path.v, path.F, path.C
+    return path.x, path.v, path.F, path.C, *([] if path.F_total is None else [path.F_total])
 
 
-def simulate_slowly(model, law, start, mass, vol0, frames):
+def simulate_slowly(model, law, start, mass, vol0, frames, total=False):
     """The same by the torch twin."""
     x, v, F, C = start
-    return torch_simulation.rollout(model, law, State(x, v, mass, vol0, F, C), frames)
+    return torch_simulation.rollout(model, law, State(x, v, mass, vol0, F, C), frames, total)
 
 
 def trainable(law):
@@ -114,22 +114,82 @@ def test_finite_differences(name, steps, model, height):
     assert_slopes_match(value, points, grads, sizes)
 
 
+def falling():
+    """An undeformed cube in the air that has met the floor after 40 steps: start (x, v, F, C), mass and volume."""
+    x, mass, vol0 = cube(COUNT, side=0.25, centre=(0.5, 0.19, 0.5))
+    v = torch.tensor([0.3, -2.0, 0.1], dtype=x.dtype).repeat(COUNT, 1)
+    at_rest = torch.eye(3, dtype=x.dtype).repeat(COUNT, 1, 1), torch.zeros(COUNT, 3, 3, dtype=x.dtype)
+    return (x, v, *at_rest), mass, vol0
+
+
+def assert_gradients_match(model, law, start, mass, vol0, frames, size=1e-6, **options):
+    """Gradients with respect to x0, v0, F0 and C0 against finite differences of a step size."""
+    _, grads = gradients(model, law, start, mass, vol0, frames, **options)
+
+    def value(points):
+        return random_loss()(simulate(model, law, points, mass, vol0, frames, **options))
+
+    assert_slopes_match(value, list(start), grads, [size] * 4)
+
+
 @pytest.mark.parametrize("boundary", ["no_slip", "slip", "sticky"])
 def test_finite_differences_through_a_bounce(boundary):
     """From free flight to the way back, with respect to x0, v0, F0 and C0; nodes start and stop on the way."""
-    x, mass, vol0 = cube(COUNT, side=0.25, centre=(0.5, 0.19, 0.5))
-    v = torch.tensor([0.3, -2.0, 0.1], dtype=x.dtype).repeat(COUNT, 1)
-    start = (x, v, torch.eye(3, dtype=x.dtype).repeat(COUNT, 1, 1), torch.zeros(COUNT, 3, 3, dtype=x.dtype))
+    start, mass, vol0 = falling()
     model, law, frames = MPMModel(14, DT, boundary=boundary), make_law("hencky"), (0, 40, 100)
     path = simulate(model, law, start, mass, vol0, frames)
     assert contact_clearance(model, path[0][0]) > 0 > contact_clearance(model, path[0][1])
     assert boundary == "sticky" or path[1][2, :, 1].mean() > 0.5
-    _, grads = gradients(model, law, start, mass, vol0, frames)
+    assert_gradients_match(model, law, start, mass, vol0, frames)
 
-    def value(points):
-        return random_loss()(simulate(model, law, points, mass, vol0, frames))
 
-    assert_slopes_match(value, list(start), grads, [1e-6] * 4)
+@pytest.mark.parametrize("name, size", [("von_mises", 1e-6), ("viscous_flow", 1e-5)])
+def test_finite_differences_of_the_total_deformation_where_a_body_flows(name, size):
+    """Through contact and plastic flow, where the total deformation is another than the elastic one.
+
+    A law without a yield point has no switches, so that a larger step can stand out of the round-off.
+    """
+    start, mass, vol0 = falling()
+    model, law, frames = MPMModel(14, DT), make_law(name), (0, 40, 100)
+    x, _, F, _, F_total = simulate(model, law, start, mass, vol0, frames, total=True)
+    assert contact_clearance(model, x[0]) > 0 > contact_clearance(model, x[1])
+    assert (F_total[2] - F[2]).abs().max() > 0.1
+    assert_gradients_match(model, law, start, mass, vol0, frames, size, total=True)
+
+
+@pytest.mark.parametrize("cache_bytes", [0, math.inf])
+@pytest.mark.parametrize("name", ["von_mises", "drucker_prager", "neural"])
+def test_total_deformation_equals_torch_twin(name, cache_bytes):
+    """All states and gradients of 15 steps in a corner, from a start that is strained already, to 1e-9."""
+    model, start, mass, vol0 = corner()
+    law, frames = make_law(name), (0, 4, 15)
+    parameters = trainable(law) if name == "neural" else []
+
+    states = simulate(model, law, start, mass, vol0, frames, total=True)
+    expected = simulate_slowly(model, law, start, mass, vol0, frames, total=True)
+    for a, b in zip(states, expected, strict=True):
+        assert (a - b).abs().max() < 1e-9 * b.abs().max()
+    for options in ({}, {"memory": 6.2e5}):
+        options |= {"cache_bytes": cache_bytes, "total": True}
+        _, grads = gradients(model, law, start, mass, vol0, frames, parameters, **options)
+        run = dict(run=simulate_slowly, total=True)
+        _, expected = gradients(model, law, start, mass, vol0, frames, parameters, **run)
+        for a, b in zip(grads, expected, strict=True):
+            assert (a - b).abs().max() < 1e-9 * b.abs().max()
+
+
+def test_carrying_the_total_deformation_changes_nothing_else():
+    """States, and gradients of a loss that does not read it, are the same bytes."""
+    start, mass, vol0 = scene(TOUCHING)
+    law, model, frames = make_law("von_mises"), MPMModel(14, DT), (0, 3, 12)
+    for options in ({}, {"cache_bytes": 0}):
+        found = []
+        for total in (False, True):
+            begin = tuple(value.clone().requires_grad_() for value in start)
+            states = simulate(model, law, begin, mass, vol0, frames, total=total, **options)
+            found.append((*states[:4], *torch.autograd.grad(random_loss()(states[:4]), begin)))
+            assert len(states) == 4 + total
+        assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
 
 
 def corner(walls="outside"):
@@ -204,18 +264,22 @@ def test_what_is_cached_does_not_change_the_gradient():
         assert all(torch.equal(a, b) for a, b in zip(grads, everything, strict=True))
 
 
-@pytest.mark.parametrize("cache_bytes,segment", [(0, 5), (math.inf, 4), (math.inf, 2)])
-def test_checkpoints_do_not_change_the_gradient(cache_bytes, segment):
+@pytest.mark.parametrize(
+    "cache_bytes,segment,total",
+    [(0, 5, False), (math.inf, 4, False), (math.inf, 2, False), (0, 5, True), (math.inf, 4, True)],
+)
+def test_checkpoints_do_not_change_the_gradient(cache_bytes, segment, total):
     """With little memory the steps are computed again, segment by segment: the same bytes, also the second time."""
     x, mass, vol0 = cube(2000, side=0.25, centre=(0.5, TOUCHING, 0.5))
     start, steps = (x, *strained(x)), 13
     law = make_law("neural")
     parameters = trainable(law)
     model, frames = MPMModel(9, DT), (0, 3, 7, steps)
-    _, expected = gradients(model, law, start, mass, vol0, frames, parameters, cache_bytes=cache_bytes)
-    state, step = 8 * 24 * len(x), 8 * (18 * len(x) + 8 * model.nodes**3)
+    options = dict(cache_bytes=cache_bytes, total=total)
+    _, expected = gradients(model, law, start, mass, vol0, frames, parameters, **options)
+    state, step = 8 * (33 if total else 24) * len(x), 8 * (18 * len(x) + 8 * model.nodes**3)
     memory = state * (segment + 1 + math.ceil(steps / segment)) + step * (segment if cache_bytes else 1)
-    options = dict(memory=memory, cache_bytes=cache_bytes)
+    options["memory"] = memory
     assert plan_memory(steps, len(x), model.nodes**3, 8, **options) == MemoryPlan(segment, cache_bytes > 0, 0)
     loss = random_loss()(simulate(model, law, start, mass, vol0, frames, **options))
     for _ in range(2):
@@ -272,8 +336,9 @@ def test_gradient_through_a_skipped_flight(frames):
         x = x0.clone().requires_grad_()
         v = torch.tensor([0.3, -2.0, 0.1], dtype=torch.float64, requires_grad=True)
         state = State(x, v, mass, vol0)
-        path = rollout(model, law, state, steps=frames[-1], frames=frames, skip_free_flight=skip)
-        loss = random_loss()((path.x, path.v, path.F, path.C))
+        options = dict(skip_free_flight=skip, total=True)
+        path = rollout(model, law, state, steps=frames[-1], frames=frames, **options)
+        loss = random_loss()((path.x, path.v, path.F, path.C, path.F_total))
         return torch.autograd.grad(loss, (x, v, *parameters), materialize_grads=True)
 
     for a, b in zip(grads(True), grads(False), strict=True):

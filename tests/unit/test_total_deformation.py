@@ -3,6 +3,7 @@
 import pytest
 import torch
 from grounding_scene import MODEL, ball, observe
+from sim_scenes import cube, spinning
 
 from neuma_lib.config.material import MaterialConfig
 from neuma_lib.errors import InputError
@@ -11,12 +12,13 @@ from neuma_lib.fitting.material import PixelLoss, train_material
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.sim.rollout import rollout
-from neuma_lib.sim.total_deformation import every_step, total_deformation
+from neuma_lib.sim.state import State
 
 FRAMES = (0, 30, 60)
 V0 = torch.tensor([0.0, -1.5, 0.0], dtype=torch.float64)
 ELASTIC = {"elasticity": {"name": "hencky", "E": 3e4, "nu": 0.3}}
 PLASTIC = {**ELASTIC, "plasticity": {"name": "von_mises", "yield_stress": 50.0}}
+EYE = torch.eye(3, dtype=torch.float64)
 
 
 @pytest.fixture(scope="module")
@@ -24,56 +26,92 @@ def body():
     return ball()
 
 
-def paths(body, spec):
-    """The same motion at the frames, and with its total deformation."""
+def run(body, spec, frames=FRAMES, **options):
+    options = {"total": True, **options}
+    return rollout(MODEL, analytic_law(spec), body.state(V0), steps=frames[-1], frames=frames, **options)
 
-    def run(frames):
-        return rollout(MODEL, analytic_law(spec), body.state(V0), steps=FRAMES[-1], frames=frames)
 
-    return run(FRAMES), total_deformation(run(every_step(FRAMES)), MODEL.dt, FRAMES)
+def product_of_increments(path):
+    """The product of I + dt C over all steps, at each of them, from a path that holds them all."""
+    found = [EYE.expand_as(path.C[0])]
+    for C in path.C[1:]:
+        found.append((EYE + MODEL.dt * C) @ found[-1])
+    return torch.stack(found)
+
+
+def test_is_none_unless_asked_for(body):
+    path = run(body, ELASTIC, total=False)
+    assert path.F_total is None and torch.equal(path.stretch, path.F)
+
+
+def test_is_the_product_of_the_increments(body):
+    every = run(body, PLASTIC, range(FRAMES[-1] + 1))
+    expected = product_of_increments(every)
+    assert (every.F_total - expected).abs().max() < 1e-12 * expected.abs().max()
+    path = run(body, PLASTIC)
+    assert torch.equal(path.F_total, every.F_total[list(FRAMES)]) and path.stretch is path.F_total
 
 
 def test_equals_the_elastic_one_where_nothing_flows(body):
-    elastic, total = paths(body, ELASTIC)
-    assert total.frames == FRAMES and torch.equal(total.x, elastic.x)
-    assert (total.F[-1] - torch.eye(3, dtype=torch.float64)).abs().max() > 1e-3
-    assert torch.allclose(total.F, elastic.F, atol=1e-10)
+    path = run(body, ELASTIC)
+    assert (path.F_total[-1] - EYE).abs().max() > 1e-3
+    assert torch.allclose(path.F_total, path.F, atol=1e-12)
 
 
 def test_keeps_what_has_flowed(body):
-    elastic, total = paths(body, PLASTIC)
+    path = run(body, PLASTIC)
     # The return map of von Mises keeps volume, so both have the same determinant but not the same shape.
-    assert torch.allclose(torch.linalg.det(total.F), torch.linalg.det(elastic.F), rtol=1e-8)
-    spread = [torch.linalg.svdvals(F[-1]).log().std(1).max() for F in (elastic.F, total.F)]
+    assert torch.allclose(torch.linalg.det(path.F_total), torch.linalg.det(path.F), rtol=1e-8)
+    spread = [torch.linalg.svdvals(F[-1]).log().std(1).max() for F in (path.F, path.F_total)]
     assert spread[1] > 3 * spread[0]
 
 
-def test_needs_every_step(body):
-    with pytest.raises(InputError, match="every_step"):
-        total_deformation(paths(body, ELASTIC)[0], MODEL.dt, FRAMES)
+def test_is_exact_over_a_skipped_free_flight(body):
+    frames = (0, 10, 30, 60)
+    skipped, simulated = (run(body, PLASTIC, frames, skip_free_flight=skip) for skip in (True, False))
+    assert torch.equal(skipped.F_total[1], EYE.expand_as(skipped.F[1]))  # in flight, from closed form
+    assert (skipped.F_total - simulated.F_total).abs().max() < 1e-10
 
 
-def test_evaluation_follows_it_in_one_simulation(body, monkeypatch):
+def test_turns_with_a_spinning_body_in_flight():
+    """Affine motions are exact in APIC: each step multiplies by I + dt C, with C that follows the motion."""
+    x, mass, vol0 = cube(200)
+    v, C = spinning(x)
+    state = State(x, v, mass, vol0, C=C)
+    path = rollout(MODEL, analytic_law(ELASTIC), state, steps=50, frames=range(51), total=True)
+    expected = product_of_increments(path)
+    assert (path.F_total[-1] - EYE).abs().max() > 0.3
+    assert (path.F_total - expected).abs().max() < 1e-12
+
+
+def test_starts_from_the_deformation_of_the_start(body):
+    """A body that is strained already has not flowed before: its total deformation is the elastic one."""
+    strained = body.state(V0)
+    F = torch.diag(torch.tensor([1.05, 1.0, 0.96], dtype=torch.float64)).expand_as(strained.F)
+    state = State(strained.x, strained.v, strained.mass, strained.vol0, F=F)
+    path = rollout(MODEL, analytic_law(ELASTIC), state, steps=20, frames=(0, 20), total=True)
+    assert torch.equal(path.F_total[0], F) and torch.allclose(path.F_total, path.F, atol=1e-12)
+
+
+def test_evaluation_carries_it(body):
     """Same states and metrics as without it, and the total deformation of a rollout of its own, to the bit."""
-    law, runs = analytic_law(PLASTIC), []
-    monkeypatch.setattr(
-        motion, "rollout", lambda *args, **options: runs.append(1) or rollout(*args, **options)
-    )
+    law = analytic_law(PLASTIC)
     tracers = body.x0[:20]
     truth = tracers.expand(len(FRAMES), -1, -1)
     elastic = motion.evaluate(MODEL, law, body.state(V0), FRAMES, truth, truth, tracers)
     total = motion.evaluate(MODEL, law, body.state(V0), FRAMES, truth, truth, tracers, total=True)
-    assert len(runs) == 2 and elastic.F_total is None
+    assert elastic.path.F_total is None
     assert total.metrics == elastic.metrics and torch.equal(total.tracers, elastic.tracers)
     assert total.path.frames == FRAMES and torch.equal(total.path.F, elastic.path.F)
-    assert torch.equal(total.F_total, paths(body, PLASTIC)[1].F)
+    assert torch.equal(total.path.F_total, run(body, PLASTIC).F_total)
 
 
 def test_frames_of_a_rollout_that_stopped_early(body):
-    held = paths(body, ELASTIC)[0].hold_last(2)
+    held = run(body, PLASTIC).hold_last(2)
     wanted = held.at((0, 60, 90, 120))
     assert wanted.frames == (0, 60, 60, 60)
-    assert torch.equal(wanted.x, held.x[[0, 2, 2, 2]])
+    for name in ("x", "F_total"):
+        assert torch.equal(getattr(wanted, name), getattr(held, name)[[0, 2, 2, 2]])
     with pytest.raises(InputError, match="frames"):
         held.at((0, 31))
 

@@ -330,6 +330,18 @@ def material_settings(wildcards):
     return SETTINGS.method_material(wildcards.scene, wildcards.method).plain()
 
 
+def stretches_by_total(scene, method):
+    """Whether the total deformation stretches the Gaussians in a method on a scene."""
+    return SETTINGS.method_material(scene, method).covariance_from == "total"
+
+
+@checked
+def carries_total(wildcards):
+    """Whether a prediction carries the total deformation: the method asks for it, for one of the bodies at least."""
+    scenes = SETTINGS.body_scenes(subject(wildcards))
+    return any(stretches_by_total(scene, wildcards.method) for scene in scenes)
+
+
 @checked
 def material_prior(wildcards):
     """The law that a method starts from; none where it takes an analytic one."""

@@ -51,7 +51,7 @@ rule evaluation:
         simulation=simulation_settings,
         densities=lambda wildcards: [method_density(wildcards)],
         laws=lambda wildcards: [law for law in [true_law(wildcards)] if law],
-        covariance_from=lambda wildcards: material_settings(wildcards)["covariance_from"],
+        total=carries_total,
         carrier=judged_carrier,
         frames=frame_steps,
         device=SETTINGS.device,

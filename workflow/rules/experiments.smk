@@ -72,6 +72,7 @@ rule experiment:
         simulation=experiment_simulation,
         densities=of_each_body(method_density),
         laws=of_each_body(true_law),
+        total=carries_total,
         carrier=lambda wildcards: of_each_body(judged_carrier)(wildcards)[0],
         frames=experiment_frames,
         device=SETTINGS.device,

@@ -155,6 +155,7 @@ FIGURES = {
         },
         "params": {
             "scenes": scene_constants(DRAWN.lora_alphav),
+            "total": {scene: stretches_by_total(scene, "neuma") for scene in DRAWN.lora_alphav},
             "weights": list(DRAWN.weights),
             "shown": DRAWN.shown - 1,
             "device": SETTINGS.device,

@@ -42,12 +42,11 @@ def main(inputs, output, params, run) -> None:
         torch.from_numpy(truth["tracers"]).to(device),
         torch.from_numpy(truth["tracers_again"]).to(device),
         torch.from_numpy(measure["starts"]).to(device),
-        total=params.get("covariance_from") == "total",
+        total=params.total,
         floor=torch.from_numpy(measure["floor"]),
     )
-    path = {name: getattr(evaluation.path, name).cpu().numpy() for name in ("x", "F")}
-    if evaluation.F_total is not None:
-        path["F_total"] = evaluation.F_total.cpu().numpy()
+    found = {name: getattr(evaluation.path, name) for name in ("x", "F", "F_total")}
+    path = {name: values.cpu().numpy() for name, values in found.items() if values is not None}
     write_arrays(
         output.rollout, {**path, "frames": np.asarray(params.frames)}, {"dt": params.simulation["dt"]}
     )

@@ -5,14 +5,13 @@ height of the body over time. Grey: the part that was observed. Paper: fig:ext_t
 from __future__ import annotations
 
 import numpy as np
-import torch
 from matplotlib.figure import Figure
 
 from neuma_lib.evaluation.metrics import mean_height
 from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.evaluation.plotting.image_grid import GAP, ImageGrid, draw_images, place
 from neuma_lib.io.hdf5 import read_arrays
-from neuma_lib.io.particles import load_body
+from neuma_lib.io.particles import load_body, load_motion
 
 LEFT, TOP, CURVE = 0.92, 0.2, 1.3
 
@@ -26,8 +25,8 @@ def data(inputs, params, say) -> ImageGrid:
     truth, attributes = read_arrays(inputs.truth, required=names, only=names)
     body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density)
     shown = rendering.evenly(params.shown, len(truth["frames"]))
-    paths = [read_arrays(file, required=("x", "F"))[0] for file in inputs.rollouts]
-    everywhere = [arrays["x"].reshape(-1, 3) for arrays in (truth, *paths)]
+    motions = [load_motion(file) for file in inputs.rollouts]
+    everywhere = [np.asarray(x).reshape(-1, 3) for x in (truth["x"], *(x for x, _ in motions))]
     cameras = rendering.frontal(np.concatenate(everywhere), params.size, params.size)
     rows = [
         rendering.particle_pictures(
@@ -35,11 +34,9 @@ def data(inputs, params, say) -> ImageGrid:
         )
     ]
     heights = {"truth": mean_height(truth["x"], truth["mass"])}
-    for method, arrays in zip(params.titles, paths, strict=True):
-        rows.append(
-            rendering.renders(body, cameras, *(torch.from_numpy(arrays[name][shown]) for name in ("x", "F")))
-        )
-        heights[method] = mean_height(arrays["x"], body.mass)
+    for method, (x, F) in zip(params.titles, motions, strict=True):
+        rows.append(rendering.renders(body, cameras, x[shown], F[shown]))
+        heights[method] = mean_height(x, body.mass)
     dt = attributes["dt"]
     numbers = {
         "observed": params.observed,

@@ -46,8 +46,8 @@ def data(inputs, params, say) -> ImageGrid:
         columns, heights = [], []
         for weight in params.weights:
             law.set_adaptor_weight(weight)
-            path, failure = predict(model, law, start, video.frames)
-            columns.append(rendering.renders(body, cameras, path.x[shown], path.F[shown]))
+            path, failure = predict(model, law, start, video.frames, total=params.total[scene])
+            columns.append(rendering.renders(body, cameras, path.x[shown], path.stretch[shown]))
             heights.append(mean_height(path.x.cpu(), body.mass.cpu()))
             if failure:
                 say(f"{scene}: w = {weight:g}: a particle {failure.happened} at step {failure.step}")

@@ -6,13 +6,12 @@ the law learned in its own video, on one grid. Paper: fig:vis_generalize; distan
 from __future__ import annotations
 
 import numpy as np
-import torch
 from matplotlib.figure import Figure
 
 from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.evaluation.plotting.image_grid import GAP, ImageGrid, draw_images, note
 from neuma_lib.io.hdf5 import read_arrays
-from neuma_lib.io.particles import load_body
+from neuma_lib.io.particles import load_body, load_motion
 
 LEFT, TOP, BETWEEN = 0.92, 0.36, 0.42
 DENSITY = 1000.0
@@ -26,7 +25,7 @@ def data(inputs, params, say) -> ImageGrid:
 
     Numbers: ``letters``, the count of rows of (a); ``materials``, one a letter; ``times``, column titles of (b).
     """
-    paths = [read_arrays(file, required=("x", "F", "frames")) for file in inputs.rollouts]
+    paths = [read_arrays(file, required=("x", "frames"), only=("x", "frames")) for file in inputs.rollouts]
     reconstructed = zip(inputs.particles, inputs.binding, inputs.gaussians, strict=True)
     bodies = [load_body(*files, DENSITY) for files in reconstructed]
     letters, count = len(params.letters), len(params.letters) or params.shown
@@ -35,10 +34,8 @@ def data(inputs, params, say) -> ImageGrid:
     width, height = params.size, round(params.size * float(np.clip(high / wide, WIDEST, TALLEST)))
 
     def filmed(k: int, cameras, shown) -> np.ndarray:
-        arrays, _ = paths[k]
-        return rendering.renders(
-            bodies[k], cameras, *(torch.from_numpy(arrays[name][shown]) for name in ("x", "F"))
-        )
+        motion = load_motion(inputs.rollouts[k])
+        return rendering.renders(bodies[k], cameras, *(state[shown] for state in motion))
 
     rows, titles, times = [], [], []
     if letters:
