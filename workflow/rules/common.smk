@@ -56,8 +56,8 @@ onstart:
             ) from None
 
 
-# Tables of distances; the other two have rules of their own.
-CHAMFER_TABLES = [name for name in SETTINGS.tables if name not in ("table4", "learning_rates")]
+# Tables of distances; the other three have rules of their own.
+CHAMFER_TABLES = [name for name in SETTINGS.tables if name not in ("table4", "learning_rates", "bias")]
 
 
 wildcard_constraints:
@@ -293,6 +293,11 @@ def table_records(table):
 def table_cells(table):
     """Method and column of every run behind a table, in the order of `table_runs`."""
     return [[run["method"], run["column"]] for run in table_runs(table)]
+
+
+def bias_cells(table):
+    """Scene, as its chain is called, and method of every run behind a table, in the order of `table_runs`."""
+    return [{"scene": run["scene"], "method": run["method"]} for run in table_runs(table)]
 
 
 def learning_rate_cells(table):

@@ -81,6 +81,20 @@ rule learning_rates:
         "../scripts/learning_rates.py"
 
 
+rule bias_table:
+    input:
+        bias=lambda wildcards: table_files("bias", "bias.json"),
+        metrics=lambda wildcards: table_files("bias", "metrics.json"),
+    output:
+        csv=f"{RESULTS}/bias.csv",
+        markdown=f"{RESULTS}/bias.md",
+    params:
+        cells=lambda wildcards: bias_cells("bias"),
+        titles=lambda wildcards: table_titles("bias"),
+    script:
+        "../scripts/bias_table.py"
+
+
 rule timings:
     input:
         benchmarks=lambda wildcards: [benchmark for benchmark, _ in table_records("table1")],

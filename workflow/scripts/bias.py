@@ -1,0 +1,44 @@
+"""The loss of a method's law in the views of its training, beside that of the true law on the same reconstruction."""
+
+from dataclasses import asdict
+
+import torch
+
+from neuma_lib.config.material import MaterialConfig
+from neuma_lib.device import choose_device
+from neuma_lib.evaluation.bias import bias_report, frame_losses
+from neuma_lib.fitting.material import PixelLoss
+from neuma_lib.io.files import read_json, write_json
+from neuma_lib.io.images import load_observation
+from neuma_lib.io.laws import load_law
+from neuma_lib.io.particles import load_body, thrown
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.sim.model import MPMModel
+from workflow.stage import run_script
+
+
+def main(inputs, output, params, run) -> None:
+    settings = MaterialConfig(**params.material)
+    device = choose_device(params.device)
+    body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density, settings.carrier)
+    body = body.to(torch.float32, device)
+    video = load_observation(inputs.transforms, settings.views).to(torch.float32, device)
+    loss = PixelLoss(body, video, total=settings.covariance_from == "total")
+    model, start = MPMModel(**params.simulation), thrown(body, inputs.velocity)
+    truth = analytic_law(params.truth, dt=params.simulation["dt"])
+    if inputs.prior:
+        law = load_law(inputs.prior, inputs.get("adaptor") or None)
+    else:
+        spec = read_json(inputs.identified)["law"] if inputs.identified else params.truth
+        law = analytic_law(spec, dt=params.simulation["dt"])
+    losses, failure = frame_losses(model, law.to(device), start, loss)
+    true_losses, true_failure = frame_losses(model, truth.to(device), start, loss)
+    report = bias_report(losses, true_losses)
+    about = {"frames": list(loss.frames), "views": list(settings.views)}
+    about |= {"diverged": failure and asdict(failure)}
+    about |= {"true_law_diverged": true_failure and asdict(true_failure)}
+    write_json(output.bias, {**report, **about})
+    run.say(f"loss {report['loss']:.3e}, {report['ratio']:.2f} of the true law's")
+
+
+run_script(main, snakemake)
