@@ -29,7 +29,8 @@ def project(tmp_path_factory, kernels):
 
 
 def test_only_evaluation_and_figures_of_it_and_one_ablation_read_the_truth(project):
-    everything = ("tables", "figures", "videos", "packed", f"{SCENE}/{SUPERVISED}/image_metrics.json")
+    on_request = [f"{SCENE}/{SUPERVISED}/image_metrics.json", f"{SCENE}/neuma/bias.json"]
+    everything = ("tables", "figures", "videos", "packed", *on_request)
     graph = jobs(project.run("--dry-run", *everything))
     assert len(graph) > 80
     truths = {
