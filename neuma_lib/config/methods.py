@@ -13,6 +13,9 @@ from neuma_lib.config.base import Section
 from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.variants import split_variant
 
+LAW_FROM = "law_from"
+"""Key of a variant: the scene whose law is evaluated, in place of the scene's own."""
+
 
 class MethodConfig(Section):
     """A method is a set of options over the same code."""
@@ -46,12 +49,13 @@ class MethodConfig(Section):
 def parse_method(text: str, methods: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     """Split a method's folder name, ``neuma+rank=4+seed=2``, into its base and its settings.
 
-    Keys are those of the section ``material``, and ``prior``. Values are YAML scalars; a comma makes a list.
+    Keys are those of the section ``material``, ``prior``, and ``law_from``, a scene. Values are YAML scalars; a comma
+    makes a list.
 
     Raises:
         InputError: unknown method or key, a repeated key, or a piece without '='.
     """
-    base, given = split_variant(text, methods, [*MaterialConfig.model_fields, "prior"], "method")
+    base, given = split_variant(text, methods, [*MaterialConfig.model_fields, "prior", LAW_FROM], "method")
     variant: dict[str, Any] = {}
     for key, value in given.items():
         field = MaterialConfig.model_fields.get(key)

@@ -66,6 +66,12 @@ class SceneConfig(Section):
     images: SuppliedConfig = Field(
         SuppliedConfig(), description="files of its images, where Blender makes none"
     )
+    videos: tuple[str, ...] = Field(
+        (),
+        description="further scenes of the same material: one law is trained with all these videos, which count alike, "
+        "however long. In place of a name, settings that differ from this scene's make another throw of its object, "
+        "the scene `<name>_throw2`, or 3, ... by its place in the list. Not handed on by `like`",
+    )
     story: str = Field("", description="in which way the prior is wrong, in words")
     material: dict[str, Any] = Field(
         {}, description="settings of the section material that this scene overrides"

@@ -23,7 +23,7 @@ from neuma_lib.config.gaussians import GaussiansConfig
 from neuma_lib.config.geometry import GeometryConfig
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.material import MaterialConfig
-from neuma_lib.config.methods import MethodConfig, parse_method, variant_title
+from neuma_lib.config.methods import LAW_FROM, MethodConfig, parse_method, variant_title
 from neuma_lib.config.priors import PriorsConfig
 from neuma_lib.config.random_scenes import RandomConfig, draw_scenes
 from neuma_lib.config.scenes import SceneConfig
@@ -88,6 +88,7 @@ class Config(Section):
                 )
             _changed(self.material, scene.material, f"scenes.{name}.material")
             self.scene_truth(name)
+            self._check_videos(name)
         for name, method in self.methods.items():
             _changed(self.material, method.material, f"methods.{name}.material")
             own = [known for known, entry in self.methods.items() if entry.trained_as is None]
@@ -105,11 +106,32 @@ class Config(Section):
         for name in self.experiments:
             self.experiment_truth(name)
         for method in self.random.methods if self.random.count else ():
-            parse_method(method, self.methods)
+            self._law_from(method)
         for table in self.tables.values():
             for method in (*table.methods, *table.titles):
-                parse_method(method, self.methods)
+                self._law_from(method)
         return self
+
+    def _check_videos(self, name: str) -> None:
+        """Further videos of a scene are others, of its material, in its time step."""
+        scene, where = self.scenes[name], f"scenes.{name}.videos"
+        for video in scene.videos:
+            if video not in self.scenes:
+                raise ValueError(f"{where}: no scene '{video}'{hint(video, self.scenes)}")
+            other, supplied = self.scenes[video], self.scenes[video].images.dynamic
+            if video == name or scene.videos.count(video) > 1:
+                raise ValueError(f"{where}: '{video}' is there twice; its own video a scene has anyway")
+            if supplied is not None and supplied == scene.images.dynamic:
+                raise ValueError(f"{where}: '{video}' has the same video, {supplied}; give it images.dynamic")
+            if other.videos:
+                raise ValueError(f"{where}: '{video}' has further videos itself; list all in one of the two")
+            for key, why in (
+                ("law", "one law is sought"),
+                ("prior", "one law starts from one prior"),
+                ("dt", "what a law lets flow in a step depends on it"),
+            ):
+                if getattr(other, key) != getattr(scene, key):
+                    raise ValueError(f"{where}: '{video}' has another {key}, but {why}; give both the same")
 
     @model_validator(mode="after")
     def _floor_means_something(self) -> Config:
@@ -223,13 +245,34 @@ class Config(Section):
         )
 
     def true_law(self, scene: str, method: str) -> dict[str, Any] | None:
-        """The scene's own law, where this is what a method evaluates."""
+        """The true law of the scene, where this is what a method evaluates."""
         base, _ = parse_method(method, self.methods)
-        return self.scene(scene).law.plain() if self.methods[base].law == "true" else None
+        return (
+            self.scene(self.law_scene(scene, method)).law.plain()
+            if self.methods[base].law == "true"
+            else None
+        )
 
     def is_identified(self, method: str) -> bool:
         """Whether a method evaluates the analytic law that was identified in the video."""
         return self.methods[parse_method(method, self.methods)[0]].law == "identified"
+
+    def video_scenes(self, name: str) -> list[str]:
+        """Folders of the scenes whose videos the law of a scene is found in, in its chain: itself, then the others."""
+        base, seeds = self.chain(name)
+        return [name, *(folder(video, seeds) for video in self.scenes[base].videos)]
+
+    def _law_from(self, method: str) -> str | None:
+        """The scene whose law a variant evaluates everywhere; None: each scene's own."""
+        source = parse_method(method, self.methods)[1].get(LAW_FROM)
+        if source is not None and source not in self.scenes:
+            raise InputError(f"{method}: no scene '{source}'{hint(source, self.scenes)}")
+        return source
+
+    def law_scene(self, scene: str, method: str) -> str:
+        """Folder of the scene whose law a method evaluates on a scene, in its chain."""
+        source = self._law_from(method)
+        return scene if source is None else folder(source, self.chain(scene)[1])
 
     def method_density(self, scene: str, method: str) -> float | dict[str, Any]:
         """Density that a method takes the scene's body to have: the scene's, unless it assumes another."""
@@ -272,8 +315,11 @@ class Config(Section):
         return variant_title(self.methods[base].title, variant)
 
     def method_training(self, method: str) -> str:
-        """The method or variant whose training gives a method's law: itself, unless it takes another's."""
-        base, *variant = method.split("+")
+        """The method or variant whose training gives a method's law: itself, unless it takes another's.
+
+        In the scene that the law is from, `law_scene`.
+        """
+        base, *variant = (piece for piece in method.split("+") if not piece.startswith(f"{LAW_FROM}="))
         parse_method(method, self.methods)
         return "+".join([self.methods[base].trained_as or base, *variant])
 
@@ -291,7 +337,7 @@ class Config(Section):
     def method_prior(self, scene: str, method: str) -> str:
         """The prior that a method starts from: the scene's, unless the variant names another."""
         _, variant = parse_method(method, self.methods)
-        prior = str(variant.get("prior", self.scene(scene).prior))
+        prior = str(variant.get("prior", self.scene(self.law_scene(scene, method)).prior))
         if "prior" in variant and prior not in self.priors.laws:
             raise InputError(f"{method}: no prior '{prior}' in priors.laws{hint(prior, self.priors.laws)}")
         return prior
@@ -299,10 +345,11 @@ class Config(Section):
     def method_material(self, scene: str, method: str) -> MaterialConfig:
         """Effective material settings: the section, changed by the scene, then the method, then its variant.
 
-        The seed of the scene's chain is added to the one that these give.
+        The scene is that of the law (`law_scene`). The seed of the scene's chain is added to the one that these give.
         """
         base, variant = parse_method(self.method_training(method), self.methods)
         variant.pop("prior", None)
+        scene = self.law_scene(scene, method)
         section = self.material
         for changes, origin in (
             (self.scene(scene).material, f"scenes.{scene}.material"),
@@ -327,7 +374,7 @@ def load(raw: Mapping[str, Any], root: str | Path = ".") -> Config:
     scenes_file = Path(root) / str(raw.get("scenes_file", Config.model_fields["scenes_file"].default))
     scenes, changes = {**read_yaml(scenes_file), **_random_scenes(raw)}, raw.get("scenes") or {}
     if isinstance(changes, Mapping):
-        changes = _complete(merged(scenes, changes))
+        changes = _complete(_with_throws(merged(scenes, changes)))
     return validate(Config, {**raw, "scenes": changes})
 
 
@@ -339,6 +386,25 @@ def _random_scenes(raw: Mapping[str, Any]) -> dict[str, Any]:
     except InputError:
         return {}
     return draw_scenes(random, priors.laws, simulation.grid, simulation.gravity)
+
+
+def _with_throws(scenes: Mapping[str, Any]) -> dict[str, Any]:
+    """Scenes, and beside them the throws of their objects that their ``videos`` describe in place."""
+    found = dict(scenes)
+    for name, scene in scenes.items():
+        videos = scene.get("videos") if isinstance(scene, Mapping) else None
+        if not isinstance(videos, list):
+            continue
+        names = [f"{name}_throw{k}" if isinstance(v, Mapping) else v for k, v in enumerate(videos, 2)]
+        for throw, video in zip(names, videos, strict=True):
+            if isinstance(video, Mapping):
+                if throw in found:
+                    raise InputError(
+                        f"settings: scenes.{name}.videos makes {throw}, which is another scene: rename it"
+                    )
+                found[throw] = {"like": name, **video}
+        found[name] = {**scene, "videos": names}
+    return found
 
 
 def _complete(scenes: Mapping[str, Any]) -> dict[str, Any]:
@@ -353,7 +419,8 @@ def _complete(scenes: Mapping[str, Any]) -> dict[str, Any]:
             raise InputError(f"settings: scenes.{name}.like: no scene '{like}'{hint(like, scenes)}")
         if like in (name, *asked):
             raise InputError(f"settings: scenes.{name}.like: {like} is in turn like {name}")
-        return merged(complete(like, (name, *asked)), scene)
+        base = complete(like, (name, *asked))
+        return merged({key: value for key, value in base.items() if key != "videos"}, scene)
 
     return {name: complete(name) for name in scenes}
 

@@ -1,5 +1,7 @@
 """Grounding the material law in the video (paper Sec. 3.2-3.4): low-rank corrections of both networks, from pixels.
 
+Several videos of one material train one law: each counts by the mean over its own frames, and all videos alike.
+
 One loop serves the method and its ablations; they differ in the options that it is given:
 
 ==============================  =======================================================================
@@ -15,7 +17,7 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from statistics import median
 from typing import ClassVar, Protocol
@@ -151,6 +153,7 @@ def train_material(
     loss: TrajectoryLoss,
     settings: MaterialConfig,
     *,
+    further: Sequence[tuple[State, TrajectoryLoss]] = (),
     checkpoint: Checkpoint | None = None,
     progress: Callable[[int, int, float], None] | None = None,
     log: Callable[[str], None] = print,
@@ -162,6 +165,7 @@ def train_material(
         law: prior with an adaptor; its parameters that require gradients are optimised, in place.
         start: particles with their initial motion.
         loss: per-frame loss of a trajectory.
+        further: starts and losses of other videos of the same material, which train the same law.
         settings: hyper-parameters, from ``iterations`` on and ``lr_scale``.
         checkpoint: where to keep the state of the loop, so that a killed run goes on; None keeps none.
         progress: called with (iteration, iterations, loss).
@@ -171,8 +175,9 @@ def train_material(
         NonFiniteError: the very first rollout is not finite, so there is no good state to return to.
         InputError: the law has nothing to train, or is too stiff for the time step.
     """
-    model.check_courant(law, float(start.density.min()))
-    loop = _Loop(model, law, start, loss, settings, log)
+    videos = [(start, loss), *further]
+    model.check_courant(law, min(float(start.density.min()) for start, _ in videos))
+    loop = _Loop(model, law, videos, settings, log)
     if checkpoint is not None and (state := checkpoint.load()) is not None:
         loop.load_state_dict(state)
         log(f"resumed at iteration {loop.iteration} of {settings.iterations}")
@@ -192,9 +197,9 @@ def train_material(
 class _Loop:
     """The state of training, and one step of it."""
 
-    def __init__(self, model, law, start, loss, settings, log):
-        self.model, self.law, self.start = model, law, start
-        self.loss, self.settings, self.log = loss, settings, log
+    def __init__(self, model, law, videos, settings, log):
+        self.model, self.law, self.videos = model, law, videos
+        self.settings, self.log = settings, log
         self.nets = {
             "elastic": [p for p in law.elasticity.parameters() if p.requires_grad],
             "plastic": [p for p in law.plasticity.parameters() if p.requires_grad],
@@ -218,7 +223,7 @@ class _Loop:
         started = time.perf_counter()
         try:
             frame_losses = self._frame_losses()
-            value = float(frame_losses.detach().mean())
+            value = _mean(frame_losses)
             if not math.isfinite(value):
                 raise NonFiniteError("material", f"the loss is not finite at iteration {self.iteration}")
             if value > self.settings.diverged_ratio * max(self.best["loss"], 1e-12):
@@ -248,30 +253,33 @@ class _Loop:
             return
         try:
             with torch.no_grad():
-                value = float(self._frame_losses().mean())
+                value = _mean(self._frame_losses())
         except NonFiniteError:
             return
         if math.isfinite(value):
             self.best = self._better_state(value)
 
-    def _frame_losses(self) -> Tensor:
-        frames = self.loss.frames
-        path = rollout(
-            self.model,
-            self.law,
-            self.start,
-            steps=frames[-1],
-            frames=frames,
-            total=self.loss.total,
-            memory=None if self.settings.memory is None else self.settings.memory * 2**30,
+    def _frame_losses(self) -> list[Tensor]:
+        """Losses of the frames of every video, shape (T,) each."""
+        memory = None if self.settings.memory is None else self.settings.memory * 2**30 / len(self.videos)
+        paths = (
+            rollout(
+                self.model,
+                self.law,
+                start,
+                steps=loss.frames[-1],
+                frames=loss.frames,
+                total=loss.total,
+                memory=memory,
+            )
+            for start, loss in self.videos
         )
-        return self.loss(path)
+        return [loss(path) for path, (_, loss) in zip(paths, self.videos, strict=True)]
 
-    def _backward(self, frame_losses: Tensor) -> tuple[dict[str, float], float]:
+    def _backward(self, frame_losses: Sequence[Tensor]) -> tuple[dict[str, float], float]:
         if self.first_loss is None:
-            self.first_loss = float(frame_losses.detach().mean())
-        weights = frame_weights(self.iteration, len(frame_losses), self.settings).to(frame_losses)
-        weighted = (weights * frame_losses).sum() / weights.sum()
+            self.first_loss = _mean(frame_losses)
+        weighted = torch.stack([self._weighted(losses) for losses in frame_losses]).mean()
         if self.settings.zero_gradients:
             self.optimizer.zero_grad(set_to_none=True)
         (weighted / max(self.first_loss, 1e-30)).backward()
@@ -285,6 +293,11 @@ class _Loop:
                         "material", f"{name} gradient is not finite at iteration {self.iteration}"
                     )
         return norms, float(weighted.detach())
+
+    def _weighted(self, losses: Tensor) -> Tensor:
+        """Weighted mean of the frames of a video."""
+        weights = frame_weights(self.iteration, len(losses), self.settings).to(losses)
+        return (weights * losses).sum() / weights.sum()
 
     def _step(self) -> None:
         s = self.settings
@@ -357,3 +370,8 @@ class _Loop:
 
     def _parameters(self) -> list[torch.nn.Parameter]:
         return [p for parameters in self.nets.values() for p in parameters]
+
+
+def _mean(frame_losses: Sequence[Tensor]) -> float:
+    """Mean over the videos of the mean over the frames of each."""
+    return float(torch.stack([losses.detach().mean() for losses in frame_losses]).mean())

@@ -318,6 +318,92 @@ class TestLike:
             settings.load(settings.merged(raw, {"scenes": change}), ROOT)
 
 
+class TestVideos:
+    def loaded(self, raw, **scenes):
+        return settings.load(settings.merged(raw, {"scenes": scenes}), ROOT)
+
+    def test_another_throw_of_the_same_object_is_one_line(self, raw):
+        again = {"velocity": [0.5, -1.0, 0.0], "steps": 300}
+        loaded = self.loaded(
+            raw, ClayCat={"videos": [again, "OtherCat"]}, OtherCat={"like": "ClayCat", "shape": "duck"}
+        )
+        throw, cat = loaded.scene("ClayCat_throw2"), loaded.scene("ClayCat")
+        assert cat.videos == ("ClayCat_throw2", "OtherCat")
+        assert (throw.velocity, throw.steps) == ((0.5, -1.0, 0.0), 300)
+        own = {"velocity", "steps", "videos", "like"}
+        plain = [scene.model_dump(exclude=own) for scene in (throw, cat)]
+        assert plain[0] == plain[1]
+
+    def test_videos_are_not_handed_on(self, raw):
+        loaded = self.loaded(raw, ClayCat={"videos": [{"height": 0.4}]}, Near={"like": "ClayCat"})
+        assert not loaded.scene("Near").videos and not loaded.scene("UnevenCat").videos
+        assert not loaded.scene("ClayCat_throw2").videos
+
+    def test_all_videos_are_of_the_chain(self, raw):
+        loaded = self.loaded(raw, ClayCat={"videos": [{"height": 0.4}]})
+        assert loaded.video_scenes("ClayCat+seed=2") == ["ClayCat+seed=2", "ClayCat_throw2+seed=2"]
+        assert loaded.video_scenes("BouncyBall") == ["BouncyBall"]
+
+    @pytest.mark.parametrize(
+        ("scenes", "message"),
+        [
+            (
+                {"ClayCat": {"videos": ["ClayCatt"]}},
+                r"scenes\.ClayCat\.videos: no scene 'ClayCatt'; did you mean",
+            ),
+            ({"ClayCat": {"videos": ["ClayCat"]}}, r"scenes\.ClayCat\.videos: 'ClayCat' is there twice"),
+            ({"ClayCat": {"videos": ["UnevenCat", "UnevenCat"]}}, "'UnevenCat' is there twice"),
+            ({"ClayCat": {"videos": ["BouncyBall"]}}, "'BouncyBall' has another law"),
+            ({"ClayCat": {"videos": [{"prior": "sand"}]}}, "'ClayCat_throw2' has another prior"),
+            ({"ClayCat": {"videos": [{"dt": 2.5e-4}]}}, "'ClayCat_throw2' has another dt"),
+            (
+                {"ClayCat": {"videos": ["UnevenCat"]}, "UnevenCat": {"videos": ["ClayCat"]}},
+                "'UnevenCat' has further videos itself",
+            ),
+            (
+                {"ClayCat": {"videos": [{}]}, "ClayCat_throw2": {"like": "ClayCat"}},
+                "ClayCat_throw2, which is another",
+            ),
+            (
+                {"ClayCat": {"videos": [{"height": 0.4}], "images": {"dynamic": "mine.json"}}},
+                r"'ClayCat_throw2' has the same video, mine\.json",
+            ),
+            ({"ClayCat": {"videos": [{"heigth": 0.4}]}}, r"scenes\.ClayCat_throw2\.heigth: unknown key"),
+        ],
+    )
+    def test_mistakes(self, raw, scenes, message):
+        with pytest.raises(InputError, match=message):
+            self.loaded(raw, **scenes)
+
+
+class TestLawFrom:
+    """A law that was learned in one scene is judged in another."""
+
+    def test_everything_about_the_law_is_of_its_scene(self, raw):
+        change = {"scenes": {"ClayCat": {"material": {"iterations": 7, "covariance_from": "total"}}}}
+        loaded = settings.load(settings.merged(raw, change), ROOT)
+        method = "neuma+law_from=ClayCat+rank=4"
+        assert loaded.law_scene("BouncyBall+seed=2", method) == "ClayCat+seed=2"
+        assert loaded.law_scene("BouncyBall+seed=2", "neuma") == "BouncyBall+seed=2"
+        assert loaded.method_training(method) == "neuma+rank=4"
+        assert loaded.method_prior("BouncyBall", method) == "plasticine"
+        expected = loaded.method_material("ClayCat+seed=2", "neuma+rank=4")
+        assert loaded.method_material("BouncyBall+seed=2", method) == expected
+        assert (
+            loaded.true_law("BouncyBall", "true_law+law_from=ClayCat") == loaded.scene("ClayCat").law.plain()
+        )
+
+    def test_the_body_stays_that_of_the_scene(self, loaded):
+        assert loaded.method_density("ClayCat", "neuma+law_from=UnevenCat") == loaded.scene("ClayCat").density
+
+    def test_unknown_scene(self, raw, loaded):
+        with pytest.raises(InputError, match=r"law_from=ClayCatt: no scene 'ClayCatt'; did you mean ClayCat"):
+            loaded.law_scene("BouncyBall", "neuma+law_from=ClayCatt")
+        table = {"scenes": ["BouncyBall"], "methods": ["neuma+law_from=ClayCatt"]}
+        with pytest.raises(InputError, match="no scene 'ClayCatt'"):
+            settings.load(settings.merged(raw, {"tables": {"new": table}}), ROOT)
+
+
 class TestFinerTruth:
     def loaded(self, raw, **changes):
         return settings.load(settings.merged(raw, changes), ROOT)

@@ -92,6 +92,55 @@ def test_training_lowers_the_loss_and_moves_the_adaptor_only(trained):
         assert after.requires_grad or torch.equal(before, after)
 
 
+def video_of(body, v0, frames):
+    """Start and loss of another throw, which shows the same material as `observe`."""
+    return body.state(v0), PixelLoss(body, observe(body, v0, frames))
+
+
+def test_the_same_video_twice_trains_as_once(problem, trained):
+    again = train(problem, further=[(problem[0].state(V0), problem[1])])
+    torch.testing.assert_close(
+        torch.tensor(again.history.loss), torch.tensor(trained.history.loss), rtol=1e-9, atol=0
+    )
+    torch.testing.assert_close(again.law.adaptor_state(), trained.law.adaptor_state(), rtol=1e-6, atol=1e-9)
+
+
+def test_videos_count_alike_however_long(problem):
+    """Loss and gradient of the first iteration are the means of those of the videos, one of which has more frames."""
+    once = SETTINGS.model_copy(update={"iterations": 1, "gradient_clip": 1e30})
+    further = video_of(
+        problem[0], torch.tensor([0.4, -0.8, 0.1], dtype=torch.float64), tuple(range(0, 55, 6))
+    )
+    both = train(problem, settings=once, further=[further])
+    alone = [train((problem[0], problem[1]), settings=once)]
+    law = stiff_random_law()
+    alone.append(train_material(MODEL, law, *further, once, log=lambda _: None))
+    first = [run.history.loss[0] for run in alone]
+    assert both.history.loss[0] == pytest.approx(sum(first) / 2, rel=1e-12)
+    weighted = [run.history.weighted_loss[0] for run in alone]
+    assert both.history.weighted_loss[0] == pytest.approx(sum(weighted) / 2, rel=1e-12)
+    # The loss is divided by its first value before.
+    grads = [
+        {key: p.grad * run.history.loss[0] for key, p in run.law.named_parameters() if p.grad is not None}
+        for run in (both, *alone)
+    ]
+    assert grads[0]
+    for name, grad in grads[0].items():
+        torch.testing.assert_close(grad, (grads[1][name] + grads[2][name]) / 2, rtol=1e-9, atol=1e-18)
+
+
+def test_one_law_fits_two_videos(problem):
+    further = video_of(problem[0], torch.tensor([0.4, -0.8, 0.1], dtype=torch.float64), FRAMES)
+    both = train(problem, further=[further])
+
+    def loss_of(law, start, loss):
+        with torch.no_grad():
+            return float(loss(rollout(MODEL, law, start, steps=FRAMES[-1], frames=FRAMES)).mean())
+
+    for start, loss in ((problem[0].state(V0), problem[1]), further):
+        assert loss_of(both.law, start, loss) < 0.8 * loss_of(stiff_random_law(), start, loss)
+
+
 class MemoryCheckpoint:
     """Keeps every state that it is given; interrupts after ``fail_after`` of them."""
 

@@ -114,7 +114,30 @@ def test_an_experiment_follows_the_chains_of_its_scenes(project):
     assert f"{SCENE}+seed=1/velocity.json" in read["experiment_start"]
 
 
-@pytest.mark.parametrize("chains", [(), CHAINS], ids=["one chain", "three chains"])
+TWO_VIDEOS = ("--config", "scenes={BouncyBall: {videos: [{velocity: [0.5, -1.0, 0.0]}]}}", "--")
+THROW = f"{SCENE}_throw2"
+
+
+def test_several_videos_train_one_law_which_is_judged_on_all(project):
+    held_out = "neuma+law_from=BouncyBall"
+    targets = (f"{SCENE}+seed=1/neuma/metrics.json", f"{THROW}+seed=1/{held_out}/metrics.json")
+    graph = jobs(project.run("--dry-run", *TWO_VIDEOS, *targets))
+    ((read, (adaptor, _)),) = [(read, made) for rule, read, made in graph if rule == "material"]
+    for folder in (f"{SCENE}+seed=1", f"{THROW}+seed=1"):
+        for file in ("particles.h5", "binding.h5", "gaussians.ply", "velocity.json"):
+            assert f"{folder}/{file}" in read
+    assert {file for file in read if file.endswith("transforms.json")} == {
+        "tiny/data/BouncyBall/dynamic/transforms.json",
+        "tiny/data/BouncyBall_throw2/dynamic/transforms.json",
+    }
+    judged = {made[0]: read for rule, read, made in graph if rule == "evaluation"}
+    assert len(judged) == 2 and all(adaptor in read for read in judged.values())
+    refused = f"{THROW}/{held_out}/adaptor.safetensors"
+    said = project.run("--dry-run", *TWO_VIDEOS, refused, succeeds=False)
+    assert "trains nothing: its law is that of BouncyBall/neuma" in said
+
+
+@pytest.mark.parametrize("chains", [(), CHAINS, TWO_VIDEOS], ids=["one chain", "three chains", "two videos"])
 def test_timings_read_the_benchmark_of_every_job_behind_them(project, chains):
     graph = jobs(project.run("--dry-run", *chains, "tiny/results/timings.csv"))
     (read,) = [read for rule, read, _ in graph if rule == "timings"]

@@ -150,6 +150,17 @@ def body_files():
     return {name: of_chain(file) for name, file in BODY.items()}
 
 
+def of_each_video(function):
+    """A function of wildcards of a scene, applied to the scenes of all its videos: a list where there are several."""
+
+    @checked
+    def choose(wildcards):
+        found = [function(SimpleNamespace(scene=scene)) for scene in SETTINGS.video_scenes(wildcards.scene)]
+        return found if len(found) > 1 else found[0]
+
+    return choose
+
+
 def each_of(bodies):
     """Files by name of the bodies of several scenes or experiments."""
     return {name: [home(body, file) for body in bodies] for name, file in BODY.items()}
@@ -273,7 +284,17 @@ def table_records(table):
     pairs = [SimpleNamespace(**run) for run in table_runs(table) if run["scene"]]
     makers = {"made": "render", "supplied": "supplied", "packed": "unpack"}
     jobs = [("kernels", {"group": group}) for group in ("geometry", "simulation", "laws", "rendering")]
-    for pair in pairs:
+    trained = [
+        (SETTINGS.law_scene(pair.scene, pair.method), SETTINGS.method_training(pair.method))
+        for pair in pairs
+        if trained_adaptor(pair)
+    ]
+    seen = [
+        SimpleNamespace(scene=video, method=method)
+        for scene, method in trained
+        for video in SETTINGS.video_scenes(scene)
+    ]
+    for pair in [*pairs, *seen]:
         scene, _ = SETTINGS.chain(pair.scene)
         priors = [Path(prior_file(pair.scene, method)) for method in (None, pair.method)]
         jobs += [("prior", {"prior": file.stem}) for file in priors if file.parent == Path(RESULTS, "priors")]
@@ -281,7 +302,6 @@ def table_records(table):
         images = [f"{makers[origin_of(part, scene)]}_{part}" for part in ("static", "dynamic")]
         jobs += [(rule, {"scene": scene}) for rule in (truth, *images)]
         jobs += [(rule, {"scene": Path(home(pair.scene, file)).parent.name}) for rule, file in MAKERS.items()]
-    trained = [(pair.scene, SETTINGS.method_training(pair.method)) for pair in pairs if trained_adaptor(pair)]
     jobs += [("material", {"scene": scene, "method": method}) for scene, method in trained]
     jobs += [("evaluation", vars(pair)) for pair in pairs]
     jobs += [("chamfer_table", {"table": table})]
@@ -348,11 +368,23 @@ def carries_total(wildcards):
 
 
 @checked
+def training_settings(wildcards):
+    """The same of a method that trains a law of its own."""
+    scene, method = wildcards.scene, wildcards.method
+    trained = SETTINGS.law_scene(scene, method), SETTINGS.method_training(method)
+    if trained != (scene, method):
+        raise InputError(
+            f"{scene}/{method} trains nothing: its law is that of {'/'.join(trained)}, ask for that one"
+        )
+    return material_settings(wildcards)
+
+
+@checked
 def material_prior(wildcards):
     """The law that a method starts from; none where it takes an analytic one."""
     if SETTINGS.true_law(wildcards.scene, wildcards.method) or SETTINGS.is_identified(wildcards.method):
         return []
-    return prior_file(wildcards.scene, wildcards.method)
+    return prior_file(SETTINGS.law_scene(wildcards.scene, wildcards.method), wildcards.method)
 
 
 @checked
@@ -364,7 +396,9 @@ def true_law(wildcards):
 @checked
 def identified_law(wildcards):
     """The law that was identified in a scene's video, where this is what a method evaluates."""
-    return home(wildcards.scene, "identified.json") if SETTINGS.is_identified(wildcards.method) else []
+    if not SETTINGS.is_identified(wildcards.method):
+        return []
+    return home(SETTINGS.law_scene(wildcards.scene, wildcards.method), "identified.json")
 
 
 @checked
@@ -375,12 +409,12 @@ def stock_law(wildcards):
 
 
 def supervised_by(kind, file):
-    """A function of wildcards: a file of the scene's data, where the method is supervised by what is in it."""
+    """A function of wildcards: a file of each video's data, where the method is supervised by what is in it."""
 
     @checked
     def choose(wildcards):
         material = SETTINGS.method_material(wildcards.scene, wildcards.method)
-        return of_scene(file)(wildcards) if material.supervision == kind else []
+        return of_each_video(of_scene(file))(wildcards) if material.supervision == kind else []
 
     return choose
 
@@ -391,10 +425,11 @@ training_particles = supervised_by("particles", "particles.h5")  # ground truth,
 
 @checked
 def trained_adaptor(wildcards):
-    """The adaptor, where there is one: of the method itself, or of the one whose law it takes."""
+    """The adaptor, where there is one: of the method on the scene itself, or of those whose law it takes."""
     if not SETTINGS.method_material(wildcards.scene, wildcards.method).train:
         return []
-    run = SETTINGS.run_folder(wildcards.scene, SETTINGS.method_training(wildcards.method))
+    scene = SETTINGS.law_scene(wildcards.scene, wildcards.method)
+    run = SETTINGS.run_folder(scene, SETTINGS.method_training(wildcards.method))
     return f"{RESULTS}/{run}/adaptor.safetensors"
 
 
@@ -406,6 +441,14 @@ def judged_carrier(wildcards):
 @checked
 def method_density(wildcards):
     return SETTINGS.method_density(wildcards.scene, wildcards.method)
+
+
+@checked
+def training_densities(wildcards):
+    """Densities that a method takes the bodies of all videos of a scene to have."""
+    own = [SETTINGS.scene(scene).plain()["density"] for scene in SETTINGS.video_scenes(wildcards.scene)]
+    assumed = SETTINGS.method_material(wildcards.scene, wildcards.method).assumed_density
+    return own if assumed is None else [assumed] * len(own)
 
 
 @checked

@@ -3,10 +3,10 @@
 
 rule material:
     input:
-        **body_files(),
+        **{name: of_each_video(of_chain(file)) for name, file in BODY.items()},
         kernels=kernels("laws", "rendering"),
         transforms=training_video,
-        velocity=of_chain("velocity.json"),
+        velocity=of_each_video(of_chain("velocity.json")),
         prior=material_prior,
         truth=training_particles,
     output:
@@ -18,8 +18,8 @@ rule material:
         runtime=240,
     params:
         simulation=simulation_settings,
-        density=method_density,
-        material=material_settings,
+        densities=training_densities,
+        material=training_settings,
         checkpoint=lambda wildcards: f"{RESULTS}/{wildcards.scene}/{wildcards.method}/checkpoint.pt",
         device=SETTINGS.device,
     script:

@@ -14,12 +14,8 @@ from neuma_lib.io.particles import load_start
 from neuma_lib.io.weights import read_weights
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.model import MPMModel, consecutive
+from workflow.inputs import listed
 from workflow.stage import run_script
-
-
-def listed(files) -> list[str]:
-    """Named input files as a list: Snakemake gives one file as a text."""
-    return [files] if isinstance(files, str) else list(files or ())
 
 
 def main(inputs, output, params, run) -> None:

@@ -1,10 +1,11 @@
-"""Adapt the material law to the video, or to ground-truth particles."""
+"""Adapt the material law to one video or several, or to ground-truth particles."""
 
 from dataclasses import asdict
 
 import torch
 
 from neuma_lib.config.material import MaterialConfig
+from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.device import choose_device
 from neuma_lib.fitting.material import ParticleLoss, PixelLoss, train_material
 from neuma_lib.io.checkpoint import Checkpoint
@@ -14,8 +15,20 @@ from neuma_lib.io.images import load_observation
 from neuma_lib.io.laws import load_law, save_adaptor
 from neuma_lib.io.particles import load_body, thrown
 from neuma_lib.sim.model import MPMModel
+from workflow.inputs import listed
 from workflow.provenance import fingerprint
 from workflow.stage import run_script
+
+
+def particle_loss(truth: str, device: torch.device) -> ParticleLoss:
+    found, _ = read_arrays(truth, required=("x", "frames"), only=("x", "frames"))
+    return ParticleLoss(tuple(found["frames"].tolist()), torch.from_numpy(found["x"]).to(device))
+
+
+def pixel_loss(body: Reconstruction, transforms: str, settings: MaterialConfig) -> PixelLoss:
+    video = load_observation(transforms, settings.views).to(body.x0.dtype, body.x0.device)
+    total = settings.covariance_from == "total"
+    return PixelLoss(body, video, settings.covariance_gradient, total=total)
 
 
 def main(inputs, output, params, run) -> None:
@@ -23,25 +36,34 @@ def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
     law = load_law(inputs.prior).to(device)
     law.attach_adaptor(settings.rank, settings.alpha, settings.seed)
-    body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density, settings.carrier)
-    body = body.to(torch.float32, device)
+    parts = zip(*(listed(inputs[name]) for name in ("particles", "binding", "gaussians")), strict=True)
+    bodies = [
+        load_body(*files, density, settings.carrier).to(torch.float32, device)
+        for files, density in zip(parts, params.densities, strict=True)
+    ]
+    starts = [thrown(body, file) for body, file in zip(bodies, listed(inputs.velocity), strict=True)]
     if settings.supervision == "particles":
-        truth, _ = read_arrays(inputs.truth, required=("x", "frames"), only=("x", "frames"))
-        targets = torch.from_numpy(truth["x"]).to(device)
-        loss = ParticleLoss(tuple(truth["frames"].tolist()), targets)
+        losses = [particle_loss(file, device) for file in listed(inputs.truth)]
     else:
-        video = load_observation(inputs.transforms, settings.views).to(torch.float32, device)
-        total = settings.covariance_from == "total"
-        loss = PixelLoss(body, video, settings.covariance_gradient, total=total)
-    files = {name: str(file) for name, file in inputs.items() if name != "kernels" and isinstance(file, str)}
-    stamp = {"simulation": params.simulation, "density": params.density, **params.material}
+        losses = [
+            pixel_loss(body, file, settings)
+            for body, file in zip(bodies, listed(inputs.transforms), strict=True)
+        ]
+    files = {
+        f"{name} {k}": file
+        for name, found in inputs.items()
+        if name != "kernels"
+        for k, file in enumerate(listed(found))
+    }
+    stamp = {"simulation": params.simulation, "densities": params.densities, **params.material}
     checkpoint = Checkpoint(params.checkpoint, fingerprint(stamp, files, params.code))
     trained = train_material(
         MPMModel(**params.simulation),
         law,
-        thrown(body, inputs.velocity),
-        loss,
+        starts[0],
+        losses[0],
         settings,
+        further=list(zip(starts[1:], losses[1:], strict=True)),
         checkpoint=checkpoint,
         progress=run.progress,
         log=run.say,
