@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neuma_lib.mechanics.law import Law
+from neuma_lib.mechanics.law import Constitutive, Law
 
 OUTER = 0.005
 """Part of the visited states that is left out at either end of a range, as outliers."""
@@ -49,7 +49,7 @@ class Visited:
 
 def largest_shear_stress(law: Law, F: Tensor) -> float:
     """Largest shear stress that a law gives to visited elastic states F (..., 3, 3), outliers left out [Pa]."""
-    tau = _stress(law, F.reshape(-1, 3, 3).double())
+    tau = stress(law, F.reshape(-1, 3, 3).double())
     principal = torch.linalg.eigvalsh(0.5 * (tau + tau.mT))
     return _quantile(0.5 * (principal[:, 2] - principal[:, 0]), 1 - OUTER)
 
@@ -60,13 +60,13 @@ def uniaxial(law: Law, stretch: Tensor) -> Tensor:
     The two lateral stretches are equal and such that the lateral stresses cancel in the mean; they are followed from
     1 outwards, so that a law with several equilibria is on the branch of the undeformed state.
     """
-    stress = torch.empty_like(stretch)
+    axial = torch.empty_like(stretch)
     order = (stretch - 1).abs().argsort().tolist()
     lateral = {True: 1.0, False: 1.0}  # of the last point in tension and in compression
     for index in order:
         tension = bool(stretch[index] > 1)
-        lateral[tension], stress[index] = _free_sides(law, float(stretch[index]), lateral[tension])
-    return stress
+        lateral[tension], axial[index] = _free_sides(law, float(stretch[index]), lateral[tension])
+    return axial
 
 
 def _free_sides(law: Law, axial: float, lateral: float) -> tuple[float, Tensor]:
@@ -74,7 +74,7 @@ def _free_sides(law: Law, axial: float, lateral: float) -> tuple[float, Tensor]:
     for _ in range(_NEWTON_STEPS):
         pair = torch.tensor([lateral, lateral + _DIFFERENCE], dtype=torch.float64)
         F = torch.diag_embed(torch.stack([pair, torch.full_like(pair, axial), pair], dim=1))
-        tau = _stress(law, F)
+        tau = stress(law, F)
         side = 0.5 * (tau[:, 0, 0] + tau[:, 2, 2])
         slope = (side[1] - side[0]) / _DIFFERENCE
         step = float(side[0] / slope) if float(slope) > 0 else 0.0
@@ -88,7 +88,7 @@ def sheared(law: Law, shear: Tensor, J: float = 1.0) -> Tensor:
     """Shear Kirchhoff stress [Pa] (n,) of the elastic law for simple shears (n,) at the volume ratio J."""
     F = torch.eye(3, dtype=shear.dtype).repeat(len(shear), 1, 1)
     F[:, 0, 1] = shear
-    return _stress(law, J ** (1 / 3) * F)[:, 0, 1]
+    return stress(law, J ** (1 / 3) * F)[:, 0, 1]
 
 
 def yielding(law: Law, rate: float, dt: float, steps: int, J: float = 1.0) -> Tensor:
@@ -106,18 +106,26 @@ def yielding(law: Law, rate: float, dt: float, steps: int, J: float = 1.0) -> Te
     F = J ** (1 / 3) * torch.eye(3, dtype=torch.float64)[None]
     increment = torch.eye(3, dtype=torch.float64)
     increment[0, 1] = rate * dt
-    weights = [w.detach().double() for w in law.plasticity.weights()]
-    stresses = [_stress(law, F)[0, 0, 1]]
+    stresses = [stress(law, F)[0, 0, 1]]
     for _ in range(steps):
-        F = law.plasticity.evaluate(increment @ F, tuple(weights))
-        stresses.append(_stress(law, F)[0, 0, 1])
+        F = returned(law, increment @ F)
+        stresses.append(stress(law, F)[0, 0, 1])
     return torch.stack(stresses)
 
 
-def _stress(law: Law, F: Tensor) -> Tensor:
-    weights = tuple(w.detach().double() for w in law.elasticity.weights())
+def stress(law: Law, F: Tensor) -> Tensor:
+    """Kirchhoff stress [Pa] of the elastic law in float64, (N, 3, 3), for deformation gradients F (N, 3, 3)."""
+    return _value(law.elasticity, F)
+
+
+def returned(law: Law, F_trial: Tensor) -> Tensor:
+    """Elastic deformation gradients after the return map in float64, (N, 3, 3), of trial ones (N, 3, 3)."""
+    return _value(law.plasticity, F_trial)
+
+
+def _value(part: Constitutive, F: Tensor) -> Tensor:
     with torch.no_grad():
-        return law.elasticity.evaluate(F, weights)
+        return part.evaluate(F, tuple(w.detach().double() for w in part.weights()))
 
 
 def _quantile(values: Tensor, q: float) -> float:

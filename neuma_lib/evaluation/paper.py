@@ -30,8 +30,39 @@ class Claim:
 
 
 @dataclass(frozen=True)
+class Target:
+    """A bound that we set ourselves to the error of a method.
+
+    Attributes:
+        statement: what is said, with places for ``most`` and ``count``.
+        method: whose error it is.
+        most: the bound, in the table's unit, or in multiples of the error of the method ``of`` in the same column.
+        of: the method that it is measured by; none if empty.
+        count: in how many columns it has to be kept; None: on average over them.
+        columns: scenes or experiments; all columns if empty.
+    """
+
+    statement: str
+    method: str
+    most: float
+    of: str = ""
+    count: int | None = None
+    columns: tuple[str, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """The statement with its numbers."""
+        return self.statement.format(most=self.most, count=self.count)
+
+    @property
+    def methods(self) -> set[str]:
+        """Methods that it is about."""
+        return {self.method, self.of} - {""}
+
+
+@dataclass(frozen=True)
 class PaperTable:
-    """A table of the paper.
+    """A table of the paper, or one of ours.
 
     Attributes:
         label: its name there.
@@ -40,6 +71,7 @@ class PaperTable:
         columns: scenes or experiments.
         rows: method -> one distance a column.
         claims: what can be checked with the numbers of a run.
+        targets: what we want of these numbers.
     """
 
     label: str
@@ -48,6 +80,7 @@ class PaperTable:
     columns: tuple[str, ...] = ()
     rows: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     claims: tuple[Claim, ...] = ()
+    targets: tuple[Target, ...] = ()
 
     def row(self, method: str, columns: Sequence[str]) -> list[float] | None:
         """The distances of a method in some columns, or None where the paper does not have them all."""
@@ -78,6 +111,14 @@ _CHOICES = ("BouncyBall", "RubberPawn", "ClayCat")
 _GENERALISATION = ("letter_N_rubber", "letter_N_clay")
 _FINER = ("BouncyBall_finer", "JellyDuck_finer", "RubberPawn_finer", "ClayCat_finer", "SandFish_finer",
           "HoneyBottle_finer")  # fmt: skip
+_LETTERS = (
+    "letter_N_bouncy",
+    "letter_N_jelly",
+    "letter_N_rubber",
+    "letter_N_clay",
+    "letter_N_sand",
+    "letter_N_honey",
+)
 
 PAPER = {
     "table1": PaperTable(
@@ -208,8 +249,32 @@ PAPER = {
             ),
         ),
     ),
+    "letters": PaperTable(
+        "",
+        "Letters",
+        "Trained laws on the letter N, thrown at 1 and at 3 m/s, against the true laws",
+        (*_LETTERS, *(f"{letter}_fast" for letter in _LETTERS)),
+        targets=(
+            Target(
+                "at 1 m/s, structured laws are at most {most:g} mm off on average",
+                *("neuma_structured", 6.0, "", None, _LETTERS),
+            ),
+        ),
+    ),
+    "stress": PaperTable(
+        "",
+        "Stresses",
+        "Stresses of learned laws on the states that the true law visits",
+        ("BouncyBall", "JellyDuck", "RubberPawn", "ClayCat", "SandFish", "HoneyBottle"),
+        targets=(
+            Target(
+                "stresses of structured laws are within {most:g} % of the true ones on at least {count} scenes",
+                *("neuma_structured", 20.0, "", 4),
+            ),
+        ),
+    ),
 }
-"""Tables of distances by the name of our table."""
+"""Tables by the name of our table."""
 
 BALL_PARTICLES, BALL_RADIUS = 25_744, 0.25
 """Of the paper's BouncyBall, by its authors' released data; radius in metres."""

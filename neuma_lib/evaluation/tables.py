@@ -7,13 +7,13 @@ sampling floor (`neuma_lib.evaluation.motion` says what it does not see).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from neuma_lib.errors import InputError
-from neuma_lib.evaluation.paper import BALL_FLOOR, Claim, PaperTable
+from neuma_lib.evaluation.paper import BALL_FLOOR, Claim, PaperTable, Target
 from neuma_lib.evaluation.reports import as_csv, as_markdown
 
 QUANTITIES = {
@@ -92,13 +92,13 @@ class Verdict:
     """What became of a claim.
 
     Attributes:
-        claim: the claim.
+        claim: the claim or target.
         word: "holds", "mixed" or "does not hold".
         here: our numbers, and what keeps it from holding.
         paper: the paper's Chamfer distances, or why there are none.
     """
 
-    claim: Claim
+    claim: Claim | Target
     word: str
     here: str
     paper: str
@@ -184,14 +184,17 @@ class Table:
         return "\n".join(parts)
 
     def verdicts(self) -> list[Verdict]:
-        """A verdict on each claim whose rows and columns are here."""
-        claims = self.paper.claims if self.paper else ()
+        """A verdict on each claim and each target whose rows and columns are here."""
         methods = {row.method for row in self.rows}
-        return [
+        claims, targets = (self.paper.claims, self.paper.targets) if self.paper else ((), ())
+        found = [
             self._verdict(claim)
             for claim in claims
             if {*claim.better, *claim.worse} <= methods and set(claim.columns) <= set(self.columns)
         ]
+        rows = {row.method: row for row in self._rows(JUDGED)}
+        broken = {cell for cell, signs in self.marks.items() if ROLLOUT_DIVERGED in signs}
+        return found + reached(targets, rows, list(self.columns), "mm", broken)
 
     def outliers(self) -> list[str]:
         """Runs whose `JUDGED` is more than twice the mean of their method's chains in the column, a sentence each."""
@@ -359,6 +362,54 @@ RULE = (
     "*does not hold* if neither the average nor most columns are on its side; else it is *mixed*."
 )
 """`Table._verdict` for people."""
+
+
+def reached(
+    targets: Sequence[Target],
+    rows: Mapping[str, Row],
+    columns: Sequence[str],
+    unit: str,
+    broken: Collection[tuple[str, str]] = (),
+) -> list[Verdict]:
+    """A verdict on each target whose rows and columns are here.
+
+    A target *holds* if it is reached by means plus standard deviations over `MIN_CHAINS` chains at least, and no
+    prediction of its method broke off there. It is *mixed* if it is reached by the means alone, else it *does not
+    hold*.
+
+    Args:
+        rows: errors by method.
+        columns: those of the rows, in order.
+        unit: of the errors.
+        broken: (method, column) of predictions that broke off.
+    """
+    found = []
+    for target in targets:
+        if not (target.methods <= rows.keys() and set(target.columns) <= set(columns)):
+            continue
+        chosen = target.columns or tuple(columns)
+        index = [list(columns).index(column) for column in chosen]
+        row, of = rows[target.method].over(index), rows[target.of].over(index) if target.of else None
+        bound = target.most * (np.ones(len(index) + 1) if of is None else of.mean)
+        spreads = np.zeros(len(index) + 1) if row.std is None else row.std
+        kept = {"mean": row.mean <= bound, "surely": row.mean + spreads <= bound}
+        if target.count is None:
+            met, surely = (bool(inside[-1]) for inside in kept.values())
+        else:
+            met, surely = (bool(inside[:-1].sum() >= target.count) for inside in kept.values())
+        doubts = [] if surely else ["not with the ±"]
+        if len(row.runs) < MIN_CHAINS:
+            doubts.append(f"{len(row.runs)} run{'s' if len(row.runs) > 1 else ''}, no spread to judge by")
+        if away := [column for column in chosen if (target.method, column) in broken]:
+            doubts.append(f"broke off in {len(away)} of {len(chosen)}")
+        here = f"{spread(row)} {unit} ({row.title})"
+        here += f" against {spread(of)} ({of.title})" if of else ""
+        here += f", kept in {kept['mean'][:-1].sum()} of {len(index)}" if target.count is not None else ""
+        word = FAILS if not met else MIXED if doubts else HOLDS
+        found.append(
+            Verdict(target, word, "; ".join([here, *doubts] if met else [here]), "not compared there")
+        )
+    return found
 
 
 def shown(value: float, digits: int) -> str:

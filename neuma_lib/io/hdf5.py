@@ -17,7 +17,8 @@ from neuma_lib.io.files import atomic, existing, one_line, reading
 QUANTITIES = {
     "x": ("m", "particle positions, shape (T, N, 3), or (N, 3) where there is one state"),
     "v": ("m/s", "particle velocities, shape (T, N, 3)"),
-    "F": ("1", "elastic deformation gradients, shape (T, N, 3, 3)"),
+    "F": ("1", "elastic deformation gradients, shape (T, N, 3, 3), or (N, 3, 3) of single states"),
+    "F_trial": ("1", "the same before the return map of a step, shape (N, 3, 3)"),
     "F_total": ("1", "total deformation gradients, plastic flow included, shape (T, N, 3, 3)"),
     "C": ("1/s", "APIC affine velocities, shape (T, N, 3, 3)"),
     "frames": ("1", "simulation step of each frame, shape (T,)"),

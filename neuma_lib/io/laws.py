@@ -7,7 +7,8 @@ there; any other is a pair of NCLaw networks. Whoever loads a law need not know 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,36 @@ import torch
 from torch import Tensor
 
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import existing, one_line
+from neuma_lib.io.files import existing, one_line, read_json
 from neuma_lib.io.weights import read_torch, read_weights, write_weights
 from neuma_lib.mechanics.adaptor import AdaptableLaw
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.mechanics.structured import StructuredLaw, structured_law
 
 STRUCTURED = "structured"
+
+
+def load_laws(
+    dt: float,
+    specs: Sequence[Mapping[str, Any]] = (),
+    identified: Sequence[str | Path] = (),
+    priors: Sequence[str | Path] = (),
+    adaptors: Sequence[str | Path] = (),
+) -> list[Law]:
+    """The laws of a method's bodies: analytic ones from specifications or identified.json, or trained ones.
+
+    Args:
+        dt: time step [s].
+        specs: what `analytic_law` takes, a body each; empty where the method has no such law.
+        identified: files of the stage `identify`, likewise.
+        priors, adaptors: files of trained laws, likewise; without adaptors the priors as they are.
+    """
+    specs = specs or [read_json(file)["law"] for file in identified]
+    if specs:
+        return [analytic_law(spec, dt=dt) for spec in specs]
+    return [load_law(prior, adaptor) for prior, adaptor in zip_longest(priors, adaptors)]
 
 
 def save_prior(path: str | Path, law: AdaptableLaw, metadata: Mapping[str, Any]) -> None:

@@ -56,8 +56,9 @@ onstart:
             ) from None
 
 
-# Tables of distances; the other three have rules of their own.
-CHAMFER_TABLES = [name for name in SETTINGS.tables if name not in ("table4", "learning_rates", "bias")]
+# Tables of distances; the others have rules of their own.
+OTHER_TABLES = ("table4", "learning_rates", "bias", "stress")
+CHAMFER_TABLES = [name for name in SETTINGS.tables if name not in OTHER_TABLES]
 
 
 wildcard_constraints:
@@ -91,7 +92,7 @@ def checked(function):
 DRAWN_IN = {
     **dict.fromkeys(["gaussians.ply", "gaussians.json", "mesh.ply", "tracers.h5"], ["gaussians"]),
     **dict.fromkeys(["sampled_particles.h5", "particles.h5", "binding.h5"], ["gaussians", "particles"]),
-    **dict.fromkeys(["velocity.json", "identified.json"], ["prior", "gaussians", "particles"]),
+    **dict.fromkeys(["velocity.json", "identified.json", "visited.h5"], ["prior", "gaussians", "particles"]),
 }
 
 

@@ -1,18 +1,15 @@
 """Roll learned laws, true or identified ones, out from the estimated start and compare them with the ground truth."""
 
-from itertools import zip_longest
-
 import numpy as np
 import torch
 
 from neuma_lib.device import choose_device
 from neuma_lib.evaluation.motion import evaluate
-from neuma_lib.io.files import read_json, write_json
+from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
-from neuma_lib.io.laws import load_law
+from neuma_lib.io.laws import load_laws
 from neuma_lib.io.particles import load_start
 from neuma_lib.io.weights import read_weights
-from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.model import MPMModel, consecutive
 from workflow.inputs import listed
 from workflow.stage import run_script
@@ -20,16 +17,14 @@ from workflow.stage import run_script
 
 def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
-    priors, adaptors = listed(inputs.prior), listed(inputs.get("adaptor"))
     truth, _ = read_arrays(
         inputs.truth, only=("tracers", "tracers_again"), required=("tracers", "tracers_again")
     )
     measure, _ = read_arrays(inputs.tracers, required=("starts", "floor"))
     files = [inputs[name] for name in ("particles", "binding", "gaussians", "velocity")]
     start, counts = load_start(*files, params.densities, params.carrier)
-    specs = params.laws or [read_json(file)["law"] for file in listed(inputs.get("identified"))]
-    laws = [analytic_law(spec, dt=params.simulation["dt"]) for spec in specs]
-    laws = laws or [load_law(prior, adaptor) for prior, adaptor in zip_longest(priors, adaptors)]
+    identified, adaptors = listed(inputs.get("identified")), listed(inputs.get("adaptor"))
+    laws = load_laws(params.simulation["dt"], params.laws, identified, listed(inputs.prior), adaptors)
     evaluation = evaluate(
         MPMModel(**params.simulation),
         consecutive([law.to(device) for law in laws], counts),

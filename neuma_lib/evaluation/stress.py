@@ -1,0 +1,152 @@
+"""How wrong the stresses of a law are on the states that a motion goes through.
+
+States are those of the true law on the reconstruction, so that laws are compared where the video could show them, and
+nothing else (particles, start, grid) differs. Elastic F and trial F of single steps test the two parts of a law one by
+one. But how a deformation is shared between elastic F and flow is a law's own affair: a stiffer one that yields at a
+smaller strain may carry the same stress. What the motion feels is the stress along a path of total deformation, on
+which every law carries its own elastic F from the start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuma_lib.errors import InputError
+from neuma_lib.evaluation.material_point import returned, stress
+from neuma_lib.mechanics.law import Law
+from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State
+
+STRAINED = 1e-4
+"""Largest component of F - I from which a body counts as deformed: its contact has begun."""
+PARTS = {
+    "stress": "Kirchhoff stress of the visited elastic states",
+    "volumetric": "Its volumetric part, the mean of the normal stresses",
+    "deviatoric": "Its deviatoric part",
+    "returned": "Stress of the visited trial states after the return map of a step",
+    "path": "Stress along the visited paths of total deformation, every law with its own elastic state",
+}
+"""What the errors of `stress_errors` are of."""
+
+
+@dataclass(frozen=True)
+class VisitedStates:
+    """What material points of a motion went through.
+
+    Attributes:
+        F: elastic deformation gradients, shape (S, 3, 3).
+        F_trial: those of the same points and steps before the return map, shape (S, 3, 3).
+        C: velocity gradients of P points at the steps 0, 1, ..., T - 1 [1/s], shape (T, P, 3, 3); step n deforms them
+            by I + dt C_n.
+        frames: steps at which the stress of these points is looked at, after the first contact.
+    """
+
+    F: Tensor
+    F_trial: Tensor
+    C: Tensor
+    frames: tuple[int, ...]
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, np.ndarray]) -> VisitedStates:
+        """The states in the arrays of `arrays`."""
+        values = (torch.from_numpy(arrays[name]) for name in ("F", "F_trial", "C"))
+        return cls(*values, tuple(arrays["frames"].tolist()))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The states as arrays by name, for a file."""
+        values = {name: getattr(self, name).numpy() for name in ("F", "F_trial", "C")}
+        return {**values, "frames": np.asarray(self.frames)}
+
+
+def visit(
+    model: MPMModel, law: Law, start: State, frames: Sequence[int], states: int, paths: int, seed: int
+) -> VisitedStates:
+    """Simulate a law, and draw states from its motion as they occur.
+
+    Args:
+        start: particles with their initial motion.
+        frames: steps of the video's frames; states are drawn from those after the first contact, evenly.
+        states: S, drawn independently; a particle in proportion to its volume.
+        paths: P, of different particles, likewise; at most as many as there are.
+        seed: of the draws.
+
+    Raises:
+        InputError: nothing is deformed up to the last frame.
+        NonFiniteError: the rollout diverges.
+    """
+    with torch.no_grad():
+        motion = rollout(model, law, start, steps=frames[-1], frames=range(frames[-1] + 1)).cpu()
+    F, C = motion.F, motion.C
+    deformed = (F - torch.eye(3, dtype=F.dtype)).abs().amax(dim=(1, 2, 3)) > STRAINED
+    if not deformed[[n for n in frames if n > 0]].any():
+        raise InputError(
+            f"no particle is deformed up to step {frames[-1]}: there are no stresses to compare; let the video go on"
+        )
+    first = max(1, int(deformed.int().argmax()))
+    after = torch.tensor([n for n in frames if n >= first])
+    generator, volumes = torch.Generator().manual_seed(seed), start.vol0.cpu()
+    p = volumes.multinomial(states, replacement=True, generator=generator)
+    n = after[torch.randint(len(after), (states,), generator=generator)]
+    points = volumes.multinomial(min(paths, len(volumes)), generator=generator)
+    before = F[n - 1, p]
+    return VisitedStates(F[n, p], before + model.dt * (C[n, p] @ before), C[:, points], tuple(after.tolist()))
+
+
+def stress_errors(law: Law, truth: Law, visited: VisitedStates, dt: float) -> dict[str, float | int | None]:
+    """Errors of a law's stresses, relative to the true ones.
+
+    Returns:
+        of each of `PARTS` the root mean square of the error over that of the truth's stress; ``asymmetric``, the same
+        of the antisymmetric part of the law's stress; ``true_rms``, the root mean square of the true stress [Pa];
+        ``broken_paths``, on how many paths the law's stress became non-finite: these are left out of ``path``, which is
+        None if there is no other.
+    """
+    F, F_trial = visited.F.double(), visited.F_trial.double()
+    tau, true = stress(law, F), stress(truth, F)
+    volumetric, true_volumetric = (_volumetric(t) for t in (tau, true))
+    after, true_after = (stress(each, returned(each, F_trial)) for each in (law, truth))
+    along, true_along = (_along(each, visited, dt) for each in (law, truth))
+    sound = along.isfinite().all(dim=-1).all(dim=-1).all(dim=0)
+    return {
+        "stress": _relative(tau, true),
+        "volumetric": _relative(volumetric, true_volumetric),
+        "deviatoric": _relative(tau - volumetric, true - true_volumetric),
+        "returned": _relative(after, true_after),
+        "path": _relative(along[:, sound], true_along[:, sound]) if sound.any() else None,
+        "asymmetric": _rms(0.5 * (tau - tau.mT)) / _rms(true),
+        "true_rms": _rms(true),
+        "broken_paths": int((~sound).sum()),
+    }
+
+
+def _along(law: Law, visited: VisitedStates, dt: float) -> Tensor:
+    """Stresses (frames, P, 3, 3) of a law along the paths; not finite from where they break on."""
+    F = torch.eye(3, dtype=torch.float64).expand(visited.C.shape[1], 3, 3)
+    wanted, found = set(visited.frames), []
+    broken = torch.zeros(len(F), dtype=torch.bool)
+    for step, C in enumerate(visited.C.double()):
+        F = returned(law, F + dt * (C @ F)) if step else F
+        broken = broken | ~F.isfinite().all(dim=-1).all(dim=-1)
+        F = torch.where(broken[:, None, None], torch.eye(3, dtype=F.dtype), F)
+        if step in wanted:
+            found.append(torch.where(broken[:, None, None], torch.nan, stress(law, F)))
+    return torch.stack(found)
+
+
+def _volumetric(tau: Tensor) -> Tensor:
+    mean = tau.diagonal(dim1=-2, dim2=-1).mean(dim=-1)
+    return mean[..., None, None] * torch.eye(3, dtype=tau.dtype)
+
+
+def _rms(values: Tensor) -> float:
+    return float(values.square().sum(dim=(-2, -1)).mean().sqrt())
+
+
+def _relative(values: Tensor, true: Tensor) -> float:
+    return _rms(values - true) / _rms(true)

@@ -1,0 +1,54 @@
+"""How wrong the stresses of laws are, on states that the true law goes through on the reconstruction."""
+
+
+rule visited:
+    input:
+        **body_files(),
+        kernels=kernels("simulation"),
+        velocity=of_chain("velocity.json"),
+    output:
+        visited=f"{RESULTS}/{{scene}}/visited.h5",
+    resources:
+        gpu=GPU,
+    params:
+        simulation=simulation_settings,
+        density=scene_setting("density"),
+        law=scene_setting("law"),
+        frames=frame_steps,
+        states=SETTINGS.evaluation.states,
+        paths=SETTINGS.evaluation.paths,
+        seed=SETTINGS.seed,
+        device=SETTINGS.device,
+    script:
+        "../scripts/visited.py"
+
+
+rule stress:
+    input:
+        kernels=kernels("laws"),
+        visited=of_chain("visited.h5"),
+        prior=material_prior,
+        adaptor=trained_adaptor,
+        identified=identified_law,
+    output:
+        stress=f"{RESULTS}/{{scene}}/{{method}}/stress.json",
+    params:
+        dt=scene_setting("dt"),
+        truth=scene_setting("law"),
+        laws=lambda wildcards: [law for law in [true_law(wildcards)] if law],
+    script:
+        "../scripts/stress.py"
+
+
+rule stress_table:
+    input:
+        stress=lambda wildcards: table_files("stress", "stress.json"),
+    output:
+        csv=report(f"{RESULTS}/stress.csv", caption="../report/stress.rst", category="Tables"),
+        markdown=f"{RESULTS}/stress.md",
+    params:
+        cells=lambda wildcards: table_cells("stress"),
+        titles=lambda wildcards: table_titles("stress"),
+        columns=lambda wildcards: table_columns("stress"),
+    script:
+        "../scripts/stress_table.py"
