@@ -76,6 +76,18 @@ class Family:
             spec[self._admitted[key][0]][key] = value
         return spec
 
+    def unbounded_dict(self, values: Values, covariance: np.ndarray) -> dict[str, Any]:
+        """Unbounded constants with their covariance, for JSON: u = log(value - low) - log(high - value), the
+        second term where there is an upper bound (``high`` is null where there is none)."""
+        bounds = [self._bounds(key) for key in self.constants]
+        return {
+            "constants": list(self.constants),
+            "values": self.unbounded(values).tolist(),
+            "covariance": covariance.tolist(),
+            "low": [low for low, _ in bounds],
+            "high": [high if math.isfinite(high) else None for _, high in bounds],
+        }
+
     def with_guesses(self, known: Values) -> Values:
         """Known constants, where the family has them and they lie within its bounds, and guesses for the others."""
         usable = {key: known[key] for key in self.constants if key in known and self._inside(key, known[key])}

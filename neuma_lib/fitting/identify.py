@@ -5,7 +5,11 @@ handful of rollouts. The residuals of sharp images have a basin a pixel wide; av
 smaller ones in turn, they lead there from afar. Constants are unbounded logarithms and logits. A family starts from the
 best of its own guess, the scene's prior and what simpler families have found; one that falls far behind is given up.
 
+How the body was thrown is known from the frames before contact, up to an uncertainty that the constants would take up.
+So the last round fits velocity and spin along, held by what is known of them.
+
 Families are fitted to the first frames and judged by the last ones, so that more constants do not win by themselves.
+One that explains the images no better than a simpler one is not followed to the end.
 What the video says of the constants of a family is told by the jackknife over blocks of the image, in combinations:
 of a flow that never springs back, the flow stress is seen and the stiffness is not.
 """
@@ -14,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -27,16 +31,16 @@ from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.frame_batches import frame_batches, spread_frames
 from neuma_lib.fitting.least_squares import Linearisation, in_blocks, jackknife, levenberg_marquardt
+from neuma_lib.fitting.throw import Throw
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import Values, named_combinations, physical
-from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
-from neuma_lib.sim.state import State
 from neuma_lib.splatting.observation import Observation
 
 _LAST_GAIN = 0.1  # of `least_gain`, in the last round
 _LEAST_LOSS = 1e-12  # below it, held-out images agree exactly
+_MOTION = 6  # unknowns of a throw: velocity and spin
 
 
 @dataclass
@@ -49,7 +53,8 @@ class FamilyFit:
         loss: mean squared residual of the fitted frames, at the last squares it came to; infinite if all diverged.
         held_out: the same of the frames that were held out, at the finest squares.
         score: logarithm of ``held_out`` plus the penalty on constants; smaller is better.
-        covariance: of the unbounded constants, shape (k, k).
+        covariance: of the unbounded constants, shape (k, k); what is uncertain about the throw is in it.
+        throw: the initial motion that was fitted along, with its standard deviations.
         refined: whether it came to the finest squares.
         rollouts: simulations that it took.
         steps: accepted Levenberg-Marquardt steps.
@@ -61,6 +66,7 @@ class FamilyFit:
     held_out: float = math.inf
     score: float = math.inf
     covariance: np.ndarray | None = None
+    throw: Throw | None = None
     refined: bool = False
     rollouts: int = 0
     steps: int = 0
@@ -96,6 +102,8 @@ class FamilyFit:
                 for key, value, std in self.quantities(settings)
             }
             plain["combinations"] = self.combinations(settings)
+            plain["unbounded"] = self.family.unbounded_dict(self.values, self.covariance)
+            plain["start"] = self.throw.as_dict()
         return plain
 
     def quantities(self, settings: IdentifyConfig) -> list[tuple[str, float, float]]:
@@ -147,6 +155,7 @@ class Identified:
             "family": self.best.family.name,
             "ties": self.ties,
             "law": self.best.family.law_spec(self.best.values),
+            "start": self.best.throw.as_dict(),
             "says": self.summary(),
             "best": self.best.as_dict(self.settings),
             "families": {name: fit.as_dict(self.settings) for name, fit in self.fits.items()},
@@ -171,7 +180,7 @@ class Identified:
 
 def identify(
     model: MPMModel,
-    start: State,
+    throw: Throw,
     body: Reconstruction,
     observation: Observation,
     settings: IdentifyConfig,
@@ -183,7 +192,7 @@ def identify(
 
     Args:
         model: simulator constants.
-        start: the body's particles with their initial motion.
+        throw: how the body is thrown, as the frames before contact tell.
         body: reconstructed particles and Gaussians.
         observation: the video; its views are those of the settings.
         settings: candidates and hyper-parameters.
@@ -203,7 +212,7 @@ def identify(
     families.sort(key=lambda family: len(family.constants))  # simpler ones give starts to the others
     seen = observation.select(spread_frames(len(observation.frames), settings.frames))
     fitted = min(len(seen.frames) - 1, max(2, round((1 - settings.held_out) * len(seen.frames))))
-    video = _Video(model, start, body, seen, settings)
+    video = _Video(model, throw, body, seen, settings)
     stock_values = _constants(stock) if stock else {}
     running: list[_Run] = []
     rounds = len(settings.squares)
@@ -213,16 +222,14 @@ def identify(
         running.append(run)
     total = rounds * len(families)
     for level in range(1, rounds):
-        if not any(run.alive for run in running):
-            break
-        least = min(run.fit.cost for run in running if run.alive)
-        for done, run in enumerate(running):
-            if run.alive and run.fit.cost <= settings.give_up * least:
-                run.refine(level)
-                if progress:
-                    progress(level * len(families) + done + 1, total, run.loss)
-            else:
-                run.alive = False
+        _leave_behind(running, settings)
+        following = sorted((run for run in running if run.alive), key=lambda run: run.fit.cost)
+        if following and level == rounds - 1:
+            video.by_motion = following[0].motion_columns()
+        for done, run in enumerate(following):
+            run.refine(level)
+            if progress:
+                progress(level * len(families) + done + 1, total, run.loss)
     fits = {run.family.name: run.judged() for run in running}
     for name, fit in fits.items():
         log(
@@ -230,9 +237,23 @@ def identify(
             + ", ".join(f"{key} {value:.4g}" for key, value in fit.values.items())
         )
     chosen, ties = _choice(list(fits.values()), settings)
-    final = _Run(chosen.family, video, len(seen.frames), settings)
-    final.begin([chosen.values], level=rounds - 1)
+    run = next(run for run in running if run.family is chosen.family)
+    final = _Run(run.family, video, len(seen.frames), settings)
+    final.begin([run.values], level=rounds - 1, deviations=run.deviations)
     return Identified(final.judged(), ties, fits, seen.frames[:fitted], seen.frames[fitted:], settings)
+
+
+def _leave_behind(running: Sequence[_Run], settings: IdentifyConfig) -> None:
+    """Give up families that are far behind the best one, or that a simpler one explains the images as well as."""
+    alive = [run for run in running if run.alive]
+    least = min((run.fit.cost for run in alive), default=0.0)
+    for run in alive:
+        simpler = [other for other in alive if len(other.values) < len(run.values)]
+        worth = [
+            run.fit.cost * math.exp(settings.penalty * (len(run.values) - len(other.values))) < other.fit.cost
+            for other in simpler
+        ]
+        run.alive = run.fit.cost <= settings.give_up * least and all(worth)
 
 
 def _found(running: Sequence[_Run], family: Family) -> list[Values]:
@@ -264,15 +285,29 @@ def _constants(spec: Mapping[str, Mapping[str, Any]]) -> Values:
     return {key: float(value) for part in spec.values() for key, value in part.items() if key != "name"}
 
 
+@dataclass(frozen=True)
+class _Try:
+    """A law's specification, and how the throw deviates from what is known of it [standard deviations], shape (6,)."""
+
+    law: Mapping[str, Mapping[str, Any]]
+    deviations: np.ndarray
+
+
 class _Video:
-    """Simulated minus observed images, averaged over the finest squares, of laws."""
+    """Simulated minus observed images, averaged over the finest squares.
+
+    Attributes:
+        by_motion: derivatives of the residuals of all frames with respect to the throw's deviations; None: not yet
+            known. All families share those of one that fits: they are mostly kinematics.
+    """
 
     def __init__(
-        self, model: MPMModel, start: State, body: Reconstruction, seen: Observation, settings: IdentifyConfig
+        self, model: MPMModel, throw: Throw, body: Reconstruction, seen: Observation, settings: IdentifyConfig
     ):
-        self.model, self.start, self.frames = model, start, seen.frames
-        self.density = float(start.density.min())
-        self._total = settings.covariance_from == "total"
+        self.model, self.throw, self.frames = model, throw, seen.frames
+        self.density = float((body.mass / body.vol0).min())
+        self.by_motion: list[Tensor] | None = None
+        self._body, self._total = body, settings.covariance_from == "total"
         self._renderer = body.particle_gs(seen.cameras)
         width = seen.cameras.width
         sizes = [max(1, round(width / across)) for across in settings.squares]
@@ -282,25 +317,25 @@ class _Video:
         parts = frame_batches(len(seen.frames), self._renderer.frames_per_batch)
         self._observed = torch.cat([averaged(seen.colours(part), self.finest) for part in parts])
 
-    def residual(self, spec: Mapping[str, Mapping[str, Any]], count: int) -> Tensor | None:
-        """Residuals (count, V, H', W', 3) of the first frames; None if the rollout diverges."""
+    def residuals(self, tries: Sequence[_Try], count: int) -> list[Tensor | None]:
+        """Residuals (count, V, H', W', 3) of the first frames for each try; None where the rollout diverges."""
+        return [self._residual(one, count) for one in tries]
+
+    def _residual(self, one: _Try, count: int) -> Tensor | None:
         frames = self.frames[:count]
-        law = analytic_law(spec, self.model.dt).to(self.start.x.device)
+        start = self.throw.moved(one.deviations).of_body(self._body)
+        law = analytic_law(one.law, self.model.dt).to(start.x.device)
         try:
             with torch.no_grad():
-                x, F = self._path(law, frames)
+                path = rollout(self.model, law, start, steps=frames[-1], frames=frames, total=self._total)
                 images = [
-                    averaged(self._renderer(x[part], F[part]), self.finest)
+                    averaged(self._renderer(path.x[part], path.stretch[part]), self.finest)
                     for part in frame_batches(count, self._renderer.frames_per_batch)
                 ]
         except NonFiniteError:
             return None
         residual = torch.cat(images) - self._observed[:count]
         return residual if bool(residual.isfinite().all()) else None
-
-    def _path(self, law: Law, frames: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-        path = rollout(self.model, law, self.start, steps=frames[-1], frames=frames, total=self._total)
-        return path.x, path.stretch
 
 
 def averaged(images: Tensor, size: int) -> Tensor:
@@ -314,13 +349,17 @@ def averaged(images: Tensor, size: int) -> Tensor:
 
 
 class _Run:
-    """The fit of one family to the first frames; residuals and Jacobians serve all sizes of squares."""
+    """The fit of one family to the first frames; residuals and Jacobians serve all sizes of squares.
+
+    Unknowns are the unbounded constants, relative to the start of the fit, and the deviations of the throw.
+    """
 
     def __init__(self, family: Family, video: _Video, count: int, settings: IdentifyConfig):
         self.family, self.video, self.count, self.settings = family, video, count, settings
         self.alive, self.refined, self.rollouts, self.steps = False, False, 0, 0
         self.fit: Linearisation | None = None
-        self._origin, self._u, self._size = np.zeros(0), np.zeros(0), 1
+        self._constants = len(family.constants)
+        self._origin, self._u, self._size = np.zeros(0), np.zeros(self._constants + _MOTION), 1
         self._images: dict[bytes, Tensor | None] = {}
         self._columns: dict[bytes, list[Tensor]] = {}
 
@@ -329,18 +368,24 @@ class _Run:
         return self._values(self._u)
 
     @property
+    def deviations(self) -> np.ndarray:
+        return self._u[self._constants :]
+
+    @property
     def loss(self) -> float:
         """Mean squared residual at the present squares; infinite if nothing was simulated."""
         return self.fit.rms**2 if self.fit else math.inf
 
-    def begin(self, starts: Sequence[Values], level: int = 0) -> None:
+    def begin(self, starts: Sequence[Values], level: int = 0, deviations: np.ndarray | None = None) -> None:
         """Fit from the best of some starts, in a round."""
         self._size = self.video.sizes[level]
         tried = {tuple(values.values()): values for values in starts}
-        best, here = math.inf, np.zeros(len(self.family.constants))
+        best, here = math.inf, self._u.copy()
+        if deviations is not None:
+            here[self._constants :] = deviations
         for values in tried.values():
             self._origin = self.family.unbounded(values)
-            residual = self._simulate(here)
+            (residual,) = self._simulate([here])
             if residual is not None and (cost := self._cost(residual)) < best:
                 best, origin, self._images = cost, self._origin, {here.tobytes(): residual}
         self._u, self.alive = here, math.isfinite(best)
@@ -351,10 +396,11 @@ class _Run:
     def refine(self, level: int) -> None:
         """Go on with a round's squares."""
         self._size, last = self.video.sizes[level], level == len(self.video.sizes) - 1
+        moving = np.flatnonzero(self.video.throw.std) if self.video.by_motion else []
         self._u, self.fit, steps = levenberg_marquardt(
             self,
             self._u,
-            list(range(len(self._u))),
+            [*range(self._constants), *(self._constants + k for k in moving)],
             self._held,
             self.settings.least_gain * (_LAST_GAIN if last else 1.0),
             self.settings.iterations,
@@ -363,24 +409,36 @@ class _Run:
         self.steps += steps
         self.refined = last
 
+    def motion_columns(self) -> list[Tensor]:
+        """Forward differences of all frames by the deviations of the throw; 0 where it is known or diverges."""
+        points = [self._u] + [
+            self._u + np.eye(len(self._u))[self._constants + k] for k in np.flatnonzero(self.video.throw.std)
+        ]
+        here, *there = self._simulate(points, len(self.video.frames))
+        columns = [torch.zeros_like(here)] * _MOTION
+        for k, residual in zip(np.flatnonzero(self.video.throw.std), there, strict=True):
+            if residual is not None:
+                columns[k] = residual - here
+        return columns
+
     def judged(self) -> FamilyFit:
         """What was found, judged by the frames that were held out, if any."""
         found = FamilyFit(self.family, self.values, self.loss, refined=self.refined, steps=self.steps)
         if self.fit is not None and self.refined:
-            P = self._held(self.fit)
-            inverse = np.linalg.pinv(self.fit.curvature + P)
-            by_prior = inverse @ P * self.settings.spread
-            found.covariance = jackknife(self.fit, P) + by_prior @ by_prior.T
+            k, P = self._constants, self._held(self.fit)
+            by_prior = np.linalg.pinv(self.fit.curvature + P) @ P * self._spreads
+            covariance = jackknife(self.fit, P) + by_prior @ by_prior.T
+            found.covariance = covariance[:k, :k]
+            moved = self.video.throw.moved(self.deviations)
+            found.throw = replace(moved, std=moved.std * np.sqrt(np.diag(covariance)[k:]))
             if self.count < len(self.video.frames):
                 found.held_out = self._held_out()
-                found.score = math.log(max(found.held_out, _LEAST_LOSS)) + self.settings.penalty * len(
-                    self._u
-                )
+                found.score = math.log(max(found.held_out, _LEAST_LOSS)) + self.settings.penalty * k
         found.rollouts = self.rollouts
         return found
 
     def cost(self, unknowns: np.ndarray) -> float:
-        """Sum of squared residuals, infinite if the rollout diverges; unknowns are relative to the start."""
+        """Sum of squared residuals, infinite if the rollout diverges."""
         residual = self._residual(unknowns)
         return math.inf if residual is None else self._cost(residual)
 
@@ -393,51 +451,67 @@ class _Run:
         key = unknowns.tobytes()
         self._images = {key: residual}  # where the fit stands; the next size of squares begins here
         if key not in self._columns:
-            self._columns = {key: [self._column(unknowns, residual, k) for k in free]}
-        r = self._seen(residual)
-        columns = torch.stack([in_blocks(self._seen(c)) for c in self._columns[key]], dim=-1).double()
+            self._columns = {key: self._constant_columns(unknowns, residual)}
+        columns = self._columns[key] + [c[: self.count] for c in self.video.by_motion or ()]
+        r, k = self._seen(residual), len(unknowns)
+        J = torch.stack([in_blocks(self._seen(columns[i])) for i in free], dim=-1).double()
         blocks = in_blocks(r).double()
+        curvatures, scores = np.zeros((len(J), k, k)), np.zeros((len(J), k))
+        curvatures[:, np.array(free)[:, None], free] = (J.mT @ J).cpu().numpy()
+        scores[:, free] = (J.mT @ blocks[..., None])[..., 0].cpu().numpy()
         cost = self._cost(residual)
-        return Linearisation(
-            (columns.mT @ columns).cpu().numpy(),
-            (columns.mT @ blocks[..., None])[..., 0].cpu().numpy(),
-            cost,
-            math.sqrt(cost / r.numel()),
-        )
+        return Linearisation(curvatures, scores, cost, math.sqrt(cost / r.numel()))
 
-    def _column(self, unknowns: np.ndarray, residual: Tensor, k: int) -> Tensor:
-        """Forward difference; backward where there is no forward: a divergence, or the stiffest that dt bears, which
-        the last step may have passed."""
-        here, step = self._values(unknowns), self.settings.difference
-        for h in (step, -step, -step - self.settings.longest_step):
-            moved = unknowns + h * np.eye(len(unknowns))[k]
-            if self._values(moved) != here and (there := self._simulate(moved)) is not None:
-                return (there - residual) / h
-        return torch.zeros_like(residual)
+    def _constant_columns(self, unknowns: np.ndarray, residual: Tensor) -> list[Tensor]:
+        """Differences by the constants: forward, and backward where there is no forward: a divergence, or the stiffest
+        that dt bears, which the last step may have passed."""
+        here, h = self._values(unknowns), self.settings.difference
+        columns = [torch.zeros_like(residual)] * self._constants
+        missing = range(self._constants)
+        for step in (h, -h, -h - self.settings.longest_step):
+            moved = {k: unknowns + step * np.eye(len(unknowns))[k] for k in missing}
+            moved = {k: point for k, point in moved.items() if self._values(point) != here}
+            for k, there in zip(moved, self._simulate(list(moved.values())), strict=True):
+                if there is not None:
+                    columns[k] = (there - residual) / step
+                    missing = [other for other in missing if other != k]
+            if not missing:
+                break
+        return columns
+
+    @property
+    def _spreads(self) -> np.ndarray:
+        """Expected distance of the unknowns from 0."""
+        return np.append(np.full(self._constants, self.settings.spread), np.ones(_MOTION))
 
     def _held(self, fit: Linearisation) -> np.ndarray:
-        """Curvature that holds every constant at its start +- `spread`."""
-        return np.eye(len(self._origin)) * fit.block_cost / self.settings.spread**2
+        """Curvature that holds every unknown at 0 +- its spread."""
+        return np.diag(fit.block_cost / self._spreads**2)
 
     def _values(self, unknowns: np.ndarray) -> Values:
-        return self.family.values(self._origin + unknowns, self.video.model, self.video.density)
+        constants = self._origin + unknowns[: self._constants]
+        return self.family.values(constants, self.video.model, self.video.density)
 
     def _residual(self, unknowns: np.ndarray) -> Tensor | None:
         key = unknowns.tobytes()
         if key not in self._images:
             # What was tried before is not accepted and never comes back.
-            self._images = dict([*list(self._images.items())[:1], (key, self._simulate(unknowns))])
+            (found,) = self._simulate([unknowns])
+            self._images = dict([*list(self._images.items())[:1], (key, found)])
         return self._images[key]
 
-    def _simulate(self, unknowns: np.ndarray) -> Tensor | None:
-        self.rollouts += 1
-        return self.video.residual(self.family.law_spec(self._values(unknowns)), self.count)
+    def _simulate(self, points: Sequence[np.ndarray], count: int | None = None) -> list[Tensor | None]:
+        """Residuals at unknowns, of the frames that are fitted or of so many."""
+        self.rollouts += len(points)
+        tries = [
+            _Try(self.family.law_spec(self._values(point)), point[self._constants :]) for point in points
+        ]
+        return self.video.residuals(tries, count or self.count)
 
     def _seen(self, residual: Tensor) -> Tensor:
         return averaged(residual, self._size)
 
     def _held_out(self) -> float:
         """Mean squared residual of the frames after those that are fitted; infinite if the rollout diverges there."""
-        self.rollouts += 1
-        residual = self.video.residual(self.family.law_spec(self.values), len(self.video.frames))
+        (residual,) = self._simulate([self._u], len(self.video.frames))
         return math.inf if residual is None else float(residual[self.count :].double().square().mean())

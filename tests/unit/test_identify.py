@@ -1,6 +1,7 @@
 """Family and constants found in a video whose truth is known: one of the candidates, as seen, and as uncertain."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,8 +13,9 @@ from neuma_lib.config.laws import LawConfig
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.evaluation.identified_page import identified_page
 from neuma_lib.fitting.families import Family
-from neuma_lib.fitting.identify import FamilyFit, _choice, averaged, identify
+from neuma_lib.fitting.identify import FamilyFit, _choice, _leave_behind, averaged, identify
 from neuma_lib.fitting.least_squares import Linearisation, jackknife, levenberg_marquardt
+from neuma_lib.fitting.throw import Throw
 from neuma_lib.io.files import write_json
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import named_combinations
@@ -47,14 +49,19 @@ def pixel_noise(images: torch.Tensor) -> torch.Tensor:
     return 0.01 * torch.randn(images.shape, generator=torch.Generator().manual_seed(5), dtype=images.dtype)
 
 
-def found_in(spec: dict, families: dict, noise=pixel_noise, **options):
+def known(body, std=(0.0,) * 6) -> Throw:
+    """The true throw, up to standard deviations."""
+    centre = (body.mass @ body.x0 / body.mass.sum()).numpy()
+    return Throw(np.array(V0), np.zeros(3), centre, np.eye(3), np.array(std))
+
+
+def found_in(spec: dict, families: dict, noise=pixel_noise, throw=None, **options):
     """What is identified in a noisy video of the ball under a law."""
     body = ball()
+    throw = throw or known(body)
     seen = observe(body, V0, FRAMES, spec)
     seen = Observation(seen.frames, seen.images + noise(seen.images), seen.cameras)
-    return identify(
-        MODEL, body.state(V0), body, seen, settings(families, covariance_from="elastic", **options)
-    )
+    return identify(MODEL, throw, body, seen, settings(families, covariance_from="elastic", **options))
 
 
 def test_constants_and_family_of_the_truth_are_found():
@@ -67,6 +74,56 @@ def test_constants_and_family_of_the_truth_are_found():
     assert found.best.values["nu"] == pytest.approx(0.35, abs=0.02)
     assert found.frames + found.held_out == FRAMES and len(found.held_out) == 4
     assert found.as_dict()["law"]["plasticity"] == {"name": "identity"}
+
+
+def test_an_uncertain_throw_is_corrected_and_widens_the_constants():
+    """A velocity that is off by a standard deviation along all axes is found to a third of that, and the constants as
+    well as with the true one; what is left of the uncertainty is passed on to them."""
+    truth, families = law("hencky", E=3e4, nu=0.35), {"hencky": ELASTIC}
+    off, std = np.array([0.03, -0.03, 0.06]), (0.03, 0.03, 0.06, 0.2, 0.2, 0.2)
+    throw = known(ball(), std)
+    found = found_in(truth, families, throw=replace(throw, velocity=throw.velocity + off)).best
+    assert (np.abs(found.throw.velocity - V0) < np.abs(off) / 3).all()
+    assert (np.abs(found.throw.spin) < 0.2).all()
+    assert (found.throw.std < std).all() and (found.throw.std > 0).all()
+    assert found.values["E"] == pytest.approx(3e4, rel=0.04)
+    sure = found_in(truth, families).best
+    assert (np.diag(found.covariance) > np.diag(sure.covariance)).all()
+    assert sure.throw.std.max() == 0 and sure.as_dict(settings(families))["start"]["v0"] == list(V0)
+
+
+def test_a_throw_is_read_moved_and_written():
+    """Deviations along the camera's axes are those of the world turned; what is known does not move."""
+    axes = [[0, 0, 1], [0, -1, 0], [1, 0, 0]]
+    content = {"v0": [1, 2, 3], "angular_velocity": [0, 1, 0], "centre": [0.5, 0.5, 0.5], "camera_axes": axes}
+    throw = Throw.of(content | {"std_camera": [0.1, 0.2, 0.3], "angular_velocity_std_camera": [1, 0, 0]})
+    moved = throw.moved(np.array([1.0, 2.0, 0.0, 1.0, 5.0, 5.0]))
+    np.testing.assert_allclose(moved.velocity, [1, 1.6, 3.1])
+    np.testing.assert_allclose(moved.spin, [0, 1, 1])
+    again = Throw.of(moved.as_dict())
+    assert all(np.array_equal(getattr(again, field), getattr(moved, field)) for field in vars(moved))
+    assert not Throw.of(content).std.any()
+    body = ball()
+    around = np.cross(moved.spin, body.x0.numpy() - moved.centre)
+    np.testing.assert_allclose(moved.of_body(body).v, moved.velocity + around)
+
+
+def test_families_that_are_far_behind_or_no_better_than_simpler_ones_are_left():
+    class Run:
+        alive = True
+
+        def __init__(self, cost, constants):
+            self.fit, self.values = (
+                Linearisation(np.zeros(0), np.zeros(0), cost, 0.0),
+                dict.fromkeys(constants),
+            )
+
+    options = settings({"hencky": ELASTIC}, give_up=3.0, penalty=0.1)
+    elastic, far, no_better, better = Run(1.0, "ab"), Run(3.1, "ab"), Run(0.95, "abc"), Run(0.8, "abc")
+    _leave_behind([elastic, far, no_better], options)
+    assert [run.alive for run in (elastic, far, no_better)] == [True, False, False]
+    _leave_behind([elastic, better], options)
+    assert elastic.alive and better.alive
 
 
 def test_a_plastic_body_is_no_elastic_one_and_is_pictured(tmp_path):
@@ -188,7 +245,7 @@ def test_images_are_averaged_over_squares():
 def test_few_frames_and_unknown_constants_are_named():
     body = ball()
     with pytest.raises(InputError, match="four frames"):
-        identify(MODEL, body.state(V0), body, observe(body, V0, (0, 4, 8)), settings({"hencky": ELASTIC}))
+        identify(MODEL, known(body), body, observe(body, V0, (0, 4, 8)), settings({"hencky": ELASTIC}))
     with pytest.raises(InputError, match="no constant stiffness"):
         Family("x", {"elasticity": {"name": "hencky", "E": 1e4, "nu": 0.3, "stiffness": 2}})
     both = {"name": "von_mises", "yield_stress": 1e3, "nu": 0.2}

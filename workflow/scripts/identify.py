@@ -5,9 +5,10 @@ import torch
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.device import choose_device
 from neuma_lib.fitting.identify import identify
-from neuma_lib.io.files import write_json
+from neuma_lib.fitting.throw import Throw
+from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.images import load_observation
-from neuma_lib.io.particles import load_body, thrown
+from neuma_lib.io.particles import load_body
 from neuma_lib.sim.model import MPMModel
 from workflow.stage import run_script
 
@@ -18,9 +19,9 @@ def main(inputs, output, params, run) -> None:
     body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density)
     body = body.to(torch.float32, device)
     video = load_observation(inputs.transforms, settings.views).to(torch.float32, device)
-    start = thrown(body, inputs.velocity)
+    throw = Throw.of(read_json(inputs.velocity))
     model = MPMModel(**params.simulation)
-    found = identify(model, start, body, video, settings, params.stock, run.progress, run.say)
+    found = identify(model, throw, body, video, settings, params.stock, run.progress, run.say)
     write_json(output.identified, found.as_dict())
     run.say(found.summary())
 

@@ -1,0 +1,239 @@
+"""Identification judged against known truths: constants with their uncertainty, choice of family, motion, time.
+
+    python -m benchmarks.identification RubberPawn                          # reads data/, results/, config/config.yaml
+    python -m benchmarks.identification random1_05 random2_03 --seeds 1 2 --count 12 --jobs 16 --out found.json
+    python -m benchmarks.identification random1_05 --set '{"give_up": 3}'   # other settings of `identify`
+
+A scene may be named by the beginning of its name; without names, all random scenes that have results are taken.
+Dataset and reconstruction must exist (`snakemake results/SCENE/velocity.json`). The truth is read here and nowhere in
+the library. Settings are to be tuned on draws that are not reported.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import multiprocessing
+import resource
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.config.settings import Config, load, merged, read_yaml
+from neuma_lib.evaluation.metrics import tracer_errors
+from neuma_lib.evaluation.motion import predict
+from neuma_lib.fitting.identify import Identified, identify
+from neuma_lib.fitting.throw import Throw
+from neuma_lib.io.files import read_json, write_json
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.images import load_observation
+from neuma_lib.io.particles import load_body
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.combinations import named_combinations, physical
+from neuma_lib.sim.model import MPMModel
+
+TRACERS = 2000  # of the truth's, for the motion
+COVERED = 2.0  # standard deviations
+CLOSE = 0.1  # relative error
+
+
+def judge(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Identify one scene and compare with its truth; plain numbers."""
+    torch.set_num_threads(1)
+    scene = settings.scene(name)
+    data, results = Path(settings.data_root) / name, Path(settings.results_root) / name
+    chosen = IdentifyConfig(**merged(settings.identify.plain(), changes))
+    body = load_body(
+        results / "particles.h5", results / "binding.h5", results / "gaussians.ply", scene.density
+    )
+    body = body.to(torch.float32)
+    video = load_observation(data / "dynamic/transforms.json", chosen.views).to(torch.float32)
+    throw = Throw.of(read_json(results / "velocity.json"))
+    simulation = settings.simulation.plain()
+    model = MPMModel(
+        dt=scene.dt, **{key: simulation[key] for key in ("grid", "gravity", "boundary", "walls")}
+    )
+    stock = settings.priors.laws.get(scene.prior)
+    before = _core_seconds()
+    found = identify(model, throw, body, video, chosen, stock.plain() if stock else None)
+    seconds = _core_seconds() - before
+    truth = scene.law.plain()
+    row = {
+        "scene": name,
+        "truth": truth,
+        "core_seconds": seconds,
+        **_family(found, truth),
+        "quantities": _quantities(found, truth),
+        "combinations": _combinations(found, truth),
+        "found": found.as_dict(),
+    }
+    arrays, _ = read_arrays(data / "particles.h5", required=("tracers",), only=("tracers",))
+    tracers = torch.from_numpy(arrays["tracers"])
+    tracers = tracers[:, :: max(1, tracers.shape[1] // TRACERS)].to(body.x0)
+    laws = {"identified": row["found"]["law"], "true_law": truth}
+    starts = {"velocity": throw, "fitted": found.best.throw}
+    for law, spec in laws.items():
+        for start, thrown in starts.items():
+            path, _ = predict(
+                model, analytic_law(spec, model.dt), thrown.of_body(body), video.frames, tracers[0]
+            )
+            row[f"rmse_mm_{law}_{start}_start"] = tracer_errors(path.tracers, tracers)["tracer_rmse_mm"]
+    return row
+
+
+def _core_seconds() -> float:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def _kind(spec: Mapping[str, Any]) -> tuple[str, str]:
+    return spec["elasticity"]["name"], (spec.get("plasticity") or {"name": "identity"})["name"]
+
+
+def _family(found: Identified, truth: Mapping[str, Any]) -> dict[str, Any]:
+    """Whether the family is right, or tied with the right one; None where the truth is no candidate."""
+    kinds = {name: _kind(fit.family.spec) for name, fit in found.fits.items()}
+    right = [name for name, kind in kinds.items() if kind == _kind(truth) and "bingham" not in name]
+    ok = None
+    if right:
+        ok = (
+            "right" if found.best.family.name in right else "tie" if set(right) & set(found.ties) else "wrong"
+        )
+    return {"family": found.best.family.name, "ties": found.ties, "family_is": ok}
+
+
+def _constants(spec: Mapping[str, Any]) -> dict[str, float]:
+    return {key: float(value) for part in spec.values() for key, value in part.items() if key != "name"}
+
+
+def _quantities(found: Identified, truth: Mapping[str, Any]) -> dict[str, Any]:
+    """Named combinations that the truth has too: value, truth, standard deviation of the logarithm, z score."""
+    true = named_combinations(_constants(truth))
+    return {
+        key: {
+            "value": value,
+            "truth": true[key],
+            "log_std": std,
+            "z": math.log(value / true[key]) / std,
+            "determined": std < found.settings.determined,
+        }
+        for key, value, std in found.best.quantities(found.settings)
+        if key in true
+    }
+
+
+def _combinations(found: Identified, truth: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The same of combinations whose errors are independent, if the truth has all of the constants."""
+    true = physical(_constants(truth))
+    if set(true) != set(physical(found.best.values)):
+        return []
+    rows = []
+    for entry in found.best.combinations(found.settings):
+        error = entry["log_value"] - sum(
+            power * math.log(true[key]) for key, power in entry["powers"].items()
+        )
+        rows.append({**entry, "log_error": error, "z": error / entry["log_std"]})
+    return rows
+
+
+def summary(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Coverage, closeness, choice of family, motion and time over scenes, as lines."""
+    lines = []
+    for kind in ("quantities", "combinations"):
+        entries = [e for row in rows for e in (row[kind].values() if kind == "quantities" else row[kind])]
+        sure = [e for e in entries if e["determined"]]
+        if sure:
+            covered = sum(abs(e["z"]) < COVERED for e in sure)
+            close = sum(abs(e["z"] * e["log_std"]) < math.log(1 + CLOSE) for e in sure)
+            rms = math.sqrt(sum(e["z"] ** 2 for e in sure) / len(sure))
+            lines.append(
+                f"{kind}: {len(sure)} of {len(entries)} determined, truth within {COVERED:g} standard deviations in "
+                f"{covered}, within {CLOSE:.0%} in {close}, rms z {rms:.2f}"
+            )
+    known = [row["family_is"] for row in rows if row["family_is"]]
+    lines.append("family: " + ", ".join(f"{known.count(ok)} {ok}" for ok in ("right", "tie", "wrong")))
+    for key in [key for key in rows[0] if key.startswith("rmse")]:
+        lines.append(f"{key}: {sum(row[key] for row in rows) / len(rows):.2f} on average")
+    seconds = [row["core_seconds"] for row in rows]
+    lines.append(f"core seconds: {sum(seconds) / len(seconds):.0f} on average, at most {max(seconds):.0f}")
+    return "\n".join(lines)
+
+
+def lines_of(row: Mapping[str, Any]) -> str:
+    """A scene for people."""
+    ties = f" (tie with {', '.join(row['ties'])})" if row["ties"] else ""
+    lines = [
+        f"{row['scene']}: {row['family']}{ties}, {row['family_is'] or 'truth is no candidate'}; "
+        f"{row['found']['rollouts']} rollouts, {row['core_seconds']:.0f} core s; "
+        + ", ".join(f"{key[5:]} {value:.2f}" for key, value in row.items() if key.startswith("rmse"))
+    ]
+    for key, e in row["quantities"].items():
+        lines.append(
+            f"    {key:16} {e['value']:10.4g} true {e['truth']:10.4g} ({e['value'] / e['truth'] - 1:+.0%}) "
+            f"log std {e['log_std']:.3f} z {e['z']:+.1f} {'determined' if e['determined'] else ''}"
+        )
+    return "\n".join(lines)
+
+
+def _settings(args: argparse.Namespace) -> list[Config]:
+    """Settings of the project, once for every seed of the random scenes."""
+    raw = {}
+    for file in args.settings:
+        raw = merged(raw, read_yaml(file))
+    raw = merged(
+        raw, {key: str(path) for key in ("data_root", "results_root") if (path := getattr(args, key))}
+    )
+    return [load(merged(raw, {"random": {"seed": seed, "count": args.count}})) for seed in args.seeds] or [
+        load(raw)
+    ]
+
+
+def _wanted(args: argparse.Namespace) -> list[tuple[str, Config, dict[str, Any]]]:
+    """Scenes with their settings."""
+    jobs, changes = [], json.loads(args.set)
+    for settings in _settings(args):
+        for name in settings.scenes:
+            asked = any(name == given or name.startswith(f"{given}_") for given in args.scenes)
+            drawn = not args.scenes and name.startswith(settings.random.prefix)
+            if asked or drawn and (Path(settings.results_root) / name / "velocity.json").exists():
+                jobs.append((name, settings, changes))
+    return list({name: job for job in jobs for name in job[:1]}.values())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scenes", nargs="*", help="names, or their beginnings")
+    parser.add_argument("--settings", nargs="+", default=["config/config.yaml"], help="YAML files")
+    parser.add_argument("--seeds", type=int, nargs="*", default=[], help="of random scenes")
+    parser.add_argument("--count", type=int, default=12, help="of random scenes of each seed")
+    parser.add_argument("--data", dest="data_root", type=Path, help="instead of data_root")
+    parser.add_argument("--results", dest="results_root", type=Path, help="instead of results_root")
+    parser.add_argument("--set", default="{}", help="changes of the settings of `identify`, as JSON")
+    parser.add_argument("--jobs", type=int, default=1, help="scenes at a time")
+    parser.add_argument("--out", type=Path, help="JSON file for all numbers")
+    args = parser.parse_args()
+    jobs = _wanted(args)
+    if not jobs:
+        parser.error("no such scene has results: make velocity.json first")
+    rows = []
+    with multiprocessing.get_context("spawn").Pool(args.jobs, maxtasksperchild=1) as pool:
+        for row in pool.imap_unordered(_judge, jobs):
+            rows.append(row)
+            print(lines_of(row), flush=True)
+            if args.out:
+                write_json(args.out, {row["scene"]: row for row in rows})
+    print(summary(rows))
+
+
+def _judge(job: tuple[str, Config, dict[str, Any]]) -> dict[str, Any]:
+    return judge(*job)
+
+
+if __name__ == "__main__":
+    main()
