@@ -22,6 +22,9 @@ class IdentifyConfig(Section):
     covariance_from: Literal["elastic", "total"] = Field(
         "total", description="deformation that stretches the Gaussians, as `material.covariance_from`"
     )
+    gaussian_motion: Literal["mean", "affine"] = Field(
+        "affine", description="how Gaussians follow their particles, as `material.gaussian_motion`"
+    )
     frames: int = Field(33, ge=4, description="most frames that are compared, spread evenly over the video")
     held_out: float = Field(
         0.25, gt=0, lt=1, description="part of the frames, the last ones, that families are judged by"

@@ -32,6 +32,11 @@ class MaterialConfig(Section):
         description="deformation that stretches the Gaussians: the elastic F (paper), or the total one, with all that "
         "has flowed",
     )
+    gaussian_motion: Literal["mean", "affine"] = Field(
+        "mean",
+        description="how Gaussians follow their particles: shifted by their mean displacement (paper), or by their "
+        "affine motion, which also turns and stretches a Gaussian's distance from them",
+    )
     assumed_density: float | None = Field(
         None, gt=0, description="density believed everywhere [kg/m^3]; null: the scene's is told"
     )
@@ -69,6 +74,12 @@ class MaterialConfig(Section):
         ge=1,
         description="after a return to the best state the rates are halved; each accepted iteration multiplies "
         "them by this, up to their full size",
+    )
+    penalty: float = Field(
+        0.0,
+        ge=0,
+        description="weight of the mean squared relative change of stress and return map on states that the video did "
+        "not visit, beside the loss divided by its first value; 0: none (paper)",
     )
     diverged_ratio: float = Field(
         5.0,

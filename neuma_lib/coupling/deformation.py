@@ -18,12 +18,16 @@ def deform(
     x: torch.Tensor,
     F: torch.Tensor,
     *,
+    arms: torch.Tensor | None = None,
     covariance_gradient: bool = True,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Move and stretch Gaussians with the particles that they are bound to.
 
     x_t = x_0 + B (p_t - p_0); F_bar = B F_t; A_t = F_bar A_0 F_bar^T. The first is the sum of the paper's
-    increments, because B does not change. Differentiable with respect to x and F, not to what is at rest.
+    increments, because B does not change. It holds where a Gaussian lies amid its particles; one beside them, as most
+    of those on the surface do, keeps its distance a = x_0 - B p_0 from them as it was, however the body turns or
+    stretches. With `arms` a follows too, x_t = B p_t + F_bar a, which is exact for affine motions.
+    Differentiable with respect to x and F, not to what is at rest.
 
     Args:
         means: (G, 3) Gaussian centres at rest [m].
@@ -32,8 +36,9 @@ def deform(
         x0: (N, 3) particle positions at rest [m].
         x: (T, N, 3) particle positions of the frames [m].
         F: (T, N, 3, 3) their deformation gradients.
-        covariance_gradient: let image gradients reach F through the covariances. The authors' released code
-            does not (its deformation kernel is not taped); False reproduces that.
+        arms: (G, 3) distances a at rest [m], of `arms_at_rest`; None: the paper's equation.
+        covariance_gradient: let image gradients reach F through the covariances, and through arms. The authors'
+            released code does not (its deformation kernel is not taped); False reproduces that.
 
     Returns:
         means (T, G, 3), covars (T, G, 3, 3)
@@ -50,39 +55,54 @@ def deform(
         "covars": (covars, (G, 3, 3)),
     }
     advice = f" for a binding of {G} Gaussians to {N} particles. Rerun the binding stage if either changed."
+    if arms is not None:
+        expected["arms"], arms = (arms, (G, 3)), arms.contiguous()
     check_tensors("deform", expected, advice)
-    at_rest = (value.contiguous() for value in (means, covars, x0))
+    at_rest = (*(value.contiguous() for value in (means, covars, x0)), arms)
     return _Deform.apply(binding, *at_rest, x, F if covariance_gradient else F.detach())
+
+
+def arms_at_rest(means: torch.Tensor, binding: Binding, x0: torch.Tensor) -> torch.Tensor:
+    """From the mean of a Gaussian's particles to its centre [m], shape (G, 3); zero for one without particles.
+
+    Args:
+        means: (G, 3) Gaussian centres at rest [m].
+        binding: B (G x N, rows sum to 1).
+        x0: (N, 3) particle positions at rest [m].
+    """
+    nothing, F = means.new_zeros(len(means), 3, 3), x0.new_zeros(1, len(x0), 3, 3)
+    anchors, _ = deform(torch.zeros_like(means), nothing, binding, torch.zeros_like(x0), x0[None], F)
+    return torch.where(binding.counts[:, None].to(means.device) > 0, means - anchors[0], 0.0)
 
 
 class _Deform(torch.autograd.Function):
     """`deform` by the kernels of `deformation_kernels`."""
 
     @staticmethod
-    def forward(ctx, binding: Binding, means, covars, x0, x, F):
+    def forward(ctx, binding: Binding, means, covars, x0, arms, x, F):
         T, G = len(x), len(means)
         carry, _, _ = kernels(x.dtype)
         moved, stretched = x.new_empty(T, G, 3), x.new_empty(T, G, 3, 3)
-        F_bar = torch.empty_like(stretched) if ctx.needs_input_grad[5] else None
+        F_bar = torch.empty_like(stretched) if ctx.needs_input_grad[6] else None
         rows = binding.rows(x.dtype)
-        launch(
-            carry, (T, G), *rows, means, covars, x0, x.contiguous(), F.contiguous(), moved, stretched, F_bar
-        )
-        ctx.save_for_backward(covars, F_bar)
+        states = (x.contiguous(), F.contiguous())
+        launch(carry, (T, G), *rows, means, covars, x0, *states, arms, moved, stretched, F_bar)
+        ctx.save_for_backward(covars, F_bar, arms)
         ctx.binding = binding
         return moved, stretched
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_moved, grad_stretched):
-        covars, F_bar = ctx.saved_tensors
+        covars, F_bar, arms = ctx.saved_tensors
         T, N = len(grad_moved), ctx.binding.shape[1]
         grad_moved = grad_moved.contiguous()
         _, stretch_adjoint, carry_adjoint = kernels(grad_moved.dtype)
         grad_x, grad_F, grad_F_bar = grad_moved.new_empty(T, N, 3), None, None
         if F_bar is not None:
             grad_F_bar, grad_F = torch.empty_like(F_bar), grad_moved.new_empty(T, N, 3, 3)
-            launch(stretch_adjoint, F_bar.shape[:2], covars, F_bar, grad_stretched.contiguous(), grad_F_bar)
+            incoming = (grad_stretched.contiguous(), arms, grad_moved)
+            launch(stretch_adjoint, F_bar.shape[:2], covars, F_bar, *incoming, grad_F_bar)
         columns = ctx.binding.columns(grad_moved.dtype)
         launch(carry_adjoint, (T, N), *columns, grad_moved, grad_F_bar, grad_x, grad_F)
-        return None, None, None, None, grad_x, grad_F
+        return None, None, None, None, None, grad_x, grad_F

@@ -35,6 +35,7 @@ def kernels(dtype: torch.dtype):
         x0: wp.array(dtype=vec3),  # (N,)
         x: wp.array2d(dtype=vec3),  # (T, N)
         F: wp.array2d(dtype=mat33),  # (T, N)
+        arms: wp.array(dtype=vec3),  # (G,); None: Gaussians only shift
         moved: wp.array2d(dtype=vec3),  # (T, G), out
         stretched: wp.array2d(dtype=mat33),  # (T, G), out
         F_bar: wp.array2d(dtype=mat33),  # (T, G), out; None where nobody needs it
@@ -46,6 +47,8 @@ def kernels(dtype: torch.dtype):
             j = indices[k]
             shift += weights[k] * (x[t, j] - x0[j])
             mean_F += weights[k] * F[t, j]
+        if arms:
+            shift += mean_F * arms[g] - arms[g]
         moved[t, g] = means[g] + shift
         stretched[t, g] = mean_F * covars[g] * wp.transpose(mean_F)
         if F_bar:
@@ -56,12 +59,17 @@ def kernels(dtype: torch.dtype):
         covars: wp.array(dtype=mat33),  # (G,)
         F_bar: wp.array2d(dtype=mat33),  # (T, G)
         grad_stretched: wp.array2d(dtype=mat33),  # (T, G)
+        arms: wp.array(dtype=vec3),  # (G,) or None
+        grad_moved: wp.array2d(dtype=vec3),  # (T, G)
         grad_F_bar: wp.array2d(dtype=mat33),  # (T, G), out
     ):
         t, g = wp.tid()
         grad = grad_stretched[t, g]
         A = covars[g]
-        grad_F_bar[t, g] = grad * F_bar[t, g] * wp.transpose(A) + wp.transpose(grad) * F_bar[t, g] * A
+        total = grad * F_bar[t, g] * wp.transpose(A) + wp.transpose(grad) * F_bar[t, g] * A
+        if arms:
+            total += wp.outer(grad_moved[t, g], arms[g])
+        grad_F_bar[t, g] = total
 
     @kernel
     def carry_adjoint(

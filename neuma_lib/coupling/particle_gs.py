@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.coupling.binding import Binding
-from neuma_lib.coupling.deformation import deform
+from neuma_lib.coupling.deformation import arms_at_rest, deform
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.rasterizer import rasterize
@@ -27,6 +27,7 @@ class ParticleGS:
         cameras: V views.
         background: colour behind the Gaussians.
         covariance_gradient: whether gradients reach the particles through the covariances as well as the means.
+        affine: whether Gaussians beside their particles follow the affine motion of these (`deform` with arms).
         eps2d: variance that a pixel adds to a splat [px^2]; Gaussians of `fit_gaussians` hold it already.
     """
 
@@ -38,6 +39,7 @@ class ParticleGS:
         cameras: Cameras,
         background: tuple[float, float, float] = (1.0, 1.0, 1.0),
         covariance_gradient: bool = True,
+        affine: bool = False,
         eps2d: float = 0.0,
     ):
         self.gaussians, self.binding, self.x0, self.cameras = gaussians, binding, x0, cameras
@@ -45,11 +47,12 @@ class ParticleGS:
         with torch.no_grad():
             self._covars0 = gaussians.covars()
             self._sh = gaussians.sh()
+            self._arms = arms_at_rest(gaussians.means, binding, x0) if affine else None
 
     def deformed(self, x: Tensor, F: Tensor) -> tuple[Tensor, Tensor]:
         """Means (T, G, 3) and covariances (T, G, 3, 3) for particle states x (T, N, 3) and F (T, N, 3, 3)."""
         at_rest = (self.gaussians.means, self._covars0, self.binding, self.x0)
-        return deform(*at_rest, x, F, covariance_gradient=self.covariance_gradient)
+        return deform(*at_rest, x, F, arms=self._arms, covariance_gradient=self.covariance_gradient)
 
     def __call__(self, x: Tensor, F: Tensor) -> Tensor:
         """Images (T, V, H, W, 3) in [0, 1] of the particle states x (T, N, 3) [m] and F (T, N, 3, 3)."""

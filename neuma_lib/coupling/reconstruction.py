@@ -26,6 +26,7 @@ class Reconstruction:
         mass: particle masses [kg], shape (N,).
         gaussians: static Gaussians, G of them.
         binding: (G, N) binding matrix.
+        affine: whether Gaussians follow the affine motion of their particles, not only the mean shift (`deform`).
     """
 
     x0: Tensor
@@ -33,6 +34,7 @@ class Reconstruction:
     mass: Tensor
     gaussians: Gaussians
     binding: Binding
+    affine: bool = False
 
     @classmethod
     def of_gaussians(cls, gaussians: Gaussians, volume: float, density: Density) -> Reconstruction:
@@ -54,8 +56,11 @@ class Reconstruction:
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Reconstruction:
         """The same body in another precision or on another device."""
         kind = dict(dtype=dtype, device=device)
-        return Reconstruction(*(getattr(self, field.name).to(**kind) for field in fields(self)))
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return Reconstruction(**{
+            name: value if isinstance(value, bool) else value.to(**kind) for name, value in values.items()
+        })  # fmt: skip
 
     def particle_gs(self, cameras: Cameras, **options) -> ParticleGS:
         """The renderer of this body for the given cameras."""
-        return ParticleGS(self.gaussians, self.binding, self.x0, cameras, **options)
+        return ParticleGS(self.gaussians, self.binding, self.x0, cameras, affine=self.affine, **options)

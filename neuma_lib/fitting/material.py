@@ -28,6 +28,7 @@ from torch import Tensor
 from neuma_lib.config.material import MaterialConfig
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.fitting.deviation import Deviation
 from neuma_lib.fitting.frame_batches import evaluate_in_batches
 from neuma_lib.fitting.image_loss import mean_squared_error
 from neuma_lib.geometry.chamfer import chamfer_loss
@@ -217,6 +218,11 @@ class _Loop:
         self.iteration, self.lr_scale, self.ended = 0, 1.0, False
         self.history, self.first_loss = History(), None
         self.best = {"loss": math.inf, "iteration": 0, **self._snapshot()}
+        self.deviation = None
+        if settings.penalty:
+            with torch.no_grad():  # before a checkpoint is loaded: the law that training begins with
+                paths = [self._path(start, loss) for start, loss in self.videos]
+                self.deviation = Deviation.of_videos(law, paths, model.dt)
 
     def advance(self) -> None:
         """One accepted optimiser step, or a return to the best state."""
@@ -260,21 +266,24 @@ class _Loop:
             self.best = self._better_state(value)
 
     def _frame_losses(self) -> list[Tensor]:
-        """Losses of the frames of every video, shape (T,) each."""
+        """Losses of the frames of every video, shape (T,) each; the penalty, times the first loss, is added to all."""
+        losses = [loss(self._path(start, loss)) for start, loss in self.videos]
+        if self.deviation is None or self.first_loss is None:
+            return losses
+        added = self.settings.penalty * self.first_loss * self.deviation()
+        return [frames + added for frames in losses]
+
+    def _path(self, start: State, loss: TrajectoryLoss) -> Trajectory:
         memory = None if self.settings.memory is None else self.settings.memory * 2**30 / len(self.videos)
-        paths = (
-            rollout(
-                self.model,
-                self.law,
-                start,
-                steps=loss.frames[-1],
-                frames=loss.frames,
-                total=loss.total,
-                memory=memory,
-            )
-            for start, loss in self.videos
+        return rollout(
+            self.model,
+            self.law,
+            start,
+            steps=loss.frames[-1],
+            frames=loss.frames,
+            total=loss.total,
+            memory=memory,
         )
-        return [loss(path) for path, (_, loss) in zip(paths, self.videos, strict=True)]
 
     def _backward(self, frame_losses: Sequence[Tensor]) -> tuple[dict[str, float], float]:
         if self.first_loss is None:

@@ -19,6 +19,8 @@ from neuma_lib.sim.state import State
 
 Carrier = Literal["binding", "gaussians"]
 """What moves a body's Gaussians: bound volume particles, or themselves."""
+GaussianMotion = Literal["mean", "affine"]
+"""How they follow these: by the mean displacement, or by the affine motion."""
 
 
 def save_particles(
@@ -46,10 +48,12 @@ def load_body(
     gaussians: str | Path,
     density: Density,
     carrier: Carrier = "binding",
+    gaussian_motion: GaussianMotion = "mean",
 ) -> Reconstruction:
     """The reconstructed body of a scene or experiment: particles with their volumes, and the Gaussians they carry.
 
-    With ``carrier="gaussians"`` the Gaussians are the particles, with equal shares of the same volume.
+    With ``carrier="gaussians"`` the Gaussians are the particles, with equal shares of the same volume. With
+    ``gaussian_motion="affine"`` renders let Gaussians follow the affine motion of their particles.
     Raises InputError where the binding was made for other Gaussians or particles.
     """
     splats = load_gaussians(gaussians)
@@ -70,6 +74,7 @@ def load_body(
         binding=Binding(
             **{name: torch.from_numpy(array) for name, array in arrays.items()}, shape=(len(splats), len(x0))
         ),
+        affine=gaussian_motion == "affine",
     )
 
 

@@ -66,6 +66,8 @@ class Adaptor(nn.Module):
 class AdaptableConstitutive(Constitutive):
     """A network of a few matrices with frozen base weights and, if one is attached, an adaptor."""
 
+    isotropic = False
+    """Whether the axes of the stretch do not matter, for any weights."""
     base: nn.ParameterList
     adaptor: Adaptor | None
 

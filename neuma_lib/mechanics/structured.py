@@ -195,6 +195,8 @@ class StructuredElasticity(AdaptableConstitutive, Elasticity):
         InputError: no such form, a base that has none, weights of other shapes.
     """
 
+    isotropic = True
+
     def __init__(
         self, base: AnalyticElasticity, form: str = "stretch", weights: Weights | None = None, seed: int = 0
     ):
@@ -311,6 +313,8 @@ class StructuredPlasticity(AdaptableConstitutive, Plasticity):
     Raises:
         InputError: a base that has none, weights of other shapes.
     """
+
+    isotropic = True
 
     def __init__(self, base: Plasticity, weights: Weights | None = None, seed: int = 0):
         super().__init__()

@@ -10,7 +10,7 @@ from grounding_scene import ball, camera
 from render_scenes import dense
 from test_binding import random_gaussians, random_particles
 
-from neuma_lib.coupling.deformation import deform
+from neuma_lib.coupling.deformation import arms_at_rest, deform
 from neuma_lib.coupling.particle_binding import bind
 from neuma_lib.errors import InputError
 from neuma_lib.fitting.frame_batches import evaluate_in_batches, frame_batches
@@ -75,11 +75,17 @@ def test_images_of_another_shape_are_refused():
 # ---- deformation
 
 
-def three_equations(means, covars, binding, x0, x, F):
-    """x_t = x_0 + B (p_t - p_0), A_t = F_bar A_0 F_bar^T with F_bar = B F, as they stand."""
+def three_equations(means, covars, binding, x0, x, F, arms=None):
+    """x_t = x_0 + B (p_t - p_0), or B p_t + F_bar a; A_t = F_bar A_0 F_bar^T with F_bar = B F; as they stand."""
     B = dense(binding)
     F_bar = torch.einsum("gn,tnij->tgij", B, F)
-    return means + torch.einsum("gn,tni->tgi", B, x - x0), F_bar @ covars @ F_bar.mT
+    moved = means + torch.einsum("gn,tni->tgi", B, x - x0)
+    if arms is not None:
+        bound = (binding.counts > 0)[:, None]
+        moved = torch.where(
+            bound, torch.einsum("gn,tni->tgi", B, x) + (F_bar @ arms[..., None])[..., 0], moved
+        )
+    return moved, F_bar @ covars @ F_bar.mT
 
 
 def deformation(dtype, device, frames=4):
@@ -97,14 +103,16 @@ def deformation(dtype, device, frames=4):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_fused_deformation_is_the_three_equations(dtype, device):
+@pytest.mark.parametrize("affine", [False, True])
+def test_fused_deformation_is_the_three_equations(dtype, device, affine):
     binding, means, covars, x0, x, F = deformation(dtype, device)
+    arms = arms_at_rest(means, binding, x0) if affine else None
     cotangents = [
         normal(4, 70, *shape, seed=3, dtype=dtype, device=device) for shape in ((3,), (3, 3))
     ]  # the second is not symmetric
     results = []
     for way in (deform, three_equations):
-        out = way(means, covars, binding, x0, x, F)
+        out = way(means, covars, binding, x0, x, F, arms=arms)
         results.append([*(o.detach() for o in out), *torch.autograd.grad(out, (x, F), cotangents)])
     for fused, plain in zip(*results, strict=True):
         assert_near(fused, plain, dtype)

@@ -5,7 +5,7 @@ import torch
 from render_scenes import dense
 
 from neuma_lib.coupling.binding import Binding
-from neuma_lib.coupling.deformation import deform
+from neuma_lib.coupling.deformation import arms_at_rest, deform
 from neuma_lib.errors import InputError
 from neuma_lib.splatting import spherical_harmonics as harmonics
 from neuma_lib.splatting.gaussians import Gaussians, rotations
@@ -109,17 +109,35 @@ def test_affine_motion_carries_gaussians_exactly():
     assert torch.allclose(covars[0], A @ covars0 @ A.T)
 
 
-def test_rest_state_is_unchanged():
+def test_affine_motion_carries_gaussians_beside_their_particles_exactly():
+    """With arms, x -> A x + b on every particle takes the centres to A x + b too, wherever they lie."""
+    gaussians, binding, x0, _, _, generator = deformation_case()
+    A = torch.eye(3) + 0.3 * torch.randn(3, 3, generator=generator, dtype=torch.float64)
+    b = torch.tensor([0.1, -0.2, 0.3], dtype=torch.float64)
+    arms = arms_at_rest(gaussians.means, binding, x0)
+    assert torch.allclose(arms, gaussians.means - dense(binding) @ x0)
+    F = A.expand(1, len(x0), 3, 3)
+    means, _ = deform(gaussians.means, gaussians.covars(), binding, x0, (x0 @ A.T + b)[None], F, arms=arms)
+    assert torch.allclose(means[0], gaussians.means @ A.T + b)
+
+
+@pytest.mark.parametrize("affine", [False, True])
+def test_rest_state_is_unchanged(affine):
     gaussians, binding, x0, _, _, _ = deformation_case()
+    arms = arms_at_rest(gaussians.means, binding, x0) if affine else None
     identity = torch.eye(3, dtype=torch.float64).expand(2, len(x0), 3, 3)
-    means, covars = deform(gaussians.means, gaussians.covars(), binding, x0, x0.expand(2, -1, 3), identity)
+    means, covars = deform(
+        gaussians.means, gaussians.covars(), binding, x0, x0.expand(2, -1, 3), identity, arms=arms
+    )
     assert (means - gaussians.means).abs().max() < 1e-15
     assert (covars - gaussians.covars()).abs().max() < 1e-14
 
 
+@pytest.mark.parametrize("affine", [False, True])
 @pytest.mark.parametrize("covariance_gradient", [True, False])
-def test_deformation_gradient(covariance_gradient):
+def test_deformation_gradient(covariance_gradient, affine):
     gaussians, binding, x0, x, F, generator = deformation_case()
+    arms = arms_at_rest(gaussians.means, binding, x0) if affine else None
     covars0 = gaussians.covars()
     weight_m = torch.randn(3, 7, 3, generator=generator, dtype=torch.float64)
     weight_c = torch.randn(3, 7, 3, 3, generator=generator, dtype=torch.float64)
@@ -128,7 +146,7 @@ def test_deformation_gradient(covariance_gradient):
 
     def loss(x, F):
         means, covars = deform(
-            gaussians.means, covars0, binding, x0, x, F, covariance_gradient=covariance_gradient
+            gaussians.means, covars0, binding, x0, x, F, arms=arms, covariance_gradient=covariance_gradient
         )
         return (weight_m * means).sum() + (weight_c * covars).sum()
 

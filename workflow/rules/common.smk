@@ -440,6 +440,11 @@ def judged_carrier(wildcards):
 
 
 @checked
+def gaussian_motion(wildcards):
+    return material_settings(wildcards)["gaussian_motion"]
+
+
+@checked
 def method_density(wildcards):
     return SETTINGS.method_density(wildcards.scene, wildcards.method)
 

@@ -95,6 +95,7 @@ rule video:
     params:
         density=scene_setting("density"),
         carrier=judged_carrier,
+        gaussian_motion=gaussian_motion,
         view=SETTINGS.evaluation.video_view,
         frame_rate=SETTINGS.evaluation.frame_rate,
         magnify=SETTINGS.evaluation.video_magnify,

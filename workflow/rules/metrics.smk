@@ -22,6 +22,7 @@ rule image_metrics:
     params:
         density=scene_setting("density"),
         carrier=judged_carrier,
+        gaussian_motion=gaussian_motion,
         views=evaluation_views,
         training_views=lambda wildcards: material_settings(wildcards)["views"],
         margin=SETTINGS.evaluation.margin,

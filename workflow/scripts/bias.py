@@ -20,7 +20,8 @@ from workflow.stage import run_script
 def main(inputs, output, params, run) -> None:
     settings = MaterialConfig(**params.material)
     device = choose_device(params.device)
-    body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density, settings.carrier)
+    files = (inputs.particles, inputs.binding, inputs.gaussians)
+    body = load_body(*files, params.density, settings.carrier, settings.gaussian_motion)
     body = body.to(torch.float32, device)
     video = load_observation(inputs.transforms, settings.views).to(torch.float32, device)
     loss = PixelLoss(body, video, total=settings.covariance_from == "total")

@@ -16,7 +16,8 @@ from workflow.stage import run_script
 def main(inputs, output, params, run) -> None:
     settings = IdentifyConfig(**params.identify)
     device = choose_device(params.device)
-    body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density)
+    files = (inputs.particles, inputs.binding, inputs.gaussians)
+    body = load_body(*files, params.density, gaussian_motion=settings.gaussian_motion)
     body = body.to(torch.float32, device)
     video = load_observation(inputs.transforms, settings.views).to(torch.float32, device)
     throw = Throw.of(read_json(inputs.velocity))

@@ -33,7 +33,8 @@ def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
     weights, _ = read_weights(inputs.weights)
     networks = {name: LPIPS(weights, name).to(device) for name in ("vgg", "alex")}
-    body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density, params.carrier)
+    files = (inputs.particles, inputs.binding, inputs.gaussians)
+    body = load_body(*files, params.density, params.carrier, params.gaussian_motion)
     body = body.to(torch.float32, device)
     arrays, _ = read_arrays(inputs.rollout, required=("frames",), only=("frames",))
     x, F = (state.to(device) for state in load_motion(inputs.rollout))

@@ -38,7 +38,7 @@ def main(inputs, output, params, run) -> None:
     law.attach_adaptor(settings.rank, settings.alpha, settings.seed)
     parts = zip(*(listed(inputs[name]) for name in ("particles", "binding", "gaussians")), strict=True)
     bodies = [
-        load_body(*files, density, settings.carrier).to(torch.float32, device)
+        load_body(*files, density, settings.carrier, settings.gaussian_motion).to(torch.float32, device)
         for files, density in zip(parts, params.densities, strict=True)
     ]
     starts = [thrown(body, file) for body, file in zip(bodies, listed(inputs.velocity), strict=True)]

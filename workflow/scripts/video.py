@@ -15,7 +15,8 @@ from workflow.stage import run_script
 def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
     observation = load_observation(inputs.transforms, [params.view]).to(torch.float32, device)
-    body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density, params.carrier)
+    files = (inputs.particles, inputs.binding, inputs.gaussians)
+    body = load_body(*files, params.density, params.carrier, params.gaussian_motion)
     body = body.to(torch.float32, device)
     x, F = load_motion(inputs.rollout)
     renderer = body.particle_gs(observation.cameras)
