@@ -2,11 +2,14 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from scipy.optimize import nnls
 from test_materials import EYE, E, deformations, hencky_deviator, rotations
 
 from neuma_lib.errors import InputError
+from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.elasticity import FibreReinforced, Hencky, MooneyRivlin, NeoHookean, Ogden
 from neuma_lib.mechanics.isotropic import lame
 from neuma_lib.mechanics.plasticity import (
@@ -306,6 +309,67 @@ def test_foam_loses_the_volume_that_von_mises_keeps():
     kept = VonMises(E=E, nu=NU, yield_stress=1e3).evaluate(F, ())
     assert torch.equal(kept, F)
     assert float(torch.linalg.det(RETURNS["foam"].evaluate(F, ()))) > float(torch.linalg.det(F)) * 1.5
+
+
+# ------------------------------------------------------------------------------------------------ scenes
+
+
+def least_misfit(target: np.ndarray, curves: list[np.ndarray]) -> float:
+    """Relative residual of the best sum of the curves with factors >= 0."""
+    return nnls(np.stack(curves, axis=1), target)[1] / float(np.linalg.norm(target))
+
+
+@pytest.mark.parametrize(
+    ("scene", "first", "last"), [("OutsideStiffening", 1.0, 1.3), ("OutsideRubber", 0.55, 1.6)]
+)
+def test_no_shear_modulus_fits_the_elastic_scenes(loaded, scene, first, last):
+    """tau_1 - tau_2 of a bar of constant volume, over the stretches that the scene sees: a candidate has one factor."""
+    stretch = torch.linspace(first, last, 40, dtype=torch.float64)
+    F = torch.diag_embed(torch.stack([stretch, stretch**-0.5, stretch**-0.5], dim=1))
+
+    def curve(elasticity) -> np.ndarray:
+        tau = analytic_law({"elasticity": elasticity}).elasticity.evaluate(F, ())
+        return (tau[:, 0, 0] - tau[:, 1, 1]).numpy()
+
+    truth = curve(loaded.scene(scene).law.elasticity.plain())
+    for family in loaded.identify.families.values():
+        assert least_misfit(truth, [curve(family.elasticity.plain())]) > 0.2
+
+
+def test_no_bingham_line_fits_the_paste_scene(loaded):
+    """Shear stress over shear rates of 2 to 30 per second."""
+    law = loaded.scene("OutsidePaste").law.plasticity.plain()
+    rate = np.linspace(2, 30, 40)
+    stress = law["yield_stress"] / math.sqrt(2) + law["consistency"] * rate ** law["exponent"]
+    assert least_misfit(stress, [np.ones(40), rate]) > 0.2
+
+
+def test_what_no_candidate_does_in_the_plastic_scenes(loaded):
+    """Foam loses volume under pressure. Damp sand bears tension, rubs, and grows where it slides: each return of a
+    candidate keeps the volume where it bears any tension."""
+
+    def part(law, dt):
+        return analytic_law(law.plain(), dt=dt).plasticity
+
+    foam, sand = (loaded.scene(name) for name in ("OutsideFoam", "OutsideDampSand"))
+    pressed = diagonal(0.8, 0.8, 0.8)
+    slid = diagonal(1.04, 1 / 1.04, 1.0)
+    assert float(torch.linalg.det(part(foam.law, foam.dt).evaluate(pressed, ()))) > 0.6
+    # elastic volume falls under shear at none: the body grows by as much
+    assert float(torch.linalg.det(part(sand.law, sand.dt).evaluate(slid, ()))) < 0.99
+    for family in loaded.identify.families.values():
+        back = part(family, 5e-4)
+        assert float(torch.linalg.det(back.evaluate(pressed, ()))) == pytest.approx(0.512)
+        after = back.evaluate(slid, ())
+        torn = torch.equal(after, EYE[None])  # dry sand, which bears no tension
+        assert torn or float(torch.linalg.det(after)) == pytest.approx(1.0)
+
+
+def test_fibres_of_the_scene_lie_askew_and_bear_most(loaded):
+    law = loaded.scene("OutsideFibres").law.elasticity
+    constants = law.plain()
+    assert 20 <= constants["elevation"] <= 30
+    assert constants["fibre_modulus"] > 5 * constants["E"]
 
 
 # ------------------------------------------------------------------------------------------------ mistakes
