@@ -25,7 +25,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
     ordered = scatter != "atomic"
     run_of, deposit = vars(scatter_functions(dtype, scatter, 3)).values()
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
-    base_node, from_base = functions.base_node, functions.from_base
+    base_node, copy_of, from_base = functions.base_node, functions.copy_of, functions.from_base
     weights, slopes = functions.weights, functions.slopes
     column, offsets, wall_mask = functions.column, functions.offsets, functions.wall_mask
     moved_mask = functions.moved_mask
@@ -60,7 +60,8 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
             p = order[sort, wp.min(p, grad_x.shape[0] - 1)]
         xp = x[now, p]
         bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
-        run = run_of(wp.where(alive, (bi * c.n + bj) * c.n + bk, -1))
+        plane = copy_of(c, p) * c.n + bi
+        run = run_of(wp.where(alive, (plane * c.n + bj) * c.n + bk, -1))
         f = from_base(c, xp, bi, bj, bk)
         wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
         si, sj, sk = slopes(f[0]), slopes(f[1]), slopes(f[2])
@@ -81,7 +82,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         for i in range(3):
             u_ij = u_i
             for j in range(3):
-                row = ((bi + i) * c.n + bj + j) * c.n + bk
+                row = ((plane + i) * c.n + bj + j) * c.n + bk
                 deposit(grad_grid_rows, side, row, (wi[i] * wj[j]) * (wp.outer(wk, u_ij) + slope_k), run)
                 nodes = grid_v_rows[cached, row]
                 vu = nodes * u_ij + wp.cw_mul(step_k, nodes * column(D, 2))
@@ -135,6 +136,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         p = wp.tid()
         xp = x[now, p]
         bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
+        plane = copy_of(c, p) * c.n + bi
         f = from_base(c, xp, bi, bj, bk)
         wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
         si, sj, sk = slopes(f[0]), slopes(f[1]), slopes(f[2])
@@ -153,7 +155,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         for i in range(3):
             q_ij = q_i
             for j in range(3):
-                nodes = grad_grid_rows[side, ((bi + i) * c.n + bj + j) * c.n + bk]
+                nodes = grad_grid_rows[side, ((plane + i) * c.n + bj + j) * c.n + bk]
                 along_k = wk * nodes
                 total += (wi[i] * wj[j]) * along_k
                 G_i += (wd_i[i] * wj[j]) * along_k

@@ -12,6 +12,9 @@ matrix (3 x 4) of nodes b, b + 1 and b + 2. Sums over the last axis of the stenc
 
 Order: where a scatter to the grid wants neighbours side by side (`scatter`), thread i takes particle
 ``order[sort, i]``, the particles sorted by cell a few steps ago. A gather is faster in the order of memory.
+
+Copies: several simulations of as many particles each, which do not see each other, lie one after the other in the
+arrays of particles and in those of nodes.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -49,6 +52,7 @@ def warp_types(dtype: torch.dtype) -> SimpleNamespace:
     @wp.struct
     class GridConstants:
         n: wp.int32  # nodes along an edge
+        particles: wp.int32  # of a copy
         wall_nodes: wp.int32  # nodes of a wall, from either end of the grid
         walls: types.walls  # condition on x_min, x_max, y_min, y_max, z_min, z_max
         first: real  # coordinate of node 0 [dx]
@@ -75,6 +79,14 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
     def base_node(c: GridConstants, x: real):
         """First of the three nodes that see coordinate x; clamped, so that no fault indexes outside."""
         return wp.clamp(wp.int32(x * c.inv_dx - (c.first + real(0.5))), 0, c.n - 3)
+
+    @wp.func
+    def copy_of(c: GridConstants, p: wp.int32):
+        """The copy that particle p belongs to."""
+        copy = wp.int32(0)
+        if p >= c.particles:  # spares a single simulation the division
+            copy = p / c.particles
+        return copy
 
     @wp.func
     def from_base(c: GridConstants, x: vec3, i: wp.int32, j: wp.int32, k: wp.int32):
@@ -144,6 +156,7 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
 
     return SimpleNamespace(
         base_node=base_node,
+        copy_of=copy_of,
         from_base=from_base,
         weights=weights,
         slopes=slopes,
@@ -164,7 +177,7 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
     ordered = scatter != "atomic"
     run_of, deposit = vars(scatter_functions(dtype, scatter, 4)).values()
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
-    base_node, from_base = functions.base_node, functions.from_base
+    base_node, copy_of, from_base = functions.base_node, functions.copy_of, functions.from_base
     weights, offsets = functions.weights, functions.offsets
     column, wall_mask, moved = functions.column, functions.wall_mask, functions.moved
     module = f"neuma_lib.sim.forward_{str(dtype).removeprefix('torch.')}_{scatter}"
@@ -175,7 +188,8 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         """Index of the first node that a particle sees, to sort by."""
         p = wp.tid()
         xp = x[now, p]
-        cell[p] = (base_node(c, xp[0]) * c.n + base_node(c, xp[1])) * c.n + base_node(c, xp[2])
+        bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
+        cell[p] = ((copy_of(c, p) * c.n + bi) * c.n + bj) * c.n + bk
 
     @kernel
     def p2g(
@@ -199,7 +213,8 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
             p = order[sort, wp.min(p, mass.shape[0] - 1)]
         xp = x[now, p]
         bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
-        run = run_of(wp.where(alive, (bi * c.n + bj) * c.n + bk, -1))
+        plane = copy_of(c, p) * c.n + bi
+        run = run_of(wp.where(alive, (plane * c.n + bj) * c.n + bk, -1))
         f = from_base(c, xp, bi, bj, bk)
         wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
         m = mass[p]
@@ -211,7 +226,7 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         for i in range(3):
             q_ij = q_i
             for j in range(3):
-                row = ((bi + i) * c.n + bj + j) * c.n + bk
+                row = ((plane + i) * c.n + bj + j) * c.n + bk
                 deposit(grid_rows, cached, row, (wi[i] * wj[j]) * (wp.outer(wk, q_ij) + slope_k), run)
                 q_ij += column(A, 1)
             q_i += column(A, 0)
@@ -243,12 +258,14 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         C: wp.array2d(dtype=mat33),
         F: wp.array2d(dtype=mat33),
         F_trial: wp.array2d(dtype=mat33),
-        faults: wp.array(dtype=wp.int64),
+        faults: wp.array2d(dtype=wp.int64),
     ):
         """v = sum w_i v_i,  C = (4/dx^2) sum w_i v_i d_i^T,  x += dt v (clamped),  F_trial = (I + dt C) F."""
         p = wp.tid()
         xp = x[now, p]
         bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
+        copy = copy_of(c, p)
+        plane = copy * c.n + bi
         f = from_base(c, xp, bi, bj, bk)
         wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
         wd_i = wp.cw_mul(wi, offsets(f[0]))
@@ -257,7 +274,7 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         total, B_i, B_j, B_k = vec4(), vec4(), vec4(), vec4()  # sum w v, columns of sum w v d^T / dx
         for i in range(3):
             for j in range(3):
-                nodes = grid_v_rows[cached, ((bi + i) * c.n + bj + j) * c.n + bk]
+                nodes = grid_v_rows[cached, ((plane + i) * c.n + bj + j) * c.n + bk]
                 along_k = wk * nodes
                 total += (wi[i] * wj[j]) * along_k
                 B_i += (wd_i[i] * wj[j]) * along_k
@@ -275,11 +292,11 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         # Faults keep the first (step, particle). A clamped position would hide both of them.
         here = wp.int64(step) * wp.int64(2147483648) + wp.int64(p)
         if not (wp.isfinite(v_new) and wp.isfinite(C_new)):
-            wp.atomic_min(faults, 0, here)
+            wp.atomic_min(faults, copy, 0, here)
         elif c.dt * wp.max(wp.abs(v_new)) > c.dx:
-            wp.atomic_min(faults, 1, here)
+            wp.atomic_min(faults, copy, 1, here)
         elif wp.min(x_new) < c.leave_low or wp.max(x_new) > c.leave_high:
-            wp.atomic_min(faults, 2, here)
+            wp.atomic_min(faults, copy, 2, here)
 
     @kernel
     def trial_deformation(
@@ -302,7 +319,10 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
     def advect_tracers(
         c: GridConstants, cached: wp.int32, grid_v_rows: wp.array2d(dtype=mat34), x: wp.array(dtype=vec3)
     ):
-        """x += dt v, v interpolated over the nodes that carry mass; a tracer that sees none of them stays."""
+        """x += dt v, v interpolated over the nodes that carry mass; a tracer that sees none of them stays.
+
+        All tracers follow the first copy.
+        """
         p = wp.tid()
         xp = x[p]
         bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])

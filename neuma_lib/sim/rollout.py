@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from neuma_lib.errors import InputError
+from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.free_flight import ballistic, free_flight_steps
 from neuma_lib.sim.memory import DEFAULT_CACHE_BYTES, plan_memory
@@ -64,16 +64,38 @@ def rollout(
         NonFiniteError: a particle became non-finite, crossed a cell in a step or left the grid; has
             `step` and `particle`.
     """
-    frames = _checked_frames(frames, steps)
+    frames = checked_frames(frames, steps)
     bodies = as_bodies(law, len(state.x))
-    _check_inside(model, state.x)
+    check_inside(model, state.x)
     if tracers is not None and (tracers.ndim != 2 or tracers.shape[1] != 3 or tracers.dtype != state.x.dtype):
         raise InputError(f"tracers: give positions of shape (M, 3) as {state.x.dtype}")
 
     first = free_flight_steps(model, bodies, state, frames[-1]) if skip_free_flight else 0
+    plan = dict(memory=memory, cache_bytes=cache_bytes)
+    return fly_and_simulate(model, bodies, state, frames, first, tracers, total, scatter, **plan)[0]
+
+
+def fly_and_simulate(
+    model: MPMModel,
+    bodies: tuple[Body, ...],
+    state: State,
+    frames: tuple[int, ...],
+    first: int,
+    tracers: Tensor | None = None,
+    total: bool = False,
+    scatter: str | None = None,
+    copies: int = 1,
+    memory: float | None = None,
+    cache_bytes: float | None = None,
+) -> tuple[Trajectory, list[NonFiniteError | None]]:
+    """The body of `rollout`, with its arguments checked and `first` steps in free flight.
+
+    The state may hold several ``copies``, simulations of as many particles each. What is returned of one that
+    diverges, to which the second result has an error, means nothing; that all do is raised.
+    """
     start = (*state.motion, state.F) if total else state.motion
     in_flight = sum(n < first for n in frames)
-    parts = []
+    parts, errors = [], [None] * copies
     if in_flight:
         parts.append(ballistic(model, start, tracers, frames[:in_flight]))
     if in_flight < len(frames):
@@ -82,10 +104,11 @@ def rollout(
             start = (landed.x[0], landed.v[0], *start[2:])
             tracers = None if tracers is None else landed.tracers[0]
         plan = dict(memory=memory, cache_bytes=cache_bytes)
-        parts.append(
-            _simulate(model, bodies, state, start, tracers, first, frames[in_flight:], scatter, **plan)
+        path, errors = _simulate(
+            model, bodies, state, start, tracers, first, frames[in_flight:], scatter, copies, **plan
         )
-    return parts[0] if len(parts) == 1 else parts[0].followed_by(parts[1])
+        parts.append(path)
+    return parts[0] if len(parts) == 1 else parts[0].followed_by(parts[1]), errors
 
 
 def _simulate(
@@ -97,9 +120,10 @@ def _simulate(
     first: int,
     frames: tuple[int, ...],
     scatter: str | None,
+    copies: int,
     memory: float | None,
     cache_bytes: float | None,
-) -> Trajectory:
+) -> tuple[Trajectory, list[NonFiniteError | None]]:
     """Step from (x, v, F, C), with F_total behind them or without, at step `first` to the last frame."""
     x, steps, total = state.x, frames[-1] - first, len(start) == 5
     weights, slices = gather_weights(bodies, x.dtype)
@@ -107,10 +131,11 @@ def _simulate(
     plan = None
     if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
         cache_bytes = DEFAULT_CACHE_BYTES[x.device.type] if cache_bytes is None else cache_bytes
-        plan = plan_memory(steps, len(x), model.nodes**3, x.element_size(), cache_bytes, memory, total)
-    simulation = Simulation(model, bodies, slices, state, steps, first, plan, scatter, total)
+        nodes = copies * model.nodes**3
+        plan = plan_memory(steps, len(x), nodes, x.element_size(), cache_bytes, memory, total)
+    simulation = Simulation(model, bodies, slices, state, steps, first, plan, scatter, total, copies)
     *states, seen = RolloutFunction.apply(simulation, [n - first for n in frames], tracers, *inputs)
-    return Trajectory(frames, *states[:4], seen, *states[4:])
+    return Trajectory(frames, *states[:4], seen, *states[4:]), simulation.errors
 
 
 class RolloutFunction(torch.autograd.Function):
@@ -136,7 +161,8 @@ class RolloutFunction(torch.autograd.Function):
         return None, None, None, *start, *weights
 
 
-def _checked_frames(frames: Sequence[int], steps: int) -> tuple[int, ...]:
+def checked_frames(frames: Sequence[int], steps: int) -> tuple[int, ...]:
+    """The steps of the frames, strictly increasing from 0 on and not beyond the last."""
     frames = tuple(int(n) for n in frames)
     if not frames or frames[0] < 0 or any(b <= a for a, b in zip(frames, frames[1:], strict=False)):
         raise InputError(f"frames = {list(frames)}: give at least one step, from 0 on, strictly increasing")
@@ -145,7 +171,7 @@ def _checked_frames(frames: Sequence[int], steps: int) -> tuple[int, ...]:
     return frames
 
 
-def _check_inside(model: MPMModel, x0: Tensor) -> None:
+def check_inside(model: MPMModel, x0: Tensor) -> None:
     """Every particle must see three nodes along each axis."""
     low, high = model.stencil_range
     outside = ~((x0 >= low) & (x0 <= high)).all(dim=1)

@@ -56,6 +56,11 @@ class Simulation:
         plan: what to keep for `run_adjoint`; None if that will not be called.
         scatter: how particles are added to nodes, one of `scatter.SCATTERS`; None takes the fastest.
         total: whether the state carries the total deformation.
+        copies: simulations of as many particles each that the state holds one after the other; they share the
+            launches and do not see each other.
+
+    Attributes:
+        errors: after `run`, what went wrong in each copy, or None.
     """
 
     def __init__(
@@ -69,11 +74,12 @@ class Simulation:
         plan: MemoryPlan | None = None,
         scatter: str | None = None,
         total: bool = False,
+        copies: int = 1,
     ):
         self.model, self.bodies, self.steps, self.first, self.plan = model, bodies, steps, first, plan
         x = state.x
         scatter = scatter or scatter_for(x.device, x.dtype)
-        size = WorkspaceSize(model, len(x), x.dtype, x.device, total=total, scatter=scatter)
+        size = WorkspaceSize(model, len(x), x.dtype, x.device, total=total, copies=copies, scatter=scatter)
         if plan:
             size = size._replace(
                 n_states=plan.segment + 1,
@@ -90,6 +96,7 @@ class Simulation:
         self._weight_slices = weight_slices
         laws = [getattr(body.law, part) for body in bodies for part in PARTS]
         self._uses_graphs = x.device.type == "cuda" and all(law.capturable for law in laws)
+        self.errors: list[NonFiniteError | None] = [None] * copies
         self._graph_key = tuple((b.start, b.stop) for b in bodies), tuple(law.graph_key() for law in laws)
 
     def run(
@@ -99,7 +106,11 @@ class Simulation:
         frames: Sequence[int],
         tracers: Tensor | None = None,
     ) -> tuple[Tensor | None, ...]:
-        """From the start (x, v, F, C and maybe F_total) through all steps; the same and tracers at the frames."""
+        """From the start (x, v, F, C and maybe F_total) through all steps; the same and tracers at the frames.
+
+        Raises:
+            NonFiniteError: every copy diverges. Where only some do, they are in `errors`, and the others are right.
+        """
         ws = self.workspace
         states = ws.states
         result = tuple(value.new_empty(len(frames), *value.shape) for value in start)
@@ -109,7 +120,7 @@ class Simulation:
             ws.load_weights(weights)
             weights = ws.weights
         passive = None if tracers is None else _Tracers(ws, tracers, frames)
-        faults = [ws.faults.clone()]
+        faults = ws.faults.clone()
         self._copy_frames(0, [0], frames, result)
         last = 0  # where the last state of the segment before is
         for index, (first, steps) in enumerate(self._segments(frames)):
@@ -124,9 +135,13 @@ class Simulation:
                 self._advance(steps, weights, lambda n, first=first: passive.move(n, first))
             last, self._segment_in_memory = ws.at(steps), index
             self._copy_frames(first, range(1, steps + 1) if self.plan else [steps], frames, result)
-            faults.append(torch.where(ws.faults < NO_FAULT, ws.faults + (first << 31), ws.faults))
+            found = torch.where(ws.faults < NO_FAULT, ws.faults + (first << 31), ws.faults)
+            torch.minimum(faults, found, out=faults)
             ws.faults.fill_(NO_FAULT)
-        self._raise_faults(torch.stack(faults).amin(0), result[2][-1])
+            # A GPU would have to wait for the answer.
+            if ws.size.device.type == "cpu" and (faults < NO_FAULT).any(dim=1).all():
+                break
+        self._find_errors(faults, result[2][-1])
         return *result, None if passive is None else passive.seen
 
     def step(self, n: int, weights: Sequence[Tensor]) -> None:
@@ -297,15 +312,23 @@ class Simulation:
             found.append((law, slice(body.start, body.stop), self._weight_slices[id(body.law), part], key))
         return found
 
-    def _raise_faults(self, faults: Tensor, F: Tensor) -> None:
-        """Raise if a velocity on the way or the last F (N, 3, 3) is not what a stable simulation gives."""
-        not_finite, too_fast, left = faults.tolist()
-        if min(not_finite, too_fast, left) == NO_FAULT and not torch.isfinite(F).all():
-            particle = int((~torch.isfinite(F).flatten(1).all(dim=1)).nonzero()[0])
-            not_finite = (self.steps - 1) << 31 | particle
+    def _find_errors(self, faults: Tensor, F: Tensor) -> None:
+        """Note the copies where a velocity on the way or the last F (N, 3, 3) is not what a stable simulation gives,
+        and raise if these are all."""
+        self.errors = []
+        for copy, (flags, own) in enumerate(zip(faults.tolist(), F.chunk(len(faults)), strict=True)):
+            if min(flags) == NO_FAULT and not torch.isfinite(own).all():
+                particle = int((~torch.isfinite(own).flatten(1).all(dim=1)).nonzero()[0])
+                flags[0] = (self.steps - 1) << 31 | copy * len(own) + particle
+            self.errors.append(self._error(*flags))
+        if all(self.errors):
+            raise self.errors[0]
+
+    def _error(self, not_finite: int, too_fast: int, left: int) -> NonFiniteError | None:
+        """What the flags of a copy say."""
         fault = min(not_finite, too_fast, left)
         if fault == NO_FAULT:
-            return
+            return None
         step, particle = self.first + (fault >> 31) + 1, fault & (1 << 31) - 1
         law = next(body.law for body in self.bodies if body.start <= particle < body.stop)
         happened = {
@@ -313,7 +336,9 @@ class Simulation:
             too_fast: "moved by more than a cell in a step",
             left: "left the grid",
         }[fault]
-        raise NonFiniteError(
+        size = self.workspace.size
+        particle %= size.particles // size.copies  # counted in its copy
+        return NonFiniteError(
             "rollout",
             f"particle {particle} (law {law.name!r}) {happened} at step {step}, t = "
             f"{step * self.model.dt:.4g} s: the simulation is unstable. Use a smaller dt (see "

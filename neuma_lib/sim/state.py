@@ -173,6 +173,15 @@ class Trajectory:
         joined = {name: torch.cat([value, getattr(second, name)]) for name, value in self._parts().items()}
         return Trajectory(self.frames + second.frames, **joined)
 
+    def split(self, count: int) -> list[Trajectory]:
+        """The trajectories of several simulations whose particles stand one after the other."""
+        if count == 1:
+            return [self]
+        return [
+            self._each(lambda value, copy=copy: value.unflatten(1, (count, -1))[:, copy].contiguous())
+            for copy in range(count)
+        ]
+
     def _each(self, function: Callable[[Tensor], Tensor]) -> Trajectory:
         return replace(self, **{name: function(value) for name, value in self._parts().items()})
 

@@ -46,11 +46,12 @@ class WorkspaceSize(NamedTuple):
     n_checkpoints: int = 0  # segments, if there are several
     differentiable: bool = False
     total: bool = False  # whether the total deformation is carried
+    copies: int = 1  # simulations side by side, which share the particles equally
     scatter: str = "atomic"  # one of `scatter.SCATTERS`
 
 
 class Workspace:
-    """States, grids and gradients of N particles.
+    """States, grids and gradients of N particles, those of all copies.
 
     The states of steps n and n + `n_states` share a place, and so do the cached values of steps n and
     n + `n_cached_steps`.
@@ -61,11 +62,11 @@ class Workspace:
         F_total: total deformation gradients, shape (n_states, N, 3, 3), where they are carried.
         states: x, v, F, C and, where it is carried, F_total; grad_states: their gradients.
         tau, F_trial: Kirchhoff stresses [Pa] and trial deformation gradients, shape (n_cached_steps, N, 3, 3).
-        grid: momentum [kg m/s] and mass [kg] of the nodes, shape (n_cached_steps, nodes^3, 4).
-        grid_v: velocity [m/s] of the nodes and 1 where there is mass, shape (n_cached_steps, nodes^3, 4).
+        grid: momentum [kg m/s] and mass [kg] of the nodes, shape (n_cached_steps, copies * nodes^3, 4).
+        grid_v: velocity [m/s] of the nodes and 1 where there is mass, shape (n_cached_steps, copies * nodes^3, 4).
         mass, vol0: particle masses [kg] and initial volumes [m^3], shape (N,).
         faults: first step and particle of a non-finite value, of one that crossed a cell in a step and of one
-            that left the grid, shape (3,).
+            that left the grid, shape (copies, 3).
         order: particles sorted by cell, every `SORT_EVERY` steps, shape (n_sorts, N).
         checkpoints: the states at the start of each segment, shape (n_checkpoints, ...).
         grad_*: gradients of the above for one step, without the first axis. grad_grid has two sides that steps
@@ -83,7 +84,7 @@ class Workspace:
         self.weights: list[Tensor] = []
         self.grad_weights: list[Tensor] = []
         self._frame_grads: dict[Hashable, list[Tensor | None]] = {}
-        N, nodes = size.particles, size.model.nodes**3
+        N, nodes = size.particles, self._nodes_of_all
         states, cached = size.n_states, size.n_cached_steps
         self.x, self.v = self._vectors(states, N), self._vectors(states, N)
         self.C, self.F = self._matrices(states, N), self._matrices(states, N)
@@ -94,7 +95,7 @@ class Workspace:
         self.tau, self.F_trial = self._matrices(cached, N), self._matrices(cached, N)
         self.grid, self.grid_v = self._nodes(cached, nodes), self._nodes(cached, nodes)
         self.mass, self.vol0 = self._scalars(N), self._scalars(N)
-        self.faults = self._buffer((3,), None, torch.int64)
+        self.faults = self._buffer((size.copies, 3), None, torch.int64)
         self.checkpoints = tuple(
             value.new_empty(size.n_checkpoints, *value.shape[1:]) for value in self.states
         )
@@ -102,7 +103,7 @@ class Workspace:
         n_sorts = -(-max(states - 1, 1) // SORT_EVERY) if self.sorts and size.differentiable else 1
         self.order = self._buffer((n_sorts, N if self.sorts else 1), None, torch.int32)
         self.cells = self._buffer((N if self.sorts else 1,), None, torch.int32)
-        self._constants = _grid_constants(size.model, size.dtype)
+        self._constants = _grid_constants(size)
         self._record_forward()
         if size.differentiable:
             self.grad_x, self.grad_v = self._vectors(N), self._vectors(N)
@@ -250,6 +251,11 @@ class Workspace:
         )
 
     @property
+    def _nodes_of_all(self) -> int:
+        """Nodes of all copies."""
+        return self.size.copies * self.size.model.nodes**3
+
+    @property
     def _scattering_threads(self) -> int:
         """Threads of a kernel that scatters: whole warps where these work together."""
         N = self.size.particles
@@ -257,7 +263,7 @@ class Workspace:
 
     def _record_forward(self) -> None:
         k = forward_kernels(self.size.dtype, self.size.scatter)
-        N, nodes = self.size.particles, self.size.model.nodes**3
+        N, nodes = self.size.particles, self._nodes_of_all
         rows, rows_v = self._rows(self.grid), self._rows(self.grid_v)
         if self.sorts:
             self._cells = self._record(k.cells, N, 0, self.x, self.cells)
@@ -277,7 +283,7 @@ class Workspace:
 
     def _record_adjoint(self) -> None:
         k = adjoint_kernels(self.size.dtype, self.size.scatter)
-        N, nodes = self.size.particles, self.size.model.nodes**3
+        N, nodes = self.size.particles, self._nodes_of_all
         rows_v, grad_rows = self._rows(self.grid_v), self._rows(self.grad_grid)
         self._g2p_adjoint = self._record(
             k.g2p_adjoint, self._scattering_threads, 0, 0, 0, 0, 0, self.order,
@@ -332,9 +338,10 @@ def _run(launch: wp.Launch, *indices: int) -> None:
     launch.launch()
 
 
-def _grid_constants(model: MPMModel, dtype: torch.dtype):
-    t = warp_types(dtype)
+def _grid_constants(size: WorkspaceSize):
+    model, t = size.model, warp_types(size.dtype)
     c = t.GridConstants()
+    c.particles = size.particles // size.copies
     c.n, c.wall_nodes, c.first = model.nodes, model.wall_nodes, model.first_node
     c.walls = t.walls(*(_CONDITION_CODES[condition] for condition in model.boundary))
     c.dx, c.inv_dx, c.dt = model.dx, float(model.grid), model.dt
