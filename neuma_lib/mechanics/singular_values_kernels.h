@@ -1,8 +1,8 @@
 // Text of the kernels that begin with the SVD of 3x3 matrices: a pack of matrices, one a SIMD lane on the CPU and one a
 // thread on a GPU. The module replaces REAL, CPU_WIDTH and SWEEPS.
 
-// Opens a kernel: the type `Pack`, its size `WIDTH`, and the macros LANE and SQRT.
-//// pack
+// The type `Pack`, its size `WIDTH`, and the macros LANE and SQRT.
+//// types
     typedef REAL Real;
 #if defined(__CUDA_ARCH__)
     typedef Real Pack;
@@ -15,6 +15,9 @@
     #define LANE(x, l) (x)[l]
     #define SQRT(x) __builtin_elementwise_sqrt(x)
 #endif
+
+// Opens a kernel over packs.
+//// pack
     const int first = block * WIDTH;
     const int used = n - first < WIDTH ? n - first : WIDTH;
 

@@ -3,8 +3,8 @@
 An SVD is a long chain of dependent square roots and divisions, so on a CPU one matrix at a time leaves the
 vector units idle. The text in ``singular_values_kernels.h`` works on a *pack*: 8 matrices, one per SIMD lane, on the
 CPU (6 times faster than the same code for one matrix), and one matrix per thread on a GPU. It is C++ because Warp's
-Python functions know no lanes. A kernel is the part "pack", then :data:`LOAD`, :data:`SVD` and what follows from it,
-and the part "end" (:func:`snippet`).
+Python functions know no lanes. A kernel is the parts "types" and "pack", then :data:`LOAD`, :data:`SVD` and what
+follows from it, and the part "end" (:func:`snippet`).
 """
 
 from functools import cache
@@ -21,12 +21,16 @@ CPU_WIDTH = 8
 SWEEPS = {torch.float32: 3, torch.float64: 4}
 """Cyclic Jacobi sweeps until the off-diagonal of A^T A is round-off; convergence is quadratic from the second on."""
 _PARTS = native_source(__file__, ".h")
-LOAD, SVD, STORE = (_PARTS[name] for name in ("load", "svd", "store"))
+TYPES, LOAD, SVD, STORE, END = (_PARTS[name] for name in ("types", "load", "svd", "store", "end"))
 
 
 def snippet(*parts: str, dtype: torch.dtype) -> str:
-    """Join parts of C++ and fill in the scalar type and the number of Jacobi sweeps."""
-    text = "".join((_PARTS["pack"], *parts, _PARTS["end"]))
+    """A kernel over packs of parts of C++, see `filled`."""
+    return filled("".join((TYPES, _PARTS["pack"], *parts, END)), dtype)
+
+
+def filled(text: str, dtype: torch.dtype) -> str:
+    """C++ with the scalar type, the size of a pack and the number of Jacobi sweeps filled in."""
     text = text.replace("CPU_WIDTH", str(CPU_WIDTH)).replace("SWEEPS", str(SWEEPS[dtype]))
     return text.replace("REAL", {torch.float32: "float", torch.float64: "double"}[dtype])
 

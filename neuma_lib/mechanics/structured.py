@@ -36,8 +36,7 @@ A last layer of zeros, where training starts and which an adaptor weight of 0 re
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from typing import Any
 
 import torch
@@ -45,6 +44,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from neuma_lib.errors import InputError
+from neuma_lib.mechanics import structured_kernels as kernels
 from neuma_lib.mechanics.adaptor import LAYER_KEYS, AdaptableConstitutive, AdaptableLaw
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.elasticity import (
@@ -66,23 +66,19 @@ from neuma_lib.mechanics.plasticity import (
     hencky_strain,
 )
 from neuma_lib.mechanics.singular_values import rotation_and_singular_values
+from neuma_lib.mechanics.structured_kernels import (
+    COHESION_UNIT,
+    INVARIANTS,
+    LIMIT,
+    LODE,
+    SMOOTH,
+    STRAIN,
+    WIDTH,
+)
 
 FORMS = {"stretch": 3, "energy": 2}
 """Numbers that the network of each form of elasticity gives."""
 PLASTIC_OUTPUTS = 3
-WIDTH = 16
-INVARIANTS = 3
-LIMIT = 3.0
-"""Bound of the network's outputs: it changes a constant by a factor of at most exp(3) = 20."""
-STRAIN = 0.1
-"""Strain that counts as one for the network."""
-SMOOTH = 0.05
-"""Strain below which the size of the deviator, which has a kink at zero, is rounded off."""
-LODE = 3 * math.sqrt(6)
-"""|det dev e| is at most |dev e|^3 / LODE."""
-COHESION_UNIT = 0.02
-"""Strain that a network output of one adds to a cohesion or yield strain of zero."""
-
 # Shear function f = sum of c (x^p - 1) / p over (c, p), with log x for p = 0: the base's deviator is 2 mu dev f.
 SHEAR_TERMS: dict[type[AnalyticElasticity], tuple[tuple[float, float], ...]] = {
     Hencky: ((1.0, 0.0),),
@@ -183,7 +179,29 @@ class _Pairs:
         self.log = self.clamped / self.cj * torch.where(equal, 1.0, self.gap / torch.where(equal, 1.0, ratio))
 
 
-class StructuredElasticity(AdaptableConstitutive, Elasticity):
+class StructuredConstitutive(AdaptableConstitutive):
+    """A network around an analytic law. The kernels of :mod:`structured_kernels` do the work; `response` is their slow
+    twin."""
+
+    capturable = True
+    kernel: tuple[str, kernels.Constants]
+    """Which kernel, and what it knows beside the weights."""
+
+    def graph_key(self) -> Hashable:
+        return type(self), self.kernel
+
+    def evaluate(self, F: Tensor, weights: Weights, out: Tensor | None = None) -> Tensor:
+        return kernels.evaluate(*self.kernel, F, weights, out)
+
+    def evaluate_with_cache(self, F, weights, out=None, cache=None):
+        cache = kernels.new_cache(F) if cache is None else cache
+        return kernels.evaluate(*self.kernel, F, weights, out, cache), cache
+
+    def vjp(self, F, weights, grad_out, cache=None, grad_F=None, grad_weights=None):
+        return kernels.vjp(*self.kernel, F, weights, grad_out, cache, grad_F, grad_weights)
+
+
+class StructuredElasticity(StructuredConstitutive, Elasticity):
     """A corrected isotropic elasticity, see the module.
 
     Args:
@@ -214,6 +232,8 @@ class StructuredElasticity(AdaptableConstitutive, Elasticity):
             raise InputError(
                 f"the energy form needs nu >= 0, not {base.values['nu']:g}: its volume part is else negative"
             )
+        base_number = kernels.BASES.index(NAMES[type(base)])
+        self.kernel = form, kernels.Constants(base_number, (self.mu, self.lam, 0.0))
         self.freeze(_checked(weights, FORMS[form], seed))
 
     def response(self, F: Tensor, weights: Weights) -> Tensor:
@@ -303,7 +323,7 @@ class StructuredElasticity(AdaptableConstitutive, Elasticity):
         return lam / 2 * volume, mu * shear, *stresses
 
 
-class StructuredPlasticity(AdaptableConstitutive, Plasticity):
+class StructuredPlasticity(StructuredConstitutive, Plasticity):
     """A corrected radial return, see the module.
 
     Args:
@@ -327,6 +347,8 @@ class StructuredPlasticity(AdaptableConstitutive, Plasticity):
         self.threshold = base.values["cohesion"] if self.granular else base.values["yield_stress"] / (2 * mu)
         viscous = isinstance(base, ViscousFlow)
         self.rate = base.values["viscosity"] / (mu * base.values["dt"]) if viscous else 0.0
+        constants = self.threshold, self.friction, self.rate
+        self.kernel = "return", kernels.Constants(int(self.granular), tuple(map(float, constants)))
         self.freeze(_checked(weights, PLASTIC_OUTPUTS, seed))
 
     def response(self, F: Tensor, weights: Weights) -> Tensor:

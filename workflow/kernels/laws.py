@@ -1,18 +1,27 @@
-"""Kernels of the neural laws."""
+"""Kernels of the neural and of the structured laws."""
 
 from __future__ import annotations
 
 import torch
 
+from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.neural import neural_law
+from neuma_lib.mechanics.structured import FORMS, structured_law
+
+SPEC = {
+    "elasticity": {"name": "hencky", "E": 1e4, "nu": 0.2},
+    "plasticity": {"name": "von_mises", "yield_stress": 1e2},
+}
 
 
 def compile_kernels(device: torch.device) -> None:
-    """Both networks, forward and backward, in both precisions."""
+    """All networks, forward and backward, in both precisions."""
+    laws: list[Law] = [neural_law(), *(structured_law({**SPEC, "form": form}) for form in FORMS)]
     for dtype in (torch.float32, torch.float64):
-        law = neural_law().to(device, dtype)
-        F = torch.eye(3, dtype=dtype, device=device).repeat(4, 1, 1)
-        for part in (law.elasticity, law.plasticity):
-            weights = tuple(w.detach() for w in part.weights())
-            value = part.evaluate(F, weights)
-            part.vjp(F, weights, torch.ones_like(value))
+        for law in laws:
+            law.to(device, dtype)
+            F = torch.eye(3, dtype=dtype, device=device).repeat(4, 1, 1)
+            for part in (law.elasticity, law.plasticity):
+                weights = tuple(w.detach() for w in part.weights())
+                value = part.evaluate(F, weights)
+                part.vjp(F, weights, torch.ones_like(value))

@@ -1,0 +1,292 @@
+"""The laws of `structured` as one kernel forward and one backward, on a CPU and on CUDA: SVD, invariants, network,
+principal values and back.
+
+The text in ``structured_kernels.h`` works on packs: 8 rows, one a SIMD lane, on a CPU, and a row a thread on a GPU. A
+row stays in registers from F to the result. Backward computes it again, but for the SVD, which the CPU caches, and
+takes the adjoint in closed form; the sums of the weights' gradients are kept by pack on the CPU and by block on a GPU,
+where a second kernel adds them, always in the same order.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cache
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from neuma_lib.device import native_source, warp_stream
+from neuma_lib.mechanics.elasticity import STRETCH_MIN
+from neuma_lib.mechanics.law import Weights
+from neuma_lib.mechanics.singular_values_kernels import CPU_WIDTH, END, SVD, TYPES, filled, warp_types
+
+WIDTH = 16
+INVARIANTS = 3
+LIMIT = 3.0
+"""Bound of the network's outputs: it changes a constant by a factor of at most exp(3) = 20."""
+STRAIN = 0.1
+"""Strain that counts as one for the network."""
+SMOOTH = 0.05
+"""Strain below which the size of the deviator, which has a kink at zero, is rounded off."""
+LODE = 3 * math.sqrt(6)
+"""|det dev e| is at most |dev e|^3 / LODE."""
+COHESION_UNIT = 0.02
+"""Strain that a network output of one adds to a cohesion or yield strain of zero."""
+KINDS = {"stretch": 3, "energy": 2, "return": 3}
+"""Kernels there are, with the outputs of their networks: the two forms of elasticity, and plasticity."""
+BASES = ("hencky", "neo_hookean", "fixed_corotated")
+"""Bases of elasticity, in the order of their numbers in the kernels."""
+CACHED = 21
+"""Numbers that the CPU caches of a row: U, V and the singular values."""
+THREADS = {torch.float32: 128, torch.float64: 64}
+"""Rows, and threads, of a block: what they put in shared memory is 36 KB of the 48 KB that every GPU has."""
+BLOCKS_PER_PROCESSOR = 2
+LANES, GROUPS = 32, 8  # of the kernel that adds the blocks' sums
+
+
+@dataclass(frozen=True)
+class Constants:
+    """What a kernel knows of its law beside the weights: a number for its kind, and three constants."""
+
+    kind: int
+    values: tuple[float, float, float]
+
+
+def weight_count(kind: str) -> int:
+    return WIDTH * (INVARIANTS + 1) + (WIDTH + KINDS[kind]) * (WIDTH + 1)
+
+
+def _constants(kind: str, dtype: torch.dtype) -> str:
+    single = dtype == torch.float32
+    first = WIDTH * (INVARIANTS + 1)
+    integers = {
+        "INPUTS": INVARIANTS,
+        "HIDDEN": WIDTH,
+        "OUTPUTS": KINDS[kind],
+        "W1_START": first,
+        "W2_START": first + WIDTH * (WIDTH + 1),
+        "WEIGHTS": weight_count(kind),
+        "CACHED": CACHED,
+        "THREADS": THREADS[dtype],
+        **{name.upper(): number for number, name in enumerate(BASES)},
+        "GRANULAR": 1,
+        "LANES": LANES,
+        "GROUPS": GROUPS,
+        # terms after which series are good to round-off: exp to log(2) / 2, atanh(x) / x where x^2 is at most
+        # ATANH_SQUARE, sinh(x) / x to 1/2
+        "EXP_TERMS": 8 if single else 14,
+        "ATANH_TERMS": 5 if single else 11,
+        "SINH_TERMS": 4 if single else 8,
+    }
+    reals = {
+        "STRETCH_MIN": STRETCH_MIN,
+        "SMOOTH": SMOOTH,
+        "LODE": LODE,
+        "STRAIN": STRAIN,
+        "LIMIT": LIMIT,
+        "COHESION_UNIT": COHESION_UNIT,
+        "THIRD_PART": 1 / 3,
+        "ATANH_SQUARE": 0.03,
+        "EPS": torch.finfo(dtype).eps,
+        "LEAST": torch.finfo(dtype).tiny,
+    }
+    text = "".join(f"    const int {name} = {value};\n" for name, value in integers.items())
+    return text + "".join(f"    const Real {name} = Real({value!r});\n" for name, value in reals.items())
+
+
+def source(kind: str, backward: bool, dtype: torch.dtype) -> str:
+    """C++ text of the body of a kernel, one of :data:`KINDS`."""
+    parts = native_source(__file__, ".h")
+    if kind == "return":
+        names = "const Real threshold_base = p0, friction_base = p1, rate_base = p2;"
+        gradient, value, result = ("load_gradient",), ("plastic",), ("deformation",)
+        adjoint = ("if_moves", "plastic_vjp", "network_vjp", "put_gradient", "end_if")
+    else:
+        names = "const Real mu = p0, lam = p1;"
+        gradient, result = ("load_gradient", "stress_gradient"), ("stress",)
+        value = ("stretch",) if kind == "stretch" else ("energy_parts", "energy")
+        adjoint = (f"{kind}_vjp", "network_vjp", "stress_vjp", "put_gradient")
+    if backward:
+        body = ("sums", "rows", "decompose", "network", "pairs", *gradient, *value, *adjoint)
+        body = (*body, "store_gradient", "end_rows", "put_sums")
+    else:
+        body = ("rows", "decompose", "network", "pairs", "no_gradient", *value, *result, "end_rows")
+    text = parts["begin"] + TYPES + _constants(kind, dtype) + f"    {names}\n" + parts["functions"]
+    text += "".join(parts[name] for name in body) + parts["end"] + END
+    single, energy = dtype == torch.float32, kind == "energy"
+    for name, inserted in {
+        "{ROUND_ALL}": parts["round_all"],
+        "{SVD}": SVD,
+        "{PLUS_B0}": " + b0[k]" if energy else "",
+        "{PLUS_B1}": " + b1[k]" if energy else "",
+        "{CHOOSE}": "g[k] = changed ? value : g[k];" if kind == "return" else "g[k] = value;",
+        "INTEGER": "int" if single else "long long",
+    }.items():
+        text = text.replace(name, inserted)
+    return filled(text, dtype)
+
+
+def add_source(kind: str, dtype: torch.dtype) -> str:
+    """C++ text of the body of the kernel that adds the sums of blocks."""
+    return filled(TYPES + _constants(kind, dtype) + native_source(__file__, ".h")["add"] + END, dtype)
+
+
+# Arrays are handed over as addresses: Warp's array objects would cost more time than the kernel.
+@cache
+def evaluate_kernel(kind: str, dtype: torch.dtype):
+    """Kernel (F, W0, W1, W2, number, three constants, n, cached, cache, out), launched by `_launch`.
+
+    ``cached``: 0 keeps nothing of the SVD, 1 writes it to the cache (n / CPU_WIDTH packs, CACHED, CPU_WIDTH).
+    """
+    real, _, _ = warp_types(dtype)
+
+    @wp.func_native(source(kind, False, dtype))
+    def evaluate_rows(
+        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, kind: int, p0: real, p1: real, p2: real,
+        n: int, cached: int, cache: wp.uint64, out: wp.uint64,
+    ): ...  # fmt: skip
+
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
+    def structured_evaluate(
+        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, kind: int, p0: real, p1: real, p2: real,
+        n: int, cached: int, cache: wp.uint64, out: wp.uint64,
+    ):  # fmt: skip
+        evaluate_rows(F, W0, W1, W2, kind, p0, p1, p2, n, cached, cache, out)
+
+    return structured_evaluate
+
+
+@cache
+def vjp_kernel(kind: str, dtype: torch.dtype):
+    """Kernel (F, W0, W1, W2, number, three constants, n, cached, cache, grad_out, grad_F, ...), likewise.
+
+    ``cached``: 0 computes the SVD, 2 reads it from the cache. The sums go to the last arguments: on a CPU they are
+    added to three totals, on a GPU they are put into partials (blocks, weights).
+    """
+    real, _, _ = warp_types(dtype)
+
+    @wp.func_native(source(kind, True, dtype))
+    def vjp_rows(
+        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, kind: int, p0: real, p1: real, p2: real,
+        n: int, cached: int, cache: wp.uint64, grad_out: wp.uint64, grad_F: wp.uint64,
+        total0: wp.uint64, total1: wp.uint64, total2: wp.uint64, partials: wp.uint64,
+    ): ...  # fmt: skip
+
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
+    def structured_vjp(
+        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, kind: int, p0: real, p1: real, p2: real,
+        n: int, cached: int, cache: wp.uint64, grad_out: wp.uint64, grad_F: wp.uint64,
+        total0: wp.uint64, total1: wp.uint64, total2: wp.uint64, partials: wp.uint64,
+    ):  # fmt: skip
+        vjp_rows(
+            F, W0, W1, W2, kind, p0, p1, p2, n, cached, cache, grad_out, grad_F, total0, total1, total2, partials
+        )  # fmt: skip
+
+    return structured_vjp
+
+
+@cache
+def add_kernel(kind: str, dtype: torch.dtype):
+    """CUDA kernel (partials (blocks, weights), blocks, three totals) that adds the sums of the blocks."""
+
+    @wp.func_native(add_source(kind, dtype))
+    def add_columns(
+        partials: wp.uint64, blocks: int, total0: wp.uint64, total1: wp.uint64, total2: wp.uint64
+    ): ...
+
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
+    def structured_add(
+        partials: wp.uint64, blocks: int, total0: wp.uint64, total1: wp.uint64, total2: wp.uint64
+    ):
+        add_columns(partials, blocks, total0, total1, total2)
+
+    return structured_add
+
+
+@cache
+def _device(device: torch.device) -> wp.Device:
+    return wp.device_from_torch(device)
+
+
+def _blocks(F: Tensor) -> int:
+    """Blocks of threads for the rows of F; one on a CPU, which goes through all rows by itself."""
+    if F.device.type == "cpu":
+        return 1
+    return min(-(-len(F) // THREADS[F.dtype]), BLOCKS_PER_PROCESSOR * _device(F.device).sm_count)
+
+
+def _launch(kernel, blocks: int, threads: int, device: torch.device, *inputs) -> None:
+    inputs = [x.data_ptr() if isinstance(x, Tensor) else 0 if x is None else x for x in inputs]
+    threads = 1 if device.type == "cpu" else threads
+    wp.launch(
+        kernel,
+        dim=blocks * threads,
+        inputs=inputs,
+        block_dim=threads,
+        device=_device(device),
+        stream=warp_stream(device),
+    )
+
+
+def new_cache(F: Tensor) -> Tensor | None:
+    """Memory for the SVD of F (n, 3, 3) on a CPU: (packs, CACHED, CPU_WIDTH); None on a GPU."""
+    return F.new_empty(-(-len(F) // CPU_WIDTH), CACHED, CPU_WIDTH) if F.device.type == "cpu" else None
+
+
+@torch.no_grad()
+def evaluate(
+    kind: str,
+    constants: Constants,
+    F: Tensor,
+    weights: Weights,
+    out: Tensor | None = None,
+    cache: Tensor | None = None,
+) -> Tensor:
+    """The law of ``kind`` at F (n, 3, 3); the SVD goes to ``cache`` (`new_cache`) if given. See `Constitutive`."""
+    F = F.detach().contiguous()
+    result = out if out is not None and out.is_contiguous() else torch.empty_like(F)
+    if len(F):
+        W = [w.detach().contiguous() for w in weights]
+        inputs = *W, constants.kind, *constants.values, len(F), int(cache is not None), cache, result
+        _launch(evaluate_kernel(kind, F.dtype), _blocks(F), THREADS[F.dtype], F.device, F, *inputs)
+    return result if out is None or out is result else out.copy_(result)
+
+
+@torch.no_grad()
+def vjp(
+    kind: str,
+    constants: Constants,
+    F: Tensor,
+    weights: Weights,
+    grad_out: Tensor,
+    cache: Tensor | None = None,
+    grad_F: Tensor | None = None,
+    grad_weights: Weights | None = None,
+) -> tuple[Tensor, Weights]:
+    """Gradients of F and, added to ``grad_weights``, of the weights. See `Constitutive`."""
+    F, grad_out = F.detach().contiguous(), grad_out.contiguous()
+    result = grad_F if grad_F is not None and grad_F.is_contiguous() else torch.empty_like(F)
+    totals = tuple(torch.zeros_like(w) for w in weights) if grad_weights is None else grad_weights
+    if len(F):
+        W, on_gpu = [w.detach().contiguous() for w in weights], F.device.type != "cpu"
+        blocks, threads = _blocks(F), THREADS[F.dtype]
+        partials = F.new_empty(blocks, weight_count(kind)) if on_gpu else None
+        sums = [total if total.is_contiguous() else total.contiguous() for total in totals]
+        inputs = (
+            *W,
+            constants.kind,
+            *constants.values,
+            len(F),
+            0 if cache is None else 2,
+            cache,
+            grad_out,
+            result,
+        )
+        _launch(vjp_kernel(kind, F.dtype), blocks, threads, F.device, F, *inputs, *sums, partials)
+        if on_gpu:
+            columns = -(-weight_count(kind) // LANES)
+            _launch(add_kernel(kind, F.dtype), columns, LANES * GROUPS, F.device, partials, blocks, *sums)
+        for total, summed in zip(totals, sums, strict=True):
+            if total is not summed:
+                total.copy_(summed)
+    return (result if grad_F is None or grad_F is result else grad_F.copy_(result)), totals
