@@ -702,12 +702,12 @@
 //// end
     #undef UNROLL
 
-// A kernel of its own, on a GPU: a block of LANES times GROUPS threads adds a column a lane of partials (blocks, WEIGHTS).
+// A kernel of its own, on a GPU: a block of LANES times GROUPS threads adds a column a lane of partials (summands, WEIGHTS).
 //// add
     __shared__ Real sums[GROUPS][LANES];
     const int lane = threadIdx.x % LANES, group = threadIdx.x / LANES, i = LANES * blockIdx.x + lane;
     Real sum = Real(0);
-    for (int b = group; b < blocks && i < WEIGHTS; b += GROUPS) sum += ((const Real*)partials)[b * WEIGHTS + i];
+    for (int b = group; b < summands && i < WEIGHTS; b += GROUPS) sum += ((const Real*)partials)[b * WEIGHTS + i];
     sums[group][lane] = sum;
     __syncthreads();
     if (group == 0 && i < WEIGHTS) {

@@ -187,18 +187,18 @@ def vjp_kernel(kind: str, dtype: torch.dtype):
 
 @cache
 def add_kernel(kind: str, dtype: torch.dtype):
-    """CUDA kernel (partials (blocks, weights), blocks, three totals) that adds the sums of the blocks."""
+    """CUDA kernel (partials (blocks, weights), their number, three totals) that adds the sums of the blocks."""
 
     @wp.func_native(add_source(kind, dtype))
     def add_columns(
-        partials: wp.uint64, blocks: int, total0: wp.uint64, total1: wp.uint64, total2: wp.uint64
+        partials: wp.uint64, summands: int, total0: wp.uint64, total1: wp.uint64, total2: wp.uint64
     ): ...
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def structured_add(
-        partials: wp.uint64, blocks: int, total0: wp.uint64, total1: wp.uint64, total2: wp.uint64
+        partials: wp.uint64, summands: int, total0: wp.uint64, total1: wp.uint64, total2: wp.uint64
     ):
-        add_columns(partials, blocks, total0, total1, total2)
+        add_columns(partials, summands, total0, total1, total2)
 
     return structured_add
 

@@ -1,4 +1,4 @@
-"""The CUDA code of the fused laws and of the tile compositor, compiled for the CPU by ``cuda_emulator.h``."""
+"""The CUDA code of the laws and of the tile compositor, compiled for the CPU by ``cuda_emulator.h``."""
 
 import ctypes
 import functools
@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from neuma_lib.device import launch
-from neuma_lib.mechanics import neural_fused
+from neuma_lib.mechanics import neural_fused, structured_kernels
 from neuma_lib.splatting import compositor_cuda
 
 COMPILER = shutil.which("g++")
@@ -20,7 +20,7 @@ class _Array(ctypes.Structure):
 
 
 @functools.cache
-def _library(folder: Path, name: str, bodies: tuple[tuple[str, str, str], ...]) -> ctypes.CDLL:
+def _library(folder: Path, name: str, bodies: tuple[tuple[str, str, str], ...], *flags: str) -> ctypes.CDLL:
     """Kernels (name, parameters, body), each as a function (blocks, threads, bytes of shared memory, parameters)."""
     code = '#include "cuda_emulator.h"\n'
     for kernel, parameters, body in bodies:
@@ -38,18 +38,21 @@ def _library(folder: Path, name: str, bodies: tuple[tuple[str, str, str], ...]) 
         "-fPIC",
         "-w",
         f"-I{Path(__file__).parent}",
+        *flags,
     ]
     subprocess.run([COMPILER, *options, "-o", path.with_suffix(".so"), path.with_suffix(".cpp")], check=True)
     return ctypes.CDLL(str(path.with_suffix(".so")))
 
 
 def _launch(function, blocks: int, threads: int, shared: int, *arguments) -> None:
-    """Numbers are handed over as C's int and float, tensors as the struct ``Array``."""
+    """Numbers are handed over as C's int and float, unless they are C's double, tensors as the struct ``Array``."""
 
     def value(x):
         if isinstance(x, torch.Tensor):
             assert x.is_contiguous()
             return _Array(x.data_ptr())
+        if isinstance(x, ctypes.c_double):
+            return x
         return ctypes.c_int(x) if isinstance(x, int) else ctypes.c_float(x)
 
     assert function(*map(value, (blocks, threads, shared, *arguments))) == 0, (
@@ -107,6 +110,12 @@ class EmulatedTiles:
         launch(finish, splats.shape[:2], splats, grad_splats)
 
 
+def _addresses(parameters: str) -> str:
+    """C++ that gives the kernels, which take addresses, those of the parameters "Array<...> name_"."""
+    names = [part.split()[-1] for part in parameters.split(",") if "Array" in part]
+    return "".join(f"    const uint64_t {n[:-1]} = uint64_t({n}.data);\n" for n in names)
+
+
 class EmulatedLaws:
     """The kernels of ``neural_fused`` on the CPU, for any number of blocks."""
 
@@ -117,10 +126,7 @@ class EmulatedLaws:
         backward += ", Array<float> partials_"
 
         def body(kind, is_backward, parameters):
-            # the kernels take addresses
-            names = [part.split()[-1] for part in parameters.split(",") if "Array" in part]
-            addresses = "".join(f"    const uint64_t {n[:-1]} = uint64_t({n}.data);\n" for n in names)
-            return addresses + neural_fused.source(kind, is_backward, "EMULATED_MACHINE\n")
+            return _addresses(parameters) + neural_fused.source(kind, is_backward, "EMULATED_MACHINE\n")
 
         bodies = [
             (f"{name}_{kind}", parameters, body(kind, name == "vjp", parameters))
@@ -147,3 +153,48 @@ class EmulatedLaws:
             _launch(function, blocks, neural_fused.ROWS, size, *arguments)
         sums = partials.double().sum(0).split([w.numel() for w in weights])
         return [result.double(), grad_F.double(), *(x.view_as(w) for x, w in zip(sums, weights, strict=True))]
+
+
+class EmulatedStructuredLaws:
+    """The kernels of ``structured_kernels`` on the CPU, for any number of blocks."""
+
+    def __init__(self, folder: Path, dtype: torch.dtype):
+        self.dtype = dtype
+        real = {torch.float32: "float", torch.float64: "double"}[dtype]
+        array = f"Array<{real}>"
+        common = f"{array} F_, {array} W0_, {array} W1_, {array} W2_, int kind, {real} p0, {real} p1, {real} p2, int n"
+        totals = f"{array} total0_, {array} total1_, {array} total2_"
+        forward = f"{common}, {array} out_"
+        backward = f"{common}, {array} grad_out_, {array} grad_F_, {array} partials_"
+        add = f"{array} partials_, int summands, {totals}"
+        # a GPU caches nothing
+        uncached = "    const int cached = 0;\n    const uint64_t cache = 0;\n"
+        bodies = []
+        for name in structured_kernels.KINDS:
+            for which, parameters in (("evaluate", forward), ("vjp", backward)):
+                text = structured_kernels.source(name, which == "vjp", dtype)
+                bodies.append((f"{which}_{name}", parameters, _addresses(parameters) + uncached + text))
+            text = structured_kernels.add_source(name, dtype)
+            bodies.append((f"add_{name}", add, _addresses(add) + text))
+        bodies = tuple((name, parameters, text) for name, parameters, text in bodies)
+        self.library = _library(folder, f"structured_{real}", bodies, "-D__CUDA_ARCH__=800")
+
+    def __call__(self, part, F, weights, g, blocks: int) -> list[torch.Tensor]:
+        """Result, gradient of F (n, 3, 3) and gradients of the weights."""
+        name, constants = part.kernel
+        F, g, *weights = (x.to(self.dtype).contiguous() for x in (F, g, *weights))
+        result, grad_F = (torch.full_like(F, torch.nan) for _ in range(2))
+        partials = torch.full((blocks, structured_kernels.weight_count(name)), torch.nan, dtype=self.dtype)
+        totals = [torch.zeros_like(w) for w in weights]
+        number = ctypes.c_double if self.dtype == torch.float64 else float
+        common = F, *weights, constants.kind, *map(number, constants.values), len(F)
+        threads = structured_kernels.THREADS[self.dtype]
+        lanes, groups = structured_kernels.LANES, structured_kernels.GROUPS
+        columns = -(-partials.shape[1] // lanes)
+        for which, size, arguments in (
+            ("evaluate", (blocks, threads), (*common, result)),
+            ("vjp", (blocks, threads), (*common, g, grad_F, partials)),
+            ("add", (columns, lanes * groups), (partials, blocks, *totals)),
+        ):
+            _launch(getattr(self.library, f"{which}_{name}"), *size, 0, *arguments)
+        return [result, grad_F, *totals]
