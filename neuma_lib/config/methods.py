@@ -11,20 +11,29 @@ from pydantic import Field, model_validator
 
 from neuma_lib.config.base import Section
 from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.config.variants import split_variant
 
 LAW_FROM = "law_from"
 """Key of a variant: the scene whose law is evaluated, in place of the scene's own."""
+IDENTIFIED = "identified"
+"""Name of the prior, or of the law, that the stage `identify` found in the scene's own video."""
 
 
 class MethodConfig(Section):
     """A method is a set of options over the same code."""
 
     title: str = Field(description="name in tables")
-    law: Literal["learned", "true", "identified"] = Field(
+    law: Literal["learned", "structured", "true", "identified"] = Field(
         "learned",
-        description="true: the scene's own law on the reconstruction, the yardstick; identified: the analytic law that "
-        "the stage `identify` found in the video. Neither is trained",
+        description="learned: the paper's networks; structured: a correction of the prior's analytic law that keeps "
+        "the structure of a material; true: the scene's own law on the reconstruction, the yardstick; identified: the "
+        "analytic law that the stage `identify` found in the video. The last two are not trained",
+    )
+    prior: str | None = Field(
+        None,
+        description="prior that it starts from: one of priors.laws, or `identified`, the law that was found in the "
+        "video; null: the scene's",
     )
     note: str | None = Field(None, description="what a reader must know of its numbers; stands below tables")
     trained_as: str | None = Field(
@@ -38,24 +47,37 @@ class MethodConfig(Section):
     material: dict[str, Any] = Field(
         {}, description="settings of the section material that the method changes"
     )
+    structured: dict[str, Any] = Field(
+        {}, description="settings of the section structured that a method with a structured law changes"
+    )
 
     @model_validator(mode="after")
-    def _analytic_laws_are_not_trained(self) -> MethodConfig:
-        if self.law != "learned" and self.material.get("train", True):
+    def _fits_its_law(self) -> MethodConfig:
+        trained = self.law in ("learned", "structured")
+        if not trained and self.material.get("train", True):
             raise ValueError(f"law: the {self.law} law is not trained, set material: {{train: false}}")
+        if not trained and self.prior is not None:
+            raise ValueError(f"prior: the {self.law} law has none, leave it out")
+        if self.law == "structured" and not self.material.get("train", True):
+            raise ValueError(
+                "law: a structured law without training is its analytic law, choose law: identified"
+            )
+        if self.law != "structured" and self.structured:
+            raise ValueError("structured: only a method with law: structured has these settings")
         return self
 
 
 def parse_method(text: str, methods: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     """Split a method's folder name, ``neuma+rank=4+seed=2``, into its base and its settings.
 
-    Keys are those of the section ``material``, ``prior``, and ``law_from``, a scene. Values are YAML scalars; a comma
-    makes a list.
+    Keys are those of the sections ``material`` and ``structured``, ``prior``, and ``law_from``, a scene. Values are
+    YAML scalars; a comma makes a list.
 
     Raises:
         InputError: unknown method or key, a repeated key, or a piece without '='.
     """
-    base, given = split_variant(text, methods, [*MaterialConfig.model_fields, "prior", LAW_FROM], "method")
+    keys = [*MaterialConfig.model_fields, *StructuredConfig.model_fields, "prior", LAW_FROM]
+    base, given = split_variant(text, methods, keys, "method")
     variant: dict[str, Any] = {}
     for key, value in given.items():
         field = MaterialConfig.model_fields.get(key)

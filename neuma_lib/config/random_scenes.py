@@ -119,7 +119,7 @@ class RandomConfig(Section):
     count: int = Field(0, ge=0, description="number of scenes; more of them leave the first ones as they are")
     seed: int = Field(0, ge=0, description="seed of the draws")
     methods: tuple[str, ...] = Field(
-        ("nclaw", "neuma", "true_law"),
+        ("nclaw", "neuma", "constants", "neuma_structured", "true_law"),
         min_length=2,
         description="rows of results/random.csv: the prior, the method that is judged, and others to be shown",
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import yaml
 from pydantic import Field, model_validator
@@ -23,16 +23,19 @@ from neuma_lib.config.gaussians import GaussiansConfig
 from neuma_lib.config.geometry import GeometryConfig
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.material import MaterialConfig
-from neuma_lib.config.methods import LAW_FROM, MethodConfig, parse_method, variant_title
+from neuma_lib.config.methods import IDENTIFIED, LAW_FROM, MethodConfig, parse_method, variant_title
 from neuma_lib.config.priors import PriorsConfig
 from neuma_lib.config.random_scenes import RandomConfig, draw_scenes
 from neuma_lib.config.scenes import SceneConfig
 from neuma_lib.config.simulation import SimulationConfig
+from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.config.tables import TableConfig
 from neuma_lib.config.validation import hint, validate
 from neuma_lib.config.variants import DRAWN, folder, parse_chain
 from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.errors import InputError
+
+Changed = TypeVar("Changed", MaterialConfig, StructuredConfig)
 
 TRUTH_DRAWS = ("the particles", "the tracers", "the second tracers")
 """What the seeds dataset.seed, dataset.seed + 1 and dataset.seed + 2 draw, see `neuma_lib.data.ground_truth`."""
@@ -62,6 +65,9 @@ class Config(Section):
     velocity: VelocityConfig = Field(VelocityConfig(), description="initial velocity")
     identify: IdentifyConfig = Field(IdentifyConfig(), description="family and constants of the material")
     material: MaterialConfig = Field(MaterialConfig(), description="adaptation of the law")
+    structured: StructuredConfig = Field(
+        StructuredConfig(), description="laws with the structure of a material"
+    )
     evaluation: EvaluationConfig = Field(EvaluationConfig(), description="measures and videos")
     figures: FiguresConfig = Field(FiguresConfig(), description="figures")
     methods: dict[str, MethodConfig] = Field({}, description="methods by name")
@@ -78,6 +84,10 @@ class Config(Section):
                     raise ValueError(
                         f"{kind}.{name}: it names a folder, and + begins a variant; leave out + and /"
                     )
+        if IDENTIFIED in self.priors.laws:
+            raise ValueError(
+                f"priors.laws.{IDENTIFIED}: this names the law found in the video; choose another name"
+            )
         for name in self.scenes.keys() & self.experiments.keys():
             raise ValueError(f"experiments.{name}: a scene has this name")
         for name, scene in self.scenes.items():
@@ -91,14 +101,17 @@ class Config(Section):
             self._check_videos(name)
         for name, method in self.methods.items():
             _changed(self.material, method.material, f"methods.{name}.material")
+            _changed(self.structured, method.structured, f"methods.{name}.structured")
+            self._known_prior(method.prior, f"methods.{name}.prior")
             own = [known for known, entry in self.methods.items() if entry.trained_as is None]
             if method.trained_as not in (None, *own):
                 unknown = f"no method '{method.trained_as}' with a training of its own"
                 raise ValueError(f"methods.{name}.trained_as: {unknown}{hint(method.trained_as, own)}")
-            if method.trained_as and method.material:
-                raise ValueError(
-                    f"methods.{name}.material: that of '{method.trained_as}' counts; leave it out"
-                )
+            for key in ("material", "structured", "prior") if method.trained_as else ():
+                if getattr(method, key):
+                    raise ValueError(
+                        f"methods.{name}.{key}: that of '{method.trained_as}' counts; leave it out"
+                    )
         for where, kind, name in self._mentioned():
             known = self.scenes if kind == "scene" else self.experiments
             if name not in known:
@@ -257,6 +270,11 @@ class Config(Section):
         """Whether a method evaluates the analytic law that was identified in the video."""
         return self.methods[parse_method(method, self.methods)[0]].law == "identified"
 
+    def is_structured(self, method: str) -> bool:
+        """Whether a method's law is a structured correction of an analytic one."""
+        base, _ = parse_method(self.method_training(method), self.methods)
+        return self.methods[base].law == "structured"
+
     def video_scenes(self, name: str) -> list[str]:
         """Folders of the scenes whose videos the law of a scene is found in, in its chain: itself, then the others."""
         base, seeds = self.chain(name)
@@ -295,7 +313,8 @@ class Config(Section):
         """
         base, seeds = self.chain(column)
         chosen = [self.method_material(scene, method) for scene in self.body_scenes(column)]
-        adaptor = any(material.train and material.rank is not None for material in chosen)
+        random = self.is_structured(method)  # the first layers, whatever the rank
+        adaptor = any(material.train and (material.rank is not None or random) for material in chosen)
         return f"{folder(base, seeds, DRAWN if adaptor else DRAWN[:-1])}/{method}"
 
     def runs(self, table: str, method: str, column: str) -> list[str]:
@@ -335,12 +354,31 @@ class Config(Section):
         return self.methods[base].note
 
     def method_prior(self, scene: str, method: str) -> str:
-        """The prior that a method starts from: the scene's, unless the variant names another."""
-        _, variant = parse_method(method, self.methods)
-        prior = str(variant.get("prior", self.scene(self.law_scene(scene, method)).prior))
-        if "prior" in variant and prior not in self.priors.laws:
-            raise InputError(f"{method}: no prior '{prior}' in priors.laws{hint(prior, self.priors.laws)}")
-        return prior
+        """The prior that a method starts from: the scene's, unless the method or its variant names another.
+
+        `IDENTIFIED` is the law that was found in the scene's video.
+        """
+        base, variant = parse_method(self.method_training(method), self.methods)
+        named = variant.get("prior", self.methods[base].prior)
+        self._known_prior(named, method)
+        return self.scene(self.law_scene(scene, method)).prior if named is None else named
+
+    def _known_prior(self, prior: str | None, origin: str) -> None:
+        known = [*self.priors.laws, IDENTIFIED]
+        if prior is not None and prior not in known:
+            raise InputError(f"{origin}: no prior '{prior}' in priors.laws{hint(prior, known)}")
+
+    def method_base(self, scene: str, method: str) -> dict[str, Any] | None:
+        """The analytic law that a structured method corrects; None: the one that was found in the scene's video."""
+        prior = self.method_prior(scene, method)
+        if prior == IDENTIFIED:
+            return None
+        if prior not in self.priors.laws:
+            raise InputError(
+                f"{method} corrects an analytic law, and the prior of {scene} is the file {prior}: take "
+                f"+prior={IDENTIFIED} or another of priors.laws"
+            )
+        return self.priors.laws[prior].plain()
 
     def method_material(self, scene: str, method: str) -> MaterialConfig:
         """Effective material settings: the section, changed by the scene, then the method, then its variant.
@@ -348,16 +386,30 @@ class Config(Section):
         The scene is that of the law (`law_scene`). The seed of the scene's chain is added to the one that these give.
         """
         base, variant = parse_method(self.method_training(method), self.methods)
-        variant.pop("prior", None)
         scene = self.law_scene(scene, method)
         section = self.material
         for changes, origin in (
             (self.scene(scene).material, f"scenes.{scene}.material"),
             (self.methods[base].material, f"methods.{base}.material"),
-            (variant, method),
+            ({key: value for key, value in variant.items() if key in MaterialConfig.model_fields}, method),
         ):
             section = _changed(section, changes, origin)
+        if not section.train and self.is_structured(method):
+            raise InputError(
+                f"{method}: without training it is its analytic law; take a method with that law"
+            )
         return section.model_copy(update={"seed": section.seed + self.chain(scene)[1]["adaptor"]})
+
+    def method_structured(self, method: str) -> StructuredConfig | None:
+        """Settings of a method's structured law: the section, changed by the method, then its variant; None without."""
+        base, variant = parse_method(self.method_training(method), self.methods)
+        changes = {key: value for key, value in variant.items() if key in StructuredConfig.model_fields}
+        if not self.is_structured(method):
+            if changes:
+                raise InputError(f"{method}: its law is not structured, leave out {', '.join(changes)}")
+            return None
+        section = _changed(self.structured, self.methods[base].structured, f"methods.{base}.structured")
+        return _changed(section, changes, method)
 
 
 def load(raw: Mapping[str, Any], root: str | Path = ".") -> Config:
@@ -450,5 +502,5 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
     return result
 
 
-def _changed(section: MaterialConfig, changes: Mapping[str, Any], origin: str) -> MaterialConfig:
-    return validate(MaterialConfig, {**section.plain(), **changes}, origin)
+def _changed(section: Changed, changes: Mapping[str, Any], origin: str) -> Changed:
+    return validate(type(section), {**section.plain(), **changes}, origin)

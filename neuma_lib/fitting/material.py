@@ -18,7 +18,7 @@ import copy
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from statistics import median
 from typing import ClassVar, Protocol
 
@@ -54,6 +54,9 @@ class TrajectoryLoss(Protocol):
     def __call__(self, path: Trajectory) -> Tensor:
         """Losses of the frames, shape (T,)."""
 
+    def first(self, count: int) -> TrajectoryLoss:
+        """The same of the first frames alone."""
+
 
 @dataclass
 class PixelLoss:
@@ -84,6 +87,10 @@ class PixelLoss:
     def __call__(self, path: Trajectory) -> Tensor:
         return evaluate_in_batches(self._losses, self._batch, path.x, path.stretch)
 
+    def first(self, count: int) -> PixelLoss:
+        """The same of the first frames alone."""
+        return replace(self, observation=self.observation.select(range(count)))
+
     def _losses(self, part: slice, x: Tensor, F: Tensor) -> Tensor:
         return mean_squared_error(self._renderer(x, F), self.observation.stored(part))
 
@@ -103,6 +110,10 @@ class ParticleLoss:
 
     def __call__(self, path: Trajectory) -> Tensor:
         return chamfer_loss(path.x, self.targets)
+
+    def first(self, count: int) -> ParticleLoss:
+        """The same of the first frames alone."""
+        return ParticleLoss(self.frames[:count], self.targets[:count])
 
 
 @dataclass

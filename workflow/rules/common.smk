@@ -9,6 +9,7 @@ from types import SimpleNamespace
 ROOT = Path(workflow.basedir).resolve()
 sys.path.insert(0, str(ROOT))
 
+from neuma_lib.config.methods import IDENTIFIED
 from neuma_lib.config.settings import load
 from neuma_lib.config.variants import folder, parse_chain
 from neuma_lib.errors import InputError
@@ -92,7 +93,10 @@ def checked(function):
 DRAWN_IN = {
     **dict.fromkeys(["gaussians.ply", "gaussians.json", "mesh.ply", "tracers.h5"], ["gaussians"]),
     **dict.fromkeys(["sampled_particles.h5", "particles.h5", "binding.h5"], ["gaussians", "particles"]),
-    **dict.fromkeys(["velocity.json", "identified.json", "visited.h5"], ["prior", "gaussians", "particles"]),
+    **dict.fromkeys(
+        ["velocity.json", "identified.json", "priors/identified.safetensors", "visited.h5"],
+        ["prior", "gaussians", "particles"],
+    ),
 }
 
 
@@ -235,6 +239,8 @@ def truth_particles(wildcards):
 def prior_file(scene, method=None):
     """The prior of a scene, or of a method there, in its chain: made here, or the user's own if it is a path."""
     name = SETTINGS.method_prior(scene, method) if method else SETTINGS.scene(scene).prior
+    if name == IDENTIFIED:
+        return home(scene, "priors/identified.safetensors")
     if name not in SETTINGS.priors.laws:
         return name
     return f"{RESULTS}/priors/{folder(name, SETTINGS.chain(scene)[1], ['prior'])}.safetensors"
@@ -297,12 +303,18 @@ def table_records(table):
     ]
     for pair in [*pairs, *seen]:
         scene, _ = SETTINGS.chain(pair.scene)
-        priors = [Path(prior_file(pair.scene, method)) for method in (None, pair.method)]
+        priors = [Path(file) for file in (prior_file(pair.scene), material_prior(pair)) if file]
         jobs += [("prior", {"prior": file.stem}) for file in priors if file.parent == Path(RESULTS, "priors")]
         truth = "ground_truth" if origin_of("truth", scene) == "made" else "unpack_truth"
         images = [f"{makers[origin_of(part, scene)]}_{part}" for part in ("static", "dynamic")]
         jobs += [(rule, {"scene": scene}) for rule in (truth, *images)]
         jobs += [(rule, {"scene": Path(home(pair.scene, file)).parent.name}) for rule, file in MAKERS.items()]
+    for pair in pairs:
+        own = Path(home(SETTINGS.law_scene(pair.scene, pair.method), "identified.json"))
+        networks = material_prior(pair) == f"{own.parent}/priors/identified.safetensors"
+        jobs += [("identified_prior", {"scene": own.parent.name})] if networks else []
+        if networks or identified_law(pair) or identified_base(pair):
+            jobs += [("identify", {"scene": own.parent.name})]
     jobs += [("material", {"scene": scene, "method": method}) for scene, method in trained]
     jobs += [("evaluation", vars(pair)) for pair in pairs]
     jobs += [("chamfer_table", {"table": table})]
@@ -382,10 +394,34 @@ def training_settings(wildcards):
 
 @checked
 def material_prior(wildcards):
-    """The law that a method starts from; none where it takes an analytic one."""
-    if SETTINGS.true_law(wildcards.scene, wildcards.method) or SETTINGS.is_identified(wildcards.method):
+    """The networks that a method starts from; none where its law is analytic, or corrects an analytic one."""
+    analytic = SETTINGS.is_identified(wildcards.method) or SETTINGS.is_structured(wildcards.method)
+    if analytic or SETTINGS.true_law(wildcards.scene, wildcards.method):
         return []
     return prior_file(SETTINGS.law_scene(wildcards.scene, wildcards.method), wildcards.method)
+
+
+@checked
+def stock_base(wildcards):
+    """The analytic law that a structured method corrects, where it is that of a prior."""
+    if not SETTINGS.is_structured(wildcards.method):
+        return None
+    return SETTINGS.method_base(wildcards.scene, wildcards.method)
+
+
+@checked
+def identified_base(wildcards):
+    """The law that was identified in a scene's video, where this is what a structured method corrects."""
+    if not SETTINGS.is_structured(wildcards.method) or stock_base(wildcards):
+        return []
+    return home(SETTINGS.law_scene(wildcards.scene, wildcards.method), "identified.json")
+
+
+@checked
+def structured_settings(wildcards):
+    """Settings of a method's structured law; none where it has another."""
+    section = SETTINGS.method_structured(wildcards.method)
+    return section.plain() if section else None
 
 
 @checked

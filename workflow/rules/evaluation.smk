@@ -77,6 +77,7 @@ rule bias:
         density=method_density,
         material=material_settings,
         truth=scene_setting("law"),
+        laws=lambda wildcards: [law for law in [true_law(wildcards)] if law],
         device=SETTINGS.device,
     script:
         "../scripts/bias.py"

@@ -8,6 +8,7 @@ rule material:
         transforms=training_video,
         velocity=of_each_video(of_chain("velocity.json")),
         prior=material_prior,
+        identified=identified_base,
         truth=training_particles,
     output:
         adaptor=f"{RESULTS}/{{scene}}/{{method}}/adaptor.safetensors",
@@ -20,6 +21,8 @@ rule material:
         simulation=simulation_settings,
         densities=training_densities,
         material=training_settings,
+        base=stock_base,
+        structured=structured_settings,
         checkpoint=lambda wildcards: f"{RESULTS}/{wildcards.scene}/{wildcards.method}/checkpoint.pt",
         device=SETTINGS.device,
     script:

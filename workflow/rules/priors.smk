@@ -18,3 +18,23 @@ rule prior:
         device=SETTINGS.device,
     script:
         "../scripts/prior.py"
+
+
+rule identified_prior:
+    input:
+        kernels=kernels("laws"),
+        identified=f"{RESULTS}/{{scene}}/identified.json",
+    output:
+        weights=f"{RESULTS}/{{scene}}/priors/identified.safetensors",
+        report=f"{RESULTS}/{{scene}}/priors/identified.json",
+    resources:
+        gpu=GPU,
+    params:
+        name=IDENTIFIED,
+        dt=lambda wildcards: SETTINGS.scene(wildcards.scene).dt,
+        method=SETTINGS.priors.method,
+        options=SETTINGS.priors.plain()[SETTINGS.priors.method],
+        seed=lambda wildcards: SETTINGS.priors.seed + SETTINGS.chain(wildcards.scene)[1]["prior"],
+        device=SETTINGS.device,
+    script:
+        "../scripts/prior.py"

@@ -8,12 +8,13 @@ from neuma_lib.config.material import MaterialConfig
 from neuma_lib.device import choose_device
 from neuma_lib.evaluation.bias import bias_report, frame_losses
 from neuma_lib.fitting.material import PixelLoss
-from neuma_lib.io.files import read_json, write_json
+from neuma_lib.io.files import write_json
 from neuma_lib.io.images import load_observation
-from neuma_lib.io.laws import load_law
+from neuma_lib.io.laws import load_laws
 from neuma_lib.io.particles import load_body, thrown
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.model import MPMModel
+from workflow.inputs import listed
 from workflow.stage import run_script
 
 
@@ -27,11 +28,8 @@ def main(inputs, output, params, run) -> None:
     loss = PixelLoss(body, video, total=settings.covariance_from == "total")
     model, start = MPMModel(**params.simulation), thrown(body, inputs.velocity)
     truth = analytic_law(params.truth, dt=params.simulation["dt"])
-    if inputs.prior:
-        law = load_law(inputs.prior, inputs.get("adaptor") or None)
-    else:
-        spec = read_json(inputs.identified)["law"] if inputs.identified else params.truth
-        law = analytic_law(spec, dt=params.simulation["dt"])
+    found = [listed(inputs.get(name)) for name in ("identified", "prior", "adaptor")]
+    (law,) = load_laws(params.simulation["dt"], params.laws, *found)
     losses, failure = frame_losses(model, law.to(device), start, loss)
     true_losses, true_failure = frame_losses(model, truth.to(device), start, loss)
     report = bias_report(losses, true_losses)

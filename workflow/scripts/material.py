@@ -5,15 +5,18 @@ from dataclasses import asdict
 import torch
 
 from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.device import choose_device
 from neuma_lib.fitting.material import ParticleLoss, PixelLoss, train_material
+from neuma_lib.fitting.structured_fit import train_structured
 from neuma_lib.io.checkpoint import Checkpoint
-from neuma_lib.io.files import write_json
+from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_observation
 from neuma_lib.io.laws import load_law, save_adaptor
 from neuma_lib.io.particles import load_body, thrown
+from neuma_lib.mechanics.structured import structured_law
 from neuma_lib.sim.model import MPMModel
 from workflow.inputs import listed
 from workflow.provenance import fingerprint
@@ -34,7 +37,13 @@ def pixel_loss(body: Reconstruction, transforms: str, settings: MaterialConfig) 
 def main(inputs, output, params, run) -> None:
     settings = MaterialConfig(**params.material)
     device = choose_device(params.device)
-    law = load_law(inputs.prior).to(device)
+    structured = StructuredConfig(**params.structured) if params.structured else None
+    if structured:
+        base = params.base or read_json(inputs.identified)["law"]
+        law = structured_law({**base, "form": structured.form}, params.simulation["dt"], seed=settings.seed)
+    else:
+        law = load_law(inputs.prior)
+    law = law.to(device)
     law.attach_adaptor(settings.rank, settings.alpha, settings.seed)
     parts = zip(*(listed(inputs[name]) for name in ("particles", "binding", "gaussians")), strict=True)
     bodies = [
@@ -56,18 +65,18 @@ def main(inputs, output, params, run) -> None:
         for k, file in enumerate(listed(found))
     }
     stamp = {"simulation": params.simulation, "densities": params.densities, **params.material}
+    stamp |= {"base": params.base, **params.structured} if structured else {}
     checkpoint = Checkpoint(params.checkpoint, fingerprint(stamp, files, params.code))
-    trained = train_material(
-        MPMModel(**params.simulation),
-        law,
-        starts[0],
-        losses[0],
-        settings,
-        further=list(zip(starts[1:], losses[1:], strict=True)),
-        checkpoint=checkpoint,
-        progress=run.progress,
-        log=run.say,
-    )
+    problem = (MPMModel(**params.simulation), law, starts[0], losses[0], settings)
+    options = {"checkpoint": checkpoint, "progress": run.progress, "log": run.say}
+    options["further"] = list(zip(starts[1:], losses[1:], strict=True))
+    choice = {}
+    if structured:
+        trained, chosen = train_structured(*problem, structured, **options)
+        run.say(chosen.summary())
+        choice = chosen.as_dict()
+    else:
+        trained = train_material(*problem, **options)
     report = {
         "best_loss": trained.best_loss,
         "best_iteration": trained.best_iteration,
@@ -75,10 +84,9 @@ def main(inputs, output, params, run) -> None:
     }
     curves = asdict(trained.history)
     del curves["seconds"]  # the same settings give the same file
-    write_json(output.history, {**report, **curves})
-    save_adaptor(
-        output.adaptor, trained.law, settings.rank, settings.alpha, {"settings": params.material, **report}
-    )
+    write_json(output.history, {**report, **choice, **curves})
+    about = {"settings": params.material | (params.structured or {}), **report}
+    save_adaptor(output.adaptor, trained.law, settings.rank, settings.alpha, about)
     checkpoint.remove()
     run.say(trained.summary())
 

@@ -2,16 +2,24 @@
 
 from neuma_lib.config.priors import RegressionConfig, TrajectoryConfig
 from neuma_lib.fitting.prior_training import train_prior
-from neuma_lib.io.files import write_json
+from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.weights import write_weights
+from neuma_lib.mechanics.analytic import analytic_law
 from workflow.stage import run_script
+
+
+def at_step(spec: dict, dt: float) -> dict:
+    """A law for the scene's time step, whatever that of the throws: a network knows one step only."""
+    depends = "dt" in analytic_law(spec, dt).plasticity.values
+    return {**spec, "plasticity": {**spec["plasticity"], "dt": dt}} if depends else spec
 
 
 def main(inputs, output, params, run) -> None:
     kind = {"regression": RegressionConfig, "trajectory": TrajectoryConfig}[params.method]
-    law, report = train_prior(params.law, kind(**params.options), params.seed, run.progress)
+    spec = params.get("law") or at_step(read_json(inputs.identified)["law"], params.dt)
+    law, report = train_prior(spec, kind(**params.options), params.seed, run.progress)
     write_weights(
-        output.weights, law.prior_state(), {"prior": params.name, "law": params.law, "method": params.method}
+        output.weights, law.prior_state(), {"prior": params.name, "law": spec, "method": params.method}
     )
     write_json(output.report, report)
     run.say(

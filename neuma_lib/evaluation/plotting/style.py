@@ -56,6 +56,7 @@ METHODS = {
     "neuma_without_adaptor": Look(PURPLE, "D", (0, (2, 1))),
     "true_law": Look("#5b3a1e", "d", (0, (1, 2))),
     "constants": Look("#330dcc", "p", (0, (6, 2, 2, 2))),
+    "neuma_structured": Look("#a5005a", "h", (0, (8, 1.5))),
     "pac_nerf": Look(SKY, "P", (0, (5, 1, 1, 1, 1, 1))),
     "spring_gaus": Look(YELLOW, "X", (0, (3, 2))),
 }

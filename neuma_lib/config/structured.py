@@ -1,0 +1,30 @@
+"""Settings of laws with the structure of a material, and of how their correction is chosen."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from neuma_lib.config.base import Section
+
+
+class StructuredConfig(Section):
+    """Correction of an analytic law by structured networks: which parts of the law it may change."""
+
+    form: Literal["stretch", "energy"] = Field(
+        "stretch",
+        description="elastic correction: stresses ordered as the stretches, or the derivative of an energy",
+    )
+    held_out: float = Field(
+        0.25, gt=0, lt=1, description="part of the frames, the last ones, that corrections are judged by"
+    )
+    trial_iterations: int = Field(
+        12, ge=1, description="optimiser steps of each trial of a correction on the frames before those"
+    )
+    margin: float = Field(
+        0.05,
+        ge=0,
+        description="what a part of the law must gain to be corrected: the loss of the held-out frames falls by this "
+        "part of itself",
+    )

@@ -1,0 +1,205 @@
+"""Fit of a structured law around constants that are found already: which parts to correct, and the correction.
+
+A video need not tell anything that the constants leave open. So each choice of parts (elastic, plastic, both) is tried:
+it is trained on the first frames, for a few iterations, and judged by the last ones, which it has not seen, beside the
+law as it is. A part is corrected only if those frames gain enough; the parts that are chosen are trained anew, on all
+frames. The others stay as they are, exactly, and so does a law that nothing improves.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+
+from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.structured import StructuredConfig
+from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.fitting.material import History, TrainedMaterial, TrajectoryLoss, train_material
+from neuma_lib.io.checkpoint import Checkpoint
+from neuma_lib.mechanics.structured import StructuredLaw
+from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State
+
+Video = tuple[State, TrajectoryLoss]
+NOTHING = "nothing"
+"""Name of the choice to correct no part."""
+PARTS = {"elastic": "elasticity", "plastic": "plasticity"}
+"""Parts of a law by their short names."""
+LEAST_FRAMES = 4
+"""Fewer frames cannot be fitted and judged by."""
+
+
+@dataclass
+class Trial:
+    """How a choice of parts did.
+
+    Attributes:
+        loss: mean loss of the frames that it was trained on.
+        held_out_loss: mean loss of the frames after them; infinite if the motion breaks off.
+    """
+
+    loss: float
+    held_out_loss: float
+
+
+@dataclass
+class Choice:
+    """Which parts are corrected, and why.
+
+    Attributes:
+        parts: short names of the parts; empty if the law stays as it is.
+        trials: what was tried, by the names of the parts joined with " + ", beside `NOTHING`.
+        held_out_frames: steps of the frames that judged, a tuple a video.
+    """
+
+    parts: tuple[str, ...]
+    trials: dict[str, Trial]
+    held_out_frames: tuple[tuple[int, ...], ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON; a loss that is infinite is None."""
+        trials = {
+            name: {key: value if math.isfinite(value) else None for key, value in asdict(trial).items()}
+            for name, trial in self.trials.items()
+        }
+        held_out = [list(frames) for frames in self.held_out_frames]
+        return {"corrected_parts": list(self.parts), "trials": trials, "held_out_frames": held_out}
+
+    def summary(self) -> str:
+        """One line for people."""
+        before = self.trials[NOTHING].held_out_loss
+        gains = [
+            f"{name} {100 * (trial.held_out_loss / before - 1):+.1f} %"
+            for name, trial in self.trials.items()
+            if name != NOTHING
+        ]
+        chosen = " + ".join(self.parts) or NOTHING
+        return f"corrected: {chosen}; change of the held-out loss: {', '.join(gains)}"
+
+
+def train_structured(
+    model: MPMModel,
+    law: StructuredLaw,
+    start: State,
+    loss: TrajectoryLoss,
+    settings: MaterialConfig,
+    structured: StructuredConfig,
+    *,
+    further: Sequence[Video] = (),
+    checkpoint: Checkpoint | None = None,
+    progress: Callable[[int, int, float], None] | None = None,
+    log: Callable[[str], None] = print,
+) -> tuple[TrainedMaterial, Choice]:
+    """Choose the parts of a law that deserve a correction, and train them; in place.
+
+    Args:
+        model, start, loss, settings, further: as of `train_material`.
+        law: analytic law with an adaptor that is zero still.
+        structured: how parts are judged.
+        checkpoint: keeps what was tried, and the state of the training that runs.
+        progress: called with (iterations done, of all trainings together, loss).
+        log: receives a line for every trial.
+
+    Raises:
+        InputError: too few frames, and as `train_material`.
+        NonFiniteError: the law without correction breaks off.
+    """
+    videos = [(start, loss), *further]
+    if any(len(loss.frames) < LEAST_FRAMES for _, loss in videos):
+        raise InputError(f"a structured law needs at least {LEAST_FRAMES} frames, to fit and to judge by")
+    fitted = [max(2, round((1 - structured.held_out) * len(loss.frames))) for _, loss in videos]
+    fitted = [min(count, len(loss.frames) - 1) for count, (_, loss) in zip(fitted, videos, strict=True)]
+    first = [(start, loss.first(count)) for count, (start, loss) in zip(fitted, videos, strict=True)]
+    trained_parts = [name for name, part in PARTS.items() if part in law.parts]
+    choices = [(part,) for part in trained_parts]
+    choices += [tuple(trained_parts)] if len(trained_parts) > 1 else []
+    brief = settings.model_copy(update={"iterations": structured.trial_iterations})
+    uncorrected = copy.deepcopy(law.state_dict())
+    kept = checkpoint.load() if checkpoint else None
+    trials = {name: Trial(**found) for name, found in kept["trials"].items()} if kept else {}
+    total = len(choices) * brief.iterations + settings.iterations
+
+    def train(parts: Iterable[str], videos: Sequence[Video], how: MaterialConfig, before: int):
+        law.load_state_dict(uncorrected)
+        for name in trained_parts:
+            law.parts[PARTS[name]].adaptor.requires_grad_(name in parts)
+        inner = checkpoint and _Stage(checkpoint, {name: asdict(trial) for name, trial in trials.items()})
+        shown = progress and (lambda done, _, value: progress(before + done, total, value))
+        options = {"further": videos[1:], "checkpoint": inner, "progress": shown, "log": log}
+        return train_material(model, law, *videos[0], how, **options)
+
+    def tried() -> Trial:
+        losses = [_frame_losses(model, law, *video) for video in videos]
+        parts = [(_mean(found[:n]), _mean(found[n:])) for found, n in zip(losses, fitted, strict=True)]
+        return Trial(*(_mean(values) for values in zip(*parts, strict=True)))
+
+    if NOTHING not in trials:
+        trials[NOTHING] = tried()
+        if not math.isfinite(trials[NOTHING].held_out_loss):
+            raise NonFiniteError("material", "the motion of the uncorrected law breaks off")
+    for k, parts in enumerate(choices):
+        name = " + ".join(parts)
+        if name not in trials:
+            train(parts, first, brief, k * brief.iterations)
+            trials[name] = tried()
+            log(f"{name} corrected: {_compared(trials[name], trials[NOTHING])}")
+    parts = _chosen(choices, trials, structured.margin)
+    held_out = tuple(loss.frames[count:] for count, (_, loss) in zip(fitted, videos, strict=True))
+    choice = Choice(parts, trials, held_out)
+    if parts:
+        return train(parts, videos, settings, total - settings.iterations), choice
+    law.load_state_dict(uncorrected)
+    value = _mean([_mean(_frame_losses(model, law, *video)) for video in videos])
+    return TrainedMaterial(law, History(loss=[value], seconds=[0.0]), value, 0, stable=True), choice
+
+
+def _chosen(choices: Iterable[tuple[str, ...]], trials: dict[str, Trial], margin: float) -> tuple[str, ...]:
+    """Parts of the lowest held-out loss, of which each must lower it by the margin."""
+
+    def score(parts: tuple[str, ...]) -> float:
+        loss = trials[" + ".join(parts) or NOTHING].held_out_loss
+        return loss * (1 - margin) ** -len(parts)
+
+    return min([(), *choices], key=score)
+
+
+def _frame_losses(model: MPMModel, law: StructuredLaw, start: State, loss: TrajectoryLoss) -> list[float]:
+    """Losses of all frames; infinite from the first one that the motion does not come to."""
+    frames = loss.frames
+    with torch.no_grad():
+        try:
+            path = rollout(model, law, start, steps=frames[-1], frames=frames, total=loss.total)
+        except NonFiniteError:
+            return [math.inf] * len(frames)
+        return loss(path).tolist()
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values)
+
+
+def _compared(trial: Trial, other: Trial) -> str:
+    texts = {"fitted": (trial.loss, other.loss), "held out": (trial.held_out_loss, other.held_out_loss)}
+    return ", ".join(f"{name} {now:.3e} (before {before:.3e})" for name, (now, before) in texts.items())
+
+
+@dataclass
+class _Stage:
+    """The checkpoint of one of several trainings, which also knows what was tried before it."""
+
+    whole: Checkpoint
+    trials: dict[str, dict[str, float]]
+
+    def load(self) -> dict[str, Any] | None:
+        """The state of this training; None if that of another is kept."""
+        kept = self.whole.load()
+        return kept["loop"] if kept and kept["trials"] == self.trials else None
+
+    def save(self, state: dict[str, Any]) -> None:
+        self.whole.save({"trials": self.trials, "loop": state})

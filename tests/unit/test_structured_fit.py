@@ -1,0 +1,131 @@
+"""Which parts of a structured law are corrected, and that the others stay as they are."""
+
+import copy
+
+import pytest
+import torch
+from grounding_scene import MODEL, TRUTH, ball, observe
+
+from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.structured import StructuredConfig
+from neuma_lib.errors import InputError
+from neuma_lib.fitting.material import ParticleLoss, PixelLoss
+from neuma_lib.fitting.structured_fit import Trial, _chosen, train_structured
+from neuma_lib.mechanics.structured import structured_law
+from neuma_lib.sim.rollout import rollout
+
+FRAMES = (0, 50, 60, 70, 80, 90, 100, 110)  # it touches the ground at about 50
+V0 = torch.tensor([0.0, -1.5, 0.0], dtype=torch.float64)
+SETTINGS = MaterialConfig(
+    iterations=3, rank=None, lr_elastic=0.1, lr_plastic=0.1, warm_up=0, checkpoint_every=1
+)
+STRUCTURED = StructuredConfig(trial_iterations=2)
+FLOWS = {
+    "elasticity": {**TRUTH["elasticity"], "E": 6e4},
+    "plasticity": {"name": "von_mises", "yield_stress": 1e6},  # beyond what the fall reaches
+}
+
+
+@pytest.fixture(scope="module")
+def problem():
+    body = ball()
+    return body, PixelLoss(body, observe(body, V0, FRAMES))
+
+
+def fit(problem, spec, settings=SETTINGS, structured=STRUCTURED, **options):
+    body, loss = problem
+    law = structured_law(spec, MODEL.dt).double()
+    law.attach_adaptor(rank=settings.rank)
+    return train_structured(MODEL, law, body.state(V0), loss, settings, structured, **options)
+
+
+def deltas(law, part):
+    return [p.detach() for p in law.parts[part].adaptor.parameters()]
+
+
+@pytest.fixture(scope="module")
+def too_stiff(problem):
+    said, shown = [], []
+    trained, choice = fit(problem, FLOWS, log=said.append, progress=lambda *state: shown.append(state))
+    return trained, choice, said, shown
+
+
+def test_the_part_that_gains_is_corrected_and_the_other_stays_exactly(too_stiff):
+    trained, choice, said, shown = too_stiff
+    assert choice.parts == ("elastic",)
+    assert set(choice.trials) == {"nothing", "elastic", "plastic", "elastic + plastic"}
+    before, after = choice.trials["nothing"], choice.trials["elastic"]
+    assert after.held_out_loss < 0.95 * before.held_out_loss
+    assert choice.trials["plastic"] == before, "no state yields"
+    assert any(bool(p.any()) for p in deltas(trained.law, "elasticity"))
+    assert not any(bool(p.any()) for p in deltas(trained.law, "plasticity"))
+    assert trained.best_loss < trained.history.loss[0] and len(said) == 3
+    done = [state[0] for state in shown]
+    assert done == sorted(done) and done[-1] == 9 and {state[1] for state in shown} == {9}
+    assert choice.held_out_frames == (FRAMES[6:],) and choice.as_dict()["held_out_frames"] == [[100, 110]]
+
+
+def test_a_law_that_nothing_improves_stays_exactly_as_it_is(problem):
+    """The video is that of the law itself."""
+    trained, choice = fit(problem, TRUTH, log=lambda _: None)
+    assert choice.parts == () and set(choice.trials) == {"nothing", "elastic"}
+    assert not any(bool(p.any()) for p in deltas(trained.law, "elasticity"))
+    assert trained.stable and len(trained.history.loss) == 1 and trained.summary()
+
+
+@pytest.mark.parametrize("saves", [1, 3, 7])
+def test_a_killed_run_goes_on_to_the_same_bits(problem, too_stiff, saves):
+    """In the first trial, in the second, in the last training."""
+
+    class Keep:
+        states, left = [], saves
+
+        def load(self):
+            return copy.deepcopy(self.states[-1]) if self.states else None
+
+        def save(self, state):
+            self.states.append(copy.deepcopy(state))
+            self.left -= 1
+            if self.left == 0:
+                raise KeyboardInterrupt
+
+    keep = Keep()
+    with pytest.raises(KeyboardInterrupt):
+        fit(problem, FLOWS, log=lambda _: None, checkpoint=keep)
+    before = len(keep.states)
+    trained, choice = fit(problem, FLOWS, log=lambda _: None, checkpoint=keep)
+    assert choice == too_stiff[1] and len(keep.states) == 12 and before == saves
+    for part in ("elasticity", "plasticity"):
+        for again, once in zip(deltas(trained.law, part), deltas(too_stiff[0].law, part), strict=True):
+            assert torch.equal(again, once)
+
+
+def test_each_part_has_to_gain_the_margin():
+    def chosen(elastic, plastic, both, margin=0.1):
+        losses = {"nothing": 1.0, "elastic": elastic, "plastic": plastic, "elastic + plastic": both}
+        trials = {name: Trial(0.0, loss) for name, loss in losses.items()}
+        return _chosen([("elastic",), ("plastic",), ("elastic", "plastic")], trials, margin)
+
+    assert chosen(0.91, 0.95, 0.82) == ()
+    assert chosen(0.89, 0.95, 0.82) == ("elastic",)
+    assert chosen(0.89, 0.85, 0.77) == ("plastic",)
+    assert chosen(0.89, 0.85, 0.76) == ("elastic", "plastic")
+    assert chosen(0.89, 0.85, float("inf")) == ("plastic",)
+    assert chosen(1.0, 1.0, 1.0, margin=0.0) == ()
+
+
+def test_first_frames_of_a_loss_are_those_of_the_loss(problem):
+    body, loss = problem
+    law = structured_law(FLOWS, MODEL.dt).double()
+    path = rollout(MODEL, law, body.state(V0), steps=FRAMES[-1], frames=FRAMES)
+    targets = ParticleLoss(FRAMES, path.x.flip(0))
+    for whole in (loss, targets):
+        part = whole.first(5)
+        assert part.frames == FRAMES[:5] and part.total == whole.total
+        assert torch.equal(part(path.at(FRAMES[:5])), whole(path)[:5])
+
+
+def test_too_few_frames(problem):
+    body, loss = problem
+    with pytest.raises(InputError, match="at least 4 frames"):
+        fit((body, loss.first(3)), TRUTH)
