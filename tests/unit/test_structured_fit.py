@@ -17,7 +17,7 @@ from neuma_lib.sim.rollout import rollout
 FRAMES = (0, 50, 60, 70, 80, 90, 100, 110)  # it touches the ground at about 50
 V0 = torch.tensor([0.0, -1.5, 0.0], dtype=torch.float64)
 SETTINGS = MaterialConfig(
-    iterations=3, rank=None, lr_elastic=0.1, lr_plastic=0.1, warm_up=0, checkpoint_every=1
+    iterations=3, rank=None, lr_elastic=0.05, lr_plastic=0.05, warm_up=0, checkpoint_every=1
 )
 STRUCTURED = StructuredConfig(trial_iterations=2)
 FLOWS = {
@@ -94,7 +94,7 @@ def test_a_killed_run_goes_on_to_the_same_bits(problem, too_stiff, saves):
         fit(problem, FLOWS, log=lambda _: None, checkpoint=keep)
     before = len(keep.states)
     trained, choice = fit(problem, FLOWS, log=lambda _: None, checkpoint=keep)
-    assert choice == too_stiff[1] and len(keep.states) == 12 and before == saves
+    assert choice == too_stiff[1] and len(keep.states) == 9 and before == saves
     for part in ("elasticity", "plasticity"):
         for again, once in zip(deltas(trained.law, part), deltas(too_stiff[0].law, part), strict=True):
             assert torch.equal(again, once)
