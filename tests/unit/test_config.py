@@ -206,6 +206,68 @@ class TestVariants:
         with pytest.raises(InputError, match="no prior 'snad'"):
             loaded.method_prior("BouncyBall", "neuma+prior=snad")
 
+    def test_the_identified_law_is_a_prior_for_any_method(self, raw, loaded):
+        assert loaded.method_prior("BouncyBall", "neuma+prior=identified") == "identified"
+        assert loaded.method_prior("BouncyBall", "neuma_structured") == "identified"
+        assert loaded.method_prior("BouncyBall", "neuma_structured+prior=sand") == "sand"
+        law = raw["priors"]["laws"]["jelly"]
+        for change, message in (
+            ({"priors": {"laws": {"identified": law}}}, r"priors\.laws\.identified: this names"),
+            (
+                {"methods": {"new": {"title": "new", "prior": "snad"}}},
+                r"methods\.new\.prior: no prior 'snad'",
+            ),
+            ({"methods": {"constants": {"prior": "sand"}}}, "the identified law has none"),
+            ({"scenes": {"BouncyBall": {"prior": "identified"}}}, "no prior 'identified' in priors.laws"),
+        ):
+            with pytest.raises(InputError, match=message):
+                settings.load(settings.merged(raw, change), ROOT)
+
+    def test_a_structured_method_corrects_the_analytic_law_of_its_prior(self, loaded):
+        assert loaded.method_base("BouncyBall", "neuma_structured") is None
+        jelly = loaded.priors.laws["jelly"].plain()
+        assert loaded.method_base("BouncyBall", "neuma_structured+prior=jelly") == jelly
+        changed = loaded.method_structured("neuma_structured+form=energy+margin=0")
+        assert (changed.form, changed.margin) == ("energy", 0.0)
+        assert changed.held_out == loaded.structured.held_out and loaded.method_structured("neuma") is None
+        assert loaded.method_material("BouncyBall", "neuma_structured+margin=0").rank is None
+        # Its first layers are drawn, with any rank.
+        assert loaded.run_folder("ClayCat+adaptor_seed=1", "neuma_structured").startswith("ClayCat+adaptor")
+
+    @pytest.mark.parametrize(
+        ("method", "message"),
+        [
+            ("neuma+form=energy", "its law is not structured, leave out form"),
+            ("neuma_structured+form=secant", r"neuma_structured\+form=secant\.form"),
+        ],
+    )
+    def test_mistakes_with_structured_laws(self, loaded, method, message):
+        with pytest.raises(InputError, match=message):
+            loaded.method_structured(method)
+
+    @pytest.mark.parametrize(
+        ("method", "message"),
+        [
+            ({"structured": {"margin": 0.1}}, "only a method with law: structured"),
+            ({"law": "structured", "structured": {"margins": 0.1}}, "did you mean margin"),
+            ({"law": "structured", "material": {"train": False}}, "choose law: identified"),
+        ],
+    )
+    def test_mistakes_in_a_structured_method(self, raw, method, message):
+        with pytest.raises(InputError, match=message):
+            settings.load(settings.merged(raw, {"methods": {"new": {"title": "new", **method}}}), ROOT)
+
+    def test_a_structured_law_needs_an_analytic_one_and_training(self, raw, loaded):
+        law = {"title": "new", "law": "structured"}
+        own = settings.load(
+            settings.merged(raw, {"scenes": {"BouncyBall": {"prior": "my/law.pt"}}, "methods": {"new": law}}),
+            ROOT,
+        )
+        with pytest.raises(InputError, match=r"the file my/law\.pt: take \+prior=identified"):
+            own.method_base("BouncyBall", "new")
+        with pytest.raises(InputError, match="without training it is its analytic law"):
+            loaded.method_material("BouncyBall", "neuma_structured+train=false")
+
     def test_wrong_value_names_the_variant(self, loaded):
         with pytest.raises(InputError, match=r"neuma\+rank=x\.rank"):
             loaded.method_material("BouncyBall", "neuma+rank=x")

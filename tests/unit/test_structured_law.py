@@ -8,10 +8,11 @@ from sim_scenes import cube, strained
 from test_materials import EYE, deformations, hencky_deviator, rotations, weights_of
 
 from neuma_lib.errors import InputError
-from neuma_lib.io.laws import load_law, save_adaptor, save_prior
+from neuma_lib.io.laws import load_law, load_laws, save_adaptor, save_prior
 from neuma_lib.io.weights import write_weights
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.isotropic import PAIRS, lame
+from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.mechanics.plasticity import hencky_strain
 from neuma_lib.mechanics.structured import FORMS, SMOOTH, invariants, network, structured_law
 from neuma_lib.sim.model import MPMModel
@@ -379,7 +380,7 @@ def test_files_round_trip(tmp_path, rank):
         save_adaptor(adaptor, law, rank, 16.0, {})
         save_prior(merged, law, {})
         F = deformations(50)
-        for again in (load_law(prior, adaptor), load_law(merged)):
+        for again in (load_law(prior, adaptor), load_law(merged), load_law(None, adaptor)):
             assert again.specification() == law.specification()
             for name in ("elasticity", "plasticity"):
                 one, other = getattr(law, name), getattr(again, name)
@@ -387,6 +388,37 @@ def test_files_round_trip(tmp_path, rank):
                 assert all(torch.equal(a, b) for a, b in pairs) and (pairs or name == "plasticity")
                 assert other.evaluate(F, weights_of(other)).allclose(one.evaluate(F, weights_of(one)))
         assert load_law(prior).longitudinal_modulus() == pytest.approx(LAM + 2 * MU, rel=1e-4)
+
+
+@pytest.mark.parametrize("rank", [4, None])
+def test_a_law_from_a_file_flows_as_much_in_a_second_at_any_time_step(tmp_path, rank):
+    """The base's rate is that of its viscosity at the step that it is loaded for, and the correction is the same."""
+    spec, path = specification(plastic="viscous_flow"), tmp_path / "adaptor.safetensors"
+    law = structured_law(spec, dt=DT, seed=5)
+    law.attach_adaptor(rank=rank)
+    with torch.no_grad():
+        for p in (p for p in law.parameters() if p.requires_grad):
+            p.copy_(0.3 * torch.randn(p.shape, generator=torch.Generator().manual_seed(len(p))))
+    save_adaptor(path, law, rank, 16.0, {})
+    half = load_law(None, path, dt=DT / 2)
+    assert half.plasticity.rate == pytest.approx(2 * law.plasticity.rate)
+    (again,) = load_laws(DT, adaptors=[path])
+    assert again.specification() == law.specification()
+    for loaded in (half, again):
+        for name, part in loaded.parts.items():
+            pairs = zip(part.weights(), law.parts[name].weights(), strict=True)
+            assert all(torch.equal(a, b) for a, b in pairs)
+
+
+def test_an_adaptor_of_networks_needs_their_prior(tmp_path):
+    path = tmp_path / "adaptor.safetensors"
+    law = neural_law(seed=0)
+    law.attach_adaptor(rank=4)
+    save_adaptor(path, law, 4, 16.0, {})
+    with pytest.raises(InputError, match="corrects a prior: give its file too"):
+        load_law(None, path)
+    with pytest.raises(InputError, match="needs the file of a prior"):
+        load_law(None)
 
 
 @pytest.mark.parametrize(

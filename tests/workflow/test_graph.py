@@ -60,6 +60,30 @@ def test_identified_constants_need_the_video_and_no_training(project):
     assert f"{SCENE}+seed=1/identified.json" in chained
 
 
+def test_a_structured_law_corrects_what_the_video_shows(project):
+    """Around the constants of its scene, in its chain, and without networks to start from."""
+    graph = jobs(project.run("--dry-run", f"{SCENE}+seed=1/neuma_structured/metrics.json"))
+    made = {rule: (read, outputs) for rule, read, outputs in graph}
+    assert f"{SCENE}+seed=1/identified.json" in made["material"][0]
+    assert not any("/priors/" in file for rule in ("material", "evaluation") for file in made[rule][0])
+    assert f"{SCENE}+seed=1/neuma_structured/adaptor.safetensors" in made["evaluation"][0]
+    graph = jobs(project.run("--dry-run", f"{SCENE}/neuma_structured+prior=jelly/metrics.json"))
+    assert "identify" not in {rule for rule, *_ in graph}
+
+
+def test_networks_can_start_from_what_the_video_shows(project):
+    graph = jobs(project.run("--dry-run", f"{SCENE}+seed=1/neuma+prior=identified/metrics.json"))
+    made = {rule: (read, outputs) for rule, read, outputs in graph}
+    read, outputs = made["identified_prior"]
+    assert f"{SCENE}+seed=1/identified.json" in read
+    assert outputs[0] == f"{SCENE}+seed=1/priors/identified.safetensors"
+    assert all(outputs[0] in made[rule][0] for rule in ("material", "evaluation"))
+    assert "tiny/results/priors/jelly+seed=1.safetensors" in made["velocity"][0]
+
+
+METHODS_OF_OURS = "tables={table1: {methods: [neuma, constants, neuma_structured, neuma+prior=identified]}}"
+
+
 CHAINS = ("--config", "tables={table1: {seeds: 3}}", "--")
 DATA_RULES = ("kernels", "ground_truth", "render_static", "render_dynamic")
 
