@@ -47,10 +47,8 @@ def judge(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str, 
     scene = settings.scene(name)
     data, results = Path(settings.data_root) / name, Path(settings.results_root) / name
     chosen = IdentifyConfig(**merged(settings.identify.plain(), changes))
-    body = load_body(
-        results / "particles.h5", results / "binding.h5", results / "gaussians.ply", scene.density
-    )
-    body = body.to(torch.float32)
+    files = (results / name for name in ("particles.h5", "binding.h5", "gaussians.ply"))
+    body = load_body(*files, scene.density, gaussian_motion=chosen.gaussian_motion).to(torch.float32)
     video = load_observation(data / "dynamic/transforms.json", chosen.views).to(torch.float32)
     throw = Throw.of(read_json(results / "velocity.json"))
     simulation = settings.simulation.plain()
