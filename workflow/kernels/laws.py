@@ -1,9 +1,11 @@
-"""Kernels of the neural and of the structured laws."""
+"""Kernels of the neural and of the structured laws, and of analytic laws side by side."""
 
 from __future__ import annotations
 
 import torch
 
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.analytic_fused import side_by_side
 from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.mechanics.structured import FORMS, structured_law
@@ -15,7 +17,7 @@ SPEC = {
 
 
 def compile_kernels(device: torch.device) -> None:
-    """All networks, forward and backward, in both precisions."""
+    """All networks, forward and backward, in both precisions; analytic laws in the one of identification."""
     laws: list[Law] = [neural_law(), *(structured_law({**SPEC, "form": form}) for form in FORMS)]
     for dtype in (torch.float32, torch.float64):
         for law in laws:
@@ -25,3 +27,7 @@ def compile_kernels(device: torch.device) -> None:
                 weights = tuple(w.detach() for w in part.weights())
                 value = part.evaluate(F, weights)
                 part.vjp(F, weights, torch.ones_like(value))
+    F = torch.eye(3, device=device).repeat(4, 1, 1)
+    law = side_by_side([analytic_law(SPEC)], device)
+    for part in (law.elasticity, law.plasticity):
+        part.evaluate(F, tuple(w.to(F.dtype) for w in part.weights()))
