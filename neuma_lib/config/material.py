@@ -37,6 +37,11 @@ class MaterialConfig(Section):
         description="how Gaussians follow their particles: shifted by their mean displacement (paper), or by their "
         "affine motion, which also turns and stretches a Gaussian's distance from them",
     )
+    start: Literal["estimated", "identified"] = Field(
+        "estimated",
+        description="initial motion: as the frames before contact tell it (paper), or as the stage `identify` fitted "
+        "it to all frames, along with the constants",
+    )
     assumed_density: float | None = Field(
         None, gt=0, description="density believed everywhere [kg/m^3]; null: the scene's is told"
     )

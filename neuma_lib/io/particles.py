@@ -82,9 +82,15 @@ INITIAL_MOTION = ("v0", "angular_velocity", "centre")
 """Keys of a motion in velocity.json: velocity of the centre [m/s], angular velocity about it [rad/s], centre [m]."""
 
 
+def _initial_motion(file: str | Path) -> dict[str, Any]:
+    """Content of velocity.json, or the start in identified.json, which has the same keys."""
+    found = read_json(file)
+    return found.get("start", found)
+
+
 def thrown(body: Reconstruction, velocity: str | Path) -> State:
-    """A reconstructed body with the initial motion that was estimated for it."""
-    found = read_json(velocity)
+    """A reconstructed body with the initial motion that was estimated for it: velocity.json or identified.json."""
+    found = _initial_motion(velocity)
     return body.state(*(found[key] for key in INITIAL_MOTION))
 
 
@@ -106,7 +112,7 @@ def load_start(
     """
     together = load_body(particles, binding, gaussians, 1.0, carrier)
     x0, vol0 = together.x0, together.vol0
-    found = read_json(velocity)
+    found = _initial_motion(velocity)
     parts = found.get("bodies", [{**found, "particles": len(x0)}])
     if carrier == "gaussians":
         if len(parts) > 1:

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from grounding_scene import ball
 from PIL import Image
 
 from neuma_lib.errors import InputError
@@ -13,6 +14,7 @@ from neuma_lib.io.gaussians import load_gaussians, save_gaussians
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.io.images import read_image_set, write_transforms
 from neuma_lib.io.mesh import read_mesh, write_mesh
+from neuma_lib.io.particles import thrown
 from neuma_lib.io.ply import read_ply
 from neuma_lib.io.weights import read_weights, write_weights
 from neuma_lib.splatting.gaussians import Gaussians
@@ -390,3 +392,12 @@ def test_same_bytes(tmp_path, write):
         contents.add(path.read_bytes())
     assert len(contents) == 1
     assert str(tmp_path).encode() not in contents.pop()
+
+
+def test_an_identified_start_throws_as_a_velocity_does(tmp_path):
+    body = ball()
+    motion = {"v0": [0.1, -1.0, 0.2], "angular_velocity": [1.0, 2.0, 3.0], "centre": [0.5, 0.3, 0.5]}
+    write_json(tmp_path / "velocity.json", motion)
+    write_json(tmp_path / "identified.json", {"law": {}, "start": motion})
+    one, other = (thrown(body, tmp_path / f"{name}.json") for name in ("velocity", "identified"))
+    assert torch.equal(one.v, other.v) and torch.equal(one.C, other.C) and one.C.any()

@@ -81,6 +81,15 @@ def test_networks_can_start_from_what_the_video_shows(project):
     assert "tiny/results/priors/jelly+seed=1.safetensors" in made["velocity"][0]
 
 
+def test_a_method_can_start_as_identification_found(project):
+    graph = jobs(project.run("--dry-run", f"{SCENE}+seed=1/neuma+start=identified/bias.json"))
+    graph += jobs(project.run("--dry-run", f"{SCENE}+seed=1/neuma+start=identified/metrics.json"))
+    made = {rule: (read, outputs) for rule, read, outputs in graph}
+    for rule in ("material", "evaluation", "bias"):
+        assert f"{SCENE}+seed=1/identified.json" in made[rule][0]
+        assert not any(file.endswith("velocity.json") for file in made[rule][0])
+
+
 METHODS_OF_OURS = "tables={table1: {methods: [neuma, constants, neuma_structured, neuma+prior=identified]}}"
 
 

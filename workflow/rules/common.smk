@@ -476,6 +476,22 @@ def judged_carrier(wildcards):
 
 
 @checked
+def start_name(wildcards):
+    """The file that tells a method how bodies are thrown."""
+    identified = material_settings(wildcards)["start"] == "identified"
+    return "identified.json" if identified else "velocity.json"
+
+
+def start_file(wildcards):
+    return of_chain(start_name(wildcards))(wildcards)
+
+
+def start_files(wildcards):
+    """The same of each video."""
+    return of_each_video(of_chain(start_name(wildcards)))(wildcards)
+
+
+@checked
 def gaussian_motion(wildcards):
     return material_settings(wildcards)["gaussian_motion"]
 

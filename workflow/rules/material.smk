@@ -6,7 +6,7 @@ rule material:
         **{name: of_each_video(of_chain(file)) for name, file in BODY.items()},
         kernels=kernels("laws", "rendering"),
         transforms=training_video,
-        velocity=of_each_video(of_chain("velocity.json")),
+        velocity=start_files,
         prior=material_prior,
         identified=identified_base,
         truth=training_particles,
