@@ -73,7 +73,7 @@ def judge(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str, 
     tracers = torch.from_numpy(arrays["tracers"])
     tracers = tracers[:, :: max(1, tracers.shape[1] // TRACERS)].to(body.x0)
     laws = {"identified": row["found"]["law"], "true_law": truth}
-    starts = {"velocity": throw, "fitted": found.best.throw}
+    starts = {"velocity": throw, "fitted": found.best.throws[0]}
     for law, spec in laws.items():
         for start, thrown in starts.items():
             path, _ = predict(

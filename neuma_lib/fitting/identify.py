@@ -12,6 +12,8 @@ Families are fitted to the first frames and judged by the last ones, so that mor
 One that explains the images no better than a simpler one is not followed to the end.
 What the video says of the constants of a family is told by the jackknife over blocks of the image, in combinations:
 of a flow that never springs back, the flow stress is seen and the stiffness is not.
+
+Several videos of one material have the constants in common and a throw each; they count alike, however long.
 """
 
 from __future__ import annotations
@@ -53,8 +55,8 @@ class FamilyFit:
         loss: mean squared residual of the fitted frames, at the last squares it came to; infinite if all diverged.
         held_out: the same of the frames that were held out, at the finest squares.
         score: logarithm of ``held_out`` plus the penalty on constants; smaller is better.
-        covariance: of the unbounded constants, shape (k, k); what is uncertain about the throw is in it.
-        throw: the initial motion that was fitted along, with its standard deviations.
+        covariance: of the unbounded constants, shape (k, k); what is uncertain about the throws is in it.
+        throws: the initial motion in each video, which was fitted along, with its standard deviations.
         refined: whether it came to the finest squares.
         rollouts: simulations that it took.
         steps: accepted Levenberg-Marquardt steps.
@@ -66,7 +68,7 @@ class FamilyFit:
     held_out: float = math.inf
     score: float = math.inf
     covariance: np.ndarray | None = None
-    throw: Throw | None = None
+    throws: tuple[Throw, ...] = ()
     refined: bool = False
     rollouts: int = 0
     steps: int = 0
@@ -103,7 +105,7 @@ class FamilyFit:
             }
             plain["combinations"] = self.combinations(settings)
             plain["unbounded"] = self.family.unbounded_dict(self.values, self.covariance)
-            plain["start"] = self.throw.as_dict()
+            plain["start"] = self.throws[0].as_dict()
         return plain
 
     def quantities(self, settings: IdentifyConfig) -> list[tuple[str, float, float]]:
@@ -138,29 +140,32 @@ class Identified:
         best: the family that is chosen, fitted again to all frames.
         ties: names of families that are as good, the best one not among them.
         fits: all candidates as they were judged, by name.
-        frames: steps of the frames that were fitted.
-        held_out: steps of the frames that were held out.
+        frames: steps of the frames that were fitted, of each video.
+        held_out: steps of the frames that were held out, of each video.
     """
 
     best: FamilyFit
     ties: list[str]
     fits: dict[str, FamilyFit]
-    frames: tuple[int, ...]
-    held_out: tuple[int, ...]
+    frames: list[tuple[int, ...]]
+    held_out: list[tuple[int, ...]]
     settings: IdentifyConfig = field(repr=False)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON; ``law`` is what `analytic_law` takes."""
+        videos = [
+            {"start": throw.as_dict(), "frames": list(frames), "held_out_frames": list(held_out)}
+            for throw, frames, held_out in zip(self.best.throws, self.frames, self.held_out, strict=True)
+        ]
         return {
             "family": self.best.family.name,
             "ties": self.ties,
             "law": self.best.family.law_spec(self.best.values),
-            "start": self.best.throw.as_dict(),
             "says": self.summary(),
             "best": self.best.as_dict(self.settings),
             "families": {name: fit.as_dict(self.settings) for name, fit in self.fits.items()},
-            "frames": list(self.frames),
-            "held_out_frames": list(self.held_out),
+            **videos[0],
+            **({"further_videos": videos[1:]} if videos[1:] else {}),
             "rollouts": self.best.rollouts + sum(fit.rollouts for fit in self.fits.values()),
         }
 
@@ -185,6 +190,8 @@ def identify(
     observation: Observation,
     settings: IdentifyConfig,
     stock: Mapping[str, Mapping[str, Any]] | None = None,
+    *,
+    further: Sequence[tuple[Throw, Reconstruction, Observation]] = (),
     progress: Callable[[int, int, float], None] | None = None,
     log: Callable[[str], None] = lambda text: None,
 ) -> Identified:
@@ -197,6 +204,7 @@ def identify(
         observation: the video; its views are those of the settings.
         settings: candidates and hyper-parameters.
         stock: specification of the law that the scene's prior was trained on: another start; None if unknown.
+        further: throw, body and video of others of the same material.
         progress: called with (rounds done, rounds, mean squared residual).
         log: receives a line for every family.
 
@@ -204,20 +212,21 @@ def identify(
         InputError: fewer than four frames, no family, or one with unknown parts.
         NonFiniteError: every family diverges from every start.
     """
-    if len(observation.frames) < 4:
+    given = [(throw, body, observation), *further]
+    if min(len(seen.frames) for *_, seen in given) < 4:
         raise InputError("identify needs at least four frames of the training view, to fit and to judge by")
     if not settings.families:
         raise InputError("identify.families names no candidate: give at least one elasticity with E and nu")
     families = [Family(name, law.plain()) for name, law in settings.families.items()]
     families.sort(key=lambda family: len(family.constants))  # simpler ones give starts to the others
-    seen = observation.select(spread_frames(len(observation.frames), settings.frames))
-    fitted = min(len(seen.frames) - 1, max(2, round((1 - settings.held_out) * len(seen.frames))))
-    video = _Video(model, throw, body, seen, settings)
+    videos = [_Video(model, *one, settings) for one in given]
+    for video in videos:
+        video.weight = (videos[0].pixels / video.pixels) ** 0.5
     stock_values = _constants(stock) if stock else {}
     running: list[_Run] = []
     rounds = len(settings.squares)
     for family in families:
-        run = _Run(family, video, fitted, settings)
+        run = _Run(family, videos, [video.fitted for video in videos], settings)
         run.begin([family.with_guesses(values) for values in ({}, stock_values, *_found(running, family))])
         running.append(run)
     total = rounds * len(families)
@@ -225,7 +234,7 @@ def identify(
         _leave_behind(running, settings)
         following = sorted((run for run in running if run.alive), key=lambda run: run.fit.cost)
         if following and level == rounds - 1:
-            video.by_motion = following[0].motion_columns()
+            following[0].move_throws()
         for done, run in enumerate(following):
             run.refine(level)
             if progress:
@@ -238,9 +247,16 @@ def identify(
         )
     chosen, ties = _choice(list(fits.values()), settings)
     run = next(run for run in running if run.family is chosen.family)
-    final = _Run(run.family, video, len(seen.frames), settings)
+    final = _Run(run.family, videos, [len(video.frames) for video in videos], settings)
     final.begin([run.values], level=rounds - 1, deviations=run.deviations)
-    return Identified(final.judged(), ties, fits, seen.frames[:fitted], seen.frames[fitted:], settings)
+    return Identified(
+        final.judged(),
+        ties,
+        fits,
+        [video.frames[: video.fitted] for video in videos],
+        [video.frames[video.fitted :] for video in videos],
+        settings,
+    )
 
 
 def _leave_behind(running: Sequence[_Run], settings: IdentifyConfig) -> None:
@@ -297,14 +313,24 @@ class _Video:
     """Simulated minus observed images, averaged over the finest squares.
 
     Attributes:
+        frames: steps of the frames that are compared.
+        fitted: the number of those that families are fitted to; the others judge them.
+        weight: factor on all residuals.
         by_motion: derivatives of the residuals of all frames with respect to the throw's deviations; None: not yet
             known. All families share those of one that fits: they are mostly kinematics.
     """
 
     def __init__(
-        self, model: MPMModel, throw: Throw, body: Reconstruction, seen: Observation, settings: IdentifyConfig
+        self,
+        model: MPMModel,
+        throw: Throw,
+        body: Reconstruction,
+        video: Observation,
+        settings: IdentifyConfig,
     ):
-        self.model, self.throw, self.frames = model, throw, seen.frames
+        seen = video.select(spread_frames(len(video.frames), settings.frames))
+        self.model, self.throw, self.frames, self.weight = model, throw, seen.frames, 1.0
+        self.fitted = min(len(seen.frames) - 1, max(2, round((1 - settings.held_out) * len(seen.frames))))
         self.density = float((body.mass / body.vol0).min())
         self.by_motion: list[Tensor] | None = None
         self._body, self._total = body, settings.covariance_from == "total"
@@ -316,6 +342,7 @@ class _Video:
         """Edge of each round's squares in squares of the finest ones."""
         parts = frame_batches(len(seen.frames), self._renderer.frames_per_batch)
         self._observed = torch.cat([averaged(seen.colours(part), self.finest) for part in parts])
+        self.pixels = self._observed.numel()
 
     def residuals(self, tries: Sequence[_Try], count: int) -> list[Tensor | None]:
         """Residuals (count, V, H', W', 3) of the first frames for each try; None where the rollout diverges."""
@@ -334,7 +361,7 @@ class _Video:
                 ]
         except NonFiniteError:
             return None
-        residual = torch.cat(images) - self._observed[:count]
+        residual = self.weight * (torch.cat(images) - self._observed[:count])
         return residual if bool(residual.isfinite().all()) else None
 
 
@@ -351,17 +378,21 @@ def averaged(images: Tensor, size: int) -> Tensor:
 class _Run:
     """The fit of one family to the first frames; residuals and Jacobians serve all sizes of squares.
 
-    Unknowns are the unbounded constants, relative to the start of the fit, and the deviations of the throw.
+    Unknowns are the unbounded constants, relative to the start of the fit, and the deviations of each video's throw.
+    Residuals and their columns are lists over the videos; `counts` of their frames are fitted.
     """
 
-    def __init__(self, family: Family, video: _Video, count: int, settings: IdentifyConfig):
-        self.family, self.video, self.count, self.settings = family, video, count, settings
+    def __init__(
+        self, family: Family, videos: Sequence[_Video], counts: Sequence[int], settings: IdentifyConfig
+    ):
+        self.family, self.videos, self.counts, self.settings = family, videos, counts, settings
         self.alive, self.refined, self.rollouts, self.steps = False, False, 0, 0
         self.fit: Linearisation | None = None
         self._constants = len(family.constants)
-        self._origin, self._u, self._size = np.zeros(0), np.zeros(self._constants + _MOTION), 1
-        self._images: dict[bytes, Tensor | None] = {}
-        self._columns: dict[bytes, list[Tensor]] = {}
+        self._origin, self._level = np.zeros(0), 0
+        self._u = np.zeros(self._constants + _MOTION * len(videos))
+        self._images: dict[bytes, list[Tensor] | None] = {}
+        self._columns: dict[bytes, list[list[Tensor]]] = {}
 
     @property
     def values(self) -> Values:
@@ -378,7 +409,7 @@ class _Run:
 
     def begin(self, starts: Sequence[Values], level: int = 0, deviations: np.ndarray | None = None) -> None:
         """Fit from the best of some starts, in a round."""
-        self._size = self.video.sizes[level]
+        self._level = level
         tried = {tuple(values.values()): values for values in starts}
         best, here = math.inf, self._u.copy()
         if deviations is not None:
@@ -395,12 +426,12 @@ class _Run:
 
     def refine(self, level: int) -> None:
         """Go on with a round's squares."""
-        self._size, last = self.video.sizes[level], level == len(self.video.sizes) - 1
-        moving = np.flatnonzero(self.video.throw.std) if self.video.by_motion else []
+        self._level, last = level, level == len(self.settings.squares) - 1
+        moving = [k for v, video in enumerate(self.videos) if video.by_motion for k in self._moving(v)]
         self._u, self.fit, steps = levenberg_marquardt(
             self,
             self._u,
-            [*range(self._constants), *(self._constants + k for k in moving)],
+            [*range(self._constants), *moving],
             self._held,
             self.settings.least_gain * (_LAST_GAIN if last else 1.0),
             self.settings.iterations,
@@ -409,17 +440,27 @@ class _Run:
         self.steps += steps
         self.refined = last
 
-    def motion_columns(self) -> list[Tensor]:
-        """Forward differences of all frames by the deviations of the throw; 0 where it is known or diverges."""
-        points = [self._u] + [
-            self._u + np.eye(len(self._u))[self._constants + k] for k in np.flatnonzero(self.video.throw.std)
-        ]
-        here, *there = self._simulate(points, len(self.video.frames))
-        columns = [torch.zeros_like(here)] * _MOTION
-        for k, residual in zip(np.flatnonzero(self.video.throw.std), there, strict=True):
-            if residual is not None:
-                columns[k] = residual - here
-        return columns
+    def _motion(self, v: int) -> slice:
+        """Places of the unknowns of a video's throw."""
+        return slice(self._constants + v * _MOTION, self._constants + (v + 1) * _MOTION)
+
+    def _moving(self, v: int) -> list[int]:
+        """Places of those that are not known."""
+        return (self._motion(v).start + np.flatnonzero(self.videos[v].throw.std)).tolist()
+
+    def move_throws(self) -> None:
+        """Forward differences of all frames by the deviations of the throws, for all families; 0 where one is known
+        or diverges."""
+        law = self.family.law_spec(self.values)
+        for v, video in enumerate(self.videos):
+            deviations, moving = self._u[self._motion(v)], np.flatnonzero(video.throw.std)
+            tries = [_Try(law, deviations), *(_Try(law, deviations + np.eye(_MOTION)[k]) for k in moving)]
+            self.rollouts += len(tries)
+            here, *there = video.residuals(tries, len(video.frames))
+            video.by_motion = [torch.zeros_like(here)] * _MOTION
+            for k, residual in zip(moving, there, strict=True):
+                if residual is not None:
+                    video.by_motion[k] = residual - here
 
     def judged(self) -> FamilyFit:
         """What was found, judged by the frames that were held out, if any."""
@@ -428,52 +469,64 @@ class _Run:
             k, P = self._constants, self._held(self.fit)
             by_prior = np.linalg.pinv(self.fit.curvature + P) @ P * self._spreads
             covariance = jackknife(self.fit, P) + by_prior @ by_prior.T
-            found.covariance = covariance[:k, :k]
-            moved = self.video.throw.moved(self.deviations)
-            found.throw = replace(moved, std=moved.std * np.sqrt(np.diag(covariance)[k:]))
-            if self.count < len(self.video.frames):
+            found.covariance, stds = covariance[:k, :k], np.sqrt(np.diag(covariance))
+            moved = [video.throw.moved(self._u[self._motion(v)]) for v, video in enumerate(self.videos)]
+            found.throws = tuple(
+                replace(throw, std=throw.std * stds[self._motion(v)]) for v, throw in enumerate(moved)
+            )
+            if any(count < len(video.frames) for count, video in zip(self.counts, self.videos, strict=True)):
                 found.held_out = self._held_out()
                 found.score = math.log(max(found.held_out, _LEAST_LOSS)) + self.settings.penalty * k
         found.rollouts = self.rollouts
         return found
 
     def cost(self, unknowns: np.ndarray) -> float:
-        """Sum of squared residuals, infinite if the rollout diverges."""
+        """Sum of squared residuals, infinite if a rollout diverges."""
         residual = self._residual(unknowns)
         return math.inf if residual is None else self._cost(residual)
 
-    def _cost(self, residual: Tensor) -> float:
-        return float(self._seen(residual).square().sum(dtype=torch.float64))
+    def _cost(self, residual: Sequence[Tensor]) -> float:
+        return sum(float(r.square().sum(dtype=torch.float64)) for r in self._seen(residual))
 
     def linearise(self, unknowns: np.ndarray, free: Sequence[int]) -> Linearisation:
-        """Sums of the residuals and of their forward differences."""
+        """Sums of the residuals and of their forward differences, block by block of one video after the other."""
         residual = self._residual(unknowns)
         key = unknowns.tobytes()
         self._images = {key: residual}  # where the fit stands; the next size of squares begins here
         if key not in self._columns:
             self._columns = {key: self._constant_columns(unknowns, residual)}
-        columns = self._columns[key] + [c[: self.count] for c in self.video.by_motion or ()]
-        r, k = self._seen(residual), len(unknowns)
-        J = torch.stack([in_blocks(self._seen(columns[i])) for i in free], dim=-1).double()
-        blocks = in_blocks(r).double()
-        curvatures, scores = np.zeros((len(J), k, k)), np.zeros((len(J), k))
-        curvatures[:, np.array(free)[:, None], free] = (J.mT @ J).cpu().numpy()
-        scores[:, free] = (J.mT @ blocks[..., None])[..., 0].cpu().numpy()
+        curvatures, scores, k = [], [], len(unknowns)
+        for v, (video, r) in enumerate(zip(self.videos, self._seen(residual), strict=True)):
+            columns = dict(enumerate(column[v] for column in self._columns[key]))
+            columns |= zip(range(*self._motion(v).indices(k)), video.by_motion or (), strict=False)
+            own = [i for i in free if i in columns]
+            J = torch.stack(
+                [in_blocks(self._averaged(v, columns[i][: len(r)])) for i in own], dim=-1
+            ).double()
+            blocks = in_blocks(r).double()
+            curvatures.append(np.zeros((len(J), k, k)))
+            scores.append(np.zeros((len(J), k)))
+            curvatures[v][:, np.array(own)[:, None], own] = (J.mT @ J).cpu().numpy()
+            scores[v][:, own] = (J.mT @ blocks[..., None])[..., 0].cpu().numpy()
         cost = self._cost(residual)
-        return Linearisation(curvatures, scores, cost, math.sqrt(cost / r.numel()))
+        # Weights make the sum of squares that of as many residuals a video as the first one has.
+        count = len(self.videos) * self._seen(residual)[0].numel()
+        return Linearisation(
+            np.concatenate(curvatures), np.concatenate(scores), cost, math.sqrt(cost / count)
+        )
 
-    def _constant_columns(self, unknowns: np.ndarray, residual: Tensor) -> list[Tensor]:
+    def _constant_columns(self, unknowns: np.ndarray, residual: Sequence[Tensor]) -> list[list[Tensor]]:
         """Differences by the constants: forward, and backward where there is no forward: a divergence, or the stiffest
         that dt bears, which the last step may have passed."""
         here, h = self._values(unknowns), self.settings.difference
-        columns = [torch.zeros_like(residual)] * self._constants
+        columns = [[torch.zeros_like(r) for r in residual]] * self._constants
         missing = range(self._constants)
         for step in (h, -h, -h - self.settings.longest_step):
             moved = {k: unknowns + step * np.eye(len(unknowns))[k] for k in missing}
             moved = {k: point for k, point in moved.items() if self._values(point) != here}
             for k, there in zip(moved, self._simulate(list(moved.values())), strict=True):
                 if there is not None:
-                    columns[k] = (there - residual) / step
+                    columns[k] = [(t - r) / step for t, r in zip(there, residual, strict=True)]
                     missing = [other for other in missing if other != k]
             if not missing:
                 break
@@ -482,17 +535,19 @@ class _Run:
     @property
     def _spreads(self) -> np.ndarray:
         """Expected distance of the unknowns from 0."""
-        return np.append(np.full(self._constants, self.settings.spread), np.ones(_MOTION))
+        motion = np.ones(_MOTION * len(self.videos))
+        return np.append(np.full(self._constants, self.settings.spread), motion)
 
     def _held(self, fit: Linearisation) -> np.ndarray:
-        """Curvature that holds every unknown at 0 +- its spread."""
-        return np.diag(fit.block_cost / self._spreads**2)
+        """Curvature that holds every unknown at 0 +- its spread; blocks of all videos count as one residual each."""
+        return np.diag(fit.block_cost / len(self.videos) / self._spreads**2)
 
     def _values(self, unknowns: np.ndarray) -> Values:
         constants = self._origin + unknowns[: self._constants]
-        return self.family.values(constants, self.video.model, self.video.density)
+        density = min(video.density for video in self.videos)
+        return self.family.values(constants, self.videos[0].model, density)
 
-    def _residual(self, unknowns: np.ndarray) -> Tensor | None:
+    def _residual(self, unknowns: np.ndarray) -> list[Tensor] | None:
         key = unknowns.tobytes()
         if key not in self._images:
             # What was tried before is not accepted and never comes back.
@@ -500,18 +555,35 @@ class _Run:
             self._images = dict([*list(self._images.items())[:1], (key, found)])
         return self._images[key]
 
-    def _simulate(self, points: Sequence[np.ndarray], count: int | None = None) -> list[Tensor | None]:
-        """Residuals at unknowns, of the frames that are fitted or of so many."""
-        self.rollouts += len(points)
-        tries = [
-            _Try(self.family.law_spec(self._values(point)), point[self._constants :]) for point in points
+    def _simulate(
+        self, points: Sequence[np.ndarray], counts: Sequence[int] | None = None
+    ) -> list[list[Tensor] | None]:
+        """Residuals of the videos at unknowns, of the frames that are fitted or of so many; None where one diverges."""
+        self.rollouts += len(points) * len(self.videos)
+        laws = [self.family.law_spec(self._values(point)) for point in points]
+        found = [
+            video.residuals(
+                [_Try(law, p[self._motion(v)]) for law, p in zip(laws, points, strict=True)], count
+            )
+            for v, (video, count) in enumerate(zip(self.videos, counts or self.counts, strict=True))
         ]
-        return self.video.residuals(tries, count or self.count)
+        return [
+            None if any(r is None for r in of_all) else list(of_all) for of_all in zip(*found, strict=True)
+        ]
 
-    def _seen(self, residual: Tensor) -> Tensor:
-        return averaged(residual, self._size)
+    def _seen(self, residual: Sequence[Tensor]) -> list[Tensor]:
+        return [self._averaged(v, r) for v, r in enumerate(residual)]
+
+    def _averaged(self, v: int, images: Tensor) -> Tensor:
+        return averaged(images, self.videos[v].sizes[self._level])
 
     def _held_out(self) -> float:
-        """Mean squared residual of the frames after those that are fitted; infinite if the rollout diverges there."""
-        (residual,) = self._simulate([self._u], len(self.video.frames))
-        return math.inf if residual is None else float(residual[self.count :].double().square().mean())
+        """Mean squared residual of the frames after those that are fitted; infinite if a rollout diverges there."""
+        (residual,) = self._simulate([self._u], [len(video.frames) for video in self.videos])
+        if residual is None:
+            return math.inf
+        losses = [
+            float(r[count:].double().square().mean()) / video.weight**2
+            for r, count, video in zip(residual, self.counts, self.videos, strict=True)
+        ]
+        return sum(losses) / len(losses)

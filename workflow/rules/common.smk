@@ -502,9 +502,15 @@ def method_density(wildcards):
 
 
 @checked
+def video_densities(wildcards):
+    """Densities of the bodies of all videos of a scene."""
+    return [SETTINGS.scene(scene).plain()["density"] for scene in SETTINGS.video_scenes(wildcards.scene)]
+
+
+@checked
 def training_densities(wildcards):
-    """Densities that a method takes the bodies of all videos of a scene to have."""
-    own = [SETTINGS.scene(scene).plain()["density"] for scene in SETTINGS.video_scenes(wildcards.scene)]
+    """The same as a method takes them to be."""
+    own = video_densities(wildcards)
     assumed = SETTINGS.method_material(wildcards.scene, wildcards.method).assumed_density
     return own if assumed is None else [assumed] * len(own)
 

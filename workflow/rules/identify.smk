@@ -3,17 +3,17 @@
 
 rule identify:
     input:
-        **body_files(),
+        **{name: of_each_video(of_chain(file)) for name, file in BODY.items()},
         kernels=kernels("laws", "rendering"),
-        transforms=of_scene("dynamic/transforms.json"),
-        velocity=of_chain("velocity.json"),
+        transforms=of_each_video(of_scene("dynamic/transforms.json")),
+        velocity=of_each_video(of_chain("velocity.json")),
     output:
         identified=f"{RESULTS}/{{scene}}/identified.json",
     resources:
         gpu=GPU,
     params:
         simulation=simulation_settings,
-        density=scene_setting("density"),
+        densities=video_densities,
         identify=SETTINGS.identify.plain(),
         stock=stock_law,
         device=SETTINGS.device,

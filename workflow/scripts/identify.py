@@ -1,4 +1,4 @@
-"""Find the family and the constants of the material in the video."""
+"""Find the family and the constants of the material in one video or several."""
 
 import torch
 
@@ -10,19 +10,33 @@ from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.images import load_observation
 from neuma_lib.io.particles import load_body
 from neuma_lib.sim.model import MPMModel
+from workflow.inputs import listed
 from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
     settings = IdentifyConfig(**params.identify)
     device = choose_device(params.device)
-    files = (inputs.particles, inputs.binding, inputs.gaussians)
-    body = load_body(*files, params.density, gaussian_motion=settings.gaussian_motion)
-    body = body.to(torch.float32, device)
-    video = load_observation(inputs.transforms, settings.views).to(torch.float32, device)
-    throw = Throw.of(read_json(inputs.velocity))
-    model = MPMModel(**params.simulation)
-    found = identify(model, throw, body, video, settings, params.stock, run.progress, run.say)
+    names = ("particles", "binding", "gaussians", "velocity", "transforms")
+    videos = [
+        (
+            Throw.of(read_json(velocity)),
+            load_body(*body, density, gaussian_motion=settings.gaussian_motion).to(torch.float32, device),
+            load_observation(transforms, settings.views).to(torch.float32, device),
+        )
+        for *body, velocity, transforms, density in zip(
+            *(listed(inputs[name]) for name in names), params.densities, strict=True
+        )
+    ]
+    found = identify(
+        MPMModel(**params.simulation),
+        *videos[0],
+        settings,
+        params.stock,
+        further=videos[1:],
+        progress=run.progress,
+        log=run.say,
+    )
     write_json(output.identified, found.as_dict())
     run.say(found.summary())
 
