@@ -154,15 +154,16 @@ THROW = f"{SCENE}_throw2"
 def test_several_videos_train_one_law_which_is_judged_on_all(project):
     held_out = "neuma+law_from=BouncyBall"
     targets = (f"{SCENE}+seed=1/neuma/metrics.json", f"{THROW}+seed=1/{held_out}/metrics.json")
-    graph = jobs(project.run("--dry-run", *TWO_VIDEOS, *targets))
-    ((read, (adaptor, _)),) = [(read, made) for rule, read, made in graph if rule == "material"]
-    for folder in (f"{SCENE}+seed=1", f"{THROW}+seed=1"):
-        for file in ("particles.h5", "binding.h5", "gaussians.ply", "velocity.json"):
-            assert f"{folder}/{file}" in read
-    assert {file for file in read if file.endswith("transforms.json")} == {
-        "tiny/data/BouncyBall/dynamic/transforms.json",
-        "tiny/data/BouncyBall_throw2/dynamic/transforms.json",
-    }
+    graph = jobs(project.run("--dry-run", *TWO_VIDEOS, *targets, f"{SCENE}+seed=1/identified.json"))
+    ((_, (adaptor, _)),) = [(read, made) for rule, read, made in graph if rule == "material"]
+    for read in (read for rule, read, _ in graph if rule in ("material", "identify")):
+        for folder in (f"{SCENE}+seed=1", f"{THROW}+seed=1"):
+            for file in ("particles.h5", "binding.h5", "gaussians.ply", "velocity.json"):
+                assert f"{folder}/{file}" in read
+        assert {file for file in read if file.endswith("transforms.json")} == {
+            "tiny/data/BouncyBall/dynamic/transforms.json",
+            "tiny/data/BouncyBall_throw2/dynamic/transforms.json",
+        }
     judged = {made[0]: read for rule, read, made in graph if rule == "evaluation"}
     assert len(judged) == 2 and all(adaptor in read for read in judged.values())
     refused = f"{THROW}/{held_out}/adaptor.safetensors"

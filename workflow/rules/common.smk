@@ -291,31 +291,32 @@ def table_records(table):
     pairs = [SimpleNamespace(**run) for run in table_runs(table) if run["scene"]]
     makers = {"made": "render", "supplied": "supplied", "packed": "unpack"}
     jobs = [("kernels", {"group": group}) for group in ("geometry", "simulation", "laws", "rendering")]
-    trained = [
-        (SETTINGS.law_scene(pair.scene, pair.method), SETTINGS.method_training(pair.method))
-        for pair in pairs
-        if trained_adaptor(pair)
-    ]
-    seen = [
-        SimpleNamespace(scene=video, method=method)
-        for scene, method in trained
-        for video in SETTINGS.video_scenes(scene)
-    ]
-    for pair in [*pairs, *seen]:
-        scene, _ = SETTINGS.chain(pair.scene)
-        priors = [Path(file) for file in (prior_file(pair.scene), material_prior(pair)) if file]
-        jobs += [("prior", {"prior": file.stem}) for file in priors if file.parent == Path(RESULTS, "priors")]
-        truth = "ground_truth" if origin_of("truth", scene) == "made" else "unpack_truth"
-        images = [f"{makers[origin_of(part, scene)]}_{part}" for part in ("static", "dynamic")]
-        jobs += [(rule, {"scene": scene}) for rule in (truth, *images)]
-        jobs += [(rule, {"scene": Path(home(pair.scene, file)).parent.name}) for rule, file in MAKERS.items()]
+    priors, laws, videos = [], [], []
     for pair in pairs:
-        own = Path(home(SETTINGS.law_scene(pair.scene, pair.method), "identified.json"))
+        scene = SETTINGS.law_scene(pair.scene, pair.method)
+        own = Path(home(scene, "identified.json"))
         networks = material_prior(pair) == f"{own.parent}/priors/identified.safetensors"
-        jobs += [("identified_prior", {"scene": own.parent.name})] if networks else []
-        if networks or identified_law(pair) or identified_base(pair):
-            jobs += [("identify", {"scene": own.parent.name})]
-    jobs += [("material", {"scene": scene, "method": method}) for scene, method in trained]
+        identified, trained = networks or identified_law(pair) or identified_base(pair), trained_adaptor(pair)
+        laws += [("identified_prior", {"scene": own.parent.name})] if networks else []
+        laws += [("identify", {"scene": own.parent.name})] if identified else []
+        method = SETTINGS.method_training(pair.method)
+        laws += [("material", {"scene": scene, "method": method})] if trained else []
+        priors += [prior_file(pair.scene), material_prior(pair)]
+        videos += SETTINGS.video_scenes(scene) if identified or trained else []
+    judged = [pair.scene for pair in pairs]
+    priors += [prior_file(video) for video in videos]
+    files = [Path(file) for file in priors if file]
+    jobs += [("prior", {"prior": file.stem}) for file in files if file.parent == Path(RESULTS, "priors")]
+    for run in dict.fromkeys([*judged, *videos]):
+        scene, _ = SETTINGS.chain(run)
+        origins = {part: origin_of(part, scene) for part in ("static", "dynamic")}
+        if run in judged or "made" in origins.values():
+            truth = "ground_truth" if origin_of("truth", scene) == "made" else "unpack_truth"
+            jobs += [(truth, {"scene": scene})]
+        jobs += [(f"{makers[origin]}_{part}", {"scene": scene}) for part, origin in origins.items()]
+        makes = {rule: file for rule, file in MAKERS.items() if run in judged or rule != "tracers"}
+        jobs += [(rule, {"scene": Path(home(run, file)).parent.name}) for rule, file in makes.items()]
+    jobs += laws
     jobs += [("evaluation", vars(pair)) for pair in pairs]
     jobs += [("chamfer_table", {"table": table})]
     made = [(getattr(rules, name), wildcards) for name, wildcards in jobs]
