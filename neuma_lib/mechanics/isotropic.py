@@ -69,13 +69,22 @@ def _decomposed(ctx, F: Tensor, quotients: Quotients) -> tuple[Tensor, Tensor, T
     return parts
 
 
+def _stress(U: Tensor, y: Tensor) -> Tensor:
+    return (U * y[:, None]) @ U.mT
+
+
+def _deformation(F: Tensor, U: Tensor, sigma: Tensor, Vh: Tensor, y: Tensor) -> Tensor:
+    unchanged = (y == sigma).all(dim=1)
+    return torch.where(unchanged[:, None, None], F, (U * y[:, None]) @ Vh)
+
+
 class _Stress(torch.autograd.Function):
     """(F, y) -> U diag(y) U^T; the gradient to F is that of U at fixed y."""
 
     @staticmethod
     def forward(ctx, F, y, quotients):
         U, _, _ = _decomposed(ctx, F, quotients)
-        return (U * y[:, None]) @ U.mT
+        return _stress(U, y)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -93,9 +102,7 @@ class _Deformation(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, F, y, quotients):
-        U, sigma, Vh = _decomposed(ctx, F, quotients)
-        unchanged = (y == sigma).all(dim=1)
-        return torch.where(unchanged[:, None, None], F, (U * y[:, None]) @ Vh)
+        return _deformation(F, *_decomposed(ctx, F, quotients), y)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -121,12 +128,18 @@ def coaxial_deformation(F: Tensor, y: Tensor, quotients: Quotients) -> Tensor:
 
 def isotropic_stress(F: Tensor, function: PrincipalFunction) -> Tensor:
     """U diag(y(sigma)) U^T, (N, 3, 3), differentiable in F and in what ``function`` closes over."""
+    if not torch.is_grad_enabled():  # one decomposition instead of two
+        U, sigma, _ = svd3(F)
+        return _stress(U, function(sigma))
     _, sigma = rotation_and_singular_values(F) if F.requires_grad else (None, svd3(F)[1])
     return coaxial_stress(F, function(sigma), _moving_apart(function))
 
 
 def isotropic_deformation(F: Tensor, function: PrincipalFunction) -> Tensor:
     """U diag(y(sigma)) V^T, (N, 3, 3), differentiable likewise; exactly F where y(sigma) equals sigma."""
+    if not torch.is_grad_enabled():
+        parts = svd3(F)
+        return _deformation(F, *parts, function(parts[1]))
     _, sigma = rotation_and_singular_values(F) if F.requires_grad else (None, svd3(F)[1])
     return coaxial_deformation(F, function(sigma), _moving_apart(function))
 

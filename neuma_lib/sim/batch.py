@@ -9,7 +9,6 @@ import torch
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.mechanics.analytic_fused import fusible, side_by_side
 from neuma_lib.mechanics.law import Law
-from neuma_lib.sim.free_flight import free_flight_steps
 from neuma_lib.sim.model import Body, MPMModel
 from neuma_lib.sim.rollout import check_inside, checked_frames, fly_and_simulate
 from neuma_lib.sim.state import State, Trajectory
@@ -41,7 +40,7 @@ def rollout_batch(
         laws: B materials, each of all particles.
         start: N particles at the start, for all laws or one for each.
         steps, frames, total, scatter: as in `rollout`.
-        skip_free_flight: as in `rollout`, up to the first contact of any copy.
+        skip_free_flight: as in `rollout`, up to the first contact of any copy in the same launches.
         together: copies that share launches; None: `TOGETHER` of the device.
 
     Returns:
@@ -59,16 +58,13 @@ def rollout_batch(
         )
     for state in {id(state): state for state in starts}.values():
         check_inside(model, state.x)
-    first = frames[-1] if skip_free_flight else 0
-    for law, state in zip(laws, starts, strict=True):
-        first = free_flight_steps(model, [Body(law, 0, len(state.x))], state, first) if first else 0
-
     found: list[Trajectory | None] = [None] * len(laws)
     order = sorted(range(len(laws)), key=lambda copy: not fusible(laws[copy]))
     together = together or TOGETHER[starts[0].x.device.type]
     for copies in (order[i : i + together] for i in range(0, len(laws), together)):
         own = [laws[copy] for copy in copies], [starts[copy] for copy in copies]
-        for copy, path in zip(copies, _side_by_side(model, *own, frames, first, total, scatter), strict=True):
+        paths = _side_by_side(model, *own, frames, total, skip_free_flight, scatter)
+        for copy, path in zip(copies, paths, strict=True):
             found[copy] = path
     return found
 
@@ -78,8 +74,8 @@ def _side_by_side(
     laws: Sequence[Law],
     starts: Sequence[State],
     frames: tuple[int, ...],
-    first: int,
     total: bool,
+    skip_free_flight: bool,
     scatter: str | None,
 ) -> list[Trajectory | None]:
     """Laws in the same launches, those with kernels in front."""
@@ -91,7 +87,7 @@ def _side_by_side(
     state = State.joined(starts) if copies > 1 else starts[0]
     try:
         path, errors = fly_and_simulate(
-            model, tuple(bodies), state, frames, first, total=total, scatter=scatter, copies=copies
+            model, tuple(bodies), state, frames, None, total, skip_free_flight, scatter, copies
         )
     except NonFiniteError:
         return [None] * copies

@@ -16,41 +16,51 @@ from neuma_lib.sim.state import State, Trajectory
 _MARGIN = 1e-3  # distance from the zone of contact at which free flight ends [dx]
 
 
-def free_flight_steps(model: MPMModel, bodies: Sequence[Body], state: State, last: int) -> int:
-    """Number of leading steps, at most `last`, in which nothing but gravity acts and nothing can deform."""
+def free_flight_steps(
+    model: MPMModel, bodies: Sequence[Body], state: State, last: int, copies: int = 1
+) -> int:
+    """Number of leading steps, at most `last`, in which nothing but gravity acts and nothing can deform.
+
+    Of several copies (see `kernels`), each may have a velocity of its own; the first to touch ends it for all.
+    """
     x, v, F, C = state.x, state.v, state.F, state.C
     if torch.is_grad_enabled() and (v.ndim == 2 and v.requires_grad or F.requires_grad or C.requires_grad):
         return 0
     with torch.no_grad():
-        if v.ndim == 2 and not (v == v[0]).all():
+        v = v.expand_as(x).unflatten(0, (copies, -1))
+        if not (v == v[:, :1]).all():
             return 0
         if not (F == torch.eye(3, dtype=F.dtype, device=F.device)).all() or C.any():
             return 0
-        clear = _clear_of_walls(model, x, v if v.ndim == 1 else v[0], last)
-        if clear and not all(_at_rest(model, body, state) for body in bodies):
+        clear = _clear_of_walls(model, x.unflatten(0, (copies, -1)), v[:, :1], last)
+        if clear and not all(_at_rest(model, body, state, len(x) // copies) for body in bodies):
             return 0
     return clear
 
 
 def _clear_of_walls(model: MPMModel, x0: Tensor, v0: Tensor, last: int) -> int:
-    """Number of leading ballistic steps that start with all particles out of reach of the walls."""
-    box = torch.stack([x0.amin(dim=0), x0.amax(dim=0)]).double().cpu()
-    n = torch.arange(last, dtype=torch.float64)[:, None, None]
+    """Number of leading ballistic steps that start with all particles x0 (copies, N, 3) out of reach of the walls."""
+    box = torch.stack([x0.amin(dim=1), x0.amax(dim=1)], dim=1).double().cpu()
+    n = torch.arange(last, dtype=torch.float64)[:, None, None, None]
     gravity = torch.tensor(model.gravity, dtype=torch.float64)
     box = box + n * model.dt * v0.double().cpu() + model.dt**2 * n * (n + 1) / 2 * gravity
-    touching = contact_clearance(model, box) <= _MARGIN * model.dx
+    touching = (contact_clearance(model, box) <= _MARGIN * model.dx).any(dim=1)
     return int(touching.int().argmax()) if touching.any() else last
 
 
-def _at_rest(model: MPMModel, body: Body, state: State) -> bool:
-    """Whether the law leaves F = I as it is and without a stress that could be felt in a step."""
-    x0, mass, vol0 = state.x, state.mass, state.vol0
-    eye = torch.eye(3, dtype=x0.dtype, device=x0.device)[None]
+def _at_rest(model: MPMModel, body: Body, state: State, copy: int) -> bool:
+    """Whether the law leaves F = I as it is and without a stress that could be felt in a step.
+
+    A body of several copies, of ``copy`` particles each, has a law that may differ from copy to copy.
+    """
+    x0, firsts = state.x, slice(body.start, body.stop, copy)
+    mass, vol0 = state.mass[firsts], state.vol0[firsts]
+    eye = torch.eye(3, dtype=x0.dtype, device=x0.device).repeat(len(mass), 1, 1)
     elastic, plastic = law_weights(body.law, x0.dtype)
     tau = body.law.elasticity.evaluate(eye, elastic)
     F = body.law.plasticity.evaluate(eye, plastic)
     eps = torch.finfo(x0.dtype).eps
-    kick = float(tau.abs().max() * vol0[body.start] / mass[body.start]) * model.dt / model.dx
+    kick = float((tau.abs().amax(dim=(1, 2)) * vol0 / mass).max()) * model.dt / model.dx
     return kick <= eps and float((F - eye).abs().max()) <= 4 * eps
 
 

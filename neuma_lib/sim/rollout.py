@@ -70,9 +70,10 @@ def rollout(
     if tracers is not None and (tracers.ndim != 2 or tracers.shape[1] != 3 or tracers.dtype != state.x.dtype):
         raise InputError(f"tracers: give positions of shape (M, 3) as {state.x.dtype}")
 
-    first = free_flight_steps(model, bodies, state, frames[-1]) if skip_free_flight else 0
     plan = dict(memory=memory, cache_bytes=cache_bytes)
-    return fly_and_simulate(model, bodies, state, frames, first, tracers, total, scatter, **plan)[0]
+    return fly_and_simulate(model, bodies, state, frames, tracers, total, skip_free_flight, scatter, **plan)[
+        0
+    ]
 
 
 def fly_and_simulate(
@@ -80,19 +81,20 @@ def fly_and_simulate(
     bodies: tuple[Body, ...],
     state: State,
     frames: tuple[int, ...],
-    first: int,
     tracers: Tensor | None = None,
     total: bool = False,
+    skip_free_flight: bool = True,
     scatter: str | None = None,
     copies: int = 1,
     memory: float | None = None,
     cache_bytes: float | None = None,
 ) -> tuple[Trajectory, list[NonFiniteError | None]]:
-    """The body of `rollout`, with its arguments checked and `first` steps in free flight.
+    """The body of `rollout`, with its arguments checked.
 
     The state may hold several ``copies``, simulations of as many particles each. What is returned of one that
     diverges, to which the second result has an error, means nothing; that all do is raised.
     """
+    first = free_flight_steps(model, bodies, state, frames[-1], copies) if skip_free_flight else 0
     start = (*state.motion, state.F) if total else state.motion
     in_flight = sum(n < first for n in frames)
     parts, errors = [], [None] * copies
