@@ -236,6 +236,10 @@ class StructuredElasticity(StructuredConstitutive, Elasticity):
         self.kernel = form, kernels.Constants(base_number, (self.mu, self.lam, 0.0))
         self.freeze(_checked(weights, FORMS[form], seed))
 
+    def outputs(self, z: Tensor, weights: Weights) -> Tensor:
+        """What the network gives (N, k) for invariants z (N, 3)."""
+        return network(z, weights)
+
     def response(self, F: Tensor, weights: Weights) -> Tensor:
         _, sigma = rotation_and_singular_values(F)
         return coaxial_stress(F, *self.principal(sigma, weights))
@@ -246,7 +250,7 @@ class StructuredElasticity(StructuredConstitutive, Elasticity):
 
     def _stretch_form(self, sigma, weights):
         strain = sigma.clamp(min=STRETCH_MIN).log()
-        n0, n1, n2 = network(invariants(strain), weights).split(1, dim=1)
+        n0, n1, n2 = self.outputs(invariants(strain), weights).split(1, dim=1)
         shift = 3 * n2.expm1() / (n2.exp() + 3)
         shear = self._shear(sigma, strain, shift)
         mean = self.analytic.principal(sigma, self.mu, self.lam).mean(1, keepdim=True)
@@ -351,6 +355,10 @@ class StructuredPlasticity(StructuredConstitutive, Plasticity):
         self.kernel = "return", kernels.Constants(int(self.granular), tuple(map(float, constants)))
         self.freeze(_checked(weights, PLASTIC_OUTPUTS, seed))
 
+    def outputs(self, z: Tensor, weights: Weights) -> Tensor:
+        """What the network gives (N, k) for invariants z (N, 3)."""
+        return network(z, weights)
+
     def response(self, F: Tensor, weights: Weights) -> Tensor:
         _, sigma = rotation_and_singular_values(F)
         return coaxial_deformation(F, *self.principal(sigma, weights))
@@ -358,7 +366,7 @@ class StructuredPlasticity(StructuredConstitutive, Plasticity):
     def principal(self, sigma: Tensor, weights: Weights) -> tuple[Tensor, Quotients]:
         """Principal stretches (N, 3) after the return, sigma itself where nothing yields; their divided differences."""
         trace, deviator, norm = hencky_strain(sigma)
-        n0, n1, n2 = network(invariants(trace / 3 + deviator), weights).split(1, dim=1)
+        n0, n1, n2 = self.outputs(invariants(trace / 3 + deviator), weights).split(1, dim=1)
         threshold = _corrected(self.threshold, n0, COHESION_UNIT)
         friction = _corrected(self.friction, n1, 1.0)
         rate = _corrected(self.rate, n2, 1.0)

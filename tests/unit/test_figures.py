@@ -27,6 +27,7 @@ from neuma_lib.evaluation.figures import (
     ablation_gradients,
     ch_dist_curve,
     image_quality,
+    material_response,
 )
 from neuma_lib.evaluation.figures.lora_alphav import monotone_frames
 from neuma_lib.evaluation.material_point import Visited, largest_shear_stress, sheared, uniaxial, yielding
@@ -47,6 +48,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SETTINGS = yaml.safe_load((ROOT / "config/config.yaml").read_text())
 METHODS = [name for name in style.METHODS if name in SETTINGS["tables"]["table1"]["methods"]]
 TITLES = {method: f"NeuMA {method[6:]}" for method in METHODS}
+RESPONDING = ["nclaw", "neuma", "constants", "neuma_structured"]
 SCENES = ["BouncyBall", "JellyDuck", "RubberPawn", "ClayCat", "SandFish", "HoneyBottle"]
 
 
@@ -77,8 +79,17 @@ def cells(low: float, high: float, methods, scenes) -> dict:
 
 def response() -> dict:
     x = np.linspace(-0.2, 0.2, 9).tolist()
-    test = {"x": x, "stress": {law: curves(9) for law in ("truth", "nclaw", "neuma")}, "visited": [-0.1, 0.1]}
-    return {"uniaxial": test, "shear": test, "yield": {**test, "x": np.linspace(0, 0.6, 9).tolist()}}
+    band = {"x": x[::2], "low": [-1.0] * 5, "high": [1.0] * 5, "inside": 0.5}
+    laws = {
+        law: {"stress": curves(9), "band": band if law in ("constants", "neuma_structured") else None}
+        for law in RESPONDING
+    }
+    test = {"x": x, "visited": [-0.1, 0.1], "by_stress": False, "true": curves(9), "laws": laws}
+    return {
+        "uniaxial": test,
+        "shear": test,
+        "yield": {**test, "x": np.linspace(0, 0.6, 9).tolist(), "by_stress": True},
+    }
 
 
 DATA = {
@@ -161,7 +172,10 @@ DATA = {
         {"first": ["views", "Gaussians", "surface", "particles", "binding"], "heads": ["text"] * 5},
         row_titles=["I\ninitial\nstate", "II\nsimulation", "III\nrendering", "\nobservation", "\ndifference"],
     ),  # fmt: skip
-    "material_response": lambda: {scene: response() for scene in SCENES},
+    "material_response": lambda: {
+        "titles": {law: SETTINGS["methods"].get(law, {"title": law})["title"] for law in RESPONDING},
+        "scenes": {scene: response() for scene in SCENES},
+    },
     "random_scenes": lambda: {
         "titles": ["NCLaw", "NeuMA"],
         "families": {
@@ -288,6 +302,31 @@ def test_every_number_is_of_its_method_and_scene(tmp_path):
     assert choices["tracer_rmse_mm"]["neuma"] == {"A": 2.2, "B": 3.2}
     assert choices["psnr"]["nclaw"] == {"A": 4, "B": 5}
     assert len(said) == 3
+
+
+def test_responses_are_of_their_law_and_bands_of_all_chains(tmp_path):
+    def content(k):
+        test = {"x": [0, 1, 2], "visited": [0, 2], "by_stress": False, "true": [0, 1, 2], "stress": [k, k, k]}
+        band = {"x": [0, 2], "low": [-k, -k], "high": [k, k]}
+        return dict.fromkeys(material_response.TESTS, test if k < 2 else {**test, "band": band})
+
+    files = results(tmp_path, "response", content)
+    params = SimpleNamespace(
+        titles={"neuma": "NeuMA", "constants": "Constants"}, cells=[["A", "neuma", 2], ["A", "constants", 2]]
+    )
+    said = []
+    found = material_response.data(SimpleNamespace(responses=files), params, said.append)
+    laws = found["scenes"]["A"]["shear"]["laws"]
+    assert laws["neuma"]["stress"] == [0, 0, 0] and laws["constants"]["stress"] == [2, 2, 2]
+    assert (laws["neuma"]["band"]["low"], laws["neuma"]["band"]["high"]) == ([0, 0, 0], [1, 1, 1])
+    assert (laws["constants"]["band"]["low"], laws["constants"]["band"]["high"]) == ([-3, -3], [3, 3])
+    assert (
+        laws["neuma"]["band"]["inside"] == pytest.approx(2 / 3) and laws["constants"]["band"]["inside"] == 1
+    )
+    assert said[1] == "Constants: the truth is inside 3 of 3 bands everywhere"
+    alone = SimpleNamespace(titles={"neuma": "NeuMA"}, cells=[["A", "neuma", 1]])
+    found = material_response.data(SimpleNamespace(responses=files[:1]), alone, said.append)
+    assert found["scenes"]["A"]["yield"]["laws"]["neuma"]["band"] is None
 
 
 # ---- style

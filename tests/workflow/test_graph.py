@@ -10,7 +10,7 @@ SUPERVISED = "neuma_particle_supervision"  # the one method that trains on the t
 MAY_READ_THE_TRUTH = {
     *("render_static", "render_dynamic", "pack", "initial_state", "evaluation", "experiment"),
     *("tracers", "experiment_tracers"),
-    *("particles_app", "lora_alphav", "ext_time", "material_response"),
+    *("particles_app", "lora_alphav", "ext_time"),
 }
 
 

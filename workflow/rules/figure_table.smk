@@ -9,6 +9,13 @@ METHODS = [m for m in (COMPARED or SETTINGS).methods if SETTINGS.method_training
 NAMES = table_titles("table1") if COMPARED else {}
 TITLES = {method: NAMES.get(method) or SETTINGS.method_title(method) for method in METHODS}
 PREDICTED = ["nclaw", "neuma"]
+# Laws of tests of material points: those whose stresses are compared, in all their chains.
+RESPONDING = SETTINGS.tables.get("stress")
+RESPONSES = [
+    (scene, method, SETTINGS.runs("stress", method, scene))
+    for scene in (DRAWN.material_response if RESPONDING else ())
+    for method in RESPONDING.methods
+]
 SHOWN_EXPERIMENTS = [*DRAWN.letters, *DRAWN.meetings]
 
 
@@ -236,14 +243,10 @@ FIGURES = {
     },
     "material_response": {
         "kind": "json",
-        "input": {
-            **learned(DRAWN.material_response),
-            "truth": truths_of(DRAWN.material_response),
-        },
+        "input": {"responses": [f"{RESULTS}/{run}/response.json" for *_, runs in RESPONSES for run in runs]},
         "params": {
-            "scenes": scene_constants(DRAWN.material_response),
-            "rate": DRAWN.shear_rate,
-            "total_shear": DRAWN.total_shear,
+            "cells": [[scene, method, len(runs)] for scene, method, runs in RESPONSES],
+            "titles": {method: SETTINGS.method_title(method) for _, method, _ in RESPONSES},
         },
     },
     "ablation_gradients": {

@@ -40,6 +40,35 @@ rule stress:
         "../scripts/stress.py"
 
 
+rule response:
+    input:
+        kernels=kernels("laws"),
+        # that of the first chain: the tests of all chains have one axis
+        visited=checked(lambda wildcards: home(SETTINGS.chain(wildcards.scene)[0], "visited.h5")),
+        prior=material_prior,
+        adaptor=trained_adaptor,
+        identified=identified_law,
+        base=identified_base,
+        rollout=lambda wildcards: (
+            f"{RESULTS}/{wildcards.scene}/{wildcards.method}/rollout.h5"
+            if identified_base(wildcards)
+            else []
+        ),
+    output:
+        response=f"{RESULTS}/{{scene}}/{{method}}/response.json",
+    params:
+        dt=scene_setting("dt"),
+        truth=scene_setting("law"),
+        laws=lambda wildcards: [law for law in [true_law(wildcards)] if law],
+        rate=SETTINGS.figures.shear_rate,
+        total_shear=SETTINGS.figures.total_shear,
+        model_std=SETTINGS.identify.model_std,
+        spread=SETTINGS.identify.spread,
+        seed=SETTINGS.seed,
+    script:
+        "../scripts/response.py"
+
+
 rule stress_table:
     input:
         stress=lambda wildcards: table_files("stress", "stress.json"),

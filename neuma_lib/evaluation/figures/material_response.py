@@ -2,29 +2,27 @@
 the elastic law over the axial stretch, the sides free of traction. Middle: shear stress of the elastic law over simple
 shear, compressed to the 5th percentile of the observed volume ratios J. Bottom: the same shear at a constant rate of 20
 per second with elastic law and return map step by step, as in the simulation: where the curve bends, the material
-yields or flows. Blue: the range of elastic stretches, shears and shear stresses that the true motion of the video went
-through (99 % of them). Ranges are marginal: not every combination inside them was visited. The video determines motion,
-that is elastic law and return map together; where the two can trade places, each alone may differ from the truth. Not
-in the paper.
+yields or flows. Blue ground: the range of elastic stretches, shears and shear stresses that the true law goes through
+on the reconstruction (99 % of them). Ranges are marginal: not every combination inside them was visited. Coloured
+bands: 95 % of the laws that the video leaves possible, by the constants' covariance and, around a correction, a process
+that is as free as the correction where the video is silent; of laws without such an account, the range of their chains,
+if there are several. The video determines motion, that is elastic law and return map together; where the two can trade
+places, each alone may differ from the truth. Not in the paper.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import partial
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-import torch
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from neuma_lib.evaluation.material_point import Visited, largest_shear_stress, sheared, uniaxial, yielding
+from neuma_lib.evaluation.bands import envelope
 from neuma_lib.evaluation.plotting import style
-from neuma_lib.io.hdf5 import read_arrays
-from neuma_lib.io.laws import load_law
-from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.evaluation.response import inside
+from neuma_lib.io.files import read_json
 
-LAWS = {"truth": "true law", "nclaw": "prior", "neuma": "NeuMA"}
 TESTS = {
     "uniaxial": ("axial stretch", "axial stress"),
     "shear": ("elastic shear", "shear stress"),
@@ -32,69 +30,63 @@ TESTS = {
 }
 VISITED = "#d9e6ef"
 """Colour of the visited ranges."""
-BEYOND = 1.6
-"""How far the tests go beyond the visited range, relative to its distance from the undeformed state."""
-SMALLEST_STRETCH = 0.05
-POINTS = 121
-"""Points of a curve."""
-STATES = 300_000
-"""About the most states of the motion that are looked at."""
+HEADROOM = 0.6
+"""How far the curves of compared laws may go beyond those of the truth, relative to the truth's; then they are cut."""
 
 
 def data(inputs, params, say) -> dict:
-    """Of every scene the tests of `TESTS`: ``x``, ``stress`` [Pa] {law: values} and ``visited`` (low, high).
-
-    The last is a range of x, for the test of yielding of the stress.
+    """Titles of the laws; of every scene the tests of `TESTS`: ``x``, ``visited`` (low, high), ``by_stress``, ``true``
+    [Pa] and ``laws``: of each its ``stress`` [Pa], ``title``, and ``band``, if there is one, with ``x``, ``low``,
+    ``high``, and ``inside``, the part of its visited points at which the truth lies in it.
     """
-    found = {}
-    for k, (scene, setting) in enumerate(params.scenes.items()):
-        truth, _ = read_arrays(inputs.truth[k], required=("F",), only=("F",))
-        F = torch.from_numpy(truth["F"]).reshape(-1, 3, 3)
-        F = F[:: max(1, len(F) // STATES)]
-        dt = setting["dt"]
-        laws = {
-            "truth": analytic_law(setting["law"], dt=dt),
-            "nclaw": load_law(inputs.prior[k]),
-            "neuma": load_law(inputs.prior[k], inputs.adaptor[k]),
-        }
-        seen = Visited.of(F)
-        low, high = (1 + BEYOND * (end - 1) for end in seen.stretch)
-        stretch, shear = _axis(max(low, SMALLEST_STRETCH), high), _axis(*(BEYOND * s for s in seen.shear))
-        steps = round(params.total_shear / (params.rate * dt))
-        total = params.rate * dt * torch.arange(steps + 1, dtype=torch.float64)
-        yielded = partial(yielding, rate=params.rate, dt=dt, steps=steps, J=seen.pressed)
-        tests = {
-            "uniaxial": (stretch, partial(uniaxial, stretch=stretch), seen.stretch),
-            "shear": (shear, partial(sheared, shear=shear, J=seen.pressed), seen.shear),
-            "yield": (total, yielded, (0.0, largest_shear_stress(laws["truth"], F))),
-        }
-        found[scene] = {
-            test: {
-                "x": x.tolist(),
-                "stress": {name: stress(law).tolist() for name, law in laws.items()},
-                "visited": visited,
-            }
-            for test, (x, stress, visited) in tests.items()
-        }
-        low, high = seen.stretch
-        say(f"{scene}: stretches {low:.2f} to {high:.2f}, 5th percentile of J {seen.pressed:.3f}")
-    return found
+    files = iter(inputs.responses)
+    runs = [(*cell, [read_json(next(files)) for _ in range(chains)]) for *cell, chains in params.cells]
+    found: dict = {}
+    for scene, method, chains in runs:
+        for test in TESTS:
+            of_test = [chain[test] for chain in chains]
+            first = of_test[0]
+            shared = {key: first[key] for key in ("x", "visited", "by_stress", "true")}
+            entry = found.setdefault(scene, {}).setdefault(test, {**shared, "laws": {}})
+            entry["laws"][method] = {"stress": first["stress"], "band": _band(of_test)}
+    bands = [
+        (scene, method, law["band"]["inside"])
+        for scene, tests in found.items()
+        for test in tests.values()
+        for method, law in test["laws"].items()
+        if law["band"] and law["band"]["inside"] is not None
+    ]
+    for method in params.titles:
+        parts = [part for _, other, part in bands if other == method]
+        if parts:
+            whole = sum(part == 1 for part in parts)
+            say(f"{params.titles[method]}: the truth is inside {whole} of {len(parts)} bands everywhere")
+    return {"titles": params.titles, "scenes": found}
 
 
-def _axis(low: float, high: float) -> torch.Tensor:
-    return torch.linspace(low, high, POINTS, dtype=torch.float64)
+def _band(chains: Sequence[Mapping]) -> dict | None:
+    """The band of all chains of a law in a test; that of their curves where they have none."""
+    if all("band" in chain for chain in chains):
+        x, ends = chains[0]["band"]["x"], [(chain["band"]["low"], chain["band"]["high"]) for chain in chains]
+    elif len(chains) > 1:
+        x, ends = chains[0]["x"], [(chain["stress"], chain["stress"]) for chain in chains]
+    else:
+        return None
+    low, high = envelope(ends)
+    found = {"x": x, "low": low.tolist(), "high": high.tolist()}
+    return {**found, "inside": inside({**chains[0], "band": found})}
 
 
 @style.styled
 def draw(data: Mapping) -> Figure:
     """A column a scene and a row a test."""
-    scenes = list(data)
+    scenes = data["scenes"]
     figure = style.new_figure(style.PAGE if len(scenes) > 2 else style.COLUMN, 0.35 + 1.25 * len(TESTS))
     panels = figure.subplots(len(TESTS), len(scenes), squeeze=False)
-    for column, scene in zip(panels.T, scenes):
+    for column, (scene, tests) in zip(panels.T, scenes.items()):
         column[0].set_title(scene)
         for axes, test in zip(column, TESTS):
-            _curves(axes, test, data[scene][test])
+            _curves(axes, test, tests[test], data["titles"])
     for row, (xlabel, ylabel) in zip(panels, TESTS.values()):
         for axes in row:
             axes.set_xlabel(xlabel)
@@ -104,18 +96,25 @@ def draw(data: Mapping) -> Figure:
     return figure
 
 
-def _curves(axes, test: str, values: Mapping) -> None:
-    x = np.asarray(values["x"])
+def _curves(axes, test: str, values: Mapping, titles: Mapping[str, str]) -> None:
+    x, true = np.asarray(values["x"]), 1e-3 * np.asarray(values["true"])
     low, high = values["visited"]
-    span = axes.axhspan if test == "yield" else axes.axvspan
-    scale = 1e-3 if test == "yield" else 1.0
+    span = axes.axhspan if values["by_stress"] else axes.axvspan
+    scale = 1e-3 if values["by_stress"] else 1.0
     span(scale * low, scale * high, color=VISITED, linewidth=0, label="visited in the video")
-    for law, title in LAWS.items():
-        line = style.look(law).line | ({"color": style.GREY, "linewidth": 2.4} if law == "truth" else {})
-        axes.plot(x, 1e-3 * np.asarray(values["stress"][law]), **line, label=title)
-    shown = 1e-3 * np.concatenate(list(values["stress"].values()))
-    margin = 0.08 * (np.ptp(shown) or 1.0)
-    axes.set(xlim=(x.min(), x.max()), ylim=(shown.min() - margin, shown.max() + margin))
+    axes.plot(x, true, color=style.GREY, linewidth=2.4, label="true law")
+    shown = [true]
+    for law, entry in values["laws"].items():
+        line = style.look(law).line
+        if entry["band"]:
+            ends = [1e-3 * np.asarray(entry["band"][key]) for key in ("low", "high")]
+            axes.fill_between(entry["band"]["x"], *ends, color=line["color"], alpha=0.18, linewidth=0)
+        shown.append(1e-3 * np.asarray(entry["stress"]))
+        axes.plot(x, shown[-1], **line, label=titles[law])
+    room = HEADROOM * (np.ptp(true) or 1.0)
+    ends = max(np.min(shown), true.min() - room), min(np.max(shown), true.max() + room)
+    margin = 0.08 * (ends[1] - ends[0] or 1.0)
+    axes.set(xlim=(x.min(), x.max()), ylim=(ends[0] - margin, ends[1] + margin))
     axes.axhline(0, color=style.GREY, linewidth=0.4, zorder=0.5)
     axes.set_xticks(_ticks(test, x))
     axes.xaxis.set_major_formatter("{x:g}")

@@ -1,0 +1,103 @@
+"""Response of laws to tests of a material point, over the range of states that a motion went through."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuma_lib.evaluation.bands import band
+from neuma_lib.evaluation.material_point import Visited, largest_shear_stress, sheared, uniaxial, yielding
+from neuma_lib.mechanics.law import Law
+
+BEYOND = 1.6
+"""How far the tests go beyond the visited range, relative to its distance from the undeformed state."""
+SMALLEST_STRETCH = 0.05
+POINTS = 121
+"""Points of a curve."""
+EVERY = 5
+"""Points of a curve for one of its band."""
+
+
+@dataclass(frozen=True)
+class PointTest:
+    """A test of a material point.
+
+    Attributes:
+        x: what is prescribed, (P,).
+        curve: the stresses (P',) [Pa] of a law at some of these.
+        visited: range of x that was visited; of the stress [Pa], if ``by_stress``.
+    """
+
+    x: Tensor
+    curve: Callable[[Law, Tensor], Tensor]
+    visited: tuple[float, float]
+    by_stress: bool = False
+
+
+def material_tests(truth: Law, F: Tensor, rate: float, total_shear: float, dt: float) -> dict[str, PointTest]:
+    """Uniaxial stretch and shear of the elastic law, and shear at a constant rate with the return map.
+
+    Args:
+        truth: the true law, for the largest stress that was visited.
+        F: visited elastic deformation gradients (S, 3, 3).
+        rate: of the last test [1/s].
+        total_shear: at its end.
+        dt: time step [s].
+    """
+    seen = Visited.of(F)
+    low, high = (1 + BEYOND * (end - 1) for end in seen.stretch)
+    steps = round(total_shear / (rate * dt))
+    total = rate * dt * torch.arange(steps + 1, dtype=torch.float64)
+
+    def flow(law: Law, x: Tensor) -> Tensor:
+        return yielding(law, rate, dt, steps, seen.pressed)[torch.searchsorted(total, x)]
+
+    return {
+        "uniaxial": PointTest(_axis(max(low, SMALLEST_STRETCH), high), uniaxial, seen.stretch),
+        "shear": PointTest(
+            _axis(*(BEYOND * s for s in seen.shear)), partial(sheared, J=seen.pressed), seen.shear
+        ),
+        "yield": PointTest(total, flow, (0.0, largest_shear_stress(truth, F)), by_stress=True),
+    }
+
+
+def response(law: Law, truth: Law, test: PointTest, draws: Sequence[Law] = ()) -> dict[str, Any]:
+    """Curves of a law and of the true one in a test, and a band of laws, as plain numbers.
+
+    Returns:
+        ``x``, ``visited``, ``by_stress``, ``stress`` and ``true`` [Pa]; where there are draws, ``band`` with its own
+        ``x``, ``low`` and ``high``.
+    """
+    found: dict[str, Any] = {
+        "x": test.x.tolist(),
+        "visited": list(test.visited),
+        "by_stress": test.by_stress,
+        "stress": test.curve(law, test.x).tolist(),
+        "true": test.curve(truth, test.x).tolist(),
+    }
+    if draws:
+        x = test.x[::EVERY].contiguous()
+        low, high = band(draws, lambda law: test.curve(law, x))
+        found["band"] = {"x": x.tolist(), "low": low.tolist(), "high": high.tolist()}
+    return found
+
+
+def inside(found: Mapping[str, Any]) -> float | None:
+    """Part of the points of a band, within the visited range of its test, at which the true curve lies in it; None
+    where no point was visited."""
+    x, low, high = (np.array(found["band"][key]) for key in ("x", "low", "high"))
+    true = np.interp(x, found["x"], found["true"])
+    start, end = found["visited"]
+    where = true if found["by_stress"] else x
+    seen = (where >= start) & (where <= end)
+    return float(((low <= true) & (true <= high))[seen].mean()) if seen.any() else None
+
+
+def _axis(low: float, high: float) -> Tensor:
+    return torch.linspace(low, high, POINTS, dtype=torch.float64)
