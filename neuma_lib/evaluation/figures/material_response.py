@@ -92,7 +92,7 @@ def draw(data: Mapping) -> Figure:
             axes.set_xlabel(xlabel)
         row[0].set_ylabel(f"{ylabel} [kPa]")
     figure.align_ylabels(panels[:, 0])
-    style.legend_above(figure, panels[0, 0], 4)
+    style.legend_above(figure, panels[0, 0], 6 if len(scenes) > 2 else 2)
     return figure
 
 
