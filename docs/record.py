@@ -43,6 +43,10 @@ MADE_BY = {
     "initial_states": "tables figures",
     "timings": "tables figures",
     "learning_rates": "results/learning_rates.csv",
+    "yardstick": "results/yardstick.csv",
+    "stress": "results/stress.csv",
+    "letters": "results/letters.csv",
+    "views": "results/views.csv",
 }
 """Tables that are recorded, and the target of Snakemake that makes them."""
 VERDICT_HEAD = f"| {' | '.join(VERDICTS[:2])} |"

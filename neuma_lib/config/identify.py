@@ -18,7 +18,12 @@ class IdentifyConfig(Section):
         description="candidates by name. Every constant that is given is fitted, from there or from the scene's prior "
         "if that fits better; nu is kept between 0 and 0.5",
     )
-    views: tuple[int, ...] = Field((0,), min_length=1, description="views of the video that are used")
+    views: tuple[int, ...] = Field(
+        (0,),
+        min_length=1,
+        description="views of the video that are used; for a method that trains on "
+        "other views than material.views, such as neuma_structured+views=0,1, those",
+    )
     covariance_from: Literal["elastic", "total"] = Field(
         "total", description="deformation that stretches the Gaussians, as `material.covariance_from`"
     )

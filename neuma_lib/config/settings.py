@@ -270,6 +270,12 @@ class Config(Section):
         """Whether a method evaluates the analytic law that was identified in the video."""
         return self.methods[parse_method(method, self.methods)[0]].law == "identified"
 
+    def identified_views(self, scene: str, method: str) -> tuple[int, ...] | None:
+        """Views that a method's law is identified in, if it trains on others than methods do by default; None: those
+        of ``identify.views``."""
+        views = self.method_material(scene, method).views
+        return None if views in (self.material.views, self.identify.views) else views
+
     def is_structured(self, method: str) -> bool:
         """Whether a method's law is a structured correction of an analytic one."""
         base, _ = parse_method(self.method_training(method), self.methods)

@@ -206,6 +206,16 @@ class TestVariants:
         with pytest.raises(InputError, match="no prior 'snad'"):
             loaded.method_prior("BouncyBall", "neuma+prior=snad")
 
+    def test_it_is_identified_in_the_views_that_its_method_trains_on(self, raw, loaded):
+        assert loaded.identified_views("BouncyBall", "neuma_structured") is None
+        assert loaded.identified_views("BouncyBall", "neuma_structured+views=0,2") == (0, 2)
+        assert loaded.identified_views("BouncyBall", "constants+views=1") == (1,)
+        change = {"identify": {"views": [0, 1]}, "scenes": {"ClayCat": {"material": {"views": [1, 2]}}}}
+        own = settings.load(settings.merged(raw, change), ROOT)
+        assert own.identified_views("BouncyBall", "neuma_structured") is None, "those of identify.views"
+        assert own.identified_views("BouncyBall", "neuma_structured+views=0,1") is None, "the same"
+        assert own.identified_views("ClayCat", "constants") == (1, 2)
+
     def test_the_identified_law_is_a_prior_for_any_method(self, raw, loaded):
         assert loaded.method_prior("BouncyBall", "neuma+prior=identified") == "identified"
         assert loaded.method_prior("BouncyBall", "neuma_structured") == "identified"

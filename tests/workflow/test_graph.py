@@ -71,6 +71,25 @@ def test_a_structured_law_corrects_what_the_video_shows(project):
     assert "identify" not in {rule for rule, *_ in graph}
 
 
+def test_more_views_have_constants_of_their_own(project):
+    methods = [f"{SCENE}+seed=1/{method}+views=0,1/metrics.json" for method in ("neuma_structured", "constants")]
+    graph = jobs(project.run("--dry-run", *methods))
+    (found,) = [outputs for rule, _, outputs in graph if rule.startswith("identify")]
+    assert found == [f"{SCENE}+seed=1/identified+views=0,1.json"]
+    readers = [rule for rule, read, _ in graph if found[0] in read]
+    assert sorted(readers) == ["evaluation", "material"]
+
+
+def test_stresses_are_compared_in_the_states_of_their_chain_and_drawn_over_those_of_the_first(project):
+    target = [f"{SCENE}+seed=1/neuma_structured/{name}.json" for name in ("stress", "response")]
+    made = {outputs[0]: read for _, read, outputs in jobs(project.run("--dry-run", *target))}
+    stress, response = (made[file] for file in target)
+    assert f"{SCENE}+seed=1/visited.h5" in stress and f"{SCENE}/visited.h5" in response
+    assert f"{SCENE}+seed=1/identified.json" in response
+    assert f"{SCENE}+seed=1/neuma_structured/rollout.h5" in response
+    assert not any("/data/" in file and "kernels" not in file for read in (stress, response) for file in read)
+
+
 def test_networks_can_start_from_what_the_video_shows(project):
     graph = jobs(project.run("--dry-run", f"{SCENE}+seed=1/neuma+prior=identified/metrics.json"))
     made = {rule: (read, outputs) for rule, read, outputs in graph}

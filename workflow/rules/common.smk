@@ -1,6 +1,7 @@
 """Reads and checks the settings, and says what every rule shares. Nothing is computed here."""
 
 import os
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -69,6 +70,7 @@ wildcard_constraints:
     experiment=f"({'|'.join(SETTINGS.experiments) or 'none'})([+][^/]*)?",
     table="|".join(CHAMFER_TABLES) or "none",
     group="geometry|simulation|laws|rendering",
+    views="[0-9]+(,[0-9]+)*",
 
 
 def kernels(*groups):
@@ -104,7 +106,10 @@ def home(name, file):
     """The one path of a file of a scene or experiment in a chain."""
     base, seeds = SETTINGS.chain(name)
     if base in SETTINGS.scenes:
-        return f"{RESULTS}/{folder(base, seeds, DRAWN_IN[file])}/{file}"
+        drawn = DRAWN_IN[
+            re.sub("[+]views=[0-9,]+", "", file)
+        ]  # of identified+views=0,1.json, that of identified.json
+        return f"{RESULTS}/{folder(base, seeds, drawn)}/{file}"
     # Solids are filled with particles; where a scene's own object is among them, all that led to its start counts.
     rebuilt = any(body.shape is None for body in SETTINGS.experiments[base].bodies)
     drawn = DRAWN_IN["velocity.json"] if rebuilt else ["particles"]
@@ -296,9 +301,10 @@ def table_records(table):
         scene = SETTINGS.law_scene(pair.scene, pair.method)
         own = Path(home(scene, "identified.json"))
         networks = material_prior(pair) == f"{own.parent}/priors/identified.safetensors"
-        identified, trained = networks or identified_law(pair) or identified_base(pair), trained_adaptor(pair)
+        identified = identified_law(pair) or identified_base(pair) or (networks and own)
+        trained = trained_adaptor(pair)
         laws += [("identified_prior", {"scene": own.parent.name})] if networks else []
-        laws += [("identify", {"scene": own.parent.name})] if identified else []
+        laws += [identification(identified)] if identified else []
         method = SETTINGS.method_training(pair.method)
         laws += [("material", {"scene": scene, "method": method})] if trained else []
         priors += [prior_file(pair.scene), material_prior(pair)]
@@ -410,12 +416,37 @@ def stock_base(wildcards):
     return SETTINGS.method_base(wildcards.scene, wildcards.method)
 
 
+def identified_name(scene, method):
+    """The file of what was identified for a method: in the views of its training, if these are its own."""
+    views = SETTINGS.identified_views(scene, method)
+    return f"identified+views={','.join(map(str, views))}.json" if views else "identified.json"
+
+
+def identified_file(wildcards):
+    """The same of the scene that a method's law is from, in its chain."""
+    scene, method = wildcards.scene, wildcards.method
+    return home(SETTINGS.law_scene(scene, method), identified_name(scene, method))
+
+
+def identification(file):
+    """The job that makes such a file: its rule and its wildcards."""
+    scene, _, views = str(file).removeprefix(f"{RESULTS}/").removesuffix(".json").partition("/identified")
+    views = views.removeprefix("+views=")
+    return ("identify_views", {"scene": scene, "views": views}) if views else ("identify", {"scene": scene})
+
+
+def identify_settings(wildcards):
+    """Settings of an identification, in the views that its file names, if any."""
+    views = getattr(wildcards, "views", None)
+    return SETTINGS.identify.plain() | ({"views": [int(view) for view in views.split(",")]} if views else {})
+
+
 @checked
 def identified_base(wildcards):
     """The law that was identified in a scene's video, where this is what a structured method corrects."""
     if not SETTINGS.is_structured(wildcards.method) or stock_base(wildcards):
         return []
-    return home(SETTINGS.law_scene(wildcards.scene, wildcards.method), "identified.json")
+    return identified_file(wildcards)
 
 
 @checked
@@ -436,7 +467,7 @@ def identified_law(wildcards):
     """The law that was identified in a scene's video, where this is what a method evaluates."""
     if not SETTINGS.is_identified(wildcards.method):
         return []
-    return home(SETTINGS.law_scene(wildcards.scene, wildcards.method), "identified.json")
+    return identified_file(wildcards)
 
 
 @checked
@@ -480,7 +511,7 @@ def judged_carrier(wildcards):
 def start_name(wildcards):
     """The file that tells a method how bodies are thrown."""
     identified = material_settings(wildcards)["start"] == "identified"
-    return "identified.json" if identified else "velocity.json"
+    return identified_name(wildcards.scene, wildcards.method) if identified else "velocity.json"
 
 
 def start_file(wildcards):

@@ -14,11 +14,17 @@ rule identify:
     params:
         simulation=simulation_settings,
         densities=video_densities,
-        identify=SETTINGS.identify.plain(),
+        identify=identify_settings,
         stock=stock_law,
         device=SETTINGS.device,
     script:
         "../scripts/identify.py"
+
+
+# For methods that train on other views than the rest.
+use rule identify as identify_views with:
+    output:
+        identified=f"{RESULTS}/{{scene}}/identified+views={{views}}.json",
 
 
 rule identified_page:

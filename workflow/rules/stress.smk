@@ -48,6 +48,12 @@ rule response:
         prior=material_prior,
         adaptor=trained_adaptor,
         identified=identified_law,
+        base=identified_base,
+        rollout=lambda wildcards: (
+            f"{RESULTS}/{wildcards.scene}/{wildcards.method}/rollout.h5"
+            if identified_base(wildcards)
+            else []
+        ),
     output:
         response=f"{RESULTS}/{{scene}}/{{method}}/response.json",
     params:
