@@ -72,7 +72,9 @@ def test_a_structured_law_corrects_what_the_video_shows(project):
 
 
 def test_more_views_have_constants_of_their_own(project):
-    methods = [f"{SCENE}+seed=1/{method}+views=0,1/metrics.json" for method in ("neuma_structured", "constants")]
+    methods = [
+        f"{SCENE}+seed=1/{method}+views=0,1/metrics.json" for method in ("neuma_structured", "constants")
+    ]
     graph = jobs(project.run("--dry-run", *methods))
     (found,) = [outputs for rule, _, outputs in graph if rule.startswith("identify")]
     assert found == [f"{SCENE}+seed=1/identified+views=0,1.json"]

@@ -106,9 +106,7 @@ def home(name, file):
     """The one path of a file of a scene or experiment in a chain."""
     base, seeds = SETTINGS.chain(name)
     if base in SETTINGS.scenes:
-        drawn = DRAWN_IN[
-            re.sub("[+]views=[0-9,]+", "", file)
-        ]  # of identified+views=0,1.json, that of identified.json
+        drawn = DRAWN_IN[re.sub("[+]views=[0-9,]+", "", file)]
         return f"{RESULTS}/{folder(base, seeds, drawn)}/{file}"
     # Solids are filled with particles; where a scene's own object is among them, all that led to its start counts.
     rebuilt = any(body.shape is None for body in SETTINGS.experiments[base].bodies)
