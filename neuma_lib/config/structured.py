@@ -28,3 +28,8 @@ class StructuredConfig(Section):
         description="what a part of the law must gain to be corrected: the loss of the held-out frames falls by this "
         "part of itself",
     )
+    penalties: tuple[float, ...] = Field(
+        (),
+        description="weights of `material.penalty` that are tried beside it, each for as many steps as a trial: of "
+        "those that the held-out frames do as well with, the largest is taken",
+    )

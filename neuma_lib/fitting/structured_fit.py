@@ -4,6 +4,9 @@ A video need not tell anything that the constants leave open. So each choice of 
 it is trained on the first frames, for a few iterations, and judged by the last ones, which it has not seen, beside the
 law as it is. A part is corrected only if those frames gain enough; the parts that are chosen are trained anew, on all
 frames. The others stay as they are, exactly, and so does a law that nothing improves.
+
+How firmly the correction is held where the video is silent (`neuma_lib.fitting.deviation`) is chosen by the same
+frames: of the weights that are tried, the largest that they do as well with.
 """
 
 from __future__ import annotations
@@ -31,6 +34,8 @@ NOTHING = "nothing"
 """Name of the choice to correct no part."""
 PARTS = {"elastic": "elasticity", "plastic": "plasticity"}
 """Parts of a law by their short names."""
+AS_WELL = 0.01
+"""Part by which the held-out loss may exceed the least one, for a larger weight of the penalty."""
 LEAST_FRAMES = 4
 """Fewer frames cannot be fitted and judged by."""
 
@@ -54,13 +59,15 @@ class Choice:
 
     Attributes:
         parts: short names of the parts; empty if the law stays as it is.
-        trials: what was tried, by the names of the parts joined with " + ", beside `NOTHING`.
+        trials: what was tried, by the names of the parts joined with " + ", beside `NOTHING`; with a penalty, that too.
         held_out_frames: steps of the frames that judged, a tuple a video.
+        penalty: weight of the penalty on states that the video did not visit.
     """
 
     parts: tuple[str, ...]
     trials: dict[str, Trial]
     held_out_frames: tuple[tuple[int, ...], ...]
+    penalty: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, for JSON; a loss that is infinite is None."""
@@ -69,7 +76,8 @@ class Choice:
             for name, trial in self.trials.items()
         }
         held_out = [list(frames) for frames in self.held_out_frames]
-        return {"corrected_parts": list(self.parts), "trials": trials, "held_out_frames": held_out}
+        about = {"corrected_parts": list(self.parts), "penalty": self.penalty}
+        return {**about, "trials": trials, "held_out_frames": held_out}
 
     def summary(self) -> str:
         """One line for people."""
@@ -80,7 +88,8 @@ class Choice:
             if name != NOTHING
         ]
         chosen = " + ".join(self.parts) or NOTHING
-        return f"corrected: {chosen}; change of the held-out loss: {', '.join(gains)}"
+        held = f", penalty {self.penalty:g}" if self.penalty else ""
+        return f"corrected: {chosen}{held}; change of the held-out loss: {', '.join(gains)}"
 
 
 def train_structured(
@@ -123,7 +132,8 @@ def train_structured(
     uncorrected = copy.deepcopy(law.state_dict())
     kept = checkpoint.load() if checkpoint else None
     trials = {name: Trial(**found) for name, found in kept["trials"].items()} if kept else {}
-    total = len(choices) * brief.iterations + settings.iterations
+    weights = [weight for weight in structured.penalties if weight != settings.penalty]
+    total = (len(choices) + len(weights)) * brief.iterations + settings.iterations
 
     def train(parts: Iterable[str], videos: Sequence[Video], how: MaterialConfig, before: int):
         law.load_state_dict(uncorrected)
@@ -151,9 +161,20 @@ def train_structured(
             log(f"{name} corrected: {_compared(trials[name], trials[NOTHING])}")
     parts = _chosen(choices, trials, structured.margin)
     held_out = tuple(loss.frames[count:] for count, (_, loss) in zip(fitted, videos, strict=True))
-    choice = Choice(parts, trials, held_out)
+    choice = Choice(parts, trials, held_out, settings.penalty)
     if parts:
-        return train(parts, videos, settings, total - settings.iterations), choice
+        name = " + ".join(parts)
+        judged = {settings.penalty: trials[name].held_out_loss}
+        for k, weight in enumerate(weights, len(choices)):
+            held = f"{name}, penalty {weight:g}"
+            if held not in trials:
+                train(parts, first, brief.model_copy(update={"penalty": weight}), k * brief.iterations)
+                trials[held] = tried()
+                log(f"{held}: {_compared(trials[held], trials[NOTHING])}")
+            judged[weight] = trials[held].held_out_loss
+        choice.penalty = largest_as_good(judged)
+        how = settings.model_copy(update={"penalty": choice.penalty})
+        return train(parts, videos, how, total - settings.iterations), choice
     law.load_state_dict(uncorrected)
     value = _mean([_mean(_frame_losses(model, law, *video)) for video in videos])
     return TrainedMaterial(law, History(loss=[value], seconds=[0.0]), value, 0, stable=True), choice
@@ -167,6 +188,11 @@ def _chosen(choices: Iterable[tuple[str, ...]], trials: dict[str, Trial], margin
         return loss * (1 - margin) ** -len(parts)
 
     return min([(), *choices], key=score)
+
+
+def largest_as_good(losses: dict[float, float]) -> float:
+    """The largest weight whose held-out loss is the least one, or exceeds it by no more than `AS_WELL`."""
+    return max(w for w, loss in losses.items() if loss <= (1 + AS_WELL) * min(losses.values()))
 
 
 def _frame_losses(model: MPMModel, law: StructuredLaw, start: State, loss: TrajectoryLoss) -> list[float]:

@@ -10,7 +10,7 @@ from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.errors import InputError
 from neuma_lib.fitting.material import ParticleLoss, PixelLoss
-from neuma_lib.fitting.structured_fit import Trial, _chosen, train_structured
+from neuma_lib.fitting.structured_fit import AS_WELL, Trial, _chosen, largest_as_good, train_structured
 from neuma_lib.mechanics.structured import structured_law
 from neuma_lib.sim.rollout import rollout
 
@@ -112,6 +112,20 @@ def test_each_part_has_to_gain_the_margin():
     assert chosen(0.89, 0.85, 0.76) == ("elastic", "plastic")
     assert chosen(0.89, 0.85, float("inf")) == ("plastic",)
     assert chosen(1.0, 1.0, 1.0, margin=0.0) == ()
+
+
+def test_the_largest_penalty_that_held_out_frames_bear_is_taken(problem):
+    """A crushing weight leaves the law at its base, which these frames do not bear."""
+    said = []
+    structured = STRUCTURED.model_copy(update={"penalties": (1e-9, 1e9)})
+    spec = {"elasticity": FLOWS["elasticity"]}
+    trained, choice = fit(problem, spec, structured=structured, log=said.append)
+    assert set(choice.trials) == {"nothing", "elastic", "elastic, penalty 1e-09", "elastic, penalty 1e+09"}
+    assert choice.penalty == 1e-9 == choice.as_dict()["penalty"] and any("1e-09" in line for line in said)
+    free, held = (choice.trials[f"elastic{w}"].held_out_loss for w in ("", ", penalty 1e+09"))
+    assert held > (1 + AS_WELL) * free and trained.best_loss < trained.history.loss[0]
+    assert largest_as_good({0.0: 1.0, 0.1: 1 + AS_WELL / 2, 1.0: 1 + 2 * AS_WELL}) == 0.1
+    assert largest_as_good({0.0: 1.0, 0.1: 0.9, 1.0: float("inf")}) == 0.1
 
 
 def test_first_frames_of_a_loss_are_those_of_the_loss(problem):
