@@ -28,9 +28,11 @@ from neuma_lib.evaluation.metrics import tracer_errors
 from neuma_lib.evaluation.motion import predict
 from neuma_lib.fitting.identify import Identified, identify
 from neuma_lib.fitting.throw import Throw
+from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_observation
+from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_body
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import named_combinations, physical
@@ -49,6 +51,16 @@ def judge(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str, 
     chosen = IdentifyConfig(**merged(settings.identify.plain(), changes))
     files = (results / name for name in ("particles.h5", "binding.h5", "gaussians.ply"))
     body = load_body(*files, scene.density, gaussian_motion=chosen.gaussian_motion).to(torch.float32)
+    mesh = read_mesh(results / "mesh.ply")
+    finer = [
+        body.refilled(
+            torch.from_numpy(sample_volume(mesh, chosen.particles, seed)),
+            mesh.volume,
+            scene.density,
+            settings.binding,
+        )
+        for seed in range(1, 1 + (chosen.samplings if chosen.particles else 0))
+    ]
     video = load_observation(data / "dynamic/transforms.json", chosen.views).to(torch.float32)
     throw = Throw.of(read_json(results / "velocity.json"))
     simulation = settings.simulation.plain()
@@ -57,7 +69,7 @@ def judge(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str, 
     )
     stock = settings.priors.laws.get(scene.prior)
     before = _core_seconds()
-    found = identify(model, throw, body, video, chosen, stock.plain() if stock else None)
+    found = identify(model, throw, body, video, chosen, stock.plain() if stock else None, finer=[finer])
     seconds = _core_seconds() - before
     truth = scene.law.plain()
     row = {

@@ -31,6 +31,17 @@ class IdentifyConfig(Section):
         "affine", description="how Gaussians follow their particles, as `material.gaussian_motion`"
     )
     frames: int = Field(33, ge=4, description="most frames that are compared, spread evenly over the video")
+    particles: int = Field(
+        8000,
+        ge=0,
+        description="particles of the bodies that say what the coarseness of the reconstruction's changes; 0: ignored",
+    )
+    misplaced: float = Field(
+        1e-3,
+        ge=0,
+        description="expected constant shift [m] and relative enlargement of the rendered body, fitted along",
+    )
+    samplings: int = Field(2, ge=1, description="such bodies: their difference is a part of the uncertainty")
     held_out: float = Field(
         0.25, gt=0, lt=1, description="part of the frames, the last ones, that families are judged by"
     )

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
 
+from neuma_lib.config.binding import BindingConfig
 from neuma_lib.coupling.binding import Binding
+from neuma_lib.coupling.particle_binding import bind_two_pass
 from neuma_lib.coupling.particle_gs import ParticleGS
 from neuma_lib.mechanics.density import Density, density_at
 from neuma_lib.sim.state import State
@@ -43,6 +45,16 @@ class Reconstruction:
         vol0 = torch.full_like(gaussians.means[:, 0], volume / count)
         mass = vol0 * density_at(gaussians.means, density)
         return cls(gaussians.means, vol0, mass, gaussians, Binding.identity(count, gaussians.means))
+
+    def refilled(
+        self, x: Tensor, volume: float, density: Density, settings: BindingConfig | None = None
+    ) -> Reconstruction:
+        """The same Gaussians on other particles x (N', 3) [m], which share a volume [m^3] evenly."""
+        gaussians = self.gaussians
+        binding, x0, _, vol0 = bind_two_pass(gaussians.means, gaussians.covars(), x, volume, settings)
+        x0, vol0 = x0.to(self.x0), vol0.to(self.x0)
+        binding = binding.to(dtype=self.x0.dtype, device=self.x0.device)
+        return replace(self, x0=x0, vol0=vol0, mass=vol0 * density_at(x0, density), binding=binding)
 
     def state(
         self,

@@ -6,7 +6,9 @@ smaller ones in turn, they lead there from afar. Constants are unbounded logarit
 best of its own guess, the scene's prior and what simpler families have found; one that falls far behind is given up.
 
 How the body was thrown is known from the frames before contact, up to an uncertainty that the constants would take up.
-So the last round fits velocity and spin along, held by what is known of them.
+So the last round fits velocity and spin along, held by what is known of them, and a constant shift and enlargement of
+the rendered body, which would be taken for motion. And a body of few particles, each at random in its cell, moves as if
+its material were another: what many particles change in the images is added to those of the few.
 
 Families are fitted to the first frames and judged by the last ones, so that more constants do not win by themselves.
 One that explains the images no better than a simpler one is not followed to the end.
@@ -28,6 +30,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.coupling.particle_gs import ParticleGS
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.families import Family
@@ -38,11 +41,13 @@ from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import Values, named_combinations, physical
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import Trajectory
 from neuma_lib.splatting.observation import Observation
 
 _LAST_GAIN = 0.1  # of `least_gain`, in the last round
 _LEAST_LOSS = 1e-12  # below it, held-out images agree exactly
 _MOTION = 6  # unknowns of a throw: velocity and spin
+_NUISANCES = 9  # and of the rendered body: shift right and down, enlargement
 
 
 @dataclass
@@ -142,6 +147,7 @@ class Identified:
         fits: all candidates as they were judged, by name.
         frames: steps of the frames that were fitted, of each video.
         held_out: steps of the frames that were held out, of each video.
+        rollouts: simulations that it took, some of which families share.
     """
 
     best: FamilyFit
@@ -149,6 +155,7 @@ class Identified:
     fits: dict[str, FamilyFit]
     frames: list[tuple[int, ...]]
     held_out: list[tuple[int, ...]]
+    rollouts: int
     settings: IdentifyConfig = field(repr=False)
 
     def as_dict(self) -> dict[str, Any]:
@@ -166,7 +173,7 @@ class Identified:
             "families": {name: fit.as_dict(self.settings) for name, fit in self.fits.items()},
             **videos[0],
             **({"further_videos": videos[1:]} if videos[1:] else {}),
-            "rollouts": self.best.rollouts + sum(fit.rollouts for fit in self.fits.values()),
+            "rollouts": self.rollouts,
         }
 
     def summary(self) -> str:
@@ -191,6 +198,7 @@ def identify(
     settings: IdentifyConfig,
     stock: Mapping[str, Mapping[str, Any]] | None = None,
     *,
+    finer: Sequence[Sequence[Reconstruction]] = (),
     further: Sequence[tuple[Throw, Reconstruction, Observation]] = (),
     progress: Callable[[int, int, float], None] | None = None,
     log: Callable[[str], None] = lambda text: None,
@@ -204,6 +212,8 @@ def identify(
         observation: the video; its views are those of the settings.
         settings: candidates and hyper-parameters.
         stock: specification of the law that the scene's prior was trained on: another start; None if unknown.
+        finer: of each video, the same body filled anew with more particles, once or several times; none: what the
+            coarseness of the body changes is not corrected.
         further: throw, body and video of others of the same material.
         progress: called with (rounds done, rounds, mean squared residual).
         log: receives a line for every family.
@@ -219,7 +229,8 @@ def identify(
         raise InputError("identify.families names no candidate: give at least one elasticity with E and nu")
     families = [Family(name, law.plain()) for name, law in settings.families.items()]
     families.sort(key=lambda family: len(family.constants))  # simpler ones give starts to the others
-    videos = [_Video(model, *one, settings) for one in given]
+    fillings = finer or [()] * len(given)
+    videos = [_Video(model, *one, settings, own) for one, own in zip(given, fillings, strict=True)]
     for video in videos:
         video.weight = (videos[0].pixels / video.pixels) ** 0.5
     stock_values = _constants(stock) if stock else {}
@@ -234,7 +245,9 @@ def identify(
         _leave_behind(running, settings)
         following = sorted((run for run in running if run.alive), key=lambda run: run.fit.cost)
         if following and level == rounds - 1:
-            following[0].move_throws()
+            following[0].look_closer(derivatives=True)
+            for run in following:
+                run.forget()
         for done, run in enumerate(following):
             run.refine(level)
             if progress:
@@ -247,6 +260,7 @@ def identify(
         )
     chosen, ties = _choice(list(fits.values()), settings)
     run = next(run for run in running if run.family is chosen.family)
+    run.look_closer()
     final = _Run(run.family, videos, [len(video.frames) for video in videos], settings)
     final.begin([run.values], level=rounds - 1, deviations=run.deviations)
     return Identified(
@@ -255,6 +269,7 @@ def identify(
         fits,
         [video.frames[: video.fitted] for video in videos],
         [video.frames[video.fitted :] for video in videos],
+        sum(video.rollouts for video in videos),
         settings,
     )
 
@@ -303,7 +318,13 @@ def _constants(spec: Mapping[str, Mapping[str, Any]]) -> Values:
 
 @dataclass(frozen=True)
 class _Try:
-    """A law's specification, and how the throw deviates from what is known of it [standard deviations], shape (6,)."""
+    """What is simulated and rendered.
+
+    Attributes:
+        law: specification.
+        deviations: of the throw from what is known of it, along velocity and spin, in standard deviations; then of the
+            rendered body to the right, down and in size, in the setting ``misplaced``; shape (9,).
+    """
 
     law: Mapping[str, Mapping[str, Any]]
     deviations: np.ndarray
@@ -316,8 +337,11 @@ class _Video:
         frames: steps of the frames that are compared.
         fitted: the number of those that families are fitted to; the others judge them.
         weight: factor on all residuals.
-        by_motion: derivatives of the residuals of all frames with respect to the throw's deviations; None: not yet
-            known. All families share those of one that fits: they are mostly kinematics.
+        unsure: places of the deviations that are not known to be 0.
+        by_deviation: derivatives of the residuals of all frames with respect to the deviations; None: not taken yet.
+            All families share those of one that fits: they are mostly kinematics.
+        spread: how residuals of all frames differ between two fillings with many particles; None: not known.
+        rollouts: simulations so far.
     """
 
     def __init__(
@@ -327,42 +351,94 @@ class _Video:
         body: Reconstruction,
         video: Observation,
         settings: IdentifyConfig,
+        finer: Sequence[Reconstruction] = (),
     ):
         seen = video.select(spread_frames(len(video.frames), settings.frames))
         self.model, self.throw, self.frames, self.weight = model, throw, seen.frames, 1.0
         self.fitted = min(len(seen.frames) - 1, max(2, round((1 - settings.held_out) * len(seen.frames))))
         self.density = float((body.mass / body.vol0).min())
-        self.by_motion: list[Tensor] | None = None
-        self._body, self._total = body, settings.covariance_from == "total"
-        self._renderer = body.particle_gs(seen.cameras)
+        self.unsure = np.flatnonzero([*throw.std, *[settings.misplaced] * (_NUISANCES - _MOTION)]).tolist()
+        self.by_deviation: list[Tensor] | None = None
+        self.spread: Tensor | None = None
+        self.rollouts = 0
+        self._added: Tensor | None = None
+        self._misplaced = settings.misplaced
+        self._total, self._axes = settings.covariance_from == "total", seen.cameras.viewmats[0, :3, :3]
+        self._body, *self._finer = [(each, each.particle_gs(seen.cameras)) for each in (body, *finer)]
         width = seen.cameras.width
         sizes = [max(1, round(width / across)) for across in settings.squares]
         self.finest = sizes[-1]
         self.sizes = [max(1, round(size / self.finest)) for size in sizes]
         """Edge of each round's squares in squares of the finest ones."""
-        parts = frame_batches(len(seen.frames), self._renderer.frames_per_batch)
+        parts = frame_batches(len(seen.frames), self._body[1].frames_per_batch)
         self._observed = torch.cat([averaged(seen.colours(part), self.finest) for part in parts])
         self.pixels = self._observed.numel()
 
     def residuals(self, tries: Sequence[_Try], count: int) -> list[Tensor | None]:
         """Residuals (count, V, H', W', 3) of the first frames for each try; None where the rollout diverges."""
-        return [self._residual(one, count) for one in tries]
+        found = [self._residual(one, count, *self._body) for one in tries]
+        if self._added is None:
+            return found
+        return [None if residual is None else residual + self._added[:count] for residual in found]
 
-    def _residual(self, one: _Try, count: int) -> Tensor | None:
-        frames = self.frames[:count]
-        start = self.throw.moved(one.deviations).of_body(self._body)
-        law = analytic_law(one.law, self.model.dt).to(start.x.device)
+    def differentiate(self, here: _Try) -> None:
+        """Take the derivatives by the deviations there: forward differences, 0 where a rollout diverges."""
+        steps = np.eye(_NUISANCES)[self.unsure]
         try:
-            with torch.no_grad():
-                path = rollout(self.model, law, start, steps=frames[-1], frames=frames, total=self._total)
-                images = [
-                    averaged(self._renderer(path.x[part], path.stretch[part]), self.finest)
-                    for part in frame_batches(count, self._renderer.frames_per_batch)
-                ]
+            path = self._path(here, self.frames, self._body[0])
+        except NonFiniteError:
+            return  # it held for the frames that are fitted
+        base, *there = (
+            # What only moves the rendered body needs no rollout.
+            self._residual(one, len(self.frames), *self._body, path if k >= _MOTION else None)
+            for k, one in zip(
+                [_NUISANCES, *self.unsure],
+                [here, *(replace(here, deviations=here.deviations + step) for step in steps)],
+                strict=True,
+            )
+        )
+        self.by_deviation = [torch.zeros_like(base) if each is None else each - base for each in there]
+
+    def refine_particles(self, here: _Try) -> None:
+        """Add what more particles change in the images to all residuals from now on, and know how sure that is."""
+        if not self._finer:
+            return
+        count = len(self.frames)
+        coarse, *fine = (self._residual(here, count, *each) for each in (self._body, *self._finer))
+        fine = [residual for residual in fine if residual is not None]
+        if coarse is not None and fine:
+            self._added = torch.stack(fine).mean(0) - coarse
+            self.spread = fine[0] - fine[-1] if len(fine) > 1 else None
+
+    def _residual(
+        self,
+        one: _Try,
+        count: int,
+        body: Reconstruction,
+        renderer: ParticleGS,
+        path: Trajectory | None = None,
+    ) -> Tensor | None:
+        right, down, enlargement = (self._misplaced * one.deviations[_MOTION:]).tolist()
+        try:
+            path = path or self._path(one, self.frames[:count], body)
         except NonFiniteError:
             return None
+        images = []
+        for part in frame_batches(count, renderer.frames_per_batch):
+            centre = path.x[part].mean(dim=1, keepdim=True)
+            x = centre + (1 + enlargement) * (path.x[part] - centre)
+            x = x + right * self._axes[0] + down * self._axes[1]
+            with torch.no_grad():
+                images.append(averaged(renderer(x, (1 + enlargement) * path.stretch[part]), self.finest))
         residual = self.weight * (torch.cat(images) - self._observed[:count])
         return residual if bool(residual.isfinite().all()) else None
+
+    def _path(self, one: _Try, frames: tuple[int, ...], body: Reconstruction) -> Trajectory:
+        self.rollouts += 1
+        start = self.throw.moved(one.deviations[:_MOTION]).of_body(body)
+        law = analytic_law(one.law, self.model.dt).to(start.x.device)
+        with torch.no_grad():
+            return rollout(self.model, law, start, steps=frames[-1], frames=frames, total=self._total)
 
 
 def averaged(images: Tensor, size: int) -> Tensor:
@@ -390,7 +466,7 @@ class _Run:
         self.fit: Linearisation | None = None
         self._constants = len(family.constants)
         self._origin, self._level = np.zeros(0), 0
-        self._u = np.zeros(self._constants + _MOTION * len(videos))
+        self._u = np.zeros(self._constants + _NUISANCES * len(videos))
         self._images: dict[bytes, list[Tensor] | None] = {}
         self._columns: dict[bytes, list[list[Tensor]]] = {}
 
@@ -427,11 +503,11 @@ class _Run:
     def refine(self, level: int) -> None:
         """Go on with a round's squares."""
         self._level, last = level, level == len(self.settings.squares) - 1
-        moving = [k for v, video in enumerate(self.videos) if video.by_motion for k in self._moving(v)]
+        unsure = [k for v, video in enumerate(self.videos) if video.by_deviation for k in self._unsure(v)]
         self._u, self.fit, steps = levenberg_marquardt(
             self,
             self._u,
-            [*range(self._constants), *moving],
+            [*range(self._constants), *unsure],
             self._held,
             self.settings.least_gain * (_LAST_GAIN if last else 1.0),
             self.settings.iterations,
@@ -440,40 +516,42 @@ class _Run:
         self.steps += steps
         self.refined = last
 
-    def _motion(self, v: int) -> slice:
-        """Places of the unknowns of a video's throw."""
-        return slice(self._constants + v * _MOTION, self._constants + (v + 1) * _MOTION)
+    def _own(self, v: int) -> list[int]:
+        """Places of the deviations of a video."""
+        first = self._constants + v * _NUISANCES
+        return list(range(first, first + _NUISANCES))
 
-    def _moving(self, v: int) -> list[int]:
-        """Places of those that are not known."""
-        return (self._motion(v).start + np.flatnonzero(self.videos[v].throw.std)).tolist()
+    def _unsure(self, v: int) -> list[int]:
+        """Places of those that are not known to be 0."""
+        return [self._own(v)[k] for k in self.videos[v].unsure]
 
-    def move_throws(self) -> None:
-        """Forward differences of all frames by the deviations of the throws, for all families; 0 where one is known
-        or diverges."""
+    def look_closer(self, derivatives: bool = False) -> None:
+        """Let the videos learn what more particles change, and what the deviations do, where the fit stands."""
         law = self.family.law_spec(self.values)
         for v, video in enumerate(self.videos):
-            deviations, moving = self._u[self._motion(v)], np.flatnonzero(video.throw.std)
-            tries = [_Try(law, deviations), *(_Try(law, deviations + np.eye(_MOTION)[k]) for k in moving)]
-            self.rollouts += len(tries)
-            here, *there = video.residuals(tries, len(video.frames))
-            video.by_motion = [torch.zeros_like(here)] * _MOTION
-            for k, residual in zip(moving, there, strict=True):
-                if residual is not None:
-                    video.by_motion[k] = residual - here
+            here = _Try(law, self._u[self._own(v)])
+            if derivatives:
+                video.differentiate(here)
+            video.refine_particles(here)
+
+    def forget(self) -> None:
+        """Simulate again where the fit stands, because the videos add something else now."""
+        self._images = {}
 
     def judged(self) -> FamilyFit:
         """What was found, judged by the frames that were held out, if any."""
         found = FamilyFit(self.family, self.values, self.loss, refined=self.refined, steps=self.steps)
         if self.fit is not None and self.refined:
             k, P = self._constants, self._held(self.fit)
-            by_prior = np.linalg.pinv(self.fit.curvature + P) @ P * self._spreads
+            inverse = np.linalg.pinv(self.fit.curvature + P)
+            by_prior = inverse @ P * self._spreads
             covariance = jackknife(self.fit, P) + by_prior @ by_prior.T
+            for v, video in enumerate(self.videos):
+                if video.spread is not None:
+                    by_particles = inverse @ self._slope(v, video.spread)
+                    covariance += np.outer(by_particles, by_particles)
             found.covariance, stds = covariance[:k, :k], np.sqrt(np.diag(covariance))
-            moved = [video.throw.moved(self._u[self._motion(v)]) for v, video in enumerate(self.videos)]
-            found.throws = tuple(
-                replace(throw, std=throw.std * stds[self._motion(v)]) for v, throw in enumerate(moved)
-            )
+            found.throws = tuple(self._thrown(v, stds) for v in range(len(self.videos)))
             if any(count < len(video.frames) for count, video in zip(self.counts, self.videos, strict=True)):
                 found.held_out = self._held_out()
                 found.score = math.log(max(found.held_out, _LEAST_LOSS)) + self.settings.penalty * k
@@ -496,13 +574,10 @@ class _Run:
         if key not in self._columns:
             self._columns = {key: self._constant_columns(unknowns, residual)}
         curvatures, scores, k = [], [], len(unknowns)
-        for v, (video, r) in enumerate(zip(self.videos, self._seen(residual), strict=True)):
-            columns = dict(enumerate(column[v] for column in self._columns[key]))
-            columns |= zip(range(*self._motion(v).indices(k)), video.by_motion or (), strict=False)
+        for v, r in enumerate(self._seen(residual)):
+            columns = self._columns_of(v)
             own = [i for i in free if i in columns]
-            J = torch.stack(
-                [in_blocks(self._averaged(v, columns[i][: len(r)])) for i in own], dim=-1
-            ).double()
+            J = torch.stack([in_blocks(self._averaged(v, columns[i])) for i in own], dim=-1).double()
             blocks = in_blocks(r).double()
             curvatures.append(np.zeros((len(J), k, k)))
             scores.append(np.zeros((len(J), k)))
@@ -514,6 +589,24 @@ class _Run:
         return Linearisation(
             np.concatenate(curvatures), np.concatenate(scores), cost, math.sqrt(cost / count)
         )
+
+    def _columns_of(self, v: int) -> dict[int, Tensor]:
+        """Derivatives of a video's residuals by its unknowns, where the fit stands."""
+        (by_constants,) = self._columns.values()
+        own = zip(self._unsure(v), self.videos[v].by_deviation or (), strict=False)
+        return {k: column[: self.counts[v]] for k, column in (*enumerate(c[v] for c in by_constants), *own)}
+
+    def _slope(self, v: int, residual: Tensor) -> np.ndarray:
+        """J^T r of another residual of a video, shape (k,)."""
+        slope, seen = np.zeros(len(self._u)), self._averaged(v, residual[: self.counts[v]]).double()
+        for k, column in self._columns_of(v).items():
+            slope[k] = float((self._averaged(v, column) * seen).sum())
+        return slope
+
+    def _thrown(self, v: int, stds: np.ndarray) -> Throw:
+        """The fitted throw of a video; standard deviations of all unknowns are given."""
+        motion, throw = self._own(v)[:_MOTION], self.videos[v].throw
+        return replace(throw.moved(self._u[motion]), std=throw.std * stds[motion])
 
     def _constant_columns(self, unknowns: np.ndarray, residual: Sequence[Tensor]) -> list[list[Tensor]]:
         """Differences by the constants: forward, and backward where there is no forward: a divergence, or the stiffest
@@ -535,8 +628,8 @@ class _Run:
     @property
     def _spreads(self) -> np.ndarray:
         """Expected distance of the unknowns from 0."""
-        motion = np.ones(_MOTION * len(self.videos))
-        return np.append(np.full(self._constants, self.settings.spread), motion)
+        deviations = np.ones(_NUISANCES * len(self.videos))
+        return np.append(np.full(self._constants, self.settings.spread), deviations)
 
     def _held(self, fit: Linearisation) -> np.ndarray:
         """Curvature that holds every unknown at 0 +- its spread; blocks of all videos count as one residual each."""
@@ -562,9 +655,7 @@ class _Run:
         self.rollouts += len(points) * len(self.videos)
         laws = [self.family.law_spec(self._values(point)) for point in points]
         found = [
-            video.residuals(
-                [_Try(law, p[self._motion(v)]) for law, p in zip(laws, points, strict=True)], count
-            )
+            video.residuals([_Try(law, p[self._own(v)]) for law, p in zip(laws, points, strict=True)], count)
             for v, (video, count) in enumerate(zip(self.videos, counts or self.counts, strict=True))
         ]
         return [

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from grounding_scene import MODEL, ball, observe
+from grounding_scene import MODEL, RADIUS, ball, observe
 
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.laws import LawConfig
@@ -42,7 +42,7 @@ FLUID = law("hencky", "viscous_flow", viscosity=60)
 
 def settings(families: dict, **options) -> IdentifyConfig:
     families = {name: LawConfig(**spec) for name, spec in families.items()}
-    return IdentifyConfig(families=families, **{"squares": SQUARES, **options})
+    return IdentifyConfig(families=families, **{"squares": SQUARES, "misplaced": 0.0, **options})
 
 
 def pixel_noise(images: torch.Tensor) -> torch.Tensor:
@@ -134,6 +134,32 @@ def test_videos_count_alike_however_long():
     assert held_out[2] == pytest.approx((held_out[0] + held_out[1]) / 2, rel=0.02)
     losses = [one.fits["hencky"].loss for one in found]
     assert losses[2] == pytest.approx((losses[0] + losses[1]) / 2, rel=0.02)
+
+
+def test_what_many_particles_change_is_added_and_its_scatter_is_uncertainty():
+    """The video is of a body of many particles: identified with few alone, the constants are those of another body.
+    With other fillings of many beside them, they come nearer, and are less sure than if one filling told all."""
+    truth, families = law("hencky", E=3e4, nu=0.35), {"hencky": ELASTIC}
+    generator = torch.Generator().manual_seed(1)
+    few = ball(count=60)
+
+    def filled(count):
+        at = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+        radius = RADIUS * torch.rand(count, 1, generator=generator, dtype=torch.float64) ** (1 / 3)
+        x = torch.tensor([0.5, 0.3, 0.5]) + radius * at / at.norm(dim=1, keepdim=True)
+        return few.refilled(x, float(few.vol0.sum()), 1000.0)
+
+    many = filled(3000)
+    assert len(many.x0) >= 3000 and float(many.mass.sum()) == pytest.approx(float(few.mass.sum()))
+    seen, throw = observe(many, V0, FRAMES, truth), known(many)
+    options = settings(families, covariance_from="elastic")
+    found = [
+        identify(MODEL, throw, few, seen, options, finer=[finer] if finer else ()).best
+        for finer in ((), (filled(3000), filled(3000)))
+    ]
+    errors = [abs(math.log(fit.values["E"] / 3e4)) for fit in found]
+    assert errors[1] < errors[0] / 2
+    assert found[1].loss < found[0].loss / 2
 
 
 def test_a_throw_is_read_moved_and_written():

@@ -4,7 +4,8 @@
 rule identify:
     input:
         **{name: of_each_video(of_chain(file)) for name, file in BODY.items()},
-        kernels=kernels("laws", "rendering"),
+        kernels=kernels("geometry", "laws", "rendering"),
+        mesh=of_each_video(of_chain("mesh.ply")),
         transforms=of_each_video(of_scene("dynamic/transforms.json")),
         velocity=of_each_video(of_chain("velocity.json")),
     output:
@@ -14,7 +15,9 @@ rule identify:
     params:
         simulation=simulation_settings,
         densities=video_densities,
+binding=SETTINGS.binding.plain(),
         identify=identify_settings,
+        seed=seed_of("particles"),
         stock=stock_law,
         device=SETTINGS.device,
     script:

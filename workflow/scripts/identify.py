@@ -2,12 +2,15 @@
 
 import torch
 
+from neuma_lib.config.binding import BindingConfig
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.device import choose_device
 from neuma_lib.fitting.identify import identify
 from neuma_lib.fitting.throw import Throw
+from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.images import load_observation
+from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_body
 from neuma_lib.sim.model import MPMModel
 from workflow.inputs import listed
@@ -15,7 +18,7 @@ from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
-    settings = IdentifyConfig(**params.identify)
+    settings, binding = IdentifyConfig(**params.identify), BindingConfig(**params.binding)
     device = choose_device(params.device)
     names = ("particles", "binding", "gaussians", "velocity", "transforms")
     videos = [
@@ -28,11 +31,23 @@ def main(inputs, output, params, run) -> None:
             *(listed(inputs[name]) for name in names), params.densities, strict=True
         )
     ]
+    seeds = range(params.seed + 1, params.seed + 1 + (settings.samplings if settings.particles else 0))
+    meshes = [read_mesh(file) for file in listed(inputs.mesh)]
+    finer = [
+        [
+            body.refilled(
+                torch.from_numpy(sample_volume(mesh, settings.particles, seed)), mesh.volume, density, binding
+            )
+            for seed in seeds
+        ]
+        for (_, body, _), mesh, density in zip(videos, meshes, params.densities, strict=True)
+    ]
     found = identify(
         MPMModel(**params.simulation),
         *videos[0],
         settings,
         params.stock,
+        finer=finer,
         further=videos[1:],
         progress=run.progress,
         log=run.say,
