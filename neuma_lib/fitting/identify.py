@@ -39,8 +39,8 @@ from neuma_lib.fitting.least_squares import Linearisation, in_blocks, jackknife,
 from neuma_lib.fitting.throw import Throw
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import Values, named_combinations, physical
+from neuma_lib.sim.batch import rollout_batch
 from neuma_lib.sim.model import MPMModel
-from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import Trajectory
 from neuma_lib.splatting.observation import Observation
 
@@ -240,6 +240,10 @@ def identify(
         run = _Run(family, videos, [video.fitted for video in videos], settings)
         run.begin([family.with_guesses(values) for values in ({}, stock_values, *_found(running, family))])
         running.append(run)
+    best = min((run for run in running if run.alive), key=lambda run: run.fit.cost, default=None)
+    for run in running[: running.index(best)] if best else ():  # those behind it have begun from it
+        if run.alive:
+            run.reconsider(run.family.with_guesses({**run.values, **best.values}))
     total = rounds * len(families)
     for level in range(1, rounds):
         _leave_behind(running, settings)
@@ -376,69 +380,61 @@ class _Video:
 
     def residuals(self, tries: Sequence[_Try], count: int) -> list[Tensor | None]:
         """Residuals (count, V, H', W', 3) of the first frames for each try; None where the rollout diverges."""
-        found = [self._residual(one, count, *self._body) for one in tries]
+        paths = self._paths(tries, self.frames[:count], self._body[0])
+        found = [self._residual(one, path, self._body[1]) for one, path in zip(tries, paths, strict=True)]
         if self._added is None:
             return found
         return [None if residual is None else residual + self._added[:count] for residual in found]
 
     def differentiate(self, here: _Try) -> None:
         """Take the derivatives by the deviations there: forward differences, 0 where a rollout diverges."""
-        steps = np.eye(_NUISANCES)[self.unsure]
-        try:
-            path = self._path(here, self.frames, self._body[0])
-        except NonFiniteError:
-            return  # it held for the frames that are fitted
+        moved = [replace(here, deviations=here.deviations + step) for step in np.eye(_NUISANCES)[self.unsure]]
+        flown = [here, *(one for one, k in zip(moved, self.unsure, strict=True) if k < _MOTION)]
+        paths = self._paths(flown, self.frames, self._body[0])
+        paths += [paths[0]] * (
+            1 + len(moved) - len(flown)
+        )  # what only moves the rendered body needs no rollout
         base, *there = (
-            # What only moves the rendered body needs no rollout.
-            self._residual(one, len(self.frames), *self._body, path if k >= _MOTION else None)
-            for k, one in zip(
-                [_NUISANCES, *self.unsure],
-                [here, *(replace(here, deviations=here.deviations + step) for step in steps)],
-                strict=True,
-            )
+            self._residual(one, path, self._body[1]) for one, path in zip([here, *moved], paths, strict=True)
         )
-        self.by_deviation = [torch.zeros_like(base) if each is None else each - base for each in there]
+        if base is not None:  # it held for the frames that are fitted
+            self.by_deviation = [torch.zeros_like(base) if each is None else each - base for each in there]
 
     def refine_particles(self, here: _Try) -> None:
         """Add what more particles change in the images to all residuals from now on, and know how sure that is."""
         if not self._finer:
             return
-        count = len(self.frames)
-        coarse, *fine = (self._residual(here, count, *each) for each in (self._body, *self._finer))
+        coarse, *fine = (
+            self._residual(here, self._paths([here], self.frames, body)[0], renderer)
+            for body, renderer in (self._body, *self._finer)
+        )
         fine = [residual for residual in fine if residual is not None]
         if coarse is not None and fine:
             self._added = torch.stack(fine).mean(0) - coarse
             self.spread = fine[0] - fine[-1] if len(fine) > 1 else None
 
-    def _residual(
-        self,
-        one: _Try,
-        count: int,
-        body: Reconstruction,
-        renderer: ParticleGS,
-        path: Trajectory | None = None,
-    ) -> Tensor | None:
-        right, down, enlargement = (self._misplaced * one.deviations[_MOTION:]).tolist()
-        try:
-            path = path or self._path(one, self.frames[:count], body)
-        except NonFiniteError:
+    def _paths(
+        self, tries: Sequence[_Try], frames: tuple[int, ...], body: Reconstruction
+    ) -> list[Trajectory | None]:
+        self.rollouts += len(tries)
+        starts = [self.throw.moved(one.deviations[:_MOTION]).of_body(body) for one in tries]
+        laws = [analytic_law(one.law, self.model.dt).to(starts[0].x.device) for one in tries]
+        options = dict(steps=frames[-1], frames=frames, total=self._total)
+        return rollout_batch(self.model, laws, starts, **options)
+
+    @torch.no_grad()
+    def _residual(self, one: _Try, path: Trajectory | None, renderer: ParticleGS) -> Tensor | None:
+        if path is None:
             return None
+        right, down, enlargement = (self._misplaced * one.deviations[_MOTION:]).tolist()
         images = []
-        for part in frame_batches(count, renderer.frames_per_batch):
+        for part in frame_batches(len(path.x), renderer.frames_per_batch):
             centre = path.x[part].mean(dim=1, keepdim=True)
             x = centre + (1 + enlargement) * (path.x[part] - centre)
             x = x + right * self._axes[0] + down * self._axes[1]
-            with torch.no_grad():
-                images.append(averaged(renderer(x, (1 + enlargement) * path.stretch[part]), self.finest))
-        residual = self.weight * (torch.cat(images) - self._observed[:count])
+            images.append(averaged(renderer(x, (1 + enlargement) * path.stretch[part]), self.finest))
+        residual = self.weight * (torch.cat(images) - self._observed[: len(path.x)])
         return residual if bool(residual.isfinite().all()) else None
-
-    def _path(self, one: _Try, frames: tuple[int, ...], body: Reconstruction) -> Trajectory:
-        self.rollouts += 1
-        start = self.throw.moved(one.deviations[:_MOTION]).of_body(body)
-        law = analytic_law(one.law, self.model.dt).to(start.x.device)
-        with torch.no_grad():
-            return rollout(self.model, law, start, steps=frames[-1], frames=frames, total=self._total)
 
 
 def averaged(images: Tensor, size: int) -> Tensor:
@@ -487,18 +483,24 @@ class _Run:
         """Fit from the best of some starts, in a round."""
         self._level = level
         tried = {tuple(values.values()): values for values in starts}
-        best, here = math.inf, self._u.copy()
+        origins = [self.family.unbounded(values) for values in tried.values()]
         if deviations is not None:
-            here[self._constants :] = deviations
-        for values in tried.values():
-            self._origin = self.family.unbounded(values)
-            (residual,) = self._simulate([here])
-            if residual is not None and (cost := self._cost(residual)) < best:
-                best, origin, self._images = cost, self._origin, {here.tobytes(): residual}
-        self._u, self.alive = here, math.isfinite(best)
+            self._u[self._constants :] = deviations
+        self._origin, deviations = origins[0], self._u[self._constants :]
+        found = self._simulate([np.append(origin - self._origin, deviations) for origin in origins])
+        costs = [math.inf if residual is None else self._cost(residual) for residual in found]
+        best = int(np.argmin(costs))
+        self.alive = math.isfinite(costs[best])
         if self.alive:
-            self._origin = origin
+            self._origin, self._images = origins[best], {self._u.tobytes(): found[best]}
             self.refine(level)
+
+    def reconsider(self, values: Values) -> None:
+        """Go on from constants that another family has found, if they suit this one better than its own."""
+        there = np.append(self.family.unbounded(values) - self._origin, self._u[self._constants :])
+        if self.cost(there) < self.fit.cost:
+            self._u = there
+            self.refine(self._level)
 
     def refine(self, level: int) -> None:
         """Go on with a round's squares."""
