@@ -15,7 +15,7 @@ rule identify:
     params:
         simulation=simulation_settings,
         densities=video_densities,
-binding=SETTINGS.binding.plain(),
+        binding=SETTINGS.binding.plain(),
         identify=identify_settings,
         seed=seed_of("particles"),
         stock=stock_law,
