@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
+from neuma_lib.sim.gather import gather_function
 from neuma_lib.sim.kernels import grid_functions, warp_types
 from neuma_lib.sim.scatter import scatter_functions
 
@@ -26,7 +27,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
     run_of, deposit = vars(scatter_functions(dtype, scatter, 3)).values()
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
     base_node, copy_of, from_base = functions.base_node, functions.copy_of, functions.from_base
-    weights, slopes = functions.weights, functions.slopes
+    weights, slopes, gather = functions.weights, functions.slopes, gather_function(dtype)
     column, offsets, wall_mask = functions.column, functions.offsets, functions.wall_mask
     moved_mask = functions.moved_mask
     module = f"neuma_lib.sim.adjoint_{str(dtype).removeprefix('torch.')}_{scatter}"
@@ -150,24 +151,20 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         q0 = m * v[now, p] - A * f
         q_i = vec4(q0[0], q0[1], q0[2], m)
         step_k = vec3(real(0.0), real(1.0), real(2.0))
-        total, G_i, G_j, G_k = vec4(), vec4(), vec4(), vec4()  # sum w g, columns of sum w g d^T / dx
+        # rows: sum w g, then the columns of G = sum w g d^T / dx
+        S = gather(grad_grid_rows, side, (plane * c.n + bj) * c.n + bk, c.n, wi, wj, wk, wd_i, wd_j, wd_k)
         moving = vec3()  # sum (g_i . q_i) N'_i
         for i in range(3):
             q_ij = q_i
             for j in range(3):
                 nodes = grad_grid_rows[side, ((plane + i) * c.n + bj + j) * c.n + bk]
-                along_k = wk * nodes
-                total += (wi[i] * wj[j]) * along_k
-                G_i += (wd_i[i] * wj[j]) * along_k
-                G_j += (wi[i] * wd_j[j]) * along_k
-                G_k += (wi[i] * wj[j]) * (wd_k * nodes)
                 gq = nodes * q_ij + wp.cw_mul(step_k, nodes * column(A, 2))
                 gq_w, gq_s = wp.dot(gq, wk), wp.dot(gq, sk)
                 moving += vec3(si[i] * wj[j] * gq_w, wi[i] * sj[j] * gq_w, wi[i] * wj[j] * gq_s)
                 q_ij += column(A, 1)
             q_i += column(A, 0)
-        g = vec3(total[0], total[1], total[2])
-        g_A = c.dx * mat33(G_i[0], G_j[0], G_k[0], G_i[1], G_j[1], G_k[1], G_i[2], G_j[2], G_k[2])
+        g = vec3(S[0, 0], S[0, 1], S[0, 2])
+        g_A = c.dx * mat33(S[1, 0], S[2, 0], S[3, 0], S[1, 1], S[2, 1], S[3, 1], S[1, 2], S[2, 2], S[3, 2])
         grad_v[p] = m * g
         grad_C[p] = m * g_A
         grad_tau[p] = -stress * g_A

@@ -30,7 +30,7 @@ def rollout_batch(
     scatter: str | None = None,
     together: int | None = None,
 ) -> list[Trajectory | None]:
-    """As `rollout` for each of several laws, without gradient, to round-off; faster, on a GPU by far.
+    """As `rollout` for each of several laws, to round-off, without gradient and in fewer launches.
 
     Analytic laws that have kernels (`analytic_fused`) are evaluated in one launch, whatever their kinds and constants;
     of other laws only the transfers are shared.

@@ -25,6 +25,7 @@ import torch
 import warp as wp
 
 from neuma_lib.device import start_warp
+from neuma_lib.sim.gather import gather_function
 from neuma_lib.sim.scatter import scatter_functions
 
 start_warp()
@@ -178,7 +179,7 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
     run_of, deposit = vars(scatter_functions(dtype, scatter, 4)).values()
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
     base_node, copy_of, from_base = functions.base_node, functions.copy_of, functions.from_base
-    weights, offsets = functions.weights, functions.offsets
+    weights, offsets, gather = functions.weights, functions.offsets, gather_function(dtype)
     column, wall_mask, moved = functions.column, functions.wall_mask, functions.moved
     module = f"neuma_lib.sim.forward_{str(dtype).removeprefix('torch.')}_{scatter}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
@@ -271,18 +272,11 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         wd_i = wp.cw_mul(wi, offsets(f[0]))
         wd_j = wp.cw_mul(wj, offsets(f[1]))
         wd_k = wp.cw_mul(wk, offsets(f[2]))
-        total, B_i, B_j, B_k = vec4(), vec4(), vec4(), vec4()  # sum w v, columns of sum w v d^T / dx
-        for i in range(3):
-            for j in range(3):
-                nodes = grid_v_rows[cached, ((plane + i) * c.n + bj + j) * c.n + bk]
-                along_k = wk * nodes
-                total += (wi[i] * wj[j]) * along_k
-                B_i += (wd_i[i] * wj[j]) * along_k
-                B_j += (wi[i] * wd_j[j]) * along_k
-                B_k += (wi[i] * wj[j]) * (wd_k * nodes)
-        v_new = vec3(total[0], total[1], total[2])
+        # rows: sum w v, then the columns of B = sum w v d^T / dx
+        S = gather(grid_v_rows, cached, (plane * c.n + bj) * c.n + bk, c.n, wi, wj, wk, wd_i, wd_j, wd_k)
+        v_new = vec3(S[0, 0], S[0, 1], S[0, 2])
         C_new = (real(4.0) * c.inv_dx) * mat33(
-            B_i[0], B_j[0], B_k[0], B_i[1], B_j[1], B_k[1], B_i[2], B_j[2], B_k[2]
+            S[1, 0], S[2, 0], S[3, 0], S[1, 1], S[2, 1], S[3, 1], S[1, 2], S[2, 2], S[3, 2]
         )
         x_new = moved(c, xp, v_new)
         x[after, p] = x_new

@@ -1,0 +1,34 @@
+// Text of the function of gather.py. REAL is the scalar type.
+//// gather
+    typedef REAL Real;
+    // A node is one vector register on a CPU, where the compiler would otherwise take its numbers one by one.
+#if defined(__CUDA_ARCH__)
+    struct alignas(16) Node { Real c[4]; };
+    #define EACH for (int a = 0; a < 4; ++a)
+    #define OF(x) (x).c[a]
+#else
+    typedef Real Node __attribute__((vector_size(4 * sizeof(Real)), aligned(sizeof(Real))));
+    #define EACH
+    #define OF(x) (x)
+#endif
+    const char* place = (const char*)rows.data + (size_t)index * rows.strides[0] + (size_t)row * rows.strides[1];
+    const Node* first = (const Node*)place;
+    Node sums[4] = {}, along, across;
+    #pragma unroll
+    for (int i = 0; i < 3; ++i)
+        #pragma unroll
+        for (int j = 0; j < 3; ++j) {
+            const Node* node = first + (i * n + j) * n;
+            EACH OF(along) = OF(node[0]) * wk[0] + OF(node[1]) * wk[1] + OF(node[2]) * wk[2];
+            EACH OF(across) = OF(node[0]) * wd_k[0] + OF(node[1]) * wd_k[1] + OF(node[2]) * wd_k[2];
+            EACH OF(sums[0]) = OF(sums[0]) + OF(along) * (wi[i] * wj[j]);
+            EACH OF(sums[1]) = OF(sums[1]) + OF(along) * (wd_i[i] * wj[j]);
+            EACH OF(sums[2]) = OF(sums[2]) + OF(along) * (wi[i] * wd_j[j]);
+            EACH OF(sums[3]) = OF(sums[3]) + OF(across) * (wi[i] * wj[j]);
+        }
+    wp::mat_t<4, 4, Real> result;
+    for (int s = 0; s < 4; ++s)
+        for (int k = 0; k < 4; ++k) result.data[s][k] = ((const Real*)&sums[s])[k];
+    return result;
+#undef EACH
+#undef OF
