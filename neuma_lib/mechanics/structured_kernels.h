@@ -20,11 +20,14 @@
     const Pack one = zero + Real(1);
 #if defined(__CUDA_ARCH__)
     #define UNROLL _Pragma("unroll")
+    // Weights are read again: else all of them are kept in registers, from layer to layer and from tile to tile.
+    #define READ_AGAIN asm volatile("" : : : "memory");
     auto exponential = [](const Pack& x) { return Real(exp(x)); };
     auto logarithm = [](const Pack& x) { return Real(log(x)); };
     auto any = [](bool mask) { return mask; };
 #else
     #define UNROLL
+    #define READ_AGAIN
     typedef INTEGER Bits __attribute__((vector_size(CPU_WIDTH * sizeof(Real))));
     const int MANTISSA = sizeof(Real) == 4 ? 23 : 52, BIAS = sizeof(Real) == 4 ? 127 : 1023;
     // 1.5 2^MANTISSA: adding it rounds to an integer, which the last bits of the sum then hold
@@ -91,6 +94,7 @@
     auto layer = [&](const Real* W, const auto& x, auto& y, Real bias) {
         const int N = sizeof(x) / sizeof(x[0]), M = sizeof(y) / sizeof(y[0]), PART = M < 8 ? M : 8;
         UNROLL for (int start = 0; start < M; start += PART) {
+            READ_AGAIN
             Pack sum[PART];
             UNROLL for (int o = 0; o < PART; ++o) sum[o] = zero + bias * W[(start + o) * (N + 1) + N];
             UNROLL for (int i = 0; i < N; ++i)
@@ -102,6 +106,7 @@
     auto layer_back = [](const Real* W, const auto& y, auto& x) {
         const int N = sizeof(x) / sizeof(x[0]), M = sizeof(y) / sizeof(y[0]), PART = N < 8 ? N : 8;
         UNROLL for (int start = 0; start < N; start += PART) {
+            READ_AGAIN
             Pack sum[PART];
             UNROLL for (int i = 0; i < PART; ++i) sum[i] = y[0] * W[start + i];
             UNROLL for (int o = 1; o < M; ++o)
@@ -701,6 +706,7 @@
 
 //// end
     #undef UNROLL
+    #undef READ_AGAIN
 
 // A kernel of its own, on a GPU: a block of LANES times GROUPS threads adds a column a lane of partials (summands, WEIGHTS).
 //// add
