@@ -15,6 +15,7 @@ from neuma_lib.fitting.velocity import estimate_velocity
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.neural import neural_law
+from neuma_lib.mechanics.structured import FORMS, structured_law
 from neuma_lib.sim.model import Body
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
@@ -24,6 +25,10 @@ from neuma_lib.splatting.observation import Observation
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
 STEPS, FRAMES = 50, (0, 10, 25, 50)
+STRUCTURED = {
+    "elasticity": {"name": "hencky", "E": 3e4, "nu": 0.3},
+    "plasticity": {"name": "von_mises", "yield_stress": 1e3},
+}
 
 
 def throw(law, device, dtype):
@@ -45,12 +50,21 @@ def relative(a, b):
     return float((a - b).norm() / b.norm())
 
 
-@pytest.fixture(scope="module", params=["analytic", "neural"])
+def with_network(name, dtype=torch.float64):
+    """A law with an untrained adaptor: a neural one, or a structured one in either form."""
+    if name == "neural":
+        law = make_law("neural", dtype)
+    else:
+        law = structured_law({**STRUCTURED, "form": name}).to(dtype)
+    law.attach_adaptor(rank=4, seed=1)
+    return law
+
+
+@pytest.fixture(scope="module", params=["analytic", "neural", *FORMS])
 def law(request):
     if request.param == "analytic":
         return analytic_law(TRUTH, MODEL.dt)
-    law = make_law("neural")
-    law.attach_adaptor(rank=4, seed=1)
+    law = with_network(request.param)
     with torch.no_grad():
         for p in law.parameters():
             if p.requires_grad:
@@ -74,13 +88,11 @@ def test_float32_stays_as_near_to_float64_as_the_cpu_does(law):
     assert gpu < 5 * cpu and cpu < 5 * gpu
 
 
-@pytest.fixture(scope="module")
-def drop():
-    """A ball in contact: arguments of a rollout on the GPU in float32, and a neural law with an adaptor."""
+@pytest.fixture(scope="module", params=["neural", *FORMS])
+def drop(request):
+    """A ball in contact: arguments of a rollout on the GPU in float32, and a law with an adaptor."""
     body = ball(height=0.2, dtype=torch.float32).to(torch.float32, "cuda")
-    law = make_law("neural", torch.float32)
-    law.attach_adaptor(rank=4, seed=1)
-    law = law.to("cuda")
+    law = with_network(request.param, torch.float32).to("cuda")
     v0 = torch.tensor([0.3, -2.0, 0.1], device="cuda")
     return law, (MODEL, law, body.state(v0))
 

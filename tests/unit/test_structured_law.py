@@ -270,6 +270,123 @@ def test_work_in_closed_cycles(base, form):
     assert form == "energy" or gained > 1e-3  # the test can tell the forms apart
 
 
+def tangent(part, sigma, weights):
+    """Principal stresses (N, 3), and d y_i / d log sigma_j (N, 3, 3)."""
+    sigma = sigma.clone().requires_grad_()
+    y, _ = part.principal(sigma, weights)
+    slopes = [torch.autograd.grad(y[:, i].sum(), sigma, retain_graph=True)[0] for i in range(3)]
+    return y.detach(), torch.stack(slopes, 1) * sigma.detach()[:, None]
+
+
+def acoustic_minimum(part, sigma, weights, spared=0.0, directions=100):
+    """Least m . dtau n - (m . n)(m . tau n) of dF = (m n^T) F over unit m and n (half a sphere of them), (N,) [Pa];
+    ``spared`` (m . n)^2 is taken away.
+
+    That is m n^T : (dP) F^T; positive: strongly elliptic, waves in all directions and no jump of F. In the axes of the
+    stress dtau_ij = (y_i - y_j) / (b_i - b_j) (b_j L_ij + b_i L_ji) off the diagonal, with b = sigma^2, L = m n^T.
+    """
+    k = torch.arange(directions, dtype=torch.float64) + 0.5
+    height, angle = 1 - k / directions, math.pi * (1 + 5**0.5) * k
+    n = torch.stack([(1 - height**2).sqrt() * angle.cos(), (1 - height**2).sqrt() * angle.sin(), height], 1)
+    y, D = tangent(part, sigma, weights)
+    b = sigma**2
+    eye = torch.eye(3, dtype=torch.bool)
+    apart = torch.where(eye, 1.0, b[:, :, None] - b[:, None])
+    shear = torch.where(eye, 0.0, (y[:, :, None] - y[:, None]) / apart)
+    Q = torch.einsum("sij,di,dj->sdij", D + shear * b[:, :, None] - y[:, :, None], n, n)
+    Q = Q + torch.diag_embed(torch.einsum("sij,sj,dj->sdi", shear, b, n**2))
+    Q = 0.5 * (Q + Q.mT) - spared * torch.einsum("di,dj->dij", n, n)
+    return torch.linalg.eigvalsh(Q)[..., 0].amin(1)
+
+
+def strains(radius, count=150):
+    """(count, 3) principal logarithmic strains e with |e| up to a radius, evenly in volume."""
+    generator = torch.Generator().manual_seed(6)
+    e = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    size = torch.rand(count, 1, generator=generator, dtype=torch.float64) ** (1 / 3)
+    return radius * size * e / e.norm(dim=1, keepdim=True)
+
+
+def network_of_size(part, size, seed):
+    """Weights as after some training: the first layers as at the start, the last one random of a given size."""
+    *hidden, last = (w.double() for w in structured_law(specification(), seed=seed).elasticity.base)
+    generator = torch.Generator().manual_seed(seed)
+    return *hidden, size * torch.randn(part.base[2].shape, generator=generator, dtype=last.dtype)
+
+
+ELLIPTIC_RADIUS = 0.3
+# (largest |n|, margin): for constants changed by outputs n so far from zero, the acoustic tensor, half of its bulk term
+# taken away, is at least margin mu exp(n1) up to ELLIPTIC_RADIUS
+MARGINS = {"hencky": (3.0, 0.5), "neo_hookean": (1.0, 0.4), "fixed_corotated": (1.0, 0.25)}
+BULK = LAM + 2 * MU / 3
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_elliptic_with_other_constants(base):
+    """The stretch form with constant outputs n: strongly elliptic up to |e| = 0.3, for `hencky` whatever they are."""
+    part = elasticity(base, "stretch")
+    largest, margin = MARGINS[base]
+    sigma = strains(ELLIPTIC_RADIUS).exp()
+    for signs in torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)] * 3):
+        n = 0.999 * largest * signs
+        weights = tuple(torch.zeros(w.shape, dtype=torch.float64) for w in part.base)
+        weights[2][:, -1] = n / (1 - (n / 3) ** 2).sqrt()
+        least = acoustic_minimum(part, sigma, weights, spared=0.5 * BULK * math.exp(n[0]))
+        assert float(least.min()) > margin * MU * math.exp(n[1])
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_elliptic_where_the_correction_changes_slowly(base):
+    """For any weights: strongly elliptic up to |e| = 0.3 where d n / d e is small against 1 / |e|.
+
+    The acoustic tensor is that of constant n and, with a_i = m_i n_i, |a| <= 1, p' = exp(n0) p, mu' = mu exp(n1) and
+    K' = K exp(n0),  p' (m . n)(dn0 . a) + 2 mu' ((dev f . a)(dn1 . a) + (d dev f / dk . a)(dk . a)). The first is at
+    least -K' (m . n)^2 / 2 - (p' dn0)^2 / (2 K'), and half of the bulk term is to spare.
+    """
+    part = elasticity(base, "stretch")
+    largest, margin = MARGINS[base]
+    e = strains(ELLIPTIC_RADIUS)
+    sigma = e.exp()
+    held, lost = 0, 0
+    for seed in range(3):
+        for size in (0.05, 0.2, 1.0):
+            weights = network_of_size(part, size, seed)
+            z = e.clone().requires_grad_()
+            n = network(invariants(z), weights)
+            slopes = [
+                torch.autograd.grad(n[:, i].sum(), z, retain_graph=True)[0].norm(dim=1) for i in range(3)
+            ]
+            n0, n1, n2 = n.detach().unbind(1)
+            shift = (3 * n2.expm1() / (n2.exp() + 3))[:, None]
+            dk = 12 * n2.exp() / (n2.exp() + 3) ** 2 * slopes[2]
+
+            def deviator(shift):
+                shear = part._shear(sigma, e, shift)
+                return shear - shear.mean(1, keepdim=True)
+
+            twist = (deviator(shift + 1e-6) - deviator(shift - 1e-6)).norm(dim=1) / 2e-6
+            pressure = part.analytic.principal(sigma, MU, LAM).mean(1)
+            bulk, mu = BULK * n0.exp(), MU * n1.exp()
+            loss = (n0.exp() * pressure * slopes[0]) ** 2 / (2 * bulk)
+            loss = loss + 2 * mu * (deviator(shift).norm(dim=1) * slopes[1] + twist * dk)
+            slow = (loss < margin * mu) & (n.detach().abs() <= largest).all(1)
+            least = acoustic_minimum(part, sigma, weights)
+            assert bool((least[slow] > 0).all())
+            held += int(slow.sum())
+            lost += int((least <= 0).sum())
+    assert held > 150 and lost > 50  # both happen with these weights
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_a_moderate_correction_is_elliptic_in_the_visited_range(base):
+    """Last layers of size 0.05 change moduli by up to 1.4 times; the stretch form keeps its waves up to |e| = 0.3."""
+    part = elasticity(base, "stretch")
+    e = strains(ELLIPTIC_RADIUS)
+    for seed in range(4):
+        weights = network_of_size(part, 0.05, seed)
+        assert float(acoustic_minimum(part, e.exp(), weights).min()) > 0.2 * MU
+
+
 # ---------------------------------------------------------------------------------------------- adjoints
 
 
