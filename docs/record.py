@@ -17,12 +17,13 @@ import re
 import shutil
 import subprocess
 from itertools import takewhile
+from math import nan
 from pathlib import Path
 from statistics import mean, median
 
 from PIL import Image
 
-from neuma_lib.evaluation.figures import image_quality, lora_alphav
+from neuma_lib.evaluation.figures import image_quality, lora_alphav, material_response
 from neuma_lib.evaluation.paper import PAPER
 from neuma_lib.evaluation.plotting.image_grid import load_image_grid
 from neuma_lib.evaluation.reports import as_markdown
@@ -157,6 +158,22 @@ def figure_numbers(folder: Path) -> str:
             f"contact (`lora_alphav`): {', '.join(counts)}.",
             "",
         ]
+    if (folder / "material_response.json").exists():
+        responses = read_json(folder / "material_response.json")
+        rows = [
+            [
+                responses["titles"][method],
+                *(f"{100 * mean(parts.get(s, [nan])):.0f} %" for s in responses["scenes"]),
+            ]
+            for method, parts in material_response.covered(responses).items()
+        ]
+        if rows:
+            about = (
+                "Part of the visited points of response curves at which the truth lies in a law's 95 % band "
+                "or, where it has none, in the range of its chains"
+            )
+            parts += [f"{about} (`material_response`):", ""]
+            parts += [*as_markdown(["Method", *responses["scenes"]], rows, numbers=True), ""]
     return "\n".join(parts)
 
 

@@ -41,6 +41,11 @@ def project(tmp_path):
     write_json(
         figures / "gradient_analysis.json", {"A": {"norms": norms, "change": change, "wrong": "elastic"}}
     )
+    laws = {"constants": {"band": {"inside": 0.5}}, "neuma": {"band": None}}
+    tests = {"uniaxial": {"laws": laws}, "shear": {"laws": {"constants": {"band": {"inside": 1.0}}}}}
+    write_json(
+        figures / "material_response.json", {"titles": {"constants": "Constants"}, "scenes": {"A": tests}}
+    )
     heights = [[1.0, 0.9, 0.5], [1.0, 0.9, 0.6], [1.0, 0.9, 0.4], [1.0, 0.0, 0.0]]
     grid = ImageGrid(
         np.zeros((1, 1, 2, 2, 3), np.uint8),
@@ -78,6 +83,7 @@ def test_pages_are_filled_from_tables_and_figures(project, monkeypatch):
     assert "Made by `snakemake tables figures` and `python -m docs.record`." in readme
     assert "| NeuMA | 0.5 | 0.5 | 0.5 | 0.5 |" in page and "Training saw the views of B." in page
     assert "| A | elastic | 2 | 0.5 | 6.8 % | 1.1 % |" in page
+    assert "| Method | A |\n|---|---:|\n| Constants | 75 % |" in page
     # Heights part in the last frame only, and there 0.6 is no step from 0.5 to 0.4.
     assert "0 of 1 (A)" in page
     assert recorded(project, monkeypatch) == (readme, page)

@@ -49,19 +49,23 @@ def data(inputs, params, say) -> dict:
             shared = {key: first[key] for key in ("x", "visited", "by_stress", "true")}
             entry = found.setdefault(scene, {}).setdefault(test, {**shared, "laws": {}})
             entry["laws"][method] = {"stress": first["stress"], "band": _band(of_test)}
-    bands = [
-        (scene, method, law["band"]["inside"])
-        for scene, tests in found.items()
-        for test in tests.values()
-        for method, law in test["laws"].items()
-        if law["band"] and law["band"]["inside"] is not None
-    ]
-    for method in params.titles:
-        parts = [part for _, other, part in bands if other == method]
-        if parts:
-            whole = sum(part == 1 for part in parts)
-            say(f"{params.titles[method]}: the truth is inside {whole} of {len(parts)} bands everywhere")
-    return {"titles": params.titles, "scenes": found}
+    gathered = {"titles": params.titles, "scenes": found}
+    for method, parts in covered(gathered).items():
+        whole = sum(part == 1 for values in parts.values() for part in values)
+        total = sum(map(len, parts.values()))
+        say(f"{params.titles[method]}: the truth is inside {whole} of {total} bands everywhere")
+    return gathered
+
+
+def covered(data: Mapping) -> dict[str, dict[str, list[float]]]:
+    """Of each law with bands and each scene, the parts of visited points of its tests at which the truth is inside."""
+    found: dict[str, dict[str, list[float]]] = {}
+    for scene, tests in data["scenes"].items():
+        for test in tests.values():
+            for method, law in test["laws"].items():
+                if law["band"] and law["band"]["inside"] is not None:
+                    found.setdefault(method, {}).setdefault(scene, []).append(law["band"]["inside"])
+    return found
 
 
 def _band(chains: Sequence[Mapping]) -> dict | None:
