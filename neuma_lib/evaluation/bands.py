@@ -11,7 +11,8 @@ the elastic strain. Deviations g_a(z) of the n_a are drawn from a Gaussian proce
   of them are the bound of the correction, whatever it was trained to; and a constant with the standard deviation that
   `identify` gives to unbounded constants (`identify.spread`).
 - The video: its information on constant factors of the moduli, the inverse A of their covariance, is spread over the
-  states that it shows as they occur, so that deviations cost <g^T A g> / 2.
+  states that it shows, so that deviations cost <g^T A g> / 2. A state counts by its squared strain, since a modulus
+  that is wrong by some factor is felt in proportion to the stress.
 
 So a band is about as wide as that of the constants where the video has shown most, wider in seldom states, and as wide
 as the correction is free where the video is silent. The process is one of random features (Rahimi and Recht 2007), so
@@ -55,6 +56,8 @@ SILENT = LIMIT / 2
 """Standard deviation of a log-modulus's deviation where the video is silent."""
 FEATURES = 150
 """Random features of the Gaussian process."""
+STATES = 20_000
+"""About the most states of a motion that are looked at."""
 _DIFFERENCE = 1e-4  # of an unbounded constant
 Output = tuple[str, int]
 """Part of a law and number of an output of its network."""
@@ -111,8 +114,11 @@ def corrected_draws(
         raise InputError(f"bands are drawn of structured laws of the form stretch, not {law.elasticity.form}")
     generator = np.random.default_rng(seed)
     field = RandomField(generator.standard_normal((FEATURES, INVARIANTS)), generator.uniform(size=FEATURES))
-    _, sigma = rotation_and_singular_values(visited.reshape(-1, 3, 3).double())
-    shown = field(invariants(sigma.clamp(min=STRETCH_MIN).log())).numpy()
+    states = visited.reshape(-1, 3, 3)
+    _, sigma = rotation_and_singular_values(states[:: max(1, len(states) // STATES)].double())
+    strain = sigma.clamp(min=STRETCH_MIN).log()
+    felt = strain.square().sum(1, keepdim=True)
+    shown = (field(invariants(strain)) * (felt / felt.mean()).sqrt()).numpy()
     outputs, covariance = _log_moduli(fit, dt, model_std)
     prior = np.append(np.full(FEATURES, SILENT), spread)
     posterior = field_covariance(shown, np.linalg.inv(covariance), prior)
@@ -144,7 +150,7 @@ def field_covariance(features: np.ndarray, information: np.ndarray, prior: np.nd
     """Posterior covariance (a f, a f) of weights w_a of log-moduli's deviations g_a = w_a . h.
 
     Args:
-        features: h at states as they occur, shape (N, f).
+        features: h at states, scaled by the roots of their weights, whose mean is 1, shape (N, f).
         information: of the video on constant deviations (a,), shape (a, a).
         prior: standard deviations of weights, shape (f,).
     """
