@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
 from neuma_lib.config import settings
@@ -16,8 +17,11 @@ from neuma_lib.config.random_scenes import DENSITY, FLAWS, SHAPES, draw_scenes
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.random_scenes import RandomScene, failure, random_table
 from neuma_lib.geometry import shapes
+from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State
 
 ROOT = Path(__file__).resolve().parents[2]
 GRAVITY = (0.0, -9.8, 0.0)
@@ -99,6 +103,23 @@ def test_materials_outside_the_families_are_drawn_when_asked_for(loaded):
             law = analytic_law(scene["law"], dt=scene["dt"])
             assert MPMModel(grid=24, dt=scene["dt"]).courant(law, DENSITY) <= 0.6 * (1 + 1e-3)
     assert not {*random.families} & {*random.outside}
+
+
+@pytest.mark.slow
+def test_draws_outside_the_families_are_strained_and_stay_finite(loaded):
+    """Each of six draws on a coarse grid: no rollout breaks, and half of the particles are deformed by a tenth."""
+    for name, scene in drawn(loaded, draw_from="outside", seed=2, count=6).items():
+        mesh = shapes.place(scene["shape"], scene["size"], scene["height"], scene["center"])
+        x = torch.as_tensor(sample_volume(mesh, 400, seed=0), dtype=torch.float32)
+        vol0 = torch.full((len(x),), mesh.volume / len(x), dtype=torch.float32)
+        body = State.thrown(x, DENSITY * vol0, vol0, scene["velocity"], scene["spin"])
+        model, law = MPMModel(grid=16, dt=scene["dt"]), analytic_law(scene["law"], dt=scene["dt"])
+        frames = [scene["steps"] * k // 8 for k in range(1, 9)]
+        with torch.no_grad():
+            path = rollout(model, law, body, steps=scene["steps"], frames=frames, total=True)
+        assert bool(torch.isfinite(path.x).all())
+        strain = torch.linalg.svdvals(path.stretch).log().abs().amax((0, 2))
+        assert float(strain.median()) > 0.1, name
 
 
 def test_other_seeds_draw_other_scenes(many):
