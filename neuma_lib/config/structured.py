@@ -16,11 +16,15 @@ class StructuredConfig(Section):
         "stretch",
         description="elastic correction: stresses ordered as the stretches, or the derivative of an energy",
     )
-    held_out: float = Field(
-        0.25, gt=0, lt=1, description="part of the frames, the last ones, that corrections are judged by"
+    held_out: float = Field(0.25, gt=0, lt=1, description="part of the frames that corrections are judged by")
+    blocks: int = Field(
+        4,
+        ge=1,
+        description="the video is cut into so many equal parts, and the last frames of each are held out. With one the "
+        "correction has to foretell strains that it has not seen",
     )
     trial_iterations: int = Field(
-        12, ge=1, description="optimiser steps of each trial of a correction on the frames before those"
+        16, ge=1, description="optimiser steps of each trial of a correction on the other frames"
     )
     margin: float = Field(
         0.05,

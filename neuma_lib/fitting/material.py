@@ -54,8 +54,8 @@ class TrajectoryLoss(Protocol):
     def __call__(self, path: Trajectory) -> Tensor:
         """Losses of the frames, shape (T,)."""
 
-    def first(self, count: int) -> TrajectoryLoss:
-        """The same of the first frames alone."""
+    def select(self, keep: Sequence[int]) -> TrajectoryLoss:
+        """The same of the frames with the given indices alone."""
 
 
 @dataclass
@@ -87,9 +87,9 @@ class PixelLoss:
     def __call__(self, path: Trajectory) -> Tensor:
         return evaluate_in_batches(self._losses, self._batch, path.x, path.stretch)
 
-    def first(self, count: int) -> PixelLoss:
-        """The same of the first frames alone."""
-        return replace(self, observation=self.observation.select(range(count)))
+    def select(self, keep: Sequence[int]) -> PixelLoss:
+        """The same of the frames with the given indices alone."""
+        return replace(self, observation=self.observation.select(keep))
 
     def _losses(self, part: slice, x: Tensor, F: Tensor) -> Tensor:
         return mean_squared_error(self._renderer(x, F), self.observation.stored(part))
@@ -111,9 +111,9 @@ class ParticleLoss:
     def __call__(self, path: Trajectory) -> Tensor:
         return chamfer_loss(path.x, self.targets)
 
-    def first(self, count: int) -> ParticleLoss:
-        """The same of the first frames alone."""
-        return ParticleLoss(self.frames[:count], self.targets[:count])
+    def select(self, keep: Sequence[int]) -> ParticleLoss:
+        """The same of the frames with the given indices alone."""
+        return ParticleLoss(tuple(self.frames[k] for k in keep), self.targets[list(keep)])
 
 
 @dataclass
@@ -141,6 +141,8 @@ class TrainedMaterial:
 
     def summary(self) -> str:
         """One line for people."""
+        if not self.history.seconds:
+            return f"nothing trained, loss {self.best_loss:.3e}"
         first = self.history.loss[0]
         note = "" if self.stable else "; UNSTABLE: best state kept"
         moves = f", {len(self.history.recoveries)} recoveries" if self.history.recoveries else ""

@@ -1,9 +1,10 @@
 """Fit of a structured law around constants that are found already: which parts to correct, and the correction.
 
 A video need not tell anything that the constants leave open. So each choice of parts (elastic, plastic, both) is tried:
-it is trained on the first frames, for a few iterations, and judged by the last ones, which it has not seen, beside the
-law as it is. A part is corrected only if those frames gain enough; the parts that are chosen are trained anew, on all
-frames. The others stay as they are, exactly, and so does a law that nothing improves.
+it is trained for a few iterations without some of the frames, and judged by these, beside the law as it is. A part is
+corrected only if those frames gain enough; the parts that are chosen are trained anew, on all frames. The others stay
+as they are, exactly, and so does a law that nothing improves. Frames before the first contact say nothing of the law
+and judge nothing.
 
 How firmly the correction is held where the video is silent (`neuma_lib.fitting.deviation`) is chosen by the same
 frames: of the weights that are tried, the largest that they do as well with.
@@ -15,9 +16,11 @@ import copy
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.structured import StructuredConfig
@@ -25,9 +28,9 @@ from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.material import History, TrainedMaterial, TrajectoryLoss, train_material
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.mechanics.structured import StructuredLaw
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPMModel, contact_clearance
 from neuma_lib.sim.rollout import rollout
-from neuma_lib.sim.state import State
+from neuma_lib.sim.state import State, Trajectory
 
 Video = tuple[State, TrajectoryLoss]
 NOTHING = "nothing"
@@ -46,7 +49,7 @@ class Trial:
 
     Attributes:
         loss: mean loss of the frames that it was trained on.
-        held_out_loss: mean loss of the frames after them; infinite if the motion breaks off.
+        held_out_loss: mean loss of the others; infinite if the motion breaks off.
     """
 
     loss: float
@@ -122,14 +125,23 @@ def train_structured(
     videos = [(start, loss), *further]
     if any(len(loss.frames) < LEAST_FRAMES for _, loss in videos):
         raise InputError(f"a structured law needs at least {LEAST_FRAMES} frames, to fit and to judge by")
-    fitted = [max(2, round((1 - structured.held_out) * len(loss.frames))) for _, loss in videos]
-    fitted = [min(count, len(loss.frames) - 1) for count, (_, loss) in zip(fitted, videos, strict=True)]
-    first = [(start, loss.first(count)) for count, (start, loss) in zip(fitted, videos, strict=True)]
+    uncorrected = copy.deepcopy(law.state_dict())
+    as_it_is = [_simulated(model, law, *video) for video in videos]
+    if any(found is None for found in as_it_is):
+        raise NonFiniteError("material", "the motion of the uncorrected law breaks off")
+    held_out = [
+        held_out_frames(len(loss.frames), structured, first_contact(model, path.x))
+        for (_, loss), (path, _) in zip(videos, as_it_is, strict=True)
+    ]
+    fitted = [
+        [k for k in range(len(loss.frames)) if k not in out]
+        for (_, loss), out in zip(videos, held_out, strict=True)
+    ]
+    seen = [(start, loss.select(keep)) for keep, (start, loss) in zip(fitted, videos, strict=True)]
     trained_parts = [name for name, part in PARTS.items() if part in law.parts]
     choices = [(part,) for part in trained_parts]
     choices += [tuple(trained_parts)] if len(trained_parts) > 1 else []
     brief = settings.model_copy(update={"iterations": structured.trial_iterations})
-    uncorrected = copy.deepcopy(law.state_dict())
     kept = checkpoint.load() if checkpoint else None
     trials = {name: Trial(**found) for name, found in kept["trials"].items()} if kept else {}
     weights = [weight for weight in structured.penalties if weight != settings.penalty]
@@ -144,31 +156,36 @@ def train_structured(
         options = {"further": videos[1:], "checkpoint": inner, "progress": shown, "log": log}
         return train_material(model, law, *videos[0], how, **options)
 
-    def tried() -> Trial:
-        losses = [_frame_losses(model, law, *video) for video in videos]
-        parts = [(_mean(found[:n]), _mean(found[n:])) for found, n in zip(losses, fitted, strict=True)]
-        return Trial(*(_mean(values) for values in zip(*parts, strict=True)))
+    def judged_by(videos: Sequence[tuple[Trajectory, list[float]] | None]) -> Trial:
+        if any(found is None for found in videos):
+            return Trial(math.inf, math.inf)
+        losses = [found for _, found in videos]
+        parts = (
+            [_mean([found[k] for k in one]) for found, one in zip(losses, which, strict=True)]
+            for which in (fitted, held_out)
+        )
+        return Trial(*map(_mean, parts))
 
-    if NOTHING not in trials:
-        trials[NOTHING] = tried()
-        if not math.isfinite(trials[NOTHING].held_out_loss):
-            raise NonFiniteError("material", "the motion of the uncorrected law breaks off")
+    def tried() -> Trial:
+        return judged_by([_simulated(model, law, *video) for video in videos])
+
+    trials[NOTHING] = judged_by(as_it_is)
     for k, parts in enumerate(choices):
         name = " + ".join(parts)
         if name not in trials:
-            train(parts, first, brief, k * brief.iterations)
+            train(parts, seen, brief, k * brief.iterations)
             trials[name] = tried()
             log(f"{name} corrected: {_compared(trials[name], trials[NOTHING])}")
     parts = _chosen(choices, trials, structured.margin)
-    held_out = tuple(loss.frames[count:] for count, (_, loss) in zip(fitted, videos, strict=True))
-    choice = Choice(parts, trials, held_out, settings.penalty)
+    steps = (tuple(loss.frames[k] for k in out) for out, (_, loss) in zip(held_out, videos, strict=True))
+    choice = Choice(parts, trials, tuple(steps), settings.penalty)
     if parts:
         name = " + ".join(parts)
         judged = {settings.penalty: trials[name].held_out_loss}
         for k, weight in enumerate(weights, len(choices)):
             held = f"{name}, penalty {weight:g}"
             if held not in trials:
-                train(parts, first, brief.model_copy(update={"penalty": weight}), k * brief.iterations)
+                train(parts, seen, brief.model_copy(update={"penalty": weight}), k * brief.iterations)
                 trials[held] = tried()
                 log(f"{held}: {_compared(trials[held], trials[NOTHING])}")
             judged[weight] = trials[held].held_out_loss
@@ -176,8 +193,31 @@ def train_structured(
         how = settings.model_copy(update={"penalty": choice.penalty})
         return train(parts, videos, how, total - settings.iterations), choice
     law.load_state_dict(uncorrected)
-    value = _mean([_mean(_frame_losses(model, law, *video)) for video in videos])
-    return TrainedMaterial(law, History(loss=[value], seconds=[0.0]), value, 0, stable=True), choice
+    value = _mean([_mean(losses) for _, losses in as_it_is])
+    return TrainedMaterial(law, History(loss=[value]), value, 0, stable=True), choice
+
+
+def first_contact(model: MPMModel, x: Tensor) -> int:
+    """Index of the first frame in which a particle feels a wall, of positions x (T, N, 3) [m]; T if there is none."""
+    touching = contact_clearance(model, x) <= 0
+    return int(touching.int().argmax()) if bool(touching.any()) else len(x)
+
+
+def held_out_frames(count: int, settings: StructuredConfig, contact: int = 0) -> list[int]:
+    """Indices of the frames that judge: the last ones of each of some equal parts of the video, one at least each.
+
+    Args:
+        count: frames of the video.
+        settings: share and parts.
+        contact: index of the first frame that tells of the law; frames before it are left out, unless fewer than two
+            remain.
+    """
+    first = contact if count - contact >= 2 else 0
+    told = count - first
+    blocks = min(settings.blocks, told // 2)
+    ends = [first + round(k * told / blocks) for k in range(blocks + 1)]
+    size = max(1, round(settings.held_out * told / blocks))
+    return [frame for start, end in pairwise(ends) for frame in range(max(start + 1, end - size), end)]
 
 
 def _chosen(choices: Iterable[tuple[str, ...]], trials: dict[str, Trial], margin: float) -> tuple[str, ...]:
@@ -195,15 +235,17 @@ def largest_as_good(losses: dict[float, float]) -> float:
     return max(w for w, loss in losses.items() if loss <= (1 + AS_WELL) * min(losses.values()))
 
 
-def _frame_losses(model: MPMModel, law: StructuredLaw, start: State, loss: TrajectoryLoss) -> list[float]:
-    """Losses of all frames; infinite from the first one that the motion does not come to."""
+def _simulated(
+    model: MPMModel, law: StructuredLaw, start: State, loss: TrajectoryLoss
+) -> tuple[Trajectory, list[float]] | None:
+    """The motion at all frames, and their losses; None if it breaks off."""
     frames = loss.frames
     with torch.no_grad():
         try:
             path = rollout(model, law, start, steps=frames[-1], frames=frames, total=loss.total)
         except NonFiniteError:
-            return [math.inf] * len(frames)
-        return loss(path).tolist()
+            return None
+        return path, loss(path).tolist()
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -1,6 +1,7 @@
 """Which parts of a structured law are corrected, and that the others stay as they are."""
 
 import copy
+from itertools import pairwise
 
 import pytest
 import torch
@@ -10,7 +11,15 @@ from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.errors import InputError
 from neuma_lib.fitting.material import ParticleLoss, PixelLoss
-from neuma_lib.fitting.structured_fit import AS_WELL, Trial, _chosen, largest_as_good, train_structured
+from neuma_lib.fitting.structured_fit import (
+    AS_WELL,
+    Trial,
+    _chosen,
+    first_contact,
+    held_out_frames,
+    largest_as_good,
+    train_structured,
+)
 from neuma_lib.mechanics.structured import structured_law
 from neuma_lib.sim.rollout import rollout
 
@@ -19,7 +28,7 @@ V0 = torch.tensor([0.0, -1.5, 0.0], dtype=torch.float64)
 SETTINGS = MaterialConfig(
     iterations=3, rank=None, lr_elastic=0.05, lr_plastic=0.05, warm_up=0, checkpoint_every=1
 )
-STRUCTURED = StructuredConfig(trial_iterations=2)
+STRUCTURED = StructuredConfig(trial_iterations=2, blocks=2)
 FLOWS = {
     "elasticity": {**TRUTH["elasticity"], "E": 6e4},
     "plasticity": {"name": "von_mises", "yield_stress": 1e6},  # beyond what the fall reaches
@@ -62,7 +71,7 @@ def test_the_part_that_gains_is_corrected_and_the_other_stays_exactly(too_stiff)
     assert trained.best_loss < trained.history.loss[0] and len(said) == 3
     done = [state[0] for state in shown]
     assert done == sorted(done) and done[-1] == 9 and {state[1] for state in shown} == {9}
-    assert choice.held_out_frames == (FRAMES[6:],) and choice.as_dict()["held_out_frames"] == [[100, 110]]
+    assert choice.held_out_frames == ((80, 110),) and choice.as_dict()["held_out_frames"] == [[80, 110]]
 
 
 def test_a_law_that_nothing_improves_stays_exactly_as_it_is(problem):
@@ -128,18 +137,41 @@ def test_the_largest_penalty_that_held_out_frames_bear_is_taken(problem):
     assert largest_as_good({0.0: 1.0, 0.1: 0.9, 1.0: float("inf")}) == 0.1
 
 
-def test_first_frames_of_a_loss_are_those_of_the_loss(problem):
+def test_some_frames_of_a_loss_are_those_of_the_loss(problem):
     body, loss = problem
-    law = structured_law(FLOWS, MODEL.dt).double()
+    law, keep = structured_law(FLOWS, MODEL.dt).double(), [0, 1, 4, 6]
     path = rollout(MODEL, law, body.state(V0), steps=FRAMES[-1], frames=FRAMES)
     targets = ParticleLoss(FRAMES, path.x.flip(0))
     for whole in (loss, targets):
-        part = whole.first(5)
-        assert part.frames == FRAMES[:5] and part.total == whole.total
-        assert torch.equal(part(path.at(FRAMES[:5])), whole(path)[:5])
+        part = whole.select(keep)
+        assert part.frames == tuple(FRAMES[k] for k in keep) and part.total == whole.total
+        assert torch.equal(part(path.at(part.frames)), whole(path)[keep])
+
+
+@pytest.mark.parametrize("contact", [0, 3])
+@pytest.mark.parametrize("blocks", [1, 2, 4, 50])
+@pytest.mark.parametrize("count", [4, 7, 33, 400])
+@pytest.mark.parametrize("share", [0.01, 0.25, 0.9])
+def test_frames_that_judge_end_every_part_of_what_follows_the_contact(blocks, count, share, contact):
+    """They are about the share of all, the last frame is among them, the first is not, and every part keeps some."""
+    found = held_out_frames(count, StructuredConfig(held_out=share, blocks=blocks), contact)
+    first = contact if contact < count - 1 else 0
+    parts = min(blocks, (count - first) // 2)
+    assert found == sorted(set(found)) and found[-1] == count - 1 and found[0] > first
+    assert abs(len(found) - share * (count - first)) <= parts
+    edges = [first + round(k * (count - first) / parts) for k in range(parts + 1)]
+    for start, end in pairwise(edges):
+        assert end - 1 in found and start not in found
+
+
+def test_the_first_contact_is_that_of_any_particle():
+    x = torch.full((5, 2, 3), 0.5)
+    assert first_contact(MODEL, x) == 5
+    x[3:, 1, 1] = 0.01
+    assert first_contact(MODEL, x) == 3
 
 
 def test_too_few_frames(problem):
     body, loss = problem
     with pytest.raises(InputError, match="at least 4 frames"):
-        fit((body, loss.first(3)), TRUTH)
+        fit((body, loss.select([0, 1, 2])), TRUTH)

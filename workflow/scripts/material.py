@@ -73,8 +73,8 @@ def main(inputs, output, params, run) -> None:
     choice = {}
     if structured:
         trained, chosen = train_structured(*problem, structured, **options)
-        run.say(chosen.summary())
         choice = chosen.as_dict()
+        run.say(chosen.summary())
     else:
         trained = train_material(*problem, **options)
     report = {
