@@ -87,10 +87,10 @@ class IdentifyConfig(Section):
         description="families whose penalised held-out losses differ by less than this part are a tie",
     )
     model_std: float = Field(
-        0.02,
+        0.05,
         ge=0,
         description="standard deviation of the logarithm of every constant beside that from the images, for what all "
-        "images share: velocity, volume and density of the reconstruction",
+        "images share: shape, volume, density and appearance of the reconstruction",
     )
     determined: float = Field(
         0.1,

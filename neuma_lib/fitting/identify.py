@@ -238,7 +238,8 @@ def identify(
     rounds = len(settings.squares)
     for family in families:
         run = _Run(family, videos, [video.fitted for video in videos], settings)
-        run.begin([family.with_guesses(values) for values in ({}, stock_values, *_found(running, family))])
+        known = [family.with_guesses(values) for values in ({}, stock_values, *_found(running, family))]
+        run.begin([*known, *family.with_less_flow(known[min(2, len(known) - 1)])])
         running.append(run)
     best = min((run for run in running if run.alive), key=lambda run: run.fit.cost, default=None)
     for run in running[: running.index(best)] if best else ():  # those behind it have begun from it

@@ -284,6 +284,18 @@ def test_unbounded_constants_return_and_stay_within_bounds_and_the_time_step():
         assert number == pytest.approx(COURANT_LIMIT, rel=1e-3) or values["E"] < 1e-3
 
 
+def test_less_flow_is_towards_the_elastic_limit_and_within_bounds():
+    values = {"E": 3e4, "nu": 0.2}
+    family = Family("plastic", law("hencky", "von_mises", yield_stress=4e3))
+    found = family.with_less_flow({**values, "yield_stress": 1e3})
+    assert [v["yield_stress"] for v in found] == pytest.approx([4e3, 1.6e4])
+    assert all(v["E"] == pytest.approx(3e4) and v["nu"] == pytest.approx(0.2) for v in found)
+    grains = Family("grains", law("hencky", "drucker_prager", friction_angle=30))
+    angles = [v["friction_angle"] for v in grains.with_less_flow({**values, "friction_angle": 30.0})]
+    assert 30 < angles[0] < angles[1] < 90
+    assert Family("elastic", ELASTIC).with_less_flow(values) == []
+
+
 def test_a_stock_law_gives_what_the_family_has():
     family = Family("plastic", PLASTIC)
     known = {"E": 1e5, "nu": -0.2, "friction_angle": 25.0}
