@@ -1,4 +1,4 @@
-"""Time of one call of a neural law's networks, fused and by their twin, against what the hardware allows.
+"""Time of one call of a law's networks, fused and by their twin, against what the hardware allows.
 
     python -m benchmarks.laws                              # 2,000 rows on the CPU
     python -m benchmarks.laws --rows 30000 --device cuda
@@ -16,21 +16,28 @@ from collections.abc import Callable
 
 import torch
 
-from neuma_lib.mechanics.neural import SHAPES, NeuralConstitutive, neural_law
+from neuma_lib.mechanics.adaptor import AdaptableConstitutive
+from neuma_lib.mechanics.law import Constitutive
+from neuma_lib.mechanics.neural import neural_law
+from neuma_lib.mechanics.structured import FORMS, structured_law
 
 BANDWIDTH = 4.3e12
 """Bytes per second of a copy."""
 FLOAT32, FLOAT16 = 67e12, 989e12
 """Operations per second."""
 CALLS = 50
+SOFT = {
+    "elasticity": {"name": "hencky", "E": 1e5, "nu": 0.3},
+    "plasticity": {"name": "von_mises", "yield_stress": 5e3},
+}
 
 
-def floors(rows: int, backward: bool) -> tuple[float, float, float]:
-    """Seconds for the memory traffic, for the products in float32, and for their split into halves.
+def floors(rows: int, weights: int, backward: bool) -> tuple[float, float, float]:
+    """Seconds for the memory traffic, for the networks' products in float32, and for their split into halves.
 
     Backward counts the recomputation of the forward pass, which the fused kernel cannot avoid.
     """
-    operations = 2 * rows * sum(a * b for a, b in SHAPES) * (3 if backward else 1)
+    operations = 2 * rows * weights * (3 if backward else 1)
     matrices = 3 if backward else 2
     return 36 * rows * matrices / BANDWIDTH, operations / FLOAT32, 3 * operations / FLOAT16
 
@@ -66,15 +73,27 @@ def _wall_time(call: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def calls(part: NeuralConstitutive, F: torch.Tensor, g: torch.Tensor) -> dict[str, Callable[[], object]]:
-    """The passes of one network at F (n, 3, 3) with gradient g (n, 3, 3), into buffers of their own."""
+def calls(
+    part: AdaptableConstitutive, F: torch.Tensor, g: torch.Tensor, plain: bool = False
+) -> dict[str, Callable[[], object]]:
+    """The passes of one network at F (n, 3, 3) with gradient g (n, 3, 3), into buffers of their own, or in torch."""
     weights = tuple(w.detach() for w in part.weights())
     totals = tuple(torch.zeros_like(w) for w in weights)
     out, grad_F = torch.empty_like(F), torch.empty_like(F)
-    return {
+    if plain:
+        return {
+            "forward": lambda: Constitutive.evaluate(part, F, weights, out),
+            "backward": lambda: Constitutive.vjp(part, F, weights, g, None, grad_F, totals),
+        }
+    passes = {
         "forward": lambda: part.evaluate(F, weights, out),
         "backward": lambda: part.vjp(F, weights, g, grad_F=grad_F, grad_weights=totals),
     }
+    _, cache = part.evaluate_with_cache(F, weights, out)
+    if cache is not None:
+        passes["cached"] = lambda: part.evaluate_with_cache(F, weights, out, cache)
+        passes["from it"] = lambda: part.vjp(F, weights, g, cache, grad_F, totals)
+    return passes
 
 
 def main() -> None:
@@ -87,22 +106,38 @@ def main() -> None:
     args = parser.parse_args()
 
     device = torch.device(args.device)
-    law = neural_law(seed=0).to(device)
+    neural = neural_law(seed=0).to(device)
+    structured = {form: structured_law({**SOFT, "form": form}).to(device) for form in FORMS}
+    networks = {f"{form} elasticity": law.elasticity for form, law in structured.items()}
+    networks["return map"] = structured["stretch"].plasticity
+    fused = neural.elasticity.uses_fused(torch.zeros(1, 3, 3, device=device))
+    parts = [
+        (f"neural {name}", part, path)
+        for name, part in neural.parts.items()
+        for path in (("fused", "twin") if fused else ("twin",))
+    ]
+    parts += [(name, part, path) for name, part in networks.items() for path in ("fused", "torch")]
     print(
-        f"{'rows':>8} {'network':12} {'pass':9} {'path':6} {'us':>9} {'bytes':>7} {'fp32':>7} {'3 fp16':>7}"
+        f"{'rows':>8} {'network':20} {'pass':9} {'path':6} {'us':>9} {'bytes':>7} {'fp32':>7} {'3 fp16':>7}"
     )
     for rows in args.rows:
         generator = torch.Generator().manual_seed(0)
         F = (torch.eye(3) + 0.1 * torch.randn(rows, 3, 3, generator=generator)).to(device)
         g = torch.randn(rows, 3, 3, generator=generator).to(device)
-        for name, part in law.parts.items():
-            for path in ("fused", "twin") if part.uses_fused(F) else ("twin",):
+        for name, part, path in parts:
+            if name.startswith("neural"):
                 part.fused = path == "fused"
-                for which, call in calls(part, F, g).items():
-                    seconds = seconds_per_call(call, device, args.repetitions)
-                    limits = " ".join(f"{1e6 * x:7.2f}" for x in floors(rows, which == "backward"))
-                    print(f"{rows:8d} {name:12} {which:9} {path:6} {1e6 * seconds:9.1f} {limits}", flush=True)
-            part.fused = None
+            # autograd of the plain twins of structured laws cannot be recorded in a graph
+            plain = path == "torch"
+            if plain and device.type == "cuda":
+                continue
+            for which, call in calls(part, F, g, plain).items():
+                seconds = seconds_per_call(call, device, args.repetitions)
+                weights = sum(w.numel() for w in part.base)
+                limits = " ".join(
+                    f"{1e6 * x:7.2f}" for x in floors(rows, weights, which in ("backward", "from it"))
+                )
+                print(f"{rows:8d} {name:20} {which:9} {path:6} {1e6 * seconds:9.1f} {limits}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Time of one training iteration's parts on this machine: rollout forward and backward, and rendering.
 
     python -m benchmarks.rollout                        # 2,000 particles, 24^3 grid, 100 steps, neural law
+    python -m benchmarks.rollout --law stretch          # a structured law of that form, or energy
     python -m benchmarks.rollout --render               # and 20 frames of 1,500 Gaussians at 64 px
     python -m benchmarks.rollout --particles 30000 --grid 32 --steps 400 --device cuda
 
@@ -19,7 +20,9 @@ import torch
 
 from neuma_lib.coupling.deformation import deform
 from neuma_lib.coupling.particle_binding import bind
-from neuma_lib.mechanics.neural import NeuralLaw, neural_law
+from neuma_lib.mechanics.adaptor import AdaptableLaw
+from neuma_lib.mechanics.neural import neural_law
+from neuma_lib.mechanics.structured import FORMS, structured_law
 from neuma_lib.sim.memory import MemoryPlan
 from neuma_lib.sim.model import MPMModel, as_bodies
 from neuma_lib.sim.rollout import RolloutFunction, rollout
@@ -56,10 +59,20 @@ def falling_cube(count: int, device: torch.device) -> State:
     return State(*(value.to(device) for value in (x, v, 1000 * vol0, vol0)))
 
 
-def soft_law(device: torch.device) -> NeuralLaw:
-    """An untrained law of little stiffness with an adaptor, as in training."""
-    law = neural_law(seed=0)
-    law.attach_adaptor(rank=16, alpha=16.0)
+SOFT = {
+    "elasticity": {"name": "hencky", "E": 1e4, "nu": 0.3},
+    "plasticity": {"name": "von_mises", "yield_stress": 5e2},
+}
+
+
+def soft_law(name: str, device: torch.device) -> AdaptableLaw:
+    """An untrained law of little stiffness with an adaptor, as in training: neural, or structured of a form."""
+    if name == "neural":
+        law = neural_law(seed=0)
+        law.attach_adaptor(rank=16, alpha=16.0)
+    else:
+        law = structured_law({**SOFT, "form": name})
+        law.attach_adaptor(rank=None)
     return law.to(device)
 
 
@@ -85,7 +98,7 @@ def picture(
 
 
 def measure(
-    rows: dict[str, Callable[[], torch.Tensor]], law: NeuralLaw, repetitions: int
+    rows: dict[str, Callable[[], torch.Tensor]], law: AdaptableLaw, repetitions: int
 ) -> dict[str, tuple[float, float]]:
     """Seconds of each row's fastest forward and backward pass, rows taken in turns.
 
@@ -116,6 +129,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--law", choices=["neural", *FORMS], default="neural")
     parser.add_argument("--particles", type=int, default=2000)
     parser.add_argument("--grid", type=int, default=24)
     parser.add_argument("--steps", type=int, default=100)
@@ -131,7 +145,7 @@ def main() -> None:
     torch.set_num_threads(args.threads)
     device = torch.device(args.device)
     model = MPMModel(args.grid, 1e-3)
-    law = soft_law(device)
+    law = soft_law(args.law, device)
     state = falling_cube(args.particles, device)
     frames = sorted({max(1, round(args.steps * (i + 1) / args.frames)) for i in range(args.frames)})
     options = dict(steps=args.steps, frames=frames, skip_free_flight=False)
@@ -145,7 +159,7 @@ def main() -> None:
 
     print(
         f"{args.particles} particles, {args.grid}^3 grid, {args.steps} steps, {len(frames)} frames, "
-        f"neural law, {device}; best of {args.repetitions} [ms]"
+        f"{args.law} law, {device}; best of {args.repetitions} [ms]"
     )
     rows = {
         "rollout": lambda: scalar(simulate()),
