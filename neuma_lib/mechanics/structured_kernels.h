@@ -1,5 +1,5 @@
 // Text of the kernels of structured_kernels.py: a pack of rows at a time, as in singular_values_kernels.h, whose parts
-// "types", "load" and "svd" stand in between. Letters are those of structured.py.
+// "types" and "svd" stand in between. Letters are those of structured.py.
 
 // A CPU is to multiply and add in one instruction, as a GPU does; Warp's default there is not to.
 //// begin
