@@ -216,6 +216,9 @@ def _blocks(F: Tensor) -> int:
 
 
 def _launch(kernel, blocks: int, threads: int, device: torch.device, *inputs) -> None:
+    tensors = [x for x in inputs if isinstance(x, Tensor)]
+    if any(x.dtype != tensors[0].dtype or x.device != device for x in tensors):  # addresses do not know
+        raise TypeError("F, weights and buffers of a structured law must be of one dtype and on one device")
     inputs = [x.data_ptr() if isinstance(x, Tensor) else 0 if x is None else x for x in inputs]
     threads = 1 if device.type == "cpu" else threads
     wp.launch(

@@ -118,6 +118,12 @@ def test_rows_do_not_know_of_each_other():
     assert torch.equal(spoilt[others], value[others]) and torch.equal(grad_spoilt[others], grad_F[others])
 
 
+def test_precisions_do_not_mix():
+    part, F = part_of("hencky stretch"), states("hencky stretch")
+    with pytest.raises(TypeError, match="one dtype"):
+        part.evaluate(F, random_weights(part, 1, torch.float32))
+
+
 # ----------------------------------------------------------------------------------------------- CUDA
 
 
