@@ -7,9 +7,9 @@ the best one give equal parts of the draws. Such a band is right if the truth li
 **A structured correction** (`neuma_lib.mechanics.structured`) multiplies moduli m_a by exp(n_a(z)), z the invariants of
 the elastic strain. Deviations g_a(z) of the n_a are drawn from a Gaussian process:
 
-- Before the video is seen: a squared exponential kernel of length `STRAIN` and standard deviation `SILENT`, so that two
-  of them are the bound of the correction, whatever it was trained to; and a constant with the standard deviation that
-  `identify` gives to unbounded constants (`identify.spread`).
+- Before the video is seen: a squared exponential kernel of length `LENGTH`, that of the correction's own networks, and
+  standard deviation `SILENT`, so that two of them are the bound of the correction, whatever it was trained to; and a
+  constant with the standard deviation that `identify` gives to unbounded constants (`identify.spread`).
 - The video: its information on constant factors of the moduli, the inverse A of their covariance, is spread over the
   states that it shows, so that deviations cost <g^T A g> / 2. A state counts by its squared strain, since a modulus
   that is wrong by some factor is felt in proportion to the stress.
@@ -54,6 +54,8 @@ COVERED = 0.95
 DRAWS = 100
 SILENT = LIMIT / 2
 """Standard deviation of a log-modulus's deviation where the video is silent."""
+LENGTH = 3 * STRAIN
+"""Strain at which features of untrained networks are correlated by exp(-1/2)."""
 FEATURES = 150
 """Random features of the Gaussian process."""
 STATES = 20_000
@@ -129,7 +131,7 @@ def corrected_draws(
 
 @dataclass(frozen=True)
 class RandomField:
-    """Features of a squared exponential kernel of length `STRAIN`, and 1 as the last one.
+    """Features of a squared exponential kernel of length `LENGTH`, and 1 as the last one.
 
     Attributes:
         frequencies: standard normal, shape (M, 3).
@@ -142,7 +144,7 @@ class RandomField:
     def __call__(self, z: Tensor) -> Tensor:
         """Features (N, M + 1) at invariants z (N, 3)."""
         frequencies, phases = (torch.from_numpy(values).to(z) for values in (self.frequencies, self.phases))
-        waves = (z / STRAIN @ frequencies.T + 2 * math.pi * phases).cos() * (2 / len(phases)) ** 0.5
+        waves = (z / LENGTH @ frequencies.T + 2 * math.pi * phases).cos() * (2 / len(phases)) ** 0.5
         return torch.cat([waves, torch.ones_like(waves[:, :1])], dim=1)
 
 

@@ -8,6 +8,7 @@ import torch
 
 from neuma_lib.evaluation.bands import (
     COVERED,
+    LENGTH,
     SILENT,
     band,
     constants_draws,
@@ -19,7 +20,7 @@ from neuma_lib.evaluation.material_point import sheared, stress
 from neuma_lib.evaluation.response import inside, material_tests, response
 from neuma_lib.fitting.families import Family
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.mechanics.structured import LIMIT, structured_law
+from neuma_lib.mechanics.structured import LIMIT, WIDTH, initial_weights, network, structured_law
 
 DT = 5e-4
 MISES = {
@@ -152,19 +153,33 @@ def test_draws_around_a_correction_are_structured_and_centred():
 
 def test_bands_are_wide_where_the_video_is_silent():
     covariance = 1e-3 * np.eye(3)
-    shear = torch.tensor(
-        [0.15, 0.6], dtype=torch.float64
-    )  # as strained as the states mostly are, and far beyond
-    seen, silent = log_spread(corrected(covariance), lambda law: sheared(law, shear))
+    shear = torch.tensor([0.1, 0.6], dtype=torch.float64)  # as the most strained states, and far beyond
+    seen, silent = log_spread(corrected(covariance, size=0.02), lambda law: sheared(law, shear))
     known = log_spread(
         constants_draws(fit(covariance=covariance), 0.0, DT, 80, 0), lambda law: sheared(law, shear)
     )
     assert known.max() < seen < 0.2 and silent > 0.7 * SILENT
     centre = sheared(structured_law(MISES, DT), shear)
-    ratios = torch.stack([(sheared(law, shear) / centre).log() for law in corrected(covariance)])
+    ratios = torch.stack([(sheared(law, shear) / centre).log() for law in corrected(covariance, size=0.02)])
     assert ratios.abs().max() < LIMIT + 1e-9, "no wider than the correction may go"
     blind = log_spread(corrected(1e6 * np.eye(3), spread=0.5), lambda law: sheared(law, shear))
     assert (blind > 0.4).all()
+
+
+def test_deviations_vary_over_strains_as_the_networks_of_a_correction_do():
+    """Correlation of the features of untrained networks at states that are LENGTH apart, their mean left out."""
+    generator, found = torch.Generator().manual_seed(0), []
+    last = 1e-3 * torch.eye(WIDTH, WIDTH + 1)  # gives the features themselves
+    for seed in range(100):
+        *hidden, _ = initial_weights(WIDTH, seed)
+        z = 0.3 * (2 * torch.rand(64, 3, generator=generator) - 1)
+        away = torch.randn(64, 3, generator=generator)
+        ends = [z, z + LENGTH * away / away.norm(dim=1, keepdim=True)]
+        H = [network(end, (*hidden, last)) for end in ends]
+        mean = torch.cat(H).mean(dim=0)
+        a, b = (h - mean for h in H)
+        found.append(float((a * b).sum() / (a.square().sum() * b.square().sum()).sqrt()))
+    assert np.mean(found) == pytest.approx(np.exp(-0.5), abs=0.05)
 
 
 def test_what_is_known_together_stays_known_together():
