@@ -411,6 +411,16 @@ class TestVideos:
         assert not loaded.scene("Near").videos and not loaded.scene("UnevenCat").videos
         assert not loaded.scene("ClayCat_throw2").videos
 
+    def test_pairs_of_throws_that_are_shown(self, raw):
+        pairs = settings.read_yaml(ROOT / "config" / "two_throws.yaml")
+        loaded = settings.load(settings.merged(raw, pairs), ROOT)
+        for material in ("Paste", "Gel"):
+            slow, both = loaded.scene(f"{material}Slow"), loaded.scene(f"{material}Both")
+            assert both.videos == (f"{material}Fast",) and not slow.videos
+            own = {"videos", "images", "like"}
+            assert slow.model_dump(exclude=own) == both.model_dump(exclude=own)
+            assert loaded.tables[f"two_throws_{material.lower()}"].on_request
+
     def test_all_videos_are_of_the_chain(self, raw):
         loaded = self.loaded(raw, ClayCat={"videos": [{"height": 0.4}]})
         assert loaded.video_scenes("ClayCat+seed=2") == ["ClayCat+seed=2", "ClayCat_throw2+seed=2"]
