@@ -7,7 +7,7 @@ on the reconstruction (99 % of them). Ranges are marginal: not every combination
 bands: 95 % of the laws that the video leaves possible, by the constants' covariance and, around a correction, a process
 that is as free as the correction where the video is silent; of laws without such an account, the range of their chains,
 if there are several. The video determines motion, that is elastic law and return map together; where the two can trade
-places, each alone may differ from the truth. Not in the paper.
+places, each alone may differ from the truth. Laws far off are cut where they leave the panel. Not in the paper.
 """
 
 from __future__ import annotations
