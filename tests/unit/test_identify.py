@@ -13,7 +13,7 @@ from neuma_lib.config.laws import LawConfig
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.evaluation.identified_page import identified_page
 from neuma_lib.fitting.families import Family
-from neuma_lib.fitting.identify import FamilyFit, _choice, _leave_behind, averaged, identify
+from neuma_lib.fitting.identify import FamilyFit, _choice, _leave_behind, _Run, _Video, averaged, identify
 from neuma_lib.fitting.least_squares import Linearisation, jackknife, levenberg_marquardt
 from neuma_lib.fitting.throw import Throw
 from neuma_lib.io.files import write_json
@@ -271,6 +271,19 @@ def test_nesting_of_families():
     assert plastic.contains(elastic) and not plastic.contains(fluid) and not plastic.contains(plastic)
     assert not grains.contains(elastic), "sand bears no tension, whatever its friction"
     assert not plastic.contains(Family("x", law("neo_hookean")))
+
+
+def test_stiffness_that_the_time_step_does_not_bear_has_a_difference_too():
+    """At the stiffest that dt bears no small step changes the law: the difference is taken over a long one."""
+    body, seen = video_of(ELASTIC, V0, FRAMES)
+    chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", particles=0)
+    video, family = _Video(MODEL, known(body), body, seen, chosen), Family("hencky", ELASTIC)
+    run = _Run(family, [video], [len(FRAMES)], chosen)
+    run._origin = family.unbounded({"E": 1e9, "nu": 0.3})
+    run._u[0] = math.log(run.values["E"] / 1e9) + 0.5  # beyond the limit by more than a small step
+    here = run._residual(run._u)
+    by_stiffness, by_nu = run._constant_columns(run._u, here)
+    assert by_stiffness[0].abs().max() > 0 and by_nu[0].isfinite().all()
 
 
 def test_unbounded_constants_return_and_stay_within_bounds_and_the_time_step():
