@@ -48,6 +48,8 @@ MADE_BY = {
     "stress": "results/stress.csv",
     "letters": "results/letters.csv",
     "views": "results/views.csv",
+    "outside": "results/outside.csv",
+    "identified": "results/identified.csv",
 }
 """Tables that are recorded, and the target of Snakemake that makes them."""
 VERDICT_HEAD = f"| {' | '.join(VERDICTS[:2])} |"

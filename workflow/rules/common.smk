@@ -263,6 +263,24 @@ def random_files(methods, name):
     return [f"{RESULTS}/{scene}/{method}/{name}" for method in methods for scene in SETTINGS.random_scenes]
 
 
+def identified_scenes():
+    """Every identification that a table judges: the scenes of table1 in all its chains, and the random scenes."""
+    table, methods = SETTINGS.tables.get("table1"), SETTINGS.methods
+    constants = [name for name in methods if SETTINGS.is_identified(name)][:1]
+    runs = [
+        run
+        for s in (table.scenes if table else ())
+        for m in constants
+        for run in SETTINGS.runs("table1", m, s)
+    ]
+    named = {run.partition("/")[0]: "scenes of Table 1" for run in runs}
+    named |= dict.fromkeys(SETTINGS.random_scenes, f"random scenes, seed {SETTINGS.random.seed}")
+    return [
+        {"name": name, "group": group, "truth": SETTINGS.scene(name).law.plain()}
+        for name, group in named.items()
+    ]
+
+
 def prior_chain(wildcards):
     """Name of a prior, and the seeds of its chain."""
     return parse_chain(wildcards.prior, SETTINGS.priors.laws, "prior")

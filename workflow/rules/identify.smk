@@ -39,3 +39,15 @@ rule identified_page:
         law=scene_setting("law"),
     script:
         "../scripts/identified_page.py"
+
+
+rule identified_table:
+    input:
+        identified=[home(entry["name"], "identified.json") for entry in identified_scenes()],
+    output:
+        csv=f"{RESULTS}/identified.csv",
+        markdown=f"{RESULTS}/identified.md",
+    params:
+        scenes=identified_scenes(),
+    script:
+        "../scripts/identified_table.py"
