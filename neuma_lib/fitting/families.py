@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -93,14 +93,16 @@ class Family:
         usable = {key: known[key] for key in self.constants if key in known and self._inside(key, known[key])}
         return {**self.guess, **usable}
 
-    def with_less_flow(self, values: Values) -> list[Values]:
-        """The same with what limits plastic flow raised fourfold and again (in logarithms, logits); none if elastic.
+    @property
+    def flows(self) -> bool:
+        """Whether it has constants that limit plastic flow."""
+        return any(key not in ("E", "nu") for key in self.constants)
 
-        An elastic body is among the limits of most families that flow: there they begin where they end.
-        """
+    def with_other_limits(self, values: Values, powers: Sequence[int]) -> list[Values]:
+        """The same with what limits plastic flow times 4 to some powers (in logarithms, logits); none if elastic."""
         flow = np.array([key not in ("E", "nu") for key in self.constants])
         u = self.unbounded(values)
-        return [self.bounded(u + math.log(4) * n * flow) for n in (1, 2)] if flow.any() else []
+        return [self.bounded(u + math.log(4) * n * flow) for n in powers] if self.flows else []
 
     def _bounds(self, key: str) -> tuple[float, float]:
         constant = self._admitted[key][1]

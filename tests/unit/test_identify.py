@@ -300,13 +300,15 @@ def test_unbounded_constants_return_and_stay_within_bounds_and_the_time_step():
 def test_less_flow_is_towards_the_elastic_limit_and_within_bounds():
     values = {"E": 3e4, "nu": 0.2}
     family = Family("plastic", law("hencky", "von_mises", yield_stress=4e3))
-    found = family.with_less_flow({**values, "yield_stress": 1e3})
+    found = family.with_other_limits({**values, "yield_stress": 1e3}, (1, 2))
     assert [v["yield_stress"] for v in found] == pytest.approx([4e3, 1.6e4])
     assert all(v["E"] == pytest.approx(3e4) and v["nu"] == pytest.approx(0.2) for v in found)
     grains = Family("grains", law("hencky", "drucker_prager", friction_angle=30))
-    angles = [v["friction_angle"] for v in grains.with_less_flow({**values, "friction_angle": 30.0})]
+    angles = [
+        v["friction_angle"] for v in grains.with_other_limits({**values, "friction_angle": 30.0}, (1, 2))
+    ]
     assert 30 < angles[0] < angles[1] < 90
-    assert Family("elastic", ELASTIC).with_less_flow(values) == []
+    assert Family("elastic", ELASTIC).with_other_limits(values, (1, 2)) == []
 
 
 def test_a_stock_law_gives_what_the_family_has():
