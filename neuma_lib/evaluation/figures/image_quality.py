@@ -23,6 +23,8 @@ MEASURES = {
 }
 SPREAD = 0.62
 """Part of a scene's slot over which the methods stand side by side."""
+LEGEND_COLUMNS = 5
+"""Most names in a row of the legend."""
 
 
 def data(inputs, params, say) -> dict:
@@ -57,5 +59,6 @@ def draw(data: Mapping) -> Figure:
             axes.axvline(edge + 0.5, color=style.LIGHT, linewidth=0.5)
     panels[-1].set_xticks(range(len(scenes) + 1), [*style.scene_labels(scenes, data["seen"]), "average"])
     figure.align_ylabels(panels)
-    style.legend_above(figure, panels[0], len(titles))
+    rows = -(-len(titles) // LEGEND_COLUMNS)
+    style.legend_above(figure, panels[0], -(-len(titles) // rows))
     return figure
