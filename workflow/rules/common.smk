@@ -273,7 +273,7 @@ def identified_scenes():
         for m in constants
         for run in SETTINGS.runs("table1", m, s)
     ]
-    named = {run.partition("/")[0]: "scenes of Table 1" for run in runs}
+    named = dict.fromkeys((Path(run).parent.name for run in runs), "scenes of Table 1")
     named |= dict.fromkeys(SETTINGS.random_scenes, f"random scenes, seed {SETTINGS.random.seed}")
     return [
         {"name": name, "group": group, "truth": SETTINGS.scene(name).law.plain()}
@@ -446,8 +446,7 @@ def identified_file(wildcards):
 
 def identification(file):
     """The job that makes such a file: its rule and its wildcards."""
-    scene, _, views = str(file).removeprefix(f"{RESULTS}/").removesuffix(".json").partition("/identified")
-    views = views.removeprefix("+views=")
+    scene, views = Path(file).parent.name, Path(file).stem.partition("views=")[2]
     return ("identify_views", {"scene": scene, "views": views}) if views else ("identify", {"scene": scene})
 
 
