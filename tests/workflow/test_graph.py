@@ -113,9 +113,6 @@ def test_a_method_can_start_as_identification_found(project):
         assert not any(file.endswith("velocity.json") for file in made[rule][0])
 
 
-METHODS_OF_OURS = "tables={table1: {methods: [neuma, constants, neuma_structured, neuma+prior=identified]}}"
-
-
 CHAINS = ("--config", "tables={table1: {seeds: 3}}", "--")
 DATA_RULES = ("kernels", "ground_truth", "render_static", "render_dynamic")
 
