@@ -26,7 +26,8 @@ from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.settings import Config, load, merged, read_yaml
 from neuma_lib.evaluation.metrics import tracer_errors
 from neuma_lib.evaluation.motion import predict
-from neuma_lib.fitting.identify import Identified, identify
+from neuma_lib.fitting.identified import Identified
+from neuma_lib.fitting.identify import identify
 from neuma_lib.fitting.throw import Throw
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import read_json, write_json

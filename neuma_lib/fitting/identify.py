@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -35,10 +35,11 @@ from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.frame_batches import frame_batches, spread_frames
+from neuma_lib.fitting.identified import FamilyFit, Identified
 from neuma_lib.fitting.least_squares import Linearisation, in_blocks, jackknife, levenberg_marquardt
 from neuma_lib.fitting.throw import Throw
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.mechanics.combinations import Values, named_combinations, physical
+from neuma_lib.mechanics.combinations import Values
 from neuma_lib.sim.batch import rollout_batch
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.state import Trajectory
@@ -48,146 +49,6 @@ _LAST_GAIN = 0.1  # of `least_gain`, in the last round
 _LEAST_LOSS = 1e-12  # below it, held-out images agree exactly
 _MOTION = 6  # unknowns of a throw: velocity and spin
 _NUISANCES = 9  # and of the rendered body: shift right and down, enlargement
-
-
-@dataclass
-class FamilyFit:
-    """What was found for a family.
-
-    Attributes:
-        family: the candidate.
-        values: its constants; those of the last start if every rollout diverged.
-        loss: mean squared residual of the fitted frames, at the last squares it came to; infinite if all diverged.
-        held_out: the same of the frames that were held out, at the finest squares.
-        score: logarithm of ``held_out`` plus the penalty on constants; smaller is better.
-        covariance: of the unbounded constants, shape (k, k); what is uncertain about the throws is in it.
-        throws: the initial motion in each video, which was fitted along, with its standard deviations.
-        refined: whether it came to the finest squares.
-        rollouts: simulations that it took.
-        steps: accepted Levenberg-Marquardt steps.
-    """
-
-    family: Family
-    values: Values
-    loss: float = math.inf
-    held_out: float = math.inf
-    score: float = math.inf
-    covariance: np.ndarray | None = None
-    throws: tuple[Throw, ...] = ()
-    refined: bool = False
-    rollouts: int = 0
-    steps: int = 0
-
-    def log_covariance(self, of: Callable[[Values], Values]) -> tuple[list[str], np.ndarray]:
-        """Names (m,) and covariance (m, m) of the logarithms of positive functions of the constants, to first order."""
-        u, h = self.family.unbounded(self.values), 1e-4
-        names = list(of(self.values))
-
-        def logs(point):
-            return np.log(list(of(self.family.bounded(point)).values()))
-
-        slope = np.stack([(logs(u + h * e) - logs(u - h * e)) / (2 * h) for e in np.eye(len(u))], axis=1)
-        return names, slope @ self.covariance @ slope.T
-
-    def as_dict(self, settings: IdentifyConfig) -> dict[str, Any]:
-        """Plain numbers, for JSON."""
-        plain = {"law": self.family.law_spec(self.values), "rollouts": self.rollouts, "steps": self.steps}
-        if not math.isfinite(self.loss):
-            return {**plain, "diverged": True}
-        plain |= {"diverged": False, "refined": self.refined, "loss": self.loss}
-        if math.isfinite(self.score):
-            plain |= {"held_out_loss": self.held_out, "score": self.score}
-        if self.covariance is not None:
-            names, covariance = self.log_covariance(lambda values: values)
-            stds = np.sqrt(np.diag(covariance))
-            plain["constants"] = {
-                key: {"value": self.values[key], "log_std": float(std)}
-                for key, std in zip(names, stds, strict=True)
-            }
-            plain["quantities"] = {
-                key: {"value": value, "log_std": std, "determined": std < settings.determined}
-                for key, value, std in self.quantities(settings)
-            }
-            plain["combinations"] = self.combinations(settings)
-            plain["unbounded"] = self.family.unbounded_dict(self.values, self.covariance)
-            plain["start"] = self.throws[0].as_dict()
-        return plain
-
-    def quantities(self, settings: IdentifyConfig) -> list[tuple[str, float, float]]:
-        """Name, value and standard deviation of the logarithm of the named combinations."""
-        names, covariance = self.log_covariance(named_combinations)
-        stds = np.sqrt(np.diag(covariance) + settings.model_std**2)
-        return list(zip(names, named_combinations(self.values).values(), stds.tolist(), strict=True))
-
-    def combinations(self, settings: IdentifyConfig) -> list[dict[str, Any]]:
-        """Products of powers of the physical constants whose errors are independent, the best determined first."""
-        names, covariance = self.log_covariance(physical)
-        variances, axes = np.linalg.eigh(covariance)
-        logs = np.log(list(physical(self.values).values()))
-        found = []
-        for variance, axis in zip(variances, axes.T, strict=True):
-            axis = axis * np.sign(axis[np.abs(axis).argmax()])
-            std = math.sqrt(max(variance, 0.0) + settings.model_std**2)
-            found.append({
-                "powers": dict(zip(names, axis.tolist(), strict=True)),
-                "log_value": float(axis @ logs),
-                "log_std": std,
-                "determined": std < settings.determined,
-            })  # fmt: skip
-        return found
-
-
-@dataclass
-class Identified:
-    """Result of `identify`.
-
-    Attributes:
-        best: the family that is chosen, fitted again to all frames.
-        ties: names of families that are as good, the best one not among them.
-        fits: all candidates as they were judged, by name.
-        frames: steps of the frames that were fitted, of each video.
-        held_out: steps of the frames that were held out, of each video.
-        rollouts: simulations that it took, some of which families share.
-    """
-
-    best: FamilyFit
-    ties: list[str]
-    fits: dict[str, FamilyFit]
-    frames: list[tuple[int, ...]]
-    held_out: list[tuple[int, ...]]
-    rollouts: int
-    settings: IdentifyConfig = field(repr=False)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, for JSON; ``law`` is what `analytic_law` takes."""
-        videos = [
-            {"start": throw.as_dict(), "frames": list(frames), "held_out_frames": list(held_out)}
-            for throw, frames, held_out in zip(self.best.throws, self.frames, self.held_out, strict=True)
-        ]
-        return {
-            "family": self.best.family.name,
-            "ties": self.ties,
-            "law": self.best.family.law_spec(self.best.values),
-            "says": self.summary(),
-            "best": self.best.as_dict(self.settings),
-            "families": {name: fit.as_dict(self.settings) for name, fit in self.fits.items()},
-            **videos[0],
-            **({"further_videos": videos[1:]} if videos[1:] else {}),
-            "rollouts": self.rollouts,
-        }
-
-    def summary(self) -> str:
-        """One line for people: the family, its constants, and what is determined."""
-        fit = self.best
-        tied = f" (tie with {', '.join(self.ties)})" if self.ties else ""
-        values = ", ".join(f"{key} = {value:.4g}" for key, value in fit.values.items())
-        sure = {key: std < self.settings.determined for key, _, std in fit.quantities(self.settings)}
-        lists = [
-            f"{'determined' if wanted else 'not determined'}: {', '.join(names)}"
-            for wanted in (True, False)
-            if (names := [key for key, found in sure.items() if found == wanted])
-        ]
-        return f"{fit.family.name}{tied}: {values}; {'; '.join(lists)}"
 
 
 def identify(

@@ -13,7 +13,8 @@ from neuma_lib.config.laws import LawConfig
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.evaluation.identified_page import identified_page
 from neuma_lib.fitting.families import Family
-from neuma_lib.fitting.identify import FamilyFit, _choice, _leave_behind, _Run, _Video, averaged, identify
+from neuma_lib.fitting.identified import FamilyFit
+from neuma_lib.fitting.identify import _choice, _leave_behind, _Run, _Video, averaged, identify
 from neuma_lib.fitting.least_squares import Linearisation, jackknife, levenberg_marquardt
 from neuma_lib.fitting.throw import Throw
 from neuma_lib.io.files import write_json
