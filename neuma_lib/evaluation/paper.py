@@ -296,7 +296,7 @@ PAPER = {
         "",
         "Views",
         "Laws trained on one, two and three views",
-        ("BouncyBall", "RubberPawn", "ClayCat"),
+        _SCENES,
         claims=tuple(
             Claim(
                 f"trained on {words}, structured laws are closer than NeuMA",
