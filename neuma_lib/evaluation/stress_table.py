@@ -6,13 +6,17 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from neuma_lib.evaluation.paper import PaperTable
+from neuma_lib.evaluation.paper import OUTSIDE, PaperTable
 from neuma_lib.evaluation.reports import as_csv, as_markdown
+from neuma_lib.evaluation.response import inside
 from neuma_lib.evaluation.stress import PARTS
 from neuma_lib.evaluation.tables import VERDICTS, Row, Verdict, reached, shown
 
 ASYMMETRIC = "asymmetric"
 HEADINGS = PARTS | {ASYMMETRIC: "Antisymmetric part of the stress, which no material has"}
+OUTSIDE_HEADING = (
+    "Visited points at which the true response curve is outside the 95 % band of a law, in the worst test"
+)
 
 
 def stress_table(
@@ -20,6 +24,7 @@ def stress_table(
     titles: Mapping[str, str],
     columns: Mapping[str, str],
     paper: PaperTable,
+    responses: Mapping[str, Mapping[str, Sequence[Mapping]]] | None = None,
 ) -> tuple[str, str, list[Verdict]]:
     """Relative errors of stresses in per cent.
 
@@ -28,6 +33,8 @@ def stress_table(
         titles: method -> name in the table, in the order of the rows.
         columns: scene -> heading, in order.
         paper: heading and targets.
+        responses: method -> scene -> what `response` gave by the name of the test, one a chain; laws without bands have
+            no row.
 
     Returns:
         CSV, with a row ``<part>_std`` behind each row of means over several chains; Markdown; verdicts on the targets.
@@ -41,13 +48,15 @@ def stress_table(
         )  # None, of broken paths, is not a number
 
     rows = {part: {m: row(part, m, title) for m, title in titles.items()} for part in HEADINGS}
+    rows[OUTSIDE] = _outside(responses or {}, titles, columns)
     verdicts = reached(paper.targets, rows["stress"], list(columns), "%")
+    verdicts += reached(paper.targets, rows[OUTSIDE], list(columns), "%", quantity=OUTSIDE)
     lines = [["quantity", "method", "title", *columns, "Average"]]
     about = (
         "Errors in per cent of the true stress, root mean squares over states that the true law goes through"
     )
     text = [f"# {paper.heading}", "", f"{about} on the reconstruction.", ""]
-    for part, heading in HEADINGS.items():
+    for part, heading in (HEADINGS | ({OUTSIDE: OUTSIDE_HEADING} if rows[OUTSIDE] else {})).items():
         cells = []
         for each in rows[part].values():
             for suffix, values in ("", each.mean), ("_std", each.std):
@@ -88,6 +97,22 @@ def stress_table(
 
 def _number(value: float, digits: str) -> str:
     return format(value, digits) if np.isfinite(value) else "–"
+
+
+def _outside(responses: Mapping, titles: Mapping[str, str], columns: Mapping[str, str]) -> dict[str, Row]:
+    """Rows of `OUTSIDE` of the laws that have bands, every chain judged by its own band."""
+
+    def outside(tests: Mapping[str, Mapping]) -> float:
+        parts = [inside(test) for test in tests.values()]
+        return max((100 * (1 - part) for part in parts if part is not None), default=np.nan)
+
+    found = {}
+    for method, row in responses.items():
+        chains = list(zip(*(row[column] for column in columns), strict=True))
+        if all("band" in test for chain in chains for tests in chain for test in tests.values()):
+            runs = [[outside(tests) for tests in chain] for chain in chains]
+            found[method] = Row(OUTSIDE, method, titles[method], np.array(runs))
+    return found
 
 
 def _broken(errors: Mapping, titles: Mapping[str, str], columns: Mapping[str, str]) -> list[str]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from neuma_lib.errors import InputError
-from neuma_lib.evaluation.paper import BALL_FLOOR, Claim, PaperTable, Target
+from neuma_lib.evaluation.paper import BALL_FLOOR, BROKEN, Claim, PaperTable, Target
 from neuma_lib.evaluation.reports import as_csv, as_markdown
 
 QUANTITIES = {
@@ -152,6 +152,8 @@ class Table:
         wins = self.wins()
         lines = [["quantity", "method", "title", *self.columns, "Average", "Median", "wins", "diverged"]]
         for row in self.rows:
+            if row.quantity == BROKEN:  # the last column says it
+                continue
             diverged = " ".join(c for c in self.columns if (row.method, c) in self.marks)
             best = wins.get(row.method, "") if row.quantity == JUDGED else ""
             ends = ("", row.mean, [f"{row.median:.4f}", best]), ("_std", row.std, ["", ""])
@@ -192,9 +194,11 @@ class Table:
             for claim in claims
             if {*claim.better, *claim.worse} <= methods and set(claim.columns) <= set(self.columns)
         ]
-        rows = {row.method: row for row in self._rows(JUDGED)}
+        rows, broke_off = ({row.method: row for row in self._rows(name)} for name in (JUDGED, BROKEN))
         broken = {cell for cell, signs in self.marks.items() if ROLLOUT_DIVERGED in signs}
-        return found + reached(targets, rows, list(self.columns), "mm", broken)
+        columns = list(self.columns)
+        found += reached(targets, rows, columns, "mm", broken)
+        return found + reached(targets, broke_off, columns, "%", quantity=BROKEN)
 
     def outliers(self) -> list[str]:
         """Runs whose `JUDGED` is more than twice the mean of their method's chains in the column, a sentence each."""
@@ -370,8 +374,9 @@ def reached(
     columns: Sequence[str],
     unit: str,
     broken: Collection[tuple[str, str]] = (),
+    quantity: str = "",
 ) -> list[Verdict]:
-    """A verdict on each target whose rows and columns are here.
+    """A verdict on each target of a quantity whose rows and columns are here.
 
     A target *holds* if it is reached by means plus standard deviations over `MIN_CHAINS` chains at least, and no
     prediction of its method broke off there. It is *mixed* if it is reached by the means alone, else it *does not
@@ -382,10 +387,15 @@ def reached(
         columns: those of the rows, in order.
         unit: of the errors.
         broken: (method, column) of predictions that broke off.
+        quantity: as targets call it.
     """
     found = []
     for target in targets:
-        if not (target.methods <= rows.keys() and set(target.columns) <= set(columns)):
+        if not (
+            target.quantity == quantity
+            and target.methods <= rows.keys()
+            and set(target.columns) <= set(columns)
+        ):
             continue
         chosen = target.columns or tuple(columns)
         index = [list(columns).index(column) for column in chosen]
@@ -459,7 +469,7 @@ def chamfer_table(
             raise InputError(f"table: there is no metrics.json of {method} on {missing}")
         return Row(quantity, method, title, np.array(runs))
 
-    for quantity in QUANTITIES:
+    for quantity in (*QUANTITIES, BROKEN):
         table.rows += [row(quantity, method, title) for method, title in titles.items()]
     floor = row("chamfer_floor", next(iter(titles)), "Sampling floor").runs[:1]
     table.rows.append(Row("chamfer_floor", "floor", "Sampling floor", floor))
@@ -488,7 +498,7 @@ def _told(failure: Mapping, run: Mapping) -> str:
 
 
 def _number(quantity: str, method: str, column: str, run: Mapping) -> float:
-    value = run.get(quantity)
+    value = 100.0 * bool(run.get("diverged")) if quantity == BROKEN else run.get(quantity)
     if not isinstance(value, int | float) or not math.isfinite(value):
         raise InputError(
             f"table: {quantity} of {method} on {column} is {value}; remove "

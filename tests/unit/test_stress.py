@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -158,12 +159,12 @@ def errors(value, **changes):
     return dict.fromkeys([*PARTS, "asymmetric"], value) | {"true_rms": 2e3, "broken_paths": 0} | changes
 
 
-def table(neuma, constants, paper=None):
+def table(neuma, constants, paper=None, responses=None):
     content = {
         method: dict(zip(SCENES, values, strict=True))
         for method, values in (("neuma", neuma), ("constants", constants))
     }
-    return stress_table(content, TITLES, SCENES, paper or PaperTable("", "Stresses", ""))
+    return stress_table(content, TITLES, SCENES, paper or PaperTable("", "Stresses", ""), responses)
 
 
 def test_the_table_has_means_spreads_and_the_size_of_the_true_stress():
@@ -199,6 +200,33 @@ def test_a_target_counts_scenes(runs, word):
     chains = [[errors(value) for value in values] for values in runs]
     _, markdown, (verdict,) = table(chains, chains, paper)
     assert verdict.word == word and f"| within 20 % on 2 | **{word}** |" in markdown
+
+
+def response_of(inside, band=True):
+    """A response with two tests, in the second of which so many of ten visited points are in the band."""
+    x = list(range(10))
+    found = {"x": x, "visited": [0, 9], "by_stress": False, "true": [1.0] * 10}
+    bands = [{"x": x, "low": [0.0] * 10, "high": [2.0] * n + [0.5] * (10 - n)} for n in (10, inside)]
+    return {name: found | ({"band": b} if band else {}) for name, b in zip("st", bands, strict=True)}
+
+
+@pytest.mark.parametrize(
+    ("last", "word"), [((10, 10, 10), "holds"), ((10, 10), "mixed"), ((10, 9, 10), "does not hold")]
+)
+def test_bands_are_judged_by_the_worst_test_of_every_chain(last, word):
+    (target,) = [target for target in PAPER["stress"].targets if target.quantity]
+    target = replace(target, method="constants", count=3)
+    runs = [[errors(0.1)] * len(last)] * 3
+    whole = [[response_of(10)] * len(last)] * 2
+    responses = {
+        "neuma": dict.fromkeys(SCENES, [response_of(3, band=False)] * len(last)),
+        "constants": dict(zip(SCENES, [*whole, [response_of(n) for n in last]], strict=True)),
+    }
+    text, _, (verdict,) = table(runs, runs, PaperTable("", "Stresses", "", targets=(target,)), responses)
+    rows = {r["method"]: r for r in csv.DictReader(io.StringIO(text)) if r["quantity"] == "outside_band"}
+    assert list(rows) == ["constants"], "a law without a band has no row"
+    assert float(rows["constants"]["c"]) == pytest.approx(np.mean([100 - 10 * n for n in last]), abs=1e-4)
+    assert verdict.word == word, verdict.here
 
 
 def test_targets_of_the_project_are_about_rows_and_columns_of_their_tables():

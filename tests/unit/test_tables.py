@@ -153,6 +153,19 @@ def test_diverged_runs_and_averages_with_them_are_marked_and_explained():
     assert rows["chamfer", "neuma"]["diverged"] == "BouncyBall"
 
 
+@pytest.mark.parametrize(
+    ("failing", "word"), [({}, "holds"), ({"letter_N_jelly_fast": BROKEN}, "does not hold")]
+)
+def test_that_no_letter_breaks_off_is_judged_by_all_of_them(failing, word):
+    columns = dict.fromkeys(PAPER["letters"].columns, "")
+    metrics = {"neuma_structured": {c: [run(2.0), run(2.1), run(2.2, **failing.get(c, {}))] for c in columns}}
+    table = chamfer_table(metrics, {"neuma_structured": "ours"}, columns, PAPER["letters"])
+    near, sound = table.verdicts()
+    assert near.word == "holds", "a letter at 3 m/s is no matter of those at 1 m/s"
+    assert sound.word == word and f"kept in {12 - len(failing)} of 12" in sound.here
+    assert "broke_off" not in table.csv()
+
+
 def test_a_missing_or_broken_cell_is_named():
     column = {"BouncyBall": "BouncyBall"}
     with pytest.raises(InputError, match="no metrics.json of neuma on BouncyBall"):

@@ -72,6 +72,7 @@ rule response:
 rule stress_table:
     input:
         stress=lambda wildcards: table_files("stress", "stress.json"),
+        responses=lambda wildcards: table_files("stress", "response.json"),
     output:
         csv=report(f"{RESULTS}/stress.csv", caption="../report/stress.rst", category="Tables"),
         markdown=f"{RESULTS}/stress.md",

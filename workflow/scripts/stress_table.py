@@ -7,10 +7,14 @@ from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
-    errors: dict[str, dict[str, list]] = {}
-    for (method, column), file in zip(params.cells, list(inputs.stress), strict=True):
-        errors.setdefault(method, {}).setdefault(column, []).append(read_json(file))
-    csv, markdown, verdicts = stress_table(errors, params.titles, params.columns, PAPER["stress"])
+    found: dict[str, dict[str, dict[str, list]]] = {}
+    for kind in ("stress", "responses"):
+        for (method, column), file in zip(params.cells, list(inputs[kind]), strict=True):
+            runs = found.setdefault(kind, {}).setdefault(method, {}).setdefault(column, [])
+            runs.append(read_json(file))
+    csv, markdown, verdicts = stress_table(
+        found["stress"], params.titles, params.columns, PAPER["stress"], found["responses"]
+    )
     write_text(output.csv, csv)
     write_text(output.markdown, markdown)
     run.say(f"{len(params.titles)} methods, {len(params.columns)} columns: {output.markdown}")
