@@ -7,7 +7,10 @@ configfile: "config/config.yaml"
 report: "workflow/report/workflow.rst"
 
 
-include: "workflow/rules/common.smk"
+include: "workflow/rules/settings.smk"
+include: "workflow/rules/scenes.smk"
+include: "workflow/rules/methods.smk"
+include: "workflow/rules/tables.smk"
 include: "workflow/rules/dataset.smk"
 include: "workflow/rules/packing.smk"
 include: "workflow/rules/priors.smk"

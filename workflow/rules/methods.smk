@@ -1,0 +1,200 @@
+"""What methods start from, read and are told. Needs scenes.smk."""
+
+from neuma_lib.config.methods import IDENTIFIED
+from neuma_lib.config.variants import parse_chain
+
+
+def prior_file(scene, method=None):
+    """The prior of a scene, or of a method there, in its chain: made here, or the user's own if it is a path."""
+    name = SETTINGS.method_prior(scene, method) if method else SETTINGS.scene(scene).prior
+    if name == IDENTIFIED:
+        return home(scene, "priors/identified.safetensors")
+    if name not in SETTINGS.priors.laws:
+        return name
+    return f"{RESULTS}/priors/{folder(name, SETTINGS.chain(scene)[1], ['prior'])}.safetensors"
+
+
+def prior_chain(wildcards):
+    """Name of a prior, and the seeds of its chain."""
+    return parse_chain(wildcards.prior, SETTINGS.priors.laws, "prior")
+
+
+@checked
+def material_settings(wildcards):
+    return SETTINGS.method_material(wildcards.scene, wildcards.method).plain()
+
+
+def stretches_by_total(scene, method):
+    """Whether the total deformation stretches the Gaussians in a method on a scene."""
+    return SETTINGS.method_material(scene, method).covariance_from == "total"
+
+
+@checked
+def carries_total(wildcards):
+    """Whether a prediction carries the total deformation: the method asks for it, for one of the bodies at least."""
+    scenes = SETTINGS.body_scenes(subject(wildcards))
+    return any(stretches_by_total(scene, wildcards.method) for scene in scenes)
+
+
+@checked
+def training_settings(wildcards):
+    """The same of a method that trains a law of its own."""
+    scene, method = wildcards.scene, wildcards.method
+    trained = SETTINGS.law_scene(scene, method), SETTINGS.method_training(method)
+    if trained != (scene, method):
+        raise InputError(
+            f"{scene}/{method} trains nothing: its law is that of {'/'.join(trained)}, ask for that one"
+        )
+    return material_settings(wildcards)
+
+
+@checked
+def material_prior(wildcards):
+    """The networks that a method starts from; none where its law is analytic, or corrects an analytic one."""
+    analytic = SETTINGS.is_identified(wildcards.method) or SETTINGS.is_structured(wildcards.method)
+    if analytic or SETTINGS.true_law(wildcards.scene, wildcards.method):
+        return []
+    return prior_file(SETTINGS.law_scene(wildcards.scene, wildcards.method), wildcards.method)
+
+
+@checked
+def stock_base(wildcards):
+    """The analytic law that a structured method corrects, where it is that of a prior."""
+    if not SETTINGS.is_structured(wildcards.method):
+        return None
+    return SETTINGS.method_base(wildcards.scene, wildcards.method)
+
+
+def identified_name(scene, method):
+    """The file of what was identified for a method: in the views of its training, if these are its own."""
+    views = SETTINGS.identified_views(scene, method)
+    return f"identified+views={','.join(map(str, views))}.json" if views else "identified.json"
+
+
+def identified_file(wildcards):
+    """The same of the scene that a method's law is from, in its chain."""
+    scene, method = wildcards.scene, wildcards.method
+    return home(SETTINGS.law_scene(scene, method), identified_name(scene, method))
+
+
+def identification(file):
+    """The job that makes such a file: its rule and its wildcards."""
+    scene, views = Path(file).parent.name, Path(file).stem.partition("views=")[2]
+    return ("identify_views", {"scene": scene, "views": views}) if views else ("identify", {"scene": scene})
+
+
+def identify_settings(wildcards):
+    """Settings of an identification, in the views that its file names, if any."""
+    views = getattr(wildcards, "views", None)
+    return SETTINGS.identify.plain() | ({"views": [int(view) for view in views.split(",")]} if views else {})
+
+
+@checked
+def identified_base(wildcards):
+    """The law that was identified in a scene's video, where this is what a structured method corrects."""
+    if not SETTINGS.is_structured(wildcards.method) or stock_base(wildcards):
+        return []
+    return identified_file(wildcards)
+
+
+@checked
+def structured_settings(wildcards):
+    """Settings of a method's structured law; none where it has another."""
+    section = SETTINGS.method_structured(wildcards.method)
+    return section.plain() if section else None
+
+
+@checked
+def true_law(wildcards):
+    """The scene's own law, where this is what a method evaluates."""
+    return SETTINGS.true_law(wildcards.scene, wildcards.method) or []
+
+
+@checked
+def identified_law(wildcards):
+    """The law that was identified in a scene's video, where this is what a method evaluates."""
+    if not SETTINGS.is_identified(wildcards.method):
+        return []
+    return identified_file(wildcards)
+
+
+@checked
+def stock_law(wildcards):
+    """The analytic law that a scene's prior is trained on; none where the prior is a file of the user's."""
+    law = SETTINGS.priors.laws.get(SETTINGS.scene(wildcards.scene).prior)
+    return law.plain() if law else None
+
+
+def supervised_by(kind, file):
+    """A function of wildcards: a file of each video's data, where the method is supervised by what is in it."""
+
+    @checked
+    def choose(wildcards):
+        material = SETTINGS.method_material(wildcards.scene, wildcards.method)
+        return of_each_video(of_scene(file))(wildcards) if material.supervision == kind else []
+
+    return choose
+
+
+training_video = supervised_by("pixels", "dynamic/transforms.json")
+training_particles = supervised_by("particles", "particles.h5")  # ground truth, in one ablation
+
+
+@checked
+def trained_adaptor(wildcards):
+    """The adaptor, where there is one: of the method on the scene itself, or of those whose law it takes."""
+    if not SETTINGS.method_material(wildcards.scene, wildcards.method).train:
+        return []
+    scene = SETTINGS.law_scene(wildcards.scene, wildcards.method)
+    run = SETTINGS.run_folder(scene, SETTINGS.method_training(wildcards.method))
+    return f"{RESULTS}/{run}/adaptor.safetensors"
+
+
+@checked
+def judged_carrier(wildcards):
+    return SETTINGS.judged_carrier(wildcards.scene, wildcards.method)
+
+
+@checked
+def start_name(wildcards):
+    """The file that tells a method how bodies are thrown."""
+    identified = material_settings(wildcards)["start"] == "identified"
+    return identified_name(wildcards.scene, wildcards.method) if identified else "velocity.json"
+
+
+def start_file(wildcards):
+    return of_chain(start_name(wildcards))(wildcards)
+
+
+def start_files(wildcards):
+    """The same of each video."""
+    return of_each_video(of_chain(start_name(wildcards)))(wildcards)
+
+
+@checked
+def gaussian_motion(wildcards):
+    return material_settings(wildcards)["gaussian_motion"]
+
+
+@checked
+def method_density(wildcards):
+    return SETTINGS.method_density(wildcards.scene, wildcards.method)
+
+
+@checked
+def training_densities(wildcards):
+    """The same as a method takes them to be."""
+    own = video_densities(wildcards)
+    assumed = SETTINGS.method_material(wildcards.scene, wildcards.method).assumed_density
+    return own if assumed is None else [assumed] * len(own)
+
+
+@checked
+def evaluation_views(wildcards):
+    """Views that image metrics are taken in: those that are asked for, or those that training does not see.
+
+    Where training sees all views, these: image metrics and figures then say so.
+    """
+    seen = SETTINGS.method_material(wildcards.scene, wildcards.method).views
+    unseen = [view for view in range(SETTINGS.dataset.dynamic.views) if view not in seen]
+    return list(SETTINGS.evaluation.views or unseen or seen)

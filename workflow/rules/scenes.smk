@@ -1,0 +1,209 @@
+"""Files and settings of scenes and experiments, each in its chain. Needs settings.smk."""
+
+import re
+from types import SimpleNamespace
+
+from neuma_lib.config.variants import folder
+
+# What a chain's seeds change in a file of a scene or an experiment (config/variants.py); runs of methods have
+# `Config.run_folder`.
+DRAWN_IN = {
+    **dict.fromkeys(["gaussians.ply", "gaussians.json", "mesh.ply", "tracers.h5"], ["gaussians"]),
+    **dict.fromkeys(["sampled_particles.h5", "particles.h5", "binding.h5"], ["gaussians", "particles"]),
+    **dict.fromkeys(
+        ["velocity.json", "identified.json", "priors/identified.safetensors", "visited.h5"],
+        ["prior", "gaussians", "particles"],
+    ),
+}
+
+
+def home(name, file):
+    """The one path of a file of a scene or experiment in a chain."""
+    base, seeds = SETTINGS.chain(name)
+    if base in SETTINGS.scenes:
+        drawn = DRAWN_IN[re.sub("[+]views=[0-9,]+", "", file)]
+        return f"{RESULTS}/{folder(base, seeds, drawn)}/{file}"
+    # Solids are filled with particles; where a scene's own object is among them, all that led to its start counts.
+    rebuilt = any(body.shape is None for body in SETTINGS.experiments[base].bodies)
+    drawn = DRAWN_IN["velocity.json"] if rebuilt else ["particles"]
+    return f"{RESULTS}/experiments/{folder(base, seeds, drawn)}/{file}"
+
+
+def of_chain(file):
+    """A function of wildcards: a file of the scene or experiment in its chain."""
+    return checked(lambda wildcards: home(subject(wildcards), file))
+
+
+def of_scene(file):
+    """A function of wildcards: a file of the scene's or experiment's data, which all its chains share."""
+
+    @checked
+    def choose(wildcards):
+        base, _ = SETTINGS.chain(subject(wildcards))
+        return f"{DATA}/{base if base in SETTINGS.scenes else f'experiments/{base}'}/{file}"
+
+    return choose
+
+
+def seed_of(drawn):
+    """A function of wildcards: the seed of what a scene or experiment draws in its chain."""
+    return checked(lambda wildcards: SETTINGS.seed + SETTINGS.chain(subject(wildcards))[1][drawn])
+
+
+def subject(wildcards):
+    """The scene or experiment, with the seeds of its chain, that a job is about."""
+    return getattr(wildcards, "scene", None) or wildcards.experiment
+
+
+# The rules that reconstruct a scene and prepare its evaluation, and a file of each.
+MAKERS = {
+    "gaussians": "gaussians.ply",
+    "mesh": "mesh.ply",
+    "sampled_particles": "sampled_particles.h5",
+    "binding": "binding.h5",
+    "velocity": "velocity.json",
+    "tracers": "tracers.h5",
+}
+# Files of a reconstructed body: the particles that are simulated, the Gaussians, and what binds them.
+BODY = {"particles": "particles.h5", "binding": "binding.h5", "gaussians": "gaussians.ply"}
+
+
+def body_files():
+    """Functions of wildcards: the files of the body of a scene or experiment, by name."""
+    return {name: of_chain(file) for name, file in BODY.items()}
+
+
+def of_each_video(function):
+    """A function of wildcards of a scene, applied to the scenes of all its videos: a list where there are several."""
+
+    @checked
+    def choose(wildcards):
+        found = [function(SimpleNamespace(scene=scene)) for scene in SETTINGS.video_scenes(wildcards.scene)]
+        return found if len(found) > 1 else found[0]
+
+    return choose
+
+
+def each_of(bodies):
+    """Files by name of the bodies of several scenes or experiments."""
+    return {name: [home(body, file) for body in bodies] for name, file in BODY.items()}
+
+
+def scene_setting(*names):
+    """A function of wildcards: the named settings of the scene, as plain values."""
+
+    @checked
+    def choose(wildcards):
+        scene = SETTINGS.scene(wildcards.scene).plain()
+        return scene[names[0]] if len(names) == 1 else {name: scene[name] for name in names}
+
+    return choose
+
+
+def origin_of(part, scene):
+    """Whether a part ('static', 'dynamic', 'truth') of a scene is 'made', 'supplied' by the user or 'packed'.
+
+    A truth is not supplied: that of a scene with a video of the user's is simulated.
+    """
+    if getattr(SETTINGS.scenes[scene].images, "dynamic" if part == "truth" else part):
+        return "made" if part == "truth" else "supplied"
+    return "packed" if SETTINGS.dataset.packed else "made"
+
+
+def scenes_with(part, origin):
+    """Pattern of the scenes whose part is of an origin: each file has one maker."""
+    return "|".join(scene for scene in SETTINGS.scenes if origin_of(part, scene) == origin) or "none"
+
+
+def truth_memory(wildcards):
+    """Memory that a ground truth takes [MB]: twice the particles (x, v, F, C) and tracers of all frames."""
+    bytes_a_frame = 96 * truth_settings(wildcards).particles + 24 * SETTINGS.dataset.tracers
+    return 2000 + 2 * len(SETTINGS.frame_steps(wildcards.scene)) * bytes_a_frame // 10**6
+
+
+def frame_steps(wildcards):
+    return list(SETTINGS.frame_steps(wildcards.scene))
+
+
+def simulation_settings(wildcards):
+    """Constants of the simulator for a scene."""
+    return simulator(SETTINGS.scene(wildcards.scene).dt)
+
+
+def simulator(dt, grid=None):
+    """Constants of the simulator with a time step [s], on the reconstruction's grid unless another is given."""
+    section = SETTINGS.simulation.plain() | ({"grid": grid} if grid else {})
+    return {"dt": dt, **{name: section[name] for name in ("grid", "gravity", "boundary", "walls")}}
+
+
+@checked
+def truth_settings(wildcards):
+    """How finely the ground truth of a scene or experiment is simulated."""
+    if hasattr(wildcards, "scene"):
+        return SETTINGS.scene_truth(wildcards.scene)
+    return SETTINGS.experiment_truth(wildcards.experiment)
+
+
+def truth_simulation(wildcards):
+    """Constants of the simulator for the ground truth of a scene or experiment."""
+    truth = truth_settings(wildcards)
+    return simulator(truth.dt, truth.grid)
+
+
+def truth_particles(wildcards):
+    return truth_settings(wildcards).particles
+
+
+@checked
+def video_densities(wildcards):
+    """Densities of the bodies of all videos of a scene."""
+    return [SETTINGS.scene(scene).plain()["density"] for scene in SETTINGS.video_scenes(wildcards.scene)]
+
+
+def scene_bodies(wildcards):
+    """What the ground truth of a scene simulates."""
+    keys = ("shape", "size", "height", "center", "velocity", "spin", "density", "law")
+    return [scene_setting(*keys)(wildcards)]
+
+
+def experiment_bodies(*keys):
+    """A function of wildcards: the named settings of an experiment's bodies."""
+
+    @checked
+    def choose(wildcards):
+        return [{key: body[key] for key in keys} for body in SETTINGS.experiment_bodies(wildcards.experiment)]
+
+    return choose
+
+
+def experiment_frames(wildcards):
+    return list(SETTINGS.dataset.frame_steps(SETTINGS.experiment(wildcards.experiment).steps))
+
+
+def experiment_simulation(wildcards):
+    """Constants of the simulator for an experiment."""
+    return simulator(SETTINGS.experiment_dt(wildcards.experiment))
+
+
+def reconstructed_files(name):
+    """A function of wildcards: a file of the scene of each body that is the scene's own object."""
+
+    @checked
+    def choose(wildcards):
+        bodies = SETTINGS.experiment(wildcards.experiment).bodies
+        scenes = SETTINGS.body_scenes(wildcards.experiment)
+        return [home(scene, name) for body, scene in zip(bodies, scenes) if body.shape is None]
+
+    return choose
+
+
+def of_each_body(function):
+    """A function of wildcards of scene and method, applied to the scene of each body of an experiment."""
+
+    @checked
+    def choose(wildcards):
+        scenes = SETTINGS.body_scenes(wildcards.experiment)
+        found = [function(SimpleNamespace(scene=scene, method=wildcards.method)) for scene in scenes]
+        return [value for value in found if value != []]
+
+    return choose

@@ -1,0 +1,80 @@
+"""Reads and checks the settings; folders, machine, names and functions that every rule shares."""
+
+import os
+import shutil
+import sys
+from pathlib import Path
+
+ROOT = Path(workflow.basedir).resolve()
+sys.path.insert(0, str(ROOT))
+
+from neuma_lib.config.settings import load
+from neuma_lib.errors import InputError
+from workflow.defaults import complete
+from workflow.provenance import code_digest
+
+try:
+    SETTINGS = load(config)
+except InputError as error:
+    raise WorkflowError(str(error)) from None
+
+DATA = SETTINGS.data_root.rstrip("/")
+RESULTS = SETTINGS.results_root.rstrip("/")
+KERNELS = f"{DATA}/kernels"  # what is known of them; they themselves are in SETTINGS.kernel_cache
+HAS_CUDA = shutil.which("nvidia-smi") is not None
+GPU = int({"cpu": False, "cuda": True, "auto": HAS_CUDA}[SETTINGS.device])
+# Kernels and ground truths are made with or without a GPU, so that its images can be rendered where none is.
+EITHER_DEVICE = "cpu" if SETTINGS.device == "cpu" else "auto"
+EITHER_GPU = int(GPU and HAS_CUDA)
+
+# Scripts are processes of their own: they find the library, share one kernel cache, and keep to one thread each
+# (two OpenMP threads on a busy machine are far slower than one).
+THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+os.environ.update(
+    {
+        "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]),
+        "NEUMA_KERNEL_CACHE": str(Path(SETTINGS.kernel_cache).resolve()),
+        **{name: os.environ.get(name, "1") for name in THREAD_LIMITS},
+    }
+)
+
+
+# Runs when all jobs are known and none has started, and not in a dry run. A cluster's nodes are not this machine.
+onstart:
+    rules = sorted({job.rule.name for job in workflow.dag.needrun_jobs() if job.resources.get("gpu")})
+    if SETTINGS.device == "cuda" and rules and workflow.local_exec:
+        from neuma_lib.device import choose_device
+
+        try:
+            choose_device("cuda")
+        except InputError as error:
+            raise WorkflowError(
+                f"{error}. Rules that wait for one: {', '.join(rules)}. Ground truth and images (target 'dataset')"
+                " need none."
+            ) from None
+
+
+wildcard_constraints:
+    scene=f"({'|'.join(SETTINGS.scenes) or 'none'})([+][^/]*)?",
+    prior=f"({'|'.join(SETTINGS.priors.laws) or 'none'})([+]seed=[1-9][0-9]*)?",
+    method=f"({'|'.join(SETTINGS.methods) or 'none'})([+][^/]*)?",
+    experiment=f"({'|'.join(SETTINGS.experiments) or 'none'})([+][^/]*)?",
+    group="geometry|simulation|laws|rendering",
+    views="[0-9]+(,[0-9]+)*",
+
+
+def kernels(*groups):
+    """Files that say that groups of Warp kernels are compiled; `laws` brings `simulation` with it."""
+    return [f"{KERNELS}/{group}.ready" for group in groups]
+
+
+def checked(function):
+    """An input or parameter function whose InputError ends Snakemake with its message alone."""
+
+    def call(wildcards):
+        try:
+            return function(wildcards)
+        except InputError as error:
+            raise WorkflowError(str(error)) from None
+
+    return call
