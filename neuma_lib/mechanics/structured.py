@@ -19,15 +19,25 @@ length of the cycle in e.
 **Elasticity, form "energy".** tau_i = d psi / d e_i of psi = exp(n0) psi_volume + exp(n1) psi_shear, two non-negative
 parts of the base's energy: no cycle gains or loses energy, but stresses need not be ordered.
 
-**Plasticity.** A radial return of q = |dev e| that keeps t,
+**Plasticity.** A return of t and of q = |dev e| along dev e: first a share of t relaxes, then the rest slips by D,
 
-    q' = q - a ramp(q - q_y),    q_y = q0(n0) + m(n1) ramp(-t),    a = 1 / (1 + r(n2)),
+    t1 = (1 - a v) t,    q' = q - D,    t' = (1 - k D / q) t1 - d D,    D = a ramp(q - q_y) / (1 + m d),
+    q_y = q0(n0) + m(n1) ramp(-t1),    a = 1 / (1 + r(n2)),
+    v = ramp(n3) / LIMIT,    k = ramp(-n4) / LIMIT,    d = ramp(n4) / LIMIT 2 mu m / K.
 
-with 0 <= q' <= q for any weights. Von Mises is m = r = 0, viscous flow r = viscosity / (mu dt), a Bingham fluid the
-same with q0 > 0. A granular base (``drucker_prager``) has a cohesion c(n0) instead of q0: q_y = m ramp(3 c - t), and
-beyond t = 3 c it is torn to the tip of its cone, e' = c. A constant x > 0 of the base becomes x exp(n); one that is 0
-becomes unit * ramp(n), so that a base without friction, rate or cohesion can learn some. Where the elastic stresses
-are ordered as the stretches, d psi / d q = tau . dev e / q >= 0, so a radial return never adds elastic energy.
+Von Mises is m = r = 0, viscous flow r = viscosity / (mu dt), a Bingham fluid the same with q0 > 0. A granular base
+(``drucker_prager``) has a cohesion c(n0) instead of q0: q_y = m (3 c - t1), and beyond t1 = 3 c + d q it is torn to the
+tip of its cone, e' = c. A constant x > 0 of the base becomes x exp(n); one that is 0 becomes unit * ramp(n), so that a
+base without friction, rate or cohesion can learn some. No base changes the volume in flow; v compacts under pressure
+(from a pressure on that the network sets) and gives way in tension, k compacts in shear, and d dilates: t' is the
+elastic part, so a body that grows has less of it. D is consistent: without rate, slip with dilatancy ends on the cone
+at its new pressure, and m = 3 K alpha(phi) / (2 mu), d = 3 alpha(psi) are the angles of `CohesiveDruckerPrager`.
+
+For any weights 0 <= q' <= q, and t' lies between 0 and t, but for dilatancy, which slips at most as the normal of the
+cone. So the Hencky energy mu q^2 + K t^2 / 2 of the base's constants, which mu and K above are, never grows; without
+dilatancy no energy does where stresses are ordered as stretches (tau . dev e >= 0) and the mean stress has the sign of
+t. Dilatancy
+under a pressure p = -tr tau / 3 may add up to d p a unit of slip in any other elasticity, a corrected one too.
 
 A last layer of zeros, where training starts and which an adaptor weight of 0 restores, leaves the base exactly
 (to round-off). Bases are those named above with any of ``identity`` (stays elastic, has no network), ``von_mises``,
@@ -78,7 +88,7 @@ from neuma_lib.mechanics.structured_kernels import (
 
 FORMS = {"stretch": 3, "energy": 2}
 """Numbers that the network of each form of elasticity gives."""
-PLASTIC_OUTPUTS = 3
+PLASTIC_OUTPUTS = 5
 # Shear function f = sum of c (x^p - 1) / p over (c, p), with log x for p = 0: the base's deviator is 2 mu dev f.
 SHEAR_TERMS: dict[type[AnalyticElasticity], tuple[tuple[float, float], ...]] = {
     Hencky: ((1.0, 0.0),),
@@ -233,7 +243,7 @@ class StructuredElasticity(StructuredConstitutive, Elasticity):
                 f"the energy form needs nu >= 0, not {base.values['nu']:g}: its volume part is else negative"
             )
         base_number = kernels.BASES.index(NAMES[type(base)])
-        self.kernel = form, kernels.Constants(base_number, (self.mu, self.lam, 0.0))
+        self.kernel = form, kernels.Constants(base_number, (self.mu, self.lam, 0.0, 0.0))
         self.freeze(_checked(weights, FORMS[form], seed))
 
     def outputs(self, z: Tensor, weights: Weights) -> Tensor:
@@ -328,7 +338,7 @@ class StructuredElasticity(StructuredConstitutive, Elasticity):
 
 
 class StructuredPlasticity(StructuredConstitutive, Plasticity):
-    """A corrected radial return, see the module.
+    """A corrected return map, see the module.
 
     Args:
         base: its analytic law, with numbers as constants: von Mises, Drucker-Prager or viscous flow.
@@ -346,12 +356,13 @@ class StructuredPlasticity(StructuredConstitutive, Plasticity):
             raise InputError(_no_base("plasticity", "identity, von_mises, drucker_prager, viscous_flow"))
         self.analytic = base
         self.granular = isinstance(base, DruckerPrager)
-        mu, _ = lame(base.values["E"], base.values["nu"])
+        mu, lam = lame(base.values["E"], base.values["nu"])
+        self.associated = 2 * mu / (lam + 2 * mu / 3)
         self.friction = base.slope(**base.values) if self.granular else 0.0
         self.threshold = base.values["cohesion"] if self.granular else base.values["yield_stress"] / (2 * mu)
         viscous = isinstance(base, ViscousFlow)
         self.rate = base.values["viscosity"] / (mu * base.values["dt"]) if viscous else 0.0
-        constants = self.threshold, self.friction, self.rate
+        constants = self.threshold, self.friction, self.rate, self.associated
         self.kernel = "return", kernels.Constants(int(self.granular), tuple(map(float, constants)))
         self.freeze(_checked(weights, PLASTIC_OUTPUTS, seed))
 
@@ -366,24 +377,29 @@ class StructuredPlasticity(StructuredConstitutive, Plasticity):
     def principal(self, sigma: Tensor, weights: Weights) -> tuple[Tensor, Quotients]:
         """Principal stretches (N, 3) after the return, sigma itself where nothing yields; their divided differences."""
         trace, deviator, norm = hencky_strain(sigma)
-        n0, n1, n2 = self.outputs(invariants(trace / 3 + deviator), weights).split(1, dim=1)
-        threshold = _corrected(self.threshold, n0, COHESION_UNIT)
-        friction = _corrected(self.friction, n1, 1.0)
-        rate = _corrected(self.rate, n2, 1.0)
+        n = self.outputs(invariants(trace / 3 + deviator), weights)
+        threshold = _corrected(self.threshold, n[:, :1], COHESION_UNIT)
+        friction = _corrected(self.friction, n[:, 1:2], 1.0)
+        fluidity = 1 / (1 + _corrected(self.rate, n[:, 2:3], 1.0))
+        crush, dilation, compaction = (x.clamp(min=0) / LIMIT for x in (n[:, 3:4], n[:, 4:], -n[:, 4:]))
+        dilatancy = dilation * self.associated * friction
+        eased = trace * (1 - fluidity * crush)
         if self.granular:
-            pressed = trace - 3 * threshold
-            limit = friction * (-pressed).clamp(min=0)
-            torn = pressed > 0
+            pressed = eased - 3 * threshold
+            limit = -friction * pressed
+            torn = pressed > dilatancy * norm
         else:
-            limit = threshold + friction * (-trace).clamp(min=0)
+            limit = threshold + friction * (-eased).clamp(min=0)
             torn = torch.zeros_like(trace, dtype=torch.bool)
-        kept = rate / (1 + rate)
-        ratio = kept + (1 - kept) * (limit / norm)
-        returned = (trace / 3 + deviator * ratio).exp()
+        slips = ~torn & (norm > limit)
+        share = fluidity / (1 + friction * dilatancy) * (1 - limit / torch.where(slips, norm, 1.0))
+        share = torch.where(slips, share, 0.0)  # D / q
+        after = eased * (1 - compaction * share) - dilatancy * share * norm
+        returned = (after / 3 + deviator * (1 - share)).exp()
         tip = threshold.exp().expand_as(sigma) if self.granular else returned
-        changed = torn | (norm > limit)
+        changed = torn | slips | (crush > 0)
         y = torch.where(changed, torch.where(torn, tip, returned), sigma)
-        scale = torch.where(torn, 0.0, ratio).detach()
+        scale = torch.where(torn, 0.0, 1 - share).detach()
 
         def quotients(sigma):
             pairs, values = _Pairs(sigma), y.detach()

@@ -535,8 +535,8 @@
 
 // Principal stretches y after the return, where `changed`; growing, slopes of threshold, friction and rate by change.
 //// plastic
-        Pack value[OUTPUTS], growing[OUTPUTS];
-        for (int k = 0; k < OUTPUTS; ++k) {
+        Pack value[3], growing[3];
+        for (int k = 0; k < 3; ++k) {
             const Real constant = k == 0 ? threshold_base : k == 1 ? friction_base : rate_base;
             const Real unit = k == 0 ? COHESION_UNIT : Real(1);
             if (constant > Real(0)) {
@@ -547,22 +547,30 @@
                 growing[k] = change[k] >= Real(0) ? zero + unit : zero;
             }
         }
+        const Pack crush = (change[3] > Real(0) ? change[3] : zero) * (Real(1) / LIMIT);
+        const Pack dilation = (change[4] > Real(0) ? change[4] : zero) * (Real(1) / LIMIT);
+        const Pack compaction = (change[4] < Real(0) ? -change[4] : zero) * (Real(1) / LIMIT);
         const Pack tiny = zero + LEAST;
         const Pack norm = SQRT(square > LEAST ? square : tiny), inverse_norm = one / norm;
-        const Pack pressed = kind == GRANULAR ? trace - Real(3) * value[0] : trace;
-        const Pack pressure = pressed < Real(0) ? -pressed : zero;
+        const Pack fluid = one / (one + value[2]), dilatancy = dilation * associated * value[1];
+        const Pack eased = trace * (one - fluid * crush);
+        const Pack pressed = kind == GRANULAR ? eased - Real(3) * value[0] : eased;
+        const Pack pressure = kind == GRANULAR ? -pressed : pressed < Real(0) ? -pressed : zero;
         const Pack limit = (kind == GRANULAR ? zero : value[0]) + value[1] * pressure;
-        const auto torn = (kind == GRANULAR ? pressed : zero) > Real(0);
-        const auto changed = torn | (norm > limit);
+        const Pack beyond_tip = kind == GRANULAR ? pressed - dilatancy * norm : zero;
+        const auto torn = beyond_tip > Real(0);
+        const auto slips = (norm > limit) & (beyond_tip <= Real(0));
+        const auto changed = torn | slips | (crush > Real(0));
         const bool moves = any(changed);
-        const Pack fluid = one / (one + value[2]), held = value[2] * fluid;
-        const Pack ratio = held + fluid * (limit * inverse_norm);
+        const Pack held = one / (one + value[1] * dilatancy), slip = one - limit * inverse_norm;
+        const Pack share = slips ? fluid * held * slip : zero;
         Pack y[3];
         for (int k = 0; k < 3; ++k) y[k] = s[k];
         if (moves) {
             const Pack tip = kind == GRANULAR ? exponential(value[0]) : one;
+            const Pack after = eased * (one - compaction * share) - dilatancy * share * norm;
             for (int k = 0; k < 3; ++k) {
-                const Pack returned = exponential(trace * THIRD_PART + dev[k] * ratio);
+                const Pack returned = exponential(after * THIRD_PART + dev[k] * (one - share));
                 y[k] = torn ? tip : changed ? returned : s[k];
             }
         }
@@ -591,22 +599,31 @@
                     gv[k][i] = g[3 * i] * v[k][0] + g[3 * i + 1] * v[k][1] + g[3 * i + 2] * v[k][2];
             for (int i = 0; i < 3; ++i)
                 for (int j = 0; j < 3; ++j) G[i][j] = dot(u[i], gv[j]);
-            const Pack scale = torn ? zero : ratio;
+            const Pack scale = torn ? zero : one - share;
             Pack ga[3];
             for (int k = 0; k < 3; ++k) ga[k] = changed ? G[k][k] * y[k] : zero;
             const Pack total = ga[0] + ga[1] + ga[2];
-            const Pack g_ratio = torn ? zero : dot(ga, dev);
-            const Pack g_limit = g_ratio * fluid * inverse_norm;
-            const Pack g_pressed = pressed < Real(0) ? -(g_limit * value[1]) : zero;
-            const Pack g_trace = (torn ? zero : total * THIRD_PART) + g_pressed;
-            g_change[0] = kind == GRANULAR ? (torn ? total : Real(-3) * g_pressed) : g_limit;
-            g_change[1] = g_limit * pressure;
-            g_change[2] = g_ratio * (one - limit * inverse_norm) * fluid * fluid;
-            for (int k = 0; k < OUTPUTS; ++k) g_change[k] = g_change[k] * growing[k];
-            const Pack towards = g_limit * limit * inverse_norm * inverse_norm;
+            const Pack g_after = torn ? zero : total * THIRD_PART;
+            const Pack g_share = slips ? -(dot(ga, dev) + g_after * (eased * compaction + dilatancy * norm)) : zero;
+            const Pack g_slip = g_share * fluid * held;
+            const Pack g_limit = -(g_slip * inverse_norm);
+            const Pack pulled = kind == GRANULAR ? -value[1] : pressed < Real(0) ? -value[1] : zero;  // d limit / d pressed
+            const Pack g_pressed = g_limit * pulled;
+            const Pack g_eased = g_after * (one - compaction * share) + g_pressed;
+            const Pack g_held = -(g_share * share * held);  // of the product of friction and dilatancy
+            const Pack g_dilatancy = g_held * value[1] - g_after * share * norm;
+            const Pack g_fluid = g_share * held * slip - g_eased * trace * crush;
+            const Pack g_trace = g_eased * (one - fluid * crush);
+            const Pack g_norm = g_slip * limit * inverse_norm * inverse_norm - g_after * dilatancy * share;
+            g_change[0] = (kind == GRANULAR ? (torn ? total : Real(-3) * g_pressed) : g_limit) * growing[0];
+            g_change[1] = (g_limit * pressure + g_held * dilatancy + g_dilatancy * dilation * associated) * growing[1];
+            g_change[2] = -(g_fluid * fluid * fluid * growing[2]);
+            g_change[3] = change[3] >= Real(0) ? g_eased * trace * fluid * (Real(-1) / LIMIT) : zero;
+            g_change[4] = (change[4] >= Real(0) ? g_dilatancy * associated * value[1] : zero) * (Real(1) / LIMIT)
+                + (change[4] <= Real(0) ? g_after * eased * share : zero) * (Real(1) / LIMIT);
             for (int k = 0; k < 3; ++k) {
-                const Pack straight = torn ? zero : ratio * (ga[k] - total * THIRD_PART);
-                g_s[k] = rate[k] * (g_trace + straight - towards * dev[k]);
+                const Pack straight = torn ? zero : scale * (ga[k] - total * THIRD_PART);
+                g_s[k] = rate[k] * (g_trace + straight + g_norm * inverse_norm * dev[k]);
             }
             for (int pair = 0; pair < 3; ++pair) {
                 const int i = FIRST[pair], j = SECOND[pair];

@@ -32,24 +32,24 @@ LODE = 3 * math.sqrt(6)
 """|det dev e| is at most |dev e|^3 / LODE."""
 COHESION_UNIT = 0.02
 """Strain that a network output of one adds to a cohesion or yield strain of zero."""
-KINDS = {"stretch": 3, "energy": 2, "return": 3}
+KINDS = {"stretch": 3, "energy": 2, "return": 5}
 """Kernels there are, with the outputs of their networks: the two forms of elasticity, and plasticity."""
 BASES = ("hencky", "neo_hookean", "fixed_corotated")
 """Bases of elasticity, in the order of their numbers in the kernels."""
 CACHED = 21
 """Numbers that the CPU caches of a row: U, V and the singular values."""
 THREADS = {torch.float32: 128, torch.float64: 64}
-"""Rows, and threads, of a block: what they put in shared memory is 36 KB of the 48 KB that every GPU has."""
+"""Rows, and threads, of a block: what they put in shared memory is at most 40 KB of the 48 KB that every GPU has."""
 BLOCKS_PER_PROCESSOR = 2
 LANES, GROUPS = 32, 8  # of the kernel that adds the blocks' sums
 
 
 @dataclass(frozen=True)
 class Constants:
-    """What a kernel knows of its law beside the weights: a number for its kind, and three constants."""
+    """What a kernel knows of its law beside the weights: a number for its kind, and four constants."""
 
     kind: int
-    values: tuple[float, float, float]
+    values: tuple[float, float, float, float]
 
 
 def weight_count(kind: str) -> int:
@@ -98,7 +98,7 @@ def source(kind: str, backward: bool, dtype: torch.dtype) -> str:
     """C++ text of the body of a kernel, one of :data:`KINDS`."""
     parts = native_source(__file__, ".h")
     if kind == "return":
-        names = "const Real threshold_base = p0, friction_base = p1, rate_base = p2;"
+        names = "const Real threshold_base = p0, friction_base = p1, rate_base = p2, associated = p3;"
         gradient, value, result = ("load_gradient",), ("plastic",), ("deformation",)
         adjoint = ("if_moves", "plastic_vjp", "network_vjp", "put_gradient", "end_if")
     else:
@@ -134,7 +134,7 @@ def add_source(kind: str, dtype: torch.dtype) -> str:
 # Arrays are handed over as addresses: Warp's array objects would cost more time than the kernel.
 @cache
 def evaluate_kernel(kind: str, dtype: torch.dtype):
-    """Kernel (F, W0, W1, W2, number, three constants, n, cached, cache, out), launched by `_launch`.
+    """Kernel (F, W0, W1, W2, number, four constants, n, cached, cache, out), launched by `_launch`.
 
     ``cached``: 0 keeps nothing of the SVD, 1 writes it to the cache (n / CPU_WIDTH packs, CACHED, CPU_WIDTH).
     """
@@ -142,23 +142,23 @@ def evaluate_kernel(kind: str, dtype: torch.dtype):
 
     @wp.func_native(source(kind, False, dtype))
     def evaluate_rows(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, kind: int, p0: real, p1: real, p2: real,
+        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, kind: int, p0: real, p1: real, p2: real, p3: real,
         n: int, cached: int, cache: wp.uint64, out: wp.uint64,
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def structured_evaluate(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, kind: int, p0: real, p1: real, p2: real,
+        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, kind: int, p0: real, p1: real, p2: real, p3: real,
         n: int, cached: int, cache: wp.uint64, out: wp.uint64,
     ):  # fmt: skip
-        evaluate_rows(F, W0, W1, W2, kind, p0, p1, p2, n, cached, cache, out)
+        evaluate_rows(F, W0, W1, W2, kind, p0, p1, p2, p3, n, cached, cache, out)
 
     return structured_evaluate
 
 
 @cache
 def vjp_kernel(kind: str, dtype: torch.dtype):
-    """Kernel (F, W0, W1, W2, number, three constants, n, cached, cache, grad_out, grad_F, ...), likewise.
+    """Kernel (F, W0, W1, W2, number, four constants, n, cached, cache, grad_out, grad_F, ...), likewise.
 
     ``cached``: 0 computes the SVD, 2 reads it from the cache. The sums go to the last arguments: on a CPU they are
     added to three totals, on a GPU they are put into partials (blocks, weights).
@@ -167,19 +167,19 @@ def vjp_kernel(kind: str, dtype: torch.dtype):
 
     @wp.func_native(source(kind, True, dtype))
     def vjp_rows(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, kind: int, p0: real, p1: real, p2: real,
+        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, kind: int, p0: real, p1: real, p2: real, p3: real,
         n: int, cached: int, cache: wp.uint64, grad_out: wp.uint64, grad_F: wp.uint64,
         total0: wp.uint64, total1: wp.uint64, total2: wp.uint64, partials: wp.uint64,
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def structured_vjp(
-        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, kind: int, p0: real, p1: real, p2: real,
+        F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, kind: int, p0: real, p1: real, p2: real, p3: real,
         n: int, cached: int, cache: wp.uint64, grad_out: wp.uint64, grad_F: wp.uint64,
         total0: wp.uint64, total1: wp.uint64, total2: wp.uint64, partials: wp.uint64,
     ):  # fmt: skip
         vjp_rows(
-            F, W0, W1, W2, kind, p0, p1, p2, n, cached, cache, grad_out, grad_F, total0, total1, total2, partials
+            F, W0, W1, W2, kind, p0, p1, p2, p3, n, cached, cache, grad_out, grad_F, total0, total1, total2, partials
         )  # fmt: skip
 
     return structured_vjp

@@ -13,8 +13,8 @@ from neuma_lib.io.weights import write_weights
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.isotropic import PAIRS, lame
 from neuma_lib.mechanics.neural import neural_law
-from neuma_lib.mechanics.plasticity import hencky_strain
-from neuma_lib.mechanics.structured import FORMS, SMOOTH, invariants, network, structured_law
+from neuma_lib.mechanics.plasticity import CohesiveDruckerPrager, hencky_strain
+from neuma_lib.mechanics.structured import FORMS, LIMIT, SMOOTH, invariants, network, structured_law
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
@@ -197,26 +197,99 @@ def elastic_energy(sigma):
     return (LAM / 2 + MU / 3) * trace[:, 0] ** 2 + MU * (deviator**2).sum(1)
 
 
+def spread_stretches(seed=2, count=4000):
+    """(count, 3) principal stretches of strains between small and 1."""
+    spread = torch.randn(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return (torch.linspace(0.01, 1, count, dtype=torch.float64)[:, None] * spread).exp()
+
+
+def keeping_volume(weights):
+    """Weights whose outputs of compaction and dilatancy are zero."""
+    *hidden, last = weights
+    return *hidden, torch.cat([last[:3], torch.zeros_like(last[3:])])
+
+
+@pytest.mark.parametrize("volume_flows", [False, True])
 @pytest.mark.parametrize("name", RETURNS)
-def test_return_never_adds_energy_and_is_radial(name):
-    part = plasticity(name)
-    spread = torch.randn(4000, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    sigma = (torch.linspace(0.01, 1, 4000, dtype=torch.float64)[:, None] * spread).exp()
+def test_return_never_adds_energy_and_is_radial(name, volume_flows):
+    """The volume is kept without its two outputs, and else the elastic trace lies between 0 and what it was, unless the
+    body dilates: then it falls, by no more than the energy of the shear pays for."""
+    part, sigma = plasticity(name), spread_stretches()
     trace, deviator, q = hencky_strain(sigma)
     for seed in range(5):
-        returned, _ = part.principal(sigma, random_weights(part, seed))
+        weights = random_weights(part, seed)
+        weights = weights if volume_flows else keeping_volume(weights)
+        returned, _ = part.principal(sigma, weights)
         trace_after, deviator_after, q_after = hencky_strain(returned)
         rounding = 64 * EPS * (1 + elastic_energy(sigma))
         assert bool((elastic_energy(returned) <= elastic_energy(sigma) + rounding * MU).all())
-        inside = (sigma > 0.06).all(1) & (returned > 0.06).all(1)  # elsewhere the strain is clamped
+        inside = ((sigma > 0.06) & (returned > 0.06)).all(1)  # elsewhere the strain is clamped
         along = (deviator_after - deviator * (q_after / q))[inside]
         assert float(along.abs().max()) < 64 * EPS and bool((q_after <= q * (1 + 64 * EPS))[inside].all())
+        assert int((q_after < 0.9 * q).sum()) > 100
         volume = (trace_after - trace)[inside]
+        if volume_flows:
+            n = part.outputs(invariants(sigma.log()), weights)[inside]
+            dilates = n[:, 4] > 0
+            assert bool((volume * trace[inside].sign() < 64 * EPS)[~dilates].all())
+            assert bool((trace_after.abs() <= trace.abs() + 64 * EPS)[inside][~dilates].all())
+            assert bool((trace_after * trace >= -64 * EPS)[inside][~dilates].all())
+            assert bool((volume - (-trace[inside]).clamp(min=0) < 64 * EPS)[dilates].all())
+            assert int((volume.abs() > 0.1 * trace[inside].abs()).sum()) > 100
+            continue
         if part.granular:
             assert float(volume.max()) < 64 * EPS
             volume = volume[trace[inside] < 0]
         assert float(volume.abs().max()) < 64 * EPS
-        assert int((q_after < 0.9 * q).sum()) > 100
+
+
+def constant_outputs(part, *n):
+    """Weights whose outputs are n wherever they are asked."""
+    weights = tuple(torch.zeros(w.shape, dtype=torch.float64) for w in part.base)
+    n = torch.tensor(n, dtype=torch.float64)
+    weights[2][:, -1] = n / (1 - (n / LIMIT) ** 2).sqrt()
+    return weights
+
+
+@pytest.mark.parametrize("dilation", [0.0, 12.0, 34.0])
+def test_grains_that_dilate_are_contained(dilation):
+    """One constant output makes `CohesiveDruckerPrager` of `DruckerPrager`, its tip and its tensile states too."""
+
+    def alpha(degrees):
+        sine = math.sin(math.radians(degrees))
+        return math.sqrt(2 / 3) * 2 * sine / (3 - sine)
+
+    cohesion, friction = 0.01, 40.0
+    spec = {"name": "drucker_prager", "friction_angle": friction, "cohesion": cohesion}
+    part = structured_law(specification() | {"plasticity": spec}).plasticity
+    pressure = BULK * cohesion * 3 * math.tan(math.radians(friction))  # cohesion [Pa] of the same tip
+    truth = CohesiveDruckerPrager(
+        E=E, nu=NU, friction_angle=friction, cohesion=pressure, dilation_angle=dilation
+    )
+    sigma = spread_stretches()
+    weights = constant_outputs(part, 0.0, 0.0, 0.0, 0.0, LIMIT * alpha(dilation) / alpha(friction))
+    value, expected = part.principal(sigma, weights)[0], truth.principal(sigma, **truth.values)
+    assert float((value - expected).abs().max()) < 64 * EPS * float(expected.max())
+
+
+@pytest.mark.parametrize("name", ["von_mises", "viscous_flow"])
+def test_pressure_and_tension_relax_by_their_share(name):
+    """A constant output n3 relaxes a share n3 / LIMIT of t at the rate of the shear, without any shear."""
+    part, share = plasticity(name), 0.4
+    sigma = torch.tensor([[0.8, 0.8, 0.8], [1.3, 1.3, 1.3]], dtype=torch.float64)
+    after = part.principal(sigma, constant_outputs(part, 0.0, 0.0, 0.0, LIMIT * share, 0.0))[0]
+    expected = (1 - share / (1 + part.rate)) * sigma.log()
+    torch.testing.assert_close(after.log(), expected, rtol=1e-13, atol=0)
+
+
+def test_shear_compacts_by_its_share():
+    """n4 < 0: t falls by the share of q that relaxes, times -n4 / LIMIT; with 1 the return would be radial to 0."""
+    part, share = plasticity("von_mises"), 0.9
+    sigma = torch.tensor([[1.0, 0.8, 0.7], [1.3, 1.1, 0.9]], dtype=torch.float64)
+    after = part.principal(sigma, constant_outputs(part, 0.0, 0.0, 0.0, 0.0, -LIMIT * share))[0]
+    (trace, _, q), (trace_after, _, q_after) = hencky_strain(sigma), hencky_strain(after)
+    torch.testing.assert_close(q_after, torch.full_like(q, part.threshold), rtol=1e-12, atol=0)
+    torch.testing.assert_close(trace_after, trace * (1 - share * (1 - q_after / q)), rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("name", [*map(str, range(len(ELASTIC))), *RETURNS])
@@ -426,9 +499,10 @@ def test_adjoint_against_differences(name):
     assert abs(difference - exact) < 1e-7 * size
 
 
-def test_a_base_without_friction_and_rate_can_learn_them():
-    """The slope of the ramp at a last layer of zeros counts, so that training starts."""
-    part = plasticity("von_mises")
+@pytest.mark.parametrize("name", RETURNS)
+def test_what_a_base_does_not_have_can_be_learned(name):
+    """The slopes of the ramps at a last layer of zeros count, so that training starts."""
+    part = plasticity(name)
     F = deformations(200)
     grads = part.vjp(F, weights_of(part), F)[1]
     assert bool((grads[2].abs().amax(1) > 0).all())
