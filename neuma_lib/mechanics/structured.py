@@ -19,25 +19,26 @@ length of the cycle in e.
 **Elasticity, form "energy".** tau_i = d psi / d e_i of psi = exp(n0) psi_volume + exp(n1) psi_shear, two non-negative
 parts of the base's energy: no cycle gains or loses energy, but stresses need not be ordered.
 
-**Plasticity.** A return of t and of q = |dev e| along dev e: first a share of t relaxes, then the rest slips by D,
+**Plasticity.** A share v of t relaxes, then q = |dev e| slips by D along dev e, which may compact (k) or dilate (d):
 
     t1 = (1 - a v) t,    q' = q - D,    t' = (1 - k D / q) t1 - d D,    D = a ramp(q - q_y) / (1 + m d),
     q_y = q0(n0) + m(n1) ramp(-t1),    a = 1 / (1 + r(n2)),
-    v = ramp(n3) / LIMIT,    k = ramp(-n4) / LIMIT,    d = ramp(n4) / LIMIT 2 mu m / K.
+    v = ramp(n3) / LIMIT,    k = ramp(-n4) / LIMIT,    d = 2 mu m / K ramp(n4) / LIMIT.
 
 Von Mises is m = r = 0, viscous flow r = viscosity / (mu dt), a Bingham fluid the same with q0 > 0. A granular base
 (``drucker_prager``) has a cohesion c(n0) instead of q0: q_y = m (3 c - t1), and beyond t1 = 3 c + d q it is torn to the
 tip of its cone, e' = c. A constant x > 0 of the base becomes x exp(n); one that is 0 becomes unit * ramp(n), so that a
-base without friction, rate or cohesion can learn some. No base changes the volume in flow; v compacts under pressure
-(from a pressure on that the network sets) and gives way in tension, k compacts in shear, and d dilates: t' is the
-elastic part, so a body that grows has less of it. D is consistent: without rate, slip with dilatancy ends on the cone
-at its new pressure, and m = 3 K alpha(phi) / (2 mu), d = 3 alpha(psi) are the angles of `CohesiveDruckerPrager`.
+base without friction, rate or cohesion can learn some.
 
-For any weights 0 <= q' <= q, and t' lies between 0 and t, but for dilatancy, which slips at most as the normal of the
-cone. So the Hencky energy mu q^2 + K t^2 / 2 of the base's constants, which mu and K above are, never grows; without
-dilatancy no energy does where stresses are ordered as stretches (tau . dev e >= 0) and the mean stress has the sign of
-t. Dilatancy
-under a pressure p = -tr tau / 3 may add up to d p a unit of slip in any other elasticity, a corrected one too.
+The bases keep the volume (v = k = d = 0). A v that begins at some pressure is a crush cap, one that begins in tension
+a tensile strength, and k near 1 returns towards e = 0, as `CrushableFoam` does. t is the elastic part, so that a body
+which grows in shear is pressed: slip at a = 1 ends on the cone at its new pressure, where m = 3 K alpha(phi) / (2 mu)
+and d = 3 alpha(psi) give `CohesiveDruckerPrager`.
+
+For any weights 0 <= q' <= q, t' lies between 0 and t unless n4 > 0, and d is at most that of flow normal to the cone.
+So mu q^2 + K t^2 / 2, the Hencky energy of the base's mu and K, never grows. With other elastic stresses tau, of a
+corrected elasticity too, no return adds energy where tau . dev e >= 0, as with stresses ordered as the stretches, and
+tr tau has the sign of t; but dilatancy under a pressure p may add up to p d D.
 
 A last layer of zeros, where training starts and which an adaptor weight of 0 restores, leaves the base exactly
 (to round-off). Bases are those named above with any of ``identity`` (stays elastic, has no network), ``von_mises``,
@@ -357,6 +358,7 @@ class StructuredPlasticity(StructuredConstitutive, Plasticity):
         self.analytic = base
         self.granular = isinstance(base, DruckerPrager)
         mu, lam = lame(base.values["E"], base.values["nu"])
+        # d / m of flow normal to the cone
         self.associated = 2 * mu / (lam + 2 * mu / 3)
         self.friction = base.slope(**base.values) if self.granular else 0.0
         self.threshold = base.values["cohesion"] if self.granular else base.values["yield_stress"] / (2 * mu)

@@ -533,7 +533,8 @@
     }
 #endif
 
-// Principal stretches y after the return, where `changed`; growing, slopes of threshold, friction and rate by change.
+// Principal stretches y after the return, where `changed`; growing, slopes of threshold, friction and rate by change;
+// share = D / q. Letters of structured.py: crush v, compaction k, dilatancy d, eased t1, after t'.
 //// plastic
         Pack value[3], growing[3];
         for (int k = 0; k < 3; ++k) {
@@ -607,7 +608,8 @@
             const Pack g_share = slips ? -(dot(ga, dev) + g_after * (eased * compaction + dilatancy * norm)) : zero;
             const Pack g_slip = g_share * fluid * held;
             const Pack g_limit = -(g_slip * inverse_norm);
-            const Pack pulled = kind == GRANULAR ? -value[1] : pressed < Real(0) ? -value[1] : zero;  // d limit / d pressed
+            // d limit / d pressed
+            const Pack pulled = kind == GRANULAR ? -value[1] : pressed < Real(0) ? -value[1] : zero;
             const Pack g_pressed = g_limit * pulled;
             const Pack g_eased = g_after * (one - compaction * share) + g_pressed;
             const Pack g_held = -(g_share * share * held);  // of the product of friction and dilatancy

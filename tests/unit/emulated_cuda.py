@@ -162,7 +162,8 @@ class EmulatedStructuredLaws:
         self.dtype = dtype
         real = {torch.float32: "float", torch.float64: "double"}[dtype]
         array = f"Array<{real}>"
-        common = f"{array} F_, {array} W0_, {array} W1_, {array} W2_, int kind, {real} p0, {real} p1, {real} p2, {real} p3, int n"
+        constants = f"{real} p0, {real} p1, {real} p2, {real} p3"
+        common = f"{array} F_, {array} W0_, {array} W1_, {array} W2_, int kind, {constants}, int n"
         totals = f"{array} total0_, {array} total1_, {array} total2_"
         forward = f"{common}, {array} out_"
         backward = f"{common}, {array} grad_out_, {array} grad_F_, {array} partials_"
