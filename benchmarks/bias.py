@@ -13,7 +13,6 @@ particles" are not simulated: the truth carries the reconstructed particles, so 
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -24,7 +23,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuma_lib.config.settings import Config, load, merged, read_yaml
+from benchmarks.project_scenes import chosen_scenes, scene_parser, simulator
+from neuma_lib.config.settings import Config
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.fitting.frame_batches import frame_batches
 from neuma_lib.fitting.image_loss import mean_squared_error
@@ -64,15 +64,13 @@ class Scene:
         files = (results / file for file in ("particles.h5", "binding.h5", "gaussians.ply"))
         body = load_body(*files, scene.density).to(torch.float32)
         video = load_observation(data / "dynamic/transforms.json", (0,)).to(torch.float32)
-        known = settings.simulation.plain()
-        model = MPMModel(dt=scene.dt, **{key: known[key] for key in ("grid", "gravity", "boundary", "walls")})
         arrays, _ = read_arrays(data / "particles.h5", required=("x", "mass"), only=("x", "mass"))
         centre = torch.from_numpy(np.average(arrays["x"][0], axis=0, weights=arrays["mass"]))
         starts = {
             "estimated start": Throw.of(read_json(results / "velocity.json")).of_body(body),
             "true start": body.state(scene.velocity, scene.spin, centre),
         }
-        return cls(model, scene.law.plain(), body, video, starts, arrays["x"])
+        return cls(simulator(settings, scene), scene.law.plain(), body, video, starts, arrays["x"])
 
     def path(self, law: Mapping[str, Mapping[str, Any]], start: str) -> Trajectory:
         """Rollout over the video's frames."""
@@ -147,31 +145,13 @@ def lowest(losses: list[float]) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("scenes", nargs="+", help="names, or their beginnings")
-    parser.add_argument("--settings", nargs="+", default=["config/config.yaml"], help="YAML files")
-    parser.add_argument("--seeds", type=int, nargs="*", default=[], help="of random scenes")
-    parser.add_argument("--count", type=int, default=12, help="of random scenes of each seed")
-    parser.add_argument("--data", dest="data_root", help="instead of data_root")
-    parser.add_argument("--results", dest="results_root", help="instead of results_root")
+    parser = scene_parser(__doc__, nargs="+")
     parser.add_argument(
         "--scan", action="store_true", help="change each constant by up to 35 percent as well"
     )
     args = parser.parse_args()
     torch.set_num_threads(1)
-    raw: dict[str, Any] = {}
-    for file in args.settings:
-        raw = merged(raw, read_yaml(file))
-    raw = merged(raw, {key: path for key in ("data_root", "results_root") if (path := getattr(args, key))})
-    drawn = [merged(raw, {"random": {"seed": seed, "count": args.count}}) for seed in args.seeds]
-    chosen = {
-        name: settings
-        for settings in map(load, drawn or [raw])
-        for name in settings.scenes
-        if any(name == given or name.startswith(f"{given}_") for given in args.scenes)
-    }
+    chosen = chosen_scenes(args)
     if not chosen:
         parser.error("there is no such scene")
     for name, settings in chosen.items():

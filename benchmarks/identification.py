@@ -11,7 +11,6 @@ the library. Settings are to be tuned on draws that are not reported.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import multiprocessing
@@ -22,8 +21,9 @@ from typing import Any
 
 import torch
 
+from benchmarks.project_scenes import chosen_scenes, scene_parser, simulator
 from neuma_lib.config.identify import IdentifyConfig
-from neuma_lib.config.settings import Config, load, merged, read_yaml
+from neuma_lib.config.settings import Config, merged
 from neuma_lib.evaluation.metrics import tracer_errors
 from neuma_lib.evaluation.motion import predict
 from neuma_lib.fitting.identified import Identified
@@ -37,7 +37,6 @@ from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_body
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import named_combinations, physical
-from neuma_lib.sim.model import MPMModel
 
 TRACERS = 2000  # of the truth's, for the motion
 COVERED = 2.0  # standard deviations
@@ -64,10 +63,7 @@ def judge(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str, 
     ]
     video = load_observation(data / "dynamic/transforms.json", chosen.views).to(torch.float32)
     throw = Throw.of(read_json(results / "velocity.json"))
-    simulation = settings.simulation.plain()
-    model = MPMModel(
-        dt=scene.dt, **{key: simulation[key] for key in ("grid", "gravity", "boundary", "walls")}
-    )
+    model = simulator(settings, scene)
     stock = settings.priors.laws.get(scene.prior)
     before = _core_seconds()
     found = identify(model, throw, body, video, chosen, stock.plain() if stock else None, finer=[finer])
@@ -190,46 +186,19 @@ def lines_of(row: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _settings(args: argparse.Namespace) -> list[Config]:
-    """Settings of the project, once for every seed of the random scenes."""
-    raw = {}
-    for file in args.settings:
-        raw = merged(raw, read_yaml(file))
-    raw = merged(
-        raw, {key: str(path) for key in ("data_root", "results_root") if (path := getattr(args, key))}
-    )
-    return [load(merged(raw, {"random": {"seed": seed, "count": args.count}})) for seed in args.seeds] or [
-        load(raw)
-    ]
-
-
-def _wanted(args: argparse.Namespace) -> list[tuple[str, Config, dict[str, Any]]]:
-    """Scenes with their settings."""
-    jobs, changes = [], json.loads(args.set)
-    for settings in _settings(args):
-        for name in settings.scenes:
-            asked = any(name == given or name.startswith(f"{given}_") for given in args.scenes)
-            drawn = not args.scenes and name.startswith(settings.random.prefix)
-            if asked or drawn and (Path(settings.results_root) / name / "velocity.json").exists():
-                jobs.append((name, settings, changes))
-    return list({name: job for job in jobs for name in job[:1]}.values())
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("scenes", nargs="*", help="names, or their beginnings")
-    parser.add_argument("--settings", nargs="+", default=["config/config.yaml"], help="YAML files")
-    parser.add_argument("--seeds", type=int, nargs="*", default=[], help="of random scenes")
-    parser.add_argument("--count", type=int, default=12, help="of random scenes of each seed")
-    parser.add_argument("--data", dest="data_root", type=Path, help="instead of data_root")
-    parser.add_argument("--results", dest="results_root", type=Path, help="instead of results_root")
+    parser = scene_parser(__doc__, nargs="*")
     parser.add_argument("--set", default="{}", help="changes of the settings of `identify`, as JSON")
     parser.add_argument("--jobs", type=int, default=1, help="scenes at a time")
     parser.add_argument("--out", type=Path, help="JSON file for all numbers")
     args = parser.parse_args()
-    jobs = _wanted(args)
+    changes = json.loads(args.set)
+    jobs = [
+        (name, settings, changes)
+        for name, settings in chosen_scenes(args).items()
+        if (args.scenes or name.startswith(settings.random.prefix))
+        and Path(settings.results_root, name, "velocity.json").exists()
+    ]
     if not jobs:
         parser.error("no such scene has results: make velocity.json first")
     rows = []

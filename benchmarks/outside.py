@@ -19,6 +19,7 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 
+from benchmarks.project_scenes import simulator
 from neuma_lib.config.scenes import SceneConfig
 from neuma_lib.config.settings import Config, load, read_yaml
 from neuma_lib.errors import InputError, NonFiniteError
@@ -32,7 +33,6 @@ from neuma_lib.mechanics.combinations import Values
 from neuma_lib.mechanics.law import Constitutive, Law
 from neuma_lib.mechanics.structured import structured_law
 from neuma_lib.sim.batch import rollout_batch
-from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
@@ -58,9 +58,7 @@ class Truth:
         if not isinstance(self.scene.density, (int, float)):
             raise InputError(f"{name}: this benchmark takes bodies of one density only")
         self.density, self.spec = float(self.scene.density), self.scene.law.plain()
-        simulation = settings.simulation.plain()
-        constants = {key: simulation[key] for key in ("grid", "gravity", "boundary", "walls")}
-        self.model = MPMModel(dt=self.scene.dt, **constants)
+        self.model = simulator(settings, self.scene)
         self.law = analytic_law(self.spec, self.scene.dt)
         self.mesh = place(self.scene.shape, self.scene.size, self.scene.height, self.scene.center)
         self.count = settings.simulation.particles
