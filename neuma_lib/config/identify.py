@@ -43,7 +43,10 @@ class IdentifyConfig(Section):
     )
     samplings: int = Field(2, ge=1, description="such bodies: their difference is a part of the uncertainty")
     held_out: float = Field(
-        0.25, gt=0, lt=1, description="part of the frames, the last ones, that families are judged by"
+        0.25,
+        gt=0,
+        lt=1,
+        description="part of the frames after the first contact, the last ones, that families are judged by",
     )
     squares: tuple[int, ...] = Field(
         (6, 12, 24, 96),
@@ -69,7 +72,7 @@ class IdentifyConfig(Section):
         3.0,
         gt=0,
         description="expected distance of the unbounded constants from their start; it holds what the video does "
-        "not show",
+        "not show, and bounds how uncertain they are",
     )
     give_up: float = Field(
         4.0,

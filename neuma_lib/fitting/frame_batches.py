@@ -1,4 +1,4 @@
-"""Functions whose value at a frame depends on the state of that frame alone, a few frames at a time.
+"""Frames of a video: which are compared, which judge, and functions of one frame each, a few frames at a time.
 
 Autograd would keep what every frame needs for its gradient until the backward pass: for renders of 400 frames, tens of
 gigabytes. Here gradients with respect to the states are taken while a part is still at hand. They are small, and the
@@ -8,10 +8,13 @@ backward pass only weights them.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from neuma_lib.sim.model import MPMModel, contact_clearance
 
 
 def frame_batches(count: int, size: int) -> Iterator[slice]:
@@ -24,6 +27,30 @@ def frame_batches(count: int, size: int) -> Iterator[slice]:
 def spread_frames(count: int, most: int) -> list[int]:
     """At most ``most`` of ``count`` frames, evenly spread, first and last among them."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
+
+
+def first_contact(model: MPMModel, x: Tensor) -> int:
+    """Index of the first frame in which a particle feels a wall, of positions x (T, N, 3) [m]; T if there is none."""
+    touching = contact_clearance(model, x) <= 0
+    return int(touching.int().argmax()) if bool(touching.any()) else len(x)
+
+
+def held_out_frames(count: int, share: float, blocks: int = 1, contact: int = 0) -> list[int]:
+    """Indices of the frames that judge: the last ones of each of some equal parts of the video, one at least each.
+
+    Args:
+        count: frames of the video.
+        share: part of what follows the contact.
+        blocks: number of the parts.
+        contact: index of the first frame that tells of the law; frames before it are left out, unless fewer than two
+            remain.
+    """
+    first = contact if count - contact >= 2 else 0
+    told = count - first
+    blocks = min(blocks, told // 2)
+    ends = [first + round(k * told / blocks) for k in range(blocks + 1)]
+    size = max(1, round(share * told / blocks))
+    return [frame for start, end in pairwise(ends) for frame in range(max(start + 1, end - size), end)]
 
 
 def evaluate_in_batches(function: Callable[..., Tensor], size: int, *states: Tensor) -> Tensor:

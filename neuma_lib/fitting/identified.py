@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -42,6 +42,20 @@ class FamilyFit:
     refined: bool = False
     rollouts: int = 0
     steps: int = 0
+
+    def disagree(self, first: FamilyFit, ties: Sequence[FamilyFit]) -> None:
+        """Add to the covariance what parts of the video, and families that are as good, disagree about.
+
+        Args:
+            first: the fit to the first frames: what the others change is how far one part of the video can lead.
+            ties: fits of other families to the same frames; their constants, where shared, scatter around ``first``.
+        """
+        u = self.family.unbounded
+        before = u(first.values)
+        self.covariance = self.covariance + np.outer(u(self.values) - before, u(self.values) - before)
+        for tie in ties:
+            shared = {key: tie.values.get(key, value) for key, value in first.values.items()}
+            self.covariance += np.outer(u(shared) - before, u(shared) - before) / (len(ties) + 1)
 
     def log_covariance(self, of: Callable[[Values], Values]) -> tuple[list[str], np.ndarray]:
         """Names (m,) and covariance (m, m) of the logarithms of positive functions of the constants, to first order."""

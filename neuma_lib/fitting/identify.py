@@ -10,10 +10,12 @@ So the last round fits velocity and spin along, held by what is known of them, a
 the rendered body, which would be taken for motion. And a body of few particles, each at random in its cell, moves as if
 its material were another: what many particles change in the images is added to those of the few.
 
-Families are fitted to the first frames and judged by the last ones, so that more constants do not win by themselves.
-One that explains the images no better than a simpler one is not followed to the end.
+Families are fitted to the first frames and judged by the last ones, so that more constants do not win by themselves;
+frames before the first contact tell nothing of a law and are among those that are fitted. One that shows the images of
+a family that it contains, its further constants at their limits, is not followed to the end.
 What the video says of the constants of a family is told by the jackknife over blocks of the image, in combinations:
-of a flow that never springs back, the flow stress is seen and the stiffness is not.
+of a flow that never springs back, the flow stress is seen and the stiffness is not. Wider are those that are on a
+plateau, that the last frames have moved, or that families which predict as well disagree about.
 
 Several videos of one material have the constants in common and a throw each; they count alike, however long.
 """
@@ -21,7 +23,7 @@ Several videos of one material have the constants in common and a throw each; th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -34,9 +36,15 @@ from neuma_lib.coupling.particle_gs import ParticleGS
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.families import Family
-from neuma_lib.fitting.frame_batches import frame_batches, spread_frames
+from neuma_lib.fitting.frame_batches import first_contact, frame_batches, held_out_frames, spread_frames
 from neuma_lib.fitting.identified import FamilyFit, Identified
-from neuma_lib.fitting.least_squares import Linearisation, in_blocks, jackknife, levenberg_marquardt
+from neuma_lib.fitting.least_squares import (
+    LEAST_COST,
+    Linearisation,
+    in_blocks,
+    jackknife,
+    levenberg_marquardt,
+)
 from neuma_lib.fitting.throw import Throw
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import Values
@@ -93,7 +101,8 @@ def identify(
     fillings = finer or [()] * len(given)
     videos = [_Video(model, *one, settings, own) for one, own in zip(given, fillings, strict=True)]
     for video in videos:
-        video.weight = (videos[0].pixels / video.pixels) ** 0.5
+        video.hold_out(families[0], settings.held_out)
+        video.weight = (videos[0].fitted_pixels / video.fitted_pixels) ** 0.5
     stock_values = _constants(stock) if stock else {}
     running: list[_Run] = []
     rounds = len(settings.squares)
@@ -126,8 +135,12 @@ def identify(
     run.look_closer()
     final = _Run(run.family, videos, [len(video.frames) for video in videos], settings)
     final.begin([run.values], level=rounds - 1, deviations=run.deviations)
+    best = final.judged()
+    if best.covariance is not None:
+        best.covariance = final.widened()
+        best.disagree(chosen, [fits[name] for name in ties])
     return Identified(
-        final.judged(),
+        best,
         ties,
         fits,
         [video.frames[: video.fitted] for video in videos],
@@ -147,35 +160,44 @@ def _begun(
     """A family's fit in the first round, the better of two where it flows.
 
     An elastic body is among the limits of most families that flow. Seen coarsely, one as soft as to lie flat is a
-    better start than any flow that is not fitted yet, but nothing leads away from it: it never yields. So what other
-    families have found is one start, nearer to their elastic limit too, and guesses, with less to limit the flow, are
-    another.
+    better start than any flow that is not fitted yet, but nothing leads away from it: it never yields. So guesses, with
+    less to limit the flow, are one start; what other families have found, nearer to their elastic limit too, is
+    another if it is better than where the first one led. A fit that shows what a family within it shows already is
+    taken only if there is no other.
     """
     guesses = [family.with_guesses(values) for values in ({}, stock_values)]
     found = [family.with_guesses(values) for values in _found(running, family)]
     groups = [[*guesses, *found]]
     if family.flows and found:
         flowing = [*guesses, *family.with_other_limits(guesses[-1], (-1, -2))]
-        groups = [[*found, *family.with_other_limits(found[0], (1, 2))], flowing]
-    fits = [_Run(family, videos, [video.fitted for video in videos], settings) for _ in groups]
+        groups = [flowing, [*found, *family.with_other_limits(found[0], (1, 2))]]
+    fits, least = (
+        [_Run(family, videos, [video.fitted for video in videos], settings) for _ in groups],
+        math.inf,
+    )
     for run, starts in zip(fits, groups, strict=True):
-        run.begin(starts)
-    best = min(fits, key=lambda run: run.fit.cost if run.alive else math.inf)
+        run.begin(starts, below=least)
+        least = run.fit.cost if run.alive else math.inf
+    best = min(fits, key=lambda run: (not run.alive, _adds_nothing(run, running), run.loss))
     best.rollouts = sum(run.rollouts for run in fits)
     return best
 
 
 def _leave_behind(running: Sequence[_Run], settings: IdentifyConfig) -> None:
-    """Give up families that are far behind the best one, or that a simpler one explains the images as well as."""
+    """Give up families that are far behind the best one, or show what one that they contain shows.
+
+    One that merely explains blurred images no better than a simpler one goes on: finer squares tell more.
+    """
     alive = [run for run in running if run.alive]
     least = min((run.fit.cost for run in alive), default=0.0)
-    for run in alive:
-        simpler = [other for other in alive if len(other.values) < len(run.values)]
-        worth = [
-            run.fit.cost * math.exp(settings.penalty * (len(run.values) - len(other.values))) < other.fit.cost
-            for other in simpler
-        ]
-        run.alive = run.fit.cost <= settings.give_up * least and all(worth)
+    left = [run for run in alive if run.fit.cost > settings.give_up * least or _adds_nothing(run, alive)]
+    for run in left:
+        run.alive = False
+
+
+def _adds_nothing(run: _Run, others: Sequence[_Run]) -> bool:
+    """Whether a family that this one contains shows the same images: its further constants are at their limits."""
+    return any(run.alive and o.alive and run.family.contains(o.family) and run.resembles(o) for o in others)
 
 
 def _found(running: Sequence[_Run], family: Family) -> list[Values]:
@@ -246,7 +268,7 @@ class _Video:
     ):
         seen = video.select(spread_frames(len(video.frames), settings.frames))
         self.model, self.throw, self.frames, self.weight = model, throw, seen.frames, 1.0
-        self.fitted = min(len(seen.frames) - 1, max(2, round((1 - settings.held_out) * len(seen.frames))))
+        self.fitted = len(seen.frames)
         self.density = float((body.mass / body.vol0).min())
         self.unsure = np.flatnonzero([*throw.std, *[settings.misplaced] * (_NUISANCES - _MOTION)]).tolist()
         self.by_deviation: list[Tensor] | None = None
@@ -263,7 +285,17 @@ class _Video:
         """Edge of each round's squares in squares of the finest ones."""
         parts = frame_batches(len(seen.frames), self._body[1].frames_per_batch)
         self._observed = torch.cat([averaged(seen.colours(part), self.finest) for part in parts])
-        self.pixels = self._observed.numel()
+
+    @property
+    def fitted_pixels(self) -> int:
+        return self._observed[: self.fitted].numel()
+
+    def hold_out(self, family: Family, share: float) -> None:
+        """Leave a share of the frames after the first contact, the last ones, to judge by; any law falls alike."""
+        law = family.law_spec(family.values(family.unbounded(family.guess), self.model, self.density))
+        (path,) = self._paths([_Try(law, np.zeros(_NUISANCES))], self.frames, self._body[0])
+        contact = 0 if path is None else first_contact(self.model, path.x)
+        self.fitted = held_out_frames(len(self.frames), share, contact=contact)[0]
 
     def residuals(self, tries: Sequence[_Try], count: int) -> list[Tensor | None]:
         """Residuals (count, V, H', W', 3) of the first frames for each try; None where the rollout diverges."""
@@ -324,6 +356,10 @@ class _Video:
         return residual if bool(residual.isfinite().all()) else None
 
 
+def _squares(residual: Iterable[Tensor]) -> float:
+    return sum(float(r.square().sum(dtype=torch.float64)) for r in residual)
+
+
 def averaged(images: Tensor, size: int) -> Tensor:
     """Images (T, V, H, W, C) averaged over squares of ``size`` pixels, those at the far edges over what is there."""
     if size == 1:
@@ -366,8 +402,19 @@ class _Run:
         """Mean squared residual at the present squares; infinite if nothing was simulated."""
         return self.fit.rms**2 if self.fit else math.inf
 
-    def begin(self, starts: Sequence[Values], level: int = 0, deviations: np.ndarray | None = None) -> None:
-        """Fit from the best of some starts, in a round."""
+    def resembles(self, other: _Run) -> bool:
+        """Whether the images differ by less than a part, the penalty of a constant, of what both leave unexplained."""
+        pairs = zip(self._seen(self._residual(self._u)), other._seen(other._residual(other._u)), strict=True)
+        return _squares(a - b for a, b in pairs) < self.settings.penalty * self.fit.cost
+
+    def begin(
+        self,
+        starts: Sequence[Values],
+        level: int = 0,
+        deviations: np.ndarray | None = None,
+        below: float = math.inf,
+    ) -> None:
+        """Fit from the best of some starts, in a round, if its squared residuals are below a number."""
         self._level = level
         tried = {tuple(values.values()): values for values in starts}
         origins = [self.family.unbounded(values) for values in tried.values()]
@@ -377,7 +424,7 @@ class _Run:
         found = self._simulate([np.append(origin - self._origin, deviations) for origin in origins])
         costs = [math.inf if residual is None else self._cost(residual) for residual in found]
         best = int(np.argmin(costs))
-        self.alive = math.isfinite(costs[best])
+        self.alive = costs[best] < below
         if self.alive:
             self._origin, self._images = origins[best], {self._u.tobytes(): found[best]}
             self.refine(level)
@@ -431,14 +478,8 @@ class _Run:
         """What was found, judged by the frames that were held out, if any."""
         found = FamilyFit(self.family, self.values, self.loss, refined=self.refined, steps=self.steps)
         if self.fit is not None and self.refined:
-            k, P = self._constants, self._held(self.fit)
-            inverse = np.linalg.pinv(self.fit.curvature + P)
-            by_prior = inverse @ P * self._spreads
-            covariance = jackknife(self.fit, P) + by_prior @ by_prior.T
-            for v, video in enumerate(self.videos):
-                if video.spread is not None:
-                    by_particles = inverse @ self._slope(v, video.spread)
-                    covariance += np.outer(by_particles, by_particles)
+            k = self._constants
+            covariance = self._covariance()
             found.covariance, stds = covariance[:k, :k], np.sqrt(np.diag(covariance))
             found.throws = tuple(self._thrown(v, stds) for v in range(len(self.videos)))
             if any(count < len(video.frames) for count, video in zip(self.counts, self.videos, strict=True)):
@@ -447,13 +488,46 @@ class _Run:
         found.rollouts = self.rollouts
         return found
 
+    def _covariance(self) -> np.ndarray:
+        """Covariance of all unknowns, to first order."""
+        P = self._held(self.fit)
+        inverse = np.linalg.pinv(self.fit.curvature + P)
+        by_prior = inverse @ P * self._spreads
+        covariance = jackknife(self.fit, P) + by_prior @ by_prior.T
+        for v, video in enumerate(self.videos):
+            if video.spread is not None:
+                by_particles = inverse @ self._slope(v, video.spread)
+                covariance += np.outer(by_particles, by_particles)
+        return covariance
+
+    def widened(self) -> np.ndarray:
+        """Covariance (k, k) of the constants, larger along axes where the images change less than the derivatives tell.
+
+        Of the principal axes, those that are not determined are followed for two standard deviations, to the side where
+        the squared residuals rise less: the variance grows by how much less than the quadratic, up to
+        `IdentifyConfig.spread`. A plateau has small derivatives somewhere, and a wide range all the same.
+        """
+        k, whole = self._constants, self._covariance()
+        variances, axes = np.linalg.eigh(whole[:k, :k])
+        for variance, axis in zip(variances, axes.T, strict=True):
+            if not self.settings.determined**2 < variance < self.settings.spread**2:
+                continue
+            # The deviations follow the constants as they are correlated.
+            step = 2 * whole[:, :k] @ axis / math.sqrt(variance)
+            found = self._simulate([self._u + step, self._u - step])
+            costs = [math.inf if residual is None else self._cost(residual) for residual in found]
+            promised, rise = step @ self.fit.curvature @ step, max(min(costs) - self.fit.cost, LEAST_COST)
+            wider = min(variance * max(promised / rise, 1.0), self.settings.spread**2)
+            whole[:k, :k] += (wider - variance) * np.outer(axis, axis)
+        return whole[:k, :k]
+
     def cost(self, unknowns: np.ndarray) -> float:
         """Sum of squared residuals, infinite if a rollout diverges."""
         residual = self._residual(unknowns)
         return math.inf if residual is None else self._cost(residual)
 
     def _cost(self, residual: Sequence[Tensor]) -> float:
-        return sum(float(r.square().sum(dtype=torch.float64)) for r in self._seen(residual))
+        return _squares(self._seen(residual))
 
     def linearise(self, unknowns: np.ndarray, free: Sequence[int]) -> Linearisation:
         """Sums of the residuals and of their forward differences, block by block of one video after the other."""

@@ -16,19 +16,18 @@ import copy
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
-from itertools import pairwise
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.fitting.frame_batches import first_contact, held_out_frames
 from neuma_lib.fitting.material import History, TrainedMaterial, TrajectoryLoss, train_material
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.mechanics.structured import StructuredLaw
-from neuma_lib.sim.model import MPMModel, contact_clearance
+from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
@@ -130,7 +129,9 @@ def train_structured(
     if any(found is None for found in as_it_is):
         raise NonFiniteError("material", "the motion of the uncorrected law breaks off")
     held_out = [
-        held_out_frames(len(loss.frames), structured, first_contact(model, path.x))
+        held_out_frames(
+            len(loss.frames), structured.held_out, structured.blocks, first_contact(model, path.x)
+        )
         for (_, loss), (path, _) in zip(videos, as_it_is, strict=True)
     ]
     fitted = [
@@ -195,29 +196,6 @@ def train_structured(
     law.load_state_dict(uncorrected)
     value = _mean([_mean(losses) for _, losses in as_it_is])
     return TrainedMaterial(law, History(loss=[value]), value, 0, stable=True), choice
-
-
-def first_contact(model: MPMModel, x: Tensor) -> int:
-    """Index of the first frame in which a particle feels a wall, of positions x (T, N, 3) [m]; T if there is none."""
-    touching = contact_clearance(model, x) <= 0
-    return int(touching.int().argmax()) if bool(touching.any()) else len(x)
-
-
-def held_out_frames(count: int, settings: StructuredConfig, contact: int = 0) -> list[int]:
-    """Indices of the frames that judge: the last ones of each of some equal parts of the video, one at least each.
-
-    Args:
-        count: frames of the video.
-        settings: share and parts.
-        contact: index of the first frame that tells of the law; frames before it are left out, unless fewer than two
-            remain.
-    """
-    first = contact if count - contact >= 2 else 0
-    told = count - first
-    blocks = min(settings.blocks, told // 2)
-    ends = [first + round(k * told / blocks) for k in range(blocks + 1)]
-    size = max(1, round(settings.held_out * told / blocks))
-    return [frame for start, end in pairwise(ends) for frame in range(max(start + 1, end - size), end)]
 
 
 def _chosen(choices: Iterable[tuple[str, ...]], trials: dict[str, Trial], margin: float) -> tuple[str, ...]:

@@ -10,13 +10,12 @@ from grounding_scene import MODEL, TRUTH, ball, observe
 from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.errors import InputError
+from neuma_lib.fitting.frame_batches import first_contact, held_out_frames
 from neuma_lib.fitting.material import ParticleLoss, PixelLoss
 from neuma_lib.fitting.structured_fit import (
     AS_WELL,
     Trial,
     _chosen,
-    first_contact,
-    held_out_frames,
     largest_as_good,
     train_structured,
 )
@@ -154,7 +153,7 @@ def test_some_frames_of_a_loss_are_those_of_the_loss(problem):
 @pytest.mark.parametrize("share", [0.01, 0.25, 0.9])
 def test_frames_that_judge_end_every_part_of_what_follows_the_contact(blocks, count, share, contact):
     """They are about the share of all, the last frame is among them, the first is not, and every part keeps some."""
-    found = held_out_frames(count, StructuredConfig(held_out=share, blocks=blocks), contact)
+    found = held_out_frames(count, share, blocks, contact)
     first = contact if contact < count - 1 else 0
     parts = min(blocks, (count - first) // 2)
     assert found == sorted(set(found)) and found[-1] == count - 1 and found[0] > first
