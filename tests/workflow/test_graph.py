@@ -191,6 +191,13 @@ def test_several_videos_train_one_law_which_is_judged_on_all(project):
     assert "trains nothing: its law is that of BouncyBall/neuma" in said
 
 
+def test_identifications_behind_a_table_are_those_of_the_laws_that_its_constants_have(project):
+    methods = "tables={table1: {methods: [neuma, constants, constants+law_from=BouncyBall_throw2]}}"
+    plan = project.run("--dry-run", *TWO_VIDEOS[:2], methods, "--", "tiny/results/identified_table1.csv")
+    (read,) = [read for rule, read, _ in jobs(plan) if rule == "identified_behind_table"]
+    assert sorted(read) == [f"{SCENE}/identified.json", f"{THROW}/identified.json"]
+
+
 @pytest.mark.parametrize("chains", [(), CHAINS, TWO_VIDEOS], ids=["one chain", "three chains", "two videos"])
 def test_timings_read_the_benchmark_of_every_job_behind_them(project, chains):
     graph = jobs(project.run("--dry-run", *chains, "tiny/results/timings.csv"))

@@ -51,3 +51,15 @@ rule identified_table:
         scenes=identified_scenes(),
     script:
         "../scripts/identified_table.py"
+
+
+use rule identified_table as identified_behind_table with:
+    input:
+        identified=lambda wildcards: [
+            home(entry["name"], "identified.json") for entry in identified_behind(wildcards.table)
+        ],
+    output:
+        csv=f"{RESULTS}/identified_{{table}}.csv",
+        markdown=f"{RESULTS}/identified_{{table}}.md",
+    params:
+        scenes=lambda wildcards: identified_behind(wildcards.table),

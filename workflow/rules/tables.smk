@@ -34,10 +34,23 @@ def identified_scenes():
         for run in SETTINGS.runs("table1", m, s)
     ]
     named = dict.fromkeys((Path(run).parent.name for run in runs), "scenes of Table 1")
-    named |= dict.fromkeys(SETTINGS.random_scenes, f"random scenes, seed {SETTINGS.random.seed}")
+    return with_truths(
+        named | dict.fromkeys(SETTINGS.random_scenes, f"random scenes, seed {SETTINGS.random.seed}")
+    )
+
+
+def identified_behind(table):
+    """The same of every scene whose identified constants have a row in a table."""
+    runs = [run for run in table_runs(table) if run["scene"] and SETTINGS.is_identified(run["method"])]
+    scenes = [SETTINGS.law_scene(run["scene"], run["method"]) for run in runs]
+    return with_truths({Path(home(scene, "identified.json")).parent.name: table for scene in scenes})
+
+
+def with_truths(groups):
+    """Scenes with their groups and true laws."""
     return [
         {"name": name, "group": group, "truth": SETTINGS.scene(name).law.plain()}
-        for name, group in named.items()
+        for name, group in groups.items()
     ]
 
 
