@@ -24,7 +24,10 @@ class StructuredConfig(Section):
         "correction has to foretell strains that it has not seen",
     )
     trial_iterations: int = Field(
-        16, ge=1, description="optimiser steps of each trial of a correction on the other frames"
+        10,
+        ge=1,
+        description="optimiser steps of all parts' corrections together, without the held-out frames, before the parts "
+        "are judged; `material.iterations` more follow on all frames, of those that are chosen",
     )
     margin: float = Field(
         0.05,

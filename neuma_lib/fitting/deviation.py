@@ -2,7 +2,7 @@
 
 The images say what stress the visited deformations have. What a trained law answers elsewhere is up to the weights that
 happened to explain the images, and shows when it is thrown in another shape. So states are sampled around and beyond
-the visited ones, and the law is held there to what it was when training began: its prior, as a fresh adaptor is zero.
+the visited ones, and the law is held there to its prior, what it is without the adaptor.
 
 **States.** F = V diag(exp e) V^T, since a law that is frame-indifferent needs no further rotation. The principal
 logarithmic strains e have uniform directions in their space, so all mixtures of volume change and shear, and sizes |e|
@@ -50,7 +50,7 @@ class Deviation:
     """How far a law is from what it was, on states that a video did not visit.
 
     Args:
-        law: the law where training begins; what it answers now is the reference.
+        law: what it answers without its adaptor is the reference.
         visited: deformation gradients (M, 3, 3) that each part is asked about in the video, by the part's name.
         states: number of sampled states a part.
 
@@ -74,7 +74,7 @@ class Deviation:
             F, self.weights[name] = sample_unvisited(visited[name], states, part.isotropic)
             self.states[name] = F
             with torch.no_grad():
-                answer = part.response(F, part.weights())
+                answer = part.response(F, tuple(part.base))
                 asked = F - torch.eye(3).to(F) if name == "plasticity" else answer
                 squares = asked.square().sum((1, 2))
                 self._sizes[name] = squares + FLOOR**2 * squares.mean()
@@ -91,7 +91,7 @@ class Deviation:
         return cls(law, {"elasticity": F, "plasticity": trial})
 
     def __call__(self) -> Tensor:
-        """The penalty, a number that is 0 at the start and differentiable in the adaptor's parameters."""
+        """The penalty, a number that is 0 for the prior and differentiable in the adaptor's parameters."""
         return torch.stack([self._of_part(name, part) for name, part in self._parts.items()]).sum()
 
     def _of_part(self, name: str, part: AdaptableConstitutive) -> Tensor:

@@ -57,6 +57,9 @@ class TrajectoryLoss(Protocol):
     def select(self, keep: Sequence[int]) -> TrajectoryLoss:
         """The same of the frames with the given indices alone."""
 
+    def later(self, step: int) -> TrajectoryLoss:
+        """The same for a trajectory that starts at a step of this one."""
+
 
 @dataclass
 class PixelLoss:
@@ -91,6 +94,11 @@ class PixelLoss:
         """The same of the frames with the given indices alone."""
         return replace(self, observation=self.observation.select(keep))
 
+    def later(self, step: int) -> PixelLoss:
+        """The same for a trajectory that starts at a step of this one."""
+        frames = tuple(frame - step for frame in self.frames)
+        return replace(self, observation=replace(self.observation, frames=frames))
+
     def _losses(self, part: slice, x: Tensor, F: Tensor) -> Tensor:
         return mean_squared_error(self._renderer(x, F), self.observation.stored(part))
 
@@ -114,6 +122,10 @@ class ParticleLoss:
     def select(self, keep: Sequence[int]) -> ParticleLoss:
         """The same of the frames with the given indices alone."""
         return ParticleLoss(tuple(self.frames[k] for k in keep), self.targets[list(keep)])
+
+    def later(self, step: int) -> ParticleLoss:
+        """The same for a trajectory that starts at a step of this one."""
+        return ParticleLoss(tuple(frame - step for frame in self.frames), self.targets)
 
 
 @dataclass

@@ -1,10 +1,11 @@
 """Fit of a structured law around constants that are found already: which parts to correct, and the correction.
 
-A video need not tell anything that the constants leave open. So each choice of parts (elastic, plastic, both) is tried:
-it is trained for a few iterations without some of the frames, and judged by these, beside the law as it is. A part is
-corrected only if those frames gain enough; the parts that are chosen are trained anew, on all frames. The others stay
-as they are, exactly, and so does a law that nothing improves. Frames before the first contact say nothing of the law
-and judge nothing.
+A video need not tell anything that the constants leave open. So all parts are first trained together for a few
+iterations, without some of the frames. By these every choice of parts (elastic, plastic, both) is judged, with the
+other part as it was, beside the law as it is. A part is corrected only if those frames gain enough; the parts that are
+chosen are trained on from there, on all frames. The others stay as they are, exactly, and so does a law that nothing
+improves. Frames before the first contact say nothing of the law: they train and judge nothing, and the steps up to
+there are simulated once, with the law as it is.
 
 How firmly the correction is held where the video is silent (`neuma_lib.fitting.deviation`) is chosen by the same
 frames: of the weights that are tried, the largest that they do as well with.
@@ -16,9 +17,11 @@ import copy
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
+from itertools import combinations
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.structured import StructuredConfig
@@ -32,6 +35,7 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
 Video = tuple[State, TrajectoryLoss]
+LawState = dict[str, Tensor]
 NOTHING = "nothing"
 """Name of the choice to correct no part."""
 PARTS = {"elastic": "elasticity", "plastic": "plasticity"}
@@ -74,8 +78,8 @@ class Choice:
     def as_dict(self) -> dict[str, Any]:
         """Plain values, for JSON; a loss that is infinite is None."""
         trials = {
-            name: {key: value if math.isfinite(value) else None for key, value in asdict(trial).items()}
-            for name, trial in self.trials.items()
+            name: {key: value if math.isfinite(value) else None for key, value in found.items()}
+            for name, found in _plain(self.trials).items()
         }
         held_out = [list(frames) for frames in self.held_out_frames]
         about = {"corrected_parts": list(self.parts), "penalty": self.penalty}
@@ -128,74 +132,108 @@ def train_structured(
     as_it_is = [_simulated(model, law, *video) for video in videos]
     if any(found is None for found in as_it_is):
         raise NonFiniteError("material", "the motion of the uncorrected law breaks off")
-    held_out = [
-        held_out_frames(
-            len(loss.frames), structured.held_out, structured.blocks, first_contact(model, path.x)
-        )
-        for (_, loss), (path, _) in zip(videos, as_it_is, strict=True)
-    ]
+    paths = [path for path, _ in as_it_is]
+    firsts = [told_from(len(path.x), first_contact(model, path.x)) for path in paths]
+    told = [from_frame(*video, path, k) for video, path, k in zip(videos, paths, firsts, strict=True)]
+    held_out = [held_out_frames(len(loss.frames), structured.held_out, structured.blocks) for _, loss in told]
     fitted = [
         [k for k in range(len(loss.frames)) if k not in out]
-        for (_, loss), out in zip(videos, held_out, strict=True)
+        for (_, loss), out in zip(told, held_out, strict=True)
     ]
-    seen = [(start, loss.select(keep)) for keep, (start, loss) in zip(fitted, videos, strict=True)]
-    trained_parts = [name for name, part in PARTS.items() if part in law.parts]
-    choices = [(part,) for part in trained_parts]
-    choices += [tuple(trained_parts)] if len(trained_parts) > 1 else []
+    seen = [(start, loss.select(keep)) for keep, (start, loss) in zip(fitted, told, strict=True)]
+    trained_parts = tuple(name for name, part in PARTS.items() if part in law.parts)
     brief = settings.model_copy(update={"iterations": structured.trial_iterations})
+    weights = [weight for weight in structured.penalties if weight != settings.penalty]
+    total = (1 + len(weights)) * brief.iterations + settings.iterations
     kept = checkpoint.load() if checkpoint else None
     trials = {name: Trial(**found) for name, found in kept["trials"].items()} if kept else {}
-    weights = [weight for weight in structured.penalties if weight != settings.penalty]
-    total = (len(choices) + len(weights)) * brief.iterations + settings.iterations
+    states = dict(kept["states"]) if kept else {}
 
-    def train(parts: Iterable[str], videos: Sequence[Video], how: MaterialConfig, before: int):
-        law.load_state_dict(uncorrected)
+    def train(
+        begin: LawState, parts: Sequence[str], videos: Sequence[Video], how: MaterialConfig, before: int
+    ) -> TrainedMaterial:
+        law.load_state_dict(begin)
         for name in trained_parts:
             law.parts[PARTS[name]].adaptor.requires_grad_(name in parts)
-        inner = checkpoint and _Stage(checkpoint, {name: asdict(trial) for name, trial in trials.items()})
+        inner = checkpoint and _Stage(checkpoint, _plain(trials), dict(states))
         shown = progress and (lambda done, _, value: progress(before + done, total, value))
         options = {"further": videos[1:], "checkpoint": inner, "progress": shown, "log": log}
         return train_material(model, law, *videos[0], how, **options)
 
-    def judged_by(videos: Sequence[tuple[Trajectory, list[float]] | None]) -> Trial:
-        if any(found is None for found in videos):
+    def judged(state: LawState) -> Trial:
+        """How a law does on the frames that tell of it."""
+        law.load_state_dict(state)
+        found = [_simulated(model, law, *video) for video in told]
+        if any(one is None for one in found):
             return Trial(math.inf, math.inf)
-        losses = [found for _, found in videos]
-        parts = (
-            [_mean([found[k] for k in one]) for found, one in zip(losses, which, strict=True)]
+        means = (
+            _mean([_mean([losses[k] for k in one]) for (_, losses), one in zip(found, which, strict=True)])
             for which in (fitted, held_out)
         )
-        return Trial(*map(_mean, parts))
+        return Trial(*means)
 
-    def tried() -> Trial:
-        return judged_by([_simulated(model, law, *video) for video in videos])
+    def tried(name: str, state: LawState) -> None:
+        trials[name] = judged(state)
+        log(f"{name} corrected: {_compared(trials[name], trials[NOTHING])}")
 
-    trials[NOTHING] = judged_by(as_it_is)
-    for k, parts in enumerate(choices):
-        name = " + ".join(parts)
-        if name not in trials:
-            train(parts, seen, brief, k * brief.iterations)
-            trials[name] = tried()
-            log(f"{name} corrected: {_compared(trials[name], trials[NOTHING])}")
-    parts = _chosen(choices, trials, structured.margin)
-    steps = (tuple(loss.frames[k] for k in out) for out, (_, loss) in zip(held_out, videos, strict=True))
-    choice = Choice(parts, trials, tuple(steps), settings.penalty)
+    if NOTHING not in trials:
+        train(uncorrected, trained_parts, seen, brief, 0)
+        together = states[settings.penalty] = copy.deepcopy(law.state_dict())
+        trials[NOTHING] = judged(uncorrected)
+        for parts in subsets(trained_parts):
+            tried(" + ".join(parts), corrected_in(parts, together, uncorrected))
+    parts = _chosen(subsets(trained_parts), trials, structured.margin)
+    steps = tuple(
+        tuple(loss.frames[first + k] for k in out)
+        for first, out, (_, loss) in zip(firsts, held_out, videos, strict=True)
+    )
+    choice = Choice(parts, trials, steps, settings.penalty)
     if parts:
         name = " + ".join(parts)
-        judged = {settings.penalty: trials[name].held_out_loss}
-        for k, weight in enumerate(weights, len(choices)):
+        losses = {settings.penalty: trials[name].held_out_loss}
+        for k, weight in enumerate(weights, 1):
             held = f"{name}, penalty {weight:g}"
             if held not in trials:
-                train(parts, seen, brief.model_copy(update={"penalty": weight}), k * brief.iterations)
-                trials[held] = tried()
-                log(f"{held}: {_compared(trials[held], trials[NOTHING])}")
-            judged[weight] = trials[held].held_out_loss
-        choice.penalty = largest_as_good(judged)
+                how = brief.model_copy(update={"penalty": weight})
+                train(uncorrected, parts, seen, how, k * brief.iterations)
+                states[weight] = copy.deepcopy(law.state_dict())
+                tried(held, states[weight])
+            losses[weight] = trials[held].held_out_loss
+        choice.penalty = largest_as_good(losses)
         how = settings.model_copy(update={"penalty": choice.penalty})
-        return train(parts, videos, how, total - settings.iterations), choice
+        begin = corrected_in(parts, states[choice.penalty], uncorrected)
+        return train(begin, parts, told, how, total - settings.iterations), choice
     law.load_state_dict(uncorrected)
-    value = _mean([_mean(losses) for _, losses in as_it_is])
+    value = _mean([_mean(losses[first:]) for first, (_, losses) in zip(firsts, as_it_is, strict=True)])
     return TrainedMaterial(law, History(loss=[value]), value, 0, stable=True), choice
+
+
+def subsets(parts: Sequence[str]) -> list[tuple[str, ...]]:
+    """All choices of at least one of the parts, smaller ones first."""
+    return [chosen for size in range(1, len(parts) + 1) for chosen in combinations(parts, size)]
+
+
+def corrected_in(parts: Sequence[str], state: LawState, uncorrected: LawState) -> LawState:
+    """The state of a law that is corrected in some parts, and in the others as it was."""
+    prefixes = tuple(f"{PARTS[name]}." for name in parts)
+    return {key: (state if key.startswith(prefixes) else uncorrected)[key] for key in uncorrected}
+
+
+def told_from(count: int, contact: int) -> int:
+    """Index of the first of ``count`` frames that tells of the law: that of the contact, unless too few follow it."""
+    return contact if count - contact >= LEAST_FRAMES else 0
+
+
+def from_frame(start: State, loss: TrajectoryLoss, path: Trajectory, first: int) -> Video:
+    """A video from the frame with index ``first`` on; the body starts as it is on a path at the frame before.
+
+    Nothing of the law shows before a contact, so those steps are simulated once. Gradients do not reach them.
+    """
+    if first == 0:
+        return start, loss
+    at = first - 1
+    state = State(path.x[at], path.v[at], start.mass, start.vol0, path.F[at], path.C[at])
+    return state, loss.select(range(first, len(loss.frames))).later(path.frames[at])
 
 
 def _chosen(choices: Iterable[tuple[str, ...]], trials: dict[str, Trial], margin: float) -> tuple[str, ...]:
@@ -226,6 +264,10 @@ def _simulated(
         return path, loss(path).tolist()
 
 
+def _plain(trials: dict[str, Trial]) -> dict[str, dict[str, float]]:
+    return {name: asdict(trial) for name, trial in trials.items()}
+
+
 def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values)
 
@@ -237,10 +279,16 @@ def _compared(trial: Trial, other: Trial) -> str:
 
 @dataclass
 class _Stage:
-    """The checkpoint of one of several trainings, which also knows what was tried before it."""
+    """The checkpoint of one of several trainings, which also knows what the ones before it found.
+
+    Attributes:
+        trials: how what was tried did.
+        states: laws that were trained, by the weight of the penalty.
+    """
 
     whole: Checkpoint
     trials: dict[str, dict[str, float]]
+    states: dict[float, LawState]
 
     def load(self) -> dict[str, Any] | None:
         """The state of this training; None if that of another is kept."""
@@ -248,4 +296,4 @@ class _Stage:
         return kept["loop"] if kept and kept["trials"] == self.trials else None
 
     def save(self, state: dict[str, Any]) -> None:
-        self.whole.save({"trials": self.trials, "loop": state})
+        self.whole.save({"trials": self.trials, "states": self.states, "loop": state})
