@@ -251,6 +251,21 @@ def constant_outputs(part, *n):
     return weights
 
 
+@pytest.mark.parametrize("name", RETURNS)
+def test_return_at_the_ends_of_its_outputs(name):
+    """All outputs as large as they get, in all combinations of signs: no energy is added, all gradients are finite."""
+    part, sigma = plasticity(name), spread_stretches(count=200)
+    energy = elastic_energy(sigma)
+    F = torch.diag_embed(sigma)
+    for signs in torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * len(part.base[2])):
+        weights = constant_outputs(part, *(0.9999 * LIMIT * signs))
+        returned, _ = part.principal(sigma, weights)
+        assert bool((elastic_energy(returned) <= energy + 64 * EPS * (1 + energy) * MU).all())
+        for dtype in (torch.float32, torch.float64):
+            found = part.vjp(F.to(dtype), tuple(w.to(dtype) for w in weights), torch.ones_like(F, dtype=dtype))
+            assert all(bool(x.isfinite().all()) for x in (found[0], *found[1]))
+
+
 @pytest.mark.parametrize("dilation", [0.0, 12.0, 34.0])
 def test_grains_that_dilate_are_contained(dilation):
     """One constant output makes `CohesiveDruckerPrager` of `DruckerPrager`, its tip and its tensile states too."""
