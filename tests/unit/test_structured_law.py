@@ -262,7 +262,9 @@ def test_return_at_the_ends_of_its_outputs(name):
         returned, _ = part.principal(sigma, weights)
         assert bool((elastic_energy(returned) <= energy + 64 * EPS * (1 + energy) * MU).all())
         for dtype in (torch.float32, torch.float64):
-            found = part.vjp(F.to(dtype), tuple(w.to(dtype) for w in weights), torch.ones_like(F, dtype=dtype))
+            found = part.vjp(
+                F.to(dtype), tuple(w.to(dtype) for w in weights), torch.ones_like(F, dtype=dtype)
+            )
             assert all(bool(x.isfinite().all()) for x in (found[0], *found[1]))
 
 
