@@ -108,10 +108,8 @@ def identify(
     rounds = len(settings.squares)
     for family in families:
         running.append(_begun(family, videos, running, stock_values, settings))
-    best = min((run for run in running if run.alive), key=lambda run: run.fit.cost, default=None)
-    for run in running[: running.index(best)] if best else ():  # those behind it have begun from it
-        if run.alive:
-            run.reconsider(run.family.with_guesses({**run.values, **best.values}))
+    for run, best in _better_later(running):
+        run.reconsider(run.family.with_guesses({**run.values, **best.values}))
     total = rounds * len(families)
     for level in range(1, rounds):
         _leave_behind(running, settings)
@@ -181,6 +179,16 @@ def _begun(
     best = min(fits, key=lambda run: (not run.alive, _adds_nothing(run, running), run.loss))
     best.rollouts = sum(run.rollouts for run in fits)
     return best
+
+
+def _better_later(running: Sequence[_Run]) -> list[tuple[_Run, _Run]]:
+    """Fits, each with the best of all and with the best of the same constants where these began after it."""
+    ranked, pairs = sorted((run for run in running if run.alive), key=lambda run: run.fit.cost), []
+    for at, run in enumerate(running):
+        alike = [other for other in ranked if other.family.constants == run.family.constants]
+        leaders = dict.fromkeys([*ranked[:1], *alike[:1]])
+        pairs += [(run, best) for best in leaders if run.alive and best in running[at + 1 :]]
+    return pairs
 
 
 def _leave_behind(running: Sequence[_Run], settings: IdentifyConfig) -> None:

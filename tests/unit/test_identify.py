@@ -15,7 +15,7 @@ from neuma_lib.evaluation.identified_page import identified_page
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.frame_batches import first_contact
 from neuma_lib.fitting.identified import FamilyFit
-from neuma_lib.fitting.identify import _choice, _leave_behind, _Run, _Video, averaged, identify
+from neuma_lib.fitting.identify import _better_later, _choice, _leave_behind, _Run, _Video, averaged, identify
 from neuma_lib.fitting.least_squares import Linearisation, jackknife, levenberg_marquardt
 from neuma_lib.fitting.throw import Throw
 from neuma_lib.io.files import write_json
@@ -207,6 +207,17 @@ def test_families_are_left_that_are_far_behind_or_show_what_one_within_them_show
     grains = Begun(1.0, law("hencky", "drucker_prager", friction_angle=30), "soft")
     _leave_behind([elastic, grains], options)
     assert grains.alive, "sand does not contain the elastic body"
+
+
+def test_fits_learn_of_better_ones_that_began_later():
+    """Of the best of all, and of the best one of the same constants: a flow may lead with constants that no elastic
+    body bears."""
+    stuck, elastic = Begun(9.0, ELASTIC, "stuck"), Begun(2.0, law("fixed_corotated"), "soft")
+    worse, flow = Begun(3.0, law("neo_hookean"), "soft"), Begun(1.0, PLASTIC, "flows")
+    pairs = _better_later([stuck, elastic, worse, flow])
+    assert pairs == [(stuck, flow), (stuck, elastic), (elastic, flow), (worse, flow)]
+    stuck.alive = flow.alive = False
+    assert _better_later([stuck, elastic, worse, flow]) == []
 
 
 def test_a_flow_that_never_yields_shows_the_elastic_body():
