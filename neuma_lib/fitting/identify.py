@@ -132,7 +132,12 @@ def identify(
     run = next(run for run in running if run.family is chosen.family)
     run.look_closer()
     final = _Run(run.family, videos, [len(video.frames) for video in videos], settings)
-    final.begin([run.values], level=rounds - 1, deviations=run.deviations)
+    starts, first = [run.values], rounds - 1
+    if chosen.held_out > settings.give_up * chosen.loss:  # the first frames misled: from the beginning
+        starts, first = [run.values, *(run.family.with_guesses(values) for values in ({}, stock_values))], 0
+    final.begin(starts, first, run.deviations)
+    for level in range(first + 1, rounds if final.alive else 0):
+        final.refine(level)
     best = final.judged()
     if best.covariance is not None:
         best.covariance = final.widened()

@@ -85,6 +85,22 @@ def test_constants_and_family_of_the_truth_are_found():
     assert found.as_dict()["law"]["plasticity"] == {"name": "identity"}
 
 
+def test_first_frames_that_mislead_are_not_where_the_last_fit_begins(monkeypatch):
+    """All frames are fitted through all squares, from guesses too, if the last ones are predicted far worse, as those
+    of a plastic body by an elastic one."""
+    begun, begin = [], _Run.begin
+
+    def noted(run, starts, level=0, *args, **options):
+        begun.append((len(starts), level))
+        begin(run, starts, level, *args, **options)
+
+    monkeypatch.setattr(_Run, "begin", noted)
+    truth = law("hencky", "von_mises", E=6e4, nu=0.3, yield_stress=2e3)
+    for factor, expected in ((1e6, (1, len(SQUARES) - 1)), (1.2, (3, 0))):
+        assert found_in(truth, {"hencky": ELASTIC}, give_up=factor).best.refined
+        assert begun[-1] == expected
+
+
 def test_an_uncertain_throw_is_corrected_and_widens_the_constants():
     """A velocity that is off by a standard deviation along all axes is found to a third of that, and the constants as
     well as with the true one; what is left of the uncertainty is passed on to them."""
