@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import median
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -142,14 +142,33 @@ class History:
 
 
 @dataclass
+class Stretch:
+    """A training that is a stretch of a longer one: its schedules are those of the whole.
+
+    Attributes:
+        before, after: iterations of the whole that come before it and after it.
+        memory: `TrainedMaterial.memory` of what came before; None: nothing did.
+    """
+
+    before: int = 0
+    after: int = 0
+    memory: dict[str, Any] | None = None
+
+
+@dataclass
 class TrainedMaterial:
-    """Result of `train_material`: the law at its best training loss, how it got there, and whether it stayed stable."""
+    """Result of `train_material`: the law at its best training loss, how it got there, and whether it stayed stable.
+
+    ``memory`` is what a training that goes on from there needs beside the law: the optimiser's averages of each
+    parameter by its name, and the loss that losses are measured by.
+    """
 
     law: Law
     history: History
     best_loss: float
     best_iteration: int
     stable: bool
+    memory: dict[str, Any] | None = None
 
     def summary(self) -> str:
         """One line for people."""
@@ -180,6 +199,7 @@ def train_material(
     settings: MaterialConfig,
     *,
     further: Sequence[tuple[State, TrajectoryLoss]] = (),
+    stretch: Stretch | None = None,
     checkpoint: Checkpoint | None = None,
     progress: Callable[[int, int, float], None] | None = None,
     log: Callable[[str], None] = print,
@@ -193,6 +213,7 @@ def train_material(
         loss: per-frame loss of a trajectory.
         further: starts and losses of other videos of the same material, which train the same law.
         settings: hyper-parameters, from ``iterations`` on and ``lr_scale``.
+        stretch: what comes before and after in a longer training; None: this is the whole.
         checkpoint: where to keep the state of the loop, so that a killed run goes on; None keeps none.
         progress: called with (iteration, iterations, loss).
         log: receives a line for every recovery from a diverging step.
@@ -203,7 +224,7 @@ def train_material(
     """
     videos = [(start, loss), *further]
     model.check_courant(law, min(float(start.density.min()) for start, _ in videos))
-    loop = _Loop(model, law, videos, settings, log)
+    loop = _Loop(model, law, videos, settings, log, stretch or Stretch())
     if checkpoint is not None and (state := checkpoint.load()) is not None:
         loop.load_state_dict(state)
         log(f"resumed at iteration {loop.iteration} of {settings.iterations}")
@@ -216,15 +237,22 @@ def train_material(
     loop.judge_last_step()
     law.load_state_dict(loop.best["law"])
     return TrainedMaterial(
-        law, loop.history, loop.best["loss"], loop.best["iteration"], stable=not loop.ended
+        law,
+        loop.history,
+        loop.best["loss"],
+        loop.best["iteration"],
+        stable=not loop.ended,
+        memory=loop.memory(),
     )
 
 
 class _Loop:
     """The state of training, and one step of it."""
 
-    def __init__(self, model, law, videos, settings, log):
-        self.model, self.law, self.videos = model, law, videos
+    def __init__(self, model, law, videos, settings, log, stretch):
+        self.model, self.law, self.videos, self.before = model, law, videos, stretch.before
+        whole = stretch.before + settings.iterations + stretch.after
+        self.whole = settings.model_copy(update={"iterations": whole})
         self.settings, self.log = settings, log
         self.nets = {
             "elastic": [p for p in law.elasticity.parameters() if p.requires_grad],
@@ -240,8 +268,12 @@ class _Loop:
             [{"params": p, "lr": rates[k], "base_lr": rates[k]} for k, p in self.nets.items() if p],
             betas=settings.betas,
         )
+        memory = stretch.memory or {"averages": {}, "first_loss": None}
+        for name, parameter in law.named_parameters():
+            if parameter.requires_grad and name in memory["averages"]:
+                self.optimizer.state[parameter] = copy.deepcopy(memory["averages"][name])
         self.iteration, self.lr_scale, self.ended = 0, 1.0, False
-        self.history, self.first_loss = History(), None
+        self.history, self.first_loss = History(), memory["first_loss"]
         self.best = {"loss": math.inf, "iteration": 0, **self._snapshot()}
         self.deviation = None
         if settings.penalty:
@@ -330,18 +362,22 @@ class _Loop:
 
     def _weighted(self, losses: Tensor) -> Tensor:
         """Weighted mean of the frames of a video."""
-        weights = frame_weights(self.iteration, len(losses), self.settings).to(losses)
+        weights = frame_weights(self.before + self.iteration, len(losses), self.whole).to(losses)
         return (weights * losses).sum() / weights.sum()
 
     def _step(self) -> None:
-        s = self.settings
-        cosine = (1 + math.cos(math.pi * self.iteration / max(1, s.iterations))) / 2
-        schedule = min(1.0, (self.iteration + 1) / max(1, s.warm_up)) * (
-            s.lr_floor + (1 - s.lr_floor) * cosine
-        )
+        s, iteration = self.whole, self.before + self.iteration
+        cosine = (1 + math.cos(math.pi * iteration / max(1, s.iterations))) / 2
+        schedule = min(1.0, (iteration + 1) / max(1, s.warm_up)) * (s.lr_floor + (1 - s.lr_floor) * cosine)
         for group in self.optimizer.param_groups:
             group["lr"] = group["base_lr"] * self.lr_scale * schedule
         self.optimizer.step()
+
+    def memory(self) -> dict[str, Any]:
+        """What a training that goes on from here needs beside the law."""
+        state = self.optimizer.state
+        averages = {name: copy.deepcopy(state[p]) for name, p in self.law.named_parameters() if p in state}
+        return {"averages": averages, "first_loss": self.first_loss}
 
     def _better_state(self, value: float) -> dict:
         """The present state if its loss is the lowest so far, else the best one."""

@@ -27,7 +27,7 @@ from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.frame_batches import first_contact, held_out_frames
-from neuma_lib.fitting.material import History, TrainedMaterial, TrajectoryLoss, train_material
+from neuma_lib.fitting.material import History, Stretch, TrainedMaterial, TrajectoryLoss, train_material
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.mechanics.structured import StructuredLaw
 from neuma_lib.sim.model import MPMModel
@@ -143,6 +143,7 @@ def train_structured(
     seen = [(start, loss.select(keep)) for keep, (start, loss) in zip(fitted, told, strict=True)]
     trained_parts = tuple(name for name, part in PARTS.items() if part in law.parts)
     brief = settings.model_copy(update={"iterations": structured.trial_iterations})
+    first = Stretch(after=settings.iterations)
     weights = [weight for weight in structured.penalties if weight != settings.penalty]
     total = (1 + len(weights)) * brief.iterations + settings.iterations
     kept = checkpoint.load() if checkpoint else None
@@ -150,7 +151,12 @@ def train_structured(
     states = dict(kept["states"]) if kept else {}
 
     def train(
-        begin: LawState, parts: Sequence[str], videos: Sequence[Video], how: MaterialConfig, before: int
+        begin: LawState,
+        parts: Sequence[str],
+        videos: Sequence[Video],
+        how: MaterialConfig,
+        stretch: Stretch,
+        before: int,
     ) -> TrainedMaterial:
         law.load_state_dict(begin)
         for name in trained_parts:
@@ -158,7 +164,11 @@ def train_structured(
         inner = checkpoint and _Stage(checkpoint, _plain(trials), dict(states))
         shown = progress and (lambda done, _, value: progress(before + done, total, value))
         options = {"further": videos[1:], "checkpoint": inner, "progress": shown, "log": log}
-        return train_material(model, law, *videos[0], how, **options)
+        return train_material(model, law, *videos[0], how, stretch=stretch, **options)
+
+    def keep(weight: float, trained: TrainedMaterial) -> LawState:
+        states[weight] = {"law": copy.deepcopy(law.state_dict()), "memory": trained.memory}
+        return states[weight]["law"]
 
     def judged(state: LawState) -> Trial:
         """How a law does on the frames that tell of it."""
@@ -177,15 +187,14 @@ def train_structured(
         log(f"{name} corrected: {_compared(trials[name], trials[NOTHING])}")
 
     if NOTHING not in trials:
-        train(uncorrected, trained_parts, seen, brief, 0)
-        together = states[settings.penalty] = copy.deepcopy(law.state_dict())
+        together = keep(settings.penalty, train(uncorrected, trained_parts, seen, brief, first, 0))
         trials[NOTHING] = judged(uncorrected)
         for parts in subsets(trained_parts):
             tried(" + ".join(parts), corrected_in(parts, together, uncorrected))
     parts = _chosen(subsets(trained_parts), trials, structured.margin)
     steps = tuple(
-        tuple(loss.frames[first + k] for k in out)
-        for first, out, (_, loss) in zip(firsts, held_out, videos, strict=True)
+        tuple(loss.frames[begin + k] for k in out)
+        for begin, out, (_, loss) in zip(firsts, held_out, videos, strict=True)
     )
     choice = Choice(parts, trials, steps, settings.penalty)
     if parts:
@@ -195,16 +204,17 @@ def train_structured(
             held = f"{name}, penalty {weight:g}"
             if held not in trials:
                 how = brief.model_copy(update={"penalty": weight})
-                train(uncorrected, parts, seen, how, k * brief.iterations)
-                states[weight] = copy.deepcopy(law.state_dict())
-                tried(held, states[weight])
+                done = k * brief.iterations
+                tried(held, keep(weight, train(uncorrected, parts, seen, how, first, done)))
             losses[weight] = trials[held].held_out_loss
         choice.penalty = largest_as_good(losses)
         how = settings.model_copy(update={"penalty": choice.penalty})
-        begin = corrected_in(parts, states[choice.penalty], uncorrected)
-        return train(begin, parts, told, how, total - settings.iterations), choice
+        found = states[choice.penalty]
+        begin = corrected_in(parts, found["law"], uncorrected)
+        last = Stretch(before=brief.iterations, memory=found["memory"])
+        return train(begin, parts, told, how, last, total - settings.iterations), choice
     law.load_state_dict(uncorrected)
-    value = _mean([_mean(losses[first:]) for first, (_, losses) in zip(firsts, as_it_is, strict=True)])
+    value = _mean([_mean(losses[begin:]) for begin, (_, losses) in zip(firsts, as_it_is, strict=True)])
     return TrainedMaterial(law, History(loss=[value]), value, 0, stable=True), choice
 
 
@@ -283,12 +293,12 @@ class _Stage:
 
     Attributes:
         trials: how what was tried did.
-        states: laws that were trained, by the weight of the penalty.
+        states: laws that were trained, and the memory of their trainings, by the weight of the penalty.
     """
 
     whole: Checkpoint
     trials: dict[str, dict[str, float]]
-    states: dict[float, LawState]
+    states: dict[float, dict[str, Any]]
 
     def load(self) -> dict[str, Any] | None:
         """The state of this training; None if that of another is kept."""

@@ -11,7 +11,7 @@ from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.errors import InputError
 from neuma_lib.fitting.frame_batches import first_contact, held_out_frames
-from neuma_lib.fitting.material import ParticleLoss, PixelLoss
+from neuma_lib.fitting.material import ParticleLoss, PixelLoss, Stretch, train_material
 from neuma_lib.fitting.structured_fit import (
     AS_WELL,
     Trial,
@@ -89,6 +89,27 @@ def test_the_last_training_goes_on_from_the_law_that_was_judged(problem, too_sti
     assert contact > 0
     mean = (trial.loss * (told - out) + trial.held_out_loss * out) / told
     assert trained.history.loss[0] == pytest.approx(mean, rel=1e-9)
+
+
+def test_a_training_in_two_stretches_is_the_whole(problem):
+    body, loss = problem
+    slow = SETTINGS.model_copy(update={"lr_elastic": 1e-3, "warm_up": 2})  # every step lowers the loss
+
+    def train(law, iterations, stretch=None):
+        how = slow.model_copy(update={"iterations": iterations})
+        return train_material(MODEL, law, body.state(V0), loss, how, stretch=stretch)
+
+    laws = [structured_law({"elasticity": FLOWS["elasticity"]}, MODEL.dt).double() for _ in range(2)]
+    for law in laws:
+        law.attach_adaptor(rank=None)
+    whole = train(laws[0], 5)
+    first = train(laws[1], 2, Stretch(after=3))
+    assert first.best_iteration == 2, "the law is that of the last step"
+    second = train(laws[1], 3, Stretch(before=2, memory=first.memory))
+    curve = first.history.weighted_loss + second.history.weighted_loss
+    assert curve == pytest.approx(whole.history.weighted_loss, rel=1e-9)
+    for once, again in zip(*(deltas(law, "elasticity") for law in laws), strict=True):
+        assert torch.allclose(once, again, rtol=1e-9, atol=1e-15)
 
 
 def test_a_law_that_nothing_improves_stays_exactly_as_it_is(problem):
