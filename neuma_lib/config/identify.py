@@ -77,7 +77,8 @@ class IdentifyConfig(Section):
     give_up: float = Field(
         4.0,
         gt=1,
-        description="a family whose squared residuals exceed the best one's by this factor is not refined further",
+        description="a family whose squared residuals exceed the best one's by this factor is not refined further; "
+        "where held-out ones exceed the fitted ones by it, the fit to all frames begins anew",
     )
     penalty: float = Field(
         0.05,
