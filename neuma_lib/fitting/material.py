@@ -220,11 +220,15 @@ def train_material(
 
     Raises:
         NonFiniteError: the very first rollout is not finite, so there is no good state to return to.
-        InputError: the law has nothing to train, or is too stiff for the time step.
+        InputError: the law has nothing to train, or is too stiff for the time step when training begins.
     """
     videos = [(start, loss), *further]
-    model.check_courant(law, min(float(start.density.min()) for start, _ in videos))
-    loop = _Loop(model, law, videos, settings, log, stretch or Stretch())
+    stretch = stretch or Stretch()
+    if (
+        not stretch.before
+    ):  # what was trained may pass the limit, which leaves a margin: a step too far is taken back
+        model.check_courant(law, min(float(start.density.min()) for start, _ in videos))
+    loop = _Loop(model, law, videos, settings, log, stretch)
     if checkpoint is not None and (state := checkpoint.load()) is not None:
         loop.load_state_dict(state)
         log(f"resumed at iteration {loop.iteration} of {settings.iterations}")

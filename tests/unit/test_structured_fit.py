@@ -112,6 +112,24 @@ def test_a_training_in_two_stretches_is_the_whole(problem):
         assert torch.allclose(once, again, rtol=1e-9, atol=1e-15)
 
 
+def test_a_correction_may_stiffen_beyond_the_limit_where_training_may_begin(problem):
+    """Constants found at the edge of what the time step bears are corrected upwards, too."""
+    body, loss = problem
+    density, spec = float(body.state(V0).density.min()), {"elasticity": FLOWS["elasticity"]}
+    number = MODEL.courant(structured_law(spec, MODEL.dt).double(), density)
+    stiff = {"elasticity": {**FLOWS["elasticity"], "E": FLOWS["elasticity"]["E"] * (0.799 / number) ** 2}}
+    law = structured_law(stiff, MODEL.dt).double()
+    law.attach_adaptor(rank=None)
+    with torch.no_grad():
+        *_, last = law.elasticity.adaptor.parameters()
+        last[:2, -1] = 0.1  # both moduli by 10 %
+    assert MODEL.courant(law, density) > 0.8
+    how = SETTINGS.model_copy(update={"iterations": 1})
+    with pytest.raises(InputError, match="Courant"):
+        train_material(MODEL, law, body.state(V0), loss, how)
+    assert train_material(MODEL, law, body.state(V0), loss, how, stretch=Stretch(before=2)).stable
+
+
 def test_a_law_that_nothing_improves_stays_exactly_as_it_is(problem):
     """The video is that of the law itself."""
     trained, choice = fit(problem, TRUTH, log=lambda _: None)
