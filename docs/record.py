@@ -50,6 +50,7 @@ MADE_BY = {
     "views": "results/views.csv",
     "outside": "results/outside.csv",
     "identified": "results/identified.csv",
+    "bias": "results/bias.csv",
 }
 """Tables that are recorded, and the target of Snakemake that makes them."""
 VERDICT_HEAD = f"| {' | '.join(VERDICTS[:2])} |"
