@@ -1,0 +1,272 @@
+"""Fitting a network of springs to a video (Spring-Gaus, Zhong et al. 2024: the stage "dynamic").
+
+Its own are the network and the steps from frame to frame: at each frame an optimiser step is made with the gradient of
+the substeps since the frame before it, and the state is taken as given from there on. Start, images and loss are those
+of all methods here. The whole gradient through all frames is a choice beside it.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from statistics import median
+
+import torch
+from torch import Tensor
+
+from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.springs import SpringsConfig
+from neuma_lib.errors import NonFiniteError
+from neuma_lib.fitting.material import PixelLoss, frame_weights
+from neuma_lib.io.checkpoint import Checkpoint
+from neuma_lib.sim.state import State
+from neuma_lib.springs.body import SpringBody
+from neuma_lib.springs.network import Springs
+from neuma_lib.springs.rollout import SpringModel, spring_rollout
+
+
+@dataclass
+class SpringHistory:
+    """Curves of a fit, one entry an iteration: state before its optimiser steps.
+
+    Attributes:
+        loss: mean squared error over all frames.
+        modulus: Young's modulus of the network [Pa].
+        softness, friction, resistance: as `Springs.values` gives them, the first as its parameter.
+        substeps: parts of a time step.
+        lr_scale: factor on the learning rate after recoveries.
+        recoveries: returns to the best state.
+        seconds: wall time [s].
+    """
+
+    loss: list[float] = field(default_factory=list)
+    modulus: list[float] = field(default_factory=list)
+    softness: list[float] = field(default_factory=list)
+    friction: list[float] = field(default_factory=list)
+    resistance: list[float] = field(default_factory=list)
+    substeps: list[int] = field(default_factory=list)
+    lr_scale: list[float] = field(default_factory=list)
+    recoveries: list[dict] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+
+
+@dataclass
+class FittedSprings:
+    """Result of `fit_springs`: the springs at their lowest loss, and how they got there."""
+
+    springs: Springs
+    substeps: int
+    history: SpringHistory
+    best_loss: float
+    best_iteration: int
+    stable: bool
+
+    def summary(self, density: float) -> str:
+        """One line for people; density [kg/m^3]."""
+        if not self.history.loss:
+            return f"nothing fitted, loss {self.best_loss:.3e}"
+        note = "" if self.stable else "; UNSTABLE: best state kept"
+        friction = float(self.springs.values()[3])
+        return (
+            f"loss {self.history.loss[0]:.3e} -> {self.best_loss:.3e} at iteration {self.best_iteration}, E "
+            f"{self.history.modulus[0]:.3g} -> {self.springs.modulus(density):.3g} Pa, friction {friction:.2f}, "
+            f"{self.substeps} substeps, {median(self.history.seconds):.3g} s an iteration{note}"
+        )
+
+
+def fit_springs(
+    model: SpringModel,
+    body: SpringBody,
+    springs: Springs,
+    start: State,
+    loss: PixelLoss,
+    settings: MaterialConfig,
+    how: SpringsConfig,
+    *,
+    checkpoint: Checkpoint | None = None,
+    progress: Callable[[int, int, float], None] | None = None,
+    log: Callable[[str], None] = print,
+) -> FittedSprings:
+    """Optimise the parameters of the springs so that the particles that follow them match the video.
+
+    Args:
+        model: time step, gravity and box.
+        body: particles and network.
+        springs: the network with its parameters; those that require gradients are optimised, in place.
+        start: the particles with their initial motion.
+        loss: of the particles' states at the frames.
+        settings: iterations, rate schedule, clipping, frame weights, recoveries.
+        how: mode and learning rate.
+        checkpoint: where to keep the state of the loop, so that a killed run goes on; None keeps none.
+        progress: called with (iteration, iterations, loss).
+        log: receives a line for every halving of the step and every recovery.
+
+    Raises:
+        NonFiniteError: already the first rollout runs away.
+    """
+    loop = _Loop(model, body, springs, start, loss, settings, how, log)
+    if checkpoint is not None and (state := checkpoint.load()) is not None:
+        loop.load_state_dict(state)
+        log(f"resumed at iteration {loop.iteration} of {settings.iterations}")
+    while loop.iteration < settings.iterations and not loop.ended:
+        loop.advance()
+        if progress and loop.history.loss:
+            progress(loop.iteration, settings.iterations, loop.history.loss[-1])
+        if checkpoint is not None and loop.iteration % settings.checkpoint_every == 0:
+            checkpoint.save(loop.state_dict())
+    loop.judge_last_step()
+    best = loop.best
+    springs.load_state_dict(best["springs"])
+    return FittedSprings(
+        springs, best["substeps"], loop.history, best["loss"], best["iteration"], stable=not loop.ended
+    )
+
+
+class _Loop:
+    """The state of the fit, and one pass over the video."""
+
+    def __init__(self, model, body, springs, start, loss, settings, how, log):
+        self.model, self.body, self.springs, self.loss = model, body, springs, loss
+        self.settings, self.how, self.log = settings, how, log
+        self.start = body.start(start)
+        self.density = float(start.mass.sum() / start.vol0.sum())
+        later = [k for k, n in enumerate(loss.frames) if n > 0]
+        self.single = [loss.select([k]) for k in later] if how.truncated else []
+        slow = [springs.log_damping] if springs.log_damping.requires_grad else []
+        groups = [(how.lr_springs, [springs.log_stiffness, springs.softness, springs.grip])]
+        groups += [(0.1 * how.lr_springs, slow)] if slow else []
+        self.optimizer = torch.optim.Adam(
+            [{"params": parameters, "lr": rate, "base_lr": rate} for rate, parameters in groups],
+            betas=settings.betas,
+        )
+        self.iteration, self.lr_scale, self.ended = 0, 1.0, False
+        self.history, self.first_loss = SpringHistory(), None
+        self.best = {"loss": math.inf, "iteration": 0, **self._snapshot()}
+
+    def advance(self) -> None:
+        """Judge the springs, then one pass of optimiser steps; or a return to the best state."""
+        started = time.perf_counter()
+        try:
+            with torch.set_grad_enabled(not self.how.truncated):
+                losses = self._frame_losses()
+            value = float(losses.detach().mean())
+            self._keep_if_better(value)
+            self._note(value)
+            self.first_loss = self.first_loss or max(value, 1e-30)
+            self._set_rates()
+            if self.how.truncated:
+                self._frame_by_frame()
+            else:
+                weights = frame_weights(self.iteration, len(losses), self.settings).to(losses)
+                self._step((weights * losses).sum() / weights.sum())
+        except NonFiniteError as error:
+            self._recover(error)
+        else:
+            self.history.seconds.append(time.perf_counter() - started)
+            self.iteration += 1
+
+    def judge_last_step(self) -> None:
+        """Whether the springs after the last pass are the best ones."""
+        if self.ended:
+            return
+        try:
+            with torch.no_grad():
+                self._keep_if_better(float(self._frame_losses().mean()))
+        except NonFiniteError:
+            return
+
+    def _frame_losses(self) -> Tensor:
+        """Losses of all frames, shape (T,)."""
+        x, v, self.model = spring_rollout(
+            self.model, self.springs, *self.start, self.loss.frames, log=self.log
+        )
+        return self.loss(self.body.path(self.loss.frames, x, v))
+
+    def _frame_by_frame(self) -> None:
+        """An optimiser step for every frame, by the gradient of the substeps since the frame before it."""
+        (x, v), reached = self.start, 0
+        for loss in self.single:
+            (frame,) = loss.frames
+            xs, vs, self.model = spring_rollout(
+                self.model, self.springs, x, v, (frame,), reached, log=self.log
+            )
+            self._step(loss(self.body.path((frame,), xs, vs)).sum())
+            x, v, reached = xs[0].detach(), vs[0].detach(), frame
+
+    def _step(self, loss: Tensor) -> None:
+        """One optimiser step down the gradient of a loss, which is divided by the first one before it is clipped."""
+        self.optimizer.zero_grad(set_to_none=True)
+        (loss / self.first_loss).backward()
+        parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
+        norm = torch.nn.utils.clip_grad_norm_(parameters, self.settings.gradient_clip)
+        if not math.isfinite(norm):
+            raise NonFiniteError("springs", f"the gradient is not finite at iteration {self.iteration}")
+        self.optimizer.step()
+
+    def _set_rates(self) -> None:
+        s = self.settings
+        cosine = (1 + math.cos(math.pi * self.iteration / max(1, s.iterations))) / 2
+        schedule = s.lr_floor + (1 - s.lr_floor) * cosine
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["base_lr"] * self.lr_scale * schedule
+
+    def _note(self, value: float) -> None:
+        history = self.history
+        _, _, resistance, friction = self.springs.values()
+        history.loss.append(value)
+        history.modulus.append(self.springs.modulus(self.density))
+        history.softness.append(float(self.springs.softness.detach()))
+        history.friction.append(float(friction.detach()))
+        history.resistance.append(float(resistance.detach()))
+        history.substeps.append(self.model.substeps)
+        history.lr_scale.append(self.lr_scale)
+
+    def _keep_if_better(self, value: float) -> None:
+        if value < self.best["loss"]:
+            self.best = {"loss": value, "iteration": self.iteration, **self._snapshot()}
+
+    def _snapshot(self) -> dict:
+        """Copies of what an optimiser step changes."""
+        return {
+            "springs": copy.deepcopy(self.springs.state_dict()),
+            "optimizer": copy.deepcopy(self.optimizer.state_dict()),
+            "substeps": self.model.substeps,
+        }
+
+    def _restore(self, state: dict) -> None:
+        self.springs.load_state_dict(state["springs"])
+        self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
+        self.model = SpringModel(**{**self.model.__dict__, "substeps": state["substeps"]})
+
+    def _recover(self, error: NonFiniteError) -> None:
+        """Return to the best state with half the rates; after too many returns the fit ends there."""
+        if not math.isfinite(self.best["loss"]):
+            raise error
+        self.lr_scale /= 2
+        self._restore(self.best)
+        self.history.recoveries.append(
+            {"iteration": self.iteration, "reason": str(error), "lr_scale": self.lr_scale}
+        )
+        self.log(
+            f"iteration {self.iteration}: {error}; back to iteration {self.best['iteration']}, rates x{self.lr_scale:g}"
+        )
+        self.ended = len(self.history.recoveries) > self.settings.max_recoveries
+
+    def state_dict(self) -> dict:
+        """Everything that the next iterations depend on."""
+        return {
+            **{key: getattr(self, key) for key in ("iteration", "lr_scale", "ended", "first_loss")},
+            "history": copy.deepcopy(self.history.__dict__),
+            "best": copy.deepcopy(self.best),
+            **self._snapshot(),
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """Continue from a `state_dict`."""
+        for key in ("iteration", "lr_scale", "ended", "first_loss", "best"):
+            setattr(self, key, state[key])
+        self.history = SpringHistory(**state["history"])
+        self._restore(state)

@@ -1,0 +1,63 @@
+"""Files of fitted networks of springs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuma_lib.errors import InputError
+from neuma_lib.io.weights import read_weights, write_weights
+from neuma_lib.springs.body import SpringBody
+from neuma_lib.springs.network import SpringNetwork, Springs
+
+_PARAMETERS = ("log_stiffness", "softness", "grip", "log_damping")
+
+
+def save_springs(path: str | Path, body: SpringBody, springs: Springs, metadata: Mapping[str, Any]) -> None:
+    """Write a network with its parameters; the metadata need ``stable``."""
+    network = body.network
+    tensors = {
+        "index": body.index,
+        **{name: getattr(network, name) for name in ("anchors", "neighbours", "rest")},
+        **{name: getattr(springs, name) for name in _PARAMETERS},
+    }
+    write_weights(path, tensors, {"hard": network.hard, "exponent": network.exponent, **metadata})
+
+
+def load_springs(
+    path: str | Path, x0: Tensor, carriers: int
+) -> tuple[SpringBody, Springs, dict[str, Any]]:
+    """Springs of a body, in the precision of its particles x0 (N, 3) [m], and the metadata of their file.
+
+    Args:
+        carriers: anchors that a particle follows.
+
+    Raises:
+        InputError: missing or foreign file, or springs of other particles.
+    """
+    tensors, metadata = read_weights(path)
+    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    A, K = shapes.get("rest", (0, 0)) if len(shapes.get("rest", ())) == 2 else (0, 0)
+    expected = {"index": (A,), "anchors": (A, 3), "neighbours": (A, K), "rest": (A, K)}
+    expected |= dict(zip(_PARAMETERS, [(A,), (1,), (1,), (1,)], strict=True))
+    hard, exponent = metadata.get("hard"), metadata.get("exponent")
+    if shapes != expected or not A or type(hard) is not int or not isinstance(exponent, float):
+        raise InputError(f"{path} holds no network of springs: run the rule springs again")
+    neighbours, index = tensors["neighbours"], tensors["index"]
+    if not (0 <= int(neighbours.min()) and int(neighbours.max()) < A and 0 <= int(index.min())):
+        raise InputError(f"{path} names anchors that it does not hold: run the rule springs again")
+    network = SpringNetwork(tensors["anchors"], neighbours, tensors["rest"], hard, exponent)
+    network = network.to(x0.dtype, x0.device)
+    try:
+        body = SpringBody.with_network(x0, index.to(x0.device), network, carriers)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    springs = Springs(network, 1.0, 1.0)
+    with torch.no_grad():
+        for name in _PARAMETERS:
+            getattr(springs, name).copy_(tensors[name])
+    return body, springs, metadata
