@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from neuma_lib.config.base import Section
 from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.springs import SpringsConfig
 from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.config.variants import split_variant
 
@@ -24,11 +25,12 @@ class MethodConfig(Section):
     """A method is a set of options over the same code."""
 
     title: str = Field(description="name in tables")
-    law: Literal["learned", "structured", "true", "identified"] = Field(
+    law: Literal["learned", "structured", "true", "identified", "springs"] = Field(
         "learned",
         description="learned: the paper's networks; structured: a correction of the prior's analytic law that keeps "
         "the structure of a material; true: the scene's own law on the reconstruction, the yardstick; identified: the "
-        "analytic law that the stage `identify` found in the video. The last two are not trained",
+        "analytic law that the stage `identify` found in the video. The last two are not trained. springs: no law of a "
+        "material, but a network of springs in the body (Spring-Gaus)",
     )
     prior: str | None = Field(
         None,
@@ -50,33 +52,38 @@ class MethodConfig(Section):
     structured: dict[str, Any] = Field(
         {}, description="settings of the section structured that a method with a structured law changes"
     )
+    springs: dict[str, Any] = Field(
+        {}, description="settings of the section springs that a method with springs changes"
+    )
 
     @model_validator(mode="after")
     def _fits_its_law(self) -> MethodConfig:
-        trained = self.law in ("learned", "structured")
+        trained = self.law in ("learned", "structured", "springs")
         if not trained and self.material.get("train", True):
             raise ValueError(f"law: the {self.law} law is not trained, set material: {{train: false}}")
-        if not trained and self.prior is not None:
+        if (not trained or self.law == "springs") and self.prior is not None:
             raise ValueError(f"prior: the {self.law} law has none, leave it out")
         if self.law == "structured" and not self.material.get("train", True):
             raise ValueError(
                 "law: a structured law without training is its analytic law, choose law: identified"
             )
-        if self.law != "structured" and self.structured:
-            raise ValueError("structured: only a method with law: structured has these settings")
+        for section in ("structured", "springs"):
+            if self.law != section and getattr(self, section):
+                raise ValueError(f"{section}: only a method with law: {section} has these settings")
         return self
 
 
 def parse_method(text: str, methods: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     """Split a method's folder name, ``neuma+rank=4+seed=2``, into its base and its settings.
 
-    Keys are those of the sections ``material`` and ``structured``, ``prior``, and ``law_from``, a scene. Values are
-    YAML scalars; a comma makes a list.
+    Keys are those of the sections ``material``, ``structured`` and ``springs``, ``prior``, and ``law_from``, a scene.
+    Values are YAML scalars; a comma makes a list.
 
     Raises:
         InputError: unknown method or key, a repeated key, or a piece without '='.
     """
-    keys = [*MaterialConfig.model_fields, *StructuredConfig.model_fields, "prior", LAW_FROM]
+    sections = (MaterialConfig, StructuredConfig, SpringsConfig)
+    keys = [*(key for section in sections for key in section.model_fields), "prior", LAW_FROM]
     base, given = split_variant(text, methods, keys, "method")
     variant: dict[str, Any] = {}
     for key, value in given.items():

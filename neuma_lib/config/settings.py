@@ -28,6 +28,7 @@ from neuma_lib.config.priors import PriorsConfig
 from neuma_lib.config.random_scenes import RandomConfig, draw_scenes
 from neuma_lib.config.scenes import SceneConfig
 from neuma_lib.config.simulation import SimulationConfig
+from neuma_lib.config.springs import SpringsConfig
 from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.config.tables import TableConfig
 from neuma_lib.config.validation import hint, validate
@@ -35,7 +36,7 @@ from neuma_lib.config.variants import DRAWN, folder, parse_chain
 from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.errors import InputError
 
-Changed = TypeVar("Changed", MaterialConfig, StructuredConfig)
+Changed = TypeVar("Changed", MaterialConfig, StructuredConfig, SpringsConfig)
 
 TRUTH_DRAWS = ("the particles", "the tracers", "the second tracers")
 """What the seeds dataset.seed, dataset.seed + 1 and dataset.seed + 2 draw, see `neuma_lib.data.ground_truth`."""
@@ -68,6 +69,7 @@ class Config(Section):
     structured: StructuredConfig = Field(
         StructuredConfig(), description="laws with the structure of a material"
     )
+    springs: SpringsConfig = Field(SpringsConfig(), description="bodies of springs")
     evaluation: EvaluationConfig = Field(EvaluationConfig(), description="measures and videos")
     figures: FiguresConfig = Field(FiguresConfig(), description="figures")
     methods: dict[str, MethodConfig] = Field({}, description="methods by name")
@@ -102,12 +104,13 @@ class Config(Section):
         for name, method in self.methods.items():
             _changed(self.material, method.material, f"methods.{name}.material")
             _changed(self.structured, method.structured, f"methods.{name}.structured")
+            _changed(self.springs, method.springs, f"methods.{name}.springs")
             self._known_prior(method.prior, f"methods.{name}.prior")
             own = [known for known, entry in self.methods.items() if entry.trained_as is None]
             if method.trained_as not in (None, *own):
                 unknown = f"no method '{method.trained_as}' with a training of its own"
                 raise ValueError(f"methods.{name}.trained_as: {unknown}{hint(method.trained_as, own)}")
-            for key in ("material", "structured", "prior") if method.trained_as else ():
+            for key in ("material", "structured", "springs", "prior") if method.trained_as else ():
                 if getattr(method, key):
                     raise ValueError(
                         f"methods.{name}.{key}: that of '{method.trained_as}' counts; leave it out"
@@ -281,6 +284,10 @@ class Config(Section):
         base, _ = parse_method(self.method_training(method), self.methods)
         return self.methods[base].law == "structured"
 
+    def is_springs(self, method: str) -> bool:
+        """Whether a method moves the body by springs, and has no law of a material."""
+        return self.methods[parse_method(method, self.methods)[0]].law == "springs"
+
     def video_scenes(self, name: str) -> list[str]:
         """Folders of the scenes whose videos the law of a scene is found in, in its chain: itself, then the others."""
         base, seeds = self.chain(name)
@@ -408,13 +415,28 @@ class Config(Section):
 
     def method_structured(self, method: str) -> StructuredConfig | None:
         """Settings of a method's structured law: the section, changed by the method, then its variant; None without."""
+        return self._of_law("structured", self.structured, method)
+
+    def method_springs(self, method: str) -> SpringsConfig | None:
+        """The same of a method with springs in place of a law, which are those of one body.
+
+        Raises:
+            InputError: also where the variant takes the springs of another scene.
+        """
+        found = self._of_law("springs", self.springs, method)
+        if found and self._law_from(method):
+            raise InputError(f"{method}: springs are those of the scene's own body; leave out {LAW_FROM}")
+        return found
+
+    def _of_law(self, law: str, section: Changed, method: str) -> Changed | None:
+        """Settings that only methods with one kind of law have."""
         base, variant = parse_method(self.method_training(method), self.methods)
-        changes = {key: value for key, value in variant.items() if key in StructuredConfig.model_fields}
-        if not self.is_structured(method):
+        changes = {key: value for key, value in variant.items() if key in type(section).model_fields}
+        if self.methods[base].law != law:
             if changes:
-                raise InputError(f"{method}: its law is not structured, leave out {', '.join(changes)}")
+                raise InputError(f"{method}: its law is not {law}, leave out {', '.join(changes)}")
             return None
-        section = _changed(self.structured, self.methods[base].structured, f"methods.{base}.structured")
+        section = _changed(section, getattr(self.methods[base], law), f"methods.{base}.{law}")
         return _changed(section, changes, method)
 
 

@@ -11,14 +11,20 @@ class SpringsConfig(Section):
     """A network of springs between anchors in the body, and how it is fitted; iterations and views are those of
     `material`."""
 
-    anchors: int = Field(400, ge=4, description="particles of the body that are anchors, far from each other (2048)")
+    anchors: int = Field(
+        400, ge=4, description="particles of the body that are anchors, far from each other (2048)"
+    )
     neighbours: int = Field(48, ge=1, description="springs of an anchor, to its nearest (256)")
     hard_springs: int = Field(
-        8, ge=0, description="of these, the nearest, which always pull fully (16); how fast the others fade is learned"
+        8,
+        ge=0,
+        description="of these, the nearest, which always pull fully (16); how fast the others fade is learned",
     )
     exponent: float = Field(0.5, ge=0, description="p of the factor (1 + |strain|)^p of a spring's force")
     guess: float = Field(
-        2.0e5, gt=0, description="Young's modulus that all stiffnesses start from, the same in every scene [Pa]"
+        2.0e5,
+        gt=0,
+        description="Young's modulus that all stiffnesses start from, the same in every scene [Pa]",
     )
     resistance: float = Field(0.1, gt=0, description="damping c along the springs at the start [m/s]")
     learn_resistance: bool = Field(False, description="whether the damping is learned, too")

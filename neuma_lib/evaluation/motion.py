@@ -8,8 +8,9 @@ two samplings of one and the same body are apart, by less the denser they are. T
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -88,11 +89,26 @@ def predict(
     Returns:
         The trajectory at the frames, and how it failed (None: it did not).
     """
+    return sound_frames(
+        lambda kept: rollout(model, law, start, steps=kept[-1], frames=kept, tracers=tracers, total=total),
+        frames,
+    )
+
+
+def sound_frames(
+    simulate: Callable[[Sequence[int]], Trajectory], frames: Sequence[int]
+) -> tuple[Trajectory, Failure | None]:
+    """What a simulation gives up to its last sound frame, held from there on, and how it failed (None: it did not).
+
+    Args:
+        simulate: called with the frames that are wanted; raises NonFiniteError where one of them is not sound.
+        frames: simulation steps of all frames.
+    """
     kept, failure = list(frames), None
     while True:
         try:
             with torch.no_grad():
-                path = rollout(model, law, start, steps=kept[-1], frames=kept, tracers=tracers, total=total)
+                path = simulate(kept)
             break
         except NonFiniteError as error:
             failure = failure or Failure(error.happened, error.step, error.particle)
@@ -103,15 +119,15 @@ def predict(
     return path.hold_last(missing) if missing else path, failure
 
 
-def energy_gain_after(model: MPMModel, start: State, path: Trajectory) -> int | None:
+def energy_gain_after(gravity: Sequence[float], start: State, path: Trajectory) -> int | None:
     """The last step of a path up to which no more energy was seen than at the start; None if there never was more.
 
     A body without a motor turns its kinetic and gravitational energy into others and back, and never has more of it
     than at the start: one that does, by `ENERGY_TOLERANCE`, has begun to go wrong. Seen at the path's frames.
     """
     x, v, *_ = start.motion
-    allowed = (1 + ENERGY_TOLERANCE) * mechanical_energy(x, v, start.mass, model.gravity)
-    more = mechanical_energy(path.x, path.v, start.mass, model.gravity) > allowed
+    allowed = (1 + ENERGY_TOLERANCE) * mechanical_energy(x, v, start.mass, gravity)
+    more = mechanical_energy(path.x, path.v, start.mass, gravity) > allowed
     if not more.any():
         return None
     first = int(more.nonzero()[0])
@@ -145,16 +161,46 @@ def evaluate(
     Raises:
         InputError: other counts than a sampling's tolerance allows, with which the floor is not that of the distance.
     """
+    courant = max(
+        model.courant(part.law, float(start.density[part.start : part.stop].min()))
+        for part in as_bodies(law, len(start.x))
+    )
+
+    def predicted(starts: Tensor) -> tuple[Trajectory, Failure | None]:
+        return predict(model, law, start, frames, starts, total)
+
+    own = {"courant": courant}
+    return judge(predicted, start, model.gravity, frames, truth, truth_again, tracers, floor, own)
+
+
+def judge(
+    predicted: Callable[[Tensor], tuple[Trajectory, Failure | None]],
+    start: State,
+    gravity: Sequence[float],
+    frames: Sequence[int],
+    truth: Tensor,
+    truth_again: Tensor,
+    tracers: Tensor,
+    floor: Tensor | None = None,
+    own: Mapping[str, Any] | None = None,
+) -> Evaluation:
+    """The measures of `evaluate`, of whatever moves particles and tracers.
+
+    Args:
+        predicted: called with the starts of all tracers; gives the path with them, and how it failed.
+        start: what it starts from.
+        gravity: acceleration [m/s^2].
+        own: further entries of the metrics.
+    """
     counts = [truth.shape[1], truth_again.shape[1], len(tracers)]
     if max(counts) > (1 + COUNT_TOLERANCE) * min(counts):
         raise InputError(
             f"the truth has {counts[0]} and {counts[1]} tracers, the prediction {counts[2]}: the sampling floor is "
             "that of equal counts. Set evaluation.tracers to the dataset.tracers that the truth was made with"
         )
-    starts = torch.cat([tracers, truth[0].to(tracers)])
-    path, failure = predict(model, law, start, frames, starts, total)
-    predicted, same_start = path.tracers[:, : len(tracers)], path.tracers[:, len(tracers) :]
-    chamfer = chamfer_sequence(predicted, truth)
+    path, failure = predicted(torch.cat([tracers, truth[0].to(tracers)]))
+    ours, same_start = path.tracers[:, : len(tracers)], path.tracers[:, len(tracers) :]
+    chamfer = chamfer_sequence(ours, truth)
     floor = chamfer_sequence(truth_again, truth) if floor is None else floor
     metrics = {
         **tracer_errors(same_start, truth),
@@ -165,12 +211,9 @@ def evaluate(
         "frames": list(frames),
         "chamfer_per_frame": [float(c) for c in chamfer],
         "chamfer_floor_per_frame": [float(c) for c in floor],
-        "courant": max(
-            model.courant(part.law, float(start.density[part.start : part.stop].min()))
-            for part in as_bodies(law, len(start.x))
-        ),
-        "energy_gain_after_step": energy_gain_after(model, start, path),
+        **(own or {}),
+        "energy_gain_after_step": energy_gain_after(gravity, start, path),
         "diverged_at_step": failure and failure.step,
         "diverged": failure and asdict(failure),
     }
-    return Evaluation(path, predicted, metrics)
+    return Evaluation(path, ours, metrics)

@@ -28,9 +28,7 @@ def save_springs(path: str | Path, body: SpringBody, springs: Springs, metadata:
     write_weights(path, tensors, {"hard": network.hard, "exponent": network.exponent, **metadata})
 
 
-def load_springs(
-    path: str | Path, x0: Tensor, carriers: int
-) -> tuple[SpringBody, Springs, dict[str, Any]]:
+def load_springs(path: str | Path, x0: Tensor, carriers: int) -> tuple[SpringBody, Springs, dict[str, Any]]:
     """Springs of a body, in the precision of its particles x0 (N, 3) [m], and the metadata of their file.
 
     Args:

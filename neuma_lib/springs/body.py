@@ -52,10 +52,12 @@ class SpringBody:
         x, v, *_ = state.motion
         return x[self.index], v[self.index]
 
-    def path(self, frames: tuple[int, ...], x: Tensor, v: Tensor, tracers: Tensor | None = None) -> Trajectory:
+    def path(
+        self, frames: tuple[int, ...], x: Tensor, v: Tensor, tracers: Tensor | None = None
+    ) -> Trajectory:
         """States of the particles for those of the anchors at frames, x and v (T, A, 3).
 
-        F is the gradient of the fitted motion, which has no part that flows; particles do not turn in themselves, C = 0.
+        F is the gradient of the fitted motion, which has no part that flows. C is left at zero.
         """
         positions, F = self.follow(x)
         return Trajectory(frames, positions, self.follow.velocities(v), F, torch.zeros_like(F), tracers)

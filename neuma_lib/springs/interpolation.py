@@ -49,7 +49,9 @@ class Interpolation:
         rows = np.concatenate([shifts[:, None], slopes], 1)  # (N, 4, K)
         columns = np.broadcast_to(index[:, None], rows.shape)
         self.points, self.anchors = points, anchors
-        self._matrices = _compressed(rows.reshape(4 * len(P), -1), columns.reshape(4 * len(P), -1), len(X), points)
+        self._matrices = _compressed(
+            rows.reshape(4 * len(P), -1), columns.reshape(4 * len(P), -1), len(X), points
+        )
 
     def __call__(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Positions (T, N, 3) [m] and deformation gradients (T, N, 3, 3) for anchors at x (T, A, 3) [m]."""

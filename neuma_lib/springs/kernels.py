@@ -131,7 +131,9 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
         friction: wp.array(dtype=real),
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
-        grad_x: wp.array2d(dtype=vec3),  # (2, A): the side of the state after the step, and the other, all zero
+        grad_x: wp.array2d(
+            dtype=vec3
+        ),  # (2, A): the side of the state after the step, and the other, all zero
         grad_v: wp.array2d(dtype=vec3),
         grad_stiffness: wp.array(dtype=real),  # (A,), added to, as are the three below
         grad_eta: wp.array2d(dtype=real),  # (A, K), the part of each anchor

@@ -71,11 +71,15 @@ class SpringNetwork:
         count = min(neighbours, len(points) - 1)
         distance, index = cKDTree(points).query(points, k=count + 1)
         others = index != np.arange(len(points))[:, None]
-        others[others.all(1), -1] = False  # an anchor that others in its place have pushed out of its own list
+        others[others.all(1), -1] = (
+            False  # an anchor that others in its place have pushed out of its own list
+        )
         shape = (len(points), count)
         if not (distance[others] > 0).all():
             raise InputError("springs: two anchors are in one place; sample the particles again")
-        rest, index = (torch.as_tensor(a[others].reshape(shape)).to(anchors.device) for a in (distance, index))
+        rest, index = (
+            torch.as_tensor(a[others].reshape(shape)).to(anchors.device) for a in (distance, index)
+        )
         return cls(anchors, index.int(), rest.to(anchors), min(hard, count), exponent)
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> SpringNetwork:

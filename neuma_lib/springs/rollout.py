@@ -127,7 +127,9 @@ def _check(model: SpringModel, network: SpringNetwork, x: Tensor, v: Tensor, fir
         at, anchor = wrong.nonzero()[0].tolist()
         step = first + at // model.substeps
         finite = bool(x[at, anchor].isfinite().all() & v[at, anchor].isfinite().all())
-        happened = "moved by more than the spacing of the anchors in a substep" if finite else "became non-finite"
+        happened = (
+            "moved by more than the spacing of the anchors in a substep" if finite else "became non-finite"
+        )
         detail = f"anchor {anchor} {happened} at step {step} in {model.substeps} substeps each"
         raise NonFiniteError("springs", detail, step, anchor, happened)
 
@@ -165,7 +167,14 @@ class _Launcher:
             if step:
                 self._run(launch, step - 1, side)
         stiffness, eta, damping, friction = sums
-        return of_x[0], of_v[0], stiffness, eta.sum(0), damping.sum(0, keepdim=True), friction.sum(0, keepdim=True)
+        return (
+            of_x[0],
+            of_v[0],
+            stiffness,
+            eta.sum(0),
+            damping.sum(0, keepdim=True),
+            friction.sum(0, keepdim=True),
+        )
 
     def _recorded(self, kernel: wp.Kernel, *arguments) -> wp.Launch:
         parameters = kernel.adj.args[1:]

@@ -1,4 +1,4 @@
-"""Networks of springs: forces and gradients against a slow twin, closed forms, energy, momentum, and what follows them."""
+"""Networks of springs: forces and gradients against a slow twin, closed forms, energy, momentum, what follows them."""
 
 import math
 
@@ -19,12 +19,16 @@ def cloud(count, seed=0, size=0.2, centre=0.5, dtype=torch.float64):
     return (centre + size * (torch.rand(count, 3, generator=g, dtype=torch.float64) - 0.5)).to(dtype)
 
 
-def springs_of(count=14, neighbours=8, hard=3, k=60.0, damping=0.1, exponent=0.5, dtype=torch.float64, spread=0.2):
+def springs_of(
+    count=14, neighbours=8, hard=3, k=60.0, damping=0.1, exponent=0.5, dtype=torch.float64, spread=0.2
+):
     """A small random network with stiffnesses that differ."""
     network = SpringNetwork.of(cloud(count, dtype=dtype), neighbours, hard, exponent)
     springs = Springs(network, k, damping, learn_damping=True)
     with torch.no_grad():
-        springs.log_stiffness += spread * torch.randn(count, generator=torch.Generator().manual_seed(1)).to(dtype)
+        springs.log_stiffness += spread * torch.randn(count, generator=torch.Generator().manual_seed(1)).to(
+            dtype
+        )
         springs.softness += 0.3
     return springs
 
@@ -56,7 +60,9 @@ def falling(dtype=torch.float64, exponent=0.5):
     """Fourteen anchors that hit the ground and a side wall obliquely."""
     springs = springs_of(dtype=dtype, exponent=exponent)
     x0 = springs.network.anchors + torch.tensor([-0.38, -0.38, 0.0], dtype=dtype)
-    x0 = x0 + 0.01 * torch.randn(x0.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64).to(dtype)
+    x0 = x0 + 0.01 * torch.randn(
+        x0.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64
+    ).to(dtype)
     v0 = torch.tensor([-1.0, -1.5, 0.4], dtype=dtype) + torch.zeros_like(x0)
     return SpringModel(5e-3, G, 0.0, 1.0, 2), springs, x0, v0
 
@@ -103,7 +109,9 @@ def test_gradients_agree_with_differences(exponent):
                 tensor += sign * h * direction
                 values.append(float(value()))
         slope = (values[0] - values[1]) / (2 * h)
-        assert float((grads[name] * direction).sum()) == pytest.approx(slope, rel=2e-6, abs=2e-8), name  # round-off / h
+        assert float((grads[name] * direction).sum()) == pytest.approx(slope, rel=2e-6, abs=2e-8), (
+            name
+        )  # round-off / h
         assert abs(slope) > 1e-3, name
 
 
@@ -129,14 +137,16 @@ def test_bodies_at_rest_fall_freely_and_keep_their_shape():
 
 
 def test_frequency_of_one_spring():
-    """Two unit masses that both pull swing with omega^2 = 2 k / l; semi-implicit Euler with sin(phi / 2) = omega dt / 2."""
+    """Two unit masses that both pull: omega^2 = 2 k / l, and a step of phase with sin(phase / 2) = omega dt / 2."""
     rest, k, dt = 0.2, 50.0, 1e-3
     anchors = torch.tensor([[0.4, 0.5, 0.5], [0.4 + rest, 0.5, 0.5]], dtype=torch.float64)
     springs = Springs(SpringNetwork.of(anchors, 1, 1, exponent=0.0), k, 1e-12)
     amplitude, steps = 0.02, 400
     x0 = anchors + torch.tensor([[-amplitude / 2, 0, 0], [amplitude / 2, 0, 0]], dtype=torch.float64)
     with torch.no_grad():
-        x, *_ = spring_rollout(SpringModel(dt, FREE, 0.0, 1.0), springs, x0, torch.zeros_like(x0), range(steps))
+        x, *_ = spring_rollout(
+            SpringModel(dt, FREE, 0.0, 1.0), springs, x0, torch.zeros_like(x0), range(steps)
+        )
     elongation = (x[:, 1] - x[:, 0])[:, 0] - rest
     phase = 2 * math.asin(math.sqrt(2 * k / rest) * dt / 2)
     n = torch.arange(steps, dtype=torch.float64)
@@ -199,11 +209,13 @@ def test_modulus_of_a_network_is_that_of_its_energy():
     generator = torch.Generator().manual_seed(4)
     points = torch.randn(3000, 3, generator=generator, dtype=torch.float64)
     radius = 0.2
-    points *= radius * torch.rand(3000, 1, generator=generator, dtype=torch.float64) ** (1 / 3) / points.norm(
-        dim=1, keepdim=True
+    points *= (
+        radius
+        * torch.rand(3000, 1, generator=generator, dtype=torch.float64) ** (1 / 3)
+        / points.norm(dim=1, keepdim=True)
     )
     network = SpringNetwork.of(points, 48, 8)
-    density, volume, strain = 1000.0, 4 / 3 * math.pi * radius**3, 1e-4
+    density, strain = 1000.0, 1e-4
     springs = Springs.of_modulus(network, 2e5, density, 0.1)
     assert springs.modulus(density) == pytest.approx(2e5)
     stiffness, eta, *_ = (value.detach() for value in springs.values())

@@ -51,6 +51,11 @@ def training_settings(wildcards):
 @checked
 def material_prior(wildcards):
     """The networks that a method starts from; none where its law is analytic, or corrects an analytic one."""
+    if SETTINGS.is_springs(wildcards.method):
+        raise InputError(
+            f"{wildcards.method} has no law of a material, only springs in the body of its scene: it moves no other "
+            "body, and no stress or bias can be told of it"
+        )
     analytic = SETTINGS.is_identified(wildcards.method) or SETTINGS.is_structured(wildcards.method)
     if analytic or SETTINGS.true_law(wildcards.scene, wildcards.method):
         return []
@@ -102,6 +107,12 @@ def structured_settings(wildcards):
     """Settings of a method's structured law; none where it has another."""
     section = SETTINGS.method_structured(wildcards.method)
     return section.plain() if section else None
+
+
+@checked
+def springs_settings(wildcards):
+    """Settings of a method with springs in place of a law."""
+    return SETTINGS.method_springs(wildcards.method).plain()
 
 
 @checked

@@ -82,6 +82,10 @@ def table_records(table):
     jobs = [("kernels", {"group": group}) for group in ("geometry", "simulation", "laws", "rendering")]
     priors, laws, videos = [], [], []
     for pair in pairs:
+        if SETTINGS.is_springs(pair.method):
+            laws += [("kernels", {"group": "springs"}), ("springs", vars(pair))]
+            priors += [prior_file(pair.scene)]
+            continue
         scene = SETTINGS.law_scene(pair.scene, pair.method)
         own = Path(home(scene, "identified.json"))
         networks = material_prior(pair) == f"{own.parent}/priors/identified.safetensors"
@@ -107,7 +111,8 @@ def table_records(table):
         makes = {rule: file for rule, file in MAKERS.items() if run in judged or rule != "tracers"}
         jobs += [(rule, {"scene": Path(home(run, file)).parent.name}) for rule, file in makes.items()]
     jobs += laws
-    jobs += [("evaluation", vars(pair)) for pair in pairs]
+    springs = {True: "springs_evaluation", False: "evaluation"}
+    jobs += [(springs[SETTINGS.is_springs(pair.method)], vars(pair)) for pair in pairs]
     jobs += [("chamfer_table", {"table": table})]
     made = [(getattr(rules, name), wildcards) for name, wildcards in jobs]
     files = [(rule.benchmark, str(rule.log[0]), wildcards) for rule, wildcards in made]

@@ -1,0 +1,55 @@
+"""Bodies of springs (Spring-Gaus): fitted and judged in place of a material law. Needs methods.smk."""
+
+SPRING_METHODS = "|".join(name for name in SETTINGS.methods if SETTINGS.is_springs(name)) or "none"
+
+
+ruleorder: springs_evaluation > evaluation
+
+
+rule springs:
+    input:
+        **body_files(),
+        kernels=kernels("springs", "rendering"),
+        transforms=of_scene("dynamic/transforms.json"),
+        velocity=start_file,
+    output:
+        springs=f"{RESULTS}/{{scene}}/{{method}}/springs.safetensors",
+        history=f"{RESULTS}/{{scene}}/{{method}}/history.json",
+    wildcard_constraints:
+        method=f"({SPRING_METHODS})([+][^/]*)?",
+    resources:
+        gpu=GPU,
+    params:
+        simulation=simulation_settings,
+        density=method_density,
+        material=material_settings,
+        springs=springs_settings,
+        checkpoint=lambda wildcards: f"{RESULTS}/{wildcards.scene}/{wildcards.method}/checkpoint.pt",
+        device=SETTINGS.device,
+    script:
+        "../scripts/springs.py"
+
+
+rule springs_evaluation:
+    input:
+        **body_files(),
+        kernels=kernels("springs"),
+        truth=of_scene("particles.h5"),
+        tracers=of_chain("tracers.h5"),
+        velocity=start_file,
+        springs=f"{RESULTS}/{{scene}}/{{method}}/springs.safetensors",
+    output:
+        rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
+        metrics=f"{RESULTS}/{{scene}}/{{method}}/metrics.json",
+    wildcard_constraints:
+        method=f"({SPRING_METHODS})([+][^/]*)?",
+    resources:
+        gpu=GPU,
+    params:
+        simulation=simulation_settings,
+        density=method_density,
+        springs=springs_settings,
+        frames=frame_steps,
+        device=SETTINGS.device,
+    script:
+        "../scripts/springs_evaluation.py"
