@@ -37,10 +37,16 @@ class SpringsConfig(Section):
     lr_springs: float = Field(
         0.01,
         gt=0,
-        description="learning rate of log10 stiffness, softness, friction; a tenth of it for log10 damping (0.001)",
+        description="learning rate of log10 stiffness, softness and friction (0.001); a tenth of it for log10 damping, "
+        "0.03 of it [m] for the gap",
     )
-    wall_gap: float = Field(
-        0.0, description="how far inside the simulator's walls anchors are stopped [m]; negative: outside"
+    gap: float = Field(
+        0.0,
+        description="how far inside the simulator's walls anchors are stopped at the start [m]; negative: beyond",
+    )
+    learn_gap: bool = Field(
+        True,
+        description="whether this is learned, too (published: the ground is known); grids have no sharp walls",
     )
     substeps: int = Field(
         1, ge=1, description="least parts of a time step; more are taken where the springs are stiff"

@@ -35,7 +35,8 @@ class SpringHistory:
     Attributes:
         loss: mean squared error over all frames.
         modulus: Young's modulus of the network [Pa].
-        softness, friction, resistance: as `Springs.values` gives them, the first as its parameter.
+        softness: the parameter of the soft vector.
+        friction, resistance, gap: as `Springs.values` gives them.
         substeps: parts of a time step.
         lr_scale: factor on the learning rate after recoveries.
         recoveries: returns to the best state.
@@ -47,6 +48,7 @@ class SpringHistory:
     softness: list[float] = field(default_factory=list)
     friction: list[float] = field(default_factory=list)
     resistance: list[float] = field(default_factory=list)
+    gap: list[float] = field(default_factory=list)
     substeps: list[int] = field(default_factory=list)
     lr_scale: list[float] = field(default_factory=list)
     recoveries: list[dict] = field(default_factory=list)
@@ -69,11 +71,11 @@ class FittedSprings:
         if not self.history.loss:
             return f"nothing fitted, loss {self.best_loss:.3e}"
         note = "" if self.stable else "; UNSTABLE: best state kept"
-        friction = float(self.springs.values()[3])
+        _, friction, gap = self.springs.shared()
         return (
             f"loss {self.history.loss[0]:.3e} -> {self.best_loss:.3e} at iteration {self.best_iteration}, E "
             f"{self.history.modulus[0]:.3g} -> {self.springs.modulus(density):.3g} Pa, friction {friction:.2f}, "
-            f"{self.substeps} substeps, {median(self.history.seconds):.3g} s an iteration{note}"
+            f"gap {1e3 * gap:.1f} mm, {self.substeps} substeps, {median(self.history.seconds):.3g} s an iteration{note}"
         )
 
 
@@ -95,11 +97,11 @@ def fit_springs(
     Args:
         model: time step, gravity and box.
         body: particles and network.
-        springs: the network with its parameters; those that require gradients are optimised, in place.
+        springs: the network with its parameters, which are optimised in place.
         start: the particles with their initial motion.
         loss: of the particles' states at the frames.
         settings: iterations, rate schedule, clipping, frame weights, recoveries.
-        how: mode and learning rate.
+        how: mode, learning rate, and what is learned.
         checkpoint: where to keep the state of the loop, so that a killed run goes on; None keeps none.
         progress: called with (iteration, iterations, loss).
         log: receives a line for every halving of the step and every recovery.
@@ -135,13 +137,15 @@ class _Loop:
         self.density = float(start.mass.sum() / start.vol0.sum())
         later = [k for k, n in enumerate(loss.frames) if n > 0]
         self.single = [loss.select([k]) for k in later] if how.truncated else []
-        slow = [springs.log_damping] if springs.log_damping.requires_grad else []
-        groups = [(how.lr_springs, [springs.log_stiffness, springs.softness, springs.grip])]
-        groups += [(0.1 * how.lr_springs, slow)] if slow else []
-        self.optimizer = torch.optim.Adam(
-            [{"params": parameters, "lr": rate, "base_lr": rate} for rate, parameters in groups],
-            betas=settings.betas,
-        )
+        springs.log_damping.requires_grad_(how.learn_resistance)
+        springs.gap.requires_grad_(how.learn_gap)
+        rates = {"log_damping": 0.1 * how.lr_springs, "gap": 0.03 * how.lr_springs}
+        groups = [
+            {"params": p, "lr": rate, "base_lr": rate}
+            for name, p in springs.named_parameters()
+            if p.requires_grad and (rate := rates.get(name, how.lr_springs))
+        ]
+        self.optimizer = torch.optim.Adam(groups, betas=settings.betas)
         self.iteration, self.lr_scale, self.ended = 0, 1.0, False
         self.history, self.first_loss = SpringHistory(), None
         self.best = {"loss": math.inf, "iteration": 0, **self._snapshot()}
@@ -215,12 +219,13 @@ class _Loop:
 
     def _note(self, value: float) -> None:
         history = self.history
-        _, _, resistance, friction = self.springs.values()
         history.loss.append(value)
         history.modulus.append(self.springs.modulus(self.density))
         history.softness.append(float(self.springs.softness.detach()))
-        history.friction.append(float(friction.detach()))
-        history.resistance.append(float(resistance.detach()))
+        for curve, now in zip(
+            (history.resistance, history.friction, history.gap), self.springs.shared(), strict=True
+        ):
+            curve.append(now)
         history.substeps.append(self.model.substeps)
         history.lr_scale.append(self.lr_scale)
 

@@ -14,7 +14,7 @@ from neuma_lib.io.weights import read_weights, write_weights
 from neuma_lib.springs.body import SpringBody
 from neuma_lib.springs.network import SpringNetwork, Springs
 
-_PARAMETERS = ("log_stiffness", "softness", "grip", "log_damping")
+_PARAMETERS = ("log_stiffness", "softness", "log_damping", "grip", "gap")
 
 
 def save_springs(path: str | Path, body: SpringBody, springs: Springs, metadata: Mapping[str, Any]) -> None:
@@ -41,7 +41,7 @@ def load_springs(path: str | Path, x0: Tensor, carriers: int) -> tuple[SpringBod
     shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
     A, K = shapes.get("rest", (0, 0)) if len(shapes.get("rest", ())) == 2 else (0, 0)
     expected = {"index": (A,), "anchors": (A, 3), "neighbours": (A, K), "rest": (A, K)}
-    expected |= dict(zip(_PARAMETERS, [(A,), (1,), (1,), (1,)], strict=True))
+    expected |= dict(zip(_PARAMETERS, [(A,), *4 * [(1,)]], strict=True))
     hard, exponent = metadata.get("hard"), metadata.get("exponent")
     if shapes != expected or not A or type(hard) is not int or not isinstance(exponent, float):
         raise InputError(f"{path} holds no network of springs: run the rule springs again")

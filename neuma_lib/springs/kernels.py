@@ -1,7 +1,8 @@
 """A substep of a network of springs as one Warp kernel, and its adjoint, written by hand.
 
 Anchors have unit mass. A substep is semi-implicit Euler, v <- v + dt (f(x, v) + g), x <- x + dt v, and then the planes
-of the box: a coordinate beyond one is put on it and loses its velocity, the others keep a part of theirs.
+of the box, all moved inwards by one gap: a coordinate beyond one is put on it and loses its velocity, the others keep a
+part of theirs.
 
 Anchor i feels its own list of neighbours j, with its own stiffness k_i (Spring-Gaus, Zhong et al. 2024):
 
@@ -70,12 +71,14 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
         return result
 
     @wp.func(module=module)
-    def beyond(c: SpringConstants, x: vec3):
-        """1 for each coordinate on or beyond a plane, 0 for the others."""
+    def beyond(c: SpringConstants, gap: real, x: vec3):
+        """For each coordinate, 1 on or beyond the lower plane, -1 for the upper one, 0 between them."""
         result = vec3()
         for a in range(3):
-            if x[a] <= c.low or x[a] >= c.high:
+            if x[a] <= c.low + gap:
                 result[a] = real(1.0)
+            elif x[a] >= c.high - gap:
+                result[a] = real(-1.0)
         return result
 
     @kernel
@@ -88,6 +91,7 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
         eta: wp.array(dtype=real),  # (K,)
         damping: wp.array(dtype=real),  # (1,)
         friction: wp.array(dtype=real),  # (1,)
+        gap: wp.array(dtype=real),  # (1,)
         x: wp.array2d(dtype=vec3),  # (S + 1, A)
         v: wp.array2d(dtype=vec3),
     ):
@@ -107,14 +111,14 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
                 force += (per_rest * (pull + damp * wp.dot(v[now, j] - vi, n))) * n
         v_new = vi + c.dt * (force + c.gravity)
         x_new = xi + c.dt * v_new
-        hit = beyond(c, x_new)
+        hit = beyond(c, gap[0], x_new)
         kept = real(1.0)
-        for _ in range(wp.int32(hit[0] + hit[1] + hit[2])):
+        for _ in range(wp.int32(wp.dot(hit, hit))):
             kept *= friction[0]
         for a in range(3):
-            v_new[a] *= kept * (real(1.0) - hit[a])
-            if hit[a] > real(0.0):
-                x_new[a] = wp.clamp(x_new[a], c.low, c.high)
+            v_new[a] *= kept * (real(1.0) - wp.abs(hit[a]))
+            if hit[a] != real(0.0):
+                x_new[a] = wp.clamp(x_new[a], c.low + gap[0], c.high - gap[0])
         x[now + 1, i] = x_new
         v[now + 1, i] = v_new
 
@@ -129,16 +133,18 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
         eta: wp.array(dtype=real),
         damping: wp.array(dtype=real),
         friction: wp.array(dtype=real),
+        gap: wp.array(dtype=real),
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         grad_x: wp.array2d(
             dtype=vec3
         ),  # (2, A): the side of the state after the step, and the other, all zero
         grad_v: wp.array2d(dtype=vec3),
-        grad_stiffness: wp.array(dtype=real),  # (A,), added to, as are the three below
+        grad_stiffness: wp.array(dtype=real),  # (A,), added to, as are the four below
         grad_eta: wp.array2d(dtype=real),  # (A, K), the part of each anchor
         grad_damping: wp.array(dtype=real),  # (A,)
         grad_friction: wp.array(dtype=real),  # (A,)
+        grad_gap: wp.array(dtype=real),  # (A,)
     ):
         """Gradients of the state after a step to those of the state before it, on the other side; clears the first.
 
@@ -147,13 +153,14 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
         i = wp.tid()
         before = 1 - after_side
         xi, vi, ki, damp, kept = x[now, i], v[now, i], stiffness[i], damping[0], friction[0]
-        hit = beyond(c, x[now + 1, i])
-        free = vec3(real(1.0), real(1.0), real(1.0)) - hit
+        hit = beyond(c, gap[0], x[now + 1, i])
+        grad_gap[i] = grad_gap[i] + wp.dot(hit, grad_x[after_side, i])
+        free = vec3(real(1.0), real(1.0), real(1.0)) - wp.cw_mul(hit, hit)
         g_x = wp.cw_mul(free, grad_x[after_side, i])
         g_after = wp.cw_mul(free, grad_v[after_side, i])
         grad_x[after_side, i] = vec3()
         grad_v[after_side, i] = vec3()
-        planes = wp.int32(hit[0] + hit[1] + hit[2])
+        planes = wp.int32(wp.dot(hit, hit))
         passed, slope = real(1.0), real(0.0)  # kept^planes and its derivative
         for _ in range(planes):
             slope = slope * kept + passed

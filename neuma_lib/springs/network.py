@@ -123,42 +123,51 @@ class SpringNetwork:
 
 
 class Springs(nn.Module):
-    """What is learned of a network: a stiffness for each anchor, and three numbers that all share.
+    """What is learned of a network: a stiffness for each anchor, and four numbers that all share.
 
     Args:
         network: gives number of anchors, precision and device.
         stiffness: of every anchor at the start [m/s^2].
         damping: c [m/s].
-        learn_damping: whether it is learned, too.
+        gap: how far inside the box anchors are stopped [m].
     """
 
-    def __init__(self, network: SpringNetwork, stiffness: float, damping: float, learn_damping: bool = False):
+    def __init__(self, network: SpringNetwork, stiffness: float, damping: float, gap: float = 0.0):
         super().__init__()
         like = network.rest
         self.network = network
         self.log_stiffness = nn.Parameter(like.new_full((len(like),), float(np.log10(stiffness))))
         self.softness = nn.Parameter(like.new_zeros(1))
+        self.log_damping = nn.Parameter(like.new_full((1,), float(np.log10(damping))))
         self.grip = nn.Parameter(like.new_full((1,), FRICTION_START))
-        self.log_damping = nn.Parameter(like.new_full((1,), float(np.log10(damping))), learn_damping)
+        self.gap = nn.Parameter(like.new_full((1,), gap))
 
     @classmethod
     def of_modulus(
-        cls, network: SpringNetwork, E: float, density: float, damping: float, learn_damping: bool = False
+        cls, network: SpringNetwork, E: float, density: float, damping: float, gap: float = 0.0
     ) -> Springs:
         """Springs of one stiffness, that of a body of Young's modulus E [Pa] and a mass density [kg/m^3]."""
-        springs = cls(network, 1.0, damping, learn_damping)
-        unit, eta, *_ = springs.values()
+        springs = cls(network, 1.0, damping, gap)
         with torch.no_grad():
+            unit, eta, *_ = springs.values()
             springs.log_stiffness.fill_(float(np.log10(E / network.youngs_modulus(unit, eta, density))))
         return springs
 
-    def values(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Stiffnesses (A,) [m/s^2], soft vector (K,), damping (1,) [m/s] and friction (1,), differentiable.
+    def values(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """What a rollout needs, differentiable.
 
-        Friction is the part of its velocity along a wall that an anchor keeps in a substep on it.
+        Returns:
+            stiffnesses (A,) [m/s^2], soft vector (K,), damping (1,) [m/s]; friction (1,), the part of its velocity
+            along a wall that an anchor keeps in a substep on it; gap (1,) [m].
         """
         friction = (1.2 * self.grip.sigmoid() - 0.1).clamp(0, 1)
-        return 10**self.log_stiffness, self.network.soft_vector(self.softness), 10**self.log_damping, friction
+        eta = self.network.soft_vector(self.softness)
+        return 10**self.log_stiffness, eta, 10**self.log_damping, friction, self.gap
+
+    @torch.no_grad()
+    def shared(self) -> tuple[float, float, float]:
+        """Damping [m/s], friction and gap [m] as numbers."""
+        return tuple(float(value) for value in self.values()[2:])
 
     def modulus(self, density: float) -> float:
         """Young's modulus of the network [Pa], see `SpringNetwork.youngs_modulus`."""

@@ -28,7 +28,7 @@ class SpringModel:
     Attributes:
         dt: time step that frames are counted in [s].
         gravity: acceleration [m/s^2].
-        low, high: coordinates on every axis of the planes that nothing passes [m].
+        low, high: coordinates on every axis of the planes, before the gap of the springs [m].
         substeps: equal parts that a time step is taken in, at least.
     """
 
@@ -39,11 +39,11 @@ class SpringModel:
     substeps: int = 1
 
     @classmethod
-    def of(cls, model: MPMModel, gap: float = 0.0, substeps: int = 1) -> SpringModel:
-        """Gravity, time step and box of another simulator: planes where bodies rest in it, moved inwards by gap [m]."""
+    def of(cls, model: MPMModel, substeps: int = 1) -> SpringModel:
+        """Gravity, time step and box of another simulator, with planes where bodies come to rest in it."""
         low, high = model.free_range  # half a cell before the walls
         half = 0.5 * model.dx
-        return cls(model.dt, model.gravity, low - half + gap, high + half - gap, substeps)
+        return cls(model.dt, model.gravity, low - half, high + half, substeps)
 
 
 def spring_rollout(
@@ -152,11 +152,11 @@ class _Launcher:
             self._run(launch, step)
 
     def backward(self, kept: list[int], grad_x: Tensor, grad_v: Tensor) -> tuple[Tensor, ...]:
-        """Gradients of x0, v0, stiffness, eta, damping and friction, for those of the kept states."""
+        """Gradients of x0, v0 and the values of the springs, for those of the kept states."""
         A, K = self.network.rest.shape
         like = self.x
         of_x, of_v = like.new_zeros(2, A, 3), like.new_zeros(2, A, 3)
-        sums = [like.new_zeros(shape) for shape in ((A,), (A, K), (A,), (A,))]
+        sums = [like.new_zeros(shape) for shape in ((A,), (A, K), (A,), (A,), (A,))]
         launch = self._recorded(kernels(like.dtype).step_adjoint, 0, 0, *self._shared, of_x, of_v, *sums)
         frames = {step: i for i, step in enumerate(kept)}
         for step in range(kept[-1], -1, -1):
@@ -166,15 +166,8 @@ class _Launcher:
                 of_v[side] += grad_v[frames[step]]
             if step:
                 self._run(launch, step - 1, side)
-        stiffness, eta, damping, friction = sums
-        return (
-            of_x[0],
-            of_v[0],
-            stiffness,
-            eta.sum(0),
-            damping.sum(0, keepdim=True),
-            friction.sum(0, keepdim=True),
-        )
+        stiffness, eta, *single = sums
+        return of_x[0], of_v[0], stiffness, eta.sum(0), *(value.sum(0, keepdim=True) for value in single)
 
     def _recorded(self, kernel: wp.Kernel, *arguments) -> wp.Launch:
         parameters = kernel.adj.args[1:]

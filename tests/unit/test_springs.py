@@ -24,7 +24,7 @@ def springs_of(
 ):
     """A small random network with stiffnesses that differ."""
     network = SpringNetwork.of(cloud(count, dtype=dtype), neighbours, hard, exponent)
-    springs = Springs(network, k, damping, learn_damping=True)
+    springs = Springs(network, k, damping, gap=4e-3)
     with torch.no_grad():
         springs.log_stiffness += spread * torch.randn(count, generator=torch.Generator().manual_seed(1)).to(
             dtype
@@ -35,7 +35,7 @@ def springs_of(
 
 def twin(model, springs, x, v, frames):
     """The same in plain torch, substep by substep."""
-    stiffness, eta, damping, friction = springs.values()
+    stiffness, eta, damping, friction, gap = springs.values()
     network, dt = springs.network, model.dt / model.substeps
     near, rest = network.neighbours.long(), network.rest
     found = []
@@ -50,9 +50,9 @@ def twin(model, springs, x, v, frames):
         drag = damping / rest * ((v[near] - v[:, None]) * n).sum(-1)
         v = v + dt * (((pull + drag)[..., None] * n).sum(1) + torch.tensor(model.gravity, dtype=x.dtype))
         x = x + dt * v
-        hit = (x <= model.low) | (x >= model.high)
+        hit = (x <= model.low + gap) | (x >= model.high - gap)
         v = torch.where(hit, 0.0, v * friction ** hit.sum(1, keepdim=True))
-        x = torch.where(hit, x.clamp(model.low, model.high), x)
+        x = torch.where(hit, torch.minimum(torch.maximum(x, model.low + gap), model.high - gap), x)
     return tuple(torch.stack(part) for part in zip(*found, strict=True))
 
 
@@ -74,7 +74,7 @@ def test_kernel_agrees_with_its_twin(exponent):
         x, v, used = spring_rollout(model, springs, x0, v0, (0, 3, 12))
         x_twin, v_twin = twin(used, springs, x0, v0, (0, 3, 12))
     assert used == model
-    assert (x[-1] <= 0).any(0)[:2].all()  # both walls were met
+    assert (x[-1] <= 4e-3).any(0)[:2].all()  # both walls were met
     assert (x - x_twin).abs().max() < 1e-12 and (v - v_twin).abs().max() < 1e-10
 
 
@@ -89,7 +89,7 @@ def test_single_precision_agrees_with_double():
 
 @pytest.mark.parametrize("exponent", [0.5, 1.3])
 def test_gradients_agree_with_differences(exponent):
-    """Of x, v, stiffness, soft vector, damping and friction, with contacts at two walls and two frames in the loss."""
+    """Of start, stiffness, soft vector, damping, friction and gap; contacts at two walls, two frames in the loss."""
     model, springs, x0, v0 = falling(exponent=exponent)
     x0, v0 = x0.requires_grad_(), v0.requires_grad_()
     generator = torch.Generator().manual_seed(3)
@@ -103,15 +103,13 @@ def test_gradients_agree_with_differences(exponent):
     grads = dict(zip(inputs, torch.autograd.grad(value(), list(inputs.values())), strict=True))
     for name, tensor in inputs.items():
         direction = torch.randn(tensor.shape, generator=generator, dtype=torch.float64)
-        h, values = 1e-7, []
+        h, values = 1e-6, []
         for sign in (1, -2, 1):
             with torch.no_grad():
                 tensor += sign * h * direction
                 values.append(float(value()))
         slope = (values[0] - values[1]) / (2 * h)
-        assert float((grads[name] * direction).sum()) == pytest.approx(slope, rel=2e-6, abs=2e-8), (
-            name
-        )  # round-off / h
+        assert float((grads[name] * direction).sum()) == pytest.approx(slope, rel=2e-6, abs=1e-8), name
         assert abs(slope) > 1e-3, name
 
 

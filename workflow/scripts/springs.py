@@ -32,12 +32,12 @@ def main(inputs, output, params, run) -> None:
     start, density = thrown(body, inputs.velocity), float(body.mass.sum() / body.vol0.sum())
     network = (how.anchors, how.neighbours, how.hard_springs, how.exponent, how.carriers)
     anchored = SpringBody.of(body.x0, *network)
-    springs = Springs.of_modulus(anchored.network, how.guess, density, how.resistance, how.learn_resistance)
+    springs = Springs.of_modulus(anchored.network, how.guess, density, how.resistance, how.gap)
     stamp = {"simulation": params.simulation, "density": params.density, **params.material, **params.springs}
     read = {name: inputs[name] for name in ("particles", "binding", "gaussians", "transforms", "velocity")}
     checkpoint = Checkpoint(params.checkpoint, fingerprint(stamp, read, params.code))
     fitted = fit_springs(
-        SpringModel.of(MPMModel(**params.simulation), how.wall_gap, how.substeps),
+        SpringModel.of(MPMModel(**params.simulation), how.substeps),
         anchored,
         springs,
         start,

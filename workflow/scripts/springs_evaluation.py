@@ -26,7 +26,7 @@ def main(inputs, output, params, run) -> None:
     start = start.to(device)
     body, springs, about = load_springs(inputs.springs, start.x, how.carriers)
     evaluation = evaluate_springs(
-        SpringModel.of(MPMModel(**params.simulation), how.wall_gap, about["substeps"]),
+        SpringModel.of(MPMModel(**params.simulation), about["substeps"]),
         body,
         springs,
         start,
