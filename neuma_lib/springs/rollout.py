@@ -83,7 +83,7 @@ def spring_rollout(
         if substeps > MOST_SUBSTEPS:
             raise NonFiniteError(
                 "springs",
-                f"too stiff for {MOST_SUBSTEPS} substeps of {model.dt:g} s; lower springs.lr_springs or springs.E",
+                f"too stiff for {MOST_SUBSTEPS} substeps of {model.dt:g} s; lower springs.lr_springs or springs.guess",
             )
         model = replace(model, substeps=substeps)
         try:
