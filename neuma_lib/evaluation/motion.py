@@ -8,9 +8,8 @@ two samplings of one and the same body are apart, by less the denser they are. T
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -161,20 +160,22 @@ def evaluate(
     Raises:
         InputError: other counts than a sampling's tolerance allows, with which the floor is not that of the distance.
     """
-    courant = max(
-        model.courant(part.law, float(start.density[part.start : part.stop].min()))
-        for part in as_bodies(law, len(start.x))
-    )
 
     def predicted(starts: Tensor) -> tuple[Trajectory, Failure | None]:
         return predict(model, law, start, frames, starts, total)
 
-    own = {"courant": courant}
-    return judge(predicted, start, model.gravity, frames, truth, truth_again, tracers, floor, own)
+    def courant() -> float:
+        return max(
+            model.courant(part.law, float(start.density[part.start : part.stop].min()))
+            for part in as_bodies(law, len(start.x))
+        )
+
+    return judge(predicted, courant, start, model.gravity, frames, truth, truth_again, tracers, floor)
 
 
 def judge(
     predicted: Callable[[Tensor], tuple[Trajectory, Failure | None]],
+    courant: Callable[[], float | None],
     start: State,
     gravity: Sequence[float],
     frames: Sequence[int],
@@ -182,15 +183,15 @@ def judge(
     truth_again: Tensor,
     tracers: Tensor,
     floor: Tensor | None = None,
-    own: Mapping[str, Any] | None = None,
 ) -> Evaluation:
     """The measures of `evaluate`, of whatever moves particles and tracers.
 
     Args:
         predicted: called with the starts of all tracers; gives the path with them, and how it failed.
+        courant: gives the Courant number of the simulation, None where it has none.
         start: what it starts from.
         gravity: acceleration [m/s^2].
-        own: further entries of the metrics.
+        frames, truth, truth_again, tracers, floor: as there.
     """
     counts = [truth.shape[1], truth_again.shape[1], len(tracers)]
     if max(counts) > (1 + COUNT_TOLERANCE) * min(counts):
@@ -211,7 +212,7 @@ def judge(
         "frames": list(frames),
         "chamfer_per_frame": [float(c) for c in chamfer],
         "chamfer_floor_per_frame": [float(c) for c in floor],
-        **(own or {}),
+        "courant": courant(),
         "energy_gain_after_step": energy_gain_after(gravity, start, path),
         "diverged_at_step": failure and failure.step,
         "diverged": failure and asdict(failure),

@@ -21,6 +21,9 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from neuma_lib.splatting import observation
 from neuma_lib.splatting.observation import Observation
+from neuma_lib.springs.body import SpringBody
+from neuma_lib.springs.network import Springs
+from neuma_lib.springs.rollout import SpringModel, spring_rollout
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
@@ -245,3 +248,21 @@ def test_a_video_that_does_not_fit_stays_off_the_device(monkeypatch):
     assert kept.images.is_cuda and not streamed.images.is_cuda
     assert torch.equal(kept.colours(slice(1, 3)), streamed.colours(slice(1, 3)))
     assert streamed.stored([2]).is_cuda
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_springs_agree(dtype):
+    """Motion of the particles that follow them, and gradients, of a fall onto the ground."""
+    found = []
+    for device in ("cpu", "cuda"):
+        body = ball(height=0.24, dtype=dtype).to(dtype, device)
+        anchored = SpringBody.of(body.x0, 60, 12, 4, 0.5, 12)
+        springs = Springs.of_modulus(anchored.network, 1e5, 1000.0, 0.1)
+        state = body.state((0.3, -2.0, 0.1))
+        x, v, _ = spring_rollout(SpringModel.of(MODEL), springs, *anchored.start(state), FRAMES)
+        path = anchored.path(FRAMES, x, v)
+        grads = torch.autograd.grad(path.x.square().sum() + path.F.square().sum(), list(springs.parameters()))
+        found.append([t.detach().cpu().double() for t in (path.x, path.F, *grads)])
+    bound = {torch.float32: 1e-3, torch.float64: 1e-9}[dtype]
+    for cpu, cuda in zip(*found, strict=True):
+        assert relative(cuda, cpu) < bound
