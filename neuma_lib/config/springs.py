@@ -8,8 +8,8 @@ from neuma_lib.config.base import Section
 
 
 class SpringsConfig(Section):
-    """A network of springs between anchors in the body, and how it is fitted; iterations and views are those of
-    `material`."""
+    """A network of springs between anchors in the body, and how it is fitted. Iterations and views are those of
+    `material`. In brackets what Spring-Gaus has published."""
 
     anchors: int = Field(
         400, ge=4, description="particles of the body that are anchors, far from each other (2048)"
@@ -46,7 +46,7 @@ class SpringsConfig(Section):
     )
     learn_gap: bool = Field(
         True,
-        description="whether this is learned, too (published: the ground is known); grids have no sharp walls",
+        description="whether this is learned, too (no: the ground is known); the walls of a grid are not sharp",
     )
     substeps: int = Field(
         1, ge=1, description="least parts of a time step; more are taken where the springs are stiff"

@@ -71,9 +71,8 @@ class SpringNetwork:
         count = min(neighbours, len(points) - 1)
         distance, index = cKDTree(points).query(points, k=count + 1)
         others = index != np.arange(len(points))[:, None]
-        others[others.all(1), -1] = (
-            False  # an anchor that others in its place have pushed out of its own list
-        )
+        # An anchor may be pushed out of its own list by others in its place.
+        others[others.all(1), -1] = False
         shape = (len(points), count)
         if not (distance[others] > 0).all():
             raise InputError("springs: two anchors are in one place; sample the particles again")
@@ -84,8 +83,7 @@ class SpringNetwork:
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> SpringNetwork:
         """The same in another precision or on another device."""
-        moved = (value.to(device=device, dtype=dtype) for value in (self.anchors, self.rest))
-        anchors, rest = moved
+        anchors, rest = (value.to(device=device, dtype=dtype) for value in (self.anchors, self.rest))
         return SpringNetwork(anchors, self.neighbours.to(device), rest, self.hard, self.exponent)
 
     @property

@@ -76,7 +76,7 @@ def spring_rollout(
     """
     values = springs.values()
     safe = springs.network.stable_step(*(value.detach() for value in values[:3]))
-    needed = model.dt / max(safe, 1e-30)
+    needed = model.dt / safe if safe > 0 else math.inf  # NaN where a stiffness is infinite
     substeps = max(model.substeps, math.ceil(min(needed, MOST_SUBSTEPS + 1)))
     counts = [n - first for n in frames]
     while True:

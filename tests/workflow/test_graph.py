@@ -60,6 +60,18 @@ def test_identified_constants_need_the_video_and_no_training(project):
     assert f"{SCENE}+seed=1/identified.json" in chained
 
 
+def test_springs_are_fitted_to_the_video_alone(project):
+    graph = jobs(project.run("--dry-run", f"{SCENE}/spring_gaus+anchors=50/metrics.json"))
+    made = {rule: (read, outputs) for rule, read, outputs in graph}
+    read, outputs = made["springs"]
+    assert outputs[0] == f"{SCENE}/spring_gaus+anchors=50/springs.safetensors" and "material" not in made
+    assert "tiny/data/BouncyBall/dynamic/transforms.json" in read and f"{SCENE}/velocity.json" in read
+    assert not any("/priors/" in file or "/data/BouncyBall/particles.h5" in file for file in read)
+    assert outputs[0] in made["springs_evaluation"][0] and "evaluation" not in made
+    target = "tiny/results/experiments/letter_and_ball/spring_gaus/metrics.json"
+    assert "spring_gaus has no law of a material" in project.run("--dry-run", target, succeeds=False)
+
+
 def test_a_structured_law_corrects_what_the_video_shows(project):
     """Around the constants of its scene, in its chain, and without networks to start from."""
     graph = jobs(project.run("--dry-run", f"{SCENE}+seed=1/neuma_structured/metrics.json"))
