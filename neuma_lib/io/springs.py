@@ -18,7 +18,7 @@ _PARAMETERS = ("log_stiffness", "softness", "log_damping", "grip", "gap")
 
 
 def save_springs(path: str | Path, body: SpringBody, springs: Springs, metadata: Mapping[str, Any]) -> None:
-    """Write a network with its parameters; the metadata need ``stable``."""
+    """Write a network with its parameters."""
     network = body.network
     tensors = {
         "index": body.index,
@@ -28,14 +28,14 @@ def save_springs(path: str | Path, body: SpringBody, springs: Springs, metadata:
     write_weights(path, tensors, {"hard": network.hard, "exponent": network.exponent, **metadata})
 
 
-def load_springs(path: str | Path, x0: Tensor, carriers: int) -> tuple[SpringBody, Springs, dict[str, Any]]:
-    """Springs of a body, in the precision of its particles x0 (N, 3) [m], and the metadata of their file.
+def load_springs(path: str | Path, like: Tensor) -> tuple[Tensor, Springs, dict[str, Any]]:
+    """Springs with their network, in the precision and on the device of a tensor.
 
-    Args:
-        carriers: anchors that a particle follows.
+    Returns:
+        the particles that are anchors, int64, shape (A,); the springs; the metadata of their file.
 
     Raises:
-        InputError: missing or foreign file, or springs of other particles.
+        InputError: missing or foreign file.
     """
     tensors, metadata = read_weights(path)
     shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
@@ -49,13 +49,8 @@ def load_springs(path: str | Path, x0: Tensor, carriers: int) -> tuple[SpringBod
     if not (0 <= int(neighbours.min()) and int(neighbours.max()) < A and 0 <= int(index.min())):
         raise InputError(f"{path} names anchors that it does not hold: run the rule springs again")
     network = SpringNetwork(tensors["anchors"], neighbours, tensors["rest"], hard, exponent)
-    network = network.to(x0.dtype, x0.device)
-    try:
-        body = SpringBody.with_network(x0, index.to(x0.device), network, carriers)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    springs = Springs(network, 1.0, 1.0)
+    springs = Springs(network.to(like.dtype, like.device), 1.0, 1.0)
     with torch.no_grad():
         for name in _PARAMETERS:
             getattr(springs, name).copy_(tensors[name])
-    return body, springs, metadata
+    return index.to(like.device), springs, metadata

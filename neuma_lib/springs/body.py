@@ -44,7 +44,9 @@ class SpringBody:
             InputError: its anchors are not these particles.
         """
         if index.max() >= len(x0) or not torch.equal(x0[index], network.anchors):
-            raise InputError("springs: their anchors are not among the body's particles: fit them again")
+            raise InputError(
+                "springs: their anchors are not the body's particles: run the rule springs again"
+            )
         return cls(index, network, Interpolation(x0, network.anchors, carriers))
 
     def start(self, state: State) -> tuple[Tensor, Tensor]:

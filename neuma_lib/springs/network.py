@@ -151,6 +151,21 @@ class Springs(nn.Module):
             springs.log_stiffness.fill_(float(np.log10(E / network.youngs_modulus(unit, eta, density))))
         return springs
 
+    def for_network(self, network: SpringNetwork, density: float, other_density: float) -> Springs:
+        """Springs of another body of the same material: the shared numbers, and one stiffness of the same modulus.
+
+        Args:
+            network: of the other body.
+            density, other_density: mass densities of this body and of the other one [kg/m^3].
+        """
+        other = Springs(network, 1.0, 1.0)
+        with torch.no_grad():
+            for name in ("softness", "log_damping", "grip", "gap"):
+                getattr(other, name).copy_(getattr(self, name))
+            stiffness = self.modulus(density) / other.modulus(other_density)
+            other.log_stiffness.fill_(float(np.log10(stiffness)))
+        return other
+
     def values(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """What a rollout needs, differentiable.
 

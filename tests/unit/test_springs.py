@@ -227,6 +227,14 @@ def test_modulus_of_a_network_is_that_of_its_energy():
     assert sum(found) / 3 == pytest.approx(2e5, rel=0.02) and min(found) > 0.9 * max(found)
 
 
+def test_springs_of_another_body_have_the_same_modulus():
+    springs = springs_of(60, 20, 4)
+    network = SpringNetwork.of(cloud(90, seed=7, size=0.3), 20, 4)
+    other = springs.for_network(network, 1000.0, 500.0)
+    assert other.modulus(500.0) == pytest.approx(springs.modulus(1000.0))
+    assert other.shared() == springs.shared() and torch.equal(other.softness, springs.softness)
+
+
 def test_soft_vector_is_that_of_the_paper():
     network = SpringNetwork.of(cloud(30), 20, 4)
     eta = network.soft_vector(torch.zeros(1, dtype=torch.float64))

@@ -68,8 +68,13 @@ def test_springs_are_fitted_to_the_video_alone(project):
     assert "tiny/data/BouncyBall/dynamic/transforms.json" in read and f"{SCENE}/velocity.json" in read
     assert not any("/priors/" in file or "/data/BouncyBall/particles.h5" in file for file in read)
     assert outputs[0] in made["springs_evaluation"][0] and "evaluation" not in made
-    target = "tiny/results/experiments/letter_and_ball/spring_gaus/metrics.json"
-    assert "spring_gaus has no law of a material" in project.run("--dry-run", target, succeeds=False)
+    target = "tiny/results/experiments/{}/spring_gaus/metrics.json"
+    graph = jobs(project.run("--dry-run", target.format("letter_N_bouncy")))
+    made = {rule: (read, outputs) for rule, read, outputs in graph}
+    assert f"{SCENE}/spring_gaus/springs.safetensors" in made["springs_experiment"][0]
+    for impossible in (target.format("letter_and_ball"), f"{SCENE}/spring_gaus/bias.json"):
+        refused = project.run("--dry-run", impossible, succeeds=False)
+        assert "only springs in one body: it has no stress and no bias" in refused
 
 
 def test_a_structured_law_corrects_what_the_video_shows(project):

@@ -53,8 +53,8 @@ def material_prior(wildcards):
     """The networks that a method starts from; none where its law is analytic, or corrects an analytic one."""
     if SETTINGS.is_springs(wildcards.method):
         raise InputError(
-            f"{wildcards.method} has no law of a material, only springs in the body of its scene: it moves no other "
-            "body, and no stress or bias can be told of it"
+            f"{wildcards.method} has no law of a material, only springs in one body: it has no stress and no bias, and "
+            "no experiment with several bodies"
         )
     analytic = SETTINGS.is_identified(wildcards.method) or SETTINGS.is_structured(wildcards.method)
     if analytic or SETTINGS.true_law(wildcards.scene, wildcards.method):

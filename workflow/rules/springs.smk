@@ -4,6 +4,16 @@ SPRING_METHODS = "|".join(name for name in SETTINGS.methods if SETTINGS.is_sprin
 
 
 ruleorder: springs_evaluation > evaluation
+ruleorder: springs_experiment > experiment
+
+
+@checked
+def fitted_springs(wildcards):
+    """The springs of a scene, or of the scene of an experiment's one body."""
+    scenes = SETTINGS.body_scenes(subject(wildcards))
+    if len(scenes) > 1:
+        raise InputError(f"{wildcards.method} moves one body, {subject(wildcards)} has {len(scenes)}")
+    return f"{RESULTS}/{SETTINGS.run_folder(scenes[0], wildcards.method)}/springs.safetensors"
 
 
 rule springs:
@@ -37,7 +47,7 @@ rule springs_evaluation:
         truth=of_scene("particles.h5"),
         tracers=of_chain("tracers.h5"),
         velocity=start_file,
-        springs=f"{RESULTS}/{{scene}}/{{method}}/springs.safetensors",
+        springs=fitted_springs,
     output:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
         metrics=f"{RESULTS}/{{scene}}/{{method}}/metrics.json",
@@ -47,9 +57,31 @@ rule springs_evaluation:
         gpu=GPU,
     params:
         simulation=simulation_settings,
-        density=method_density,
+        densities=lambda wildcards: [method_density(wildcards)],
         springs=springs_settings,
+        other_body=False,
         frames=frame_steps,
         device=SETTINGS.device,
     script:
         "../scripts/springs_evaluation.py"
+
+
+# The same object followed for longer, or another one of the same material: one stiffness with the modulus of the first.
+use rule springs_evaluation as springs_experiment with:
+    input:
+        **body_files(),
+        kernels=kernels("springs"),
+        truth=of_scene("particles.h5"),
+        tracers=of_chain("tracers.h5"),
+        velocity=of_chain("velocity.json"),
+        springs=fitted_springs,
+    output:
+        rollout=f"{RESULTS}/experiments/{{experiment}}/{{method}}/rollout.h5",
+        metrics=f"{RESULTS}/experiments/{{experiment}}/{{method}}/metrics.json",
+    params:
+        simulation=experiment_simulation,
+        densities=of_each_body(method_density),
+        springs=springs_settings,
+        other_body=lambda wildcards: SETTINGS.experiment(wildcards.experiment).bodies[0].shape is not None,
+        frames=experiment_frames,
+        device=SETTINGS.device,

@@ -53,7 +53,7 @@ def main(inputs, output, params, run) -> None:
     report = {"best_loss": fitted.best_loss, "best_iteration": fitted.best_iteration}
     report |= {"stable": fitted.stable, "substeps": fitted.substeps}
     write_json(output.history, {**report, **curves})
-    about = {"settings": {**params.material, **params.springs}, **report}
+    about = {"settings": {**params.material, **params.springs}, "density": density, **report}
     save_springs(output.springs, anchored, fitted.springs, about)
     checkpoint.remove()
     run.say(fitted.summary(density))

@@ -1,4 +1,4 @@
-"""Let fitted springs move the body from its estimated start, and compare it with the ground truth."""
+"""Let fitted springs move their body, or another of the same material, and compare it with the ground truth."""
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.io.particles import load_start
 from neuma_lib.io.springs import load_springs
 from neuma_lib.sim.model import MPMModel
+from neuma_lib.springs.body import SpringBody
 from neuma_lib.springs.rollout import SpringModel
 from workflow.stage import run_script
 
@@ -22,9 +23,16 @@ def main(inputs, output, params, run) -> None:
     )
     measure, _ = read_arrays(inputs.tracers, required=("starts", "floor"))
     files = [inputs[name] for name in ("particles", "binding", "gaussians", "velocity")]
-    start, _ = load_start(*files, [params.density])
+    start, _ = load_start(*files, params.densities)
     start = start.to(device)
-    body, springs, about = load_springs(inputs.springs, start.x, how.carriers)
+    index, springs, about = load_springs(inputs.springs, start.x)
+    if params.other_body:
+        network = (how.anchors, how.neighbours, how.hard_springs, how.exponent, how.carriers)
+        body = SpringBody.of(start.x, *network)
+        density = float(start.mass.sum() / start.vol0.sum())
+        springs = springs.for_network(body.network, about["density"], density)
+    else:
+        body = SpringBody.with_network(start.x, index, springs.network, how.carriers)
     evaluation = evaluate_springs(
         SpringModel.of(MPMModel(**params.simulation), about["substeps"]),
         body,
