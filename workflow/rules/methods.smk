@@ -48,14 +48,19 @@ def training_settings(wildcards):
     return material_settings(wildcards)
 
 
+def without_law(method):
+    """The error of a method with springs where a law is asked for."""
+    return InputError(
+        f"{method} has no law of a material, only springs in one body: it has no stress and no bias, and no experiment "
+        "with several bodies"
+    )
+
+
 @checked
 def material_prior(wildcards):
     """The networks that a method starts from; none where its law is analytic, or corrects an analytic one."""
     if SETTINGS.is_springs(wildcards.method):
-        raise InputError(
-            f"{wildcards.method} has no law of a material, only springs in one body: it has no stress and no bias, and "
-            "no experiment with several bodies"
-        )
+        raise without_law(wildcards.method)
     analytic = SETTINGS.is_identified(wildcards.method) or SETTINGS.is_structured(wildcards.method)
     if analytic or SETTINGS.true_law(wildcards.scene, wildcards.method):
         return []

@@ -12,7 +12,7 @@ def fitted_springs(wildcards):
     """The springs of a scene, or of the scene of an experiment's one body."""
     scenes = SETTINGS.body_scenes(subject(wildcards))
     if len(scenes) > 1:
-        raise InputError(f"{wildcards.method} moves one body, {subject(wildcards)} has {len(scenes)}")
+        raise without_law(wildcards.method)
     return f"{RESULTS}/{SETTINGS.run_folder(scenes[0], wildcards.method)}/springs.safetensors"
 
 
