@@ -30,12 +30,12 @@ class SpringsConfig(Section):
     learn_resistance: bool = Field(False, description="whether the damping is learned, too")
     carriers: int = Field(16, ge=4, description="nearest anchors that a particle or tracer follows")
     truncated: bool = Field(
-        True,
+        False,
         description="true: an optimiser step for every frame, by the gradient of the steps since the frame before it "
         "(published); false: one for the whole video, by its whole gradient",
     )
     lr_springs: float = Field(
-        0.01,
+        0.05,
         gt=0,
         description="learning rate of log10 stiffness, softness and friction (0.001); a tenth of it for log10 damping, "
         "0.03 of it [m] for the gap",
