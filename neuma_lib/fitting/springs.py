@@ -1,8 +1,8 @@
 """Fitting a network of springs to a video (Spring-Gaus, Zhong et al. 2024: the stage "dynamic").
 
-Its own are the network and the steps from frame to frame: at each frame an optimiser step is made with the gradient of
-the substeps since the frame before it, and the state is taken as given from there on. Start, images and loss are those
-of all methods here. The whole gradient through all frames is a choice beside it.
+Start, images and loss are those of all methods here. As published, an optimiser step is made at each frame with the
+gradient of the substeps since the frame before it, and the state is taken as given from there on (`truncated`). Beside
+it stands one step for the whole video, by the gradient through all substeps.
 """
 
 from __future__ import annotations
