@@ -7,8 +7,7 @@ best of its own guess, the scene's prior and what simpler families have found; o
 
 How the body was thrown is known from the frames before contact, up to an uncertainty that the constants would take up.
 So the last round fits velocity and spin along, held by what is known of them, and a constant shift and enlargement of
-the rendered body, which would be taken for motion. And a body of few particles, each at random in its cell, moves as if
-its material were another: what many particles change in the images is added to those of the few.
+the rendered body, which would be taken for motion (`thrown_video`).
 
 Families are fitted to the first frames and judged by the last ones, so that more constants do not win by themselves;
 frames before the first contact tell nothing of a law and are among those that are fitted. One that shows the images of
@@ -24,7 +23,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -32,11 +31,9 @@ import torch
 from torch import Tensor
 
 from neuma_lib.config.identify import IdentifyConfig
-from neuma_lib.coupling.particle_gs import ParticleGS
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.families import Family
-from neuma_lib.fitting.frame_batches import first_contact, frame_batches, held_out_frames, spread_frames
 from neuma_lib.fitting.identified import FamilyFit, Identified
 from neuma_lib.fitting.least_squares import (
     LEAST_COST,
@@ -46,17 +43,13 @@ from neuma_lib.fitting.least_squares import (
     levenberg_marquardt,
 )
 from neuma_lib.fitting.throw import Throw
-from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.fitting.thrown_video import MOTION, NUISANCES, ThrownVideo, Try, averaged
 from neuma_lib.mechanics.combinations import Values
-from neuma_lib.sim.batch import rollout_batch
 from neuma_lib.sim.model import MPMModel
-from neuma_lib.sim.state import Trajectory
 from neuma_lib.splatting.observation import Observation
 
 _LAST_GAIN = 0.1  # of `least_gain`, in the last round
 _LEAST_LOSS = 1e-12  # below it, held-out images agree exactly
-_MOTION = 6  # unknowns of a throw: velocity and spin
-_NUISANCES = 9  # and of the rendered body: shift right and down, enlargement
 
 
 def identify(
@@ -99,7 +92,7 @@ def identify(
     families = [Family(name, law.plain()) for name, law in settings.families.items()]
     families.sort(key=lambda family: len(family.constants))  # simpler ones give starts to the others
     fillings = finer or [()] * len(given)
-    videos = [_Video(model, *one, settings, own) for one, own in zip(given, fillings, strict=True)]
+    videos = [ThrownVideo(model, *one, settings, own) for one, own in zip(given, fillings, strict=True)]
     for video in videos:
         video.hold_out(families[0], settings.held_out)
         video.weight = (videos[0].fitted_pixels / video.fitted_pixels) ** 0.5
@@ -155,7 +148,7 @@ def identify(
 
 def _begun(
     family: Family,
-    videos: Sequence[_Video],
+    videos: Sequence[ThrownVideo],
     running: Sequence[_Run],
     stock_values: Values,
     settings: IdentifyConfig,
@@ -174,10 +167,8 @@ def _begun(
     if family.flows and found:
         flowing = [*guesses, *family.with_other_limits(guesses[-1], (-1, -2))]
         groups = [flowing, [*found, *family.with_other_limits(found[0], (1, 2))]]
-    fits, least = (
-        [_Run(family, videos, [video.fitted for video in videos], settings) for _ in groups],
-        math.inf,
-    )
+    fits = [_Run(family, videos, [video.fitted for video in videos], settings) for _ in groups]
+    least = math.inf
     for run, starts in zip(fits, groups, strict=True):
         run.begin(starts, below=least)
         least = run.fit.cost if run.alive else math.inf
@@ -242,145 +233,8 @@ def _constants(spec: Mapping[str, Mapping[str, Any]]) -> Values:
     return {key: float(value) for part in spec.values() for key, value in part.items() if key != "name"}
 
 
-@dataclass(frozen=True)
-class _Try:
-    """What is simulated and rendered.
-
-    Attributes:
-        law: specification.
-        deviations: of the throw from what is known of it, along velocity and spin, in standard deviations; then of the
-            rendered body to the right, down and in size, in the setting ``misplaced``; shape (9,).
-    """
-
-    law: Mapping[str, Mapping[str, Any]]
-    deviations: np.ndarray
-
-
-class _Video:
-    """Simulated minus observed images, averaged over the finest squares.
-
-    Attributes:
-        frames: steps of the frames that are compared.
-        fitted: the number of those that families are fitted to; the others judge them.
-        weight: factor on all residuals.
-        unsure: places of the deviations that are not known to be 0.
-        by_deviation: derivatives of the residuals of all frames with respect to the deviations; None: not taken yet.
-            All families share those of one that fits: they are mostly kinematics.
-        spread: how residuals of all frames differ between two fillings with many particles; None: not known.
-        rollouts: simulations so far.
-    """
-
-    def __init__(
-        self,
-        model: MPMModel,
-        throw: Throw,
-        body: Reconstruction,
-        video: Observation,
-        settings: IdentifyConfig,
-        finer: Sequence[Reconstruction] = (),
-    ):
-        seen = video.select(spread_frames(len(video.frames), settings.frames))
-        self.model, self.throw, self.frames, self.weight = model, throw, seen.frames, 1.0
-        self.fitted = len(seen.frames)
-        self.density = float((body.mass / body.vol0).min())
-        self.unsure = np.flatnonzero([*throw.std, *[settings.misplaced] * (_NUISANCES - _MOTION)]).tolist()
-        self.by_deviation: list[Tensor] | None = None
-        self.spread: Tensor | None = None
-        self.rollouts = 0
-        self._added: Tensor | None = None
-        self._misplaced = settings.misplaced
-        self._total, self._axes = settings.covariance_from == "total", seen.cameras.viewmats[0, :3, :3]
-        self._body, *self._finer = [(each, each.particle_gs(seen.cameras)) for each in (body, *finer)]
-        width = seen.cameras.width
-        sizes = [max(1, round(width / across)) for across in settings.squares]
-        self.finest = sizes[-1]
-        self.sizes = [max(1, round(size / self.finest)) for size in sizes]
-        """Edge of each round's squares in squares of the finest ones."""
-        parts = frame_batches(len(seen.frames), self._body[1].frames_per_batch)
-        self._observed = torch.cat([averaged(seen.colours(part), self.finest) for part in parts])
-
-    @property
-    def fitted_pixels(self) -> int:
-        return self._observed[: self.fitted].numel()
-
-    def hold_out(self, family: Family, share: float) -> None:
-        """Leave a share of the frames after the first contact, the last ones, to judge by; any law falls alike."""
-        law = family.law_spec(family.values(family.unbounded(family.guess), self.model, self.density))
-        (path,) = self._paths([_Try(law, np.zeros(_NUISANCES))], self.frames, self._body[0])
-        contact = 0 if path is None else first_contact(self.model, path.x)
-        self.fitted = held_out_frames(len(self.frames), share, contact=contact)[0]
-
-    def residuals(self, tries: Sequence[_Try], count: int) -> list[Tensor | None]:
-        """Residuals (count, V, H', W', 3) of the first frames for each try; None where the rollout diverges."""
-        paths = self._paths(tries, self.frames[:count], self._body[0])
-        found = [self._residual(one, path, self._body[1]) for one, path in zip(tries, paths, strict=True)]
-        if self._added is None:
-            return found
-        return [None if residual is None else residual + self._added[:count] for residual in found]
-
-    def differentiate(self, here: _Try) -> None:
-        """Take the derivatives by the deviations there: forward differences, 0 where a rollout diverges."""
-        moved = [replace(here, deviations=here.deviations + step) for step in np.eye(_NUISANCES)[self.unsure]]
-        flown = [here, *(one for one, k in zip(moved, self.unsure, strict=True) if k < _MOTION)]
-        paths = self._paths(flown, self.frames, self._body[0])
-        paths += [paths[0]] * (
-            1 + len(moved) - len(flown)
-        )  # what only moves the rendered body needs no rollout
-        base, *there = (
-            self._residual(one, path, self._body[1]) for one, path in zip([here, *moved], paths, strict=True)
-        )
-        if base is not None:  # it held for the frames that are fitted
-            self.by_deviation = [torch.zeros_like(base) if each is None else each - base for each in there]
-
-    def refine_particles(self, here: _Try) -> None:
-        """Add what more particles change in the images to all residuals from now on, and know how sure that is."""
-        if not self._finer:
-            return
-        coarse, *fine = (
-            self._residual(here, self._paths([here], self.frames, body)[0], renderer)
-            for body, renderer in (self._body, *self._finer)
-        )
-        fine = [residual for residual in fine if residual is not None]
-        if coarse is not None and fine:
-            self._added = torch.stack(fine).mean(0) - coarse
-            self.spread = fine[0] - fine[-1] if len(fine) > 1 else None
-
-    def _paths(
-        self, tries: Sequence[_Try], frames: tuple[int, ...], body: Reconstruction
-    ) -> list[Trajectory | None]:
-        self.rollouts += len(tries)
-        starts = [self.throw.moved(one.deviations[:_MOTION]).of_body(body) for one in tries]
-        laws = [analytic_law(one.law, self.model.dt).to(starts[0].x.device) for one in tries]
-        options = dict(steps=frames[-1], frames=frames, total=self._total)
-        return rollout_batch(self.model, laws, starts, **options)
-
-    @torch.no_grad()
-    def _residual(self, one: _Try, path: Trajectory | None, renderer: ParticleGS) -> Tensor | None:
-        if path is None:
-            return None
-        right, down, enlargement = (self._misplaced * one.deviations[_MOTION:]).tolist()
-        images = []
-        for part in frame_batches(len(path.x), renderer.frames_per_batch):
-            centre = path.x[part].mean(dim=1, keepdim=True)
-            x = centre + (1 + enlargement) * (path.x[part] - centre)
-            x = x + right * self._axes[0] + down * self._axes[1]
-            images.append(averaged(renderer(x, (1 + enlargement) * path.stretch[part]), self.finest))
-        residual = self.weight * (torch.cat(images) - self._observed[: len(path.x)])
-        return residual if bool(residual.isfinite().all()) else None
-
-
 def _squares(residual: Iterable[Tensor]) -> float:
     return sum(float(r.square().sum(dtype=torch.float64)) for r in residual)
-
-
-def averaged(images: Tensor, size: int) -> Tensor:
-    """Images (T, V, H, W, C) averaged over squares of ``size`` pixels, those at the far edges over what is there."""
-    if size == 1:
-        return images
-    T, V = images.shape[:2]
-    flat = images.flatten(0, 1).movedim(-1, 1)
-    pooled = torch.nn.functional.avg_pool2d(flat, size, ceil_mode=True, count_include_pad=False)
-    return pooled.movedim(1, -1).unflatten(0, (T, V))
 
 
 class _Run:
@@ -391,14 +245,14 @@ class _Run:
     """
 
     def __init__(
-        self, family: Family, videos: Sequence[_Video], counts: Sequence[int], settings: IdentifyConfig
+        self, family: Family, videos: Sequence[ThrownVideo], counts: Sequence[int], settings: IdentifyConfig
     ):
         self.family, self.videos, self.counts, self.settings = family, videos, counts, settings
         self.alive, self.refined, self.rollouts, self.steps = False, False, 0, 0
         self.fit: Linearisation | None = None
         self._constants = len(family.constants)
         self._origin, self._level = np.zeros(0), 0
-        self._u = np.zeros(self._constants + _NUISANCES * len(videos))
+        self._u = np.zeros(self._constants + NUISANCES * len(videos))
         self._images: dict[bytes, list[Tensor] | None] = {}
         self._columns: dict[bytes, list[list[Tensor]]] = {}
 
@@ -467,8 +321,8 @@ class _Run:
 
     def _own(self, v: int) -> list[int]:
         """Places of the deviations of a video."""
-        first = self._constants + v * _NUISANCES
-        return list(range(first, first + _NUISANCES))
+        first = self._constants + v * NUISANCES
+        return list(range(first, first + NUISANCES))
 
     def _unsure(self, v: int) -> list[int]:
         """Places of those that are not known to be 0."""
@@ -478,7 +332,7 @@ class _Run:
         """Let the videos learn what more particles change, and what the deviations do, where the fit stands."""
         law = self.family.law_spec(self.values)
         for v, video in enumerate(self.videos):
-            here = _Try(law, self._u[self._own(v)])
+            here = Try(law, self._u[self._own(v)])
             if derivatives:
                 video.differentiate(here)
             video.refine_particles(here)
@@ -581,7 +435,7 @@ class _Run:
 
     def _thrown(self, v: int, stds: np.ndarray) -> Throw:
         """The fitted throw of a video; standard deviations of all unknowns are given."""
-        motion, throw = self._own(v)[:_MOTION], self.videos[v].throw
+        motion, throw = self._own(v)[:MOTION], self.videos[v].throw
         return replace(throw.moved(self._u[motion]), std=throw.std * stds[motion])
 
     def _constant_columns(self, unknowns: np.ndarray, residual: Sequence[Tensor]) -> list[list[Tensor]]:
@@ -604,7 +458,7 @@ class _Run:
     @property
     def _spreads(self) -> np.ndarray:
         """Expected distance of the unknowns from 0."""
-        deviations = np.ones(_NUISANCES * len(self.videos))
+        deviations = np.ones(NUISANCES * len(self.videos))
         return np.append(np.full(self._constants, self.settings.spread), deviations)
 
     def _held(self, fit: Linearisation) -> np.ndarray:
@@ -633,7 +487,7 @@ class _Run:
         self.rollouts += len(points) * len(self.videos)
         laws = [self.family.law_spec(self._values(point)) for point in points]
         found = [
-            video.residuals([_Try(law, p[self._own(v)]) for law, p in zip(laws, points, strict=True)], count)
+            video.residuals([Try(law, p[self._own(v)]) for law, p in zip(laws, points, strict=True)], count)
             for v, (video, count) in enumerate(zip(self.videos, counts or self.counts, strict=True))
         ]
         return [

@@ -15,9 +15,10 @@ from neuma_lib.evaluation.identified_page import identified_page
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.frame_batches import first_contact
 from neuma_lib.fitting.identified import FamilyFit
-from neuma_lib.fitting.identify import _better_later, _choice, _leave_behind, _Run, _Video, averaged, identify
+from neuma_lib.fitting.identify import _better_later, _choice, _leave_behind, _Run, identify
 from neuma_lib.fitting.least_squares import Linearisation, jackknife, levenberg_marquardt
 from neuma_lib.fitting.throw import Throw
+from neuma_lib.fitting.thrown_video import ThrownVideo, averaged
 from neuma_lib.io.files import write_json
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import named_combinations
@@ -240,7 +241,7 @@ def test_a_flow_that_never_yields_shows_the_elastic_body():
     """And one that yields does not, whatever their squared residuals."""
     body, seen = video_of(ELASTIC, V0, FRAMES)
     chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", particles=0)
-    video = _Video(MODEL, known(body), body, seen, chosen)
+    video = ThrownVideo(MODEL, known(body), body, seen, chosen)
     runs = [_Run(Family("x", spec), [video], [len(FRAMES)], chosen) for spec in (ELASTIC, PLASTIC, PLASTIC)]
     for run, limit in zip(runs, (1.0, 1e5, 1e3), strict=True):
         values = run.family.with_guesses({"yield_stress": limit})
@@ -255,7 +256,7 @@ def test_frames_after_the_contact_judge():
     body, seen = video_of(ELASTIC, V0, FRAMES)
     for v0, share in ((V0, 0.25), ((0.5, -0.6, 0.0), 0.25), (V0, 0.5)):
         chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", particles=0)
-        video = _Video(MODEL, known(body, v0=v0), body, seen, chosen)
+        video = ThrownVideo(MODEL, known(body, v0=v0), body, seen, chosen)
         video.hold_out(Family("hencky", ELASTIC), share)
         path = rollout(MODEL, analytic_law(ELASTIC), body.state(v0), steps=FRAMES[-1], frames=FRAMES)
         told = len(FRAMES) - first_contact(MODEL, path.x)
@@ -326,7 +327,7 @@ def test_uncertainty_covers_the_error_of_patches_that_last():
 
 
 def test_a_family_that_diverges_loses_and_alone_is_an_error(monkeypatch):
-    import neuma_lib.fitting.identify as module
+    import neuma_lib.fitting.thrown_video as module
 
     def rollout_batch(model, laws, *args, **options):
         paths = real(model, laws, *args, **options)
@@ -376,7 +377,7 @@ def test_stiffness_that_the_time_step_does_not_bear_has_a_difference_too():
     """At the stiffest that dt bears no small step changes the law: the difference is taken over a long one."""
     body, seen = video_of(ELASTIC, V0, FRAMES)
     chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", particles=0)
-    video, family = _Video(MODEL, known(body), body, seen, chosen), Family("hencky", ELASTIC)
+    video, family = ThrownVideo(MODEL, known(body), body, seen, chosen), Family("hencky", ELASTIC)
     run = _Run(family, [video], [len(FRAMES)], chosen)
     run._origin = family.unbounded({"E": 1e9, "nu": 0.3})
     run._u[0] = math.log(run.values["E"] / 1e9) + 0.5  # beyond the limit by more than a small step
