@@ -1,0 +1,67 @@
+"""Settings of PAC-NeRF's first stage: a voxel radiance field from the views at t = 0."""
+
+from __future__ import annotations
+
+from pydantic import Field, model_validator
+
+from neuma_lib.config.base import Section
+
+
+class RadianceConfig(Section):
+    """Voxel radiance field of the views at t = 0 (PAC-NeRF). What differs from the authors' values says so."""
+
+    iterations: int = Field(
+        600, ge=1, description="optimiser steps, each on one view (authors: 6001, plasticine 10001)"
+    )
+    rays: int = Field(
+        2048,
+        ge=1,
+        description="pixels of a step, at random among those whose ray meets the lattice (authors: 2^17 of 800 x 800)",
+    )
+    voxel: float = Field(0.16, gt=0, description="voxel of the coarsest lattice [m]")
+    halvings: tuple[float, ...] = Field(
+        (1 / 6, 1 / 3, 2 / 3),
+        description="fractions of the iterations at which the voxel is halved, ascending (authors: at 1000, 2000, 4000)",
+    )
+    initial_opacity: float = Field(
+        1e-4, gt=0, lt=1, description="opacity of raw density 0, where all begins, over one interval"
+    )
+    spacing: float = Field(
+        0.5,
+        gt=0,
+        le=1,
+        description="mean distance between neighbouring particles [voxels]; 0.5: eight a voxel",
+    )
+    least_opacity: float = Field(
+        1e-3,
+        ge=0,
+        lt=1,
+        description="particles less opaque than this part of the most opaque one are left out",
+    )
+    rate_density: float = Field(0.1, ge=0, description="learning rate of the raw density")
+    rate_features: float = Field(0.1, ge=0, description="learning rate of the colour features")
+    rate_network: float = Field(1e-3, ge=0, description="learning rate of the network of the colours")
+    entropy_weight: float = Field(
+        1e-4,
+        ge=0,
+        description="weight of the entropy of what comes through along a ray, at the start (authors: 1e-4, some scenes 1e-3)",
+    )
+    entropy_doublings: int = Field(
+        6, ge=0, description="times that this weight doubles, evenly over the iterations"
+    )
+    entropy_most: float = Field(0.1, ge=0, description="largest weight of the entropy")
+    volume_weight: float = Field(
+        1e-3,
+        ge=0,
+        description="weight of the particles' opacity times voxel^2 / 8 (authors: 1e-3, plasticine 1e-4)",
+    )
+    held_out: int = Field(
+        10, ge=0, description="every how many-th view is kept for measurement only; 0 for none"
+    )
+    checkpoint_every: int = Field(100, ge=1, description="iterations between two saves of the state")
+
+    @model_validator(mode="after")
+    def _ascending(self) -> RadianceConfig:
+        if list(self.halvings) != sorted(set(self.halvings)) or not all(0 < f < 1 for f in self.halvings):
+            raise ValueError("radiance.halvings: give fractions between 0 and 1, ascending, none twice")
+        return self
