@@ -21,7 +21,7 @@ class RadianceConfig(Section):
     voxel: float = Field(0.16, gt=0, description="voxel of the coarsest lattice [m]")
     halvings: tuple[float, ...] = Field(
         (1 / 6, 1 / 3, 2 / 3),
-        description="fractions of the iterations at which the voxel is halved, ascending (authors: at 1000, 2000, 4000)",
+        description="fractions of the iterations at which the voxel is halved (authors: at 1000, 2000, 4000)",
     )
     initial_opacity: float = Field(
         1e-4, gt=0, lt=1, description="opacity of raw density 0, where all begins, over one interval"
@@ -44,7 +44,7 @@ class RadianceConfig(Section):
     entropy_weight: float = Field(
         1e-4,
         ge=0,
-        description="weight of the entropy of what comes through along a ray, at the start (authors: 1e-4, some scenes 1e-3)",
+        description="weight of the entropy of a ray's transmittance, at the start (authors: 1e-4, some scenes 1e-3)",
     )
     entropy_doublings: int = Field(
         6, ge=0, description="times that this weight doubles, evenly over the iterations"

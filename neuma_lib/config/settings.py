@@ -25,6 +25,7 @@ from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.methods import IDENTIFIED, LAW_FROM, MethodConfig, parse_method, variant_title
 from neuma_lib.config.priors import PriorsConfig
+from neuma_lib.config.radiance import RadianceConfig
 from neuma_lib.config.random_scenes import RandomConfig, draw_scenes
 from neuma_lib.config.scenes import SceneConfig
 from neuma_lib.config.simulation import SimulationConfig
@@ -61,6 +62,7 @@ class Config(Section):
     simulation: SimulationConfig = Field(SimulationConfig(), description="material point method")
     priors: PriorsConfig = Field(PriorsConfig(), description="pre-trained laws")
     gaussians: GaussiansConfig = Field(GaussiansConfig(), description="static reconstruction")
+    radiance: RadianceConfig = Field(RadianceConfig(), description="voxel field of PAC-NeRF")
     geometry: GeometryConfig = Field(GeometryConfig(), description="mesh and particles")
     binding: BindingConfig = Field(BindingConfig(), description="Gaussians to particles")
     velocity: VelocityConfig = Field(VelocityConfig(), description="initial velocity")

@@ -45,7 +45,6 @@ class RadianceReport:
         psnr, psnr_object: mean PSNR [dB] of the held-out views, full frame over white and inside the object (pixels
             with alpha above 1/2), through particles and back.
         direct_psnr, direct_psnr_object: the same of the field itself, without particles.
-        train_psnr, train_psnr_object: through particles, of the views that were fitted.
     """
 
     losses: list[float]
@@ -57,8 +56,6 @@ class RadianceReport:
     psnr_object: float
     direct_psnr: float
     direct_psnr_object: float
-    train_psnr: float
-    train_psnr_object: float
 
 
 def fit_radiance_field(
@@ -73,7 +70,7 @@ def fit_radiance_field(
 
     Args:
         images: (V, H, W, 4) RGBA with straight alpha in [0, 1].
-        cameras: their V cameras.
+        cameras: their V cameras, more than half of `settings.held_out`.
         settings: hyper-parameters.
         seed: of everything random; the same seed gives the same field on a CPU.
         checkpoint: where the state is kept, so that a killed fit goes on.
@@ -83,10 +80,9 @@ def fit_radiance_field(
         InputError: shapes disagree, a mask is empty or covers the frame, or nothing is left of the field.
         NonFiniteError: the loss is not finite.
     """
-    _check(images, cameras)
+    _check(images, cameras, settings.held_out)
     images = images.to(cameras.viewmats.dtype)
-    every = settings.held_out
-    held_out = list(range(every // 2, len(cameras), every)) if every else []
+    held_out = list(range(settings.held_out // 2, len(cameras), settings.held_out))
     fitted = [view for view in range(len(cameras)) if view not in held_out]
     fit = _Fit(images[fitted], cameras[fitted], settings, seed)
     start = fit.resume(checkpoint.load()) if checkpoint else 0
@@ -102,10 +98,7 @@ def fit_radiance_field(
             checkpoint.save(fit.state(iteration + 1))
     field = fit.field.requires_grad_(False)
     particles = field.particles(settings.spacing, settings.least_opacity)
-    scores = [
-        evaluate(field, images, cameras, views, part)
-        for views, part in ((held_out, particles), (held_out, None), (fitted, particles))
-    ]
+    scores = [evaluate(field, images, cameras, held_out, part) for part in (particles, None)]
     report = RadianceReport(
         fit.losses, field.lattice.voxel, field.lattice.nodes, len(particles.x), held_out,
         *(value for pair in scores for value in pair),
@@ -132,8 +125,6 @@ def evaluate(
     particles: FieldParticles | None = None,
 ) -> tuple[float, float]:
     """Mean PSNR [dB] over views against RGBA images over white: full frame; where alpha > 1/2."""
-    if not views:
-        return math.nan, math.nan
     full, inside = [], []
     for view in views:
         error = (draw(field, cameras, view, particles).clamp(0, 1) - over_white(images[view])) ** 2
@@ -241,8 +232,12 @@ def _meeting(lattice: Lattice, origins: Tensor, directions: Tensor) -> Tensor:
     return (last > first.clamp(min=0)).nonzero()[:, 0]
 
 
-def _check(images: Tensor, cameras: Cameras) -> None:
+def _check(images: Tensor, cameras: Cameras, held_out: int) -> None:
     expected = (len(cameras), cameras.height, cameras.width, 4)
     if tuple(images.shape) != expected:
         raise InputError(f"images of shape {tuple(images.shape)} do not fit the cameras: expected {expected}")
+    if len(cameras) <= max(1, held_out // 2):
+        raise InputError(
+            f"radiance field: {len(cameras)} views leave none to measure with; lower radiance.held_out ({held_out})"
+        )
     check_masks(images[..., 3])
