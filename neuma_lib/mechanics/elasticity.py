@@ -98,6 +98,21 @@ class Fluid(AnalyticElasticity):
         return (lam * J * (J - 1)).expand_as(sigma)
 
 
+class Tait(AnalyticElasticity):
+    """tau = (K / 7) (J - J^-6) I + 2 mu dev eps, K = lam + 2 mu / 3: a liquid by the equation of state of Tait and Cole
+    with the exponent 7, and `Hencky` in shear.
+
+    With the return `fluid_projection` only J counts, as in PAC-NeRF's weakly compressible fluid (Li et al. 2023), whose
+    kappa is K / 7. With `viscous_flow` it is a Newtonian fluid: in steady flow tau is 2 viscosity dev D beside the
+    pressure, so that PAC-NeRF's mu is twice the viscosity.
+    """
+
+    def principal(self, sigma, mu, lam):
+        strain, _ = _isochoric_strain(sigma)
+        J = _volume_ratio(sigma).clamp(min=STRETCH_MIN)
+        return (lam + 2 * mu / 3) / 7 * (J - J**-6) + 2 * mu * strain
+
+
 class Ogden(AnalyticElasticity):
     """One-term Ogden solid: tau_i = (2 mu / alpha) dev(s_i^alpha) + (lam + 2 mu / 3) log J, s_i = sigma_i J^(-1/3).
 
@@ -171,6 +186,7 @@ ELASTICITIES: dict[str, type[AnalyticElasticity]] = {
     "hencky": Hencky,
     "neo_hookean": NeoHookean,
     "fluid": Fluid,
+    "tait": Tait,
     "ogden": Ogden,
     "mooney_rivlin": MooneyRivlin,
     "fibre_reinforced": FibreReinforced,

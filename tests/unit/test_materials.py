@@ -11,7 +11,7 @@ from neuma_lib.io.laws import load_prior
 from neuma_lib.io.weights import write_weights
 from neuma_lib.mechanics.adaptor import Adaptor
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.mechanics.elasticity import ELASTICITIES, Hencky
+from neuma_lib.mechanics.elasticity import ELASTICITIES, Hencky, Tait
 from neuma_lib.mechanics.isotropic import lame
 from neuma_lib.mechanics.law import Constitutive, Law
 from neuma_lib.mechanics.neural import CPU_ROWS, SHAPES, neural_law
@@ -111,6 +111,9 @@ def uniaxial_stress(name: str, a: float) -> list[float]:
         return [a * a * (2 * MU + LAM) * green, LAM * green]
     if name == "hencky":
         return [(2 * MU + LAM) * math.log(a), LAM * math.log(a)]
+    if name == "tait":  # dev eps = (2/3, -1/3, -1/3) log a
+        pressure, shear = (LAM + 2 * MU / 3) / 7 * (a - a**-6), 2 * MU * math.log(a) / 3
+        return [pressure + 2 * shear, pressure - shear]
     if name == "neo_hookean":  # tau = mu (b - I) + lam log J I
         return [MU * (a * a - 1) + LAM * math.log(a), LAM * math.log(a)]
     if name in ("ogden", "mooney_rivlin"):  # isochoric stretches a^(2/3), a^(-1/3) twice
@@ -142,7 +145,7 @@ def simple_shear_stress(name: str, k: float) -> torch.Tensor:
         green = (F.mT @ F - eye) / 2
         plane = F @ (2 * MU * green + LAM * green.trace() * eye) @ F.mT
         out_of_plane = LAM * float(green.trace())
-    elif name in ("hencky", "fibre_reinforced"):  # fibres along e_x are not strained
+    elif name in ("hencky", "tait", "fibre_reinforced"):  # fibres along e_x are not strained
         # principal log stretches +-asinh(k / 2), the larger one at atan(k/2 + sqrt(1+k^2/4))
         strain = math.asinh(k / 2)
         angle = math.atan2(1.0, math.sqrt(1 + k * k / 4) - k / 2)  # of the axis, from e_y side
@@ -369,6 +372,15 @@ def test_viscous_flow_is_newtonian_in_steady_shear():
     assert float(law.evaluate(F, ())[0, 0, 1]) == pytest.approx(
         viscosity * rate, rel=4 * (strain + rate * dt)
     )
+
+
+def test_a_projected_tait_fluid_knows_its_volume_alone():
+    """PAC-NeRF's weakly compressible fluid without viscosity: kappa (J - J^-6) I, whatever the deformation."""
+    F = deformations(50)
+    part, law = FluidProjection(), Tait(E=E, nu=NU)
+    J = torch.linalg.det(F)[:, None, None]
+    expected = (LAM + 2 * MU / 3) / 7 * (J - J**-6) * EYE
+    torch.testing.assert_close(law.evaluate(part.evaluate(F, ()), ()), expected, rtol=1e-10, atol=1e-10 * E)
 
 
 def test_a_bingham_body_bears_its_yield_stress_and_flows_beyond_it():
