@@ -19,8 +19,13 @@ class RadianceConfig(Section):
         description="pixels of a step, at random among those whose ray meets the lattice (authors: 2^17 of 800 x 800)",
     )
     voxel: float = Field(0.16, gt=0, description="voxel of the coarsest lattice [m]")
+    hull_resolution: int = Field(
+        32,
+        ge=2,
+        description="voxels along the visual hull, in whose box the field begins (authors: a box by hand)",
+    )
     halvings: tuple[float, ...] = Field(
-        (1 / 6, 1 / 3, 2 / 3),
+        (0.17, 0.33, 0.67),
         description="fractions of the iterations at which the voxel is halved (authors: at 1000, 2000, 4000)",
     )
     initial_opacity: float = Field(
@@ -41,6 +46,12 @@ class RadianceConfig(Section):
     rate_density: float = Field(0.1, ge=0, description="learning rate of the raw density")
     rate_features: float = Field(0.1, ge=0, description="learning rate of the colour features")
     rate_network: float = Field(1e-3, ge=0, description="learning rate of the network of the colours")
+    rate_decay: float = Field(
+        0.1,
+        gt=0,
+        le=1,
+        description="last over first of these rates: they fall exponentially after the last halving (authors: 1)",
+    )
     entropy_weight: float = Field(
         1e-4,
         ge=0,
@@ -53,7 +64,7 @@ class RadianceConfig(Section):
     volume_weight: float = Field(
         1e-3,
         ge=0,
-        description="weight of the particles' opacity times voxel^2 / 8 (authors: 1e-3, plasticine 1e-4)",
+        description="weight of the particles' opacities times volume over voxel (authors: 1e-3, plasticine 1e-4)",
     )
     held_out: int = Field(
         10, ge=0, description="every how many-th view is kept for measurement only; 0 for none"

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from neuma_lib.config.radiance import RadianceConfig
 from neuma_lib.errors import InputError, NonFiniteError
-from neuma_lib.geometry.visual_hull import check_masks
+from neuma_lib.geometry.visual_hull import Hull, check_masks, visual_hull
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.radiance.field import FieldParticles, RadianceField
 from neuma_lib.radiance.lattice import Lattice
@@ -66,7 +66,7 @@ def fit_radiance_field(
     checkpoint: Checkpoint | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> tuple[RadianceField, RadianceReport]:
-    """Fit a field in the unit cube to images of an object.
+    """Fit a field to images of an object. It begins in the box of the object's visual hull.
 
     Args:
         images: (V, H, W, 4) RGBA with straight alpha in [0, 1].
@@ -77,7 +77,7 @@ def fit_radiance_field(
         progress: called with (iteration, loss) after each iteration.
 
     Raises:
-        InputError: shapes disagree, a mask is empty or covers the frame, or nothing is left of the field.
+        InputError: shapes disagree, a mask is empty or covers the frame, or masks and poses contradict each other.
         NonFiniteError: the loss is not finite.
     """
     _check(images, cameras, settings.held_out)
@@ -140,15 +140,13 @@ class _Fit:
         self.settings, self.generator = settings, torch.Generator().manual_seed(seed)
         self.targets = over_white(images).flatten(1, 2)
         self.rays = [camera_rays(cameras, view) for view in range(len(cameras))]
+        self.halvings = [round(part * settings.iterations) for part in settings.halvings]
         self.order: list[int] = []
         self.losses: list[float] = []
-        nodes = (math.ceil(1 / settings.voxel) + 1,) * 3
-        with torch.random.fork_rng(devices=[]):
+        lattice = _around(visual_hull(images[..., 3], cameras, settings.hull_resolution), settings.voxel)
+        with torch.random.fork_rng(devices=[]):  # of the network
             torch.manual_seed(seed)
-            field = RadianceField(
-                Lattice((0.0, 0.0, 0.0), settings.voxel, nodes),
-                Opacity(settings.initial_opacity, settings.voxel),
-            )
+            field = RadianceField(lattice, Opacity(settings.initial_opacity, settings.voxel))
         self._begin(field.to(images))
 
     def _begin(self, field: RadianceField) -> None:
@@ -156,9 +154,12 @@ class _Fit:
         self.field, settings = field, self.settings
         self.optimizer = torch.optim.Adam(
             [
-                {"params": [field.density], "lr": settings.rate_density},
-                {"params": [field.features], "lr": settings.rate_features},
-                {"params": list(field.network.parameters()), "lr": settings.rate_network},
+                {"params": list(parameters), "first_lr": rate}
+                for parameters, rate in (
+                    ([field.density], settings.rate_density),
+                    ([field.features], settings.rate_features),
+                    (field.network.parameters(), settings.rate_network),
+                )
             ]
         )
         self.meeting = [_meeting(field.lattice, *rays) for rays in self.rays]
@@ -166,7 +167,7 @@ class _Fit:
     def step(self, iteration: int) -> float:
         """One Adam step."""
         settings = self.settings
-        if iteration in [round(part * settings.iterations) for part in settings.halvings]:
+        if iteration in self.halvings:
             self._begin(self.field.halved(settings.least_opacity))
         if not self.order:
             self.order = torch.randperm(len(self.rays), generator=self.generator).tolist()
@@ -186,13 +187,20 @@ class _Fit:
         weight = min(settings.entropy_weight * 2**doublings, settings.entropy_most)
         passed = passed.clamp(CERTAIN, 1 - CERTAIN)
         entropy = -(passed * passed.log() + (1 - passed) * (1 - passed).log()).mean()
-        fuzzy = particles.opacities.clamp(*VOLUME_RANGE).sum() * self.field.lattice.voxel**2 / 8
+        fuzzy = particles.opacities.clamp(*VOLUME_RANGE).sum() * particles.volume / particles.voxel
         loss = loss + weight * entropy + settings.volume_weight * fuzzy
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["first_lr"] * settings.rate_decay ** self._done(iteration)
         self.optimizer.step()
         self.losses.append(float(loss.detach()))
         return self.losses[-1]
+
+    def _done(self, iteration: int) -> float:
+        """How much of what follows the last halving is behind us, from 0 to 1."""
+        first = self.halvings[-1] if self.halvings else 0
+        return max(0.0, (iteration - first) / (self.settings.iterations - first))
 
     def state(self, iteration: int) -> dict:
         """All that a checkpoint must hold."""
@@ -222,6 +230,15 @@ class _Fit:
         self.generator.set_state(state["generator"])
         self.order, self.losses = list(state["order"]), list(state["losses"])
         return state["iteration"]
+
+
+def _around(hull: Hull, voxel: float) -> Lattice:
+    """A lattice about the box of a visual hull, with the hull in the middle of it."""
+    found = hull.occupied.nonzero()
+    low, high = (hull.origin + hull.voxel * corner for corner in (found.amin(0), found.amax(0) + 1))
+    cells = ((high - low) / voxel).ceil().clamp(min=1)
+    origin = (low + high - voxel * cells) / 2
+    return Lattice(tuple(origin.tolist()), voxel, tuple(int(n) + 1 for n in cells.tolist()))
 
 
 def _meeting(lattice: Lattice, origins: Tensor, directions: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from grounding_scene import MODEL, TRUTH, ball, camera, observe
+from radiance_scenes import CHANNELS, LATTICE, OPACITY, random, scattered, small_scene
 from sim_scenes import make_law
 
 from neuma_lib.config.material import MaterialConfig
@@ -16,6 +17,8 @@ from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.mechanics.structured import FORMS, structured_law
+from neuma_lib.radiance.lattice import from_particles
+from neuma_lib.radiance.rendering import render as render_field
 from neuma_lib.sim.model import Body
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
@@ -177,6 +180,30 @@ def test_particle_gs_agrees():
     difference = (images_32.double() - images_cpu).abs()
     assert float(difference.mean()) < 1e-5
     assert float((difference.amax(-1) > 1 / 255).double().mean()) < 1e-3
+
+
+def seen_particles(device, dtype):
+    """Particles to nodes to rays: colours and transmittances, and gradients of positions, features and network."""
+    _, network, *rays = small_scene(density=150.0)
+    network = network.to(device, dtype)
+    x, features = scattered(300), 30 * random(300, CHANNELS) - 5
+    x, features = (value.to(device, dtype).requires_grad_() for value in (x, features))
+    rays = (part.to(device, dtype) for part in rays)
+    colours, passed = render_field(LATTICE, from_particles(LATTICE, x, features), OPACITY, network, *rays)
+    weight = torch.linspace(0.5, 1.5, colours.numel(), dtype=dtype, device=device).view(colours.shape)
+    loss = (weight * colours).sum() + passed.square().sum()
+    grads = torch.autograd.grad(loss, [x, features, *network.parameters()])
+    return colours.detach().cpu(), [grad.cpu() for grad in grads]
+
+
+def test_volume_rendering_of_particles_agrees():
+    colours_cpu, grads_cpu = seen_particles("cpu", torch.float64)
+    colours_gpu, grads_gpu = seen_particles("cuda", torch.float64)
+    assert float((colours_cpu - colours_gpu).abs().max()) < 1e-9
+    for ours, expected in zip(grads_gpu, grads_cpu, strict=True):
+        assert relative(ours, expected) < 1e-7
+    colours_32, _ = seen_particles("cuda", torch.float32)
+    assert float((colours_32.double() - colours_cpu).abs().mean()) < 1e-5
 
 
 def train(device, settings, checkpoint=None):
