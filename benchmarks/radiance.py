@@ -3,7 +3,7 @@
     python -m benchmarks.radiance BouncyBall                                  # reads data/ and config/config.yaml
     python -m benchmarks.radiance random1_04 random1_01 --seeds 1 --count 8 --set '{"iterations": 600}'
 
-A scene may be named by the beginning of its name. Its images must exist (`snakemake data/SCENE/static/transforms.json`).
+A scene may be named by the beginning of its name. Its images must exist: `snakemake data/SCENE/static/transforms.json`.
 Settings are to be tuned on draws that are not reported.
 """
 

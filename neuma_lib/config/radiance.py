@@ -11,14 +11,21 @@ class RadianceConfig(Section):
     """Voxel radiance field of the views at t = 0 (PAC-NeRF). What differs from the authors' values says so."""
 
     iterations: int = Field(
-        600, ge=1, description="optimiser steps, each on one view (authors: 6001, plasticine 10001)"
+        2000, ge=1, description="optimiser steps, each on one view (authors: 6001, plasticine 10001)"
     )
     rays: int = Field(
-        2048,
+        1024,
         ge=1,
         description="pixels of a step, at random among those whose ray meets the lattice (authors: 2^17 of 800 x 800)",
     )
-    voxel: float = Field(0.16, gt=0, description="voxel of the coarsest lattice [m]")
+    particles: int = Field(
+        4000, ge=1, description="about how many fill the visual hull at the end, which decides the voxel"
+    )
+    voxel: float | None = Field(
+        None,
+        gt=0,
+        description="voxel of the coarsest lattice [m] (authors: 0.16, some scenes 0.1 or 0.12); null: by particles",
+    )
     hull_resolution: int = Field(
         32,
         ge=2,
@@ -32,10 +39,10 @@ class RadianceConfig(Section):
         1e-4, gt=0, lt=1, description="opacity of raw density 0, where all begins, over one interval"
     )
     spacing: float = Field(
-        0.5,
+        1.0,
         gt=0,
         le=1,
-        description="mean distance between neighbouring particles [voxels]; 0.5: eight a voxel",
+        description="mean distance between neighbouring particles [voxels] (authors: 0.5, eight a voxel)",
     )
     least_opacity: float = Field(
         1e-3,
@@ -43,7 +50,12 @@ class RadianceConfig(Section):
         lt=1,
         description="particles less opaque than this part of the most opaque one are left out",
     )
-    rate_density: float = Field(0.1, ge=0, description="learning rate of the raw density")
+    rate_density: float = Field(
+        0.8,
+        ge=0,
+        description="learning rate of the raw density on the coarsest lattice; doubles with each halving, as"
+        " what makes a voxel opaque does (authors: 0.1 on all)",
+    )
     rate_features: float = Field(0.1, ge=0, description="learning rate of the colour features")
     rate_network: float = Field(1e-3, ge=0, description="learning rate of the network of the colours")
     rate_decay: float = Field(

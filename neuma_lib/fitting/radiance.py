@@ -143,10 +143,10 @@ class _Fit:
         self.halvings = [round(part * settings.iterations) for part in settings.halvings]
         self.order: list[int] = []
         self.losses: list[float] = []
-        lattice = _around(visual_hull(images[..., 3], cameras, settings.hull_resolution), settings.voxel)
+        lattice = _around(visual_hull(images[..., 3], cameras, settings.hull_resolution), settings)
         with torch.random.fork_rng(devices=[]):  # of the network
             torch.manual_seed(seed)
-            field = RadianceField(lattice, Opacity(settings.initial_opacity, settings.voxel))
+            field = RadianceField(lattice, Opacity(settings.initial_opacity, lattice.voxel))
         self._begin(field.to(images))
 
     def _begin(self, field: RadianceField) -> None:
@@ -156,7 +156,7 @@ class _Fit:
             [
                 {"params": list(parameters), "first_lr": rate}
                 for parameters, rate in (
-                    ([field.density], settings.rate_density),
+                    ([field.density], settings.rate_density * field.opacity.base_voxel / field.lattice.voxel),
                     ([field.features], settings.rate_features),
                     (field.network.parameters(), settings.rate_network),
                 )
@@ -168,20 +168,15 @@ class _Fit:
         """One Adam step."""
         settings = self.settings
         if iteration in self.halvings:
-            self._begin(self.field.halved(settings.least_opacity))
+            self._begin(self.field.halved())
         if not self.order:
             self.order = torch.randperm(len(self.rays), generator=self.generator).tolist()
         view = self.order.pop()
-        meeting = self.meeting[view]
-        if not len(meeting):
-            raise InputError(
-                "radiance field: a view does not see the unit cube, in which the object must lie"
-            )
-        chosen = meeting[
-            torch.randint(len(meeting), (settings.rays,), generator=self.generator).to(meeting.device)
-        ]
+        drawn = torch.randint(len(self.meeting[view]), (settings.rays,), generator=self.generator)
+        chosen = self.meeting[view][drawn.to(self.targets.device)]
         particles = self.field.particles(settings.spacing, settings.least_opacity, self.generator)
-        colours, passed = self.field.render(*particles.seen(), *(part[chosen] for part in self.rays[view]))
+        rays = (part[chosen] for part in self.rays[view])
+        colours, passed = self.field.render(*particles.seen(), *rays)
         loss = ((colours - self.targets[view, chosen]) ** 2).mean()
         doublings = math.floor(iteration / settings.iterations * settings.entropy_doublings)
         weight = min(settings.entropy_weight * 2**doublings, settings.entropy_most)
@@ -232,8 +227,11 @@ class _Fit:
         return state["iteration"]
 
 
-def _around(hull: Hull, voxel: float) -> Lattice:
-    """A lattice about the box of a visual hull, with the hull in the middle of it."""
+def _around(hull: Hull, settings: RadianceConfig) -> Lattice:
+    """The coarsest lattice, with the box of a visual hull in the middle of it."""
+    volume = float(hull.occupied.sum()) * hull.voxel**3
+    last = (volume / settings.particles) ** (1 / 3) / settings.spacing
+    voxel = settings.voxel or 2 ** len(settings.halvings) * last
     found = hull.occupied.nonzero()
     low, high = (hull.origin + hull.voxel * corner for corner in (found.amin(0), found.amax(0) + 1))
     cells = ((high - low) / voxel).ceil().clamp(min=1)

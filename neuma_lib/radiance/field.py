@@ -12,10 +12,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from neuma_lib.errors import InputError
 from neuma_lib.radiance.lattice import Lattice, from_particles, interpolate
 from neuma_lib.radiance.rendering import FEATURES, ColourNetwork, Opacity, render
 
+OCCUPIED = 1e-7
+"""A halved lattice keeps the nodes that have at least this part of the largest opacity, and those next to them
+(PAC-NeRF: this opacity)."""
 STIFFNESS_POWER = 3
 """Stiffness is that of the material times this power of a particle's opacity (PAC-NeRF's code)."""
 
@@ -81,22 +83,16 @@ class RadianceField(nn.Module):
         return torch.cat([self.density, self.features], dim=3)
 
     @torch.no_grad()
-    def occupied(self, least_opacity: float) -> Tensor:
-        """Nodes (X, Y, Z) in or next to a cell that holds particles, see `particles`.
-
-        Raises:
-            InputError: the density is not finite.
-        """
+    def occupied(self, least: float) -> Tensor:
+        """Nodes (X, Y, Z) that have at least a part of the largest opacity, and those next to them."""
         alphas = self.opacity(self.density[..., 0], 1.0)
-        if not alphas.isfinite().all():
-            raise InputError("radiance field: the density is not finite; lower radiance.rate_density")
         near = nn.functional.max_pool3d(alphas[None, None], kernel_size=3, stride=1, padding=1)[0, 0]
-        return near >= least_opacity * alphas.max()
+        return near >= least * alphas.max()
 
     @torch.no_grad()
-    def halved(self, least_opacity: float) -> RadianceField:
+    def halved(self) -> RadianceField:
         """The occupied part of the field on a lattice of half the voxel, with the same network."""
-        found, lattice = self.occupied(least_opacity).nonzero(), self.lattice
+        found, lattice = self.occupied(OCCUPIED).nonzero(), self.lattice
         low = found.amin(0).clamp(max=torch.tensor(lattice.nodes, device=found.device) - 2)
         spans = (found.amax(0) - low).clamp(min=1)
         origin = tuple(o + lattice.voxel * k for o, k in zip(lattice.origin, low.tolist(), strict=True))
