@@ -78,9 +78,7 @@ class RadianceConfig(Section):
         ge=0,
         description="weight of the particles' opacities times volume over voxel (authors: 1e-3, plasticine 1e-4)",
     )
-    held_out: int = Field(
-        10, ge=0, description="every how many-th view is kept for measurement only; 0 for none"
-    )
+    held_out: int = Field(10, ge=2, description="every how many-th view is kept for measurement only")
     checkpoint_every: int = Field(100, ge=1, description="iterations between two saves of the state")
 
     @model_validator(mode="after")

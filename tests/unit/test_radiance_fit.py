@@ -54,6 +54,15 @@ def test_particles_and_back_lose_at_most_one_decibel(fit):
     assert report.psnr > report.direct_psnr - 1
 
 
+@pytest.mark.slow
+def test_default_settings_reach_25_decibels_inside_the_object():
+    """On a finely textured body, as large and as near as those of the benchmark."""
+    cameras = raycast.sphere_cameras(50, 128)
+    _, report = fit_radiance_field(raycast.render(cameras, samples=2), cameras, RadianceConfig())
+    assert report.psnr_object > 25 and report.psnr > 25
+    assert report.psnr_object > report.direct_psnr_object - 1
+
+
 def test_particles_lie_in_the_body(fit):
     field, report = fit
     particles = field.particles(SMALL.spacing, SMALL.least_opacity)
@@ -155,6 +164,8 @@ def test_bad_input_is_named(duck):
     images[7, ..., 3] = 0
     with pytest.raises(InputError, match="view 7"):
         fit_radiance_field(images, cameras, SHORT)
+    with pytest.raises(InputError, match="held_out"):
+        fit_radiance_field(images[:1], cameras[:1], SHORT)
     with pytest.raises(ValueError, match="halvings"):
         RadianceConfig(halvings=(0.5, 0.2))
 
