@@ -11,7 +11,7 @@ class RadianceConfig(Section):
     """Voxel radiance field of the views at t = 0 (PAC-NeRF). What differs from the authors' values says so."""
 
     iterations: int = Field(
-        2000, ge=1, description="optimiser steps, each on one view (authors: 6001, plasticine 10001)"
+        1500, ge=1, description="optimiser steps, each on one view (authors: 6001, plasticine 10001)"
     )
     rays: int = Field(
         1024,
@@ -19,7 +19,7 @@ class RadianceConfig(Section):
         description="pixels of a step, at random among those whose ray meets the lattice (authors: 2^17 of 800 x 800)",
     )
     particles: int = Field(
-        4000, ge=1, description="about how many fill the visual hull at the end, which decides the voxel"
+        12000, ge=1, description="about how many fill the visual hull at the end, which decides the voxel"
     )
     voxel: float | None = Field(
         None,
