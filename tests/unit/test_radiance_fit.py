@@ -11,9 +11,14 @@ from neuma_lib.errors import InputError
 from neuma_lib.fitting.radiance import draw, fit_radiance_field
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.radiance import load_field, save_field
+from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.radiance.field import RadianceField
 from neuma_lib.radiance.lattice import Lattice, interpolate
-from neuma_lib.radiance.rendering import ColourNetwork, Opacity
+from neuma_lib.radiance.rendering import END_LIGHT, ColourNetwork, Opacity, camera_rays
+from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State
+from neuma_lib.splatting.cameras import Cameras, look_at
 
 SIZE = 64
 SMALL = RadianceConfig(iterations=300, rays=512, particles=2000, rate_density=2.0, held_out=8)
@@ -52,6 +57,41 @@ def test_particles_and_back_lose_at_most_one_decibel(fit):
     _, report = fit
     assert report.psnr_object > report.direct_psnr_object - 1
     assert report.psnr > report.direct_psnr - 1
+
+
+@pytest.mark.parametrize("wrt", ["log10 E", "velocity"])
+def test_gradient_from_a_picture_through_motion_to_the_law(wrt):
+    """What later stages descend on: a bounce on the floor, rendered, against central differences.
+
+    A node that gets its first particle jumps; the step of 1e-6 is far too small for that to happen here.
+    """
+    torch.manual_seed(0)
+    field = ball(radius=0.12, voxel=0.04, inside=20.0)
+    field.features.data = torch.randn_like(field.features)
+    particles = field.particles(1.0, 1e-3)
+    x0 = particles.x - torch.tensor([0.0, 0.33, 0.0]).double()
+    camera = Cameras(
+        look_at(torch.tensor([[0.5, 0.4, 1.4]]), torch.tensor([0.5, 0.15, 0.5]), torch.tensor([0.0, 1.0, 0.0])),
+        torch.tensor([[[24.0, 0, 8.0], [0, 24.0, 7.0], [0, 0, 1]]]), 16, 14,
+    ).to(dtype=torch.float64)  # fmt: skip
+    start = torch.tensor([5.0] if wrt == "log10 E" else [0.2, -2.0, 0.1]).double()
+    direction = torch.ones_like(start)
+
+    def picture(value):
+        E, v = (10**value, torch.tensor([0.2, -2.0, 0.1]).double()) if wrt == "log10 E" else (1e5, value)
+        law = analytic_law({"elasticity": {"name": "neo_hookean", "E": E, "nu": 0.3}})
+        state = State(x0, v, particles.masses(1000.0), particles.volumes())
+        path = rollout(MPMModel(grid=16, dt=1e-3), law, state, steps=60, frames=[60])
+        colours, passed = field.render(*particles.seen(path.x[0]), *camera_rays(camera, 0))
+        assert passed.min() > 2 * END_LIGHT  # no ray ends early, where the picture has small steps
+        weights = torch.linspace(-1, 1, colours.numel()).double().view_as(colours)
+        return (weights * colours).sum()
+
+    leaf = start.clone().requires_grad_()
+    exact = float(torch.autograd.grad(picture(leaf), leaf)[0] @ direction)
+    h = 1e-6
+    difference = float(picture(start + h * direction) - picture(start - h * direction)) / (2 * h)
+    assert abs(exact) > 1e-3 and abs(exact - difference) < 1e-5 * abs(difference)
 
 
 @pytest.mark.slow
