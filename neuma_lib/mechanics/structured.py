@@ -23,12 +23,14 @@ parts of the base's energy: no cycle gains or loses energy, but stresses need no
 
     t1 = (1 - a v) t,    q' = q - D,    t' = (1 - k D / q) t1 - d D,    D = a ramp(q - q_y) / (1 + m d),
     q_y = q0(n0) + m(n1) ramp(-t1),    a = 1 / (1 + r(n2)),
-    v = ramp(n3) / LIMIT,    k = ramp(-n4) / LIMIT,    d = 2 mu m / K ramp(n4) / LIMIT.
+    v = g(n3) / LIMIT,    k = g(-n4) / LIMIT,    d = 2 mu m / K g(n4) / LIMIT.
 
 Von Mises is m = r = 0, viscous flow r = viscosity / (mu dt), a Bingham fluid the same with q0 > 0. A granular base
 (``drucker_prager``) has a cohesion c(n0) instead of q0: q_y = m (3 c - t1), and beyond t1 = 3 c + d q it is torn to the
-tip of its cone, e' = c. A constant x > 0 of the base becomes x exp(n); one that is 0 becomes unit * ramp(n), so that a
-base without friction, rate or cohesion can learn some.
+tip of its cone, e' = c. A constant x > 0 of the base becomes x exp(n); one that is 0 becomes unit g(n), so that a base
+without friction, rate or cohesion can learn some. g(n), `from_zero`, rises from 0 for n <= 0 to LIMIT as an exponential
+does, since such constants lie orders of magnitude apart: v = 0.01 a step lets go all pressure within some hundred
+steps, and a fluid with a yield strain of 0.001 hardly flows. A first step of training must not take it there.
 
 The bases keep the volume (v = k = d = 0). A v that begins at some pressure is a crush cap, one that begins in tension
 a tensile strength, and k near 1 returns towards e = 0, as `CrushableFoam` does. t is the elastic part, so that a body
@@ -47,6 +49,7 @@ A last layer of zeros, where training starts and which an adaptor weight of 0 re
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Mapping
 from typing import Any
 
@@ -79,6 +82,7 @@ from neuma_lib.mechanics.plasticity import (
 from neuma_lib.mechanics.singular_values import rotation_and_singular_values
 from neuma_lib.mechanics.structured_kernels import (
     COHESION_UNIT,
+    GROWTH,
     INVARIANTS,
     LIMIT,
     LODE,
@@ -126,6 +130,11 @@ def invariants(strain: Tensor) -> Tensor:
     rounded = s + SMOOTH**2
     size = s / (rounded.sqrt() + SMOOTH)  # no difference of nearly equal numbers
     return torch.stack([trace, size, LODE * deviator.prod(1) / rounded], dim=1)
+
+
+def from_zero(n: Tensor) -> Tensor:
+    """g(n) = LIMIT expm1(GROWTH ramp(n)) / expm1(GROWTH LIMIT); its slope at n = 0 counts as that of n > 0."""
+    return LIMIT / math.expm1(GROWTH * LIMIT) * (GROWTH * n.clamp(min=0)).expm1()
 
 
 def _bend(x: Tensor) -> Tensor:
@@ -383,7 +392,7 @@ class StructuredPlasticity(StructuredConstitutive, Plasticity):
         threshold = _corrected(self.threshold, n[:, :1], COHESION_UNIT)
         friction = _corrected(self.friction, n[:, 1:2], 1.0)
         fluidity = 1 / (1 + _corrected(self.rate, n[:, 2:3], 1.0))
-        crush, dilation, compaction = (x.clamp(min=0) / LIMIT for x in (n[:, 3:4], n[:, 4:], -n[:, 4:]))
+        crush, dilation, compaction = (from_zero(x) / LIMIT for x in (n[:, 3:4], n[:, 4:], -n[:, 4:]))
         dilatancy = dilation * self.associated * friction
         eased = trace * (1 - fluidity * crush)
         if self.granular:
@@ -413,8 +422,8 @@ class StructuredPlasticity(StructuredConstitutive, Plasticity):
 
 
 def _corrected(constant: float, n: Tensor, unit: float) -> Tensor:
-    """constant exp(n), or unit ramp(n) for a constant that is zero; its slope at n = 0 counts as that of n > 0."""
-    return constant * n.exp() if constant > 0 else unit * n.clamp(min=0)
+    """constant exp(n), or unit g(n) for a constant that is zero."""
+    return constant * n.exp() if constant > 0 else unit * from_zero(n)
 
 
 def _sums(y: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:

@@ -534,8 +534,13 @@
 #endif
 
 // Principal stretches y after the return, where `changed`; growing, slopes of threshold, friction and rate by change;
-// share = D / q. Letters of structured.py: crush v, compaction k, dilatancy d, eased t1, after t'.
+// share = D / q. Letters of structured.py: crush v, compaction k, dilatancy d, eased t1, after t', from_zero g.
 //// plastic
+        auto from_zero = [&](const Pack& x, Pack& risen, Pack& slope) {
+            const Pack factor = exponential(GROWTH * (x > Real(0) ? x : zero));
+            risen = x > Real(0) ? RISE * (factor - Real(1)) : zero;
+            slope = x >= Real(0) ? GROWTH * RISE * factor : zero;
+        };
         Pack value[3], growing[3];
         for (int k = 0; k < 3; ++k) {
             const Real constant = k == 0 ? threshold_base : k == 1 ? friction_base : rate_base;
@@ -544,13 +549,18 @@
                 value[k] = constant * exponential(change[k]);
                 growing[k] = value[k];
             } else {
-                value[k] = change[k] > Real(0) ? unit * change[k] : zero;
-                growing[k] = change[k] >= Real(0) ? zero + unit : zero;
+                from_zero(change[k], value[k], growing[k]);
+                value[k] = unit * value[k];
+                growing[k] = unit * growing[k];
             }
         }
-        const Pack crush = (change[3] > Real(0) ? change[3] : zero) * (Real(1) / LIMIT);
-        const Pack dilation = (change[4] > Real(0) ? change[4] : zero) * (Real(1) / LIMIT);
-        const Pack compaction = (change[4] < Real(0) ? -change[4] : zero) * (Real(1) / LIMIT);
+        Pack crush, crush_slope, dilation, dilation_slope, compaction, compaction_slope;
+        from_zero(change[3], crush, crush_slope);
+        from_zero(change[4], dilation, dilation_slope);
+        from_zero(-change[4], compaction, compaction_slope);
+        crush = crush * (Real(1) / LIMIT);
+        dilation = dilation * (Real(1) / LIMIT);
+        compaction = compaction * (Real(1) / LIMIT);
         const Pack tiny = zero + LEAST;
         const Pack norm = SQRT(square > LEAST ? square : tiny), inverse_norm = one / norm;
         const Pack fluid = one / (one + value[2]), dilatancy = dilation * associated * value[1];
@@ -620,9 +630,9 @@
             g_change[0] = (kind == GRANULAR ? (torn ? total : Real(-3) * g_pressed) : g_limit) * growing[0];
             g_change[1] = (g_limit * pressure + g_held * dilatancy + g_dilatancy * dilation * associated) * growing[1];
             g_change[2] = -(g_fluid * fluid * fluid * growing[2]);
-            g_change[3] = change[3] >= Real(0) ? g_eased * trace * fluid * (Real(-1) / LIMIT) : zero;
-            g_change[4] = (change[4] >= Real(0) ? g_dilatancy * associated * value[1] : zero) * (Real(1) / LIMIT)
-                + (change[4] <= Real(0) ? g_after * eased * share : zero) * (Real(1) / LIMIT);
+            g_change[3] = g_eased * trace * fluid * crush_slope * (Real(-1) / LIMIT);
+            g_change[4] = (g_dilatancy * associated * value[1] * dilation_slope
+                           + g_after * eased * share * compaction_slope) * (Real(1) / LIMIT);
             for (int k = 0; k < 3; ++k) {
                 const Pack straight = torn ? zero : scale * (ga[k] - total * THIRD_PART);
                 g_s[k] = rate[k] * (g_trace + straight + g_norm * inverse_norm * dev[k]);

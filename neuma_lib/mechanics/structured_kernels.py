@@ -24,6 +24,9 @@ WIDTH = 16
 INVARIANTS = 3
 LIMIT = 3.0
 """Bound of the network's outputs: it changes a constant by a factor of at most exp(3) = 20."""
+GROWTH = 2.0
+"""Rate at which what a base lacks grows with an output: at 0.05, as a first optimiser step leaves it, a share of
+the trace relaxes within some 4000 steps, and a cohesion or yield strain of zero becomes 2e-5."""
 STRAIN = 0.1
 """Strain that counts as one for the network."""
 SMOOTH = 0.05
@@ -31,7 +34,7 @@ SMOOTH = 0.05
 LODE = 3 * math.sqrt(6)
 """|det dev e| is at most |dev e|^3 / LODE."""
 COHESION_UNIT = 0.02
-"""Strain that a network output of one adds to a cohesion or yield strain of zero."""
+"""Strain that g = 1 adds to a cohesion or yield strain of zero; g is at most LIMIT."""
 KINDS = {"stretch": 3, "energy": 2, "return": 5}
 """Kernels there are, with the outputs of their networks: the two forms of elasticity, and plasticity."""
 BASES = ("hencky", "neo_hookean", "fixed_corotated")
@@ -85,6 +88,8 @@ def _constants(kind: str, dtype: torch.dtype) -> str:
         "STRAIN": STRAIN,
         "LIMIT": LIMIT,
         "COHESION_UNIT": COHESION_UNIT,
+        "GROWTH": GROWTH,
+        "RISE": LIMIT / math.expm1(GROWTH * LIMIT),
         "THIRD_PART": 1 / 3,
         "ATANH_SQUARE": 0.03,
         "EPS": torch.finfo(dtype).eps,

@@ -130,6 +130,24 @@ def test_a_correction_may_stiffen_beyond_the_limit_where_training_may_begin(prob
     assert train_material(MODEL, law, body.state(V0), loss, how, stretch=Stretch(before=2)).stable
 
 
+@pytest.mark.parametrize("viscosity", [20.0, 60.0])
+def test_the_first_step_on_a_fluid_that_is_too_viscous_lowers_the_loss(viscosity):
+    """It also gives the fluid a yield stress and lets its volume go, which must not undo what it gains."""
+    body, elasticity = ball(), {"name": "hencky", "E": 5e4, "nu": 0.3}
+
+    def spec(factor):
+        flow = {"name": "viscous_flow", "viscosity": factor * viscosity}
+        return {"elasticity": elasticity, "plasticity": flow}
+
+    law = structured_law(spec(1.08), MODEL.dt).double()
+    law.attach_adaptor(rank=None)
+    how = MaterialConfig(iterations=2, rank=None, lr_elastic=0.02, lr_plastic=0.04)
+    loss = PixelLoss(body, observe(body, V0, FRAMES, spec(1.0)))
+    trained = train_material(MODEL, law, body.state(V0), loss, how, stretch=Stretch(after=24))
+    first, second = trained.history.loss
+    assert second < first and not trained.history.recoveries
+
+
 def test_a_law_that_nothing_improves_stays_exactly_as_it_is(problem):
     """The video is that of the law itself."""
     trained, choice = fit(problem, TRUTH, log=lambda _: None)

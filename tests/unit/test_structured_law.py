@@ -14,7 +14,16 @@ from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.isotropic import PAIRS, lame
 from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.mechanics.plasticity import CohesiveDruckerPrager, hencky_strain
-from neuma_lib.mechanics.structured import FORMS, LIMIT, SMOOTH, invariants, network, structured_law
+from neuma_lib.mechanics.structured import (
+    FORMS,
+    GROWTH,
+    LIMIT,
+    SMOOTH,
+    from_zero,
+    invariants,
+    network,
+    structured_law,
+)
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
@@ -251,6 +260,17 @@ def constant_outputs(part, *n):
     return weights
 
 
+def risen_to(share):
+    """The output from which g is that share of its largest value."""
+    return math.log1p(share * math.expm1(GROWTH * LIMIT)) / GROWTH
+
+
+def test_what_grows_from_zero_begins_slowly_and_ends_at_the_limit():
+    n = torch.tensor([-1.0, 0.0, 0.05, risen_to(0.3), LIMIT], dtype=torch.float64)
+    expected = torch.tensor([0.0, 0.0, LIMIT * 2.6e-4, 0.3 * LIMIT, LIMIT], dtype=torch.float64)
+    torch.testing.assert_close(from_zero(n), expected, rtol=6e-3, atol=0)
+
+
 @pytest.mark.parametrize("name", RETURNS)
 def test_return_at_the_ends_of_its_outputs(name):
     """All outputs as large as they get, in all combinations of signs: no energy is added, all gradients are finite."""
@@ -284,26 +304,26 @@ def test_grains_that_dilate_are_contained(dilation):
         E=E, nu=NU, friction_angle=friction, cohesion=pressure, dilation_angle=dilation
     )
     sigma = spread_stretches()
-    weights = constant_outputs(part, 0.0, 0.0, 0.0, 0.0, LIMIT * alpha(dilation) / alpha(friction))
+    weights = constant_outputs(part, 0.0, 0.0, 0.0, 0.0, risen_to(alpha(dilation) / alpha(friction)))
     value, expected = part.principal(sigma, weights)[0], truth.principal(sigma, **truth.values)
     assert float((value - expected).abs().max()) < 64 * EPS * float(expected.max())
 
 
 @pytest.mark.parametrize("name", ["von_mises", "viscous_flow"])
 def test_pressure_and_tension_relax_by_their_share(name):
-    """A constant output n3 relaxes a share n3 / LIMIT of t at the rate of the shear, without any shear."""
+    """A constant output n3 relaxes a share g(n3) / LIMIT of t at the rate of the shear, without any shear."""
     part, share = plasticity(name), 0.4
     sigma = torch.tensor([[0.8, 0.8, 0.8], [1.3, 1.3, 1.3]], dtype=torch.float64)
-    after = part.principal(sigma, constant_outputs(part, 0.0, 0.0, 0.0, LIMIT * share, 0.0))[0]
+    after = part.principal(sigma, constant_outputs(part, 0.0, 0.0, 0.0, risen_to(share), 0.0))[0]
     expected = (1 - share / (1 + part.rate)) * sigma.log()
     torch.testing.assert_close(after.log(), expected, rtol=1e-13, atol=0)
 
 
 def test_shear_compacts_by_its_share():
-    """n4 < 0: t falls by the share of q that relaxes, times -n4 / LIMIT; with 1 the return would be radial to 0."""
+    """n4 < 0: t falls by the share of q that relaxes, times g(-n4) / LIMIT; with 1 the return would be radial to 0."""
     part, share = plasticity("von_mises"), 0.9
     sigma = torch.tensor([[1.0, 0.8, 0.7], [1.3, 1.1, 0.9]], dtype=torch.float64)
-    after = part.principal(sigma, constant_outputs(part, 0.0, 0.0, 0.0, 0.0, -LIMIT * share))[0]
+    after = part.principal(sigma, constant_outputs(part, 0.0, 0.0, 0.0, 0.0, -risen_to(share)))[0]
     (trace, _, q), (trace_after, _, q_after) = hencky_strain(sigma), hencky_strain(after)
     torch.testing.assert_close(q_after, torch.full_like(q, part.threshold), rtol=1e-12, atol=0)
     torch.testing.assert_close(trace_after, trace * (1 - share * (1 - q_after / q)), rtol=1e-12, atol=0)
@@ -518,7 +538,7 @@ def test_adjoint_against_differences(name):
 
 @pytest.mark.parametrize("name", RETURNS)
 def test_what_a_base_does_not_have_can_be_learned(name):
-    """The slopes of the ramps at a last layer of zeros count, so that training starts."""
+    """The slopes of g at a last layer of zeros count, so that training starts."""
     part = plasticity(name)
     F = deformations(200)
     grads = part.vjp(F, weights_of(part), F)[1]
