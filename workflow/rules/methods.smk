@@ -121,6 +121,15 @@ def springs_settings(wildcards):
 
 
 @checked
+def fitted_springs(wildcards):
+    """The springs of a scene, or of the scene of an experiment's one body."""
+    scenes = SETTINGS.body_scenes(subject(wildcards))
+    if len(scenes) > 1:
+        raise without_law(wildcards.method)
+    return f"{RESULTS}/{SETTINGS.run_folder(scenes[0], wildcards.method)}/springs.safetensors"
+
+
+@checked
 def true_law(wildcards):
     """The scene's own law, where this is what a method evaluates."""
     return SETTINGS.true_law(wildcards.scene, wildcards.method) or []

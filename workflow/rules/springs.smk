@@ -7,15 +7,6 @@ ruleorder: springs_evaluation > evaluation
 ruleorder: springs_experiment > experiment
 
 
-@checked
-def fitted_springs(wildcards):
-    """The springs of a scene, or of the scene of an experiment's one body."""
-    scenes = SETTINGS.body_scenes(subject(wildcards))
-    if len(scenes) > 1:
-        raise without_law(wildcards.method)
-    return f"{RESULTS}/{SETTINGS.run_folder(scenes[0], wildcards.method)}/springs.safetensors"
-
-
 rule springs:
     input:
         **body_files(),
