@@ -45,6 +45,8 @@ rule evaluation:
     output:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
         metrics=f"{RESULTS}/{{scene}}/{{method}}/metrics.json",
+    wildcard_constraints:
+        method=LAW_METHOD,
     resources:
         gpu=GPU,
     params:

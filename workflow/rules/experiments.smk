@@ -66,6 +66,8 @@ rule experiment:
     output:
         rollout=f"{RESULTS}/experiments/{{experiment}}/{{method}}/rollout.h5",
         metrics=f"{RESULTS}/experiments/{{experiment}}/{{method}}/metrics.json",
+    wildcard_constraints:
+        method=LAW_METHOD,
     resources:
         gpu=GPU,
     params:

@@ -63,6 +63,13 @@ wildcard_constraints:
     views="[0-9]+(,[0-9]+)*",
 
 
+# Methods without a law of a material have rules of their own beside those of evaluation.
+SPRING_METHOD = (
+    f"({'|'.join(name for name in SETTINGS.methods if SETTINGS.is_springs(name)) or 'none'})([+][^/]*)?"
+)
+LAW_METHOD = f"(?!{SPRING_METHOD}/)({'|'.join(SETTINGS.methods) or 'none'})([+][^/]*)?"
+
+
 def kernels(*groups):
     """Files that say that groups of Warp kernels are compiled; `laws` brings `simulation` with it."""
     return [f"{KERNELS}/{group}.ready" for group in groups]

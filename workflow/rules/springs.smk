@@ -1,11 +1,5 @@
 """Bodies of springs (Spring-Gaus): fitted and judged in place of a material law. Needs methods.smk."""
 
-SPRING_METHODS = "|".join(name for name in SETTINGS.methods if SETTINGS.is_springs(name)) or "none"
-
-
-ruleorder: springs_evaluation > evaluation
-ruleorder: springs_experiment > experiment
-
 
 rule springs:
     input:
@@ -17,7 +11,7 @@ rule springs:
         springs=f"{RESULTS}/{{scene}}/{{method}}/springs.safetensors",
         history=f"{RESULTS}/{{scene}}/{{method}}/history.json",
     wildcard_constraints:
-        method=f"({SPRING_METHODS})([+][^/]*)?",
+        method=SPRING_METHOD,
     resources:
         gpu=GPU,
     params:
@@ -43,7 +37,7 @@ rule springs_evaluation:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
         metrics=f"{RESULTS}/{{scene}}/{{method}}/metrics.json",
     wildcard_constraints:
-        method=f"({SPRING_METHODS})([+][^/]*)?",
+        method=SPRING_METHOD,
     resources:
         gpu=GPU,
     params:
