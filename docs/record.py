@@ -51,6 +51,7 @@ MADE_BY = {
     "outside": "results/outside.csv",
     "identified": "results/identified.csv",
     "bias": "results/bias.csv",
+    "table1_systems": "results/table1_systems.csv",
 }
 """Tables that are recorded, and the target of Snakemake that makes them."""
 VERDICT_HEAD = f"| {' | '.join(VERDICTS[:2])} |"
