@@ -126,7 +126,7 @@ def test_tables_that_are_not_recorded_are_named(project, monkeypatch):
     _, page = recorded(project, monkeypatch)
     missing = page[page.index("Not recorded: ") :].partition(".\n")[0]
     assert "finer_truth (`snakemake results/finer_truth.csv`), random (`snakemake random`)" in missing
-    assert "table1" not in missing and "finer_truth](" not in page and "random](" not in page
+    assert "table1 (" not in missing and "finer_truth](" not in page and "random](" not in page
     whole = dict.fromkeys(record.MADE_BY, f"{record.VERDICT_HEAD} here |\n|---|---|---|\n")
     assert "ecorded" not in record.verdicts(whole)
     assert "older version, without verdicts: table2." in record.verdicts(whole | {"table2": "- Holds: ..."})
