@@ -399,9 +399,14 @@ class Config(Section):
         """Effective material settings: the section, changed by the scene, then the method, then its variant.
 
         The scene is that of the law (`law_scene`). The seed of the scene's chain is added to the one that these give.
+
+        Raises:
+            InputError: a variant with settings of another kind of law, or a structured law without training.
         """
         base, variant = parse_method(self.method_training(method), self.methods)
         scene = self.law_scene(scene, method)
+        for law in ("structured", "springs"):
+            self._of_law(law, getattr(self, law), method)  # refuses settings that only those methods have
         section = self.material
         for changes, origin in (
             (self.scene(scene).material, f"scenes.{scene}.material"),

@@ -224,9 +224,8 @@ def train_material(
     """
     videos = [(start, loss), *further]
     stretch = stretch or Stretch()
-    if (
-        not stretch.before
-    ):  # what was trained may pass the limit, which leaves a margin: a step too far is taken back
+    # What was trained may pass the limit, which leaves a margin: a step too far is taken back.
+    if not stretch.before:
         model.check_courant(law, min(float(start.density.min()) for start, _ in videos))
     loop = _Loop(model, law, videos, settings, log, stretch)
     if checkpoint is not None and (state := checkpoint.load()) is not None:

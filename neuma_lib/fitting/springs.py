@@ -11,7 +11,7 @@ import copy
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from statistics import median
 
 import torch
@@ -244,7 +244,7 @@ class _Loop:
     def _restore(self, state: dict) -> None:
         self.springs.load_state_dict(state["springs"])
         self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
-        self.model = SpringModel(**{**self.model.__dict__, "substeps": state["substeps"]})
+        self.model = replace(self.model, substeps=state["substeps"])
 
     def _recover(self, error: NonFiniteError) -> None:
         """Return to the best state with half the rates; after too many returns the fit ends there."""

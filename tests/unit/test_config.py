@@ -256,6 +256,18 @@ class TestVariants:
             loaded.method_structured(method)
 
     @pytest.mark.parametrize(
+        ("method", "law", "key"),
+        [
+            ("neuma+anchors=50", "springs", "anchors"),
+            ("neuma+form=energy", "structured", "form"),
+            ("spring_gaus+margin=0", "structured", "margin"),
+        ],
+    )
+    def test_settings_of_another_kind_of_law_are_refused_by_every_method(self, loaded, method, law, key):
+        with pytest.raises(InputError, match=f"its law is not {law}, leave out {key}"):
+            loaded.method_material("BouncyBall", method)
+
+    @pytest.mark.parametrize(
         ("method", "message"),
         [
             ({"structured": {"margin": 0.1}}, "only a method with law: structured"),
