@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from neuma_lib.config.base import Section
 from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.pac_nerf import PacNerfConfig
 from neuma_lib.config.springs import SpringsConfig
 from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.config.variants import split_variant
@@ -25,12 +26,13 @@ class MethodConfig(Section):
     """A method is a set of options over the same code."""
 
     title: str = Field(description="name in tables")
-    law: Literal["learned", "structured", "true", "identified", "springs"] = Field(
+    law: Literal["learned", "structured", "true", "identified", "springs", "pac_nerf"] = Field(
         "learned",
         description="learned: the paper's networks; structured: a correction of the prior's analytic law that keeps "
         "the structure of a material; true: the scene's own law on the reconstruction, the yardstick; identified: the "
         "analytic law that the stage `identify` found in the video. The last two are not trained. springs: no law of a "
-        "material, but a network of springs in the body (Spring-Gaus)",
+        "material, but a network of springs in the body (Spring-Gaus). pac_nerf: the analytic law, and the throw, that "
+        "PAC-NeRF found in the video; its settings are those of the section pac_nerf",
     )
     prior: str | None = Field(
         None,
@@ -55,6 +57,9 @@ class MethodConfig(Section):
     springs: dict[str, Any] = Field(
         {}, description="settings of the section springs that a method with springs changes"
     )
+    pac_nerf: dict[str, Any] = Field(
+        {}, description="settings of the section pac_nerf that a method with PAC-NeRF's law changes"
+    )
 
     @model_validator(mode="after")
     def _fits_its_law(self) -> MethodConfig:
@@ -67,7 +72,7 @@ class MethodConfig(Section):
             raise ValueError(
                 "law: a structured law without training is its analytic law, choose law: identified"
             )
-        for section in ("structured", "springs"):
+        for section in ("structured", "springs", "pac_nerf"):
             if self.law != section and getattr(self, section):
                 raise ValueError(f"{section}: only a method with law: {section} has these settings")
         return self
@@ -76,13 +81,14 @@ class MethodConfig(Section):
 def parse_method(text: str, methods: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     """Split a method's folder name, ``neuma+rank=4+seed=2``, into its base and its settings.
 
-    Keys are those of the sections ``material``, ``structured`` and ``springs``, ``prior``, and ``law_from``, a scene.
+    Keys are those of the sections ``material``, ``structured``, ``springs`` and ``pac_nerf``, ``prior``, and
+    ``law_from``, a scene.
     Values are YAML scalars; a comma makes a list.
 
     Raises:
         InputError: unknown method or key, a repeated key, or a piece without '='.
     """
-    sections = (MaterialConfig, StructuredConfig, SpringsConfig)
+    sections = (MaterialConfig, StructuredConfig, SpringsConfig, PacNerfConfig)
     keys = [*(key for section in sections for key in section.model_fields), "prior", LAW_FROM]
     base, given = split_variant(text, methods, keys, "method")
     variant: dict[str, Any] = {}

@@ -24,6 +24,7 @@ from neuma_lib.config.geometry import GeometryConfig
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.methods import IDENTIFIED, LAW_FROM, MethodConfig, parse_method, variant_title
+from neuma_lib.config.pac_nerf import PacNerfConfig
 from neuma_lib.config.priors import PriorsConfig
 from neuma_lib.config.radiance import RadianceConfig
 from neuma_lib.config.random_scenes import RandomConfig, draw_scenes
@@ -37,7 +38,7 @@ from neuma_lib.config.variants import DRAWN, folder, parse_chain
 from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.errors import InputError
 
-Changed = TypeVar("Changed", MaterialConfig, StructuredConfig, SpringsConfig)
+Changed = TypeVar("Changed", MaterialConfig, StructuredConfig, SpringsConfig, PacNerfConfig)
 
 TRUTH_DRAWS = ("the particles", "the tracers", "the second tracers")
 """What the seeds dataset.seed, dataset.seed + 1 and dataset.seed + 2 draw, see `neuma_lib.data.ground_truth`."""
@@ -72,6 +73,7 @@ class Config(Section):
         StructuredConfig(), description="laws with the structure of a material"
     )
     springs: SpringsConfig = Field(SpringsConfig(), description="bodies of springs")
+    pac_nerf: PacNerfConfig = Field(PacNerfConfig(), description="velocity and constants of PAC-NeRF")
     evaluation: EvaluationConfig = Field(EvaluationConfig(), description="measures and videos")
     figures: FiguresConfig = Field(FiguresConfig(), description="figures")
     methods: dict[str, MethodConfig] = Field({}, description="methods by name")
@@ -107,12 +109,13 @@ class Config(Section):
             _changed(self.material, method.material, f"methods.{name}.material")
             _changed(self.structured, method.structured, f"methods.{name}.structured")
             _changed(self.springs, method.springs, f"methods.{name}.springs")
+            _changed(self.pac_nerf, method.pac_nerf, f"methods.{name}.pac_nerf")
             self._known_prior(method.prior, f"methods.{name}.prior")
             own = [known for known, entry in self.methods.items() if entry.trained_as is None]
             if method.trained_as not in (None, *own):
                 unknown = f"no method '{method.trained_as}' with a training of its own"
                 raise ValueError(f"methods.{name}.trained_as: {unknown}{hint(method.trained_as, own)}")
-            for key in ("material", "structured", "springs", "prior") if method.trained_as else ():
+            for key in ("material", "structured", "springs", "pac_nerf", "prior") if method.trained_as else ():
                 if getattr(method, key):
                     raise ValueError(
                         f"methods.{name}.{key}: that of '{method.trained_as}' counts; leave it out"
@@ -275,6 +278,10 @@ class Config(Section):
         """Whether a method evaluates the analytic law that was identified in the video."""
         return self.methods[parse_method(method, self.methods)[0]].law == "identified"
 
+    def is_pac_nerf(self, method: str) -> bool:
+        """Whether a method evaluates the analytic law, and the throw, that PAC-NeRF found in the video."""
+        return self.methods[parse_method(method, self.methods)[0]].law == "pac_nerf"
+
     def identified_views(self, scene: str, method: str) -> tuple[int, ...] | None:
         """Views that a method's law is identified in, if it trains on others than methods do by default; None: those
         of ``identify.views``."""
@@ -434,6 +441,10 @@ class Config(Section):
         if found and self._law_from(method):
             raise InputError(f"{method}: springs are those of the scene's own body; leave out {LAW_FROM}")
         return found
+
+    def method_pac_nerf(self, method: str) -> PacNerfConfig | None:
+        """The same of a method with PAC-NeRF's law."""
+        return self._of_law("pac_nerf", self.pac_nerf, method)
 
     def _of_law(self, law: str, section: Changed, method: str) -> Changed | None:
         """Settings that only methods with one kind of law have."""

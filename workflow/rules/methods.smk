@@ -61,7 +61,8 @@ def material_prior(wildcards):
     """The networks that a method starts from; none where its law is analytic, or corrects an analytic one."""
     if SETTINGS.is_springs(wildcards.method):
         raise without_law(wildcards.method)
-    analytic = SETTINGS.is_identified(wildcards.method) or SETTINGS.is_structured(wildcards.method)
+    kinds = (SETTINGS.is_identified, SETTINGS.is_structured, SETTINGS.is_pac_nerf)
+    analytic = any(is_kind(wildcards.method) for is_kind in kinds)
     if analytic or SETTINGS.true_law(wildcards.scene, wildcards.method):
         return []
     return prior_file(SETTINGS.law_scene(wildcards.scene, wildcards.method), wildcards.method)
@@ -99,6 +100,12 @@ def identify_settings(wildcards):
     return SETTINGS.identify.plain() | ({"views": [int(view) for view in views.split(",")]} if views else {})
 
 
+def pac_nerf_file(wildcards):
+    """The law that PAC-NeRF found in the video of the scene that a method's law is from."""
+    scene = SETTINGS.law_scene(wildcards.scene, wildcards.method)
+    return f"{RESULTS}/{SETTINGS.run_folder(scene, SETTINGS.method_training(wildcards.method))}/constants.json"
+
+
 @checked
 def identified_base(wildcards):
     """The law that was identified in a scene's video, where this is what a structured method corrects."""
@@ -130,6 +137,12 @@ def fitted_springs(wildcards):
 
 
 @checked
+def pac_nerf_settings(wildcards):
+    """Settings of a method with PAC-NeRF's law."""
+    return SETTINGS.method_pac_nerf(wildcards.method).plain()
+
+
+@checked
 def true_law(wildcards):
     """The scene's own law, where this is what a method evaluates."""
     return SETTINGS.true_law(wildcards.scene, wildcards.method) or []
@@ -137,7 +150,9 @@ def true_law(wildcards):
 
 @checked
 def identified_law(wildcards):
-    """The law that was identified in a scene's video, where this is what a method evaluates."""
+    """The law that was identified in a scene's video, by us or by PAC-NeRF, where this is what a method evaluates."""
+    if SETTINGS.is_pac_nerf(wildcards.method):
+        return pac_nerf_file(wildcards)
     if not SETTINGS.is_identified(wildcards.method):
         return []
     return identified_file(wildcards)
@@ -182,12 +197,14 @@ def judged_carrier(wildcards):
 
 @checked
 def start_name(wildcards):
-    """The file that tells a method how bodies are thrown."""
+    """The file of a scene's chain that tells a method how bodies are thrown."""
     identified = material_settings(wildcards)["start"] == "identified"
     return identified_name(wildcards.scene, wildcards.method) if identified else "velocity.json"
 
 
 def start_file(wildcards):
+    if SETTINGS.is_pac_nerf(wildcards.method):
+        return f"{RESULTS}/{SETTINGS.run_folder(wildcards.scene, wildcards.method)}/constants.json"
     return of_chain(start_name(wildcards))(wildcards)
 
 

@@ -1,4 +1,7 @@
-"""PAC-NeRF, with which we compare: its voxel radiance field of the views at t = 0."""
+"""PAC-NeRF, with which we compare: its voxel radiance field of the views at t = 0, then velocity and constants. Needs
+methods.smk."""
+
+PAC_NERF_METHODS = "|".join(name for name in SETTINGS.methods if SETTINGS.is_pac_nerf(name)) or "none"
 
 
 rule radiance_field:
@@ -18,3 +21,30 @@ rule radiance_field:
         device=SETTINGS.device,
     script:
         "../scripts/radiance_field.py"
+
+
+rule pac_nerf:
+    input:
+        kernels=kernels("laws", "radiance"),
+        field=of_chain("pac_nerf/field.safetensors"),
+        transforms=of_scene("dynamic/transforms.json"),
+        velocity=of_chain("velocity.json"),
+    output:
+        constants=f"{RESULTS}/{{scene}}/{{method}}/constants.json",
+        history=f"{RESULTS}/{{scene}}/{{method}}/history.json",
+    wildcard_constraints:
+        method=f"({PAC_NERF_METHODS})([+][^/]*)?",
+    resources:
+        gpu=GPU,
+    params:
+        simulation=simulation_settings,
+        density=method_density,
+        views=lambda wildcards: material_settings(wildcards)["views"],
+        radiance={key: SETTINGS.radiance.plain()[key] for key in ("spacing", "least_opacity")},
+        pac_nerf=pac_nerf_settings,
+        prior=stock_law,
+        seed=SETTINGS.seed,
+        checkpoint=lambda wildcards: f"{RESULTS}/{wildcards.scene}/{wildcards.method}/checkpoint.pt",
+        device=SETTINGS.device,
+    script:
+        "../scripts/pac_nerf.py"

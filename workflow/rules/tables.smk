@@ -89,6 +89,12 @@ def table_records(table):
         scene = SETTINGS.law_scene(pair.scene, pair.method)
         own = Path(home(scene, "identified.json"))
         networks = material_prior(pair) == f"{own.parent}/priors/identified.safetensors"
+        if SETTINGS.is_pac_nerf(pair.method):
+            fitted = {"scene": scene, "method": SETTINGS.method_training(pair.method)}
+            field = {"scene": Path(home(scene, "pac_nerf/field.safetensors")).parent.parent.name}
+            laws += [("kernels", {"group": "radiance"}), ("radiance_field", field), ("pac_nerf", fitted)]
+            priors += [prior_file(pair.scene)]
+            continue
         identified = identified_law(pair) or identified_base(pair) or (networks and own)
         trained = trained_adaptor(pair)
         laws += [("identified_prior", {"scene": own.parent.name})] if networks else []

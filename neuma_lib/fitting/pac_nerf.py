@@ -1,0 +1,467 @@
+"""Velocity and constants of a named family of laws from a video: the later stages of PAC-NeRF (Li et al. 2023, Sec. 3.3).
+
+A radiance field stays as the first stage has left it. Particles carry it: first one velocity for all of them is found
+in frames before contact, by L-BFGS; then the constants of the law, by Adam, first in the frames until a little after
+contact, then in all. Every picture goes through the simulation, back to a lattice and along rays, and gradients go the
+same way back. Constants are stored as the authors store them: moduli, yield stress and viscosity as log10, Poisson's
+ratio as x with nu = 0.45 tanh(x / 0.45), the friction angle in degrees.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuma_lib.config.pac_nerf import MODULI, PacFamilyConfig, PacNerfConfig
+from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.io.checkpoint import Checkpoint
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.density import Density, density_at
+from neuma_lib.mechanics.isotropic import lame
+from neuma_lib.mechanics.law import Law
+from neuma_lib.radiance.field import RadianceField
+from neuma_lib.radiance.lattice import Lattice
+from neuma_lib.radiance.rendering import camera_rays
+from neuma_lib.sim.model import COURANT_LIMIT, MPMModel
+from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State
+from neuma_lib.splatting.observation import Observation
+from neuma_lib.springs.interpolation import Interpolation
+
+POISSON_MOST = 0.45
+"""Bound on Poisson's ratio (PAC-NeRF)."""
+ANGLES = (0.5, 85.0)
+"""Friction angles that a law is given [degrees]; the authors have no bounds, but a cone needs some."""
+MOST_HALVINGS = 4
+"""Times that a time step is halved before a rollout counts as unstable."""
+LEAST_STEP = 1e-3
+"""L-BFGS ends where a step changes no component of the velocity by more than this [m/s] (PAC-NeRF)."""
+HISTORY = 20
+"""Steps that L-BFGS remembers (PAC-NeRF)."""
+
+
+class FamilyConstants(torch.nn.Module):
+    """The constants of a family of laws, those that are fitted as parameters.
+
+    Args:
+        family: parts of the law with the constants of the stock guess, and which are fitted.
+        known: constants to start from instead, by name, where the family has them.
+
+    Raises:
+        InputError: a guess that the parametrisation cannot hold.
+    """
+
+    def __init__(self, family: PacFamilyConfig, known: Mapping[str, float] | None = None):
+        super().__init__()
+        spec = family.plain()
+        del spec["fitted"]
+        self.spec: dict[str, dict[str, Any]] = spec
+        self.fitted = family.fitted
+        for part in spec.values():
+            part.update({name: (known or {}).get(name, value) for name, value in part.items() if name != "name"})
+        analytic_law(spec, dt=1.0)  # names unknown parts and constants, and those out of range
+        E, nu = (spec["elasticity"][name] for name in ("E", "nu"))
+        mu, _ = lame(E, nu)
+        start = {**spec["plasticity"], "E": E, "nu": nu, "mu": mu, "kappa": E / (3 * (1 - 2 * nu))}
+        self.fixed = {name: start[name] for name in MODULI}
+        self.stored = torch.nn.ParameterDict({
+            name: torch.nn.Parameter(torch.tensor(_to_stored(name, start[name]), dtype=torch.float64))
+            for name in self.fitted
+        })  # fmt: skip
+
+    def values(self) -> dict[str, Tensor]:
+        """What is fitted, as the law's own constants, differentiable."""
+        found = {name: _from_stored(name, self.stored[name]) for name in self.fitted}
+        if set(MODULI) & set(found):
+            mu, kappa = (found.pop(name, self.fixed[name]) for name in MODULI)
+            found["E"] = 9 * kappa * mu / (3 * kappa + mu)
+            found["nu"] = (3 * kappa - 2 * mu) / (2 * (3 * kappa + mu))
+        return found
+
+    def law(self, dt: float, device: torch.device | str = "cpu") -> Law:
+        """The law, differentiable with respect to what is fitted; dt [s] counts where it depends on the rate."""
+        values = {name: value.to(device) for name, value in self.values().items()}
+        return analytic_law(self._filled(values), dt=dt)
+
+    @torch.no_grad()
+    def specification(self) -> dict[str, dict[str, Any]]:
+        """Names and constants as numbers, as `analytic_law` takes them."""
+        return self._filled({name: float(value) for name, value in self.values().items()})
+
+    def groups(self, settings: PacNerfConfig) -> list[dict[str, Any]]:
+        """Groups of parameters with their learning rates, for an optimiser."""
+        rates = {
+            **dict.fromkeys(("E", *MODULI), settings.rate_modulus),
+            "nu": settings.rate_poisson,
+            "yield_stress": settings.rate_yield,
+            "viscosity": settings.rate_viscosity,
+            "friction_angle": settings.rate_angle,
+        }
+        return [{"params": [self.stored[name]], "first_lr": rates[name]} for name in self.fitted]
+
+    def _filled(self, values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+        return {
+            part: {name: values.get(name, value) for name, value in given.items()}
+            for part, given in self.spec.items()
+        }
+
+
+def _to_stored(name: str, value: float) -> float:
+    if name == "friction_angle":
+        return value
+    if name == "nu":
+        if not abs(value) < POISSON_MOST:
+            raise InputError(f"pac_nerf: a Poisson's ratio of {value:g} cannot be fitted, only one below {POISSON_MOST}")
+        return POISSON_MOST * math.atanh(value / POISSON_MOST)
+    if not value > 0:
+        raise InputError(f"pac_nerf: {name} = {value:g} cannot be fitted, it must be positive")
+    return math.log10(value)
+
+
+def _from_stored(name: str, stored: Tensor) -> Tensor:
+    if name == "friction_angle":
+        return stored.clamp(*ANGLES)
+    if name == "nu":
+        return POISSON_MOST * torch.tanh(stored / POISSON_MOST)
+    return 10**stored
+
+
+def choose_family(
+    settings: PacNerfConfig, prior: Mapping[str, Mapping[str, Any]] | None
+) -> tuple[str, FamilyConstants]:
+    """The family of a scene and its constants at the start, by the rule of the settings.
+
+    Args:
+        settings: families, and which one, if it is named.
+        prior: the analytic law of the scene's prior, as `analytic_law` takes it; None where there is none.
+
+    Raises:
+        InputError: there is no such family, or no prior to choose by.
+    """
+    families, name = settings.families, settings.family
+    if prior is None and (name is None or settings.guesses == "prior"):
+        raise InputError("pac_nerf: the scene's prior is a file, not an analytic law: set pac_nerf.family, and stock guesses")
+    if name is None:
+        plasticity = prior["plasticity"]["name"]
+        fitting = [key for key, family in families.items() if family.plasticity.name == plasticity]
+        if not fitting:
+            raise InputError(
+                f"pac_nerf: no family has the prior's return map {plasticity}: add one to pac_nerf.families, or set "
+                "pac_nerf.family"
+            )
+        name = fitting[0]
+    if name not in families:
+        raise InputError(f"pac_nerf.family: no {name!r} in pac_nerf.families, which has {', '.join(families)}")
+    known = {key: value for part in (prior or {}).values() for key, value in part.items() if key != "name"}
+    return name, FamilyConstants(families[name], known if settings.guesses == "prior" else None)
+
+
+class CarriedField:
+    """A field as its particles carry it: fewer of them are simulated, the others follow.
+
+    Args:
+        field: of the first stage.
+        spacing, least_opacity: of the particles that are seen, see `RadianceField.particles`.
+        settings: how many move.
+        density: of the body [kg/m^3].
+    """
+
+    def __init__(
+        self, field: RadianceField, spacing: float, least_opacity: float, settings: PacNerfConfig, density: Density
+    ):
+        self.field = field.requires_grad_(False)
+        self.shown = field.particles(spacing, least_opacity)
+        if not len(self.shown.x):
+            raise InputError("pac_nerf: the field has no particles: run the rule radiance_field again")
+        coarser = max(1.0, (len(self.shown.x) / settings.particles) ** (1 / 3))
+        self.moving = field.particles(coarser * spacing, max(least_opacity, settings.least_opacity))
+        self.mass = self.moving.masses(density_at(self.moving.x, density))
+        self._follow = Interpolation(self.shown.x, self.moving.x, settings.followed)
+
+    def state(self, velocity: Tensor) -> State:
+        """What moves, with one velocity (3,) [m/s]."""
+        return State(self.moving.x, velocity.to(self.moving.x), self.mass, self.moving.volumes())
+
+    def positions(self, x: Tensor) -> Tensor:
+        """Of what is seen, (T, N, 3) [m], for those of what moves, (T, A, 3)."""
+        return self._follow(x)[0]
+
+
+class Video:
+    """Pixels of a video and their rays."""
+
+    def __init__(self, observation: Observation):
+        self.frames = observation.frames
+        self.colours = observation.colours().flatten(2, 3)  # (T, V, P, 3)
+        self.rays = [camera_rays(observation.cameras, view) for view in range(len(observation.cameras))]
+
+    def shows_body(self, k: int, view: int, lattice: Lattice) -> Tensor:
+        """Indices of the pixels of a frame that are not white, or whose ray meets a lattice."""
+        coloured = (self.colours[k, view] < 1 - 1 / 512).any(-1)
+        origins, directions = self.rays[view]
+        low, high = (torch.tensor(corner).to(origins) for corner in (lattice.origin, lattice.far))
+        one, other = (low - origins) / directions, (high - origins) / directions
+        first, last = torch.minimum(one, other).amax(1), torch.maximum(one, other).amin(1)
+        return (coloured | (last > first.clamp(min=0))).nonzero()[:, 0]
+
+    def error(
+        self, body: CarriedField, x: Tensor, k: int, view: int, pixels: int | None, generator: torch.Generator | None
+    ) -> Tensor:
+        """Squared error of a frame over all its pixels, for the body's particles at x (N, 3): PAC-NeRF's loss.
+
+        From at most ``pixels`` of those that show the body, drawn at random; the others are white in both.
+        """
+        lattice, values = body.shown.seen(x)
+        chosen = self.shows_body(k, view, lattice)
+        count = len(chosen)
+        if pixels is not None and count > pixels:
+            drawn = torch.randperm(count, generator=generator)[:pixels]
+            chosen = chosen[drawn.to(chosen.device)]
+        origins, directions = (part[chosen] for part in self.rays[view])
+        colours, _ = body.field.render(lattice, values, origins, directions)
+        squares = (colours - self.colours[k, view, chosen]).square().sum()
+        return squares * (count / max(1, len(chosen)) / self.colours.shape[2])
+
+
+@dataclass
+class PacNerfHistory:
+    """Curves of a fit, one entry an Adam step: the state before it.
+
+    Attributes:
+        loss: of the frames, views and pixels of the step.
+        constants: what is fitted, by name.
+        halvings: of the time step.
+        seconds: wall time [s].
+    """
+
+    loss: list[float] = field(default_factory=list)
+    constants: dict[str, list[float]] = field(default_factory=dict)
+    halvings: list[int] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+
+
+@dataclass
+class PacNerfFit:
+    """What was found.
+
+    Attributes:
+        velocity: of all particles [m/s], shape (3,).
+        velocity_losses: of every evaluation of L-BFGS.
+        constants: of the law.
+        history: of the constants.
+        particles: how many move, and how many are seen.
+    """
+
+    velocity: Tensor
+    velocity_losses: list[float]
+    constants: FamilyConstants
+    history: PacNerfHistory
+    particles: tuple[int, int]
+
+    def summary(self) -> str:
+        """One line for people."""
+        v, h = self.velocity.tolist(), self.history
+        curves = ", ".join(
+            f"{name} {curve[0]:.4g} -> {float(self.constants.values()[name]):.4g}"
+            for name, curve in h.constants.items()
+        )
+        return (
+            f"v0 = ({v[0]:+.3f}, {v[1]:+.3f}, {v[2]:+.3f}) m/s in {len(self.velocity_losses)} evaluations; {curves} in"
+            f" {len(h.loss)} steps; {self.particles[0]} of {self.particles[1]} particles move"
+        )
+
+
+def fit_pac_nerf(
+    model: MPMModel,
+    body: CarriedField,
+    observation: Observation,
+    contact: int,
+    constants: FamilyConstants,
+    settings: PacNerfConfig,
+    seed: int = 0,
+    *,
+    checkpoint: Checkpoint | None = None,
+    progress: Callable[[int, int, float], None] | None = None,
+    log: Callable[[str], None] = print,
+) -> PacNerfFit:
+    """Find the velocity and the constants with which a body's pictures match a video.
+
+    Args:
+        model: grid, time step, gravity and walls.
+        body: field and particles; their precision is that of the fit.
+        observation: the video, in all views that are to be used.
+        contact: step of the last frame before contact.
+        constants: of the law, at the guess; fitted in place.
+        settings: hyper-parameters.
+        seed: of the views and pixels that are drawn.
+        checkpoint: where the state is kept, so that a killed fit goes on.
+        progress: called with (step, steps, loss).
+        log: receives a line where something happens.
+
+    Raises:
+        InputError: no frame before contact, or none after it.
+        NonFiniteError: a rollout runs away even in the shortest time step.
+    """
+    fit = _Fit(model, body, observation, contact, constants, settings, seed, log)
+    if checkpoint is not None and (state := checkpoint.load()) is not None:
+        fit.load_state_dict(state)
+        log(f"resumed at step {fit.iteration} of {fit.iterations}")
+    if fit.velocity is None:
+        fit.find_velocity()
+        if checkpoint is not None:
+            checkpoint.save(fit.state_dict())
+    while fit.iteration < fit.iterations:
+        fit.step()
+        if progress is not None:
+            progress(fit.iteration, fit.iterations, fit.history.loss[-1])
+        if checkpoint is not None and fit.iteration % settings.save_every == 0:
+            checkpoint.save(fit.state_dict())
+    counts = len(body.moving.x), len(body.shown.x)
+    return PacNerfFit(fit.velocity, fit.velocity_losses, constants, fit.history, counts)
+
+
+class _Fit:
+    """State of the fit."""
+
+    def __init__(self, model, body, observation, contact, constants, settings, seed, log):
+        self.model, self.body, self.constants, self.settings, self.log = model, body, constants, settings, log
+        self.video, self.contact = Video(observation), contact
+        self.generator = torch.Generator().manual_seed(seed)
+        before = [k for k, n in enumerate(observation.frames) if 0 < n <= contact]
+        after = [k for k, n in enumerate(observation.frames) if n > contact]
+        if not before or not after:
+            raise InputError(
+                f"pac_nerf: {len(before)} frames before contact and {len(after)} after it: both are needed, the "
+                "velocity is found in the former, the constants in the latter"
+            )
+        warm = contact + round(settings.after_contact / model.dt)
+        near = [k for k in after if observation.frames[k] <= warm] or after[:1]
+        self.flying = spread(before, settings.velocity_frames)
+        self.stages = [spread(near, settings.most_frames), spread(after, settings.most_frames)]
+        self.iterations = settings.iterations_contact + settings.iterations_all
+        self.optimizer = torch.optim.Adam(constants.groups(settings))
+        self.iteration, self.history = 0, PacNerfHistory()
+        self.history.constants = {name: [] for name in constants.values()}
+        self.velocity: Tensor | None = None
+        self.velocity_losses: list[float] = []
+
+    def find_velocity(self) -> None:
+        """One velocity for all particles, from rest, in all views of some frames before contact."""
+        velocity = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+        settings = self.settings
+        optimizer = torch.optim.LBFGS(
+            [velocity], lr=1, max_iter=settings.velocity_iterations, history_size=HISTORY, tolerance_grad=0,
+            tolerance_change=LEAST_STEP, line_search_fn="strong_wolfe",
+        )  # fmt: skip
+
+        def evaluate():
+            optimizer.zero_grad()
+            moved, loss = self._flown(velocity), 0.0
+            seen = moved.detach().requires_grad_()
+            for t, k in enumerate(self.flying):  # a picture at a time is in memory
+                for view in range(len(self.video.rays)):
+                    error = self.video.error(self.body, seen[t], k, view, None, None) / len(self.flying)
+                    error.backward()
+                    loss += float(error.detach())
+            moved.backward(seen.grad)
+            if not (math.isfinite(loss) and bool(velocity.grad.isfinite().all())):
+                raise NonFiniteError("pac_nerf", f"the loss of the velocity {velocity.tolist()} m/s is not finite")
+            self.velocity_losses.append(loss)
+            return torch.tensor(loss, dtype=torch.float64)
+
+        optimizer.step(evaluate)
+        self.velocity = velocity.detach()
+        self.log(f"v0 = {[round(v, 3) for v in self.velocity.tolist()]} m/s from {len(self.flying)} frames")
+
+    def step(self) -> None:
+        """One Adam step on the constants, with one random view for each frame."""
+        started, settings = time.perf_counter(), self.settings
+        late = self.iteration >= settings.iterations_contact
+        for name, value in self.constants.values().items():
+            self.history.constants[name].append(float(value.detach()))
+        drawn = self.generator.get_state()
+        for halvings in range(MOST_HALVINGS + 1):
+            self.generator.set_state(drawn)
+            try:
+                loss = self._loss_with_gradient(self.stages[late], halvings)
+                break
+            except NonFiniteError as error:
+                if halvings == MOST_HALVINGS:
+                    raise NonFiniteError(
+                        "pac_nerf",
+                        f"{error}, even in steps of {self.model.dt / 2**halvings:g} s; lower pac_nerf.rate_modulus or "
+                        "choose another guess",
+                    ) from None
+        if halvings and halvings != (self.history.halvings or [0])[-1]:
+            self.log(f"step {self.iteration}: time steps of {self.model.dt / 2**halvings:g} s")
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["first_lr"] * settings.rate_decay ** max(0.0, 2 * self.iteration / self.iterations - 1)
+        self.optimizer.step()
+        self.history.loss.append(loss)
+        self.history.halvings.append(halvings)
+        self.history.seconds.append(time.perf_counter() - started)
+        self.iteration += 1
+
+    def _flown(self, velocity: Tensor) -> Tensor:
+        """Positions of what is seen at the frames before contact, (T, N, 3)."""
+        return self._moved(velocity, self.flying, 0)
+
+    def _moved(self, velocity: Tensor, chosen: Sequence[int], halvings: int) -> Tensor:
+        """Positions of what is seen at the chosen frames, (T, N, 3), in time steps halved so often."""
+        model = replace(self.model, dt=self.model.dt / 2**halvings)
+        frames = [self.video.frames[k] * 2**halvings for k in chosen]
+        state = self.body.state(velocity)
+        law = self.constants.law(model.dt, state.x.device)
+        if (number := model.courant(law, float(state.density.min()))) > COURANT_LIMIT:
+            raise NonFiniteError("pac_nerf", f"Courant number {number:.2g} of {self.constants.specification()}")
+        return self.body.positions(rollout(model, law, state, steps=frames[-1], frames=frames).x)
+
+    def _loss_with_gradient(self, chosen: Sequence[int], halvings: int) -> float:
+        """Mean loss of the frames, with its gradient in the constants."""
+        self.optimizer.zero_grad()
+        moved, loss = self._moved(self.velocity, chosen, halvings), 0.0
+        seen = moved.detach().requires_grad_()
+        for t, k in enumerate(chosen):
+            view = int(torch.randint(len(self.video.rays), (), generator=self.generator))
+            error = self.video.error(self.body, seen[t], k, view, self.settings.pixels, self.generator) / len(chosen)
+            error.backward()
+            loss += float(error.detach())
+        moved.backward(seen.grad)
+        gradients = [p.grad for p in self.constants.parameters() if p.grad is not None]
+        if not (math.isfinite(loss) and all(bool(g.isfinite().all()) for g in gradients)):
+            raise NonFiniteError("pac_nerf", f"the loss or its gradient is not finite at step {self.iteration}")
+        return loss
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the next steps depend on."""
+        return {
+            "iteration": self.iteration,
+            "velocity": self.velocity,
+            "velocity_losses": self.velocity_losses,
+            "constants": self.constants.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "generator": self.generator.get_state(),
+            "history": dict(self.history.__dict__),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a `state_dict`."""
+        for key in ("iteration", "velocity", "velocity_losses"):
+            setattr(self, key, state[key])
+        self.constants.load_state_dict(state["constants"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.generator.set_state(state["generator"])
+        self.history = PacNerfHistory(**state["history"])
+
+
+def spread(items: Sequence[int], most: int) -> list[int]:
+    """At most so many of the items, evenly spread, the last one among them."""
+    if len(items) <= most:
+        return list(items)
+    return [items[round((i + 1) * len(items) / most) - 1] for i in range(most)]
