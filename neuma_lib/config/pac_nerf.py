@@ -35,9 +35,12 @@ class PacFamilyConfig(LawConfig):
 class PacNerfConfig(Section):
     """Velocity and constants (PAC-NeRF). In brackets what PAC-NeRF has published."""
 
-    families: dict[str, PacFamilyConfig] = Field({}, description="families of laws by name, with stock guesses")
+    families: dict[str, PacFamilyConfig] = Field(
+        {}, description="families of laws by name, with stock guesses"
+    )
     family: str | None = Field(
-        None, description="family that is fitted; null: the first one with the return map of the scene's prior"
+        None,
+        description="family that is fitted; null: the first one with the return map of the scene's prior",
     )
     guesses: Literal["stock", "prior"] = Field(
         "stock",
@@ -62,10 +65,16 @@ class PacNerfConfig(Section):
         20, ge=0, description="Adam steps on the frames until a little after contact (50)"
     )
     iterations_all: int = Field(40, ge=0, description="Adam steps on all frames after that (100)")
-    after_contact: float = Field(0.125, ge=0, description="how much that little is [s] (3 frames at 24 a second)")
-    most_frames: int = Field(12, ge=1, description="most frames of a step, evenly spread from contact on (12 to 18)")
+    after_contact: float = Field(
+        0.125, ge=0, description="how much that little is [s] (3 frames at 24 a second)"
+    )
+    most_frames: int = Field(
+        12, ge=1, description="most frames of a step, evenly spread from contact on (12 to 18)"
+    )
     pixels: int = Field(
-        1024, ge=1, description="most pixels of a frame, at random among those that show the body (whole image)"
+        1024,
+        ge=1,
+        description="most pixels of a frame, at random among those that show the body (whole image)",
     )
     rate_modulus: float = Field(0.1, ge=0, description="learning rate of log10 E, mu and kappa (0.1)")
     rate_poisson: float = Field(0.01, ge=0, description="that of x with nu = 0.45 tanh(x / 0.45) (0.01)")

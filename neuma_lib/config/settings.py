@@ -115,7 +115,9 @@ class Config(Section):
             if method.trained_as not in (None, *own):
                 unknown = f"no method '{method.trained_as}' with a training of its own"
                 raise ValueError(f"methods.{name}.trained_as: {unknown}{hint(method.trained_as, own)}")
-            for key in ("material", "structured", "springs", "pac_nerf", "prior") if method.trained_as else ():
+            for key in (
+                ("material", "structured", "springs", "pac_nerf", "prior") if method.trained_as else ()
+            ):
                 if getattr(method, key):
                     raise ValueError(
                         f"methods.{name}.{key}: that of '{method.trained_as}' counts; leave it out"

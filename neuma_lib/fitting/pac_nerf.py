@@ -1,4 +1,4 @@
-"""Velocity and constants of a named family of laws from a video: the later stages of PAC-NeRF (Li et al. 2023, Sec. 3.3).
+"""Velocity and constants of a named family of laws from a video: the later stages of PAC-NeRF (Li et al. 2023).
 
 A radiance field stays as the first stage has left it. Particles carry it: first one velocity for all of them is found
 in frames before contact, by L-BFGS; then the constants of the law, by Adam, first in the frames until a little after
@@ -64,7 +64,9 @@ class FamilyConstants(torch.nn.Module):
         self.spec: dict[str, dict[str, Any]] = spec
         self.fitted = family.fitted
         for part in spec.values():
-            part.update({name: (known or {}).get(name, value) for name, value in part.items() if name != "name"})
+            part.update(
+                {name: (known or {}).get(name, value) for name, value in part.items() if name != "name"}
+            )
         analytic_law(spec, dt=1.0)  # names unknown parts and constants, and those out of range
         E, nu = (spec["elasticity"][name] for name in ("E", "nu"))
         mu, _ = lame(E, nu)
@@ -117,7 +119,9 @@ def _to_stored(name: str, value: float) -> float:
         return value
     if name == "nu":
         if not abs(value) < POISSON_MOST:
-            raise InputError(f"pac_nerf: a Poisson's ratio of {value:g} cannot be fitted, only one below {POISSON_MOST}")
+            raise InputError(
+                f"pac_nerf: nu = {value:g} cannot be fitted, its size must be below {POISSON_MOST}"
+            )
         return POISSON_MOST * math.atanh(value / POISSON_MOST)
     if not value > 0:
         raise InputError(f"pac_nerf: {name} = {value:g} cannot be fitted, it must be positive")
@@ -146,7 +150,9 @@ def choose_family(
     """
     families, name = settings.families, settings.family
     if prior is None and (name is None or settings.guesses == "prior"):
-        raise InputError("pac_nerf: the scene's prior is a file, not an analytic law: set pac_nerf.family, and stock guesses")
+        raise InputError(
+            "pac_nerf: the scene's prior is a file, not an analytic law: set pac_nerf.family, and guesses: stock"
+        )
     if name is None:
         plasticity = prior["plasticity"]["name"]
         fitting = [key for key, family in families.items() if family.plasticity.name == plasticity]
@@ -157,7 +163,9 @@ def choose_family(
             )
         name = fitting[0]
     if name not in families:
-        raise InputError(f"pac_nerf.family: no {name!r} in pac_nerf.families, which has {', '.join(families)}")
+        raise InputError(
+            f"pac_nerf.family: no {name!r} in pac_nerf.families, which has {', '.join(families)}"
+        )
     known = {key: value for part in (prior or {}).values() for key, value in part.items() if key != "name"}
     return name, FamilyConstants(families[name], known if settings.guesses == "prior" else None)
 
@@ -173,7 +181,12 @@ class CarriedField:
     """
 
     def __init__(
-        self, field: RadianceField, spacing: float, least_opacity: float, settings: PacNerfConfig, density: Density
+        self,
+        field: RadianceField,
+        spacing: float,
+        least_opacity: float,
+        settings: PacNerfConfig,
+        density: Density,
     ):
         self.field = field.requires_grad_(False)
         self.shown = field.particles(spacing, least_opacity)
@@ -211,7 +224,13 @@ class Video:
         return (coloured | (last > first.clamp(min=0))).nonzero()[:, 0]
 
     def error(
-        self, body: CarriedField, x: Tensor, k: int, view: int, pixels: int | None, generator: torch.Generator | None
+        self,
+        body: CarriedField,
+        x: Tensor,
+        k: int,
+        view: int,
+        pixels: int | None,
+        generator: torch.Generator | None,
     ) -> Tensor:
         """Squared error of a frame over all its pixels, for the body's particles at x (N, 3): PAC-NeRF's loss.
 
@@ -371,7 +390,9 @@ class _Fit:
                     loss += float(error.detach())
             moved.backward(seen.grad)
             if not (math.isfinite(loss) and bool(velocity.grad.isfinite().all())):
-                raise NonFiniteError("pac_nerf", f"the loss of the velocity {velocity.tolist()} m/s is not finite")
+                raise NonFiniteError(
+                    "pac_nerf", f"the loss of the velocity {velocity.tolist()} m/s is not finite"
+                )
             self.velocity_losses.append(loss)
             return torch.tensor(loss, dtype=torch.float64)
 
@@ -401,7 +422,9 @@ class _Fit:
         if halvings and halvings != (self.history.halvings or [0])[-1]:
             self.log(f"step {self.iteration}: time steps of {self.model.dt / 2**halvings:g} s")
         for group in self.optimizer.param_groups:
-            group["lr"] = group["first_lr"] * settings.rate_decay ** max(0.0, 2 * self.iteration / self.iterations - 1)
+            group["lr"] = group["first_lr"] * settings.rate_decay ** max(
+                0.0, 2 * self.iteration / self.iterations - 1
+            )
         self.optimizer.step()
         self.history.loss.append(loss)
         self.history.halvings.append(halvings)
@@ -419,7 +442,9 @@ class _Fit:
         state = self.body.state(velocity)
         law = self.constants.law(model.dt, state.x.device)
         if (number := model.courant(law, float(state.density.min()))) > COURANT_LIMIT:
-            raise NonFiniteError("pac_nerf", f"Courant number {number:.2g} of {self.constants.specification()}")
+            raise NonFiniteError(
+                "pac_nerf", f"Courant number {number:.2g} of {self.constants.specification()}"
+            )
         return self.body.positions(rollout(model, law, state, steps=frames[-1], frames=frames).x)
 
     def _loss_with_gradient(self, chosen: Sequence[int], halvings: int) -> float:
@@ -429,13 +454,17 @@ class _Fit:
         seen = moved.detach().requires_grad_()
         for t, k in enumerate(chosen):
             view = int(torch.randint(len(self.video.rays), (), generator=self.generator))
-            error = self.video.error(self.body, seen[t], k, view, self.settings.pixels, self.generator) / len(chosen)
+            error = self.video.error(self.body, seen[t], k, view, self.settings.pixels, self.generator) / len(
+                chosen
+            )
             error.backward()
             loss += float(error.detach())
         moved.backward(seen.grad)
         gradients = [p.grad for p in self.constants.parameters() if p.grad is not None]
         if not (math.isfinite(loss) and all(bool(g.isfinite().all()) for g in gradients)):
-            raise NonFiniteError("pac_nerf", f"the loss or its gradient is not finite at step {self.iteration}")
+            raise NonFiniteError(
+                "pac_nerf", f"the loss or its gradient is not finite at step {self.iteration}"
+            )
         return loss
 
     def state_dict(self) -> dict[str, Any]:

@@ -77,6 +77,20 @@ def test_springs_are_fitted_to_the_video_alone(project):
         assert "only springs in one body: it has no stress and no bias" in refused
 
 
+def test_pac_nerf_needs_images_its_field_and_contact_alone(project):
+    """Its own start and law are judged; no networks, and no truth, lead to them."""
+    run = f"{SCENE}+seed=1/pac_nerf+guesses=prior"
+    graph = jobs(project.run("--dry-run", f"{run}/metrics.json"))
+    made = {rule: (read, outputs) for rule, read, outputs in graph}
+    read, outputs = made["pac_nerf"]
+    assert outputs[0] == f"{run}/constants.json" and not {"material", "identify"} & set(made)
+    assert made["radiance_field"][1][0] == f"{SCENE}+seed=1/pac_nerf/field.safetensors" in read
+    assert "tiny/data/BouncyBall/dynamic/transforms.json" in read and f"{SCENE}+seed=1/velocity.json" in read
+    assert not any("/priors/" in file or "/data/BouncyBall/particles.h5" in file for file in read)
+    judged = made["evaluation"][0]
+    assert f"{run}/constants.json" in judged and not any("velocity.json" in file for file in judged)
+
+
 def test_a_structured_law_corrects_what_the_video_shows(project):
     """Around the constants of its scene, in its chain, and without networks to start from."""
     graph = jobs(project.run("--dry-run", f"{SCENE}+seed=1/neuma_structured/metrics.json"))

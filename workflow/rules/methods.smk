@@ -100,10 +100,9 @@ def identify_settings(wildcards):
     return SETTINGS.identify.plain() | ({"views": [int(view) for view in views.split(",")]} if views else {})
 
 
-def pac_nerf_file(wildcards):
-    """The law that PAC-NeRF found in the video of the scene that a method's law is from."""
-    scene = SETTINGS.law_scene(wildcards.scene, wildcards.method)
-    return f"{RESULTS}/{SETTINGS.run_folder(scene, SETTINGS.method_training(wildcards.method))}/constants.json"
+def pac_nerf_file(scene, method):
+    """The law, and the throw, that PAC-NeRF found in a scene's video."""
+    return f"{RESULTS}/{SETTINGS.run_folder(scene, SETTINGS.method_training(method))}/constants.json"
 
 
 @checked
@@ -143,6 +142,13 @@ def pac_nerf_settings(wildcards):
 
 
 @checked
+def pac_nerf_prior(wildcards):
+    """The analytic law of the prior that decides the family of a method with PAC-NeRF's law; none if it is a file."""
+    law = SETTINGS.priors.laws.get(SETTINGS.method_prior(wildcards.scene, wildcards.method))
+    return law.plain() if law else None
+
+
+@checked
 def true_law(wildcards):
     """The scene's own law, where this is what a method evaluates."""
     return SETTINGS.true_law(wildcards.scene, wildcards.method) or []
@@ -152,7 +158,7 @@ def true_law(wildcards):
 def identified_law(wildcards):
     """The law that was identified in a scene's video, by us or by PAC-NeRF, where this is what a method evaluates."""
     if SETTINGS.is_pac_nerf(wildcards.method):
-        return pac_nerf_file(wildcards)
+        return pac_nerf_file(SETTINGS.law_scene(wildcards.scene, wildcards.method), wildcards.method)
     if not SETTINGS.is_identified(wildcards.method):
         return []
     return identified_file(wildcards)
@@ -204,7 +210,7 @@ def start_name(wildcards):
 
 def start_file(wildcards):
     if SETTINGS.is_pac_nerf(wildcards.method):
-        return f"{RESULTS}/{SETTINGS.run_folder(wildcards.scene, wildcards.method)}/constants.json"
+        return pac_nerf_file(wildcards.scene, wildcards.method)
     return of_chain(start_name(wildcards))(wildcards)
 
 

@@ -42,7 +42,7 @@ rule pac_nerf:
         views=lambda wildcards: material_settings(wildcards)["views"],
         radiance={key: SETTINGS.radiance.plain()[key] for key in ("spacing", "least_opacity")},
         pac_nerf=pac_nerf_settings,
-        prior=stock_law,
+        prior=pac_nerf_prior,
         seed=SETTINGS.seed,
         checkpoint=lambda wildcards: f"{RESULTS}/{wildcards.scene}/{wildcards.method}/checkpoint.pt",
         device=SETTINGS.device,

@@ -8,7 +8,10 @@ from neuma_lib.config.variants import folder
 # What a chain's seeds change in a file of a scene or an experiment (config/variants.py); runs of methods have
 # `Config.run_folder`.
 DRAWN_IN = {
-    **dict.fromkeys(["gaussians.ply", "gaussians.json", "mesh.ply", "tracers.h5", "pac_nerf/field.safetensors"], ["gaussians"]),
+    **dict.fromkeys(
+        ["gaussians.ply", "gaussians.json", "mesh.ply", "tracers.h5", "pac_nerf/field.safetensors"],
+        ["gaussians"],
+    ),
     **dict.fromkeys(["sampled_particles.h5", "particles.h5", "binding.h5"], ["gaussians", "particles"]),
     **dict.fromkeys(
         ["velocity.json", "identified.json", "priors/identified.safetensors", "visited.h5"],

@@ -50,7 +50,13 @@ def main(inputs, output, params, run) -> None:
     start = {"v0": fit.velocity.tolist(), "angular_velocity": [0.0, 0.0, 0.0]}
     centre = body.mass @ body.moving.x / body.mass.sum()
     law = constants.specification()
-    about = {"family": family, "law": law, "guess": guess, "guesses": settings.guesses, "fitted": constants.fitted}
+    about = {
+        "family": family,
+        "law": law,
+        "guess": guess,
+        "guesses": settings.guesses,
+        "fitted": constants.fitted,
+    }
     write_json(output.constants, {**about, "start": {**start, "centre": centre.tolist()}})
     write_json(output.history, {**curves, "velocity_loss": fit.velocity_losses})
     checkpoint.remove()
