@@ -67,7 +67,9 @@ def judge_pac_nerf(name: str, settings: Config, method: str, fields: Path) -> st
         path, failure = predict(model, law, start, video.frames, truth[0])
         errors[len(errors)] = tracer_errors(path.tracers, truth)
     said = f"{errors[0]['tracer_rmse_mm']:.2f} mm, last frame {errors[0]['tracer_rmse_last_mm']:.2f} mm (thrown as our"
-    said += f" estimate: {errors[1]['tracer_rmse_mm']:.2f} mm), {seconds:.0f} core s; {family}, {fit.summary()}"
+    said += (
+        f" estimate: {errors[1]['tracer_rmse_mm']:.2f} mm), {seconds:.0f} core s; {family}, {fit.summary()}"
+    )
     return f"{name} {method}: {said}" + (f"; a particle {failure.happened}" if failure else "")
 
 

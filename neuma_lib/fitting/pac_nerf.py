@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -42,6 +42,8 @@ MOST_HALVINGS = 4
 """Times that a time step is halved before a rollout counts as unstable."""
 LEAST_STEP = 1e-3
 """L-BFGS ends where a step changes no component of the velocity by more than this [m/s] (PAC-NeRF)."""
+LEAST_GAIN = 1e-6
+"""Or, as torch's knows no other way, where it lowers the loss by less than this part of the first one."""
 HISTORY = 20
 """Steps that L-BFGS remembers (PAC-NeRF)."""
 
@@ -287,7 +289,7 @@ class PacNerfFit:
         """One line for people."""
         v, h = self.velocity.tolist(), self.history
         curves = ", ".join(
-            f"{name} {curve[0]:.4g} -> {float(self.constants.values()[name]):.4g}"
+            f"{name} {curve[0]:.4g} -> {float(self.constants.values()[name].detach()):.4g}"
             for name, curve in h.constants.items()
         )
         return (
@@ -380,21 +382,12 @@ class _Fit:
         )  # fmt: skip
 
         def evaluate():
-            optimizer.zero_grad()
-            moved, loss = self._flown(velocity), 0.0
-            seen = moved.detach().requires_grad_()
-            for t, k in enumerate(self.flying):  # a picture at a time is in memory
-                for view in range(len(self.video.rays)):
-                    error = self.video.error(self.body, seen[t], k, view, None, None) / len(self.flying)
-                    error.backward()
-                    loss += float(error.detach())
-            moved.backward(seen.grad)
-            if not (math.isfinite(loss) and bool(velocity.grad.isfinite().all())):
-                raise NonFiniteError(
-                    "pac_nerf", f"the loss of the velocity {velocity.tolist()} m/s is not finite"
-                )
+            loss, _ = self._halving_steps(lambda halvings: self._velocity_loss(velocity, halvings))
             self.velocity_losses.append(loss)
-            return torch.tensor(loss, dtype=torch.float64)
+            # torch has one bound for both
+            scale = LEAST_STEP / LEAST_GAIN / max(self.velocity_losses[0], 1e-30)
+            velocity.grad.mul_(scale)
+            return torch.tensor(scale * loss, dtype=torch.float64)
 
         optimizer.step(evaluate)
         self.velocity = velocity.detach()
@@ -407,33 +400,48 @@ class _Fit:
         for name, value in self.constants.values().items():
             self.history.constants[name].append(float(value.detach()))
         drawn = self.generator.get_state()
-        for halvings in range(MOST_HALVINGS + 1):
+
+        def evaluate(halvings):
             self.generator.set_state(drawn)
-            try:
-                loss = self._loss_with_gradient(self.stages[late], halvings)
-                break
-            except NonFiniteError as error:
-                if halvings == MOST_HALVINGS:
-                    raise NonFiniteError(
-                        "pac_nerf",
-                        f"{error}, even in steps of {self.model.dt / 2**halvings:g} s; lower pac_nerf.rate_modulus or "
-                        "choose another guess",
-                    ) from None
+            return self._loss(self.stages[late], halvings)
+
+        loss, halvings = self._halving_steps(evaluate)
         if halvings and halvings != (self.history.halvings or [0])[-1]:
             self.log(f"step {self.iteration}: time steps of {self.model.dt / 2**halvings:g} s")
+        decay = settings.rate_decay ** max(0.0, 2 * self.iteration / self.iterations - 1)
         for group in self.optimizer.param_groups:
-            group["lr"] = group["first_lr"] * settings.rate_decay ** max(
-                0.0, 2 * self.iteration / self.iterations - 1
-            )
+            group["lr"] = decay * group["first_lr"]
         self.optimizer.step()
         self.history.loss.append(loss)
         self.history.halvings.append(halvings)
         self.history.seconds.append(time.perf_counter() - started)
         self.iteration += 1
 
-    def _flown(self, velocity: Tensor) -> Tensor:
-        """Positions of what is seen at the frames before contact, (T, N, 3)."""
-        return self._moved(velocity, self.flying, 0)
+    def _halving_steps(self, evaluate: Callable[[int], float]) -> tuple[float, int]:
+        """A loss with its gradient, in time steps halved as often as it takes to be finite; and how often that is."""
+        for halvings in range(MOST_HALVINGS + 1):
+            try:
+                return evaluate(halvings), halvings
+            except NonFiniteError as error:
+                last = error
+        raise NonFiniteError(
+            "pac_nerf",
+            f"{last}, even in steps of {self.model.dt / 2**MOST_HALVINGS:g} s; lower pac_nerf.rate_modulus or choose "
+            "another guess",
+        )
+
+    def _velocity_loss(self, velocity: Tensor, halvings: int) -> float:
+        """Mean loss of the frames before contact in all views, with its gradient in the velocity."""
+        velocity.grad = None
+        moved, loss = self._moved(velocity, self.flying, halvings), 0.0
+        seen = moved.detach().requires_grad_()
+        for t, k in enumerate(self.flying):  # a picture at a time is in memory
+            for view in range(len(self.video.rays)):
+                error = self.video.error(self.body, seen[t], k, view, None, None) / len(self.flying)
+                error.backward()
+                loss += float(error.detach())
+        moved.backward(seen.grad)
+        return self._finite(loss, [velocity])
 
     def _moved(self, velocity: Tensor, chosen: Sequence[int], halvings: int) -> Tensor:
         """Positions of what is seen at the chosen frames, (T, N, 3), in time steps halved so often."""
@@ -447,21 +455,27 @@ class _Fit:
             )
         return self.body.positions(rollout(model, law, state, steps=frames[-1], frames=frames).x)
 
-    def _loss_with_gradient(self, chosen: Sequence[int], halvings: int) -> float:
-        """Mean loss of the frames, with its gradient in the constants."""
+    def _loss(self, chosen: Sequence[int], halvings: int) -> float:
+        """Mean loss of the frames, each in a random view, with its gradient in the constants."""
         self.optimizer.zero_grad()
         moved, loss = self._moved(self.velocity, chosen, halvings), 0.0
+        if not moved.requires_grad:
+            raise InputError(
+                f"pac_nerf: thrown at {self.velocity.tolist()} m/s the body touches nothing in the video, which says"
+                " nothing of its law then: look at the field, or leave this method out"
+            )
         seen = moved.detach().requires_grad_()
         for t, k in enumerate(chosen):
             view = int(torch.randint(len(self.video.rays), (), generator=self.generator))
-            error = self.video.error(self.body, seen[t], k, view, self.settings.pixels, self.generator) / len(
-                chosen
-            )
+            error = self.video.error(self.body, seen[t], k, view, self.settings.pixels, self.generator)
+            error = error / len(chosen)
             error.backward()
             loss += float(error.detach())
         moved.backward(seen.grad)
-        gradients = [p.grad for p in self.constants.parameters() if p.grad is not None]
-        if not (math.isfinite(loss) and all(bool(g.isfinite().all()) for g in gradients)):
+        return self._finite(loss, self.constants.parameters())
+
+    def _finite(self, loss: float, of: Iterable[Tensor]) -> float:
+        if not (math.isfinite(loss) and all(bool(p.grad.isfinite().all()) for p in of)):
             raise NonFiniteError(
                 "pac_nerf", f"the loss or its gradient is not finite at step {self.iteration}"
             )

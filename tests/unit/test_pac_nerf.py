@@ -20,7 +20,7 @@ from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.isotropic import lame
 from neuma_lib.radiance.field import RadianceField
 from neuma_lib.radiance.lattice import Lattice
-from neuma_lib.radiance.rendering import ColourNetwork, Opacity, camera_rays
+from neuma_lib.radiance.rendering import Opacity, camera_rays
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.cameras import Cameras, look_at
@@ -50,16 +50,19 @@ HONEY = PacFamilyConfig(
 )
 
 
-def ball(dtype=torch.float64):
-    """A field that is opaque and speckled in a ball of 12 cm about (0.5, 0.25, 0.5), and clear outside."""
+def ball():
+    """A field of a ball of about 12 cm around (0.5, 0.25, 0.5), with large spots and, as fitted ones have, a soft edge.
+
+    A sharp one would hide the silhouette from the gradient: nodes at the border take the density of what is near,
+    however small its weight, so that they change when they get or lose a particle and not in between.
+    """
     torch.manual_seed(0)
-    field = RadianceField(
-        Lattice((0.3, 0.05, 0.3), 0.025, (17, 17, 17)), Opacity(1e-4, 0.1), ColourNetwork()
-    ).to(dtype)
-    points = field.lattice.points(field.density)
-    within = (points - torch.tensor([0.5, 0.25, 0.5]).to(points)).norm(dim=-1, keepdim=True) < 0.12
-    field.density.data = torch.where(within, 20.0, -30.0).to(dtype)
-    field.features.data = 2 * torch.randn(*field.features.shape).to(dtype)
+    field = RadianceField(Lattice((0.3, 0.05, 0.3), 0.025, (17, 17, 17)), Opacity(1e-4, 0.1)).double()
+    points = field.lattice.points(field.density).double() - torch.tensor([0.5, 0.25, 0.5]).double()
+    radius = points.norm(dim=-1, keepdim=True)
+    field.density.data = (20 - (radius - 0.08) / 0.025 * 12).clamp(-30, 20)
+    waves = 30 * torch.randn(3, 12, dtype=torch.float64) / 3**0.5
+    field.features.data = 2 * torch.sin(points @ waves + torch.randn(12, dtype=torch.float64))
     return field.requires_grad_(False)
 
 
@@ -160,16 +163,17 @@ def test_velocity_is_found_before_contact(elastic):
 
 
 def test_youngs_modulus_is_found_from_a_decade_off(elastic):
-    E = float(elastic.constants.values()["E"])
+    E = float(elastic.constants.values()["E"].detach())
     assert elastic.history.constants["E"][0] == pytest.approx(1e4)
     assert E == pytest.approx(1e5, rel=0.1)
     assert elastic.history.loss[-1] < 0.05 * elastic.history.loss[0]
 
 
 def test_poissons_ratio_is_found(elastic):
-    assert float(elastic.constants.values()["nu"]) == pytest.approx(0.3, abs=0.05)
+    assert float(elastic.constants.values()["nu"].detach()) == pytest.approx(0.3, abs=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "family, name, truth, error",
     [
@@ -184,7 +188,7 @@ def test_constants_of_flow_are_found(family, name, truth, error, carried):
     constants = FamilyConstants(family)
     video = film(carried, changed(family, **{name: truth}))
     fit_pac_nerf(MODEL, carried, video, contact(carried), constants, SMALL, log=lambda _: None)
-    assert float(constants.values()[name]) == pytest.approx(truth, rel=error)
+    assert float(constants.values()[name].detach()) == pytest.approx(truth, rel=error)
 
 
 def test_resumes_bit_for_bit(carried, tmp_path):
@@ -231,8 +235,8 @@ def test_steps_are_halved_where_a_law_is_too_stiff(carried):
 
 def test_constants_are_stored_as_published():
     constants = FamilyConstants(ELASTIC, {"E": 316228.0, "nu": 0.25})
-    assert float(constants.stored["E"]) == pytest.approx(5.5, abs=1e-6)
-    assert float(constants.stored["nu"]) == pytest.approx(0.45 * math.atanh(0.25 / 0.45))
+    assert float(constants.stored["E"].detach()) == pytest.approx(5.5, abs=1e-6)
+    assert float(constants.stored["nu"].detach()) == pytest.approx(0.45 * math.atanh(0.25 / 0.45))
     spec = constants.specification()["elasticity"]
     assert spec["E"] == pytest.approx(316228) and spec["nu"] == pytest.approx(0.25)
     with torch.no_grad():
