@@ -48,7 +48,7 @@ class PacNerfConfig(Section):
         "where the family has them",
     )
     particles: int = Field(
-        3000, ge=10, description="about how many particles move; all of the field's follow them (all of them)"
+        2000, ge=10, description="about how many particles move; all of the field's follow them (all of them)"
     )
     followed: int = Field(16, ge=4, description="nearest moving particles that one of the field's follows")
     least_opacity: float = Field(
@@ -72,7 +72,7 @@ class PacNerfConfig(Section):
         12, ge=1, description="most frames of a step, evenly spread from contact on (12 to 18)"
     )
     pixels: int = Field(
-        1024,
+        2048,
         ge=1,
         description="most pixels of a frame, at random among those that show the body (whole image)",
     )

@@ -310,6 +310,14 @@ def test_bad_input_is_named(carried, loaded):
         PacFamilyConfig(elasticity={"name": "hencky", "E": 1e5, "nu": 0.3}, fitted=("E", "mu"))
 
 
+def test_method_and_its_variants(loaded):
+    assert loaded.method_pac_nerf("pac_nerf").guesses == "stock" and loaded.method_pac_nerf("neuma") is None
+    assert loaded.method_pac_nerf("pac_nerf+guesses=prior+family=non_newtonian").family == "non_newtonian"
+    assert loaded.run_folder("BouncyBall+adaptor_seed=2", "pac_nerf") == "BouncyBall/pac_nerf"  # draws none
+    with pytest.raises(InputError, match="its law is not pac_nerf, leave out guesses"):
+        loaded.method_pac_nerf("neuma+guesses=prior")
+
+
 def test_frames_are_spread_evenly():
     assert spread(range(5), 9) == [0, 1, 2, 3, 4]
     assert spread(range(12), 3) == [3, 7, 11]

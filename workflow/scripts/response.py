@@ -19,8 +19,9 @@ def main(inputs, output, params, run) -> None:
     truth = analytic_law(params.truth, params.dt)
     tests = material_tests(truth, torch.from_numpy(visited["F"]), params.rate, params.total_shear, params.dt)
     draws, drawn = [], {"dt": params.dt, "count": DRAWS, "seed": params.seed}
-    if inputs.get("identified"):
-        draws = constants_draws(read_json(inputs.identified), params.model_std, **drawn)
+    found = read_json(inputs.identified) if inputs.get("identified") else {}
+    if "best" in found:  # constants that come with their covariance
+        draws = constants_draws(found, params.model_std, **drawn)
     elif inputs.get("base"):
         motion, _ = read_arrays(inputs.rollout, required=("F",), only=("F",))
         fit = read_json(inputs.base)["best"]
