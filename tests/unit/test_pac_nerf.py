@@ -222,6 +222,20 @@ def test_resumes_bit_for_bit(carried, tmp_path):
     assert again.constants.specification() == whole.constants.specification()
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_cuda_agrees(carried):
+    short = SMALL.model_copy(update=dict(velocity_iterations=2, iterations_all=2))
+    video, found = film(carried, changed(ELASTIC, E=1e5)), []
+    for device in ("cpu", "cuda"):
+        own = CarriedField(ball().to(device), 1.0, 1e-3, short, 1000.0)
+        seen = video.to(torch.float64, device)
+        fit = fit_pac_nerf(
+            MODEL, own, seen, contact(carried), FamilyConstants(ELASTIC), short, log=lambda _: None
+        )
+        found.append([*fit.velocity.tolist(), *fit.history.loss, *fit.history.constants["E"]])
+    assert found[1] == pytest.approx(found[0], rel=1e-5)
+
+
 def test_steps_are_halved_where_a_law_is_too_stiff(carried):
     short = SMALL.model_copy(update=dict(iterations_all=2, velocity_iterations=3))
     video = film(carried, changed(ELASTIC, E=1e5))
