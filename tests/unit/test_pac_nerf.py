@@ -261,7 +261,7 @@ def test_constants_are_stored_as_published():
 def test_elasticity_and_plasticity_share_their_moduli():
     law = FamilyConstants(PLASTIC.model_copy(update={"fitted": ("mu", "kappa", "yield_stress")})).law(1e-3)
     assert law.elasticity.values["E"] is law.plasticity.values["E"]
-    mu, lam = lame(law.elasticity.values["E"], law.elasticity.values["nu"])
+    mu, lam = lame(*(law.elasticity.values[name].detach() for name in ("E", "nu")))
     assert float(mu) == pytest.approx(1e5 / 2.5) and float(lam + 2 * mu / 3) == pytest.approx(1e5 / 1.5)
 
 
