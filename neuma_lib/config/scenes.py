@@ -22,11 +22,31 @@ class SplitDensityConfig(Section):
 
 
 class SuppliedConfig(Section):
-    """Image sets that were made elsewhere: a transforms.json, or a list in the layout of the authors' release."""
+    """Image sets that were made elsewhere.
+
+    A transforms.json, a list in the layout of the authors' release, or a folder or list in PAC-NeRF's layout
+    (all_data.json) or that of Spring-Gaus' synthetic scenes (camera.json), whose first frames are the views at t = 0.
+    """
 
     static: str | None = Field(None, description="views at t = 0; null: rendered by Blender")
     dynamic: str | None = Field(
         None, description="videos with the frames that the scene's settings name; null: rendered by Blender"
+    )
+    stride: int | None = Field(
+        None,
+        ge=1,
+        description="simulated steps from frame to frame of a folder that counts its frames, as PAC-NeRF's and "
+        "Spring-Gaus' do; then the scene's frames are all of these up to its steps, unless it lists some of them",
+    )
+    scale: float = Field(
+        1.0,
+        gt=0,
+        description="metres of the simulator to a metre of the images' world; all lengths are scaled",
+    )
+    offset: Vector | None = Field(
+        None,
+        description="where the scaled origin of the images' world is in the simulator's box [m]; null: as the layout "
+        "has it, (0.5, 0, 0.5) for PAC-NeRF, (0, -0.3, 0) for Spring-Gaus, else (0, 0, 0)",
     )
 
 
@@ -59,7 +79,8 @@ class SceneConfig(Section):
     steps: int = Field(gt=0, description="simulated steps of the video")
     frames: tuple[int, ...] | None = Field(
         None,
-        description="steps of the video's frames, ascending from 0; null: as dataset.frames or dataset.stride say",
+        description="steps of the video's frames, ascending from 0; null: as images.stride, dataset.frames or "
+        "dataset.stride say",
     )
     prior: str = Field(description="name in priors.laws, or path of a .safetensors or a released .pt file")
     appearance: AppearanceConfig = Field(description="how Blender shows it")
@@ -84,4 +105,10 @@ class SceneConfig(Section):
             list(frames) != sorted(set(frames)) or not frames or frames[0] != 0 or frames[-1] > self.steps
         ):
             raise ValueError("frames must ascend from 0 to at most 'steps' without repeats")
+        stride = self.images.stride
+        for step in frames or () if stride else ():
+            if step % stride:
+                raise ValueError(
+                    f"frames: step {step} is none of the supplied frames, images.stride: {stride}"
+                )
         return self

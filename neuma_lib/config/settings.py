@@ -349,8 +349,10 @@ class Config(Section):
 
     def frame_steps(self, name: str) -> tuple[int, ...]:
         """Steps of the frames of a scene's video."""
-        scene = self.scene(name)
-        return scene.frames or self.dataset.frame_steps(self.dataset.steps or scene.steps)
+        scene, steps = self.scene(name), self.dataset.steps or self.scene(name).steps
+        if scene.frames is None and scene.images.stride is not None:
+            return tuple(range(0, steps + 1, scene.images.stride))
+        return scene.frames or self.dataset.frame_steps(steps)
 
     def method_title(self, method: str) -> str:
         """Name of a method or variant for tables, for example "NeuMA, rank 4"."""

@@ -93,12 +93,15 @@ def write_transforms(
     write_json(path, {**intrinsics, **extra, "frames": entries})
 
 
-def list_images(source: str | Path, path: str | Path) -> ImageSet:
+def list_images(
+    source: str | Path, path: str | Path, scale: float = 1.0, offset: Sequence[float] | None = None
+) -> ImageSet:
     """Write a transforms.json for images that stay where another list names them; returns what it lists.
 
     Args:
         source: a transforms.json, or a list in the layout of the authors' release.
         path: the new transforms.json.
+        scale, offset: as of `place`; None: no offset.
 
     Raises:
         InputError: as of `read_image_set`.
@@ -106,12 +109,32 @@ def list_images(source: str | Path, path: str | Path) -> ImageSet:
     images = read_image_set(source)
     data = read_transforms(source)
     files = [_image_file(Path(source).parent, frame["file_path"], source) for frame in data["frames"]]
-    folder = Path(path).parent
-    folder.mkdir(parents=True, exist_ok=True)
-    places = [os.path.relpath(file.resolve(), folder.resolve()) for file in files]
-    frames = [{**f, "file_path": place} for f, place in zip(data.pop("frames"), places, strict=True)]
-    write_transforms(path, data, frames)
-    return images
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    names = [relative_to(path, file) for file in files]
+    frames = [{**f, "file_path": name} for f, name in zip(data.pop("frames"), names, strict=True)]
+    world = place(frames, scale, (0.0, 0.0, 0.0) if offset is None else offset)
+    write_transforms(path, data, frames, **world)
+    return read_image_set(path) if world else images
+
+
+def relative_to(path: str | Path, file: Path) -> str:
+    """The name of a file in a list at ``path``."""
+    return os.path.relpath(file.resolve(), Path(path).parent.resolve())
+
+
+def place(frames: Sequence[dict[str, Any]], scale: float, offset: Sequence[float]) -> dict[str, Any]:
+    """Move cameras in place, positions x to ``scale x + offset`` [m].
+
+    Returns:
+        What a transforms.json says of it: ``world`` with ``scale`` and ``offset``; nothing if nothing moved.
+    """
+    if scale == 1.0 and not any(offset):
+        return {}
+    for frame in frames:
+        pose = np.array(frame["transform_matrix"], dtype=np.float64)
+        pose[:3, 3] = scale * pose[:3, 3] + offset
+        frame["transform_matrix"] = pose.tolist()
+    return {"world": {"scale": scale, "offset": [float(x) for x in offset]}}
 
 
 def read_transforms(path: str | Path) -> dict[str, Any]:

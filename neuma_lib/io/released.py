@@ -34,30 +34,34 @@ def released_frames(entries: Sequence[Mapping[str, Any]], path: str | Path) -> l
     for i, entry in enumerate(entries):
         name = image_name(entry, f"{path}: entry {i}")
         where = f"{path}: entry {i} ({name})"
-        pose, K = matrix_of_numbers(entry.get("c2w")), matrix_of_numbers(entry.get("intrinsic"))
-        if pose.shape not in [(4, 4), (3, 4)]:
-            raise InputError(f"{where}: c2w must be a 4x4 matrix of numbers")
-        if K.shape != (3, 3):
-            raise InputError(f"{where}: intrinsic must be a 3x3 matrix of numbers")
-        if not np.abs(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1]).max() <= 1e-9:
-            raise InputError(f"{where}: intrinsic is not that of a pinhole camera without skew")
         named = _NAME.fullmatch(Path(name).stem)
         view, step = map(int, named.groups()) if named else (i, 0)
-        frames.append(
-            {
-                "file_path": name,
-                "transform_matrix": [*pose[:3].tolist(), [0.0, 0.0, 0.0, 1.0]],
-                **{
-                    "fl_x": K[0, 0].item(),
-                    "fl_y": K[1, 1].item(),
-                    "cx": K[0, 2].item(),
-                    "cy": K[1, 2].item(),
-                },
-                "view": view,
-                "step": step,
-            }
-        )
+        frames.append({"file_path": name, **camera(entry, where), "view": view, "step": step})
     return frames
+
+
+def camera(entry: Mapping[str, Any], where: str, intrinsic: str = "intrinsic") -> dict[str, Any]:
+    """Pose and intrinsics of an entry as transforms.json holds them.
+
+    Args:
+        entry: ``c2w`` and intrinsics as of `released_frames`.
+        where: the entry, for messages.
+        intrinsic: key of the intrinsics.
+
+    Raises:
+        InputError: names the entry and the key.
+    """
+    pose, K = matrix_of_numbers(entry.get("c2w")), matrix_of_numbers(entry.get(intrinsic))
+    if pose.shape not in [(4, 4), (3, 4)]:
+        raise InputError(f"{where}: c2w must be a 4x4 matrix of numbers")
+    if K.shape != (3, 3):
+        raise InputError(f"{where}: {intrinsic} must be a 3x3 matrix of numbers")
+    if not np.abs(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1]).max() <= 1e-9:
+        raise InputError(f"{where}: {intrinsic} is not that of a pinhole camera without skew")
+    return {
+        "transform_matrix": [*pose[:3].tolist(), [0.0, 0.0, 0.0, 1.0]],
+        **{"fl_x": K[0, 0].item(), "fl_y": K[1, 1].item(), "cx": K[0, 2].item(), "cy": K[1, 2].item()},
+    }
 
 
 def image_name(entry: Any, where: str) -> str:

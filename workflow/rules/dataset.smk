@@ -81,19 +81,27 @@ rule render_dynamic:
 
 rule supplied_static:
     input:
-        images=lambda wildcards: SETTINGS.scene(wildcards.scene).images.static,
+        images=supplied_list("static"),
     output:
         transforms=f"{DATA}/{{scene}}/static/transforms.json",
     wildcard_constraints:
         scene=scenes_with("static", "supplied"),
+    params:
+        images=supplied_world,
+        dt=scene_setting("dt"),
+        steps=[0],
     script:
         "../scripts/supplied.py"
 
 
 use rule supplied_static as supplied_dynamic with:
     input:
-        images=lambda wildcards: SETTINGS.scene(wildcards.scene).images.dynamic,
+        images=supplied_list("dynamic"),
     output:
         transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
     wildcard_constraints:
         scene=scenes_with("dynamic", "supplied"),
+    params:
+        images=supplied_world,
+        dt=scene_setting("dt"),
+        steps=frame_steps,

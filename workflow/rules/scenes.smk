@@ -4,6 +4,7 @@ import re
 from types import SimpleNamespace
 
 from neuma_lib.config.variants import folder
+from workflow.inputs import image_list
 
 # What a chain's seeds change in a file of a scene or an experiment (config/variants.py); runs of methods have
 # `Config.run_folder`.
@@ -116,6 +117,23 @@ def origin_of(part, scene):
 def scenes_with(part, origin):
     """Pattern of the scenes whose part is of an origin: each file has one maker."""
     return "|".join(scene for scene in SETTINGS.scenes if origin_of(part, scene) == origin) or "none"
+
+
+def supplied_list(part):
+    """A function of wildcards: the file that lists the images that the user supplies for a part of a scene."""
+
+    @checked
+    def choose(wildcards):
+        images = SETTINGS.scene(wildcards.scene).images
+        origin = f"scenes.{wildcards.scene}.images"
+        return image_list(getattr(images, part), images.stride, f"{origin}.{part}", f"{origin}.stride")
+
+    return choose
+
+
+def supplied_world(wildcards):
+    """How the world and the frames of supplied images become those of a scene."""
+    return SETTINGS.scene(wildcards.scene).images.model_dump(include={"stride", "scale", "offset"}, mode="json")
 
 
 def truth_memory(wildcards):

@@ -1,15 +1,23 @@
-"""Take images that were made elsewhere, in our layout or in that of the authors' release."""
+"""Take images that were made elsewhere, in our layout or in one that other systems' authors use."""
+
+from pathlib import Path
 
 from neuma_lib.io.images import list_images
+from neuma_lib.io.layouts import OFFSETS, take_video
 from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
-    images = list_images(inputs.images, output.transforms)
+    world = {key: params.images[key] for key in ("scale", "offset")}
+    said = f"from {inputs.images}"
+    if Path(inputs.images).name in OFFSETS:
+        stride = params.images["stride"]
+        images = take_video(inputs.images, output.transforms, params.steps, stride, **world)
+        said += f", a frame every {stride * params.dt:.6g} s"
+    else:
+        images = list_images(inputs.images, output.transforms, **world)
     views = len(set(images.views.tolist()))
-    run.say(
-        f"{len(images.images)} images of {images.width}x{images.height} px, {views} views, from {inputs.images}"
-    )
+    run.say(f"{len(images.images)} images of {images.width}x{images.height} px, {views} views, {said}")
 
 
 run_script(main, snakemake)

@@ -1,0 +1,295 @@
+"""Videos in the layouts of PAC-NeRF and Spring-Gaus load as they are: cameras, masks, frames, placement, mistakes."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from neuma_lib.config.scenes import SuppliedConfig
+from neuma_lib.config.settings import load
+from neuma_lib.errors import InputError
+from neuma_lib.io.files import read_json
+from neuma_lib.io.images import list_images, load_observation, read_image_set
+from neuma_lib.io.layouts import OFFSETS, take_video
+from workflow.inputs import COUNTED, image_list
+
+ROOT = Path(__file__).resolve().parents[2]
+SIZE = WIDTH, HEIGHT = 40, 36
+K = [[52.0, 0.0, 19.0], [0.0, 50.0, 18.5], [0.0, 0.0, 1.0]]
+RADIUS = 0.2
+STRIDE = 10
+
+
+def centre_of(kind, frame):
+    """Centre of a ball in their world, which falls and drifts; the ground of Spring-Gaus' is at y = 0.3."""
+    start = np.array([0.0, 0.5, 0.0]) if kind == "pac_nerf" else np.array([0.5, 0.7, 0.5])
+    return start + frame * np.array([0.02, -0.05, 0.01])
+
+
+def poses_of(kind, count):
+    """OpenGL cameras (camera to world) on a ring, which look at the ball's start from above."""
+    target, poses = centre_of(kind, 0), []
+    for angle in np.linspace(0.3, 5.0, count):
+        eye = target + np.array([1.4 * np.cos(angle), 0.5, 1.4 * np.sin(angle)])
+        back = (eye - target) / np.linalg.norm(eye - target)
+        right = np.cross([0.0, 1.0, 0.0], back)
+        right /= np.linalg.norm(right)
+        poses.append(np.column_stack([right, np.cross(back, right), back, eye]))
+    return np.array(poses)
+
+
+def picture(pose, centre, background):
+    """A shaded ball, a ray a pixel through its centre: RGBA with the true mask, over a background (H, W, 3)."""
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    rays = np.stack([(u - K[0][2]) / K[0][0], -(v - K[1][2]) / K[1][1], -np.ones_like(u)], axis=-1)
+    rays = rays @ pose[:, :3].T
+    b, c = rays @ (pose[:, 3] - centre), ((pose[:, 3] - centre) ** 2).sum() - RADIUS**2
+    a = (rays**2).sum(axis=-1)
+    inside = b**2 > a * c
+    shade = (40 + 200 * (b**2 - a * c) / (b**2 - a * c).max()).clip(0, 255)
+    colours = np.where(inside[..., None], np.stack([shade, 0.5 * shade, 20 + 0 * shade], axis=-1), background)
+    return np.dstack([colours, 255 * inside]).astype(np.uint8)
+
+
+def write_pac_nerf(folder, cameras=3, frames=4, form="matted"):
+    """A set as PAC-NeRF lays it out, and its pictures by camera and frame; masks as 'matted', 'plate' or 'alpha'."""
+    (folder / "data").mkdir(parents=True)
+    entries, truth, seed = [], {}, np.random.default_rng(0)
+    for view, pose in enumerate(poses_of("pac_nerf", cameras)):
+        plate = seed.integers(100, 180, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+        plate[..., 2] = 250
+        for frame in (-1, *range(frames)):
+            name = f"data/r_{view}_{frame}.png"
+            entries.append(
+                {"file_path": name, "c2w": pose.tolist(), "intrinsic": K, "time": max(frame, 0) / 24}
+            )
+            if frame < 0:
+                Image.fromarray(plate).save(folder / name)
+                continue
+            image = picture(pose, centre_of("pac_nerf", frame), plate)
+            truth[view, frame] = image
+            Image.fromarray(image if form == "alpha" else image[..., :3]).save(folder / name)
+            if form == "matted":
+                white = np.where(image[..., 3:] > 0, image[..., :3], 255).astype(np.uint8)
+                Image.fromarray(white).save(folder / f"data/m_{view}_{frame}.png")
+    path = folder / "all_data.json"
+    path.write_text(json.dumps(entries))
+    return path, truth
+
+
+def write_spring_gaus(folder, cameras=3, frames=4):
+    """A set as Spring-Gaus lays its synthetic scenes out, and its pictures by camera and frame."""
+    entries, truth = [], {}
+    for view, pose in enumerate(poses_of("spring_gaus", cameras)):
+        name = f"camera_{view:02d}"
+        (folder / name).mkdir(parents=True)
+        entries.append({"camera": name, "K": K, "c2w": [*pose.tolist(), [0, 0, 0, 1]]})
+        for frame in range(frames):
+            truth[view, frame] = picture(pose, centre_of("spring_gaus", frame), np.zeros(3))
+            Image.fromarray(truth[view, frame]).save(folder / name / f"{frame:03}.png")
+    (folder / "frame.json").write_text(json.dumps(list(range(frames))))
+    path = folder / "camera.json"
+    path.write_text(json.dumps(entries))
+    return path, truth
+
+
+WRITERS = {"pac_nerf": write_pac_nerf, "spring_gaus": write_spring_gaus}
+
+
+def ours(kind, points, scale=1.0, offset=None):
+    return scale * points + (
+        OFFSETS[{"pac_nerf": COUNTED[0], "spring_gaus": COUNTED[1]}[kind]] if offset is None else offset
+    )
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+@pytest.mark.parametrize("world", [{}, {"scale": 0.8, "offset": [0.4, 0.1, 0.55]}])
+def test_known_points_are_seen_where_their_cameras_see_them(tmp_path, kind, world):
+    source, _ = WRITERS[kind](tmp_path / "set")
+    images = take_video(source, tmp_path / "ours/transforms.json", [0, 20, 30], STRIDE, **world)
+    assert images.views.tolist() == [0, 1, 2] * 3 and images.steps.tolist() == [0] * 3 + [20] * 3 + [30] * 3
+    points = centre_of(kind, 1) + np.random.default_rng(1).uniform(-0.3, 0.3, (20, 3))
+    for view, viewmat, intrinsics in zip(images.views, images.viewmats, images.Ks, strict=True):
+        pose = poses_of(kind, 3)[view]
+        x, y, z = ((points - pose[:, 3]) @ pose[:, :3]).T  # OpenGL: it looks along -z, y is up in the image
+        seen = np.stack([K[0][2] + K[0][0] * x / -z, K[1][2] - K[1][1] * y / -z], axis=1)
+        local = ours(kind, points, **world) @ viewmat[:3, :3].T + viewmat[:3, 3]
+        projected = local @ intrinsics.T
+        np.testing.assert_allclose(projected[:, :2] / projected[:, 2:], seen, rtol=0, atol=1e-9)
+    said = read_json(tmp_path / "ours/transforms.json").get("world")
+    assert said == {
+        "scale": world.get("scale", 1.0),
+        "offset": list(world.get("offset") or OFFSETS[source.name]),
+    }
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_rays_through_loaded_pixels_meet_the_placed_body_where_the_mask_is(tmp_path, kind):
+    """The way back, through our own conventions (OpenCV axes, pixel centres at +0.5)."""
+    source, _ = WRITERS[kind](tmp_path / "set")
+    images = take_video(source, tmp_path / "ours/transforms.json", [0, 30], STRIDE)
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    pixels = np.stack([u, v, np.ones_like(u)], axis=-1)
+    for k, image in enumerate(images.images):
+        rays = pixels @ np.linalg.inv(images.Ks[k]).T @ images.viewmats[k][:3, :3]
+        eye = -images.viewmats[k][:3, :3].T @ images.viewmats[k][:3, 3]
+        away = eye - ours(kind, centre_of(kind, images.steps[k] / STRIDE))
+        b, a = rays @ away, (rays**2).sum(axis=-1)
+        np.testing.assert_array_equal(image[..., 3] > 0, b**2 > a * ((away**2).sum() - RADIUS**2))
+
+
+@pytest.mark.parametrize("form", ["matted", "plate", "alpha"])
+def test_images_of_pac_nerf_keep_their_colours_and_get_their_mask(tmp_path, form):
+    source, truth = write_pac_nerf(tmp_path / "set", form=form)
+    target = tmp_path / "ours/transforms.json"
+    images = take_video(source, target, [0, 10, 20, 30], STRIDE)
+    for image, view, step in zip(images.images, images.views, images.steps, strict=True):
+        np.testing.assert_array_equal(image, truth[view, step // STRIDE])
+    written = {file.name for file in target.parent.iterdir()}
+    assert written == {"transforms.json"} if form == "alpha" else len(written) == 13
+
+
+def test_white_in_the_object_is_seen_where_the_plate_is_not_white_and_no_matte_is_there(tmp_path):
+    source, truth = write_pac_nerf(tmp_path / "set", cameras=2, frames=1, form="plate")
+    file = tmp_path / "set/data/r_0_0.png"
+    pixels = truth[0, 0][..., :3].copy()
+    row, column = np.argwhere(truth[0, 0][..., 3] > 0).mean(axis=0).astype(int)
+    pixels[row, column] = 255
+    Image.fromarray(pixels).save(file)
+    images = take_video(source, tmp_path / "ours/transforms.json", [0], STRIDE)
+    assert (images.images[0][row, column] == 255).all()
+
+
+def test_images_of_spring_gaus_stay_where_they_are(tmp_path):
+    source, truth = write_spring_gaus(tmp_path / "set")
+    target = tmp_path / "ours/transforms.json"
+    images = take_video(source, target, [0, 10, 20, 30], STRIDE)
+    assert [file.name for file in target.parent.iterdir()] == ["transforms.json"]
+    for image, view, step in zip(images.images, images.views, images.steps, strict=True):
+        np.testing.assert_array_equal(image, truth[view, step // STRIDE])
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_a_part_of_a_video_and_its_first_frames_are_taken(tmp_path, kind):
+    source, _ = WRITERS[kind](tmp_path / "set")
+    static = take_video(source, tmp_path / "static/transforms.json", [0], STRIDE)
+    assert static.views.tolist() == [0, 1, 2] and not static.steps.any()
+    take_video(source, tmp_path / "dynamic/transforms.json", [0, 20], STRIDE)
+    video = load_observation(tmp_path / "dynamic/transforms.json", views=[1, 2])
+    assert video.frames == (0, 20) and video.images.shape == (2, 2, HEIGHT, WIDTH, 4)
+
+
+def edit(path, change):
+    entries = json.loads(path.read_text())
+    change(entries)
+    path.write_text(json.dumps(entries))
+
+
+PAC_MISTAKES = {
+    "no name": (lambda e: e[1].pop("file_path"), r"all_data\.json: entry 1 has no file_path"),
+    "other name": (
+        lambda e: e[1].update(file_path="data/first.png"),
+        r"entry 1 .*file_path must end in r_<camera>",
+    ),
+    "twice": (lambda e: e.append(e[1]), "entry 10 .*file_path is that of an earlier entry"),
+    "pose": (lambda e: e[1].pop("c2w"), r"entry 1 \(data/r_0_0\.png\): c2w must be a 4x4 matrix"),
+    "lens": (lambda e: e[1].update(intrinsic=[1]), "intrinsic must be a 3x3 matrix"),
+    "moved": (lambda e: e[3]["c2w"][0].__setitem__(3, 9.0), "camera 0 has moved by frame 2"),
+    "missing": (
+        lambda e: e.pop(7),
+        "lists no frame 1 of camera 1: where the video ends earlier, lower .*steps",
+    ),
+    "size": (lambda e: [x["c2w"][0].__setitem__(0, 5.0) for x in e[:5]], "is not a rigid motion"),
+    "empty": (lambda e: e.clear(), "expected a list with an entry for each image"),
+}
+SPRING_MISTAKES = {
+    "folder": (lambda e: e[1].pop("camera"), r"camera\.json: entry 1: camera must be the name of a folder"),
+    "pose": (lambda e: e[1].update(c2w=3), r"entry 1 \(camera_01\): c2w must be a 4x4 matrix"),
+    "lens": (lambda e: e[1].pop("K"), r"entry 1 \(camera_01\): K must be a 3x3 matrix"),
+    "skew": (lambda e: e[1]["K"][0].__setitem__(1, 1.0), "K is not that of a pinhole camera without skew"),
+    "missing": (
+        lambda e: e[1].update(camera="nowhere"),
+        r"nowhere/000\.png is missing: where the video ends",
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "message"),
+    [("pac_nerf", *case) for case in PAC_MISTAKES.values()]
+    + [("spring_gaus", *case) for case in SPRING_MISTAKES.values()],
+)
+def test_mistakes_are_named(tmp_path, kind, change, message):
+    source, _ = WRITERS[kind](tmp_path / "set", cameras=2)
+    edit(source, change)
+    with pytest.raises(InputError, match=message):
+        take_video(source, tmp_path / "ours/transforms.json", [0, 10, 20, 30], STRIDE)
+
+
+def test_images_without_any_mask_and_occluders_are_refused(tmp_path):
+    source, _ = write_pac_nerf(tmp_path / "set", cameras=2, form="plate")
+    with_plates = source.read_text()
+    edit(source, lambda e: [e.remove(x) for x in list(e) if x["file_path"].endswith("_-1.png")])
+    target = tmp_path / "ours/transforms.json"
+    with pytest.raises(InputError, match=r"r_0_0\.png has no mask: store it as alpha, add m_0_0\.png"):
+        take_video(source, target, [0], STRIDE)
+    source.write_text(with_plates)
+    edit(source, lambda e: e.append({**e[0], "file_path": "data/r_0_-2.png"}))
+    for alpha in (0, 255):
+        Image.new("RGBA", SIZE, (0, 0, 0, alpha)).save(tmp_path / "set/data/r_0_-2.png")
+        if alpha == 0:
+            take_video(source, target, [0], STRIDE)
+        else:
+            with pytest.raises(InputError, match=r"r_0_-2\.png says that something stands in front"):
+                take_video(source, target, [0], STRIDE)
+
+
+def test_cameras_that_look_past_the_box_are_refused(tmp_path):
+    source, _ = write_pac_nerf(tmp_path / "set")
+    with pytest.raises(
+        InputError, match=r"look at \(-1\.00, 0\.50, 0\.00\) m.*set images\.offset and images\.scale"
+    ):
+        take_video(source, tmp_path / "ours/transforms.json", [0], STRIDE, offset=[-1.0, 0.0, 0.0])
+
+
+def test_our_own_lists_are_placed_too(tmp_path):
+    take_video(
+        write_pac_nerf(tmp_path / "set")[0], tmp_path / "a/transforms.json", [0], STRIDE, offset=[0.2, 0, 0.3]
+    )
+    moved = list_images(tmp_path / "a/transforms.json", tmp_path / "b/transforms.json", 2.0, [0.1, 0.2, 0.3])
+    point = np.array([0.3, 0.4, 0.2, 1.0])
+    there = np.array([*(2.0 * point[:3] + [0.1, 0.2, 0.3]), 1.0])
+    before = read_image_set(tmp_path / "a/transforms.json")
+    np.testing.assert_allclose(
+        (moved.viewmats @ there)[:, :3], 2.0 * (before.viewmats @ point)[:, :3], atol=1e-12
+    )
+
+
+def test_settings_name_the_folder_or_the_file(tmp_path):
+    source, _ = write_spring_gaus(tmp_path / "set", cameras=1, frames=1)
+    for place in (source, source.parent, f"{source.parent}/"):
+        assert image_list(str(place), 5, "a", "b") == str(source)
+    with pytest.raises(InputError, match="b: .*counts frames; say how many simulated steps"):
+        image_list(str(source), None, "a", "b")
+    with pytest.raises(InputError, match="a: the folder .* has none of"):
+        image_list(str(tmp_path), 5, "a", "b")
+    assert image_list("release/list.json", None, "a", "b") == "release/list.json"
+    assert set(COUNTED) == set(OFFSETS)
+
+
+def test_frames_of_a_scene_are_those_that_the_folder_counts():
+    def frames(**own):
+        scene = {"images": {"stride": 100}, "steps": 450} | own
+        raw = yaml.safe_load((ROOT / "config/config.yaml").read_text())
+        return load(raw | {"scenes": {"BouncyBall": scene}}).frame_steps("BouncyBall")
+
+    assert frames() == (0, 100, 200, 300, 400)
+    assert frames(frames=[0, 200]) == (0, 200)
+    with pytest.raises(
+        InputError, match=r"frames: step 150 is none of the supplied frames, images\.stride: 100"
+    ):
+        frames(frames=[0, 150])
+    assert SuppliedConfig().offset is None
