@@ -133,7 +133,9 @@ def supplied_list(part):
 
 def supplied_world(wildcards):
     """How the world and the frames of supplied images become those of a scene."""
-    return SETTINGS.scene(wildcards.scene).images.model_dump(include={"stride", "scale", "offset"}, mode="json")
+    return SETTINGS.scene(wildcards.scene).images.model_dump(
+        include={"stride", "scale", "offset"}, mode="json"
+    )
 
 
 def truth_memory(wildcards):
