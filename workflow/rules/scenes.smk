@@ -133,9 +133,8 @@ def supplied_list(part):
 
 def supplied_world(wildcards):
     """How the world and the frames of supplied images become those of a scene."""
-    return SETTINGS.scene(wildcards.scene).images.model_dump(
-        include={"stride", "scale", "offset"}, mode="json"
-    )
+    images = SETTINGS.scene(wildcards.scene).images.plain()
+    return {name: images[name] for name in ("stride", "scale", "offset")}
 
 
 def truth_memory(wildcards):
