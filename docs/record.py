@@ -52,6 +52,7 @@ MADE_BY = {
     "identified": "results/identified.csv",
     "bias": "results/bias.csv",
     "table1_systems": "results/table1_systems.csv",
+    "table2_systems": "results/table2_systems.csv",
 }
 """Tables that are recorded, and the target of Snakemake that makes them."""
 VERDICT_HEAD = f"| {' | '.join(VERDICTS[:2])} |"

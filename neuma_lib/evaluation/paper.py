@@ -355,6 +355,12 @@ PAPER = {
             ),
         ),
     ),
+    "table2_systems": PaperTable(
+        "",
+        "Other systems elsewhere",
+        "What springs and laws that were learned from a video say of another body, and of the time after the video",
+        (*_LETTERS[:3], "longer_bouncy", "longer_jelly"),
+    ),
     "stress": PaperTable(
         "",
         "Stresses",

@@ -77,6 +77,30 @@ def test_springs_are_fitted_to_the_video_alone(project):
         assert "only springs in one body: it has no stress and no bias" in refused
 
 
+def test_springs_and_laws_of_a_table_are_put_to_use_elsewhere_as_their_scenes_taught_them(project):
+    """Fits are those of the scenes: the table repeats none, and none sees more than the video."""
+    graph = jobs(project.run("--dry-run", "tiny/results/table2_systems.csv"))
+    fitted = [outputs[0] for rule, _, outputs in graph if rule in ("springs", "pac_nerf")]
+    scenes, files = (
+        ("BouncyBall", "JellyDuck", "RubberPawn"),
+        {"spring_gaus/springs.safetensors", "pac_nerf/constants.json"},
+    )
+    assert sorted(fitted) == sorted(f"tiny/results/{scene}/{file}" for scene in scenes for file in files)
+    used = {outputs[0].split("/")[3]: read for rule, read, outputs in graph if rule == "springs_experiment"}
+    assert len(used) == 5 and sum(rule == "experiment" for rule, *_ in graph) == 5 * 5
+    for experiment, scene in (
+        ("letter_N_jelly", "JellyDuck"),
+        ("longer_jelly", "JellyDuck"),
+        ("longer_bouncy", "BouncyBall"),
+    ):
+        assert f"tiny/results/{scene}/spring_gaus/springs.safetensors" in used[experiment]
+        assert f"tiny/data/experiments/{experiment}/particles.h5" in used[experiment]
+    table = next(read for rule, read, _ in graph if rule == "chamfer_table")
+    assert len(table) == 6 * 5 and not any(
+        f"tiny/results/{scene}/" in file for scene in scenes for file in table
+    )
+
+
 def test_pac_nerf_needs_images_its_field_and_contact_alone(project):
     """Its own start and law are judged; no networks, and no truth, lead to them."""
     run = f"{SCENE}+seed=1/pac_nerf+guesses=prior"
