@@ -35,6 +35,12 @@ class StructuredConfig(Section):
         description="what a part of the law must gain to be corrected: the loss of the held-out frames falls by this "
         "part of itself",
     )
+    rivals: int = Field(
+        1,
+        ge=0,
+        description="so many of the families that tie with the identified one, and flow otherwise, are corrected for a "
+        "trial, too; the held-out frames choose between the corrections",
+    )
     penalties: tuple[float, ...] = Field(
         (),
         description="weights of `material.penalty` that are tried beside it, each for as many steps as a trial: of "

@@ -7,6 +7,9 @@ chosen are trained on from there, on all frames. The others stay as they are, ex
 improves. Frames before the first contact say nothing of the law: they train and judge nothing, and the steps up to
 there are simulated once, with the law as it is.
 
+A correction bends what its base has: an elastic base never flows, and one that flows at any stress holds no load. Where
+constants alone do not tell such families apart, rivals are tried likewise, and the frames judge their corrections, too.
+
 How firmly the correction is held where the video is silent (`neuma_lib.fitting.deviation`) is chosen by the same
 frames: of the weights that are tried, the largest that they do as well with.
 """
@@ -15,7 +18,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations
 from typing import Any
@@ -65,7 +68,9 @@ class Choice:
 
     Attributes:
         parts: short names of the parts; empty if the law stays as it is.
+        base: which of the laws is corrected: 0, or k for the k-th rival.
         trials: what was tried, by the names of the parts joined with " + ", beside `NOTHING`; with a penalty, that too.
+            Those of the k-th rival are prefixed with "rival k: ".
         held_out_frames: steps of the frames that judged, a tuple a video.
         penalty: weight of the penalty on states that the video did not visit.
     """
@@ -74,6 +79,7 @@ class Choice:
     trials: dict[str, Trial]
     held_out_frames: tuple[tuple[int, ...], ...]
     penalty: float = 0.0
+    base: int = 0
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, for JSON; a loss that is infinite is None."""
@@ -82,7 +88,7 @@ class Choice:
             for name, found in _plain(self.trials).items()
         }
         held_out = [list(frames) for frames in self.held_out_frames]
-        about = {"corrected_parts": list(self.parts), "penalty": self.penalty}
+        about = {"corrected_parts": list(self.parts), "base": self.base, "penalty": self.penalty}
         return {**about, "trials": trials, "held_out_frames": held_out}
 
     def summary(self) -> str:
@@ -93,7 +99,7 @@ class Choice:
             for name, trial in self.trials.items()
             if name != NOTHING
         ]
-        chosen = " + ".join(self.parts) or NOTHING
+        chosen = _name(self.base, self.parts)
         held = f", penalty {self.penalty:g}" if self.penalty else ""
         return f"corrected: {chosen}{held}; change of the held-out loss: {', '.join(gains)}"
 
@@ -106,6 +112,7 @@ def train_structured(
     settings: MaterialConfig,
     structured: StructuredConfig,
     *,
+    rivals: Sequence[StructuredLaw] = (),
     further: Sequence[Video] = (),
     checkpoint: Checkpoint | None = None,
     progress: Callable[[int, int, float], None] | None = None,
@@ -117,6 +124,7 @@ def train_structured(
         model, start, loss, settings, further: as of `train_material`.
         law: analytic law with an adaptor that is zero still.
         structured: how parts are judged.
+        rivals: others like it, one of which takes its place if its correction does better on the held-out frames.
         checkpoint: keeps what was tried, and the state of the training that runs.
         progress: called with (iterations done, of all trainings together, loss).
         log: receives a line for every trial.
@@ -128,7 +136,8 @@ def train_structured(
     videos = [(start, loss), *further]
     if any(len(loss.frames) < LEAST_FRAMES for _, loss in videos):
         raise InputError(f"a structured law needs at least {LEAST_FRAMES} frames, to fit and to judge by")
-    uncorrected = copy.deepcopy(law.state_dict())
+    laws = [law, *rivals]
+    uncorrected = [copy.deepcopy(each.state_dict()) for each in laws]
     as_it_is = [_simulated(model, law, *video) for video in videos]
     if any(found is None for found in as_it_is):
         raise NonFiniteError("material", "the motion of the uncorrected law breaks off")
@@ -141,16 +150,16 @@ def train_structured(
         for (_, loss), out in zip(told, held_out, strict=True)
     ]
     seen = [(start, loss.select(keep)) for keep, (start, loss) in zip(fitted, told, strict=True)]
-    trained_parts = tuple(name for name, part in PARTS.items() if part in law.parts)
     brief = settings.model_copy(update={"iterations": structured.trial_iterations})
     first = Stretch(after=settings.iterations)
     weights = [weight for weight in structured.penalties if weight != settings.penalty]
-    total = (1 + len(weights)) * brief.iterations + settings.iterations
+    total = (len(laws) + len(weights)) * brief.iterations + settings.iterations
     kept = checkpoint.load() if checkpoint else None
     trials = {name: Trial(**found) for name, found in kept["trials"].items()} if kept else {}
     states = dict(kept["states"]) if kept else {}
 
     def train(
+        base: int,
         begin: LawState,
         parts: Sequence[str],
         videos: Sequence[Video],
@@ -158,64 +167,97 @@ def train_structured(
         stretch: Stretch,
         before: int,
     ) -> TrainedMaterial:
+        law = laws[base]
         law.load_state_dict(begin)
-        for name in trained_parts:
+        for name in trained_parts(law):
             law.parts[PARTS[name]].adaptor.requires_grad_(name in parts)
         inner = checkpoint and _Stage(checkpoint, _plain(trials), dict(states))
         shown = progress and (lambda done, _, value: progress(before + done, total, value))
         options = {"further": videos[1:], "checkpoint": inner, "progress": shown, "log": log}
         return train_material(model, law, *videos[0], how, stretch=stretch, **options)
 
-    def keep(weight: float, trained: TrainedMaterial) -> LawState:
-        states[weight] = {"law": copy.deepcopy(law.state_dict()), "memory": trained.memory}
-        return states[weight]["law"]
+    def keep(base: int, weight: float, trained: TrainedMaterial) -> LawState:
+        found = {"law": copy.deepcopy(trained.law.state_dict()), "memory": trained.memory}
+        states[base, weight] = found
+        return found["law"]
 
-    def judged(state: LawState) -> Trial:
-        """How a law does on the frames that tell of it."""
-        law.load_state_dict(state)
-        found = [_simulated(model, law, *video) for video in told]
-        if any(one is None for one in found):
-            return Trial(math.inf, math.inf)
-        means = (
-            _mean([_mean([losses[k] for k in one]) for (_, losses), one in zip(found, which, strict=True)])
-            for which in (fitted, held_out)
-        )
-        return Trial(*means)
+    def tried(name: str, base: int, state: LawState) -> None:
+        """Keep how a law does on the frames that tell of it."""
+        laws[base].load_state_dict(state)
+        found = [_simulated(model, laws[base], *video) for video in told]
+        trials[name] = Trial(math.inf, math.inf)
+        if all(found):
+            means = (
+                _mean(
+                    [_mean([losses[k] for k in one]) for (_, losses), one in zip(found, which, strict=True)]
+                )
+                for which in (fitted, held_out)
+            )
+            trials[name] = Trial(*means)
+        if name != NOTHING:
+            log(f"{name} corrected: {_compared(trials[name], trials[NOTHING])}")
 
-    def tried(name: str, state: LawState) -> None:
-        trials[name] = judged(state)
-        log(f"{name} corrected: {_compared(trials[name], trials[NOTHING])}")
-
-    if NOTHING not in trials:
-        together = keep(settings.penalty, train(uncorrected, trained_parts, seen, brief, first, 0))
-        trials[NOTHING] = judged(uncorrected)
-        for parts in subsets(trained_parts):
-            tried(" + ".join(parts), corrected_in(parts, together, uncorrected))
-    parts = _chosen(subsets(trained_parts), trials, structured.margin)
+    candidates = [(base, parts) for base, law in enumerate(laws) for parts in subsets(trained_parts(law))]
+    for base, each in enumerate(laws):
+        of_base = [parts for k, parts in candidates if k == base]
+        if _name(base, of_base[0]) in trials:
+            continue
+        done = base * brief.iterations
+        trained = train(base, uncorrected[base], trained_parts(each), seen, brief, first, done)
+        together = keep(base, settings.penalty, trained)
+        if base == 0:
+            tried(NOTHING, 0, uncorrected[0])
+        for parts in of_base:
+            tried(_name(base, parts), base, corrected_in(parts, together, uncorrected[base]))
+    base, parts = _chosen(candidates, trials, structured.margin)
     steps = tuple(
         tuple(loss.frames[begin + k] for k in out)
         for begin, out, (_, loss) in zip(firsts, held_out, videos, strict=True)
     )
-    choice = Choice(parts, trials, steps, settings.penalty)
+    choice = Choice(parts, trials, steps, settings.penalty, base)
     if parts:
-        name = " + ".join(parts)
+        name = _name(base, parts)
         losses = {settings.penalty: trials[name].held_out_loss}
-        for k, weight in enumerate(weights, 1):
+        for k, weight in enumerate(weights, len(laws)):
             held = f"{name}, penalty {weight:g}"
             if held not in trials:
                 how = brief.model_copy(update={"penalty": weight})
-                done = k * brief.iterations
-                tried(held, keep(weight, train(uncorrected, parts, seen, how, first, done)))
+                trained = train(base, uncorrected[base], parts, seen, how, first, k * brief.iterations)
+                tried(held, base, keep(base, weight, trained))
             losses[weight] = trials[held].held_out_loss
         choice.penalty = largest_as_good(losses)
         how = settings.model_copy(update={"penalty": choice.penalty})
-        found = states[choice.penalty]
-        begin = corrected_in(parts, found["law"], uncorrected)
+        found = states[base, choice.penalty]
+        begin = corrected_in(parts, found["law"], uncorrected[base])
         last = Stretch(before=brief.iterations, memory=found["memory"])
-        return train(begin, parts, told, how, last, total - settings.iterations), choice
-    law.load_state_dict(uncorrected)
+        return train(base, begin, parts, told, how, last, total - settings.iterations), choice
+    law.load_state_dict(uncorrected[0])
     value = _mean([_mean(losses[begin:]) for begin, (_, losses) in zip(firsts, as_it_is, strict=True)])
     return TrainedMaterial(law, History(loss=[value]), value, 0, stable=True), choice
+
+
+def trained_parts(law: StructuredLaw) -> tuple[str, ...]:
+    """Short names of the parts of a law that a correction may change."""
+    return tuple(name for name, part in PARTS.items() if part in law.parts)
+
+
+def rival_bases(identified: Mapping[str, Any], most: int) -> list[dict[str, Any]]:
+    """Laws of the families that tie with the identified one and flow otherwise, those of the best scores first.
+
+    What stresses of the same kind of flow differ by, a correction of either can learn.
+
+    Args:
+        identified: content of identified.json.
+        most: largest number of them.
+    """
+    kinds = {_flow(identified["law"])}
+    tied = sorted((identified["families"][name] for name in identified["ties"]), key=lambda fit: fit["score"])
+    found = []
+    for law in (fit["law"] for fit in tied):
+        if len(found) < most and _flow(law) not in kinds:
+            kinds.add(_flow(law))
+            found.append(law)
+    return found
 
 
 def subsets(parts: Sequence[str]) -> list[tuple[str, ...]]:
@@ -246,14 +288,26 @@ def from_frame(start: State, loss: TrajectoryLoss, path: Trajectory, first: int)
     return state, loss.select(range(first, len(loss.frames))).later(path.frames[at])
 
 
-def _chosen(choices: Iterable[tuple[str, ...]], trials: dict[str, Trial], margin: float) -> tuple[str, ...]:
-    """Parts of the lowest held-out loss, of which each must lower it by the margin."""
+def _chosen(
+    candidates: Iterable[tuple[int, tuple[str, ...]]], trials: dict[str, Trial], margin: float
+) -> tuple[int, tuple[str, ...]]:
+    """Base and parts of the lowest held-out loss; each part must lower it by the margin, and so must a rival."""
 
-    def score(parts: tuple[str, ...]) -> float:
-        loss = trials[" + ".join(parts) or NOTHING].held_out_loss
-        return loss * (1 - margin) ** -len(parts)
+    def score(candidate: tuple[int, tuple[str, ...]]) -> float:
+        base, parts = candidate
+        return trials[_name(base, parts)].held_out_loss * (1 - margin) ** -(len(parts) + (base > 0))
 
-    return min([(), *choices], key=score)
+    return min([(0, ()), *candidates], key=score)
+
+
+def _name(base: int, parts: Sequence[str]) -> str:
+    """Name of the trial of a base's correction."""
+    return (f"rival {base}: " if base else "") + (" + ".join(parts) or NOTHING)
+
+
+def _flow(law: Mapping[str, Any]) -> str:
+    """The kind of return map of a law's specification."""
+    return law["plasticity"]["name"]
 
 
 def largest_as_good(losses: dict[float, float]) -> float:
@@ -293,12 +347,12 @@ class _Stage:
 
     Attributes:
         trials: how what was tried did.
-        states: laws that were trained, and the memory of their trainings, by the weight of the penalty.
+        states: laws that were trained, and the memory of their trainings, by their base and the weight of the penalty.
     """
 
     whole: Checkpoint
     trials: dict[str, dict[str, float]]
-    states: dict[float, dict[str, Any]]
+    states: dict[tuple[int, float], dict[str, Any]]
 
     def load(self) -> dict[str, Any] | None:
         """The state of this training; None if that of another is kept."""

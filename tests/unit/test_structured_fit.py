@@ -18,6 +18,7 @@ from neuma_lib.fitting.structured_fit import (
     _chosen,
     from_frame,
     largest_as_good,
+    rival_bases,
     subsets,
     told_from,
     train_structured,
@@ -43,11 +44,13 @@ def problem():
     return body, PixelLoss(body, observe(body, V0, FRAMES))
 
 
-def fit(problem, spec, settings=SETTINGS, structured=STRUCTURED, **options):
+def fit(problem, *specs, settings=SETTINGS, structured=STRUCTURED, **options):
     body, loss = problem
-    law = structured_law(spec, MODEL.dt).double()
-    law.attach_adaptor(rank=settings.rank)
-    return train_structured(MODEL, law, body.state(V0), loss, settings, structured, **options)
+    laws = [structured_law(spec, MODEL.dt).double() for spec in specs]
+    for law in laws:
+        law.attach_adaptor(rank=settings.rank)
+    options["rivals"] = laws[1:]
+    return train_structured(MODEL, laws[0], body.state(V0), loss, settings, structured, **options)
 
 
 def deltas(law, part):
@@ -156,23 +159,26 @@ def test_a_law_that_nothing_improves_stays_exactly_as_it_is(problem):
     assert trained.stable and len(trained.history.loss) == 1 and trained.summary()
 
 
+class KilledAfter:
+    """A checkpoint in memory whose run is killed as it has saved so many states."""
+
+    def __init__(self, saves):
+        self.states, self.left = [], saves
+
+    def load(self):
+        return copy.deepcopy(self.states[-1]) if self.states else None
+
+    def save(self, state):
+        self.states.append(copy.deepcopy(state))
+        self.left -= 1
+        if self.left == 0:
+            raise KeyboardInterrupt
+
+
 @pytest.mark.parametrize("saves", [1, 2, 4])
 def test_a_killed_run_goes_on_to_the_same_bits(problem, too_stiff, saves):
     """In the trial, at its end, in the last training."""
-
-    class Keep:
-        states, left = [], saves
-
-        def load(self):
-            return copy.deepcopy(self.states[-1]) if self.states else None
-
-        def save(self, state):
-            self.states.append(copy.deepcopy(state))
-            self.left -= 1
-            if self.left == 0:
-                raise KeyboardInterrupt
-
-    keep = Keep()
+    keep = KilledAfter(saves)
     with pytest.raises(KeyboardInterrupt):
         fit(problem, FLOWS, log=lambda _: None, checkpoint=keep)
     before = len(keep.states)
@@ -187,7 +193,9 @@ def test_each_part_has_to_gain_the_margin():
     def chosen(elastic, plastic, both, margin=0.1):
         losses = {"nothing": 1.0, "elastic": elastic, "plastic": plastic, "elastic + plastic": both}
         trials = {name: Trial(0.0, loss) for name, loss in losses.items()}
-        return _chosen([("elastic",), ("plastic",), ("elastic", "plastic")], trials, margin)
+        base, parts = _chosen([(0, parts) for parts in subsets(("elastic", "plastic"))], trials, margin)
+        assert base == 0
+        return parts
 
     assert chosen(0.91, 0.95, 0.82) == ()
     assert chosen(0.89, 0.95, 0.82) == ("elastic",)
@@ -195,6 +203,65 @@ def test_each_part_has_to_gain_the_margin():
     assert chosen(0.89, 0.85, 0.76) == ("elastic", "plastic")
     assert chosen(0.89, 0.85, float("inf")) == ("plastic",)
     assert chosen(1.0, 1.0, 1.0, margin=0.0) == ()
+
+
+CLOSER = {**FLOWS, "elasticity": {**TRUTH["elasticity"], "E": 3.5e4}}
+
+
+def test_a_rival_whose_correction_does_better_takes_the_place_of_the_law(problem):
+    """Both may flow and do not; one is nearer to the stiffness of the video."""
+    done = []
+    trained, choice = fit(
+        problem, FLOWS, CLOSER, log=lambda _: None, progress=lambda *state: done.append(state[:2])
+    )
+    assert choice.base == 1 == choice.as_dict()["base"] and choice.parts == ("elastic",)
+    assert "rival 1: elastic" in choice.summary() and "rival 1: elastic + plastic" in choice.trials
+    assert trained.law.specification()["elasticity"]["E"] == 3.5e4
+    assert done[-1] == (7, 7) and done == sorted(done)
+    # as if it had been the law from the beginning
+    alone, of_it = fit(problem, CLOSER, log=lambda _: None)
+    assert choice.trials["rival 1: elastic"] == of_it.trials["elastic"]
+    assert all(map(torch.equal, deltas(trained.law, "elasticity"), deltas(alone.law, "elasticity")))
+
+
+def test_a_rival_that_does_worse_changes_nothing(problem):
+    trained, choice = fit(problem, CLOSER, FLOWS, log=lambda _: None)
+    alone, _ = fit(problem, CLOSER, log=lambda _: None)
+    assert choice.base == 0 and trained.best_loss == alone.best_loss
+    assert all(map(torch.equal, deltas(trained.law, "elasticity"), deltas(alone.law, "elasticity")))
+
+
+@pytest.mark.parametrize("saves", [2, 3, 5, 6])
+def test_a_killed_run_with_a_rival_goes_on(problem, saves):
+    never, keep = KilledAfter(100), KilledAfter(saves)
+    whole, choice = fit(problem, FLOWS, CLOSER, log=lambda _: None, checkpoint=never)
+    with pytest.raises(KeyboardInterrupt):
+        fit(problem, FLOWS, CLOSER, log=lambda _: None, checkpoint=keep)
+    trained, again = fit(problem, FLOWS, CLOSER, log=lambda _: None, checkpoint=keep)
+    assert again == choice and len(keep.states) == len(never.states) > saves
+    assert all(map(torch.equal, deltas(trained.law, "elasticity"), deltas(whole.law, "elasticity")))
+
+
+def test_a_rival_has_to_gain_the_margin_too():
+    trials = {"nothing": Trial(0.0, 1.0), "elastic": Trial(0.0, 0.8), "rival 1: elastic": Trial(0.0, 0.73)}
+    candidates = [(0, ("elastic",)), (1, ("elastic",))]
+    assert _chosen(candidates, trials, 0.1) == (0, ("elastic",))
+    trials["rival 1: elastic"] = Trial(0.0, 0.71)
+    assert _chosen(candidates, trials, 0.1) == (1, ("elastic",))
+
+
+def test_rivals_are_ties_that_flow_otherwise_the_best_first():
+    def law(flow):
+        return {"elasticity": {"name": "hencky"}, "plasticity": {"name": flow}}
+
+    flows = {"sand": "drucker_prager", "clay": "von_mises", "hencky": "identity", "bingham": "viscous_flow"}
+    scores = {"sand": -7.2, "clay": -7.0, "hencky": -7.1, "bingham": -7.3, "fluid": -7.4}
+    families = {name: {"law": law(flow), "score": scores[name]} for name, flow in flows.items()}
+    families["fluid"] = {"law": law("viscous_flow"), "score": scores["fluid"]}
+    found = {"law": law("von_mises"), "families": families, "ties": ["clay", "hencky", "bingham", "fluid"]}
+    assert rival_bases(found, 3) == [law("viscous_flow"), law("identity")]
+    assert rival_bases(found, 1) == [law("viscous_flow")]
+    assert rival_bases(found, 0) == [] == rival_bases({**found, "ties": []}, 1)
 
 
 def test_the_largest_penalty_that_held_out_frames_bear_is_taken(problem):

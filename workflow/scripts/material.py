@@ -9,7 +9,7 @@ from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.device import choose_device
 from neuma_lib.fitting.material import ParticleLoss, PixelLoss, train_material
-from neuma_lib.fitting.structured_fit import train_structured
+from neuma_lib.fitting.structured_fit import rival_bases, train_structured
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.hdf5 import read_arrays
@@ -39,12 +39,19 @@ def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
     structured = StructuredConfig(**params.structured) if params.structured else None
     if structured:
-        base = params.base or read_json(inputs.identified)["law"]
-        law = structured_law({**base, "form": structured.form}, params.simulation["dt"], seed=settings.seed)
+        bases = [params.base]
+        if not params.base:
+            identified = read_json(inputs.identified)
+            bases = [identified["law"], *rival_bases(identified, structured.rivals)]
+        laws = [
+            structured_law({**base, "form": structured.form}, params.simulation["dt"], seed=settings.seed)
+            for base in bases
+        ]
     else:
-        law = load_law(inputs.prior)
-    law = law.to(device)
-    law.attach_adaptor(settings.rank, settings.alpha, settings.seed)
+        laws = [load_law(inputs.prior)]
+    laws = [law.to(device) for law in laws]
+    for law in laws:
+        law.attach_adaptor(settings.rank, settings.alpha, settings.seed)
     parts = zip(*(listed(inputs[name]) for name in ("particles", "binding", "gaussians")), strict=True)
     bodies = [
         load_body(*files, density, settings.carrier, settings.gaussian_motion).to(torch.float32, device)
@@ -67,12 +74,12 @@ def main(inputs, output, params, run) -> None:
     stamp = {"simulation": params.simulation, "densities": params.densities, **params.material}
     stamp |= {"base": params.base, **params.structured} if structured else {}
     checkpoint = Checkpoint(params.checkpoint, fingerprint(stamp, files, params.code))
-    problem = (MPMModel(**params.simulation), law, starts[0], losses[0], settings)
+    problem = (MPMModel(**params.simulation), laws[0], starts[0], losses[0], settings)
     options = {"checkpoint": checkpoint, "progress": run.progress, "log": run.say}
     options["further"] = list(zip(starts[1:], losses[1:], strict=True))
     choice = {}
     if structured:
-        trained, chosen = train_structured(*problem, structured, **options)
+        trained, chosen = train_structured(*problem, structured, rivals=laws[1:], **options)
         choice = chosen.as_dict()
         run.say(chosen.summary())
     else:
