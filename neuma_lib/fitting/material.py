@@ -31,6 +31,7 @@ from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.deviation import Deviation
 from neuma_lib.fitting.frame_batches import evaluate_in_batches
 from neuma_lib.fitting.image_loss import mean_squared_error
+from neuma_lib.fitting.training_loop import TrainingLoop
 from neuma_lib.geometry.chamfer import chamfer_loss
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.mechanics.law import Law
@@ -249,7 +250,7 @@ def train_material(
     )
 
 
-class _Loop:
+class _Loop(TrainingLoop):
     """The state of training, and one step of it."""
 
     def __init__(self, model, law, videos, settings, log, stretch):
@@ -275,9 +276,7 @@ class _Loop:
         for name, parameter in law.named_parameters():
             if parameter.requires_grad and name in memory["averages"]:
                 self.optimizer.state[parameter] = copy.deepcopy(memory["averages"][name])
-        self.iteration, self.lr_scale, self.ended = 0, 1.0, False
-        self.history, self.first_loss = History(), memory["first_loss"]
-        self.best = {"loss": math.inf, "iteration": 0, **self._snapshot()}
+        self._begin(History(), memory["first_loss"])
         self.deviation = None
         if settings.penalty:
             with torch.no_grad():  # before a checkpoint is loaded: the law that training begins with
@@ -382,14 +381,7 @@ class _Loop:
         averages = {name: copy.deepcopy(state[p]) for name, p in self.law.named_parameters() if p in state}
         return {"averages": averages, "first_loss": self.first_loss}
 
-    def _better_state(self, value: float) -> dict:
-        """The present state if its loss is the lowest so far, else the best one."""
-        if value < self.best["loss"]:
-            return {"loss": value, "iteration": self.iteration, **self._snapshot()}
-        return self.best
-
     def _snapshot(self) -> dict:
-        """Copies of what an optimiser step changes or depends on."""
         return {
             "law": copy.deepcopy(self.law.state_dict()),
             "optimizer": copy.deepcopy(self.optimizer.state_dict()),
@@ -402,44 +394,6 @@ class _Loop:
         for parameter, gradient in zip(self._parameters(), state["gradients"], strict=True):
             # Counts where gradients are not zeroed; a checkpoint may come from another device.
             parameter.grad = None if gradient is None else gradient.to(parameter, copy=True)
-
-    def _recover(self, error: NonFiniteError) -> None:
-        """Return to the best state as a whole (law, optimizer, gradients), with half the learning rates.
-
-        Not to the state before the diverging step: its loss may already have grown to almost `diverged_ratio` times
-        the best one. The schedules of rates and frame weights go on, so the number of iterations stays bounded.
-        """
-        if not math.isfinite(self.best["loss"]):
-            raise error
-        self.lr_scale /= 2
-        self._restore(self.best)
-        entry = {"iteration": self.iteration, "reason": str(error), "lr_scale": self.lr_scale}
-        self.history.recoveries.append(entry)
-        self.log(
-            f"iteration {self.iteration}: {error}; back to the best state, that of iteration"
-            f" {self.best['iteration']}, rates x{self.lr_scale:g}"
-        )
-        if len(self.history.recoveries) > self.settings.max_recoveries:
-            self.ended = True
-
-    def state_dict(self) -> dict:
-        """Everything that the next iterations depend on."""
-        return {
-            "iteration": self.iteration,
-            "lr_scale": self.lr_scale,
-            "ended": self.ended,
-            "first_loss": self.first_loss,
-            "history": copy.deepcopy(self.history.__dict__),
-            "best": copy.deepcopy(self.best),
-            **self._snapshot(),
-        }
-
-    def load_state_dict(self, state: dict) -> None:
-        """Continue from a `state_dict`."""
-        for key in ("iteration", "lr_scale", "ended", "first_loss", "best"):
-            setattr(self, key, state[key])
-        self.history = History(**state["history"])
-        self._restore(state)
 
     def _parameters(self) -> list[torch.nn.Parameter]:
         return [p for parameters in self.nets.values() for p in parameters]

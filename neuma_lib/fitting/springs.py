@@ -21,6 +21,7 @@ from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.springs import SpringsConfig
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.fitting.material import PixelLoss, frame_weights
+from neuma_lib.fitting.training_loop import TrainingLoop
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.sim.state import State
 from neuma_lib.springs.body import SpringBody
@@ -127,8 +128,10 @@ def fit_springs(
     )
 
 
-class _Loop:
+class _Loop(TrainingLoop):
     """The state of the fit, and one pass over the video."""
+
+    RETURN = "back to iteration"
 
     def __init__(self, model, body, springs, start, loss, settings, how, log):
         self.model, self.body, self.springs, self.loss = model, body, springs, loss
@@ -146,9 +149,7 @@ class _Loop:
             if p.requires_grad and (rate := rates.get(name, how.lr_springs))
         ]
         self.optimizer = torch.optim.Adam(groups, betas=settings.betas)
-        self.iteration, self.lr_scale, self.ended = 0, 1.0, False
-        self.history, self.first_loss = SpringHistory(), None
-        self.best = {"loss": math.inf, "iteration": 0, **self._snapshot()}
+        self._begin(SpringHistory())
 
     def advance(self) -> None:
         """Judge the springs, then one pass of optimiser steps; or a return to the best state."""
@@ -157,7 +158,7 @@ class _Loop:
             with torch.set_grad_enabled(not self.how.truncated):
                 losses = self._frame_losses()
             value = float(losses.detach().mean())
-            self._keep_if_better(value)
+            self.best = self._better_state(value)
             self._note(value)
             self.first_loss = self.first_loss or max(value, 1e-30)
             self._set_rates()
@@ -178,7 +179,7 @@ class _Loop:
             return
         try:
             with torch.no_grad():
-                self._keep_if_better(float(self._frame_losses().mean()))
+                self.best = self._better_state(float(self._frame_losses().mean()))
         except NonFiniteError:
             return
 
@@ -229,12 +230,7 @@ class _Loop:
         history.substeps.append(self.model.substeps)
         history.lr_scale.append(self.lr_scale)
 
-    def _keep_if_better(self, value: float) -> None:
-        if value < self.best["loss"]:
-            self.best = {"loss": value, "iteration": self.iteration, **self._snapshot()}
-
     def _snapshot(self) -> dict:
-        """Copies of what an optimiser step changes."""
         return {
             "springs": copy.deepcopy(self.springs.state_dict()),
             "optimizer": copy.deepcopy(self.optimizer.state_dict()),
@@ -245,33 +241,3 @@ class _Loop:
         self.springs.load_state_dict(state["springs"])
         self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
         self.model = replace(self.model, substeps=state["substeps"])
-
-    def _recover(self, error: NonFiniteError) -> None:
-        """Return to the best state with half the rates; after too many returns the fit ends there."""
-        if not math.isfinite(self.best["loss"]):
-            raise error
-        self.lr_scale /= 2
-        self._restore(self.best)
-        self.history.recoveries.append(
-            {"iteration": self.iteration, "reason": str(error), "lr_scale": self.lr_scale}
-        )
-        self.log(
-            f"iteration {self.iteration}: {error}; back to iteration {self.best['iteration']}, rates x{self.lr_scale:g}"
-        )
-        self.ended = len(self.history.recoveries) > self.settings.max_recoveries
-
-    def state_dict(self) -> dict:
-        """Everything that the next iterations depend on."""
-        return {
-            **{key: getattr(self, key) for key in ("iteration", "lr_scale", "ended", "first_loss")},
-            "history": copy.deepcopy(self.history.__dict__),
-            "best": copy.deepcopy(self.best),
-            **self._snapshot(),
-        }
-
-    def load_state_dict(self, state: dict) -> None:
-        """Continue from a `state_dict`."""
-        for key in ("iteration", "lr_scale", "ended", "first_loss", "best"):
-            setattr(self, key, state[key])
-        self.history = SpringHistory(**state["history"])
-        self._restore(state)
