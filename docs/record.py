@@ -53,6 +53,7 @@ MADE_BY = {
     "bias": "results/bias.csv",
     "table1_systems": "results/table1_systems.csv",
     "table2_systems": "results/table2_systems.csv",
+    "honey_systems": "results/honey_systems.csv",
 }
 """Tables that are recorded, and the target of Snakemake that makes them."""
 VERDICT_HEAD = f"| {' | '.join(VERDICTS[:2])} |"

@@ -64,7 +64,7 @@ class PacNerfConfig(Section):
     iterations_contact: int = Field(
         20, ge=0, description="Adam steps on the frames until a little after contact (50)"
     )
-    iterations_all: int = Field(40, ge=0, description="Adam steps on all frames after that (100)")
+    iterations_all: int = Field(40, ge=1, description="Adam steps on all frames after that (100)")
     after_contact: float = Field(
         0.125, ge=0, description="how much that little is [s] (3 frames at 24 a second)"
     )
@@ -77,11 +77,23 @@ class PacNerfConfig(Section):
         description="most pixels of a frame, at random among those that show the body (whole image)",
     )
     rate_modulus: float = Field(0.1, ge=0, description="learning rate of log10 E, mu and kappa (0.1)")
-    rate_poisson: float = Field(0.01, ge=0, description="that of x with nu = 0.45 tanh(x / 0.45) (0.01)")
+    rate_poisson: float = Field(0.03, ge=0, description="that of x with nu = 0.45 tanh(x / 0.45) (0.01)")
     rate_yield: float = Field(0.1, ge=0, description="that of log10 of the yield stress (0.1)")
     rate_viscosity: float = Field(0.05, ge=0, description="that of log10 of the viscosity (0.05)")
     rate_angle: float = Field(1.0, ge=0, description="that of the friction angle [degrees] (1)")
     rate_decay: float = Field(
         0.1, gt=0, le=1, description="last over first rate; they fall over the second half of all steps (1)"
+    )
+    beta1: float = Field(
+        0.5,
+        ge=0,
+        lt=1,
+        description="decay of Adam's mean of gradients (0.9, with which moduli overshoot and return over 20 steps)",
+    )
+    beta2: float = Field(
+        0.9,
+        ge=0,
+        lt=1,
+        description="decay of its mean of squares (0.999, with which large first gradients slow down all later steps)",
     )
     save_every: int = Field(5, ge=1, description="steps between two saves of the state")

@@ -79,6 +79,11 @@ class FamilyConstants(torch.nn.Module):
             for name in self.fitted
         })  # fmt: skip
 
+    @torch.no_grad()
+    def fitted_numbers(self) -> dict[str, float]:
+        """What is fitted, under the names that it is fitted by."""
+        return {name: float(_from_stored(name, self.stored[name])) for name in self.fitted}
+
     def values(self) -> dict[str, Tensor]:
         """What is fitted, as the law's own constants, differentiable."""
         found = {name: _from_stored(name, self.stored[name]) for name in self.fitted}
@@ -107,7 +112,9 @@ class FamilyConstants(torch.nn.Module):
             "viscosity": settings.rate_viscosity,
             "friction_angle": settings.rate_angle,
         }
-        return [{"params": [self.stored[name]], "first_lr": rates[name]} for name in self.fitted]
+        return [
+            {"params": [self.stored[name]], "first_lr": rates[name], "name": name} for name in self.fitted
+        ]
 
     def _filled(self, values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         return {
@@ -326,7 +333,7 @@ def fit_pac_nerf(
         log: receives a line where something happens.
 
     Raises:
-        InputError: no frame before contact, or none after it.
+        InputError: no frame before contact, or none after it; a guess that no time step here is short enough for.
         NonFiniteError: a rollout runs away even in the shortest time step.
     """
     fit = _Fit(model, body, observation, contact, constants, settings, seed, log)
@@ -361,16 +368,28 @@ class _Fit:
                 f"pac_nerf: {len(before)} frames before contact and {len(after)} after it: both are needed, the "
                 "velocity is found in the former, the constants in the latter"
             )
+        self._check_guess()
         warm = contact + round(settings.after_contact / model.dt)
         near = [k for k in after if observation.frames[k] <= warm] or after[:1]
         self.flying = spread(before, settings.velocity_frames)
         self.stages = [spread(near, settings.most_frames), spread(after, settings.most_frames)]
         self.iterations = settings.iterations_contact + settings.iterations_all
-        self.optimizer = torch.optim.Adam(constants.groups(settings))
+        self.optimizer = torch.optim.Adam(constants.groups(settings), betas=(settings.beta1, settings.beta2))
         self.iteration, self.history = 0, PacNerfHistory()
         self.history.constants = {name: [] for name in constants.values()}
         self.velocity: Tensor | None = None
         self.velocity_losses: list[float] = []
+
+    def _check_guess(self) -> None:
+        """Whether the law is stable at the guess, in the shortest steps."""
+        dt, rho = self.model.dt / 2**MOST_HALVINGS, float(self.body.state(torch.zeros(3)).density.min())
+        number = replace(self.model, dt=dt).courant(self.constants.law(dt), rho)
+        if not number <= COURANT_LIMIT:
+            raise InputError(
+                f"pac_nerf: the guess {self.constants.specification()} has Courant number {number:.3g}, above"
+                f" {COURANT_LIMIT}, even in steps of {dt:g} s, the scene's halved {MOST_HALVINGS} times: give"
+                " pac_nerf.families a softer one, or the scene a smaller dt"
+            )
 
     def find_velocity(self) -> None:
         """One velocity for all particles, from rest, in all views of some frames before contact."""
@@ -410,7 +429,9 @@ class _Fit:
             self.log(f"step {self.iteration}: time steps of {self.model.dt / 2**halvings:g} s")
         decay = settings.rate_decay ** max(0.0, 2 * self.iteration / self.iterations - 1)
         for group in self.optimizer.param_groups:
-            group["lr"] = decay * group["first_lr"]
+            # far from the modulus, Poisson's ratio only makes up for it, and has a long way back
+            waits = group["name"] == "nu" and self.iteration < settings.iterations_contact
+            group["lr"] = 0.0 if waits else decay * group["first_lr"]
         self.optimizer.step()
         self.history.loss.append(loss)
         self.history.halvings.append(halvings)

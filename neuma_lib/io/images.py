@@ -292,7 +292,17 @@ def load_views(transforms: str | Path, views: Sequence[int] | None = None) -> tu
 
 
 def load_observation(transforms: str | Path, views: Sequence[int]) -> Observation:
-    """The video of some views, with its pixels as they are stored: 1 GB for 400 frames of 800 x 800."""
+    """The video of some views, with its pixels as they are stored: 1 GB for 400 frames of 800 x 800.
+
+    Raises:
+        InputError: see `read_image_set` and `ImageSet.video`; a view that was not filmed.
+    """
+    filmed = sorted({frame.get("view", i) for i, frame in enumerate(read_transforms(transforms)["frames"])})
+    if missing := [view for view in views if view not in filmed]:
+        raise InputError(
+            f"{transforms}: view {missing[0]} is not among the filmed views {filmed}: film more"
+            " (dataset.dynamic.views), or let the method use fewer (methods.<name>.material.views, identify.views)"
+        )
     images = read_image_set(transforms, views)
     frames, index, columns = images.video(views)
     return Observation(frames, torch.from_numpy(images.images[index]), _cameras(images, columns))

@@ -12,7 +12,7 @@ from neuma_lib.errors import InputError
 from neuma_lib.io.files import atomic, read_json, write_json
 from neuma_lib.io.gaussians import load_gaussians, save_gaussians
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
-from neuma_lib.io.images import read_image_set, write_transforms
+from neuma_lib.io.images import load_observation, read_image_set, write_transforms
 from neuma_lib.io.mesh import read_mesh, write_mesh
 from neuma_lib.io.particles import thrown
 from neuma_lib.io.ply import read_ply
@@ -236,6 +236,8 @@ def test_unusable_images(image_set, image, message):
 def test_views_that_do_not_exist_or_do_not_match(image_set):
     with pytest.raises(InputError, match="view 7 is not among the filmed views"):
         read_image_set(image_set).video([7])
+    with pytest.raises(InputError, match=r"transforms\.json: view 7 is not .*dataset\.dynamic\.views"):
+        load_observation(image_set, [0, 7])
     edit(image_set, lambda d: d["frames"].pop(0))
     with pytest.raises(InputError, match="not filmed at the same steps"):
         read_image_set(image_set).video([0, 1])

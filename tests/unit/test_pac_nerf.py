@@ -5,8 +5,10 @@ import math
 import pytest
 import torch
 
+from benchmarks import pac_nerf as benchmark
+from benchmarks.pac_nerf import BOUNDS, DENSITY, LEAST_OPACITY, MODEL, spotted_ball
 from neuma_lib.config.pac_nerf import PacFamilyConfig, PacNerfConfig
-from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.errors import InputError
 from neuma_lib.fitting.pac_nerf import (
     CarriedField,
     FamilyConstants,
@@ -16,21 +18,13 @@ from neuma_lib.fitting.pac_nerf import (
     spread,
 )
 from neuma_lib.io.checkpoint import Checkpoint
-from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.isotropic import lame
-from neuma_lib.radiance.field import RadianceField
-from neuma_lib.radiance.lattice import Lattice
-from neuma_lib.radiance.rendering import Opacity, camera_rays
-from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
-from neuma_lib.splatting.cameras import Cameras, look_at
-from neuma_lib.splatting.observation import Observation
 
-MODEL = MPMModel(grid=16, dt=1e-3)
-V0 = torch.tensor([0.3, -1.5, 0.2], dtype=torch.float64)
+V0 = torch.tensor(benchmark.V0, dtype=torch.float64)
 FRAMES = tuple(range(0, 145, 8))
 SMALL = PacNerfConfig(
-    particles=400, followed=8, velocity_iterations=20, iterations_contact=0, iterations_all=40, most_frames=8
+    particles=400, followed=8, velocity_iterations=20, iterations_contact=15, iterations_all=30, most_frames=8
 )
 ELASTIC = PacFamilyConfig(elasticity={"name": "neo_hookean", "E": 1e4, "nu": 0.3}, fitted=("E", "nu"))
 PLASTIC = PacFamilyConfig(
@@ -51,53 +45,21 @@ HONEY = PacFamilyConfig(
 
 
 def ball():
-    """A field of a ball of about 12 cm around (0.5, 0.25, 0.5), with large spots and, as fitted ones have, a soft edge.
-
-    A sharp one would hide the silhouette from the gradient: nodes at the border take the density of what is near,
-    however small its weight, so that they change when they get or lose a particle and not in between.
-    """
-    torch.manual_seed(0)
-    field = RadianceField(Lattice((0.3, 0.05, 0.3), 0.025, (17, 17, 17)), Opacity(1e-4, 0.1)).double()
-    points = field.lattice.points(field.density).double() - torch.tensor([0.5, 0.25, 0.5]).double()
-    radius = points.norm(dim=-1, keepdim=True)
-    field.density.data = (20 - (radius - 0.08) / 0.025 * 12).clamp(-30, 20)
-    waves = 30 * torch.randn(3, 12, dtype=torch.float64) / 3**0.5
-    field.features.data = 2 * torch.sin(points @ waves + torch.randn(12, dtype=torch.float64))
-    return field.requires_grad_(False)
-
-
-def cameras(size=24):
-    eyes = torch.tensor([[0.5, 0.4, 1.5], [1.4, 0.5, 0.3], [-0.3, 0.5, 0.2]])
-    K = torch.tensor([[1.6 * size, 0, size / 2], [0, 1.6 * size, size / 2], [0, 0, 1.0]])
-    poses = look_at(eyes, torch.tensor([0.5, 0.17, 0.5]), torch.tensor([0.0, 1.0, 0.0]))
-    return Cameras(poses, K.expand(3, 3, 3).contiguous(), size, size).to(dtype=torch.float64)
+    return spotted_ball(torch.float64)
 
 
 def body(settings=SMALL):
-    return CarriedField(ball(), 1.0, 1e-3, settings, 1000.0)
+    return CarriedField(ball(), 1.0, LEAST_OPACITY, settings, DENSITY)
 
 
 def film(carried, spec):
     """The video of a body with this law, thrown with V0; its own particles move."""
-    view = cameras()
-    with torch.no_grad():
-        path = rollout(
-            MODEL, analytic_law(spec, dt=MODEL.dt), carried.state(V0), steps=FRAMES[-1], frames=FRAMES
-        )
-        pictures = [
-            carried.field.render(*carried.shown.seen(x), *camera_rays(view, k))[0]
-            for x in carried.positions(path.x)
-            for k in range(len(view))
-        ]
-    images = torch.stack(pictures).view(len(FRAMES), len(view), view.height, view.width, 3)
-    return Observation(FRAMES, images, view)
+    return benchmark.film(carried.field, carried.shown, spec, FRAMES, benchmark.cameras(24, torch.float64))
 
 
 def contact(carried):
     """Step of the last frame before contact."""
-    low = carried.moving.x[:, 1].min() - MODEL.free_range[0]
-    fall = [float(V0[1]) * n * MODEL.dt - 4.9 * (n * MODEL.dt) ** 2 for n in FRAMES]
-    return max(n for n, y in zip(FRAMES, fall, strict=True) if low + y > 0)
+    return benchmark.contact(carried.moving.x, FRAMES)
 
 
 def changed(family, **values):
@@ -173,22 +135,20 @@ def test_poissons_ratio_is_found(elastic):
     assert float(elastic.constants.values()["nu"].detach()) == pytest.approx(0.3, abs=0.05)
 
 
+def test_poissons_ratio_waits_for_the_modulus(elastic):
+    found = elastic.history.constants["nu"]
+    assert set(found[: SMALL.iterations_contact + 1]) == {found[0]} and found[-1] != found[0]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "family, name, truth, error",
-    [
-        (PLASTIC, "yield_stress", 8e3, 0.15),
-        (HONEY, "viscosity", 60.0, 0.2),
-        (SAND, "friction_angle", 30.0, 0.1),
-    ],
-    ids=["yield stress", "viscosity", "friction angle"],
-)
-def test_constants_of_flow_are_found(family, name, truth, error, carried):
-    """Within 15 %, 20 % and 3 degrees."""
-    constants = FamilyConstants(family)
-    video = film(carried, changed(family, **{name: truth}))
-    fit_pac_nerf(MODEL, carried, video, contact(carried), constants, SMALL, log=lambda _: None)
-    assert float(constants.values()[name].detach()) == pytest.approx(truth, rel=error)
+@pytest.mark.parametrize("name", list(BOUNDS))
+def test_constants_of_every_family_are_found_from_its_stock_guess(name, loaded):
+    """With default settings, within what is published for the authors' own scenes; see benchmarks/pac_nerf.py."""
+    settings = loaded.pac_nerf.model_copy(update=benchmark.SMALL)
+    fit = benchmark.recover(name, settings.families[name], settings, log=lambda _: None)
+    found = fit.constants.fitted_numbers()
+    for key, bound in BOUNDS[name].items():
+        assert benchmark.error(key, benchmark.TRUTHS[name][key], found[key]) < bound
 
 
 def test_resumes_bit_for_bit(carried, tmp_path):
@@ -224,7 +184,7 @@ def test_resumes_bit_for_bit(carried, tmp_path):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_cuda_agrees(carried):
-    short = SMALL.model_copy(update=dict(velocity_iterations=2, iterations_all=2))
+    short = SMALL.model_copy(update=dict(velocity_iterations=2, iterations_contact=0, iterations_all=2))
     video, found = film(carried, changed(ELASTIC, E=1e5)), []
     for device in ("cpu", "cuda"):
         own = CarriedField(ball().to(device), 1.0, 1e-3, short, 1000.0)
@@ -237,12 +197,12 @@ def test_cuda_agrees(carried):
 
 
 def test_steps_are_halved_where_a_law_is_too_stiff(carried):
-    short = SMALL.model_copy(update=dict(iterations_all=2, velocity_iterations=3))
+    short = SMALL.model_copy(update=dict(iterations_contact=0, iterations_all=2, velocity_iterations=3))
     video = film(carried, changed(ELASTIC, E=1e5))
     stiff, said = FamilyConstants(ELASTIC, {"E": 8e6}), []
     fit = fit_pac_nerf(MODEL, carried, video, contact(carried), stiff, short, log=said.append)
     assert fit.history.halvings[0] == 2 and any("0.00025 s" in line for line in said)
-    with pytest.raises(NonFiniteError, match="choose another guess"):
+    with pytest.raises(InputError, match="a softer one"):
         stiffer = FamilyConstants(ELASTIC, {"E": 1e12})
         fit_pac_nerf(MODEL, carried, video, contact(carried), stiffer, short, log=said.append)
 
