@@ -5,8 +5,8 @@
 
 The body is a radiance field of a spotted ball, written down instead of fitted, so that what is judged is the stages
 that follow. It is thrown on the floor, moved by the simulator with more particles than the fit has, and filmed through
-the same rays. The fit starts from the family's stock guess, with a modulus, yield stress or viscosity a decade off. Every
-family has one bound at least, see `BOUNDS`; the other constants are printed.
+the same rays. The fit starts from the family's stock guess, with a modulus, yield stress or viscosity a decade off.
+Every family has one bound at least, see `BOUNDS`; the other constants are printed.
 """
 
 from __future__ import annotations
