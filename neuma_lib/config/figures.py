@@ -10,7 +10,7 @@ from neuma_lib.config.base import Section
 
 
 class FiguresConfig(Section):
-    """What the figures show. Methods that a figure compares are those of tables.table1."""
+    """What the figures show. Methods that a figure compares are those of tables.table1, but for those of `methods`."""
 
     # Keys that name scenes or experiments.
     SHOWN: ClassVar[dict[str, str]] = {
@@ -37,6 +37,12 @@ class FiguresConfig(Section):
     particles_app: str = Field("JellyDuck", description="scene whose particles are shown under all methods")
     lora_alphav: tuple[str, ...] = Field(
         ("BouncyBall", "RubberPawn"), min_length=1, description="scenes of the interpolation"
+    )
+    methods: tuple[str, ...] = Field(
+        ("neuma", "neuma_structured"),
+        min_length=1,
+        description="trained laws at work elsewhere: a row each in ext_time, a figure each of vis_generalize and "
+        "lora_alphav, from the second on with the method's name behind it",
     )
     weights: tuple[float, ...] = Field(
         (0.0, 0.25, 0.5, 0.75, 1.0, 1.25), min_length=1, description="weights w of the adaptor, in order"

@@ -47,6 +47,22 @@ def test_only_evaluation_and_figures_of_it_and_one_ablation_read_the_truth(proje
     assert not any(file.endswith("transforms.json") for file in supervised)
 
 
+def test_a_figure_that_shows_one_law_is_there_for_each_method(project):
+    named = 'figures={"methods": ["neuma", "neuma_structured"]}'
+    graph = jobs(project.run("--dry-run", "figures", "--config", named))
+    read = {rule: " ".join(files) for rule, files, _ in graph}
+    for figure, file in {"lora_alphav": "adaptor.safetensors", "vis_generalize": "rollout.h5"}.items():
+        published, structured = read[figure], read[f"{figure}_neuma_structured"]
+        assert f"/neuma/{file}" in published and "structured" not in published
+        assert f"/neuma_structured/{file}" in structured and "/neuma/" not in structured
+    assert "/priors/" in read["lora_alphav"] and f"{SCENE}/velocity.json" in read["lora_alphav"]
+    structured = read["lora_alphav_neuma_structured"]
+    assert "/priors/" not in structured and f"{SCENE}/identified.json" in structured
+    assert all(
+        f"/{method}/rollout.h5" in read["ext_time"] for method in ("nclaw", "neuma", "neuma_structured")
+    )
+
+
 def test_identified_constants_need_the_video_and_no_training(project):
     target = f"{SCENE}/constants/metrics.json"
     graph = jobs(project.run("--dry-run", target, f"{SCENE}/identified.png"))

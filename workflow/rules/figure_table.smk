@@ -8,7 +8,7 @@ COMPARED = SETTINGS.tables["table1"] if "table1" in SETTINGS.tables else None
 METHODS = [m for m in (COMPARED or SETTINGS).methods if SETTINGS.method_training(m) == m]
 NAMES = table_titles("table1") if COMPARED else {}
 TITLES = {method: NAMES.get(method) or SETTINGS.method_title(method) for method in METHODS}
-PREDICTED = ["nclaw", "neuma"]
+PREDICTED = ["nclaw", *DRAWN.methods]
 # Laws of tests of material points: those whose stresses are compared, in all their chains.
 RESPONDING = SETTINGS.tables.get("stress")
 RESPONSES = [
@@ -63,12 +63,12 @@ def filmed(scenes):
     }
 
 
-def learned(scenes):
-    """The laws of scenes before and after training."""
+def learned(scenes, method="neuma"):
+    """The laws of scenes before and after training; that of a structured one is its own prior."""
     return {
         "kernels": kernels("laws"),
-        "prior": priors_of(scenes),
-        "adaptor": of_methods(scenes, ["neuma"], "adaptor.safetensors"),
+        "prior": [] if SETTINGS.is_structured(method) else priors_of(scenes),
+        "adaptor": of_methods(scenes, [method], "adaptor.safetensors"),
     }
 
 
@@ -105,10 +105,63 @@ def figure_module(figure):
     return ROOT / "neuma_lib" / "evaluation" / "figures" / f"{figure}.py"
 
 
-# ---- the figures: kind of the data file, inputs and parameters of `data`, resources other than the default, and
-# whether they are left out of the target `figures`
+# ---- the figures: kind of the data file, inputs and parameters of `data`, resources other than the default, the module
+# if its name is another, and whether they are left out of the target `figures`
 
 IN_VIEW = {"view": DRAWN.view, "magnify": DRAWN.magnify}
+
+
+def interpolation(method):
+    """What lora_alphav is made of for a method."""
+    return {
+        "kind": "h5",
+        "input": {
+            **filmed(DRAWN.lora_alphav),
+            **learned(DRAWN.lora_alphav, method),
+            "kernels": kernels("laws", "rendering"),
+            "truth": truths_of(DRAWN.lora_alphav),
+            "start": [home(scene, start_of(scene, method)) for scene in DRAWN.lora_alphav],
+        },
+        "params": {
+            "scenes": scene_constants(DRAWN.lora_alphav),
+            "total": {scene: stretches_by_total(scene, method) for scene in DRAWN.lora_alphav},
+            "weights": list(DRAWN.weights),
+            "shown": DRAWN.shown - 1,
+            "device": SETTINGS.device,
+            **IN_VIEW,
+        },
+        "resources": {"gpu": GPU, "mem_mb": 8000},
+    }
+
+
+def elsewhere(method):
+    """What vis_generalize is made of for a method."""
+    return {
+        "kind": "h5",
+        "input": {
+            "kernels": kernels("rendering"),
+            "rollouts": of_experiments(f"{method}/rollout.h5"),
+            **each_of(SHOWN_EXPERIMENTS),
+        },
+        "params": {
+            "letters": lambda wildcards: [
+                {"letter": body["shape"].removeprefix("letter_"), "material": body["scene"]}
+                for body in (SETTINGS.experiment_bodies(name)[0] for name in DRAWN.letters)
+            ],
+            "others": lambda wildcards: {name: SETTINGS.experiment(name).title for name in DRAWN.meetings},
+            "shown": DRAWN.shown - 1,
+            "size": DRAWN.size,
+        },
+    }
+
+
+def of_each_method(figure, made_of):
+    """A figure for each of figures.methods, with its name from the second on."""
+    names = [figure, *(f"{figure}_{method}" for method in DRAWN.methods[1:])]
+    return {
+        name: {**made_of(method), "module": figure} for name, method in zip(names, DRAWN.methods, strict=True)
+    }
+
 
 FIGURES = {
     "ch_dist_curve": {
@@ -151,42 +204,8 @@ FIGURES = {
             "size": DRAWN.size,
         },
     },
-    "lora_alphav": {
-        "kind": "h5",
-        "input": {
-            **filmed(DRAWN.lora_alphav),
-            **learned(DRAWN.lora_alphav),
-            "kernels": kernels("laws", "rendering"),
-            "truth": truths_of(DRAWN.lora_alphav),
-            "velocity": [f"{RESULTS}/{scene}/velocity.json" for scene in DRAWN.lora_alphav],
-        },
-        "params": {
-            "scenes": scene_constants(DRAWN.lora_alphav),
-            "total": {scene: stretches_by_total(scene, "neuma") for scene in DRAWN.lora_alphav},
-            "weights": list(DRAWN.weights),
-            "shown": DRAWN.shown - 1,
-            "device": SETTINGS.device,
-            **IN_VIEW,
-        },
-        "resources": {"gpu": GPU, "mem_mb": 8000},
-    },
-    "vis_generalize": {
-        "kind": "h5",
-        "input": {
-            "kernels": kernels("rendering"),
-            "rollouts": of_experiments("neuma/rollout.h5"),
-            **each_of(SHOWN_EXPERIMENTS),
-        },
-        "params": {
-            "letters": lambda wildcards: [
-                {"letter": body["shape"].removeprefix("letter_"), "material": body["scene"]}
-                for body in (SETTINGS.experiment_bodies(name)[0] for name in DRAWN.letters)
-            ],
-            "others": lambda wildcards: {name: SETTINGS.experiment(name).title for name in DRAWN.meetings},
-            "shown": DRAWN.shown - 1,
-            "size": DRAWN.size,
-        },
-    },
+    **of_each_method("lora_alphav", interpolation),
+    **of_each_method("vis_generalize", elsewhere),
     "ext_time": {
         "kind": "h5",
         "input": {
@@ -273,4 +292,4 @@ FIGURES = {
 }
 
 # Read by report/figure.rst. They are no parameters, as an edit of a caption need not draw the figure again.
-config["captions"] = {figure: caption(figure) for figure in FIGURES}
+config["captions"] = {figure: caption(made_of.get("module", figure)) for figure, made_of in FIGURES.items()}

@@ -4,7 +4,7 @@ for figure, made_of in FIGURES.items():
 
     rule:
         name:
-            figure
+            re.sub(r"\W", "_", figure)
         input:
             **made_of["input"],
         output:
@@ -20,8 +20,8 @@ for figure, made_of in FIGURES.items():
             **{"mem_mb": 6000, **made_of.get("resources", {})},
         params:
             **made_of["params"],
-            figure=figure,
-            module=code_digest(figure_module(figure)),
+            figure=made_of.get("module", figure),
+            module=code_digest(figure_module(made_of.get("module", figure))),
         script:
             "../scripts/figure.py"
 

@@ -201,11 +201,15 @@ def judged_carrier(wildcards):
     return SETTINGS.judged_carrier(wildcards.scene, wildcards.method)
 
 
+def start_of(scene, method):
+    """The file of a scene's chain that tells a method how bodies are thrown."""
+    identified = SETTINGS.method_material(scene, method).start == "identified"
+    return identified_name(scene, method) if identified else "velocity.json"
+
+
 @checked
 def start_name(wildcards):
-    """The file of a scene's chain that tells a method how bodies are thrown."""
-    identified = material_settings(wildcards)["start"] == "identified"
-    return identified_name(wildcards.scene, wildcards.method) if identified else "velocity.json"
+    return start_of(wildcards.scene, wildcards.method)
 
 
 def start_file(wildcards):

@@ -1,5 +1,5 @@
-"""Prediction three times as long as the video: particles of the truth, renders of the prior and of NeuMA, and the mean
-height of the body over time. Grey: the part that was observed. Paper: fig:ext_time.
+"""Prediction three times as long as the video: particles of the truth, renders of the prior and of trained laws, and
+the mean height of the body over time. Grey: the part that was observed. Paper: fig:ext_time.
 """
 
 from __future__ import annotations
@@ -45,8 +45,9 @@ def data(inputs, params, say) -> ImageGrid:
         "heights": heights,
     }
     (images,) = rendering.cropped([np.stack(rows)])
-    far = max(abs(a - b) for a, b in zip(heights["truth"], heights["neuma"], strict=True))
-    say(f"mean height within {1e3 * far:.1f} mm of the truth")
+    for method in params.titles:
+        far = max(abs(a - b) for a, b in zip(heights["truth"], heights[method], strict=True))
+        say(f"{method}: mean height within {1e3 * far:.1f} mm of the truth")
     columns = tuple(rendering.milliseconds(truth["frames"][shown], dt))
     return ImageGrid(images, ("Truth (particles)", *params.titles.values()), columns, numbers)
 

@@ -1,6 +1,7 @@
-"""Between prior and observation: the adaptor with weight w, from the prior (w = 0) to the trained law (w = 1) and a
-little beyond (dashed). Left: renders; right: mean height of the body over time, dots: the truth. A motion that becomes
-non-finite, which can happen beyond 1, is held at its last finite frame. Paper: fig:lora_alphav.
+"""Between prior and observation: the adaptor with weight w, from the prior (w = 0; of a structured law, its constants)
+to the trained law (w = 1) and a little beyond (dashed). Left: renders; right: mean height of the body over time, dots:
+the truth. A motion that becomes non-finite, which can happen beyond 1, is held at its last finite frame. Paper:
+fig:lora_alphav.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ def data(inputs, params, say) -> ImageGrid:
         model = MPMModel(**setting["simulation"])
         video, body, cameras = rendering.film(inputs, params, k, setting["density"])
         body, cameras = body.to(torch.float32, device), cameras.to(device)
-        law = load_law(inputs.prior[k], inputs.adaptor[k]).to(device)
-        start = thrown(body, inputs.velocity[k])
+        law = load_law(inputs.prior[k] if inputs.prior else None, inputs.adaptor[k], model.dt).to(device)
+        start = thrown(body, inputs.start[k])
         truth, _ = read_arrays(inputs.truth[k], required=("x", "mass"), only=("x", "mass"))
         shown = rendering.evenly(params.shown, len(video.frames))[1:]  # the start is the same for all
         columns, heights = [], []
