@@ -537,9 +537,12 @@
 // share = D / q. Letters of structured.py: crush v, compaction k, dilatancy d, eased t1, after t', from_zero g.
 //// plastic
         auto from_zero = [&](const Pack& x, Pack& risen, Pack& slope) {
-            const Pack factor = exponential(GROWTH * (x > Real(0) ? x : zero));
-            risen = x > Real(0) ? RISE * (factor - Real(1)) : zero;
-            slope = x >= Real(0) ? GROWTH * RISE * factor : zero;
+            // expm1(2 h) = 2 exp(h) sinh(h): no difference of nearly equal numbers
+            const Pack h = Real(0.5) * GROWTH * (x > Real(0) ? x : zero), X = exponential(h);
+            Pack value, derivative;
+            sinhc(h, X, value, derivative);
+            risen = RISE * Real(2) * h * X * value;
+            slope = x >= Real(0) ? GROWTH * RISE * X * X : zero;
         };
         Pack value[3], growing[3];
         for (int k = 0; k < 3; ++k) {
