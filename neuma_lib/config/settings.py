@@ -128,7 +128,7 @@ class Config(Section):
                 raise ValueError(f"{where}: no {kind} '{name}'{hint(name, known)}")
         for name in self.experiments:
             self.experiment_truth(name)
-        for method in (*self.figures.methods, *(self.random.methods if self.random.count else ())):
+        for method in self.random.methods if self.random.count else ():
             self._law_from(method)
         for table in self.tables.values():
             for method in (*table.methods, *table.titles):
