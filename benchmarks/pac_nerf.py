@@ -23,7 +23,8 @@ from torch import Tensor
 from neuma_lib.config.pac_nerf import PacFamilyConfig, PacNerfConfig
 from neuma_lib.config.settings import load, merged, read_yaml
 from neuma_lib.evaluation.reports import as_markdown
-from neuma_lib.fitting.pac_nerf import CarriedField, FamilyConstants, PacNerfFit, fit_pac_nerf
+from neuma_lib.fitting.carried_field import CarriedField
+from neuma_lib.fitting.pac_nerf import FamilyConstants, PacNerfFit, fit_pac_nerf
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.radiance.field import FieldParticles, RadianceField
 from neuma_lib.radiance.lattice import Lattice

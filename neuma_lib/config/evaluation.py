@@ -16,8 +16,8 @@ class EvaluationConfig(Section):
     views: tuple[int, ...] | None = Field(
         None,
         min_length=1,
-        description="views of the image metrics; null: those that training does not see. Where there are none, the "
-        "training views are taken, and results and figures say so",
+        description="views of the image metrics; null: those that training does not see. Where there are none, those "
+        "that `material.views` leaves out are taken, or else the training views, and results and figures say so",
     )
     margin: float = Field(
         0.1,

@@ -44,6 +44,11 @@ class FiguresConfig(Section):
         description="trained laws at work elsewhere: a row each in ext_time, a figure each of vis_generalize and "
         "lora_alphav, from the second on with the method's name behind it",
     )
+    beside: tuple[str, ...] = Field(
+        (),
+        description="further methods, beside those of tables.table1, in ch_dist_curve, image_quality, main_res and "
+        "particles_app: other systems (docs/systems.md), which are fitted then",
+    )
     weights: tuple[float, ...] = Field(
         (0.0, 0.25, 0.5, 0.75, 1.0, 1.25), min_length=1, description="weights w of the adaptor, in order"
     )

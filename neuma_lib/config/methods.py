@@ -46,7 +46,8 @@ class MethodConfig(Section):
     judged_on: Literal["particles", "carrier"] = Field(
         "particles",
         description="what is simulated when it is judged: the particles of the body's volume, or the carrier of its "
-        "training (`material.carrier`)",
+        "training: that of `material.carrier`, and with PAC-NeRF's law the particles of its field, which then also "
+        "carries the pictures",
     )
     material: dict[str, Any] = Field(
         {}, description="settings of the section material that the method changes"

@@ -130,6 +130,8 @@ class Config(Section):
             self.experiment_truth(name)
         for method in self.random.methods if self.random.count else ():
             self._law_from(method)
+        for method in self.figures.beside:
+            self._law_from(method)
         for table in self.tables.values():
             for method in (*table.methods, *table.titles):
                 self._law_from(method)
@@ -282,7 +284,8 @@ class Config(Section):
 
     def is_pac_nerf(self, method: str) -> bool:
         """Whether a method evaluates the analytic law, and the throw, that PAC-NeRF found in the video."""
-        return self.methods[parse_method(method, self.methods)[0]].law == "pac_nerf"
+        base, _ = parse_method(self.method_training(method), self.methods)
+        return self.methods[base].law == "pac_nerf"
 
     def identified_views(self, scene: str, method: str) -> tuple[int, ...] | None:
         """Views that a method's law is identified in, if it trains on others than methods do by default; None: those
@@ -369,10 +372,17 @@ class Config(Section):
         return "+".join([self.methods[base].trained_as or base, *variant])
 
     def judged_carrier(self, scene: str, method: str) -> str:
-        """What is simulated when a method is judged, as in ``material.carrier``."""
+        """What is simulated when a method is judged, as in ``material.carrier``; or "field", see `carries_field`."""
+        if self.carries_field(method):
+            return "field"
         base, _ = parse_method(method, self.methods)
         carrier = self.methods[base].judged_on == "carrier"
         return self.method_material(scene, method).carrier if carrier else "binding"
+
+    def carries_field(self, method: str) -> bool:
+        """Whether a method is judged on the particles of PAC-NeRF's field, and shows what they carry."""
+        base, _ = parse_method(method, self.methods)
+        return self.methods[base].judged_on == "carrier" and self.is_pac_nerf(method)
 
     def method_note(self, method: str) -> str | None:
         """What a reader must know of a method's numbers, if anything."""

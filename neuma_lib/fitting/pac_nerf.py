@@ -20,19 +20,16 @@ from torch import Tensor
 
 from neuma_lib.config.pac_nerf import MODULI, PacFamilyConfig, PacNerfConfig
 from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.fitting.carried_field import CarriedField
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.mechanics.density import Density, density_at
 from neuma_lib.mechanics.isotropic import lame
 from neuma_lib.mechanics.law import Law
-from neuma_lib.radiance.field import RadianceField
 from neuma_lib.radiance.lattice import Lattice
 from neuma_lib.radiance.rendering import camera_rays
 from neuma_lib.sim.model import COURANT_LIMIT, MPMModel
 from neuma_lib.sim.rollout import rollout
-from neuma_lib.sim.state import State
 from neuma_lib.splatting.observation import Observation
-from neuma_lib.springs.interpolation import Interpolation
 
 POISSON_MOST = 0.45
 """Bound on Poisson's ratio (PAC-NeRF)."""
@@ -177,42 +174,6 @@ def choose_family(
         )
     known = {key: value for part in (prior or {}).values() for key, value in part.items() if key != "name"}
     return name, FamilyConstants(families[name], known if settings.guesses == "prior" else None)
-
-
-class CarriedField:
-    """A field as its particles carry it: fewer of them are simulated, the others follow.
-
-    Args:
-        field: of the first stage.
-        spacing, least_opacity: of the particles that are seen, see `RadianceField.particles`.
-        settings: how many move.
-        density: of the body [kg/m^3].
-    """
-
-    def __init__(
-        self,
-        field: RadianceField,
-        spacing: float,
-        least_opacity: float,
-        settings: PacNerfConfig,
-        density: Density,
-    ):
-        self.field = field.requires_grad_(False)
-        self.shown = field.particles(spacing, least_opacity)
-        if not len(self.shown.x):
-            raise InputError("pac_nerf: the field has no particles: run the rule radiance_field again")
-        coarser = max(1.0, (len(self.shown.x) / settings.particles) ** (1 / 3))
-        self.moving = field.particles(coarser * spacing, max(least_opacity, settings.least_opacity))
-        self.mass = self.moving.masses(density_at(self.moving.x, density))
-        self._follow = Interpolation(self.shown.x, self.moving.x, settings.followed)
-
-    def state(self, velocity: Tensor) -> State:
-        """What moves, with one velocity (3,) [m/s]."""
-        return State(self.moving.x, velocity.to(self.moving.x), self.mass, self.moving.volumes())
-
-    def positions(self, x: Tensor) -> Tensor:
-        """Of what is seen, (T, N, 3) [m], for those of what moves, (T, A, 3)."""
-        return self._follow(x)[0]
 
 
 class Video:

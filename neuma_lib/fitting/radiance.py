@@ -28,8 +28,6 @@ VOLUME_RANGE = (1e-4, 1e-1)
 """Opacities between which a particle counts in the volume term (PAC-NeRF)."""
 CERTAIN = 1e-5
 """Transmittances are kept this far from 0 and 1 in their entropy (PAC-NeRF)."""
-RENDERED_AT_ONCE = 4096
-"""Rays of a picture that are drawn together."""
 
 
 @dataclass
@@ -106,17 +104,6 @@ def fit_radiance_field(
     return field, report
 
 
-@torch.no_grad()
-def draw(
-    field: RadianceField, cameras: Cameras, view: int, particles: FieldParticles | None = None
-) -> Tensor:
-    """Picture (H, W, 3) over white of a field, or of the particles that carry it."""
-    lattice, values = (field.lattice, field.values()) if particles is None else particles.seen()
-    rays = zip(*(part.split(RENDERED_AT_ONCE) for part in camera_rays(cameras, view)), strict=True)
-    colours = [field.render(lattice, values, *part)[0] for part in rays]
-    return torch.cat(colours).view(cameras.height, cameras.width, 3)
-
-
 def evaluate(
     field: RadianceField,
     images: Tensor,
@@ -127,7 +114,7 @@ def evaluate(
     """Mean PSNR [dB] over views against RGBA images over white: full frame; where alpha > 1/2."""
     full, inside = [], []
     for view in views:
-        error = (draw(field, cameras, view, particles).clamp(0, 1) - over_white(images[view])) ** 2
+        error = (field.draw(cameras, view, particles).clamp(0, 1) - over_white(images[view])) ** 2
         full.append(-10 * math.log10(float(error.mean())))
         inside.append(-10 * math.log10(float(error[images[view, ..., 3] > 0.5].mean())))
     return sum(full) / len(full), sum(inside) / len(inside)

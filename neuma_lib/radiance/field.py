@@ -13,13 +13,17 @@ import torch
 from torch import Tensor, nn
 
 from neuma_lib.radiance.lattice import Lattice, from_particles, interpolate
-from neuma_lib.radiance.rendering import FEATURES, ColourNetwork, Opacity, render
+from neuma_lib.radiance.rendering import FEATURES, ColourNetwork, Opacity, camera_rays, render
+from neuma_lib.splatting.cameras import Cameras
 
 OCCUPIED = 1e-7
 """A halved lattice keeps the nodes that have at least this part of the largest opacity, and those next to them
 (PAC-NeRF: this opacity)."""
 STIFFNESS_POWER = 3
 """Stiffness is that of the material times this power of a particle's opacity (PAC-NeRF's code)."""
+RENDERED_AT_ONCE = 4096
+"""Rays of a picture that are drawn together."""
+WHITE = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -134,7 +138,21 @@ class RadianceField(nn.Module):
         values: Tensor,
         origins: Tensor,
         directions: Tensor,
-        background: Sequence[float] = (1.0, 1.0, 1.0),
+        background: Sequence[float] = WHITE,
     ) -> tuple[Tensor, Tensor]:
         """`rendering.render` of values on a lattice, those of the field or of particles, in the field's colours."""
         return render(lattice, values, self.opacity, self.network, origins, directions, background)
+
+    @torch.no_grad()
+    def draw(
+        self,
+        cameras: Cameras,
+        view: int,
+        particles: FieldParticles | None = None,
+        background: Sequence[float] = WHITE,
+    ) -> Tensor:
+        """Picture (H, W, 3) of the field, or of the particles that carry it, where these are."""
+        lattice, values = (self.lattice, self.values()) if particles is None else particles.seen()
+        rays = zip(*(part.split(RENDERED_AT_ONCE) for part in camera_rays(cameras, view)), strict=True)
+        colours = [self.render(lattice, values, *part, background)[0] for part in rays]
+        return torch.cat(colours).view(cameras.height, cameras.width, 3)

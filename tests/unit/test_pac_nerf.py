@@ -9,8 +9,8 @@ from benchmarks import pac_nerf as benchmark
 from benchmarks.pac_nerf import BOUNDS, DENSITY, LEAST_OPACITY, MODEL, spotted_ball
 from neuma_lib.config.pac_nerf import PacFamilyConfig, PacNerfConfig
 from neuma_lib.errors import InputError
+from neuma_lib.fitting.carried_field import CarriedField
 from neuma_lib.fitting.pac_nerf import (
-    CarriedField,
     FamilyConstants,
     Video,
     choose_family,
@@ -18,8 +18,11 @@ from neuma_lib.fitting.pac_nerf import (
     spread,
 )
 from neuma_lib.io.checkpoint import Checkpoint
+from neuma_lib.io.radiance import save_field
 from neuma_lib.mechanics.isotropic import lame
+from neuma_lib.radiance.rendering import camera_rays
 from neuma_lib.sim.rollout import rollout
+from neuma_lib.splatting.cameras import Cameras
 
 V0 = torch.tensor(benchmark.V0, dtype=torch.float64)
 FRAMES = tuple(range(0, 145, 8))
@@ -295,3 +298,103 @@ def test_method_and_its_variants(loaded):
 def test_frames_are_spread_evenly():
     assert spread(range(5), 9) == [0, 1, 2, 3, 4]
     assert spread(range(12), 3) == [3, 7, 11]
+
+
+class TestOwnParticles:
+    """The row that is judged on the particles that carry the field, and its pictures."""
+
+    CAMERAS = benchmark.cameras(24, torch.float64)
+
+    def rendered(self, carried, x, **how):
+        """Pictures (T, V, H, W, 3) of states x (T, A, 3) of what moves."""
+        return carried.particle_gs(self.CAMERAS, **how)(x)
+
+    def test_nothing_moved_shows_the_field_itself(self, carried):
+        """At t = 0 the pictures are those of the field's particles where they were drawn, bit for bit."""
+        (images,) = self.rendered(carried, carried.moving.x[None])
+        for view, image in enumerate(images):
+            assert torch.equal(image, carried.field.draw(self.CAMERAS, view, carried.shown))
+        assert images.amin() < 0.6 and images.amax() <= 1
+
+    def test_a_rigid_motion_by_voxels_is_one_of_the_cameras(self, carried):
+        """Nodes are multiples of the voxel, so that a shift by some of them is the same as moving the cameras back."""
+        shift = carried.shown.voxel * torch.tensor([2.0, -1.0, 3.0], dtype=torch.float64)
+        x = carried.moving.x
+        (moved,) = self.rendered(carried, (x + shift)[None])
+        viewmats = self.CAMERAS.viewmats.clone()
+        viewmats[:, :3, 3] += viewmats[:, :3, :3] @ shift
+        behind = Cameras(viewmats, self.CAMERAS.Ks, self.CAMERAS.width, self.CAMERAS.height)
+        (still,) = carried.particle_gs(behind)(x[None])
+        assert torch.allclose(moved, still, atol=1e-9)
+        (before,) = self.rendered(carried, x[None])
+        assert (moved - before).abs().max() > 0.1
+
+    def test_background_shows_where_the_body_is_not(self, carried):
+        """What a white and a black background differ by is the light that comes through: the mask of image metrics."""
+        x = carried.moving.x[None]
+        over_white, over_black = (self.rendered(carried, x, background=(c, c, c)) for c in (1.0, 0.0))
+        through = (over_white - over_black).mean(-1)[0, 1].flatten()
+        rays = camera_rays(self.CAMERAS, 1)
+        _, passed = carried.field.render(*carried.shown.seen(), *rays)
+        assert torch.allclose(through, passed, atol=1e-12) and passed.amin() < 0.3 and passed.amax() == 1
+        assert torch.equal(self.rendered(carried, x), over_white)
+
+    def test_frames_are_rendered_in_batches_alike(self, carried):
+        x = carried.moving.x + torch.tensor([[[0.0]], [[0.013]], [[0.05]]], dtype=torch.float64)
+        F = torch.eye(3).expand(*x.shape, 3)
+        renderer = carried.particle_gs(self.CAMERAS[0])
+        parts = list(renderer.batches(x, F, size=2))
+        assert [part for part, _ in parts] == [slice(0, 2), slice(2, 3)]
+        assert torch.equal(torch.cat([images for _, images in parts]), renderer(x))
+        assert len(list(renderer.batches(x, F))) == 3
+
+    def test_its_own_particles_make_the_video_that_it_was_fitted_to(self, carried):
+        """The loss that fitting sees is that of these pictures: own law, own throw, own particles, all the way."""
+        spec = changed(ELASTIC, E=1e5)
+        law = FamilyConstants(ELASTIC, {"E": 1e5}).law(MODEL.dt)
+        video, k = film(carried, spec), len(FRAMES) - 1
+        state = carried.state(V0.tolist())
+        with torch.no_grad():
+            x = rollout(MODEL, law, state, steps=FRAMES[k], frames=[FRAMES[k]]).x
+        (images,) = carried.particle_gs(video.cameras)(x)
+        errors = (images - video.colours([k])[0]).square().flatten(1).sum(1) / images[0, ..., 0].numel()
+        for view, error in enumerate(errors):
+            loss = Video(video).error(carried, carried.positions(x)[0], k, view, None, None)
+            assert float(error) == pytest.approx(float(loss), rel=1e-9)
+
+    def test_tracers_are_carried_by_particles_of_weighed_mass_and_stiffness(self, carried):
+        """In free flight all that is in the body, tracers too, falls alike, whatever a particle weighs."""
+        state, law = carried.state(V0), FamilyConstants(ELASTIC).law(MODEL.dt)
+        assert torch.equal(state.mass, carried.moving.opacities * DENSITY * carried.moving.volume)
+        assert torch.equal(state.vol0, carried.moving.opacities**3 * carried.moving.volume)
+        assert float(state.mass.max() / state.mass.min()) > 2, "a shell that is lighter than the core"
+        steps = 40
+        tracers = carried.moving.x[:50].mean(0) + 0.02 * torch.eye(3, dtype=torch.float64)
+        with torch.no_grad():
+            path = rollout(MODEL, law, state, steps=steps, frames=[steps], tracers=tracers)
+        fallen = path.tracers[-1] - tracers
+        assert torch.allclose(fallen, (path.x[-1] - state.x).mean(0).expand(3, 3), atol=1e-4)
+
+    def test_a_file_gives_the_particles_that_the_fit_had(self, tmp_path):
+        carried = CarriedField(ball().float(), 1.0, LEAST_OPACITY, SMALL, DENSITY)
+        save_field(tmp_path / "field.safetensors", carried.field, {})
+        own = {"spacing": 1.0, "least_opacity": LEAST_OPACITY, "settings": SMALL.plain()}
+        loaded = CarriedField.load(tmp_path / "field.safetensors", own, DENSITY)
+        assert torch.equal(loaded.moving.x, carried.moving.x) and torch.equal(loaded.mass, carried.mass)
+        x = carried.moving.x[None] + 0.01
+        assert torch.equal(loaded.particle_gs(self.CAMERAS)(x), self.rendered(carried, x))
+
+    def test_bad_input_is_named(self, carried):
+        with pytest.raises(InputError, match="rollout of 7 particles is not that of a field that"):
+            self.rendered(carried, torch.zeros(1, 7, 3, dtype=torch.float64))
+
+    def test_it_is_a_row_of_its_own(self, loaded):
+        for own, base in (
+            ("pac_nerf_own", "pac_nerf"),
+            ("pac_nerf_own+guesses=prior", "pac_nerf+guesses=prior"),
+        ):
+            assert loaded.method_training(own) == base and loaded.is_pac_nerf(own)
+            assert loaded.judged_carrier("BouncyBall", own) == "field" and loaded.carries_field(own)
+            assert loaded.judged_carrier("BouncyBall", base) == "binding" and not loaded.carries_field(base)
+            assert loaded.method_pac_nerf(own) == loaded.method_pac_nerf(base)
+            assert {own, base} <= set(loaded.tables["table1_systems"].methods)

@@ -8,7 +8,7 @@ import torch
 
 from neuma_lib.config.radiance import RadianceConfig
 from neuma_lib.errors import InputError
-from neuma_lib.fitting.radiance import draw, fit_radiance_field
+from neuma_lib.fitting.radiance import fit_radiance_field
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.radiance import load_field, save_field
 from neuma_lib.mechanics.analytic import analytic_law
@@ -184,7 +184,7 @@ def test_file_round_trip(tmp_path, fit, duck):
     save_field(path, field, {"seed": 3})
     loaded, metadata = load_field(path)
     assert metadata["seed"] == 3 and loaded.lattice == field.lattice
-    assert torch.equal(draw(loaded, duck[1], 4), draw(field, duck[1], 4))
+    assert torch.equal(loaded.draw(duck[1], 4), field.draw(duck[1], 4))
 
 
 def test_foreign_file_is_named(tmp_path):

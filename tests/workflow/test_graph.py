@@ -131,6 +131,43 @@ def test_pac_nerf_needs_images_its_field_and_contact_alone(project):
     assert f"{run}/constants.json" in judged and not any("velocity.json" in file for file in judged)
 
 
+def test_pac_nerfs_own_particles_are_judged_with_its_field_and_fit_nothing_again(project):
+    own, base = (f"{SCENE}+seed=1/{name}+guesses=prior" for name in ("pac_nerf_own", "pac_nerf"))
+    graph = jobs(project.run("--dry-run", *(f"{own}/{name}" for name in ("image_metrics.json", "video.mp4"))))
+    made = {rule: (read, outputs) for rule, read, outputs in graph}
+    assert made["pac_nerf"][1][0] == f"{base}/constants.json" and "radiance_field" in made
+    for rule in ("evaluation", "image_metrics", "video"):
+        read, (first, *_) = made[rule]
+        assert first.startswith(f"{own}/") and f"{SCENE}+seed=1/pac_nerf/field.safetensors" in read
+        assert any(file.endswith("radiance.ready") for file in read)
+    assert f"{base}/constants.json" in made["evaluation"][0]
+    for name, said in {
+        "constants.json": "MissingRule",
+        "history.json": "trains nothing: its law is that of",
+    }.items():
+        assert said in project.run("--dry-run", f"{own}/{name}", succeeds=False)
+    elsewhere = "tiny/results/experiments/letter_N_bouncy/pac_nerf_own/metrics.json"
+    assert "experiments have none; take pac_nerf," in project.run("--dry-run", elsewhere, succeeds=False)
+
+
+def test_other_systems_are_in_figures_that_ask_for_them_alone(project):
+    figures = ("main_res", "image_quality", "ch_dist_curve")
+    targets = [f"tiny/results/figures/{name}.png" for name in figures]
+    plain = jobs(project.run("--dry-run", "figures", *targets))
+    assert not any(
+        "pac_nerf" in file or "spring_gaus" in file for _, read, made in plain for file in read + made
+    )
+    beside = ("--config", "figures={beside: [spring_gaus, pac_nerf_own]}", "--")
+    read = {rule: files for rule, files, _ in jobs(project.run("--dry-run", *beside, *targets))}
+    for name, file in zip(figures, ("rollout.h5", "image_metrics.json", "metrics.json"), strict=True):
+        assert {f"{SCENE}/{method}/{file}" for method in ("neuma", "spring_gaus", "pac_nerf_own")} <= set(
+            read[name]
+        )
+    assert f"{SCENE}/pac_nerf/field.safetensors" in read["main_res"]
+    unknown = ("--config", "figures={beside: [pac_nerv]}", "--")
+    assert "pac_nerf" in project.run("--dry-run", *unknown, *targets, succeeds=False)
+
+
 def test_a_structured_law_corrects_what_the_video_shows(project):
     """Around the constants of its scene, in its chain, and without networks to start from."""
     graph = jobs(project.run("--dry-run", f"{SCENE}+seed=1/neuma_structured/metrics.json"))

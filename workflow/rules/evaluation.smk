@@ -35,9 +35,10 @@ rule tracers:
 rule evaluation:
     input:
         **body_files(),
-        kernels=kernels("laws"),
+        kernels=kernels_and_field("laws"),
         truth=of_scene("particles.h5"),
         tracers=of_chain("tracers.h5"),
+        field=own_field,
         velocity=start_file,
         prior=material_prior,
         adaptor=trained_adaptor,
@@ -55,6 +56,7 @@ rule evaluation:
         laws=lambda wildcards: [law for law in [true_law(wildcards)] if law],
         total=carries_total,
         carrier=judged_carrier,
+        own=own_carrying,
         frames=frame_steps,
         device=SETTINGS.device,
     script:
@@ -88,9 +90,10 @@ rule bias:
 rule video:
     input:
         **body_files(),
-        kernels=kernels("rendering"),
+        kernels=kernels_and_field("rendering"),
         transforms=of_scene("dynamic/transforms.json"),
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
+        field=own_field,
     output:
         video=f"{RESULTS}/{{scene}}/{{method}}/video.mp4",
     resources:
@@ -98,6 +101,7 @@ rule video:
     params:
         density=scene_setting("density"),
         carrier=judged_carrier,
+        own=own_carrying,
         gaussian_motion=gaussian_motion,
         view=SETTINGS.evaluation.video_view,
         frame_rate=SETTINGS.evaluation.frame_rate,

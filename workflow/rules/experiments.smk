@@ -75,7 +75,8 @@ rule experiment:
         densities=of_each_body(method_density),
         laws=of_each_body(true_law),
         total=carries_total,
-        carrier=lambda wildcards: of_each_body(judged_carrier)(wildcards)[0],
+        carrier=experiment_carrier,
+        own=None,
         frames=experiment_frames,
         device=SETTINGS.device,
     script:

@@ -4,9 +4,12 @@ import ast
 
 DRAWN = SETTINGS.figures
 COMPARED = SETTINGS.tables["table1"] if "table1" in SETTINGS.tables else None
-# A law that is judged twice is shown once, on the particles that all methods share.
+# A law that is judged twice is shown once, on the particles that all methods share, unless figures.beside names it.
 METHODS = [m for m in (COMPARED or SETTINGS).methods if SETTINGS.method_training(m) == m]
+METHODS += [m for m in DRAWN.beside if m not in METHODS]
 NAMES = table_titles("table1") if COMPARED else {}
+# Methods whose pictures are of PAC-NeRF's field, which their own particles carry.
+OWN = [m for m in METHODS if SETTINGS.carries_field(m)]
 TITLES = {method: NAMES.get(method) or SETTINGS.method_title(method) for method in METHODS}
 PREDICTED = ["nclaw", *DRAWN.methods]
 # Laws of tests of material points: those whose stresses are compared, in all their chains.
@@ -181,11 +184,14 @@ FIGURES = {
         "kind": "h5",
         "input": {
             **filmed(DRAWN.main_res),
+            "kernels": kernels("rendering", *(["radiance"] if OWN else [])),
             "rollouts": of_methods(DRAWN.main_res, METHODS, "rollout.h5"),
+            "fields": [home(scene, FIELD) for scene in DRAWN.main_res if OWN],
         },
         "params": {
             "titles": TITLES,
             "scenes": scene_constants(DRAWN.main_res),
+            "own": {method: carrying(method) for method in OWN},
             "shown": DRAWN.shown,
             **IN_VIEW,
         },

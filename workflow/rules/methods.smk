@@ -201,6 +201,40 @@ def judged_carrier(wildcards):
     return SETTINGS.judged_carrier(wildcards.scene, wildcards.method)
 
 
+@checked
+def experiment_carrier(wildcards):
+    """The same in an experiment, of whose bodies no radiance field is fitted."""
+    if SETTINGS.carries_field(wildcards.method):
+        raise InputError(
+            f"{wildcards.method}: its own particles are those of a field, and experiments have none; take "
+            f"{SETTINGS.method_training(wildcards.method)}, the same law on the particles that all methods share"
+        )
+    return SETTINGS.judged_carrier(SETTINGS.body_scenes(wildcards.experiment)[0], wildcards.method)
+
+
+def carrying(method):
+    """How PAC-NeRF's field is carried by a method's particles, to `CarriedField.load`."""
+    field = {name: SETTINGS.radiance.plain()[name] for name in ("spacing", "least_opacity")}
+    return {**field, "settings": SETTINGS.method_pac_nerf(method).plain()}
+
+
+@checked
+def own_carrying(wildcards):
+    """The same of a method that is judged on PAC-NeRF's own particles; None of others."""
+    return carrying(wildcards.method) if SETTINGS.carries_field(wildcards.method) else None
+
+
+@checked
+def own_field(wildcards):
+    """The field that a method's own particles carry; none where it is judged on others."""
+    return home(wildcards.scene, FIELD) if SETTINGS.carries_field(wildcards.method) else []
+
+
+def kernels_and_field(*groups):
+    """A function of wildcards: groups of kernels, and those of the radiance field where a method's particles carry it."""
+    return lambda wildcards: kernels(*groups, *(["radiance"] if own_field(wildcards) else []))
+
+
 def start_of(scene, method):
     """The file of a scene's chain that tells a method how bodies are thrown."""
     identified = SETTINGS.method_material(scene, method).start == "identified"
@@ -245,8 +279,12 @@ def training_densities(wildcards):
 def evaluation_views(wildcards):
     """Views that image metrics are taken in: those that are asked for, or those that training does not see.
 
-    Where training sees all views, these: image metrics and figures then say so.
+    Where training sees all views, those that other methods are measured in, or all: image metrics and figures then say
+    so.
     """
     seen = SETTINGS.method_material(wildcards.scene, wildcards.method).views
-    unseen = [view for view in range(SETTINGS.dataset.dynamic.views) if view not in seen]
-    return list(SETTINGS.evaluation.views or unseen or seen)
+    views = range(SETTINGS.dataset.dynamic.views)
+    unseen, others = (
+        [view for view in views if view not in used] for used in (seen, SETTINGS.material.views)
+    )
+    return list(SETTINGS.evaluation.views or unseen or others or seen)

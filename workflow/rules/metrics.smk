@@ -11,10 +11,11 @@ rule lpips_weights:
 rule image_metrics:
     input:
         **body_files(),
-        kernels=kernels("rendering"),
+        kernels=kernels_and_field("rendering"),
         weights=f"{DATA}/weights/lpips.safetensors",
         transforms=of_scene("dynamic/transforms.json"),
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
+        field=own_field,
     output:
         metrics=f"{RESULTS}/{{scene}}/{{method}}/image_metrics.json",
     resources:
@@ -22,6 +23,7 @@ rule image_metrics:
     params:
         density=scene_setting("density"),
         carrier=judged_carrier,
+        own=own_carrying,
         gaussian_motion=gaussian_motion,
         views=evaluation_views,
         training_views=lambda wildcards: material_settings(wildcards)["views"],

@@ -1,7 +1,10 @@
 """PAC-NeRF, with which we compare: its voxel radiance field of the views at t = 0, then velocity and constants. Needs
 methods.smk."""
 
-PAC_NERF_METHODS = "|".join(name for name in SETTINGS.methods if SETTINGS.is_pac_nerf(name)) or "none"
+PAC_NERF_METHODS = [name for name in SETTINGS.methods if SETTINGS.is_pac_nerf(name)]
+FITTED_METHODS = (
+    "|".join(name for name in PAC_NERF_METHODS if SETTINGS.method_training(name) == name) or "none"
+)
 
 
 rule radiance_field:
@@ -26,14 +29,14 @@ rule radiance_field:
 rule pac_nerf:
     input:
         kernels=kernels("laws", "radiance"),
-        field=of_chain("pac_nerf/field.safetensors"),
+        field=of_chain(FIELD),
         transforms=of_scene("dynamic/transforms.json"),
         velocity=of_chain("velocity.json"),
     output:
         constants=f"{RESULTS}/{{scene}}/{{method}}/constants.json",
         history=f"{RESULTS}/{{scene}}/{{method}}/history.json",
     wildcard_constraints:
-        method=f"({PAC_NERF_METHODS})([+][^/]*)?",
+        method=f"({FITTED_METHODS})([+][^/]*)?",
     resources:
         gpu=GPU,
     params:

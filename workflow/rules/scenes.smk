@@ -6,11 +6,12 @@ from types import SimpleNamespace
 from neuma_lib.config.variants import folder
 from workflow.inputs import image_list
 
+FIELD = "pac_nerf/field.safetensors"
 # What a chain's seeds change in a file of a scene or an experiment (config/variants.py); runs of methods have
 # `Config.run_folder`.
 DRAWN_IN = {
     **dict.fromkeys(
-        ["gaussians.ply", "gaussians.json", "mesh.ply", "tracers.h5", "pac_nerf/field.safetensors"],
+        ["gaussians.ply", "gaussians.json", "mesh.ply", "tracers.h5", FIELD],
         ["gaussians"],
     ),
     **dict.fromkeys(["sampled_particles.h5", "particles.h5", "binding.h5"], ["gaussians", "particles"]),

@@ -91,7 +91,7 @@ def table_records(table):
         networks = material_prior(pair) == f"{own.parent}/priors/identified.safetensors"
         if SETTINGS.is_pac_nerf(pair.method):
             fitted = {"scene": scene, "method": SETTINGS.method_training(pair.method)}
-            field = {"scene": Path(home(scene, "pac_nerf/field.safetensors")).parent.parent.name}
+            field = {"scene": Path(home(scene, FIELD)).parent.parent.name}
             laws += [("kernels", {"group": "radiance"}), ("radiance_field", field), ("pac_nerf", fitted)]
             priors += [prior_file(pair.scene)]
             continue

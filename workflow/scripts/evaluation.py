@@ -5,10 +5,11 @@ import torch
 
 from neuma_lib.device import choose_device
 from neuma_lib.evaluation.motion import evaluate
+from neuma_lib.fitting.carried_field import CarriedField
 from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.io.laws import load_laws
-from neuma_lib.io.particles import load_start
+from neuma_lib.io.particles import load_start, thrown
 from neuma_lib.io.weights import read_weights
 from neuma_lib.sim.model import MPMModel, consecutive
 from workflow.inputs import listed
@@ -22,7 +23,11 @@ def main(inputs, output, params, run) -> None:
     )
     measure, _ = read_arrays(inputs.tracers, required=("starts", "floor"))
     files = [inputs[name] for name in ("particles", "binding", "gaussians", "velocity")]
-    start, counts = load_start(*files, params.densities, params.carrier)
+    if params.own:
+        body = CarriedField.load(inputs.field, params.own, params.densities[0])
+        start, counts = thrown(body, inputs.velocity), [len(body.moving.x)]
+    else:
+        start, counts = load_start(*files, params.densities, params.carrier)
     identified, adaptors = listed(inputs.get("identified")), listed(inputs.get("adaptor"))
     laws = load_laws(params.simulation["dt"], params.laws, identified, listed(inputs.prior), adaptors)
     evaluation = evaluate(

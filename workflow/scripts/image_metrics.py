@@ -7,6 +7,7 @@ from neuma_lib.device import choose_device
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.image_metrics import MEASURES, image_metrics
 from neuma_lib.evaluation.lpips import LPIPS
+from neuma_lib.fitting.carried_field import CarriedField
 from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_observation
@@ -33,9 +34,12 @@ def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
     weights, _ = read_weights(inputs.weights)
     networks = {name: LPIPS(weights, name).to(device) for name in ("vgg", "alex")}
-    files = (inputs.particles, inputs.binding, inputs.gaussians)
-    body = load_body(*files, params.density, params.carrier, params.gaussian_motion)
-    body = body.to(torch.float32, device)
+    if params.own:
+        body = CarriedField.load(inputs.field, params.own, params.density, device)
+    else:
+        files = (inputs.particles, inputs.binding, inputs.gaussians)
+        body = load_body(*files, params.density, params.carrier, params.gaussian_motion)
+        body = body.to(torch.float32, device)
     arrays, _ = read_arrays(inputs.rollout, required=("frames",), only=("frames",))
     x, F = (state.to(device) for state in load_motion(inputs.rollout))
     table = []

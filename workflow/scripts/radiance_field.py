@@ -7,7 +7,7 @@ from PIL import Image
 
 from neuma_lib.config.radiance import RadianceConfig
 from neuma_lib.device import choose_device
-from neuma_lib.fitting.radiance import draw, fit_radiance_field
+from neuma_lib.fitting.radiance import fit_radiance_field
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.files import atomic, write_json
 from neuma_lib.io.images import load_views
@@ -34,7 +34,7 @@ def main(inputs, output, params, run) -> None:
     )
     particles = field.particles(settings.spacing, settings.least_opacity)
     pairs = [
-        torch.cat([over_white(images[view]), draw(field, cameras, view, particles).clamp(0, 1)])
+        torch.cat([over_white(images[view]), field.draw(cameras, view, particles).clamp(0, 1)])
         for view in report.held_out
     ]
     with atomic(output.views) as partial:  # the images above, the field below

@@ -6,6 +6,7 @@ import torch
 from neuma_lib.device import choose_device
 from neuma_lib.evaluation.image_metrics import psnr
 from neuma_lib.evaluation.video import side_by_side, write_mp4
+from neuma_lib.fitting.carried_field import CarriedField
 from neuma_lib.io.files import atomic
 from neuma_lib.io.images import load_observation
 from neuma_lib.io.particles import load_body, load_motion
@@ -15,9 +16,12 @@ from workflow.stage import run_script
 def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
     observation = load_observation(inputs.transforms, [params.view]).to(torch.float32, device)
-    files = (inputs.particles, inputs.binding, inputs.gaussians)
-    body = load_body(*files, params.density, params.carrier, params.gaussian_motion)
-    body = body.to(torch.float32, device)
+    if params.own:
+        body = CarriedField.load(inputs.field, params.own, params.density, device)
+    else:
+        files = (inputs.particles, inputs.binding, inputs.gaussians)
+        body = load_body(*files, params.density, params.carrier, params.gaussian_motion)
+        body = body.to(torch.float32, device)
     x, F = load_motion(inputs.rollout)
     renderer = body.particle_gs(observation.cameras)
     panels, quality = [], []

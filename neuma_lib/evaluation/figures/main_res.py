@@ -1,5 +1,6 @@
 """Renders over time: the observation as it was filmed, the prior (NCLaw), NeuMA and its ablations, at the same times
-and from the training view. Renders have a higher resolution than the video. Paper: fig:main_res.
+and from the training view. Renders have a higher resolution than the video; those of PAC-NeRF on its own particles are
+of its radiance field. Paper: fig:main_res.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from matplotlib.figure import Figure
 
 from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.evaluation.plotting.image_grid import GAP, ImageGrid, draw_images, note
+from neuma_lib.fitting.carried_field import CarriedField
 from neuma_lib.io.particles import load_motion
 
 LEFT, TOP, BETWEEN = 0.92, 0.3, 0.06
@@ -22,10 +24,11 @@ def data(inputs, params, say) -> ImageGrid:
         video, body, cameras = rendering.film(inputs, params, k, setting["density"])
         shown = rendering.evenly(params.shown, len(video.frames))
         rows = [rendering.observed(video, shown, params.magnify)]
-        for _ in params.titles:
-            rows.append(
-                rendering.renders(body, cameras, *(state[shown] for state in load_motion(next(rollouts))))
-            )
+        for method in params.titles:
+            states = (state[shown] for state in load_motion(next(rollouts)))
+            own = params.own.get(method)
+            seen = CarriedField.load(inputs.fields[k], own, setting["density"]) if own else body
+            rows.append(rendering.renders(seen, cameras, *states))
         blocks.append(np.stack(rows))
         times += rendering.milliseconds([video.frames[i] for i in shown], setting["dt"])
         groups.append((scene, len(shown)))

@@ -58,6 +58,7 @@ METHODS = {
     "constants": Look("#330dcc", "p", (0, (6, 2, 2, 2))),
     "neuma_structured": Look("#a5005a", "h", (0, (8, 1.5))),
     "pac_nerf": Look(SKY, "P", (0, (5, 1, 1, 1, 1, 1))),
+    "pac_nerf_own": Look("#2d78ff", "<", (0, (1, 2, 4, 2))),
     "spring_gaus": Look(YELLOW, "X", (0, (3, 2))),
 }
 """One look a method, everywhere."""
