@@ -120,7 +120,9 @@ def verdicts(tables: dict[str, str]) -> str:
     lacking = {
         "Not recorded": [f"{name} (`snakemake {MADE_BY[name]}`)" for name in MADE_BY if name not in tables],
         "Recorded by an older version, without verdicts": [
-            name for name, text in tables.items() if name in PAPER and VERDICT_HEAD not in text
+            name
+            for name, text in tables.items()
+            if name in PAPER and (PAPER[name].claims or PAPER[name].targets) and VERDICT_HEAD not in text
         ],
     }
     said = [line for what, names in lacking.items() if names for line in ("", f"{what}: {', '.join(names)}.")]
