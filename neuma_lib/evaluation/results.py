@@ -24,6 +24,17 @@ def read_results(
     return {method: {scene: value(read_json(next(files))) for scene in scenes} for method in methods}
 
 
+def seen_everywhere(metrics: Mapping[str, Mapping[str, Any]], scenes: Iterable[str]) -> list[str]:
+    """Methods whose images were measured in views of their training in all scenes, where not all methods' were.
+
+    Args:
+        metrics: {method: {scene: image_metrics.json}}.
+    """
+    scenes = list(scenes)
+    found = [m for m, row in metrics.items() if all(row[s]["views_seen_in_training"] for s in scenes)]
+    return found if len(found) < len(metrics) else []
+
+
 def seen_in_training(metrics: Mapping[str, Mapping[str, Any]], scenes: Iterable[str]) -> list[str]:
     """Scenes whose images were measured in a view of the training, from {method: {scene: image_metrics.json}}."""
     return [s for s in scenes if any(row[s]["views_seen_in_training"] for row in metrics.values())]

@@ -118,6 +118,7 @@ class Table:
         marks: (method, column) -> signs of `FOOTNOTES`, for runs that diverged.
         failures: what happened in each prediction that broke off.
         notes: method -> what a reader must know of its numbers.
+        note: what a reader must know of the whole table.
     """
 
     columns: dict[str, str]
@@ -126,6 +127,7 @@ class Table:
     marks: dict[tuple[str, str], str] = field(default_factory=dict)
     failures: list[str] = field(default_factory=list)
     notes: Mapping[str, str] = field(default_factory=dict)
+    note: str | None = None
 
     def row(self, quantity: str, method: str) -> Row:
         """One row.
@@ -180,6 +182,7 @@ class Table:
         parts += [self.absorbed(), ""] if self.absorbed() else []
         for method, note in self.notes.items():
             parts += [f"{self._note_sign(method)} {note}", ""]
+        parts += [self.note, ""] if self.note else []
         if verdicts := self.verdicts():
             rows = [[v.claim.text, f"**{v.word}**", v.here, v.paper] for v in verdicts]
             parts += ["**What holds**", "", *as_markdown(VERDICTS, rows), "", RULE, ""]
@@ -439,6 +442,7 @@ def chamfer_table(
     columns: Mapping[str, str],
     paper: PaperTable | None = None,
     notes: Mapping[str, str] | None = None,
+    note: str | None = None,
 ) -> Table:
     """A table of tracer errors and distances. Any method may have a row; none is implied.
 
@@ -448,6 +452,7 @@ def chamfer_table(
         columns: scene or experiment -> heading, in order.
         paper: what to show beside it.
         notes: method -> what a reader must know of its numbers.
+        note: what a reader must know of the whole table.
 
     Raises:
         InputError: a method lacks a column, or a column a finite value.
@@ -456,7 +461,7 @@ def chamfer_table(
         raise InputError(
             "table: there are no methods, or no scenes and experiments; see tables in the configuration"
         )
-    table = Table(dict(columns), paper, notes=notes or {})
+    table = Table(dict(columns), paper, notes=notes or {}, note=note)
 
     def row(quantity: str, method: str, title: str) -> Row:
         chains = min(len(metrics.get(method, {}).get(column, ())) for column in columns)

@@ -295,13 +295,19 @@ def test_every_number_is_of_its_method_and_scene(tmp_path):
     quality = image_quality.data(SimpleNamespace(metrics=images), params, said.append)
     assert quality["seen"] == ["B"], "a method has no other view of it"
     assert quality["ssim"] == {"nclaw": {"A": 4, "B": 5}, "neuma": {"A": 6, "B": 7}}
+    assert quality["titles"] == titles
+    files = [json.loads(Path(file).read_text()) for file in images]
+    for name, file in zip(images, files, strict=True):  # NeuMA now trains on all views
+        Path(name).write_text(json.dumps({**file, "views_seen_in_training": [1] if file["ssim"] > 5 else []}))
+    quality = image_quality.data(SimpleNamespace(metrics=images), params, said.append)
+    assert quality["titles"] == {**titles, "neuma": "NeuMA (training views)"} and quality["seen"] == []
     choices = ablation_gradients.data(
         SimpleNamespace(histories=histories, metrics=motion, image_metrics=images), params, said.append
     )
     assert choices["loss"] == {"nclaw": {"A": 0, "B": 1}, "neuma": {"A": 2, "B": 3}}
     assert choices["tracer_rmse_mm"]["neuma"] == {"A": 2.2, "B": 3.2}
     assert choices["psnr"]["nclaw"] == {"A": 4, "B": 5}
-    assert len(said) == 3
+    assert len(said) == 4
 
 
 def test_responses_are_of_their_law_and_bands_of_all_chains(tmp_path):

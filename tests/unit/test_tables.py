@@ -286,3 +286,12 @@ def test_verdicts_stand_in_the_table_if_its_rows_do():
         in text
     )
     assert "nobody runs this" not in text
+
+
+def test_a_note_stands_below_its_table_and_other_systems_beside_the_papers_row():
+    metrics = {"pac_nerf": {scene: [run(30.0)] for scene in SCENES}}
+    paper = PAPER["table1_systems"]
+    text = chamfer_table(metrics, {"pac_nerf": "PAC-NeRF"}, SCENES, paper, note="See elsewhere.").markdown()
+    assert text.rstrip().endswith("\n\nSee elsewhere.") and "| *paper* | *516.30* |" in text
+    plain = chamfer_table(metrics, {"pac_nerf": "PAC-NeRF"}, SCENES, paper)
+    assert plain.markdown() == text.replace("\nSee elsewhere.\n", "")

@@ -18,6 +18,7 @@ rule chamfer_table:
         titles=lambda wildcards: table_titles(wildcards.table),
         columns=lambda wildcards: table_columns(wildcards.table),
         notes=lambda wildcards: table_notes(wildcards.table),
+        note=lambda wildcards: SETTINGS.tables[wildcards.table].note,
         caption=lambda wildcards: (
             PAPER[wildcards.table].caption if wildcards.table in PAPER else wildcards.table
         ),

@@ -10,7 +10,9 @@ def main(inputs, output, params, run) -> None:
     metrics: dict[str, dict[str, list]] = {}
     for (method, column), file in zip(params.cells, list(inputs.metrics), strict=True):
         metrics.setdefault(method, {}).setdefault(column, []).append(read_json(file))
-    table = chamfer_table(metrics, params.titles, params.columns, PAPER.get(params.name), params.notes)
+    table = chamfer_table(
+        metrics, params.titles, params.columns, PAPER.get(params.name), params.notes, params.note
+    )
     write_text(output.csv, table.csv())
     write_text(output.markdown, table.markdown())
     run.say(f"{len(params.titles)} methods, {len(params.columns)} columns: {output.markdown}")
