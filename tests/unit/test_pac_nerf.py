@@ -146,7 +146,7 @@ def test_poissons_ratio_waits_for_the_modulus(elastic):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(BOUNDS))
 def test_constants_of_every_family_are_found_from_its_stock_guess(name, loaded):
-    """With default settings, within what is published for the authors' own scenes; see benchmarks/pac_nerf.py."""
+    """With default settings, within the bounds of docs/systems.md; see benchmarks/pac_nerf.py."""
     settings = loaded.pac_nerf.model_copy(update=benchmark.SMALL)
     fit = benchmark.recover(name, settings.families[name], settings, log=lambda _: None)
     found = fit.constants.fitted_numbers()
