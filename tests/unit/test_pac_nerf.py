@@ -384,6 +384,14 @@ class TestOwnParticles:
         x = carried.moving.x[None] + 0.01
         assert torch.equal(loaded.particle_gs(self.CAMERAS)(x), self.rendered(carried, x))
 
+    @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+    def test_cuda_shows_the_same(self, carried):
+        on_gpu = CarriedField(ball().cuda(), 1.0, LEAST_OPACITY, SMALL, DENSITY)
+        x = carried.moving.x[None] + 0.01
+        assert torch.allclose(
+            self.rendered(on_gpu, x).cpu(), self.rendered(carried, x), atol=1e-9
+        )  # x is brought to the field
+
     def test_bad_input_is_named(self, carried):
         with pytest.raises(InputError, match="rollout of 7 particles is not that of a field that"):
             self.rendered(carried, torch.zeros(1, 7, 3, dtype=torch.float64))

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.evaluation.plotting.spheres import draw_spheres
-from neuma_lib.fitting.carried_field import CarriedField
 from neuma_lib.io.images import load_observation
 from neuma_lib.io.particles import load_body
 from neuma_lib.mechanics.density import Density
@@ -55,8 +54,11 @@ def as_bytes(images: Tensor) -> np.ndarray:
     return (255 * images.detach().cpu().numpy().clip(0, 1)).round().astype(np.uint8)
 
 
-def renders(body: Reconstruction | CarriedField, cameras: Cameras, x: Tensor, F: Tensor) -> np.ndarray:
-    """Pictures of a body's states x (T, N, 3) [m] and F (T, N, 3, 3) in the first view: uint8 (T, H, W, 3)."""
+def renders(body: Reconstruction, cameras: Cameras, x: Tensor, F: Tensor) -> np.ndarray:
+    """Pictures of states x (T, N, 3) [m] and F (T, N, 3, 3) in the first view: uint8 (T, H, W, 3).
+
+    Of a reconstruction, or of what else has its ``particle_gs``, as a carried field does.
+    """
     with torch.no_grad():
         parts = [images[:, 0] for _, images in body.particle_gs(cameras[0]).batches(x, F, size=_BATCH)]
     return as_bytes(torch.cat(parts))
