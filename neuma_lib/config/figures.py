@@ -46,8 +46,8 @@ class FiguresConfig(Section):
     )
     beside: tuple[str, ...] = Field(
         (),
-        description="further methods, beside those of tables.table1, in ch_dist_curve, image_quality, main_res and "
-        "particles_app: other systems (docs/systems.md), which are fitted then",
+        description="further methods, beside those of tables.table1, in ch_dist_curve, image_quality and main_res: "
+        "other systems (docs/systems.md), which are fitted then",
     )
     weights: tuple[float, ...] = Field(
         (0.0, 0.25, 0.5, 0.75, 1.0, 1.25), min_length=1, description="weights w of the adaptor, in order"

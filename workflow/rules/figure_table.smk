@@ -5,8 +5,8 @@ import ast
 DRAWN = SETTINGS.figures
 COMPARED = SETTINGS.tables["table1"] if "table1" in SETTINGS.tables else None
 # A law that is judged twice is shown once, on the particles that all methods share, unless figures.beside names it.
-METHODS = [m for m in (COMPARED or SETTINGS).methods if SETTINGS.method_training(m) == m]
-METHODS += [m for m in DRAWN.beside if m not in METHODS]
+SHARED = [m for m in (COMPARED or SETTINGS).methods if SETTINGS.method_training(m) == m]
+METHODS = SHARED + [m for m in DRAWN.beside if m not in SHARED]
 NAMES = table_titles("table1") if COMPARED else {}
 # Methods whose pictures are of PAC-NeRF's field, which their own particles carry.
 OWN = [m for m in METHODS if SETTINGS.carries_field(m)]
@@ -201,10 +201,10 @@ FIGURES = {
         "input": {
             "truth": f"{DATA}/{DRAWN.particles_app}/particles.h5",
             "particles": f"{RESULTS}/{DRAWN.particles_app}/particles.h5",
-            "rollouts": of_methods([DRAWN.particles_app], METHODS, "rollout.h5"),
+            "rollouts": of_methods([DRAWN.particles_app], SHARED, "rollout.h5"),
         },
         "params": {
-            "titles": TITLES,
+            "titles": {method: TITLES[method] for method in SHARED},
             "dt": SETTINGS.scene(DRAWN.particles_app).dt,
             "shown": DRAWN.shown + 3,
             "size": DRAWN.size,
