@@ -133,7 +133,7 @@ class Config(Section):
         for method in self.figures.beside:
             self._law_from(method)
         for table in self.tables.values():
-            for method in (*table.methods, *table.titles):
+            for method in (*table.methods, *table.if_made, *table.titles):
                 self._law_from(method)
         return self
 

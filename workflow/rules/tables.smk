@@ -54,8 +54,8 @@ def with_truths(groups):
     ]
 
 
-def table_runs(table):
-    """Every run behind a table, row by row and chain by chain: its method, column, folder of the scene, and folder."""
+def method_runs(table, method):
+    """Every run behind a row of a table: its method, column, folder of the scene, and folder."""
     chosen = SETTINGS.tables[table]
     return [
         {
@@ -64,10 +64,26 @@ def table_runs(table):
             "scene": run.partition("/")[0] if column in chosen.scenes else None,
             "folder": f"{RESULTS}/{run}" if column in chosen.scenes else f"{RESULTS}/experiments/{run}",
         }
-        for method in chosen.methods
         for column in (*chosen.scenes, *chosen.experiments)
         for run in SETTINGS.runs(table, method, column)
     ]
+
+
+def is_made(table, method):
+    """Whether all results of a row are there."""
+    return all(Path(run["folder"], "metrics.json").exists() for run in method_runs(table, method))
+
+
+# Looked up once, so that files which appear while jobs run change no job.
+TABLE_METHODS = {
+    name: [*table.methods, *(method for method in table.if_made if is_made(name, method))]
+    for name, table in SETTINGS.tables.items()
+}
+
+
+def table_runs(table):
+    """Every run behind a table, row by row and chain by chain, see `method_runs`."""
+    return [run for method in TABLE_METHODS[table] for run in method_runs(table, method)]
 
 
 def table_files(table, name):
@@ -150,12 +166,12 @@ def learning_rate_cells(table):
 def table_titles(table):
     """Row names of a table by method."""
     chosen = SETTINGS.tables[table]
-    return {method: chosen.titles.get(method) or SETTINGS.method_title(method) for method in chosen.methods}
+    return {m: chosen.titles.get(m) or SETTINGS.method_title(m) for m in TABLE_METHODS[table]}
 
 
 def table_notes(table):
     """What readers must know of the rows of a table, by method."""
-    notes = {method: SETTINGS.method_note(method) for method in SETTINGS.tables[table].methods}
+    notes = {method: SETTINGS.method_note(method) for method in TABLE_METHODS[table]}
     return {method: note for method, note in notes.items() if note}
 
 
