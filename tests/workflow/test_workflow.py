@@ -16,6 +16,7 @@ import torch
 from project import ROOT, SCENE, TABLE, Project, copied
 
 from neuma_lib.evaluation.lpips import expected_shapes
+from neuma_lib.evaluation.plotting.image_grid import load_image_grid
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.weights import write_weights
@@ -229,6 +230,33 @@ def test_laws_are_put_to_use_on_other_bodies_and_images_are_measured(clone):
     assert measured["views"] == [1] and measured["views_seen_in_training"] == []
     assert len(measured["ssim_per_frame"]) == 7
     assert measured["psnr"] > 8 and measured["lpips_vgg"] != 0
+
+
+def test_pac_nerf_is_judged_and_shown_on_its_own_particles(clone):
+    """In so short a fit that nothing is found: what moves, carries tracers and is seen are the field's particles."""
+    own = "pac_nerf_own+views=0,1"
+    small = (
+        'radiance={"iterations": 60, "rays": 256, "particles": 500}',
+        'pac_nerf={"particles": 100, "followed": 8, "velocity_iterations": 3, "iterations_contact": 1, '
+        '"iterations_all": 2, "most_frames": 3, "pixels": 200}',
+        f'figures={{beside: ["{own}"]}}',
+    )
+    files = [f"{SCENE}/{own}/{name}" for name in ("metrics.json", "video.mp4")]
+    targets = ("--config", *small, "--", *files, "tiny/results/figures/main_res.png")
+    said = clone.run(*targets)
+    assert clone.plan(*targets) == {}
+    moving, shown = re.search(r"(\d+) of (\d+) particles move", said).groups()
+    x = read_arrays(clone.root / SCENE / own / "rollout.h5", only=("x",))[0]["x"]
+    shared = read_arrays(clone.root / SCENE / "neuma" / "rollout.h5", only=("x",))[0]["x"]
+    assert x.shape == (7, int(moving), 3) and int(moving) < int(shown)
+    assert abs(x[0].mean(0) - shared[0].mean(0)).max() < 0.03 and x.shape != shared.shape
+    assert json.loads((clone.root / files[0]).read_text())["tracer_rmse_mm"] > 0
+    grid = load_image_grid(clone.root / "tiny/results/figures/main_res.h5")
+    assert grid.rows == ("Observation", "NCLaw", "NeuMA", "PAC-NeRF, own particles, views 0,1")
+    seen, _, splatted, rendered = (row[0].astype(int) for row in grid.images)
+    masks = [(image < 200).any(-1) for image in (seen, rendered)]
+    assert (masks[0] & masks[1]).sum() > 0.5 * (masks[0] | masks[1]).sum()
+    assert abs(rendered - splatted).max() > 20, "pictures of the field, not of Gaussians"
 
 
 def test_a_chain_of_another_seed_draws_everything_anew(clone):
