@@ -84,16 +84,9 @@ class PacNerfConfig(Section):
     rate_decay: float = Field(
         0.1, gt=0, le=1, description="last over first rate; they fall over the second half of all steps (1)"
     )
-    beta1: float = Field(
-        0.5,
-        ge=0,
-        lt=1,
-        description="decay of Adam's mean of gradients (0.9, with which moduli overshoot and return over 20 steps)",
-    )
-    beta2: float = Field(
-        0.9,
-        ge=0,
-        lt=1,
-        description="decay of its mean of squares (0.999, with which large first gradients slow down all later steps)",
+    betas: tuple[float, float] = Field(
+        (0.5, 0.9),
+        description="Adam's averaging factors (0.9, 0.999; with the first moduli overshoot and return over 20 steps,"
+        " with the second large first gradients slow down all later steps)",
     )
     save_every: int = Field(5, ge=1, description="steps between two saves of the state")

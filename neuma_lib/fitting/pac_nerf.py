@@ -335,7 +335,7 @@ class _Fit:
         self.flying = spread(before, settings.velocity_frames)
         self.stages = [spread(near, settings.most_frames), spread(after, settings.most_frames)]
         self.iterations = settings.iterations_contact + settings.iterations_all
-        self.optimizer = torch.optim.Adam(constants.groups(settings), betas=(settings.beta1, settings.beta2))
+        self.optimizer = torch.optim.Adam(constants.groups(settings), betas=settings.betas)
         self.iteration, self.history = 0, PacNerfHistory()
         self.history.constants = {name: [] for name in constants.values()}
         self.velocity: Tensor | None = None
