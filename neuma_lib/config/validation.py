@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import types
 import typing
 from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
@@ -53,10 +54,16 @@ def _explained(kind: type, problem: Mapping[str, Any], origin: str) -> str:
 def _keys_at(kind: Any, where: tuple) -> list[str]:
     """Keys of the section at a path."""
     for step in where:
-        if isinstance(kind, type) and issubclass(kind, BaseModel) and step in kind.model_fields:
+        if _is_section(kind) and step in kind.model_fields:
             kind = kind.model_fields[step].annotation
         elif typing.get_origin(kind) in (dict, tuple):
             kind = typing.get_args(kind)[typing.get_origin(kind) is dict]
         else:
             return []
-    return list(kind.model_fields) if isinstance(kind, type) and issubclass(kind, BaseModel) else []
+        if typing.get_origin(kind) is types.UnionType:  # of a section or null
+            kind = next(filter(_is_section, typing.get_args(kind)), kind)
+    return list(kind.model_fields) if _is_section(kind) else []
+
+
+def _is_section(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)

@@ -1,0 +1,162 @@
+"""Settings of a capture, `captures/<name>/capture.yaml`: what photographs and videos cannot tell themselves."""
+
+from __future__ import annotations
+
+from pathlib import PurePosixPath, PureWindowsPath
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field, model_validator
+
+from neuma_lib.config.base import Section
+
+PAPERS = {"A4": (0.210, 0.297), "A3": (0.297, 0.420)}
+"""Width and height of a page [m]."""
+
+
+def _inside(name: str) -> str:
+    """A path as the settings have it: relative, and not above the folder that it starts from."""
+    plain = PurePosixPath(name.replace("\\", "/"))
+    if not name.strip() or not name.isprintable():
+        raise ValueError("expected the name of a file or folder")
+    if plain.is_absolute() or PureWindowsPath(name).drive or ".." in plain.parts or name.startswith("~"):
+        raise ValueError(
+            "a path must stay in the capture's folder: copy the file there, and name it from there"
+        )
+    return name
+
+
+Inside = Annotated[str, AfterValidator(_inside)]
+Pixel = tuple[float, float]
+
+
+class BoardConfig(Section):
+    """The printed ChArUco board."""
+
+    square: float = Field(
+        gt=0.002, lt=0.5, description="side of a square as measured on the print, not as ordered [m]"
+    )
+    squares: tuple[int, int] = Field((6, 8), description="squares along the width and the height of the page")
+    marker: float = Field(0.75, ge=0.4, le=0.9, description="side of a marker, in squares")
+    dictionary: Literal["DICT_4X4_100", "DICT_5X5_100", "DICT_6X6_100", "DICT_APRILTAG_36h11"] = Field(
+        "DICT_5X5_100", description="OpenCV's name of the set of markers"
+    )
+    thickness: float = Field(
+        0.0, ge=0, lt=0.1, description="how far the print lies above the floor, on a plate for example [m]"
+    )
+
+    @model_validator(mode="after")
+    def _markers_suffice(self) -> BoardConfig:
+        columns, rows = self.squares
+        if min(columns, rows) < 3 or columns * rows > 200:
+            raise ValueError("squares: expected at least 3 each way, and at most 200 in all")
+        return self
+
+
+class LengthConfig(Section):
+    """A length between two points that are marked in photographs, where no board was laid."""
+
+    metres: float = Field(gt=0, description="distance between the points [m]")
+    ends: dict[str, tuple[Pixel, Pixel]] = Field(
+        description="photograph -> (x, y) of the first and of the second point [px], from its left upper corner; the "
+        "same two points in at least two photographs"
+    )
+
+    @model_validator(mode="after")
+    def _seen_twice(self) -> LengthConfig:
+        if len(self.ends) < 2:
+            raise ValueError("ends: mark the two points in at least two photographs")
+        return self
+
+
+class CameraConfig(Section):
+    """One fixed video camera, by the name of its files: `videos/<camera>.mp4` and `stills/<camera>.jpg`."""
+
+    rate: float | None = Field(
+        None,
+        gt=0,
+        description="frames a second that were really filmed; null: the file's time stamps, or the rate of filming "
+        "that a slow-motion file names",
+    )
+    offset: float | None = Field(
+        None, description="what is added to its times to make them those of the first camera [s]; null: found"
+    )
+    exposure: float | None = Field(
+        None, gt=0, description="exposure of a frame, over which motion blurs [s]; null: short, no blur"
+    )
+    row_time: float = Field(
+        0.0, ge=0, lt=1e-3, description="time from row to row of a rolling shutter [s]; 0: all rows at once"
+    )
+
+
+class ThrowConfig(Section):
+    """One throw or drop, filmed by all cameras or by some of them."""
+
+    folder: Inside = Field(description="folder with a video for each camera, <camera>.mp4")
+    held_out: bool = Field(False, description="whether it is only predicted, and no law is learned from it")
+
+
+class CaptureConfig(Section):
+    """Own photographs and videos of one object."""
+
+    board: BoardConfig | None = Field(
+        None, description="the printed board; it gives metres, the floor and where down is"
+    )
+    length: LengthConfig | None = Field(
+        None,
+        description="a stated length, which gives metres where there is no board; the floor is fitted then",
+    )
+    prior: str = Field(
+        description="what is believed of the material: a name in priors.laws, or a file of weights"
+    )
+    photographs: Inside = Field("photos", description="folder of the photographs, all of one camera and zoom")
+    photographed: Literal["apart", "start"] = Field(
+        "apart",
+        description="how the object lay in the photographs: `apart`, in any pose of its own, on the floor for example; "
+        "`start`, just as in the first frame of the first throw",
+    )
+    stills: Inside = Field(
+        "stills", description="folder with a picture of the empty scene for each camera, <camera>.jpg or .png"
+    )
+    throws: dict[str, ThrowConfig] = Field(
+        {}, description="throws by name; none: the videos in `videos`, or one throw for each folder in it"
+    )
+    cameras: dict[str, CameraConfig] = Field(
+        {}, description="what the files of a camera do not say, by its name"
+    )
+    poses: Inside = Field(
+        "photographs",
+        description="how the cameras are found: `photographs`, from all pictures together; `board`, from the board in "
+        "each picture; or a transforms.json that has them, in metres, y up, the floor at y = 0",
+    )
+    lens: Inside | None = Field(
+        None,
+        description="file with the intrinsics of cameras, by name, `photographs` among them (docs/capture.md); needed "
+        "for poses: board; null: found from the photographs",
+    )
+    masks: Inside = Field(
+        "masks", description="folder of own masks, which are taken as they are; it need not exist"
+    )
+    center: Pixel | None = Field(
+        None,
+        description="the place on the floor that becomes the middle of the simulator's box, in the board's frame: x "
+        "right, y up the page from the left lower corner of the squares [m]; null: the middle of the board",
+    )
+    scale: float = Field(
+        1.0, gt=0, description="metres of the simulator to a metre of the room, for throws that leave the box"
+    )
+    seed: int = Field(0, ge=0, description="of the search for camera poses")
+
+    @model_validator(mode="after")
+    def _metres_from_somewhere(self) -> CaptureConfig:
+        if self.board is None and self.poses == "board":
+            raise ValueError(
+                "poses: board needs `board: {square: ...}`, the square's side as measured in metres"
+            )
+        if self.board is None and self.length is None and self.poses == "photographs":
+            raise ValueError(
+                "nothing says how large the scene is: give `board: {square: ...}`, its square's side as measured in "
+                "metres, or a stated `length`"
+            )
+        if self.poses == "board" and self.lens is None:
+            raise ValueError("poses: board needs `lens`, a file with the cameras' intrinsics")
+        return self

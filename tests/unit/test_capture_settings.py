@@ -1,0 +1,123 @@
+"""Settings and files of a capture."""
+
+import pytest
+
+from neuma_lib.capture import folder as capture_folder
+from neuma_lib.capture import tools
+from neuma_lib.errors import InputError
+
+MINIMAL = "board: {square: 0.0298}\nprior: soft\n"
+
+
+@pytest.fixture
+def mug(tmp_path):
+    """A complete capture of empty files."""
+    root = tmp_path / "mug"
+    for name in ("photos/b.jpg", "photos/a.JPG", "photos/.hidden.jpg", "photos/notes.txt", "stills/left.jpg",
+                 "stills/right.png", "videos/right.mp4", "videos/left.MOV"):  # fmt: skip
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).touch()
+    (root / "capture.yaml").write_text(MINIMAL)
+    return root
+
+
+def refusal(root, text=None):
+    if text is not None:
+        (root / "capture.yaml").write_text(text)
+    with pytest.raises(InputError) as error:
+        capture_folder.read_capture(root)
+    return str(error.value)
+
+
+def test_two_lines_suffice_and_files_are_found(mug):
+    found = capture_folder.read_capture(mug)
+    assert [p.name for p in found.photographs] == ["a.JPG", "b.jpg"]
+    assert {c: p.name for c, p in found.stills.items()} == {"left": "left.jpg", "right": "right.png"}
+    assert list(found.throws) == ["first"] and found.cameras == ("left", "right")
+    assert found.settings.board.square == 0.0298 and found.settings.board.squares == (6, 8)
+
+
+def test_folders_of_videos_are_throws(mug):
+    for throw in ("one", "two"):
+        (mug / "videos" / throw).mkdir()
+    for camera in ("left.MOV", "right.mp4"):
+        (mug / "videos" / camera).rename(mug / "videos" / "one" / camera)
+    (mug / "videos/two/left.mp4").touch()
+    throws = capture_folder.read_capture(mug).throws
+    assert {t: list(v) for t, v in throws.items()} == {"one": ["left", "right"], "two": ["left"]}
+    (mug / "videos/right.mp4").touch()
+    assert "a folder of its own" in refusal(mug)
+
+
+@pytest.mark.parametrize(
+    "name", ["../photos", "/etc", "a/../../b", "~/photos", "C:\\photos", "..\\photos", " "]
+)
+def test_paths_stay_in_the_folder(mug, name):
+    message = refusal(mug, MINIMAL + f"photographs: '{name}'\n")
+    assert "capture.yaml: photographs:" in message
+
+
+def test_links_stay_in_the_folder(mug, tmp_path):
+    outside = tmp_path / "outside.jpg"
+    outside.touch()
+    (mug / "photos/c.jpg").symlink_to(outside)
+    assert "leads out of the capture's folder" in refusal(mug)
+    (mug / "photos/c.jpg").unlink()
+    (mug / "photos/c.jpg").symlink_to(mug / "photos/b.jpg")
+    assert len(capture_folder.read_capture(mug).photographs) == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("board: {square: 0.03}\n", ["capture.yaml: prior: this key is missing"]),
+        ("prior: soft\n", ["nothing says how large the scene is", "square"]),
+        ("prior: soft\nboard: {}\n", ["board.square: this key is missing"]),
+        ("prior: soft\nboard: {square: 30}\n", ["board.square"]),
+        ("prior: soft\nboard: {square: 0.03, sqares: [6, 8]}\n", ["board.sqares: unknown key", "squares"]),
+        ("prior: soft\nboard: {square: 0.03, squares: [2, 8]}\n", ["board", "at least 3"]),
+        ("prior: soft\nboard: {square: 0.03}\nposes: board\n", ["lens"]),
+        ("prior: soft\nlength: {metres: 1, ends: {a.JPG: [[0, 0], [1, 1]]}}\n", ["at least two photographs"]),
+        (
+            "prior: soft\nlength: {metres: 1, ends: {a.JPG: [[0, 0], [1, 1]], c.jpg: [[0, 0], [1, 1]]}}\n",
+            ["length.ends.c.jpg: there is no such photograph"],
+        ),
+        (MINIMAL + "cameras: {lefft: {rate: 240}}\n", ["cameras.lefft", "did you mean left"]),
+        (MINIMAL + "cameras: {left: {rate: 0}}\n", ["cameras.left.rate"]),
+        (MINIMAL + "throws: {one: {folder: none}}\n", ["none has no videos"]),
+        ("board: [", ["cannot be read as YAML"]),
+        ("- 1\n", ["capture.yaml"]),
+    ],
+)
+def test_messages_name_file_and_key(mug, text, words):
+    message = refusal(mug, text)
+    assert "capture.yaml" in message or "none" in message
+    assert all(word in message for word in words), message
+
+
+@pytest.mark.parametrize(
+    ("gone", "words"),
+    [
+        ("stills/left.jpg", "no picture of the empty scene for the camera 'left'"),
+        ("photos", "has no photographs"),
+        ("videos", "has no videos"),
+        ("capture.yaml", "does not exist"),
+    ],
+)
+def test_what_is_missing_is_named(mug, gone, words):
+    (mug / gone).rename(mug / "elsewhere")
+    assert words in refusal(mug)
+
+
+def test_files_that_cannot_be_told_apart_or_read(mug):
+    (mug / "videos/left.mp4").touch()
+    assert "same camera" in refusal(mug)
+    (mug / "videos/left.mp4").unlink()
+    (mug / "photos/c.HEIC").touch()
+    assert "convert it to JPEG" in refusal(mug)
+
+
+def test_a_missing_extra_says_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "cv2", None)
+    with pytest.raises(InputError, match="make capture"):
+        tools.opencv()
