@@ -1,0 +1,350 @@
+"""The ChArUco board: printing it, finding it, and what it tells: metres, the floor, and where down is.
+
+The board's frame: origin at the left lower corner of the squares, x right and y up the page, z out of the print;
+metres. (OpenCV's own has y down the page and z into the table.) A print that lies on the floor face up has z up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_pdf import FigureCanvasPdf
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from neuma_lib.capture.lens import HALF_PIXEL, Lens
+from neuma_lib.capture.placement import Similarity, fit_similarity, triangulate
+from neuma_lib.capture.tools import opencv
+from neuma_lib.config.capture import PAPERS, BoardConfig
+from neuma_lib.errors import InputError
+from neuma_lib.io.files import atomic
+
+MARGIN = 0.010
+"""Border of the page that printers leave white [m]."""
+FOOT = 0.024
+"""Strip under the squares for the ruler and the text [m]."""
+RULER = 0.100
+"""Length of the printed ruler [m]."""
+PRINT_SQUARE = 0.030
+"""Side of a square as printed, if nobody asks for another [m]."""
+LEAST_CORNERS = 6
+"""Fewest corners of the board from which a pose is taken."""
+NEIGHBOURS = 13
+"""A corner and the nearest others from which its place is predicted."""
+OFF_NEIGHBOURS = (0.4, 0.005)
+"""How far a corner may lie from where its neighbours predict it: pixels, and share of a square's side."""
+LEAST_ANGLE = np.deg2rad(3.0)
+"""Least angle between rays to a corner from which its place is taken; flatter ones say little of its distance."""
+MOST_PIXELS = 2.0
+"""A pose from which corners are further away than this, root mean square, is refused [px]."""
+MOST_MISFIT = 0.05
+"""Root-mean-square misfit of the board's corners above which it was bent, moved or of other squares [squares]."""
+Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""From z up to y up: a turn by -90 degrees about x."""
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """Corners of the board in a picture.
+
+    Attributes:
+        ids: (N,), in rows from the page's top, as OpenCV counts them.
+        pixels: (N, 2), pixel centres at +0.5.
+    """
+
+    ids: np.ndarray
+    pixels: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class BoardFit:
+    """Where the board is in a reconstruction.
+
+    Attributes:
+        board_from_world: the similarity from the reconstruction to the board's frame.
+        corners: numbers of the corners that were used, (N,).
+        residual: root-mean-square distance between corners in space and on the print [m].
+        flatness: the part of it that is normal to the print [m].
+        pictures: how many pictures show the board.
+    """
+
+    board_from_world: Similarity
+    corners: np.ndarray
+    residual: float
+    flatness: float
+    pictures: int
+
+    def plain(self) -> dict:
+        """What a report says of it; lengths in millimetres."""
+        return {
+            "corners": len(self.corners),
+            "pictures": self.pictures,
+            "residual_mm": 1000 * self.residual,
+            "flatness_mm": 1000 * self.flatness,
+            "metres_per_unit": self.board_from_world.scale,
+        }
+
+
+def corner_positions(board: BoardConfig) -> np.ndarray:
+    """Inner corners of the chessboard in the board's frame, (N, 3) [m], by their numbers."""
+    columns, rows = board.squares
+    j, i = np.mgrid[1:rows, 1:columns]
+    flat = np.stack([i, rows - j, np.zeros_like(i)], axis=-1).reshape(-1, 3)
+    return board.square * flat.astype(np.float64)
+
+
+def black_rectangles(board: BoardConfig) -> tuple[np.ndarray, np.ndarray]:
+    """What is to be printed, in the board's frame.
+
+    Returns:
+        Black rectangles, and white ones over them, as x, y of the left lower corner, width and height [m], (N, 4) each.
+        White ones overlap, so that no hair lines are left between them.
+    """
+    cv2 = opencv()
+    dictionary = _dictionary(board)
+    columns, rows = board.squares
+    side = board.marker
+    black, white = [], []
+    number = 0
+    for row in range(rows):  # from the page's top
+        for column in range(columns):
+            left, bottom = column, rows - 1 - row
+            if (row + column) % 2 == 0:
+                black.append((left, bottom, 1.0, 1.0))
+                continue
+            bits = dictionary.markerSize + 2
+            picture = cv2.aruco.generateImageMarker(dictionary, number, bits, borderBits=1)
+            number += 1
+            x0, y1 = left + (1 - side) / 2, bottom + (1 + side) / 2
+            black.append((x0, y1 - side, side, side))
+            bit = side / bits
+            for first, last, line in _runs(picture > 127):
+                white.append((x0 + first * bit, y1 - (line + 1) * bit, (last - first) * bit, bit))
+            for first, last, line in _runs((picture > 127).T):
+                white.append((x0 + line * bit, y1 - last * bit, bit, (last - first) * bit))
+    return board.square * np.array(black), board.square * np.array(white)
+
+
+def _runs(picture: np.ndarray) -> list[tuple[int, int, int]]:
+    """Runs of ones: first, behind the last, and the row."""
+    found = []
+    for line, row in enumerate(picture):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(int), [0]])))
+        found += [(int(a), int(b), line) for a, b in zip(edges[::2], edges[1::2])]
+    return found
+
+
+def print_board(path: str | Path, board: BoardConfig, paper: str = "A4") -> None:
+    """Write a PDF page with the board at its true size, and a ruler to measure the print with.
+
+    Raises:
+        InputError: an unknown size of paper, or squares that it has no room for.
+    """
+    page = board_page(board, paper)
+    with atomic(path) as partial:
+        FigureCanvasPdf(page).print_pdf(partial, metadata={"CreationDate": None, "Title": "ChArUco board"})
+
+
+def board_page(board: BoardConfig, paper: str) -> Figure:
+    """The page of `print_board`; its axes are millimetres from the left lower corner."""
+    if paper not in PAPERS:
+        raise InputError(f"paper {paper!r}: known are {', '.join(PAPERS)}")
+    width, height = PAPERS[paper]
+    columns, rows = board.squares
+    room = min((width - 2 * MARGIN) / columns, (height - 2 * MARGIN - FOOT) / rows)
+    if board.square > room:
+        raise InputError(
+            f"{columns} x {rows} squares of {1000 * board.square:.1f} mm do not fit on {paper}: at most "
+            f"{int(1000 * room)} mm; set board.square or board.squares, or take {'A3' if paper == 'A4' else 'fewer'}"
+        )
+    figure = Figure(figsize=(width / 0.0254, height / 0.0254))
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.set(xlim=(0, 1000 * width), ylim=(0, 1000 * height))
+    axes.axis("off")
+    left = (width - columns * board.square) / 2
+    bottom = MARGIN + FOOT + (height - 2 * MARGIN - FOOT - rows * board.square) / 2
+    black, white = black_rectangles(board)
+    for rectangles, colour in ((black, "black"), (white, "white")):
+        for x, y, w, h in 1000 * (rectangles + [left, bottom, 0, 0]):
+            axes.add_patch(Rectangle((x, y), w, h, facecolor=colour, linewidth=0))
+    start, line = 1000 * MARGIN, 1000 * (MARGIN + 0.010)
+    axes.add_patch(Rectangle((start, line), 1000 * RULER, 0.3, facecolor="black", linewidth=0))
+    for millimetre in range(0, round(1000 * RULER) + 1, 5):
+        tall = 4.0 if millimetre % 50 == 0 else 2.5 if millimetre % 10 == 0 else 1.5
+        axes.add_patch(Rectangle((start + millimetre - 0.1, line), 0.2, tall, facecolor="black", linewidth=0))
+    axes.text(start, line + 5, "0", fontsize=7, ha="center")
+    axes.text(start + 1000 * RULER, line + 5, f"{1000 * RULER:.0f} mm", fontsize=7, ha="center")
+    words = (
+        f"ChArUco {columns} x {rows}, {board.dictionary}, marker {board.marker:g} of a square. Square: "
+        f"{1000 * board.square:.2f} mm if this ruler is {1000 * RULER:.0f} mm long.\n"
+        "Print at 100 %, without 'fit to page'. Measure the ruler and the board's width on the print, and give the "
+        "true side of a square as board.square [m]."
+    )
+    axes.text(start, 1000 * MARGIN, words, fontsize=6, va="bottom", linespacing=1.3)
+    return figure
+
+
+def find_board(image: np.ndarray, board: BoardConfig) -> Detection:
+    """Corners of the board in a picture, below a pixel; none where it is not to be seen.
+
+    Args:
+        image: (H, W, 3) RGB or (H, W), uint8.
+    """
+    cv2 = opencv()
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    printed = cv2.aruco.CharucoBoard(
+        board.squares, board.square, board.square * board.marker, _dictionary(board)
+    )
+    detector = cv2.aruco.CharucoDetector(printed, cv2.aruco.CharucoParameters(), parameters)
+    corners, ids, _, _ = detector.detectBoard(np.ascontiguousarray(grey))
+    if ids is None or len(ids) == 0:
+        return Detection(np.empty(0, np.int64), np.empty((0, 2)))
+    return _refined(grey, ids.ravel().astype(np.int64), corners.reshape(-1, 2), board)
+
+
+def _refined(grey: np.ndarray, ids: np.ndarray, corners: np.ndarray, board: BoardConfig) -> Detection:
+    """Corners of the board's detector, refined once more, without those that are not where their neighbours say.
+
+    The detector leaves some unrefined, and whether half a pixel is in its results depends on its version. The window
+    stops before the markers. A homography over a few squares leaves little of a lens's distortion.
+    """
+    cv2 = opencv()
+    places = np.stack(np.divmod(ids, board.squares[0] - 1), axis=1)
+    distances = np.abs(places[:, None] - places[None]).sum(axis=2)
+    refined, sides = corners.astype(np.float32), np.zeros(len(ids))
+    for i, corner in enumerate(corners):
+        near = distances[i] == 1
+        if near.any():
+            sides[i] = np.linalg.norm(corners[near] - corner, axis=1).min()
+            window = int(np.clip(sides[i] * (1 - board.marker) / 2, 2, 10))
+            start = corner.reshape(1, 1, 2).astype(np.float32)
+            refined[i] = cv2.cornerSubPix(grey, start, (window, window), (-1, -1), (3, 50, 1e-3)).ravel()
+    kept = []
+    for i in range(len(ids) if len(ids) >= LEAST_CORNERS else 0):
+        others = np.argsort(distances[i], kind="stable")[1:NEIGHBOURS]
+        homography, _ = cv2.findHomography(places[others].astype(np.float32), refined[others], cv2.LMEDS)
+        if homography is None:
+            continue
+        predicted = homography @ [*places[i], 1.0]
+        off = np.linalg.norm(refined[i] - predicted[:2] / predicted[2])
+        if sides[i] > 0 and off < OFF_NEIGHBOURS[0] + OFF_NEIGHBOURS[1] * sides[i]:
+            kept.append(i)
+    return Detection(ids[kept], refined[kept].astype(np.float64) + HALF_PIXEL)
+
+
+def board_pose(found: Detection, board: BoardConfig, lens: Lens, where: str) -> tuple[np.ndarray, float]:
+    """Pose of one camera from the board alone.
+
+    Args:
+        found: the corners in its picture.
+        where: the picture, for messages.
+
+    Returns:
+        Board's frame to camera (4, 4), and the root-mean-square distance of the corners in the picture [px].
+
+    Raises:
+        InputError: too few corners, or they do not fit a flat board seen from above.
+    """
+    cv2 = opencv()
+    points = corner_positions(board)[found.ids]
+    if len(points) < LEAST_CORNERS or np.linalg.matrix_rank(points - points.mean(axis=0), 1e-9) < 2:
+        raise InputError(
+            f"{where}: {len(points)} corners of the board are seen, {LEAST_CORNERS} in two rows are needed: is it the "
+            "board of capture.yaml, sharp, and without glare?"
+        )
+    seen = lens.directions(found.pixels)
+    flat = points.reshape(-1, 1, 3), seen.reshape(-1, 1, 2), np.eye(3), None
+    _, rotations, shifts, _ = cv2.solvePnPGeneric(*flat, flags=cv2.SOLVEPNP_IPPE)
+    best = None
+    for rotation, shift in zip(rotations, shifts):  # a flat board has two; noise decides between them
+        rotation, shift = cv2.solvePnPRefineLM(*flat, rotation, shift)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(rotation)[0], shift.ravel()
+        error = _pixel_error(pose, points, found.pixels, lens)
+        from_above = (pose[:3, :3].T @ pose[:3, 3])[2] < 0
+        if from_above and (best is None or error < best[1]):
+            best = pose, error
+    if best is None or not best[1] < MOST_PIXELS:
+        raise InputError(
+            f"{where}: the corners do not fit a flat board seen from above"
+            + (f" ({best[1]:.1f} px)" if best else "")
+            + ": check board.squares, the lens, and that the print lies flat"
+        )
+    return best
+
+
+def _pixel_error(pose: np.ndarray, points: np.ndarray, pixels: np.ndarray, lens: Lens) -> float:
+    seen = points @ pose[:3, :3].T + pose[:3, 3]
+    if (seen[:, 2] <= 0).any():
+        return np.inf
+    return float(np.sqrt(((lens.project(seen) - pixels) ** 2).sum(axis=1).mean()))
+
+
+def fit_board(
+    found: Sequence[Detection], lenses: Sequence[Lens], viewmats: np.ndarray, board: BoardConfig
+) -> BoardFit:
+    """The similarity from a reconstruction to the board's frame, from its corners in many pictures.
+
+    Args:
+        found: the corners in each picture, (N) of them; empty ones are left out.
+        lenses: of each picture.
+        viewmats: world to camera, (N, 4, 4).
+
+    Raises:
+        InputError: the board is seen too rarely, or its corners do not lie as printed.
+    """
+    seen: dict[int, list[tuple[int, np.ndarray]]] = {}
+    for picture, (corners, lens) in enumerate(zip(found, lenses)):
+        if len(corners.ids):
+            for number, direction in zip(corners.ids, lens.directions(corners.pixels)):
+                seen.setdefault(int(number), []).append((picture, direction))
+    pictures = sum(len(corners.ids) > 0 for corners in found)
+    numbers, points = [], []
+    for number, views in sorted(seen.items()):
+        if len(views) < 2:
+            continue
+        index = [picture for picture, _ in views]
+        point, angle = triangulate(viewmats[index], np.stack([direction for _, direction in views]))
+        if angle > LEAST_ANGLE and np.isfinite(point).all():
+            numbers.append(number)
+            points.append(point)
+    printed = corner_positions(board)[numbers] if numbers else np.empty((0, 3))
+    if len(numbers) < LEAST_CORNERS or np.linalg.matrix_rank(printed - printed.mean(axis=0), 1e-9) < 2:
+        raise InputError(
+            f"the board is seen in {pictures} of {len(found)} pictures, and {len(numbers)} of its corners from two "
+            f"sides ({LEAST_CORNERS} in two rows are needed): photograph it with the object, uncovered, from all "
+            "sides; or state a length instead"
+        )
+    world = np.stack(points)
+    placed = fit_similarity(world, printed)
+    off = placed.apply(world) - printed
+    fit = BoardFit(
+        placed,
+        np.array(numbers),
+        float(np.sqrt((off**2).sum(axis=1).mean())),
+        float(np.sqrt((off[:, 2] ** 2).mean())),
+        pictures,
+    )
+    if fit.residual > MOST_MISFIT * board.square:
+        raise InputError(
+            f"the board's corners are {1000 * fit.residual:.1f} mm off the print, root mean square: it was moved or "
+            "bent between the photographs, or board.squares is not as printed"
+        )
+    return fit
+
+
+def room_from_board(board: BoardConfig, center: tuple[float, float] | None) -> Similarity:
+    """From the board's frame to the room: y up, the floor at y = 0, the origin under ``center`` (None: its middle)."""
+    columns, rows = board.squares
+    x, y = center or (board.square * columns / 2, board.square * rows / 2)
+    return Similarity(1.0, Y_UP, -Y_UP @ [x, y, -board.thickness])
+
+
+def _dictionary(board: BoardConfig):
+    cv2 = opencv()
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))

@@ -1,0 +1,149 @@
+"""Lenses with distortion, and the conventions of everything that this package calls.
+
+Pixels: the centre of the left upper pixel is (0.5, 0.5), as in COLMAP and in all of this project; OpenCV has it at
+(0, 0), so what goes to OpenCV is shifted by half a pixel here and nowhere else. Cameras look along +z, x is right and y
+down (COLMAP, OpenCV); `transforms.json` has OpenGL axes (`neuma_lib.io.images`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from neuma_lib.capture.tools import opencv
+from neuma_lib.errors import InputError
+
+HALF_PIXEL = 0.5
+"""What OpenCV's pixel coordinates lack."""
+COLMAP_MODELS = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+}
+"""COLMAP's camera models that are polynomials of Brown and Conrady as OpenCV's is, with their parameters in order."""
+_INVERSION = (3, 100, 1e-12)
+"""Both criteria, iterations and precision of the inverse of the distortion."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """Intrinsics of a camera.
+
+    Attributes:
+        width, height: of its pictures [px].
+        K: (3, 3) [px], no skew.
+        distortion: k1, k2, p1, p2, k3 of Brown and Conrady, as in OpenCV.
+    """
+
+    width: int
+    height: int
+    K: np.ndarray
+    distortion: np.ndarray
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Pixels (N, 2) of points (N, 3) in the camera's frame, z > 0."""
+        x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
+        k1, k2, p1, p2, k3 = self.distortion
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        distorted_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        distorted_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        return np.stack([distorted_x, distorted_y], axis=1) * self.K[[0, 1], [0, 1]] + self.K[:2, 2]
+
+    def directions(self, pixels: np.ndarray) -> np.ndarray:
+        """x/z and y/z (N, 2) in the camera's frame of pixels (N, 2): the inverse of `project`."""
+        cv2 = opencv()
+        points = np.asarray(pixels, np.float64).reshape(-1, 1, 2)
+        return cv2.undistortPointsIter(points, self.K, self.distortion, None, None, _INVERSION).reshape(-1, 2)
+
+    def pinhole(self) -> Lens:
+        """The lens without distortion and of the same size all of whose pixels this one sees."""
+        if not self.distortion.any():
+            return self
+        size = (self.width, self.height)
+        K, _ = opencv().getOptimalNewCameraMatrix(self._opencv_K(), self.distortion, size, 0)
+        K[:2, 2] += HALF_PIXEL
+        return Lens(self.width, self.height, K, np.zeros(5))
+
+    def undistort(self, image: np.ndarray, linear: bool = True) -> np.ndarray:
+        """What the lens of `pinhole` would have seen.
+
+        Args:
+            image: (H, W) or (H, W, C), uint8 or float32.
+            linear: whether to interpolate between pixels; without it, labels stay labels.
+        """
+        if image.shape[:2] != (self.height, self.width):
+            height, width = image.shape[:2]
+            raise InputError(
+                f"a picture of {width}x{height} is not of the lens of {self.width}x{self.height}"
+            )
+        if not self.distortion.any():
+            return image
+        cv2 = opencv()
+        target = self.pinhole()._opencv_K()
+        size = (self.width, self.height)
+        maps = cv2.initUndistortRectifyMap(
+            self._opencv_K(), self.distortion, None, target, size, cv2.CV_32FC1
+        )
+        method = cv2.INTER_LINEAR if linear else cv2.INTER_NEAREST
+        return cv2.remap(image, *maps, method, borderMode=cv2.BORDER_REPLICATE)
+
+    def intrinsics(self) -> dict[str, float]:
+        """Entries of a transforms.json; of a lens without distortion."""
+        assert not self.distortion.any(), "a transforms.json holds pinhole cameras"
+        focal, centre = self.K[[0, 1], [0, 1]].tolist(), self.K[:2, 2].tolist()
+        return {
+            **dict(zip(("fl_x", "fl_y"), focal)),
+            **dict(zip(("cx", "cy"), centre)),
+            "w": self.width,
+            "h": self.height,
+        }
+
+    def plain(self) -> dict[str, Any]:
+        """The lens as JSON has it; `read` undoes it."""
+        names = ("k1", "k2", "p1", "p2", "k3")
+        pinhole = Lens(self.width, self.height, self.K, np.zeros(5)).intrinsics()
+        return {**pinhole, **dict(zip(names, self.distortion.tolist()))}
+
+    def _opencv_K(self) -> np.ndarray:
+        K = self.K.copy()
+        K[:2, 2] -= HALF_PIXEL
+        return K
+
+
+def read_lens(values: Any, where: str) -> Lens:
+    """A lens from ``fl_x``, ``fl_y``, ``cx``, ``cy``, ``w``, ``h`` and k1, k2, p1, p2, k3 (0 where they are missing).
+
+    Raises:
+        InputError: names ``where`` and the key.
+    """
+    known = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+    coefficients = ("k1", "k2", "p1", "p2", "k3")
+    if not isinstance(values, dict):
+        raise InputError(f"{where}: expected intrinsics, {', '.join(known)} in pixels")
+    for key in (*known, *coefficients):
+        value = values.get(key, None if key in known else 0.0)
+        if type(value) not in (int, float) or not np.isfinite(value) or (key in known and value <= 0):
+            raise InputError(f"{where}: {key} must be a {'positive ' * (key in known)}number")
+    if int(values["w"]) != values["w"] or int(values["h"]) != values["h"]:
+        raise InputError(f"{where}: w and h must be whole numbers")
+    K = np.array(
+        [[values["fl_x"], 0, values["cx"]], [0, values["fl_y"], values["cy"]], [0, 0, 1]], np.float64
+    )
+    distortion = np.array([values.get(key, 0.0) for key in coefficients], np.float64)
+    return Lens(int(values["w"]), int(values["h"]), K, distortion)
+
+
+def lens_of_colmap(model: str, parameters: np.ndarray, width: int, height: int) -> Lens:
+    """The lens of one of COLMAP's cameras. Raises InputError for a model that is none of `COLMAP_MODELS`."""
+    if model not in COLMAP_MODELS:
+        raise InputError(f"camera model {model} is not read; known: {', '.join(COLMAP_MODELS)}")
+    named = dict(zip(COLMAP_MODELS[model], np.asarray(parameters, np.float64)))
+    fx, fy = named.get("fx", named.get("f")), named.get("fy", named.get("f"))
+    K = np.array([[fx, 0, named["cx"]], [0, fy, named["cy"]], [0, 0, 1]])
+    distortion = np.array([named.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")])
+    return Lens(width, height, K, distortion)
