@@ -1,8 +1,8 @@
 """Frames of a video with the times at which they were taken.
 
 Phones film at a variable rate, and write slow motion at another rate than they film: a frame's time is its time stamp,
-never its number over a rate. OpenCV gives no time stamps that one could trust (it counts frames where the rate varies),
-so the ffmpeg that imageio-ffmpeg brings decodes, and says of each frame when it is shown.
+never its number over a rate. The ffmpeg that imageio-ffmpeg brings decodes: unlike OpenCV it says of each frame whether
+it has a time stamp, in ticks of the file's clock, and what the phone has noted of the rate of filming.
 """
 
 from __future__ import annotations

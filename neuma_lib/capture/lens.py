@@ -92,6 +92,15 @@ class Lens:
         method = cv2.INTER_LINEAR if linear else cv2.INTER_NEAREST
         return cv2.remap(image, *maps, method, borderMode=cv2.BORDER_REPLICATE)
 
+    def resized(self, longest: int) -> Lens:
+        """The lens of pictures that were shrunk to a longer side of at most ``longest`` pixels."""
+        factor = min(1.0, longest / max(self.width, self.height))
+        width, height = max(1, round(factor * self.width)), max(1, round(factor * self.height))
+        K = self.K.copy()  # pixel centres at +0.5: edges stay edges, and no shift is needed
+        K[0] *= width / self.width
+        K[1] *= height / self.height
+        return Lens(width, height, K, self.distortion)
+
     def intrinsics(self) -> dict[str, float]:
         """Entries of a transforms.json; of a lens without distortion."""
         assert not self.distortion.any(), "a transforms.json holds pinhole cameras"

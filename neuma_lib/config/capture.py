@@ -144,6 +144,12 @@ class CaptureConfig(Section):
     scale: float = Field(
         1.0, gt=0, description="metres of the simulator to a metre of the room, for throws that leave the box"
     )
+    longest: int = Field(
+        1000,
+        ge=64,
+        le=8192,
+        description="longer side of the undistorted pictures, which are never enlarged [px]",
+    )
     seed: int = Field(0, ge=0, description="of the search for camera poses")
 
     @model_validator(mode="after")
