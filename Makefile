@@ -1,6 +1,7 @@
 # make table1   the environment, then Table 1 of the paper at the default scale
 # make test     the tests (make test-all adds the slow ones)
 # make env      the environment alone        make lint    style checks
+# make capture  the environment, with OpenCV and COLMAP for own photographs and videos (docs/capture.md)
 # make lock     envs/ again from the pins in pyproject.toml
 # make unlock   after a killed Snakemake     make clean   everything computed, but not the environment
 
@@ -11,7 +12,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 SNAKEMAKE := $(BIN)/snakemake --cores $(CORES)
 
-.PHONY: table1 all dataset test test-all lint env check unlock lock clean
+.PHONY: table1 all dataset test test-all lint env capture check unlock lock clean
 
 table1: env unlock
 	$(SNAKEMAKE) results/table1.csv
@@ -39,6 +40,9 @@ unlock: env
 	@$(BIN)/python -m workflow.unlock
 
 env: $(READY)
+
+capture: env envs/requirements-capture.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r envs/requirements-capture.txt
 
 $(READY): envs/requirements.txt envs/requirements-dev.txt
 	@command -v $(PYTHON) >/dev/null 2>&1 && $(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { \

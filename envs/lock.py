@@ -2,6 +2,7 @@
 
 requirements.txt      everything that the workflow needs, exact versions
 requirements-dev.txt  the same, and what tests and style checks need
+requirements-capture.txt  the same as the first, and what own photographs and videos need
 conda.yaml            requirements.txt inside a conda environment with Python 3.11 (`snakemake --sdm conda`)
 
 Local builds (``+cpu``) and the addresses of package indices are left out, so that the files resolve anywhere.
@@ -41,14 +42,15 @@ def resolve(extras: list[str]) -> list[str]:
 
 
 def main() -> None:
-    run, dev = resolve([]), resolve(["dev"])
+    run, dev, capture = resolve([]), resolve(["dev"]), resolve(["capture"])
     (HERE / "requirements.txt").write_text(HEADER + "".join(f"{line}\n" for line in run))
     (HERE / "requirements-dev.txt").write_text(HEADER + "".join(f"{line}\n" for line in dev))
+    (HERE / "requirements-capture.txt").write_text(HEADER + "".join(f"{line}\n" for line in capture))
     pins = "".join(f"      - {line}\n" for line in run)
     (HERE / "conda.yaml").write_text(
         f"{HEADER}channels:\n  - conda-forge\ndependencies:\n  - python=3.11\n  - pip\n  - pip:\n{pins}"
     )
-    print(f"{len(run)} packages, {len(dev)} with those of development")
+    print(f"{len(run)} packages, {len(dev)} with those of development, {len(capture)} with those of captures")
 
 
 if __name__ == "__main__":

@@ -13,6 +13,8 @@ from neuma_lib.config.validation import hint, validate
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import existing, reading
 
+PHOTOGRAPHS = "photographs"
+"""Group of the photographs, beside the names of the cameras."""
 PICTURES = (".jpg", ".jpeg", ".png", ".webp")
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
 OTHER_PICTURES = (".heic", ".heif", ".dng", ".cr2", ".nef", ".arw")
@@ -102,6 +104,8 @@ def read_capture(folder: str | Path) -> Capture:
     for camera in settings.cameras:
         if camera not in cameras:
             raise InputError(f"{source}: cameras.{camera}: no video is named so{hint(camera, cameras)}")
+    if PHOTOGRAPHS in cameras:
+        raise InputError(f"{folder}: a video camera cannot be named '{PHOTOGRAPHS}': rename its files")
     stills = _by_camera(folder, settings.stills, PICTURES)
     if settings.length:
         names = [file.name for file in photographs]
@@ -145,7 +149,13 @@ def _pictures(folder: Path, name: str) -> tuple[Path, ...]:
     for file in found:
         if file.suffix.lower() in OTHER_PICTURES:
             raise InputError(f"{file}: pictures of this kind are not read: convert it to JPEG, and remove it")
-    return tuple(file for file in found if file.suffix.lower() in PICTURES)
+    pictures = [file for file in found if file.suffix.lower() in PICTURES]
+    for i, file in enumerate(pictures):
+        if file.stem in [other.stem for other in pictures[:i]]:
+            raise InputError(
+                f"{file}: another picture differs from it in its ending only: rename one of them"
+            )
+    return tuple(pictures)
 
 
 def _by_camera(folder: Path, name: str, suffixes: Iterable[str]) -> dict[str, Path]:

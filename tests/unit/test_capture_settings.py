@@ -113,6 +113,12 @@ def test_files_that_cannot_be_told_apart_or_read(mug):
     (mug / "videos/left.mp4").touch()
     assert "same camera" in refusal(mug)
     (mug / "videos/left.mp4").unlink()
+    (mug / "photos/b.png").touch()
+    assert "differs from it in its ending only" in refusal(mug)
+    (mug / "photos/b.png").unlink()
+    for name in ("videos/left.MOV", "stills/left.jpg"):
+        (mug / name).rename((mug / name).with_stem("photographs"))
+    assert "cannot be named" in refusal(mug)
     (mug / "photos/c.HEIC").touch()
     assert "convert it to JPEG" in refusal(mug)
 
