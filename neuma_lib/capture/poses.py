@@ -53,8 +53,8 @@ LEAST_REGISTERED = 0.7
 LARGEST = 2400
 """Longer side at which features are sought [px]."""
 PHOTOGRAPH_MODEL, STILL_MODEL = "RADIAL", "SIMPLE_RADIAL"
-"""COLMAP's camera models, with square pixels: on ten photographs a second focal length went 4 % astray. One picture of a
-fixed camera does not tell more than focal length and one coefficient."""
+"""COLMAP's camera models, with square pixels: on ten photographs a second focal length went 4 % astray. One picture of
+a fixed camera does not tell more than focal length and one coefficient."""
 FLOOR_TOLERANCE = 0.005
 """Distance from the floor that counts as near, as share of the distance from the cameras to the points."""
 BOX_MIDDLE = (0.5, 0.0, 0.5)
