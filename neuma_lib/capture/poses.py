@@ -134,7 +134,9 @@ def gather_pictures(groups: Mapping[str, Sequence[Path]], target: str | Path) ->
                     if not turned:
                         shutil.copyfile(file, partial)
                     elif image.format == "JPEG":
-                        partial.write_bytes(_unturned(content, image.info["exif"]))
+                        with reading(file, "an image"):
+                            upright_content = _unturned(content, image.info["exif"])
+                        partial.write_bytes(upright_content)
                     else:
                         with reading(file, "an image"):
                             pixels = image.convert("RGB")
@@ -151,7 +153,12 @@ def gather_pictures(groups: Mapping[str, Sequence[Path]], target: str | Path) ->
 
 def _unturned(content: bytes, exif: bytes) -> bytes:
     """A JPEG file whose first directory of notes (TIFF 6.0, section 2) says that the picture is upright; no pixel of it
-    is touched."""
+    is touched.
+
+    Raises ValueError or struct.error where the notes are damaged.
+    """
+    if exif not in content:
+        raise ValueError("its EXIF notes are in several parts")
     tiff = exif.index(b"Exif\0\0") + 6
     order = "<" if exif[tiff : tiff + 2] == b"II" else ">"
     directory = tiff + struct.unpack_from(f"{order}I", exif, tiff + 4)[0]
