@@ -11,6 +11,7 @@ include: "workflow/rules/settings.smk"
 include: "workflow/rules/scenes.smk"
 include: "workflow/rules/methods.smk"
 include: "workflow/rules/tables.smk"
+include: "workflow/rules/captures.smk"
 include: "workflow/rules/dataset.smk"
 include: "workflow/rules/packing.smk"
 include: "workflow/rules/priors.smk"
@@ -29,6 +30,7 @@ include: "workflow/rules/metrics.smk"
 include: "workflow/rules/paper.smk"
 include: "workflow/rules/figure_table.smk"
 include: "workflow/rules/figures.smk"
+include: "workflow/rules/capturing.smk"
 
 
 rule all:

@@ -4,6 +4,7 @@ requirements.txt      everything that the workflow needs, exact versions
 requirements-dev.txt  the same, and what tests and style checks need
 requirements-capture.txt  the same as the first, and what own photographs and videos need
 conda.yaml            requirements.txt inside a conda environment with Python 3.11 (`snakemake --sdm conda`)
+conda-capture.yaml    requirements-capture.txt so
 
 Local builds (``+cpu``) and the addresses of package indices are left out, so that the files resolve anywhere.
 """
@@ -46,10 +47,11 @@ def main() -> None:
     (HERE / "requirements.txt").write_text(HEADER + "".join(f"{line}\n" for line in run))
     (HERE / "requirements-dev.txt").write_text(HEADER + "".join(f"{line}\n" for line in dev))
     (HERE / "requirements-capture.txt").write_text(HEADER + "".join(f"{line}\n" for line in capture))
-    pins = "".join(f"      - {line}\n" for line in run)
-    (HERE / "conda.yaml").write_text(
-        f"{HEADER}channels:\n  - conda-forge\ndependencies:\n  - python=3.11\n  - pip\n  - pip:\n{pins}"
-    )
+    for name, packages in (("conda.yaml", run), ("conda-capture.yaml", capture)):
+        pins = "".join(f"      - {line}\n" for line in packages)
+        (HERE / name).write_text(
+            f"{HEADER}channels:\n  - conda-forge\ndependencies:\n  - python=3.11\n  - pip\n  - pip:\n{pins}"
+        )
     print(f"{len(run)} packages, {len(dev)} with those of development, {len(capture)} with those of captures")
 
 

@@ -28,8 +28,6 @@ FOOT = 0.024
 """Strip under the squares for the ruler and the text [m]."""
 RULER = 0.100
 """Length of the printed ruler [m]."""
-PRINT_SQUARE = 0.030
-"""Side of a square as printed, if nobody asks for another [m]."""
 LEAST_CORNERS = 6
 """Fewest corners of the board from which a pose is taken."""
 NEIGHBOURS = 13

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +12,10 @@ import yaml
 from neuma_lib.config.capture import CaptureConfig
 from neuma_lib.config.validation import hint, validate
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import existing, reading
+from neuma_lib.io.files import existing, one_line, reading
 
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+"""What captures, throws and cameras may be named, since results are named after them."""
 PHOTOGRAPHS = "photographs"
 """Group of the photographs, beside the names of the cameras."""
 PICTURES = (".jpg", ".jpeg", ".png", ".webp")
@@ -28,9 +31,9 @@ class Capture:
     Attributes:
         folder: where all of it lies.
         settings: its capture.yaml.
-        photographs: pictures of the object, by name.
+        photographs: pictures of the object, by name; there may be none yet.
         stills: camera -> its picture of the empty scene.
-        throws: throw -> camera -> video; cameras in the order of their names.
+        throws: throw -> camera -> video; cameras in the order of their names. There may be none yet.
     """
 
     folder: Path
@@ -39,10 +42,30 @@ class Capture:
     stills: dict[str, Path]
     throws: dict[str, dict[str, Path]]
 
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """All cameras that filmed, by name."""
-        return tuple(sorted({camera for videos in self.throws.values() for camera in videos}))
+    def pictures(self) -> dict[str, tuple[Path, ...]]:
+        """Photographs and stills, by group. Raises InputError where there are no photographs."""
+        if not self.photographs:
+            raise InputError(
+                f"{self.folder / self.settings.photographs} has no photographs ({', '.join(PICTURES)}): put them there"
+            )
+        return {PHOTOGRAPHS: self.photographs, **{camera: (file,) for camera, file in self.stills.items()}}
+
+    def video(self, throw: str, camera: str) -> Path:
+        """The video of a throw by a camera. Raises InputError where there is none."""
+        if not self.throws:
+            raise _no_videos(self.folder / "videos")
+        if throw not in self.throws:
+            raise InputError(f"{self.folder} has no throw '{throw}'{hint(throw, self.throws)}")
+        videos = self.throws[throw]
+        if camera not in videos:
+            raise InputError(f"{self.folder}: no video of '{throw}' by '{camera}'{hint(camera, videos)}")
+        return videos[camera]
+
+
+def _no_videos(folder: Path) -> InputError:
+    return InputError(
+        f"{folder} has no videos ({', '.join(VIDEOS)}): put one there for each camera, <camera>.mp4"
+    )
 
 
 def read_settings(path: str | Path) -> CaptureConfig:
@@ -76,37 +99,40 @@ def inside(folder: str | Path, name: str | Path) -> Path:
 
 
 def read_capture(folder: str | Path) -> Capture:
-    """Settings and files of a capture.
+    """Settings and files of a capture, of which some may still be missing.
 
     Raises:
-        InputError: see `read_settings` and `inside`; no photographs or videos; a camera without a picture of the empty
-            scene; settings of a camera that did not film; two files for one camera.
+        InputError: see `read_settings` and `inside`; a throw without videos; a camera that filmed without a picture of
+            the empty scene; settings of a camera that is not there; two files for one camera.
     """
     folder = Path(folder)
     source = folder / "capture.yaml"
     settings = read_settings(source)
     photographs = _pictures(folder, settings.photographs)
-    if not photographs:
-        raise InputError(
-            f"{folder / settings.photographs} has no photographs ({', '.join(PICTURES)}): put them there"
-        )
     if settings.throws:
         throws = {name: _by_camera(folder, throw.folder, VIDEOS) for name, throw in settings.throws.items()}
     else:
         throws = _default_throws(folder)
     for name, videos in throws.items():
         if not videos:
-            where = settings.throws[name].folder if name in settings.throws else "videos"
-            raise InputError(
-                f"{folder / where} has no videos ({', '.join(VIDEOS)}): put one there for each camera, <camera>.mp4"
+            raise _no_videos(
+                folder / (settings.throws[name].folder if name in settings.throws else f"videos/{name}")
             )
-    cameras = sorted({camera for videos in throws.values() for camera in videos})
+    stills = _by_camera(folder, settings.stills, PICTURES)
+    filmed = {camera for videos in throws.values() for camera in videos}
+    cameras = sorted(filmed | stills.keys())
     for camera in settings.cameras:
         if camera not in cameras:
-            raise InputError(f"{source}: cameras.{camera}: no video is named so{hint(camera, cameras)}")
+            raise InputError(
+                f"{source}: cameras.{camera}: no video or still is named so{hint(camera, cameras)}"
+            )
+    for name in (*cameras, *throws):
+        if not NAME.fullmatch(name):
+            raise InputError(
+                f"{folder}: '{one_line(name)}' is to name folders and results: rename it, with letters, digits, - and _"
+            )
     if PHOTOGRAPHS in cameras:
         raise InputError(f"{folder}: a video camera cannot be named '{PHOTOGRAPHS}': rename its files")
-    stills = _by_camera(folder, settings.stills, PICTURES)
     if settings.length:
         names = [file.name for file in photographs]
         for name in settings.length.ends:
@@ -114,13 +140,12 @@ def read_capture(folder: str | Path) -> Capture:
                 raise InputError(
                     f"{source}: length.ends.{name}: there is no such photograph{hint(name, names)}"
                 )
-    for camera in cameras:
-        if camera not in stills:
-            raise InputError(
-                f"{folder / settings.stills} has no picture of the empty scene for the camera '{camera}': film a "
-                f"second before the object is there, and save a frame of it as {camera}.png"
-            )
-    return Capture(folder, settings, photographs, {c: stills[c] for c in cameras}, throws)
+    for camera in sorted(filmed - stills.keys()):
+        raise InputError(
+            f"{folder / settings.stills} has no picture of the empty scene for the camera '{camera}': film a "
+            f"second before the object is there, and save a frame of it as {camera}.png"
+        )
+    return Capture(folder, settings, photographs, stills, throws)
 
 
 def _default_throws(folder: Path) -> dict[str, dict[str, Path]]:
@@ -134,7 +159,7 @@ def _default_throws(folder: Path) -> dict[str, dict[str, Path]]:
         )
     if below:
         return {p.name: _by_camera(folder, f"videos/{p.name}", VIDEOS) for p in below}
-    return {"first": direct}
+    return {"first": direct} if direct else {}
 
 
 def _listed(folder: Path, name: str) -> list[Path]:

@@ -15,22 +15,20 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Queue
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import imageio_ffmpeg
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
 
+from neuma_lib.capture.pictures import picture_sheet
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import atomic, existing, one_line
+from neuma_lib.io.files import existing, one_line
 from neuma_lib.io.images import MAX_PIXELS
 
 MAX_FRAMES = 100_000
 """Most frames of a video that is read: a quarter of an hour at 120 a second."""
 STEADY = 0.1
 """Intervals between frames that differ by less than this share count as one rate."""
-SHEET_WIDTH = 1600
-"""Width of a contact sheet [px]."""
 _SHOWN = re.compile(r"\bn:\s*(\d+)\s+pts:\s*(-?\d+|NOPTS)\s.*\bs:(\d+)x(\d+)\b")
 _TIME_BASE = re.compile(r"config in time_base:\s*(\d+)/(\d+)")
 _FILMED = re.compile(
@@ -63,6 +61,19 @@ class Timeline:
         """Whether all intervals are alike."""
         gaps = np.diff(self.times)
         return bool((np.abs(gaps * self.rate - 1) < STEADY).all())
+
+    def plain(self) -> dict[str, Any]:
+        """What a report says of it, with all times."""
+        return {
+            "frames": len(self.times),
+            "rate": self.rate,
+            "steady": self.steady,
+            "lost_before": self.lost.tolist(),
+            "stretch": self.stretch,
+            "width": self.width,
+            "height": self.height,
+            "times_s": self.times.tolist(),
+        }
 
     @property
     def lost(self) -> np.ndarray:
@@ -166,21 +177,8 @@ def contact_sheet(path: str | Path, frames: Sequence[Frame], title: str, columns
     """Write a picture with frames in rows, each under its number and time."""
     if not frames:
         raise InputError(f"{path}: there are no frames to show")
-    font = ImageFont.load_default(14)
-    columns = min(columns, len(frames))
-    width = SHEET_WIDTH // columns
-    height = round(width * frames[0].pixels.shape[0] / frames[0].pixels.shape[1])
-    line = 20
-    rows = -(-len(frames) // columns)
-    sheet = Image.new("RGB", (columns * width, line + rows * (height + line)), "white")
-    draw = ImageDraw.Draw(sheet)
-    draw.text((4, 2), title, fill="black", font=font)
-    for i, frame in enumerate(frames):
-        x, y = (i % columns) * width, line + (i // columns) * (height + line)
-        draw.text((x + 4, y + 2), f"{frame.number}: {frame.time:.4f} s", fill="black", font=font)
-        sheet.paste(Image.fromarray(frame.pixels).resize((width - 2, height), Image.LANCZOS), (x, y + line))
-    with atomic(path) as partial:
-        sheet.save(partial, "PNG")
+    lines = [f"{frame.number}: {frame.time:.4f} s" for frame in frames]
+    picture_sheet(path, [(line, frame.pixels) for line, frame in zip(lines, frames)], title, columns)
 
 
 def sheet_numbers(count: int, most: int = 24) -> list[int]:

@@ -1,48 +1,26 @@
-"""Where the cameras stood: from the photographs together (structure from motion), from the board alone, or as given.
-
-Pictures come in groups that share a lens: `photographs`, and each fixed camera with its picture of the empty scene. A
-picture's name is ``<group>/<file>``.
-
-Pictures are taken as the sensor wrote them: a note to turn them is removed, since the tools disagree about it, and a
-phone's lens is the same however it is held.
-"""
+"""Where the cameras stood: from the photographs together (structure from motion), from the board alone, or as given."""
 
 from __future__ import annotations
 
 import shutil
-import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from PIL import Image
 
-from neuma_lib.capture.board import BoardFit, Detection, board_pose, find_board, fit_board, room_from_board
-from neuma_lib.capture.folder import PHOTOGRAPHS, Capture, inside
+from neuma_lib.capture.board import Detection, board_pose, find_board
+from neuma_lib.capture.folder import PHOTOGRAPHS
 from neuma_lib.capture.lens import Lens, lens_of_colmap, read_lens
-from neuma_lib.capture.placement import (
-    Similarity,
-    camera_centres,
-    fit_floor,
-    identity,
-    stated_length,
-    upright,
-)
-from neuma_lib.capture.tools import colmap, opencv
-from neuma_lib.config.capture import CaptureConfig, LengthConfig
+from neuma_lib.capture.pictures import copy_pictures, group_of, name_pictures, picture_size, read_picture
+from neuma_lib.capture.placement import Similarity
+from neuma_lib.capture.tools import colmap
+from neuma_lib.config.capture import BoardConfig
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import atomic, one_line, read_json, reading
-from neuma_lib.io.images import (
-    OPENGL_TO_OPENCV,
-    open_image,
-    place,
-    read_transforms,
-    write_transforms,
-)
+from neuma_lib.io.files import one_line, read_json, reading, write_json
+from neuma_lib.io.images import OPENGL_TO_OPENCV, read_transforms
+from neuma_lib.io.ply import read_ply, write_ply
 
 LEAST_PHOTOGRAPHS = 8
 """Fewest photographs that structure from motion is tried with."""
@@ -55,12 +33,6 @@ LARGEST = 2400
 PHOTOGRAPH_MODEL, STILL_MODEL = "RADIAL", "SIMPLE_RADIAL"
 """COLMAP's camera models, with square pixels: on ten photographs a second focal length went 4 % astray. One picture of
 a fixed camera does not tell more than focal length and one coefficient."""
-FLOOR_TOLERANCE = 0.005
-"""Distance from the floor that counts as near, as share of the distance from the cameras to the points."""
-BOX_MIDDLE = (0.5, 0.0, 0.5)
-"""Where the room's origin, on the floor, is put in the simulator's box [m]."""
-ORIENTATION = 0x0112
-"""EXIF's note of how to turn a picture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,84 +62,82 @@ class Poses:
         return replace(self, viewmats=by.move_cameras(self.viewmats), points=by.apply(self.points))
 
 
-@dataclass(frozen=True, eq=False)
-class Room:
-    """Poses in metres, y up, the floor at y = 0, and how that was found.
+def find_poses(
+    groups: Mapping[str, Sequence[Path]],
+    source: str,
+    work: str | Path,
+    lenses: str | Path | None = None,
+    board: BoardConfig | None = None,
+    seed: int = 0,
+    threads: int = 1,
+) -> Poses:
+    """Cameras of photographs and stills.
 
-    Attributes:
-        poses: in the room.
-        room_from_world: from the world in which the poses were found.
-        board: fit of the board; None without one.
-        floor: share of the points near the fitted floor; None with a board.
-    """
-
-    poses: Poses
-    room_from_world: Similarity
-    board: BoardFit | None = None
-    floor: float | None = None
-
-
-def group_of(name: str) -> str:
-    """Group of a picture."""
-    return name.split("/")[0]
-
-
-def gather_pictures(groups: Mapping[str, Sequence[Path]], target: str | Path) -> dict[str, Path]:
-    """Copy pictures into a folder for each group, without notes to turn them.
-
-    Returns:
-        Name of the picture -> file.
+    Args:
+        groups: pictures of `photographs` and of each fixed camera.
+        source: how: `photographs`, `board`, or a transforms.json.
+        work: folder for copies of the pictures and for COLMAP's files.
+        lenses: file of `read_lenses`.
+        board: for the source `board`.
+        seed, threads: see `structure_from_motion`.
 
     Raises:
-        InputError: a file that is no picture; pictures of different sizes in a group.
+        InputError: see the functions that it calls; a lens of another size than its pictures.
     """
-    found: dict[str, Path] = {}
-    for group, files in groups.items():
-        sizes: dict[tuple[int, int], Path] = {}
-        for file in files:
-            copy = Path(target) / group / file.name
-            content = file.read_bytes()
-            with open_image(content, file) as image:
-                sizes.setdefault(image.size, file)
-                turned = image.getexif().get(ORIENTATION, 1) != 1
-                with atomic(copy) as partial:
-                    if not turned:
-                        shutil.copyfile(file, partial)
-                    elif image.format == "JPEG":
-                        with reading(file, "an image"):
-                            upright_content = _unturned(content, image.info["exif"])
-                        partial.write_bytes(upright_content)
-                    else:
-                        with reading(file, "an image"):
-                            pixels = image.convert("RGB")
-                        pixels.save(partial, image.format, lossless=True)
-            found[f"{group}/{file.name}"] = copy
-        if len(sizes) > 1:
-            (first, a), (second, b) = list(sizes.items())[:2]
-            raise InputError(
-                f"{a} is {first[0]}x{first[1]}, {b} is {second[0]}x{second[1]}: all pictures of '{group}' must be of "
-                "one camera, at one zoom and size, and not cropped or turned by a program"
-            )
-    return found
+    pictures = name_pictures(groups)
+    known = read_lenses(lenses) if lenses else {}
+    for name, file in pictures.items():
+        if (lens := known.get(group_of(name))) is not None:
+            size = picture_size(file)
+            if size != (lens.width, lens.height):
+                raise InputError(
+                    f"{lenses}: the lens of '{group_of(name)}' is of {lens.width}x{lens.height} pixels, {file} has "
+                    f"{size[0]}x{size[1]}: calibrate at this size"
+                )
+    if source == "photographs":
+        copies = copy_pictures(pictures, Path(work) / "pictures")
+        return structure_from_motion(copies, Path(work) / "colmap", seed, threads, known)
+    if source == "board":
+        return poses_from_board(find_boards(pictures, board), known, board, lenses)
+    return given_poses(source, pictures)
 
 
-def _unturned(content: bytes, exif: bytes) -> bytes:
-    """A JPEG file whose first directory of notes (TIFF 6.0, section 2) says that the picture is upright; no pixel of it
-    is touched.
+def find_boards(pictures: Mapping[str, Path], board: BoardConfig) -> dict[str, Detection]:
+    """Corners of the board in every picture, by name."""
+    return {name: find_board(read_picture(file), board) for name, file in pictures.items()}
 
-    Raises ValueError or struct.error where the notes are damaged.
-    """
-    if exif not in content:
-        raise ValueError("its EXIF notes are in several parts")
-    tiff = exif.index(b"Exif\0\0") + 6
-    order = "<" if exif[tiff : tiff + 2] == b"II" else ">"
-    directory = tiff + struct.unpack_from(f"{order}I", exif, tiff + 4)[0]
-    changed = bytearray(exif)
-    for entry in range(struct.unpack_from(f"{order}H", exif, directory)[0]):
-        at = directory + 2 + 12 * entry
-        if struct.unpack_from(f"{order}H", exif, at)[0] == ORIENTATION:
-            struct.pack_into(f"{order}H", changed, at + 8, 1)
-    return content.replace(exif, bytes(changed), 1)
+
+def save_poses(path: str | Path, points: str | Path, poses: Poses) -> None:
+    """Write cameras as JSON, and points as PLY, which viewers of meshes open."""
+    columns = [(axis, "<f4", poses.points[:, i]) for i, axis in enumerate("xyz")]
+    columns += [(channel, "u1", poses.colours[:, i]) for i, channel in enumerate(("red", "green", "blue"))]
+    rows = np.empty(len(poses.points), dtype=[(name, kind) for name, kind, _ in columns])
+    for name, _, column in columns:
+        rows[name] = column
+    write_ply(points, rows)
+    pictures = [
+        {"name": name, "world_to_camera": viewmat.tolist(), "lens": lens.plain()}
+        for name, viewmat, lens in zip(poses.names, poses.viewmats, poses.lenses)
+    ]
+    error = poses.error if np.isfinite(poses.error) else None
+    write_json(path, {"reprojection_error_px": error, "lost": list(poses.lost), "pictures": pictures})
+
+
+def load_poses(path: str | Path, points: str | Path) -> Poses:
+    """What `save_poses` wrote. Raises InputError for a file that it did not write."""
+    data = read_json(path)
+    rows, _ = read_ply(points)
+    with reading(path, "poses"):
+        pictures = data["pictures"]
+        return Poses(
+            tuple(picture["name"] for picture in pictures),
+            tuple(read_lens(picture["lens"], f"{path}: {picture['name']}") for picture in pictures),
+            np.array([picture["world_to_camera"] for picture in pictures], np.float64).reshape(-1, 4, 4),
+            np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64),
+            np.stack([rows[channel] for channel in ("red", "green", "blue")], axis=1),
+            np.nan if data["reprojection_error_px"] is None else data["reprojection_error_px"],
+            tuple(data["lost"]),
+        )
 
 
 def read_lenses(path: str | Path) -> dict[str, Lens]:
@@ -191,14 +161,14 @@ def structure_from_motion(
 ) -> Poses:
     """Cameras and points from pictures that overlap, in a world of any scale and direction.
 
-    SIFT features on the CPU, every picture matched with every other, incremental mapping (COLMAP). The same seed and
-    one thread give the same result.
+    SIFT features on the CPU, every picture matched with every other, incremental mapping (COLMAP). The mapping keeps
+    to one thread, since sums in another order give other poses: the same seed gives the same result.
 
     Args:
-        pictures: name -> file, `<folder>/<group>/<file>` as `gather_pictures` lays them out.
+        pictures: name -> file, `<folder>/<group>/<file>` as `copy_pictures` lays them out.
         work: folder for COLMAP's files.
         seed: of all random draws.
-        threads: processors to use.
+        threads: processors for features and matches.
         lenses: known lenses by group, which are kept; others are found.
 
     Raises:
@@ -246,7 +216,7 @@ def structure_from_motion(
     pycolmap.match_exhaustive(
         database, matching, verification_options=verification, device=pycolmap.Device.cpu
     )
-    options = _mapping_options(len(photographs), seed, threads)
+    options = _mapping_options(len(photographs), seed)
     with pycolmap.Database.open(database) as opened:
         known = {image.camera_id for image in opened.read_all_images() if group_of(image.name) in lenses}
     options.constant_cameras = known
@@ -284,10 +254,10 @@ def _some(names: Sequence[str], most: int = 5) -> str:
     return ", ".join(name.split("/")[-1] for name in names[:most]) + more
 
 
-def _mapping_options(photographs: int, seed: int, threads: int):
+def _mapping_options(photographs: int, seed: int):
     options = colmap().IncrementalPipelineOptions()
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
-    options.num_threads = threads
+    options.num_threads = 1
     options.min_model_size = 3
     options.extract_colors = True
     if photographs < FEW_PHOTOGRAPHS:
@@ -321,9 +291,17 @@ def _poses_of(model: Any, pictures: Mapping[str, Path], lenses: Mapping[str, Len
 
 
 def poses_from_board(
-    found: Mapping[str, Detection], lenses: Mapping[str, Lens], settings: CaptureConfig
+    found: Mapping[str, Detection],
+    lenses: Mapping[str, Lens],
+    board: BoardConfig,
+    listed_in: str | Path | None = None,
 ) -> Poses:
     """Cameras from the board in each picture, in the board's frame [m]; photographs that do not show it are lost.
+
+    Args:
+        found: corners by picture.
+        lenses: by group.
+        listed_in: file of the lenses, for messages.
 
     Raises:
         InputError: a group without a lens; a fixed camera that does not see the board; too few photographs that do.
@@ -332,11 +310,11 @@ def poses_from_board(
     for name, corners in found.items():
         if group_of(name) not in lenses:
             raise InputError(
-                f"{settings.lens}: no lens for '{group_of(name)}', which poses: board needs; known: "
+                f"{listed_in}: no lens for '{group_of(name)}', which poses: board needs; known: "
                 f"{', '.join(lenses)}"
             )
         try:
-            pose, error = board_pose(corners, settings.board, lenses[group_of(name)], name)
+            pose, error = board_pose(corners, board, lenses[group_of(name)], name)
         except InputError:
             if group_of(name) != PHOTOGRAPHS:
                 raise
@@ -383,8 +361,7 @@ def given_poses(path: str | Path, pictures: Mapping[str, Path]) -> Poses:
         if frame is None:
             lost.append(name)
             continue
-        with open_image(file.read_bytes(), file) as image:
-            size = {"w": image.width, "h": image.height}
+        size = dict(zip("wh", picture_size(file)))
         lens = read_lens({**_centred(frame, **size), **size}, f"{path}: {name}")
         if (frame.get("w", lens.width), frame.get("h", lens.height)) != (lens.width, lens.height):
             raise InputError(
@@ -407,208 +384,3 @@ def _centred(frame: Mapping[str, Any], w: int, h: int) -> dict[str, Any]:
     if focal is None and "camera_angle_x" in frame:
         focal = 0.5 * w / np.tan(0.5 * frame["camera_angle_x"])
     return {"fl_x": focal, "fl_y": focal, "cx": w / 2, "cy": h / 2, **values}
-
-
-def find_room(capture: Capture, work: str | Path, threads: int = 1) -> tuple[Room, dict[str, Path]]:
-    """Cameras of a capture's photographs and stills, in the way that its settings name.
-
-    Args:
-        work: folder for copies of the pictures and for COLMAP's files.
-        threads: processors to use.
-
-    Returns:
-        The room, and name of the picture -> copied file, which `write_room` takes.
-
-    Raises:
-        InputError: see the functions that it calls.
-    """
-    settings = capture.settings
-    groups = {PHOTOGRAPHS: list(capture.photographs), **{c: [still] for c, still in capture.stills.items()}}
-    pictures = gather_pictures(groups, Path(work) / "pictures")
-    lenses = read_lenses(inside(capture.folder, settings.lens)) if settings.lens else {}
-    for name, file in pictures.items():
-        if (lens := lenses.get(group_of(name))) is not None:
-            with open_image(file.read_bytes(), file) as image:
-                if image.size != (lens.width, lens.height):
-                    raise InputError(
-                        f"{capture.folder / settings.lens}: the lens of '{group_of(name)}' is of {lens.width}x"
-                        f"{lens.height} pixels, {name} has {image.width}x{image.height}: calibrate at this size"
-                    )
-    if settings.poses == "photographs":
-        poses = structure_from_motion(pictures, Path(work) / "colmap", settings.seed, threads, lenses)
-        found = find_boards(pictures, settings) if settings.board else {}
-        return room_of(poses, found, settings), pictures
-    if settings.poses == "board":
-        poses = poses_from_board(find_boards(pictures, settings), lenses, settings)
-        room = room_from_board(settings.board, settings.center)
-        return Room(poses.moved(room), room), pictures
-    return Room(given_poses(inside(capture.folder, settings.poses), pictures), identity()), pictures
-
-
-def find_boards(pictures: Mapping[str, Path], settings: CaptureConfig) -> dict[str, Detection]:
-    """Corners of the board in every picture, by name."""
-    return {name: find_board(read_picture(file), settings.board) for name, file in pictures.items()}
-
-
-def room_of(poses: Poses, found: Mapping[str, Detection], settings: CaptureConfig) -> Room:
-    """Make poses metric, upright and placed: by the board, else by the stated length and a fitted floor.
-
-    Args:
-        poses: of structure from motion.
-        found: corners of the board by picture; not read without a board.
-
-    Raises:
-        InputError: see `fit_board`, `stated_length`, `fit_floor`.
-    """
-    if settings.board is not None:
-        corners = [found[name] for name in poses.names]
-        fit = fit_board(corners, poses.lenses, poses.viewmats, settings.board)
-        room = room_from_board(settings.board, settings.center).after(fit.board_from_world)
-        return Room(poses.moved(room), room, board=fit)
-    centres = camera_centres(poses.viewmats)
-    away = (
-        np.median(np.linalg.norm(poses.points - centres.mean(axis=0), axis=1)) if len(poses.points) else 0.0
-    )
-    point, normal, share = fit_floor(poses.points, centres, FLOOR_TOLERANCE * away, settings.seed)
-    middle = np.median(poses.points, axis=0)
-    level = upright(normal, middle - ((middle - point) @ normal) * normal)
-    scale = _metres_per_unit(poses, settings.length)
-    room = Similarity(scale, np.eye(3), np.zeros(3)).after(level)
-    return Room(poses.moved(room), room, floor=share)
-
-
-def _metres_per_unit(poses: Poses, length: LengthConfig) -> float:
-    views, directions = [], []
-    for file, ends in length.ends.items():
-        name = f"{PHOTOGRAPHS}/{file}"
-        if name in poses.names:
-            i = poses.names.index(name)
-            views.append(poses.viewmats[i])
-            directions.append(poses.lenses[i].directions(np.array(ends)))
-    if len(views) < 2:
-        raise InputError(
-            "length.ends: fewer than two of the marked photographs found their place: mark the points in others"
-        )
-    return stated_length(views, directions, length.metres)
-
-
-def read_picture(file: Path) -> np.ndarray:
-    """RGB (H, W, 3), uint8, as the sensor wrote it."""
-    with open_image(file.read_bytes(), file) as image, reading(file, "an image"):
-        return np.asarray(image.convert("RGB"))
-
-
-def write_room(
-    path: str | Path, room: Room, pictures: Mapping[str, Path], settings: CaptureConfig
-) -> dict[str, Any]:
-    """Write undistorted pictures and their transforms.json, with the room placed into the simulator's box.
-
-    ``world`` of the file says how the room's metres were placed; ``room`` how the room came from the reconstruction.
-
-    Args:
-        path: .../transforms.json.
-
-    Returns:
-        The report: pictures, errors, lenses, board or floor.
-    """
-    folder = Path(path).parent
-    folder.mkdir(parents=True, exist_ok=True)
-    Path(path).unlink(missing_ok=True)  # a folder without it is an unfinished one
-    frames = []
-    views = {
-        group: i for i, group in enumerate(sorted({group_of(n) for n in room.poses.names} - {PHOTOGRAPHS}))
-    }
-    photographs = 0
-    for name, lens, viewmat in zip(room.poses.names, room.poses.lenses, room.poses.viewmats):
-        smaller = lens.pinhole().resized(settings.longest)
-        pixels = undistorted(read_picture(pictures[name]), lens, settings.longest)
-        file = folder / Path(name).with_suffix(".png")
-        with atomic(file) as partial:
-            Image.fromarray(pixels).save(partial, "PNG")
-        group = group_of(name)
-        view = photographs if group == PHOTOGRAPHS else views[group]
-        photographs += group == PHOTOGRAPHS
-        frames.append(
-            {
-                "file_path": str(file.relative_to(folder)),
-                "transform_matrix": (np.linalg.inv(viewmat) @ OPENGL_TO_OPENCV).tolist(),
-                **smaller.intrinsics(),
-                "group": group,
-                "view": view,
-                "step": 0,
-            }
-        )
-    offset = tuple(np.array(BOX_MIDDLE, np.float64).tolist())
-    world = place(frames, settings.scale, offset)
-    write_transforms(path, {}, frames, room=room.room_from_world.plain(), **world)
-    return report(room)
-
-
-def undistorted(pixels: np.ndarray, lens: Lens, longest: int) -> np.ndarray:
-    """A picture (H, W, 3), uint8, as the pinhole of `Lens.pinhole` and `Lens.resized` sees it."""
-    smaller = lens.pinhole().resized(longest)
-    whole = lens.undistort(pixels)
-    if (smaller.width, smaller.height) == (lens.width, lens.height):
-        return whole
-    cv2 = opencv()
-    return cv2.resize(whole, (smaller.width, smaller.height), interpolation=cv2.INTER_AREA)
-
-
-def report(room: Room) -> dict[str, Any]:
-    """What is known of the poses, for people and for later stages."""
-    poses = room.poses
-    lenses = {group_of(name): lens.plain() for name, lens in zip(poses.names, poses.lenses)}
-    return {
-        "registered": len(poses.names),
-        "pictures": len(poses.names) + len(poses.lost),
-        "lost": list(poses.lost),
-        "points": len(poses.points),
-        "reprojection_error_px": poses.error if np.isfinite(poses.error) else None,
-        "lenses": lenses,
-        "board": room.board.plain() if room.board else None,
-        "share_of_points_on_floor": room.floor,
-        "centres_m": dict(zip(poses.names, camera_centres(poses.viewmats).tolist())),
-    }
-
-
-def draw_room(path: str | Path, room: Room) -> None:
-    """Write a picture of cameras and points, from above and from the side, in metres."""
-    poses = room.poses
-    centres = camera_centres(poses.viewmats)
-    forward = poses.viewmats[:, 2, :3]
-    fixed = np.array([group_of(name) != PHOTOGRAPHS for name in poses.names])
-    reach = 1.2 * max(np.abs(centres).max(), 0.1)
-    near = (np.abs(poses.points) < reach).all(axis=1)
-    figure = Figure(figsize=(12, 6), layout="constrained")
-    for axes, (across, up, title) in zip(
-        figure.subplots(1, 2), ((0, 2, "from above"), (0, 1, "from the side"))
-    ):
-        axes.scatter(*poses.points[near][:, [across, up]].T, s=1, c=poses.colours[near] / 255.0, linewidths=0)
-        for chosen, colour, label in (
-            (~fixed, "tab:blue", "photographs"),
-            (fixed, "tab:red", "fixed cameras"),
-        ):
-            axes.quiver(
-                *centres[chosen][:, [across, up]].T,
-                *(0.15 * reach * forward[chosen][:, [across, up]]).T,
-                angles="xy",
-                scale_units="xy",
-                scale=1,
-                color=colour,
-                width=0.004,
-                label=label,
-            )
-        axes.set(title=title, xlabel="x [m]", ylabel=f"{'xyz'[up]} [m]", aspect="equal")
-        axes.set(xlim=(-reach, reach), ylim=(-reach, reach) if up == 2 else (-0.15 * reach, reach))
-        axes.grid(alpha=0.3)
-        if up == 1:
-            axes.axhline(0, color="black", linewidth=1)
-        else:
-            axes.invert_yaxis()  # x right, z towards the reader: seen from +y
-            axes.legend()
-    title = f"{len(poses.names)} of {len(poses.names) + len(poses.lost)} pictures"
-    title += f", {poses.error:.2f} px" if np.isfinite(poses.error) else ""
-    title += f", board {1000 * room.board.residual:.2f} mm" if room.board else ""
-    figure.suptitle(title)
-    with atomic(path) as partial:
-        FigureCanvasAgg(figure).print_png(partial, metadata={"Software": None})

@@ -1,4 +1,4 @@
-"""Settings of a capture, `captures/<name>/capture.yaml`: what photographs and videos cannot tell themselves."""
+"""Settings of captures: the board that is printed for them, and the capture.yaml of each."""
 
 from __future__ import annotations
 
@@ -77,26 +77,16 @@ class CameraConfig(Section):
         description="frames a second that were really filmed; null: the file's time stamps, or the rate of filming "
         "that a slow-motion file names",
     )
-    offset: float | None = Field(
-        None, description="what is added to its times to make them those of the first camera [s]; null: found"
-    )
-    exposure: float | None = Field(
-        None, gt=0, description="exposure of a frame, over which motion blurs [s]; null: short, no blur"
-    )
-    row_time: float = Field(
-        0.0, ge=0, lt=1e-3, description="time from row to row of a rolling shutter [s]; 0: all rows at once"
-    )
 
 
 class ThrowConfig(Section):
     """One throw or drop, filmed by all cameras or by some of them."""
 
-    folder: Inside = Field(description="folder with a video for each camera, <camera>.mp4")
-    held_out: bool = Field(False, description="whether it is only predicted, and no law is learned from it")
+    folder: Inside = Field(description="folder with a video for each camera, `<camera>.mp4`")
 
 
 class CaptureConfig(Section):
-    """Own photographs and videos of one object."""
+    """Own photographs and videos of one object, in `captures/<name>/`: what they cannot tell themselves."""
 
     board: BoardConfig | None = Field(
         None, description="the printed board; it gives metres, the floor and where down is"
@@ -105,17 +95,10 @@ class CaptureConfig(Section):
         None,
         description="a stated length, which gives metres where there is no board; the floor is fitted then",
     )
-    prior: str = Field(
-        description="what is believed of the material: a name in priors.laws, or a file of weights"
-    )
     photographs: Inside = Field("photos", description="folder of the photographs, all of one camera and zoom")
-    photographed: Literal["apart", "start"] = Field(
-        "apart",
-        description="how the object lay in the photographs: `apart`, in any pose of its own, on the floor for example; "
-        "`start`, just as in the first frame of the first throw",
-    )
     stills: Inside = Field(
-        "stills", description="folder with a picture of the empty scene for each camera, <camera>.jpg or .png"
+        "stills",
+        description="folder with a picture of the empty scene for each camera, `<camera>.jpg` or .png",
     )
     throws: dict[str, ThrowConfig] = Field(
         {}, description="throws by name; none: the videos in `videos`, or one throw for each folder in it"
@@ -132,9 +115,6 @@ class CaptureConfig(Section):
         None,
         description="file with the intrinsics of cameras, by name, `photographs` among them (docs/capture.md); needed "
         "for poses: board; null: found from the photographs",
-    )
-    masks: Inside = Field(
-        "masks", description="folder of own masks, which are taken as they are; it need not exist"
     )
     center: Pixel | None = Field(
         None,
@@ -163,6 +143,23 @@ class CaptureConfig(Section):
                 "nothing says how large the scene is: give `board: {square: ...}`, its square's side as measured in "
                 "metres, or a stated `length`"
             )
+        if self.board is not None and self.length is not None:
+            raise ValueError("length: the board says how long a metre is; give one of the two")
+        if self.center is not None and (self.board is None or self.poses not in ("photographs", "board")):
+            raise ValueError(
+                "center: it is a place in the frame of the board, from which nothing is taken here; leave it out"
+            )
         if self.poses == "board" and self.lens is None:
             raise ValueError("poses: board needs `lens`, a file with the cameras' intrinsics")
         return self
+
+
+class CapturesConfig(Section):
+    """Own photographs and videos ([guide](capture.md)): where they lie, and the board that is printed for them."""
+
+    root: str = Field("captures", description="folder with a folder for each capture")
+    paper: Literal["A4", "A3"] = Field("A4", description="page that the board is printed on")
+    printed: BoardConfig = Field(
+        BoardConfig(square=0.030),
+        description="the board as printed; what a print measures stands in capture.yaml",
+    )

@@ -11,6 +11,7 @@ import yaml
 from pydantic.fields import FieldInfo
 
 from neuma_lib.config.base import Section
+from neuma_lib.config.capture import CaptureConfig
 from neuma_lib.config.settings import Config
 
 INTRODUCTION = """\
@@ -25,13 +26,15 @@ A method with other settings gets a folder of its own: `results/<scene>/neuma+ra
 the keys are those of the section `material`, and `prior`. A chain of other seeds has its own too:
 `results/<scene>+seed=1/...`, or with one of `prior_seed`, `gaussians_seed`, `particles_seed`, `adaptor_seed`.
 """
+OF_A_CAPTURE = "capture.yaml"
+"""The file of settings that each capture has of its own, in its folder."""
 BOUNDS = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
 
 
 def settings_markdown() -> str:
     """The text of docs/settings.md: every section once, with its keys, types, defaults and explanations."""
     places: dict[type[Section], list[str]] = {}
-    for path, kind in _sections(Config, "Top level"):
+    for path, kind in (*_sections(Config, "Top level"), *_sections(CaptureConfig, OF_A_CAPTURE)):
         places.setdefault(kind, []).append(path)
     lines = [INTRODUCTION]
     for kind, (first, *others) in places.items():

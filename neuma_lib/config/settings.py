@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 
 from neuma_lib.config.base import Section
 from neuma_lib.config.binding import BindingConfig
+from neuma_lib.config.capture import CapturesConfig
 from neuma_lib.config.dataset import DatasetConfig, TruthConfig
 from neuma_lib.config.evaluation import EvaluationConfig
 from neuma_lib.config.experiments import ExperimentConfig
@@ -74,6 +75,7 @@ class Config(Section):
     )
     springs: SpringsConfig = Field(SpringsConfig(), description="bodies of springs")
     pac_nerf: PacNerfConfig = Field(PacNerfConfig(), description="velocity and constants of PAC-NeRF")
+    captures: CapturesConfig = Field(CapturesConfig(), description="own photographs and videos")
     evaluation: EvaluationConfig = Field(EvaluationConfig(), description="measures and videos")
     figures: FiguresConfig = Field(FiguresConfig(), description="figures")
     methods: dict[str, MethodConfig] = Field({}, description="methods by name")

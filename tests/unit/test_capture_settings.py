@@ -6,7 +6,7 @@ from neuma_lib.capture import folder as capture_folder
 from neuma_lib.capture import tools
 from neuma_lib.errors import InputError
 
-MINIMAL = "board: {square: 0.0298}\nprior: soft\n"
+MINIMAL = "board: {square: 0.0298}\n"
 
 
 @pytest.fixture
@@ -29,11 +29,13 @@ def refusal(root, text=None):
     return str(error.value)
 
 
-def test_two_lines_suffice_and_files_are_found(mug):
+def test_one_line_suffices_and_files_are_found(mug):
     found = capture_folder.read_capture(mug)
     assert [p.name for p in found.photographs] == ["a.JPG", "b.jpg"]
     assert {c: p.name for c, p in found.stills.items()} == {"left": "left.jpg", "right": "right.png"}
-    assert list(found.throws) == ["first"] and found.cameras == ("left", "right")
+    assert {t: list(v) for t, v in found.throws.items()} == {"first": ["left", "right"]}
+    assert list(found.pictures()) == ["photographs", "left", "right"]
+    assert found.video("first", "left").name == "left.MOV"
     assert found.settings.board.square == 0.0298 and found.settings.board.squares == (6, 8)
 
 
@@ -70,18 +72,22 @@ def test_links_stay_in_the_folder(mug, tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("board: {square: 0.03}\n", ["capture.yaml: prior: this key is missing"]),
-        ("prior: soft\n", ["nothing says how large the scene is", "square"]),
-        ("prior: soft\nboard: {}\n", ["board.square: this key is missing"]),
-        ("prior: soft\nboard: {square: 30}\n", ["board.square"]),
-        ("prior: soft\nboard: {square: 0.03, sqares: [6, 8]}\n", ["board.sqares: unknown key", "squares"]),
-        ("prior: soft\nboard: {square: 0.03, squares: [2, 8]}\n", ["board", "at least 3"]),
-        ("prior: soft\nboard: {square: 0.03}\nposes: board\n", ["lens"]),
-        ("prior: soft\nlength: {metres: 1, ends: {a.JPG: [[0, 0], [1, 1]]}}\n", ["at least two photographs"]),
+        ("", ["nothing says how large the scene is", "square"]),
+        ("board: {}\n", ["board.square: this key is missing"]),
+        ("board: {square: 30}\n", ["board.square"]),
+        ("board: {square: 0.03, sqares: [6, 8]}\n", ["board.sqares: unknown key", "squares"]),
+        ("board: {square: 0.03, squares: [2, 8]}\n", ["board", "at least 3"]),
+        ("board: {square: 0.03}\nposes: board\n", ["lens"]),
+        ("length: {metres: 1, ends: {a.JPG: [[0, 0], [1, 1]]}}\n", ["at least two photographs"]),
         (
-            "prior: soft\nlength: {metres: 1, ends: {a.JPG: [[0, 0], [1, 1]], c.jpg: [[0, 0], [1, 1]]}}\n",
+            "length: {metres: 1, ends: {a.JPG: [[0, 0], [1, 1]], c.jpg: [[0, 0], [1, 1]]}}\n",
             ["length.ends.c.jpg: there is no such photograph"],
         ),
+        (
+            MINIMAL + "length: {metres: 1, ends: {a.JPG: [[0, 0], [1, 1]], b.jpg: [[0, 0], [1, 1]]}}\n",
+            ["length: the board"],
+        ),
+        ("poses: t.json\ncenter: [0, 0]\n", ["center: it is a place in the frame of the board"]),
         (MINIMAL + "cameras: {lefft: {rate: 240}}\n", ["cameras.lefft", "did you mean left"]),
         (MINIMAL + "cameras: {left: {rate: 0}}\n", ["cameras.left.rate"]),
         (MINIMAL + "throws: {one: {folder: none}}\n", ["none has no videos"]),
@@ -99,14 +105,38 @@ def test_messages_name_file_and_key(mug, text, words):
     ("gone", "words"),
     [
         ("stills/left.jpg", "no picture of the empty scene for the camera 'left'"),
-        ("photos", "has no photographs"),
-        ("videos", "has no videos"),
         ("capture.yaml", "does not exist"),
     ],
 )
 def test_what_is_missing_is_named(mug, gone, words):
     (mug / gone).rename(mug / "elsewhere")
     assert words in refusal(mug)
+
+
+def test_photographs_and_videos_can_come_one_after_the_other(mug):
+    """Each is missed where it is needed, and not before."""
+    (mug / "videos").rename(mug / "later")
+    photographed = capture_folder.read_capture(mug)
+    assert list(photographed.pictures()) == ["photographs", "left", "right"] and photographed.throws == {}
+    with pytest.raises(InputError, match="videos has no videos"):
+        photographed.video("first", "left")
+    (mug / "later").rename(mug / "videos")
+    (mug / "photos").rename(mug / "elsewhere")
+    filmed = capture_folder.read_capture(mug)
+    with pytest.raises(InputError, match="photos has no photographs"):
+        filmed.pictures()
+    for wrong, words in (
+        (("second", "left"), "no throw 'second'"),
+        (("first", "lefft"), "did you mean left"),
+    ):
+        with pytest.raises(InputError, match=words):
+            filmed.video(*wrong)
+
+
+def test_names_of_cameras_can_name_results(mug):
+    for file in ("videos/left.MOV", "stills/left.jpg"):
+        (mug / file).rename((mug / file).with_stem("left {0}"))
+    assert "'left {0}' is to name folders" in refusal(mug)
 
 
 def test_files_that_cannot_be_told_apart_or_read(mug):

@@ -38,10 +38,11 @@ def test_locked_files_follow_the_pins(pins, name):
     assert set(pins) <= set(requirements(name)), "run: make lock"
 
 
-def test_conda_environment_holds_the_same():
-    environment = yaml.safe_load((ENVS / "conda.yaml").read_text())
+@pytest.mark.parametrize("kind", ["", "-capture"])
+def test_conda_environment_holds_the_same(kind):
+    environment = yaml.safe_load((ENVS / f"conda{kind}.yaml").read_text())
     assert environment["dependencies"][0] == "python=3.11"
-    assert environment["dependencies"][-1]["pip"] == requirements("requirements.txt")
+    assert environment["dependencies"][-1]["pip"] == requirements(f"requirements{kind}.txt")
 
 
 def test_a_missing_python_is_named(tmp_path):

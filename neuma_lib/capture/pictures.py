@@ -1,0 +1,150 @@
+"""Photographs and stills in groups that share a lens: `photographs`, and each fixed camera with its picture of the
+empty scene. A picture's name is ``<group>/<file>``.
+
+Pictures are taken as the sensor wrote them: a note to turn them is removed, since the tools disagree about it, and a
+phone's lens is the same however it is held.
+"""
+
+from __future__ import annotations
+
+import shutil
+import struct
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from neuma_lib.capture.lens import Lens
+from neuma_lib.capture.tools import opencv
+from neuma_lib.errors import InputError
+from neuma_lib.io.files import atomic, reading
+from neuma_lib.io.images import open_image
+
+ORIENTATION = 0x0112
+"""EXIF's note of how to turn a picture."""
+SHEET_WIDTH = 1600
+"""Width of a contact sheet [px]."""
+
+
+def group_of(name: str) -> str:
+    """Group of a picture."""
+    return name.split("/")[0]
+
+
+def name_pictures(groups: Mapping[str, Sequence[Path]]) -> dict[str, Path]:
+    """Name of each picture -> its file.
+
+    Raises:
+        InputError: a file that is no picture; pictures of different sizes in a group.
+    """
+    found: dict[str, Path] = {}
+    for group, files in groups.items():
+        sizes: dict[tuple[int, int], Path] = {}
+        for file in map(Path, files):
+            sizes.setdefault(picture_size(file), file)
+            found[f"{group}/{file.name}"] = file
+        if len(sizes) > 1:
+            (first, a), (second, b) = list(sizes.items())[:2]
+            raise InputError(
+                f"{a} is {first[0]}x{first[1]}, {b} is {second[0]}x{second[1]}: all pictures of '{group}' must be of "
+                "one camera, at one zoom and size, and not cropped or turned by a program"
+            )
+    return found
+
+
+def picture_size(file: Path) -> tuple[int, int]:
+    """Width and height as the sensor wrote it [px]. Raises InputError for a file that is no picture."""
+    with open_image(file.read_bytes(), file) as image:
+        return image.size
+
+
+def copy_pictures(pictures: Mapping[str, Path], target: str | Path) -> dict[str, Path]:
+    """Copy pictures into a folder for each group, without notes to turn them.
+
+    Returns:
+        Name of each picture -> its copy.
+
+    Raises:
+        InputError: a file that is no picture, or has damaged notes.
+    """
+    copies = {name: Path(target) / name for name in pictures}
+    for name, file in pictures.items():
+        content = file.read_bytes()
+        with open_image(content, file) as image:
+            turned = image.getexif().get(ORIENTATION, 1) != 1
+            with atomic(copies[name]) as partial:
+                if not turned:
+                    shutil.copyfile(file, partial)
+                elif image.format == "JPEG":
+                    with reading(file, "an image"):
+                        upright_content = _unturned(content, image.info["exif"])
+                    partial.write_bytes(upright_content)
+                else:
+                    with reading(file, "an image"):
+                        pixels = image.convert("RGB")
+                    pixels.save(partial, image.format, lossless=True)
+    return copies
+
+
+def _unturned(content: bytes, exif: bytes) -> bytes:
+    """A JPEG file whose first directory of notes (TIFF 6.0, section 2) says that the picture is upright; no pixel of it
+    is touched.
+
+    Raises ValueError or struct.error where the notes are damaged.
+    """
+    if exif not in content:
+        raise ValueError("its EXIF notes are in several parts")
+    tiff = exif.index(b"Exif\0\0") + 6
+    order = "<" if exif[tiff : tiff + 2] == b"II" else ">"
+    directory = tiff + struct.unpack_from(f"{order}I", exif, tiff + 4)[0]
+    changed = bytearray(exif)
+    for entry in range(struct.unpack_from(f"{order}H", exif, directory)[0]):
+        at = directory + 2 + 12 * entry
+        if struct.unpack_from(f"{order}H", exif, at)[0] == ORIENTATION:
+            struct.pack_into(f"{order}H", changed, at + 8, 1)
+    return content.replace(exif, bytes(changed), 1)
+
+
+def read_picture(file: Path) -> np.ndarray:
+    """RGB (H, W, 3), uint8, as the sensor wrote it."""
+    with open_image(file.read_bytes(), file) as image, reading(file, "an image"):
+        return np.asarray(image.convert("RGB"))
+
+
+def undistorted(pixels: np.ndarray, lens: Lens, longest: int) -> np.ndarray:
+    """A picture (H, W, 3), uint8, as the pinhole of `Lens.pinhole` and `Lens.resized` sees it."""
+    smaller = lens.pinhole().resized(longest)
+    whole = lens.undistort(pixels)
+    if (smaller.width, smaller.height) == (lens.width, lens.height):
+        return whole
+    cv2 = opencv()
+    return cv2.resize(whole, (smaller.width, smaller.height), interpolation=cv2.INTER_AREA)
+
+
+def picture_sheet(
+    path: str | Path, pictures: Sequence[tuple[str, np.ndarray]], title: str, columns: int
+) -> None:
+    """Write pictures in rows, each under a line of text.
+
+    Args:
+        pictures: the line, and RGB pixels (H, W, 3), uint8, of each.
+        title: first line of the sheet.
+        columns: most pictures in a row.
+    """
+    font = ImageFont.load_default(14)
+    columns = min(columns, len(pictures))
+    width = SHEET_WIDTH // columns
+    heights = [round(width * pixels.shape[0] / pixels.shape[1]) for _, pixels in pictures]
+    line = 20
+    rows = [max(heights[k : k + columns]) for k in range(0, len(pictures), columns)]
+    sheet = Image.new("RGB", (columns * width, line + sum(rows) + line * len(rows)), "white")
+    draw = ImageDraw.Draw(sheet)
+    draw.text((4, 2), title, fill="black", font=font)
+    for i, ((text, pixels), height) in enumerate(zip(pictures, heights)):
+        row = i // columns
+        x, y = (i % columns) * width, line + sum(rows[:row]) + line * row
+        draw.text((x + 4, y + 2), text, fill="black", font=font)
+        sheet.paste(Image.fromarray(pixels).resize((width - 2, height), Image.LANCZOS), (x, y + line))
+    with atomic(path) as partial:
+        sheet.save(partial, "PNG")

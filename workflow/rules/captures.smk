@@ -1,0 +1,77 @@
+"""Files and settings of captures, own photographs and videos (docs/capture.md). Needs settings.smk."""
+
+from functools import cache
+
+from neuma_lib.capture.folder import NAME, inside, read_capture
+
+CAPTURES = SETTINGS.captures.root.rstrip("/")
+CAPTURE_ENVIRONMENT = "../../envs/conda-capture.yaml"
+POSES_THREADS = 8  # for features and matches; all that there are where these are fewer
+
+
+for name in SETTINGS.scenes:
+    if Path(CAPTURES, name).is_dir():
+        raise WorkflowError(f"{CAPTURES}/{name}: a scene is named so; rename the folder")
+
+
+wildcard_constraints:
+    # results of others lie in folders of these names
+    capture=f"(?!({'|'.join([*SETTINGS.scenes, 'figures', 'logs', 'benchmarks', 'experiments', 'priors'])})/){NAME.pattern}",
+    throw=NAME.pattern,
+    camera=NAME.pattern,
+
+
+@cache
+def capture_named(name):
+    return read_capture(f"{CAPTURES}/{name}")
+
+
+def of_capture(choose):
+    """A function of wildcards: something of their capture."""
+    return checked(lambda wildcards: choose(capture_named(wildcards.capture)))
+
+
+def capture_photographs(capture):
+    return list(map(str, capture.pictures()["photographs"]))
+
+
+def capture_stills(capture):
+    return list(map(str, capture.stills.values()))
+
+
+def capture_file(capture, name):
+    """A file that the settings name, inside the capture's folder."""
+    return [str(inside(capture.folder, name))] if name else []
+
+
+def given_poses(capture):
+    poses = capture.settings.poses
+    return capture_file(capture, None if poses in ("photographs", "board") else poses)
+
+
+def filmed_by(capture):
+    """Throw and camera of all videos."""
+    return [(throw, camera) for throw, cameras in capture.throws.items() for camera in cameras]
+
+
+def of_videos(ending):
+    """A function of wildcards: a file of each video of their capture."""
+
+    @checked
+    def choose(wildcards):
+        name = wildcards.capture
+        videos = filmed_by(capture_named(name))
+        return [f"{RESULTS}/{name}/frames/{throw}/{camera}.{ending}" for throw, camera in videos]
+
+    return choose
+
+
+@checked
+def filmed_rate(wildcards):
+    camera = capture_named(wildcards.capture).settings.cameras.get(wildcards.camera)
+    return camera.rate if camera else None
+
+
+def room_settings(capture):
+    """Settings of a capture that its room depends on."""
+    return capture.settings.model_dump(mode="json", exclude={"photographs", "stills", "throws", "cameras"})

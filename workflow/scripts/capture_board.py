@@ -1,0 +1,18 @@
+"""Print the board that is laid on the floor, at its true size."""
+
+from neuma_lib.capture.board import print_board
+from neuma_lib.config.capture import BoardConfig
+from workflow.stage import run_script
+
+
+def main(inputs, output, params, run) -> None:
+    board = BoardConfig(**params.board)
+    print_board(output.board, board, params.paper)
+    columns, rows = board.squares
+    run.say(
+        f"{columns} x {rows} squares of {1000 * board.square:.1f} mm on {params.paper}: print it at 100 %, measure it,"
+        " and give a square's side as board.square in capture.yaml"
+    )
+
+
+run_script(main, snakemake)

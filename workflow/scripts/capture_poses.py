@@ -1,0 +1,36 @@
+"""Find the cameras of photographs and stills, and the points that they see."""
+
+import tempfile
+from pathlib import Path
+
+from neuma_lib.capture.drawing import draw_poses
+from neuma_lib.capture.folder import PHOTOGRAPHS
+from neuma_lib.capture.poses import find_poses, save_poses
+from neuma_lib.config.capture import BoardConfig
+from workflow.inputs import listed
+from workflow.stage import run_script
+
+
+def main(inputs, output, params, run) -> None:
+    groups = {PHOTOGRAPHS: listed(inputs.photographs)} | {Path(f).stem: [f] for f in listed(inputs.stills)}
+    run.say(f"{len(groups[PHOTOGRAPHS])} photographs, {len(groups) - 1} fixed cameras")
+    given, lenses = listed(inputs.given), listed(inputs.lenses)
+    with tempfile.TemporaryDirectory(dir=Path(output.poses).parent, prefix=".colmap-") as work:
+        poses = find_poses(
+            groups,
+            given[0] if given else params.poses,
+            work,
+            lenses[0] if lenses else None,
+            BoardConfig(**params.board) if params.board else None,
+            params.seed,
+            snakemake.threads,
+        )
+    draw_poses(output.picture, poses)
+    save_poses(output.poses, output.points, poses)
+    run.say(
+        f"{len(poses.names)} of {len(poses.names) + len(poses.lost)} pictures have their place, {len(poses.points)}"
+        f" points, reprojection error {poses.error:.2f} px"
+    )
+
+
+run_script(main, snakemake)

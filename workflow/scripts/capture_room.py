@@ -1,0 +1,33 @@
+"""Make poses metric and upright, place them in the simulator's box, and undistort the pictures."""
+
+from pathlib import Path
+
+from neuma_lib.capture.drawing import draw_floor, draw_room
+from neuma_lib.capture.folder import PHOTOGRAPHS
+from neuma_lib.capture.pictures import name_pictures
+from neuma_lib.capture.poses import load_poses
+from neuma_lib.capture.room import find_room, write_room
+from neuma_lib.config.capture import CaptureConfig
+from neuma_lib.io.files import write_json
+from workflow.inputs import listed
+from workflow.stage import run_script
+
+
+def main(inputs, output, params, run) -> None:
+    settings = CaptureConfig(**params.settings)
+    groups = {PHOTOGRAPHS: listed(inputs.photographs)} | {Path(f).stem: [f] for f in listed(inputs.stills)}
+    pictures = name_pictures(groups)
+    room = find_room(load_poses(inputs.poses, inputs.points), pictures, settings)
+    report = write_room(output.transforms, room, pictures, settings)
+    draw_room(output.cameras, room)
+    draw_floor(output.floor, output.transforms)
+    write_json(output.report, report)
+    if room.board:
+        run.say(
+            f"{len(room.board.corners)} corners of the board, {1000 * room.board.residual:.2f} mm off the print"
+        )
+    elif room.floor is not None:
+        run.say(f"{100 * room.floor:.0f} % of the points lie on the floor")
+
+
+run_script(main, snakemake)
