@@ -43,10 +43,21 @@ class Capture:
     throws: dict[str, dict[str, Path]]
 
     def pictures(self) -> dict[str, tuple[Path, ...]]:
-        """Photographs and stills, by group. Raises InputError where there are no photographs."""
+        """Photographs and stills, by group.
+
+        Raises:
+            InputError: there are no photographs, or no picture of the empty scene for a camera that filmed.
+        """
         if not self.photographs:
             raise InputError(
                 f"{self.folder / self.settings.photographs} has no photographs ({', '.join(PICTURES)}): put them there"
+            )
+        for camera in sorted(
+            {camera for videos in self.throws.values() for camera in videos} - self.stills.keys()
+        ):
+            raise InputError(
+                f"{self.folder / self.settings.stills} has no picture of the empty scene for the camera '{camera}': "
+                f"film a second before the object is there, and save a frame of it as {camera}.png"
             )
         return {PHOTOGRAPHS: self.photographs, **{camera: (file,) for camera, file in self.stills.items()}}
 
@@ -102,8 +113,8 @@ def read_capture(folder: str | Path) -> Capture:
     """Settings and files of a capture, of which some may still be missing.
 
     Raises:
-        InputError: see `read_settings` and `inside`; a throw without videos; a camera that filmed without a picture of
-            the empty scene; settings of a camera that is not there; two files for one camera.
+        InputError: see `read_settings` and `inside`; a throw without videos; settings of a camera that is not there;
+            two files for one camera.
     """
     folder = Path(folder)
     source = folder / "capture.yaml"
@@ -140,11 +151,6 @@ def read_capture(folder: str | Path) -> Capture:
                 raise InputError(
                     f"{source}: length.ends.{name}: there is no such photograph{hint(name, names)}"
                 )
-    for camera in sorted(filmed - stills.keys()):
-        raise InputError(
-            f"{folder / settings.stills} has no picture of the empty scene for the camera '{camera}': film a "
-            f"second before the object is there, and save a frame of it as {camera}.png"
-        )
     return Capture(folder, settings, photographs, stills, throws)
 
 
