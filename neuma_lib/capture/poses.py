@@ -36,6 +36,10 @@ PHOTOGRAPH_MODEL, STILL_MODEL = "RADIAL", "SIMPLE_RADIAL"
 went 4 % astray. One picture of a fixed camera does not tell more than focal length and one coefficient."""
 REFINED_MODEL = "OPENCV"
 """That of the photographs in the end, with a lens off the centre, where there are enough of them."""
+MOST_OFF_CENTRE = 0.02
+"""How far a phone's lens is off the centre, as share of the longer side; found further off, it is not determined."""
+MOST_STRETCH = 0.01
+"""How much the focal lengths of the two sides differ at most, as share of either."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,6 +248,10 @@ def _lens_refined(model: Any, known: set[int]) -> Any:
     On drawn photographs with such a lens, a centred one turns cameras by the angle of its offset and errs by 0.2 % in
     the scale. Afterwards the lenses of the stills fit the moved points once more.
 
+    Where the photographs do not tell it (all from one side and held alike, for example), tangential distortion, centre
+    and direction stand in for each other, and no real phone has the lens that comes out (`plausible`). The model then
+    stays as it is.
+
     Args:
         known: numbers of cameras whose lenses are kept.
     """
@@ -268,10 +276,18 @@ def _lens_refined(model: Any, known: set[int]) -> Any:
         for number in constant:
             config.set_constant_cam_intrinsics(number)
         done = pycolmap.create_default_bundle_adjuster(options, config, refined).solve()
-        if not done.is_solution_usable():
+        lenses = [_lens_of(camera) for number, camera in refined.cameras.items() if number not in constant]
+        if not done.is_solution_usable() or not all(map(plausible, lenses)):
             return model
     refined.update_point_3d_errors()
     return refined
+
+
+def plausible(lens: Lens) -> bool:
+    """Whether a lens is as little off the centre of its pictures, and as little stretched, as those of phones are."""
+    off = np.abs(lens.K[:2, 2] - [lens.width / 2, lens.height / 2]).max()
+    stretch = abs(lens.K[0, 0] / lens.K[1, 1] - 1)
+    return bool(off < MOST_OFF_CENTRE * max(lens.width, lens.height) and stretch < MOST_STRETCH)
 
 
 def check_registered(poses: Poses) -> None:
@@ -309,6 +325,10 @@ def _mapping_options(photographs: int, seed: int):
     return options
 
 
+def _lens_of(camera: Any) -> Lens:
+    return lens_of_colmap(camera.model.name, camera.params, camera.width, camera.height)
+
+
 def _poses_of(model: Any, pictures: Mapping[str, Path], lenses: Mapping[str, Lens]) -> Poses:
     """What this project keeps of COLMAP's reconstruction."""
     images = {model.images[number].name: model.images[number] for number in model.reg_image_ids()}
@@ -317,9 +337,7 @@ def _poses_of(model: Any, pictures: Mapping[str, Path], lenses: Mapping[str, Len
     found = []
     for viewmat, name in zip(viewmats, names):
         viewmat[:3] = images[name].cam_from_world().matrix()
-        camera = images[name].camera
-        lens = lenses.get(group_of(name))
-        found.append(lens or lens_of_colmap(camera.model.name, camera.params, camera.width, camera.height))
+        found.append(lenses.get(group_of(name)) or _lens_of(images[name].camera))
     points = [model.points3D[number] for number in sorted(model.points3D)]
     return Poses(
         names,

@@ -14,7 +14,7 @@ from neuma_lib.capture import drawing, placement, poses
 from neuma_lib.capture import folder as capture_folder
 from neuma_lib.capture import pictures as pics
 from neuma_lib.capture import room as rooms
-from neuma_lib.capture.lens import Lens
+from neuma_lib.capture.lens import Lens, read_lens
 from neuma_lib.config.capture import CaptureConfig
 from neuma_lib.errors import InputError
 from neuma_lib.io.images import OPENGL_TO_OPENCV, read_transforms
@@ -85,6 +85,22 @@ def test_what_found_no_place_is_named():
     poses.check_registered(poses.replace(whole, lost=lost[:3]))
     with pytest.raises(InputError, match="fixed camera of left/left.png"):
         poses.check_registered(poses.replace(whole, lost=("left/left.png",)))
+
+
+@pytest.mark.parametrize(
+    ("change", "believed"),
+    [
+        ({}, True),
+        ({"cx": 411.3}, True),
+        ({"cx": 420.0}, False),
+        ({"cy": 260.0}, False),
+        ({"fl_y": 715.0}, False),
+    ],
+)
+def test_lenses_that_no_phone_has_are_not_believed(change, believed):
+    """At most 16 of 800 pixels off the centre, and 1 % stretched."""
+    centred = {"fl_x": 700.0, "fl_y": 700.0, "cx": 400.0, "cy": 300.0, "w": 800, "h": 600}
+    assert poses.plausible(read_lens({**centred, **change}, "here")) is believed
 
 
 def test_room_from_the_board():
