@@ -6,7 +6,7 @@ from neuma_lib.capture.folder import NAME, inside, read_capture
 
 CAPTURES = SETTINGS.captures.root.rstrip("/")
 CAPTURE_ENVIRONMENT = "../../envs/conda-capture.yaml"
-POSES_THREADS = 8  # for features and matches; all that there are where these are fewer
+POSES_THREADS = 8  # for matches; all that there are where these are fewer
 
 
 for name in SETTINGS.scenes:
