@@ -1,0 +1,393 @@
+"""Masks of the object: in videos of a fixed camera against the empty scene, in photographs by a network.
+
+A fixed camera knows what stands behind the object. What differs from this plate, after the exposure has been matched,
+is the object, its shadow, or something else that moves: a shadow darkens all channels by one factor, and of the rest
+the part is taken that lies where the object is expected. GrabCut (Rother et al. 2004) then draws the edge, on the
+difference from the plate in place of the colours: there, the background is one flat colour whatever its texture.
+
+Pictures are RGB, uint8, (H, W, 3); masks are Boolean, (H, W); places are (x, y) [px], pixel centres at +0.5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from neuma_lib.capture.frames import Frame
+from neuma_lib.capture.tools import opencv
+from neuma_lib.errors import InputError
+from neuma_lib.io.files import existing, reading
+from neuma_lib.io.images import open_image
+
+MOST_PLATE_FRAMES = 61
+"""Frames of which the median is taken where there is no empty still."""
+SURE, POSSIBLE = 30.0, 12.0
+"""Differences from the plate [levels of 255] that are certainly something, and that may be."""
+SHADOW = (0.4, 0.97)
+"""Factors by which a shadow darkens."""
+SHADOW_TINT = 0.06
+"""Most difference between the factors of the channels in a shadow."""
+LEAST_AREA = 2e-5
+"""Part of the picture that an object covers at least."""
+MOST_MOVING = 0.05
+"""Part of the picture outside object and shadows that may differ from the plate."""
+MOST_JUMP = 0.2
+"""Change of a mask's area from one frame of free flight to the next that is an error; 0.03 is usual."""
+EDGE = 0.7
+"""Deviation of the blur that makes a mask's edge soft [px]."""
+_NOISES = 5.0  # deviations of the noise that a difference must exceed
+_GRABCUT_ROUNDS = 4
+_LONGEST = 800  # side of a photograph that GrabCut works on [px]
+
+
+@dataclass(frozen=True, eq=False)
+class VideoMasks:
+    """Masks of the frames of a video.
+
+    Attributes:
+        masks: (T, H, W), Boolean; all False where the object is not to be seen.
+        moving: part of the picture, outside object and shadows, that differs from the plate, (T,).
+        gains, offsets: exposure of each frame against the plate, (T, 3).
+    """
+
+    masks: np.ndarray
+    moving: np.ndarray
+    gains: np.ndarray
+    offsets: np.ndarray
+
+    @property
+    def centroids(self) -> np.ndarray:
+        """(T, 2), NaN where the mask is empty."""
+        return np.array([centroid(mask) for mask in self.masks])
+
+    @property
+    def areas(self) -> np.ndarray:
+        """[px], (T,)."""
+        return self.masks.sum(axis=(1, 2))
+
+
+def centroid(mask: np.ndarray) -> np.ndarray:
+    """Mean place (x, y) of a mask, (2,); NaN where it is empty."""
+    y, x = np.nonzero(mask)
+    return np.array([x.mean(), y.mean()]) + 0.5 if len(x) else np.full(2, np.nan)
+
+
+def median_plate(frames: Sequence[np.ndarray]) -> np.ndarray:
+    """The empty scene as the median of frames (H, W, 3), uint8: right where the object is in less than half of them."""
+    chosen = np.linspace(0, len(frames) - 1, min(len(frames), MOST_PLATE_FRAMES)).round().astype(int)
+    return np.median(np.stack([frames[i] for i in chosen]), axis=0).round().astype(np.uint8)
+
+
+def match_exposure(frame: np.ndarray, plate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gain and offset of each channel, (3,) each, so that frame = gain * plate + offset where nothing has moved.
+
+    Least squares, repeated without the pixels whose residual is large: what moves covers less than half of the picture.
+    """
+    gains, offsets = np.ones(3), np.zeros(3)
+    step = max(1, int(np.sqrt(frame[..., 0].size / 2e5)))  # two unknowns do not need every pixel
+    for c in range(3):
+        seen, empty = (p[::step, ::step, c].ravel().astype(np.float64) for p in (frame, plate))
+        valid = (seen > 4) & (seen < 251) & (empty > 4) & (empty < 251)  # clipped ones do not follow
+        if valid.sum() < 100:
+            continue
+        seen, empty = seen[valid], empty[valid]
+        ratio = np.median(seen / empty)
+        kept = np.abs(seen - ratio * empty) <= np.quantile(np.abs(seen - ratio * empty), 0.6)
+        for _ in range(8):
+            x, y = empty[kept], seen[kept]
+            # A plate of one brightness tells no offset from a gain.
+            gain = np.cov(x, y)[0, 1] / x.var(ddof=1) if x.std() > 4 else y.mean() / x.mean()
+            offset = y.mean() - gain * x.mean()
+            residual = np.abs(seen - gain * empty - offset)
+            kept = residual <= max(2.0, 3 * 1.4826 * np.median(residual))
+        gains[c], offsets[c] = gain, offset
+    return gains, offsets
+
+
+def video_masks(
+    frames: Sequence[np.ndarray],
+    name: str | Path,
+    plate: np.ndarray | None = None,
+    places: np.ndarray | None = None,
+) -> VideoMasks:
+    """Masks of the object in a video of a fixed camera.
+
+    Args:
+        frames: T pictures.
+        name: of the file, for messages.
+        plate: the empty scene; None: the median of the frames.
+        places: where the object is expected, (T, 2), NaN where that is not known. There, it is expected where the two
+            frames before say; before it has been seen twice, near to where it was; and before it has been seen, the
+            largest moving thing is taken.
+
+    Raises:
+        InputError: the plate is of another size, or the background moves.
+    """
+    if len(frames) == 0:
+        raise InputError(f"{name}: there are no frames to mask")
+    if plate is None:
+        plate = median_plate(frames)
+    if plate.shape != frames[0].shape:
+        raise InputError(
+            f"{name}: the empty picture is {plate.shape[1]}x{plate.shape[0]}, the frames"
+            f" {frames[0].shape[1]}x{frames[0].shape[0]}: take it as a frame of the same camera in the same mode"
+        )
+    count = len(frames)
+    found = VideoMasks(
+        np.zeros((count, *plate.shape[:2]), bool), np.zeros(count), np.ones((count, 3)), np.zeros((count, 3))
+    )
+    seen: list[tuple[int, np.ndarray, float]] = []  # frame, place and area of what was found
+    for i, frame in enumerate(frames):
+        gain, offset = match_exposure(frame, plate)
+        difference, shadow = compare(frame, gain * plate.astype(np.float32) + offset)
+        largest = np.abs(difference).max(axis=2)
+        noise = 1.4826 * float(np.median(largest))
+        strong = (largest > max(SURE, _NOISES * noise)) & ~shadow
+        strong = ndimage.binary_opening(strong, iterations=1)
+        given = None if places is None or np.isnan(places[i]).any() else places[i]
+        mask = _component(strong, _expected(given, seen, i), seen[-1][2] if seen else None)
+        if mask.any():
+            mask = _refined(difference, shadow, mask, max(POSSIBLE, 3 * noise))
+        if mask.any():
+            seen.append((i, centroid(mask), float(mask.sum())))
+        found.masks[i], found.gains[i], found.offsets[i] = mask, gain, offset
+        around = ndimage.binary_dilation(mask, iterations=5)
+        found.moving[i] = (strong & ~around).mean()
+    check_background(found.moving, name)
+    return found
+
+
+def compare(frame: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Difference of a frame from the plate at its exposure, (H, W, 3), float32, and where it is a shadow, (H, W).
+
+    A shadow darkens every channel by nearly the same factor; the factors are taken over 5 x 5 pixels, against noise.
+    """
+    cv2 = opencv()
+    difference = frame.astype(np.float32) - expected
+    smooth = [cv2.blur(np.maximum(p.astype(np.float32), 0), (5, 5)) for p in (frame, expected)]
+    factor = smooth[0] / np.maximum(smooth[1], 1.0)
+    spread = factor.max(axis=2) - factor.min(axis=2)
+    mean = factor.mean(axis=2)
+    return difference, (mean > SHADOW[0]) & (mean < SHADOW[1]) & (spread < SHADOW_TINT)
+
+
+def _expected(given: np.ndarray | None, seen: Sequence, i: int) -> np.ndarray | None:
+    if given is not None or not seen:
+        return given
+    (last, place, _) = seen[-1]
+    if len(seen) == 1:
+        return place
+    (before, previous, _) = seen[-2]
+    return place + (place - previous) * (i - last) / (last - before)
+
+
+def _component(strong: np.ndarray, place: np.ndarray | None, area: float | None) -> np.ndarray:
+    """The connected part that is nearest to a place and to an area; the largest where neither is known."""
+    labels, count = ndimage.label(strong, np.ones((3, 3)))
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:].astype(float)
+    enough = np.flatnonzero(sizes >= max(9, LEAST_AREA * strong.size))
+    if len(enough) == 0:
+        return np.zeros_like(strong)
+    score = np.log(sizes[enough])
+    if area is not None:
+        score = -np.abs(score - np.log(area))
+    if place is not None:
+        middles = np.array(ndimage.center_of_mass(strong, labels, enough + 1))[:, ::-1] + 0.5
+        reach = np.sqrt((sizes[enough] if area is None else area) / np.pi)
+        score = score - (np.linalg.norm(middles - place, axis=1) / (2 * reach)) ** 2
+    return ndimage.binary_fill_holes(labels == enough[np.argmax(score)] + 1)
+
+
+def _refined(difference: np.ndarray, shadow: np.ndarray, mask: np.ndarray, possible: float) -> np.ndarray:
+    """The mask with its edge drawn by GrabCut on the difference from the plate."""
+    radius = np.sqrt(mask.sum() / np.pi)
+    inner, outer = max(1, round(0.15 * radius)), max(3, round(0.3 * radius))
+    box = _box(mask, 2 * outer)
+    mask, shadow, d = mask[box], shadow[box], difference[box]
+    d = np.where((shadow & ~mask)[..., None], 0, d)
+    strength = np.abs(d).max(axis=2)
+    reach = ndimage.binary_dilation(mask, iterations=outer)
+    sure = ndimage.binary_erosion(mask, iterations=inner)
+    foreground = (strength > SURE) & reach
+    background = ~reach | ((strength < possible) & ~mask)
+    image = np.clip(128 + d / 2, 0, 255).astype(np.uint8)
+    return _in_full(_grabcut(image, sure, foreground, background), box, difference.shape[:2])
+
+
+def _box(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    return tuple(slice(max(0, a[0] - margin), a[-1] + 1 + margin) for a in (rows, columns))
+
+
+def _in_full(part: np.ndarray, box: tuple[slice, slice], shape: tuple[int, int]) -> np.ndarray:
+    full = np.zeros(shape, bool)
+    full[box] = part
+    return full
+
+
+def _grabcut(
+    image: np.ndarray, sure: np.ndarray, foreground: np.ndarray, background: np.ndarray
+) -> np.ndarray:
+    """GrabCut from what is certainly the object, probably the object, and certainly not; its largest part, filled."""
+    cv2 = opencv()
+    labels = np.full(image.shape[:2], cv2.GC_PR_BGD, np.uint8)
+    labels[foreground], labels[background], labels[sure] = cv2.GC_PR_FGD, cv2.GC_BGD, cv2.GC_FGD
+    inside = np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))
+    # GrabCut fits colours to both sides: it needs some pixels of each.
+    if min(inside.sum(), (~inside).sum()) >= 10:
+        cv2.setRNGSeed(0)
+        models = np.zeros((1, 65)), np.zeros((1, 65))
+        cv2.grabCut(image, labels, None, *models, _GRABCUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
+        inside = np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))
+    return _component(inside, None, None)
+
+
+def photograph_mask(pixels: np.ndarray, saliency: Callable[[np.ndarray], np.ndarray], name: str | Path) -> np.ndarray:
+    """Mask of the object in a photograph.
+
+    Args:
+        pixels: the picture.
+        saliency: `neuma_lib.capture.saliency.Saliency`, or another that gives (H, W) in [0, 1].
+        name: of the file, for messages.
+
+    Raises:
+        InputError: nothing stands out.
+    """
+    cv2 = opencv()
+    height, width = pixels.shape[:2]
+    scale = min(1.0, _LONGEST / max(height, width))
+    small = cv2.resize(pixels, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
+    probability = saliency(small)
+    likely = _component(probability > 0.5, None, None)
+    if not likely.any():
+        raise InputError(
+            f"{name}: the mask is empty, nothing stands out: photograph the object closer and before a plain ground,"
+            f" leave the picture out, or give a mask of your own"
+        )
+    radius = np.sqrt(likely.sum() / np.pi)
+    reach = ndimage.binary_dilation(likely, iterations=max(3, round(0.1 * radius)))
+    sure = ndimage.binary_erosion(likely & (probability > 0.9), iterations=max(1, round(0.08 * radius)))
+    mask = _grabcut(small, sure, likely, ~reach | (probability < 0.02))
+    if not mask.any():
+        mask = likely
+    return cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
+
+
+def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
+    """A mask of the user's: opaque where the picture has transparency, else where it is brighter than half, (H, W).
+
+    Args:
+        path: PNG, JPEG or WebP.
+        size: width and height of the picture that it belongs to [px].
+
+    Raises:
+        InputError: missing, damaged, of another size, or empty.
+    """
+    content = existing(path, "put the mask there, or remove it from the settings").read_bytes()
+    with open_image(content, path) as image, reading(path, "a mask"):
+        image.load()
+        clear = "A" in image.mode or "transparency" in image.info
+        mask = np.asarray(image.convert("RGBA").getchannel("A") if clear else image.convert("L")) > 127
+    if mask.shape[::-1] != tuple(size):
+        raise InputError(
+            f"{path} is {mask.shape[1]}x{mask.shape[0]}, its picture {size[0]}x{size[1]}: make the mask at that size"
+        )
+    check_not_empty(mask, path)
+    return mask
+
+
+def matted(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """The object with a soft edge, straight-alpha RGBA (H, W, 4), uint8.
+
+    Colours within two pixels of the edge, and outside, are those of the nearest pixel further in: a pixel at the edge
+    shows the floor, too, which must not bleed into the object.
+    """
+    cv2 = opencv()
+    alpha = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), EDGE)
+    inside = ndimage.binary_erosion(mask, iterations=2, border_value=1)
+    if not inside.any():
+        inside = mask
+    colours = pixels
+    if inside.any():
+        row, column = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
+        colours = pixels[row, column]
+    return np.dstack([colours, np.rint(255 * alpha).astype(np.uint8)])
+
+
+def overlay(frame: Frame, mask: np.ndarray) -> Frame:
+    """A frame with the ground darkened and the mask outlined in red, for `neuma_lib.capture.frames.contact_sheet`."""
+    shown = np.where(mask[..., None], frame.pixels, frame.pixels // 2)
+    width = max(1, frame.pixels.shape[1] // 400)  # to be seen on a contact sheet
+    shown[ndimage.binary_dilation(mask, iterations=width) & ~mask] = (255, 0, 0)
+    return frame._replace(pixels=shown.astype(np.uint8))
+
+
+def iou(a: np.ndarray, b: np.ndarray) -> float:
+    """Intersection over union of two masks; 1 where both are empty."""
+    union = np.logical_or(a, b).sum()
+    return float(np.logical_and(a, b).sum() / union) if union else 1.0
+
+
+def area_jumps(areas: np.ndarray) -> np.ndarray:
+    """|Change| of the area (T,) from frame to frame, as a part of the smaller one, (T - 1,)."""
+    areas = np.asarray(areas, float)
+    return np.abs(np.diff(areas)) / np.maximum(np.minimum(areas[1:], areas[:-1]), 1)
+
+
+def check_not_empty(mask: np.ndarray, name: str | Path, frame: int | None = None) -> None:
+    """Raises InputError where a mask has no pixel."""
+    if not mask.any():
+        raise InputError(
+            f"{_where(name, frame)}: the mask is empty, the object was not found: cut the video to the frames that"
+            f" show it, film against a ground of another colour, or give a mask of your own"
+        )
+
+
+def check_background(moving: np.ndarray, name: str | Path) -> None:
+    """Raises InputError where more than `MOST_MOVING` of a picture moves besides the object, (T,)."""
+    worst = int(np.argmax(moving))
+    if moving[worst] > MOST_MOVING:
+        raise InputError(
+            f"{_where(name, worst)}: the background moves, {moving[worst]:.0%} of the picture differ from the empty"
+            f" one besides the object: fix the camera, take the empty picture from the same place, lock focus and"
+            f" exposure, and keep hands out of the picture"
+        )
+
+
+def check_flight(masks: np.ndarray, name: str | Path, frames: Sequence[int]) -> np.ndarray:
+    """Check the masks of free flight: none empty, none at the picture's border, no sudden change of area.
+
+    Args:
+        masks: of the whole video, (T, H, W).
+        name: of the file, for messages.
+        frames: numbers of the frames before contact.
+
+    Returns:
+        `area_jumps` of these frames.
+
+    Raises:
+        InputError: names file and frame.
+    """
+    for i in frames:
+        check_not_empty(masks[i], name, i)
+        if masks[i][[0, -1]].any() or masks[i][:, [0, -1]].any():
+            raise InputError(
+                f"{_where(name, i)}: the object leaves the picture: leave this frame out, or film from farther away"
+            )
+    jumps = area_jumps(masks[list(frames)].sum(axis=(1, 2)))
+    if len(jumps) and jumps.max() > MOST_JUMP:
+        worst = int(np.argmax(jumps))
+        raise InputError(
+            f"{_where(name, frames[worst + 1])}: the mask's area changes by {jumps[worst]:.0%} from the frame before,"
+            f" in free flight: look at the contact sheet; a hand, a shadow or a ground of the object's colour may be"
+            f" in the mask; leave such frames out, or give masks of your own"
+        )
+    return jumps
+
+
+def _where(name: str | Path, frame: int | None) -> str:
+    return f"{name}" if frame is None else f"{name}, frame {frame}"

