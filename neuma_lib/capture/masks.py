@@ -246,7 +246,9 @@ def _grabcut(
     return _component(inside, None, None)
 
 
-def photograph_mask(pixels: np.ndarray, saliency: Callable[[np.ndarray], np.ndarray], name: str | Path) -> np.ndarray:
+def photograph_mask(
+    pixels: np.ndarray, saliency: Callable[[np.ndarray], np.ndarray], name: str | Path
+) -> np.ndarray:
     """Mask of the object in a photograph.
 
     Args:

@@ -1,0 +1,207 @@
+"""Free flight of an object's centre in metres: the check of scale, time base and floor together.
+
+Between release and contact the centre moves as x(t) = x0 + v0 t + a t^2 / 2, whatever the object is. With a = g the
+squares of the board, the frame rate and the floor are right; times that are off by a part e show as 2 e in |a|.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from neuma_lib.errors import InputError
+
+GRAVITY = 9.81
+"""[m/s^2]"""
+MOST_MISMATCH = 0.1
+"""Part by which the measured gravity may differ from the true one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Where a camera saw the object's centre, undistorted.
+
+    Attributes:
+        times: by the camera's clock [s], (T,).
+        places: (x, y) [px], pixel centres at +0.5, (T, 2).
+        viewmat: world to camera, OpenCV axes, (4, 4).
+        K: intrinsics [px], (3, 3).
+        name: of the video, for messages.
+    """
+
+    times: np.ndarray
+    places: np.ndarray
+    viewmat: np.ndarray
+    K: np.ndarray
+    name: str
+
+
+@dataclass(frozen=True, eq=False)
+class FreeFall:
+    """x(t) = x0 + v0 t + a t^2 / 2, t from ``start`` by the clock of the first camera.
+
+    Attributes:
+        x0, v0, a: [m], [m/s], [m/s^2], (3,) each.
+        offsets: seconds to add to the times of each camera, the first 0, (cameras,).
+        covariance: of (x0, v0, a, offsets without the first), (9 + cameras - 1,) squared.
+        start: [s].
+        rms: of the residuals [px].
+        views: "triangulated" or "one view in a plane".
+    """
+
+    x0: np.ndarray
+    v0: np.ndarray
+    a: np.ndarray
+    offsets: np.ndarray
+    covariance: np.ndarray
+    start: float
+    rms: float
+    views: str
+
+    @property
+    def ratio(self) -> tuple[float, float]:
+        """|a| / 9.81 and its deviation."""
+        size = np.linalg.norm(self.a)
+        slope = self.a / size
+        return float(size / GRAVITY), float(np.sqrt(slope @ self.covariance[6:9, 6:9] @ slope) / GRAVITY)
+
+    def angle(self, normal: Sequence[float]) -> tuple[float, float]:
+        """Angle between the acceleration and straight down, and its deviation (root mean square of both ways) [deg].
+
+        Args:
+            normal: of the floor, upward, (3,).
+        """
+        up = np.asarray(normal, float) / np.linalg.norm(normal)
+        size = np.linalg.norm(self.a)
+        down = self.a / size
+        across = np.eye(3) - np.outer(down, down)
+        spread = np.trace(across @ self.covariance[6:9, 6:9] @ across) / 2
+        angle = np.arctan2(np.linalg.norm(np.cross(down, -up)), -down @ up)
+        return float(np.degrees(angle)), float(np.degrees(np.sqrt(spread) / size))
+
+
+def fit_free_fall(
+    tracks: Sequence[Track], plane: tuple[np.ndarray, np.ndarray] | None = None, offsets: bool = True
+) -> FreeFall:
+    """Fit the parabola to what cameras saw, by least squares of the distances in the pictures.
+
+    Several cameras triangulate within the fit. One camera needs the plane of the fall: a point (3,) and a normal (3,);
+    what happens along the normal is then taken as known, and the covariance does not hold an error of the plane.
+
+    Args:
+        tracks: of one camera or more, of frames before contact only.
+        plane: for one camera.
+        offsets: fit a time offset for each camera but the first.
+
+    Raises:
+        InputError: too few frames, one camera without a plane, or motion that does not determine the fit.
+    """
+    for track in tracks:
+        if len(track.times) < 4:
+            raise InputError(
+                f"{track.name}: {len(track.times)} frames before contact, at least 4 are needed: film at more frames"
+                f" a second, or drop the object from higher"
+            )
+    if not tracks or (len(tracks) == 1 and plane is None):
+        raise InputError(
+            "free fall: one camera cannot tell how far the object is: state the plane of the fall, or film with a"
+            " second camera at about 90 degrees"
+        )
+    start = float(tracks[0].times[0])
+    basis, base = np.eye(9), np.zeros(9)
+    if len(tracks) == 1:
+        point, normal = (np.asarray(p, float) for p in plane)
+        across = np.linalg.svd(normal[None] / np.linalg.norm(normal))[2][1:]  # two directions in the plane
+        basis, base = np.kron(np.eye(3), across.T), np.concatenate([point, np.zeros(6)])
+    free = len(tracks) - 1 if offsets else 0
+    count = basis.shape[1]
+
+    def motion(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return (base + basis @ u[:count]).reshape(3, 3), np.concatenate(
+            [[0.0], u[count:], np.zeros(len(tracks))]
+        )
+
+    def residuals(u: np.ndarray) -> np.ndarray:
+        (x0, v0, a), shift = motion(u)
+        parts = []
+        for track, offset in zip(tracks, shift):
+            t = (track.times + offset - start)[:, None]
+            p = ((x0 + v0 * t + a * t**2 / 2) @ track.viewmat[:3, :3].T + track.viewmat[:3, 3]) @ track.K.T
+            parts.append(p[:, :2] / p[:, 2:] - track.places)
+        return np.concatenate(parts).ravel()
+
+    linear = _linear(tracks, start, basis, base)
+    found = least_squares(residuals, np.concatenate([linear, np.zeros(free)]), x_scale="jac", method="trf")
+    J, scale = found.jac, np.linalg.norm(found.jac, axis=0)
+    singular = np.linalg.svd(J / np.maximum(scale, 1e-300), compute_uv=False)
+    if not np.isfinite(found.x).all() or len(found.fun) <= len(found.x) or singular[-1] < 1e-7 * singular[0]:
+        raise InputError(
+            f"free fall of {', '.join(t.name for t in tracks)}: the tracks do not determine the motion: use more"
+            f" frames, or cameras that look from different sides"
+        )
+    variance = found.fun @ found.fun / (len(found.fun) - len(found.x))
+    covariance = variance * np.linalg.inv((J / scale).T @ (J / scale)) / np.outer(scale, scale)
+    full = np.zeros((9 + free, count + free))
+    full[:9, :count], full[9:, count:] = basis, np.eye(free)
+    (x0, v0, a), shift = motion(found.x)
+    return FreeFall(
+        x0=x0,
+        v0=v0,
+        a=a,
+        offsets=shift[: len(tracks)],
+        covariance=full @ covariance @ full.T,
+        start=start,
+        rms=float(np.sqrt(np.mean(found.fun**2))),
+        views="one view in a plane" if len(tracks) == 1 else "triangulated",
+    )
+
+
+def _linear(tracks: Sequence[Track], start: float, basis: np.ndarray, base: np.ndarray) -> np.ndarray:
+    """Unknowns of the parabola without offsets, from equations that are linear in them (as of triangulation)."""
+    rows, values = [], []
+    for track in tracks:
+        P = track.K @ track.viewmat[:3]
+        for t, place in zip(track.times - start, track.places):
+            # (p_k - place_k p_3) . (x, 1) = 0 for the rows p of the projection
+            A = P[:2] - place[:, None] * P[2:]
+            A = A / np.linalg.norm(A[:, :3], axis=1, keepdims=True)
+            rows.append(np.kron([1.0, t, t * t / 2], A[:, :3]))
+            values.append(-A[:, 3])
+    M, y = np.concatenate(rows), np.concatenate(values)
+    return np.linalg.lstsq(M @ basis, y - M @ base, rcond=None)[0]
+
+
+def check_gravity(fall: FreeFall, normal: Sequence[float], name: str) -> str:
+    """A line that tells the measured gravity.
+
+    Args:
+        normal: of the floor, upward, (3,).
+        name: of the videos, for messages.
+
+    Raises:
+        InputError: it differs from 9.81 m/s^2 downward by more than `MOST_MISMATCH`, as a vector.
+    """
+    (ratio, deviation), (angle, angle_deviation) = fall.ratio, fall.angle(normal)
+    line = (
+        f"{name}: gravity is {ratio:.3f} +- {deviation:.3f} of {GRAVITY} m/s^2, {angle:.1f} +- {angle_deviation:.1f}"
+        f" degrees from the floor's normal ({fall.views}, {fall.rms:.2f} px)"
+    )
+    up = np.asarray(normal, float) / np.linalg.norm(normal)
+    if np.linalg.norm(fall.a / GRAVITY + up) <= MOST_MISMATCH:
+        return line
+    causes = []
+    if abs(ratio - 1) > MOST_MISMATCH / 2:
+        causes.append(f"the board's square size is {ratio:.2f} of what is stated (measure it)")
+        causes.append(
+            f"the frame rate is {ratio**-0.5:.2f} of what is assumed (slow motion: state the true rate)"
+        )
+        causes.append("the time base is not steady (take the file as the camera wrote it)")
+    if angle > np.degrees(MOST_MISMATCH / 2):
+        causes.append("the floor or board is not level, or the camera has moved since its pose was taken")
+    causes.append(
+        "frames after contact, or while a hand still holds the object, are among those of free flight"
+    )
+    raise InputError(f"{line}. Likely causes: {'; '.join(causes)}")

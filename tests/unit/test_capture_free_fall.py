@@ -1,0 +1,86 @@
+"""Gravity from tracks: exact without noise, unbiased with it, and what a wrong time base or scale does."""
+
+import numpy as np
+import pytest
+
+from neuma_lib.capture.free_fall import GRAVITY, Track, check_gravity, fit_free_fall
+from neuma_lib.errors import InputError
+
+X0, V0, A = np.array([0.1, 1.2, 0.0]), np.array([0.4, 0.3, -0.2]), np.array([0.0, -GRAVITY, 0.0])
+UP = (0.0, 1.0, 0.0)
+K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
+
+
+def camera(position):
+    position = np.array(position)
+    z = np.array([0.1, 0.8, 0]) - position
+    z /= np.linalg.norm(z)
+    x = np.cross(z, UP)
+    x /= np.linalg.norm(x)
+    R = np.stack([x, np.cross(z, x), z])
+    view = np.eye(4)
+    view[:3, :3], view[:3, 3] = R, -R @ position
+    return view
+
+
+def track(position, offset=0.0, noise=0.0, rng=None, v0=V0, stretch=1.0, count=40):
+    t = np.arange(count) / 120
+    x = X0 + v0 * t[:, None] + A * t[:, None] ** 2 / 2
+    view = camera(position)
+    p = (x @ view[:3, :3].T + view[:3, 3]) @ K.T
+    places = p[:, :2] / p[:, 2:]
+    if noise:
+        places = places + rng.normal(0, noise, places.shape)
+    return Track(5 + t * stretch - offset, places, view, K, f"{position}.mp4")
+
+
+def two(**options):
+    return [track((2.0, 1.0, 0.3), **options), track((0.2, 1.1, 2.2), **{**options, "offset": 0.004})]
+
+
+def test_without_noise_the_motion_and_the_offset_are_exact():
+    fall = fit_free_fall(two())
+    np.testing.assert_allclose(np.stack([fall.x0, fall.v0, fall.a]), [X0, V0, A], atol=1e-5)
+    np.testing.assert_allclose(fall.offsets, [0, 0.004], atol=1e-7)
+    assert fall.views == "triangulated" and check_gravity(fall, UP, "drop")
+
+
+def test_with_noise_the_fit_is_unbiased_and_its_covariance_holds():
+    rng = np.random.default_rng(1)
+    z = []
+    for _ in range(100):
+        fall = fit_free_fall(two(noise=0.5, rng=rng))
+        error = np.concatenate([fall.x0 - X0, fall.v0 - V0, fall.a - A, fall.offsets[1:] - 0.004])
+        z.append(error / np.sqrt(np.diag(fall.covariance)))
+    z = np.array(z)
+    # mean of 100 unit normals: deviation 0.1; their standard deviation: 1 / sqrt(200) = 0.07
+    assert np.abs(z.mean(axis=0)).max() < 0.4
+    assert 0.72 < z.std(axis=0).min() and z.std(axis=0).max() < 1.28
+
+
+def test_a_time_base_off_by_3_percent_shows_as_6_percent_in_gravity():
+    fall = fit_free_fall([track((2.0, 1.0, 0.3), stretch=1.03), track((0.2, 1.1, 2.2), stretch=1.03)])
+    assert fall.ratio[0] == pytest.approx(1.03**-2, abs=1e-4)
+
+
+def test_one_camera_measures_gravity_in_the_plane_of_the_fall():
+    flat = np.array([0.4, 0.3, 0.0])
+    one = track((0.2, 1.1, 2.2), v0=flat)
+    fall = fit_free_fall([one], plane=(X0, np.array([0.0, 0, 1])))
+    np.testing.assert_allclose(np.stack([fall.v0, fall.a]), [flat, A], atol=1e-5)
+    assert fall.views == "one view in a plane" and fall.angle(UP)[0] < 1e-3
+    with pytest.raises(InputError, match="plane"):
+        fit_free_fall([one])
+
+
+def test_a_mismatch_names_the_likely_causes():
+    slow = fit_free_fall([track((2.0, 1.0, 0.3), stretch=4.0), track((0.2, 1.1, 2.2), stretch=4.0)])
+    with pytest.raises(InputError, match=r"(?s)square size.*frame rate is 4\.00.*time base"):
+        check_gravity(slow, UP, "drop")
+    with pytest.raises(InputError, match="floor or board"):
+        check_gravity(fit_free_fall(two()), (0.2, 1.0, 0.0), "drop")
+
+
+def test_too_few_frames_are_refused():
+    with pytest.raises(InputError, match="at least 4"):
+        fit_free_fall([track((2.0, 1.0, 0.3), count=3)])
