@@ -11,12 +11,14 @@ Pictures are RGB, uint8, (H, W, 3); masks are Boolean, (H, W); places are (x, y)
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
+from neuma_lib.capture.arcs import Arc, find_arcs
 from neuma_lib.capture.frames import Frame
 from neuma_lib.capture.tools import opencv
 from neuma_lib.errors import InputError
@@ -40,6 +42,8 @@ MOST_JUMP = 0.2
 EDGE = 0.7
 """Deviation of the blur that makes a mask's edge soft [px]."""
 _NOISES = 5.0  # deviations of the noise that a difference must exceed
+_RATIO = 3.0  # of areas from frame to frame that may be the same object's
+_LOST = 2  # frames after which an object that was not found is no longer looked for
 _GRABCUT_ROUNDS = 4
 _LONGEST = 800  # side of a photograph that GrabCut works on [px]
 
@@ -52,12 +56,14 @@ class VideoMasks:
         masks: (T, H, W), Boolean; all False where the object is not to be seen.
         moving: part of the picture, outside object and shadows, that differs from the plate, (T,).
         gains, offsets: exposure of each frame against the plate, (T, 3).
+        arcs: stretches of free flight, in the order of time.
     """
 
     masks: np.ndarray
     moving: np.ndarray
     gains: np.ndarray
     offsets: np.ndarray
+    arcs: tuple[Arc, ...]
 
     @property
     def centroids(self) -> np.ndarray:
@@ -88,7 +94,7 @@ def match_exposure(frame: np.ndarray, plate: np.ndarray) -> tuple[np.ndarray, np
     Least squares, repeated without the pixels whose residual is large: what moves covers less than half of the picture.
     """
     gains, offsets = np.ones(3), np.zeros(3)
-    step = max(1, int(np.sqrt(frame[..., 0].size / 2e5)))  # two unknowns do not need every pixel
+    step = max(1, int(np.sqrt(frame[..., 0].size / 5e4)))  # two unknowns do not need every pixel
     for c in range(3):
         seen, empty = (p[::step, ::step, c].ravel().astype(np.float64) for p in (frame, plate))
         valid = (seen > 4) & (seen < 251) & (empty > 4) & (empty < 251)  # clipped ones do not follow
@@ -112,20 +118,23 @@ def video_masks(
     frames: Sequence[np.ndarray],
     name: str | Path,
     plate: np.ndarray | None = None,
+    times: np.ndarray | None = None,
     places: np.ndarray | None = None,
 ) -> VideoMasks:
     """Masks of the object in a video of a fixed camera.
+
+    In free flight the object is what keeps to an arc (`find_arcs`). Before and after, it is expected where two frames
+    that are nearer to the flight say, and nothing is taken that is far from there or of quite another size.
 
     Args:
         frames: T pictures.
         name: of the file, for messages.
         plate: the empty scene; None: the median of the frames.
-        places: where the object is expected, (T, 2), NaN where that is not known. There, it is expected where the two
-            frames before say; before it has been seen twice, near to where it was; and before it has been seen, the
-            largest moving thing is taken.
+        times: of the frames [s], ascending, (T,); None: evenly.
+        places: where the object is expected, (T, 2), NaN where that is not known: goes before arcs.
 
     Raises:
-        InputError: the plate is of another size, or the background moves.
+        InputError: the plate is of another size, the background moves, or the object is in no frame.
     """
     if len(frames) == 0:
         raise InputError(f"{name}: there are no frames to mask")
@@ -136,29 +145,184 @@ def video_masks(
             f"{name}: the empty picture is {plate.shape[1]}x{plate.shape[0]}, the frames"
             f" {frames[0].shape[1]}x{frames[0].shape[0]}: take it as a frame of the same camera in the same mode"
         )
-    count = len(frames)
-    found = VideoMasks(
-        np.zeros((count, *plate.shape[:2]), bool), np.zeros(count), np.ones((count, 3)), np.zeros((count, 3))
-    )
-    seen: list[tuple[int, np.ndarray, float]] = []  # frame, place and area of what was found
-    for i, frame in enumerate(frames):
-        gain, offset = match_exposure(frame, plate)
-        difference, shadow = compare(frame, gain * plate.astype(np.float32) + offset)
-        largest = np.abs(difference).max(axis=2)
-        noise = 1.4826 * float(np.median(largest))
-        strong = (largest > max(SURE, _NOISES * noise)) & ~shadow
-        strong = ndimage.binary_opening(strong, iterations=1)
-        given = None if places is None or np.isnan(places[i]).any() else places[i]
-        mask = _component(strong, _expected(given, seen, i), seen[-1][2] if seen else None)
-        if mask.any():
-            mask = _refined(difference, shadow, mask, max(POSSIBLE, 3 * noise))
-        if mask.any():
-            seen.append((i, centroid(mask), float(mask.sum())))
-        found.masks[i], found.gains[i], found.offsets[i] = mask, gain, offset
-        around = ndimage.binary_dilation(mask, iterations=5)
-        found.moving[i] = (strong & ~around).mean()
-    check_background(found.moving, name)
-    return found
+    seen = [_changed(frame, plate) for frame in frames]
+    times = np.arange(len(frames), dtype=float) if times is None else np.asarray(times, float)
+    arcs = find_arcs([change.parts[~change.cut] for change in seen], times)
+    masks = np.zeros((len(frames), *plate.shape[:2]), bool)
+    known = np.zeros(len(frames), bool)
+    arcs = [_fly(arc, frames, plate, seen, times, masks, known) for arc in arcs]
+    for i in [] if places is None else np.flatnonzero(~np.isnan(places).any(axis=1)):
+        masks[i], known[i] = _mask(frames[i], plate, seen[i], places[i]), True
+    begins = [arc.frames[0] for arc in arcs[:1]]
+    for order in (
+        range(begins[0] if begins else 0, len(frames)),
+        range(begins[0] - 1 if begins else -1, -1, -1),
+    ):
+        _follow(order, frames, plate, seen, masks, known)
+    moving = np.array([(c.strong & ~_grown(m, 5)).mean() for c, m in zip(seen, masks)])
+    there = masks.any(axis=(1, 2))
+    # A hand that comes before or after does no harm.
+    check_background(np.where(there, moving, 0) if there.any() else moving, name)
+    if not there.any():
+        check_not_empty(masks, name)
+    exposures = (np.stack([getattr(change, key) for change in seen]) for key in ("gain", "offset"))
+    return VideoMasks(masks, moving, *exposures, tuple(arcs))
+
+
+def _whole(mask: np.ndarray) -> bool:
+    """Whether there is something, and the picture's border does not cut it."""
+    return bool(mask.any() and not _cut(mask))
+
+
+def _cut(mask: np.ndarray) -> bool:
+    return bool(mask[[0, -1]].any() or mask[:, [0, -1]].any())
+
+
+class _Change(NamedTuple):
+    """What differs from the plate in a frame: exposure, noise, where, and its parts (x, y, area), cut off or not."""
+
+    gain: np.ndarray
+    offset: np.ndarray
+    noise: float
+    strong: np.ndarray
+    parts: np.ndarray
+    cut: np.ndarray
+
+
+def _changed(frame: np.ndarray, plate: np.ndarray) -> _Change:
+    gain, offset = match_exposure(frame, plate)
+    difference, shadow = compare(frame, _exposed(plate, gain, offset))
+    largest = _largest(np.abs(difference))
+    noise = 1.4826 * float(np.median(largest[::4, ::4]))
+    strong = _opened((largest > _sure(noise)) & ~shadow)
+    labels, sizes, middles = _parts(strong)
+    enough = np.flatnonzero(sizes >= _least_area(strong))
+    border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+    parts = np.column_stack([middles[enough], sizes[enough]])
+    return _Change(gain, offset, noise, strong, parts, np.isin(enough + 1, border))
+
+
+def _parts(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Labels (H, W) of the connected parts, from 1, their areas (N,) [px] and their middles (N, 2)."""
+    _, labels, stats, middles = opencv().connectedComponentsWithStats(mask.view(np.uint8))
+    return labels, stats[1:, -1].astype(float), middles[1:] + 0.5
+
+
+def _largest(picture: np.ndarray) -> np.ndarray:
+    """Largest of the three channels, (H, W); numpy's own maximum along so short an axis takes ten times as long."""
+    return np.maximum(np.maximum(picture[..., 0], picture[..., 1]), picture[..., 2])
+
+
+def _opened(mask: np.ndarray) -> np.ndarray:
+    cv2 = opencv()
+    return cv2.morphologyEx(mask.view(np.uint8), cv2.MORPH_OPEN, _cross()).view(bool)
+
+
+def _cross() -> np.ndarray:
+    cv2 = opencv()
+    return cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+
+
+def _grown(mask: np.ndarray, by: int) -> np.ndarray:
+    return opencv().dilate(mask.view(np.uint8), _cross(), iterations=by).view(bool)
+
+
+def _shrunk(mask: np.ndarray, by: int) -> np.ndarray:
+    """What is farther than some pixels from an edge; the picture's border is one."""
+    return opencv().erode(mask.view(np.uint8), _cross(), iterations=by, borderValue=0).view(bool)
+
+
+def _exposed(plate: np.ndarray, gain: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    return plate * gain.astype(np.float32) + offset.astype(np.float32)
+
+
+def _sure(noise: float) -> float:
+    return max(SURE, _NOISES * noise)
+
+
+def _least_area(picture: np.ndarray) -> float:
+    return max(9, LEAST_AREA * picture.size)
+
+
+def _fly(
+    arc: Arc,
+    frames: Sequence[np.ndarray],
+    plate: np.ndarray,
+    seen: Sequence[_Change],
+    times: np.ndarray,
+    masks: np.ndarray,
+    known: np.ndarray,
+) -> Arc:
+    """Fill in the masks along an arc, and beyond its ends as far as the object is on it: fast and blurred there, it may
+    have passed for a shadow. Gives the longer arc."""
+
+    def flying(i: int) -> np.ndarray:
+        return _mask(frames[i], plate, seen[i], arc.place(times[i]), arc.area, 2 * arc.reach, in_flight=True)
+
+    first, last = arc.frames
+    for i in range(first, last + 1):
+        masks[i], known[i] = flying(i), True
+    while first > 0 and not known[first - 1] and _whole(mask := flying(first - 1)):
+        first -= 1
+        masks[first], known[first] = mask, True
+    while last + 1 < len(frames) and not known[last + 1] and _whole(mask := flying(last + 1)):
+        last += 1
+        masks[last], known[last] = mask, True
+    return replace(arc, frames=(first, last))
+
+
+def _follow(
+    order: range,
+    frames: Sequence[np.ndarray],
+    plate: np.ndarray,
+    seen: Sequence[_Change],
+    masks: np.ndarray,
+    known: np.ndarray,
+) -> None:
+    """Fill in masks one after the other, each from the two before it."""
+    last: list[tuple[int, np.ndarray, float]] = []
+    if order.step < 0:  # begin with what is known behind the first
+        after = [i for i in range(order.start + 1, len(frames)) if masks[i].any()][:2]
+        last = [(i, centroid(masks[i]), float(masks[i].sum())) for i in reversed(after)]
+        if not last:
+            return
+    for i in order:
+        if not known[i]:
+            if not last:
+                masks[i] = _mask(frames[i], plate, seen[i])
+            elif abs(i - last[-1][0]) <= _LOST:
+                (_, place, area), step = last[-1], np.zeros(2)
+                if len(last) > 1:
+                    step = (place - last[-2][1]) / abs(last[-1][0] - last[-2][0]) * abs(i - last[-1][0])
+                # It may have been stopped, or have turned back.
+                gate = 1.5 * np.sqrt(area / np.pi) + 1.5 * np.linalg.norm(step)
+                masks[i] = _mask(frames[i], plate, seen[i], place + step, area, gate)
+        if masks[i].any():
+            last = [*last[-1:], (i, centroid(masks[i]), float(masks[i].sum()))]
+
+
+def _mask(
+    frame: np.ndarray,
+    plate: np.ndarray,
+    change: _Change,
+    place: np.ndarray | None = None,
+    area: float | None = None,
+    gate: float | None = None,
+    in_flight: bool = False,
+) -> np.ndarray:
+    """The mask of a frame near a place, refined; empty where there is none."""
+    mask = _component(change.strong, place, area, gate)
+    empty = _exposed(plate, change.gain, change.offset)
+    if in_flight and not mask.any():
+        # Nothing but the object is here: blurred and dark, it only looks like a shadow.
+        largest = _largest(np.abs(frame - empty))
+        mask = _component(_opened(largest > _sure(change.noise)), place, area, gate)
+    if not mask.any():
+        return mask
+    radius = np.sqrt(mask.sum() / np.pi)
+    box = _box(mask, 2 * max(3, round(0.3 * radius)))
+    difference, shadow = compare(frame[box], empty[box])
+    return _in_full(_refined(difference, shadow, mask[box], max(POSSIBLE, 3 * change.noise)), box, mask.shape)
 
 
 def compare(frame: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -170,35 +334,34 @@ def compare(frame: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, np.nda
     difference = frame.astype(np.float32) - expected
     smooth = [cv2.blur(np.maximum(p.astype(np.float32), 0), (5, 5)) for p in (frame, expected)]
     factor = smooth[0] / np.maximum(smooth[1], 1.0)
-    spread = factor.max(axis=2) - factor.min(axis=2)
-    mean = factor.mean(axis=2)
+    spread = _largest(factor) + _largest(-factor)
+    mean = (factor[..., 0] + factor[..., 1] + factor[..., 2]) / 3
     return difference, (mean > SHADOW[0]) & (mean < SHADOW[1]) & (spread < SHADOW_TINT)
 
 
-def _expected(given: np.ndarray | None, seen: Sequence, i: int) -> np.ndarray | None:
-    if given is not None or not seen:
-        return given
-    (last, place, _) = seen[-1]
-    if len(seen) == 1:
-        return place
-    (before, previous, _) = seen[-2]
-    return place + (place - previous) * (i - last) / (last - before)
+def _component(
+    strong: np.ndarray, place: np.ndarray | None = None, area: float | None = None, gate: float | None = None
+) -> np.ndarray:
+    """The connected part that is nearest to a place and to an area; the largest where neither is known.
 
-
-def _component(strong: np.ndarray, place: np.ndarray | None, area: float | None) -> np.ndarray:
-    """The connected part that is nearest to a place and to an area; the largest where neither is known."""
-    labels, count = ndimage.label(strong, np.ones((3, 3)))
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:].astype(float)
-    enough = np.flatnonzero(sizes >= max(9, LEAST_AREA * strong.size))
+    With a gate [px], a part whose middle is farther from the place, or whose area is another by more than `_RATIO`, is
+    not taken.
+    """
+    labels, sizes, middles = _parts(strong)
+    enough = np.flatnonzero(sizes >= _least_area(strong))
     if len(enough) == 0:
         return np.zeros_like(strong)
     score = np.log(sizes[enough])
     if area is not None:
         score = -np.abs(score - np.log(area))
     if place is not None:
-        middles = np.array(ndimage.center_of_mass(strong, labels, enough + 1))[:, ::-1] + 0.5
         reach = np.sqrt((sizes[enough] if area is None else area) / np.pi)
-        score = score - (np.linalg.norm(middles - place, axis=1) / (2 * reach)) ** 2
+        off = np.linalg.norm(middles[enough] - place, axis=1)
+        score = score - (off / (2 * reach)) ** 2
+        if gate is not None:
+            score[(off > gate) | (np.abs(np.log(sizes[enough] / area)) > np.log(_RATIO))] = -np.inf
+    if not np.isfinite(score).any():
+        return np.zeros_like(strong)
     return ndimage.binary_fill_holes(labels == enough[np.argmax(score)] + 1)
 
 
@@ -206,16 +369,13 @@ def _refined(difference: np.ndarray, shadow: np.ndarray, mask: np.ndarray, possi
     """The mask with its edge drawn by GrabCut on the difference from the plate."""
     radius = np.sqrt(mask.sum() / np.pi)
     inner, outer = max(1, round(0.15 * radius)), max(3, round(0.3 * radius))
-    box = _box(mask, 2 * outer)
-    mask, shadow, d = mask[box], shadow[box], difference[box]
-    d = np.where((shadow & ~mask)[..., None], 0, d)
-    strength = np.abs(d).max(axis=2)
-    reach = ndimage.binary_dilation(mask, iterations=outer)
-    sure = ndimage.binary_erosion(mask, iterations=inner)
+    difference = np.where((shadow & ~mask)[..., None], 0, difference)
+    strength = _largest(np.abs(difference))
+    reach, sure = _grown(mask, outer), _shrunk(mask, inner)
     foreground = (strength > SURE) & reach
     background = ~reach | ((strength < possible) & ~mask)
-    image = np.clip(128 + d / 2, 0, 255).astype(np.uint8)
-    return _in_full(_grabcut(image, sure, foreground, background), box, difference.shape[:2])
+    image = np.clip(128 + difference / 2, 0, 255).astype(np.uint8)
+    return _grabcut(image, sure, foreground, background)
 
 
 def _box(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
@@ -243,7 +403,7 @@ def _grabcut(
         models = np.zeros((1, 65)), np.zeros((1, 65))
         cv2.grabCut(image, labels, None, *models, _GRABCUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
         inside = np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))
-    return _component(inside, None, None)
+    return _component(inside)
 
 
 def photograph_mask(
@@ -264,15 +424,15 @@ def photograph_mask(
     scale = min(1.0, _LONGEST / max(height, width))
     small = cv2.resize(pixels, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
     probability = saliency(small)
-    likely = _component(probability > 0.5, None, None)
+    likely = _component(probability > 0.5)
     if not likely.any():
         raise InputError(
             f"{name}: the mask is empty, nothing stands out: photograph the object closer and before a plain ground,"
             f" leave the picture out, or give a mask of your own"
         )
     radius = np.sqrt(likely.sum() / np.pi)
-    reach = ndimage.binary_dilation(likely, iterations=max(3, round(0.1 * radius)))
-    sure = ndimage.binary_erosion(likely & (probability > 0.9), iterations=max(1, round(0.08 * radius)))
+    reach = _grown(likely, max(3, round(0.1 * radius)))
+    sure = _shrunk(likely & (probability > 0.9), max(1, round(0.08 * radius)))
     mask = _grabcut(small, sure, likely, ~reach | (probability < 0.02))
     if not mask.any():
         mask = likely
@@ -376,7 +536,7 @@ def check_flight(masks: np.ndarray, name: str | Path, frames: Sequence[int]) -> 
     """
     for i in frames:
         check_not_empty(masks[i], name, i)
-        if masks[i][[0, -1]].any() or masks[i][:, [0, -1]].any():
+        if _cut(masks[i]):
             raise InputError(
                 f"{_where(name, i)}: the object leaves the picture: leave this frame out, or film from farther away"
             )
