@@ -35,10 +35,12 @@ SHADOW_TINT = 0.06
 """Most difference between the factors of the channels in a shadow."""
 LEAST_AREA = 2e-5
 """Part of the picture that an object covers at least."""
-MOST_MOVING = 0.05
+MOST_MOVING = 0.1
 """Part of the picture outside object and shadows that may differ from the plate."""
 MOST_JUMP = 0.2
 """Change of a mask's area from one frame of free flight to the next that is an error; 0.03 is usual."""
+MOST_NOISE = 6.0
+"""Deviation of a camera's noise [levels]; what differs by more has moved."""
 EDGE = 0.7
 """Deviation of the blur that makes a mask's edge soft [px]."""
 _NOISES = 5.0  # deviations of the noise that a difference must exceed
@@ -160,11 +162,9 @@ def video_masks(
     ):
         _follow(order, frames, plate, seen, masks, known)
     moving = np.array([(c.strong & ~_grown(m, 5)).mean() for c, m in zip(seen, masks)])
-    there = masks.any(axis=(1, 2))
-    # A hand that comes before or after does no harm.
-    check_background(np.where(there, moving, 0) if there.any() else moving, name)
-    if not there.any():
-        check_not_empty(masks, name)
+    # A hand that holds the object before its flight does no harm.
+    check_background(np.where(np.arange(len(frames)) < (arcs[0].frames[0] if arcs else 0), 0, moving), name)
+    check_not_empty(masks, name)
     exposures = (np.stack([getattr(change, key) for change in seen]) for key in ("gain", "offset"))
     return VideoMasks(masks, moving, *exposures, tuple(arcs))
 
@@ -193,7 +193,7 @@ def _changed(frame: np.ndarray, plate: np.ndarray) -> _Change:
     gain, offset = match_exposure(frame, plate)
     difference, shadow = compare(frame, _exposed(plate, gain, offset))
     largest = _largest(np.abs(difference))
-    noise = 1.4826 * float(np.median(largest[::4, ::4]))
+    noise = min(1.4826 * float(np.median(largest[::4, ::4])), MOST_NOISE)
     strong = _opened((largest > _sure(noise)) & ~shadow)
     labels, sizes, middles = _parts(strong)
     enough = np.flatnonzero(sizes >= _least_area(strong))
@@ -313,7 +313,7 @@ def _mask(
     """The mask of a frame near a place, refined; empty where there is none."""
     mask = _component(change.strong, place, area, gate)
     empty = _exposed(plate, change.gain, change.offset)
-    if in_flight and not mask.any():
+    if in_flight and not mask.any() and not _component(change.strong, place, area, 2 * gate).any():
         # Nothing but the object is here: blurred and dark, it only looks like a shadow.
         largest = _largest(np.abs(frame - empty))
         mask = _component(_opened(largest > _sure(change.noise)), place, area, gate)
@@ -328,15 +328,16 @@ def _mask(
 def compare(frame: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Difference of a frame from the plate at its exposure, (H, W, 3), float32, and where it is a shadow, (H, W).
 
-    A shadow darkens every channel by nearly the same factor; the factors are taken over 5 x 5 pixels, against noise.
+    A shadow darkens every channel by nearly the same factor. The factors are those of medians over 5 x 5 pixels, which
+    noise changes little, and which keep the edge between an object and its shadow.
     """
     cv2 = opencv()
-    difference = frame.astype(np.float32) - expected
-    smooth = [cv2.blur(np.maximum(p.astype(np.float32), 0), (5, 5)) for p in (frame, expected)]
-    factor = smooth[0] / np.maximum(smooth[1], 1.0)
+    pictures = [np.maximum(picture.astype(np.float32), 0) for picture in (frame, expected)]
+    seen, empty = (cv2.medianBlur(picture, 5) for picture in pictures)
+    factor = seen / np.maximum(empty, 1.0)
     spread = _largest(factor) + _largest(-factor)
     mean = (factor[..., 0] + factor[..., 1] + factor[..., 2]) / 3
-    return difference, (mean > SHADOW[0]) & (mean < SHADOW[1]) & (spread < SHADOW_TINT)
+    return pictures[0] - expected, (mean > SHADOW[0]) & (mean < SHADOW[1]) & (spread < SHADOW_TINT)
 
 
 def _component(

@@ -1,0 +1,71 @@
+"""Agreement of masks between views: of a body in all of them, and with one mask that does not belong."""
+
+import numpy as np
+import pytest
+
+from neuma_lib.errors import InputError
+
+pytest.importorskip("cv2")
+
+from neuma_lib.capture.agreement import LEAST_AGREEMENT, agreement  # noqa: E402
+
+WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
+K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+RADII = np.array([0.12, 0.08, 0.06])
+
+
+def looking(eye, at=(0.1, 0.1, 0.0)):
+    eye, at = np.array(eye, float), np.array(at, float)
+    z = (at - eye) / np.linalg.norm(at - eye)
+    x = np.cross(z, (0, 1, 0))
+    x /= np.linalg.norm(x)
+    view = np.eye(4)
+    view[:3, :3] = np.stack([x, np.cross(z, x), z])
+    view[:3, 3] = -view[:3, :3] @ eye
+    return view
+
+
+def ellipsoid_mask(view, centre=(0.1, 0.1, 0.0), radii=RADII):
+    """Exact: a pixel is inside where its ray meets the ellipsoid."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    rays = np.stack([(x - K[0, 2]) / FOCAL, (y - K[1, 2]) / FOCAL, np.ones_like(x)], axis=-1) @ view[:3, :3]
+    eye = (-view[:3, :3].T @ view[:3, 3] - centre) / radii
+    d = rays / radii
+    b, c = d @ eye, eye @ eye - 1
+    return b * b - c * (d * d).sum(axis=-1) >= 0
+
+
+def ring(count):
+    angles = 2 * np.pi * np.arange(count) / count
+    return np.stack([looking((np.cos(a), 0.4 + 0.3 * (i % 2), np.sin(a))) for i, a in enumerate(angles)])
+
+
+def test_exact_masks_of_one_body_agree():
+    views = ring(16)
+    found = agreement([ellipsoid_mask(v) for v in views], views, np.tile(K, (16, 1, 1)))
+    # The body's outline is drawn in voxels, some 45 of them across: half of one all around is 4 % of the area.
+    assert found.min() > 0.93
+
+
+def test_one_mask_of_something_else_stands_out_and_spares_the_others():
+    views = ring(16)
+    masks = [ellipsoid_mask(v) for v in views]
+    masks[5] = np.roll(masks[5], 60, axis=1)
+    y, _ = np.mgrid[:HEIGHT, :WIDTH]
+    masks[9] = masks[9] | (y > 180)  # the floor has come along
+    found = agreement(masks, views, np.tile(K, (16, 1, 1)))
+    assert found[5] < LEAST_AGREEMENT and found[9] < LEAST_AGREEMENT
+    assert np.delete(found, [5, 9]).min() > 0.9
+
+
+def test_two_fixed_cameras_are_enough():
+    views = np.stack([looking((1, 0.5, 0)), looking((0, 0.5, 1))])
+    found = agreement([ellipsoid_mask(v) for v in views], views, np.tile(K, (2, 1, 1)))
+    assert found.min() > 0.9
+
+
+def test_masks_of_different_objects_have_no_common_place():
+    views = np.stack([looking((1, 0.5, 0)), looking((0, 0.5, 1))])
+    masks = [ellipsoid_mask(views[0]), ellipsoid_mask(views[1], centre=(0.1, 0.35, 0))]
+    with pytest.raises(InputError, match="not of one object"):
+        agreement(masks, views, np.tile(K, (2, 1, 1)))
