@@ -7,7 +7,7 @@ squares of the board, the frame rate and the floor are right; times that are off
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -18,6 +18,11 @@ GRAVITY = 9.81
 """[m/s^2]"""
 MOST_MISMATCH = 0.1
 """Part by which the measured gravity may differ from the true one."""
+MOST_RMS = 0.004
+"""Distance of the places from the fit, as part of the picture's height, above which there is no one flight."""
+_ENDS = 0.2  # part of a track at either end that the fit begins without
+_OFF = 4.0  # distance that is still on the fit, in root mean squares of both coordinates
+_LEAST_RMS = 0.2  # [px], where the fit is closer than masks are
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +51,7 @@ class FreeFall:
     Attributes:
         x0, v0, a: [m], [m/s], [m/s^2], (3,) each.
         offsets: seconds to add to the times of each camera, the first 0, (cameras,).
-        covariance: of (x0, v0, a, offsets without the first), (9 + cameras - 1,) squared.
+        covariance: of (x0, v0, a, offsets without the first), (8 + cameras,) squared; 0 for what was stated.
         start: [s].
         rms: of the residuals [px].
         views: "triangulated" or "one view in a plane".
@@ -60,6 +65,17 @@ class FreeFall:
     start: float
     rms: float
     views: str
+
+    def place(self, times: np.ndarray) -> np.ndarray:
+        """Places (T, 3) [m] at times by the first camera's clock [s]."""
+        t = np.asarray(times, float)[:, None] - self.start
+        return self.x0 + self.v0 * t + self.a * t**2 / 2
+
+    def seen(self, track: Track, camera: int) -> np.ndarray:
+        """Where a camera, by its number, sees the fall at the times of a track, (T, 2) [px]."""
+        x = self.place(track.times + self.offsets[camera])
+        p = (x @ track.viewmat[:3, :3].T + track.viewmat[:3, 3]) @ track.K.T
+        return p[:, :2] / p[:, 2:]
 
     @property
     def ratio(self) -> tuple[float, float]:
@@ -84,7 +100,10 @@ class FreeFall:
 
 
 def fit_free_fall(
-    tracks: Sequence[Track], plane: tuple[np.ndarray, np.ndarray] | None = None, offsets: bool = True
+    tracks: Sequence[Track],
+    plane: tuple[np.ndarray, np.ndarray] | None = None,
+    offsets: Sequence[float] | None = None,
+    stated: Sequence[bool] | None = None,
 ) -> FreeFall:
     """Fit the parabola to what cameras saw, by least squares of the distances in the pictures.
 
@@ -94,7 +113,9 @@ def fit_free_fall(
     Args:
         tracks: of one camera or more, of frames before contact only.
         plane: for one camera.
-        offsets: fit a time offset for each camera but the first.
+        offsets: what is to be added to each camera's times [s], from sound, motion or the user; None: nothing. The
+            first is 0; the others are refined, below a frame, by when each camera saw the object at a height.
+        stated: whether the offset of a camera is kept as it is; None: none of them.
 
     Raises:
         InputError: too few frames, one camera without a plane, or motion that does not determine the fit.
@@ -116,13 +137,14 @@ def fit_free_fall(
         point, normal = (np.asarray(p, float) for p in plane)
         across = np.linalg.svd(normal[None] / np.linalg.norm(normal))[2][1:]  # two directions in the plane
         basis, base = np.kron(np.eye(3), across.T), np.concatenate([point, np.zeros(6)])
-    free = len(tracks) - 1 if offsets else 0
-    count = basis.shape[1]
+    known = np.zeros(len(tracks)) if offsets is None else np.asarray(offsets, float)
+    fitted = [k for k in range(1, len(tracks)) if stated is None or not stated[k]]
+    count, free = basis.shape[1], len(fitted)
 
     def motion(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return (base + basis @ u[:count]).reshape(3, 3), np.concatenate(
-            [[0.0], u[count:], np.zeros(len(tracks))]
-        )
+        shift = known.copy()
+        shift[fitted] = u[count:]
+        return (base + basis @ u[:count]).reshape(3, 3), shift
 
     def residuals(u: np.ndarray) -> np.ndarray:
         (x0, v0, a), shift = motion(u)
@@ -133,8 +155,15 @@ def fit_free_fall(
             parts.append(p[:, :2] / p[:, 2:] - track.places)
         return np.concatenate(parts).ravel()
 
-    linear = _linear(tracks, start, basis, base)
-    found = least_squares(residuals, np.concatenate([linear, np.zeros(free)]), x_scale="jac", method="trf")
+    linear = _linear(tracks, start, known, basis, base)
+    found = least_squares(
+        residuals,
+        np.concatenate([linear, known[fitted]]),
+        x_scale="jac",
+        method="trf",
+        xtol=1e-12,
+        ftol=1e-12,
+    )
     J, scale = found.jac, np.linalg.norm(found.jac, axis=0)
     singular = np.linalg.svd(J / np.maximum(scale, 1e-300), compute_uv=False)
     if not np.isfinite(found.x).all() or len(found.fun) <= len(found.x) or singular[-1] < 1e-7 * singular[0]:
@@ -144,14 +173,15 @@ def fit_free_fall(
         )
     variance = found.fun @ found.fun / (len(found.fun) - len(found.x))
     covariance = variance * np.linalg.inv((J / scale).T @ (J / scale)) / np.outer(scale, scale)
-    full = np.zeros((9 + free, count + free))
-    full[:9, :count], full[9:, count:] = basis, np.eye(free)
+    full = np.zeros((8 + len(tracks), count + free))
+    full[:9, :count] = basis
+    full[[8 + k for k in fitted], range(count, count + free)] = 1.0
     (x0, v0, a), shift = motion(found.x)
     return FreeFall(
         x0=x0,
         v0=v0,
         a=a,
-        offsets=shift[: len(tracks)],
+        offsets=shift,
         covariance=full @ covariance @ full.T,
         start=start,
         rms=float(np.sqrt(np.mean(found.fun**2))),
@@ -159,12 +189,14 @@ def fit_free_fall(
     )
 
 
-def _linear(tracks: Sequence[Track], start: float, basis: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """Unknowns of the parabola without offsets, from equations that are linear in them (as of triangulation)."""
+def _linear(
+    tracks: Sequence[Track], start: float, offsets: np.ndarray, basis: np.ndarray, base: np.ndarray
+) -> np.ndarray:
+    """Unknowns of the parabola at these offsets, from equations that are linear in them (as of triangulation)."""
     rows, values = [], []
-    for track in tracks:
+    for track, offset in zip(tracks, offsets):
         P = track.K @ track.viewmat[:3]
-        for t, place in zip(track.times - start, track.places):
+        for t, place in zip(track.times + offset - start, track.places):
             # (p_k - place_k p_3) . (x, 1) = 0 for the rows p of the projection
             A = P[:2] - place[:, None] * P[2:]
             A = A / np.linalg.norm(A[:, :3], axis=1, keepdims=True)
@@ -172,6 +204,61 @@ def _linear(tracks: Sequence[Track], start: float, basis: np.ndarray, base: np.n
             values.append(-A[:, 3])
     M, y = np.concatenate(rows), np.concatenate(values)
     return np.linalg.lstsq(M @ basis, y - M @ base, rcond=None)[0]
+
+
+def fit_flight(
+    tracks: Sequence[Track],
+    plane: tuple[np.ndarray, np.ndarray] | None = None,
+    offsets: Sequence[float] | None = None,
+    stated: Sequence[bool] | None = None,
+) -> tuple[FreeFall, list[slice]]:
+    """`fit_free_fall` to the part of the tracks that is free flight: from the middle on, to both sides, as far as the
+    next frame is where the fit of those before it says.
+
+    At its ends a track may have a frame of the hand that lets go, or of the contact. One frame of contact, 1/120 s long
+    at 3 m/s, is off by up to 25 mm.
+
+    Returns:
+        The fit, and which frames of each track it is of.
+    """
+    kept = []
+    for track in tracks:
+        count = len(track.times)
+        cut = min(int(_ENDS * count), max(0, (count - 4) // 2))
+        kept.append([cut, count - cut])
+    chosen = [_part(track, *ends) for track, ends in zip(tracks, kept)]
+    fall = fit_free_fall(chosen, plane, offsets, stated)
+    growing = True
+    while growing:
+        growing = False
+        for k, track in enumerate(tracks):
+            for end, step in ((0, -1), (1, 1)):
+                i = kept[k][0] - 1 if end == 0 else kept[k][1]
+                if not 0 <= i < len(track.times):
+                    continue
+                off = float(np.linalg.norm(fall.seen(_part(track, i, i + 1), k) - track.places[i]))
+                if off <= _OFF * max(fall.rms, _LEAST_RMS):
+                    kept[k][end] += step
+                    growing = True
+        if growing:
+            chosen = [_part(track, *ends) for track, ends in zip(tracks, kept)]
+            fall = fit_free_fall(chosen, plane, fall.offsets, stated)
+    if fall.rms > MOST_RMS * min(map(_height, tracks)):
+        raise InputError(
+            f"{', '.join(t.name for t in tracks)}: no free flight fits what the cameras saw, {fall.rms:.1f} px off:"
+            f" are the videos of one throw and one object, have the cameras stood still since their poses were"
+            f" found, and are the masks right? Look at the contact sheets"
+        )
+    return fall, [slice(*ends) for ends in kept]
+
+
+def _part(track: Track, first: int, end: int) -> Track:
+    return replace(track, times=track.times[first:end], places=track.places[first:end])
+
+
+def _height(track: Track) -> float:
+    """About the picture's height: the optical axis is near its middle."""
+    return 2 * float(track.K[1, 2])
 
 
 def check_gravity(fall: FreeFall, normal: Sequence[float], name: str) -> str:
@@ -201,6 +288,8 @@ def check_gravity(fall: FreeFall, normal: Sequence[float], name: str) -> str:
         causes.append("the time base is not steady (take the file as the camera wrote it)")
     if angle > np.degrees(MOST_MISMATCH / 2):
         causes.append("the floor or board is not level, or the camera has moved since its pose was taken")
+    if fall.views == "triangulated":
+        causes.append("the videos are of different throws or objects")
     causes.append(
         "frames after contact, or while a hand still holds the object, are among those of free flight"
     )

@@ -122,6 +122,22 @@ def offset_from_motion(
     return Offset(float(lags[peak] + _vertex(values[peak - 1 : peak + 2]) * step), interval / 3, "motion")
 
 
+def row_times(
+    times: np.ndarray, rows: np.ndarray, row_time: float, height: int, sensor_rows: int
+) -> np.ndarray:
+    """When a rolling shutter, which reads row after row from the top, saw what lies in a row.
+
+    Args:
+        times: of the frames, which are those of their first rows, (T,) [s].
+        rows: y in the undistorted pictures, (T,) [px].
+        row_time: from one of the sensor's rows to the next [s].
+        height: of the undistorted pictures [px].
+        sensor_rows: rows of a frame as filmed. Where the lens bends rows, by some of them, is left out: 10 rows at
+            10 us are 0.1 ms.
+    """
+    return times + row_time * rows * (sensor_rows / height)
+
+
 def choose_offset(sound: Offset | None, motion: Offset | None, name: str) -> tuple[Offset, str]:
     """The offset that is surer, and a line that says which and why.
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from neuma_lib.capture.free_fall import GRAVITY, Track, check_gravity, fit_free_fall
+from neuma_lib.capture.free_fall import GRAVITY, Track, check_gravity, fit_flight, fit_free_fall
+from neuma_lib.capture.timing import row_times
 from neuma_lib.errors import InputError
 
 X0, V0, A = np.array([0.1, 1.2, 0.0]), np.array([0.4, 0.3, -0.2]), np.array([0.0, -GRAVITY, 0.0])
@@ -84,3 +85,69 @@ def test_a_mismatch_names_the_likely_causes():
 def test_too_few_frames_are_refused():
     with pytest.raises(InputError, match="at least 4"):
         fit_free_fall([track((2.0, 1.0, 0.3), count=3)])
+
+
+def test_frames_of_the_hand_and_of_the_contact_are_left_out():
+    rng = np.random.default_rng(2)
+    tracks = two(noise=0.2, rng=rng)
+    for track, first, last in zip(tracks, (3, 5), (36, 35)):
+        track.places[:first] = track.places[first]  # held
+        track.places[last:] += 3.0 * np.arange(1, 41 - last)[:, None] * (0.2, -1)  # stopped by the floor
+    fall, kept = fit_flight(tracks)
+    # a frame beside them that is off by as little as the noise may stay
+    assert np.abs(np.subtract([(k.start, k.stop) for k in kept], [(3, 36), (5, 35)])).max() <= 1
+    assert abs(fall.ratio[0] - 1) < 4 * fall.ratio[1] < 0.1
+    spoiled = fit_free_fall(tracks)
+    assert abs(spoiled.ratio[0] - 1) > 0.1 > abs(fall.ratio[0] - 1)
+
+
+def test_videos_of_different_throws_are_refused():
+    tracks = [track((2.0, 1.0, 0.3)), track((0.2, 1.1, 2.2), v0=np.array([-1.5, 2.5, 0.7]))]
+    with pytest.raises(InputError, match="videos of one throw and one object"):
+        fit_flight(tracks)
+
+
+def test_an_offset_that_is_stated_is_kept():
+    fall = fit_free_fall(two(), offsets=[0, 0.004], stated=[False, True])
+    np.testing.assert_array_equal(fall.offsets, [0, 0.004])
+    assert fall.ratio[0] == pytest.approx(1, abs=1e-6) and fall.covariance[9, 9] == 0
+    far = fit_free_fall(two(), offsets=[0, 0.03])  # the beginning, a few frames off, does not matter
+    assert far.offsets[1] == pytest.approx(0.004, abs=1e-6)
+
+
+def test_the_deviation_of_gravity_is_that_of_the_closed_form():
+    # x(t) = x0 + v0 t + a t^2 / 2 from N places over T seconds: sigma_a = sigma_x sqrt(720 / N) / T^2. The camera looks
+    # across the fall from 2.1 m, so that a pixel is 2.1 / 800 m.
+    count, noise = 40, 0.3
+    rng = np.random.default_rng(0)
+    flat = np.array([0.4, 0.3, 0.0])
+    found = []
+    for _ in range(30):
+        one = track((0.1, 0.8, 2.1), v0=flat, noise=noise, rng=rng, count=count)
+        found.append(fit_free_fall([one], plane=(X0, np.array([0.0, 0, 1]))).ratio[1])
+    expected = noise * 2.1 / 800 * np.sqrt(720 / count) / ((count - 1) / 120) ** 2 / GRAVITY
+    assert np.mean(found) == pytest.approx(expected, rel=0.1)
+
+
+def test_a_rolling_shutter_is_undone_by_the_times_of_the_rows():
+    row_time, rows = 15e-6, 960
+    tracks = []
+    for whole in two():
+        # What a shutter saw at time t lies where it was row_time * y later; two rounds are exact to far below a row.
+        places = whole.places
+        for _ in range(4):
+            t = (row_times(whole.times, places[:, 1], row_time, 480, rows) - whole.times)[:, None]
+            offset = 0.004 if whole.viewmat[2, 3] != two()[0].viewmat[2, 3] else 0.0
+            fall_t = whole.times[:, None] - 5 + t + offset
+            x = X0 + V0 * fall_t + A * fall_t**2 / 2
+            p = (x @ whole.viewmat[:3, :3].T + whole.viewmat[:3, 3]) @ whole.K.T
+            places = p[:, :2] / p[:, 2:]
+        tracks.append(Track(whole.times, places, whole.viewmat, whole.K, whole.name))
+    assert abs(fit_free_fall(tracks).ratio[0] - 1) > 0.02
+    undone = [
+        Track(row_times(t.times, t.places[:, 1], row_time, 480, rows), t.places, t.viewmat, t.K, t.name)
+        for t in tracks
+    ]
+    fall = fit_free_fall(undone)
+    assert fall.ratio[0] == pytest.approx(1, abs=1e-4)
+    assert fall.offsets[1] == pytest.approx(0.004, abs=1e-5)
