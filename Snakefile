@@ -31,6 +31,7 @@ include: "workflow/rules/paper.smk"
 include: "workflow/rules/figure_table.smk"
 include: "workflow/rules/figures.smk"
 include: "workflow/rules/capturing.smk"
+include: "workflow/rules/capture_motion.smk"
 
 
 rule all:

@@ -63,14 +63,26 @@ class Capture:
 
     def video(self, throw: str, camera: str) -> Path:
         """The video of a throw by a camera. Raises InputError where there is none."""
+        if camera not in self.cameras_of(throw):
+            videos = self.throws[throw]
+            raise InputError(f"{self.folder}: no video of '{throw}' by '{camera}'{hint(camera, videos)}")
+        return self.throws[throw][camera]
+
+    def cameras_of(self, throw: str) -> tuple[str, ...]:
+        """Cameras that filmed a throw, by name. Raises InputError where there is no such throw."""
         if not self.throws:
             raise _no_videos(self.folder / "videos")
         if throw not in self.throws:
             raise InputError(f"{self.folder} has no throw '{throw}'{hint(throw, self.throws)}")
-        videos = self.throws[throw]
-        if camera not in videos:
-            raise InputError(f"{self.folder}: no video of '{throw}' by '{camera}'{hint(camera, videos)}")
-        return videos[camera]
+        return tuple(self.throws[throw])
+
+    def own_masks(self, name: str) -> dict[str, Path]:
+        """Own masks in a folder of those of the capture, by the stem of their files.
+
+        Raises:
+            InputError: two masks of one picture, or a path out of the capture.
+        """
+        return _by_camera(self.folder, f"{self.settings.masks}/{name}", PICTURES)
 
 
 def _no_videos(folder: Path) -> InputError:

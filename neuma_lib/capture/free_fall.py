@@ -281,7 +281,7 @@ def check_gravity(fall: FreeFall, normal: Sequence[float], name: str) -> str:
         return line
     causes = []
     if abs(ratio - 1) > MOST_MISMATCH / 2:
-        causes.append(f"the board's square size is {ratio:.2f} of what is stated (measure it)")
+        causes.append(f"the board's square size is {1 / ratio:.2f} of what is stated (measure it)")
         causes.append(
             f"the frame rate is {ratio**-0.5:.2f} of what is assumed (slow motion: state the true rate)"
         )

@@ -169,6 +169,17 @@ def video_masks(
     return VideoMasks(masks, moving, *exposures, tuple(arcs))
 
 
+def given_masks(masks: np.ndarray, times: np.ndarray) -> VideoMasks:
+    """Own masks (T, H, W) of a video, which are taken as they are, with the arcs that they show.
+
+    Args:
+        times: of the frames [s], ascending, (T,).
+    """
+    seen = [np.array([[*centroid(mask), mask.sum()]]) if _whole(mask) else np.empty((0, 3)) for mask in masks]
+    still = np.ones((len(masks), 3))
+    return VideoMasks(masks, np.zeros(len(masks)), still, 0 * still, tuple(find_arcs(seen, times)))
+
+
 def _whole(mask: np.ndarray) -> bool:
     """Whether there is something, and the picture's border does not cut it."""
     return bool(mask.any() and not _cut(mask))

@@ -76,9 +76,9 @@ def follow(frames: Sequence[np.ndarray], masks: np.ndarray, times: np.ndarray, c
     """
     cv2 = opencv()
     grey = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames]
-    shape = cv2.getStructuringElement(
-        cv2.MORPH_ELLIPSE, (5, 5)
-    )  # half a window would leave nothing of small objects
+    # What is compared around a point should be the object; of a small one that would leave nothing.
+    edge = 2 * max(2, min(_WINDOW // 2, round(0.25 * float(np.sqrt(masks[0].sum() / np.pi))))) + 1
+    shape = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (edge, edge))
     inner = [cv2.erode(mask.astype(np.uint8), shape) for mask in masks]
     middles = [np.argwhere(mask).mean(axis=0)[::-1] for mask in masks]
     options = {"winSize": (_WINDOW, _WINDOW), "maxLevel": 2, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}

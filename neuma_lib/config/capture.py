@@ -77,6 +77,14 @@ class CameraConfig(Section):
         description="frames a second that were really filmed; null: the file's time stamps, or the rate of filming "
         "that a slow-motion file names",
     )
+    offset: float | None = Field(
+        None,
+        description="what is added to its times to make them those of the first camera, by name [s]; null: found from "
+        "sound or motion, and refined by the free flight",
+    )
+    row_time: float = Field(
+        0.0, ge=0, lt=1e-3, description="time from row to row of a rolling shutter [s]; 0: all rows at once"
+    )
 
 
 class ThrowConfig(Section):
@@ -115,6 +123,11 @@ class CaptureConfig(Section):
         None,
         description="file with the intrinsics of cameras, by name, `photographs` among them (docs/capture.md); needed "
         "for poses: board; null: found from the photographs",
+    )
+    masks: Inside = Field(
+        "masks",
+        description="folder of own masks, which are taken as they are: `photographs/<photograph>.png`, "
+        "`<throw>/<camera>/<frame>.png`; it need not exist",
     )
     center: Pixel | None = Field(
         None,

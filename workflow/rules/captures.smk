@@ -54,14 +54,14 @@ def filmed_by(capture):
     return [(throw, camera) for throw, cameras in capture.throws.items() for camera in cameras]
 
 
-def of_videos(ending):
+def of_videos(ending, stage="frames"):
     """A function of wildcards: a file of each video of their capture."""
 
     @checked
     def choose(wildcards):
         name = wildcards.capture
         videos = filmed_by(capture_named(name))
-        return [f"{RESULTS}/{name}/frames/{throw}/{camera}.{ending}" for throw, camera in videos]
+        return [f"{RESULTS}/{name}/{stage}/{throw}/{camera}.{ending}" for throw, camera in videos]
 
     return choose
 
@@ -74,4 +74,72 @@ def filmed_rate(wildcards):
 
 def room_settings(capture):
     """Settings of a capture that its room depends on."""
-    return capture.settings.model_dump(mode="json", exclude={"photographs", "stills", "throws", "cameras"})
+    return capture.settings.model_dump(
+        mode="json", exclude={"photographs", "stills", "throws", "cameras", "masks"}
+    )
+
+
+def photograph_masks(capture):
+    return list(map(str, capture.own_masks("photographs").values()))
+
+
+@checked
+def saliency_network(wildcards):
+    """The network, where a photograph has no mask of its own."""
+    capture = capture_named(wildcards.capture)
+    own = capture.own_masks("photographs")
+    return [] if all(p.stem in own for p in capture.photographs) else [f"{DATA}/weights/u2netp.onnx"]
+
+
+@checked
+def video_masks(wildcards):
+    own = capture_named(wildcards.capture).own_masks(f"{wildcards.throw}/{wildcards.camera}")
+    return list(map(str, own.values()))
+
+
+@checked
+def filmed_cameras(wildcards):
+    """Cameras of a throw, the first of which keeps the time."""
+    return capture_named(wildcards.capture).cameras_of(wildcards.throw)
+
+
+def of_throw(pattern):
+    """A function of wildcards: a file for each camera of their throw."""
+
+    @checked
+    def choose(wildcards):
+        cameras = capture_named(wildcards.capture).cameras_of(wildcards.throw)
+        return [
+            pattern.format(capture=wildcards.capture, throw=wildcards.throw, camera=camera)
+            for camera in cameras
+        ]
+
+    return choose
+
+
+def of_throws(pattern):
+    """A function of wildcards: a file for each throw of their capture."""
+
+    @checked
+    def choose(wildcards):
+        name = wildcards.capture
+        return [pattern.format(capture=name, throw=throw) for throw in capture_named(name).throws]
+
+    return choose
+
+
+@checked
+def throw_videos(wildcards):
+    capture = capture_named(wildcards.capture)
+    return [str(capture.video(wildcards.throw, camera)) for camera in capture.cameras_of(wildcards.throw)]
+
+
+@checked
+def camera_timing(wildcards):
+    """Stated offset and row time of each camera of a throw."""
+    capture = capture_named(wildcards.capture)
+    settings = [capture.settings.cameras.get(camera) for camera in capture.cameras_of(wildcards.throw)]
+    return {
+        "offsets": [camera.offset if camera else None for camera in settings],
+        "row_times": [camera.row_time if camera else 0.0 for camera in settings],
+    }

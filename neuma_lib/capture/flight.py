@@ -1,0 +1,231 @@
+"""Free flight of one throw, from the masks of all its cameras: offsets, gravity, velocity, spin; and its picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from neuma_lib.capture.agreement import agreement
+from neuma_lib.capture.free_fall import FreeFall, Track, check_gravity, fit_flight
+from neuma_lib.capture.spin import Spin, fit_spin, follow
+from neuma_lib.capture.timing import Offset, choose_offset, offset_from_motion, offset_from_sound, row_times
+from neuma_lib.errors import InputError
+from neuma_lib.io.files import atomic
+
+UP = (0.0, 1.0, 0.0)
+"""The floor's normal in the room."""
+
+
+@dataclass(frozen=True, eq=False)
+class Filmed:
+    """What one camera saw of a throw, undistorted, in the frames that have a mask.
+
+    Attributes:
+        camera: its name.
+        numbers: of the frames, (T,).
+        times: by its clock [s], (T,).
+        pixels: (T, H, W, 3), uint8.
+        masks: (T, H, W).
+        arc: numbers of the first and last frame of its first free flight; None: there is none.
+        viewmat, K: in the room, (4, 4) and (3, 3).
+        sensor_rows: rows of a frame as filmed.
+        row_time: of a rolling shutter [s].
+        sound: mono, (N,); None: none, or not by the clock of the picture.
+        offset: stated [s]; None: it is to be found.
+    """
+
+    camera: str
+    numbers: np.ndarray
+    times: np.ndarray
+    pixels: np.ndarray
+    masks: np.ndarray
+    arc: tuple[int, int] | None
+    viewmat: np.ndarray
+    K: np.ndarray
+    sensor_rows: int
+    row_time: float = 0.0
+    sound: np.ndarray | None = None
+    offset: float | None = None
+
+    @property
+    def centroids(self) -> np.ndarray:
+        """(T, 2) [px]."""
+        return np.array([np.argwhere(mask).mean(axis=0)[::-1] + 0.5 for mask in self.masks])
+
+    @property
+    def row_times(self) -> np.ndarray:
+        """When the row of the object's centre was read, (T,) [s]."""
+        rows = self.centroids[:, 1]
+        return row_times(self.times, rows, self.row_time, self.masks.shape[1], self.sensor_rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """A throw's free flight.
+
+    Attributes:
+        fall: in the room.
+        spin: None where the object has too little texture.
+        frames: numbers of the first and last frame of the fit, of each camera.
+        tracks: of the cameras, in whole.
+        offsets_from: a line for each camera but the first.
+        agreement: IoU of each camera's mask with the body of all, where the object rests; None of one camera.
+        gravity: a line that tells the check.
+    """
+
+    fall: FreeFall
+    spin: Spin | None
+    frames: list[tuple[int, int]]
+    tracks: list[Track]
+    offsets_from: list[str]
+    agreement: np.ndarray | None
+    gravity: str
+
+
+def find_flight(views: Sequence[Filmed], name: str) -> Flight:
+    """Fit the free flight of a throw.
+
+    One camera alone is taken to see the object fall above the middle of the room, across its view.
+
+    Args:
+        views: of the cameras, the first of which keeps the time.
+        name: of the throw, for messages.
+
+    Raises:
+        InputError: a camera saw no free flight, nothing tells the time between two, no flight fits, or gravity is off
+            by more than 10 %.
+    """
+    tracks, inside = [], []
+    for view in views:
+        if view.arc is None:
+            raise InputError(
+                f"{name}, {view.camera}: no free flight was seen, in which the object moves along a parabola for at"
+                " least 5 frames by more than its size: film the whole fall, from 0.3 m or more, at 60 frames a second"
+                " or more, and look at the contact sheet of the masks"
+            )
+        flying = (view.numbers >= view.arc[0]) & (view.numbers <= view.arc[1])
+        inside.append(np.flatnonzero(flying))
+        times, places = view.row_times[flying], view.centroids[flying]
+        tracks.append(Track(times, places, view.viewmat, view.K, f"{name}, {view.camera}"))
+    offsets, lines = [0.0], []
+    for view in views[1:]:
+        offset, line = _offset(views[0], view, f"{name}, {view.camera}")
+        offsets.append(offset)
+        lines.append(line)
+    stated = [view.offset is not None for view in views]
+    plane = _plane(views[0]) if len(views) == 1 else None
+    fall, kept = fit_flight(tracks, plane, offsets, stated)
+    gravity = check_gravity(fall, UP, name)
+    frames, paths = [], []
+    for number, (view, flying, part) in enumerate(zip(views, inside, kept)):
+        used = flying[part]
+        frames.append((int(view.numbers[used[0]]), int(view.numbers[used[-1]])))
+        paths += follow(list(view.pixels[used]), view.masks[used], view.row_times[used], number)
+    spin = fit_spin(paths, tracks, fall)
+    return Flight(fall, spin, frames, tracks, lines, _at_rest(views, fall.offsets), gravity)
+
+
+def _offset(first: Filmed, second: Filmed, name: str) -> tuple[float, str]:
+    if second.offset is not None:
+        return second.offset, f"{name}: time between the cameras as stated"
+    heard: Offset | None = None
+    if first.sound is not None and second.sound is not None:
+        heard = offset_from_sound(first.sound, second.sound)
+    speeds = [np.linalg.norm(np.gradient(v.centroids, v.times, axis=0), axis=1) for v in (first, second)]
+    moved = offset_from_motion((first.times, second.times), (speeds[0], speeds[1]))
+    best, line = choose_offset(heard, moved, name)
+    return best.seconds, line
+
+
+def _plane(view: Filmed) -> tuple[np.ndarray, np.ndarray]:
+    """Upright, through the middle of the room, towards the camera."""
+    eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
+    return np.zeros(3), np.array([eye[0], 0.0, eye[2]])
+
+
+def _at_rest(views: Sequence[Filmed], offsets: np.ndarray) -> np.ndarray | None:
+    if len(views) == 1:
+        return None
+    end = min(float(view.times[-1] + offset) for view, offset in zip(views, offsets))
+    masks = [view.masks[int(np.abs(view.times + o - end).argmin())] for view, o in zip(views, offsets)]
+    return agreement(masks, np.stack([v.viewmat for v in views]), np.stack([v.K for v in views]))
+
+
+def report(flight: Flight, views: Sequence[Filmed]) -> dict[str, Any]:
+    """What is known of a flight, for people and for later stages; the room's metres, y up."""
+    fall, spin = flight.fall, flight.spin
+    deviations = np.sqrt(np.diag(fall.covariance))
+    names = [view.camera for view in views]
+    ratio, angle = fall.ratio, fall.angle(UP)
+    return {
+        "start_s": fall.start,
+        "x0_m": fall.x0.tolist(),
+        "v0_m_s": fall.v0.tolist(),
+        "v0_deviation_m_s": deviations[3:6].tolist(),
+        "gravity_m_s2": fall.a.tolist(),
+        "gravity_ratio": ratio[0],
+        "gravity_ratio_deviation": ratio[1],
+        "gravity_angle_deg": angle[0],
+        "gravity_angle_deviation_deg": angle[1],
+        "offsets_s": dict(zip(names, fall.offsets.tolist())),
+        "offsets_deviation_s": dict(zip(names, [0.0, *deviations[9:].tolist()])),
+        "offsets_from": flight.offsets_from,
+        "spin_rad_s": spin.velocity.tolist() if spin else None,
+        "spin_deviation_rad_s": np.sqrt(np.diag(spin.covariance)).tolist() if spin else None,
+        "spin_points": spin.points if spin else 0,
+        "rms_px": fall.rms,
+        "views": fall.views,
+        "frames": dict(zip(names, flight.frames)),
+        "agreement": dict(zip(names, flight.agreement.tolist())) if flight.agreement is not None else None,
+        "gravity": flight.gravity,
+    }
+
+
+def draw_flight(path: str | Path, flight: Flight, views: Sequence[Filmed], title: str) -> None:
+    """Write a picture: where each camera saw the object's centre, where the fit has it, and the distances between."""
+    figure = Figure(figsize=(5 * (len(views) + 1), 5), layout="constrained")
+    *cameras, last = figure.subplots(1, len(views) + 1)
+    for number, (axes, view, track) in enumerate(zip(cameras, views, flight.tracks)):
+        fitted = flight.fall.seen(track, number)
+        axes.imshow(view.pixels[0] // 2 + 127)
+        axes.plot(*track.places.T, ".", label="seen")
+        axes.plot(*fitted.T, "-", label="free flight")
+        axes.set(title=view.camera, xlabel="x [px]", ylabel="y [px]")
+        axes.legend()
+        clock = track.times + flight.fall.offsets[number] - flight.fall.start
+        last.plot(1000 * clock, np.linalg.norm(fitted - track.places, axis=1), ".-", label=view.camera)
+    last.set(title="off the fit", xlabel="time [ms]", ylabel="[px]", yscale="log")
+    last.legend()
+    figure.suptitle(title)
+    with atomic(path) as partial:
+        FigureCanvasAgg(figure).print_png(partial, metadata={"Software": None})
+
+
+def flight_checks(name: str, found: Mapping[str, Any]) -> list[tuple[str, str, str, bool]]:
+    """Checks of a flight's `report`: what, found, wanted, good."""
+    spread, angle = found["gravity_ratio_deviation"], found["gravity_angle_deg"]
+    unsure = found["gravity_angle_deviation_deg"]
+    checks = [
+        (
+            f"gravity in {name}",
+            f"{found['gravity_ratio']:.3f} +- {spread:.3f} of 9.81 m/s^2",
+            "1 +- 0.03",
+            abs(found["gravity_ratio"] - 1) < 0.03 + 2 * spread,
+        ),
+        (
+            f"down in {name}",
+            f"{angle:.1f} +- {unsure:.1f} degrees off the floor's normal",
+            "< 1.5 degrees",
+            angle < 1.5 + 2 * unsure,
+        ),
+        (f"flight in {name}", f"{found['rms_px']:.2f} px off the fit", "< 1 px", found["rms_px"] < 1),
+    ]
+    for camera, value in (found["agreement"] or {}).items():
+        checks.append((f"mask of {camera} at rest, {name}", f"IoU {value:.2f}", "> 0.7", value > 0.7))
+    return checks

@@ -1,0 +1,80 @@
+"""Pictures with their masks on disk: a transforms.json that lists mattes, and what a flight reads of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from neuma_lib.capture.lens import Lens
+from neuma_lib.capture.masks import matted, read_mask
+from neuma_lib.capture.pictures import undistorted
+from neuma_lib.errors import InputError
+from neuma_lib.io.files import atomic
+from neuma_lib.io.images import OPENGL_TO_OPENCV, open_image, read_transforms, write_transforms
+
+
+def room_frames(path: str | Path, group: str) -> list[dict[str, Any]]:
+    """Entries of the room's transforms.json of one group, `photographs` or a camera's name.
+
+    Raises:
+        InputError: there are none.
+    """
+    found = [frame for frame in read_transforms(path)["frames"] if frame.get("group") == group]
+    if not found:
+        raise InputError(f"{path}: no picture of '{group}' has found its place")
+    return found
+
+
+def read_pixels(path: str | Path) -> np.ndarray:
+    """RGB (H, W, 3), uint8, of a picture of the room."""
+    with open_image(Path(path).read_bytes(), path) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def own_mask(path: str | Path, lens: Lens, longest: int) -> np.ndarray:
+    """A mask of the user's, undistorted as its picture is, (H, W). Raises InputError as `read_mask` does."""
+    mask = read_mask(path, (lens.width, lens.height))
+    return undistorted(255 * mask.astype(np.uint8), lens, longest) > 127
+
+
+def metric_camera(frame: Mapping[str, Any], world: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Camera of an entry in the room's metres, before it was placed into the simulator's box.
+
+    Args:
+        world: ``world`` of the file, with scale and offset.
+
+    Returns:
+        World to camera, OpenCV axes (4, 4), and intrinsics (3, 3) [px].
+    """
+    pose = np.array(frame["transform_matrix"], np.float64)
+    pose[:3, 3] = (pose[:3, 3] - world.get("offset", 0.0)) / world.get("scale", 1.0)
+    K = np.array([[frame["fl_x"], 0, frame["cx"]], [0, frame["fl_y"], frame["cy"]], [0, 0, 1]], np.float64)
+    return np.linalg.inv(pose @ OPENGL_TO_OPENCV), K
+
+
+def write_mattes(
+    path: str | Path, mattes: Iterable[tuple[dict[str, Any], np.ndarray, np.ndarray]], room: str | Path
+) -> None:
+    """Write a transforms.json and the RGBA pictures that it lists.
+
+    Args:
+        path: .../transforms.json.
+        mattes: entry, with the ``file_path`` to write to, pixels (H, W, 3), uint8, and mask (H, W) of each picture.
+        room: the room's transforms.json, whose ``world`` is that of the mattes.
+    """
+    folder = Path(path).parent
+    folder.mkdir(parents=True, exist_ok=True)
+    Path(path).unlink(missing_ok=True)  # a folder without it is an unfinished one
+    frames = []
+    for frame, pixels, mask in mattes:
+        rgba = matted(pixels, mask)
+        rgba[rgba[..., 3] == 0] = 0  # to be small
+        with atomic(folder / frame["file_path"]) as partial:
+            Image.fromarray(rgba).save(partial, "PNG")
+        frames.append({key: value for key, value in frame.items() if key != "sha256"})
+    data = read_transforms(room)
+    write_transforms(path, {}, frames, **{key: data[key] for key in ("world", "room") if key in data})

@@ -1,0 +1,169 @@
+"""From photographs and videos of a drawn fall to masks, offsets and gravity, by real Snakemake runs."""
+
+import json
+import subprocess
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from board_pictures import BOARD, LENS, around, looking_at, picture
+from PIL import Image
+from project import copied
+from scipy.spatial.transform import Rotation
+
+PAGE = "tiny/results/mug/motion.md"
+SETTINGS = "board: {square: 0.03}\nposes: board\nlens: lenses.json\nlongest: 400\n"
+MIDDLE = np.array([0.09, 0.12, 0.0])
+RADII = np.array([0.045, 0.035, 0.04])
+GRAVITY, RATE, COUNT, OFFSET = 9.81, 120, 40, 0.0035
+HEIGHT, VELOCITY, SPIN = 0.26, np.array([0.15, -0.1, 0.0]), np.array([1.0, 2.0, 0.5])
+
+
+class Eye:
+    """A camera of the drawn room: its empty picture, and the ellipsoid before it."""
+
+    def __init__(self, pose):
+        self.pose, self.empty = pose, np.repeat(picture(pose, samples=2)[..., None], 3, axis=2)
+        x, y = np.meshgrid(np.arange(LENS.width) + 0.5, np.arange(LENS.height) + 0.5)
+        rays = LENS.directions(np.stack([x.ravel(), y.ravel()], axis=1))
+        self.rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1) @ pose[:3, :3]
+        self.at = -pose[:3, :3].T @ pose[:3, 3]
+
+    def see(self, centre, turn):
+        """Picture (H, W, 3) and mask (H, W)."""
+        eye, rays = turn.inv().apply(self.at - centre) / RADII, turn.inv().apply(self.rays) / RADII
+        a, b, c = (rays**2).sum(axis=1), rays @ eye, eye @ eye - 1
+        root = b * b - a * c
+        hit = root > 0
+        body = eye + ((-b[hit] - np.sqrt(root[hit])) / a[hit])[:, None] * rays[hit]
+        grain = np.sin(9 * body[:, 0] + 1) * np.sin(11 * body[:, 1]) * np.sin(10 * body[:, 2] + 2)
+        seen = self.empty.copy().reshape(-1, 3)
+        seen[hit] = np.clip((205, 95, 50) * (1 + 0.35 * grain[:, None]), 0, 255)
+        return seen.reshape(self.empty.shape), hit.reshape(self.empty.shape[:2])
+
+
+def motion(t):
+    """Centre in the board's frame, and the turn: free fall until the floor, where it stays."""
+    landing = np.sqrt(2 * (HEIGHT - RADII[2]) / GRAVITY)
+    t = min(t, landing)
+    start = MIDDLE + (-0.02, 0.01, HEIGHT)
+    return start + VELOCITY * t - (0, 0, GRAVITY * t * t / 2), Rotation.from_rotvec(SPIN * t)
+
+
+def write_video(path, pictures, *options):
+    height, width = pictures[0].shape[:2]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
+    command += [
+        "-s",
+        f"{width}x{height}",
+        "-r",
+        str(RATE),
+        "-i",
+        "-",
+        "-c:v",
+        "libx264",
+        "-crf",
+        "10",
+        *options,
+    ]
+    subprocess.run([*command, str(path)], input=np.stack(pictures).tobytes(), check=True)
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    """Photographs with masks, stills and videos of two cameras; the second began `OFFSET` later."""
+    pytest.importorskip("cv2")
+    root = tmp_path_factory.mktemp("drawn")
+    for name in ("photos", "stills", "videos", "masks/photographs"):
+        (root / name).mkdir(parents=True)
+    for k, pose in enumerate(around(6)):
+        seen, mask = Eye(pose).see(MIDDLE + (0.0, 0.0, RADII[2]), Rotation.identity())
+        Image.fromarray(seen).save(root / f"photos/{k}.png")
+        Image.fromarray(255 * mask.astype(np.uint8)).save(root / f"masks/photographs/{k}.png")
+    for name, angle, offset in (("left", 0.4, 0.0), ("right", 1.9, OFFSET)):
+        at = MIDDLE + (0.6 * np.cos(angle), 0.6 * np.sin(angle), 0.4)
+        eye = Eye(looking_at(at, MIDDLE + (0, 0, 0.1)))
+        Image.fromarray(eye.empty).save(root / f"stills/{name}.png")
+        write_video(
+            root / f"videos/{name}.mp4", [eye.see(*motion(k / RATE + offset))[0] for k in range(COUNT)]
+        )
+    (root / "lenses.json").write_text(
+        json.dumps(dict.fromkeys(("photographs", "left", "right"), LENS.plain()))
+    )
+    (root / "capture.yaml").write_text(SETTINGS)
+    return root
+
+
+@pytest.fixture
+def project(tmp_path, drawn):
+    made = copied(tmp_path / "project", tmp_path / "kernels")
+    subprocess.run(["cp", "-r", drawn, made.root / "captures-drawn"], check=True)
+    (made.root / "captures").mkdir(exist_ok=True)
+    (made.root / "captures-drawn").rename(made.root / "captures/mug")
+    return made
+
+
+def test_masks_offset_gravity_velocity_and_spin_are_those_that_were_drawn(project):
+    output = project.run(PAGE)
+    results, data = project.root / "tiny/results/mug", project.root / "tiny/data/mug"
+    found = json.loads((results / "flight/first.json").read_text())
+    assert "gravity is" in output
+    # The room's y is up, x and z lie as the board's x and -y.
+    velocity = np.array([VELOCITY[0], VELOCITY[2], -VELOCITY[1]])
+    assert found["gravity_ratio"] == pytest.approx(1, abs=0.02)
+    assert found["gravity_angle_deg"] < 0.5
+    assert (
+        np.linalg.norm(np.subtract(found["v0_m_s"], velocity)) < 0.03 * GRAVITY * 0.21
+    )  # of the speed at the floor
+    assert found["offsets_s"]["right"] == pytest.approx(OFFSET, abs=1e-3)  # an eighth of a frame
+    spin = np.array([SPIN[0], SPIN[2], -SPIN[1]])
+    assert np.linalg.norm(np.subtract(found["spin_rad_s"], spin)) < 0.25 * np.linalg.norm(spin)
+    assert min(found["agreement"].values()) > 0.85
+    photographs = json.loads((results / "masks/photographs.json").read_text())
+    assert photographs["left_out"] == [] and min(photographs["agreement"].values()) > 0.85
+    for file in (
+        "static/transforms.json",
+        "videos/first/left/transforms.json",
+        "videos/first/right/transforms.json",
+    ):
+        assert (data / file).is_file()
+    page = (project.root / PAGE).read_text()
+    for file in (
+        "masks/photographs.png",
+        "masks/first/left.png",
+        "masks/first/right.png",
+        "flight/first.png",
+    ):
+        with Image.open(results / file) as shown:
+            assert shown.width > 500 and f"({file})" in page
+    assert project.plan(PAGE) == {}
+    # What is stated of a camera's time repeats the flight alone.
+    (project.root / "captures/mug/capture.yaml").write_text(SETTINGS + "cameras: {right: {offset: 0.0035}}\n")
+    assert set(project.plan(PAGE)) == {"capture_flight", "capture_motion_page"}
+
+
+def test_a_wrong_square_size_is_caught_by_gravity(project):
+    wrong = SETTINGS.replace("0.03}", f"{1.2 * BOARD.square}}}")
+    (project.root / "captures/mug/capture.yaml").write_text(wrong)
+    said = project.run("tiny/results/mug/flight/first.json", succeeds=False)
+    assert "board's square size is 0.8" in said and "Traceback" not in said
+    assert not (project.root / "tiny/results/mug/flight/first.json").exists()
+
+
+def test_bad_videos_and_masks_end_with_one_line(project):
+    mug, left = project.root / "captures/mug", "tiny/results/mug/masks/first/left.json"
+    video = (mug / "videos/left.mp4").read_bytes()
+    empty = np.asarray(Image.open(mug / "stills/left.png"))
+    write_video(mug / "videos/left.mp4", [empty] * 8)
+    assert "the mask is empty, the object was not found" in project.run(left, succeeds=False)
+    shaken = [np.roll(empty, 12 * (k % 4), axis=1) for k in range(8)]
+    write_video(mug / "videos/left.mp4", shaken)
+    assert "the background moves" in project.run(left, succeeds=False)
+    write_video(mug / "videos/left.mp4", [empty[:400]] * 8)
+    assert "left.mp4 is 800x400, the picture of the empty scene" in project.run(left, succeeds=False)
+    (mug / "videos/left.mp4").write_bytes(video)
+    (mug / "masks/first/left").mkdir(parents=True)
+    Image.new("L", (800, 600), 255).save(mug / "masks/first/left/900.png")
+    assert "masks of a video are named after its frames, 0 to 39" in project.run(left, succeeds=False)
+    assert not (project.root / left).exists()
+    assert not (project.root / "tiny/data/mug/videos/first/left/transforms.json").exists()

@@ -1,0 +1,60 @@
+"""Fit the free flight of a throw to what all cameras saw, and check gravity."""
+
+from pathlib import Path
+
+import numpy as np
+
+from neuma_lib.capture.flight import Filmed, draw_flight, find_flight, report
+from neuma_lib.capture.mattes import metric_camera
+from neuma_lib.capture.timing import read_sound
+from neuma_lib.io.files import read_json, write_json
+from neuma_lib.io.images import read_image_set, read_transforms
+from workflow.inputs import listed
+from workflow.stage import run_script
+
+
+def main(inputs, output, params, run) -> None:
+    files = zip(
+        params.cameras,
+        listed(inputs.videos),
+        listed(inputs.transforms),
+        listed(inputs.reports),
+        listed(inputs.timelines),
+        params.timing["offsets"],
+        params.timing["row_times"],
+        strict=True,
+    )
+    views = [filmed(*values) for values in files]
+    flight = find_flight(views, params.name)
+    draw_flight(output.picture, flight, views, flight.gravity)
+    write_json(output.flight, report(flight, views))
+    for line in [*flight.offsets_from, flight.gravity]:
+        run.say(line)
+    if flight.spin:
+        size, deviation = flight.spin.rate
+        run.say(f"spin {size:.2f} +- {deviation:.2f} rad/s from {flight.spin.points} points")
+
+
+def filmed(camera, video, transforms, masks, timeline, offset, row_time) -> Filmed:
+    data, timeline = read_transforms(transforms), read_json(timeline)
+    images = read_image_set(transforms).images
+    arcs = read_json(masks)["arcs"]
+    viewmat, K = metric_camera(data["frames"][0], data.get("world", {}))
+    return Filmed(
+        camera,
+        np.array([frame["step"] for frame in data["frames"]]),
+        np.array([frame["time"] for frame in data["frames"]]),
+        images[..., :3],
+        images[..., 3] > 127,
+        tuple(arcs[0]) if arcs else None,
+        viewmat,
+        K,
+        timeline["height"],
+        row_time,
+        # Sound is not slowed with the picture.
+        read_sound(Path(video)) if timeline["stretch"] == 1 else None,
+        offset,
+    )
+
+
+run_script(main, snakemake)

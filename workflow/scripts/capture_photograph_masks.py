@@ -1,0 +1,73 @@
+"""Mask the object in the photographs, check the masks against each other, and write mattes."""
+
+from pathlib import Path
+
+import numpy as np
+
+from neuma_lib.capture.agreement import LEAST_AGREEMENT, agreement
+from neuma_lib.capture.folder import PHOTOGRAPHS
+from neuma_lib.capture.frames import Frame
+from neuma_lib.capture.lens import read_lens
+from neuma_lib.capture.masks import overlay, photograph_mask
+from neuma_lib.capture.mattes import metric_camera, own_mask, read_pixels, room_frames, write_mattes
+from neuma_lib.capture.pictures import picture_sheet
+from neuma_lib.capture.saliency import Saliency
+from neuma_lib.errors import InputError
+from neuma_lib.io.files import read_json, write_json
+from workflow.inputs import listed
+from workflow.stage import run_script
+
+
+def main(inputs, output, params, run) -> None:
+    frames = room_frames(inputs.room, PHOTOGRAPHS)
+    lens = read_lens(read_json(inputs.report)["lenses"][PHOTOGRAPHS], inputs.report)
+    own = {Path(file).stem: file for file in listed(inputs.own)}
+    network = Saliency(listed(inputs.network)[0]) if listed(inputs.network) else None
+    names, pictures, masks = [], [], []
+    for number, frame in enumerate(frames):
+        file = Path(inputs.room).parent / frame["file_path"]
+        pixels = read_pixels(file)
+        if file.stem in own:
+            mask = own_mask(own[file.stem], lens, params.longest)
+        else:
+            mask = photograph_mask(pixels, network, frame["file_path"])
+        names.append(file.stem)
+        pictures.append(pixels)
+        masks.append(mask)
+        run.progress(number + 1, len(frames))
+    cameras, Ks = map(np.stack, zip(*(metric_camera(frame, {}) for frame in frames)))
+    agreed = agreement(masks, cameras, Ks) if len(masks) > 1 else np.ones(1)
+    # Own masks are taken as they are.
+    doubtful = [n for n, value in zip(names, agreed) if value < LEAST_AGREEMENT and n not in own]
+    kept = [name not in doubtful for name in names]
+    if sum(kept) < 0.5 * len(names):
+        raise InputError(
+            f"{params.name}: {len(doubtful)} of {len(names)} masks of photographs do not belong to the body that the"
+            f" others show ({', '.join(doubtful[:5])}): photograph the object alone, whole, and before another"
+            f" colour; or put masks of your own into the folder masks/{PHOTOGRAPHS}"
+        )
+    shown = [
+        (f"{name}: {value:.2f}{'' if good else ', left out'}", overlay(Frame(0, 0.0, pixels), mask).pixels)
+        for name, value, good, pixels, mask in zip(names, agreed, kept, pictures, masks)
+    ]
+    said = f"{sum(kept)} of {len(names)} masks agree, IoU {np.mean(agreed[kept]):.2f} with the body that they leave"
+    picture_sheet(output.sheet, shown, f"{params.name}: {said}", 6)
+    mattes = [
+        ({**frame, "file_path": f"{name}.png"}, pixels, mask)
+        for frame, name, pixels, mask, good in zip(frames, names, pictures, masks, kept)
+        if good
+    ]
+    write_mattes(output.transforms, mattes, inputs.room)
+    write_json(
+        output.report,
+        {
+            "photographs": len(names),
+            "agreement": dict(zip(names, agreed.tolist())),
+            "left_out": doubtful,
+            "own": sorted(own),
+        },
+    )
+    run.say(said + (f"; left out: {', '.join(doubtful)}" if doubtful else ""))
+
+
+run_script(main, snakemake)

