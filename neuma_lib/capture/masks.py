@@ -37,8 +37,9 @@ LEAST_AREA = 2e-5
 """Part of the picture that an object covers at least."""
 MOST_MOVING = 0.1
 """Part of the picture outside object and shadows that may differ from the plate."""
-MOST_JUMP = 0.2
-"""Change of a mask's area from one frame of free flight to the next that is an error; 0.03 is usual."""
+MOST_JUMP = 1.0
+"""Change of a mask's area from one frame of free flight to the next that is an error: something else has come in. In
+sharp pictures 0.03 is usual; blur and a ground of a like colour make it 0.3."""
 MOST_NOISE = 6.0
 """Deviation of a camera's noise [levels]; what differs by more has moved."""
 EDGE = 0.7

@@ -82,6 +82,17 @@ def test_a_mismatch_names_the_likely_causes():
         check_gravity(fit_free_fall(two()), (0.2, 1.0, 0.0), "drop")
 
 
+def test_a_wrong_square_size_shows_as_its_share_of_gravity():
+    """A square stated 1.2 times too large makes the whole room so: also the way to the cameras."""
+    tracks = two()
+    for seen in tracks:
+        seen.viewmat[:3, 3] *= 1.2
+    fall = fit_free_fall(tracks)
+    assert fall.ratio[0] == pytest.approx(1.2, abs=1e-5)
+    with pytest.raises(InputError, match=r"square size is 0\.83 of what is stated"):
+        check_gravity(fall, UP, "drop")
+
+
 def test_too_few_frames_are_refused():
     with pytest.raises(InputError, match="at least 4"):
         fit_free_fall([track((2.0, 1.0, 0.3), count=3)])

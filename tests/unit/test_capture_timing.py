@@ -2,8 +2,17 @@
 
 import numpy as np
 import pytest
+from scipy.io import wavfile
+from test_capture_frames import ffmpeg
 
-from neuma_lib.capture.timing import RATE, Offset, choose_offset, offset_from_motion, offset_from_sound
+from neuma_lib.capture.timing import (
+    RATE,
+    Offset,
+    choose_offset,
+    offset_from_motion,
+    offset_from_sound,
+    read_sound,
+)
 from neuma_lib.errors import InputError
 
 
@@ -39,3 +48,24 @@ def test_the_surer_offset_is_chosen_and_told():
         choose_offset(None, None, "mug")
     with pytest.raises(InputError, match="disagree"):
         choose_offset(sound, Offset(0.2, 0.003, "motion"), "mug")
+
+
+def test_sound_keeps_the_clock_of_its_video(tmp_path):
+    """A click 0.5 s into sound that begins 0.25 s after the picture is heard at 0.75 s."""
+    samples = np.zeros(RATE, np.float32)
+    samples[RATE // 2] = 1.0
+    sound = tmp_path / "click.wav"
+    wavfile.write(sound, RATE, samples)
+    pictures = ("-f", "lavfi", "-i", "testsrc=s=64x48:r=30:d=2")
+    path = tmp_path / "a.mov"
+    ffmpeg(*pictures, "-itsoffset", 0.25, "-i", sound, "-c:v", "libx264", "-c:a", "pcm_f32le", path)
+    heard = read_sound(path)
+    assert abs(int(np.abs(heard).argmax()) - 0.75 * RATE) <= 16  # a millisecond
+    silent = tmp_path / "b.mp4"
+    ffmpeg(*pictures, "-c:v", "libx264", silent)
+    assert read_sound(silent) is None
+    (tmp_path / "c.mp4").write_text("no video")
+    with pytest.raises(InputError, match=r"c\.mp4 cannot be read as a video"):
+        read_sound(tmp_path / "c.mp4")
+    with pytest.raises(InputError, match=r"d\.mp4"):
+        read_sound(tmp_path / "d.mp4")

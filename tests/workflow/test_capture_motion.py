@@ -142,6 +142,7 @@ def test_masks_offset_gravity_velocity_and_spin_are_those_that_were_drawn(projec
     assert set(project.plan(PAGE)) == {"capture_flight", "capture_motion_page"}
 
 
+@pytest.mark.slow
 def test_a_wrong_square_size_is_caught_by_gravity(project):
     wrong = SETTINGS.replace("0.03}", f"{1.2 * BOARD.square}}}")
     (project.root / "captures/mug/capture.yaml").write_text(wrong)
@@ -154,13 +155,9 @@ def test_bad_videos_and_masks_end_with_one_line(project):
     mug, left = project.root / "captures/mug", "tiny/results/mug/masks/first/left.json"
     video = (mug / "videos/left.mp4").read_bytes()
     empty = np.asarray(Image.open(mug / "stills/left.png"))
-    write_video(mug / "videos/left.mp4", [empty] * 8)
-    assert "the mask is empty, the object was not found" in project.run(left, succeeds=False)
-    shaken = [np.roll(empty, 12 * (k % 4), axis=1) for k in range(8)]
-    write_video(mug / "videos/left.mp4", shaken)
-    assert "the background moves" in project.run(left, succeeds=False)
     write_video(mug / "videos/left.mp4", [empty[:400]] * 8)
-    assert "left.mp4 is 800x400, the picture of the empty scene" in project.run(left, succeeds=False)
+    said = project.run(left, succeeds=False)
+    assert "left.mp4 is 800x400, the picture of the empty scene" in said and "Traceback" not in said
     (mug / "videos/left.mp4").write_bytes(video)
     (mug / "masks/first/left").mkdir(parents=True)
     Image.new("L", (800, 600), 255).save(mug / "masks/first/left/900.png")
