@@ -28,7 +28,7 @@ from neuma_lib.io.images import open_image
 MOST_PLATE_FRAMES = 61
 """Frames of which the median is taken where there is no empty still."""
 SURE, POSSIBLE = 30.0, 12.0
-"""Differences from the plate [levels of 255] that are certainly something, and that may be."""
+"""Differences from the plate [levels of 255] that are certainly something, and that may be where there is no noise."""
 SHADOW = (0.4, 0.97)
 """Factors by which a shadow darkens."""
 SHADOW_TINT = 0.06
@@ -41,10 +41,9 @@ MOST_JUMP = 1.0
 """Change of a mask's area from one frame of free flight to the next that is an error: something else has come in. In
 sharp pictures 0.03 is usual; blur and a ground of a like colour make it 0.3."""
 MOST_NOISE = 6.0
-"""Deviation of a camera's noise [levels]; what differs by more has moved."""
+"""Most deviation of a camera's noise [levels], a fifth of `SURE`; what differs by more has moved."""
 EDGE = 0.7
 """Deviation of the blur that makes a mask's edge soft [px]."""
-_NOISES = 5.0  # deviations of the noise that a difference must exceed
 _RATIO = 3.0  # of areas from frame to frame that may be the same object's
 _LOST = 2  # frames after which an object that was not found is no longer looked for
 _GRABCUT_ROUNDS = 4
@@ -206,7 +205,7 @@ def _changed(frame: np.ndarray, plate: np.ndarray) -> _Change:
     difference, shadow = compare(frame, _exposed(plate, gain, offset))
     largest = _largest(np.abs(difference))
     noise = min(1.4826 * float(np.median(largest[::4, ::4])), MOST_NOISE)
-    strong = _opened((largest > _sure(noise)) & ~shadow)
+    strong = _opened((largest > SURE) & ~shadow)
     labels, sizes, middles = _parts(strong)
     enough = np.flatnonzero(sizes >= _least_area(strong))
     border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
@@ -248,10 +247,6 @@ def _exposed(plate: np.ndarray, gain: np.ndarray, offset: np.ndarray) -> np.ndar
     return plate * gain.astype(np.float32) + offset.astype(np.float32)
 
 
-def _sure(noise: float) -> float:
-    return max(SURE, _NOISES * noise)
-
-
 def _least_area(picture: np.ndarray) -> float:
     return max(9, LEAST_AREA * picture.size)
 
@@ -273,7 +268,8 @@ def _fly(
 
     first, last = arc.frames
     for i in range(first, last + 1):
-        masks[i], known[i] = flying(i), True
+        masks[i] = flying(i)
+        known[i] = masks[i].any()
     while first > 0 and not known[first - 1] and _whole(mask := flying(first - 1)):
         first -= 1
         masks[first], known[first] = mask, True
@@ -328,7 +324,7 @@ def _mask(
     if in_flight and not mask.any() and not _component(change.strong, place, area, 2 * gate).any():
         # Nothing but the object is here: blurred and dark, it only looks like a shadow.
         largest = _largest(np.abs(frame - empty))
-        mask = _component(_opened(largest > _sure(change.noise)), place, area, gate)
+        mask = _component(_opened(largest > SURE), place, area, gate)
     if not mask.any():
         return mask
     radius = np.sqrt(mask.sum() / np.pi)
