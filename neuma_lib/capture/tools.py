@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import signal
+import threading
 from types import ModuleType
 
 from neuma_lib.errors import InputError
@@ -15,7 +17,12 @@ def opencv() -> ModuleType:
 
 def colmap() -> ModuleType:
     """The module pycolmap. Raises InputError where it is not installed."""
-    return _module("pycolmap", "COLMAP")
+    found = _module("pycolmap", "COLMAP")
+    # Its handler of SIGTERM writes a stack trace, for which it allocates memory; sent amid an allocation, it never
+    # ends.
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
+    return found
 
 
 def _module(name: str, what: str) -> ModuleType:

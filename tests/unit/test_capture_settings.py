@@ -1,5 +1,9 @@
 """Settings and files of a capture."""
 
+import signal
+import subprocess
+import sys
+
 import pytest
 
 from neuma_lib.capture import folder as capture_folder
@@ -153,3 +157,11 @@ def test_a_missing_extra_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "cv2", None)
     with pytest.raises(InputError, match="make capture"):
         tools.opencv()
+
+
+def test_colmap_leaves_sigterm_to_the_process():
+    """Its own handler can wait for ever; a stage that is ended must end, at once and as one that was ended."""
+    pytest.importorskip("pycolmap")
+    code = "import os; from neuma_lib.capture.tools import colmap; colmap(); os.kill(os.getpid(), 15)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == -signal.SIGTERM and "SIGTERM" not in done.stderr
