@@ -85,6 +85,12 @@ class CameraConfig(Section):
     row_time: float = Field(
         0.0, ge=0, lt=1e-3, description="time from row to row of a rolling shutter [s]; 0: all rows at once"
     )
+    exposure: float = Field(
+        0.0,
+        ge=0,
+        lt=0.1,
+        description="how long a frame is exposed [s], for motion blur; its time is the middle. 0: blur is left out",
+    )
 
 
 class ThrowConfig(Section):
@@ -144,6 +150,28 @@ class CaptureConfig(Section):
         description="longer side of the undistorted pictures, which are never enlarged [px]",
     )
     seed: int = Field(0, ge=0, description="of the search for camera poses")
+    prior: str = Field(
+        "jelly", description="law that is believed in before, a name in priors.laws or a path as for a scene"
+    )
+    density: float = Field(
+        1000.0,
+        gt=0,
+        description="mass density [kg/m^3], from a kitchen scale and the volume; motion tells stiffness over density "
+        "alone",
+    )
+    dt: float = Field(5e-4, gt=0, lt=0.01, description="time step of the simulation [s]")
+    held_out: tuple[str, ...] = Field(
+        (), description="throws that the law is not learned from, but judged on"
+    )
+    duration: float = Field(
+        0.7, gt=0, description="how much of a video counts, from the start of the flight on [s]"
+    )
+    frames: int = Field(
+        60, ge=8, description="most frames of a camera that the law is learned from, evenly spread"
+    )
+    width: int = Field(
+        160, ge=32, le=2048, description="longer side of the pictures that the law is learned from [px]"
+    )
 
     @model_validator(mode="after")
     def _metres_from_somewhere(self) -> CaptureConfig:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
@@ -50,19 +51,36 @@ class SuppliedConfig(Section):
     )
 
 
+class CapturedConfig(Section):
+    """What a scene shows of a capture; the workflow writes it for each folder of captures.root."""
+
+    capture: str = Field(description="name of the capture")
+    throw: str | None = Field(None, description="its throw; null: the object as photographed")
+    cameras: tuple[str, ...] = Field((), description="cameras that filmed the throw, by name")
+    scale: float = Field(1.0, gt=0, description="metres of the simulator to a metre of the room")
+
+
+OF_THE_TRUTH = ("shape", "height", "velocity", "law", "appearance")
+"""Keys of what is simulated and rendered: nobody knows them of a captured object."""
+OF_A_VIDEO = ("steps",)
+"""Keys that the files of a captured video tell."""
+
+
 class SceneConfig(Section):
-    """A benchmark: what is thrown, of what, how, and what is believed about it."""
+    """A benchmark: what is thrown, of what, how, and what is believed about it. Or a capture: what was filmed."""
 
     like: str | None = Field(
         None, description="scene whose settings stand wherever this one has none of its own; null: none"
     )
-    shape: str = Field(description="name of the shape: ball, duck, pawn, cat, bottle, fish or letter_X")
+    shape: str | None = Field(
+        description="name of the shape: ball, duck, pawn, cat, bottle, fish or letter_X"
+    )
     size: float | None = Field(
         None, gt=0, description="longest side of the bounding box [m]; null: the shape's own"
     )
-    height: float = Field(description="y of the bounding box's centre at the start [m]")
+    height: float | None = Field(description="y of the bounding box's centre at the start [m]")
     center: tuple[float, float] = Field((0.5, 0.5), description="x and z of the bounding box's centre [m]")
-    velocity: Vector = Field(description="initial velocity [m/s]")
+    velocity: Vector | None = Field(description="initial velocity [m/s]")
     spin: Vector = Field(
         (0.0, 0.0, 0.0), description="initial angular velocity about the centre of mass, world axes [rad/s]"
     )
@@ -70,22 +88,26 @@ class SceneConfig(Section):
         1000.0,
         description="mass density rho [kg/m^3], or two of them at t = 0: {axis: x, at: 0.5, below: 800, above: 1200}",
     )
-    law: LawConfig = Field(description="the true material, known to the ground truth only")
+    law: LawConfig | None = Field(description="the true material, known to the ground truth only")
     truth: TruthConfig = Field(
         TruthConfig(),
         description="how finely its ground truth is simulated, where it has settings of its own",
     )
     dt: float = Field(gt=0, description="time step of the reconstruction, which frames are counted in [s]")
-    steps: int = Field(gt=0, description="simulated steps of the video")
+    steps: int | None = Field(gt=0, description="simulated steps of the video")
     frames: tuple[int, ...] | None = Field(
         None,
         description="steps of the video's frames, ascending from 0; null: as images.stride, dataset.frames or "
         "dataset.stride say",
     )
     prior: str = Field(description="name in priors.laws, or path of a .safetensors or a released .pt file")
-    appearance: AppearanceConfig = Field(description="how Blender shows it")
+    appearance: AppearanceConfig | None = Field(description="how Blender shows it")
     images: SuppliedConfig = Field(
         SuppliedConfig(), description="files of its images, where Blender makes none"
+    )
+    captured: CapturedConfig | None = Field(
+        None,
+        description="which capture this is, whose scenes have no truth; written by the workflow, not by hand",
     )
     videos: tuple[str, ...] = Field(
         (),
@@ -98,11 +120,28 @@ class SceneConfig(Section):
         {}, description="settings of the section material that this scene overrides"
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _without_truth(cls, raw: Any) -> Any:
+        """A captured scene need not say that it has no truth."""
+        captured = isinstance(raw, Mapping) and raw.get("captured")
+        return {**dict.fromkeys((*OF_THE_TRUTH, *OF_A_VIDEO)), **raw} if captured else raw
+
+    @model_validator(mode="after")
+    def _truth_is_whole(self) -> SceneConfig:
+        for key in (*OF_THE_TRUTH, *OF_A_VIDEO):
+            if self.captured is None and getattr(self, key) is None:
+                raise ValueError(f"{key}: null stands in scenes of captures only, give it a value")
+        return self
+
     @model_validator(mode="after")
     def _frames_ascend(self) -> SceneConfig:
         frames = self.frames
         if frames is not None and (
-            list(frames) != sorted(set(frames)) or not frames or frames[0] != 0 or frames[-1] > self.steps
+            list(frames) != sorted(set(frames))
+            or not frames
+            or frames[0] != 0
+            or frames[-1] > (self.steps or 0)
         ):
             raise ValueError("frames must ascend from 0 to at most 'steps' without repeats")
         stride = self.images.stride

@@ -41,6 +41,9 @@ from neuma_lib.errors import InputError
 
 Changed = TypeVar("Changed", MaterialConfig, StructuredConfig, SpringsConfig, PacNerfConfig)
 
+NO_TRUTH = (
+    "nobody knows the truth of a captured object: ask for a result that needs none, see docs/capture.md"
+)
 TRUTH_DRAWS = ("the particles", "the tracers", "the second tracers")
 """What the seeds dataset.seed, dataset.seed + 1 and dataset.seed + 2 draw, see `neuma_lib.data.ground_truth`."""
 
@@ -206,12 +209,13 @@ class Config(Section):
     @property
     def random_scenes(self) -> list[str]:
         """Names of the scenes drawn at random, in order."""
-        return [name for name in self.scenes if name.startswith(self.random.prefix)]
+        drawn = (name for name in self.scenes if name.startswith(self.random.prefix))
+        return [name for name in drawn if not self.scenes[name].captured]
 
     @property
     def plain_scenes(self) -> list[str]:
-        """Names of the scenes that are neither drawn at random, nor have a truth of their own fineness, nor belong to
-        tables on request alone."""
+        """Names of the scenes that are neither captured nor drawn at random, have no truth of their own fineness, and
+        do not belong to tables on request alone."""
         asked, shown = (
             {
                 scene
@@ -221,7 +225,11 @@ class Config(Section):
             }
             for on_request in (True, False)
         )
-        others = {*self.random_scenes, *(asked - shown)}
+        others = {
+            *self.random_scenes,
+            *(asked - shown),
+            *(name for name, s in self.scenes.items() if s.captured),
+        }
         return [name for name, s in self.scenes.items() if name not in others and s.truth == TruthConfig()]
 
     def experiment(self, name: str) -> ExperimentConfig:
@@ -274,11 +282,12 @@ class Config(Section):
     def true_law(self, scene: str, method: str) -> dict[str, Any] | None:
         """The true law of the scene, where this is what a method evaluates."""
         base, _ = parse_method(method, self.methods)
-        return (
-            self.scene(self.law_scene(scene, method)).law.plain()
-            if self.methods[base].law == "true"
-            else None
-        )
+        if self.methods[base].law != "true":
+            return None
+        law = self.scene(self.law_scene(scene, method)).law
+        if law is None:
+            raise InputError(f"{scene}/{method}: {NO_TRUTH}")
+        return law.plain()
 
     def is_identified(self, method: str) -> bool:
         """Whether a method evaluates the analytic law that was identified in the video."""
@@ -353,8 +362,10 @@ class Config(Section):
         return list(dict.fromkeys(self.run_folder(chain, method) for chain in chains))
 
     def frame_steps(self, name: str) -> tuple[int, ...]:
-        """Steps of the frames of a scene's video."""
+        """Steps of the frames of a scene's video. Raises InputError for a captured one, whose files tell them."""
         scene, steps = self.scene(name), self.dataset.steps or self.scene(name).steps
+        if scene.captured:
+            raise InputError(f"{name}: {NO_TRUTH}")
         if scene.frames is None and scene.images.stride is not None:
             return tuple(range(0, steps + 1, scene.images.stride))
         return scene.frames or self.dataset.frame_steps(steps)
@@ -474,19 +485,28 @@ class Config(Section):
         return _changed(section, changes, method)
 
 
-def load(raw: Mapping[str, Any], root: str | Path = ".") -> Config:
+def load(
+    raw: Mapping[str, Any], root: str | Path = ".", captured: Mapping[str, Mapping[str, Any]] | None = None
+) -> Config:
     """Validate merged settings.
 
     Args:
         raw: the YAML as nested dicts. ``scenes_file`` (relative to ``root``) is read, random scenes are drawn, and
             ``scenes`` changes both.
         root: folder of the project.
+        captured: scenes of captures (`neuma_lib.capture.scenes`), which ``scenes`` may change as well.
 
     Raises:
         InputError: names every offending key by its path and suggests close matches.
     """
     scenes_file = Path(root) / str(raw.get("scenes_file", Config.model_fields["scenes_file"].default))
     scenes, changes = {**read_yaml(scenes_file), **_random_scenes(raw)}, raw.get("scenes") or {}
+    for name in captured or {}:
+        if name in scenes:
+            raise InputError(
+                f"a capture makes the scene '{name}', and another scene is named so: rename its folder"
+            )
+    scenes |= captured or {}
     if isinstance(changes, Mapping):
         changes = _complete(_with_throws(merged(scenes, changes)))
     return validate(Config, {**raw, "scenes": changes})

@@ -8,6 +8,8 @@ rule binding:
     output:
         binding=f"{RESULTS}/{{scene}}/binding.h5",
         particles=f"{RESULTS}/{{scene}}/particles.h5",
+    wildcard_constraints:
+        scene=OBJECT_SCENE,
     params:
         binding=SETTINGS.binding.plain(),
     script:

@@ -1,22 +1,30 @@
-"""Files and settings of captures, own photographs and videos (docs/capture.md). Needs settings.smk."""
+"""Files and settings of captures, own photographs and videos (docs/capture.md). Needs scenes.smk."""
 
 from functools import cache
+from types import SimpleNamespace
 
 from neuma_lib.capture.folder import NAME, inside, read_capture
 
 CAPTURES = SETTINGS.captures.root.rstrip("/")
 CAPTURE_ENVIRONMENT = "../../envs/conda-capture.yaml"
+OF_VIDEOS = (
+    "stills",
+    "throws",
+    "cameras",
+    "prior",
+    "density",
+    "dt",
+    "held_out",
+    "duration",
+    "frames",
+    "width",
+)
 POSES_THREADS = 8  # for matches; all that there are where these are fewer
-
-
-for name in SETTINGS.scenes:
-    if Path(CAPTURES, name).is_dir():
-        raise WorkflowError(f"{CAPTURES}/{name}: a scene is named so; rename the folder")
 
 
 wildcard_constraints:
     # results of others lie in folders of these names
-    capture=f"(?!({'|'.join([*SETTINGS.scenes, 'figures', 'logs', 'benchmarks', 'experiments', 'priors'])})/){NAME.pattern}",
+    capture=f"(?!({TRUE_SCENE}|figures|logs|benchmarks|experiments|priors)/){NAME.pattern}",
     throw=NAME.pattern,
     camera=NAME.pattern,
 
@@ -74,9 +82,7 @@ def filmed_rate(wildcards):
 
 def room_settings(capture):
     """Settings of a capture that its room depends on."""
-    return capture.settings.model_dump(
-        mode="json", exclude={"photographs", "stills", "throws", "cameras", "masks"}
-    )
+    return capture.settings.model_dump(mode="json", exclude={*OF_VIDEOS, "photographs", "masks"})
 
 
 def photograph_masks(capture):
@@ -143,3 +149,31 @@ def camera_timing(wildcards):
         "offsets": [camera.offset if camera else None for camera in settings],
         "row_times": [camera.row_time if camera else 0.0 for camera in settings],
     }
+
+
+@checked
+def camera_exposures(wildcards):
+    """Stated exposure of each camera of a throw."""
+    capture = capture_named(wildcards.capture)
+    settings = [capture.settings.cameras.get(camera) for camera in capture.cameras_of(wildcards.throw)]
+    return [camera.exposure if camera else 0.0 for camera in settings]
+
+
+def of_thrown(function):
+    """A function of the wildcards capture and throw, as one of a scene that is a throw."""
+
+    def choose(wildcards):
+        captured = SETTINGS.scene(wildcards.scene).captured
+        return function(SimpleNamespace(capture=captured.capture, throw=captured.throw))
+
+    return choose
+
+
+def of_filmed(pattern):
+    """A function of a scene that is a throw: a file for each of its cameras."""
+    return of_thrown(of_throw(pattern))
+
+
+def of_thrown_capture(choose):
+    """A function of a scene that is a throw: something of its capture."""
+    return of_thrown(of_capture(choose))

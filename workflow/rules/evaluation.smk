@@ -11,6 +11,8 @@ rule initial_state:
         velocity=of_chain("velocity.json"),
     output:
         report=f"{RESULTS}/{{scene}}/initial_state.json",
+    wildcard_constraints:
+        scene=TRUE_SCENE,
     params:
         scene=scene_setting("shape", "size", "height", "center", "velocity", "spin", "density"),
         particles=SETTINGS.simulation.particles,
@@ -25,6 +27,8 @@ rule tracers:
         mesh=of_chain("mesh.ply"),
     output:
         tracers=f"{RESULTS}/{{scene}}/tracers.h5",
+    wildcard_constraints:
+        scene=TRUE_SCENE,
     params:
         tracers=SETTINGS.evaluation.tracers,
         seed=SETTINGS.seed,
@@ -47,6 +51,7 @@ rule evaluation:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
         metrics=f"{RESULTS}/{{scene}}/{{method}}/metrics.json",
     wildcard_constraints:
+        scene=TRUE_SCENE,
         method=LAW_METHOD,
     resources:
         gpu=GPU,

@@ -8,6 +8,8 @@ rule gaussians:
     output:
         gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
         report=f"{RESULTS}/{{scene}}/gaussians.json",
+    wildcard_constraints:
+        scene=OBJECT_SCENE,
     resources:
         gpu=GPU,
     params:

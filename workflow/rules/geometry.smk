@@ -7,6 +7,8 @@ rule mesh:
         gaussians=of_chain("gaussians.ply"),
     output:
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
+    wildcard_constraints:
+        scene=OBJECT_SCENE,
     params:
         surface=SETTINGS.geometry.surface.plain(),
     script:
@@ -19,6 +21,8 @@ rule sampled_particles:
         mesh=of_chain("mesh.ply"),
     output:
         particles=f"{RESULTS}/{{scene}}/sampled_particles.h5",
+    wildcard_constraints:
+        scene=OBJECT_SCENE,
     params:
         wanted=SETTINGS.simulation.particles,
         sampling=SETTINGS.geometry.sampling,

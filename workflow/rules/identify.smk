@@ -36,7 +36,7 @@ rule identified_page:
     output:
         page=f"{RESULTS}/{{scene}}/identified.png",
     params:
-        law=scene_setting("law"),
+        law=known_law,
     script:
         "../scripts/identified_page.py"
 

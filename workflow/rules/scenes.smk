@@ -3,6 +3,7 @@
 import re
 from types import SimpleNamespace
 
+from neuma_lib.config.settings import NO_TRUTH
 from neuma_lib.config.variants import folder
 from workflow.inputs import image_list
 
@@ -100,16 +101,25 @@ def scene_setting(*names):
     @checked
     def choose(wildcards):
         scene = SETTINGS.scene(wildcards.scene).plain()
+        if scene["captured"] and any(scene[name] is None for name in names):
+            raise InputError(f"{wildcards.scene}: {NO_TRUTH}")
         return scene[names[0]] if len(names) == 1 else {name: scene[name] for name in names}
 
     return choose
 
 
+def known_law(wildcards):
+    """The true law of a scene; None of a captured one."""
+    return SETTINGS.scene(wildcards.scene).plain()["law"]
+
+
 def origin_of(part, scene):
     """Whether a part ('static', 'dynamic', 'truth') of a scene is 'made', 'supplied' by the user or 'packed'.
 
-    A truth is not supplied: that of a scene with a video of the user's is simulated.
+    A truth is not supplied: that of a scene with a video of the user's is simulated. All of a capture is 'captured'.
     """
+    if SETTINGS.scenes[scene].captured:
+        return "captured"
     if getattr(SETTINGS.scenes[scene].images, "dynamic" if part == "truth" else part):
         return "made" if part == "truth" else "supplied"
     return "packed" if SETTINGS.dataset.packed else "made"
@@ -150,12 +160,17 @@ def frame_steps(wildcards):
 
 def simulation_settings(wildcards):
     """Constants of the simulator for a scene."""
-    return simulator(SETTINGS.scene(wildcards.scene).dt)
+    scene = SETTINGS.scene(wildcards.scene)
+    return simulator(scene.dt, scale=scene.captured.scale if scene.captured else 1.0)
 
 
-def simulator(dt, grid=None):
-    """Constants of the simulator with a time step [s], on the reconstruction's grid unless another is given."""
+def simulator(dt, grid=None, scale=1.0):
+    """Constants of the simulator with a time step [s], on the reconstruction's grid unless another is given.
+
+    Where all lengths are scaled, gravity is as well.
+    """
     section = SETTINGS.simulation.plain() | ({"grid": grid} if grid else {})
+    section["gravity"] = [scale * each for each in section["gravity"]]
     return {"dt": dt, **{name: section[name] for name in ("grid", "gravity", "boundary", "walls")}}
 
 

@@ -8,13 +8,16 @@ from pathlib import Path
 ROOT = Path(workflow.basedir).resolve()
 sys.path.insert(0, str(ROOT))
 
+from neuma_lib.capture.scenes import captured_scenes
+from neuma_lib.config.capture import CapturesConfig
 from neuma_lib.config.settings import load
 from neuma_lib.errors import InputError
 from workflow.defaults import complete
 from workflow.provenance import code_digest
 
 try:
-    SETTINGS = load(config)
+    root = (config.get("captures") or {}).get("root", CapturesConfig().root)
+    SETTINGS = load(config, captured=captured_scenes(str(root)))
 except InputError as error:
     raise WorkflowError(str(error)) from None
 
@@ -52,6 +55,21 @@ onstart:
                 f"{error}. Rules that wait for one: {', '.join(rules)}. Ground truth and images (target 'dataset')"
                 " need none."
             ) from None
+
+
+def names_of(scenes, chains=True):
+    """Pattern of the names of scenes, and of the folders of their chains."""
+    return f"({'|'.join(scenes) or 'none'})" + ("([+][^/]*)?" if chains else "")
+
+
+# Scenes of captures have no truth, and throws have the body and the motion that registration found.
+TRUE_SCENE = names_of(name for name, scene in SETTINGS.scenes.items() if not scene.captured)
+OBJECT_SCENE = names_of(
+    name for name, scene in SETTINGS.scenes.items() if not (scene.captured and scene.captured.throw)
+)
+THROW_SCENE = names_of(
+    (name for name, scene in SETTINGS.scenes.items() if scene.captured and scene.captured.throw), chains=False
+)
 
 
 wildcard_constraints:

@@ -9,6 +9,8 @@ rule velocity:
         prior=lambda wildcards: prior_file(wildcards.scene),
     output:
         velocity=f"{RESULTS}/{{scene}}/velocity.json",
+    wildcard_constraints:
+        scene=TRUE_SCENE,
     resources:
         gpu=GPU,
     params:

@@ -1,0 +1,95 @@
+"""The video of a throw on the simulator's clock: from mattes by each camera's clock to frames for training."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from neuma_lib.capture.timing import row_times
+from neuma_lib.errors import InputError
+
+LEAST_FRAMES = 8
+"""Frames after the start that a camera must have: fewer show no contact."""
+
+
+def frame_times(
+    frames: Sequence[Mapping[str, Any]], rows: np.ndarray, row_time: float, sensor_rows: int
+) -> np.ndarray:
+    """When a camera saw the object in each frame, by its clock, (T,) [s].
+
+    Args:
+        frames: entries with ``time`` [s] and ``h`` [px].
+        rows: y of the object's centre [px], (T,).
+        row_time: of a rolling shutter [s].
+        sensor_rows: rows of a frame as filmed.
+    """
+    times = np.array([frame["time"] for frame in frames])
+    return row_times(times, rows, row_time, frames[0]["h"], sensor_rows)
+
+
+def chosen_frames(times: np.ndarray, duration: float, most: int, name: str) -> np.ndarray:
+    """Indices of at most ``most`` frames, evenly spread over the time from 0 to ``duration`` [s].
+
+    Args:
+        times: after the start, ascending, (T,) [s].
+        name: of throw and camera, for messages.
+
+    Raises:
+        InputError: fewer than `LEAST_FRAMES` lie in it.
+    """
+    inside = np.flatnonzero((times >= 0) & (times <= duration))
+    if len(inside) < LEAST_FRAMES:
+        raise InputError(
+            f"{name}: only {len(inside)} frames show the object in the {duration:g} s after the start of its flight: "
+            "film until it rests, state a longer `duration` in capture.yaml, and look at the contact sheet of the masks"
+        )
+    places = np.linspace(0, len(inside) - 1, min(most, len(inside)))
+    return inside[np.round(places).astype(int)]
+
+
+def reduced(rgba: np.ndarray, width: int) -> np.ndarray:
+    """Straight-alpha RGBA (H, W, 4), uint8, averaged to a longer side of ``width`` pixels; never enlarged.
+
+    Colours are averaged by coverage, so none of what lies under the background enters.
+    """
+    height, across = rgba.shape[:2]
+    factor = width / max(height, across)
+    if factor >= 1:
+        return rgba
+    size = (max(1, round(across * factor)), max(1, round(height * factor)))
+    plain = rgba.astype(np.float32)
+    plain[..., :3] *= plain[..., 3:] / 255
+    small = np.stack(
+        [
+            np.asarray(Image.fromarray(plain[..., k]).resize(size, Image.Resampling.BOX), np.float32)
+            for k in range(4)
+        ],
+        axis=-1,
+    )
+    small[..., :3] *= 255 / np.maximum(small[..., 3:], 1e-6)
+    small = np.clip(np.rint(small), 0, 255).astype(np.uint8)
+    small[small[..., 3] == 0] = 0
+    return small
+
+
+def reduced_intrinsics(frame: Mapping[str, Any], size: tuple[int, int]) -> dict[str, float]:
+    """Intrinsics of an entry for a picture of another width and height [px]."""
+    across, down = size[0] / frame["w"], size[1] / frame["h"]
+    return {
+        "fl_x": frame["fl_x"] * across,
+        "fl_y": frame["fl_y"] * down,
+        "cx": frame["cx"] * across,
+        "cy": frame["cy"] * down,
+        "w": size[0],
+        "h": size[1],
+    }
+
+
+def without_gain(rgba: np.ndarray, gain: Sequence[float]) -> np.ndarray:
+    """RGBA, uint8, with its colours divided by a camera's gain against the photographs, (3,)."""
+    pixels = rgba.copy()
+    pixels[..., :3] = np.clip(np.rint(rgba[..., :3] / np.asarray(gain, np.float32)), 0, 255).astype(np.uint8)
+    return pixels
