@@ -32,6 +32,7 @@ include: "workflow/rules/figure_table.smk"
 include: "workflow/rules/figures.smk"
 include: "workflow/rules/capturing.smk"
 include: "workflow/rules/capture_motion.smk"
+include: "workflow/rules/released_captures.smk"
 include: "workflow/rules/capture_scenes.smk"
 
 

@@ -37,7 +37,7 @@ def agreement(masks: Sequence[np.ndarray], viewmats: np.ndarray, Ks: np.ndarray)
         InputError: no place in space lies in most of the masks.
     """
     centres = np.stack([centroid(mask) for mask in masks])
-    middle = _nearest(centres, viewmats, Ks)
+    middle = nearest_point(centres, viewmats, Ks)
     depths = viewmats[:, 2, :3] @ middle + viewmats[:, 2, 3]
     radii = np.array([np.sqrt(mask.sum() / np.pi) for mask in masks]) * depths / Ks[:, 0, 0]
     if not (depths > 0).any():
@@ -60,7 +60,7 @@ _APART = (
 )
 
 
-def _nearest(centres: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> np.ndarray:
+def nearest_point(centres: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> np.ndarray:
     """The point nearest to the rays through places in the pictures; weights make single bad ones harmless."""
     rays = np.concatenate(
         [(centres - Ks[:, :2, 2]) / Ks[:, [0, 1], [0, 1]], np.ones((len(centres), 1))], axis=1

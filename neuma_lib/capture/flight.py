@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from neuma_lib.capture.agreement import agreement
-from neuma_lib.capture.free_fall import FreeFall, Track, check_gravity, fit_flight
+from neuma_lib.capture.free_fall import FreeFall, Track, check_gravity, fit_flight, told_gravity
 from neuma_lib.capture.spin import Spin, fit_spin, follow
 from neuma_lib.capture.timing import Offset, choose_offset, offset_from_motion, offset_from_sound, row_times
 from neuma_lib.errors import InputError
@@ -88,7 +88,7 @@ class Flight:
     gravity: str
 
 
-def find_flight(views: Sequence[Filmed], name: str) -> Flight:
+def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flight:
     """Fit the free flight of a throw.
 
     One camera alone is taken to see the object fall above the middle of the room, across its view.
@@ -96,6 +96,7 @@ def find_flight(views: Sequence[Filmed], name: str) -> Flight:
     Args:
         views: of the cameras, the first of which keeps the time.
         name: of the throw, for messages.
+        metric: whether the room's lengths are metres, which gravity then checks.
 
     Raises:
         InputError: a camera saw no free flight, nothing tells the time between two, no flight fits, or gravity is off
@@ -121,7 +122,7 @@ def find_flight(views: Sequence[Filmed], name: str) -> Flight:
     stated = [view.offset is not None for view in views]
     plane = _plane(views[0]) if len(views) == 1 else None
     fall, kept = fit_flight(tracks, plane, offsets, stated)
-    gravity = check_gravity(fall, UP, name)
+    gravity = check_gravity(fall, UP, name) if metric else told_gravity(fall, UP, name)
     frames, paths = [], []
     for number, (view, flying, part) in enumerate(zip(views, inside, kept)):
         used = flying[part]

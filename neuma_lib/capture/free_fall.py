@@ -261,21 +261,27 @@ def _height(track: Track) -> float:
     return 2 * float(track.K[1, 2])
 
 
-def check_gravity(fall: FreeFall, normal: Sequence[float], name: str) -> str:
+def told_gravity(fall: FreeFall, normal: Sequence[float], name: str) -> str:
     """A line that tells the measured gravity.
 
     Args:
         normal: of the floor, upward, (3,).
         name: of the videos, for messages.
+    """
+    (ratio, deviation), (angle, angle_deviation) = fall.ratio, fall.angle(normal)
+    return (
+        f"{name}: gravity is {ratio:.3f} +- {deviation:.3f} of {GRAVITY} m/s^2, {angle:.1f} +- {angle_deviation:.1f}"
+        f" degrees from the floor's normal ({fall.views}, {fall.rms:.2f} px)"
+    )
+
+
+def check_gravity(fall: FreeFall, normal: Sequence[float], name: str) -> str:
+    """The line of `told_gravity`.
 
     Raises:
         InputError: it differs from 9.81 m/s^2 downward by more than `MOST_MISMATCH`, as a vector.
     """
-    (ratio, deviation), (angle, angle_deviation) = fall.ratio, fall.angle(normal)
-    line = (
-        f"{name}: gravity is {ratio:.3f} +- {deviation:.3f} of {GRAVITY} m/s^2, {angle:.1f} +- {angle_deviation:.1f}"
-        f" degrees from the floor's normal ({fall.views}, {fall.rms:.2f} px)"
-    )
+    line, (ratio, _), (angle, _) = told_gravity(fall, normal, name), fall.ratio, fall.angle(normal)
     up = np.asarray(normal, float) / np.linalg.norm(normal)
     if np.linalg.norm(fall.a / GRAVITY + up) <= MOST_MISMATCH:
         return line

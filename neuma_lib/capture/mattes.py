@@ -56,15 +56,23 @@ def metric_camera(frame: Mapping[str, Any], world: Mapping[str, Any]) -> tuple[n
     return np.linalg.inv(pose @ OPENGL_TO_OPENCV), K
 
 
+def world_of(room: str | Path) -> dict[str, Any]:
+    """What the room's transforms.json says of its world, which is that of all that is made from it."""
+    data = read_transforms(room)
+    return {key: data[key] for key in ("world", "room") if key in data}
+
+
 def write_mattes(
-    path: str | Path, mattes: Iterable[tuple[dict[str, Any], np.ndarray, np.ndarray]], room: str | Path
+    path: str | Path,
+    mattes: Iterable[tuple[dict[str, Any], np.ndarray, np.ndarray]],
+    world: Mapping[str, Any],
 ) -> None:
     """Write a transforms.json and the RGBA pictures that it lists.
 
     Args:
         path: .../transforms.json.
         mattes: entry, with the ``file_path`` to write to, pixels (H, W, 3), uint8, and mask (H, W) of each picture.
-        room: the room's transforms.json, whose ``world`` is that of the mattes.
+        world: entries of the file that say which world its cameras are in, see `world_of`.
     """
     folder = Path(path).parent
     folder.mkdir(parents=True, exist_ok=True)
@@ -76,5 +84,4 @@ def write_mattes(
         with atomic(folder / frame["file_path"]) as partial:
             Image.fromarray(rgba).save(partial, "PNG")
         frames.append({key: value for key, value in frame.items() if key != "sha256"})
-    data = read_transforms(room)
-    write_transforms(path, {}, frames, **{key: data[key] for key in ("world", "room") if key in data})
+    write_transforms(path, {}, frames, **world)

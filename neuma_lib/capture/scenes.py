@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from neuma_lib.capture.folder import NAME, Capture, read_capture
+from neuma_lib.capture.released import released_captures
+from neuma_lib.config.capture import ReleasedConfig
 from neuma_lib.config.validation import hint
 from neuma_lib.errors import InputError
 
 
-def captured_scenes(root: str | Path) -> dict[str, dict[str, Any]]:
-    """Settings of the scenes of all captures in a folder, by name.
+def captured_scenes(
+    root: str | Path, released: Mapping[str, ReleasedConfig] | None = None
+) -> dict[str, dict[str, Any]]:
+    """Settings of the scenes of all captures in a folder, and of released ones, by name.
 
     A capture ``mug`` is the scene ``mug``, what the photographs show, and a scene ``mug_<throw>`` for each throw. The
     law is that of the first throw by name that is not held out (`training_throws`), whose ``videos`` are the others of
     these. A capture that cannot be read has none here: its own rules say why.
     """
     found: dict[str, dict[str, Any]] = {}
+    for capture in released_captures(released or {}).values():
+        found |= scenes_of(capture)
     folders = sorted(p for p in Path(root).iterdir() if p.is_dir()) if Path(root).is_dir() else []
     for folder in folders:
         if not NAME.fullmatch(folder.name):

@@ -195,11 +195,52 @@ class CaptureConfig(Section):
         return self
 
 
+class ReleasedConfig(Section):
+    """A capture of Spring-Gaus, or of the copy of them by NeuMA's authors: where it lies, and what is not in it."""
+
+    folder: str = Field(
+        description="`real_capture` of Spring-Gaus, with all of its objects, or NeuMA's folder of the object"
+    )
+    object: str | None = Field(None, description="name of the object in the files; null: that of the capture")
+    photographs: str | None = Field(
+        None,
+        description="`real_capture` of Spring-Gaus, for its photographs, where `folder` is NeuMA's, which has none",
+    )
+    ground: float | None = Field(
+        None, description="z of the floor in the files' world; null: as in Spring-Gaus' settings"
+    )
+    scale: float = Field(
+        0.75,
+        gt=0,
+        description="metres to a unit of the files' world, which is not metric: free fall in it is reported to be 1.33 "
+        "times too fast. What the frames before contact say is in `flight/first.json`",
+    )
+    contact: int | None = Field(
+        None, ge=5, description="number of the frame of the first contact; null: as the files say, or 5"
+    )
+    prior: str = Field("jelly", description="as in capture.yaml")
+    density: float = Field(1000.0, gt=0, description="as in capture.yaml [kg/m^3]")
+    dt: float = Field(1 / 1920, gt=0, lt=0.01, description="time step [s]; a frame of 1/120 s has 16 of them")
+    longest: int = Field(
+        1000, ge=64, le=8192, description="longer side of the photographs that are kept [px]"
+    )
+    width: int = Field(160, ge=32, le=2048, description="as in capture.yaml [px]")
+
+    def as_capture(self) -> CaptureConfig:
+        """What a capture.yaml would say of it."""
+        same = ("prior", "density", "dt", "longest", "width")
+        return CaptureConfig(poses="released", **{key: getattr(self, key) for key in same})
+
+
 class CapturesConfig(Section):
     """Own photographs and videos ([guide](capture.md)): where they lie, and the board that is printed for them."""
 
     root: str = Field("captures", description="folder with a folder for each capture")
     paper: Literal["A4", "A3"] = Field("A4", description="page that the board is printed on")
+    released: dict[str, ReleasedConfig] = Field(
+        {},
+        description="captures of Spring-Gaus and of NeuMA's authors, by name; each makes the scene `<name>_first`",
+    )
     printed: BoardConfig = Field(
         BoardConfig(square=0.030),
         description="the board as printed; what a print measures stands in capture.yaml",

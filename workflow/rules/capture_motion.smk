@@ -22,6 +22,8 @@ rule capture_photograph_masks:
         transforms=f"{DATA}/{{capture}}/static/transforms.json",
         report=f"{RESULTS}/{{capture}}/masks/photographs.json",
         sheet=f"{RESULTS}/{{capture}}/masks/photographs.png",
+    wildcard_constraints:
+        capture=OWN_CAPTURE,
     conda:
         CAPTURE_ENVIRONMENT
     params:
@@ -44,6 +46,8 @@ rule capture_video_masks:
         transforms=MATTES,
         report=f"{VIDEO_MASKS}.json",
         sheet=f"{VIDEO_MASKS}.png",
+    wildcard_constraints:
+        capture=OWN_CAPTURE,
     conda:
         CAPTURE_ENVIRONMENT
     resources:
@@ -66,11 +70,14 @@ rule capture_flight:
     output:
         flight=f"{FLIGHT}.json",
         picture=f"{FLIGHT}.png",
+    wildcard_constraints:
+        capture=OWN_CAPTURE,
     conda:
         CAPTURE_ENVIRONMENT
     params:
         cameras=filmed_cameras,
         timing=camera_timing,
+        metric=True,
         name="{capture}, {throw}",
     script:
         "../scripts/capture_flight.py"

@@ -4,6 +4,7 @@ from functools import cache
 from types import SimpleNamespace
 
 from neuma_lib.capture.folder import NAME, inside, read_capture
+from neuma_lib.capture.released import released_captures
 
 CAPTURES = SETTINGS.captures.root.rstrip("/")
 CAPTURE_ENVIRONMENT = "../../envs/conda-capture.yaml"
@@ -22,15 +23,22 @@ OF_VIDEOS = (
 POSES_THREADS = 8  # for matches; all that there are where these are fewer
 
 
+# Results of others lie in folders of these names.
+OTHERS = f"{TRUE_SCENE}|figures|logs|benchmarks|experiments|priors"
+RELEASED_CAPTURE = names_of(SETTINGS.captures.released, chains=False)
+OWN_CAPTURE = f"(?!({OTHERS}|{RELEASED_CAPTURE})/){NAME.pattern}"
+
+
 wildcard_constraints:
-    # results of others lie in folders of these names
-    capture=f"(?!({TRUE_SCENE}|figures|logs|benchmarks|experiments|priors)/){NAME.pattern}",
+    capture=f"(?!({OTHERS})/){NAME.pattern}",
     throw=NAME.pattern,
     camera=NAME.pattern,
 
 
 @cache
 def capture_named(name):
+    if name in SETTINGS.captures.released:
+        return released_captures({name: SETTINGS.captures.released[name]})[name]
     return read_capture(f"{CAPTURES}/{name}")
 
 

@@ -21,6 +21,8 @@ rule capture_frames:
     output:
         timeline=f"{RESULTS}/{{capture}}/frames/{{throw}}/{{camera}}.json",
         sheet=f"{RESULTS}/{{capture}}/frames/{{throw}}/{{camera}}.png",
+    wildcard_constraints:
+        capture=OWN_CAPTURE,
     params:
         rate=filmed_rate,
         name=lambda wildcards: f"{wildcards.capture}, {wildcards.throw}, {wildcards.camera}",
@@ -38,6 +40,8 @@ rule capture_poses:
         poses=f"{RESULTS}/{{capture}}/poses.json",
         points=f"{RESULTS}/{{capture}}/points.ply",
         picture=f"{RESULTS}/{{capture}}/poses.png",
+    wildcard_constraints:
+        capture=OWN_CAPTURE,
     conda:
         CAPTURE_ENVIRONMENT
     threads: POSES_THREADS
@@ -65,6 +69,8 @@ rule capture_room:
         report=f"{RESULTS}/{{capture}}/room.json",
         cameras=f"{RESULTS}/{{capture}}/cameras.png",
         floor=f"{RESULTS}/{{capture}}/floor.png",
+    wildcard_constraints:
+        capture=OWN_CAPTURE,
     conda:
         CAPTURE_ENVIRONMENT
     params:

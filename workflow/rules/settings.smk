@@ -11,13 +11,14 @@ sys.path.insert(0, str(ROOT))
 from neuma_lib.capture.scenes import captured_scenes
 from neuma_lib.config.capture import CapturesConfig
 from neuma_lib.config.settings import load
+from neuma_lib.config.validation import validate
 from neuma_lib.errors import InputError
 from workflow.defaults import complete
 from workflow.provenance import code_digest
 
 try:
-    root = (config.get("captures") or {}).get("root", CapturesConfig().root)
-    SETTINGS = load(config, captured=captured_scenes(str(root)))
+    captures = validate(CapturesConfig, config.get("captures") or {}, "captures")
+    SETTINGS = load(config, captured=captured_scenes(captures.root, captures.released))
 except InputError as error:
     raise WorkflowError(str(error)) from None
 

@@ -14,9 +14,10 @@ from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
+    videos = inputs.get("videos")
     files = zip(
         params.cameras,
-        listed(inputs.videos),
+        listed(videos) if videos else [None] * len(params.cameras),
         listed(inputs.transforms),
         listed(inputs.reports),
         listed(inputs.timelines),
@@ -25,7 +26,7 @@ def main(inputs, output, params, run) -> None:
         strict=True,
     )
     views = [filmed(*values) for values in files]
-    flight = find_flight(views, params.name)
+    flight = find_flight(views, params.name, params.metric)
     draw_flight(output.picture, flight, views, flight.gravity)
     write_json(output.flight, report(flight, views))
     for line in [*flight.offsets_from, flight.gravity]:
@@ -52,7 +53,7 @@ def filmed(camera, video, transforms, masks, timeline, offset, row_time) -> Film
         timeline["height"],
         row_time,
         # Sound is not slowed with the picture.
-        read_sound(Path(video)) if timeline["stretch"] == 1 else None,
+        read_sound(Path(video)) if video and timeline["stretch"] == 1 else None,
         offset,
     )
 

@@ -9,7 +9,7 @@ from neuma_lib.capture.folder import PHOTOGRAPHS
 from neuma_lib.capture.frames import Frame
 from neuma_lib.capture.lens import read_lens
 from neuma_lib.capture.masks import overlay, photograph_mask
-from neuma_lib.capture.mattes import metric_camera, own_mask, read_pixels, room_frames, write_mattes
+from neuma_lib.capture.mattes import metric_camera, own_mask, read_pixels, room_frames, world_of, write_mattes
 from neuma_lib.capture.pictures import picture_sheet
 from neuma_lib.capture.saliency import Saliency
 from neuma_lib.errors import InputError
@@ -57,7 +57,7 @@ def main(inputs, output, params, run) -> None:
         for frame, name, pixels, mask, good in zip(frames, names, pictures, masks, kept)
         if good
     ]
-    write_mattes(output.transforms, mattes, inputs.room)
+    write_mattes(output.transforms, mattes, world_of(inputs.room))
     write_json(
         output.report,
         {

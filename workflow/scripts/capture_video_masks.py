@@ -7,7 +7,7 @@ import numpy as np
 from neuma_lib.capture.frames import contact_sheet, read_frames, read_timeline, sheet_numbers
 from neuma_lib.capture.lens import read_lens
 from neuma_lib.capture.masks import area_jumps, check_flight, given_masks, overlay, video_masks
-from neuma_lib.capture.mattes import own_mask, read_pixels, room_frames, write_mattes
+from neuma_lib.capture.mattes import own_mask, read_pixels, room_frames, world_of, write_mattes
 from neuma_lib.capture.pictures import undistorted
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import read_json, write_json
@@ -53,7 +53,7 @@ def main(inputs, output, params, run) -> None:
         )
         for i in there
     )
-    write_mattes(output.transforms, mattes, inputs.room)
+    write_mattes(output.transforms, mattes, world_of(inputs.room))
     flying = found.areas[arc[0] : arc[1] + 1] if arc else found.areas[:0]
     write_json(
         output.report,

@@ -1,0 +1,66 @@
+"""Captures of Spring-Gaus and of NeuMA's authors, whose cameras and masks lie beside them. Needs capture_motion.smk."""
+
+
+def released_settings(wildcards):
+    return SETTINGS.captures.released[wildcards.capture].plain()
+
+
+@checked
+def released_folders(wildcards):
+    settings = SETTINGS.captures.released[wildcards.capture]
+    return [folder for folder in (settings.folder, settings.photographs) if folder]
+
+
+rule released_photographs:
+    input:
+        folders=released_folders,
+    output:
+        transforms=f"{DATA}/{{capture}}/static/transforms.json",
+        report=f"{RESULTS}/{{capture}}/masks/photographs.json",
+        sheet=f"{RESULTS}/{{capture}}/masks/photographs.png",
+    wildcard_constraints:
+        capture=RELEASED_CAPTURE,
+    conda:
+        CAPTURE_ENVIRONMENT
+    params:
+        settings=released_settings,
+        name="{capture}",
+    script:
+        "../scripts/released_photographs.py"
+
+
+rule released_video:
+    input:
+        folders=released_folders,
+    output:
+        transforms=MATTES,
+        report=f"{VIDEO_MASKS}.json",
+        timeline=f"{RESULTS}/{{capture}}/frames/{{throw}}/{{camera}}.json",
+        sheet=f"{VIDEO_MASKS}.png",
+    wildcard_constraints:
+        capture=RELEASED_CAPTURE,
+    conda:
+        CAPTURE_ENVIRONMENT
+    params:
+        settings=released_settings,
+        name="{capture}",
+        camera="{camera}",
+    script:
+        "../scripts/released_video.py"
+
+
+# One clock for all cameras. The world is not metric, so gravity is no check, and is only told.
+use rule capture_flight as released_flight with:
+    input:
+        transforms=of_throw(MATTES),
+        reports=of_throw(f"{VIDEO_MASKS}.json"),
+        timelines=of_throw(f"{RESULTS}/{{capture}}/frames/{{throw}}/{{camera}}.json"),
+    wildcard_constraints:
+        capture=RELEASED_CAPTURE,
+    params:
+        cameras=filmed_cameras,
+        timing=lambda wildcards: {
+            key: [0.0] * len(filmed_cameras(wildcards)) for key in ("offsets", "row_times")
+        },
+        metric=False,
+        name="{capture}, {throw}",

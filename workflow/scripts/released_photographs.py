@@ -1,0 +1,53 @@
+"""Mattes of the photographs of a released capture, whose own world is brought about to the size of the videos."""
+
+import numpy as np
+
+from neuma_lib.capture.agreement import agreement
+from neuma_lib.capture.frames import Frame
+from neuma_lib.capture.masks import overlay
+from neuma_lib.capture.mattes import metric_camera, write_mattes
+from neuma_lib.capture.pictures import picture_sheet
+from neuma_lib.capture.released import (
+    photographs_about_to_size,
+    read_configured,
+    read_shots,
+    room_cameras,
+    seen_size,
+)
+from neuma_lib.config.capture import ReleasedConfig
+from neuma_lib.io.files import write_json
+from workflow.stage import run_script
+
+
+def main(inputs, output, params, run) -> None:
+    settings = ReleasedConfig(**params.settings)
+    found = read_configured(params.name, settings)
+    first = [shots[0] for shots in found.videos.values()]
+    viewmats = room_cameras(np.stack([shot.viewmat for shot in first]), found.ground, settings.scale)
+    lenses = [shot.lens.resized(settings.longest) for shot in first]
+    filmed = [mask for _, mask in read_shots(first, settings.longest)]
+    middle, radius = seen_size(filmed, viewmats, np.stack([lens.K for lens in lenses]))
+    pictures, masks = [], []
+    for number, (pixels, mask) in enumerate(read_shots(found.photographs, settings.longest)):
+        pictures.append(pixels)
+        masks.append(mask)
+        run.progress(number + 1, len(found.photographs))
+    frames, world = photographs_about_to_size(
+        found.photographs, masks, settings.longest, radius, float(middle[1])
+    )
+    cameras, Ks = map(np.stack, zip(*(metric_camera(frame, {}) for frame in frames)))
+    agreed = agreement(masks, cameras, Ks)
+    names = [shot.picture.stem for shot in found.photographs]
+    said = f"{len(names)} photographs, IoU {agreed.mean():.2f} of their masks with the body that they leave"
+    shown = [
+        (f"{name}: {value:.2f}", overlay(Frame(0, 0.0, pixels), mask).pixels)
+        for name, value, pixels, mask in zip(names, agreed, pictures, masks)
+    ]
+    picture_sheet(output.sheet, shown, f"{params.name}: {said}", 6)
+    write_mattes(output.transforms, zip(frames, pictures, masks, strict=True), world)
+    report = {"photographs": len(names), "agreement": dict(zip(names, agreed.tolist())), "left_out": []}
+    write_json(output.report, {**report, "own": names})
+    run.say(said)
+
+
+run_script(main, snakemake)

@@ -1,0 +1,39 @@
+"""Mattes of the frames of one camera of a released capture, with their times, and where the free flight is."""
+
+import numpy as np
+
+from neuma_lib.capture.frames import Frame, contact_sheet, sheet_numbers
+from neuma_lib.capture.masks import overlay
+from neuma_lib.capture.mattes import write_mattes
+from neuma_lib.capture.released import IN_BOX, RATE, read_configured, read_shots, video_frames
+from neuma_lib.config.capture import ReleasedConfig
+from neuma_lib.io.files import write_json
+from workflow.stage import run_script
+
+
+def main(inputs, output, params, run) -> None:
+    settings = ReleasedConfig(**params.settings)
+    found = read_configured(params.name, settings)
+    shots = found.videos[params.camera]
+    frames = video_frames(shots, found.ground, settings.scale, settings.longest)
+    pictures, masks = zip(*read_shots(shots, settings.longest))
+    write_mattes(output.transforms, zip(frames, pictures, masks, strict=True), IN_BOX)
+    numbers = [shot.number for shot in shots]
+    flying = [number for number in numbers if number < found.contact]
+    said = f"{len(shots)} frames, free flight in frames {flying[0]} to {flying[-1]}"
+    sheet = [
+        overlay(Frame(shots[i].number, frames[i]["time"], pictures[i]), masks[i])
+        for i in sheet_numbers(len(shots))
+    ]
+    contact_sheet(output.sheet, sheet, f"{params.name}, {params.camera}: {said}")
+    areas = [int(mask.sum()) for mask in masks]
+    report = {"frames": len(shots), "shown": numbers, "arcs": [[flying[0], flying[-1]]], "areas": areas}
+    write_json(output.report, {**report, "largest_jump": None, "moving": 0.0, "own": len(shots)})
+    timeline = {"frames": len(shots), "rate": RATE, "steady": True, "lost_before": [], "stretch": 1.0}
+    size = {"width": shots[0].lens.width, "height": shots[0].lens.height}
+    times = [frame["time"] for frame in frames]
+    write_json(output.timeline, {**timeline, **size, "times_s": np.asarray(times).tolist()})
+    run.say(said)
+
+
+run_script(main, snakemake)
