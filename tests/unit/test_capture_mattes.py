@@ -55,7 +55,7 @@ def test_mattes_are_read_as_they_were_written(room, tmp_path):
     pixels = np.full((HEIGHT, WIDTH, 3), (200, 60, 50), np.uint8)
     masks = [disc(30 + 5 * i) for i in range(3)]
     entries = [({**still, "file_path": f"{i}.png", "step": i}, pixels, mask) for i, mask in enumerate(masks)]
-    mattes.write_mattes(tmp_path / "out/transforms.json", entries, path)
+    mattes.write_mattes(tmp_path / "out/transforms.json", entries, mattes.world_of(path))
     found = read_image_set(tmp_path / "out/transforms.json")
     # A straight edge blurred has its half at the same place; on a disc of 9 px a few pixels of 254 differ.
     for image, mask in zip(found.images, masks):

@@ -185,3 +185,20 @@ def of_filmed(pattern):
 def of_thrown_capture(choose):
     """A function of a scene that is a throw: something of its capture."""
     return of_thrown(of_capture(choose))
+
+
+def released_settings(wildcards):
+    return SETTINGS.captures.released[wildcards.capture].plain()
+
+
+@checked
+def released_folders(wildcards):
+    settings = SETTINGS.captures.released[wildcards.capture]
+    return [folder for folder in (settings.folder, settings.photographs) if folder]
+
+
+@checked
+def one_clock(wildcards):
+    """The timing of cameras that share a clock."""
+    still = [0.0] * len(filmed_cameras(wildcards))
+    return {"offsets": still, "row_times": still}

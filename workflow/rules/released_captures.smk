@@ -1,16 +1,6 @@
 """Captures of Spring-Gaus and of NeuMA's authors, whose cameras and masks lie beside them. Needs capture_motion.smk."""
 
 
-def released_settings(wildcards):
-    return SETTINGS.captures.released[wildcards.capture].plain()
-
-
-@checked
-def released_folders(wildcards):
-    settings = SETTINGS.captures.released[wildcards.capture]
-    return [folder for folder in (settings.folder, settings.photographs) if folder]
-
-
 rule released_photographs:
     input:
         folders=released_folders,
@@ -59,8 +49,6 @@ use rule capture_flight as released_flight with:
         capture=RELEASED_CAPTURE,
     params:
         cameras=filmed_cameras,
-        timing=lambda wildcards: {
-            key: [0.0] * len(filmed_cameras(wildcards)) for key in ("offsets", "row_times")
-        },
+        timing=one_clock,
         metric=False,
         name="{capture}, {throw}",
