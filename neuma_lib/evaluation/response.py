@@ -50,7 +50,13 @@ def material_tests(truth: Law, F: Tensor, rate: float, total_shear: float, dt: f
         total_shear: at its end.
         dt: time step [s].
     """
-    seen = Visited.of(F)
+    return tests_within(Visited.of(F), largest_shear_stress(truth, F), rate, total_shear, dt)
+
+
+def tests_within(
+    seen: Visited, shear_stress: float, rate: float, total_shear: float, dt: float
+) -> dict[str, PointTest]:
+    """The same for ranges of visited states, and the largest shear stress in them [Pa]."""
     low, high = (1 + BEYOND * (end - 1) for end in seen.stretch)
     steps = round(total_shear / (rate * dt))
     total = rate * dt * torch.arange(steps + 1, dtype=torch.float64)
@@ -63,7 +69,7 @@ def material_tests(truth: Law, F: Tensor, rate: float, total_shear: float, dt: f
         "shear": PointTest(
             _axis(*(BEYOND * s for s in seen.shear)), partial(sheared, J=seen.pressed), seen.shear
         ),
-        "yield": PointTest(total, flow, (0.0, largest_shear_stress(truth, F)), by_stress=True),
+        "yield": PointTest(total, flow, (0.0, shear_stress), by_stress=True),
     }
 
 

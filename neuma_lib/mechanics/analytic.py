@@ -7,9 +7,11 @@ from difflib import get_close_matches
 from typing import Any
 
 from neuma_lib.errors import InputError
-from neuma_lib.mechanics.elasticity import ELASTICITIES
-from neuma_lib.mechanics.law import Law
+from neuma_lib.mechanics.elasticity import ELASTICITIES, AnalyticElasticity
+from neuma_lib.mechanics.law import Law, Plasticity
 from neuma_lib.mechanics.plasticity import PLASTICITIES
+
+NAMES = {kind: name for name, kind in (ELASTICITIES | PLASTICITIES).items()}
 
 
 def analytic_law(spec: Mapping[str, Any], dt: float | None = None, name: str | None = None) -> Law:
@@ -46,6 +48,15 @@ def analytic_law(spec: Mapping[str, Any], dt: float | None = None, name: str | N
             raise InputError(f"plasticity {plastic_name} depends on the rate: give the time step dt")
         plastic["dt"] = dt
     return Law(elasticity, plastic_type(**plastic), name or f"{elastic_name} + {plastic_name}")
+
+
+def specification(elasticity: AnalyticElasticity, plasticity: Plasticity) -> dict[str, Any]:
+    """The specification of two analytic parts, complete: with E, nu and dt where a plasticity has them."""
+    parts = {"elasticity": elasticity, "plasticity": plasticity}
+    return {
+        name: {"name": NAMES[type(part)], **{key: float(value) for key, value in part.values.items()}}
+        for name, part in parts.items()
+    }
 
 
 def _choose(part: str, values: Mapping[str, Any], choices: Mapping[str, type]) -> type:

@@ -60,9 +60,8 @@ from torch.nn.functional import pad
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics import structured_kernels as kernels
 from neuma_lib.mechanics.adaptor import LAYER_KEYS, AdaptableConstitutive, AdaptableLaw
-from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.analytic import NAMES, analytic_law, specification
 from neuma_lib.mechanics.elasticity import (
-    ELASTICITIES,
     STRETCH_MIN,
     AnalyticElasticity,
     FixedCorotated,
@@ -72,7 +71,6 @@ from neuma_lib.mechanics.elasticity import (
 from neuma_lib.mechanics.isotropic import PAIRS, Quotients, coaxial_deformation, coaxial_stress, lame
 from neuma_lib.mechanics.law import Elasticity, Plasticity, Weights
 from neuma_lib.mechanics.plasticity import (
-    PLASTICITIES,
     DruckerPrager,
     Identity,
     ViscousFlow,
@@ -100,7 +98,6 @@ SHEAR_TERMS: dict[type[AnalyticElasticity], tuple[tuple[float, float], ...]] = {
     NeoHookean: ((1.0, 2.0),),
     FixedCorotated: ((2.0, 2.0), (-1.0, 1.0)),
 }
-NAMES = {kind: name for name, kind in (ELASTICITIES | PLASTICITIES).items()}
 FIRST, SECOND = map(list, zip(*PAIRS, strict=True))
 THIRD = [3 - i - j for i, j in PAIRS]
 
@@ -450,14 +447,8 @@ class StructuredLaw(AdaptableLaw):
 
     def specification(self) -> dict[str, Any]:
         """Form and base, for `structured_law`."""
-        parts = {
-            name: {"name": NAMES[type(part)], **{key: float(value) for key, value in part.values.items()}}
-            for name, part in (
-                ("elasticity", self.elasticity.analytic),
-                ("plasticity", getattr(self.plasticity, "analytic", self.plasticity)),
-            )
-        }
-        return {"form": self.elasticity.form, **parts}
+        base = getattr(self.plasticity, "analytic", self.plasticity)
+        return {"form": self.elasticity.form, **specification(self.elasticity.analytic, base)}
 
 
 def structured_law(

@@ -1,5 +1,7 @@
 """Figures: one entry of FIGURES (figure_table.smk) and one module of neuma_lib/evaluation/figures make one."""
 
+import re
+
 for figure, made_of in FIGURES.items():
 
     rule:

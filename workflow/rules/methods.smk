@@ -1,17 +1,13 @@
 """What methods start from, read and are told. Needs scenes.smk."""
 
+from neuma_lib.config import places
 from neuma_lib.config.methods import IDENTIFIED
 from neuma_lib.config.variants import parse_chain
 
 
 def prior_file(scene, method=None):
     """The prior of a scene, or of a method there, in its chain: made here, or the user's own if it is a path."""
-    name = SETTINGS.method_prior(scene, method) if method else SETTINGS.scene(scene).prior
-    if name == IDENTIFIED:
-        return home(scene, "priors/identified.safetensors")
-    if name not in SETTINGS.priors.laws:
-        return name
-    return f"{RESULTS}/priors/{folder(name, SETTINGS.chain(scene)[1], ['prior'])}.safetensors"
+    return places.prior_file(SETTINGS, scene, method)
 
 
 def prior_chain(wildcards):
@@ -78,8 +74,7 @@ def stock_base(wildcards):
 
 def identified_name(scene, method):
     """The file of what was identified for a method: in the views of its training, if these are its own."""
-    views = SETTINGS.identified_views(scene, method)
-    return f"identified+views={','.join(map(str, views))}.json" if views else "identified.json"
+    return places.identified_name(SETTINGS, scene, method)
 
 
 def identified_file(wildcards):
@@ -102,7 +97,7 @@ def identify_settings(wildcards):
 
 def pac_nerf_file(scene, method):
     """The law, and the throw, that PAC-NeRF found in a scene's video."""
-    return f"{RESULTS}/{SETTINGS.run_folder(scene, SETTINGS.method_training(method))}/constants.json"
+    return places.pac_nerf_file(SETTINGS, scene, method)
 
 
 @checked

@@ -1,38 +1,16 @@
 """Files and settings of scenes and experiments, each in its chain. Needs settings.smk."""
 
-import re
 from types import SimpleNamespace
 
+from neuma_lib.config import places
+from neuma_lib.config.places import FIELD
 from neuma_lib.config.settings import NO_TRUTH
-from neuma_lib.config.variants import folder
 from workflow.inputs import image_list
-
-FIELD = "pac_nerf/field.safetensors"
-# What a chain's seeds change in a file of a scene or an experiment (config/variants.py); runs of methods have
-# `Config.run_folder`.
-DRAWN_IN = {
-    **dict.fromkeys(
-        ["gaussians.ply", "gaussians.json", "mesh.ply", "tracers.h5", FIELD],
-        ["gaussians"],
-    ),
-    **dict.fromkeys(["sampled_particles.h5", "particles.h5", "binding.h5"], ["gaussians", "particles"]),
-    **dict.fromkeys(
-        ["velocity.json", "identified.json", "priors/identified.safetensors", "visited.h5"],
-        ["prior", "gaussians", "particles"],
-    ),
-}
 
 
 def home(name, file):
     """The one path of a file of a scene or experiment in a chain."""
-    base, seeds = SETTINGS.chain(name)
-    if base in SETTINGS.scenes:
-        drawn = DRAWN_IN[re.sub("[+]views=[0-9,]+", "", file)]
-        return f"{RESULTS}/{folder(base, seeds, drawn)}/{file}"
-    # Solids are filled with particles; where a scene's own object is among them, all that led to its start counts.
-    rebuilt = any(body.shape is None for body in SETTINGS.experiments[base].bodies)
-    drawn = DRAWN_IN["velocity.json"] if rebuilt else ["particles"]
-    return f"{RESULTS}/experiments/{folder(base, seeds, drawn)}/{file}"
+    return places.home(SETTINGS, name, file)
 
 
 def of_chain(file):

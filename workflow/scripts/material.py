@@ -14,7 +14,7 @@ from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_observation
-from neuma_lib.io.laws import load_law, save_adaptor
+from neuma_lib.io.laws import load_adaptable, save_adaptor
 from neuma_lib.io.particles import load_body, thrown
 from neuma_lib.mechanics.structured import structured_law
 from neuma_lib.sim.model import MPMModel
@@ -48,7 +48,7 @@ def main(inputs, output, params, run) -> None:
             for base in bases
         ]
     else:
-        laws = [load_law(inputs.prior)]
+        laws = [load_adaptable(inputs.prior, params.simulation["dt"])]
     laws = [law.to(device) for law in laws]
     for law in laws:
         law.attach_adaptor(settings.rank, settings.alpha, settings.seed)

@@ -7,7 +7,7 @@ from neuma_lib.device import choose_device
 from neuma_lib.fitting.velocity import estimate_velocity
 from neuma_lib.io.files import write_json
 from neuma_lib.io.images import load_observation
-from neuma_lib.io.laws import load_law
+from neuma_lib.io.laws import load_prior
 from neuma_lib.io.particles import load_body
 from neuma_lib.sim.model import MPMModel
 from workflow.stage import run_script
@@ -16,7 +16,8 @@ from workflow.stage import run_script
 def main(inputs, output, params, run) -> None:
     settings = VelocityConfig(**params.velocity)
     device = choose_device(params.device)
-    model, law = MPMModel(**params.simulation), load_law(inputs.prior).to(device)
+    model = MPMModel(**params.simulation)
+    law = load_prior(inputs.prior, device, model.dt)
     body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density)
     body = body.to(torch.float32, device)
     video = load_observation(inputs.transforms, settings.views).to(torch.float32, device)

@@ -1,0 +1,54 @@
+"""A law of two networks, from the file of `python -m neuma_lib export-law`, with numpy alone."""
+
+import json
+import math
+
+import numpy as np
+
+LAYERS = ("layers.0.fc.weight", "layers.1.fc.weight", "final_layer.fc.weight")
+erf = np.vectorize(math.erf, otypes=[float])  # scipy.special.erf is faster, if you have it
+
+
+def read(path):
+    """Arrays and metadata of a .safetensors file: the length of a header, the header (JSON), numbers."""
+    data = open(path, "rb").read()
+    start = 8 + int.from_bytes(data[:8], "little")
+    header = json.loads(data[8:start])
+    about = json.loads(header.pop("__metadata__")["neuma"])
+    numbers = {
+        name: np.frombuffer(data[start:][slice(*x["data_offsets"])], "<f4") for name, x in header.items()
+    }
+    return {name: numbers[name].reshape(x["shape"]).astype(float) for name, x in header.items()}, about
+
+
+def svd(F):
+    """U, sigma, Vh of F (N, 3, 3), with U Vh a rotation and the sign of det F in the last singular value."""
+    U, sigma, Vh = np.linalg.svd(F)
+    U[:, :, 2] *= (sign := np.linalg.det(U @ Vh))[:, None]
+    sigma[:, 2] *= sign
+    return U, sigma, Vh
+
+
+def load(path):
+    """Elasticity, F (N, 3, 3) -> Kirchhoff stress [Pa], plasticity, trial F -> F once a time step, and metadata."""
+    arrays, about = read(path)
+    if about["export"]["kind"] != "networks" or "rank" in about:
+        raise SystemExit(
+            f"{path} is no pair of merged networks: see isotropic_in_numpy.py, or leave out --apart"
+        )
+    W_e, W_p = ([arrays[f"{part}.{layer}"] for layer in LAYERS] for part in ("elasticity", "plasticity"))
+    elasticity = lambda F: network(F, W_e) @ F.swapaxes(1, 2)  # noqa: E731
+    plasticity = lambda F: F + 1e-3 * network(F, W_p)  # noqa: E731
+    return elasticity, plasticity, about["export"]
+
+
+def network(F, W):
+    """R X (N, 3, 3): the rotation of F, and the symmetric output of a network that reads invariants of F."""
+    U, sigma, Vh = svd(F)
+    strain = (F.swapaxes(1, 2) @ F - np.eye(3)).reshape(-1, 9)
+    z = np.concatenate([sigma - 1, strain, np.linalg.det(F)[:, None] - 1], axis=1)
+    for W_layer in W[:2]:
+        z = z @ W_layer.T
+        z = 0.5 * z * (1 + erf(z / math.sqrt(2)))  # GELU
+    Y = (z @ W[2].T).reshape(-1, 3, 3)
+    return U @ Vh @ (Y + Y.swapaxes(1, 2)) / 2
