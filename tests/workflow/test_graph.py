@@ -6,6 +6,9 @@ import shutil
 import pytest
 from project import SCENE, TABLE, copied
 
+from neuma_lib.config.places import law_files
+from neuma_lib.project import settings_around
+
 SUPERVISED = "neuma_particle_supervision"  # the one method that trains on the truth
 # Blender films the truth, a dataset is packed of it, evaluation measures against it, and these figures show it.
 MAY_READ_THE_TRUTH = {
@@ -201,6 +204,39 @@ def test_a_structured_law_corrects_what_the_video_shows(project):
         project.run("--dry-run", f"{SCENE}/neuma_structured+prior=jelly+start=estimated/metrics.json")
     )
     assert "identify" not in {rule for rule, *_ in graph}
+
+
+def test_the_command_line_exports_the_law_that_the_rule_exports(project):
+    """Of every kind of law, in a chain too: the files that `export-law` finds are those that the rule reads."""
+    settings, _ = settings_around(project.root, [project.root / "tests/workflow/tiny.yaml"])
+    methods = (
+        "neuma",
+        "nclaw",
+        "constants",
+        "neuma_structured",
+        "neuma+prior=identified",
+        "pac_nerf",
+        "true_law",
+    )
+    methods += ("neuma_structured+views=0,1", "neuma+law_from=JellyDuck")
+    scenes = ("BouncyBall", "BouncyBall+seed=1", "BouncyBall+prior_seed=1")
+    wanted = [(scene, method) for scene in scenes for method in methods]
+    targets = {
+        f"tiny/results/{scene}/{method}/export/law.safetensors": (scene, method) for scene, method in wanted
+    }
+    read = {
+        made[0]: set(inputs)
+        for rule, inputs, made in jobs(project.run("--dry-run", *targets))
+        if rule == "export_law"
+    }
+    for target, (scene, method) in targets.items():
+        files = law_files(settings, scene, method)
+        named = {files.identified, files.prior, files.adaptor} - {None}
+        own = {f"tiny/results/{scene}/{method}/{file}" for file in ("metrics.json", "rollout.h5")}
+        assert read[target] - own == {"tiny/data/kernels/laws.ready", *named} and bool(named) == (
+            files.spec is None
+        )
+        assert own <= read[target] or "law_from" in method
 
 
 def test_more_views_have_constants_of_their_own(project):

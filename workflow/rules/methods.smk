@@ -283,3 +283,15 @@ def evaluation_views(wildcards):
         [view for view in views if view not in used] for used in (seen, SETTINGS.material.views)
     )
     return list(SETTINGS.evaluation.views or unseen or others or seen)
+
+
+def own_result(file):
+    """A function of wildcards: a file of the same run; none where it would be another scene's, or there is no truth."""
+
+    @checked
+    def choose(wildcards):
+        scene = SETTINGS.law_scene(wildcards.scene, wildcards.method)
+        without = scene != wildcards.scene or SETTINGS.scene(scene).captured
+        return [] if without else f"{RESULTS}/{wildcards.scene}/{wildcards.method}/{file}"
+
+    return choose
