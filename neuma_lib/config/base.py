@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
 Vector = tuple[float, float, float]
+Compared = Literal["colour", "masks"]
+"""What of an image is compared."""
 
 
 class Section(BaseModel):

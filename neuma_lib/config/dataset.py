@@ -53,6 +53,12 @@ class DatasetConfig(Section):
     stride: int | None = Field(
         None, ge=1, description="steps between two frames; in place of frames, which is null then"
     )
+    sub_frames: int = Field(
+        5,
+        ge=1,
+        description="most renders that are averaged to one frame where transforms.json states its exposure; they are "
+        "at least a step apart. 1: motion blur is ignored",
+    )
     tracers: int = Field(100_000, gt=0, description="passive tracers that measure the motion of the truth")
     static: ImagesConfig = Field(ImagesConfig(views=50), description="views on a sphere at t = 0")
     dynamic: ImagesConfig = Field(

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from neuma_lib.config.base import Section
+from neuma_lib.config.base import Compared, Section
 from neuma_lib.config.laws import LawConfig
 
 
@@ -24,6 +24,7 @@ class IdentifyConfig(Section):
         description="views of the video that are used; for a method that trains on "
         "other views than material.views, such as neuma_structured+views=0,1, those",
     )
+    compare: Compared = Field("colour", description="what of the images counts, as `material.compare`")
     covariance_from: Literal["elastic", "total"] = Field(
         "total", description="deformation that stretches the Gaussians, as `material.covariance_from`"
     )

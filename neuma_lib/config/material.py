@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from neuma_lib.config.base import Section
+from neuma_lib.config.base import Compared, Section
 
 
 class MaterialConfig(Section):
@@ -20,6 +20,11 @@ class MaterialConfig(Section):
         "binding", description="bound volume particles, or the Gaussians themselves as particles (w/o Bind)"
     )
     views: tuple[int, ...] = Field((0,), min_length=1, description="training views of the video")
+    compare: Compared = Field(
+        "colour",
+        description="what of the images counts: colours over white, or masks alone, how far the body covers a pixel, "
+        "where the light differs from that of the photographs",
+    )
     rank: int | None = Field(
         16, ge=1, description="rank of the adaptor; null trains the base weights (w/o dM)"
     )

@@ -60,12 +60,18 @@ class ParticleGS:
 
     def splatted(self, means: Tensor, covars: Tensor) -> Tensor:
         """Images (T, V, H, W, 3) of deformed Gaussians, means (T, G, 3) [m] and covariances (T, G, 3, 3) [m^2]."""
+        return self._rasterized(means, covars)[0]
+
+    def coverage(self, x: Tensor, F: Tensor) -> Tensor:
+        """How far the body covers each pixel, (T, V, H, W, 1) in [0, 1], for states as they are rendered."""
+        return self._rasterized(*self.deformed(x, F))[1][..., None]
+
+    def _rasterized(self, means: Tensor, covars: Tensor) -> tuple[Tensor, Tensor]:
         views = self.cameras
-        images, _ = rasterize(
+        return rasterize(
             means, covars, self.gaussians.opacities, self._sh, views.viewmats, views.Ks, views.width, views.height,
             background=self.background, eps2d=self.eps2d,
         )  # fmt: skip
-        return images
 
     @property
     def frames_per_batch(self) -> int:

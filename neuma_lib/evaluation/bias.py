@@ -41,7 +41,7 @@ def frame_losses(
     Frames after a failure count as held at the last sound one.
     """
     with torch.no_grad():
-        path, failure = predict(model, law, start, loss.frames, total=loss.total)
+        path, failure = predict(model, law, start, loss.steps, total=loss.total)
         return loss(path).tolist(), failure
 
 

@@ -24,6 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,7 @@ from neuma_lib.fitting.throw import Throw
 from neuma_lib.fitting.thrown_video import MOTION, NUISANCES, ThrownVideo, Try, averaged
 from neuma_lib.mechanics.combinations import Values
 from neuma_lib.sim.model import MPMModel
-from neuma_lib.splatting.observation import Observation
+from neuma_lib.splatting.observation import Observation, joint_frames, several
 
 _LAST_GAIN = 0.1  # of `least_gain`, in the last round
 _LEAST_LOSS = 1e-12  # below it, held-out images agree exactly
@@ -56,12 +57,12 @@ def identify(
     model: MPMModel,
     throw: Throw,
     body: Reconstruction,
-    observation: Observation,
+    observation: Observation | Sequence[Observation],
     settings: IdentifyConfig,
     stock: Mapping[str, Mapping[str, Any]] | None = None,
     *,
     finer: Sequence[Sequence[Reconstruction]] = (),
-    further: Sequence[tuple[Throw, Reconstruction, Observation]] = (),
+    further: Sequence[tuple[Throw, Reconstruction, Observation | Sequence[Observation]]] = (),
     progress: Callable[[int, int, float], None] | None = None,
     log: Callable[[str], None] = lambda text: None,
 ) -> Identified:
@@ -71,7 +72,8 @@ def identify(
         model: simulator constants.
         throw: how the body is thrown, as the frames before contact tell.
         body: reconstructed particles and Gaussians.
-        observation: the video; its views are those of the settings.
+        observation: the video, or several of the same throw by cameras of other times, sizes or exposures; their views
+            are those of the settings.
         settings: candidates and hyper-parameters.
         stock: specification of the law that the scene's prior was trained on: another start; None if unknown.
         finer: of each video, the same body filled anew with more particles, once or several times; none: what the
@@ -85,7 +87,7 @@ def identify(
         NonFiniteError: every family diverges from every start.
     """
     given = [(throw, body, observation), *further]
-    if min(len(seen.frames) for *_, seen in given) < 4:
+    if min(len(joint_frames(several(seen))) for *_, seen in given) < 4:
         raise InputError("identify needs at least four frames of the training view, to fit and to judge by")
     if not settings.families:
         raise InputError("identify.families names no candidate: give at least one elasticity with E and nu")
@@ -241,7 +243,8 @@ class _Run:
     """The fit of one family to the first frames; residuals and Jacobians serve all sizes of squares.
 
     Unknowns are the unbounded constants, relative to the start of the fit, and the deviations of each video's throw.
-    Residuals and their columns are lists over the videos; `counts` of their frames are fitted.
+    Residuals and their columns are lists over the observations of all videos, one after the other; `counts` of the
+    frames of each video are fitted.
     """
 
     def __init__(
@@ -255,6 +258,15 @@ class _Run:
         self._u = np.zeros(self._constants + NUISANCES * len(videos))
         self._images: dict[bytes, list[Tensor] | None] = {}
         self._columns: dict[bytes, list[list[Tensor]]] = {}
+
+    @cached_property
+    def _places(self) -> list[tuple[int, int, int]]:
+        """Of every observation: its video, its place there, and how many of its frames are fitted."""
+        return [
+            (v, k, rows)
+            for v, (video, count) in enumerate(zip(self.videos, self.counts, strict=True))
+            for k, rows in enumerate(video.counts(count))
+        ]
 
     @property
     def values(self) -> Values:
@@ -403,34 +415,38 @@ class _Run:
         self._images = {key: residual}  # where the fit stands; the next size of squares begins here
         if key not in self._columns:
             self._columns = {key: self._constant_columns(unknowns, residual)}
-        curvatures, scores, k = [], [], len(unknowns)
-        for v, r in enumerate(self._seen(residual)):
-            columns = self._columns_of(v)
+        curvatures, scores, k, seen = [], [], len(unknowns), self._seen(residual)
+        for at, r in enumerate(seen):
+            columns = self._columns_of(at)
             own = [i for i in free if i in columns]
-            J = torch.stack([in_blocks(self._averaged(v, columns[i])) for i in own], dim=-1).double()
+            J = torch.stack([in_blocks(self._averaged(at, columns[i])) for i in own], dim=-1).double()
             blocks = in_blocks(r).double()
             curvatures.append(np.zeros((len(J), k, k)))
             scores.append(np.zeros((len(J), k)))
-            curvatures[v][:, np.array(own)[:, None], own] = (J.mT @ J).cpu().numpy()
-            scores[v][:, own] = (J.mT @ blocks[..., None])[..., 0].cpu().numpy()
+            curvatures[at][:, np.array(own)[:, None], own] = (J.mT @ J).cpu().numpy()
+            scores[at][:, own] = (J.mT @ blocks[..., None])[..., 0].cpu().numpy()
         cost = self._cost(residual)
         # Weights make the sum of squares that of as many residuals a video as the first one has.
-        count = len(self.videos) * self._seen(residual)[0].numel()
+        first = sum(r.numel() for r, (v, *_) in zip(seen, self._places, strict=True) if v == 0)
+        count = len(self.videos) * first
         return Linearisation(
             np.concatenate(curvatures), np.concatenate(scores), cost, math.sqrt(cost / count)
         )
 
-    def _columns_of(self, v: int) -> dict[int, Tensor]:
-        """Derivatives of a video's residuals by its unknowns, where the fit stands."""
-        (by_constants,) = self._columns.values()
-        own = zip(self._unsure(v), self.videos[v].by_deviation or (), strict=False)
-        return {k: column[: self.counts[v]] for k, column in (*enumerate(c[v] for c in by_constants), *own)}
+    def _columns_of(self, at: int) -> dict[int, Tensor]:
+        """Derivatives of an observation's residuals by the unknowns of its video, where the fit stands."""
+        (by_constants,), (v, k, rows) = self._columns.values(), self._places[at]
+        own = zip(self._unsure(v), [each[k] for each in self.videos[v].by_deviation or ()], strict=False)
+        return {i: column[:rows] for i, column in (*enumerate(c[at] for c in by_constants), *own)}
 
-    def _slope(self, v: int, residual: Tensor) -> np.ndarray:
+    def _slope(self, v: int, residual: Sequence[Tensor]) -> np.ndarray:
         """J^T r of another residual of a video, shape (k,)."""
-        slope, seen = np.zeros(len(self._u)), self._averaged(v, residual[: self.counts[v]]).double()
-        for k, column in self._columns_of(v).items():
-            slope[k] = float((self._averaged(v, column) * seen).sum())
+        slope = np.zeros(len(self._u))
+        for at, (video, k, rows) in enumerate(self._places):
+            if video == v:
+                seen = self._averaged(at, residual[k][:rows]).double()
+                for i, column in self._columns_of(at).items():
+                    slope[i] += float((self._averaged(at, column) * seen).sum())
         return slope
 
     def _thrown(self, v: int, stds: np.ndarray) -> Throw:
@@ -491,22 +507,25 @@ class _Run:
             for v, (video, count) in enumerate(zip(self.videos, counts or self.counts, strict=True))
         ]
         return [
-            None if any(r is None for r in of_all) else list(of_all) for of_all in zip(*found, strict=True)
+            None if any(r is None for r in of_all) else [r for own in of_all for r in own]
+            for of_all in zip(*found, strict=True)
         ]
 
     def _seen(self, residual: Sequence[Tensor]) -> list[Tensor]:
-        return [self._averaged(v, r) for v, r in enumerate(residual)]
+        return [self._averaged(at, r) for at, r in enumerate(residual)]
 
-    def _averaged(self, v: int, images: Tensor) -> Tensor:
-        return averaged(images, self.videos[v].sizes[self._level])
+    def _averaged(self, at: int, images: Tensor) -> Tensor:
+        return averaged(images, self.videos[self._places[at][0]].sizes[self._level])
 
     def _held_out(self) -> float:
         """Mean squared residual of the frames after those that are fitted; infinite if a rollout diverges there."""
         (residual,) = self._simulate([self._u], [len(video.frames) for video in self.videos])
         if residual is None:
             return math.inf
+        later = [(v, r[rows:].flatten()) for r, (v, _, rows) in zip(residual, self._places, strict=True)]
         losses = [
-            float(r[count:].double().square().mean()) / video.weight**2
-            for r, count, video in zip(residual, self.counts, self.videos, strict=True)
+            float(torch.cat([r for owner, r in later if owner == v]).double().square().mean())
+            / video.weight**2
+            for v, video in enumerate(self.videos)
         ]
         return sum(losses) / len(losses)

@@ -28,13 +28,14 @@ def mean_squared_error(images: Tensor, observed: Tensor) -> Tensor:
 
     Args:
         images: rendered colours over white, float32 or float64, shape (T, V, H, W, 3).
-        observed: straight-alpha RGBA as uint8, shape (T, V, H, W, 4), or floating colours over white like ``images``.
+        observed: straight-alpha RGBA as uint8, shape (T, V, H, W, 4), or floating colours over white like ``images``;
+            so can be other channels, then of both.
 
     Raises:
         InputError: shapes that do not fit.
     """
     bytes_ = observed.dtype == torch.uint8
-    if images.shape[:-1] != observed.shape[:-1] or observed.shape[-1] != (4 if bytes_ else 3):
+    if observed.shape != ((*images.shape[:-1], 4) if bytes_ else images.shape):
         raise InputError(
             f"image loss: rendered images {tuple(images.shape)} do not fit observed ones {tuple(observed.shape)}"
         )

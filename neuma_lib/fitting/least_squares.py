@@ -69,7 +69,7 @@ def in_blocks(values: Tensor) -> Tensor:
     tall, wide = -(-H // BLOCKS), -(-W // BLOCKS)
     full = torch.nn.functional.pad(values, (0, 0, 0, wide * BLOCKS - W, 0, tall * BLOCKS - H))
     split = full.reshape(T, V, BLOCKS, tall, BLOCKS, wide, C)
-    return split.permute(1, 2, 4, 0, 3, 5, 6).reshape(V * BLOCKS**2, -1)
+    return split.permute(1, 2, 4, 0, 3, 5, 6).reshape(V * BLOCKS**2, T * tall * wide * C)
 
 
 def levenberg_marquardt(

@@ -25,7 +25,9 @@ from typing import Any, ClassVar, Protocol
 import torch
 from torch import Tensor
 
+from neuma_lib.config.base import Compared
 from neuma_lib.config.material import MaterialConfig
+from neuma_lib.coupling.filmed import Filmed
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.deviation import Deviation
@@ -38,7 +40,13 @@ from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
-from neuma_lib.splatting.observation import Observation
+from neuma_lib.splatting.observation import (
+    Observation,
+    joint_frames,
+    rendered_steps,
+    select_frames,
+    several,
+)
 
 
 class TrajectoryLoss(Protocol):
@@ -46,14 +54,16 @@ class TrajectoryLoss(Protocol):
 
     Attributes:
         frames: steps of the frames.
+        steps: those whose states it reads, the frames among them; more where a frame shows a span of time.
         total: whether it reads the total deformation of the trajectory.
     """
 
     frames: tuple[int, ...]
+    steps: tuple[int, ...]
     total: bool
 
     def __call__(self, path: Trajectory) -> Tensor:
-        """Losses of the frames, shape (T,)."""
+        """Losses of the frames, shape (T,), of a trajectory at the steps."""
 
     def select(self, keep: Sequence[int]) -> TrajectoryLoss:
         """The same of the frames with the given indices alone."""
@@ -66,42 +76,69 @@ class TrajectoryLoss(Protocol):
 class PixelLoss:
     """Mean squared colour difference of each frame over all training views (paper Eq. 2).
 
+    Cameras may have other times, sizes and exposures: then every step at which some camera has a picture is a frame,
+    and its loss is the mean over the pictures there, each the mean over its pixels.
+
     Attributes:
         body: what is rendered.
-        observation: the video.
+        observation: the video, or several of one motion.
         covariance_gradient: whether gradients reach the deformation gradients through the covariances.
         frames_per_batch: frames rendered at a time, forward and backward; None: as many as a render of moderate memory
             allows. The value does not depend on it.
         total: whether the total deformation stretches the Gaussians, not its elastic part.
+        compare: colours, or masks alone.
     """
 
     body: Reconstruction
-    observation: Observation
+    observation: Observation | Sequence[Observation]
     covariance_gradient: bool = True
     frames_per_batch: int | None = None
     total: bool = False
+    compare: Compared = "colour"
 
     def __post_init__(self):
-        self.frames = self.observation.frames
-        self._renderer = self.body.particle_gs(
-            self.observation.cameras, covariance_gradient=self.covariance_gradient
-        )
-        self._batch = self.frames_per_batch or self._renderer.frames_per_batch
+        self.videos = several(self.observation)
+        self.frames, self.steps = joint_frames(self.videos), rendered_steps(self.videos)
+        options = {"covariance_gradient": self.covariance_gradient}
+        self._filmed = [
+            Filmed(self.body.particle_gs(video.cameras, **options), video, self.steps, self.compare)
+            for video in self.videos
+        ]
 
     def __call__(self, path: Trajectory) -> Tensor:
-        return evaluate_in_batches(self._losses, self._batch, path.x, path.stretch)
+        if len(path.x) != len(self.steps):
+            raise InputError(f"pixel loss: {len(path.x)} states for {len(self.steps)} rendered steps")
+        if len(self.videos) == 1:
+            return self._of(0, path)
+        total, count = path.x.new_zeros(2, len(self.frames))
+        for k, video in enumerate(self.videos):
+            at = torch.tensor([self.frames.index(n) for n in video.frames], device=total.device)
+            views = len(video.cameras)
+            total = total.index_add(0, at, views * self._of(k, path))
+            count = count.index_add(0, at, torch.full_like(count[at], views))
+        return total / count
 
     def select(self, keep: Sequence[int]) -> PixelLoss:
         """The same of the frames with the given indices alone."""
-        return replace(self, observation=self.observation.select(keep))
+        return replace(self, observation=select_frames(self.videos, [self.frames[k] for k in keep]))
 
     def later(self, step: int) -> PixelLoss:
         """The same for a trajectory that starts at a step of this one."""
-        frames = tuple(frame - step for frame in self.frames)
-        return replace(self, observation=replace(self.observation, frames=frames))
+        earlier = [
+            replace(video, frames=tuple(frame - step for frame in video.frames)) for video in self.videos
+        ]
+        return replace(self, observation=earlier)
 
-    def _losses(self, part: slice, x: Tensor, F: Tensor) -> Tensor:
-        return mean_squared_error(self._renderer(x, F), self.observation.stored(part))
+    def _of(self, k: int, path: Trajectory) -> Tensor:
+        """Losses of the frames of a video."""
+        video, filmed = self.videos[k], self._filmed[k]
+
+        def losses(part: slice, x: Tensor, F: Tensor) -> Tensor:
+            seen = video.stored(part) if self.compare == "colour" else video.coverage(part)
+            return mean_squared_error(filmed(x, F), seen)
+
+        states = (filmed.states(path.x), filmed.states(path.stretch))
+        return evaluate_in_batches(losses, self.frames_per_batch or filmed.batch, *states)
 
 
 @dataclass
@@ -116,6 +153,11 @@ class ParticleLoss:
     frames: tuple[int, ...]
     targets: Tensor
     total: ClassVar[bool] = False
+
+    @property
+    def steps(self) -> tuple[int, ...]:
+        """Those of the frames."""
+        return self.frames
 
     def __call__(self, path: Trajectory) -> Tensor:
         return chamfer_loss(path.x, self.targets)
@@ -338,8 +380,8 @@ class _Loop(TrainingLoop):
             self.model,
             self.law,
             start,
-            steps=loss.frames[-1],
-            frames=loss.frames,
+            steps=loss.steps[-1],
+            frames=loss.steps,
             total=loss.total,
             memory=memory,
         )

@@ -186,20 +186,23 @@ class _Loop(TrainingLoop):
     def _frame_losses(self) -> Tensor:
         """Losses of all frames, shape (T,)."""
         x, v, self.model = spring_rollout(
-            self.model, self.springs, *self.start, self.loss.frames, log=self.log
+            self.model, self.springs, *self.start, self.loss.steps, log=self.log
         )
-        return self.loss(self.body.path(self.loss.frames, x, v))
+        return self.loss(self.body.path(self.loss.steps, x, v))
 
     def _frame_by_frame(self) -> None:
-        """An optimiser step for every frame, by the gradient of the substeps since the frame before it."""
-        (x, v), reached = self.start, 0
+        """An optimiser step for every frame, by the gradient of the substeps since the frame before it.
+
+        Where exposures overlap, those since the last state before the frame's own.
+        """
+        known = [(0, *self.start)]
         for loss in self.single:
-            (frame,) = loss.frames
+            reached, x, v = next(state for state in reversed(known) if state[0] <= loss.steps[0])
             xs, vs, self.model = spring_rollout(
-                self.model, self.springs, x, v, (frame,), reached, log=self.log
+                self.model, self.springs, x, v, loss.steps, reached, log=self.log
             )
-            self._step(loss(self.body.path((frame,), xs, vs)).sum())
-            x, v, reached = xs[0].detach(), vs[0].detach(), frame
+            self._step(loss(self.body.path(loss.steps, xs, vs)).sum())
+            known += zip(loss.steps, xs.detach(), vs.detach(), strict=True)
 
     def _step(self, loss: Tensor) -> None:
         """One optimiser step down the gradient of a loss, which is divided by the first one before it is clipped."""

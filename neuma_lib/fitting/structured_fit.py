@@ -142,7 +142,10 @@ def train_structured(
     if any(found is None for found in as_it_is):
         raise NonFiniteError("material", "the motion of the uncorrected law breaks off")
     paths = [path for path, _ in as_it_is]
-    firsts = [told_from(len(path.x), first_contact(model, path.x)) for path in paths]
+    firsts = [
+        told_from(len(loss.frames), first_contact(model, path.at(loss.frames).x))
+        for (_, loss), path in zip(videos, paths, strict=True)
+    ]
     told = [from_frame(*video, path, k) for video, path, k in zip(videos, paths, firsts, strict=True)]
     held_out = [held_out_frames(len(loss.frames), structured.held_out, structured.blocks) for _, loss in told]
     fitted = [
@@ -277,15 +280,20 @@ def told_from(count: int, contact: int) -> int:
 
 
 def from_frame(start: State, loss: TrajectoryLoss, path: Trajectory, first: int) -> Video:
-    """A video from the frame with index ``first`` on; the body starts as it is on a path at the frame before.
+    """A video from the frame with index ``first`` on; the body starts as it is on a path at the frame before, or
+    earlier where what is left shows more.
 
     Nothing of the law shows before a contact, so those steps are simulated once. Gradients do not reach them.
     """
     if first == 0:
         return start, loss
-    at = first - 1
+    left = loss.select(range(first, len(loss.frames)))
+    before = [k for k, n in enumerate(path.frames) if n < left.steps[0] and n <= loss.frames[first - 1]]
+    if not before:
+        return start, left
+    at = before[-1]
     state = State(path.x[at], path.v[at], start.mass, start.vol0, path.F[at], path.C[at])
-    return state, loss.select(range(first, len(loss.frames))).later(path.frames[at])
+    return state, left.later(path.frames[at])
 
 
 def _chosen(
@@ -318,11 +326,10 @@ def largest_as_good(losses: dict[float, float]) -> float:
 def _simulated(
     model: MPMModel, law: StructuredLaw, start: State, loss: TrajectoryLoss
 ) -> tuple[Trajectory, list[float]] | None:
-    """The motion at all frames, and their losses; None if it breaks off."""
-    frames = loss.frames
+    """The motion at all steps of a loss, and the losses of its frames; None if it breaks off."""
     with torch.no_grad():
         try:
-            path = rollout(model, law, start, steps=frames[-1], frames=frames, total=loss.total)
+            path = rollout(model, law, start, steps=loss.steps[-1], frames=loss.steps, total=loss.total)
         except NonFiniteError:
             return None
         return path, loss(path).tolist()

@@ -31,6 +31,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.config.velocity import VelocityConfig
+from neuma_lib.coupling.filmed import Filmed
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.frame_batches import frame_batches, spread_frames
@@ -39,7 +40,13 @@ from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import MPMModel, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import cross_matrix
-from neuma_lib.splatting.observation import Observation
+from neuma_lib.splatting.observation import (
+    Observation,
+    joint_frames,
+    rendered_steps,
+    select_frames,
+    several,
+)
 
 NUISANCE_SCALE = 0.02
 """Unit of the constant shift [m] and of the relative enlargement: about 1 m/s over a few frames."""
@@ -128,7 +135,7 @@ def estimate_velocity(
     model: MPMModel,
     law: Law,
     body: Reconstruction,
-    observation: Observation,
+    observation: Observation | Sequence[Observation],
     settings: VelocityConfig,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> VelocityEstimate:
@@ -138,44 +145,46 @@ def estimate_velocity(
         model: simulator constants.
         law: the prior material; before contact it matters only by how far a spinning body stretches.
         body: reconstructed particles and Gaussians.
-        observation: the video; frames from contact on are ignored.
+        observation: the video, or several of the same throw by cameras of other times, sizes or exposures; frames from
+            contact on are ignored.
         settings: hyper-parameters; its ``views`` are those of the observation.
         progress: called with (step, steps, loss).
 
     Raises:
         InputError: fewer than two frames, or the body touches a wall in the first frame.
     """
-    if len(observation.frames) < 2:
+    videos, precision = several(observation), body.x0.dtype
+    frames = joint_frames(videos)
+    if len(frames) < 2:
         raise InputError("velocity needs at least two frames of the training view before contact")
-    precision = body.x0.dtype
-    observation, law = observation.to(precision), copy.deepcopy(law).to(precision)
+    videos, law = tuple(video.to(precision) for video in videos), copy.deepcopy(law).to(precision)
     if float(contact_clearance(model, body.x0)) <= 0:
         raise InputError("the body touches a wall in the first frame: the video must start before contact")
-    axes = observation.cameras.viewmats[0, :3, :3].cpu().numpy()
-    flight = _Flight(model, law, body, observation.frames)
+    axes = videos[0].cameras.viewmats[0, :3, :3].cpu().numpy()
+    ends = tuple(max(n + video.exposure[-1] for video in videos if n in video.frames) for n in frames)
+    flight = _Flight(model, law, body, ends)
     minimise = partial(_minimise, axes=axes, settings=settings, progress=progress)
     unknowns, accepted = np.zeros(UNKNOWNS), 0
-    frames = observation.frames
     used = min(settings.initial_frames, len(frames))
     growing = used < len(frames)
     for _ in range(_ROUNDS):
         # No more than twice as many at a time: a spin from three frames says little about thirty.
         reach = min(2 * used, len(frames)) if growing else used
-        flight.simulate(unknowns, frames[:reach])
-        seen = observation.select(spread_frames(used, settings.frames))
-        residuals = _Residuals(flight, seen, settings.difference)
+        flight.simulate(unknowns, rendered_steps(select_frames(videos, frames[:reach])))
+        chosen = tuple(frames[k] for k in spread_frames(used, settings.frames))
+        residuals = _Residuals(flight, select_frames(videos, chosen), settings.difference)
         unknowns, fit, steps = minimise(residuals, unknowns, _ALL, _ROUGH_GAIN if growing else _LEAST_GAIN)
         accepted += steps
         clear = flight.frames_before_contact(unknowns, reach)
-        settled = clear == used and not growing and flight.turned(unknowns, seen.frames) < _LEAST_TURN
+        settled = clear == used and not growing and flight.turned(unknowns, chosen) < _LEAST_TURN
         if clear < 2 or settled:
             break
         used, growing = clear, growing and clear == reach < len(frames)
-    covariance, information = _uncertainty(fit, flight, seen.frames, axes, settings)
+    covariance, information = _uncertainty(fit, flight, chosen, axes, settings)
     w = unknowns[_SPIN]
     if w @ np.linalg.solve(covariance[_SPIN, _SPIN], w) <= settings.spin_significance:
         unknowns[_SPIN] = unknowns[_STRETCH] = 0.0
-        flight.simulate(unknowns, seen.frames)
+        flight.simulate(unknowns, residuals.steps)
         unknowns, fit, steps = minimise(residuals, unknowns, _STILL, _LEAST_GAIN)
         accepted += steps
     v0, spin = (vector.cpu().numpy() for vector in flight.motion(unknowns))
@@ -195,7 +204,7 @@ def estimate_velocity(
         spin_std=spin_std,
         spin_std_camera=spin_std_camera,
         information=information,
-        frames=seen.frames,
+        frames=chosen,
         nuisance=(flight.units * unknowns)[6:],
         loss=fit.rms,
         iterations=accepted,
@@ -210,13 +219,14 @@ class _Flight:
     mass follows its parabola whatever the body does about it.
 
     Attributes:
+        ends: step at which the exposure of each frame ends.
         centre: centre of mass [m], shape (3,).
         units: of the unknowns, shape (11,): 1 m/s, the spin that moves the particles by 1 m/s about their centre (root
             mean square), `NUISANCE_SCALE`, 1 and 1. So all have effects of the same order on the images.
     """
 
-    def __init__(self, model: MPMModel, law: Law, body: Reconstruction, frames: tuple[int, ...]):
-        self.model, self.law, self.body, self.frames = model, law, body, frames
+    def __init__(self, model: MPMModel, law: Law, body: Reconstruction, ends: tuple[int, ...]):
+        self.model, self.law, self.body, self.ends = model, law, body, ends
         self.centre = body.mass @ body.x0 / body.mass.sum()
         gyration = ((body.x0 - self.centre).square().sum(1) @ body.mass / body.mass.sum()).sqrt()
         self.units = np.append(np.repeat([1.0, 1.0 / float(gyration), NUISANCE_SCALE], 3), [1.0, 1.0])
@@ -235,7 +245,7 @@ class _Flight:
 
         What is known at first is a body at rest: it needs no simulation.
         """
-        reached = self._path is None or self._path.frames[-1] >= frames[-1]
+        reached = self._path is None or set(self._path.frames).issuperset(frames)
         if reached and self.turned(unknowns, frames) < _LEAST_TURN:
             return
         _, self._near = self.motion(unknowns)
@@ -276,8 +286,8 @@ class _Flight:
         return x + self.centre + n * dt * v0 + g * dt**2 * n * (n + 1) / 2, F
 
     def frames_before_contact(self, unknowns: np.ndarray, most: int) -> int:
-        """How many of the first `most` frames come before the body touches a wall."""
-        x, _ = self(*self.motion(unknowns), self.frames[:most])
+        """How many of the first `most` frames end before the body touches a wall."""
+        x, _ = self(*self.motion(unknowns), self.ends[:most])
         touching = contact_clearance(self.model, x) <= 0
         return int(touching.int().argmax()) if touching.any() else len(x)
 
@@ -287,50 +297,67 @@ class _Residuals:
     """Rendered minus observed colours as a function of the unknowns. A few frames at a time are in memory."""
 
     flight: _Flight
-    seen: Observation
+    seen: tuple[Observation, ...]
     difference: float
 
     def __post_init__(self):
-        self._renderer = self.flight.body.particle_gs(self.seen.cameras)
+        self.steps = rendered_steps(self.seen)
+        self._filmed = [
+            Filmed(self.flight.body.particle_gs(video.cameras), video, self.steps) for video in self.seen
+        ]
+        self._axes = self.seen[0].cameras.viewmats[0, :3, :3]
 
     def cost(self, unknowns: np.ndarray) -> float:
         """Sum of squares."""
         return self._checked(
-            sum(self._residual(unknowns, part).square().sum().double() for part in self._parts()), unknowns
+            sum(
+                self._residual(unknowns, k, part).square().sum().double()
+                for k in range(len(self.seen))
+                for part in self._parts(k)
+            ),
+            unknowns,
         )
 
     def linearise(self, unknowns: np.ndarray, free: Sequence[int] = _ALL) -> Linearisation:
         """Sums of the residuals and of their central differences, which are 0 for unknowns that are not free."""
-        cost, curvatures, scores = 0.0, 0.0, 0.0
-        for part in self._parts():
-            r = self._residual(unknowns, part)
-            columns = torch.zeros(*in_blocks(r).shape, UNKNOWNS).to(r)  # (blocks, pixels, 11)
-            for k in free:
-                e = self.difference * np.eye(UNKNOWNS)[k]
-                change = self._render(unknowns + e, part) - self._render(unknowns - e, part)
-                columns[..., k] = in_blocks(change / (2 * self.difference))
-            cost = cost + r.square().sum().double()
-            curvatures = curvatures + (columns.mT @ columns).double()
-            scores = scores + (columns.mT @ in_blocks(r)[..., None])[..., 0].double()
+        cost, count, sums = 0.0, 0, []
+        for video in range(len(self.seen)):
+            curvatures, scores = 0.0, 0.0
+            for part in self._parts(video):
+                r = self._residual(unknowns, video, part)
+                columns = torch.zeros(*in_blocks(r).shape, UNKNOWNS).to(r)  # (blocks, pixels, 11)
+                for k in free:
+                    e = self.difference * np.eye(UNKNOWNS)[k]
+                    change = self._render(unknowns + e, video, part) - self._render(unknowns - e, video, part)
+                    columns[..., k] = in_blocks(change / (2 * self.difference))
+                cost, count = cost + r.square().sum().double(), count + r.numel()
+                curvatures = curvatures + (columns.mT @ columns).double()
+                scores = scores + (columns.mT @ in_blocks(r)[..., None])[..., 0].double()
+            sums.append((curvatures.cpu().numpy(), scores.cpu().numpy()))
         cost = self._checked(cost, unknowns)
-        rms = float(np.sqrt(cost / (len(self.seen.frames) * r[0].numel())))
-        return Linearisation(curvatures.cpu().numpy(), scores.cpu().numpy(), cost, rms)
+        curvatures, scores = (np.concatenate(of_all) for of_all in zip(*sums, strict=True))
+        return Linearisation(curvatures, scores, cost, float(np.sqrt(cost / count)))
 
-    def _parts(self):
-        return frame_batches(len(self.seen.frames), self._renderer.frames_per_batch)
+    def _parts(self, video: int):
+        return frame_batches(len(self.seen[video].frames), self._filmed[video].batch)
 
-    def _residual(self, unknowns: np.ndarray, part: slice) -> Tensor:
-        return self._render(unknowns, part) - self.seen.colours(part)
+    def _residual(self, unknowns: np.ndarray, video: int, part: slice) -> Tensor:
+        return self._render(unknowns, video, part) - self.seen[video].colours(part)
 
-    def _render(self, unknowns: np.ndarray, part: slice) -> Tensor:
+    def _render(self, unknowns: np.ndarray, video: int, part: slice) -> Tensor:
         v0, spin = self.flight.motion(unknowns)
         right, down, enlargement, *stretch = torch.as_tensor(self.flight.units * unknowns).to(v0)[6:]
-        axes = self.seen.cameras.viewmats[0, :3, :3]
+        seen, axes = self.seen[video], self._axes
+        exposed = len(seen.exposure)
+        steps = tuple(n + k for n in seen.frames[part] for k in seen.exposure)
         with torch.no_grad():
-            x, F = self.flight(v0, spin, self.seen.frames[part], stretch)
+            x, F = self.flight(v0, spin, steps, stretch)
             centre = x.mean(dim=1, keepdim=True)
             x = centre + (1 + enlargement) * (x - centre) + right * axes[0] + down * axes[1]
-            return self._renderer(x, (1 + enlargement) * F)
+            F = (1 + enlargement) * F
+            if exposed > 1:
+                x, F = (state.unflatten(0, (-1, exposed)) for state in (x, F))
+            return self._filmed[video](x, F)
 
     def _checked(self, cost: Tensor, unknowns: np.ndarray) -> float:
         value = float(cost)

@@ -20,7 +20,7 @@ from neuma_lib.errors import InputError
 from neuma_lib.io.files import one_line, read_json, reading, sha256_file, write_json
 from neuma_lib.io.released import image_name, matrix_of_numbers, released_frames
 from neuma_lib.splatting.cameras import Cameras
-from neuma_lib.splatting.observation import Observation
+from neuma_lib.splatting.observation import Observation, exposed_steps
 
 
 @dataclass(frozen=True)
@@ -73,6 +73,8 @@ FORMATS = ("PNG", "JPEG", "WEBP")
 """Image formats that are read, by Pillow's names; others have decoders that are less tried."""
 MAX_PIXELS = 2**26
 """Most pixels of an image that is read: 8192 x 8192, 256 MiB of RGBA."""
+SUB_FRAMES = 5
+"""Most renders that are averaged to a frame, where settings say nothing else."""
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -161,6 +163,11 @@ def checked_transforms(data: Any, path: str | Path) -> dict[str, Any]:
         for key in ("view", "step"):
             if type(frame.get(key, 0)) is not int:
                 raise InputError(f"{where}: {key} must be a whole number, not {one_line(repr(frame[key]))}")
+        exposure = frame.get("exposure", 0)
+        if type(exposure) not in (int, float) or not (0 <= exposure < math.inf):
+            raise InputError(
+                f"{where}: exposure must be a duration in seconds, not {one_line(repr(exposure))}"
+            )
         if not isinstance(frame.get("sha256"), str | None):
             raise InputError(f"{where}: sha256 must be a text")
         pose = matrix_of_numbers(frame.get("transform_matrix"))
@@ -201,12 +208,21 @@ def read_image_set(path: str | Path, views: Sequence[int] | None = None) -> Imag
     Raises:
         InputError: missing image, truncated or changed image, image of another size, no intrinsics, empty mask.
     """
-    data = read_transforms(path)
-    folder = Path(path).parent
-    frames = [{**data, "view": i, "step": 0, **frame} for i, frame in enumerate(data["frames"])]
-    frames = [frame for frame in frames if views is None or frame["view"] in views]
+    frames = [frame for frame in _all_frames(path) if views is None or frame["view"] in views]
     if not frames:
         raise InputError(f"{path}: no frame belongs to the views {list(views or ())}")
+    return _read_frames(frames, path)
+
+
+def _all_frames(path: str | Path) -> list[dict[str, Any]]:
+    """The frames of a transforms.json, each with what the file says of all."""
+    data = read_transforms(path)
+    return [{**data, "view": i, "step": 0, **frame} for i, frame in enumerate(data["frames"])]
+
+
+def _read_frames(frames: Sequence[Mapping[str, Any]], path: str | Path) -> ImageSet:
+    """Images of one size, of some frames of a list."""
+    folder = Path(path).parent
     files = [_image_file(folder, frame["file_path"], path) for frame in frames]
     images = _read_all(files, frames, path)
     height, width = images.shape[1:3]
@@ -291,21 +307,95 @@ def load_views(transforms: str | Path, views: Sequence[int] | None = None) -> tu
     return pixels, _cameras(images, np.arange(len(pixels)))
 
 
-def load_observation(transforms: str | Path, views: Sequence[int]) -> Observation:
-    """The video of some views, with its pixels as they are stored: 1 GB for 400 frames of 800 x 800.
+def load_videos(
+    transforms: str | Path, views: Sequence[int], dt: float | None = None, sub_frames: int = SUB_FRAMES
+) -> tuple[Observation, ...]:
+    """The videos of some views, with their pixels as they are stored: 1 GB for 400 frames of 800 x 800.
+
+    Views that share steps, size and exposure are one observation; so all views of a scene that was rendered are. Frames
+    whose exposure began before step 0 are left out, as nothing is simulated there.
+
+    Args:
+        transforms: .../transforms.json. A frame's ``exposure`` [s] has its middle at the frame's step.
+        views: numbers of the views.
+        dt: duration of a step [s], which turns exposures into steps; None: as if all were instants.
+        sub_frames: most renders that are averaged to a frame, see `exposed_steps`.
 
     Raises:
-        InputError: see `read_image_set` and `ImageSet.video`; a view that was not filmed.
+        InputError: see `read_image_set` and `Observation`; a view that was not filmed, or only before step 0.
     """
-    filmed = sorted({frame.get("view", i) for i, frame in enumerate(read_transforms(transforms)["frames"])})
+    found = []
+    for (_, _, exposure), frames in _shots(transforms, views, dt, sub_frames).items():
+        images = _read_frames(frames, transforms)
+        order = list(dict.fromkeys(frame["view"] for frame in frames))
+        steps, index, columns = images.video(order)
+        pixels, cameras = torch.from_numpy(images.images[index]), _cameras(images, columns)
+        offsets, shares = exposure
+        found.append(Observation(steps, pixels, cameras, offsets, shares if len(offsets) > 1 else None))
+    return tuple(found)
+
+
+def filmed_steps(
+    transforms: str | Path, views: Sequence[int], dt: float | None = None, sub_frames: int = SUB_FRAMES
+) -> tuple[int, ...]:
+    """Steps whose states a comparison with `load_videos` of the same arguments needs, ascending, without its images."""
+    shots = _shots(transforms, views, dt, sub_frames)
+    return tuple(sorted({
+        step + offset for steps, _, (offsets, _) in shots for step in steps for offset in (*offsets, 0)
+    }))  # fmt: skip
+
+
+def _shots(
+    transforms: str | Path, views: Sequence[int], dt: float | None, sub_frames: int
+) -> dict[tuple, list[dict[str, Any]]]:
+    """Frames of each observation, view by view, under (steps, size, (offsets, shares) of the exposure).
+
+    A view whose camera or exposure changes along the video is one of several observations.
+    """
+    frames = _all_frames(transforms)
+    filmed = sorted({frame["view"] for frame in frames})
     if missing := [view for view in views if view not in filmed]:
         raise InputError(
             f"{transforms}: view {missing[0]} is not among the filmed views {filmed}: film more"
             " (dataset.dynamic.views), or let the method use fewer (methods.<name>.material.views, identify.views)"
         )
-    images = read_image_set(transforms, views)
-    frames, index, columns = images.video(views)
-    return Observation(frames, torch.from_numpy(images.images[index]), _cameras(images, columns))
+    shots: dict[tuple, list[dict[str, Any]]] = {}
+    for view in dict.fromkeys(views):
+        columns: dict[tuple, list[dict[str, Any]]] = {}
+        for frame in sorted((f for f in frames if f["view"] == view), key=lambda f: f["step"]):
+            exposure = exposed_steps(frame.get("exposure", 0) / dt if dt else 0.0, sub_frames)
+            if frame["step"] + exposure[0][0] >= 0:
+                columns.setdefault((exposure, _camera_key(frame)), []).append(frame)
+        if not columns:
+            raise InputError(
+                f"{transforms}: every exposure of view {view} begins before step 0, which is the start: check the steps"
+            )
+        for (exposure, _), column in columns.items():
+            steps = tuple(frame["step"] for frame in column)
+            shots.setdefault((steps, (column[0].get("w"), column[0].get("h")), exposure), []).extend(column)
+    return shots
+
+
+def _camera_key(frame: Mapping[str, Any]) -> tuple:
+    """What tells cameras apart; poses that agree to a micrometre are one."""
+    intrinsics = (frame.get(key) for key in ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x"))
+    pose = np.asarray(frame["transform_matrix"], dtype=np.float64)
+    return (*intrinsics, *(pose.round(6) + 0.0).ravel().tolist())
+
+
+def load_observation(transforms: str | Path, views: Sequence[int]) -> Observation:
+    """The video of views that were filmed at the same steps by cameras of one size that stand still, without blur.
+
+    Raises:
+        InputError: see `load_videos`; views that differ in these.
+    """
+    found = load_videos(transforms, views)
+    if len(found) > 1:
+        raise InputError(
+            f"{transforms}: views {list(views)} were not filmed at the same steps by cameras of one size that stand"
+            " still: choose one of them"
+        )
+    return found[0]
 
 
 def _cameras(images: ImageSet, index: np.ndarray) -> Cameras:

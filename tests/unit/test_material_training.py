@@ -172,7 +172,7 @@ class ScriptedLoss:
 
     def __init__(self, loss, factors):
         self.loss, self.factors = loss, list(factors)
-        self.frames, self.total = loss.frames, loss.total
+        self.frames, self.steps, self.total = loss.frames, loss.steps, loss.total
 
     def __call__(self, path):
         return self.factors.pop(0) * self.loss(path)

@@ -87,6 +87,7 @@ rule bias:
         material=material_settings,
         truth=scene_setting("law"),
         laws=lambda wildcards: [law for law in [true_law(wildcards)] if law],
+        filming=filming,
         device=SETTINGS.device,
     script:
         "../scripts/bias.py"
@@ -111,6 +112,7 @@ rule video:
         view=SETTINGS.evaluation.video_view,
         frame_rate=SETTINGS.evaluation.frame_rate,
         magnify=SETTINGS.evaluation.video_magnify,
+        filming=filming,
         device=SETTINGS.device,
     script:
         "../scripts/video.py"

@@ -24,6 +24,7 @@ rule material:
         base=stock_base,
         structured=structured_settings,
         checkpoint=lambda wildcards: f"{RESULTS}/{wildcards.scene}/{wildcards.method}/checkpoint.pt",
+        filming=filming,
         device=SETTINGS.device,
     script:
         "../scripts/material.py"

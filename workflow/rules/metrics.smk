@@ -28,6 +28,7 @@ rule image_metrics:
         views=evaluation_views,
         training_views=lambda wildcards: material_settings(wildcards)["views"],
         margin=SETTINGS.evaluation.margin,
+        filming=filming,
         device=SETTINGS.device,
     script:
         "../scripts/image_metrics.py"

@@ -48,6 +48,7 @@ rule pac_nerf:
         prior=pac_nerf_prior,
         seed=SETTINGS.seed,
         checkpoint=lambda wildcards: f"{RESULTS}/{wildcards.scene}/{wildcards.method}/checkpoint.pt",
+        filming=filming,
         device=SETTINGS.device,
     script:
         "../scripts/pac_nerf.py"

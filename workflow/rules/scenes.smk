@@ -142,6 +142,11 @@ def simulation_settings(wildcards):
     return simulator(scene.dt, scale=scene.captured.scale if scene.captured else 1.0)
 
 
+def filming(wildcards):
+    """What turns the exposures that a video states into renders."""
+    return {"dt": SETTINGS.scene(wildcards.scene).dt, "sub_frames": SETTINGS.dataset.sub_frames}
+
+
 def simulator(dt, grid=None, scale=1.0):
     """Constants of the simulator with a time step [s], on the reconstruction's grid unless another is given.
 

@@ -20,6 +20,7 @@ rule springs:
         material=material_settings,
         springs=springs_settings,
         checkpoint=lambda wildcards: f"{RESULTS}/{wildcards.scene}/{wildcards.method}/checkpoint.pt",
+        filming=filming,
         device=SETTINGS.device,
     script:
         "../scripts/springs.py"

@@ -9,7 +9,7 @@ from neuma_lib.device import choose_device
 from neuma_lib.evaluation.bias import bias_report, frame_losses
 from neuma_lib.fitting.material import PixelLoss
 from neuma_lib.io.files import write_json
-from neuma_lib.io.images import load_observation
+from neuma_lib.io.images import load_videos
 from neuma_lib.io.laws import load_laws
 from neuma_lib.io.particles import load_body, thrown
 from neuma_lib.mechanics.analytic import analytic_law
@@ -24,8 +24,11 @@ def main(inputs, output, params, run) -> None:
     files = (inputs.particles, inputs.binding, inputs.gaussians)
     body = load_body(*files, params.density, settings.carrier, settings.gaussian_motion)
     body = body.to(torch.float32, device)
-    video = load_observation(inputs.transforms, settings.views).to(torch.float32, device)
-    loss = PixelLoss(body, video, total=settings.covariance_from == "total")
+    videos = [
+        video.to(torch.float32, device)
+        for video in load_videos(inputs.transforms, settings.views, **params.filming)
+    ]
+    loss = PixelLoss(body, videos, total=settings.covariance_from == "total", compare=settings.compare)
     model, start = MPMModel(**params.simulation), thrown(body, inputs.velocity)
     truth = analytic_law(params.truth, dt=params.simulation["dt"])
     found = [listed(inputs.get(name)) for name in ("identified", "prior", "adaptor")]

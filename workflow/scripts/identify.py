@@ -9,7 +9,7 @@ from neuma_lib.fitting.identify import identify
 from neuma_lib.fitting.throw import Throw
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import read_json, write_json
-from neuma_lib.io.images import load_observation
+from neuma_lib.io.images import load_videos
 from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_body
 from neuma_lib.sim.model import MPMModel
@@ -25,7 +25,10 @@ def main(inputs, output, params, run) -> None:
         (
             Throw.of(read_json(velocity)),
             load_body(*body, density, gaussian_motion=settings.gaussian_motion).to(torch.float32, device),
-            load_observation(transforms, settings.views).to(torch.float32, device),
+            [
+                video.to(torch.float32, device)
+                for video in load_videos(transforms, settings.views, **params.filming)
+            ],
         )
         for *body, velocity, transforms, density in zip(
             *(listed(inputs[name]) for name in names), params.densities, strict=True

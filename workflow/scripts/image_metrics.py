@@ -3,27 +3,32 @@
 import numpy as np
 import torch
 
+from neuma_lib.coupling.filmed import Filmed
 from neuma_lib.device import choose_device
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.image_metrics import MEASURES, image_metrics
 from neuma_lib.evaluation.lpips import LPIPS
 from neuma_lib.fitting.carried_field import CarriedField
+from neuma_lib.fitting.frame_batches import frame_batches
 from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import read_arrays
-from neuma_lib.io.images import load_observation
+from neuma_lib.io.images import load_videos
 from neuma_lib.io.particles import load_body, load_motion
 from neuma_lib.io.weights import read_weights
+from neuma_lib.splatting.observation import rendered_steps
 from workflow.stage import run_script
 
 
-def measure_view(body, observation, x, F, networks, margin) -> list[dict[str, float]]:
-    """Measures of every frame of one view."""
-    white = body.particle_gs(observation.cameras)
-    black = body.particle_gs(observation.cameras, background=(0.0, 0.0, 0.0))
+def measure_view(body, observation, steps, x, F, networks, margin) -> list[dict[str, float]]:
+    """Measures of every frame of one view; x and F are states at the steps."""
+    white = Filmed(body.particle_gs(observation.cameras), observation, steps)
+    black = Filmed(body.particle_gs(observation.cameras, background=(0.0, 0.0, 0.0)), observation, steps)
     found = []
-    for part, images in white.batches(x, F, size=white.frames_per_batch):
+    for part in frame_batches(len(observation.frames), white.batch):
+        states = (white.states(x, part), white.states(F, part))
+        images = white(*states)
         # What shows through over white and not over black is the background.
-        alphas = 1 - (images - black(x[part], F[part])).mean(-1)
+        alphas = 1 - (images - black(*states)).mean(-1)
         seen, masks = observation.colours(part), observation.images[part][..., 3].to(images) / 255
         for frame in zip(images[:, 0], alphas[:, 0], seen[:, 0], masks[:, 0], strict=True):
             found.append(image_metrics(*frame, networks, margin))
@@ -42,20 +47,27 @@ def main(inputs, output, params, run) -> None:
         body = body.to(torch.float32, device)
     arrays, _ = read_arrays(inputs.rollout, required=("frames",), only=("frames",))
     x, F = (state.to(device) for state in load_motion(inputs.rollout))
-    table = []
+    steps, found = arrays["frames"].tolist(), {}
     for k, view in enumerate(params.views):
-        observation = load_observation(inputs.transforms, [view]).to(torch.float32, device)
-        if list(observation.frames) != arrays["frames"].tolist():
-            raise InputError(
-                f"{inputs.rollout} has other frames than {inputs.transforms}: run evaluation again"
-            )
-        with torch.no_grad():
-            table.append(measure_view(body, observation, x, F, networks, params.margin))
-        run.progress(k + 1, len(params.views), float(np.mean([m["psnr"] for m in table[-1]])))
-    per_frame = {name: np.mean([[m[name] for m in frames] for frames in table], axis=0) for name in MEASURES}
+        for video in load_videos(inputs.transforms, [view], **params.filming):
+            if not set(rendered_steps([video])) <= set(steps):
+                raise InputError(
+                    f"{inputs.rollout} has other frames than {inputs.transforms}: run evaluation again"
+                )
+            with torch.no_grad():
+                measures = measure_view(
+                    body, video.to(torch.float32, device), steps, x, F, networks, params.margin
+                )
+            for step, measured in zip(video.frames, measures, strict=True):
+                found.setdefault(step, []).append(measured)
+        run.progress(k + 1, len(params.views), float(np.mean([m["psnr"] for m in measures])))
+    frames = sorted(found)
+    per_frame = {
+        name: np.array([np.mean([m[name] for m in found[step]]) for step in frames]) for name in MEASURES
+    }
     seen = sorted(set(params.views) & set(params.training_views))
     report = {"views": params.views, "views_seen_in_training": seen}
-    report |= {"frames": arrays["frames"].tolist(), "margin": params.margin}
+    report |= {"frames": frames, "margin": params.margin}
     report |= {name: float(values.mean()) for name, values in per_frame.items()}
     report |= {f"{name}_per_frame": values.tolist() for name, values in per_frame.items()}
     write_json(output.metrics, report)

@@ -13,7 +13,7 @@ from neuma_lib.fitting.structured_fit import rival_bases, train_structured
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.hdf5 import read_arrays
-from neuma_lib.io.images import load_observation
+from neuma_lib.io.images import load_videos
 from neuma_lib.io.laws import load_adaptable, save_adaptor
 from neuma_lib.io.particles import load_body, thrown
 from neuma_lib.mechanics.structured import structured_law
@@ -28,10 +28,13 @@ def particle_loss(truth: str, device: torch.device) -> ParticleLoss:
     return ParticleLoss(tuple(found["frames"].tolist()), torch.from_numpy(found["x"]).to(device))
 
 
-def pixel_loss(body: Reconstruction, transforms: str, settings: MaterialConfig) -> PixelLoss:
-    video = load_observation(transforms, settings.views).to(body.x0.dtype, body.x0.device)
+def pixel_loss(body: Reconstruction, transforms: str, settings: MaterialConfig, filming: dict) -> PixelLoss:
+    videos = [
+        video.to(body.x0.dtype, body.x0.device)
+        for video in load_videos(transforms, settings.views, **filming)
+    ]
     total = settings.covariance_from == "total"
-    return PixelLoss(body, video, settings.covariance_gradient, total=total)
+    return PixelLoss(body, videos, settings.covariance_gradient, total=total, compare=settings.compare)
 
 
 def main(inputs, output, params, run) -> None:
@@ -62,7 +65,7 @@ def main(inputs, output, params, run) -> None:
         losses = [particle_loss(file, device) for file in listed(inputs.truth)]
     else:
         losses = [
-            pixel_loss(body, file, settings)
+            pixel_loss(body, file, settings, params.filming)
             for body, file in zip(bodies, listed(inputs.transforms), strict=True)
         ]
     files = {
@@ -71,7 +74,12 @@ def main(inputs, output, params, run) -> None:
         if name != "kernels"
         for k, file in enumerate(listed(found))
     }
-    stamp = {"simulation": params.simulation, "densities": params.densities, **params.material}
+    stamp = {
+        "simulation": params.simulation,
+        "filming": params.filming,
+        "densities": params.densities,
+        **params.material,
+    }
     stamp |= {"base": params.base, **params.structured} if structured else {}
     checkpoint = Checkpoint(params.checkpoint, fingerprint(stamp, files, params.code))
     problem = (MPMModel(**params.simulation), laws[0], starts[0], losses[0], settings)

@@ -11,7 +11,7 @@ from neuma_lib.fitting.carried_field import CarriedField
 from neuma_lib.fitting.pac_nerf import choose_family, fit_pac_nerf
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.files import read_json, write_json
-from neuma_lib.io.images import load_observation
+from neuma_lib.io.images import load_videos
 from neuma_lib.io.radiance import load_field
 from neuma_lib.sim.model import MPMModel
 from workflow.provenance import fingerprint
@@ -34,10 +34,17 @@ def main(inputs, output, params, run) -> None:
         params.checkpoint, fingerprint({**stamp, "guess": guess, **params.pac_nerf}, read, params.code)
     )
     model = MPMModel(**params.simulation)
+    video, *others = load_videos(inputs.transforms, params.views, **params.filming)
+    if others or video.exposure != (0,):
+        raise InputError(
+            f"{inputs.transforms}: pac_nerf compares pictures of an instant that all its views took at the same steps; "
+            f"views {params.views} differ in steps, size or exposure, or have one: choose one view by "
+            "methods.<name>.material.views, and ignore its blur by dataset.sub_frames: 1"
+        )
     fit = fit_pac_nerf(
         model,
         body,
-        load_observation(inputs.transforms, params.views).to(torch.float32, device),
+        video.to(torch.float32, device),
         found["frames"][-1],
         constants,
         settings,

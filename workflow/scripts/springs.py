@@ -11,7 +11,7 @@ from neuma_lib.fitting.material import PixelLoss
 from neuma_lib.fitting.springs import fit_springs
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.files import write_json
-from neuma_lib.io.images import load_observation
+from neuma_lib.io.images import load_videos
 from neuma_lib.io.particles import load_body, thrown
 from neuma_lib.io.springs import save_springs
 from neuma_lib.sim.model import MPMModel
@@ -28,12 +28,21 @@ def main(inputs, output, params, run) -> None:
     files = (inputs.particles, inputs.binding, inputs.gaussians)
     body = load_body(*files, params.density, gaussian_motion=settings.gaussian_motion)
     body = body.to(torch.float32, device)
-    video = load_observation(inputs.transforms, settings.views).to(torch.float32, device)
+    videos = [
+        video.to(torch.float32, device)
+        for video in load_videos(inputs.transforms, settings.views, **params.filming)
+    ]
     start, density = thrown(body, inputs.velocity), float(body.mass.sum() / body.vol0.sum())
     network = (how.anchors, how.neighbours, how.hard_springs, how.exponent, how.carriers)
     anchored = SpringBody.of(body.x0, *network)
     springs = Springs.of_modulus(anchored.network, how.guess, density, how.resistance, how.gap)
-    stamp = {"simulation": params.simulation, "density": params.density, **params.material, **params.springs}
+    stamp = {
+        "simulation": params.simulation,
+        "filming": params.filming,
+        "density": params.density,
+        **params.material,
+        **params.springs,
+    }
     read = {name: inputs[name] for name in ("particles", "binding", "gaussians", "transforms", "velocity")}
     checkpoint = Checkpoint(params.checkpoint, fingerprint(stamp, read, params.code))
     fitted = fit_springs(
@@ -41,7 +50,7 @@ def main(inputs, output, params, run) -> None:
         anchored,
         springs,
         start,
-        PixelLoss(body, video, settings.covariance_gradient),
+        PixelLoss(body, videos, settings.covariance_gradient, compare=settings.compare),
         settings,
         how,
         checkpoint=checkpoint,

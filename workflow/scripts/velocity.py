@@ -6,7 +6,7 @@ from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.device import choose_device
 from neuma_lib.fitting.velocity import estimate_velocity
 from neuma_lib.io.files import write_json
-from neuma_lib.io.images import load_observation
+from neuma_lib.io.images import load_videos
 from neuma_lib.io.laws import load_prior
 from neuma_lib.io.particles import load_body
 from neuma_lib.sim.model import MPMModel
@@ -20,11 +20,14 @@ def main(inputs, output, params, run) -> None:
     law = load_prior(inputs.prior, device, model.dt)
     body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density)
     body = body.to(torch.float32, device)
-    video = load_observation(inputs.transforms, settings.views).to(torch.float32, device)
-    estimate = estimate_velocity(model, law, body, video, settings, run.progress)
+    videos = [
+        video.to(torch.float32, device)
+        for video in load_videos(inputs.transforms, settings.views, **params.filming)
+    ]
+    estimate = estimate_velocity(model, law, body, videos, settings, run.progress)
     free = estimate
     if settings.ridge:
-        free = estimate_velocity(model, law, body, video, settings.model_copy(update={"ridge": 0.0}))
+        free = estimate_velocity(model, law, body, videos, settings.model_copy(update={"ridge": 0.0}))
         run.say(f"without the ridge: {free.summary()}")
     write_json(output.velocity, {**estimate.as_dict(), "without_ridge": free.as_dict()})
     run.say(estimate.summary())
