@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from neuma_lib.capture.folder import NAME, Capture, read_capture
-from neuma_lib.capture.released import released_captures
 from neuma_lib.config.capture import ReleasedConfig
 from neuma_lib.config.validation import hint
 from neuma_lib.errors import InputError
@@ -23,8 +22,12 @@ def captured_scenes(
     these. A capture that cannot be read has none here: its own rules say why.
     """
     found: dict[str, dict[str, Any]] = {}
-    for capture in released_captures(released or {}).values():
-        found |= scenes_of(capture)
+    if released:
+        # What reads them needs far more than every start of the workflow should load.
+        from neuma_lib.capture.released import released_captures
+
+        for capture in released_captures(released).values():
+            found |= scenes_of(capture)
     folders = sorted(p for p in Path(root).iterdir() if p.is_dir()) if Path(root).is_dir() else []
     for folder in folders:
         if not NAME.fullmatch(folder.name):

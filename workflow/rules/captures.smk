@@ -4,7 +4,6 @@ from functools import cache
 from types import SimpleNamespace
 
 from neuma_lib.capture.folder import NAME, inside, read_capture
-from neuma_lib.capture.released import released_captures
 
 CAPTURES = SETTINGS.captures.root.rstrip("/")
 CAPTURE_ENVIRONMENT = "../../envs/conda-capture.yaml"
@@ -38,6 +37,8 @@ wildcard_constraints:
 @cache
 def capture_named(name):
     if name in SETTINGS.captures.released:
+        from neuma_lib.capture.released import released_captures  # as in neuma_lib.capture.scenes
+
         return released_captures({name: SETTINGS.captures.released[name]})[name]
     return read_capture(f"{CAPTURES}/{name}")
 
