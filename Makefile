@@ -2,6 +2,7 @@
 # make test     the tests (make test-all adds the slow ones)
 # make env      the environment alone        make lint    style checks
 # make capture  the environment, with OpenCV and COLMAP for own photographs and videos (docs/capture.md)
+# make viewer   the environment, with viser for the viewer in a browser (docs/viewer.md)
 # make lock     envs/ again from the pins in pyproject.toml
 # make unlock   after a killed Snakemake     make clean   everything computed, but not the environment
 
@@ -12,7 +13,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 SNAKEMAKE := $(BIN)/snakemake --cores $(CORES)
 
-.PHONY: table1 all dataset test test-all lint env capture check unlock lock clean
+.PHONY: table1 all dataset test test-all lint env capture viewer check unlock lock clean
 
 table1: env unlock
 	$(SNAKEMAKE) results/table1.csv
@@ -43,6 +44,9 @@ env: $(READY)
 
 capture: env envs/requirements-capture.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r envs/requirements-capture.txt
+
+viewer: env envs/requirements-viewer.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r envs/requirements-viewer.txt
 
 $(READY): envs/requirements.txt envs/requirements-dev.txt
 	@command -v $(PYTHON) >/dev/null 2>&1 && $(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { \

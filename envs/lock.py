@@ -3,6 +3,7 @@
 requirements.txt      everything that the workflow needs, exact versions
 requirements-dev.txt  the same, and what tests and style checks need
 requirements-capture.txt  the same as the first, and what own photographs and videos need
+requirements-viewer.txt  the same as the first, and what the viewer's server needs
 conda.yaml            requirements.txt inside a conda environment with Python 3.11 (`snakemake --sdm conda`)
 conda-capture.yaml    requirements-capture.txt so
 
@@ -43,16 +44,18 @@ def resolve(extras: list[str]) -> list[str]:
 
 
 def main() -> None:
-    run, dev, capture = resolve([]), resolve(["dev"]), resolve(["capture"])
-    (HERE / "requirements.txt").write_text(HEADER + "".join(f"{line}\n" for line in run))
-    (HERE / "requirements-dev.txt").write_text(HEADER + "".join(f"{line}\n" for line in dev))
-    (HERE / "requirements-capture.txt").write_text(HEADER + "".join(f"{line}\n" for line in capture))
+    run, dev, capture, viewer = resolve([]), resolve(["dev"]), resolve(["capture"]), resolve(["viewer"])
+    for kind, packages in (("", run), ("-dev", dev), ("-capture", capture), ("-viewer", viewer)):
+        (HERE / f"requirements{kind}.txt").write_text(HEADER + "".join(f"{line}\n" for line in packages))
     for name, packages in (("conda.yaml", run), ("conda-capture.yaml", capture)):
         pins = "".join(f"      - {line}\n" for line in packages)
         (HERE / name).write_text(
             f"{HEADER}channels:\n  - conda-forge\ndependencies:\n  - python=3.11\n  - pip\n  - pip:\n{pins}"
         )
-    print(f"{len(run)} packages, {len(dev)} with those of development, {len(capture)} with those of captures")
+    print(
+        f"{len(run)} packages, {len(dev)} with those of development, {len(capture)} with those of captures, "
+        f"{len(viewer)} with those of the viewer"
+    )
 
 
 if __name__ == "__main__":

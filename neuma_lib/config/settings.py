@@ -37,6 +37,7 @@ from neuma_lib.config.tables import TableConfig
 from neuma_lib.config.validation import hint, validate
 from neuma_lib.config.variants import DRAWN, folder, parse_chain
 from neuma_lib.config.velocity import VelocityConfig
+from neuma_lib.config.viewer import ViewerConfig
 from neuma_lib.errors import InputError
 
 Changed = TypeVar("Changed", MaterialConfig, StructuredConfig, SpringsConfig, PacNerfConfig)
@@ -80,6 +81,7 @@ class Config(Section):
     pac_nerf: PacNerfConfig = Field(PacNerfConfig(), description="velocity and constants of PAC-NeRF")
     captures: CapturesConfig = Field(CapturesConfig(), description="own photographs and videos")
     evaluation: EvaluationConfig = Field(EvaluationConfig(), description="measures and videos")
+    viewer: ViewerConfig = Field(ViewerConfig(), description="viewer in a file")
     figures: FiguresConfig = Field(FiguresConfig(), description="figures")
     methods: dict[str, MethodConfig] = Field({}, description="methods by name")
     experiments: dict[str, ExperimentConfig] = Field({}, description="uses of learned laws by name")

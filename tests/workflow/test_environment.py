@@ -20,7 +20,7 @@ def requirements(name):
     return [line for line in lines if line and not line.startswith("#")]
 
 
-@pytest.mark.parametrize("name", ["requirements.txt", "requirements-dev.txt", "requirements-capture.txt"])
+@pytest.mark.parametrize("name", [f"requirements{kind}.txt" for kind in ("", "-dev", "-capture", "-viewer")])
 def test_every_line_is_an_exact_version_that_any_index_can_serve(name):
     for line in requirements(name):
         assert re.fullmatch(r"[a-z0-9._-]+==[0-9][0-9a-z.]*", line), line
@@ -32,6 +32,7 @@ def test_every_line_is_an_exact_version_that_any_index_can_serve(name):
         (PROJECT["dependencies"], "requirements.txt"),
         (PROJECT["dependencies"] + PROJECT["optional-dependencies"]["dev"], "requirements-dev.txt"),
         (PROJECT["dependencies"] + PROJECT["optional-dependencies"]["capture"], "requirements-capture.txt"),
+        (PROJECT["dependencies"] + PROJECT["optional-dependencies"]["viewer"], "requirements-viewer.txt"),
     ],
 )
 def test_locked_files_follow_the_pins(pins, name):

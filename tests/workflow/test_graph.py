@@ -10,9 +10,9 @@ from neuma_lib.config.places import law_files
 from neuma_lib.project import settings_around
 
 SUPERVISED = "neuma_particle_supervision"  # the one method that trains on the truth
-# Blender films the truth, a dataset is packed of it, evaluation measures against it, and these figures show it.
+# Blender films the truth, a dataset is packed of it, evaluation measures against it, and these figures and the viewer show it.
 MAY_READ_THE_TRUTH = {
-    *("render_static", "render_dynamic", "pack", "initial_state", "evaluation", "experiment"),
+    *("render_static", "render_dynamic", "pack", "initial_state", "evaluation", "viewer", "experiment"),
     *("tracers", "experiment_tracers"),
     *("particles_app", "lora_alphav", "ext_time"),
 }
@@ -33,7 +33,11 @@ def project(tmp_path_factory, kernels):
 
 
 def test_only_evaluation_and_figures_of_it_and_one_ablation_read_the_truth(project):
-    on_request = [f"{SCENE}/{SUPERVISED}/image_metrics.json", f"{SCENE}/neuma/bias.json"]
+    on_request = [
+        f"{SCENE}/{SUPERVISED}/image_metrics.json",
+        f"{SCENE}/neuma/bias.json",
+        f"{SCENE}/viewer.html",
+    ]
     everything = ("tables", "figures", "videos", "packed", *on_request)
     graph = jobs(project.run("--dry-run", *everything))
     assert len(graph) > 80

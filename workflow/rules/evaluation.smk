@@ -116,3 +116,16 @@ rule video:
         device=SETTINGS.device,
     script:
         "../scripts/video.py"
+
+
+rule viewer:
+    input:
+        files=lambda wildcards: viewer_files(wildcards).files,
+        kernels=kernels("laws", "rendering"),
+    output:
+        page=f"{RESULTS}/{{scene}}/viewer.html",
+    params:
+        files=lambda wildcards: viewer_files(wildcards).plain(),
+        viewer=SETTINGS.viewer.plain(),
+    script:
+        "../scripts/viewer.py"

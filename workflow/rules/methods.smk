@@ -1,8 +1,11 @@
 """What methods start from, read and are told. Needs scenes.smk."""
 
 from neuma_lib.config import places
+from dataclasses import replace
+
 from neuma_lib.config.methods import IDENTIFIED
 from neuma_lib.config.variants import parse_chain
+from neuma_lib.viewer.find import scene_files
 
 
 def prior_file(scene, method=None):
@@ -295,3 +298,8 @@ def own_result(file):
         return [] if without else f"{RESULTS}/{wildcards.scene}/{wildcards.method}/{file}"
 
     return choose
+
+@checked
+def viewer_files(wildcards):
+    """What the viewer in a file shows of a scene."""
+    return replace(scene_files(SETTINGS, wildcards.scene, SETTINGS.viewer.methods, home), velocity=None)

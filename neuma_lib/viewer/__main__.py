@@ -1,0 +1,51 @@
+"""``python -m neuma_lib.viewer results/BouncyBall --file ball.html``: motions of a scene in a browser."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.viewer.find import found_scene
+from neuma_lib.viewer.page import write_page
+from neuma_lib.viewer.scene import load_scene
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; the exit status. Errors that users can mend are one line."""
+    parser = argparse.ArgumentParser(prog="python -m neuma_lib.viewer", description=__doc__)
+    parser.add_argument("scene", help="folder of a scene, for example results/BouncyBall")
+    parser.add_argument("--file", required=True, help="write one HTML file, which opens without a server")
+    parser.add_argument("--methods", nargs="+", help="methods to show; by default all that have moved it")
+    parser.add_argument(
+        "--configfile", nargs="+", default=(), help="settings over those of the project, as for snakemake"
+    )
+    chosen = parser.parse_args(arguments)
+    try:
+        return run(chosen)
+    except (InputError, NonFiniteError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+
+
+def run(chosen: argparse.Namespace) -> int:
+    settings, files = found_scene(chosen.scene, chosen.configfile)
+    if chosen.methods:
+        known = {run.name: run for run in files.runs}
+        if unknown := [name for name in chosen.methods if name not in known]:
+            raise InputError(f"--methods {unknown[0]}: {chosen.scene} has {', '.join(known) or 'none'}")
+        files = replace(files, runs=tuple(known[name] for name in chosen.methods))
+    viewer = settings.viewer
+    scene = load_scene(files, say=print, side=viewer.image_side, skip_damaged=True)
+    for note in scene.notes:
+        print(note, file=sys.stderr)
+    size = write_page(Path(chosen.file), scene, viewer.particles, viewer.megabytes)
+    print(f"{chosen.file}: {len(scene.motions)} motions, {size / 1e6:.1f} MB; open it in a browser")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

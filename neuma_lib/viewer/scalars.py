@@ -1,0 +1,120 @@
+"""What colours particles: speed, stress, plastic strain, volume, with ranges for a legend in SI units."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from neuma_lib.mechanics.law import Law
+
+_HIGHEST = 99.5
+"""Percentile that ends a legend: single particles that are torn off would take all colours."""
+_NEIGHBOURS = 16
+"""Nearest particles whose motion is that of a particle's surroundings."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A coloured quantity: label and unit for the legend, the value in its middle if it has one, its least range."""
+
+    label: str
+    unit: str
+    middle: float | None
+    least: float
+
+
+QUANTITIES = {
+    "speed": Quantity("speed", "m/s", None, 0.01),
+    "von_mises": Quantity("von Mises stress", "Pa", None, 1.0),
+    "plastic_strain": Quantity("equivalent plastic strain", "", None, 0.01),
+    "volume_ratio": Quantity("elastic volume ratio det F", "", 1.0, 1e-3),
+}
+
+
+def speed(x: Tensor, times: Tensor, v: Tensor | None = None) -> Tensor:
+    """Speeds (T, N) [m/s] of positions (T, N, 3) at times (T,): from v (T, N, 3), or by differences without it."""
+    if v is None:
+        if len(times) == 1:
+            return x.new_zeros(x.shape[:2])
+        (v,) = torch.gradient(x, spacing=(times.to(x),), dim=0)
+    return v.norm(dim=-1)
+
+
+def von_mises(law: Law, F: Tensor) -> Tensor:
+    """Von Mises stress sqrt(3/2 s : s) [Pa] of elastic F (..., 3, 3), s the deviator of the Cauchy stress tau / det F.
+
+    The stress of a network need not be symmetric; its symmetric part counts.
+    """
+    flat = F.reshape(-1, 3, 3)
+    with torch.no_grad():
+        tau = law.elasticity.evaluate(flat, law.elasticity.weights())
+    sigma = 0.5 * (tau + tau.mT) / torch.linalg.det(flat)[:, None, None]
+    mean = sigma.diagonal(dim1=-2, dim2=-1).mean(dim=-1)
+    s = sigma - mean[:, None, None] * torch.eye(3, dtype=F.dtype)
+    return (1.5 * s.square().sum(dim=(-2, -1))).sqrt().reshape(F.shape[:-2])
+
+
+def volume_ratio(F: Tensor) -> Tensor:
+    """det F of elastic deformation gradients (..., 3, 3)."""
+    return torch.linalg.det(F)
+
+
+def plastic_strain(F: Tensor, total: Tensor) -> Tensor:
+    """Equivalent plastic strain sqrt(2/3) |dev log sigma_p|, sigma_p the stretches of F_p = F^-1 F_total.
+
+    Args:
+        F, total: elastic and total deformation gradients, (..., 3, 3).
+    """
+    stretches = torch.linalg.svdvals(torch.linalg.solve(F, total)).clamp_min(1e-6)
+    logs = stretches.log()
+    deviator = logs - logs.mean(dim=-1, keepdim=True)
+    return (2 / 3 * deviator.square().sum(dim=-1)).sqrt()
+
+
+def total_deformation(x: Tensor) -> Tensor:
+    """Total deformation gradients (T, N, 3, 3) of positions (T, N, 3), where a file has none.
+
+    The affine map that moves a particle's nearest neighbours of the first frame best, by least squares: exact for
+    affine motions, else an average over about two distances between particles.
+    """
+    x0 = x[0].double()
+    count = min(_NEIGHBOURS + 1, len(x0))
+    _, near = cKDTree(x0.numpy()).query(x0.numpy(), k=np.arange(1, count + 1))
+    near = torch.from_numpy(near)
+    rest = x0[near] - x0[near].mean(dim=1, keepdim=True)
+    inverse = torch.linalg.pinv(rest.mT @ rest)
+    found = []
+    for now in x.double():
+        moved = now[near] - now[near].mean(dim=1, keepdim=True)
+        found.append((moved.mT @ rest @ inverse).to(x.dtype))
+    return torch.stack(found)
+
+
+def ranges(motions: Iterable[Mapping[str, Tensor]]) -> dict[str, tuple[float, float]]:
+    """Ends of the legend of every quantity, the same for all motions, round numbers.
+
+    They suit the motion in the middle: one that goes astray would take all colours from the others.
+    """
+    motions = list(motions)
+    found = {}
+    for name, quantity in QUANTITIES.items():
+        values = [own[name].reshape(-1) for own in motions if name in own]
+        if not values:
+            continue
+        middle = quantity.middle or 0.0
+        ends = [float(np.percentile((v - middle).abs().numpy(), _HIGHEST)) for v in values]
+        reach = rounded_up(max(sorted(ends)[len(ends) // 2], quantity.least))
+        found[name] = (middle - reach if quantity.middle is not None else 0.0, middle + reach)
+    return found
+
+
+def rounded_up(value: float) -> float:
+    """The next of 1, 1.5, 2, 3, 4, 5, 6, 8, 10 times a power of ten that is not less than a positive value."""
+    power = 10.0 ** np.floor(np.log10(value))
+    steps = (1, 1.5, 2, 3, 4, 5, 6, 8, 10)
+    return float(next(step for step in steps if step * power >= value * (1 - 1e-9)) * power)

@@ -1,0 +1,282 @@
+"""What a viewer shows: Gaussians and particles of several motions of one body, cameras and what they saw."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from neuma_lib.coupling.binding import Binding
+from neuma_lib.coupling.deformation import arms_at_rest, deform
+from neuma_lib.coupling.reconstruction import Reconstruction
+from neuma_lib.errors import InputError
+from neuma_lib.io.files import one_line, parse_json
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.images import read_image_set, read_transforms
+from neuma_lib.io.laws import load_laws
+from neuma_lib.io.particles import load_body
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.law import Law
+from neuma_lib.splatting.gaussians import Gaussians
+from neuma_lib.viewer import scalars
+from neuma_lib.viewer.files import LawFiles, RunFiles, SceneFiles
+
+TRUTH = "truth"
+_CARRYING = 8
+"""True particles that carry a Gaussian of the reconstruction."""
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How one body moves.
+
+    Attributes:
+        name: `TRUTH`, or of a method.
+        title: for the screen.
+        steps: simulation step of each frame, length T.
+        x: particles [m], shape (T, N, 3).
+        scalars: values of particles by the names of `scalars.QUANTITIES`, shape (T, N); what cannot be known is left
+            out.
+        means, covars: Gaussians [m], [m^2], shapes (T, G, 3) and (T, G, 3, 3); None where the particles carry none.
+    """
+
+    name: str
+    title: str
+    steps: tuple[int, ...]
+    x: Tensor
+    scalars: dict[str, Tensor]
+    means: Tensor | None
+    covars: Tensor | None
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera: world to camera (4, 4) (OpenCV axes), intrinsics (3, 3) and size [px].
+
+    ``images`` by step are straight-alpha RGBA, uint8, smaller than the camera's but of its proportions.
+    """
+
+    number: int
+    viewmat: np.ndarray
+    K: np.ndarray
+    width: int
+    height: int
+    images: dict[int, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """All motions of a scene.
+
+    Attributes:
+        name: of the scene.
+        dt: time step [s].
+        gaussians: at rest; colours and opacities are the same in all motions.
+        volume: of the body [m^3].
+        motions: the true one first if it is known.
+        views: cameras.
+        ranges: ends of the legends by name, see `scalars.ranges`.
+        notes: what could not be shown, and why.
+    """
+
+    name: str
+    dt: float
+    gaussians: Gaussians
+    volume: float
+    motions: tuple[Motion, ...]
+    views: tuple[View, ...]
+    ranges: dict[str, tuple[float, float]]
+    notes: tuple[str, ...]
+
+    @property
+    def steps(self) -> tuple[int, ...]:
+        """Steps of the frames on the slider: those of the motion with most."""
+        return max((motion.steps for motion in self.motions), key=len)
+
+    def motion(self, name: str) -> Motion:
+        """The motion of that name. Raises InputError where there is none."""
+        for motion in self.motions:
+            if motion.name == name:
+                return motion
+        known = ", ".join(motion.name for motion in self.motions)
+        raise InputError(f"no motion '{name}' in {self.name}: there are {known}")
+
+
+def frame_at(steps: tuple[int, ...], step: int) -> int:
+    """Index of the last frame at or before a step; the first one where there is none."""
+    return max(int(np.searchsorted(steps, step, side="right")) - 1, 0)
+
+
+def load_scene(
+    files: SceneFiles, say: Say = lambda text: None, side: int = 160, skip_damaged: bool = False
+) -> Scene:
+    """Read a scene and move its Gaussians with every motion.
+
+    Args:
+        say: receives a line on what is being read.
+        side: see `load_views`.
+        skip_damaged: a predicted motion that cannot be read becomes a note.
+
+    Raises:
+        InputError: a damaged file of the body or of a motion, or one that must not be read (`SceneFiles.checked`).
+    """
+    paths = [files.checked(path) for path in (files.particles, files.binding, files.gaussians)]
+    body = load_body(*paths, files.density)
+    motions, notes = [], []
+    if files.truth:
+        motions.append(true_motion(files.checked(files.truth), body, files.simulation["dt"]))
+    for run in files.runs:
+        say(f"{run.title}: {run.rollout}")
+        try:
+            motions.append(_predicted(files, run, body, notes))
+        except InputError as error:
+            if not skip_damaged:
+                raise
+            notes.append(f"{run.title} is left out: {one_line(error)}")
+    if not motions:
+        raise InputError(
+            f"{files.name}: nothing moves here yet; make a motion with `snakemake --cores 2 results/{files.name}/neuma/"
+            "rollout.h5`"
+        )
+    views = ()
+    if files.transforms:
+        try:
+            views = load_views(files, side)
+        except InputError as error:
+            notes.append(f"no cameras: {one_line(error)}")
+    shown = scalars.ranges(motion.scalars for motion in motions)
+    volume = float(body.vol0.sum())
+    return Scene(
+        files.name, files.simulation["dt"], body.gaussians, volume, tuple(motions), views, shown, tuple(notes)
+    )
+
+
+def law_of(files: LawFiles, checked: Callable[[str], Path]) -> Law:
+    """The law that files describe. Raises InputError as `load_laws` and ``checked`` do."""
+    prior, adaptor, identified = (
+        [checked(file)] if file else [] for file in (files.prior, files.adaptor, files.identified)
+    )
+    return load_laws(files.dt, [files.spec] if files.spec else [], identified, prior, adaptor)[0]
+
+
+def true_motion(path: Path, body: Reconstruction, dt: float) -> Motion:
+    """The ground truth; its particles carry the Gaussians of the reconstruction.
+
+    Each follows the affine motion of the `_CARRYING` particles that are nearest to it at the start: the motion is
+    true, the Gaussians are those that were fitted.
+    """
+    names = ("x", "F", "v", "frames")
+    arrays, attributes = read_arrays(path, required=("x", "F"), only=names)
+    law = None
+    if "bodies" in attributes:
+        bodies = parse_json(attributes["bodies"], path)
+        simulation = parse_json(attributes.get("simulation", "{}"), path)
+        if len(bodies) == 1:
+            law = analytic_law(bodies[0]["law"], dt=simulation.get("dt", dt))
+    x, F = (torch.from_numpy(arrays[name]) for name in ("x", "F"))
+    v = torch.from_numpy(arrays["v"]) if "v" in arrays else None
+    steps = _steps(arrays, len(x))
+    g = body.gaussians
+    binding = nearest_binding(g.means, x[0])
+    moved = deform(g.means, g.covars(), binding, x[0], x, F, arms=arms_at_rest(g.means, binding, x[0]))
+    values = _values(x, F, None, v, steps, dt, law)
+    return Motion(TRUTH, "Truth", steps, x, values, *moved)
+
+
+def nearest_binding(means: Tensor, x: Tensor) -> Binding:
+    """Every Gaussian (G, 3) bound to its nearest particles of x (N, 3), in proportion to one over their distance."""
+    count = min(_CARRYING, len(x))
+    distance, near = cKDTree(x.numpy()).query(means.numpy(), k=np.arange(1, count + 1))
+    weights = 1 / np.maximum(distance, 1e-9)
+    order = np.argsort(near, axis=1)
+    near, weights = (np.take_along_axis(a, order, axis=1) for a in (near, weights))
+    weights /= weights.sum(axis=1, keepdims=True)
+    indptr = torch.arange(len(means) + 1) * count
+    return Binding(
+        indptr,
+        torch.from_numpy(near.ravel().astype(np.int64)),
+        torch.from_numpy(weights.ravel()).to(means),
+        (len(means), len(x)),
+    )
+
+
+def _predicted(files: SceneFiles, run: RunFiles, body: Reconstruction, notes: list[str]) -> Motion:
+    """A method's motion on the reconstructed body."""
+    path = files.checked(run.rollout)
+    arrays, attributes = read_arrays(path, required=("x", "F"), only=("x", "F", "F_total", "frames"))
+    x, F = (torch.from_numpy(arrays[name]) for name in ("x", "F"))
+    total = torch.from_numpy(arrays["F_total"]) if "F_total" in arrays else None
+    if not (x.isfinite().all() and F.isfinite().all()):
+        raise InputError(f"{path} holds values that are not finite: make it again")
+    steps, dt = _steps(arrays, len(x)), float(attributes.get("dt", files.simulation["dt"]))
+    law = None
+    if run.law is None:
+        notes.append(f"{run.title}: springs have no stress")
+    else:
+        try:
+            law = law_of(run.law, files.checked)
+        except InputError as error:
+            notes.append(f"{run.title}: no stress, as its law cannot be read ({one_line(error)})")
+    means = covars = None
+    stretch, g = F if total is None else total, body.gaussians
+    at_rest = (g.means, g.covars())
+    if x.shape[1] == len(body.x0):
+        arms = arms_at_rest(g.means, body.binding, body.x0) if run.gaussian_motion == "affine" else None
+        means, covars = deform(*at_rest, body.binding, body.x0, x, stretch, arms=arms)
+    elif x.shape[1] == len(g):
+        means, covars = deform(*at_rest, Binding.identity(len(g), g.means), g.means, x, stretch)
+    else:
+        notes.append(f"{run.title}: particles of its own, which carry no Gaussians")
+    return Motion(run.name, run.title, steps, x, _values(x, F, total, None, steps, dt, law), means, covars)
+
+
+def _values(
+    x: Tensor, F: Tensor, total: Tensor | None, v: Tensor | None, steps: tuple[int, ...], dt: float, law: Law | None
+) -> dict[str, Tensor]:  # fmt: skip
+    """All scalars of a motion that can be known."""
+    found = {
+        "speed": scalars.speed(x, dt * torch.tensor(steps), v),
+        "plastic_strain": scalars.plastic_strain(F, scalars.total_deformation(x) if total is None else total),
+        "volume_ratio": scalars.volume_ratio(F),
+    }
+    if law is not None:
+        found["von_mises"] = torch.stack([scalars.von_mises(law, frame) for frame in F])
+    return found
+
+
+def _steps(arrays: dict[str, np.ndarray], count: int) -> tuple[int, ...]:
+    return tuple(arrays["frames"].tolist()) if "frames" in arrays else tuple(range(count))
+
+
+def load_views(files: SceneFiles, side: int = 160) -> tuple[View, ...]:
+    """Cameras of a video, each with its images, made smaller.
+
+    Args:
+        side: longer side of the images [px].
+
+    Raises:
+        InputError: no such list, or an image that is damaged, missing or must not be read.
+    """
+    path = files.checked(files.transforms)
+    listed = read_transforms(path)["frames"]
+    for frame in listed:
+        for name in (frame["file_path"], f"{frame['file_path']}.png"):
+            if (path.parent / name).is_file():
+                files.checked(path.parent / name)
+    views = []
+    for number in sorted({frame.get("view", i) for i, frame in enumerate(listed)}):
+        found = read_image_set(path, [number])
+        scale = min(1.0, side / max(found.width, found.height))
+        size = max(1, round(found.width * scale)), max(1, round(found.height * scale))
+        pictures = [Image.fromarray(image).resize(size, Image.Resampling.BOX) for image in found.images]
+        images = {int(step): np.asarray(image) for step, image in zip(found.steps, pictures, strict=True)}
+        views.append(View(number, found.viewmats[0], found.Ks[0], found.width, found.height, images))
+    return tuple(views)
