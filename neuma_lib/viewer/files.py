@@ -13,7 +13,7 @@ from neuma_lib.io.files import existing
 
 @dataclass(frozen=True)
 class LawFiles:
-    """What a law is made from, as `neuma_lib.io.laws.load_laws` takes it.
+    """What a law is made from, as of `neuma_lib.config.places`, but known without the settings.
 
     Attributes:
         spec: an analytic law, or None.

@@ -139,7 +139,7 @@ def test_bad_folders_say_what_to_do(folder, tmp_path):
     with pytest.raises(InputError, match="is no folder: name that of a scene"):
         found_scene(tmp_path / "nothing")
     (tmp_path / "results" / SCENE).mkdir(parents=True)
-    with pytest.raises(InputError, match="give --configfile"):
+    with pytest.raises(InputError, match="name a folder in a project"):
         found_scene(tmp_path / "results" / SCENE)
     with pytest.raises(InputError, match="knows? no scene 'priors'"):
         found_scene(folder.parent / "priors")

@@ -10,7 +10,7 @@ from neuma_lib.config.places import law_files
 from neuma_lib.project import settings_around
 
 SUPERVISED = "neuma_particle_supervision"  # the one method that trains on the truth
-# Blender films the truth, a dataset is packed of it, evaluation measures against it, and these figures and the viewer show it.
+# Blender films the truth, a dataset is packed of it, evaluation measures against it; figures and viewer show it.
 MAY_READ_THE_TRUTH = {
     *("render_static", "render_dynamic", "pack", "initial_state", "evaluation", "viewer", "experiment"),
     *("tracers", "experiment_tracers"),

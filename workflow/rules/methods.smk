@@ -1,8 +1,8 @@
 """What methods start from, read and are told. Needs scenes.smk."""
 
-from neuma_lib.config import places
 from dataclasses import replace
 
+from neuma_lib.config import places
 from neuma_lib.config.methods import IDENTIFIED
 from neuma_lib.config.variants import parse_chain
 from neuma_lib.viewer.find import scene_files
@@ -299,7 +299,8 @@ def own_result(file):
 
     return choose
 
+
 @checked
 def viewer_files(wildcards):
     """What the viewer in a file shows of a scene."""
-    return replace(scene_files(SETTINGS, wildcards.scene, SETTINGS.viewer.methods, home), velocity=None)
+    return replace(scene_files(SETTINGS, wildcards.scene, SETTINGS.viewer.methods), velocity=None)
