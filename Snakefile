@@ -34,6 +34,7 @@ include: "workflow/rules/figures.smk"
 include: "workflow/rules/capturing.smk"
 include: "workflow/rules/capture_motion.smk"
 include: "workflow/rules/released_captures.smk"
+include: "workflow/rules/capture_registration.smk"
 include: "workflow/rules/capture_scenes.smk"
 
 

@@ -1,0 +1,104 @@
+"""Free flight of a rigid body: its centre falls on a parabola, its angular momentum stays as it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+_LONGEST_TURN = 0.1
+"""Angle [rad] of a step of the integration, whose error is of its fifth power."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigidMotion:
+    """A free flight from the time 0 on, x(t) = R(t) (x_photo - pivot) + c(t).
+
+    Attributes:
+        rotation: R(0), from the body as photographed to the world, (3, 3).
+        centre: c(0), where the centre of mass is [m], (3,).
+        velocity: of the centre [m/s], (3,).
+        spin: angular velocity at the time 0, in the world [rad/s], (3,).
+        gravity: [m/s^2], (3,).
+        inertia: about the centre of mass, of the body as photographed, for a mass of 1 kg [m^2], (3, 3).
+    """
+
+    rotation: np.ndarray
+    centre: np.ndarray
+    velocity: np.ndarray
+    spin: np.ndarray
+    gravity: np.ndarray
+    inertia: np.ndarray
+
+    def place(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Centre (T, 3) [m] and its velocity (T, 3) [m/s] at times (T,) [s]."""
+        t = np.asarray(times, float)[:, None]
+        return self.centre + self.velocity * t + self.gravity * t**2 / 2, self.velocity + self.gravity * t
+
+    def turn(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations (T, 3, 3) and angular velocities (T, 3) [rad/s] at times (T,) [s]."""
+        R, w = turned(self.rotation[None], self.spin[None], self.inertia, times)
+        return R[0], w[0]
+
+
+def turned(
+    rotations: np.ndarray, spins: np.ndarray, inertia: np.ndarray, times: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations (B, T, 3, 3) and angular velocities (B, T, 3) of B free bodies at times (T,), negative ones too.
+
+    dR/dt = [omega]_x R, omega = R J^-1 R^T L with a constant angular momentum L, by Runge and Kutta's fourth order.
+
+    Args:
+        rotations, spins: at the time 0, (B, 3, 3) and (B, 3) [rad/s].
+        inertia: J of the body at R = 1, (3, 3); its unit does not matter.
+    """
+    times, inverse = np.asarray(times, float), np.linalg.inv(inertia)
+    momentum = np.einsum("bij,jk,blk,bl->bi", rotations, inertia, rotations, spins)
+    fastest = np.linalg.norm(spins, axis=1).max()
+
+    def rate(R):
+        return np.einsum("bij,jk,blk,bl->bi", R, inverse, R, momentum)
+
+    def slope(R):
+        return np.cross(rate(R)[:, :, None], R, axis=1)
+
+    found, speeds = np.empty((len(rotations), len(times), 3, 3)), np.empty((len(rotations), len(times), 3))
+    for side in (1, -1):
+        R, now = rotations, 0.0
+        for i in np.argsort(side * times, kind="stable"):
+            if side * times[i] < 0 or (side < 0 and times[i] == 0):
+                continue
+            steps = max(1, int(np.ceil(abs(times[i] - now) * fastest / _LONGEST_TURN)))
+            h = (times[i] - now) / steps
+            for _ in range(steps if h else 0):
+                k1 = slope(R)
+                k2 = slope(R + h / 2 * k1)
+                k3 = slope(R + h / 2 * k2)
+                R = R + h / 6 * (k1 + 2 * k2 + 2 * k3 + slope(R + h * k3))
+            now, found[:, i], speeds[:, i] = times[i], R, rate(R)
+    U, _, Vt = np.linalg.svd(found)
+    return U @ Vt, speeds
+
+
+def moment_of_inertia(arms: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    """Moment of inertia (3, 3) [m^2] of points at arms (N, 3) [m] from their centre of mass, for 1 kg in all."""
+    second = np.einsum("n,ni,nj->ij", mass / mass.sum(), arms, arms)
+    return np.trace(second) * np.eye(3) - second
+
+
+def spread_rotations(count: int) -> np.ndarray:
+    """Rotations (count, 3, 3) that lie evenly in all of them: super-Fibonacci spirals (Alexa, CVPR 2022).
+
+    The farthest rotation is about 3.5 count^(-1/3) rad from one of them.
+    """
+    s = np.arange(count) + 0.5
+    inner, outer = np.sqrt(s / count), np.sqrt(1 - s / count)
+    a, b = 2 * np.pi * s / np.sqrt(2), 2 * np.pi * s / 1.533751168755204288118041
+    quats = np.stack([inner * np.sin(a), inner * np.cos(a), outer * np.sin(b), outer * np.cos(b)], axis=1)
+    return Rotation.from_quat(quats).as_matrix()
+
+
+def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angles [rad] between rotations (..., 3, 3)."""
+    return Rotation.from_matrix((a @ np.swapaxes(b, -1, -2)).reshape(-1, 3, 3)).magnitude()

@@ -1,0 +1,36 @@
+"""The photographed object placed into the video of a throw, with its motion. Needs capture_motion.smk."""
+
+
+def of_the_object(file):
+    """A function of a scene that is a throw: a file of its object as photographed."""
+    return of_thrown(lambda wildcards: f"{RESULTS}/{wildcards.capture}/{file}")
+
+
+rule capture_registration:
+    input:
+        kernels=kernels("rendering"),
+        gaussians=of_the_object("gaussians.ply"),
+        mesh=of_the_object("mesh.ply"),
+        sampled=of_the_object("sampled_particles.h5"),
+        particles=of_the_object("particles.h5"),
+        binding=of_the_object("binding.h5"),
+        transforms=of_filmed(MATTES),
+        timelines=of_filmed(f"{RESULTS}/{{capture}}/frames/{{throw}}/{{camera}}.json"),
+        flight=of_thrown(lambda wildcards: FLIGHT.format(**vars(wildcards)) + ".json"),
+    output:
+        gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
+        mesh=f"{RESULTS}/{{scene}}/mesh.ply",
+        sampled=f"{RESULTS}/{{scene}}/sampled_particles.h5",
+        particles=f"{RESULTS}/{{scene}}/particles.h5",
+        binding=f"{RESULTS}/{{scene}}/binding.h5",
+        velocity=f"{RESULTS}/{{scene}}/velocity.json",
+        registration=f"{RESULTS}/{{scene}}/registration.json",
+        picture=f"{RESULTS}/{{scene}}/registration.png",
+    wildcard_constraints:
+        scene=THROW_SCENE,
+    params:
+        cameras=lambda wildcards: SETTINGS.scene(wildcards.scene).captured.cameras,
+        timing=of_thrown(camera_timing),
+        name="{scene}",
+    script:
+        "../scripts/capture_registration.py"
