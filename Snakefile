@@ -36,6 +36,7 @@ include: "workflow/rules/capture_motion.smk"
 include: "workflow/rules/released_captures.smk"
 include: "workflow/rules/capture_registration.smk"
 include: "workflow/rules/capture_scenes.smk"
+include: "workflow/rules/capture_report.smk"
 
 
 rule all:

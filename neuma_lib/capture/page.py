@@ -1,9 +1,12 @@
-"""One page of a capture: its checks, each with what to expect, and its pictures."""
+"""Checks of a capture, each with what to expect, and its pages."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
+
+from neuma_lib.capture.agreement import LEAST_AGREEMENT
+from neuma_lib.capture.flight import flight_checks
 
 MOST_ERROR = 1.0
 """Mean reprojection error that good photographs stay below [px]."""
@@ -11,6 +14,12 @@ MOST_RESIDUAL = 0.5
 """Distance of the board's corners from the print that a flat board, measured well, stays below [mm]."""
 LEAST_FLOOR = 0.2
 """Share of the points that lie on a floor with texture."""
+MOST_LEFT_OUT = 0.1
+"""Share of the photographs whose masks may disagree with the others."""
+MOST_JUMP = 0.1
+"""Change of a mask's area from frame to frame of free flight that good masks stay below."""
+LEAST_PSNR = 20.0
+"""PSNR inside the object that Gaussians of good photographs have in photographs that were kept from the fit [dB]."""
 
 
 class Check(NamedTuple):
@@ -56,6 +65,39 @@ def checks(room: Mapping[str, Any], videos: Mapping[str, Mapping[str, Any]]) -> 
         )
         found.append(Check(f"frames of {name}", text, "none missing", not missing))
     return found
+
+
+def motion_checks(
+    photographs: Mapping[str, Any],
+    videos: Mapping[str, Mapping[str, Any]],
+    flights: Mapping[str, Mapping[str, Any]],
+) -> list[Check]:
+    """Checks of masks and free flight.
+
+    Args:
+        photographs: report of the masks of the photographs.
+        videos: of the masks of each video, by its name.
+        flights: `neuma_lib.capture.flight.report` by throw.
+    """
+    count, out = photographs["photographs"], photographs["left_out"]
+    text = f"{count - len(out)} of {count}" + (f" (not {', '.join(out)})" if out else "")
+    what = f"masks of photographs that agree (IoU > {LEAST_AGREEMENT})"
+    found = [Check(what, text, "nearly all", len(out) <= MOST_LEFT_OUT * count)]
+    for name, report in videos.items():
+        jump = report["largest_jump"]
+        text = "no free flight" if jump is None else f"{100 * jump:.1f} %"
+        good = jump is not None and jump < MOST_JUMP
+        found.append(Check(f"area of {name}, frame to frame", text, f"< {100 * MOST_JUMP:.0f} %", good))
+    for throw, flight in flights.items():
+        found += [Check(*values) for values in flight_checks(throw, flight)]
+    return found
+
+
+def object_checks(fit: Mapping[str, Any]) -> list[Check]:
+    """Checks of the Gaussians of the object as photographed, by the report of their fit."""
+    psnr = fit["psnr_object"]
+    text = f"{psnr:.1f} dB inside the object ({len(fit['held_out'])} photographs, {fit['count']} Gaussians)"
+    return [Check("PSNR of photographs kept from the fit", text, f"> {LEAST_PSNR:g} dB", psnr > LEAST_PSNR)]
 
 
 def markdown(title: str, found: list[Check], pictures: Mapping[str, str], missing: str | None = None) -> str:

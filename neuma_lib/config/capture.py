@@ -245,3 +245,6 @@ class CapturesConfig(Section):
         BoardConfig(square=0.030),
         description="the board as printed; what a print measures stands in capture.yaml",
     )
+    shown: int = Field(
+        320, ge=64, le=2048, description="longer side of the pictures that the report measures and shows [px]"
+    )

@@ -2,39 +2,20 @@
 
 from pathlib import Path
 
-from neuma_lib.capture.agreement import LEAST_AGREEMENT
-from neuma_lib.capture.flight import flight_checks
-from neuma_lib.capture.page import Check, markdown
+from neuma_lib.capture.page import markdown, motion_checks
 from neuma_lib.io.files import read_json, write_text
 from workflow.inputs import listed
 from workflow.stage import run_script
-
-MOST_JUMP = 0.1
-"""Change of a mask's area from frame to frame of free flight that good masks stay below."""
 
 
 def main(inputs, output, params, run) -> None:
     home = Path(output.page).parent
     names = [f"{throw}, {camera}" for throw, camera in params.videos]
-    photographs = read_json(inputs.photographs)
-    out = photographs["left_out"]
-    text = f"{photographs['photographs'] - len(out)} of {photographs['photographs']}"
-    checks = [
-        Check(
-            f"masks of photographs that agree (IoU > {LEAST_AGREEMENT})",
-            text + (f" (not {', '.join(out)})" if out else ""),
-            "nearly all",
-            len(out) <= 0.1 * photographs["photographs"],
-        )
-    ]
-    for name, report in zip(names, map(read_json, listed(inputs.reports))):
-        jump = report["largest_jump"]
-        found = "no free flight" if jump is None else f"{100 * jump:.1f} %"
-        checks.append(
-            Check(f"area of {name}, frame to frame", found, "< 10 %", jump is not None and jump < MOST_JUMP)
-        )
-    for throw, flight in zip(params.throws, map(read_json, listed(inputs.flights))):
-        checks += [Check(*values) for values in flight_checks(throw, flight)]
+    checks = motion_checks(
+        read_json(inputs.photographs),
+        dict(zip(names, map(read_json, listed(inputs.reports)))),
+        dict(zip(params.throws, map(read_json, listed(inputs.flights)))),
+    )
     files = {
         "Masks of photographs": inputs.photograph_sheet,
         **{f"Masks: {name}": sheet for name, sheet in zip(names, listed(inputs.sheets))},

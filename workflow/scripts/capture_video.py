@@ -43,6 +43,7 @@ def main(inputs, output, params, run) -> None:
                 **reduced_intrinsics(frames[k], pixels.shape[1::-1]),
                 "view": view,
                 "camera": camera,
+                "frame": frames[k]["step"],
                 "step": int(round(times[k] / params.dt)),
                 "time": float(times[k]),
             }

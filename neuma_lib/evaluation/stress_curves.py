@@ -1,0 +1,126 @@
+"""Stress curves of laws that were found for one object, over the states that its motion went through: no truth is known.
+
+Simulated lengths are ``scale`` times those of the room, times and densities are the same; so a stress in the room is the
+simulator's divided by the square of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from torch import Tensor
+
+from neuma_lib.evaluation.bands import band
+from neuma_lib.evaluation.plotting import style
+from neuma_lib.evaluation.response import EVERY, inside, material_tests
+from neuma_lib.mechanics.law import Law
+
+TESTS = {
+    "uniaxial": ("axial stretch", "axial stress"),
+    "shear": ("elastic shear", "shear stress"),
+    "yield": ("total shear, {rate:g} per second", "shear stress"),
+}
+"""Axes of the panels, from top to bottom."""
+VISITED = "#d9e6ef"
+"""Colour of the visited ranges."""
+HEADROOM = 0.6
+"""How far curves may go beyond those of the learned law, relative to its range; then they are cut."""
+
+
+def stress_curves(
+    laws: Mapping[str, Law],
+    learned: str,
+    F: Tensor,
+    rate: float,
+    total_shear: float,
+    dt: float,
+    draws: Mapping[str, Sequence[Law]],
+    scale: float = 1.0,
+) -> dict[str, Any]:
+    """Curves of laws in tests of a material point, in the room's units, as plain numbers.
+
+    Args:
+        laws: by method.
+        learned: the method whose motion went through F, and whose stress there is the visited range of the last test.
+        F: its elastic deformation gradients (..., 3, 3).
+        rate, total_shear: of the last test, as of `material_tests` [1/s] and 1.
+        dt: time step [s].
+        draws: laws that the video leaves possible, by method; those of a method without an account of that are missing.
+        scale: metres of the simulator to a metre of the room.
+
+    Returns:
+        ``rate``, ``learned`` and ``tests``: of each ``x``, ``visited`` (low, high), ``by_stress`` and ``laws`` with
+        ``stress`` [Pa] and ``band``: None, or ``x``, ``low`` and ``high`` [Pa].
+    """
+    per = 1 / scale**2
+    tests: dict[str, Any] = {}
+    for name, test in material_tests(laws[learned], F, rate, total_shear, dt).items():
+        found: dict[str, Any] = {}
+        for method, law in laws.items():
+            found[method] = {"stress": (per * test.curve(law, test.x)).tolist(), "band": None}
+            if draws.get(method):
+                x = test.x[::EVERY].contiguous()
+                low, high = band(draws[method], lambda drawn: test.curve(drawn, x))
+                ends = {"low": (per * low).tolist(), "high": (per * high).tolist()}
+                found[method]["band"] = {"x": x.tolist(), **ends}
+        visited = [per * end for end in test.visited] if test.by_stress else list(test.visited)
+        tests[name] = {
+            "x": test.x.tolist(),
+            "visited": visited,
+            "by_stress": test.by_stress,
+            "laws": found,
+        }
+    return {"rate": rate, "learned": learned, "tests": tests}
+
+
+def share_inside(test: Mapping[str, Any], method: str, band_of: str) -> float | None:
+    """Part of the visited range of a test at which a law lies in the band of another; None where there is no band, or
+    nothing was visited."""
+    found = test["laws"].get(band_of, {}).get("band")
+    if not found:
+        return None
+    return inside({**test, "band": found, "true": test["laws"][method]["stress"]})
+
+
+@style.styled
+def draw(curves: Mapping[str, Any], titles: Mapping[str, str]) -> Figure:
+    """A panel for each test, one below the other.
+
+    Args:
+        curves: as of `stress_curves`.
+        titles: of the methods.
+    """
+    figure = style.new_figure(1.25 * style.COLUMN, 0.4 + 1.7 * len(curves["tests"]))
+    panels = figure.subplots(len(curves["tests"]), 1, squeeze=False)[:, 0]
+    for axes, (name, test) in zip(panels, curves["tests"].items(), strict=True):
+        _panel(axes, test, titles, curves["learned"])
+        xlabel, ylabel = TESTS[name]
+        axes.set(xlabel=xlabel.format(rate=curves["rate"]), ylabel=f"{ylabel} [kPa]")
+    figure.align_ylabels(panels)
+    style.legend_above(figure, panels[0], 2)
+    return figure
+
+
+def _panel(axes, test: Mapping[str, Any], titles: Mapping[str, str], learned: str) -> None:
+    x = np.asarray(test["x"])
+    span, unit = (axes.axhspan, 1e-3) if test["by_stress"] else (axes.axvspan, 1.0)
+    span(*(unit * end for end in test["visited"]), color=VISITED, linewidth=0, label="seen in the video")
+    for method, law in test["laws"].items():
+        line = style.look(method).line
+        if law["band"]:
+            ends = [1e-3 * np.asarray(law["band"][end]) for end in ("low", "high")]
+            axes.fill_between(law["band"]["x"], *ends, color=line["color"], alpha=0.18, linewidth=0)
+        width = 1.8 if method == learned else 1.1
+        axes.plot(x, 1e-3 * np.asarray(law["stress"]), **line, linewidth=width, label=titles[method])
+    shown = 1e-3 * np.stack([law["stress"] for law in test["laws"].values()])
+    own = 1e-3 * np.asarray(test["laws"][learned]["stress"])
+    room = HEADROOM * (np.ptp(own) or 1.0)
+    low, high = max(shown.min(), own.min() - room), min(shown.max(), own.max() + room)
+    margin = 0.08 * (high - low or 1.0)
+    axes.set(xlim=(x.min(), x.max()), ylim=(low - margin, high + margin))
+    axes.axhline(0, color=style.GREY, linewidth=0.4, zorder=0.5)
+    axes.yaxis.set_major_locator(MaxNLocator(4))

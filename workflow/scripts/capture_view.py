@@ -1,0 +1,107 @@
+"""Compare a prediction with what a camera filmed: measures of every frame, and a video of both."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from neuma_lib.coupling.filmed import Filmed
+from neuma_lib.device import choose_device
+from neuma_lib.errors import InputError
+from neuma_lib.evaluation.captured_images import (
+    as_planes,
+    averaged,
+    captured_metrics,
+    error_picture,
+    exposed,
+    laid_over,
+)
+from neuma_lib.evaluation.lpips import LPIPS
+from neuma_lib.evaluation.video import side_by_side, write_mp4
+from neuma_lib.fitting.frame_batches import frame_batches
+from neuma_lib.io.files import atomic, write_json
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.images import filmed_steps, load_videos, open_image, read_transforms
+from neuma_lib.io.particles import load_body, load_motion
+from neuma_lib.io.weights import read_weights
+from workflow.stage import run_script
+
+
+def read_rgb(path: Path) -> np.ndarray:
+    with open_image(path.read_bytes(), path) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+class Prediction:
+    """Renders of a rollout in a camera: colours over black and their opacity."""
+
+    def __init__(self, body, rollout, needed):
+        self.body = body
+        arrays, _ = read_arrays(rollout, required=("frames",), only=("frames",))
+        self.steps = arrays["frames"].tolist()
+        if not set(needed) <= set(self.steps):
+            raise InputError(f"{rollout} has other steps than the video: run capture_prediction again")
+        self.x, self.F = (state.to(body.x0) for state in load_motion(rollout))
+
+    def frames(self, video):
+        """Colours (H, W, 3) and opacity (H, W) of each frame of a video of one camera."""
+        renderer = self.body.particle_gs(video.cameras, background=(0.0, 0.0, 0.0))
+        colours, masks = (Filmed(renderer, video, self.steps, kind) for kind in ("colour", "masks"))
+        x, F = colours.states(self.x), colours.states(self.F)
+        for part in frame_batches(len(video.frames), colours.batch):
+            yield from zip(colours(x[part], F[part])[:, 0], masks(x[part], F[part])[:, 0, ..., 0], strict=True)
+
+
+def main(inputs, output, params, run) -> None:
+    device = choose_device(params.device)
+    weights, _ = read_weights(inputs.weights)
+    networks = {name: LPIPS(weights, name).to(device) for name in ("vgg", "alex")}
+    needed = filmed_steps(inputs.shown, [params.view], params.dt, params.sub_frames)
+    predictions = []
+    for rollout, motion in [(inputs.rollout, params.gaussian_motion), (inputs.prior, params.prior_motion)]:
+        if rollout:
+            carrier = params.carrier if rollout == inputs.rollout else "binding"
+            files = (inputs.particles, inputs.binding, inputs.gaussians)
+            body = load_body(*files, params.density, carrier, motion).to(torch.float32, device)
+            predictions.append(Prediction(body, rollout, needed))
+    folder = Path(inputs.shown).parent
+    entries = {f["step"]: f for f in read_transforms(inputs.shown)["frames"] if f["view"] == params.view}
+    plate = read_rgb(folder / next(iter(entries.values()))["plate"])
+    measures, panels = [], []
+    for video in load_videos(inputs.shown, [params.view], params.dt, params.sub_frames):
+        video = video.to(torch.float32, device)
+        with torch.no_grad():
+            renders = zip(*(prediction.frames(video) for prediction in predictions), strict=True)
+            for k, (step, shown) in enumerate(zip(video.frames, renders, strict=True)):
+                entry = entries[step]
+                filmed = as_planes(read_rgb(folder / entry["picture"])).to(device)
+                empty = exposed(plate, entry["plate_gain"], entry["plate_offset"])
+                empty = torch.from_numpy(empty).float().to(device)
+                gain = torch.tensor(entry["gain"], dtype=torch.float32, device=device)
+                pictures = [laid_over(gain * colours, alpha, empty) for colours, alpha in shown]
+                matte = as_planes(video.images[k, 0].cpu().numpy()).to(device)
+                colours, alpha = shown[0]
+                measures.append(
+                    {"step": step}
+                    | captured_metrics(gain * colours, alpha, matte, filmed, empty, networks, params.margin)
+                )
+                shown_now = [picture.clamp(0, 1).cpu().numpy() for picture in (filmed, *pictures)]
+                panels.append((step, [*shown_now[:2], error_picture(*shown_now[:2]), *shown_now[2:]]))
+                run.progress(len(panels), len(entries), measures[-1]["psnr"])
+    panels.sort(key=lambda frame: frame[0])
+    columns = [np.stack(panel) for panel in zip(*(frame for _, frame in panels), strict=True)]
+    labels = ["video", params.title, "difference", "prior"][: len(columns)]
+    rows = [slice(0, 2), slice(2, 4)] if len(columns) == 4 else [slice(0, 3)]
+    film = np.concatenate([side_by_side(columns[row], labels[row]) for row in rows], axis=1)
+    with atomic(output.video) as partial:
+        write_mp4(partial, film, params.frame_rate, quality=24)
+    found = {"frames": sorted(measures, key=lambda frame: frame["step"])}
+    mean = averaged([{k: v for k, v in frame.items() if k != "step"} for frame in measures])
+    write_json(output.measures, {**found, "mean": mean})
+    run.say(
+        f"{len(measures)} frames, object: PSNR {mean['psnr']:.1f} dB, SSIM {mean['ssim']:.3f}, LPIPS"
+        f" {mean['lpips_vgg']:.3f}, IoU {mean['iou']:.2f}; whole picture: PSNR {mean['scene_psnr']:.1f} dB"
+    )
+
+
+run_script(main, snakemake)
