@@ -18,6 +18,10 @@ MOST_LEFT_OUT = 0.1
 """Share of the photographs whose masks may disagree with the others."""
 MOST_JUMP = 0.1
 """Change of a mask's area from frame to frame of free flight that good masks stay below."""
+LEAST_OVERLAP = 0.9
+"""IoU of filmed masks and those of the placed object, in free flight."""
+MOST_TURN = 5.0
+"""Deviation of the object's pose that good videos stay below, about its worst axis [degrees]."""
 LEAST_PSNR = 20.0
 """PSNR inside the object that Gaussians of good photographs have in photographs that were kept from the fit [dB]."""
 
@@ -98,6 +102,20 @@ def object_checks(fit: Mapping[str, Any]) -> list[Check]:
     psnr = fit["psnr_object"]
     text = f"{psnr:.1f} dB inside the object ({len(fit['held_out'])} photographs, {fit['count']} Gaussians)"
     return [Check("PSNR of photographs kept from the fit", text, f"> {LEAST_PSNR:g} dB", psnr > LEAST_PSNR)]
+
+
+def registration_checks(placed: Mapping[str, Mapping[str, Any]]) -> list[Check]:
+    """Checks of the object's place in the videos, by the report of each throw's registration."""
+    found = []
+    for throw, report in placed.items():
+        turn = max(report["rotation_std_deg_principal"])
+        text, wanted = f"+-{turn:.1f} degrees", f"< {MOST_TURN:g} degrees"
+        found.append(Check(f"pose of the object in {throw}", text, wanted, turn < MOST_TURN))
+        for camera, after in report["after"].items():
+            text, wanted = f"IoU {after['iou']:.3f}", f"> {LEAST_OVERLAP:g}"
+            what = f"placed object in {throw}, {camera}"
+            found.append(Check(what, text, wanted, after["iou"] > LEAST_OVERLAP))
+    return found
 
 
 def markdown(title: str, found: list[Check], pictures: Mapping[str, str], missing: str | None = None) -> str:

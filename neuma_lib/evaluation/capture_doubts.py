@@ -11,7 +11,8 @@ from neuma_lib.evaluation.stress_curves import share_inside
 FEW_FRAMES = 10
 """Fewer frames of a camera after the first contact tell little of a law."""
 WORSE = 1.5
-"""Factor on the mean squared error, held-out throws over learned ones, from which the law is said to fit these alone."""
+"""Factor on the mean squared error, held-out throws over learned ones, from which the law is said "
+"to fit these alone."""
 LEAST_IOU = 0.8
 """Mean overlap of predicted and filmed masks of a prediction that is at the right place."""
 MOST_OUTSIDE = 0.25
@@ -44,12 +45,16 @@ def of_filming(capture: Mapping[str, Any], throws: Mapping[str, Mapping[str, Any
         cameras, flight, moved = throw["cameras"], throw["flight"], throw["prediction"]
         if len(cameras) == 1:
             found.append(
-                f"{name}: one camera alone. It hardly sees motion towards it, and its object is taken to fall above the "
+                f"{name}: one camera alone. It hardly sees motion towards it, and its object is taken to fall above "
+                "the "
                 "middle of the box, across its view."
             )
         if flight.get("spin_rad_s") is None:
-            found.append(f"{name}: no spin was found in the flight; the object's surface has too little texture.")
-        found += [f"{name}: {line}." for line in _ambiguous(throw.get("registration") or {})]
+            found.append(
+                f"{name}: no spin was found in the flight; the object's surface has too little texture."
+            )
+        if said := (throw.get("registration") or {}).get("ambiguous"):
+            found.append(f"{name}: the pose of the object is not told by its flight: {said}.")
         blurred = [camera for camera, exposure in cameras.items() if not exposure]
         if blurred and moved.get("fastest_m_s"):
             smear = 1e3 * BLUR * moved["fastest_m_s"]
@@ -60,8 +65,9 @@ def of_filming(capture: Mapping[str, Any], throws: Mapping[str, Mapping[str, Any
         for camera, count in (moved.get("frames_after_contact") or {}).items():
             if count < FEW_FRAMES:
                 found.append(
-                    f"{name}, {camera}: only {count} frames show the object after its first contact: before it, no motion "
-                    "tells of the material."
+                    f"{name}, {camera}: only {count} frames show the object after its first contact; before it, no "
+                    ""
+                    "motion tells of the material."
                 )
         if moved.get("touched"):
             walls = ", ".join(moved["touched"])
@@ -76,20 +82,11 @@ def of_filming(capture: Mapping[str, Any], throws: Mapping[str, Mapping[str, Any
         )
     if not capture["held_out"]:
         found.append(
-            "No throw is held out: all measures are of videos that the law was learned from. Film another throw, and name "
+            "No throw is held out: all measures are of videos that the law was learned from. Film another throw, "
+            "and name "
             "it under `held_out`."
         )
     return found
-
-
-def _ambiguous(registration: Mapping[str, Any]) -> list[str]:
-    """Where another pose of the object explains its video about as well."""
-    rival = registration.get("ambiguous")
-    if not rival:
-        return []
-    angle = registration.get("runner_up_deg")
-    by = f" turned by {angle:.0f} degrees" if isinstance(angle, int | float) else ""
-    return [f"the object{by} explains the flight nearly as well, so its pose may be wrong"]
 
 
 def of_predictions(
@@ -110,7 +107,8 @@ def of_predictions(
     for throw, moved in predictions.items():
         if failure := moved.get("diverged"):
             found.append(
-                f"{throw}: the predicted motion broke off at step {failure['step']} (a particle {failure['happened']}); "
+                f"{throw}: the predicted motion broke off at step {failure['step']} (a particle "
+                f"{failure['happened']}); "
                 "what is shown from there on is its last sound state."
             )
     if any(moved.get("stable") is False for moved in predictions.values()):
@@ -128,13 +126,15 @@ def of_predictions(
             )
         if row["iou"] < LEAST_IOU:
             found.append(
-                f"{where}: predicted and filmed masks overlap by {row['iou']:.2f} on average: the prediction is at another "
+                f"{where}: predicted and filmed masks overlap by {row['iou']:.2f} on average: the prediction is at "
+                "another "
                 "place than the object, or has another shape."
             )
     seen, unseen = (own.get(("all", "all", learned)) for learned in (True, False))
     if seen and unseen and 10 ** ((seen["psnr"] - unseen["psnr"]) / 10) > WORSE:
         found.append(
-            f"Held-out throws are predicted worse than learned ones, {unseen['psnr']:.1f} dB against {seen['psnr']:.1f} dB "
+            f"Held-out throws are predicted worse than learned ones, {unseen['psnr']:.1f} dB against "
+            f"{seen['psnr']:.1f} dB "
             "on the object: part of what was learned holds for these videos alone."
         )
     return found
@@ -147,7 +147,8 @@ def of_constants(identified: Mapping[str, Any] | None) -> list[str]:
     found = []
     if identified.get("ties"):
         found.append(
-            f"The families {', '.join([identified['family'], *identified['ties']])} explain the video equally well: which "
+            f"The families {', '.join([identified['family'], *identified['ties']])} explain the video equally "
+            "well: which "
             "of them the material belongs to is not known."
         )
     best = identified["best"]
@@ -156,7 +157,8 @@ def of_constants(identified: Mapping[str, Any] | None) -> list[str]:
         known = [name for name, entry in best["quantities"].items() if entry["determined"]]
         rest = f"; it determines {', '.join(known)}" if known else ""
         found.append(
-            f"The video does not determine {', '.join(open_)} of the identified law{rest}. What is not determined is near "
+            f"The video does not determine {', '.join(open_)} of the identified law{rest}. What is not determined "
+            "is near "
             "where the search began."
         )
     if best.get("diverged"):
@@ -178,27 +180,26 @@ def of_curves(
         return []
     method, tests = curves["learned"], curves["tests"]
     found = [
-        "Outside the blue ranges of the stress curves no part of the object has been: there a curve is what its form makes "
+        "Outside the blue ranges of the stress curves no part of the object has been: there a curve is what "
+        "its form makes "
         "of the rest, not a measurement."
     ]
     if all(test["laws"][method]["band"] is None for test in tests.values()):
         found.append(
-            f"{titles[method]} has no error bars of its own: its networks say nothing of what else the video allows. The "
+            f"{titles[method]} has no error bars of its own: its networks say nothing of what else the video "
+            "allows. The "
             "bands of the identified constants are the nearest to it."
         )
+    verdicts = {
+        prior: "the video speaks against the prior there",
+        method: "either the family is wrong, or the correction fits what is no stress",
+    }
     for name, test in tests.items():
-        for other, says in ((method, "leaves"), (prior, "is outside of")):
-            share = share_inside(test, other, constants) if other in test["laws"] and other != constants else None
+        for law, verdict in verdicts.items():
+            share = share_inside(test, law, constants) if law in test["laws"] and law != constants else None
             if share is not None and 1 - share > MOST_OUTSIDE:
-                meaning = (
-                    "either the family is wrong, or the correction fits what is no stress"
-                    if other == method != prior
-                    else "the video speaks against it there"
-                )
                 found.append(
-                    f"{STRESS_TESTS[name].capitalize()}: {titles[other]} {says} the 95 % band of the identified constants "
-                    f"over {100 * (1 - share):.0f} % of the visited range: {meaning}."
+                    f"{STRESS_TESTS[name].capitalize()}: over {100 * (1 - share):.0f} % of the visited range, "
+                    f"{titles[law]} is outside the 95 % band of the identified constants: {verdict}."
                 )
     return found
-
-

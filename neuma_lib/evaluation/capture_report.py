@@ -23,7 +23,19 @@ QUALITY = 80
 """Of its JPEG."""
 STRESS_UNITS = {
     **dict.fromkeys(
-        ("E", "G", "K", "mu", "lam", "kappa", "yield_stress", "cohesion", "crush", "tension", "fibre_modulus"),
+        (
+            "E",
+            "G",
+            "K",
+            "mu",
+            "lam",
+            "kappa",
+            "yield_stress",
+            "cohesion",
+            "crush",
+            "tension",
+            "fibre_modulus",
+        ),
         "Pa",
     ),
     "viscosity": "Pa s",
@@ -259,13 +271,12 @@ def _measures(rows: Sequence[Mapping[str, Any]], own: str) -> str:
             cells += [
                 f"{row[name]:.{digits}f}" if name in row else "–" for name, (_, digits) in MEASURES.items()
             ]
-            kinds = [
-                name for name, is_it in (("first", k == 0), ("own", row["method"] == own)) if is_it
-            ]
+            kinds = [name for name, is_it in (("first", k == 0), ("own", row["method"] == own)) if is_it]
             lines.append((" ".join(kinds), cells))
     head = ["frames", "law", *(escape(heading) for heading, _ in MEASURES.values())]
     return (
-        "<p>PSNR, SSIM and mask IoU: more is better. LPIPS (VGG): less is better. The object: colours over white, on the "
+        "<p>PSNR, SSIM and mask IoU: more is better. LPIPS (VGG): less is better. The object: colours over "
+        "white, on the "
         "bounding box of the predicted and the filmed one. The whole picture: the frame as it was filmed against the "
         "prediction over the empty scene; most of it is background, which is equal whatever is predicted, and the "
         "object's shadow is in the frame alone.</p>\n" + _table(head, lines, len(MEASURES))
@@ -278,8 +289,10 @@ def _law(report: Report) -> str:
         parts += [
             "<h3>Stress curves</h3>",
             f'<figure><img alt="stress curves" src="{picture_uri(report.curves)}"><figcaption>Kirchhoff stress, in the '
-            "units of the room. Top: the elastic law under axial stretch, the sides free. Middle: the elastic law under "
-            "shear. Bottom: shear at a constant rate with yielding and flow. Blue ground: what the object went through. "
+            "units of the room. Top: the elastic law under axial stretch, the sides free. Middle: the elastic "
+            "law under "
+            "shear. Bottom: shear at a constant rate with yielding and flow. Blue ground: what the object went "
+            "through. "
             "Coloured bands: 95 % of the laws that the video leaves possible, where a law has such an account."
             "</figcaption></figure>",
         ]
@@ -300,7 +313,11 @@ def _identified(found: Mapping[str, Any], scale: float) -> str:
         value, unit = room_value(name, entry["value"], scale)
         # an exponent that floats have room for
         factor = math.exp(min(BARS * entry["log_std"], 700.0))
-        ends = "nothing is known" if factor > UNKNOWN else f"{number(value / factor)} to {number(value * factor)}"
+        ends = (
+            "nothing is known"
+            if factor > UNKNOWN
+            else f"{number(value / factor)} to {number(value * factor)}"
+        )
         mark = (
             '<span class="good">determined</span>'
             if entry["determined"]

@@ -1,10 +1,10 @@
 """How alike a prediction and the video of a real throw are: the object alone, and the whole picture.
 
 **The object** is cut out: predicted and filmed colours over white, on the bounding box of both
-(`neuma_lib.evaluation.image_metrics`). **The whole picture** is the frame as it was filmed, without the lens's distortion,
-against the prediction laid over the picture of the empty scene. That background is nearly the same in both, so its PSNR
-and SSIM are high whatever is predicted and only compare methods on one video; shadows and reflections of the object are
-in the frame alone.
+(`neuma_lib.evaluation.image_metrics`). **The whole picture** is the frame as it was filmed, without the lens's
+distortion, against the prediction laid over the picture of the empty scene. That background is nearly the same in both,
+so its PSNR and SSIM are high whatever is predicted and only compare methods on one video; shadows and reflections of
+the object are in the frame alone.
 """
 
 from __future__ import annotations
@@ -97,8 +97,8 @@ def image_rows(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Rows of the table: each camera of each throw, then all frames that were learned from, and all that were not.
 
     Args:
-        found: of each method, throw and camera ``method``, ``title``, ``throw``, ``camera``, ``learned`` (whether the law
-            was learned from these frames) and ``frames``, a list of measures.
+        found: of each method, throw and camera ``method``, ``title``, ``throw``, ``camera``, ``learned`` (whether the
+            law was learned from these frames) and ``frames``, a list of measures.
 
     Returns:
         ``method``, ``title``, ``throw``, ``camera``, ``learned``, ``frames`` (their number) and the measures; throw and

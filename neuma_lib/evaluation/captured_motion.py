@@ -32,8 +32,8 @@ def motion_report(
         scale: metres of the simulator to a metre of the room.
 
     Returns:
-        ``contact_step`` (None: there is none), ``frames_after_contact`` by camera, ``fastest_m_s`` of the centre of mass
-        in the room, and ``touched``, names of walls other than the floor.
+        ``contact_step`` (None: there is none), ``frames_after_contact`` by camera, ``fastest_m_s`` of the centre
+        of mass in the room, and ``touched``, names of walls other than the floor.
     """
     first = first_contact(model, path.x)
     contact = frames[first] if first < len(frames) else None

@@ -1,12 +1,13 @@
-"""Stress curves of laws that were found for one object, over the states that its motion went through: no truth is known.
+"""Stress curves of laws that were found for one object, over the states that its motion went through, without a truth.
 
-Simulated lengths are ``scale`` times those of the room, times and densities are the same; so a stress in the room is the
-simulator's divided by the square of it.
+Simulated lengths are ``scale`` times those of the room, times and densities are the same; so a stress in the room is
+the simulator's divided by the square of it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from neuma_lib.evaluation.bands import band
 from neuma_lib.evaluation.plotting import style
-from neuma_lib.evaluation.response import EVERY, inside, material_tests
+from neuma_lib.evaluation.response import EVERY, PointTest, inside, material_tests
 from neuma_lib.mechanics.law import Law
 
 TESTS = {
@@ -28,7 +29,7 @@ TESTS = {
 VISITED = "#d9e6ef"
 """Colour of the visited ranges."""
 HEADROOM = 0.6
-"""How far curves may go beyond those of the learned law, relative to its range; then they are cut."""
+"""How far the curve of a law without error bars may go beyond the others, relative to their range; then it is cut."""
 
 
 def stress_curves(
@@ -64,7 +65,7 @@ def stress_curves(
             found[method] = {"stress": (per * test.curve(law, test.x)).tolist(), "band": None}
             if draws.get(method):
                 x = test.x[::EVERY].contiguous()
-                low, high = band(draws[method], lambda drawn: test.curve(drawn, x))
+                low, high = band(draws[method], partial(_curve, test, x))
                 ends = {"low": (per * low).tolist(), "high": (per * high).tolist()}
                 found[method]["band"] = {"x": x.tolist(), **ends}
         visited = [per * end for end in test.visited] if test.by_stress else list(test.visited)
@@ -75,6 +76,10 @@ def stress_curves(
             "laws": found,
         }
     return {"rate": rate, "learned": learned, "tests": tests}
+
+
+def _curve(test: PointTest, x: Tensor, law: Law) -> Tensor:
+    return test.curve(law, x)
 
 
 def share_inside(test: Mapping[str, Any], method: str, band_of: str) -> float | None:
@@ -116,11 +121,19 @@ def _panel(axes, test: Mapping[str, Any], titles: Mapping[str, str], learned: st
             axes.fill_between(law["band"]["x"], *ends, color=line["color"], alpha=0.18, linewidth=0)
         width = 1.8 if method == learned else 1.1
         axes.plot(x, 1e-3 * np.asarray(law["stress"]), **line, linewidth=width, label=titles[method])
-    shown = 1e-3 * np.stack([law["stress"] for law in test["laws"].values()])
-    own = 1e-3 * np.asarray(test["laws"][learned]["stress"])
-    room = HEADROOM * (np.ptp(own) or 1.0)
-    low, high = max(shown.min(), own.min() - room), min(shown.max(), own.max() + room)
+    low, high = _limits(test, learned)
     margin = 0.08 * (high - low or 1.0)
     axes.set(xlim=(x.min(), x.max()), ylim=(low - margin, high + margin))
     axes.axhline(0, color=style.GREY, linewidth=0.4, zorder=0.5)
     axes.yaxis.set_major_locator(MaxNLocator(4))
+
+
+def _limits(test: Mapping[str, Any], learned: str) -> tuple[float, float]:
+    """Lowest and highest stress [kPa] of a panel: all laws where something was seen, as far as there is room."""
+    x, (first, last) = np.asarray(test["x"]), test["visited"]
+    seen = np.ones(len(x), bool) if test["by_stress"] else (x >= first) & (x <= last)
+    laws = {method: 1e-3 * np.asarray(law["stress"])[seen] for method, law in test["laws"].items()}
+    # what has error bars is compared with the learned law in any case
+    kept = np.concatenate([v for m, v in laws.items() if m == learned or test["laws"][m]["band"]])
+    whole, room = np.concatenate(list(laws.values())), HEADROOM * (np.ptp(kept) or 1.0)
+    return max(whole.min(), kept.min() - room), min(whole.max(), kept.max() + room)

@@ -85,7 +85,9 @@ def scene_view(wildcards):
 def method_names(wildcards):
     """Titles of the laws of a report."""
     named = {PRIOR: "prior", CONSTANTS: "identified constants"}
-    titles = {name: named.get(name, SETTINGS.method_title(name)) for name in reported_methods(wildcards.method)}
+    titles = {
+        name: named.get(name, SETTINGS.method_title(name)) for name in reported_methods(wildcards.method)
+    }
     return titles
 
 
@@ -197,7 +199,9 @@ rule capture_shown:
     params:
         cameras=scene_cameras,
         rates=lambda wildcards: [
-            of_thrown(lambda capture: filmed_rate(SimpleNamespace(**vars(capture), camera=camera)))(wildcards)
+            of_thrown(lambda capture: filmed_rate(SimpleNamespace(**vars(capture), camera=camera)))(
+                wildcards
+            )
             for camera in scene_cameras(wildcards)
         ],
         longest=of_thrown_capture(lambda capture: capture.settings.longest),
@@ -230,7 +234,7 @@ rule capture_prediction:
         total=carries_total,
         cameras=scene_cameras,
         scale=scene_scale,
-        sub_frames=SETTINGS.dataset.sub_frames,
+        filming=filming,
         device=SETTINGS.device,
     script:
         "../scripts/capture_prediction.py"
@@ -261,8 +265,7 @@ rule capture_view:
         prior_motion=lambda wildcards: (
             gaussian_motion(SimpleNamespace(scene=wildcards.scene, method=PRIOR)) if PRIOR else None
         ),
-        dt=scene_setting("dt"),
-        sub_frames=SETTINGS.dataset.sub_frames,
+        filming=filming,
         margin=SETTINGS.evaluation.margin,
         frame_rate=SETTINGS.evaluation.frame_rate,
         device=SETTINGS.device,

@@ -26,7 +26,9 @@ def main(inputs, output, params, run) -> None:
             draws[method] = constants_draws(found, params.model_std, **drawn)
         elif "base" in parts and laws[method].elasticity.form == "stretch":
             before = {"model_std": params.model_std, "spread": params.spread}
-            draws[method] = corrected_draws(laws[method], read_json(parts["base"])["best"], F, **before, **drawn)
+            draws[method] = corrected_draws(
+                laws[method], read_json(parts["base"])["best"], F, **before, **drawn
+            )
     curves = stress_curves(
         laws, params.method, F, params.rate, params.total_shear, params.dt, draws, params.scale
     )

@@ -24,7 +24,7 @@ def main(inputs, output, params, run) -> None:
     start, counts = load_start(*files, [params.density], params.carrier)
     adaptors = listed(inputs.get("adaptor"))
     laws = load_laws(dt, (), listed(inputs.get("identified")), listed(inputs.prior), adaptors)
-    steps = filmed_steps(inputs.transforms, range(len(params.cameras)), dt, params.sub_frames)
+    steps = filmed_steps(inputs.transforms, range(len(params.cameras)), **params.filming)
     frames = sorted({0, *steps})
     model = MPMModel(**params.simulation)
     bodies = consecutive([law.to(device) for law in laws], counts)
@@ -41,7 +41,9 @@ def main(inputs, output, params, run) -> None:
     write_json(output.report, report)
     touched = f", touches {', '.join(report['touched'])}" if report["touched"] else ""
     broken = f"; DIVERGED at step {failure.step}" if failure else ""
-    run.say(f"{len(frames)} states to step {frames[-1]}, first contact at {report['contact_step']}{touched}{broken}")
+    run.say(
+        f"{len(frames)} states to step {frames[-1]}, first contact at {report['contact_step']}{touched}{broken}"
+    )
 
 
 run_script(main, snakemake)

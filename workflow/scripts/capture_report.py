@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from neuma_lib.capture.page import checks, motion_checks, object_checks
+from neuma_lib.capture.page import checks, motion_checks, object_checks, registration_checks
 from neuma_lib.evaluation.capture_doubts import (
     of_checks,
     of_constants,
@@ -37,6 +37,7 @@ def main(inputs, output, params, run) -> None:
             read_json(inputs.photographs), by_video(inputs.masks), flights
         ),
         "The object as photographed": object_checks(read_json(inputs.object)),
+        "Its place in the videos": registration_checks(registrations),
     }
     filmed = {
         throw: {
@@ -59,9 +60,7 @@ def main(inputs, output, params, run) -> None:
         "Photographs": {"Masks of the photographs": inputs.photograph_sheet},
         "Videos": {f"Frames: {n}": file for n, file in zip(names, listed(inputs.frame_sheets))},
         "Masks of the videos": {f"Masks: {n}": file for n, file in zip(names, listed(inputs.mask_sheets))},
-        "Free flight": {
-            f"Free flight: {t}": file for t, file in zip(throws, listed(inputs.flight_pictures))
-        },
+        "Free flight": {f"Free flight: {t}": file for t, file in zip(throws, listed(inputs.flight_pictures))},
         "Place of the object in the videos": {
             f"Registration: {t}": file for t, file in zip(throws, listed(inputs.registration_pictures))
         },
@@ -80,7 +79,8 @@ def main(inputs, output, params, run) -> None:
     count = {camera for cameras in facts["throws"].values() for camera in cameras}
     held = f", {', '.join(facts['held_out'])} held out" if facts["held_out"] else ""
     summary = [
-        f"{facts['photographs']} photographs, {len(throws)} throws{held}, {len(count)} cameras. Prior: {facts['prior']}, "
+        f"{facts['photographs']} photographs, {len(throws)} throws{held}, {len(count)} cameras. Prior: "
+        f"{facts['prior']}, "
         f"density {facts['density']:g} kg/m³, steps of {1e3 * facts['dt']:g} ms, learned from pictures of "
         f"{facts['width']} pixels."
     ]

@@ -1,4 +1,4 @@
-"""Write a throw's video as it was filmed, at the size of the report: frames, mattes, and the empty scene behind them."""
+"""Write a throw's video as it was filmed, at the size of the report: frames, mattes, the empty scene."""
 
 from pathlib import Path
 

@@ -49,14 +49,16 @@ class Prediction:
         colours, masks = (Filmed(renderer, video, self.steps, kind) for kind in ("colour", "masks"))
         x, F = colours.states(self.x), colours.states(self.F)
         for part in frame_batches(len(video.frames), colours.batch):
-            yield from zip(colours(x[part], F[part])[:, 0], masks(x[part], F[part])[:, 0, ..., 0], strict=True)
+            yield from zip(
+                colours(x[part], F[part])[:, 0], masks(x[part], F[part])[:, 0, ..., 0], strict=True
+            )
 
 
 def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
     weights, _ = read_weights(inputs.weights)
     networks = {name: LPIPS(weights, name).to(device) for name in ("vgg", "alex")}
-    needed = filmed_steps(inputs.shown, [params.view], params.dt, params.sub_frames)
+    needed = filmed_steps(inputs.shown, [params.view], **params.filming)
     predictions = []
     for rollout, motion in [(inputs.rollout, params.gaussian_motion), (inputs.prior, params.prior_motion)]:
         if rollout:
@@ -68,7 +70,7 @@ def main(inputs, output, params, run) -> None:
     entries = {f["step"]: f for f in read_transforms(inputs.shown)["frames"] if f["view"] == params.view}
     plate = read_rgb(folder / next(iter(entries.values()))["plate"])
     measures, panels = [], []
-    for video in load_videos(inputs.shown, [params.view], params.dt, params.sub_frames):
+    for video in load_videos(inputs.shown, [params.view], **params.filming):
         video = video.to(torch.float32, device)
         with torch.no_grad():
             renders = zip(*(prediction.frames(video) for prediction in predictions), strict=True)
