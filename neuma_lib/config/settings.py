@@ -26,6 +26,7 @@ from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.methods import IDENTIFIED, LAW_FROM, MethodConfig, parse_method, variant_title
 from neuma_lib.config.pac_nerf import PacNerfConfig
+from neuma_lib.config.photographs import PhotographsConfig
 from neuma_lib.config.priors import PriorsConfig
 from neuma_lib.config.radiance import RadianceConfig
 from neuma_lib.config.random_scenes import RandomConfig, draw_scenes
@@ -68,6 +69,9 @@ class Config(Section):
     simulation: SimulationConfig = Field(SimulationConfig(), description="material point method")
     priors: PriorsConfig = Field(PriorsConfig(), description="pre-trained laws")
     gaussians: GaussiansConfig = Field(GaussiansConfig(), description="static reconstruction")
+    photographs: PhotographsConfig = Field(
+        PhotographsConfig(), description="Gaussians and mesh of what was photographed"
+    )
     radiance: RadianceConfig = Field(RadianceConfig(), description="voxel field of PAC-NeRF")
     geometry: GeometryConfig = Field(GeometryConfig(), description="mesh and particles")
     binding: BindingConfig = Field(BindingConfig(), description="Gaussians to particles")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -18,11 +18,11 @@ from torch import Tensor
 
 from neuma_lib.config.gaussians import GaussiansConfig
 from neuma_lib.errors import InputError, NonFiniteError
-from neuma_lib.geometry.visual_hull import Hull, check_masks, visual_hull
+from neuma_lib.geometry.visual_hull import ALL_AGREE, Hull, HullRules, check_masks, visual_hull
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians, covariances, rotations
 from neuma_lib.splatting.rasterizer import RenderBuffers, Statistics, rasterize
-from neuma_lib.splatting.spherical_harmonics import coefficient_count, rgb_to_sh0
+from neuma_lib.splatting.spherical_harmonics import SH_C0, coefficient_count, rgb_to_sh0
 
 
 @dataclass
@@ -37,6 +37,9 @@ class GaussianFitReport:
         psnr: mean PSNR [dB] of the held-out views, full frame over white.
         psnr_object: the same inside the object (pixels with alpha above 1/2).
         train_psnr, train_psnr_object: of the views that were fitted.
+        gains: exposure of each view, for red, green and blue, where it was fitted; None elsewhere. Those of the fitted
+            views have a geometric mean of 1. Those of the held-out ones are least squares against the render (the
+            measures have them in), since nothing else tells the exposure of a photograph.
     """
 
     losses: list[float]
@@ -47,6 +50,7 @@ class GaussianFitReport:
     psnr_object: float
     train_psnr: float
     train_psnr_object: float
+    gains: list[list[float]] | None = None
 
 
 EPS2D = 0.3
@@ -70,20 +74,24 @@ _CLONE_OFFSET = 0.5
 
 
 def fit_gaussians(
-    images: Tensor,
-    cameras: Cameras,
+    images: Tensor | Sequence[Tensor],
+    cameras: Cameras | Sequence[Cameras],
     settings: GaussiansConfig,
     seed: int = 0,
     progress: Callable[[int, float], None] | None = None,
+    rules: HullRules = ALL_AGREE,
+    gain_rate: float = 0.0,
 ) -> tuple[Gaussians, GaussianFitReport]:
     """Fit Gaussians to images of an object.
 
     Args:
-        images: (V, H, W, 4) RGBA with straight alpha in [0, 1]; alpha shows the object alone.
-        cameras: their V cameras.
+        images: V of RGBA with straight alpha in [0, 1], shape (H, W, 4) each; alpha shows the object alone.
+        cameras: their V cameras, or V sets of one where sizes differ.
         settings: hyper-parameters.
         seed: of everything random; the same seed gives the same Gaussians on a CPU.
         progress: called with (iteration, loss) after each iteration.
+        rules: of the hull that the Gaussians start in.
+        gain_rate: learning rate of the logarithms of the views' exposures, one for each channel; 0: all are alike.
 
     Returns:
         The Gaussians, without gradient and with the pixels' blur absorbed (render them with ``eps2d=0``), and a report.
@@ -92,44 +100,47 @@ def fit_gaussians(
         InputError: shapes disagree, a mask is empty or covers the frame, or masks and poses contradict each other.
         NonFiniteError: the loss is not finite.
     """
-    images = images.to(cameras.viewmats.dtype)
-    _check(images, cameras)
+    views = _Views.of(images, cameras)
+    count = len(views.cameras)
     generator = torch.Generator().manual_seed(seed)
-    held_out = (
-        list(range(settings.held_out // 2, len(cameras), settings.held_out)) if settings.held_out else []
-    )
-    fitted = [i for i in range(len(cameras)) if i not in held_out]
+    held_out = list(range(settings.held_out // 2, count, settings.held_out)) if settings.held_out else []
+    fitted = [i for i in range(count) if i not in held_out]
 
-    hull = visual_hull(images[fitted, ..., 3], cameras[fitted], settings.hull_resolution)
-    start, spacing = _initial_gaussians(hull, images[fitted], cameras[fitted], settings, generator)
-    fit = _Fit(start, spacing, settings)
+    seen = views.some(fitted)
+    hull = visual_hull(seen.masks(), seen.cameras, settings.hull_resolution, rules)
+    start, spacing = _initial_gaussians(hull, seen, settings, generator)
+    gains = _Gains(fitted, count, gain_rate, start.means) if gain_rate else None
+    fit = _Fit(start, spacing, settings, gains)
 
     losses: list[float] = []
     order: list[int] = []
-    rules = settings.densification
-    first, last = round(rules.start * settings.iterations), round(rules.stop * settings.iterations)
+    rounds = settings.densification
+    first, last = round(rounds.start * settings.iterations), round(rounds.stop * settings.iterations)
     for iteration in range(settings.iterations):
-        views = []
+        batch = []
         for _ in range(settings.batch):
             if not order:
                 order = [fitted[i] for i in torch.randperm(len(fitted), generator=generator).tolist()]
-            views.append(order.pop())
-        background = torch.rand(3, generator=generator).to(images)
-        loss = fit.step(images[views], cameras[views], background, iteration / settings.iterations)
+            batch.append(order.pop())
+        background = torch.rand(3, generator=generator).to(start.means)
+        loss = fit.step(views, batch, background, iteration / settings.iterations)
         losses.append(loss)
         if not math.isfinite(loss):
             raise NonFiniteError(
                 "gaussians", f"loss is {loss} in iteration {iteration}; lower the learning rates"
             )
-        if first <= iteration < last and (iteration + 1) % rules.every == 0:
+        if first <= iteration < last and (iteration + 1) % rounds.every == 0:
             fit.densify(generator)
         if progress is not None:
             progress(iteration, loss)
 
     everything = fit.gaussians()
-    gaussians = everything.cull(settings.cull_opacity).absorbing_blur(cameras, EPS2D)
-    psnr, psnr_object = evaluate(gaussians, images, cameras, held_out)
-    train_psnr, train_psnr_object = evaluate(gaussians, images, cameras, fitted)
+    gaussians = everything.cull(settings.cull_opacity).absorbing_blur(Cameras.joined(views.cameras), EPS2D)
+    exposures = gains.found() if gains else None
+    for view in held_out if gains else ():
+        exposures[view] = _exposure(gaussians, views, view)
+    psnr, psnr_object = _evaluate(gaussians, views, held_out, exposures)
+    train_psnr, train_psnr_object = _evaluate(gaussians, views, fitted, exposures)
     report = GaussianFitReport(
         losses=losses,
         count=len(gaussians),
@@ -139,31 +150,117 @@ def fit_gaussians(
         psnr_object=psnr_object,
         train_psnr=train_psnr,
         train_psnr_object=train_psnr_object,
+        gains=exposures.tolist() if gains else None,
     )
     return gaussians, report
 
 
-def evaluate(gaussians: Gaussians, images: Tensor, cameras: Cameras, views: list[int]) -> tuple[float, float]:
-    """Mean PSNR [dB] over ``views`` against RGBA images over white: full frame; where alpha > 1/2."""
-    if not views:
+@dataclass(frozen=True, eq=False)
+class _Views:
+    """Images and their cameras: a tensor (V, H, W, 4) and V cameras, or V of each one by one where sizes differ."""
+
+    images: Tensor | list[Tensor]
+    cameras: Cameras | list[Cameras]
+
+    @classmethod
+    def of(cls, images: Tensor | Sequence[Tensor], cameras: Cameras | Sequence[Cameras]) -> _Views:
+        """Checked. Raises InputError: shapes disagree, or a mask shows no outline."""
+        if isinstance(images, Tensor) and isinstance(cameras, Cameras):
+            images = images.to(cameras.viewmats.dtype)
+            shape, expected = tuple(images.shape), (len(cameras), cameras.height, cameras.width, 4)
+        else:
+            cameras = list(cameras)
+            images = [image.to(camera.viewmats.dtype) for image, camera in zip(images, cameras, strict=True)]
+            shape = [tuple(image.shape) for image in images]
+            expected = [(camera.height, camera.width, 4) for camera in cameras]
+        if shape != expected:
+            raise InputError(f"gaussians: images have shape {shape}, the cameras ask for {expected}")
+        views = cls(images, cameras)
+        check_masks(views.masks())
+        return views
+
+    def some(self, views: list[int]) -> _Views:
+        if isinstance(self.cameras, Cameras):
+            return _Views(self.images[views], self.cameras[views])
+        return _Views([self.images[i] for i in views], [self.cameras[i] for i in views])
+
+    def masks(self) -> Tensor | list[Tensor]:
+        """Alpha of each."""
+        return self.images[..., 3] if isinstance(self.images, Tensor) else [i[..., 3] for i in self.images]
+
+    def batches(self, views: list[int], alone: bool) -> list[tuple[list[int], Tensor, Cameras]]:
+        """Numbers, images (B, H, W, 4) and cameras of views that can be rendered together."""
+        if isinstance(self.cameras, Cameras) and not alone:
+            return [(views, self.images[views], self.cameras[views])]
+        return [([i], self.images[i][None], self.cameras[i]) for i in views]
+
+
+class _Gains:
+    """Exposure and white balance of each view against the mean of the fitted ones: a factor for each channel."""
+
+    def __init__(self, fitted: list[int], count: int, rate: float, like: Tensor):
+        self.fitted, self.rate = fitted, rate
+        self.logarithms = torch.zeros(count, 3).to(like).requires_grad_()
+        self.optimizer = torch.optim.Adam([self.logarithms], betas=_BETAS, eps=_EPS)
+
+    def of(self, view: int) -> Tensor:
+        """(3,), differentiable. The mean is taken off: brighter Gaussians and darker photographs look the same."""
+        return (self.logarithms[view] - self.logarithms[self.fitted].mean(dim=0)).exp()
+
+    def step(self, done: float) -> None:
+        self.optimizer.param_groups[0]["lr"] = self.rate * _RATE_DECAY**done
+        self.optimizer.step()
+
+    @torch.no_grad()
+    def found(self) -> Tensor:
+        """(V, 3); only those of fitted views mean something."""
+        return torch.stack([self.of(view) for view in range(len(self.logarithms))])
+
+
+def _exposed(sh: Tensor, gain: Tensor) -> Tensor:
+    """Coefficients (G, K, 3) of colours that are ``gain`` (3,) times as bright; a colour is 0.5 + sum of harmonics."""
+    brighter = sh * gain
+    return torch.cat([brighter[:, :1] + 0.5 * (gain - 1) / SH_C0, brighter[:, 1:]], dim=1)
+
+
+def _render(gaussians: Gaussians, sh: Tensor, camera: Cameras) -> tuple[Tensor, Tensor]:
+    """Picture over white (H, W, 3) and its alpha (H, W)."""
+    pictures, alphas = rasterize(
+        gaussians.means[None], gaussians.covars()[None], gaussians.opacities, sh, camera.viewmats, camera.Ks,
+        camera.width, camera.height, eps2d=0.0,
+    )  # fmt: skip
+    return pictures[0, 0], alphas[0, 0]
+
+
+def _exposure(gaussians: Gaussians, views: _Views, view: int) -> Tensor:
+    """Gain (3,) with which the render is nearest to an image inside the object, by least squares."""
+    picture, alpha = _render(gaussians, gaussians.sh(), views.cameras[view])
+    rgba = views.images[view]
+    inside = rgba[..., 3] > 0.5
+    found, target = (picture - (1 - alpha[..., None]))[inside], (rgba[..., :3] * rgba[..., 3:])[inside]
+    return (found * target).sum(dim=0) / found.square().sum(dim=0).clamp_min(_EPS)
+
+
+def _evaluate(
+    gaussians: Gaussians, views: _Views, chosen: list[int], exposures: Tensor | None
+) -> tuple[float, float]:
+    """Mean PSNR [dB] over chosen views against RGBA images over white: full frame; where alpha > 1/2."""
+    if not chosen:
         return math.nan, math.nan
     full, inside = [], []
-    covars, sh = gaussians.covars(), gaussians.sh()
-    for view in views:
-        camera = cameras[view]
-        picture, _ = rasterize(
-            gaussians.means[None], covars[None], gaussians.opacities, sh, camera.viewmats, camera.Ks,
-            camera.width, camera.height, eps2d=0.0,
-        )  # fmt: skip
-        rgba = images[view]
-        error = (picture[0, 0].clamp(0, 1) - (rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:])) ** 2
+    sh = gaussians.sh()
+    for view in chosen:
+        seen = sh if exposures is None else _exposed(sh, exposures[view])
+        picture, _ = _render(gaussians, seen, views.cameras[view])
+        rgba = views.images[view]
+        error = (picture.clamp(0, 1) - (rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:])) ** 2
         full.append(-10 * math.log10(float(error.mean())))
         inside.append(-10 * math.log10(float(error[rgba[..., 3] > 0.5].mean())))
     return sum(full) / len(full), sum(inside) / len(inside)
 
 
 def _initial_gaussians(
-    hull: Hull, images: Tensor, cameras: Cameras, settings: GaussiansConfig, generator: torch.Generator
+    hull: Hull, views: _Views, settings: GaussiansConfig, generator: torch.Generator
 ) -> tuple[Gaussians, float]:
     """Isotropic Gaussians, most near the hull's surface, and their mean spacing [m]."""
     solid = hull.occupied.float()[None, None]
@@ -193,7 +290,7 @@ def _initial_gaussians(
         quats=identity,
         scales=(_START_SCALE * spacing[:, None]).expand(-1, 3).clone(),
         opacities=torch.full_like(spacing, settings.initial_opacity),
-        sh0=rgb_to_sh0(_mean_colours(means, images, cameras))[:, None],
+        sh0=rgb_to_sh0(_mean_colours(means, views))[:, None],
         shN=torch.zeros(count, higher, 3).to(means),
     )
     return gaussians, surface_spacing
@@ -223,13 +320,14 @@ def _cell_keys(points: Tensor, size: float) -> Tensor:
     return (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
 
 
-def _mean_colours(points: Tensor, images: Tensor, cameras: Cameras) -> Tensor:
+def _mean_colours(points: Tensor, views: _Views) -> Tensor:
     """(P, 3) colour of each point averaged over the cameras that are nearest to looking straight at it."""
-    pixels, depths = cameras.project(points)
-    column = pixels[..., 0].floor().long().clamp(0, cameras.width - 1)
-    row = pixels[..., 1].floor().long().clamp(0, cameras.height - 1)
-    view = torch.arange(len(cameras), device=points.device)[:, None].expand_as(column)
-    rgba = images[view, row, column]
+    pixels, depths = Cameras.joined(views.cameras).project(points)
+    rgba = []
+    for place, image in zip(pixels.floor().long(), views.images):
+        column, row = place[:, 0].clamp(0, image.shape[1] - 1), place[:, 1].clamp(0, image.shape[0] - 1)
+        rgba.append(image[row, column])
+    rgba = torch.stack(rgba)
     # a point on the surface is hidden from half of the cameras; those in front of it are the nearest
     weights = rgba[..., 3] * torch.softmax(-depths / (_COLOUR_DEPTHS * depths.mean()), dim=0)
     return (weights[..., None] * rgba[..., :3]).sum(0) / weights.sum(0)[:, None].clamp_min(1e-6)
@@ -238,8 +336,8 @@ def _mean_colours(points: Tensor, images: Tensor, cameras: Cameras) -> Tensor:
 class _Fit:
     """Parameters of the Gaussians, the optimizer, and the rounds of densification."""
 
-    def __init__(self, start: Gaussians, spacing: float, settings: GaussiansConfig):
-        self.settings, self.spacing = settings, spacing
+    def __init__(self, start: Gaussians, spacing: float, settings: GaussiansConfig, gains: _Gains | None):
+        self.settings, self.spacing, self.gains = settings, spacing, gains
         parameters = {  # value at the start, learning rate, its decay
             "means": (start.means.clone(), settings.rate_means * spacing, _MEANS_DECAY),
             "scales": (start.scales.log(), settings.rate_scales, _RATE_DECAY),
@@ -278,14 +376,41 @@ class _Fit:
             p["means"].clone(), quats, p["scales"].exp(), opacities, p["sh0"].clone(), p["shN"].clone()
         )
 
-    def step(self, images: Tensor, cameras: Cameras, background: Tensor, done: float) -> float:
-        """One Adam step on (B, H, W, 4) images; ``done`` in [0, 1) is the part of the schedule behind us."""
+    def step(self, views: _Views, batch: list[int], background: Tensor, done: float) -> float:
+        """One Adam step on some views; ``done`` in [0, 1) is the part of the schedule behind us."""
+        self.optimizer.zero_grad(set_to_none=True)
+        if self.gains:
+            self.gains.optimizer.zero_grad(set_to_none=True)
+        total = 0.0
+        for chosen, images, cameras in views.batches(batch, alone=self.gains is not None):
+            loss = self._loss(images, cameras, background, self.gains.of(chosen[0]) if self.gains else None)
+            share = len(chosen) / len(batch)
+            (share * loss).backward()
+            total += share * float(loss.detach())
+            self.gradients += self.statistics.screen_gradients
+            self.views += self.statistics.views
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["first_lr"] * group["decay"] ** done
+        self.optimizer.step()
+        if self.gains:
+            self.gains.step(done)
+        p = self.parameters()
+        low, high = (
+            math.log(part * self.spacing) for part in (self.settings.min_scale, self.settings.max_scale)
+        )
+        with torch.no_grad():
+            p["scales"].clamp_(low, high)
+        return total
+
+    def _loss(self, images: Tensor, cameras: Cameras, background: Tensor, gain: Tensor | None) -> Tensor:
+        """Of images (B, H, W, 4), which share the gain if there is one."""
         settings, p = self.settings, self.parameters()
+        sh = torch.cat([p["sh0"], p["shN"]], dim=1)
         pictures, _ = rasterize(
             p["means"][None],
             covariances(p["quats"], p["scales"].exp())[None],
             torch.sigmoid(p["opacities"]),
-            torch.cat([p["sh0"], p["shN"]], dim=1),
+            sh if gain is None else _exposed(sh, gain),
             cameras.viewmats,
             cameras.Ks,
             cameras.width,
@@ -300,18 +425,7 @@ class _Fit:
         loss = image_loss(pictures[0], targets, settings.ssim_weight)
         spread = p["scales"].amax(dim=1) - p["scales"].amin(dim=1)
         ratio = spread.clamp_min(math.log(settings.max_anisotropy)).exp()
-        loss = loss + settings.anisotropy_weight * (ratio - settings.max_anisotropy).mean()
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        for group in self.optimizer.param_groups:
-            group["lr"] = group["first_lr"] * group["decay"] ** done
-        self.optimizer.step()
-        low, high = (math.log(part * self.spacing) for part in (settings.min_scale, settings.max_scale))
-        with torch.no_grad():
-            p["scales"].clamp_(low, high)
-        self.gradients += self.statistics.screen_gradients
-        self.views += self.statistics.views
-        return float(loss.detach())
+        return loss + settings.anisotropy_weight * (ratio - settings.max_anisotropy).mean()
 
     @torch.no_grad()
     def densify(self, generator: torch.Generator) -> None:
@@ -392,12 +506,3 @@ def _window(size: int, sigma: float, radius: int, dtype: torch.dtype, device: to
     weights = torch.exp(-(offsets**2) / (2 * sigma**2)) * (offsets.abs() <= radius)
     full = torch.exp(-(torch.arange(-radius, radius + 1, dtype=torch.float64) ** 2) / (2 * sigma**2)).sum()
     return (weights / full).to(device, dtype)
-
-
-def _check(images: Tensor, cameras: Cameras) -> None:
-    expected = (len(cameras), cameras.height, cameras.width, 4)
-    if tuple(images.shape) != expected:
-        raise InputError(
-            f"gaussians: images have shape {tuple(images.shape)}, the cameras ask for {expected}"
-        )
-    check_masks(images[..., 3])

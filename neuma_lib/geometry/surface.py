@@ -6,6 +6,7 @@ dent seen only by its shading, stays filled. The Gaussians fitted to the same vi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,13 +19,22 @@ from torch import Tensor
 
 from neuma_lib.config.geometry import SurfaceConfig
 from neuma_lib.errors import InputError
-from neuma_lib.geometry.visual_hull import NO_COMMON_SPACE, contour_distances, distance_inside
+from neuma_lib.geometry.repair import repaired
+from neuma_lib.geometry.visual_hull import (
+    ALL_AGREE,
+    NO_COMMON_SPACE,
+    HullRules,
+    contour_distances,
+    distance_inside,
+)
 from neuma_lib.geometry.volume import check_mesh
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians
 
 Array = NDArray[np.float64]
 
+BOX_SIDE = 1.0
+"""Side of the simulator's box [m]."""
 _COARSE_RESOLUTION = 32
 """Voxels along the longest side of the first look, which finds the body's box and the band around its surface."""
 
@@ -48,17 +58,19 @@ class _Grid:
 
 def reconstruct(
     gaussians: Gaussians,
-    cameras: Cameras,
-    images: Tensor,
+    cameras: Cameras | Sequence[Cameras],
+    images: Tensor | Sequence[Tensor],
     settings: SurfaceConfig,
+    rules: HullRules = ALL_AGREE,
 ) -> trimesh.Trimesh:
     """Surface of the body that the views show (paper, section 3.2, where a multi-view method makes it).
 
     Args:
         gaussians: static reconstruction; its extent bounds the search, and is widened if the body is larger.
-        cameras: V views.
-        images: RGBA with straight alpha in [0, 1], shape (V, H, W, 4).
+        cameras: V views, or V sets of one where sizes differ.
+        images: RGBA with straight alpha in [0, 1] of V views, shape (H, W, 4) each.
         settings: resolution and smoothing.
+        rules: how many masks must agree, and the floor.
 
     Returns:
         Watertight mesh in the world frame [m], one body without inner cavities, oriented outwards.
@@ -66,15 +78,16 @@ def reconstruct(
     Raises:
         InputError: images that do not fit the cameras, an empty matte, mattes that share no point of space.
     """
-    if tuple(images.shape) != (len(cameras), cameras.height, cameras.width, 4):
-        raise InputError(
-            f"surface: images {tuple(images.shape)} do not fit {len(cameras)} cameras of "
-            f"{cameras.width} x {cameras.height} pixels; expected RGBA (views, height, width, 4)"
-        )
-    cameras = cameras.to("cpu", torch.float64)
-    contours = contour_distances(images[..., 3], settings.matte_level)
+    for view, (image, camera) in enumerate(zip(images, cameras)):
+        if tuple(image.shape) != (camera.height, camera.width, 4):
+            raise InputError(
+                f"surface: images {tuple(image.shape)} (view {view}) do not fit {len(cameras)} cameras of"
+                f" {camera.width} x {camera.height} pixels; expected RGBA (height, width, 4)"
+            )
+    cameras = [camera.to("cpu", torch.float64) for camera in cameras]
+    contours = contour_distances([image[..., 3] for image in images], settings.matte_level)
 
-    coarse, distance = _locate(gaussians, contours, cameras)
+    coarse, distance = _locate(gaussians, contours, cameras, rules)
     reach = 2.0 * coarse.spacing
     near = np.argwhere(distance > -coarse.spacing)
     lower = coarse.origin + (near.min(axis=0) - 1) * coarse.spacing
@@ -87,16 +100,45 @@ def reconstruct(
     )
     band = np.flatnonzero(np.abs(field.ravel()) < reach)
     points = np.stack(np.unravel_index(band, field.shape), axis=1) * grid.spacing + grid.origin
-    field.ravel()[band] = distance_inside(torch.from_numpy(points), contours, cameras).numpy()
+    field.ravel()[band] = distance_inside(torch.from_numpy(points), contours, cameras, rules).numpy()
 
     mesh = _polygonise(_one_solid_body(field), grid)
     if settings.smoothing:
         _smooth(mesh, settings.smoothing)
+    if rules.floor is not None:  # smoothing may bend an edge on the floor down
+        mesh.vertices[:, 1] = np.maximum(mesh.vertices[:, 1], rules.floor)
     check_mesh(mesh, "surface")
     return mesh
 
 
-def _locate(gaussians: Gaussians, contours: Tensor, cameras: Cameras) -> tuple[_Grid, Array]:
+def photographed(mesh: trimesh.Trimesh, edge: float, floor: float | None) -> trimesh.Trimesh:
+    """The surface of a photographed body, repaired, remeshed, and above its floor.
+
+    Args:
+        mesh: result of `reconstruct`, in the simulator's box [m].
+        edge: length of an edge, as a fraction of the longest side.
+        floor: height of the floor [m]; None: there is none.
+
+    Raises:
+        InputError: pymeshlab is missing, no closed body is left, or it is not in the simulator's box.
+    """
+    body = repaired(mesh, edge * float(mesh.extents.max()), "surface")
+    if floor is not None:
+        body.vertices[:, 1] = np.maximum(body.vertices[:, 1], floor)
+    check_mesh(body, "surface")
+    lower, upper = body.bounds
+    if (lower < 0).any() or (upper > BOX_SIDE).any():
+        place = ", ".join(f"{axis} from {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", lower, upper))
+        raise InputError(
+            f"surface: the body reaches {place} m and leaves the simulator's box, 0 to {BOX_SIDE:g} m each way: set"
+            " `center` to the place where it lies, or a smaller `scale`, in capture.yaml"
+        )
+    return body
+
+
+def _locate(
+    gaussians: Gaussians, contours: Sequence[Tensor], cameras: Sequence[Cameras], rules: HullRules
+) -> tuple[_Grid, Array]:
     """Coarse lattice that holds the whole body, and the distances on it.
 
     Starts at the box of the Gaussians, and is doubled while the body reaches its walls.
@@ -112,7 +154,7 @@ def _locate(gaussians: Gaussians, contours: Tensor, cameras: Cameras) -> tuple[_
         margin = 0.05 * float((upper - lower).max())
         grid = _Grid.around(lower - margin, upper + margin, _COARSE_RESOLUTION)
         points = torch.cartesian_prod(*map(torch.from_numpy, grid.axes()))
-        distance = distance_inside(points, contours, cameras).numpy().reshape(tuple(grid.counts))
+        distance = distance_inside(points, contours, cameras, rules).numpy().reshape(tuple(grid.counts))
         interior = np.zeros(distance.shape, dtype=bool)
         interior[1:-1, 1:-1, 1:-1] = True
         if (distance > -grid.spacing).any() and not (distance[~interior] > 0).any():

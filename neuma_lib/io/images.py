@@ -110,7 +110,7 @@ def list_images(
     """
     images = read_image_set(source)
     data = read_transforms(source)
-    files = [_image_file(Path(source).parent, frame["file_path"], source) for frame in data["frames"]]
+    files = [image_file(Path(source).parent, frame["file_path"], source) for frame in data["frames"]]
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     names = [relative_to(path, file) for file in files]
     frames = [{**f, "file_path": name} for f, name in zip(data.pop("frames"), names, strict=True)]
@@ -176,7 +176,19 @@ def checked_transforms(data: Any, path: str | Path) -> dict[str, Any]:
         rotation = pose[:3, :3]
         if not np.isfinite(pose).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
             raise InputError(f"{where}: the transform_matrix is not a rigid motion")
+    _check_photographs(data, path)
     return data
+
+
+def _check_photographs(data: Mapping[str, Any], path: str | Path) -> None:
+    """Make sure that the entry `photographs` of a transforms.json, where there is one, can be understood."""
+    entry = data.get("photographs", {"floor": None})
+    floor = entry.get("floor", "missing") if isinstance(entry, dict) and len(entry) == 1 else "missing"
+    if floor is not None and (type(floor) not in (int, float) or not math.isfinite(floor)):
+        raise InputError(
+            f'{path}: photographs must be {{"floor": height of the floor in metres, or null}}, not'
+            f" {one_line(repr(entry))}"
+        )
 
 
 def _check_intrinsics(values: Mapping[str, Any], where: str) -> None:
@@ -192,7 +204,8 @@ def _check_intrinsics(values: Mapping[str, Any], where: str) -> None:
         raise InputError(f"{where}: {values['w']} x {values['h']} are more than {MAX_PIXELS} pixels (w, h)")
 
 
-def _intrinsic_matrix(values: Mapping[str, Any], width: int, height: int) -> np.ndarray:
+def intrinsic_matrix(values: Mapping[str, Any], width: int, height: int) -> np.ndarray:
+    """Intrinsics (3, 3) [px] of a checked entry."""
     focal = values["fl_x"] if "fl_x" in values else 0.5 * width / math.tan(0.5 * values["camera_angle_x"])
     cx, cy = values.get("cx", width / 2), values.get("cy", height / 2)
     return np.array([[focal, 0, cx], [0, values.get("fl_y", focal), cy], [0, 0, 1]], dtype=np.float64)
@@ -223,20 +236,21 @@ def _all_frames(path: str | Path) -> list[dict[str, Any]]:
 def _read_frames(frames: Sequence[Mapping[str, Any]], path: str | Path) -> ImageSet:
     """Images of one size, of some frames of a list."""
     folder = Path(path).parent
-    files = [_image_file(folder, frame["file_path"], path) for frame in frames]
+    files = [image_file(folder, frame["file_path"], path) for frame in frames]
     images = _read_all(files, frames, path)
     height, width = images.shape[1:3]
     poses = np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64)
     return ImageSet(
         images=images,
         viewmats=np.linalg.inv(poses @ OPENGL_TO_OPENCV),
-        Ks=np.stack([_intrinsic_matrix(frame, width, height) for frame in frames]),
+        Ks=np.stack([intrinsic_matrix(frame, width, height) for frame in frames]),
         views=np.array([frame["view"] for frame in frames]),
         steps=np.array([frame["step"] for frame in frames]),
     )
 
 
-def _image_file(folder: Path, name: str, listed_in: str | Path) -> Path:
+def image_file(folder: Path, name: str, listed_in: str | Path) -> Path:
+    """The file of an entry. Raises InputError where there is none."""
     for candidate in (folder / name, folder / f"{name}.png"):
         if candidate.is_file():
             return candidate
@@ -258,12 +272,12 @@ def _read_all(files: Sequence[Path], frames: Sequence[Mapping[str, Any]], path: 
                 f"{path}: w, h of {name} are {w}x{h}, the image is {width}x{height}: correct them"
             )
     # the first is decoded before memory is taken for all
-    first = _read_rgba(files[0], frames[0].get("sha256"), (width, height))
+    first = read_rgba(files[0], frames[0].get("sha256"), (width, height))
     images = np.empty((len(files), *first.shape), dtype=np.uint8)
     images[0] = first
 
     def read(row: int) -> None:
-        images[row] = _read_rgba(files[row], frames[row].get("sha256"), (width, height))
+        images[row] = read_rgba(files[row], frames[row].get("sha256"), (width, height))
 
     with ThreadPoolExecutor() as pool:
         list(pool.map(read, range(1, len(files))))
@@ -283,9 +297,14 @@ def open_image(content: bytes, where: str | Path, sha256: str | None = None) -> 
         return image
 
 
-def _read_rgba(path: Path, sha256: str | None, size: tuple[int, int]) -> np.ndarray:
+def read_rgba(path: Path, sha256: str | None, size: tuple[int, int] | None) -> np.ndarray:
+    """Pixels (H, W, 4), uint8, of a matte, of this checksum and this width and height if they are given.
+
+    Raises:
+        InputError: damaged, of another size, without alpha, with 16 bits a channel, or with an empty mask.
+    """
     with open_image(path.read_bytes(), path, sha256) as image:
-        if image.size != size:
+        if size is not None and image.size != size:
             raise InputError("{} is {}x{}, others {}x{}".format(path, *image.size, *size))
         if image.mode in ("I;16", "I"):
             raise InputError(f"{path} has 16 bits a channel: convert it to 8-bit RGBA")

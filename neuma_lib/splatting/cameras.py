@@ -6,6 +6,7 @@ A camera looks along its +z axis with +x right and +y down (OpenCV). Pixel centr
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator, Sequence
 
 import torch
 
@@ -45,6 +46,18 @@ class Cameras:
         """Some of the cameras: an int, slice or sequence of ints."""
         index = [index] if isinstance(index, int) else index
         return Cameras(self.viewmats[index], self.Ks[index], self.width, self.height)
+
+    def __iter__(self) -> Iterator[Cameras]:
+        """The cameras one by one, as sets of one."""
+        return (self[view] for view in range(len(self)))
+
+    @classmethod
+    def joined(cls, cameras: Cameras | Sequence[Cameras]) -> Cameras:
+        """Sets of cameras as one, as large as the largest picture: says where cameras stand, not what they see."""
+        if isinstance(cameras, Cameras):
+            return cameras
+        viewmats, Ks = (torch.cat([getattr(c, name) for c in cameras]) for name in ("viewmats", "Ks"))
+        return cls(viewmats, Ks, max(c.width for c in cameras), max(c.height for c in cameras))
 
     def to(self, device=None, dtype: torch.dtype | None = None) -> Cameras:
         return Cameras(self.viewmats.to(device, dtype), self.Ks.to(device, dtype), self.width, self.height)

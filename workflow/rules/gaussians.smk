@@ -14,6 +14,7 @@ rule gaussians:
         gpu=GPU,
     params:
         fit=SETTINGS.gaussians.plain(),
+        photographs=SETTINGS.photographs.plain(),
         seed=seed_of("gaussians"),
         device=SETTINGS.device,
     script:

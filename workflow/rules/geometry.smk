@@ -11,6 +11,7 @@ rule mesh:
         scene=OBJECT_SCENE,
     params:
         surface=SETTINGS.geometry.surface.plain(),
+        photographs=SETTINGS.photographs.plain(),
     script:
         "../scripts/mesh.py"
 

@@ -57,7 +57,8 @@ def main(inputs, output, params, run) -> None:
         for frame, name, pixels, mask, good in zip(frames, names, pictures, masks, kept)
         if good
     ]
-    write_mattes(output.transforms, mattes, world_of(inputs.room))
+    # the object lies on the floor of the room (neuma_lib.config.photographs)
+    write_mattes(output.transforms, mattes, {**world_of(inputs.room), "photographs": {"floor": 0.0}})
     write_json(
         output.report,
         {

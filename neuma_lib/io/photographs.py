@@ -1,0 +1,122 @@
+"""Mattes of photographs, of any sizes: each cut out around its mask, and reduced where it is larger than needed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from neuma_lib.config.photographs import PhotographsConfig
+from neuma_lib.errors import InputError
+from neuma_lib.geometry.visual_hull import ALL_AGREE, HullRules
+from neuma_lib.io.images import (
+    OPENGL_TO_OPENCV,
+    image_file,
+    intrinsic_matrix,
+    load_views,
+    read_rgba,
+    read_transforms,
+)
+from neuma_lib.splatting.cameras import Cameras
+
+LEAST_PHOTOGRAPHS = 4
+"""Fewer show no body."""
+_LEAST_MARGIN = 8
+"""What is kept around a mask at least [px]: more than the window of SSIM reaches."""
+
+
+@dataclass(frozen=True, eq=False)
+class StaticViews:
+    """Views of an object at rest.
+
+    Attributes:
+        images: V of RGBA with straight alpha in [0, 1], (H, W, 4) each; a tensor where all have one size.
+        cameras: V cameras; V sets of one where sizes may differ.
+        rules: of the visual hull.
+        photographs: their settings; None for rendered images, which are exact and of one exposure.
+    """
+
+    images: torch.Tensor | list[torch.Tensor]
+    cameras: Cameras | list[Cameras]
+    rules: HullRules = ALL_AGREE
+    photographs: PhotographsConfig | None = None
+
+    def to(self, device: torch.device) -> StaticViews:
+        """On a device."""
+        images, cameras = self.images, self.cameras
+        if isinstance(images, torch.Tensor):
+            return replace(self, images=images.to(device), cameras=cameras.to(device=device))
+        return replace(
+            self, images=[i.to(device) for i in images], cameras=[c.to(device=device) for c in cameras]
+        )
+
+
+def load_static(transforms: str | Path, settings: PhotographsConfig) -> StaticViews:
+    """Views at rest: cut out of photographs where the list has the entry `photographs`, as they are where it has not.
+
+    Raises:
+        InputError: as `neuma_lib.io.images.read_image_set`; fewer than `LEAST_PHOTOGRAPHS` photographs.
+    """
+    data = read_transforms(transforms)
+    if "photographs" not in data:
+        return StaticViews(*load_views(transforms))
+    if len(data["frames"]) < LEAST_PHOTOGRAPHS:
+        raise InputError(
+            f"{transforms}: {len(data['frames'])} mattes of photographs show no body, at least {LEAST_PHOTOGRAPHS} are"
+            " needed: take more photographs from all sides, 30 to 60 are good"
+        )
+    images, cameras = [], []
+    for frame in data["frames"]:
+        image, camera = _cut_out(Path(transforms), {**data, **frame}, settings)
+        images.append(image)
+        cameras.append(camera)
+    rules = HullRules(settings.agreement, data["photographs"]["floor"])
+    return StaticViews(images, cameras, rules, settings)
+
+
+def _cut_out(
+    listed_in: Path, frame: Mapping[str, Any], settings: PhotographsConfig
+) -> tuple[torch.Tensor, Cameras]:
+    """A matte (h, w, 4) around its mask, inside the picture, and its camera."""
+    file = image_file(listed_in.parent, frame["file_path"], listed_in)
+    size = (frame["w"], frame["h"]) if "w" in frame and "h" in frame else None
+    pixels = read_rgba(file, frame.get("sha256"), size)
+    height, width = pixels.shape[:2]
+    K = intrinsic_matrix(frame, width, height)
+    rows, columns = (np.flatnonzero((pixels[..., 3] > 127).any(axis=axis)) for axis in (1, 0))
+    margin = max(_LEAST_MARGIN, round(settings.margin * max(np.ptp(rows), np.ptp(columns))))
+    left, top = max(0, columns[0] - margin), max(0, rows[0] - margin)
+    right, bottom = min(width, columns[-1] + 1 + margin), min(height, rows[-1] + 1 + margin)
+    window = pixels[top:bottom, left:right].astype(np.float32) / 255
+    K[:2, 2] -= (left, top)
+    shrink = settings.longest / max(window.shape[:2])
+    if shrink < 1:
+        window, factors = _reduced(window, shrink)
+        K[:2] *= factors[:, None]
+    viewmat = np.linalg.inv(np.array(frame["transform_matrix"], np.float64) @ OPENGL_TO_OPENCV)
+    pose, intrinsics = (torch.from_numpy(matrix).float()[None] for matrix in (viewmat, K))
+    return torch.from_numpy(window), Cameras(pose, intrinsics, window.shape[1], window.shape[0])
+
+
+def _reduced(rgba: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray]:
+    """A matte reduced, each pixel the mean of the area that it covers, and by how much in x and y."""
+    height, width = rgba.shape[:2]
+    rows, columns = max(1, round(factor * height)), max(1, round(factor * width))
+    # colours count by their alpha: those of transparent pixels mean nothing
+    weighted = np.concatenate([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], axis=-1)
+    small = _area_means(_area_means(weighted, rows).swapaxes(0, 1), columns).swapaxes(0, 1)
+    small[..., :3] /= np.maximum(small[..., 3:], 1e-6)
+    return np.clip(small, 0, 1).astype(np.float32), np.array([columns / width, rows / height])
+
+
+def _area_means(pixels: np.ndarray, count: int) -> np.ndarray:
+    """Means over equal stretches of the first axis, whose ends may lie inside of a pixel."""
+    total = np.concatenate([np.zeros((1, *pixels.shape[1:])), np.cumsum(pixels, axis=0, dtype=np.float64)])
+    ends = np.linspace(0, len(pixels), count + 1)
+    before = np.minimum(ends.astype(int), len(pixels) - 1)
+    part = (ends - before)[:, None, None]
+    return np.diff((1 - part) * total[before] + part * total[before + 1], axis=0) * (count / len(pixels))
