@@ -16,6 +16,7 @@ class FiguresConfig(Section):
     SHOWN: ClassVar[dict[str, str]] = {
         **dict.fromkeys(("main_res", "particles_app", "lora_alphav", "gradient_analysis"), "scene"),
         **dict.fromkeys(("pipeline", "material_response"), "scene"),
+        "i23d": "scene",
         **dict.fromkeys(("letters", "meetings", "ext_time"), "experiment"),
     }
 
@@ -55,6 +56,11 @@ class FiguresConfig(Section):
     letters: tuple[str, ...] = Field((), description="experiments with one letter each, in order")
     meetings: tuple[str, ...] = Field((), description="experiments with several objects")
     ext_time: str = Field("", description="experiment that goes on after its scene's video ends")
+    i23d: tuple[str, ...] = Field(
+        ("JellyDuck", "ClayCat", "HoneyBottle"),
+        min_length=1,
+        description="scenes whose laws move all splats among the scenes, learned there by the first of `methods`",
+    )
     gradient_analysis: tuple[str, ...] = Field(
         ("BouncyBall", "RubberPawn"), min_length=1, description="scenes of the gradient norms"
     )

@@ -11,6 +11,7 @@ from neuma_lib.config.base import Section, Vector
 from neuma_lib.config.blender import AppearanceConfig
 from neuma_lib.config.dataset import TruthConfig
 from neuma_lib.config.laws import LawConfig
+from neuma_lib.config.splats import SplatConfig
 
 
 class SplitDensityConfig(Section):
@@ -64,10 +65,18 @@ OF_THE_TRUTH = ("shape", "height", "velocity", "law", "appearance")
 """Keys of what is simulated and rendered: nobody knows them of a captured object."""
 OF_A_VIDEO = ("steps",)
 """Keys that the files of a captured video tell."""
+OF_A_SPLAT = {
+    "size": 0.4, "height": 0.5, "velocity": (0.0, 0.0, 0.0), "dt": 5e-4, "steps": 1000, "prior": "jelly",
+    **dict.fromkeys(("shape", "law", "appearance")),
+}  # fmt: skip
+"""What the keys of a scene with a splat are where they are not given: half a second's fall from half a metre."""
 
 
 class SceneConfig(Section):
-    """A benchmark: what is thrown, of what, how, and what is believed about it. Or a capture: what was filmed."""
+    """A benchmark: what is thrown, of what, how, and what is believed about it.
+
+    Or a capture: what was filmed. Or a splat: what learned laws move.
+    """
 
     like: str | None = Field(
         None, description="scene whose settings stand wherever this one has none of its own; null: none"
@@ -109,6 +118,11 @@ class SceneConfig(Section):
         None,
         description="which capture this is, whose scenes have no truth; written by the workflow, not by hand",
     )
+    splat: SplatConfig | None = Field(
+        None,
+        description="Gaussians of an object made elsewhere, or their file alone. The scene has no truth then, "
+        "and size 0.4, height 0.5, velocity 0, dt 5e-4, steps 1000 and the prior jelly where it says nothing else",
+    )
     videos: tuple[str, ...] = Field(
         (),
         description="further scenes of the same material: one law is trained with all these videos, which count alike, "
@@ -120,18 +134,31 @@ class SceneConfig(Section):
         {}, description="settings of the section material that this scene overrides"
     )
 
+    @property
+    def has_truth(self) -> bool:
+        """Whether the material and the throw are known: not of captured objects, nor of splats."""
+        return self.captured is None and self.splat is None
+
     @model_validator(mode="before")
     @classmethod
     def _without_truth(cls, raw: Any) -> Any:
-        """A captured scene need not say that it has no truth."""
-        captured = isinstance(raw, Mapping) and raw.get("captured")
-        return {**dict.fromkeys((*OF_THE_TRUTH, *OF_A_VIDEO)), **raw} if captured else raw
+        """A scene of a capture or a splat need not say that it has no truth."""
+        if not isinstance(raw, Mapping):
+            return raw
+        if isinstance(raw.get("splat"), str):
+            raw = {**raw, "splat": {"file": raw["splat"]}}
+        if raw.get("splat"):
+            return {**OF_A_SPLAT, **raw}
+        return {**dict.fromkeys((*OF_THE_TRUTH, *OF_A_VIDEO)), **raw} if raw.get("captured") else raw
 
     @model_validator(mode="after")
     def _truth_is_whole(self) -> SceneConfig:
+        unknown = OF_A_SPLAT if self.splat else {}
         for key in (*OF_THE_TRUTH, *OF_A_VIDEO):
-            if self.captured is None and getattr(self, key) is None:
+            if self.captured is None and getattr(self, key) is None and unknown.get(key, ...) is not None:
                 raise ValueError(f"{key}: null stands in scenes of captures only, give it a value")
+        if self.splat and self.captured:
+            raise ValueError("splat: this scene is one of a capture; name the scene of the splat otherwise")
         return self
 
     @model_validator(mode="after")

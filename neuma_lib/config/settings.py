@@ -44,7 +44,8 @@ from neuma_lib.errors import InputError
 Changed = TypeVar("Changed", MaterialConfig, StructuredConfig, SpringsConfig, PacNerfConfig)
 
 NO_TRUTH = (
-    "nobody knows the truth of a captured object: ask for a result that needs none, see docs/capture.md"
+    "nobody knows the truth of a captured object or a splat: ask for a result that needs none, see docs/capture.md and "
+    "docs/splats.md"
 )
 TRUTH_DRAWS = ("the particles", "the tracers", "the second tracers")
 """What the seeds dataset.seed, dataset.seed + 1 and dataset.seed + 2 draw, see `neuma_lib.data.ground_truth`."""
@@ -216,12 +217,12 @@ class Config(Section):
     def random_scenes(self) -> list[str]:
         """Names of the scenes drawn at random, in order."""
         drawn = (name for name in self.scenes if name.startswith(self.random.prefix))
-        return [name for name in drawn if not self.scenes[name].captured]
+        return [name for name in drawn if self.scenes[name].has_truth]
 
     @property
     def plain_scenes(self) -> list[str]:
-        """Names of the scenes that are neither captured nor drawn at random, have no truth of their own fineness, and
-        do not belong to tables on request alone."""
+        """Names of the scenes that have a truth, not one of their own fineness, and are neither drawn at random nor
+        belong to tables on request alone."""
         asked, shown = (
             {
                 scene
@@ -234,7 +235,7 @@ class Config(Section):
         others = {
             *self.random_scenes,
             *(asked - shown),
-            *(name for name, s in self.scenes.items() if s.captured),
+            *(name for name, s in self.scenes.items() if not s.has_truth),
         }
         return [name for name, s in self.scenes.items() if name not in others and s.truth == TruthConfig()]
 
@@ -366,6 +367,12 @@ class Config(Section):
         chosen = self.tables[table]
         chains = (folder(column, dict.fromkeys(chosen.vary, k)) for k in range(chosen.seeds))
         return list(dict.fromkeys(self.run_folder(chain, method) for chain in chains))
+
+    def motion_clock(self, scene: str, method: str) -> tuple[float, tuple[int, ...]]:
+        """Time step of a method's prediction of a splat [s], and the steps of its frames: those of the scene the law
+        is from, since a law holds at the step it was learned at; the frames' times are the scene's."""
+        dt, law_dt = self.scene(scene).dt, self.scene(self.law_scene(scene, method)).dt
+        return law_dt, tuple(round(step * dt / law_dt) for step in self.frame_steps(scene))
 
     def frame_steps(self, name: str) -> tuple[int, ...]:
         """Steps of the frames of a scene's video. Raises InputError for a captured one, whose files tell them."""

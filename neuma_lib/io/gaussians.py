@@ -38,8 +38,8 @@ def save_gaussians(path: str | Path, gaussians: Gaussians) -> None:
     write_ply(path, rows)
 
 
-def load_gaussians(path: str | Path) -> Gaussians:
-    """Read Gaussians in the 3DGS layout, in float32, with unit quaternions.
+def load_gaussians(path: str | Path, remedy: str = "fit the Gaussians again") -> Gaussians:
+    """Read Gaussians in the 3DGS layout, in float32, with unit quaternions; ``remedy`` ends messages on bad values.
 
     Raises:
         InputError: missing properties (they are listed), or values that are not finite.
@@ -69,14 +69,10 @@ def load_gaussians(path: str | Path) -> Gaussians:
         for i, column in enumerate(columns):
             raw[key][:, i] = rows[column]
         if (bad := ~np.isfinite(raw[key]).all(axis=1)).any():
-            raise InputError(
-                f"{path}: {key} of Gaussian {np.argmax(bad)} is not finite: fit the Gaussians again"
-            )
+            raise InputError(f"{path}: {key} of Gaussian {np.argmax(bad)} is not finite: {remedy}")
     norm = np.linalg.norm(raw["quats"], axis=1, keepdims=True)
     if (norm == 0).any():
-        raise InputError(
-            f"{path}: the rotation of Gaussian {np.argmin(norm)} is zero: fit the Gaussians again"
-        )
+        raise InputError(f"{path}: the rotation of Gaussian {np.argmin(norm)} is zero: {remedy}")
     arrays = {
         "means": raw["means"],
         "quats": raw["quats"] / norm,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
 
@@ -18,13 +19,18 @@ TRIANGLES = ("vertex_indices", "vertex_index")
 
 def write_ply(path: str | Path, vertices: np.ndarray, faces: np.ndarray | None = None) -> None:
     """Binary little-endian PLY from a structured vertex array and (M, 3) faces."""
-    elements = [PlyElement.describe(vertices, "vertex")]
+    elements = {"vertex": vertices}
     if faces is not None:
-        rows = np.empty(len(faces), dtype=[("vertex_indices", "<i4", (3,))])
-        rows["vertex_indices"] = faces
-        elements.append(PlyElement.describe(rows, "face"))
+        elements["face"] = np.empty(len(faces), dtype=[("vertex_indices", "<i4", (3,))])
+        elements["face"]["vertex_indices"] = faces
+    write_elements(path, elements)
+
+
+def write_elements(path: str | Path, elements: Mapping[str, np.ndarray]) -> None:
+    """Binary little-endian PLY from structured arrays, in the given order."""
+    described = [PlyElement.describe(rows, name) for name, rows in elements.items()]
     with atomic(path) as partial:
-        PlyData(elements, byte_order="<").write(str(partial))
+        PlyData(described, byte_order="<").write(str(partial))
 
 
 def read_ply(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
@@ -34,6 +40,16 @@ def read_ply(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
         InputError: no such file, no PLY file, a header that claims more than the file holds, or faces that are not
             triangles.
     """
+    elements = read_elements(path)
+    return elements["vertex"], elements.get("face")
+
+
+def read_elements(path: str | Path) -> dict[str, np.ndarray]:
+    """The elements of an ASCII or binary PLY file by name, structured arrays; of faces the (M, 3) corners alone.
+
+    Raises:
+        InputError: as of `read_ply`.
+    """
     path = existing(path)
     with reading(path, "PLY of triangles"), path.open("rb") as file:
         corners = _checked_header(file.read(MAX_HEADER), path.stat().st_size)
@@ -42,13 +58,13 @@ def read_ply(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
         data = PlyData.read(file, known_list_len={"face": dict.fromkeys(corners, 3)})
         elements = {element.name: np.array(element.data) for element in data}
         if "face" not in elements:
-            return elements["vertex"], None
+            return elements
         faces = elements["face"][corners[0]]
         if data.text:  # each face is an array of its own
             if wrong := [i for i, face in enumerate(faces) if len(face) != 3]:
                 raise ValueError(f"face {wrong[0]} is not a triangle")
             faces = np.array(list(faces)).reshape(-1, 3)
-        return elements["vertex"], faces.astype(np.int64)
+        return {**elements, "face": faces.astype(np.int64)}
 
 
 def _checked_header(head: bytes, size: int) -> list[str]:

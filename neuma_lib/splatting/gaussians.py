@@ -93,3 +93,19 @@ def covariances(quats: torch.Tensor, scales: torch.Tensor) -> torch.Tensor:
     """(G, 3, 3) R S S^T R^T of rotations (G, 4) and standard deviations (G, 3)."""
     half = rotations(quats) * scales[..., None, :]
     return half @ half.mT
+
+
+def quaternions(rotations: torch.Tensor) -> torch.Tensor:
+    """Unit quaternions (..., 4), w first and not negative, of rotation matrices (..., 3, 3)."""
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = rotations.flatten(-2).unbind(-1)
+    # 4 q q^T: the row with the largest diagonal element, normalised, has no cancellation
+    rows = [
+        1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01,
+        m21 - m12, 1 + m00 - m11 - m22, m10 + m01, m02 + m20,
+        m02 - m20, m10 + m01, 1 - m00 + m11 - m22, m12 + m21,
+        m10 - m01, m02 + m20, m12 + m21, 1 - m00 - m11 + m22,
+    ]  # fmt: skip
+    products = torch.stack(rows, dim=-1).unflatten(-1, (4, 4))
+    largest = products.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
+    row = products.gather(-2, largest[..., None, None].expand(*largest.shape, 1, 4))[..., 0, :]
+    return torch.nn.functional.normalize(torch.where(row[..., :1] < 0, -row, row), dim=-1)

@@ -81,3 +81,27 @@ def rgb_to_sh0(rgb: torch.Tensor) -> torch.Tensor:
 def sh0_to_rgb(sh0: torch.Tensor) -> torch.Tensor:
     """View-independent part of the colour held by a degree-0 coefficient."""
     return sh0 * SH_C0 + 0.5
+
+
+def rotated(sh: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:
+    """Coefficients of colours that have been turned: seen along R d they are what the old ones are along d.
+
+    Harmonics of a degree turn among themselves, so that the coefficients follow exactly from the values in as many
+    directions as there are harmonics: Y sh' = Y(R^T .) sh, solved with the pseudo-inverse of Y.
+
+    Args:
+        sh: (G, K, 3) coefficients.
+        rotations: (G, 3, 3), or (3, 3) for all.
+
+    Returns:
+        (G, K, 3)
+    """
+    count = sh.shape[-2]
+    if count == 1:
+        return sh
+    index = torch.arange(4 * count, dtype=sh.dtype, device=sh.device) + 0.5
+    angle, z = math.pi * (1 + math.sqrt(5)) * index, 1 - index / (2 * count)  # evenly over the sphere
+    radius = (1 - z * z).sqrt()
+    directions = torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=-1)
+    solve = torch.linalg.pinv(basis(directions, count))
+    return solve @ (basis(directions @ rotations, count) @ sh)

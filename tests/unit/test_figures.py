@@ -147,6 +147,17 @@ DATA = {
             "heights": {"truth": curves(), "nclaw": curves(), "neuma": curves()},
         },
     ),
+    "i23d": lambda: pictures(
+        6,
+        6,
+        {"laws": 3, "diverged": [2]},
+        row_titles=[
+            f"{splat}, {law}"
+            for splat in ("Guitar", "Chair")
+            for law in ("JellyDuck", "ClayCat", "HoneyBottle")
+        ],
+        column_titles=[f"{100 * i} ms" for i in range(6)],
+    ),
     "gradient_analysis": lambda: {
         scene: {
             "norms": {"elastic": curves(50), "plastic": curves(50)},

@@ -9,7 +9,7 @@ rule binding:
         binding=f"{RESULTS}/{{scene}}/binding.h5",
         particles=f"{RESULTS}/{{scene}}/particles.h5",
     wildcard_constraints:
-        scene=OBJECT_SCENE,
+        scene=PICTURED_SCENE,
     params:
         binding=SETTINGS.binding.plain(),
     script:

@@ -23,7 +23,7 @@ POSES_THREADS = 8  # for matches; all that there are where these are fewer
 
 
 # Results of others lie in folders of these names.
-OTHERS = f"{TRUE_SCENE}|figures|logs|benchmarks|experiments|priors"
+OTHERS = f"{TRUE_SCENE}|{SPLAT_SCENE}|figures|logs|benchmarks|experiments|priors"
 RELEASED_CAPTURE = names_of(SETTINGS.captures.released, chains=False)
 OWN_CAPTURE = f"(?!({OTHERS}|{RELEASED_CAPTURE})/){NAME.pattern}"
 

@@ -158,6 +158,25 @@ def elsewhere(method):
     }
 
 
+def splats():
+    """The scenes with a splat. Raises InputError where there are none."""
+    found = [name for name, scene in SETTINGS.scenes.items() if scene.splat]
+    if not found:
+        raise InputError("i23d: no scene has a splat; name one, scenes: {Guitar: {splat: guitar.ply}}")
+    return found
+
+
+def of_splats(files):
+    """A function of wildcards: files of the splats."""
+    return checked(lambda wildcards: files(splats()))
+
+
+def of_moved(name):
+    """A function of wildcards: a file of every splat under every law of figures.i23d, splat by splat."""
+    laws = [f"{DRAWN.methods[0]}+law_from={scene}" for scene in DRAWN.i23d]
+    return of_splats(lambda scenes: of_methods(scenes, laws, name))
+
+
 def of_each_method(figure, made_of):
     """A figure for each of figures.methods, with its name from the second on."""
     names = [figure, *(f"{figure}_{method}" for method in DRAWN.methods[1:])]
@@ -227,6 +246,22 @@ FIGURES = {
             "shown": DRAWN.shown + 4,
             "size": DRAWN.size,
         },
+    },
+    "i23d": {
+        "kind": "h5",
+        "input": {
+            "kernels": kernels("rendering"),
+            "rollouts": of_moved("rollout.h5"),
+            "reports": of_moved("motion.json"),
+            **{name: of_splats(lambda scenes, name=name: each_of(scenes)[name]) for name in BODY},
+        },
+        "params": {
+            "splats": of_splats(list),
+            "laws": list(DRAWN.i23d),
+            "shown": DRAWN.shown + 1,
+            "size": DRAWN.size,
+        },
+        "on_request": True,
     },
     "gradient_analysis": {
         "kind": "json",

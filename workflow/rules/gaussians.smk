@@ -9,7 +9,7 @@ rule gaussians:
         gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
         report=f"{RESULTS}/{{scene}}/gaussians.json",
     wildcard_constraints:
-        scene=OBJECT_SCENE,
+        scene=PICTURED_SCENE,
     resources:
         gpu=GPU,
     params:

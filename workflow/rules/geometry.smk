@@ -8,7 +8,7 @@ rule mesh:
     output:
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
     wildcard_constraints:
-        scene=OBJECT_SCENE,
+        scene=PICTURED_SCENE,
     params:
         surface=SETTINGS.geometry.surface.plain(),
         photographs=SETTINGS.photographs.plain(),

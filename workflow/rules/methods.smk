@@ -201,13 +201,13 @@ def judged_carrier(wildcards):
 
 @checked
 def experiment_carrier(wildcards):
-    """The same in an experiment, of whose bodies no radiance field is fitted."""
+    """The same in an experiment, or of a splat: no radiance field is fitted to their bodies."""
     if SETTINGS.carries_field(wildcards.method):
         raise InputError(
-            f"{wildcards.method}: its own particles are those of a field, and experiments have none; take "
+            f"{wildcards.method}: its own particles are those of a field, and here is none; take "
             f"{SETTINGS.method_training(wildcards.method)}, the same law on the particles that all methods share"
         )
-    return SETTINGS.judged_carrier(SETTINGS.body_scenes(wildcards.experiment)[0], wildcards.method)
+    return SETTINGS.judged_carrier(SETTINGS.body_scenes(subject(wildcards))[0], wildcards.method)
 
 
 def carrying(method):

@@ -78,8 +78,9 @@ def scene_setting(*names):
 
     @checked
     def choose(wildcards):
-        scene = SETTINGS.scene(wildcards.scene).plain()
-        if scene["captured"] and any(scene[name] is None for name in names):
+        section = SETTINGS.scene(wildcards.scene)
+        scene = section.plain()
+        if not section.has_truth and any(scene[name] is None for name in names):
             raise InputError(f"{wildcards.scene}: {NO_TRUTH}")
         return scene[names[0]] if len(names) == 1 else {name: scene[name] for name in names}
 
@@ -87,17 +88,18 @@ def scene_setting(*names):
 
 
 def known_law(wildcards):
-    """The true law of a scene; None of a captured one."""
+    """The true law of a scene; None of one without a truth."""
     return SETTINGS.scene(wildcards.scene).plain()["law"]
 
 
 def origin_of(part, scene):
     """Whether a part ('static', 'dynamic', 'truth') of a scene is 'made', 'supplied' by the user or 'packed'.
 
-    A truth is not supplied: that of a scene with a video of the user's is simulated. All of a capture is 'captured'.
+    A truth is not supplied: that of a scene with a video of the user's is simulated. All of a capture is 'captured', and
+    a splat has neither images nor a truth.
     """
-    if SETTINGS.scenes[scene].captured:
-        return "captured"
+    if not SETTINGS.scenes[scene].has_truth:
+        return "captured" if SETTINGS.scenes[scene].captured else "none"
     if getattr(SETTINGS.scenes[scene].images, "dynamic" if part == "truth" else part):
         return "made" if part == "truth" else "supplied"
     return "packed" if SETTINGS.dataset.packed else "made"

@@ -63,14 +63,17 @@ def names_of(scenes, chains=True):
     return f"({'|'.join(scenes) or 'none'})" + ("([+][^/]*)?" if chains else "")
 
 
-# Scenes of captures have no truth, and throws have the body and the motion that registration found.
-TRUE_SCENE = names_of(name for name, scene in SETTINGS.scenes.items() if not scene.captured)
-OBJECT_SCENE = names_of(
-    name for name, scene in SETTINGS.scenes.items() if not (scene.captured and scene.captured.throw)
-)
-THROW_SCENE = names_of(
-    (name for name, scene in SETTINGS.scenes.items() if scene.captured and scene.captured.throw), chains=False
-)
+def scenes_that(holds, chains=True):
+    """Pattern of the names of the scenes that something holds for."""
+    return names_of((name for name, scene in SETTINGS.scenes.items() if holds(scene)), chains)
+
+
+# Scenes of captures and of splats have no truth. Throws have the body and the motion that registration found.
+TRUE_SCENE = scenes_that(lambda scene: scene.has_truth)
+SPLAT_SCENE = scenes_that(lambda scene: scene.splat)
+OBJECT_SCENE = scenes_that(lambda scene: not (scene.captured and scene.captured.throw))
+PICTURED_SCENE = scenes_that(lambda scene: not scene.splat and not (scene.captured and scene.captured.throw))
+THROW_SCENE = scenes_that(lambda scene: scene.captured and scene.captured.throw, chains=False)
 
 
 wildcard_constraints:

@@ -1,0 +1,166 @@
+"""Gaussian splats that were made elsewhere, in the layouts in which they are passed on.
+
+- PLY of the 3DGS release (`neuma_lib.io.gaussians`), which image-to-3D models write, or compressed
+  (`neuma_lib.io.compressed_splats`).
+- ``.splat`` (github.com/antimatter15/splat): 32 bytes each, no higher harmonics.
+- ``.spz`` (github.com/nianticlabs/spz), versions 1 to 3: 19 bytes each and the higher harmonics, under gzip.
+
+Coordinates are those of the file; which way is up, no layout says.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from neuma_lib.errors import InputError
+from neuma_lib.io.compressed_splats import is_compressed, unpacked
+from neuma_lib.io.files import existing, reading
+from neuma_lib.io.gaussians import load_gaussians
+from neuma_lib.io.ply import read_elements
+from neuma_lib.splatting.gaussians import Gaussians
+from neuma_lib.splatting.spherical_harmonics import MAX_DEGREE, SH_C0, coefficient_count
+
+KINDS = (".ply", ".splat", ".spz")
+"""Endings of the files that are read."""
+_REMEDY = "remove it in a splat editor, or export the file again"
+_SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+_SPZ_HEADER = struct.Struct("<IIIBBBB")
+"""Magic number, version, count, degree of harmonics, fractional bits of positions, flags, nothing."""
+_SPZ_MAGIC = 0x5053474E
+_SPZ_VERSIONS = (1, 2, 3)
+_SPZ_EXTENSIONS = 2
+"""Flag of extensions, among them other ranges of the harmonics."""
+_SPZ_COLOUR = 0.15
+"""Part of [0, 1] that an sh0 of 1 takes."""
+_MOST_INFLATION = 1040
+"""Bytes that a byte under gzip can hold at most (DEFLATE: 1032), with room for short files."""
+
+
+def load_splat(path: str | Path) -> Gaussians:
+    """Read Gaussians in any of the layouts of this module, in float32, with unit quaternions.
+
+    Raises:
+        InputError: a file of another kind, a damaged one, no Gaussians in it, or values that are not finite.
+    """
+    path = existing(path, "correct the path of the splat")
+    kind = path.suffix.lower()
+    if kind not in KINDS:
+        raise InputError(f"{path}: a splat's file ends in {', '.join(KINDS)}: convert it in a splat editor")
+    if kind == ".ply":
+        with reading(path, "a splat"):
+            elements = read_elements(path)
+            if not is_compressed(elements):
+                found = load_gaussians(path, _REMEDY)
+                return _checked(
+                    {field.name: getattr(found, field.name).numpy() for field in fields(found)}, path
+                )
+            return _checked(unpacked(elements), path)
+    with reading(path, f"a {kind} file"):
+        return _checked((_read_splat if kind == ".splat" else _read_spz)(path), path)
+
+
+def _checked(arrays: dict[str, np.ndarray], path: Path) -> Gaussians:
+    """Gaussians of arrays by name, with unit quaternions."""
+    if len(arrays["means"]) == 0:
+        raise InputError(f"{path} has no Gaussians: name another file")
+    for name, array in arrays.items():
+        if (bad := ~np.isfinite(array.reshape(len(array), -1)).all(axis=1)).any():
+            raise InputError(f"{path}: {name} of Gaussian {np.argmax(bad)} is not finite: {_REMEDY}")
+    norm = np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
+    if (norm == 0).any():
+        raise InputError(f"{path}: the rotation of Gaussian {np.argmin(norm)} is zero: {_REMEDY}")
+    arrays = {**arrays, "quats": arrays["quats"] / norm}
+    made = {name: torch.from_numpy(np.ascontiguousarray(a, dtype=np.float32)) for name, a in arrays.items()}
+    return Gaussians(**made)
+
+
+def _read_splat(path: Path) -> dict[str, np.ndarray]:
+    if path.stat().st_size % _SPLAT.itemsize:
+        raise ValueError(f"{path.stat().st_size} bytes are not {_SPLAT.itemsize} a Gaussian")
+    rows = np.fromfile(path, _SPLAT)
+    rgba = rows["rgba"] / 255
+    return {
+        "means": rows["mean"],
+        "quats": (rows["quat"].astype(np.float64) - 128) / 128,
+        "scales": rows["scale"],
+        "opacities": rgba[:, 3],
+        "sh0": ((rgba[:, :3] - 0.5) / SH_C0)[:, None, :],
+        "shN": np.zeros((len(rows), 0, 3)),
+    }
+
+
+def _read_spz(path: Path) -> dict[str, np.ndarray]:
+    packed = path.read_bytes()
+    if packed[:4] == struct.pack("<I", _SPZ_MAGIC):
+        raise InputError(
+            f"{path} is of version 4 or later, which is not read: export it as version 3, or as PLY"
+        )
+    stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
+    head = stream.decompress(packed, _SPZ_HEADER.size)
+    magic, version, count, degree, fractional, flags, _ = _SPZ_HEADER.unpack(head)
+    if magic != _SPZ_MAGIC:
+        raise ValueError("it does not begin with NGSP")
+    if version not in _SPZ_VERSIONS or degree > MAX_DEGREE or (degree and flags & _SPZ_EXTENSIONS):
+        raise InputError(
+            f"{path}: version {version} with harmonics of degree {degree} and flags {flags} is not read (versions "
+            f"{_SPZ_VERSIONS[0]} to {_SPZ_VERSIONS[-1]}, degrees to {MAX_DEGREE}, no extensions): export it as PLY"
+        )
+    rest = coefficient_count(degree) - 1
+    widths = {
+        "means": 6 if version == 1 else 9, "opacities": 1, "sh0": 3, "scales": 3,
+        "quats": 4 if version == 3 else 3, "shN": 3 * rest,
+    }  # fmt: skip
+    size = count * sum(widths.values())
+    if size > _MOST_INFLATION * len(packed):
+        raise ValueError(f"its header claims {count} Gaussians, more than it can hold")
+    body = stream.decompress(stream.unconsumed_tail, size) if size else b""
+    if len(body) < size:
+        raise ValueError(f"it ends after {len(body)} of {size} bytes")
+    ends = np.cumsum([count * width for width in widths.values()])
+    parts = np.split(np.frombuffer(body, np.uint8), ends[:-1])
+    raw = {name: part.reshape(count, -1) for name, part in zip(widths, parts, strict=True)}
+    if version == 1:
+        means = raw["means"].view("<f2").astype(np.float64)
+    else:
+        means = _fixed_point(raw["means"]) / 2.0**fractional
+    return {
+        "means": means,
+        "quats": _smallest_three(raw["quats"]) if version == 3 else _first_three(raw["quats"]),
+        "scales": np.exp(raw["scales"] / 16 - 10),
+        "opacities": raw["opacities"][:, 0] / 255,
+        "sh0": ((raw["sh0"] / 255 - 0.5) / _SPZ_COLOUR)[:, None, :],
+        "shN": (raw["shN"].reshape(count, rest, 3) - 128.0) / 128,
+    }
+
+
+def _fixed_point(bytes_: np.ndarray) -> np.ndarray:
+    """Signed whole numbers (G, 3) of 24 bits, the low byte first, from (G, 9)."""
+    low, middle, high = bytes_.reshape(-1, 3, 3).astype(np.int64).transpose(2, 0, 1)
+    value = low | (middle << 8) | (high << 16)
+    return value - ((value & 0x800000) << 1)
+
+
+def _first_three(bytes_: np.ndarray) -> np.ndarray:
+    """Quaternions (G, 4), w first, of x, y, z as bytes (G, 3); w is what they leave, and positive."""
+    xyz = bytes_ / 127.5 - 1
+    return np.column_stack([np.sqrt(np.maximum(0.0, 1 - np.square(xyz).sum(axis=1))), xyz])
+
+
+def _smallest_three(bytes_: np.ndarray) -> np.ndarray:
+    """Quaternions (G, 4), w first: 2 bits name the largest of x, y, z, w, 3 x 10 are sign and size of the others."""
+    words = np.ascontiguousarray(bytes_).view("<u4")[:, 0].astype(np.int64)
+    largest, rows = words >> 30, np.arange(len(words))
+    xyzw = np.zeros((len(words), 4))
+    for k in (3, 2, 1, 0):  # the last component is in the lowest bits
+        stored = largest != k
+        value = (words & 511) / 511 * np.sqrt(0.5) * np.where(words & 512, -1.0, 1.0)
+        xyzw[stored, k] = value[stored]
+        words = np.where(stored, words >> 10, words)
+    xyzw[rows, largest] = np.sqrt(np.maximum(0.0, 1 - np.square(xyzw).sum(axis=1)))
+    return xyzw[:, [3, 0, 1, 2]]
