@@ -2,18 +2,14 @@
 
 import json
 import re
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from project import copied
+from splat_files import ball, write_spz
 
 from neuma_lib.io.gaussians import load_gaussians
 from neuma_lib.io.hdf5 import read_arrays
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "unit"))
-from splat_files import ball, write_spz
 
 RESULTS = "tiny/results"
 FIGURE = f"{RESULTS}/figures/i23d.png"
