@@ -12,12 +12,15 @@ from PIL import Image
 
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.laws import LawConfig
+from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.springs import SpringsConfig
 from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.coupling import particle_gs
 from neuma_lib.coupling.filmed import Filmed
 from neuma_lib.errors import InputError
 from neuma_lib.fitting.identify import identify
 from neuma_lib.fitting.material import PixelLoss
+from neuma_lib.fitting.springs import fit_springs
 from neuma_lib.fitting.structured_fit import from_frame
 from neuma_lib.fitting.throw import Throw
 from neuma_lib.fitting.velocity import _Flight, _Residuals, estimate_velocity
@@ -28,6 +31,9 @@ from neuma_lib.sim.state import Trajectory
 from neuma_lib.splatting.cameras import Cameras, look_at
 from neuma_lib.splatting.observation import Observation, exposed_steps, rendered_steps
 from neuma_lib.splatting.rasterizer import rasterize
+from neuma_lib.springs.body import SpringBody
+from neuma_lib.springs.network import Springs
+from neuma_lib.springs.rollout import SpringModel, spring_rollout
 
 DT = 1e-3
 V0 = (0.4, -1.5, 0.1)
@@ -370,3 +376,29 @@ def test_velocity_from_staggered_cameras_that_blur():
     found = estimate_velocity(MODEL, analytic_law(law(), MODEL.dt), body, videos, VelocityConfig(frames=4))
     assert max(found.frames) <= 29 and {2, 5} & set(found.frames)
     np.testing.assert_allclose(found.v0, v0, atol=0.01)
+
+
+@pytest.mark.parametrize("truncated", [True, False])
+def test_springs_are_fitted_to_staggered_cameras_whose_exposures_overlap(truncated):
+    """Frame by frame too, where a frame's exposure begins before that of the frame before it has ended."""
+    body, v0 = ball(), (0.0, -1.5, 0.0)
+    anchored = SpringBody.of(body.x0, 60, 12, 6, 0.5, 12)
+    start, model = body.state(v0), SpringModel.of(MODEL)
+    guess, truth = (Springs.of_modulus(anchored.network, E, 1000.0, 0.1) for E in (2e5, 1e5))
+    videos = [
+        blank(cameras_from(LEFT), (30, 40, 55), (-3, 0, 3)),
+        blank(cameras_from(RIGHT, size=(16, 18)), (33, 42, 50), (-2, 0, 2)),
+    ]
+    steps = rendered_steps(videos)
+    with torch.no_grad():
+        x, v, _ = spring_rollout(model, truth, *anchored.start(start), steps)
+        path = anchored.path(steps, x, v)
+        for k, video in enumerate(videos):
+            film = Filmed(body.particle_gs(video.cameras), video, steps)
+            videos[k] = replace(video, images=film(film.states(path.x), film.states(path.F)))
+    loss = PixelLoss(body, videos)
+    assert loss.steps == steps and float(loss(path).max()) < 1e-20
+    how = SpringsConfig(truncated=truncated, lr_springs=0.05, learn_gap=False)
+    problem = (model, anchored, guess, start, loss, MaterialConfig(iterations=12), how)
+    fitted = fit_springs(*problem, log=lambda _: None)
+    assert fitted.stable and fitted.best_loss < 0.1 * fitted.history.loss[0]
