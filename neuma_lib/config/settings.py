@@ -17,6 +17,7 @@ from neuma_lib.config.base import Section
 from neuma_lib.config.binding import BindingConfig
 from neuma_lib.config.capture import CapturesConfig
 from neuma_lib.config.dataset import DatasetConfig, TruthConfig
+from neuma_lib.config.demo import DemoConfig
 from neuma_lib.config.evaluation import EvaluationConfig
 from neuma_lib.config.experiments import ExperimentConfig
 from neuma_lib.config.figures import FiguresConfig
@@ -88,6 +89,7 @@ class Config(Section):
     evaluation: EvaluationConfig = Field(EvaluationConfig(), description="measures and videos")
     viewer: ViewerConfig = Field(ViewerConfig(), description="viewer in a file")
     figures: FiguresConfig = Field(FiguresConfig(), description="figures")
+    demo: DemoConfig = Field(DemoConfig(), description="the first minute: `make demo`")
     methods: dict[str, MethodConfig] = Field({}, description="methods by name")
     experiments: dict[str, ExperimentConfig] = Field({}, description="uses of learned laws by name")
     tables: dict[str, TableConfig] = Field({}, description="tables by name")
@@ -142,7 +144,7 @@ class Config(Section):
             self.experiment_truth(name)
         for method in self.random.methods if self.random.count else ():
             self._law_from(method)
-        for method in self.figures.beside:
+        for method in (*self.figures.beside, *(self.demo.methods if self.methods else ())):
             self._law_from(method)
         for table in self.tables.values():
             for method in (*table.methods, *table.if_made, *table.titles):
@@ -198,6 +200,8 @@ class Config(Section):
             value = getattr(self.figures, key) if kind == "experiment" or self.scenes else ()
             for name in filter(None, [value] if isinstance(value, str) else value):
                 yield f"figures.{key}", kind, name
+        if self.scenes:
+            yield "demo.scene", "scene", self.demo.scene
         for name, table in self.tables.items():
             for kind in ("scene", "experiment"):
                 for column in getattr(table, f"{kind}s"):

@@ -1,4 +1,4 @@
-"""Moving pictures: prediction beside observation as mp4."""
+"""Moving pictures: prediction beside observation as mp4 or gif."""
 
 from __future__ import annotations
 
@@ -60,6 +60,17 @@ def write_mp4(path: str | Path, video: np.ndarray, frame_rate: float, quality: i
     with imageio.get_writer(path, format="FFMPEG", mode="I", macro_block_size=2, **options) as writer:
         for frame in video:
             writer.append_data(frame)
+
+
+def write_gif(path: str | Path, video: np.ndarray, frame_rate: float) -> None:
+    """Write frames (T, H, W, 3) of `side_by_side` as a GIF that repeats for ever; the same frames give the same bytes.
+
+    All frames share one palette, without dithering, which would flicker and compress badly.
+    """
+    palette = Image.fromarray(video[:: max(1, len(video) // 8)].reshape(-1, *video.shape[2:])).quantize(256)
+    frames = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in video]
+    each = {"duration": round(1000 / frame_rate), "loop": 0, "optimize": False, "disposal": 1}
+    frames[0].save(path, format="GIF", save_all=True, append_images=frames[1:], **each)
 
 
 def _as_bytes(video: np.ndarray) -> np.ndarray:

@@ -261,6 +261,13 @@ def gaussian_motion(wildcards):
 
 
 @checked
+def film_motions(wildcards):
+    """The same of each method of a film."""
+    of_methods = (SETTINGS.method_material(wildcards.scene, method) for method in SETTINGS.demo.methods)
+    return [material.gaussian_motion for material in of_methods]
+
+
+@checked
 def method_density(wildcards):
     return SETTINGS.method_density(wildcards.scene, wildcards.method)
 
