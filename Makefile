@@ -1,4 +1,5 @@
 # make table1   the environment, then Table 1 of the paper at the default scale
+# make demo     the environment, then one small scene from nothing to a film and a viewer: minutes
 # make test     the tests (make test-all adds the slow ones)
 # make env      the environment alone        make lint    style checks
 # make capture  the environment, with OpenCV and COLMAP for own photographs and videos (docs/capture.md)
@@ -13,10 +14,14 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 SNAKEMAKE := $(BIN)/snakemake --cores $(CORES)
 
-.PHONY: table1 all dataset test test-all lint env capture viewer check unlock lock clean
+.PHONY: table1 demo all dataset test test-all lint env capture viewer check unlock lock clean
 
 table1: env unlock
 	$(SNAKEMAKE) results/table1.csv
+
+demo: env unlock
+	$(SNAKEMAKE) --configfile config/demo.yaml -- demo
+	@echo "Now open $(CURDIR)/results/demo/SoftDuck/viewer.html in a browser; film and numbers: results/demo/demo.md"
 
 all dataset: env unlock
 	$(SNAKEMAKE) $@

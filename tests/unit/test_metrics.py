@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image, ImageSequence
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from neuma_lib.errors import InputError, NonFiniteError
@@ -18,7 +19,7 @@ from neuma_lib.evaluation.image_metrics import psnr, ssim
 from neuma_lib.evaluation.metrics import mean_height, mechanical_energy, tracer_errors
 from neuma_lib.evaluation.paper import BALL_PARTICLES, BALL_RADIUS, PAPER
 from neuma_lib.evaluation.reports import benchmark_table, learning_rate_table, report_table
-from neuma_lib.evaluation.video import side_by_side, write_mp4
+from neuma_lib.evaluation.video import side_by_side, write_gif, write_mp4
 from neuma_lib.geometry.chamfer import chamfer, chamfer_loss, chamfer_sequence
 from neuma_lib.geometry.volume import sample_volume
 
@@ -249,6 +250,19 @@ def test_video_shows_both_panels_and_is_the_same_every_time(film, tmp_path):
     assert max(np.diag(apart)) < 2.5
     # A frame more or less would be noticed: neighbours are further apart.
     assert (np.argmin(apart, axis=1) == range(10)).all() and np.diag(apart, 1).min() > 5
+
+
+def test_gif_shows_every_frame_and_is_the_same_every_time(film, tmp_path):
+    video = side_by_side([film, 1 - film], ["observation", "prediction"], magnify=2)
+    for name in ("first.gif", "second.gif"):
+        write_gif(tmp_path / name, video, frame_rate=12)
+    assert (tmp_path / "first.gif").read_bytes() == (tmp_path / "second.gif").read_bytes()
+    with Image.open(tmp_path / "first.gif") as read:
+        assert read.n_frames == len(video) and read.info["loop"] == 0 and read.info["duration"] == 80
+        frames = np.stack([np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(read)])
+    # Few colours, which one palette has all; Pillow looks colours up in boxes of 4 levels.
+    apart = np.abs(frames.astype(int) - video)
+    assert apart[:, 18:].max() < 4 and apart.max() < 16
 
 
 def test_learning_rate_is_chosen_by_the_geometric_mean_of_the_training_loss():

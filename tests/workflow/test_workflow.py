@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -286,6 +287,32 @@ def test_the_true_law_is_evaluated_without_training_or_prior(clone):
         json.loads((clone.root / SCENE / m / "metrics.json").read_text()) for m in ("true_law", "nclaw")
     )
     assert 0 < true["tracer_rmse_mm"] < prior["tracer_rmse_mm"] and true["stable"]
+
+
+def test_the_demo_leaves_something_to_look_at_and_a_law_that_a_scene_can_start_from(clone):
+    output = clone.run("tiny/results/demo.md")
+    assert "error of the motion: NCLaw" in output and f"{SCENE}/viewer.html" in output
+    page = (clone.root / "tiny/results/demo.md").read_text()
+    linked = {name for name in re.findall(r"BouncyBall/[\w./]+", page)}
+    assert {Path(name).name for name in linked} == {
+        "film.gif",
+        "film.mp4",
+        "law.safetensors",
+        "law.png",
+        "viewer.html",
+    }
+    for name in linked:
+        assert (clone.root / "tiny/results" / name).stat().st_size > 1000, name
+    law = f"{SCENE}/neuma/export/law.safetensors"
+    changes = "scenes={BouncyBall: {prior: %s}}"
+    variant = f"{SCENE}/neuma+iterations=1/adaptor.safetensors"
+    shutil.copy(clone.root / law, clone.root / "law.safetensors")
+    clone.run("--config", changes % "law.safetensors", "--", variant)
+    # a law of networks at the step of another scene
+    refused = clone.run(
+        "--config", "scenes={BouncyBall: {prior: law.safetensors, dt: 1.0e-3}}", "--", variant, succeeds=False
+    )
+    assert "law.safetensors: it was learned at a time step of 0.002 s" in refused
 
 
 def test_assumed_densities_are_runs_of_their_own(finished):

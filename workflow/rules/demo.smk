@@ -10,6 +10,8 @@ rule film:
     output:
         mp4=f"{RESULTS}/{{scene}}/film.mp4",
         gif=f"{RESULTS}/{{scene}}/film.gif",
+    wildcard_constraints:
+        scene=TRUE_SCENE,
     resources:
         gpu=GPU,
     params:
@@ -33,6 +35,7 @@ rule demo:
         ),
         law=f"{RESULTS}/{SETTINGS.demo.scene}/{SETTINGS.demo.methods[-1]}/export/law.safetensors",
         page=f"{RESULTS}/{SETTINGS.demo.scene}/{SETTINGS.demo.methods[-1]}/export/law.png",
+        viewer=f"{RESULTS}/{SETTINGS.demo.scene}/viewer.html",
     output:
         page=f"{RESULTS}/demo.md",
     params:
