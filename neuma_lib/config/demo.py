@@ -17,4 +17,5 @@ class DemoConfig(Section):
         description="methods beside the video in the films `results/<scene>/film.mp4` and `film.gif` of any scene; the "
         "law of the last one is exported",
     )
+    titles: dict[str, str] = Field({}, description="names of methods in the film, in place of their own")
     magnify: int = Field(2, ge=1, description="enlargement of the film's pictures")

@@ -112,8 +112,9 @@ def law_page(law: Law, about: Mapping[str, Any]) -> Figure:
         axes.plot(test.x, 1e-3 * test.curve(law, test.x), color=style.BLUE)
         axes.axhline(0, color=style.GREY, linewidth=0.4, zorder=0.5)
         axes.set(xlabel=xlabel.format(rate=settings.shear_rate), ylabel=f"{ylabel} [kPa]")
-    where = " / ".join(str(about[key]) for key in ("scene", "method") if about.get(key)) or law.name
-    figure.suptitle(f"{where}: {about['kind']}, learned at dt = {dt:g} s")
+    where = " / ".join(one_line(about[key], 60) for key in ("scene", "method") if about.get(key)) or law.name
+    step = f", learned at dt = {dt:g} s" if about.get("dt") else ""
+    figure.suptitle(f"{where}: {one_line(about.get('kind'), 20)}{step}".replace("$", r"\$"))
     return figure
 
 

@@ -16,7 +16,7 @@ rule film:
         gpu=GPU,
     params:
         density=scene_setting("density"),
-        titles=lambda wildcards: [SETTINGS.method_title(method) for method in SETTINGS.demo.methods],
+        titles=film_titles,
         motions=film_motions,
         view=SETTINGS.evaluation.video_view,
         frame_rate=SETTINGS.evaluation.frame_rate,
@@ -39,6 +39,6 @@ rule demo:
     output:
         page=f"{RESULTS}/demo.md",
     params:
-        titles=lambda wildcards: [SETTINGS.method_title(method) for method in SETTINGS.demo.methods],
+        titles=film_titles,
     script:
         "../scripts/demo.py"

@@ -261,6 +261,13 @@ def gaussian_motion(wildcards):
 
 
 @checked
+def film_titles(wildcards):
+    """Names of the methods of a film."""
+    demo = SETTINGS.demo
+    return [demo.titles.get(method) or SETTINGS.method_title(method) for method in demo.methods]
+
+
+@checked
 def film_motions(wildcards):
     """The same of each method of a film."""
     of_methods = (SETTINGS.method_material(wildcards.scene, method) for method in SETTINGS.demo.methods)

@@ -11,7 +11,7 @@ PAGE = """\
 
 ![video, prior and learned law]({gif})
 
-| | RMSE of 3D motion |
+| | error of the 3D motion (RMSE) |
 |---|---:|
 {rows}
 
