@@ -1,0 +1,181 @@
+"""What the report of a capture is made of: its laws, their runs on all throws, and files of these. Needs captures.smk."""
+
+from neuma_lib.capture.scenes import scene_name, training_throws
+from neuma_lib.config.methods import LAW_FROM
+
+# Methods that stand beside the learned one: the prior as it is, and the constants that the video shows.
+PRIOR = next(
+    (
+        name
+        for name, method in SETTINGS.methods.items()
+        if method.law == "learned" and not method.material.get("train", True)
+    ),
+    None,
+)
+CONSTANTS = next(filter(SETTINGS.is_identified, SETTINGS.methods), None)
+
+
+def reported_methods(method):
+    """Methods of a report, the learned one last."""
+    return list(dict.fromkeys([*filter(None, [PRIOR, CONSTANTS]), method]))
+
+
+@cache
+def training_scene(name):
+    """The scene that the law of a capture is learned in, with its further videos."""
+    capture = capture_named(name)
+    trained = training_throws(capture)
+    if not trained:
+        raise InputError(
+            f"{capture.folder} has no videos: a report needs at least one throw, see docs/capture.md"
+        )
+    return scene_name(name, trained[0])
+
+
+def thrown_method(name, throw, method):
+    """Folder, below the results, of a method's run on a throw, under the law of its capture."""
+    scene, training = scene_name(name, throw), training_scene(name)
+    return f"{scene}/{method}" if scene == training else f"{scene}/{method}+{LAW_FROM}={training}"
+
+
+def without_own_field(wildcards):
+    if SETTINGS.carries_field(wildcards.method):
+        raise InputError(f"{wildcards.method}: pictures of captures are not made from PAC-NeRF's field")
+
+
+@checked
+def capture_start(wildcards):
+    """How a filmed throw begins: as the method has it, or as its free flight tells where the throw is held out."""
+    without_own_field(wildcards)
+    captured = SETTINGS.scene(wildcards.scene).captured
+    if captured.throw in capture_named(captured.capture).settings.held_out:
+        return of_chain("velocity.json")(wildcards)
+    return start_file(wildcards)
+
+
+@checked
+def prior_rollout(wildcards):
+    """The prediction of the prior on the same throw, to stand beside that of a method."""
+    if PRIOR is None or wildcards.method.partition("+")[0] == PRIOR:
+        return []
+    captured = SETTINGS.scene(wildcards.scene).captured
+    return f"{RESULTS}/{thrown_method(captured.capture, captured.throw, PRIOR)}/rollout.h5"
+
+
+def scene_scale(wildcards):
+    return SETTINGS.scene(wildcards.scene).captured.scale
+
+
+def scene_cameras(wildcards):
+    return list(SETTINGS.scene(wildcards.scene).captured.cameras)
+
+
+@checked
+def scene_view(wildcards):
+    """Number of a camera of a throw."""
+    cameras = scene_cameras(wildcards)
+    if wildcards.camera not in cameras:
+        raise InputError(
+            f"{wildcards.scene} was filmed by {', '.join(cameras)}, and by no camera '{wildcards.camera}'"
+        )
+    return cameras.index(wildcards.camera)
+
+
+def method_names(wildcards):
+    """Titles of the laws of a report."""
+    named = {PRIOR: "prior", CONSTANTS: "identified constants"}
+    titles = {
+        name: named.get(name, SETTINGS.method_title(name)) for name in reported_methods(wildcards.method)
+    }
+    return titles
+
+
+def law_files(name, method):
+    """Files of the law of a capture, by kind."""
+    run = SimpleNamespace(scene=training_scene(name), method=method)
+    kinds = {
+        "identified": identified_law(run),
+        "prior": material_prior(run),
+        "adaptor": trained_adaptor(run),
+        "base": identified_base(run),
+    }
+    return {kind: file for kind, file in kinds.items() if file}
+
+
+def of_report(function):
+    """A function of wildcards: something of their capture's name and the learned method."""
+    return checked(lambda wildcards: function(wildcards.capture, wildcards.method))
+
+
+def report_cells(name, method):
+    """What each measured camera of each throw is, method by method."""
+    capture, cells = capture_named(name), []
+    titles = method_names(SimpleNamespace(method=method))
+    for each in reported_methods(method):
+        for throw, camera in filmed_by(capture):
+            learned = throw not in capture.settings.held_out
+            named = {"method": each, "title": titles[each], "throw": throw, "camera": camera}
+            cells.append({**named, "learned": learned})
+    return cells
+
+
+def measured_files(ending):
+    """A function of wildcards: a file of each of `report_cells`."""
+
+    def choose(name, method):
+        return [
+            f"{RESULTS}/{thrown_method(name, cell['throw'], cell['method'])}/views/{cell['camera']}.{ending}"
+            for cell in report_cells(name, method)
+        ]
+
+    return of_report(choose)
+
+
+def own_files(file, cameras=False):
+    """A function of wildcards: a file of the learned method for each throw, or for each of its cameras."""
+
+    def choose(name, method):
+        capture = capture_named(name)
+        places = filmed_by(capture) if cameras else [(throw, "") for throw in capture.throws]
+        return [
+            f"{RESULTS}/{thrown_method(name, throw, method)}/{file.format(camera=camera)}"
+            for throw, camera in places
+        ]
+
+    return of_report(choose)
+
+
+def thrown_files(file):
+    """A function of wildcards: a file of the scene of each throw."""
+    return of_report(
+        lambda name, method: [
+            f"{RESULTS}/{scene_name(name, throw)}/{file}" for throw in capture_named(name).throws
+        ]
+    )
+
+
+def report_identified(name, method):
+    if CONSTANTS is None:
+        return []
+    return identified_file(SimpleNamespace(scene=training_scene(name), method=CONSTANTS))
+
+
+def report_facts(name, method):
+    """What the report tells of a capture's settings."""
+    capture = capture_named(name)
+    settings = capture.settings
+    exposures = {camera: of.exposure for camera, of in settings.cameras.items()}
+    return {
+        "prior": settings.prior,
+        "density": settings.density,
+        "density_stated": "density" in settings.model_fields_set,
+        "scale": settings.scale,
+        "dt": settings.dt,
+        "width": settings.width,
+        "held_out": list(settings.held_out),
+        "photographs": len(capture.photographs),
+        "throws": {
+            throw: {camera: exposures.get(camera, 0.0) for camera in cameras}
+            for throw, cameras in capture.throws.items()
+        },
+    }
