@@ -1,0 +1,80 @@
+"""The report of a capture: what it asks for, with throws that are learned from and throws that are held out."""
+
+import re
+from collections import Counter
+
+import pytest
+from project import copied
+from test_graph import jobs
+
+SETTINGS = "board: {square: 0.03}\nheld_out: [two]\n"
+REPORT = "tiny/results/mug/{method}/report.html"
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory):
+    """A capture with three throws of two cameras, one of them held out; nothing runs, so files are empty."""
+    made = copied(tmp_path_factory.mktemp("report") / "project", tmp_path_factory.mktemp("kernels"))
+    root = made.root / "captures/mug"
+    videos = [
+        f"videos/{throw}/{camera}.mp4" for throw in ("one", "two", "three") for camera in ("left", "right")
+    ]
+    for name in ("photos/a.jpg", "stills/left.png", "stills/right.png", *videos):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).touch()
+    (root / "capture.yaml").write_text(SETTINGS)
+    return made
+
+
+@pytest.fixture(scope="module")
+def graph(project):
+    """Jobs behind the report of a structured law."""
+    return jobs(project.run("--dry-run", REPORT.format(method="neuma_structured")))
+
+
+def test_the_report_plans_every_stage_once(graph):
+    once = ("poses", "room", "photograph_masks", "curves", "images", "report")
+    throws = ("flight", "registration", "video", "shown")
+    planned = Counter(rule for rule, _, _ in graph)
+    expected = {f"capture_{name}": 1 for name in once} | {f"capture_{name}": 3 for name in throws}
+    expected |= {"capture_frames": 6, "capture_video_masks": 6}
+    expected |= {"capture_prediction": 9, "capture_view": 18}  # the prior, the constants, and the law
+    expected |= dict.fromkeys(("gaussians", "mesh", "sampled_particles", "binding", "prior", "material"), 1)
+    assert expected.items() <= planned.items(), planned
+    assert not planned.keys() & {"ground_truth", "evaluation", "velocity", "tracers", "image_metrics"}
+    # Constants begin where identification found: in each video that the law is learned from, and in none held out.
+    assert planned["identify_views"] == 2
+
+
+def test_a_held_out_throw_has_the_law_of_the_others_and_the_start_of_its_flight(graph):
+    made = {files[0]: read for _, read, files in graph}
+    (law,) = [file for file in made if file.endswith("adaptor.safetensors")]
+    assert law == "tiny/results/mug_one/neuma_structured/adaptor.safetensors"
+    videos = [file for file in made[law] if file.endswith("dynamic/transforms.json")]
+    assert videos == [
+        "tiny/data/mug_one/dynamic/transforms.json",
+        "tiny/data/mug_three/dynamic/transforms.json",
+    ]
+    for throw, start in (("two", "velocity"), ("three", "identified\\+views=0,1")):
+        read = made[f"tiny/results/mug_{throw}/neuma_structured+law_from=mug_one/rollout.h5"]
+        assert law in read and any(re.search(f"mug_{throw}/{start}.json$", file) for file in read)
+    assert not any("mug_two/" in file for file in made[law])
+
+
+def test_reports_of_the_prior_and_the_constants_train_nothing(project):
+    planned = project.plan(*(REPORT.format(method=method) for method in ("nclaw", "constants")))
+    assert "material" not in planned and planned["capture_report"] == 2 and planned["capture_prediction"] == 6
+
+
+def test_what_cannot_be_reported_is_said(project):
+    def refusal(target):
+        return project.run("--dry-run", target, succeeds=False)
+
+    said = refusal("tiny/results/mug_one/neuma/views/top.mp4")
+    assert "filmed by left, right, and by no camera 'top'" in said
+    settings = project.root / "captures/mug/capture.yaml"
+    settings.write_text(SETTINGS.replace("two", "two, one, three"))
+    try:
+        assert "held_out: all throws are" in refusal(REPORT.format(method="neuma"))
+    finally:
+        settings.write_text(SETTINGS)
