@@ -248,3 +248,6 @@ class CapturesConfig(Section):
     shown: int = Field(
         320, ge=64, le=2048, description="longer side of the pictures that the report measures and shows [px]"
     )
+    measured: int = Field(
+        20, ge=1, description="most frames of a camera that the report measures, evenly spread over its video"
+    )

@@ -66,6 +66,11 @@ class ParticleGS:
         """How far the body covers each pixel, (T, V, H, W, 1) in [0, 1], for states as they are rendered."""
         return self._rasterized(*self.deformed(x, F))[1][..., None]
 
+    def layer(self, x: Tensor, F: Tensor) -> Tensor:
+        """Colours over the background and coverage together, (T, V, H, W, 4), for states as they are rendered."""
+        colours, alpha = self._rasterized(*self.deformed(x, F))
+        return torch.cat([colours, alpha[..., None]], dim=-1)
+
     def _rasterized(self, means: Tensor, covars: Tensor) -> tuple[Tensor, Tensor]:
         views = self.cameras
         return rasterize(

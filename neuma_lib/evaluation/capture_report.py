@@ -54,7 +54,7 @@ MEASURES = {
     "iou": ("mask IoU", 3),
     "scene_psnr": ("PSNR, whole picture [dB]", 1),
     "scene_ssim": ("SSIM, whole picture", 3),
-    "scene_lpips_vgg": ("LPIPS, whole picture", 3),
+    "scene_lpips_alex": ("LPIPS, whole picture", 3),
 }
 """Columns of the table of measures: heading and digits."""
 
@@ -275,7 +275,7 @@ def _measures(rows: Sequence[Mapping[str, Any]], own: str) -> str:
             lines.append((" ".join(kinds), cells))
     head = ["frames", "law", *(escape(heading) for heading, _ in MEASURES.values())]
     return (
-        "<p>PSNR, SSIM and mask IoU: more is better. LPIPS (VGG): less is better. The object: colours over "
+        "<p>PSNR, SSIM and mask IoU: more is better. LPIPS (VGG of the object, AlexNet of the whole picture): less is better. The object: colours over "
         "white, on the "
         "bounding box of the predicted and the filmed one. The whole picture: the frame as it was filmed against the "
         "prediction over the empty scene; most of it is background, which is equal whatever is predicted, and the "

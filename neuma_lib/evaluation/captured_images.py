@@ -23,7 +23,9 @@ from neuma_lib.evaluation.reports import as_csv
 
 SCENE = "scene_"
 """What the names of measures of the whole picture begin with."""
-COLUMNS = (*MEASURES, "iou", *(f"{SCENE}{name}" for name in MEASURES))
+WHOLE = ("psnr", "ssim", "lpips_alex")
+"""Measures of the whole picture; VGG would take a second for each on a core."""
+COLUMNS = (*MEASURES, "iou", *(f"{SCENE}{name}" for name in WHOLE))
 """Measures of a frame by name; ``iou`` is that of predicted and filmed mask."""
 DIGITS = {"psnr": 2, "ssim": 4, "lpips_vgg": 4, "lpips_alex": 4, "iou": 4}
 OPAQUE = 0.5
@@ -77,6 +79,7 @@ def captured_metrics(
     planes = [each.permute(2, 0, 1)[None] for each in pair]
     found["iou"] = overlap(alpha > OPAQUE, mask > OPAQUE)
     found |= {f"{SCENE}psnr": psnr(*arrays), f"{SCENE}ssim": ssim(*arrays)}
+    networks = {name: network for name, network in networks.items() if f"lpips_{name}" in WHOLE}
     return found | {f"{SCENE}lpips_{name}": float(network(*planes)) for name, network in networks.items()}
 
 

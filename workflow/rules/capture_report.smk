@@ -88,6 +88,7 @@ rule capture_view:
         ),
         filming=filming,
         margin=SETTINGS.evaluation.margin,
+        measured=SETTINGS.captures.measured,
         frame_rate=SETTINGS.evaluation.frame_rate,
         device=SETTINGS.device,
     script:

@@ -1,6 +1,8 @@
 """Compare a prediction with what a camera filmed: measures of every frame, and a video of both."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,7 +20,7 @@ from neuma_lib.evaluation.captured_images import (
 )
 from neuma_lib.evaluation.lpips import LPIPS
 from neuma_lib.evaluation.video import side_by_side, write_mp4
-from neuma_lib.fitting.frame_batches import frame_batches
+from neuma_lib.fitting.frame_batches import frame_batches, spread_frames
 from neuma_lib.io.files import atomic, write_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import filmed_steps, load_videos, open_image, read_transforms
@@ -32,8 +34,18 @@ def read_rgb(path: Path) -> np.ndarray:
         return np.asarray(image.convert("RGB"))
 
 
+class Layers(NamedTuple):
+    """A renderer, as `Filmed` takes them, of colours with their opacity."""
+
+    render: Callable
+    frames_per_batch: int
+
+    def __call__(self, x, F):
+        return self.render(x, F)
+
+
 class Prediction:
-    """Renders of a rollout in a camera: colours over black and their opacity."""
+    """Renders of a rollout in a camera."""
 
     def __init__(self, body, rollout, needed):
         self.body = body
@@ -44,14 +56,12 @@ class Prediction:
         self.x, self.F = (state.to(body.x0) for state in load_motion(rollout))
 
     def frames(self, video):
-        """Colours (H, W, 3) and opacity (H, W) of each frame of a video of one camera."""
+        """Layer (H, W, 4) of each frame of a video of one camera: colours over black, and opacity."""
         renderer = self.body.particle_gs(video.cameras, background=(0.0, 0.0, 0.0))
-        colours, masks = (Filmed(renderer, video, self.steps, kind) for kind in ("colour", "masks"))
-        x, F = colours.states(self.x), colours.states(self.F)
-        for part in frame_batches(len(video.frames), colours.batch):
-            yield from zip(
-                colours(x[part], F[part])[:, 0], masks(x[part], F[part])[:, 0, ..., 0], strict=True
-            )
+        layers = Filmed(Layers(renderer.layer, renderer.frames_per_batch), video, self.steps)
+        x, F = layers.states(self.x), layers.states(self.F)
+        for part in frame_batches(len(video.frames), layers.batch):
+            yield from layers(x[part], F[part])[:, 0]
 
 
 def main(inputs, output, params, run) -> None:
@@ -69,6 +79,8 @@ def main(inputs, output, params, run) -> None:
     folder = Path(inputs.shown).parent
     entries = {f["step"]: f for f in read_transforms(inputs.shown)["frames"] if f["view"] == params.view}
     plate = read_rgb(folder / next(iter(entries.values()))["plate"])
+    steps = sorted(entries)
+    measured = {steps[k] for k in spread_frames(len(steps), params.measured)}
     measures, panels = [], []
     for video in load_videos(inputs.shown, [params.view], **params.filming):
         video = video.to(torch.float32, device)
@@ -80,16 +92,15 @@ def main(inputs, output, params, run) -> None:
                 empty = exposed(plate, entry["plate_gain"], entry["plate_offset"])
                 empty = torch.from_numpy(empty).float().to(device)
                 gain = torch.tensor(entry["gain"], dtype=torch.float32, device=device)
-                pictures = [laid_over(gain * colours, alpha, empty) for colours, alpha in shown]
-                matte = as_planes(video.images[k, 0].cpu().numpy()).to(device)
-                colours, alpha = shown[0]
-                measures.append(
-                    {"step": step}
-                    | captured_metrics(gain * colours, alpha, matte, filmed, empty, networks, params.margin)
-                )
+                layers = [(gain * layer[..., :3], layer[..., 3]) for layer in shown]
+                pictures = [laid_over(*layer, empty) for layer in layers]
+                if step in measured:
+                    matte = as_planes(video.images[k, 0].cpu().numpy()).to(device)
+                    values = captured_metrics(*layers[0], matte, filmed, empty, networks, params.margin)
+                    measures.append({"step": step} | values)
                 shown_now = [picture.clamp(0, 1).cpu().numpy() for picture in (filmed, *pictures)]
                 panels.append((step, [*shown_now[:2], error_picture(*shown_now[:2]), *shown_now[2:]]))
-                run.progress(len(panels), len(entries), measures[-1]["psnr"])
+                run.progress(len(panels), len(entries))
     panels.sort(key=lambda frame: frame[0])
     columns = [np.stack(panel) for panel in zip(*(frame for _, frame in panels), strict=True)]
     labels = ["video", params.title, "difference", "prior"][: len(columns)]
@@ -101,8 +112,8 @@ def main(inputs, output, params, run) -> None:
     mean = averaged([{k: v for k, v in frame.items() if k != "step"} for frame in measures])
     write_json(output.measures, {**found, "mean": mean})
     run.say(
-        f"{len(measures)} frames, object: PSNR {mean['psnr']:.1f} dB, SSIM {mean['ssim']:.3f}, LPIPS"
-        f" {mean['lpips_vgg']:.3f}, IoU {mean['iou']:.2f}; whole picture: PSNR {mean['scene_psnr']:.1f} dB"
+        f"{len(panels)} frames, {len(measures)} measured, object: PSNR {mean['psnr']:.1f} dB, SSIM {mean['ssim']:.3f},"
+        f" LPIPS {mean['lpips_vgg']:.3f}, IoU {mean['iou']:.2f}; whole picture: PSNR {mean['scene_psnr']:.1f} dB"
     )
 
 
