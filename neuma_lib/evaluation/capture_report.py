@@ -275,11 +275,11 @@ def _measures(rows: Sequence[Mapping[str, Any]], own: str) -> str:
             lines.append((" ".join(kinds), cells))
     head = ["frames", "law", *(escape(heading) for heading, _ in MEASURES.values())]
     return (
-        "<p>PSNR, SSIM and mask IoU: more is better. LPIPS (VGG of the object, AlexNet of the whole picture): less is better. The object: colours over "
-        "white, on the "
-        "bounding box of the predicted and the filmed one. The whole picture: the frame as it was filmed against the "
-        "prediction over the empty scene; most of it is background, which is equal whatever is predicted, and the "
-        "object's shadow is in the frame alone.</p>\n" + _table(head, lines, len(MEASURES))
+        "<p>PSNR, SSIM and mask IoU: more is better. LPIPS (VGG of the object, AlexNet of the whole picture): less is "
+        "better. The object: colours over white, on the bounding box of the predicted and the filmed one. The whole "
+        "picture: the frame as it was filmed against the prediction over the empty scene; most of it is background, "
+        "which is equal whatever is predicted, and the object's shadow is in the frame alone.</p>\n"
+        + _table(head, lines, len(MEASURES))
     )
 
 
