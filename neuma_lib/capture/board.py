@@ -18,7 +18,7 @@ from matplotlib.patches import Rectangle
 from neuma_lib.capture.lens import HALF_PIXEL, Lens
 from neuma_lib.capture.placement import Similarity, fit_similarity, triangulate
 from neuma_lib.capture.tools import opencv
-from neuma_lib.config.capture import PAPERS, BoardConfig
+from neuma_lib.config.board import PAPERS, BoardConfig
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import atomic
 

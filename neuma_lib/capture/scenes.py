@@ -13,15 +13,19 @@ from neuma_lib.errors import InputError
 
 
 def captured_scenes(
-    root: str | Path, released: Mapping[str, ReleasedConfig] | None = None
+    root: str | Path,
+    released: Mapping[str, ReleasedConfig] | None = None,
+    planned: Mapping[str, Capture] | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """Settings of the scenes of all captures in a folder, and of released ones, by name.
+    """Settings of the scenes of all captures in a folder, of released ones, and of those planned there, by name.
 
     A capture ``mug`` is the scene ``mug``, what the photographs show, and a scene ``mug_<throw>`` for each throw. The
     law is that of the first throw by name that is not held out (`training_throws`), whose ``videos`` are the others of
     these. A capture that cannot be read has none here: its own rules say why.
     """
     found: dict[str, dict[str, Any]] = {}
+    for capture in (planned or {}).values():
+        found |= scenes_of(capture)
     if released:
         # What reads them needs far more than every start of the workflow should load.
         from neuma_lib.capture.released import released_captures
@@ -30,7 +34,7 @@ def captured_scenes(
             found |= scenes_of(capture)
     folders = sorted(p for p in Path(root).iterdir() if p.is_dir()) if Path(root).is_dir() else []
     for folder in folders:
-        if not NAME.fullmatch(folder.name):
+        if not NAME.fullmatch(folder.name) or folder.name in (planned or {}):
             continue
         try:
             capture = read_capture(folder)

@@ -40,7 +40,7 @@ def capture_named(name):
         from neuma_lib.capture.released import released_captures  # as in neuma_lib.capture.scenes
 
         return released_captures({name: SETTINGS.captures.released[name]})[name]
-    return read_capture(f"{CAPTURES}/{name}")
+    return PLANNED.get(name) or read_capture(f"{CAPTURES}/{name}")
 
 
 def of_capture(choose):

@@ -8,6 +8,7 @@ from pathlib import Path
 ROOT = Path(workflow.basedir).resolve()
 sys.path.insert(0, str(ROOT))
 
+from neuma_lib.capture.planned import planned_captures
 from neuma_lib.capture.scenes import captured_scenes
 from neuma_lib.config.capture import CapturesConfig
 from neuma_lib.config.settings import load
@@ -18,7 +19,8 @@ from workflow.provenance import code_digest
 
 try:
     captures = validate(CapturesConfig, config.get("captures") or {}, "captures")
-    SETTINGS = load(config, captured=captured_scenes(captures.root, captures.released))
+    PLANNED = planned_captures(captures.demo, captures.root)
+    SETTINGS = load(config, captured=captured_scenes(captures.root, captures.released, PLANNED))
 except InputError as error:
     raise WorkflowError(str(error)) from None
 

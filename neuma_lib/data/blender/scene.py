@@ -134,7 +134,7 @@ def render_images(
             samples=samples,
             threads=threads,
         )
-        _run(job, len(shots), progress)
+        run_worker(worker.__name__, job, len(shots), progress)
         for index, name in enumerate(names):
             image = Path(folder) / f"{index:05d}.png"
             image.write_bytes(_pixels_only(image.read_bytes()))
@@ -153,14 +153,18 @@ def _pixels_only(png: bytes) -> bytes:
     return b"".join(kept)
 
 
-def _run(job: Path, total: int, progress: Progress | None) -> None:
-    """Start Blender on a job file and follow it."""
+def run_worker(module: str, job: Path, total: int, progress: Progress | None) -> None:
+    """Start a Blender process, a module of this package, on a job file and follow it.
+
+    Raises:
+        InputError, RuntimeError: see `render_images`.
+    """
     root = str(Path(__file__).resolve().parents[2])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
     log = job.with_suffix(".log")
     with open(log, "wb") as sink:
         process = subprocess.Popen(
-            [sys.executable, "-m", worker.__name__, str(job)],
+            [sys.executable, "-m", module, str(job)],
             stdout=subprocess.PIPE,
             stderr=sink,
             env=environment,

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 
-def _quiet_stdout():
+def quiet_stdout():
     """A stream to the real standard output; file descriptor 1 becomes standard error, because Blender prints in C."""
     sys.stdout.flush()
     real = os.fdopen(os.dup(1), "w")
@@ -22,7 +22,7 @@ def _quiet_stdout():
     return real
 
 
-def _claim_cores(count: int) -> list:
+def claim_cores(count: int) -> list:
     """Pin this process to ``count`` cores that no other Blender of ours holds, as far as there are any.
 
     Cycles' own thread limit leaves its helpers on every core. Returns open lock files: keep them while rendering.
@@ -46,11 +46,11 @@ def _claim_cores(count: int) -> list:
 
 
 def main(path: str) -> None:
-    report = _quiet_stdout()
+    report = quiet_stdout()
     with np.load(path) as file:
         job = dict(file)
     threads = int(job["threads"])
-    claimed = _claim_cores(threads)
+    claimed = claim_cores(threads)
     from neuma_lib.data.blender import cycles
 
     folder = Path(path).parent

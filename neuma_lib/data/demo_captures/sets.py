@@ -1,0 +1,60 @@
+"""Files of the demo captures that are not for the pipeline: the room, and the body in Blender."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from neuma_lib.config.demo_captures import DemoCapturesConfig
+from neuma_lib.data.blender.appearance import colors_at
+from neuma_lib.data.blender.room import Moving, Scenery
+from neuma_lib.data.demo_captures.drops import surfaces
+from neuma_lib.data.demo_captures.stage import frame_steps, lying, solid, start
+from neuma_lib.io.files import atomic
+from neuma_lib.io.hdf5 import read_arrays
+
+PLATE = "plate_"
+
+
+def write_room(path: str | Path, where: Scenery, plates: dict[str, np.ndarray]) -> None:
+    """Write the room and the plates of the video cameras (an .npz)."""
+    values = {name: getattr(where, name) for name in Scenery.__dataclass_fields__ if name != "pictures"}
+    pictures = {f"picture{number}": picture for number, picture in enumerate(where.pictures)}
+    with atomic(path) as partial, open(partial, "wb") as file:
+        np.savez(file, **values, **pictures, **{PLATE + name: plate for name, plate in plates.items()})
+
+
+def read_room(path: str | Path) -> tuple[Scenery, dict[str, np.ndarray]]:
+    """What `write_room` wrote."""
+    with np.load(path) as file:
+        values = {name: file[name][()] for name in Scenery.__dataclass_fields__ if name != "pictures"}
+        pictures = [file[f"picture{number}"] for number in range(len(values["corners"]))]
+        plates = {name.removeprefix(PLATE): file[name] for name in file if name.startswith(PLATE)}
+    return Scenery(pictures=pictures, **values), plates
+
+
+def body_at_rest(demo: DemoCapturesConfig, name: str) -> Moving:
+    """An object as it lies in its photographs."""
+    mesh = solid(demo.objects[name])
+    colors = colors_at(mesh, mesh.vertices, demo.objects[name].appearance)
+    vertices = lying(demo.objects[name], mesh).apply(mesh.vertices)[None]
+    return Moving(vertices, np.zeros_like(vertices), np.asarray(mesh.faces), colors)
+
+
+def body_of_drop(
+    demo: DemoCapturesConfig, name: str, drop: str, particles: str | Path
+) -> tuple[Moving, dict[str, np.ndarray]]:
+    """The body in a drop, and the numbers of its frames that each camera takes.
+
+    Args:
+        particles: the simulated motion.
+    """
+    item = demo.objects[name]
+    mesh = solid(item)
+    colors = colors_at(mesh, mesh.vertices, item.appearance)
+    mesh.vertices = start(item, item.drops[drop], mesh).apply(mesh.vertices)
+    arrays, _ = read_arrays(particles, ("frames", "x", "v"), ("frames", "x", "v"))
+    shown = surfaces(mesh, arrays["frames"], arrays["x"], arrays["v"])
+    frames = {camera: shown.at(frame_steps(demo, camera)) for camera in sorted(demo.cameras)}
+    return Moving(shown.vertices, shown.velocities, np.asarray(mesh.faces), colors), frames

@@ -1,0 +1,329 @@
+"""What the pipeline found of a demo capture beside what is true of it, in metres of the simulator's box."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from neuma_lib.capture.lens import Lens, read_lens
+from neuma_lib.capture.masks import iou
+from neuma_lib.capture.pictures import undistorted
+from neuma_lib.capture.placement import fit_similarity
+from neuma_lib.capture.tools import opencv
+from neuma_lib.geometry.skinning import skinning_matrix
+
+FINER = 4
+"""Silhouettes are drawn so many times finer than the pictures, and have half a pixel or more of the body."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One comparison.
+
+    Attributes:
+        what: is compared.
+        found: how far off it is, or a value of its own (IoU, a ratio).
+        unit: of ``found``.
+        goal: bound of ``found``; None: told without one.
+        least: whether the goal is the least, not the most.
+    """
+
+    what: str
+    found: float
+    unit: str
+    goal: float | None = None
+    least: bool = False
+
+    @property
+    def reached(self) -> bool | None:
+        if self.goal is None:
+            return None
+        return bool(self.found >= self.goal if self.least else self.found <= self.goal)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """The true motion of a drop, with a frame for each frame of each camera.
+
+    Attributes:
+        times: after the start [s], (T,).
+        x: particles [m], (T, N, 3).
+        mass: [kg], (N,).
+        tracers: [m], (T, M, 3).
+    """
+
+    times: np.ndarray
+    x: np.ndarray
+    mass: np.ndarray
+    tracers: np.ndarray
+
+    def center(self, frame: int) -> np.ndarray:
+        """Centre of mass [m], (3,)."""
+        return self.mass @ self.x[frame].astype(np.float64) / self.mass.sum()
+
+    def turn(self, frame: int) -> Rotation:
+        """Rotation from the start to a frame, by least squares."""
+        first, now = (self.x[k].astype(np.float64) - self.center(k) for k in (0, frame))
+        return Rotation.align_vectors(now, first)[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Flying:
+    """The true rigid motion at a time of free flight.
+
+    Attributes:
+        center: of mass [m], (3,).
+        turn: rotation from the start.
+        velocity: [m/s], (3,).
+        spin: [rad/s], (3,).
+    """
+
+    center: np.ndarray
+    turn: Rotation
+    velocity: np.ndarray
+    spin: np.ndarray
+
+
+def flying(truth: Truth, time: float, velocity: Sequence[float], gravity: Sequence[float]) -> Flying:
+    """The true motion at a time before contact.
+
+    Args:
+        time: after the start [s].
+        velocity: at the start [m/s].
+        gravity: [m/s^2].
+    """
+    k = int(np.clip(np.searchsorted(truth.times, time), 1, len(truth.times) - 1))
+    before, after = truth.turn(k - 1), truth.turn(k)
+    spin = (after * before.inv()).as_rotvec() / (truth.times[k] - truth.times[k - 1])
+    turn = Rotation.from_rotvec(spin * (time - truth.times[k - 1])) * before
+    v0, g = np.asarray(velocity, float), np.asarray(gravity, float)
+    return Flying(truth.center(0) + v0 * time + g * time * time / 2, turn, v0 + g * time, spin)
+
+
+def angle(a: np.ndarray, b: np.ndarray) -> float:
+    """Between two directions (3,) [degrees]."""
+    a, b = np.asarray(a, float) / np.linalg.norm(a), np.asarray(b, float) / np.linalg.norm(b)
+    return float(np.degrees(2 * np.arcsin(np.clip(np.linalg.norm(a - b) / 2, 0, 1))))
+
+
+def compare_cameras(
+    frames: Sequence[Mapping[str, Any]], photographs: Mapping[str, Any], cameras: Mapping[str, Any]
+) -> list[Row]:
+    """Cameras of a room's transforms.json beside the true ones.
+
+    Args:
+        frames: entries of the transforms.json.
+        photographs: true cameras, by the stem of their files.
+        cameras: true video cameras, by name.
+    """
+    rows, found_centres, true_centres = [], [], []
+    for kind in ("photographs", "video cameras"):
+        centre, turn = [], []
+        for frame in frames:
+            if (frame["group"] == "photographs") != (kind == "photographs"):
+                continue
+            stem = frame["file_path"].rpartition("/")[2].rpartition(".")[0]
+            known = photographs[stem] if kind == "photographs" else cameras[frame["group"]]
+            found, true = (np.array(entry["transform_matrix"]) for entry in (frame, known))
+            found_centres.append(found[:3, 3])
+            true_centres.append(true[:3, 3])
+            centre.append(1000 * np.linalg.norm(found[:3, 3] - true[:3, 3]))
+            turn.append(np.degrees(Rotation.from_matrix(found[:3, :3] @ true[:3, :3].T).magnitude()))
+        if centre:
+            rows.append(Row(f"centres of {kind}, largest", max(centre), "mm", 5.0))
+            rows.append(Row(f"directions of {kind}, largest", max(turn), "degrees", 0.2))
+    placed = fit_similarity(np.stack(found_centres), np.stack(true_centres))
+    rows.append(Row("scale, from the cameras", 100 * abs(1 / placed.scale - 1), "%", 0.5))
+    rows.append(Row("up, from the cameras", angle(placed.rotation @ [0, 1, 0], [0, 1, 0]), "degrees", 0.5))
+    return rows
+
+
+def silhouette(vertices: np.ndarray, faces: np.ndarray, c2w: np.ndarray, lens: Lens) -> np.ndarray:
+    """Pixels at least half of which a mesh (n, 3) [m], (m, 3) covers in a picture, (H, W)."""
+    cv2 = opencv()
+    seen = (vertices - c2w[:3, 3]) @ c2w[:3, :3] * [1.0, -1.0, -1.0]
+    corners = np.rint(FINER * lens.project(seen) * 16 - 8).astype(np.int32)[faces]
+    fine = np.zeros((FINER * lens.height, FINER * lens.width), np.uint8)
+    for triangle in corners:
+        cv2.fillConvexPoly(fine, triangle, 255, shift=4)
+    blocks = fine.reshape(lens.height, FINER, lens.width, FINER)
+    return blocks.mean(axis=(1, 3)) >= 127.5
+
+
+def mask_agreement(
+    alpha: np.ndarray,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    true: Mapping[str, Any],
+    found: Lens,
+    longest: int,
+) -> float:
+    """IoU of a matte's mask with the true silhouette, in the undistorted picture of the pipeline.
+
+    Args:
+        alpha: of the matte, (H, W), uint8.
+        vertices, faces: the body where the picture was taken.
+        true: camera of the picture as filmed, pose and lens.
+        found: lens of the picture as the pipeline has it.
+        longest: side of its undistorted pictures [px].
+    """
+    whole = silhouette(vertices, faces, np.array(true["transform_matrix"]), true_lens(true))
+    drawn = undistorted(np.repeat(255 * whole[..., None].astype(np.uint8), 3, axis=2), found, longest)[..., 0]
+    return iou(alpha > 127, drawn > 127)
+
+
+def true_lens(camera: Mapping[str, Any]) -> Lens:
+    """The lens of a camera of truth.json."""
+    return read_lens(
+        {key: value for key, value in camera.items() if key not in ("transform_matrix", "light", "offset_s")},
+        "truth.json",
+    )
+
+
+def compare_masks(agreements: Mapping[str, Sequence[float]]) -> list[Row]:
+    """IoU of masks with the truth, by what they are of."""
+    rows = []
+    for kind, values in agreements.items():
+        rows.append(Row(f"IoU of masks, {kind}, mean", float(np.mean(values)), "", 0.96, least=True))
+        rows.append(Row(f"IoU of masks, {kind}, least", float(np.min(values)), ""))
+    return rows
+
+
+def compare_flight(flight: Mapping[str, Any], known: Mapping[str, Any], truth: Truth, drop: str) -> list[Row]:
+    """A flight/<throw>.json beside the truth.
+
+    Args:
+        known: truth.json.
+    """
+    first = min(flight["offsets_s"])
+    late = {name: camera["offset_s"] for name, camera in known["cameras"].items()}
+    thrown = known["drops"][drop]
+    now = flying(truth, late[first] + flight["start_s"], thrown["v0_m_s"], known["gravity_m_s2"])
+    rows = [
+        Row("gravity, from the fall", angle(flight["gravity_m_s2"], known["gravity_m_s2"]), "degrees", 0.5),
+        Row("size of gravity, from the fall", 100 * abs(flight["gravity_ratio"] - 1), "%"),
+        Row("v0 of the masks' centre", 100 * _off(flight["v0_m_s"], now.velocity), "%"),
+    ]
+    for name, offset in flight["offsets_s"].items():
+        if name != first:
+            off = abs(offset - (late[name] - late[first]))
+            rows.append(Row(f"offset of {name}, from the fall", 1000 * off, "ms"))
+    if flight["spin_rad_s"]:
+        rows.append(
+            Row(
+                "spin, from points",
+                float(np.linalg.norm(np.subtract(flight["spin_rad_s"], now.spin))),
+                "rad/s",
+            )
+        )
+    return rows
+
+
+def compare_registration(
+    registration: Mapping[str, Any],
+    velocity: Mapping[str, Any] | None,
+    known: Mapping[str, Any],
+    truth: Truth,
+    drop: str,
+) -> list[Row]:
+    """A registration.json, and the velocity.json beside it, beside the truth."""
+    first = min(registration["offsets_s"])
+    late = {name: camera["offset_s"] for name, camera in known["cameras"].items()}
+    thrown = known["drops"][drop]
+    now = flying(truth, late[first] + registration["t0_s"], thrown["v0_m_s"], known["gravity_m_s2"])
+    rotation, translation = (np.array(registration[key]) for key in ("rotation", "translation"))
+    turn, shift = np.array(thrown["rotation"]), np.array(thrown["translation"])
+    start = np.array(thrown["center_m"])
+    photographed = turn.T @ (start - shift)  # of the centre of mass
+    true_turn = now.turn.as_matrix() @ turn
+    rows = [
+        Row(
+            "registration, place",
+            1000 * float(np.linalg.norm(rotation @ photographed + translation - now.center)),
+            "mm",
+            3.0,
+        ),
+        Row(
+            "registration, turn",
+            float(np.degrees(Rotation.from_matrix(rotation @ true_turn.T).magnitude())),
+            "degrees",
+            1.5,
+        ),
+    ]
+    for name, offset in registration["offsets_s"].items():
+        if name != first:
+            rows.append(Row(f"offset of {name}", 1000 * abs(offset - (late[name] - late[first])), "ms"))
+    if velocity is not None:
+        rows.append(Row("v0", 100 * _off(velocity["v0"], now.velocity), "%", 3.0))
+        if velocity.get("angular_velocity"):
+            rows.append(
+                Row(
+                    "spin",
+                    float(np.linalg.norm(np.subtract(velocity["angular_velocity"], now.spin))),
+                    "rad/s",
+                )
+            )
+    return rows
+
+
+def tracer_error(x: np.ndarray, times: np.ndarray, truth: Truth, start: float) -> float:
+    """Root-mean-square distance of true tracers and of the predicted motion of the places that they start from [m].
+
+    Args:
+        x: predicted particles [m], (T, N, 3), the first at the start of the prediction.
+        times: of them after that start [s], (T,).
+        start: true time of that start, after that of the truth [s].
+    """
+    starts = _between(truth.tracers, truth.times, start)
+    matrix = skinning_matrix(starts, x[0])
+    squares = []
+    for state, time in zip(x[1:], times[1:]):
+        if start + time <= truth.times[-1]:
+            off = matrix @ state.astype(np.float64) - _between(truth.tracers, truth.times, start + time)
+            squares.append((off**2).sum(axis=1).mean())
+    return float(np.sqrt(np.mean(squares)))
+
+
+def _between(values: np.ndarray, times: np.ndarray, time: float) -> np.ndarray:
+    """Values (T, ...) at a time between two of theirs, in a straight line."""
+    k = int(np.clip(np.searchsorted(times, time), 1, len(times) - 1))
+    share = np.clip((time - times[k - 1]) / (times[k] - times[k - 1]), 0, 1)
+    return (1 - share) * values[k - 1].astype(np.float64) + share * values[k].astype(np.float64)
+
+
+def _off(found: Sequence[float], true: Sequence[float]) -> float:
+    return float(np.linalg.norm(np.subtract(found, true)) / np.linalg.norm(true))
+
+
+def compare_motion(errors: Mapping[str, float], prior: str, held_out: bool) -> list[Row]:
+    """Tracer errors [m] of predictions of a drop, by method.
+
+    Args:
+        prior: the method that is the prior as it is.
+        held_out: whether no law was learned from the drop.
+    """
+    rows = []
+    for method, error in errors.items():
+        goal = None if method == prior else 15.0 if held_out else 12.0
+        rows.append(Row(f"tracer RMSE, {method}", 1000 * error, "mm", goal))
+        if method != prior and prior in errors and not held_out:
+            rows.append(
+                Row(f"prior's RMSE over that of {method}", errors[prior] / error, "", 4.0, least=True)
+            )
+    return rows
+
+
+def table(rows: Sequence[tuple[str, str, Row]]) -> tuple[str, list[list[str]]]:
+    """Markdown and cells of rows, each with its capture and drop ("" where it is of none)."""
+    head = ["capture", "drop", "what", "found", "goal", ""]
+    cells = []
+    for capture, drop, row in rows:
+        goal = "" if row.goal is None else f"{'>=' if row.least else '<='} {row.goal:g} {row.unit}".strip()
+        reached = {None: "", True: "reached", False: "missed"}[row.reached]
+        cells.append([capture, drop, row.what, f"{row.found:.3g} {row.unit}".strip(), goal, reached])
+    lines = [head, ["---"] * len(head), *cells]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n", [head, *cells]

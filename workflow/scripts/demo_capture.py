@@ -1,0 +1,28 @@
+"""What else a demo capture has: pictures of the empty scene and capture.yaml; and its truth, which is nowhere in it."""
+
+import numpy as np
+import yaml
+from PIL import Image
+
+from neuma_lib.capture.planned import capture_settings
+from neuma_lib.config.demo_captures import DemoCapturesConfig
+from neuma_lib.data.demo_captures.filming import developed
+from neuma_lib.data.demo_captures.sets import read_room
+from neuma_lib.data.demo_captures.truth import truth_of
+from neuma_lib.io.files import atomic, read_json, write_json, write_text
+from workflow.stage import run_script
+
+
+def main(inputs, output, params, run) -> None:
+    demo = DemoCapturesConfig(**params.demo)
+    _, plates = read_room(inputs.room)
+    rng = np.random.default_rng([demo.seed, 3])
+    for path, camera in zip(output.stills, sorted(demo.cameras)):
+        with atomic(path) as partial:
+            Image.fromarray(developed(plates[camera], demo.videos.noise, rng)).save(partial, "PNG")
+    write_json(output.truth, truth_of(demo, params.name, read_json(inputs.photographs)))
+    write_text(output.settings, yaml.safe_dump(capture_settings(demo, params.name), sort_keys=False))
+    run.say(f"{len(plates)} stills, capture.yaml and truth.json")
+
+
+run_script(main, snakemake)

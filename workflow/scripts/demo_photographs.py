@@ -1,0 +1,26 @@
+"""Photographs of an object at rest, for a demo capture, and where they were really taken from."""
+
+from pathlib import Path
+
+from neuma_lib.config.demo_captures import DemoCapturesConfig
+from neuma_lib.data.demo_captures.filming import photograph, write_jpeg
+from neuma_lib.data.demo_captures.sets import body_at_rest, read_room
+from neuma_lib.data.demo_captures.stage import photographers
+from neuma_lib.io.files import write_json
+from workflow.stage import run_script
+
+
+def main(inputs, output, params, run) -> None:
+    demo = DemoCapturesConfig(**params.demo)
+    where, _ = read_room(inputs.room)
+    eyes = photographers(demo, params.name)
+    taken = photograph(demo, where, body_at_rest(demo, params.name), eyes, params.threads, run.progress)
+    truth = {}
+    for path, eye, (pixels, light) in zip(output.photographs, eyes, taken):
+        write_jpeg(path, pixels, demo.photographs.quality)
+        truth[Path(path).name] = {**eye.plain(), "light": light}
+    write_json(output.truth, truth)
+    run.say(f"{len(truth)} photographs")
+
+
+run_script(main, snakemake)
