@@ -116,11 +116,11 @@ def _of_file(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
     if options.dt is not None and options.dt <= 0:
         raise InputError(f"--dt {options.dt:g}: give the time step in seconds, above zero")
     law = load_law(source, options.adaptor, dt, options.any_step, options.alpha)
-    kept = {
-        key: value
-        for key, value in said.items()
-        if key not in ("schema", "kind", "step", "units", "dt", "any_step")
-    }
+    of_the_law = ("grid", "gravity", "density", "scale")
+    if not options.adaptor:
+        of_the_law += ("scene", "method", "prior", "weight", "commit", "metrics", "visited")
+    kept = {key: said[key] for key in of_the_law if key in said}
+    kept |= {"prior": source.name} if options.adaptor else {}
     any_step = options.any_step or said.get("any_step") is True
     return law, {**kept, "dt": said.get("dt") or dt, "any_step": any_step}
 

@@ -110,9 +110,9 @@ def load_prior(
     return law.to(device)
 
 
-def load_adaptable(path: str | Path, dt: float | None = None) -> AdaptableLaw:
+def load_adaptable(path: str | Path, dt: float | None = None, any_step: bool = False) -> AdaptableLaw:
     """The same of a law to be trained. Raises InputError, too, where it has no networks."""
-    law = load_prior(path, dt=dt)
+    law = load_prior(path, dt=dt, any_step=any_step)
     if not isinstance(law, AdaptableLaw):
         raise InputError(
             f"prior {path}: it is an analytic law, without networks that could be adapted; a method that trains "
@@ -139,7 +139,7 @@ def _read_law(path: str | Path, dt: float | None, any_step: bool) -> Law:
             law = structured_law(_specification(metadata[STRUCTURED], dt), state=state, name=path.stem)
         else:
             law = neural_law(state, name=path.stem)
-        if EXPORT in metadata and "rank" in metadata:
+        if "rank" in metadata:
             _attach(law, state, metadata)
         return law
     except InputError as error:
@@ -248,7 +248,7 @@ def load_law(
     if Path(adaptor).suffix in PICKLED:
         if prior is None:
             raise InputError(f"{adaptor} corrects a prior: give its file too")
-        law = load_adaptable(prior, dt)
+        law = load_adaptable(prior, dt, any_step)
         _attach_released(law, existing(adaptor), released_alpha)
         return law
     tensors, metadata = read_weights(adaptor)
@@ -256,7 +256,7 @@ def load_law(
         raise InputError(f"{adaptor} has no rank and alpha in its metadata: it is no adaptor of this project")
     if prior is None and STRUCTURED not in metadata:
         raise InputError(f"{adaptor} corrects a prior: give its file too")
-    law = None if prior is None else load_adaptable(prior, dt)
+    law = None if prior is None else load_adaptable(prior, dt, any_step)
     try:
         if law is None:
             spec = _specification(metadata[STRUCTURED], dt)

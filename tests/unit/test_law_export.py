@@ -130,6 +130,13 @@ def test_as_a_prior_an_adaptor_apart_is_merged(tmp_path):
     same(prior, law, rel=1e-6)
 
 
+def test_the_adaptor_of_a_structured_law_is_a_whole_law(tmp_path):
+    law, path = structured(), tmp_path / "adaptor.safetensors"
+    save_adaptor(path, law, None, 16.0, {})
+    for load in (load_law, load_prior):
+        same(load(path), law, rel=1e-6)
+
+
 def test_equal_laws_give_equal_bytes(tmp_path):
     for name in "ab":
         save_law(tmp_path / name, networks(), about_law(networks(), DT), apart=True)
@@ -251,7 +258,8 @@ def test_a_released_law_is_exported(tmp_path):
     words = ["export-law", tmp_path / "jelly_0300.pt", tmp_path / "law.safetensors", "--dt", "1e-3"]
     assert main([*map(str, words), "--adaptor", str(tmp_path / "1000_lora.pt")]) == 0
     same(load_law(tmp_path / "law.safetensors"), neural_law(merged), rel=1e-5)
-    assert read_about(tmp_path / "law.safetensors")["dt"] == 1e-3
+    about = read_about(tmp_path / "law.safetensors")
+    assert about["dt"] == 1e-3 and about["prior"] == "jelly_0300.pt" and about["metrics"] is None
 
 
 DAMAGES = {
