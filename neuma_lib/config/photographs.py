@@ -25,11 +25,17 @@ class PhotographsConfig(Section):
         description="longer side of what is kept of a photograph, reduced to it where it is larger [px]",
     )
     agreement: float = Field(
-        0.95,
+        0.9,
         gt=0.5,
         le=1,
-        description="share of the masks that must hold a point of the body; with 1 the body is what all of them hold, "
-        "and a single bad mask takes from it",
+        description="share of the masks that must hold a point of the body that the masks are judged by",
+    )
+    lacking: float = Field(
+        0.1,
+        gt=0,
+        le=1,
+        description="share of that body that a mask may lack; photographs with other masks are left out, since the "
+        "surface is what all masks hold; 1: none is left out",
     )
     gain_rate: float = Field(
         0.01,

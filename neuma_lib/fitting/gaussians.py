@@ -18,7 +18,7 @@ from torch import Tensor
 
 from neuma_lib.config.gaussians import GaussiansConfig
 from neuma_lib.errors import InputError, NonFiniteError
-from neuma_lib.geometry.visual_hull import ALL_AGREE, Hull, HullRules, check_masks, visual_hull
+from neuma_lib.geometry.visual_hull import Hull, check_masks, visual_hull
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians, covariances, rotations
 from neuma_lib.splatting.rasterizer import RenderBuffers, Statistics, rasterize
@@ -79,7 +79,7 @@ def fit_gaussians(
     settings: GaussiansConfig,
     seed: int = 0,
     progress: Callable[[int, float], None] | None = None,
-    rules: HullRules = ALL_AGREE,
+    floor: float | None = None,
     gain_rate: float = 0.0,
 ) -> tuple[Gaussians, GaussianFitReport]:
     """Fit Gaussians to images of an object.
@@ -90,7 +90,7 @@ def fit_gaussians(
         settings: hyper-parameters.
         seed: of everything random; the same seed gives the same Gaussians on a CPU.
         progress: called with (iteration, loss) after each iteration.
-        rules: of the hull that the Gaussians start in.
+        floor: height y [m] below which no Gaussian starts; None: there is no floor.
         gain_rate: learning rate of the logarithms of the views' exposures, one for each channel; 0: all are alike.
 
     Returns:
@@ -107,7 +107,7 @@ def fit_gaussians(
     fitted = [i for i in range(count) if i not in held_out]
 
     seen = views.some(fitted)
-    hull = visual_hull(seen.masks(), seen.cameras, settings.hull_resolution, rules)
+    hull = visual_hull(seen.masks(), seen.cameras, settings.hull_resolution, floor)
     start, spacing = _initial_gaussians(hull, seen, settings, generator)
     gains = _Gains(fitted, count, gain_rate, start.means) if gain_rate else None
     fit = _Fit(start, spacing, settings, gains)

@@ -20,13 +20,7 @@ from torch import Tensor
 from neuma_lib.config.geometry import SurfaceConfig
 from neuma_lib.errors import InputError
 from neuma_lib.geometry.repair import repaired
-from neuma_lib.geometry.visual_hull import (
-    ALL_AGREE,
-    NO_COMMON_SPACE,
-    HullRules,
-    contour_distances,
-    distance_inside,
-)
+from neuma_lib.geometry.visual_hull import NO_COMMON_SPACE, contour_distances, distance_inside
 from neuma_lib.geometry.volume import check_mesh
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians
@@ -61,7 +55,7 @@ def reconstruct(
     cameras: Cameras | Sequence[Cameras],
     images: Tensor | Sequence[Tensor],
     settings: SurfaceConfig,
-    rules: HullRules = ALL_AGREE,
+    floor: float | None = None,
 ) -> trimesh.Trimesh:
     """Surface of the body that the views show (paper, section 3.2, where a multi-view method makes it).
 
@@ -70,7 +64,7 @@ def reconstruct(
         cameras: V views, or V sets of one where sizes differ.
         images: RGBA with straight alpha in [0, 1] of V views, shape (H, W, 4) each.
         settings: resolution and smoothing.
-        rules: how many masks must agree, and the floor.
+        floor: height y [m] below which nothing is, where no camera sees the underside; None: there is no floor.
 
     Returns:
         Watertight mesh in the world frame [m], one body without inner cavities, oriented outwards.
@@ -87,7 +81,7 @@ def reconstruct(
     cameras = [camera.to("cpu", torch.float64) for camera in cameras]
     contours = contour_distances([image[..., 3] for image in images], settings.matte_level)
 
-    coarse, distance = _locate(gaussians, contours, cameras, rules)
+    coarse, distance = _locate(gaussians, contours, cameras, floor)
     reach = 2.0 * coarse.spacing
     near = np.argwhere(distance > -coarse.spacing)
     lower = coarse.origin + (near.min(axis=0) - 1) * coarse.spacing
@@ -100,13 +94,13 @@ def reconstruct(
     )
     band = np.flatnonzero(np.abs(field.ravel()) < reach)
     points = np.stack(np.unravel_index(band, field.shape), axis=1) * grid.spacing + grid.origin
-    field.ravel()[band] = distance_inside(torch.from_numpy(points), contours, cameras, rules).numpy()
+    field.ravel()[band] = distance_inside(torch.from_numpy(points), contours, cameras, floor).numpy()
 
     mesh = _polygonise(_one_solid_body(field), grid)
     if settings.smoothing:
         _smooth(mesh, settings.smoothing)
-    if rules.floor is not None:  # smoothing may bend an edge on the floor down
-        mesh.vertices[:, 1] = np.maximum(mesh.vertices[:, 1], rules.floor)
+    if floor is not None:  # smoothing may bend an edge on the floor down
+        mesh.vertices[:, 1] = np.maximum(mesh.vertices[:, 1], floor)
     check_mesh(mesh, "surface")
     return mesh
 
@@ -137,7 +131,7 @@ def photographed(mesh: trimesh.Trimesh, edge: float, floor: float | None) -> tri
 
 
 def _locate(
-    gaussians: Gaussians, contours: Sequence[Tensor], cameras: Sequence[Cameras], rules: HullRules
+    gaussians: Gaussians, contours: Sequence[Tensor], cameras: Sequence[Cameras], floor: float | None
 ) -> tuple[_Grid, Array]:
     """Coarse lattice that holds the whole body, and the distances on it.
 
@@ -154,7 +148,7 @@ def _locate(
         margin = 0.05 * float((upper - lower).max())
         grid = _Grid.around(lower - margin, upper + margin, _COARSE_RESOLUTION)
         points = torch.cartesian_prod(*map(torch.from_numpy, grid.axes()))
-        distance = distance_inside(points, contours, cameras, rules).numpy().reshape(tuple(grid.counts))
+        distance = distance_inside(points, contours, cameras, floor).numpy().reshape(tuple(grid.counts))
         interior = np.zeros(distance.shape, dtype=bool)
         interior[1:-1, 1:-1, 1:-1] = True
         if (distance > -grid.spacing).any() and not (distance[~interior] > 0).any():

@@ -26,34 +26,14 @@ NO_COMMON_SPACE = (
     "no point of space lies inside all masks; check that they show the object alone and that the camera poses belong to"
     " these images"
 )
+_JUDGED_RESOLUTION = 40
+"""Voxels along the longest side of the body that masks are judged by."""
 _BAND = 6.0
 """Distance from a contour [px] up to which it is measured to a small part of a pixel."""
 _CONTOUR_STEPS = 8
 """Points on each segment of a contour; a segment is at most a pixel's diagonal long."""
 _FIELD_OF_VIEW = 0.75
 """Half side of the searched cube over the width that the nearest camera sees at the cube's centre."""
-
-
-@dataclass(frozen=True)
-class HullRules:
-    """What else bounds a hull, or does not.
-
-    Attributes:
-        agreement: share of the masks that must hold a point; with 1 the hull is the intersection of all, and a single
-            mask that lacks a part of the object takes it from the body.
-        floor: height [m] of the floor, y up, below which nothing is; None: there is none. The underside of an object
-            that lies on it is seen by no camera.
-    """
-
-    agreement: float = 1.0
-    floor: float | None = None
-
-    def spare(self, views: int) -> int:
-        """How many of the masks may lack a point of the hull."""
-        return int((1.0 - self.agreement) * views + 1e-9)
-
-
-ALL_AGREE = HullRules()
 
 
 @dataclass
@@ -131,21 +111,19 @@ def distance_inside(
     points: Tensor,
     contours: Sequence[Tensor],
     cameras: Cameras | Sequence[Cameras],
-    rules: HullRules = ALL_AGREE,
+    floor: float | None = None,
 ) -> Tensor:
-    """Signed distance [m] of points to the surface of the hull, negative outside, shape (P,).
+    """Least signed distance [m] of points to the silhouette cones and the floor, negative outside one, shape (P,).
 
-    It is the least one to the silhouette cones, or of those that are left without the masks that may be wrong. A
-    distance in the image is turned into metres at the point's depth. Points behind a camera are outside of its cone.
+    A distance in the image is turned into metres at the point's depth. Points behind a camera are outside.
 
     Args:
         points: positions [m], float64, shape (P, 3).
         contours: result of `contour_distances`, V of shape (H, W).
         cameras: V cameras in float64, or V sets of one where sizes differ.
-        rules: how many masks must agree, and the floor.
+        floor: height y [m] below which nothing is; None: there is no floor.
     """
-    spare = rules.spare(len(contours))
-    least = torch.full((spare + 1, len(points)), float("inf"), dtype=torch.float64)
+    least = torch.full((len(points),), float("inf"), dtype=torch.float64)
     for contour, camera in zip(contours, cameras, strict=True):
         size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
         pixels, depth = camera.project(points)
@@ -157,26 +135,51 @@ def distance_inside(
         beyond = (pixels[0] - pixels[0].clamp(min=torch.zeros(2, dtype=torch.float64), max=size)).norm(dim=-1)
         distance = torch.where(distance[0, 0, 0] < 0, distance[0, 0, 0] - beyond, distance[0, 0, 0])
         distance = distance * depth[0] / camera.Ks[0, 0, 0]
-        distance = torch.where(depth[0] > 0, distance, -depth[0].abs() - 1e-3)
-        for rank in range(spare + 1):  # the least ones, ascending
-            least[rank], distance = torch.minimum(least[rank], distance), torch.maximum(least[rank], distance)
-    found = least[spare]
-    return found if rules.floor is None else torch.minimum(found, points[:, 1] - rules.floor)
+        least = torch.minimum(least, torch.where(depth[0] > 0, distance, -depth[0].abs() - 1e-3))
+    return least if floor is None else torch.minimum(least, points[:, 1] - floor)
+
+
+def lacking(
+    masks: Tensor | Sequence[Tensor],
+    cameras: Cameras | Sequence[Cameras],
+    agreement: float,
+    floor: float | None = None,
+) -> Tensor:
+    """Share of the body that each mask lacks, (V,): that of a good one is small, whatever the others are.
+
+    The body is what nearly all masks hold. It is larger than the object where few cameras see what is not there, so it
+    serves for judging masks alone.
+
+    Args:
+        masks, cameras, floor: as of `visual_hull`.
+        agreement: share of the masks that must hold a point of this body.
+    """
+    spare = int((1.0 - agreement) * len(cameras) + 1e-9)
+    hull = visual_hull(masks, cameras, _JUDGED_RESOLUTION, floor, spare)
+    points = (hull.origin + (hull.occupied.nonzero() + 0.5) * hull.voxel).to("cpu", torch.float64)
+    views = zip(contour_distances(masks), cameras, strict=True)
+    outside = [
+        distance_inside(points, [contour], [camera.to("cpu", torch.float64)]) <= -0.5 * hull.voxel
+        for contour, camera in views
+    ]
+    return torch.stack(outside).double().mean(dim=1)
 
 
 def visual_hull(
     masks: Tensor | Sequence[Tensor],
     cameras: Cameras | Sequence[Cameras],
     resolution: int,
-    rules: HullRules = ALL_AGREE,
+    floor: float | None = None,
+    spare: int = 0,
 ) -> Hull:
-    """Space seen inside the object's silhouette by every camera, or by as many as ``rules`` ask for.
+    """Space seen inside the object's silhouette by every camera, or by nearly all.
 
     Args:
         masks: alpha in [0, 1] of V views, shape (H, W) each.
         cameras: V cameras, or V sets of one where sizes differ; the object is wholly in view of at least one.
         resolution: voxels along the longest side of the hull's bounding box.
-        rules: how many masks must agree, and the floor.
+        floor: height y [m] below which nothing is, where no camera sees the underside; None: there is no floor.
+        spare: how many masks may lack a voxel.
 
     Returns:
         The voxels whose centres are inside, or less than half a voxel outside, with the cameras' device and type.
@@ -198,7 +201,7 @@ def visual_hull(
     centre = torch.linalg.solve(system, (projectors @ eyes[..., None]).sum(0)[:, 0] + 1e-6 * eyes.mean(0))
     widths = (eyes - centre).norm(dim=-1) * sizes.amax(dim=1) / joined.Ks[:, 0, 0]
     # a picture that shows a part of the object alone must not narrow the search where masks may be wrong
-    reach = _FIELD_OF_VIEW * (widths.median() if rules.spare(len(cameras)) else widths.min())
+    reach = _FIELD_OF_VIEW * (widths.median() if spare else widths.min())
     lower, upper = centre - reach, centre + reach
     for size in (resolution // 2, resolution, resolution):
         voxel = float((upper - lower).max()) / size
@@ -208,12 +211,12 @@ def visual_hull(
         ]
         centres = torch.cartesian_prod(*ticks)
         inside, missing = torch.arange(len(centres)), torch.zeros(len(centres), dtype=torch.long)
-        if rules.floor is not None:
-            inside = inside[centres[:, 1] > rules.floor - 0.5 * voxel]
+        if floor is not None:
+            inside = inside[centres[:, 1] > floor - 0.5 * voxel]
         # most points are outside of the first few already
         for contour, camera in zip(contours, cameras, strict=True):
             missing[inside] += distance_inside(centres[inside], [contour], [camera]) <= -0.5 * voxel
-            inside = inside[missing[inside] <= rules.spare(len(cameras))]
+            inside = inside[missing[inside] <= spare]
         if len(inside) == 0:
             raise InputError(f"masks: {NO_COMMON_SPACE}")
         occupied = torch.zeros(counts, dtype=torch.bool)

@@ -12,7 +12,7 @@ import torch
 
 from neuma_lib.config.photographs import PhotographsConfig
 from neuma_lib.errors import InputError
-from neuma_lib.geometry.visual_hull import ALL_AGREE, HullRules
+from neuma_lib.geometry.visual_hull import lacking
 from neuma_lib.io.images import (
     OPENGL_TO_OPENCV,
     image_file,
@@ -25,6 +25,8 @@ from neuma_lib.splatting.cameras import Cameras
 
 LEAST_PHOTOGRAPHS = 4
 """Fewer show no body."""
+MOST_LEFT_OUT = 0.3
+"""Share of the photographs that may be left out."""
 _LEAST_MARGIN = 8
 """What is kept around a mask at least [px]: more than the window of SSIM reaches."""
 
@@ -36,14 +38,16 @@ class StaticViews:
     Attributes:
         images: V of RGBA with straight alpha in [0, 1], (H, W, 4) each; a tensor where all have one size.
         cameras: V cameras; V sets of one where sizes may differ.
-        rules: of the visual hull.
         photographs: their settings; None for rendered images, which are exact and of one exposure.
+        floor: height y of the floor that the object lies on [m]; None: there is none, or cameras see the underside.
+        left_out: files of photographs whose masks lack a part of the body.
     """
 
     images: torch.Tensor | list[torch.Tensor]
     cameras: Cameras | list[Cameras]
-    rules: HullRules = ALL_AGREE
     photographs: PhotographsConfig | None = None
+    floor: float | None = None
+    left_out: tuple[str, ...] = ()
 
     def to(self, device: torch.device) -> StaticViews:
         """On a device."""
@@ -59,23 +63,35 @@ def load_static(transforms: str | Path, settings: PhotographsConfig) -> StaticVi
     """Views at rest: cut out of photographs where the list has the entry `photographs`, as they are where it has not.
 
     Raises:
-        InputError: as `neuma_lib.io.images.read_image_set`; fewer than `LEAST_PHOTOGRAPHS` photographs.
+        InputError: as `neuma_lib.io.images.read_image_set`; fewer than `LEAST_PHOTOGRAPHS` photographs, or more
+            than `MOST_LEFT_OUT` of them with masks that lack a part of the body.
     """
     data = read_transforms(transforms)
     if "photographs" not in data:
         return StaticViews(*load_views(transforms))
-    if len(data["frames"]) < LEAST_PHOTOGRAPHS:
+    names = [frame["file_path"] for frame in data["frames"]]
+    if len(names) < LEAST_PHOTOGRAPHS:
         raise InputError(
-            f"{transforms}: {len(data['frames'])} mattes of photographs show no body, at least {LEAST_PHOTOGRAPHS} are"
-            " needed: take more photographs from all sides, 30 to 60 are good"
+            f"{transforms}: {len(names)} mattes of photographs show no body, at least {LEAST_PHOTOGRAPHS} are needed:"
+            " take more photographs from all sides, 30 to 60 are good"
         )
-    images, cameras = [], []
-    for frame in data["frames"]:
-        image, camera = _cut_out(Path(transforms), {**data, **frame}, settings)
-        images.append(image)
-        cameras.append(camera)
-    rules = HullRules(settings.agreement, data["photographs"]["floor"])
-    return StaticViews(images, cameras, rules, settings)
+    views = [_cut_out(Path(transforms), {**data, **frame}, settings) for frame in data["frames"]]
+    floor = data["photographs"]["floor"]
+    kept = list(range(len(names)))
+    if settings.lacking < 1:
+        shares = lacking(
+            [image[..., 3] for image, _ in views], [c for _, c in views], settings.agreement, floor
+        )
+        kept = (shares <= settings.lacking).nonzero()[:, 0].tolist()
+    left_out = tuple(name for i, name in enumerate(names) if i not in kept)
+    if len(left_out) > MOST_LEFT_OUT * len(names):
+        raise InputError(
+            f"{transforms}: {len(left_out)} of {len(names)} masks lack more than {100 * settings.lacking:.0f} % of the"
+            f" body that the others show ({', '.join(left_out[:5])}): give masks of your own for them, photograph the"
+            " whole object before another colour, or set photographs.lacking"
+        )
+    images, cameras = map(list, zip(*(views[i] for i in kept)))
+    return StaticViews(images, cameras, settings, floor, left_out)
 
 
 def _cut_out(

@@ -15,6 +15,8 @@ from workflow.stage import run_script
 def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
     views = load_static(inputs.transforms, PhotographsConfig(**params.photographs)).to(device)
+    if views.left_out:
+        run.say(f"left out, since their masks lack a part of the body: {', '.join(views.left_out)}")
     settings = GaussiansConfig(**params.fit)
     gaussians, report = fit_gaussians(
         views.images,
@@ -22,7 +24,7 @@ def main(inputs, output, params, run) -> None:
         settings,
         seed=params.seed,
         progress=lambda iteration, loss: run.progress(iteration + 1, settings.iterations, loss),
-        rules=views.rules,
+        floor=views.floor,
         gain_rate=views.photographs.gain_rate if views.photographs else 0.0,
     )
     save_gaussians(output.gaussians, gaussians)

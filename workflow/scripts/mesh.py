@@ -12,9 +12,9 @@ from workflow.stage import run_script
 def main(inputs, output, params, run) -> None:
     views = load_static(inputs.transforms, PhotographsConfig(**params.photographs))
     surface = SurfaceConfig(**params.surface)
-    mesh = reconstruct(load_gaussians(inputs.gaussians), views.cameras, views.images, surface, views.rules)
+    mesh = reconstruct(load_gaussians(inputs.gaussians), views.cameras, views.images, surface, views.floor)
     if views.photographs:
-        mesh = photographed(mesh, views.photographs.edge, views.rules.floor)
+        mesh = photographed(mesh, views.photographs.edge, views.floor)
     write_mesh(output.mesh, mesh.vertices, mesh.faces)
     run.say(f"{len(mesh.faces)} faces, watertight: {mesh.is_watertight}, volume {1e3 * mesh.volume:.3f} l")
 
