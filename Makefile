@@ -2,7 +2,7 @@
 # make demo     the environment, then one small scene from nothing to a film and a viewer: minutes
 # make test     the tests (make test-all adds the slow ones)
 # make env      the environment alone        make lint    style checks
-# make capture  the environment, with OpenCV and COLMAP for own photographs and videos (docs/capture.md)
+# make capture  the environment, with OpenCV, COLMAP and MeshLab for own photographs and videos (docs/capture.md)
 # make viewer   the environment, with viser for the viewer in a browser (docs/viewer.md)
 # make lock     envs/ again from the pins in pyproject.toml
 # make unlock   after a killed Snakemake     make clean   everything computed, but not the environment
