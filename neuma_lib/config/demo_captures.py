@@ -16,16 +16,27 @@ class LensConfig(Section):
     width: int = Field(ge=64, description="of its pictures [px]")
     height: int = Field(ge=64, description="of its pictures [px]")
     focal: float = Field(gt=0, description="focal length, of square pixels [px]")
-    center: tuple[float, float] = Field(description="principal point, from the left upper corner [px]")
+    center: tuple[float, float] = Field(
+        description="principal point, from the left upper corner; multiples of 0.5 [px]"
+    )
     distortion: tuple[float, float] = Field(description="k1 and k2 of Brown and Conrady")
 
+    @model_validator(mode="after")
+    def _center_is_rendered(self) -> LensConfig:
+        # A picture is part of a larger one around the optical axis, which has whole pixels.
+        if any(
+            2 * c != round(2 * c) or not 0 < c < side
+            for c, side in zip(self.center, (self.width, self.height))
+        ):
+            raise ValueError("center: expected multiples of 0.5 inside the picture")
+        return self
+
     def resized(self, factor: float) -> LensConfig:
-        """The lens of pictures of a size that is multiplied by a factor."""
+        """The lens of pictures of a size that is multiplied by a factor, but for a quarter of a pixel."""
         width, height = round(factor * self.width), round(factor * self.height)
-        center = (self.center[0] * width / self.width, self.center[1] * height / self.height)
-        return self.model_copy(
-            update={"width": width, "height": height, "focal": factor * self.focal, "center": center}
-        )
+        center = tuple(round(2 * factor * c) / 2 for c in self.center)
+        changed = {"width": width, "height": height, "focal": factor * self.focal, "center": center}
+        return LensConfig(**{**self.plain(), **changed})
 
 
 class DemoCameraConfig(Section):

@@ -52,6 +52,7 @@ def test_cycles_polynomial_is_the_lens():
         seen = eye.project(points @ eye.c2w[:3, :3].T + eye.c2w[:3, 3]) + row[4:6] - row[2:4] / 2
         angles = np.polyval(row[:5:-1], np.linalg.norm(seen, axis=1))
         assert np.abs(angles - np.arctan(slopes)).max() * eye.lens.focal < 0.01  # pixels
+        assert (row[2:6] == np.round(row[2:6])).all()  # Blender cuts off parts of a pixel
         assert (row[4:6] >= 0).all() and (row[4:6] + row[:2] <= row[2:4]).all()
 
 
@@ -287,7 +288,7 @@ def room():
     texel = board.square / 112
     size = tuple(n * board.square for n in board.squares)
     page = page_picture(*black_rectangles(board), size, (0.297, 0.42), texel)
-    coarse = DEMO.room.model_copy(update={"texels": 512})
+    coarse = DEMO.room.model_copy(update={"texels": 256})
     return filming.scenery(coarse, page, (page.shape[1] * texel, page.shape[0] * texel))
 
 
@@ -311,7 +312,7 @@ def test_rendered_pictures_are_where_the_truth_says(room):
     board = DEMO.room.board
     flat = corner_positions(board)[found.ids] - [*np.multiply(board.squares, board.square / 2), 0]
     true = eye.project(middle + np.stack([flat[:, 0], 0 * flat[:, 0] + filming.PAPER, -flat[:, 1]], axis=1))
-    assert len(found.ids) > 25
+    assert len(found.ids) >= 20
     off = found.pixels - true
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.3 and np.linalg.norm(off.mean(axis=0)) < 0.1
     red = (full[..., 0] > 4 * full[..., 1]) & (full[..., 0] > 0.02)
@@ -320,22 +321,26 @@ def test_rendered_pictures_are_where_the_truth_says(room):
 
 
 @pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="needs Blender (bpy)")
-def test_only_what_moves_is_rendered_and_it_is_blurred(room):
-    """The rest of a frame is the plate, bit by bit; within, a bright edge is as wide as the way of the exposure."""
+def test_a_body_is_blurred_over_the_exposure(room):
+    """A straight way of length L, around the frame's time, adds L^2 / 12 to the variance of where the body is seen."""
     eye = next(iter(stage.video_cameras(DEMO).values()))
     mesh = trimesh.creation.box((0.1, 0.1, 0.1))
     rest = (mesh.vertices + stage.MIDDLE + [0, 0.3, 0])[None]
-    speed = 20.0
+    speed, exposure = 20.0, 0.005
     velocities = np.broadcast_to([0.0, -speed, 0.0], rest.shape)
     body = Moving(rest, velocities, mesh.faces, np.tile([1.0, 0.0, 0.0], (8, 1)))
-    row = stage.lens_row(eye.lens)
-    samples, exposure = 32, 0.005
-    still, moved = (
-        next(shoot(room, body, [Shot(eye.c2w, row, 0)], samples=samples, exposure=e)) for e in (0.0, exposure)
-    )
-    tall = [np.flatnonzero((p[..., 0] > 3 * p[..., 1] + 0.01).any(axis=1)) for p in (still, moved)]
-    ends = eye.project(stage.MIDDLE + np.array([[0, 0.3, 0], [0, 0.3 - speed * exposure, 0]]))
-    wider = len(tall[1]) - len(tall[0])
-    assert wider == pytest.approx(np.ptp(ends[:, 1]), rel=0.3)
-    middle = [(t[0] + t[-1]) / 2 for t in tall]
-    assert abs(middle[1] - middle[0]) < 2  # the exposure is around the frame's time
+    region = (50, 28, 126, 76)  # without the floor, which is red below the body
+    shots = [Shot(eye.c2w, stage.lens_row(eye.lens), frame, region) for frame in (-1, 0)]
+    moments = []
+    for duration in (0.0, exposure):
+        empty, seen = shoot(room, body, shots, samples=16, exposure=duration)
+        redder = (seen - empty)[..., 0] - (seen - empty)[
+            ..., 1
+        ]  # in proportion to how much of a pixel is covered
+        share = redder.sum(axis=1) / redder.sum()
+        rows = np.arange(len(share)) + 0.5
+        moments.append((share @ rows, share @ rows**2 - (share @ rows) ** 2))
+    ends = eye.project(stage.MIDDLE + np.array([[0, 0.3 - 0.05, 0], [0, 0.3 + 0.05, 0]]))
+    (place, spread), (blurred_place, blurred_spread) = moments
+    assert abs(blurred_place - place) < 0.5
+    assert np.sqrt(12 * (blurred_spread - spread)) == pytest.approx(np.ptp(ends[:, 1]), rel=0.15)

@@ -64,7 +64,7 @@ def lens_row(lens: LensConfig) -> np.ndarray:
     """
     cx, cy = lens.center
     half = np.array([max(cx, lens.width - cx), max(cy, lens.height - cy)])
-    full = 2 * np.ceil(half)
+    full = 2 * half  # whole pixels, since the centre is in the middle of one or between two
     reach = BEYOND * np.linalg.norm(half)
     slope = np.linspace(0, 3 * reach / lens.focal, 20_000)
     k1, k2 = lens.distortion
