@@ -56,12 +56,16 @@ class Arc:
         return max(_OFF_LEAST, _OFF * float(np.sqrt(self.area / np.pi)))
 
 
-def find_arcs(candidates: Sequence[np.ndarray], times: np.ndarray) -> list[Arc]:
+def find_arcs(
+    candidates: Sequence[np.ndarray], times: np.ndarray, down: np.ndarray | None = None
+) -> list[Arc]:
     """Arcs in the order of time, none of which shares a frame with another; the longest are taken first.
 
     Args:
         candidates: of each of T frames, x, y and area of what moved and does not touch the picture's border, (N, 3).
         times: [s], ascending, (T,).
+        down: the way in which things fall in the picture, (2,): a body that bounces keeps to a parabola as well, which
+            is curved upward. None: not known.
     """
     times = np.asarray(times, float)
     table = np.full((len(times), MOST_CANDIDATES, 3), np.nan)
@@ -71,7 +75,7 @@ def find_arcs(candidates: Sequence[np.ndarray], times: np.ndarray) -> list[Arc]:
         order.append(largest)
         row[: len(largest)] = found[largest]
     arcs: list[Arc] = []
-    while (best := _longest(table, times)) is not None:
+    while (best := _longest(table, times, down)) is not None:
         first, last = best.frames
         table[first : last + 1] = np.nan
         arcs.append(
@@ -86,7 +90,7 @@ def find_arcs(candidates: Sequence[np.ndarray], times: np.ndarray) -> list[Arc]:
     return sorted(arcs, key=lambda arc: arc.frames)
 
 
-def _longest(table: np.ndarray, times: np.ndarray) -> Arc | None:
+def _longest(table: np.ndarray, times: np.ndarray, down: np.ndarray | None) -> Arc | None:
     best: Arc | None = None
     for spacing in _SPACINGS:
         for middle in range(spacing, len(times) - spacing):
@@ -95,6 +99,8 @@ def _longest(table: np.ndarray, times: np.ndarray) -> Arc | None:
                 if best is not None and all(best.found.get(i) == c for i, c in zip(three, chosen)):
                     continue  # would grow into the same
                 arc = _grown(table, times, three, chosen)
+                if arc is not None and down is not None and arc.coefficients[2] @ down <= 0:
+                    continue
                 if arc is not None and (best is None or len(arc.found) > len(best.found)):
                     best = arc
     return best

@@ -122,6 +122,7 @@ def video_masks(
     plate: np.ndarray | None = None,
     times: np.ndarray | None = None,
     places: np.ndarray | None = None,
+    down: np.ndarray | None = None,
 ) -> VideoMasks:
     """Masks of the object in a video of a fixed camera.
 
@@ -134,6 +135,7 @@ def video_masks(
         plate: the empty scene; None: the median of the frames.
         times: of the frames [s], ascending, (T,); None: evenly.
         places: where the object is expected, (T, 2), NaN where that is not known: goes before arcs.
+        down: the way in which things fall in the picture, see `find_arcs`.
 
     Raises:
         InputError: the plate is of another size, the background moves, or the object is in no frame.
@@ -149,7 +151,7 @@ def video_masks(
         )
     seen = [_changed(frame, plate) for frame in frames]
     times = np.arange(len(frames), dtype=float) if times is None else np.asarray(times, float)
-    arcs = find_arcs([change.parts[~change.cut] for change in seen], times)
+    arcs = find_arcs([change.parts[~change.cut] for change in seen], times, down)
     masks = np.zeros((len(frames), *plate.shape[:2]), bool)
     known = np.zeros(len(frames), bool)
     arcs = [_fly(arc, frames, plate, seen, times, masks, known) for arc in arcs]
@@ -169,15 +171,16 @@ def video_masks(
     return VideoMasks(masks, moving, *exposures, tuple(arcs))
 
 
-def given_masks(masks: np.ndarray, times: np.ndarray) -> VideoMasks:
+def given_masks(masks: np.ndarray, times: np.ndarray, down: np.ndarray | None = None) -> VideoMasks:
     """Own masks (T, H, W) of a video, which are taken as they are, with the arcs that they show.
 
     Args:
         times: of the frames [s], ascending, (T,).
+        down: the way in which things fall in the picture, see `find_arcs`.
     """
     seen = [np.array([[*centroid(mask), mask.sum()]]) if _whole(mask) else np.empty((0, 3)) for mask in masks]
     still = np.ones((len(masks), 3))
-    return VideoMasks(masks, np.zeros(len(masks)), still, 0 * still, tuple(find_arcs(seen, times)))
+    return VideoMasks(masks, np.zeros(len(masks)), still, 0 * still, tuple(find_arcs(seen, times, down)))
 
 
 def _whole(mask: np.ndarray) -> bool:

@@ -47,6 +47,26 @@ def test_a_bounce_makes_two_arcs_in_the_order_of_time():
     assert abs(arcs[0].frames[1] - 19) <= 1 and abs(arcs[1].frames[0] - 20) <= 1
 
 
+def test_a_soft_bounce_is_no_flight():
+    """Fall, contact of 24 frames, and rebound: seen as one, they keep to a parabola that is curved upward."""
+    times = np.arange(60) / 120.0
+    a, speed, contact = 1200.0, 300.0, 0.2
+    fall = times < 0.15
+    y = np.where(fall, speed * (times - 0.15) + a * (times - 0.15) ** 2 / 2, 0.0)
+    after = times - 0.15 - contact
+    y = np.where(~fall & (after < 0), speed * contact / np.pi * np.sin(np.pi * (times - 0.15) / contact), y)
+    y = np.where(after >= 0, -speed * after + a * after**2 / 2, y)
+    body = np.stack([100.0 + 20 * times, 200 + y], axis=1)
+    seen = [np.array([[*place, 700.0]]) for place in body]
+    (longest,) = sorted(find_arcs(seen, times), key=lambda arc: len(arc.found))[-1:]
+    assert longest.frames[0] < 18 < 42 < longest.frames[1] and longest.coefficients[2, 1] < 0
+    first, *_ = arcs = find_arcs(seen, times, down=np.array([0.1, 0.9]))
+    assert all(arc.coefficients[2, 1] > 0 for arc in arcs)
+    assert (
+        first.frames[0] == 0 and sum(first.frames) / 2 < 18
+    )  # its middle, where the fit begins, is in the fall
+
+
 def test_missed_frames_are_bridged():
     ball = flight(TIMES)
     ball[[10, 11, 25]] = np.nan

@@ -29,12 +29,14 @@ def main(inputs, output, params, run) -> None:
         for frame in read_frames(inputs.video, timeline)
     ]
     pixels = [frame.pixels for frame in frames]
+    # Where -y of the room points in the picture; cameras have OpenGL axes.
+    down = -np.array(still["transform_matrix"])[1, :2] * [1.0, -1.0]
     own = {Path(file).stem: file for file in listed(inputs.own)}
     if own:
-        found = given_masks(_own(own, lens, params.longest, pixels, inputs.video), timeline.times)
+        found = given_masks(_own(own, lens, params.longest, pixels, inputs.video), timeline.times, down)
     else:
         plate = read_pixels(Path(inputs.room).parent / still["file_path"])
-        found = video_masks(pixels, inputs.video, plate, timeline.times)
+        found = video_masks(pixels, inputs.video, plate, timeline.times, down=down)
     arc = list(found.arcs[0].frames) if found.arcs else None
     if arc and not own:
         check_flight(found.masks, inputs.video, range(arc[0], arc[1] + 1))
