@@ -106,3 +106,35 @@ def _known(settings: Config, method: str) -> bool:
     except InputError:
         return False
     return True
+
+
+def found_laws(settings: Config) -> dict[str, LawFiles]:
+    """All laws in the folder of results whose files are complete, by a name for a list, in order.
+
+    Those that methods trained or identified in scenes, ``scene: title of the method``, and priors, ``prior: name``.
+    """
+    results = Path(places.results_root(settings))
+    found: dict[str, LawFiles] = {}
+    for folder in sorted(results.glob("*/")):
+        if folder.name.partition("+")[0] not in settings.scenes:
+            continue
+        made = {
+            file.parent.name
+            for name in ("adaptor.safetensors", "rollout.h5")
+            for file in folder.glob(f"*/{name}")
+        }
+        for method in sorted(name for name in made if _known(settings, name)):
+            try:
+                law = law_files(settings, folder.name, method)
+            except InputError:
+                continue  # a variant that these settings do not know
+            trained = law and (law.adaptor or law.identified)
+            if trained and all(Path(file).is_file() for file in law.files):
+                found[f"{folder.name}: {settings.method_title(method)}"] = law
+    steps = {scene.prior: scene.dt for scene in reversed(settings.scenes.values())}
+    for file in sorted((results / "priors").glob("*.safetensors")):
+        name = file.stem
+        if name.partition("+")[0] in settings.priors.laws:
+            dt = steps.get(name.partition("+")[0], min(scene.dt for scene in settings.scenes.values()))
+            found[f"prior: {name}"] = LawFiles(prior=str(file), dt=dt)
+    return found

@@ -1,0 +1,150 @@
+"""A reconstructed body to play with: the live simulation, its laws, and the Gaussians that its particles carry."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from neuma_lib.coupling.bodies import coloured_solid, join
+from neuma_lib.coupling.deformation import arms_at_rest, deform
+from neuma_lib.coupling.reconstruction import Reconstruction
+from neuma_lib.errors import InputError
+from neuma_lib.geometry.shapes import place
+from neuma_lib.geometry.volume import sample_volume
+from neuma_lib.io.particles import load_body, thrown
+from neuma_lib.mechanics.law import Law
+from neuma_lib.splatting.gaussians import Gaussians
+from neuma_lib.viewer import scalars
+from neuma_lib.viewer.files import LawFiles, SceneFiles, inside
+from neuma_lib.viewer.live import LiveSimulation, Snapshot
+from neuma_lib.viewer.scene import law_of
+
+ADDED_SIZE = 0.22
+"""Longest side of a solid that is dropped onto the others [m]."""
+ADDED_PARTICLES = 500
+_COLOURS = ((0.23, 0.49, 0.77), (0.84, 0.27, 0.24), (0.94, 0.75, 0.25), (0.35, 0.65, 0.38))
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Gaussians of a snapshot: means (G, 3) [m], covariances (G, 3, 3) [m^2], and themselves at rest."""
+
+    snapshot: Snapshot
+    means: Tensor
+    covars: Tensor
+    gaussians: Gaussians
+
+
+class Playground:
+    """The live simulation of a scene's body.
+
+    Args:
+        files: of the scene.
+        laws: what may be chosen, by name.
+        chosen: the law at the start.
+
+    Raises:
+        InputError: files of the body or of the law that cannot be read, or that must not be (`files.inside`).
+    """
+
+    def __init__(self, files: SceneFiles, laws: Mapping[str, LawFiles], chosen: str):
+        self.laws, self.roots = dict(laws), files.roots
+        paths = [files.checked(path) for path in (files.particles, files.binding, files.gaussians)]
+        first = load_body(*paths, files.density, gaussian_motion="affine").to(torch.float32)
+        start = (
+            thrown(first, files.checked(files.velocity)) if files.velocity else first.state((0.0, 0.0, 0.0))
+        )
+        self._density = (
+            files.density if isinstance(files.density, int | float) else float(start.density.mean())
+        )
+        self._bodies, self._whole = [first], [first]
+        self._arms: dict[int, Tensor] = {}
+        self._loaded: dict[str, Law] = {}
+        self._changing = threading.Lock()
+        self.chosen = chosen
+        self.simulation = LiveSimulation(files.simulation, start, self.law(chosen), self.laws[chosen].dt)
+
+    def law(self, name: str) -> Law:
+        """A law by its name, read when it is first wanted."""
+        if name not in self.laws:
+            raise InputError(f"no law '{name}': choose one of {', '.join(self.laws)}")
+        if name not in self._loaded:
+            self._loaded[name] = law_of(self.laws[name], self._checked).requires_grad_(False)
+        return self._loaded[name]
+
+    def _checked(self, path: str | Path) -> Path:
+        return inside(path, self.roots)
+
+    def choose(self, name: str) -> None:
+        """Give the first body another law, from its state as it is on."""
+        law = self.law(name)
+        self.chosen = name
+        self.simulation.set_law(law, self.laws[name].dt)
+
+    def reset(self) -> None:
+        """The first body alone, at its start."""
+        with self._changing:
+            self.simulation.reset()
+            self.simulation.do()
+            del self._bodies[1:], self._whole[1:]
+
+    def add(self, shape: str) -> str | None:
+        """Drop a solid of the chosen law onto what is there; why it was not possible, or None."""
+        mesh = place(shape, ADDED_SIZE, 0.5, (0.5, 0.5), resolution=48)
+        x0 = torch.from_numpy(sample_volume(mesh, ADDED_PARTICLES)).float()
+        with self._changing:
+            colour = torch.tensor(_COLOURS[(len(self._bodies) - 1) % len(_COLOURS)])
+            body = coloured_solid(mesh, x0, self._density, colour.expand(len(x0), 3))
+            self._bodies.append(body)
+            self._whole.append(join(self._bodies))
+            at_rest = body.state((0.0, 0.0, 0.0))
+            self.simulation.add(at_rest, self.law(self.chosen), self.laws[self.chosen].dt)
+            notice = self.simulation.do().notice
+            if notice:
+                del self._bodies[-1], self._whole[-1]
+        return notice
+
+    def picture(self, snapshot: Snapshot, flow: bool = False) -> Picture:
+        """The Gaussians of a snapshot; with ``flow`` plastic deformation stretches them, too."""
+        index = len(snapshot.counts) - 1
+        whole: Reconstruction = self._whole[min(index, len(self._whole) - 1)]
+        x, F = snapshot.x, snapshot.total if flow else snapshot.F
+        if len(whole.x0) < len(x):  # a body has just been taken away
+            x, F = x[: len(whole.x0)], F[: len(whole.x0)]
+        g = whole.gaussians
+        if id(whole) not in self._arms:
+            self._arms = {id(whole): arms_at_rest(g.means, whole.binding, whole.x0)}
+        arms = self._arms[id(whole)]
+        means, covars = deform(g.means, g.covars(), whole.binding, whole.x0, x[None], F[None], arms=arms)
+        return Picture(snapshot, means[0], covars[0], g)
+
+    def values(self, snapshot: Snapshot, name: str) -> Tensor:
+        """A quantity of `scalars.QUANTITIES` of all particles, stresses by the first body's law."""
+        if name == "speed":
+            return snapshot.v.norm(dim=-1)
+        if name == "plastic_strain":
+            return scalars.plastic_strain(snapshot.F, snapshot.total)
+        if name == "volume_ratio":
+            return scalars.volume_ratio(snapshot.F)
+        return scalars.von_mises(self.law(self.chosen), snapshot.F)
+
+
+def first_law(files: SceneFiles, laws: Mapping[str, LawFiles], preferred: Sequence[str] = ("neuma",)) -> str:
+    """The law that a scene's playground begins with: that of its own method, or else the first.
+
+    Raises:
+        InputError: there is none.
+    """
+    own = {run.name: run.law for run in files.runs if run.law is not None}
+    for law in (*(own.get(name) for name in preferred), *own.values()):
+        found = [name for name, each in laws.items() if each == law]
+        if found:
+            return found[0]
+    if not laws:
+        raise InputError(f"{files.name}: no law has been trained yet; make one, for example the method neuma")
+    return next(iter(laws))

@@ -1,0 +1,447 @@
+"""The viewer's server: the motions of a scene, and its body to play with, in a browser; drawn by viser."""
+
+from __future__ import annotations
+
+import importlib
+import string
+import threading
+import time
+from types import ModuleType
+from typing import Any
+
+import matplotlib
+import numpy as np
+import torch
+
+from neuma_lib.errors import InputError
+from neuma_lib.geometry.shapes import NAMES
+from neuma_lib.splatting.spherical_harmonics import sh0_to_rgb
+from neuma_lib.viewer.live import EARTH, PIVOT, Snapshot
+from neuma_lib.viewer.page import COLOURS
+from neuma_lib.viewer.playground import Picture, Playground
+from neuma_lib.viewer.scalars import QUANTITIES, rounded_up
+from neuma_lib.viewer.scene import Motion, Scene, frame_at
+
+RECORDED, LIVE = "recorded", "live"
+NOTHING, SEEN, DISTANCE = "nothing", "Gaussians", "Gaussians by distance of both"
+BESIDE = 1.15
+"""From one box to the one beside it [m]."""
+PACES = {"1/32": 1 / 32, "1/16": 1 / 16, "1/8": 1 / 8, "1/4": 1 / 4, "real time": 1.0}
+PICTURES = 25
+"""Most pictures a second that are sent."""
+_STILL = 0.05
+"""Seconds between looks at whether there is something new."""
+_FRUSTUM = 0.12
+_HANDLE = 0.55
+"""Radius of what a hand grabs, in the longest side of the body."""
+
+
+def viser() -> ModuleType:
+    """The module viser. Raises InputError where it is not installed."""
+    try:
+        return importlib.import_module("viser")
+    except ImportError as error:
+        raise InputError(
+            f"the viewer's server needs viser ({error}): install the project's extra with `make viewer`, or write a "
+            "file with --file"
+        ) from None
+
+
+class ViewerServer:
+    """Serves a scene until it is closed.
+
+    Args:
+        scene: recorded motions.
+        playground: to play with, or None.
+        host: address to listen at; 127.0.0.1 is this machine alone.
+        port: the next free one is taken where it is not free.
+    """
+
+    def __init__(
+        self, scene: Scene, playground: Playground | None = None, host: str = "127.0.0.1", port: int = 8080
+    ):
+        self.scene, self.playground = scene, playground
+        self.viser = viser()
+        self.server = self.viser.ViserServer(host=host, port=port, label=f"{scene.name}", verbose=False)
+        self._closing, self._dirty, self._playing = threading.Event(), True, False
+        self._clock, self._number, self._nodes = 0.0, -1, {}
+        self._reach: dict[tuple[str, str], float] = {}
+        self._room()
+        self._controls()
+        if playground:
+            playground.simulation.run(False)
+            playground.simulation.open()
+        self._drawer = threading.Thread(target=self._draw_on, name="drawing", daemon=True)
+        self._drawer.start()
+
+    @property
+    def port(self) -> int:
+        """The port that it listens at."""
+        return self.server.get_port()
+
+    @property
+    def host(self) -> str:
+        """The address that it listens at."""
+        return self.server.get_host()
+
+    def close(self) -> None:
+        """End drawing, simulation and server."""
+        self._closing.set()
+        self._drawer.join(timeout=10)
+        if self.playground:
+            self.playground.simulation.close()
+        self.server.stop()
+
+    # ---- room and controls -------------------------------------------------------------------------------------------
+
+    def _room(self) -> None:
+        scene = self.server.scene
+        scene.set_up_direction("+y")
+        for name, shift in (("left", 0.0), ("right", BESIDE)):
+            scene.add_frame(f"/{name}", show_axes=False, position=(shift, 0.0, 0.0))
+            self._nodes[name, "box"] = scene.add_frame(f"/{name}/box", show_axes=False)
+            scene.add_grid(
+                f"/{name}/box/floor", width=1.0, height=1.0, plane="xz", cell_size=0.1, section_size=0.5,
+                position=(0.5, 0.0, 0.5), shadow_opacity=0.0,
+            )  # fmt: skip
+        self._nodes["right", "frame"] = scene.get_handle_by_name("/right")
+        camera = self.server.initial_camera
+        target = self.scene.motions[0].x.mean(dim=(0, 1)).numpy()
+        camera.look_at = target
+        camera.position = target + np.array([0.45, 0.35, 1.3])
+        camera.fov = 0.75
+        for view in self.scene.views:
+            pose = np.linalg.inv(view.viewmat)
+            self._nodes["view", view.number] = scene.add_camera_frustum(
+                f"/left/view_{view.number}",
+                fov=2 * np.arctan2(0.5 * view.height, view.K[1, 1]),
+                aspect=view.width / view.height,
+                scale=_FRUSTUM,
+                thickness=0.002,
+                image=next(iter(view.images.values())),
+                wxyz=self.viser.transforms.SO3.from_matrix(pose[:3, :3]).wxyz,
+                position=pose[:3, 3],
+                color=(52, 107, 191),
+            )
+
+    def _controls(self) -> None:
+        gui = self.server.gui
+        self.gui: dict[str, Any] = {}
+        add = self.gui
+        modes = [RECORDED, LIVE] if self.playground else [RECORDED]
+        add["mode"] = gui.add_dropdown("mode", modes)
+        self._status = gui.add_markdown("")
+        show = [SEEN, DISTANCE, *(f"particles by {quantity.label}" for quantity in QUANTITIES.values())]
+        add["show"] = gui.add_dropdown("show", show)
+        self._bar = gui.add_image(colour_bar("viridis"), visible=False)
+        self._legend = gui.add_markdown("", visible=False)
+        titles = [motion.title for motion in self.scene.motions]
+        learned = next((m.title for m in self.scene.motions if m.name == "neuma"), titles[0])
+        self._recorded = gui.add_folder("recorded motions")
+        with self._recorded:
+            add["left"] = gui.add_dropdown("motion", titles, initial_value=learned)
+            add["right"] = gui.add_dropdown("beside it", [NOTHING, *titles])
+            add["frame"] = gui.add_slider("frame", 0, len(self.scene.steps) - 1, 1, 0)
+            add["pace"] = gui.add_dropdown("pace", list(PACES), initial_value="1/16")
+            add["play"] = gui.add_button("Play")
+        add["frusta"] = gui.add_checkbox("frusta", True)
+        for name in ("mode", "show", "left", "right", "frusta", "frame"):
+            add[name].on_update(lambda event: self._changed())
+        add["frame"].on_update(self._slid)
+        add["play"].on_click(lambda event: self._play(not self._playing))
+        if self.playground:
+            self._live_controls()
+        self._changed()
+
+    def _live_controls(self) -> None:
+        gui, play, add = self.server.gui, self.playground, self.gui
+        simulation = play.simulation
+        self._live = gui.add_folder("live")
+        with self._live:
+            add["reset"] = gui.add_button("Reset")
+            add["running"] = gui.add_checkbox("running", True)
+            add["law"] = gui.add_dropdown("law", list(play.laws), initial_value=play.chosen)
+            add["weight"] = gui.add_slider("adaptor weight", 0.0, 1.25, 0.05, 1.0)
+            add["gravity"] = gui.add_slider("gravity [m/s²]", 0.0, 25.0, 0.1, EARTH)
+            add["tilt x"] = gui.add_slider("tilt about x [°]", -30.0, 30.0, 1.0, 0.0)
+            add["tilt z"] = gui.add_slider("tilt about z [°]", -30.0, 30.0, 1.0, 0.0)
+            add["height"] = gui.add_slider("height [m]", 0.0, 0.9, 0.01, 0.4)
+            add["drop"] = gui.add_button("Drop from there")
+            add["velocity"] = gui.add_vector3("velocity [m/s]", (1.0, 1.5, 0.0), step=0.1)
+            add["throw"] = gui.add_button("Throw")
+            shapes = [f"letter_{c}" for c in string.ascii_uppercase]
+            add["shape"] = gui.add_dropdown("solid", [*NAMES, *shapes], initial_value="letter_N")
+            add["add"] = gui.add_button("Drop it on top")
+            add["flow"] = gui.add_checkbox("flow stretches Gaussians", False)
+        value = lambda name: add[name].value  # noqa: E731
+        reactions = {
+            "running": lambda: simulation.run(value("running") and value("mode") == LIVE),
+            "law": lambda: play.choose(value("law")),
+            "weight": lambda: simulation.set_weight(value("weight")),
+            "gravity": lambda: simulation.set_gravity(value("gravity")),
+            "tilt x": lambda: simulation.set_floor(value("tilt x"), value("tilt z")),
+            "tilt z": lambda: simulation.set_floor(value("tilt x"), value("tilt z")),
+        }
+        presses = {
+            "reset": play.reset,
+            "drop": lambda: simulation.drop(value("height")),
+            "throw": lambda: simulation.throw(value("velocity")),
+            "add": lambda: play.add(value("shape")),
+        }
+        for name, act in reactions.items():
+            add[name].on_update(lambda event, act=act: self._act(act))
+        for name, act in presses.items():
+            add[name].on_click(lambda event, act=act: self._act(act))
+        x = simulation.snapshot.x
+        radius = _HANDLE * float((x.amax(dim=0) - x.amin(dim=0)).max())
+        self._handle = self.server.scene.add_icosphere(
+            "/left/box/handle", radius=radius, color=(255, 255, 255), opacity=0.02, cast_shadow=False,
+            receive_shadow=False, visible=False,
+        )  # fmt: skip
+
+        @self._handle.on_drag
+        async def dragged(event) -> None:  # async: phases in order
+            simulation.hold(None if event.phase == "end" else event.end_position)
+
+    def _act(self, act) -> None:
+        """Do what somebody asked for; an input that cannot be used is told, and changes nothing."""
+        try:
+            act()
+            self._told = None
+        except InputError as error:
+            self._told = str(error)
+        self._dirty = True
+
+    _told: str | None = None
+
+    def _play(self, playing: bool) -> None:
+        self._playing = playing
+        self.gui["play"].label = "Pause" if playing else "Play"
+        last = len(self.scene.steps) - 1
+        if playing and self.gui["frame"].value == last:
+            self.gui["frame"].value = 0
+        self._clock = self.scene.dt * self.scene.steps[self.gui["frame"].value]
+
+    def _slid(self, event) -> None:
+        if event.client_id is not None and self._playing:  # by somebody, not by playing
+            self._play(False)
+
+    def _changed(self) -> None:
+        live = self.gui["mode"].value == LIVE
+        self._recorded.visible = not live
+        if self.playground:
+            self._live.visible = self._handle.visible = live
+            self.playground.simulation.run(live and self.gui["running"].value)
+        for view in self.scene.views:
+            self._nodes["view", view.number].visible = self.gui["frusta"].value and not live
+        self._dirty = True
+
+    # ---- drawing -----------------------------------------------------------------------------------------------------
+
+    def _draw_on(self) -> None:
+        last = time.perf_counter()
+        while not self._closing.is_set():
+            now = time.perf_counter()
+            passed, last = now - last, now
+            try:
+                if self.gui["mode"].value == LIVE:
+                    self._draw_live()
+                else:
+                    self._advance(passed)
+                    if self._dirty:
+                        self._dirty = False
+                        self._draw_recorded()
+            except Exception as error:  # the next picture may be all right
+                self._say(f"**cannot be drawn:** {type(error).__name__}: {error}")
+            rest = 1 / PICTURES - (time.perf_counter() - now)
+            self._closing.wait(max(rest, 0.002))
+
+    def _advance(self, passed: float) -> None:
+        if not self._playing:
+            return
+        steps, dt = self.scene.steps, self.scene.dt
+        self._clock += passed * PACES[self.gui["pace"].value]
+        if self._clock > dt * steps[-1] + 0.03:
+            self._clock = 0.0
+        frame = frame_at(steps, int(self._clock / dt + 1e-6))
+        if frame != self.gui["frame"].value:
+            self.gui["frame"].value = frame
+            self._dirty = True
+
+    def _draw_recorded(self) -> None:
+        step = self.scene.steps[self.gui["frame"].value]
+        left = self._titled(self.gui["left"].value)
+        beside = None if self.gui["right"].value == NOTHING else self._titled(self.gui["right"].value)
+        shown = self.gui["show"].value
+        text = [f"**{1e3 * self.scene.dt * step:.0f} ms**"]
+        self._turn(np.eye(3))
+        with self.server.atomic():
+            pair = shown == DISTANCE
+            self._draw_motion("left", left, step, shown, beside, text)
+            if beside and not pair:
+                self._draw_motion("right", beside, step, shown, left, text)
+            self._nodes["right", "frame"].visible = bool(beside and not pair)
+            for view in self.scene.views:
+                at = frame_at(tuple(sorted(view.images)), step)
+                image = view.images[sorted(view.images)[at]]
+                node = self._nodes["view", view.number]
+                if node.visible and self._nodes.get(("image", view.number)) is not image:
+                    node.image = image
+                    self._nodes["image", view.number] = image
+        self._say("  \n".join([*text, *self.scene.notes]))
+
+    def _draw_motion(
+        self, side: str, motion: Motion, step: int, shown: str, other: Motion | None, text: list[str]
+    ) -> None:
+        frame = frame_at(motion.steps, step)
+        name = quantity_named(shown)
+        if name is None:
+            if motion.means is None:
+                text.append(f"{motion.title} carries no Gaussians: show its particles")
+                return self._only(side, None)
+            g = self.scene.gaussians
+            rgb = sh0_to_rgb(g.sh0[:, 0]).clamp(0, 1).numpy()
+            if shown == DISTANCE and other is not None and other.means is not None:
+                gap = (motion.means[frame] - other.means[frame_at(other.steps, step)]).norm(dim=-1).numpy()
+                reach = self._largest_gap(motion, other)
+                rgb = colours("viridis", gap / reach)
+                self._show_legend("viridis", f"distance from {other.title}", 0.0, 1e3 * reach, "mm")
+            else:
+                self._hide_legend()
+                if shown == DISTANCE:
+                    text.append("choose a second motion with Gaussians to see the distance")
+            return self._splats(side, motion.means[frame], motion.covars[frame], rgb, g.opacities)
+        if name not in motion.scalars:
+            text.append(f"{motion.title}: {QUANTITIES[name].label} is not known")
+            values = None
+        else:
+            values = motion.scalars[name][frame]
+        self._points(side, motion.x[frame], values, name, self.scene.volume)
+
+    def _draw_live(self) -> None:
+        play = self.playground
+        snapshot = play.simulation.wait(self._number + 1, _STILL)
+        if snapshot.number == self._number and not self._dirty:
+            return
+        self._number, self._dirty = snapshot.number, False
+        self._turn(play.simulation.floor)
+        self._nodes["right", "frame"].visible = False
+        shown = self.gui["show"].value
+        name = quantity_named(shown)
+        with self.server.atomic():
+            if name is None:
+                picture: Picture = play.picture(snapshot, self.gui["flow"].value)
+                rgb = sh0_to_rgb(picture.gaussians.sh0[:, 0]).clamp(0, 1).numpy()
+                self._hide_legend()
+                self._splats("left", picture.means, picture.covars, rgb, picture.gaussians.opacities)
+            else:
+                self._points("left", snapshot.x, play.values(snapshot, name), name, self.scene.volume)
+            self._handle.position = snapshot.x[: snapshot.counts[0]].mean(dim=0).numpy()
+        self._say(self._live_text(snapshot))
+
+    def _live_text(self, snapshot: Snapshot) -> str:
+        lines = [
+            f"**{snapshot.time:.2f} s**, {snapshot.rate:.0f} frames/s, {snapshot.pace:.2g} × real time, "
+            f"{len(snapshot.x)} particles, step {1e3 * snapshot.dt:.3g} ms"
+        ]
+        if snapshot.trouble:
+            lines.append(f"**Stopped: the simulation diverged.** {snapshot.trouble} — press *Reset*")
+        if told := self._told or snapshot.notice:
+            lines.append(f"*{told}*")
+        return "  \n".join(lines)
+
+    def _titled(self, title: str) -> Motion:
+        return next(motion for motion in self.scene.motions if motion.title == title)
+
+    def _largest_gap(self, a: Motion, b: Motion) -> float:
+        """Distance that 99 of 100 Gaussians of all frames do not exceed, rounded up [m]."""
+        if (a.name, b.name) not in self._reach:
+            at = [frame_at(b.steps, step) for step in a.steps]
+            gaps = (a.means - b.means[at]).norm(dim=-1)
+            self._reach[a.name, b.name] = rounded_up(max(float(np.percentile(gaps, 99)), 1e-4))
+        return self._reach[a.name, b.name]
+
+    def _turn(self, floor: np.ndarray) -> None:
+        box = self._nodes["left", "box"]
+        box.wxyz = self.viser.transforms.SO3.from_matrix(floor).wxyz
+        box.position = PIVOT - floor @ PIVOT
+
+    def _splats(
+        self, side: str, means: torch.Tensor, covars: torch.Tensor, rgb: np.ndarray, opacities
+    ) -> None:
+        given = (means.numpy(), covars.numpy(), rgb, opacities[:, None].numpy())
+        node = self._nodes.get((side, "splats"))
+        if node is None:
+            self._nodes[side, "splats"] = self.server.scene.add_gaussian_splats(f"/{side}/box/splats", *given)
+        else:
+            node.set_gaussians(*given)
+        self._only(side, "splats")
+
+    def _points(self, side: str, x: torch.Tensor, values, name: str, volume: float) -> None:
+        quantity = QUANTITIES[name]
+        low, high = self.scene.ranges.get(name, (0.0, quantity.least))
+        rgb = np.full((len(x), 3), 0.7)
+        if values is not None:
+            rgb = colours(COLOURS[quantity.middle], ((values - low) / (high - low)).numpy())
+        self._show_legend(COLOURS[quantity.middle], quantity.label, low, high, quantity.unit)
+        size = (volume / len(x)) ** (1 / 3)
+        bytes_ = (255 * rgb).astype(np.uint8)
+        node = self._nodes.get((side, "points"))
+        if node is None or len(node.points) != len(x):
+            self._nodes[side, "points"] = self.server.scene.add_point_cloud(
+                f"/{side}/box/points",
+                x.numpy(),
+                bytes_,
+                point_size=size,
+                point_shape="circle",
+                precision="float32",
+            )
+        else:
+            node.points, node.colors = x.numpy(), bytes_
+        self._only(side, "points")
+
+    def _only(self, side: str, kind: str | None) -> None:
+        for other in ("splats", "points"):
+            if (node := self._nodes.get((side, other))) is not None and node.visible != (other == kind):
+                node.visible = other == kind
+
+    def _show_legend(self, colour_map: str, label: str, low: float, high: float, unit: str) -> None:
+        key = (colour_map, label, low, high)
+        if self._nodes.get("legend") == key:
+            return
+        self._nodes["legend"] = key
+        self._bar.image = colour_bar(colour_map)
+        ends = " … ".join(in_units(value, unit) for value in (low, 0.5 * (low + high), high))
+        self._legend.content = f"{label}: {ends}"
+        self._bar.visible = self._legend.visible = True
+
+    def _hide_legend(self) -> None:
+        if self._nodes.pop("legend", None):
+            self._bar.visible = self._legend.visible = False
+
+    def _say(self, text: str) -> None:
+        if self._status.content != text:
+            self._status.content = text
+
+
+def quantity_named(shown: str) -> str | None:
+    """The quantity of an entry of the list of what can be shown; None for Gaussians."""
+    return next((name for name, q in QUANTITIES.items() if shown == f"particles by {q.label}"), None)
+
+
+def colours(name: str, share: np.ndarray) -> np.ndarray:
+    """RGB (N, 3) in [0, 1] of values (N,) between 0 and 1 on matplotlib's map of that name."""
+    return matplotlib.colormaps[name](np.clip(share, 0, 1))[:, :3]
+
+
+def colour_bar(name: str) -> np.ndarray:
+    """A picture of a colour map, from low to high."""
+    return np.broadcast_to((255 * colours(name, np.linspace(0, 1, 256))).astype(np.uint8), (14, 256, 3))
+
+
+def in_units(value: float, unit: str) -> str:
+    """A value with its unit, pascals with a prefix."""
+    for factor, prefix in ((1e6, "M"), (1e3, "k")):
+        if unit == "Pa" and abs(value) >= factor:
+            return f"{value / factor:.4g} {prefix}Pa"
+    return f"{value:.4g} {unit}".strip()
