@@ -27,7 +27,7 @@ NOTHING, SEEN, DISTANCE = "nothing", "Gaussians", "Gaussians by distance of both
 BESIDE = 1.15
 """From one box to the one beside it [m]."""
 PACES = {"1/32": 1 / 32, "1/16": 1 / 16, "1/8": 1 / 8, "1/4": 1 / 4, "real time": 1.0}
-PICTURES = 25
+PICTURES = 15
 """Most pictures a second that are sent."""
 _STILL = 0.05
 """Seconds between looks at whether there is something new."""

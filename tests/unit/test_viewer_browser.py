@@ -1,6 +1,7 @@
 """The viewer in a real browser: it loads, plays, and the slider moves pixels."""
 
 import io
+import time
 
 import numpy as np
 import pytest
@@ -8,9 +9,14 @@ from browser import opened
 from PIL import Image
 from viewer_project import STEPS, make_project
 
-from neuma_lib.viewer.find import found_scene
+from neuma_lib.viewer.find import found_laws, found_scene
 from neuma_lib.viewer.page import write_page
+from neuma_lib.viewer.playground import Playground, first_law
 from neuma_lib.viewer.scene import load_scene
+from neuma_lib.viewer.server import LIVE, ViewerServer
+
+OF_VISER = "THREE.BufferGeometry.computeBoundingSphere(): Computed radius is NaN"
+"""What viser's client 1.1.1 says now and then while it starts, whatever is in the scene."""
 
 
 @pytest.fixture(scope="module")
@@ -79,3 +85,73 @@ def test_the_file_opens_without_a_server_plays_and_follows_its_controls(folder, 
         page.mouse.up()
         assert page.input_value("#camera") == "" and differ(filmed, picture(page)) > 0.02, "a drag turns"
         assert not complaints
+
+
+@pytest.fixture
+def served(folder):
+    pytest.importorskip("viser")
+    settings, files = found_scene(folder)
+    laws = found_laws(settings)
+    playground = Playground(files, laws, first_law(files, laws))
+    server = ViewerServer(load_scene(files), playground, port=8460)
+    yield server
+    server.close()
+
+
+@pytest.mark.slow
+def test_the_server_plays_moves_and_simulates(served):
+    assert served.host == "127.0.0.1", "this machine alone, unless told otherwise"
+    with opened(f"http://127.0.0.1:{served.port}", 800, 600) as (page, complaints):
+        page.wait_for_selector("text=beside it", timeout=60_000)
+        page.wait_for_timeout(3000)  # it fades in
+
+        def settled():
+            """The picture once it stands still."""
+            shown = picture(page)
+            for _ in range(40):
+                before, shown = shown, picture(page)
+                if differ(before, shown) < 0.001:
+                    break
+            return shown
+
+        first = settled()
+        assert differ(first, np.full_like(first, 255)) > 0.02, "something is drawn"
+        slider = page.get_by_role("slider").first
+        slider.focus()
+        for _ in STEPS[1:]:
+            page.keyboard.press("ArrowRight")
+        page.wait_for_selector("text=30 ms")
+        assert served.gui["frame"].value == len(STEPS) - 1
+        assert differ(first, settled()) > 0.005, "the slider moves pixels"
+        page.get_by_role("button", name="Play").click()
+        page.wait_for_function(f"!document.body.innerText.includes('{STEPS[-1]} ms')", timeout=90_000)
+        page.get_by_role("button", name="Pause").click()
+        assert served.gui["frame"].value < len(STEPS) - 1, "it plays, from the start again"
+        served.gui["show"].value = "particles by speed"
+        page.wait_for_selector("text=speed: 0 m/s", timeout=90_000)
+
+        served.gui["mode"].value = LIVE
+        page.wait_for_selector("text=frames/s", timeout=90_000)
+        simulation = served.playground.simulation
+        begun = simulation.snapshot.time
+        simulation.wait(simulation.snapshot.number + 30, 20)
+        assert simulation.snapshot.time > begun and simulation.snapshot.trouble is None
+        page.get_by_role("button", name="Reset").click()
+        assert reached(lambda: simulation.snapshot.time < begun + 0.05)
+        served.gui["law"].value = "prior: jelly"  # a random network
+        page.get_by_role("button", name="Drop it on top").click()
+        assert reached(lambda: len(simulation.snapshot.counts) == 2)
+        simulation._trouble = "made up"
+        page.wait_for_selector("text=Stopped: the simulation diverged", timeout=90_000)
+        page.get_by_role("button", name="Reset").click()
+        page.wait_for_selector("text=Stopped: the simulation diverged", state="detached", timeout=90_000)
+        assert reached(lambda: len(simulation.snapshot.counts) == 1)
+        assert not [text for text in complaints if OF_VISER not in text]
+
+
+def reached(condition, timeout=90.0):
+    """Whether a condition comes true in time [s]."""
+    until = time.monotonic() + timeout
+    while not condition() and time.monotonic() < until:
+        time.sleep(0.05)
+    return condition()

@@ -215,5 +215,5 @@ def test_commands_are_not_held_up_by_a_slow_law(live):
     reached(simulation, lambda s: s.number > 5 and s.time > 0)
     began = time.monotonic()
     simulation.reset()
-    assert simulation.do().time < 0.2 and time.monotonic() - began < 1.0
+    assert simulation.do().time < 0.2 and time.monotonic() - began < 3.0  # a frame takes 0.06 s
     assert start().density[0] == pytest.approx(DENSITY)

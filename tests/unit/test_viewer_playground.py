@@ -1,0 +1,89 @@
+"""A reconstructed body to play with: its laws, its Gaussians, and what is put on top of it."""
+
+import pytest
+import torch
+from viewer_project import LAW, SCENE, make_project
+
+from neuma_lib.errors import InputError
+from neuma_lib.splatting.gaussians import Gaussians
+from neuma_lib.viewer.find import found_laws, found_scene
+from neuma_lib.viewer.playground import ADDED_PARTICLES, Playground, first_law
+from neuma_lib.viewer.scene import law_of
+
+CONSTANTS = f"{SCENE}: Constants"
+PRIOR = "prior: jelly"
+
+
+@pytest.fixture
+def project(tmp_path):
+    settings, files = found_scene(make_project(tmp_path / "project"))
+    return files, found_laws(settings)
+
+
+@pytest.fixture
+def playground(project):
+    files, laws = project
+    made = Playground(files, laws, first_law(files, laws))
+    made.simulation.run(False)
+    made.simulation.open()
+    yield made
+    made.simulation.close()
+
+
+def test_laws_of_the_results_are_found_with_their_time_steps(project):
+    files, laws = project
+    assert list(laws) == [CONSTANTS, PRIOR]
+    assert {law.dt for law in laws.values()} == {1e-3}
+    law = law_of(laws[CONSTANTS], files.checked)
+    assert law.elasticity.values["E"] == LAW["elasticity"]["E"]
+    assert first_law(files, laws, ("constants",)) == CONSTANTS
+    with pytest.raises(InputError, match="no law has been trained yet"):
+        first_law(files, {})
+
+
+def test_a_law_outside_the_folders_is_not_read(project, playground, tmp_path):
+    files, laws = project
+    prior = tmp_path / "project" / "results" / "priors" / "jelly.safetensors"
+    prior.rename(tmp_path / "jelly.safetensors")
+    prior.symlink_to(tmp_path / "jelly.safetensors")
+    with pytest.raises(InputError, match="lies outside"):
+        Playground(files, laws, PRIOR)
+    before = playground.chosen
+    with pytest.raises(InputError, match="lies outside"):
+        playground._loaded.clear() or playground.choose(PRIOR)
+    assert playground.chosen == before and playground.simulation.do().trouble is None
+
+
+def test_gaussians_follow_what_is_simulated(playground):
+    snapshot = playground.simulation.do()
+    picture = playground.picture(snapshot)
+    assert isinstance(picture.gaussians, Gaussians)
+    assert torch.allclose(picture.means, picture.gaussians.means, atol=1e-6)
+    assert torch.allclose(picture.covars, picture.gaussians.covars(), atol=1e-9)
+    playground.simulation.drop(0.3)
+    raised = playground.simulation.do()
+    shift = raised.x[0] - snapshot.x[0]
+    assert torch.allclose(playground.picture(raised).means, picture.means + shift, atol=1e-5)
+    for name in ("speed", "von_mises", "plastic_strain", "volume_ratio"):
+        values = playground.values(raised, name)
+        assert values.shape == (400,) and values.isfinite().all()
+
+
+def test_a_letter_lands_on_top_and_goes_with_a_reset(playground):
+    playground.simulation.drop(0.0)
+    assert playground.add("letter_N") is None
+    snapshot = playground.simulation.do()
+    first, letter = snapshot.x.split(list(snapshot.counts))
+    assert len(letter) == pytest.approx(ADDED_PARTICLES, rel=0.1) and letter[:, 1].min() > first[:, 1].max()
+    picture = playground.picture(snapshot)
+    assert torch.allclose(picture.means[-len(letter) :], letter, atol=1e-6), "a Gaussian on each particle"
+    while (notice := playground.add("ball")) is None:
+        pass
+    assert "no room" in notice
+    counts = playground.simulation.do().counts
+    assert len(playground.picture(playground.simulation.snapshot).means) == 64 + sum(counts[1:])
+    playground.reset()
+    assert playground.simulation.do().counts == (400,)
+    assert len(playground.picture(playground.simulation.snapshot).means) == 64
+    with pytest.raises(InputError, match="is not known"):
+        playground.add("teapot")
