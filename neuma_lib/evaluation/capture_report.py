@@ -88,6 +88,7 @@ figcaption { font-size: .88rem; color: #555; }
 details { margin: .5rem 0; }
 summary { cursor: pointer; color: #0a58a0; }
 .doubts li::marker { color: #a35a00; }
+.open { color: #a35a00; white-space: nowrap; }
 .missing { color: #777; font-style: italic; }
 """
 
@@ -194,17 +195,23 @@ def room_value(name: str, value: float, scale: float) -> tuple[float, str]:
 
 
 def number(value: float) -> str:
-    """Three digits, with the thousands of SI prefixes left to powers of ten."""
+    """Three digits; powers of ten where there are many zeros."""
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
     if 1e-3 <= abs(value) < 1e4:
         return f"{float(f'{value:.3g}'):g}"
     exponent = math.floor(math.log10(abs(value)))
-    return f"{value / 10**exponent:.2f} × 10{_superscript(exponent)}"
+    power = str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return f"{value / 10**exponent:.2f} × 10{power}"
 
 
-def _superscript(exponent: int) -> str:
-    return str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+def prefixed(value: float, unit: str) -> tuple[float, str]:
+    """A prefix of SI for a value: the factor on it and its likes, and the unit with the prefix."""
+    if unit.startswith("Pa") and value > 0:
+        for power, letter in ((9, "G"), (6, "M"), (3, "k")):
+            if value >= 10**power:
+                return 10.0**-power, f"{letter}{unit}"
+    return 1.0, unit
 
 
 def _uri(kind: str, content: bytes) -> str:
@@ -247,7 +254,7 @@ def _films(films: Sequence[Film]) -> str:
                 continue
             source = _uri("video/mp4", Path(film.video).read_bytes())
             parts.append(
-                f'<figure><video controls loop muted playsinline preload="auto" src="{source}"></video>'
+                f'<figure><video controls autoplay loop muted playsinline preload="auto" src="{source}"></video>'
                 f"<figcaption>{escape(film.camera)}{': ' if film.said else ''}{escape(film.said)}</figcaption></figure>"
             )
     return "\n".join(parts)
@@ -257,30 +264,37 @@ def _measures(rows: Sequence[Mapping[str, Any]], own: str) -> str:
     if not rows:
         return _missing("No pictures were measured.")
     places = dict.fromkeys((row["throw"], row["camera"], row["learned"]) for row in rows)
-    # Sums first: they are what is asked for.
-    order = sorted(places, key=lambda place: (place[0] != "all", not place[2]))
-    lines = []
-    for throw, camera, learned in order:
-        here = [
-            row for row in rows if (row["throw"], row["camera"], row["learned"]) == (throw, camera, learned)
-        ]
-        kind = "learned from" if learned else "held out"
-        where = f"all frames {kind}" if throw == "all" else f"{throw}, {camera} ({kind})"
-        for k, row in enumerate(here):
-            cells = [escape(where) if k == 0 else "", escape(row["title"])]
-            cells += [
-                f"{row[name]:.{digits}f}" if name in row else "–" for name, (_, digits) in MEASURES.items()
-            ]
-            kinds = [name for name, is_it in (("first", k == 0), ("own", row["method"] == own)) if is_it]
-            lines.append((" ".join(kinds), cells))
-    head = ["frames", "law", *(escape(heading) for heading, _ in MEASURES.values())]
+    parts = {whole: [place for place in places if (place[0] == "all") == whole] for whole in (True, False)}
+    tables = {whole: _places(rows, own, part) for whole, part in parts.items() if part}
     return (
         "<p>PSNR, SSIM and mask IoU: more is better. LPIPS (VGG of the object, AlexNet of the whole picture): less is "
         "better. The object: colours over white, on the bounding box of the predicted and the filmed one. The whole "
         "picture: the frame as it was filmed against the prediction over the empty scene; most of it is background, "
         "which is equal whatever is predicted, and the object's shadow is in the frame alone.</p>\n"
-        + _table(head, lines, len(MEASURES))
+        + tables.get(True, "")
+        + (f"\n<details><summary>Each camera</summary>{tables[False]}</details>" if False in tables else "")
     )
+
+
+def _places(rows: Sequence[Mapping[str, Any]], own: str, places: Iterable[tuple[str, str, bool]]) -> str:
+    """Table of the measures of some throws and cameras: a line for each, and one for each law below it."""
+    lines = []
+    for throw, camera, learned in places:
+        kind = "learned from" if learned else "held out"
+        where = f"All frames {kind}" if throw == "all" else f"{throw}, {camera} ({kind})"
+        lines.append(f'<tr class="first"><th colspan="{1 + len(MEASURES)}">{escape(where)}</th></tr>')
+        for row in rows:
+            if (row["throw"], row["camera"], row["learned"]) == (throw, camera, learned):
+                found = (
+                    f"{row[name]:.{digits}f}" if name in row else "–"
+                    for name, (_, digits) in MEASURES.items()
+                )
+                cells = "".join(f'<td class="n">{cell}</td>' for cell in found)
+                mark = ' class="own"' if row["method"] == own else ""
+                lines.append(f"<tr{mark}><td>{escape(row['title'])}</td>{cells}</tr>")
+    head = "".join(f'<th class="n">{escape(heading)}</th>' for heading, _ in MEASURES.values())
+    table = "\n".join([f"<tr><th>law</th>{head}</tr>", *lines])
+    return f'<div class="wide"><table>\n{table}\n</table></div>'
 
 
 def _law(report: Report) -> str:
@@ -311,6 +325,8 @@ def _identified(found: Mapping[str, Any], scale: float) -> str:
     lines = []
     for name, entry in found["best"]["quantities"].items():
         value, unit = room_value(name, entry["value"], scale)
+        prefix, unit = prefixed(value, unit)
+        value *= prefix
         # an exponent that floats have room for
         factor = math.exp(min(BARS * entry["log_std"], 700.0))
         ends = (
@@ -321,7 +337,7 @@ def _identified(found: Mapping[str, Any], scale: float) -> str:
         mark = (
             '<span class="good">determined</span>'
             if entry["determined"]
-            else '<span class="bad">not determined</span>'
+            else '<span class="open">not determined</span>'
         )
         lines.append(("", [escape(name), f"{number(value)} {escape(unit)}".strip(), ends, mark]))
     constants = _table(["constant", "value", "two standard deviations", ""], lines, 0)

@@ -99,7 +99,7 @@ def draw(curves: Mapping[str, Any], titles: Mapping[str, str]) -> Figure:
         curves: as of `stress_curves`.
         titles: of the methods.
     """
-    figure = style.new_figure(1.25 * style.COLUMN, 0.4 + 1.7 * len(curves["tests"]))
+    figure = style.new_figure(style.COLUMN, 0.4 + 1.5 * len(curves["tests"]))
     panels = figure.subplots(len(curves["tests"]), 1, squeeze=False)[:, 0]
     for axes, (name, test) in zip(panels, curves["tests"].items(), strict=True):
         _panel(axes, test, titles, curves["learned"])

@@ -11,7 +11,7 @@ from PIL import Image
 from neuma_lib.capture.page import Check
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation import capture_doubts as doubts
-from neuma_lib.evaluation.capture_report import Film, Report, number, page, picture_uri, room_value
+from neuma_lib.evaluation.capture_report import Film, Report, number, page, picture_uri, prefixed, room_value
 from neuma_lib.evaluation.captured_images import COLUMNS
 
 NASTY = "<script>alert(\"x\")</script> & 'mug'"
@@ -167,7 +167,7 @@ def test_stresses_are_those_of_the_room():
     assert room_value("friction_angle", 30.0, 2.0) == (30.0, "°")
     assert room_value("yield_strain", 0.1, 2.0) == (0.1, "")
     shown = Reader(page(Report("mug", "NeuMA", identified=identified(), scale=2.0))).said
-    assert "1.00 × 10⁵ Pa" in shown and "250 Pa" in shown and "lengths are 2 times" in shown
+    assert "100 kPa" in shown and "250 Pa" in shown and "lengths are 2 times" in shown
     # Two standard deviations of the logarithm, and one that says nothing.
     assert f"{number(250 / math.exp(0.1))} to {number(250 * math.exp(0.1))}" in shown
     assert "nothing is known" in shown
@@ -186,6 +186,11 @@ def test_stresses_are_those_of_the_room():
 )
 def test_numbers_are_short(value, text):
     assert number(value) == text
+
+
+def test_stresses_have_prefixes():
+    assert prefixed(2.5e5, "Pa") == (1e-3, "kPa") and prefixed(3e6, "Pa s") == (1e-6, "MPa s")
+    assert prefixed(250.0, "Pa") == (1.0, "Pa") and prefixed(2.5e5, "°") == (1.0, "°")
 
 
 CAPTURE = {"density": 900.0, "density_stated": True, "held_out": ["two"]}
