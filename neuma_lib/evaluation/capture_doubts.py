@@ -72,19 +72,19 @@ def of_filming(capture: Mapping[str, Any], throws: Mapping[str, Mapping[str, Any
         if moved.get("touched"):
             walls = ", ".join(moved["touched"])
             found.append(
-                f"{name}: the predicted object touches the box ({walls}), where the room has no wall: set `scale` or "
-                "`center` in capture.yaml."
+                f"{name}: the predicted object touches the box ({walls}), where the room has no wall: set scale or "
+                "center in capture.yaml."
             )
     if not capture["density_stated"]:
         found.append(
             f"The density is the default, {capture['density']:g} kg/m³. Motion tells stress over density alone: if the "
-            "object has twice the density, all stresses double. Weigh it, and state `density`."
+            "object has twice the density, all stresses double. Weigh it, and state density in capture.yaml."
         )
     if not capture["held_out"]:
         found.append(
             "No throw is held out: all measures are of videos that the law was learned from. Film another throw, "
             "and name "
-            "it under `held_out`."
+            "it under held_out in capture.yaml."
         )
     return found
 
@@ -93,6 +93,7 @@ def of_predictions(
     rows: Sequence[Mapping[str, Any]],
     method: str,
     prior: str,
+    constants: str,
     predictions: Mapping[str, Mapping[str, Any]],
 ) -> list[str]:
     """What the measures of pictures say against the learned law.
@@ -100,7 +101,7 @@ def of_predictions(
     Args:
         rows: of `neuma_lib.evaluation.captured_images.image_rows`.
         method: the learned one.
-        prior: the one that evaluates the prior as it is.
+        prior, constants: those that evaluate the prior as it is, and the identified constants.
         predictions: content of prediction.json of the learned law, by throw.
     """
     found = []
@@ -129,6 +130,14 @@ def of_predictions(
                 f"{where}: predicted and filmed masks overlap by {row['iou']:.2f} on average: the prediction is at "
                 "another "
                 "place than the object, or has another shape."
+            )
+    for row in rows:
+        mine = own.get((row["throw"], row["camera"], row["learned"]))
+        if row["method"] == constants != method and row["throw"] == "all" and mine["psnr"] < row["psnr"]:
+            kind = "learned from" if row["learned"] else "held out"
+            found.append(
+                f"In frames {kind}, the identified constants alone are closer to the video ({row['psnr']:.1f} dB against "
+                f"{mine['psnr']:.1f} dB on the object): take them, or the structured law that starts from them."
             )
     seen, unseen = (own.get(("all", "all", learned)) for learned in (True, False))
     if seen and unseen and 10 ** ((seen["psnr"] - unseen["psnr"]) / 10) > WORSE:

@@ -212,7 +212,7 @@ def test_a_capture_without_faults_leaves_no_doubt():
     assert doubts.of_filming(CAPTURE, throw()) == []
     assert doubts.of_checks({"Room": [Check("floor", "50 %", "> 20 %", True)]}) == []
     rows = [row("nclaw", psnr=15.0), row(), row(throw="all", camera="all")]
-    assert doubts.of_predictions(rows, "neuma", "nclaw", {"one": GOOD_MOTION}) == []
+    assert doubts.of_predictions(rows, "neuma", "nclaw", "constants", {"one": GOOD_MOTION}) == []
     assert doubts.of_constants(None) == [] and doubts.of_curves(None, {}, "nclaw", "constants") == []
 
 
@@ -245,17 +245,19 @@ def test_what_nobody_stated_or_held_out_is_said():
 def test_predictions_that_are_worse_than_nothing_are_said():
     rows = [row("nclaw", psnr=21.0), row(iou=0.5)]
     rows += [row(throw="all", camera="all"), row(throw="all", camera="all", learned=False, psnr=18.0)]
+    rows += [row("constants", throw="all", camera="all", psnr=22.0)]
     broken = {**GOOD_MOTION, "stable": False, "diverged": {"step": 30, "happened": "became non-finite"}}
-    found = doubts.of_predictions(rows, "neuma", "nclaw", {"one": broken})
+    found = doubts.of_predictions(rows, "neuma", "nclaw", "constants", {"one": broken})
     for text in (
         "broke off at step 30",
         "training diverged",
         "prior, without any learning",
         "overlap by 0.50",
         "Held-out",
+        "In frames learned from, the identified constants alone are closer",
     ):
         assert sum(text in line for line in found) == 1, text
-    assert len(found) == 5
+    assert len(found) == 6
 
 
 def test_undetermined_constants_and_ties_are_said():

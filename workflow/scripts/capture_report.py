@@ -50,7 +50,7 @@ def main(inputs, output, params, run) -> None:
     }
     said = [
         *of_checks(groups),
-        *of_predictions(rows, method, params.prior, predictions),
+        *of_predictions(rows, method, params.prior, params.constants, predictions),
         *of_constants(identified),
         *of_curves(curves, params.titles, params.prior, params.constants),
         *of_filming(facts, filmed),
