@@ -136,7 +136,7 @@ def of_predictions(
         if row["method"] == constants != method and row["throw"] == "all" and mine["psnr"] < row["psnr"]:
             kind = "learned from" if row["learned"] else "held out"
             found.append(
-                f"In frames {kind}, the identified constants alone are closer to the video ({row['psnr']:.1f} dB against "
+                f"In frames {kind}, the identified constants alone fit better ({row['psnr']:.1f} dB against "
                 f"{mine['psnr']:.1f} dB on the object): take them, or the structured law that starts from them."
             )
     seen, unseen = (own.get(("all", "all", learned)) for learned in (True, False))

@@ -254,7 +254,7 @@ def test_predictions_that_are_worse_than_nothing_are_said():
         "prior, without any learning",
         "overlap by 0.50",
         "Held-out",
-        "In frames learned from, the identified constants alone are closer",
+        "In frames learned from, the identified constants alone fit better",
     ):
         assert sum(text in line for line in found) == 1, text
     assert len(found) == 6
