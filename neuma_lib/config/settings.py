@@ -20,6 +20,7 @@ from neuma_lib.config.dataset import DatasetConfig, TruthConfig
 from neuma_lib.config.demo import DemoConfig
 from neuma_lib.config.evaluation import EvaluationConfig
 from neuma_lib.config.experiments import ExperimentConfig
+from neuma_lib.config.exports import ExportsConfig
 from neuma_lib.config.figures import FiguresConfig
 from neuma_lib.config.gaussians import GaussiansConfig
 from neuma_lib.config.geometry import GeometryConfig
@@ -88,6 +89,7 @@ class Config(Section):
     captures: CapturesConfig = Field(CapturesConfig(), description="own photographs and videos")
     evaluation: EvaluationConfig = Field(EvaluationConfig(), description="measures and videos")
     viewer: ViewerConfig = Field(ViewerConfig(), description="viewer in a file")
+    exports: ExportsConfig = Field(ExportsConfig(), description="motions for other programs")
     figures: FiguresConfig = Field(FiguresConfig(), description="figures")
     demo: DemoConfig = Field(DemoConfig(), description="the first minute: `make demo`")
     methods: dict[str, MethodConfig] = Field({}, description="methods by name")

@@ -1,0 +1,65 @@
+"""A moving surface as a .blend file, written by a Blender process of its own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from neuma_lib.data.blender.libraries import explain_import_error
+from neuma_lib.errors import InputError
+from neuma_lib.io.files import atomic
+from neuma_lib.io.gltf import linear
+from neuma_lib.splatting.viewpoints import video_views
+
+_WORKER = "neuma_lib.data.blender.cycles_animation"
+_SIZE, _SAMPLES = (256, 256), 16
+"""Of the picture that shows that the file renders [px], samples a pixel."""
+
+
+def write_blend(
+    path: str | Path,
+    picture: str | Path,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    times: np.ndarray,
+    colors: np.ndarray,
+) -> None:
+    """Write a moving surface, and a render of its last frame from the front; other arguments as of `write_glb`.
+
+    In the file z is up, as in Blender: the object is turned, its vertices are the simulator's.
+
+    Raises:
+        InputError: Blender cannot be imported.
+        RuntimeError: Blender failed; the message ends with its last words.
+    """
+    views = video_views(np.asarray(vertices).reshape(-1, 3), 1, *_SIZE)
+    with tempfile.TemporaryDirectory(prefix="neuma-blend-") as folder:
+        job = Path(folder) / "job.npz"
+        np.savez(
+            job, vertices=np.asarray(vertices, np.float32), faces=np.asarray(faces, np.int32), times=times,
+            colors=linear(colors).astype(np.float32), pose=views.c2w[0], focal=views.focal, size=np.array(_SIZE),
+            samples=_SAMPLES, threads=1, shown=times[-1],
+        )  # fmt: skip
+        root = str(Path(__file__).resolve().parents[3])
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
+        done = subprocess.run(
+            [sys.executable, "-m", _WORKER, str(job)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            env=environment,
+            text=True,
+            errors="replace",
+        )
+        if done.returncode:
+            if hint := explain_import_error(done.stdout):
+                raise InputError(hint)
+            tail = "\n".join(done.stdout.strip().splitlines()[-12:])
+            raise RuntimeError(f"Blender ended with status {done.returncode}:\n{tail}")
+        for made, target in ((job.with_name("motion.blend"), path), (job.with_name("proof.png"), picture)):
+            with atomic(target) as partial:
+                partial.write_bytes(made.read_bytes())

@@ -1,0 +1,90 @@
+"""A moving surface as binary glTF 2.0: one mesh with a morph target a frame, and an animation of their weights."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuma_lib.io.files import atomic
+
+_FLOAT, _UINT = 5126, 5125
+_VERTICES, _FACES = 34962, 34963
+"""Targets of the buffer views of a mesh."""
+
+
+def write_glb(
+    path: str | Path, vertices: np.ndarray, faces: np.ndarray, times: np.ndarray, colors: np.ndarray
+) -> None:
+    """Write a moving surface, y up and in metres as glTF has it.
+
+    Args:
+        vertices: (T, V, 3) [m].
+        faces: (M, 3).
+        times: (T,) ascending [s]; between two frames vertices move evenly.
+        colors: (V, 3) sRGB in [0, 1].
+    """
+    vertices = np.asarray(vertices, "<f4")
+    frames, body, views, accessors = len(vertices), bytearray(), [], []
+
+    def add(array: np.ndarray, kind: str, target: int | None = None, bounds: bool = False) -> int:
+        view = {"buffer": 0, "byteOffset": len(body), "byteLength": array.nbytes}
+        views.append(view | ({"target": target} if target else {}))
+        body.extend(array.tobytes())
+        entry: dict[str, Any] = {"bufferView": len(views) - 1, "count": len(array), "type": kind}
+        entry["componentType"] = _UINT if array.dtype == np.uint32 else _FLOAT
+        if bounds:
+            rows = array.reshape(len(array), -1)
+            entry |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
+        accessors.append(entry)
+        return len(accessors) - 1
+
+    indices = add(np.asarray(faces, "<u4").ravel(), "SCALAR", _FACES)
+    attributes = {"POSITION": add(vertices[0], "VEC3", _VERTICES, bounds=True)}
+    attributes["COLOR_0"] = add(linear(colors).astype("<f4"), "VEC3", _VERTICES)
+    targets = [
+        {"POSITION": add(frame - vertices[0], "VEC3", _VERTICES, bounds=True)} for frame in vertices[1:]
+    ]
+    weights = np.eye(frames, dtype="<f4")[:, 1:]  # the first frame is the mesh itself
+    animated = {
+        "input": add(np.asarray(times, "<f4"), "SCALAR", bounds=True),
+        "output": add(weights.reshape(-1, 1), "SCALAR"),
+        "interpolation": "LINEAR",
+    }
+    primitive = {"attributes": attributes, "indices": indices, "material": 0, "targets": targets}
+    content = {
+        "asset": {"version": "2.0", "generator": "neuma_lib"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": "body"}],
+        "meshes": [{"name": "body", "primitives": [primitive], "weights": [0.0] * (frames - 1)}],
+        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}],
+        "animations": [
+            {"samplers": [animated], "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}]}
+        ],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(body)}],
+    }
+    if frames == 1:  # nothing moves, and glTF has no empty lists
+        del content["animations"], primitive["targets"], content["meshes"][0]["weights"]
+    text = json.dumps(content, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)  # all arrays are of 4 bytes
+    with atomic(path) as partial:
+        parts = (
+            struct.pack("<II", len(text), 0x4E4F534A),
+            text,
+            struct.pack("<II", len(body), 0x004E4942),
+            body,
+        )
+        size = 12 + sum(map(len, parts))
+        partial.write_bytes(struct.pack("<4sII", b"glTF", 2, size) + b"".join(map(bytes, parts)))
+
+
+def linear(srgb: np.ndarray) -> np.ndarray:
+    """Linear colours of sRGB ones (IEC 61966-2-1), both in [0, 1]."""
+    c = np.clip(np.asarray(srgb, np.float64), 0, 1)
+    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)

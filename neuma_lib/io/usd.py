@@ -1,0 +1,53 @@
+"""A moving surface as USD (Universal Scene Description): a mesh whose points have time samples."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from neuma_lib.errors import InputError
+from neuma_lib.io.files import atomic
+from neuma_lib.io.gltf import linear
+
+CODES_A_SECOND = 24.0
+"""Time codes of USD to a second; frames lie between them where their times do."""
+
+
+def write_usd(
+    path: str | Path, vertices: np.ndarray, faces: np.ndarray, times: np.ndarray, colors: np.ndarray
+) -> None:
+    """Write a moving surface, y up, in metres; arguments as of `write_glb`. The ending says the format: usda, usdc.
+
+    Raises:
+        InputError: usd-core is missing.
+    """
+    try:
+        from pxr import Gf, Usd, UsdGeom, Vt
+    except ImportError as error:
+        raise InputError(f"USD is written with usd-core ({error}): install it with `make viewer`") from None
+    codes = np.asarray(times, np.float64) * CODES_A_SECOND
+    with atomic(path) as partial:
+        partial.unlink(missing_ok=True)
+        stage = Usd.Stage.CreateNew(str(partial))
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+        UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.LinearUnits.meters)
+        stage.SetTimeCodesPerSecond(CODES_A_SECOND)
+        stage.SetFramesPerSecond(CODES_A_SECOND)
+        stage.SetStartTimeCode(float(codes[0]))
+        stage.SetEndTimeCode(float(codes[-1]))
+        root = UsdGeom.Xform.Define(stage, "/body")
+        stage.SetDefaultPrim(root.GetPrim())
+        Usd.ModelAPI(root).SetKind("component")
+        mesh = UsdGeom.Mesh.Define(stage, "/body/surface")
+        mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
+        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.asarray(faces, np.int32).ravel()))
+        points, extent = mesh.CreatePointsAttr(), mesh.CreateExtentAttr()
+        for code, frame in zip(codes, np.ascontiguousarray(vertices, np.float32), strict=True):
+            points.Set(Vt.Vec3fArray.FromNumpy(frame), float(code))
+            ends = [Gf.Vec3f(*end.tolist()) for end in (frame.min(axis=0), frame.max(axis=0))]
+            extent.Set(Vt.Vec3fArray(ends), float(code))
+        shown = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+        shown.Set(Vt.Vec3fArray.FromNumpy(linear(colors).astype(np.float32)))
+        stage.GetRootLayer().Save()

@@ -1,0 +1,245 @@
+"""Motions for other programs: what independent readers find in the files is what was simulated."""
+
+import dataclasses
+import json
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+from plyfile import PlyData
+from splat_files import ball
+
+from neuma_lib.coupling.binding import Binding
+from neuma_lib.coupling.frames import axes_of, gaussians_at, local_rotations
+from neuma_lib.coupling.nearest_binding import bind_nearest
+from neuma_lib.coupling.reconstruction import Reconstruction
+from neuma_lib.data.blender.blend import write_blend
+from neuma_lib.evaluation.video import write_gif, write_mp4
+from neuma_lib.geometry.moving_surface import moving_surface, vertex_colours
+from neuma_lib.io.gaussians import save_gaussians
+from neuma_lib.io.gltf import linear, write_glb
+from neuma_lib.io.usd import write_usd
+from neuma_lib.splatting.gaussians import covariances, rotations
+from neuma_lib.splatting.spherical_harmonics import colours
+
+TURN = rotations(torch.tensor([0.9, 0.2, -0.3, 0.25], dtype=torch.float64))
+STRETCH = torch.tensor([[1.2, 0.1, 0.0], [0.1, 0.8, 0.05], [0.0, 0.05, 1.1]], dtype=torch.float64)
+SHIFT = torch.tensor([0.1, 0.4, -0.2], dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def body():
+    """A ball of Gaussians of degree 3 with particles in it."""
+    g = ball(300, degree=3).to(dtype=torch.float64)
+    x0 = 0.9 * ball(200, seed=7).means.double()
+    ones = torch.ones(200, dtype=torch.float64)
+    return Reconstruction(x0, ones, ones, g, bind_nearest(g.means, g.covars(), x0), affine=True)
+
+
+def moved(body, A):
+    """The state of the particles under x -> A x + SHIFT."""
+    return body.x0 @ A.T + SHIFT, A.expand(len(body.x0), 3, 3).contiguous()
+
+
+def test_scales_and_rotations_make_the_covariances_again():
+    g = ball(500).to(dtype=torch.float64)
+    flat = dataclasses.replace(g, scales=g.scales * torch.tensor([1.0, 0.1, 1e-4]))
+    for gaussians in (g, flat):
+        scales, quats = axes_of(gaussians.covars())
+        assert torch.linalg.det(rotations(quats)).min() > 0
+        again = covariances(quats, scales)
+        size = gaussians.scales.amax(dim=1).square()
+        assert ((again - gaussians.covars()).abs().amax(dim=(1, 2)) / size).max() < 1e-12
+    singular = torch.zeros(1, 3, 3, dtype=torch.float64)
+    assert torch.isfinite(axes_of(singular)[0].log()).all()  # as files store them
+
+
+def test_exported_gaussians_are_those_of_the_body_carried_along(body):
+    """Means and covariances of x -> A x + b, and harmonics turned by the rotation of A = R S."""
+    A = TURN @ STRETCH
+    found = gaussians_at(body, *moved(body, A))
+    torch.testing.assert_close(found.means, body.gaussians.means @ A.T + SHIFT, atol=1e-12, rtol=0)
+    torch.testing.assert_close(found.covars(), A @ body.gaussians.covars() @ A.T, atol=1e-12, rtol=1e-9)
+    R = local_rotations(body, A.expand(len(body.x0), 3, 3))
+    torch.testing.assert_close(R, TURN.expand_as(R), atol=1e-12, rtol=0)
+    seen = torch.nn.functional.normalize(body.gaussians.means + 0.1, dim=1)
+    sh, turned = body.gaussians.sh(), found.sh()
+    torch.testing.assert_close(colours(turned, seen @ TURN.T), colours(sh, seen), atol=1e-12, rtol=0)
+    as_they_are = gaussians_at(body, *moved(body, A), rotate_harmonics=False)
+    assert torch.equal(as_they_are.sh(), sh)
+
+
+def test_local_rotations_are_rotations_even_where_a_body_is_turned_inside_out(body):
+    mirrored = torch.diag(torch.tensor([1.0, 1.0, -0.01], dtype=torch.float64)).expand(200, 3, 3)
+    R = local_rotations(body, mirrored)
+    torch.testing.assert_close(torch.linalg.det(R), torch.ones(300, dtype=torch.float64))
+    empty = dataclasses.replace(body.binding, indptr=torch.zeros(301, dtype=torch.int64), indices=torch.zeros(0).long(),
+                                values=torch.zeros(0).double())  # fmt: skip
+    R = local_rotations(dataclasses.replace(body, binding=empty), mirrored)
+    torch.testing.assert_close(R, torch.eye(3, dtype=torch.float64).expand(300, 3, 3))
+    assert isinstance(empty, Binding)
+
+
+def test_frames_open_as_3dgs_files(tmp_path, body):
+    found = gaussians_at(body, *moved(body, TURN))
+    save_gaussians(tmp_path / "0000.ply", found)
+    rows = PlyData.read(tmp_path / "0000.ply")["vertex"]
+    names = [p.name for p in rows.properties]
+    rest = [f"f_rest_{i}" for i in range(45)]
+    assert names == [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity",
+                     "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]  # fmt: skip
+    positions = np.stack([rows[axis] for axis in "xyz"], axis=1)
+    np.testing.assert_array_equal(positions, found.means.numpy().astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def surface():
+    """A sphere that is sheared, falls and turns, in four frames: vertices, faces, times, colours, and the mesh."""
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
+    x0 = 0.095 * ball(400, seed=3).means.numpy().astype(np.float64)
+    maps = [np.eye(3) + k * np.array([[0, 0.1, 0], [0, -0.05, 0.1], [0.02, 0, 0]]) for k in range(4)]
+    x = np.stack([x0 @ A.T + [0.5, 0.5 - 0.1 * k, 0.5] for k, A in enumerate(maps)])
+    mesh.apply_translation([0.5, 0.5, 0.5])
+    vertices = moving_surface(mesh, x)
+    exact = np.stack([(mesh.vertices - 0.5) @ A.T + [0.5, 0.5 - 0.1 * k, 0.5] for k, A in enumerate(maps)])
+    np.testing.assert_allclose(vertices, exact, atol=1e-9)
+    colors = np.clip(mesh.vertices - 0.4, 0, 0.2) * 5
+    return vertices, np.asarray(mesh.faces), np.array([0.0, 0.1, 0.25, 0.5]), colors
+
+
+def test_vertices_have_the_colours_of_the_gaussians_around_them():
+    g = ball(2000)
+    g = dataclasses.replace(g, sh0=(g.means[:, None] > 0).float() * 2 - 1)  # by octant
+    mesh = trimesh.creation.icosphere(subdivisions=1)
+    rgb = vertex_colours(mesh, g)
+    inside = np.abs(mesh.vertices).min(axis=1) > 0.3  # well inside of an octant
+    expected = 0.5 + 0.2820948 * (2 * (mesh.vertices > 0) - 1)
+    assert inside.sum() > 5
+    np.testing.assert_allclose(rgb[inside], expected[inside], atol=1e-6)
+
+
+def test_gltf_holds_the_motion(tmp_path, surface):
+    vertices, faces, times, colors = surface
+    write_glb(tmp_path / "a.glb", *surface)
+    mesh = next(iter(trimesh.load(tmp_path / "a.glb", process=False).geometry.values()))
+    np.testing.assert_array_equal(mesh.vertices, vertices[0].astype(np.float32))
+    np.testing.assert_array_equal(mesh.faces, faces)
+    data = (tmp_path / "a.glb").read_bytes()
+    magic, version, size, length, kind = struct.unpack("<4sIII4s", data[:20])
+    assert (magic, version, size, kind) == (b"glTF", 2, len(data), b"JSON")
+    content, body = json.loads(data[20 : 20 + length]), data[28 + length :]
+
+    def array(index):
+        entry = content["accessors"][index]
+        view = content["bufferViews"][entry["bufferView"]]
+        assert view["byteOffset"] % 4 == 0
+        raw = np.frombuffer(body[view["byteOffset"] :][: view["byteLength"]], "<f4").reshape(
+            entry["count"], -1
+        )
+        if "min" in entry:
+            np.testing.assert_array_equal(raw.min(axis=0), np.float32(entry["min"]))
+            np.testing.assert_array_equal(raw.max(axis=0), np.float32(entry["max"]))
+        return raw
+
+    primitive = content["meshes"][0]["primitives"][0]
+    base = array(primitive["attributes"]["POSITION"]).astype(np.float64)
+    targets = np.stack([array(target["POSITION"]) for target in primitive["targets"]])
+    sampler = content["animations"][0]["samplers"][0]
+    np.testing.assert_array_equal(array(sampler["input"])[:, 0], np.float32(times))
+    weights = array(sampler["output"]).reshape(len(times), -1)
+    shown = base + np.einsum("tk,kvc->tvc", weights, targets)
+    np.testing.assert_allclose(shown, vertices, atol=2 * np.finfo(np.float32).eps)  # metres, below 1
+    np.testing.assert_allclose(array(primitive["attributes"]["COLOR_0"]), linear(colors), atol=1e-7)
+
+
+def test_gltf_is_valid_to_its_library(tmp_path, surface):
+    pygltflib = pytest.importorskip("pygltflib")
+    write_glb(tmp_path / "a.glb", *surface)
+    found = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))
+    assert len(found.meshes[0].primitives[0].targets) == 3 and len(found.animations[0].channels) == 1
+    write_glb(tmp_path / "b.glb", *(part[:1] if k in (0, 2) else part for k, part in enumerate(surface)))
+    still = pygltflib.GLTF2().load(str(tmp_path / "b.glb"))
+    assert not still.animations and not still.meshes[0].primitives[0].targets
+
+
+@pytest.mark.parametrize("kind", ["usda", "usdc"])
+def test_usd_holds_the_motion_and_its_own_validators_find_nothing(tmp_path, surface, kind):
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom, UsdValidation
+
+    vertices, faces, times, _ = surface
+    for again in range(2):
+        write_usd(tmp_path / f"{again}.{kind}", *surface)
+    assert (tmp_path / f"0.{kind}").read_bytes() == (tmp_path / f"1.{kind}").read_bytes()
+    assert len(list(tmp_path.iterdir())) == 2
+    stage = Usd.Stage.Open(str(tmp_path / f"0.{kind}"))
+    mesh = UsdGeom.Mesh(stage.GetDefaultPrim().GetChild("surface"))
+    rate = stage.GetTimeCodesPerSecond()
+    np.testing.assert_allclose(np.array(mesh.GetPointsAttr().GetTimeSamples()) / rate, times, rtol=1e-12)
+    for time, frame in zip(times, vertices, strict=True):
+        np.testing.assert_array_equal(
+            np.array(mesh.GetPointsAttr().Get(time * rate)), frame.astype(np.float32)
+        )
+    np.testing.assert_array_equal(np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3), faces)
+    assert UsdGeom.GetStageUpAxis(stage) == "Y" and UsdGeom.GetStageMetersPerUnit(stage) == 1
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    assert len(validators) > 10
+    errors = UsdValidation.ValidationContext(validators).Validate(stage)
+    assert [error.GetMessage() for error in errors] == []
+
+
+def test_films_have_all_frames(tmp_path):
+    video = np.full((12, 16, 16, 3), 255, np.uint8)
+    for k in range(12):
+        video[k, :, k, 0] = 20 * k
+    write_gif(tmp_path / "a.gif", video, 30.0)
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.n_frames == 12
+        for k in range(12):
+            image.seek(k)
+            assert np.asarray(image.convert("RGB"))[0].argmin(axis=0)[1] == k  # the column that is not white
+    write_mp4(tmp_path / "a.mp4", video, 30.0)
+    assert len(imageio.mimread(tmp_path / "a.mp4")) == 12
+
+
+READ_BLEND = """
+import sys, json, bpy, numpy as np
+bpy.ops.wm.open_mainfile(filepath=sys.argv[1])
+scene, body = bpy.context.scene, bpy.data.objects["body"]
+seen = []
+for time in json.loads(sys.argv[2]):
+    frame = time * scene.render.fps
+    scene.frame_set(int(frame), subframe=frame % 1)
+    mesh = body.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    co = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.vertices.foreach_get("co", co)
+    seen.append(co.reshape(-1, 3))
+np.savez(sys.argv[3], co=np.stack(seen), world=np.array(body.matrix_world))
+"""
+
+
+@pytest.mark.slow
+def test_blend_holds_the_motion(tmp_path, surface):
+    """Read back by another Blender process; between two frames the surface is between them."""
+    vertices, _, times, _ = surface
+    write_blend(tmp_path / "a.blend", tmp_path / "a.png", *surface)
+    with Image.open(tmp_path / "a.png") as image:
+        alpha = np.asarray(image)[..., 3]
+    assert 0.005 < (alpha > 128).mean() < 0.5
+    (tmp_path / "read.py").write_text(READ_BLEND)
+    asked = [*times.tolist(), float(times[1:3].mean())]
+    files = [str(tmp_path / name) for name in ("read.py", "a.blend")]
+    subprocess.run([sys.executable, *files, json.dumps(asked), str(tmp_path / "a.npz")], check=True)
+    found = np.load(tmp_path / "a.npz")
+    # times are single precision in Blender, a frame is 1/24 s
+    np.testing.assert_allclose(found["co"][:4], vertices, atol=1e-5)
+    np.testing.assert_allclose(found["co"][4], vertices[1:3].mean(axis=0), atol=1e-5)
+    np.testing.assert_allclose(found["world"][:3, :3] @ [0, 1, 0], [0, 0, 1], atol=1e-6)  # y is up: z
+    assert Path(tmp_path / "a.blend").stat().st_size > 1000

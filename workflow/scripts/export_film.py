@@ -1,0 +1,30 @@
+"""Film a prediction from the front, as mp4 and GIF."""
+
+import numpy as np
+
+from neuma_lib.evaluation.plotting.rendering import frontal, renders
+from neuma_lib.evaluation.video import write_gif, write_mp4
+from neuma_lib.io.files import atomic
+from neuma_lib.io.particles import load_body, load_motion
+from workflow.stage import run_script
+
+SQUARE = 2
+"""Codecs want sides of a whole number of these [px]."""
+
+
+def main(inputs, output, params, run) -> None:
+    files = (inputs.particles, inputs.binding, inputs.gaussians)
+    body = load_body(*files, params.density, params.carrier, params.gaussian_motion)
+    x, F = load_motion(inputs.rollout)
+    seen = np.concatenate([x.numpy().reshape(-1, 3), body.gaussians.means.numpy()])
+    wide, high = np.ptp(seen, axis=0)[:2]
+    height = params.size * float(np.clip(high / wide, 0.5, 2.0))
+    width, height = (SQUARE * max(1, round(side / SQUARE)) for side in (params.size, height))
+    video = renders(body, frontal(seen, width, height), x, F)
+    for file, write in ((output.film, write_mp4), (output.gif, write_gif)):
+        with atomic(file) as partial:
+            write(partial, video, params.frame_rate)
+    run.say(f"{len(video)} frames of {width}x{height} px")
+
+
+run_script(main, snakemake)

@@ -1,0 +1,29 @@
+"""Write the particles of every frame as PLY files, and of all frames as one HDF5 file."""
+
+from pathlib import Path
+
+import numpy as np
+
+from neuma_lib.io.hdf5 import read_arrays, write_arrays
+from neuma_lib.io.particles import load_body
+from neuma_lib.io.ply import write_ply
+from workflow.stage import run_script
+
+
+def main(inputs, output, params, run) -> None:
+    files = (inputs.particles, inputs.binding, inputs.gaussians)
+    body = load_body(*files, params.density, params.carrier)
+    names = ("x", "F", "frames")
+    path, attributes = read_arrays(inputs.rollout, required=names, only=names)
+    for k, (x, F) in enumerate(zip(path["x"], path["F"], strict=True)):
+        rows = np.empty(len(x), dtype=[(name, "<f4") for name in (*"xyz", "volume_ratio")])
+        for name, column in zip(rows.dtype.names, [*x.T, np.linalg.det(F.astype(np.float64))], strict=True):
+            rows[name] = column
+        write_ply(Path(output.frames, f"{k:04d}.ply"), rows)
+    vol0, mass = (getattr(body, name).numpy() for name in ("vol0", "mass"))
+    time = path["frames"] * attributes["dt"]
+    write_arrays(output.together, {"x": path["x"], "time": time, "vol0": vol0, "mass": mass}, {})
+    run.say(f"{len(path['x'])} frames of {len(body.x0)} particles")
+
+
+run_script(main, snakemake)

@@ -1,0 +1,24 @@
+"""Write the surface that the particles carry as glTF or USD."""
+
+from pathlib import Path
+
+from neuma_lib.geometry.moving_surface import moving_surface, vertex_colours
+from neuma_lib.io.gaussians import load_gaussians
+from neuma_lib.io.gltf import write_glb
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.mesh import read_mesh
+from neuma_lib.io.usd import write_usd
+from workflow.stage import run_script
+
+
+def main(inputs, output, params, run) -> None:
+    path, attributes = read_arrays(inputs.rollout, required=("x", "frames"), only=("x", "frames"))
+    mesh = read_mesh(inputs.mesh)
+    vertices = moving_surface(mesh, path["x"])
+    write = write_glb if Path(output.surface).suffix == ".glb" else write_usd
+    colours = vertex_colours(mesh, load_gaussians(inputs.gaussians))
+    write(output.surface, vertices, mesh.faces, path["frames"] * attributes["dt"], colours)
+    run.say(f"{vertices.shape[0]} frames of {vertices.shape[1]} vertices")
+
+
+run_script(main, snakemake)
