@@ -61,6 +61,15 @@ class FiguresConfig(Section):
         min_length=1,
         description="scenes whose laws move all splats among the scenes, learned there by the first of `methods`",
     )
+    realworld: tuple[str, ...] | None = Field(
+        None,
+        min_length=1,
+        description="captures in the figure of filmed objects, each by the throw that its law is learned from; null: "
+        "those of `captures.released`, or else the demo captures",
+    )
+    realworld_methods: tuple[str, ...] = Field(
+        ("spring_gaus", "neuma"), min_length=1, description="methods beside the videos of these"
+    )
     gradient_analysis: tuple[str, ...] = Field(
         ("BouncyBall", "RubberPawn"), min_length=1, description="scenes of the gradient norms"
     )

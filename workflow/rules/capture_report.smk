@@ -14,7 +14,7 @@ rule capture_shown:
     output:
         transforms=SHOWN,
     wildcard_constraints:
-        scene=THROW_SCENE,
+        scene=OWN_THROW,
     conda:
         CAPTURE_ENVIRONMENT
     params:
@@ -29,6 +29,28 @@ rule capture_shown:
         width=SETTINGS.captures.shown,
     script:
         "../scripts/capture_shown.py"
+
+
+rule released_shown:
+    input:
+        folders=of_thrown(released_folders),
+        mattes=of_filmed(MATTES),
+        dynamic=f"{DATA}/{{scene}}/dynamic/transforms.json",
+        registration=f"{RESULTS}/{{scene}}/registration.json",
+    output:
+        transforms=SHOWN,
+    wildcard_constraints:
+        scene=RELEASED_THROW,
+    conda:
+        CAPTURE_ENVIRONMENT
+    params:
+        cameras=scene_cameras,
+        settings=of_thrown(released_settings),
+        name=of_thrown(lambda capture: capture.capture),
+        longest=of_thrown_capture(lambda capture: capture.settings.longest),
+        width=SETTINGS.captures.shown,
+    script:
+        "../scripts/released_shown.py"
 
 
 rule capture_prediction:
@@ -74,7 +96,6 @@ rule capture_view:
         measures=f"{RESULTS}/{{scene}}/{{method}}/views/{{camera}}.json",
     wildcard_constraints:
         scene=THROW_SCENE,
-        method=LAW_METHOD,
     resources:
         gpu=GPU,
     params:
@@ -166,6 +187,7 @@ rule capture_report:
     output:
         page=f"{RESULTS}/{{capture}}/{{method}}/report.html",
     wildcard_constraints:
+        capture=OWN_CAPTURE,
         method=LAW_METHOD,
     params:
         capture="{capture}",
@@ -177,3 +199,28 @@ rule capture_report:
         facts=of_report(report_facts),
     script:
         "../scripts/capture_report.py"
+
+
+# Poses and masks came with the files: nothing of them was found here.
+use rule capture_report as released_report with:
+    input:
+        timelines=of_videos("json"),
+        photographs=f"{RESULTS}/{{capture}}/masks/photographs.json",
+        photograph_sheet=f"{RESULTS}/{{capture}}/masks/photographs.png",
+        masks=of_videos("json", "masks"),
+        mask_sheets=of_videos("png", "masks"),
+        flights=of_throws(f"{FLIGHT}.json"),
+        flight_pictures=of_throws(f"{FLIGHT}.png"),
+        object=f"{RESULTS}/{{capture}}/gaussians.json",
+        registrations=thrown_files("registration.json"),
+        registration_pictures=thrown_files("registration.png"),
+        predictions=own_files("prediction.json"),
+        films=own_files("views/{camera}.mp4", cameras=True),
+        images=f"{RESULTS}/{{capture}}/{{method}}/images.json",
+        table=f"{RESULTS}/{{capture}}/{{method}}/images.csv",
+        curves=f"{RESULTS}/{{capture}}/{{method}}/stress_curves.json",
+        curves_picture=f"{RESULTS}/{{capture}}/{{method}}/stress_curves.png",
+        identified=of_report(report_identified),
+    wildcard_constraints:
+        capture=RELEASED_CAPTURE,
+        method=LAW_METHOD,

@@ -26,6 +26,10 @@ POSES_THREADS = 8  # for matches; all that there are where these are fewer
 OTHERS = f"{TRUE_SCENE}|{SPLAT_SCENE}|figures|logs|benchmarks|experiments|priors"
 RELEASED_CAPTURE = names_of(SETTINGS.captures.released, chains=False)
 OWN_CAPTURE = f"(?!({OTHERS}|{RELEASED_CAPTURE})/){NAME.pattern}"
+RELEASED_THROW = scenes_that(
+    lambda scene: scene.captured and scene.captured.capture in SETTINGS.captures.released, chains=False
+)
+OWN_THROW = f"(?!{RELEASED_THROW}/){THROW_SCENE}"
 
 
 wildcard_constraints:

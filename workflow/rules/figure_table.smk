@@ -177,6 +177,42 @@ def of_moved(name):
     return of_splats(lambda scenes: of_methods(scenes, laws, name))
 
 
+def filmed_captures():
+    """Captures of the figure of filmed objects."""
+    return list(DRAWN.realworld or SETTINGS.captures.released or PLANNED)
+
+
+def of_captures(files):
+    """A function of wildcards: files of the captures of the figure."""
+    return checked(lambda wildcards: files([training_scene(name) for name in filmed_captures()]))
+
+
+def of_cameras(scenes):
+    """Measures of every camera of scenes under every method, scene by scene."""
+    return [
+        f"{RESULTS}/{scene}/{method}/views/{camera}.json"
+        for scene in scenes
+        for method in DRAWN.realworld_methods
+        for camera in SETTINGS.scene(scene).captured.cameras
+    ]
+
+
+def filmed_constants(scenes):
+    """What pictures of filmed throws need to know."""
+    return {
+        scene: {
+            "dt": SETTINGS.scene(scene).dt,
+            "cameras": len(SETTINGS.scene(scene).captured.cameras),
+            "filming": filming(SimpleNamespace(scene=scene)),
+            "motion": {
+                method: gaussian_motion(SimpleNamespace(scene=scene, method=method))
+                for method in DRAWN.realworld_methods
+            },
+        }
+        for scene in scenes
+    }
+
+
 def of_each_method(figure, made_of):
     """A figure for each of figures.methods, with its name from the second on."""
     names = [figure, *(f"{figure}_{method}" for method in DRAWN.methods[1:])]
@@ -260,6 +296,25 @@ FIGURES = {
             "laws": list(DRAWN.i23d),
             "shown": DRAWN.shown + 1,
             "size": DRAWN.size,
+        },
+        "on_request": True,
+    },
+    "realworld": {
+        "kind": "h5",
+        "input": {
+            "kernels": kernels("rendering"),
+            "shown": of_captures(
+                lambda scenes: [f"{DATA}/{scene}/shown/transforms.json" for scene in scenes]
+            ),
+            "rollouts": of_captures(lambda scenes: of_methods(scenes, DRAWN.realworld_methods, "rollout.h5")),
+            "measures": of_captures(of_cameras),
+            **{name: of_captures(lambda scenes, name=name: each_of(scenes)[name]) for name in BODY},
+        },
+        "params": {
+            "titles": {method: SETTINGS.method_title(method) for method in DRAWN.realworld_methods},
+            "scenes": of_captures(filmed_constants),
+            "view": 0,
+            "frames": DRAWN.shown + 2,
         },
         "on_request": True,
     },

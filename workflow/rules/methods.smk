@@ -124,6 +124,11 @@ def springs_settings(wildcards):
     return SETTINGS.method_springs(wildcards.method).plain()
 
 
+def scene_views(wildcards):
+    """Numbers of the cameras of a filmed throw."""
+    return list(range(len(SETTINGS.scene(wildcards.scene).captured.cameras)))
+
+
 @checked
 def fitted_springs(wildcards):
     """The springs of a scene, or of the scene of an experiment's one body."""

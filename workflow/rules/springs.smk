@@ -38,6 +38,7 @@ rule springs_evaluation:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
         metrics=f"{RESULTS}/{{scene}}/{{method}}/metrics.json",
     wildcard_constraints:
+        scene=TRUE_SCENE,
         method=SPRING_METHOD,
     resources:
         gpu=GPU,
@@ -50,6 +51,31 @@ rule springs_evaluation:
         device=SETTINGS.device,
     script:
         "../scripts/springs_evaluation.py"
+
+
+rule springs_prediction:
+    input:
+        **body_files(),
+        kernels=kernels("springs"),
+        transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
+        velocity=start_file,
+        springs=fitted_springs,
+    output:
+        rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
+    wildcard_constraints:
+        scene=THROW_SCENE,
+        method=SPRING_METHOD,
+    resources:
+        gpu=GPU,
+    params:
+        simulation=simulation_settings,
+        density=method_density,
+        views=scene_views,
+        springs=springs_settings,
+        filming=filming,
+        device=SETTINGS.device,
+    script:
+        "../scripts/springs_prediction.py"
 
 
 # The same object followed for longer, or another one of the same material: one stiffness with the modulus of the first.

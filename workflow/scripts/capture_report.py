@@ -18,6 +18,7 @@ from workflow.stage import run_script
 
 def main(inputs, output, params, run) -> None:
     facts, method = params.facts, params.method
+    of_others = "room" not in inputs.keys()  # poses and masks came with a released capture
     videos = [tuple(video) for video in params.videos]
     names, throws = [f"{throw}, {camera}" for throw, camera in videos], list(facts["throws"])
 
@@ -31,8 +32,12 @@ def main(inputs, output, params, run) -> None:
     predictions, rows = by_throw(inputs.predictions), read_json(inputs.images)
     curves = read_json(inputs.curves)
     identified = read_json(inputs.identified) if inputs.identified else None
-    groups = {
-        "Frames, cameras, room": checks(read_json(inputs.room), by_video(inputs.timelines)),
+    groups = (
+        {}
+        if of_others
+        else {"Frames, cameras, room": checks(read_json(inputs.room), by_video(inputs.timelines))}
+    )
+    groups |= {
         "Masks and free flight": motion_checks(
             read_json(inputs.photographs), by_video(inputs.masks), flights
         ),
@@ -55,10 +60,16 @@ def main(inputs, output, params, run) -> None:
         *of_curves(curves, params.titles, params.prior, params.constants),
         *of_filming(facts, filmed),
     ]
-    pictures = {
-        "Cameras and room": {"Cameras and points": inputs.cameras, "Floor and box": inputs.floor},
+    pictures = (
+        {}
+        if of_others
+        else {
+            "Cameras and room": {"Cameras and points": inputs.cameras, "Floor and box": inputs.floor},
+            "Videos": {f"Frames: {n}": file for n, file in zip(names, listed(inputs.frame_sheets))},
+        }
+    )
+    pictures |= {
         "Photographs": {"Masks of the photographs": inputs.photograph_sheet},
-        "Videos": {f"Frames: {n}": file for n, file in zip(names, listed(inputs.frame_sheets))},
         "Masks of the videos": {f"Masks: {n}": file for n, file in zip(names, listed(inputs.mask_sheets))},
         "Free flight": {f"Free flight: {t}": file for t, file in zip(throws, listed(inputs.flight_pictures))},
         "Place of the object in the videos": {
