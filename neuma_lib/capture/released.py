@@ -54,8 +54,6 @@ MIDDLE = (0.15, 0.20)
 """x and y of the middle of the volume that Spring-Gaus' settings leave for the objects."""
 GROUND = {"bun": -0.010, "burger": -0.025, "dog": -0.025, "pig": -0.025, "potato": -0.010}
 """z of the floor under each object in Spring-Gaus' settings."""
-IN_BOX = {"world": {"scale": 1.0, "offset": list(BOX_MIDDLE)}}
-"""What the transforms.json of a video says of its world."""
 _MODELS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV"}
 _PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8}
 _SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -386,21 +384,27 @@ def photographs_about_to_size(
             zip(shots, lenses, placed.move_cameras(viewmats), strict=True)
         )
     ]
-    return frames, {"scale_known": False, "photographs": placed.plain()}
+    return frames, {"scale_known": False, "photographs": {"floor": None}, "placed": placed.plain()}
 
 
-def video_frames(shots: Sequence[Shot], ground: float, scale: float, longest: int) -> list[dict[str, Any]]:
-    """Entries of a transforms.json for the frames of one camera, in the simulator's box, and their times from 0 on [s].
+def video_frames(
+    shots: Sequence[Shot], ground: float, scale: float, longest: int, enlarge: float = 1.0
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Entries of a transforms.json for the frames of one camera, in the box, with their times from 0 on [s].
 
     Args:
         ground, scale: of `room_cameras`.
         longest: longer side of the pictures [px].
+        enlarge: metres of the simulator to a metre.
+
+    Returns:
+        The entries, and what the file says of its world.
     """
     viewmat = room_cameras(shots[0].viewmat[None], ground, scale)
-    in_box = Similarity(1.0, np.eye(3), np.array(BOX_MIDDLE)).move_cameras(viewmat)[0]
+    in_box = Similarity(enlarge, np.eye(3), np.array(BOX_MIDDLE)).move_cameras(viewmat)[0]
     pose = (np.linalg.inv(in_box) @ OPENGL_TO_OPENCV).tolist()
     lens = shots[0].lens.resized(longest)
-    return [
+    frames = [
         {
             "file_path": f"{shot.number:05d}.png",
             "transform_matrix": pose,
@@ -411,6 +415,7 @@ def video_frames(shots: Sequence[Shot], ground: float, scale: float, longest: in
         }
         for shot in shots
     ]
+    return frames, {"world": {"scale": enlarge, "offset": list(BOX_MIDDLE)}}
 
 
 def read_shots(shots: Sequence[Shot], longest: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -191,6 +191,12 @@ class ReleasedConfig(Section):
         description="metres to a unit of the files' world, which is not metric: free fall in it is reported to be 1.33 "
         "times too fast. What the frames before contact say is in `flight/first.json`",
     )
+    enlarge: float = Field(
+        2.5,
+        gt=0,
+        description="metres of the simulator to a metre, as `scale` in capture.yaml: objects of 10 cm need it on a "
+        "coarse grid",
+    )
     contact: int | None = Field(
         None, ge=5, description="number of the frame of the first contact; null: as the files say, or 5"
     )
@@ -205,7 +211,9 @@ class ReleasedConfig(Section):
     def as_capture(self) -> CaptureConfig:
         """What a capture.yaml would say of it."""
         same = ("prior", "density", "dt", "longest", "width")
-        return CaptureConfig(poses="released", **{key: getattr(self, key) for key in same})
+        return CaptureConfig(
+            poses="released", scale=self.enlarge, **{key: getattr(self, key) for key in same}
+        )
 
 
 class CapturesConfig(Section):

@@ -77,13 +77,14 @@ def test_the_room_has_its_floor_below_and_metres(found):
 
 def test_frames_have_the_times_of_the_camera(found):
     shots = next(iter(found.videos.values()))
-    frames = video_frames(shots, found.ground, layouts.UNIT, 48)
+    frames, world = video_frames(shots, found.ground, layouts.UNIT, 48, 2.0)
     assert [f["step"] for f in frames] == list(range(layouts.COUNT))
     np.testing.assert_allclose([f["time"] for f in frames], np.arange(layouts.COUNT) / RATE)
     assert frames[0]["w"] == 48 and frames[0]["fl_x"] == pytest.approx(shots[0].lens.K[0, 0] / 2)
     pose = np.array(frames[0]["transform_matrix"]) @ OPENGL_TO_OPENCV
     room = np.linalg.inv(room_cameras(shots[0].viewmat[None], found.ground, layouts.UNIT)[0])
-    np.testing.assert_allclose(pose[:3, 3] - room[:3, 3], (0.5, 0, 0.5), atol=1e-12)
+    np.testing.assert_allclose(pose[:3, 3] - 2 * room[:3, 3], (0.5, 0, 0.5), atol=1e-12)
+    assert world["world"] == {"scale": 2.0, "offset": [0.5, 0.0, 0.5]}
 
 
 def test_photographs_come_to_the_middle_and_to_size(folders):
@@ -102,7 +103,7 @@ def test_photographs_come_to_the_middle_and_to_size(folders):
     eyes = np.linalg.inv(viewmats)[:, :3, 3]
     theirs = np.stack([np.linalg.inv(v)[:3, 3] for v in layouts.static_poses()])
     ratio = np.linalg.norm(eyes[1:] - eyes[0], axis=1) / np.linalg.norm(theirs[1:] - theirs[0], axis=1)
-    np.testing.assert_allclose(ratio, world["photographs"]["scale"], rtol=1e-9)
+    np.testing.assert_allclose(ratio, world["placed"]["scale"], rtol=1e-9)
 
 
 def test_the_copy_takes_its_photographs_from_the_original(folders):
@@ -185,5 +186,5 @@ def test_an_empty_mask_and_a_picture_of_another_shape_are_named(folders):
 
 def test_times_and_contact_are_plain_json(folders):
     found = read_released(folders["spring_gaus"], "bun")
-    frames = video_frames(next(iter(found.videos.values())), found.ground, 0.75, LONGEST)
+    frames, _ = video_frames(next(iter(found.videos.values())), found.ground, 0.75, LONGEST)
     assert json.loads(json.dumps(frames)) == frames

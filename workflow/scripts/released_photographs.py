@@ -33,7 +33,11 @@ def main(inputs, output, params, run) -> None:
         masks.append(mask)
         run.progress(number + 1, len(found.photographs))
     frames, world = photographs_about_to_size(
-        found.photographs, masks, settings.longest, radius, float(middle[1])
+        found.photographs,
+        masks,
+        settings.longest,
+        settings.enlarge * radius,
+        settings.enlarge * float(middle[1]),
     )
     cameras, Ks = map(np.stack, zip(*(metric_camera(frame, {}) for frame in frames)))
     agreed = agreement(masks, cameras, Ks)

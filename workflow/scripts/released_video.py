@@ -5,7 +5,7 @@ import numpy as np
 from neuma_lib.capture.frames import Frame, contact_sheet, sheet_numbers
 from neuma_lib.capture.masks import overlay
 from neuma_lib.capture.mattes import write_mattes
-from neuma_lib.capture.released import IN_BOX, RATE, read_configured, read_shots, video_frames
+from neuma_lib.capture.released import RATE, read_configured, read_shots, video_frames
 from neuma_lib.config.capture import ReleasedConfig
 from neuma_lib.io.files import write_json
 from workflow.stage import run_script
@@ -15,9 +15,9 @@ def main(inputs, output, params, run) -> None:
     settings = ReleasedConfig(**params.settings)
     found = read_configured(params.name, settings)
     shots = found.videos[params.camera]
-    frames = video_frames(shots, found.ground, settings.scale, settings.longest)
+    frames, world = video_frames(shots, found.ground, settings.scale, settings.longest, settings.enlarge)
     pictures, masks = zip(*read_shots(shots, settings.longest))
-    write_mattes(output.transforms, zip(frames, pictures, masks, strict=True), IN_BOX)
+    write_mattes(output.transforms, zip(frames, pictures, masks, strict=True), world)
     numbers = [shot.number for shot in shots]
     flying = [number for number in numbers if number < found.contact]
     said = f"{len(shots)} frames, free flight in frames {flying[0]} to {flying[-1]}"
