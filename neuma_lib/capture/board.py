@@ -343,6 +343,25 @@ def room_from_board(board: BoardConfig, center: tuple[float, float] | None) -> S
     return Similarity(1.0, Y_UP, -Y_UP @ [x, y, -board.thickness])
 
 
+def board_outline(
+    board: BoardConfig, center: tuple[float, float] | None, viewmat: np.ndarray, K: np.ndarray
+) -> np.ndarray | None:
+    """Corners (4, 2) [px] of the printed board with a margin of a square, in order; None where it is behind the camera.
+
+    Args:
+        viewmat: the room's metres to camera, OpenCV axes, (4, 4).
+        K: of a pinhole, (3, 3) [px].
+    """
+    columns, rows = board.squares
+    ends = [(-1, -1), (columns + 1, -1), (columns + 1, rows + 1), (-1, rows + 1)]
+    corners = np.array([(x * board.square, y * board.square, 0.0) for x, y in ends])
+    seen = room_from_board(board, center).apply(corners) @ viewmat[:3, :3].T + viewmat[:3, 3]
+    if (seen[:, 2] <= 0).any():
+        return None
+    pixels = seen @ K.T
+    return pixels[:, :2] / pixels[:, 2:]
+
+
 def _dictionary(board: BoardConfig):
     cv2 = opencv()
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))

@@ -113,7 +113,8 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flig
         flying = (view.numbers >= view.arc[0]) & (view.numbers <= view.arc[1])
         inside.append(np.flatnonzero(flying))
         times, places = view.row_times[flying], view.centroids[flying]
-        tracks.append(Track(times, places, view.viewmat, view.K, f"{name}, {view.camera}"))
+        radius = float(np.sqrt(np.median(view.masks[flying].sum(axis=(1, 2))) / np.pi))
+        tracks.append(Track(times, places, view.viewmat, view.K, f"{name}, {view.camera}", radius))
     offsets, lines = [0.0], []
     for view in views[1:]:
         offset, line = _offset(views[0], view, f"{name}, {view.camera}")

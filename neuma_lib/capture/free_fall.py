@@ -20,6 +20,8 @@ MOST_MISMATCH = 0.1
 """Part by which the measured gravity may differ from the true one."""
 MOST_RMS = 0.004
 """Distance of the places from the fit, as part of the picture's height, above which there is no one flight."""
+MOST_OFF = 0.1
+"""The same as part of the object's radius: the middle of its outline is not its centre, and wanders as it turns."""
 _ENDS = 0.2  # part of a track at either end that the fit begins without
 _OFF = 4.0  # distance that is still on the fit, in root mean squares of both coordinates
 _LEAST_RMS = 0.2  # [px], where the fit is closer than masks are
@@ -35,6 +37,7 @@ class Track:
         viewmat: world to camera, OpenCV axes, (4, 4).
         K: intrinsics [px], (3, 3).
         name: of the video, for messages.
+        radius: of the object's outline, as of a circle of its area [px]; 0: not known.
     """
 
     times: np.ndarray
@@ -42,6 +45,7 @@ class Track:
     viewmat: np.ndarray
     K: np.ndarray
     name: str
+    radius: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +247,7 @@ def fit_flight(
         if growing:
             chosen = [_part(track, *ends) for track, ends in zip(tracks, kept)]
             fall = fit_free_fall(chosen, plane, fall.offsets, stated)
-    if fall.rms > MOST_RMS * min(map(_height, tracks)):
+    if fall.rms > min(max(MOST_RMS * _height(track), MOST_OFF * track.radius) for track in tracks):
         raise InputError(
             f"{', '.join(t.name for t in tracks)}: no free flight fits what the cameras saw, {fall.rms:.1f} px off:"
             f" are the videos of one throw and one object, have the cameras stood still since their poses were"

@@ -48,6 +48,8 @@ _RATIO = 3.0  # of areas from frame to frame that may be the same object's
 _LOST = 2  # frames after which an object that was not found is no longer looked for
 _GRABCUT_ROUNDS = 4
 _LONGEST = 800  # side of a photograph that GrabCut works on [px]
+_AROUND = 1.3  # size of the floor around a board, in boards
+_NEUTRAL = (12.0, 0.12)  # range of the channels of a neutral pixel: levels, and part of the largest
 
 
 @dataclass(frozen=True, eq=False)
@@ -418,8 +420,44 @@ def _grabcut(
     return _component(inside)
 
 
+def without_print(pixels: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """A picture whose printed board is hidden under floor: it stands out more than most objects.
+
+    What is neutral inside the board is taken for print, under the tint of its white; what has colour and lies on the
+    board stays. A hidden pixel has the colour of one around the board, drawn at random, so that neither pattern nor
+    edge is left.
+
+    Args:
+        pixels: (H, W, 3), uint8.
+        corners: of the board in the picture, in their order, (4, 2) [px]; they may lie outside.
+    """
+    cv2 = opencv()
+    outlines = [np.zeros(pixels.shape[:2], np.uint8) for _ in range(2)]
+    middle = corners.mean(axis=0)
+    for outline, size in zip(outlines, (1.0, _AROUND)):
+        cv2.fillConvexPoly(outline, np.rint(middle + size * (corners - middle)).astype(np.int32), 1)
+    inside = outlines[0].astype(bool)
+    around = pixels[outlines[1].astype(bool) & ~inside]
+    if not inside.any() or len(around) == 0:
+        return pixels
+    smooth = cv2.medianBlur(pixels, 3)[inside].astype(np.float32)
+    brightness = smooth.max(axis=1)
+    white = np.median(smooth[brightness >= np.quantile(brightness, 0.8)], axis=0)
+    balanced = smooth * (white.max() / np.maximum(white, 1))
+    neutral = np.ptp(balanced, axis=1) < _NEUTRAL[0] + _NEUTRAL[1] * balanced.max(axis=1)
+    hidden = inside.copy()
+    hidden[inside] = neutral
+    hidden = cv2.morphologyEx(hidden.view(np.uint8), cv2.MORPH_CLOSE, _cross()).view(bool) & inside
+    plain = pixels.copy()
+    plain[hidden] = around[np.random.default_rng(0).integers(len(around), size=int(hidden.sum()))]
+    return plain
+
+
 def photograph_mask(
-    pixels: np.ndarray, saliency: Callable[[np.ndarray], np.ndarray], name: str | Path
+    pixels: np.ndarray,
+    saliency: Callable[[np.ndarray], np.ndarray],
+    name: str | Path,
+    board: np.ndarray | None = None,
 ) -> np.ndarray:
     """Mask of the object in a photograph.
 
@@ -427,6 +465,7 @@ def photograph_mask(
         pixels: the picture.
         saliency: `neuma_lib.capture.saliency.Saliency`, or another that gives (H, W) in [0, 1].
         name: of the file, for messages.
+        board: corners of the printed board in the picture, (4, 2) [px]; None: there is none, or it is not in view.
 
     Raises:
         InputError: nothing stands out.
@@ -435,7 +474,7 @@ def photograph_mask(
     height, width = pixels.shape[:2]
     scale = min(1.0, _LONGEST / max(height, width))
     small = cv2.resize(pixels, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
-    probability = saliency(small)
+    probability = saliency(small if board is None else without_print(small, scale * board))
     likely = _component(probability > 0.5)
     if not likely.any():
         raise InputError(

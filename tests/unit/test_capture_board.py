@@ -306,3 +306,21 @@ def test_floor_is_found_among_other_points():
 def test_looking_at_is_a_rotation():
     pose = looking_at(np.array([1.0, 2, 3]), np.zeros(3))
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1) and (pose @ [0, 0, 0, 1])[2] > 0
+
+
+def test_the_outline_of_the_board_is_a_square_larger_than_its_squares():
+    pose, K = around(1)[0], np.array([[700.0, 0, 400], [0, 700, 300], [0, 0, 1]])
+    room = boards.room_from_board(BOARD, None)
+    in_room = np.eye(4)  # room to camera, through the board's frame
+    back = room.inverse()
+    in_room[:3, :3] = pose[:3, :3] @ back.rotation
+    in_room[:3, 3] = pose[:3, :3] @ back.translation + pose[:3, 3]
+    found = boards.board_outline(BOARD, None, in_room, K)
+    s, (columns, rows) = BOARD.square, BOARD.squares
+    corner = pose[:3, :3] @ (-s, -s, 0) + pose[:3, 3]
+    opposite = pose[:3, :3] @ ((columns + 1) * s, (rows + 1) * s, 0) + pose[:3, 3]
+    for k, point in ((0, corner), (2, opposite)):
+        seen = K @ point
+        np.testing.assert_allclose(found[k], seen[:2] / seen[2])
+    in_room[2] *= -1
+    assert boards.board_outline(BOARD, None, in_room, K) is None

