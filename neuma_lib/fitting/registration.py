@@ -49,15 +49,17 @@ CLEAR_ANGLE = 10.0
 SPIN_SIGNIFICANCE = 11.3
 """Squared distance of the spin from 0, in standard deviations, below which there is none: one percent of chi-squared
 variables with three degrees of freedom exceed it."""
-LIKELY_SPIN, LIKELY_SIZE = 10.0, 0.01
-"""Standard deviations of the spin of a dropped object [rad/s] and of the size of its Gaussians, before it is seen."""
+LIKELY_SPIN = 10.0
+"""Standard deviation of the spin of a dropped object [rad/s], before it is seen."""
+LIKELY_SIZE, ANY_SIZE = 0.01, 0.3
+"""Standard deviations of the relative size of its Gaussians, before: in metres, and in a world of unknown scale."""
 
 SHOWN = 3
 """Pictures of each camera that are shown beside their renders."""
 
 _TURN, _PLACE, _VELOCITY, _SPIN, _SIZE, _OFFSETS = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), 12, 13
 _ANY_TURN = np.pi / np.sqrt(3)  # deviation of an angle that is not known at all [rad]
-_UNITS = np.array([_ANY_TURN] * 3 + [0.1] * 3 + [1.0] * 3 + [LIKELY_SPIN] * 3 + [LIKELY_SIZE])
+_UNITS = np.array([_ANY_TURN] * 3 + [0.1] * 3 + [1.0] * 3 + [LIKELY_SPIN] * 3)
 _OFFSET_UNIT = 0.01  # [s]
 _ACROSS = 24  # diameter of the object in the pictures of the search [px]
 _STARTS = 24  # rotations of the grid that are refined
@@ -134,12 +136,13 @@ class Agreement:
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """A photographed object placed into its video, x_video = R x_photo + t at the time `start`.
+    """A photographed object placed into its video, x_video = s R x_photo + t at the time `start`.
 
     Attributes:
         names: of the cameras.
         start: the first frame of the flight that all cameras saw, by the first camera's clock [s].
         pivot: the centre of mass as photographed [m], (3,).
+        scale_known: whether the photographs are in metres of the video, s = 1.
         found: pose and motion.
         covariance: of a turn about the world's axes [rad], the centre [m], velocity [m/s], spin [rad/s], enlargement
             and the offsets of the cameras but the first [s], (12 + cameras,) squared; 0 for what was stated.
@@ -155,6 +158,7 @@ class Registration:
     names: tuple[str, ...]
     start: float
     pivot: np.ndarray
+    scale_known: bool
     found: Found
     covariance: np.ndarray
     before: Agreement
@@ -170,8 +174,16 @@ class Registration:
         return self.found.motion.rotation
 
     @property
+    def scale(self) -> float:
+        return 1.0 if self.scale_known else 1.0 + self.found.enlargement
+
+    @property
     def translation(self) -> np.ndarray:
-        return self.found.motion.centre - self.rotation @ self.pivot
+        return self.found.motion.centre - self.scale * self.rotation @ self.pivot
+
+    def place(self, x: np.ndarray) -> np.ndarray:
+        """Points (N, 3) [m] of the object as photographed, in the video at the time `start`."""
+        return self.scale * x @ self.rotation.T + self.translation
 
     @property
     def turn_deviations(self) -> np.ndarray:
@@ -238,6 +250,7 @@ class Registration:
             "t0_s": self.start,
             "rotation": self.rotation.tolist(),
             "translation": self.translation.tolist(),
+            "scale": self.scale,
             "pivot": self.pivot.tolist(),
             "centre": self.found.motion.centre.tolist(),
             "turn_deg": float(np.degrees(Rotation.from_matrix(self.rotation).magnitude())),
@@ -324,6 +337,7 @@ def register(
     sights: Sequence[Sight],
     parabola: Parabola,
     name: str,
+    scale_known: bool = True,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> Registration:
     """Find pose and motion of a photographed object in its video.
@@ -334,6 +348,8 @@ def register(
         sights: frames of free flight of each camera, in metres of the Gaussians, the first of which keeps the time.
         parabola: of the masks' centres.
         name: of the throw, for messages.
+        scale_known: whether photographs and video are in the same metres; otherwise the size is found along, if it is
+            right within a factor of 1.5 or so.
         progress: called with (step, steps, root mean square residual).
 
     Raises:
@@ -351,6 +367,7 @@ def register(
     motion = RigidMotion(np.eye(3), parabola.place, parabola.velocity, spin, parabola.gravity, inertia)
     offsets = np.array([sight.offset for sight in sights])
     fitted = [k for k in range(1, len(sights)) if not sights[k].offset_known]
+    size = LIKELY_SIZE if scale_known else ANY_SIZE
     nothing = Found(motion, offsets, 0.0, np.ones((len(sights), 3)))
 
     interval = float(np.median(np.diff(sights[0].times))) if len(sights[0].times) > 1 else 1.0
@@ -360,10 +377,10 @@ def register(
         chosen = [sight.select(_near(sight.clock - start, stage, interval)) for sight in sights]
         pictures = Pictures(body, chosen, stage.across, distances)
         if number == 0:
-            candidates = _search(pictures, nothing, start)
+            candidates = _search(pictures, nothing, start, scale_known)
         refined = []
         for k, candidate in enumerate(candidates):
-            refined.append(_refined(_Problem(pictures, candidate, start, fitted), stage))
+            refined.append(_refined(_Problem(pictures, candidate, start, fitted, size), stage))
             if progress:
                 done = (number * 100 + 100 * (k + 1) // len(candidates), len(STAGES) * 100)
                 progress(*done, float(np.sqrt(refined[-1].cost / pictures.covered)))
@@ -374,14 +391,14 @@ def register(
             others += [(f.cost / best, f) for f in candidates[len(going) :] + dropped]
             candidates = going or candidates[:1]
     best = candidates[0]
-    problem = _Problem(pictures, best, start, fitted)
+    problem = _Problem(pictures, best, start, fitted, size)
     covariance = _covariance(problem)
     spin, inverse = best.motion.spin, np.linalg.pinv(covariance[_SPIN, _SPIN])
     told = bool(spin @ inverse @ spin > SPIN_SIGNIFICANCE)
     if not told:
         still = replace(best, motion=replace(best.motion, spin=np.zeros(3)))
         places = set(range(problem.size)) - set(range(*_SPIN.indices(problem.size)))
-        problem = _Problem(pictures, still, start, fitted)
+        problem = _Problem(pictures, still, start, fitted, size)
         best = _refined(problem, STAGES[-1]._replace(free=tuple(sorted(places & set(problem.all)))))
     others = [(ratio, other) for ratio, other in others if _apart(best, other) >= DISTINCT]
     covariance += _spread(best, others)
@@ -391,6 +408,7 @@ def register(
         names=tuple(sight.name for sight in sights),
         start=start,
         pivot=pivot,
+        scale_known=scale_known,
         found=best,
         covariance=covariance,
         before=_agreement(pictures, before, start),
@@ -415,11 +433,13 @@ class _Problem:
         start: unknowns of what it begins with.
     """
 
-    def __init__(self, pictures: Pictures, begin: Found, time: float, fitted: Sequence[int]):
+    def __init__(
+        self, pictures: Pictures, begin: Found, time: float, fitted: Sequence[int], size: float = LIKELY_SIZE
+    ):
         self.pictures, self.begin, self.time = pictures, begin, time
         cameras = len(begin.offsets)
         self.size = _OFFSETS + cameras - 1
-        self.units = np.append(_UNITS, np.full(cameras - 1, _OFFSET_UNIT))
+        self.units = np.concatenate([_UNITS, [size], np.full(cameras - 1, _OFFSET_UNIT)])
         self.all = [*range(_OFFSETS), *(_OFFSETS + k - 1 for k in fitted)]
         self.start = np.zeros(self.size)
         self.start[_SPIN], self.start[_SIZE] = begin.motion.spin, begin.enlargement
@@ -533,29 +553,35 @@ def _near(times: np.ndarray, stage: Stage, interval: float) -> np.ndarray:
     return near[spread_frames(len(near), stage.frames)]
 
 
-def _search(pictures: Pictures, nothing: Found, start: float) -> list[Found]:
-    """The likeliest rotations of a grid, each placed by the centroids of the masks."""
+def _search(pictures: Pictures, nothing: Found, start: float, scale_known: bool) -> list[Found]:
+    """The likeliest rotations of a grid, each placed by the centroids of the masks; if the scale is not known, with the
+    size that their areas have in the mean."""
     motion, times = nothing.motion, _times(pictures, nothing, start)
     grid = np.concatenate([np.eye(3)[None], spread_rotations(GRID)])
     centres, _ = motion.place(times)
     turns = Rotation.from_rotvec(times[:, None] * motion.spin).as_matrix()
     rotations = (turns @ grid[:, None]).reshape(-1, 3, 3)
     picture = np.tile(np.arange(len(times)), len(grid))
-    renders = pictures.render(rotations, np.tile(centres, (len(grid), 1)), picture)
-    pictures.fit_gains(renders, grey=True)
+    every = np.tile(centres, (len(grid), 1))
+    renders, larger, (seen, seen_area) = pictures.render(rotations, every, picture), 0.0, pictures.moments()
     there, area = pictures.moments(renders, picture)
-    seen, seen_area = pictures.moments()
+    if not scale_known:
+        larger = float(np.sqrt(seen_area.mean() / area.mean())) - 1
+        renders = pictures.render(rotations, every, picture, larger)
+        there, area = pictures.moments(renders, picture)
+    pictures.fit_gains(renders, grey=True)
     off = (seen[picture] - there).reshape(len(grid), -1, 2)
     ratio = (seen_area[picture] / np.maximum(area, 1e-9)).reshape(len(grid), -1)
     moved = pictures.shifts(np.nan_to_num(off), ratio, centres, np.arange(len(times)))
     at = (centres + moved[:, None]).reshape(-1, 3)
-    costs = pictures.residuals(pictures.render(rotations, at, picture), picture)[1].numpy()
+    costs = pictures.residuals(pictures.render(rotations, at, picture, larger), picture)[1].numpy()
     costs = costs.reshape(len(grid), -1).sum(axis=1)
     gains = pictures.gains.copy()
     return [
         replace(
             nothing,
             motion=replace(motion, rotation=grid[k], centre=motion.centre + moved[k]),
+            enlargement=larger,
             gains=gains,
             cost=float(costs[k]),
         )
@@ -566,7 +592,8 @@ def _search(pictures: Pictures, nothing: Found, start: float) -> list[Found]:
 def _refined(problem: _Problem, stage: Stage) -> Found:
     """The best pose near what a problem begins with, and the gains there."""
     pictures, u = problem.pictures, problem.start
-    free = [k for k in problem.all if stage.free is None or k in stage.free]
+    pose = (*_POSE, _SIZE) if problem.units[_SIZE] == ANY_SIZE else _POSE
+    free = [k for k in problem.all if stage.free is None or k in stage.free or k in pose]
     residuals = _Central(problem) if stage.central else problem
     for _ in range(2 if stage.central else 1):
         u, fit, _ = levenberg_marquardt(

@@ -1,4 +1,4 @@
-"""Gaussians that have been moved as one rigid body."""
+"""Gaussians that have been moved as one body."""
 
 from __future__ import annotations
 
@@ -11,13 +11,17 @@ from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.spherical_harmonics import basis
 
 
-def moved(gaussians: Gaussians, rotation: torch.Tensor, translation: torch.Tensor) -> Gaussians:
-    """Gaussians after a rigid motion, x to R x + t, R (3, 3) and t (3,) [m]; their colours turn along."""
+def moved(
+    gaussians: Gaussians, rotation: torch.Tensor, translation: torch.Tensor, scale: float = 1.0
+) -> Gaussians:
+    """Gaussians after a similarity, x to s R x + t, R (3, 3) and t (3,) [m]; their colours turn along."""
     R, t = rotation.to(gaussians.means), translation.to(gaussians.means)
     quats = _product(_quaternion(R), torch.nn.functional.normalize(gaussians.quats, dim=-1))
     sh = rotated(gaussians.sh(), rotation)
-    means = gaussians.means @ R.mT + t
-    return dataclasses.replace(gaussians, means=means, quats=quats, sh0=sh[:, :1], shN=sh[:, 1:])
+    means, scales = scale * gaussians.means @ R.mT + t, scale * gaussians.scales
+    return dataclasses.replace(
+        gaussians, means=means, scales=scales, quats=quats, sh0=sh[:, :1], shN=sh[:, 1:]
+    )
 
 
 def rotated(sh: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:

@@ -14,6 +14,7 @@ rule capture_registration:
         sampled=of_the_object("sampled_particles.h5"),
         particles=of_the_object("particles.h5"),
         binding=of_the_object("binding.h5"),
+        photographs=of_thrown(lambda wildcards: f"{DATA}/{wildcards.capture}/static/transforms.json"),
         transforms=of_filmed(MATTES),
         timelines=of_filmed(f"{RESULTS}/{{capture}}/frames/{{throw}}/{{camera}}.json"),
         flight=of_thrown(lambda wildcards: FLIGHT.format(**vars(wildcards)) + ".json"),

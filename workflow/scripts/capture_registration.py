@@ -36,31 +36,34 @@ def main(inputs, output, params, run) -> None:
     )
     sights = [sight(*values, flight) for values in files]
     world = read_transforms(listed(inputs.transforms)[0]).get("world", {})
+    scale_known = read_transforms(inputs.photographs).get("scale_known", True)
     found = register(
         gaussians,
         x.double().numpy(),
         vol0.double().numpy(),  # of one density
         sights,
-        parabola(flight, world.get("scale", 1.0), np.asarray(world.get("offset", 0.0))),
+        parabola(flight, world.get("scale", 1.0), np.asarray(world.get("offset", 0.0)), scale_known),
         params.name,
+        scale_known,
         run.progress,
     )
-    R, t = torch.from_numpy(found.rotation), torch.from_numpy(found.translation)
-    placed = x.double() @ R.mT + t
+    placed = found.place(x.double().numpy())
     if placed.min() < 0 or placed.max() > 1:
         raise InputError(
             f"{params.name}: the flight begins outside the simulator's box, which is shown in floor.png: move it by"
             " `center` in capture.yaml, or make it larger with `scale`"
         )
-    save_gaussians(output.gaussians, moved(gaussians, R, t))
+    R, t = torch.from_numpy(found.rotation), torch.from_numpy(found.translation)
+    save_gaussians(output.gaussians, moved(gaussians, R, t, found.scale))
     vertices, faces = read_ply(inputs.mesh)
-    corners = np.stack([vertices[axis] for axis in "xyz"], axis=1) @ found.rotation.T + found.translation
-    for axis, values in zip("xyz", corners.T):
+    corners = np.stack([vertices[axis] for axis in "xyz"], axis=1)
+    for axis, values in zip("xyz", found.place(corners).T):
         vertices[axis] = values
     write_ply(output.mesh, vertices, faces)
     for source, target in ((inputs.sampled, output.sampled), (inputs.particles, output.particles)):
         x, vol0, attributes = load_particles(source)
-        save_particles(target, (x.double() @ R.mT + t).to(x), vol0, attributes)
+        placed = torch.from_numpy(found.place(x.double().numpy()))
+        save_particles(target, placed.to(x), found.scale**3 * vol0, attributes)
     with atomic(output.binding) as partial:
         shutil.copyfile(inputs.binding, partial)
     pictures = []
@@ -90,14 +93,18 @@ def sight(camera, transforms, timeline, row_time, flight) -> Sight:
     return Sight(camera, times, pixels, images.viewmats[0], images.Ks[0], flight["offsets_s"][camera], known)
 
 
-def parabola(flight, scale, offset) -> Parabola:
-    """The flight of the masks' centre, from the room's metres to those of the simulator."""
+def parabola(flight, scale, offset, metric) -> Parabola:
+    """The flight of the masks' centre, from the room's metres to those of the simulator.
+
+    Gravity is known, but measured where lengths are not metres.
+    """
+    gravity = [0.0, -GRAVITY, 0.0] if metric else flight["gravity_m_s2"]
     spin, sure = flight["spin_rad_s"], flight["spin_deviation_rad_s"]
     return Parabola(
         flight["start_s"],
         scale * np.array(flight["x0_m"]) + offset,
         scale * np.array(flight["v0_m_s"]),
-        np.array([0.0, -GRAVITY * scale, 0.0]),
+        scale * np.array(gravity),
         np.array(spin) if spin and np.linalg.norm(sure) < KNOWN_SPIN else None,
     )
 
