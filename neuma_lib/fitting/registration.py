@@ -63,6 +63,7 @@ _UNITS = np.array([_ANY_TURN] * 3 + [0.1] * 3 + [1.0] * 3 + [LIKELY_SPIN] * 3)
 _OFFSET_UNIT = 0.01  # [s]
 _ACROSS = 24  # diameter of the object in the pictures of the search [px]
 _STARTS = 24  # rotations of the grid that are refined
+_FIRST_WEIGHT, _LEAST_WEIGHT = 0.5, 0.1  # of colours beside coverage: at first, and at least
 _HOPELESS = 4.0  # times the cost of the best pose, all frames compared, from which on a pose is left behind
 
 
@@ -373,9 +374,11 @@ def register(
     interval = float(np.median(np.diff(sights[0].times))) if len(sights[0].times) > 1 else 1.0
     candidates: list[Found] = []
     others: list[tuple[float, Found]] = []
+    weights = np.full(len(sights), _FIRST_WEIGHT)
     for number, stage in enumerate(STAGES):
         chosen = [sight.select(_near(sight.clock - start, stage, interval)) for sight in sights]
         pictures = Pictures(body, chosen, stage.across, distances)
+        pictures.weights = weights
         if number == 0:
             candidates = _search(pictures, nothing, start, scale_known)
         refined = []
@@ -385,6 +388,8 @@ def register(
                 done = (number * 100 + 100 * (k + 1) // len(candidates), len(STAGES) * 100)
                 progress(*done, float(np.sqrt(refined[-1].cost / pictures.covered)))
         candidates, dropped = _distinct(refined, stage.kept)
+        if 0 < number < len(STAGES) - 1:
+            weights = _colour_weights(pictures, candidates[0], start)
         if stage.reach == np.inf:
             best = max(candidates[0].cost, LEAST_COST)
             going = [f for f in candidates if f.cost < _HOPELESS * best and stage is not STAGES[-1]]
@@ -545,6 +550,13 @@ def _costs(pictures: Pictures, found: Found, start: float) -> np.ndarray:
     return pictures.residuals(_render(pictures, found, start))[1].numpy()
 
 
+def _colour_weights(pictures: Pictures, found: Found, start: float) -> np.ndarray:
+    """Weights of the colours beside coverage by how well they agree in a pose, (cameras,)."""
+    pictures.gains = found.gains.copy()
+    ratio = pictures.residual_ratio(_render(pictures, found, start))
+    return np.clip(ratio, _LEAST_WEIGHT, 1.0)
+
+
 def _near(times: np.ndarray, stage: Stage, interval: float) -> np.ndarray:
     """Indices of the frames of a camera that a stage compares, at least one; ``times`` from the start on [s]."""
     near = np.flatnonzero(np.abs(times) <= stage.reach * interval)
@@ -661,7 +673,7 @@ def _difference(a: Found, b: Found) -> np.ndarray:
 
 
 def _agreement(pictures: Pictures, found: Found, start: float) -> Agreement:
-    pictures.gains = found.gains.copy()
+    pictures.gains, pictures.weights = found.gains.copy(), np.ones(pictures.cameras)
     renders = _render(pictures, found, start)
     costs = pictures.residuals(renders)[1].numpy()
     return Agreement(pictures.camera.copy(), *pictures.agreement(renders, costs))

@@ -3,9 +3,9 @@
 A camera that sees a moved body sees what a camera that moved the other way would see of the body at rest. So all
 pictures are views of the Gaussians as photographed, whose colours turn with the body, in one call of the rasterizer.
 
-Compared are colours over black and coverage. What light does to colours is left to be fitted along, in closed form: a
-factor on each channel of a camera (its gain), and a grey factor that is linear across the body, for each picture, since
-shading stays with the lamps while the body turns (`Shade`).
+Compared are colours over black and coverage. The light of the photographs is in the colours of the Gaussians, and the
+body has turned in it. So a factor on each channel of a camera (its gain) and, for each picture, a grey factor that is
+linear across the body are fitted along, in closed form; and colours count the less, the less they agree (`weights`).
 """
 
 from __future__ import annotations
@@ -28,12 +28,14 @@ from neuma_lib.splatting.rasterizer import rasterize
 
 LOCAL = 7
 """Unknowns that a picture depends on: a turn of the body [rad], a shift [m], both in world axes, its enlargement."""
-SHADE_WEIGHT = 0.04
+SHADE_WEIGHT = 0.004
 """A factor of shading that is off by 1 costs as much as a residual of the root of this all over the body."""
 _MARGIN = 1.2
 """Side of a crop, in diameters of the body."""
 _STEP = 0.3
 """Half width of the differences [px]."""
+_DARK, _LEAST_TOLD = 0.04, 20
+"""Colour below which a pixel tells no gain, and pixels that do."""
 _BATCH_BYTES = 48e6
 
 
@@ -128,6 +130,7 @@ class Pictures:
         side: of the crops [px].
         spacing: of the world's points that are a pixel apart on the body [m], of each picture, (N,).
         gains: factor on the body's colours of each camera, (cameras, 3).
+        weights: of the residuals of colours beside those of coverage, (cameras,).
         covered: pixels of all masks.
     """
 
@@ -149,7 +152,7 @@ class Pictures:
         self.side = int(np.ceil(max(sizes)))
         self.camera = np.repeat(np.arange(len(sights)), [len(sight.images) for sight in sights])
         self.times = np.concatenate([sight.times for sight in sights])
-        self.gains = np.ones((self.cameras, 3))
+        self.gains, self.weights = np.ones((self.cameras, 3)), np.ones(self.cameras)
         images, valid, Ks, blur, spacing = [], [], [], [], []
         for sight, factor, distance in zip(sights, factors, distances, strict=True):
             for image, box in zip(sight.images, sight.boxes(), strict=True):
@@ -171,7 +174,7 @@ class Pictures:
         y, x = torch.meshgrid(*[torch.linspace(-1, 1, self.side)] * 2, indexing="ij")
         self._ramps = torch.stack([torch.ones_like(x), x, y], dim=-1)
         self._mask_size = self._observed[..., 3].sum(dim=(1, 2))
-        self._shade_cost, self.covered = SHADE_WEIGHT * self._mask_size, float(self._mask_size.sum())
+        self.covered = float(self._mask_size.sum())
         self._factor = np.array(factors)[self.camera]
 
     def __len__(self) -> int:
@@ -241,35 +244,49 @@ class Pictures:
         return found
 
     def fit_gains(self, renders: Tensor, grey: bool = False) -> None:
-        """Set the gains: seen over rendered, where both show the body; of grey alone, from any pictures of it.
+        """Set the gains to medians of seen over rendered, where both show the body.
+
+        What the light changes differs from place to place and is alike in all channels: so the channels of a pixel tell
+        the tint, and all pixels the brightness.
 
         Args:
             renders: of all pictures in turn, any number of times.
+            grey: whether the tint is left at 1, because renders show other parts of the body.
         """
         picture = np.arange(len(renders)) % len(self)
-        seen = self._observed[picture]
-        both = ((seen[..., 3:] > 0.5) & (renders[..., 3:] > 0.5) & (self._valid[picture] > 0)).float()
-        sums = (
-            torch.stack([(both * each[..., :3]).sum(dim=(1, 2)) for each in (seen, renders)]).double().numpy()
-        )
         for camera in range(self.cameras):
-            above, below = sums[:, self.camera[picture] == camera].sum(axis=1)
-            if grey:
-                above, below = above.sum(keepdims=True), below.sum(keepdims=True)
-            if (below > 0).all():
-                self.gains[camera] = np.clip(above / below, 0.1, 10.0)
+            of = self.camera[picture] == camera
+            seen, rendered = self._observed[picture[of]], renders[of]
+            both = torch.minimum(seen, rendered)
+            told = (both[..., 3] > 0.5) & (both[..., :3].amin(dim=-1) > _DARK)
+            if int(told.sum()) >= _LEAST_TOLD:
+                ratio = (seen[..., :3][told] / rendered[..., :3][told]).log()
+                brightness = ratio.mean(dim=1, keepdim=True)
+                tint = (ratio - brightness).median(dim=0).values
+                tint = 0 * tint if grey else tint - tint.mean()
+                self.gains[camera] = (tint + brightness.median()).exp().double().numpy()
+
+    def residual_ratio(self, renders: Tensor) -> np.ndarray:
+        """Root mean square residuals of coverage over those of colours, of each camera, (cameras,).
+
+        Where light makes colours differ, they say less than outlines about the pose, by that ratio.
+        """
+        self.weights = np.ones(self.cameras)
+        squares = self.residuals(renders)[0].square().sum(dim=(1, 2)).double().numpy()
+        sums = np.stack([squares[self.camera == k].sum(axis=0) for k in range(self.cameras)])
+        return np.sqrt(sums[:, 3] / np.maximum(sums[:, :3].mean(axis=1), 1e-12))
 
     def residuals(self, renders: Tensor, picture: np.ndarray | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Rendered minus seen (M, side, side, 4), with the best shading; its cost (M,); shading columns (M, P, 3)."""
         picture = np.arange(len(self)) if picture is None else picture
         valid = self._valid[picture]
         lit = self._lit(renders, picture) * valid
-        r = lit - self._observed[picture] * valid
+        r = lit - self._weighted(self._observed[picture], picture) * valid
         shade = _columns(lit[..., :3, None] * self._ramps[:, :, None])  # of the colours; coverage has none
         flat = r[..., :3].reshape(len(r), -1)
         a = -torch.linalg.solve(self._shade_normal(shade, picture), shade.mT @ flat[..., None])
         r = torch.cat([(flat + (shade @ a)[..., 0]).reshape(r[..., :3].shape), r[..., 3:]], dim=-1)
-        cost = r.square().sum(dim=(1, 2, 3)) + self._shade_cost[picture] * a[..., 0].square().sum(dim=1)
+        cost = r.square().sum(dim=(1, 2, 3)) + self._shade_cost(picture) * a[..., 0].square().sum(dim=1)
         return r, cost.double(), shade
 
     def normal_equations(
@@ -331,7 +348,7 @@ class Pictures:
         return curvature.numpy(), (blocks.mT @ off)[..., 0].double().numpy(), cost.numpy()
 
     def _shade_normal(self, shade: Tensor, picture: np.ndarray) -> Tensor:
-        return shade.mT @ shade + torch.diag_embed(self._shade_cost[picture, None].expand(-1, 3))
+        return shade.mT @ shade + torch.diag_embed(self._shade_cost(picture)[:, None].expand(-1, 3))
 
     def agreement(self, renders: Tensor, costs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """IoU of outlines and masks, distance of their centroids in pixels of the video, and root mean square residual
@@ -351,14 +368,29 @@ class Pictures:
             for k in of[spread_frames(len(of), most)]:
                 seen, rendered = (
                     np.clip((image[..., :3] + 1 - image[..., 3:]).numpy(), 0, 1)
-                    for image in (self._observed[k], self._lit(renders[k : k + 1], np.array([k]))[0])
+                    for image in (
+                        self._observed[k],
+                        self._scaled(renders[k : k + 1], self.gains[[camera]])[0],
+                    )
                 )
                 found.append(Shown(camera, float(self.times[k]), seen, rendered))
         return found
 
+    def _shade_cost(self, picture: np.ndarray) -> Tensor:
+        weights = torch.tensor(self.weights[self.camera[picture]]).float()
+        return SHADE_WEIGHT * weights**2 * self._mask_size[picture]
+
+    def _weighted(self, images: Tensor, picture: np.ndarray) -> Tensor:
+        return self._scaled(images, np.repeat(self.weights[:, None], 3, axis=1)[self.camera[picture]])
+
     def _lit(self, renders: Tensor, picture: np.ndarray) -> Tensor:
-        gains = torch.tensor(self.gains).float()[self.camera[picture]]
-        return renders * torch.cat([gains, torch.ones(len(gains), 1)], dim=1)[:, None, None]
+        return self._scaled(renders, (self.gains * self.weights[:, None])[self.camera[picture]])
+
+    @staticmethod
+    def _scaled(images: Tensor, factors: np.ndarray) -> Tensor:
+        """Images (M, side, side, 4) with their colours times factors (M, 3)."""
+        factors = torch.tensor(factors).float()
+        return images * torch.cat([factors, torch.ones(len(factors), 1)], dim=1)[:, None, None]
 
 
 def _columns(values: Tensor) -> Tensor:

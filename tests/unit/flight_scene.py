@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from neuma_lib.fitting.rigid_views import Sight
 from neuma_lib.splatting.cameras import look_at
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.rasterizer import rasterize
+from neuma_lib.splatting.spherical_harmonics import SH_C0
 
 GRAVITY = np.array([0.0, -9.81, 0.0])
 PLACE, VELOCITY, SPIN = (
@@ -33,6 +34,8 @@ class Thing:
     gaussians: Gaussians
     particles: np.ndarray
     mass: np.ndarray
+    normals: np.ndarray
+    albedo: np.ndarray
 
     @property
     def pivot(self):
@@ -60,7 +63,7 @@ def thing(count=500, radii=(0.06, 0.04, 0.05), coloured=True, bump=0.5, seed=0) 
         quats=torch.tensor(quats).float(),
         scales=torch.tensor(spacing * np.array([0.7, 0.7, 0.15])).float().repeat(count, 1),
         opacities=torch.full((count,), 0.95),
-        sh0=torch.tensor((colour - 0.5) / 0.28209479).float()[:, None],
+        sh0=torch.tensor((colour - 0.5) / SH_C0).float()[:, None],
         shN=torch.zeros(count, 0, 3),
     )
     inside = rng.normal(size=(800, 3))
@@ -68,7 +71,7 @@ def thing(count=500, radii=(0.06, 0.04, 0.05), coloured=True, bump=0.5, seed=0) 
     grown = 1 + bump * np.exp(
         -((inside / np.linalg.norm(inside, axis=1, keepdims=True) - (0.8, 0.6, 0)) ** 2).sum(axis=1) / 0.15
     )
-    return Thing(gaussians, inside * radii * grown[:, None] + photographed, np.ones(800))
+    return Thing(gaussians, inside * radii * grown[:, None] + photographed, np.ones(800), normal, colour)
 
 
 def _frame(normal):
@@ -78,13 +81,37 @@ def _frame(normal):
     return np.stack([x, np.cross(normal, x), normal], axis=1)
 
 
+def lit(albedo, normals):
+    """Colours under two lamps and the sky, (N, 3)."""
+    lamps = np.array([[0.3, 0.9, 0.3], [-0.8, 0.5, 0.3]]) / np.array([[0.995], [0.99]])
+    light = np.maximum(normals @ lamps.T, 0) @ (0.5, 0.25) + 0.25 + 0.1 * normals[:, 1]
+    return np.clip(albedo * light[:, None], 0, 1)
+
+
+def photographed_in_light(body: Thing) -> Thing:
+    """The body with the light of its photographs in its colours, and something grey where it lay on the floor."""
+    colour = lit(body.albedo, body.normals)
+    colour[body.normals[:, 1] < -0.6] = 0.25
+    g = body.gaussians
+    return replace(body, gaussians=replace(g, sh0=torch.tensor((colour - 0.5) / SH_C0).float()[:, None]))
+
+
 def true_motion(body: Thing, rotation, spin=SPIN) -> RigidMotion:
     inertia = moment_of_inertia(body.particles - body.pivot, body.mass)
     return RigidMotion(np.asarray(rotation), PLACE, VELOCITY, np.asarray(spin, float), GRAVITY, inertia)
 
 
 def filmed(
-    body: Thing, motion: RigidMotion, views=2, frames=12, rate=120.0, offset=0.0, noise=0.0, size=SIZE, seed=0
+    body: Thing,
+    motion: RigidMotion,
+    views=2,
+    frames=12,
+    rate=120.0,
+    offset=0.0,
+    noise=0.0,
+    size=SIZE,
+    seed=0,
+    light=False,
 ):
     """`Sight`s of a flight; the clock of the second camera is ``offset`` behind. They know nothing of the offset."""
     rng, width, height = np.random.default_rng(seed), *size
@@ -102,10 +129,17 @@ def filmed(
         R, c = torch.tensor(R).float(), torch.tensor(c).float()
         means = (g.means - torch.tensor(body.pivot).float()) @ R.mT + c[:, None]
         covars = R[:, None] @ g.covars() @ R[:, None].mT
-        image, alpha = rasterize(
-            means, covars, g.opacities, g.sh(), torch.tensor(viewmats[k : k + 1]).float(),
-            torch.tensor(K[None]).float(), width, height, background=(0.0, 0.0, 0.0), eps2d=0.0,
-        )  # fmt: skip
+        pictures = []
+        for m, c, turn in zip(means, covars, R.numpy()):
+            sh = g.sh()
+            if light:
+                shaded = lit(body.albedo, body.normals @ turn.T)
+                sh = torch.tensor((shaded - 0.5) / SH_C0).float()[:, None]
+            pictures.append(rasterize(
+                m[None], c[None], g.opacities, sh, torch.tensor(viewmats[k : k + 1]).float(),
+                torch.tensor(K[None]).float(), width, height, background=(0.0, 0.0, 0.0), eps2d=0.0,
+            ))  # fmt: skip
+        image, alpha = (torch.cat(parts) for parts in zip(*pictures))
         a = alpha[:, 0].numpy()[..., None]
         colour = GAINS[k] * image[:, 0].numpy() / np.maximum(a, 1e-6) + noise * rng.normal(
             size=(*a.shape[:3], 3)
