@@ -36,6 +36,8 @@ _STEP = 0.3
 """Half width of the differences [px]."""
 _DARK, _LEAST_TOLD = 0.04, 20
 """Colour below which a pixel tells no gain, and pixels that do."""
+_LIKELY_TINT = 0.15
+"""Standard deviation of a camera's tint, as a logarithm."""
 _BATCH_BYTES = 48e6
 
 
@@ -247,7 +249,8 @@ class Pictures:
         """Set the gains to medians of seen over rendered, where both show the body.
 
         What the light changes differs from place to place and is alike in all channels: so the channels of a pixel tell
-        the tint, and all pixels the brightness.
+        the tint, and all pixels the brightness. Where pixels disagree on the tint, as they do on a side that was not
+        photographed, it is taken to be smaller.
 
         Args:
             renders: of all pictures in turn, any number of times.
@@ -262,8 +265,10 @@ class Pictures:
             if int(told.sum()) >= _LEAST_TOLD:
                 ratio = (seen[..., :3][told] / rendered[..., :3][told]).log()
                 brightness = ratio.mean(dim=1, keepdim=True)
-                tint = (ratio - brightness).median(dim=0).values
-                tint = 0 * tint if grey else tint - tint.mean()
+                tints = ratio - brightness
+                tint = tints.median(dim=0).values
+                spread = (tints - tint).abs().median() / 2
+                tint = 0 * tint if grey else (tint - tint.mean()) / (1 + (spread / _LIKELY_TINT) ** 2)
                 self.gains[camera] = (tint + brightness.median()).exp().double().numpy()
 
     def residual_ratio(self, renders: Tensor) -> np.ndarray:

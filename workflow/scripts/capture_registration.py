@@ -34,7 +34,7 @@ def main(inputs, output, params, run) -> None:
         params.timing["row_times"],
         strict=True,
     )
-    sights = [sight(*values, flight) for values in files]
+    sights = [sight(*values, flight, params.name) for values in files]
     world = read_transforms(listed(inputs.transforms)[0]).get("world", {})
     scale_known = read_transforms(inputs.photographs).get("scale_known", True)
     found = register(
@@ -81,11 +81,15 @@ def main(inputs, output, params, run) -> None:
         run.say(f"not told: {found.ambiguous}")
 
 
-def sight(camera, transforms, timeline, row_time, flight) -> Sight:
+def sight(camera, transforms, timeline, row_time, flight, name) -> Sight:
     """What a camera saw of the free flight."""
     data, images = read_transforms(transforms), read_image_set(transforms)
     first, last = flight["frames"][camera]
     flying = [k for k, step in enumerate(images.steps) if first <= step <= last]
+    if not flying:
+        raise InputError(
+            f"{name}, {camera}: {transforms} has none of the frames {first} to {last} of the flight"
+        )
     frames, pixels = [data["frames"][k] for k in flying], images.images[flying]
     rows = np.array([np.flatnonzero(image[..., 3].any(axis=1)).mean() + 0.5 for image in pixels])
     times = frame_times(frames, rows, row_time, read_json(timeline)["height"])
