@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from flight_scene import GAINS, filmed, guess, thing, true_motion
+from flight_scene import GAINS, filmed, guess, photographed_in_light, thing, true_motion
 from render_scenes import random_scene
 from scipy.spatial.transform import Rotation
 
@@ -75,6 +75,17 @@ def test_every_rotation_is_found(seed):
     found, errors = registered(body, motion, offset=OFFSET, noise=0.02, views=2 + seed % 2)
     check_exact(found, errors, motion)
     assert not found.ambiguous
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("coloured", [True, False])
+def test_lamps_that_stay_while_the_body_turns_do_not_mislead(coloured):
+    body = thing(count=300, coloured=coloured, bump=0.5 if coloured else 0.9)
+    motion = true_motion(body, Rotation.random(random_state=2).as_matrix())
+    photographed = photographed_in_light(body)  # and with a bottom that nobody saw
+    found, errors = registered(photographed, motion, offset=OFFSET, noise=0.02, light=True)
+    check_exact(found, errors, motion)
+    assert (np.abs(errors) < 4 * np.sqrt(np.diag(found.covariance)[:12])).all()
 
 
 def test_one_camera_is_enough_and_less_sure_of_the_depth():
