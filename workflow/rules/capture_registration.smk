@@ -1,11 +1,6 @@
 """The photographed object placed into the video of a throw, with its motion. Needs capture_motion.smk."""
 
 
-def of_the_object(file):
-    """A function of a scene that is a throw: a file of its object as photographed."""
-    return of_thrown(lambda wildcards: f"{RESULTS}/{wildcards.capture}/{file}")
-
-
 rule capture_registration:
     input:
         kernels=kernels("rendering"),

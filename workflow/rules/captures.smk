@@ -207,3 +207,8 @@ def one_clock(wildcards):
     """The timing of cameras that share a clock."""
     still = [0.0] * len(filmed_cameras(wildcards))
     return {"offsets": still, "row_times": still}
+
+
+def of_the_object(file):
+    """A function of a scene that is a throw: a file of its object as photographed."""
+    return of_thrown(lambda wildcards: f"{RESULTS}/{wildcards.capture}/{file}")

@@ -3,12 +3,6 @@
 EXPORT = f"{RESULTS}/{{scene}}/{{method}}/export"
 
 
-@checked
-def exported_motion(wildcards):
-    """How Gaussians follow their particles: those of a splat, of which many lie beside them, affinely."""
-    return "affine" if SETTINGS.scene(wildcards.scene).splat else gaussian_motion(wildcards)
-
-
 MOVED = {**body_files(), "rollout": f"{RESULTS}/{{scene}}/{{method}}/rollout.h5"}
 CARRIED = {"density": scene_setting("density"), "carrier": experiment_carrier}
 

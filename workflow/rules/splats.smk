@@ -1,38 +1,6 @@
 """Splats that were made elsewhere: their Gaussians and surface, and their motion under learned laws (docs/splats.md)."""
 
 
-def splat_setting(choose):
-    """A function of wildcards: something of the settings of their scene's splat."""
-    return checked(lambda wildcards: choose(SETTINGS.scene(wildcards.scene)))
-
-
-@checked
-def splat_start(wildcards):
-    """The start of a splat; its law comes from elsewhere, as it has no video to learn one from."""
-    scene, method = wildcards.scene, wildcards.method
-    prior_alone = not SETTINGS.method_material(scene, method).train and not (
-        SETTINGS.true_law(scene, method) or SETTINGS.is_identified(method) or SETTINGS.is_pac_nerf(method)
-    )
-    if SETTINGS.law_scene(scene, method) == scene and not prior_alone:
-        raise InputError(
-            f"{scene}/{method}: a splat has no video to learn a law from; take that of another scene, "
-            f"{method}+law_from=<scene>, or the prior alone, nclaw"
-        )
-    return of_chain("velocity.json")(wildcards)
-
-
-@checked
-def splat_simulation(wildcards):
-    dt, _ = SETTINGS.motion_clock(wildcards.scene, wildcards.method)
-    return simulator(dt)
-
-
-@checked
-def splat_frames(wildcards):
-    _, frames = SETTINGS.motion_clock(wildcards.scene, wildcards.method)
-    return list(frames)
-
-
 rule splat_gaussians:
     input:
         splat=splat_setting(lambda scene: scene.splat.file),
