@@ -146,7 +146,7 @@ class Config(Section):
             self.experiment_truth(name)
         for method in self.random.methods if self.random.count else ():
             self._law_from(method)
-        for method in (*self.figures.beside, *(self.demo.methods if self.methods else ())):
+        for method in (*self.figures.beside, *(self.demo.methods if "demo" in self.model_fields_set else ())):
             self._law_from(method)
         for table in self.tables.values():
             for method in (*table.methods, *table.if_made, *table.titles):

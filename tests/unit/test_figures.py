@@ -158,6 +158,17 @@ DATA = {
         ],
         column_titles=[f"{100 * i} ms" for i in range(6)],
     ),
+    "realworld": lambda: pictures(
+        6,
+        7,
+        {
+            "scenes": ["demo_cat_first", "demo_duck_first"],
+            "measures": [[[21.3, 0.123], [27.9, 0.071]], [[19.0, 0.2], [30.0, 0.05]]],
+            "times": [[f"{50 * i} ms" for i in range(7)]] * 2,
+        },
+        row_titles=["video", "Spring-Gaus", "NeuMA"] * 2,
+        column_titles=[str(i) for i in range(7)],
+    ),
     "gradient_analysis": lambda: {
         scene: {
             "norms": {"elastic": curves(50), "plastic": curves(50)},
