@@ -31,6 +31,8 @@ PICTURES = 15
 """Most pictures a second that are sent."""
 _STILL = 0.05
 """Seconds between looks at whether there is something new."""
+_READABLE = 0.5
+"""Seconds that a line of numbers stands: what changes with every picture cannot be read, and moves what is below it."""
 _FRUSTUM = 0.12
 _HANDLE = 0.55
 """Radius of what a hand grabs, in the longest side of the body."""
@@ -213,6 +215,7 @@ class ViewerServer:
         self._dirty = True
 
     _told: str | None = None
+    _said, _trouble = 0.0, (None, None, None)
 
     def _play(self, playing: bool) -> None:
         self._playing = playing
@@ -337,11 +340,14 @@ class ViewerServer:
             else:
                 self._points("left", snapshot.x, play.values(snapshot, name), name, self.scene.volume)
             self._handle.position = snapshot.x[: snapshot.counts[0]].mean(dim=0).numpy()
-        self._say(self._live_text(snapshot))
+        now, trouble = time.perf_counter(), (snapshot.trouble, snapshot.notice, self._told)
+        if now - self._said > _READABLE or trouble != self._trouble:
+            self._said, self._trouble = now, trouble
+            self._say(self._live_text(snapshot))
 
     def _live_text(self, snapshot: Snapshot) -> str:
         lines = [
-            f"**{snapshot.time:.2f} s**, {snapshot.rate:.0f} frames/s, {snapshot.pace:.2g} × real time, "
+            f"**{snapshot.time:.2f} s**, {snapshot.rate:.0f} frames/s, {snapshot.pace:.2f} × real time, "
             f"{len(snapshot.x)} particles, step {1e3 * snapshot.dt:.3g} ms"
         ]
         if snapshot.trouble:

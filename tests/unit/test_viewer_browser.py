@@ -92,7 +92,9 @@ def served(folder):
     pytest.importorskip("viser")
     settings, files = found_scene(folder)
     laws = found_laws(settings)
-    playground = Playground(files, laws, first_law(files, laws))
+    playground = Playground(
+        files, laws, first_law(files, laws, ("constants",))
+    )  # the network is a random one
     server = ViewerServer(load_scene(files), playground, port=8460)
     yield server
     server.close()
@@ -124,9 +126,8 @@ def test_the_server_plays_moves_and_simulates(served):
         assert served.gui["frame"].value == len(STEPS) - 1
         assert differ(first, settled()) > 0.005, "the slider moves pixels"
         page.get_by_role("button", name="Play").click()
-        page.wait_for_function(f"!document.body.innerText.includes('{STEPS[-1]} ms')", timeout=90_000)
+        page.wait_for_selector("text=10 ms", timeout=90_000)  # it plays, from the start again
         page.get_by_role("button", name="Pause").click()
-        assert served.gui["frame"].value < len(STEPS) - 1, "it plays, from the start again"
         served.gui["show"].value = "particles by speed"
         page.wait_for_selector("text=speed: 0 m/s", timeout=90_000)
 
@@ -138,7 +139,6 @@ def test_the_server_plays_moves_and_simulates(served):
         assert simulation.snapshot.time > begun and simulation.snapshot.trouble is None
         page.get_by_role("button", name="Reset").click()
         assert reached(lambda: simulation.snapshot.time < begun + 0.05)
-        served.gui["law"].value = "prior: jelly"  # a random network
         page.get_by_role("button", name="Drop it on top").click()
         assert reached(lambda: len(simulation.snapshot.counts) == 2)
         simulation._trouble = "made up"
