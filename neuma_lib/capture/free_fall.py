@@ -283,11 +283,11 @@ def check_gravity(fall: FreeFall, normal: Sequence[float], name: str) -> str:
     """The line of `told_gravity`.
 
     Raises:
-        InputError: it differs from 9.81 m/s^2 downward by more than `MOST_MISMATCH`, as a vector.
+        InputError: as a vector it differs from 9.81 m/s^2 downward by more than `MOST_MISMATCH` and two deviations.
     """
-    line, (ratio, _), (angle, _) = told_gravity(fall, normal, name), fall.ratio, fall.angle(normal)
+    line, (ratio, unsure), (angle, _) = told_gravity(fall, normal, name), fall.ratio, fall.angle(normal)
     up = np.asarray(normal, float) / np.linalg.norm(normal)
-    if np.linalg.norm(fall.a / GRAVITY + up) <= MOST_MISMATCH:
+    if np.linalg.norm(fall.a / GRAVITY + up) <= MOST_MISMATCH + 2 * unsure:
         return line
     causes = []
     if abs(ratio - 1) > MOST_MISMATCH / 2:

@@ -1,5 +1,7 @@
 """Gravity from tracks: exact without noise, unbiased with it, and what a wrong time base or scale does."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -91,6 +93,15 @@ def test_a_wrong_square_size_shows_as_its_share_of_gravity():
     assert fall.ratio[0] == pytest.approx(1.2, abs=1e-5)
     with pytest.raises(InputError, match=r"square size is 0\.83 of what is stated"):
         check_gravity(fall, UP, "drop")
+
+
+def test_gravity_that_the_fall_does_not_tell_well_enough_is_no_error():
+    fall = fit_free_fall(two())
+    off = replace(fall, a=1.14 * fall.a)
+    with pytest.raises(InputError, match="1.140"):
+        check_gravity(off, UP, "drop")
+    unsure = fall.covariance + np.diag([0.0] * 6 + [(0.03 * GRAVITY) ** 2] * 3 + [0.0])
+    assert "1.140 +- 0.03" in check_gravity(replace(off, covariance=unsure), UP, "drop")
 
 
 def test_too_few_frames_are_refused():
