@@ -328,7 +328,9 @@ def test_all_tables_can_be_planned(finished):
 
 def test_all_figures_can_be_planned(finished):
     modules = (ROOT / "neuma_lib/evaluation/figures").glob("[!_]*.py")
-    assert {module.stem for module in modules} <= set(finished.plan("--forceall", "figures", "random"))
+    planned = finished.plan("--forceall", "figures", "random", "tiny/results/figures/realworld.png")
+    # i23d needs a splat: test_splat_scenes.py makes it.
+    assert {module.stem for module in modules} - {"i23d"} <= set(planned)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
