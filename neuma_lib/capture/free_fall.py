@@ -21,7 +21,8 @@ MOST_MISMATCH = 0.1
 MOST_RMS = 0.004
 """Distance of the places from the fit, as part of the picture's height, above which there is no one flight."""
 MOST_OFF = 0.1
-"""The same as part of the object's radius: the middle of its outline is not its centre, and wanders as it turns."""
+"""The same as part of the object's radius: the middle of its outline is not its centre, and wanders as it turns.
+Different throws that fit so well show another gravity."""
 _ENDS = 0.2  # part of a track at either end that the fit begins without
 _OFF = 4.0  # distance that is still on the fit, in root mean squares of both coordinates
 _LEAST_RMS = 0.2  # [px], where the fit is closer than masks are
@@ -283,11 +284,11 @@ def check_gravity(fall: FreeFall, normal: Sequence[float], name: str) -> str:
     """The line of `told_gravity`.
 
     Raises:
-        InputError: as a vector it differs from 9.81 m/s^2 downward by more than `MOST_MISMATCH` and two deviations.
+        InputError: it differs from 9.81 m/s^2 downward by more than `MOST_MISMATCH`, as a vector.
     """
-    line, (ratio, unsure), (angle, _) = told_gravity(fall, normal, name), fall.ratio, fall.angle(normal)
+    line, (ratio, _), (angle, _) = told_gravity(fall, normal, name), fall.ratio, fall.angle(normal)
     up = np.asarray(normal, float) / np.linalg.norm(normal)
-    if np.linalg.norm(fall.a / GRAVITY + up) <= MOST_MISMATCH + 2 * unsure:
+    if np.linalg.norm(fall.a / GRAVITY + up) <= MOST_MISMATCH:
         return line
     causes = []
     if abs(ratio - 1) > MOST_MISMATCH / 2:

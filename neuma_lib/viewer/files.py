@@ -7,24 +7,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from neuma_lib.config import places
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import existing
 
 
 @dataclass(frozen=True)
-class LawFiles:
-    """What a law is made from, as of `neuma_lib.config.places`, but known without the settings.
+class LawFiles(places.LawFiles):
+    """What a law is made from, and ``dt``, the time step that it was learned at [s]."""
 
-    Attributes:
-        spec: an analytic law, or None.
-        identified, prior, adaptor: files, or None.
-        dt: time step that it was learned at [s].
-    """
-
-    spec: dict[str, Any] | None = None
-    identified: str | None = None
-    prior: str | None = None
-    adaptor: str | None = None
     dt: float = 0.0
 
     @property

@@ -95,15 +95,6 @@ def test_a_wrong_square_size_shows_as_its_share_of_gravity():
         check_gravity(fall, UP, "drop")
 
 
-def test_gravity_that_the_fall_does_not_tell_well_enough_is_no_error():
-    fall = fit_free_fall(two())
-    off = replace(fall, a=1.14 * fall.a)
-    with pytest.raises(InputError, match="1.140"):
-        check_gravity(off, UP, "drop")
-    unsure = fall.covariance + np.diag([0.0] * 6 + [(0.03 * GRAVITY) ** 2] * 3 + [0.0])
-    assert "1.140 +- 0.03" in check_gravity(replace(off, covariance=unsure), UP, "drop")
-
-
 def test_too_few_frames_are_refused():
     with pytest.raises(InputError, match="at least 4"):
         fit_free_fall([track((2.0, 1.0, 0.3), count=3)])
@@ -127,6 +118,25 @@ def test_videos_of_different_throws_are_refused():
     tracks = [track((2.0, 1.0, 0.3)), track((0.2, 1.1, 2.2), v0=np.array([-1.5, 2.5, 0.7]))]
     with pytest.raises(InputError, match="videos of one throw and one object"):
         fit_flight(tracks)
+
+
+def test_what_a_large_object_may_be_off_is_still_refused_by_gravity():
+    """Outlines of a body of 40 px may wander by 4 px; different throws that fit so well do not fall as things do."""
+    rng = np.random.default_rng(0)
+    refused = 0
+    for _ in range(20):
+        tracks = [track((2.0, 1.0, 0.3)), track((0.2, 1.1, 2.2), v0=V0 + rng.normal(scale=0.7, size=3))]
+        try:
+            fit_flight(tracks)
+        except InputError:
+            refused += 1
+            with pytest.raises(InputError):
+                check_gravity(fit_flight([replace(each, radius=40.0) for each in tracks])[0], UP, "drop")
+    assert refused >= 3
+    fall, _ = fit_flight([replace(each, radius=40.0) for each in (
+        track((2.0, 1.0, 0.3)), track((0.2, 1.1, 2.2), v0=np.array([-1.5, 2.5, 0.7]))
+    )])  # fmt: skip
+    assert 0.004 * 480 < fall.rms < 4.0
 
 
 def test_an_offset_that_is_stated_is_kept():

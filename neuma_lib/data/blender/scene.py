@@ -159,7 +159,7 @@ def run_worker(module: str, job: Path, total: int, progress: Progress | None) ->
     Raises:
         InputError, RuntimeError: see `render_images`.
     """
-    root = str(Path(__file__).resolve().parents[2])
+    root = str(Path(__file__).resolve().parents[3])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
     log = job.with_suffix(".log")
     with open(log, "wb") as sink:
