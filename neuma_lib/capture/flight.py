@@ -12,14 +12,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from neuma_lib.capture.agreement import agreement
-from neuma_lib.capture.free_fall import FreeFall, Track, check_gravity, fit_flight, told_gravity
+from neuma_lib.capture.free_fall import FreeFall, Track, fit_flight
+from neuma_lib.capture.gravity import MOST_OUTLINE_MISMATCH, gravity_checks
 from neuma_lib.capture.spin import Spin, fit_spin, follow
 from neuma_lib.capture.timing import Offset, choose_offset, offset_from_motion, offset_from_sound, row_times
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import atomic
-
-UP = (0.0, 1.0, 0.0)
-"""The floor's normal in the room."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +98,7 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flig
 
     Raises:
         InputError: a camera saw no free flight, nothing tells the time between two, no flight fits, or gravity is off
-            by more than 10 %.
+            by more than `MOST_OUTLINE_MISMATCH`.
     """
     tracks, inside = [], []
     for view in views:
@@ -123,7 +121,7 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flig
     stated = [view.offset is not None for view in views]
     plane = _plane(views[0]) if len(views) == 1 else None
     fall, kept = fit_flight(tracks, plane, offsets, stated)
-    gravity = check_gravity(fall, UP, name) if metric else told_gravity(fall, UP, name)
+    gravity = fall.gravity.checked(name, MOST_OUTLINE_MISMATCH) if metric else fall.gravity.told(name)
     frames, paths = [], []
     for number, (view, flying, part) in enumerate(zip(views, inside, kept)):
         used = flying[part]
@@ -164,17 +162,12 @@ def report(flight: Flight, views: Sequence[Filmed]) -> dict[str, Any]:
     fall, spin = flight.fall, flight.spin
     deviations = np.sqrt(np.diag(fall.covariance))
     names = [view.camera for view in views]
-    ratio, angle = fall.ratio, fall.angle(UP)
     return {
         "start_s": fall.start,
         "x0_m": fall.x0.tolist(),
         "v0_m_s": fall.v0.tolist(),
         "v0_deviation_m_s": deviations[3:6].tolist(),
-        "gravity_m_s2": fall.a.tolist(),
-        "gravity_ratio": ratio[0],
-        "gravity_ratio_deviation": ratio[1],
-        "gravity_angle_deg": angle[0],
-        "gravity_angle_deviation_deg": angle[1],
+        **fall.gravity.report(),
         "offsets_s": dict(zip(names, fall.offsets.tolist())),
         "offsets_deviation_s": dict(zip(names, [0.0, *deviations[9:].tolist()])),
         "offsets_from": flight.offsets_from,
@@ -211,21 +204,8 @@ def draw_flight(path: str | Path, flight: Flight, views: Sequence[Filmed], title
 
 def flight_checks(name: str, found: Mapping[str, Any]) -> list[tuple[str, str, str, bool]]:
     """Checks of a flight's `report`: what, found, wanted, good."""
-    spread, angle = found["gravity_ratio_deviation"], found["gravity_angle_deg"]
-    unsure = found["gravity_angle_deviation_deg"]
     checks = [
-        (
-            f"gravity in {name}",
-            f"{found['gravity_ratio']:.3f} +- {spread:.3f} of 9.81 m/s^2",
-            "1 +- 0.03",
-            abs(found["gravity_ratio"] - 1) < 0.03 + 2 * spread,
-        ),
-        (
-            f"down in {name}",
-            f"{angle:.1f} +- {unsure:.1f} degrees off the floor's normal",
-            "< 1.5 degrees",
-            angle < 1.5 + 2 * unsure,
-        ),
+        *gravity_checks(f"outlines of {name}", found),
         (f"flight in {name}", f"{found['rms_px']:.2f} px off the fit", "< 1 px", found["rms_px"] < 1),
     ]
     for camera, value in (found["agreement"] or {}).items():

@@ -1,7 +1,6 @@
-"""Free flight of an object's centre in metres: the check of scale, time base and floor together.
+"""Free flight of an object's centre in metres.
 
-Between release and contact the centre moves as x(t) = x0 + v0 t + a t^2 / 2, whatever the object is. With a = g the
-squares of the board, the frame rate and the floor are right; times that are off by a part e show as 2 e in |a|.
+Between release and contact the centre moves as x(t) = x0 + v0 t + a t^2 / 2, whatever the object is.
 """
 
 from __future__ import annotations
@@ -12,17 +11,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
+from neuma_lib.capture.gravity import Gravity
 from neuma_lib.errors import InputError
 
-GRAVITY = 9.81
-"""[m/s^2]"""
-MOST_MISMATCH = 0.1
-"""Part by which the measured gravity may differ from the true one."""
 MOST_RMS = 0.004
 """Distance of the places from the fit, as part of the picture's height, above which there is no one flight."""
 MOST_OFF = 0.1
 """The same as part of the object's radius: the middle of its outline is not its centre, and wanders as it turns.
 Different throws that fit so well show another gravity."""
+TRIANGULATED = "triangulated"
 _ENDS = 0.2  # part of a track at either end that the fit begins without
 _OFF = 4.0  # distance that is still on the fit, in root mean squares of both coordinates
 _LEAST_RMS = 0.2  # [px], where the fit is closer than masks are
@@ -59,7 +56,7 @@ class FreeFall:
         covariance: of (x0, v0, a, offsets without the first), (8 + cameras,) squared; 0 for what was stated.
         start: [s].
         rms: of the residuals [px].
-        views: "triangulated" or "one view in a plane".
+        views: `TRIANGULATED` or "one view in a plane".
     """
 
     x0: np.ndarray
@@ -83,25 +80,10 @@ class FreeFall:
         return p[:, :2] / p[:, 2:]
 
     @property
-    def ratio(self) -> tuple[float, float]:
-        """|a| / 9.81 and its deviation."""
-        size = np.linalg.norm(self.a)
-        slope = self.a / size
-        return float(size / GRAVITY), float(np.sqrt(slope @ self.covariance[6:9, 6:9] @ slope) / GRAVITY)
-
-    def angle(self, normal: Sequence[float]) -> tuple[float, float]:
-        """Angle between the acceleration and straight down, and its deviation (root mean square of both ways) [deg].
-
-        Args:
-            normal: of the floor, upward, (3,).
-        """
-        up = np.asarray(normal, float) / np.linalg.norm(normal)
-        size = np.linalg.norm(self.a)
-        down = self.a / size
-        across = np.eye(3) - np.outer(down, down)
-        spread = np.trace(across @ self.covariance[6:9, 6:9] @ across) / 2
-        angle = np.arctan2(np.linalg.norm(np.cross(down, -up)), -down @ up)
-        return float(np.degrees(angle)), float(np.degrees(np.sqrt(spread) / size))
+    def gravity(self) -> Gravity:
+        """The acceleration."""
+        how = f"{self.views}, {self.rms:.2f} px"
+        return Gravity(self.a, self.covariance[6:9, 6:9], how, self.views == TRIANGULATED)
 
 
 def fit_free_fall(
@@ -190,7 +172,7 @@ def fit_free_fall(
         covariance=full @ covariance @ full.T,
         start=start,
         rms=float(np.sqrt(np.mean(found.fun**2))),
-        views="one view in a plane" if len(tracks) == 1 else "triangulated",
+        views="one view in a plane" if len(tracks) == 1 else TRIANGULATED,
     )
 
 
@@ -264,44 +246,3 @@ def _part(track: Track, first: int, end: int) -> Track:
 def _height(track: Track) -> float:
     """About the picture's height: the optical axis is near its middle."""
     return 2 * float(track.K[1, 2])
-
-
-def told_gravity(fall: FreeFall, normal: Sequence[float], name: str) -> str:
-    """A line that tells the measured gravity.
-
-    Args:
-        normal: of the floor, upward, (3,).
-        name: of the videos, for messages.
-    """
-    (ratio, deviation), (angle, angle_deviation) = fall.ratio, fall.angle(normal)
-    return (
-        f"{name}: gravity is {ratio:.3f} +- {deviation:.3f} of {GRAVITY} m/s^2, {angle:.1f} +- {angle_deviation:.1f}"
-        f" degrees from the floor's normal ({fall.views}, {fall.rms:.2f} px)"
-    )
-
-
-def check_gravity(fall: FreeFall, normal: Sequence[float], name: str) -> str:
-    """The line of `told_gravity`.
-
-    Raises:
-        InputError: it differs from 9.81 m/s^2 downward by more than `MOST_MISMATCH`, as a vector.
-    """
-    line, (ratio, _), (angle, _) = told_gravity(fall, normal, name), fall.ratio, fall.angle(normal)
-    up = np.asarray(normal, float) / np.linalg.norm(normal)
-    if np.linalg.norm(fall.a / GRAVITY + up) <= MOST_MISMATCH:
-        return line
-    causes = []
-    if abs(ratio - 1) > MOST_MISMATCH / 2:
-        causes.append(f"the board's square size is {1 / ratio:.2f} of what is stated (measure it)")
-        causes.append(
-            f"the frame rate is {ratio**-0.5:.2f} of what is assumed (slow motion: state the true rate)"
-        )
-        causes.append("the time base is not steady (take the file as the camera wrote it)")
-    if angle > np.degrees(MOST_MISMATCH / 2):
-        causes.append("the floor or board is not level, or the camera has moved since its pose was taken")
-    if fall.views == "triangulated":
-        causes.append("the videos are of different throws or objects")
-    causes.append(
-        "frames after contact, or while a hand still holds the object, are among those of free flight"
-    )
-    raise InputError(f"{line}. Likely causes: {'; '.join(causes)}")

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from neuma_lib.capture.agreement import LEAST_AGREEMENT
 from neuma_lib.capture.flight import flight_checks
+from neuma_lib.capture.gravity import gravity_checks
 
 MOST_ERROR = 1.0
 """Mean reprojection error that good photographs stay below [px]."""
@@ -111,6 +112,7 @@ def registration_checks(placed: Mapping[str, Mapping[str, Any]]) -> list[Check]:
         turn = max(report["rotation_std_deg_principal"])
         text, wanted = f"+-{turn:.1f} degrees", f"< {MOST_TURN:g} degrees"
         found.append(Check(f"pose of the object in {throw}", text, wanted, turn < MOST_TURN))
+        found += [Check(*values) for values in gravity_checks(throw, report)]
         for camera, after in report["after"].items():
             text, wanted = f"IoU {after['iou']:.3f}", f"> {LEAST_OVERLAP:g}"
             what = f"placed object in {throw}, {camera}"

@@ -11,8 +11,7 @@ from neuma_lib.evaluation.stress_curves import share_inside
 FEW_FRAMES = 10
 """Fewer frames of a camera after the first contact tell little of a law."""
 WORSE = 1.5
-"""Factor on the mean squared error, held-out throws over learned ones, from which the law is said "
-"to fit these alone."""
+"""Factor on the mean squared error, held-out throws over learned ones, from which the law fits the latter alone."""
 LEAST_IOU = 0.8
 """Mean overlap of predicted and filmed masks of a prediction that is at the right place."""
 MOST_OUTSIDE = 0.25
@@ -45,9 +44,8 @@ def of_filming(capture: Mapping[str, Any], throws: Mapping[str, Mapping[str, Any
         cameras, flight, moved = throw["cameras"], throw["flight"], throw["prediction"]
         if len(cameras) == 1:
             found.append(
-                f"{name}: one camera alone. It hardly sees motion towards it, and its object is taken to fall above "
-                "the "
-                "middle of the box, across its view."
+                f"{name}: one camera alone. It hardly sees motion towards it, and its object is taken to fall "
+                "above the middle of the box, across its view."
             )
         if flight.get("spin_rad_s") is None:
             found.append(
@@ -60,31 +58,31 @@ def of_filming(capture: Mapping[str, Any], throws: Mapping[str, Mapping[str, Any
             smear = 1e3 * BLUR * moved["fastest_m_s"]
             found.append(
                 f"{name}: no exposure is stated for {', '.join(blurred)}, so that motion blur is left out. At "
-                f"{moved['fastest_m_s']:.1f} m/s, the object's fastest, 1/1000 s smears it over {smear:.1f} mm."
+                f"{moved['fastest_m_s']:.1f} m/s, the object's fastest, 1/1000 s smears it over {smear:.1f} "
+                "mm."
             )
         for camera, count in (moved.get("frames_after_contact") or {}).items():
             if count < FEW_FRAMES:
                 found.append(
-                    f"{name}, {camera}: only {count} frames show the object after its first contact; before it, no "
-                    ""
-                    "motion tells of the material."
+                    f"{name}, {camera}: only {count} frames show the object after its first contact; before "
+                    "it, no motion tells of the material."
                 )
         if moved.get("touched"):
             walls = ", ".join(moved["touched"])
             found.append(
-                f"{name}: the predicted object touches the box ({walls}), where the room has no wall: set scale or "
-                "center in capture.yaml."
+                f"{name}: the predicted object touches the box ({walls}), where the room has no wall: set "
+                "scale or center in capture.yaml."
             )
     if not capture["density_stated"]:
         found.append(
-            f"The density is the default, {capture['density']:g} kg/m³. Motion tells stress over density alone: if the "
-            "object has twice the density, all stresses double. Weigh it, and state density in capture.yaml."
+            f"The density is the default, {capture['density']:g} kg/m³. Motion tells stress over density "
+            "alone: if the object has twice the density, all stresses double. Weigh it, and state density in "
+            "capture.yaml."
         )
     if not capture["held_out"]:
         found.append(
-            "No throw is held out: all measures are of videos that the law was learned from. Film another throw, "
-            "and name "
-            "it under held_out in capture.yaml."
+            "No throw is held out: all measures are of videos that the law was learned from. Film another "
+            "throw, and name it under held_out in capture.yaml."
         )
     return found
 
@@ -109,8 +107,7 @@ def of_predictions(
         if failure := moved.get("diverged"):
             found.append(
                 f"{throw}: the predicted motion broke off at step {failure['step']} (a particle "
-                f"{failure['happened']}); "
-                "what is shown from there on is its last sound state."
+                f"{failure['happened']}); what is shown from there on is its last sound state."
             )
     if any(moved.get("stable") is False for moved in predictions.values()):
         found.append("The training diverged, and its best state is shown.")
@@ -122,14 +119,13 @@ def of_predictions(
         where, first = f"{throw}, {camera}", before.get((throw, camera, learned))
         if method != prior and first and row["psnr"] < first["psnr"]:
             found.append(
-                f"{where}: the prior, without any learning, is closer to the video ({first['psnr']:.1f} dB against "
-                f"{row['psnr']:.1f} dB on the object)."
+                f"{where}: the prior, without any learning, is closer to the video ({first['psnr']:.1f} dB "
+                f"against {row['psnr']:.1f} dB on the object)."
             )
         if row["iou"] < LEAST_IOU:
             found.append(
-                f"{where}: predicted and filmed masks overlap by {row['iou']:.2f} on average: the prediction is at "
-                "another "
-                "place than the object, or has another shape."
+                f"{where}: predicted and filmed masks overlap by {row['iou']:.2f} on average: the prediction "
+                "is at another place than the object, or has another shape."
             )
     for row in rows:
         mine = own.get((row["throw"], row["camera"], row["learned"]))
@@ -137,14 +133,14 @@ def of_predictions(
             kind = "learned from" if row["learned"] else "held out"
             found.append(
                 f"In frames {kind}, the identified constants alone fit better ({row['psnr']:.1f} dB against "
-                f"{mine['psnr']:.1f} dB on the object): take them, or the structured law that starts from them."
+                f"{mine['psnr']:.1f} dB on the object): take them, or the structured law that starts from "
+                "them."
             )
     seen, unseen = (own.get(("all", "all", learned)) for learned in (True, False))
     if seen and unseen and 10 ** ((seen["psnr"] - unseen["psnr"]) / 10) > WORSE:
         found.append(
             f"Held-out throws are predicted worse than learned ones, {unseen['psnr']:.1f} dB against "
-            f"{seen['psnr']:.1f} dB "
-            "on the object: part of what was learned holds for these videos alone."
+            f"{seen['psnr']:.1f} dB on the object: part of what was learned holds for these videos alone."
         )
     return found
 
@@ -157,8 +153,7 @@ def of_constants(identified: Mapping[str, Any] | None) -> list[str]:
     if identified.get("ties"):
         found.append(
             f"The families {', '.join([identified['family'], *identified['ties']])} explain the video equally "
-            "well: which "
-            "of them the material belongs to is not known."
+            "well: which of them the material belongs to is not known."
         )
     best = identified["best"]
     open_ = [name for name, entry in best["quantities"].items() if not entry["determined"]]
@@ -166,9 +161,8 @@ def of_constants(identified: Mapping[str, Any] | None) -> list[str]:
         known = [name for name, entry in best["quantities"].items() if entry["determined"]]
         rest = f"; it determines {', '.join(known)}" if known else ""
         found.append(
-            f"The video does not determine {', '.join(open_)} of the identified law{rest}. What is not determined "
-            "is near "
-            "where the search began."
+            f"The video does not determine {', '.join(open_)} of the identified law{rest}. What is not "
+            "determined is near where the search began."
         )
     if best.get("diverged"):
         found.append("The identified law broke off while its constants were sought.")
@@ -190,14 +184,12 @@ def of_curves(
     method, tests = curves["learned"], curves["tests"]
     found = [
         "Outside the blue ranges of the stress curves no part of the object has been: there a curve is what "
-        "its form makes "
-        "of the rest, not a measurement."
+        "its form makes of the rest, not a measurement."
     ]
     if all(test["laws"][method]["band"] is None for test in tests.values()):
         found.append(
             f"{titles[method]} has no error bars of its own: its networks say nothing of what else the video "
-            "allows. The "
-            "bands of the identified constants are the nearest to it."
+            "allows. The bands of the identified constants are the nearest to it."
         )
     verdicts = {
         prior: "the video speaks against the prior there",

@@ -204,8 +204,7 @@ def compare_flight(flight: Mapping[str, Any], known: Mapping[str, Any], truth: T
     thrown = known["drops"][drop]
     now = flying(truth, late[first] + flight["start_s"], thrown["v0_m_s"], known["gravity_m_s2"])
     rows = [
-        Row("gravity, from the fall", angle(flight["gravity_m_s2"], known["gravity_m_s2"]), "degrees", 0.5),
-        Row("size of gravity, from the fall", 100 * abs(flight["gravity_ratio"] - 1), "%"),
+        *_gravity(flight, known, "outlines"),
         Row("v0 of the masks' centre", 100 * _off(flight["v0_m_s"], now.velocity), "%"),
     ]
     for name, offset in flight["offsets_s"].items():
@@ -221,6 +220,20 @@ def compare_flight(flight: Mapping[str, Any], known: Mapping[str, Any], truth: T
             )
         )
     return rows
+
+
+def _gravity(
+    found: Mapping[str, Any], known: Mapping[str, Any], source: str, goal: float | None = None
+) -> list[Row]:
+    return [
+        Row(
+            f"direction of gravity, from {source}",
+            angle(found["gravity_m_s2"], known["gravity_m_s2"]),
+            "degrees",
+            goal,
+        ),
+        Row(f"size of gravity, from {source}", 100 * abs(found["gravity_ratio"] - 1), "%"),
+    ]
 
 
 def compare_registration(
@@ -254,6 +267,7 @@ def compare_registration(
             1.5,
         ),
     ]
+    rows += _gravity(registration, known, "the placed object", 0.5)
     for name, offset in registration["offsets_s"].items():
         if name != first:
             rows.append(Row(f"offset of {name}", 1000 * abs(offset - (late[name] - late[first])), "ms"))

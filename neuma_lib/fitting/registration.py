@@ -6,7 +6,7 @@ of them are rendered as small pictures, each moved to where its outline has the 
 are refined on a few frames, then on more and more frames of the flight, in finer and finer pictures, and the worst are
 left behind (`STAGES`). The refinement is Levenberg and Marquardt's on all pixels of all cameras at once: pose,
 velocity, spin, the time between cameras, and, as in `velocity`, an enlargement of the rendered body, since what is
-rendered one percent too large looks one percent too near.
+rendered one percent too large looks one percent too near. Gravity is known there; freed at last, it is measured.
 
 A pose that another explains nearly as well is ambiguous. That is said and not an error: a plain ball has no rotation, a
 plain bottle none about its axis, and the deviations of such directions are large.
@@ -57,10 +57,12 @@ LIKELY_SIZE, ANY_SIZE = 0.01, 0.3
 SHOWN = 3
 """Pictures of each camera that are shown beside their renders."""
 
-_TURN, _PLACE, _VELOCITY, _SPIN, _SIZE, _OFFSETS = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), 12, 13
+_TURN, _PLACE, _VELOCITY, _SPIN, _SIZE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), 12
+_GRAVITY, _OFFSETS = slice(13, 16), 16
 _ANY_TURN = np.pi / np.sqrt(3)  # deviation of an angle that is not known at all [rad]
 _UNITS = np.array([_ANY_TURN] * 3 + [0.1] * 3 + [1.0] * 3 + [LIKELY_SPIN] * 3)
-_OFFSET_UNIT = 0.01  # [s]
+_NO_DIRECTIONS = np.zeros((0, 3))
+_GRAVITY_UNIT, _OFFSET_UNIT = 3.0, 0.01  # [m/s^2], [s]
 _ACROSS = 24  # diameter of the object in the pictures of the search [px]
 _STARTS = 24  # rotations of the grid that are refined
 _FIRST_WEIGHT, _LEAST_WEIGHT = 0.5, 0.1  # of colours beside coverage: at first, and at least
@@ -145,8 +147,11 @@ class Registration:
         pivot: the centre of mass as photographed [m], (3,).
         scale_known: whether the photographs are in metres of the video, s = 1.
         found: pose and motion.
-        covariance: of a turn about the world's axes [rad], the centre [m], velocity [m/s], spin [rad/s], enlargement
-            and the offsets of the cameras but the first [s], (12 + cameras,) squared; 0 for what was stated.
+        covariance: of a turn about the world's axes [rad], the centre [m], velocity [m/s], spin [rad/s], enlargement,
+            gravity [m/s^2] and the offsets of the cameras but the first [s], (15 + cameras,) squared; 0 for what was
+            stated, as gravity is.
+        gravity, gravity_covariance: the acceleration that the pictures show where it is fitted along [m/s^2], (3,) and
+            (3, 3).
         before, after: agreement of the object as photographed, where the masks' centres are, and as placed.
         rival: cost of the next distinct pose relative to the best one's, and the angle between the two [degrees]; None:
             no other was left.
@@ -162,6 +167,8 @@ class Registration:
     scale_known: bool
     found: Found
     covariance: np.ndarray
+    gravity: np.ndarray
+    gravity_covariance: np.ndarray
     before: Agreement
     after: Agreement
     rival: tuple[float, float] | None
@@ -405,6 +412,9 @@ def register(
         places = set(range(problem.size)) - set(range(*_SPIN.indices(problem.size)))
         problem = _Problem(pictures, still, start, fitted, size)
         best = _refined(problem, STAGES[-1]._replace(free=tuple(sorted(places & set(problem.all)))))
+    gravity, gravity_covariance = _gravity(
+        pictures, best, start, fitted, size, sights[0].viewmat[2, :3] if len(sights) == 1 else None
+    )
     others = [(ratio, other) for ratio, other in others if _apart(best, other) >= DISTINCT]
     covariance += _spread(best, others)
     ratio, other = min(others, key=lambda each: each[0], default=(None, None))
@@ -416,6 +426,8 @@ def register(
         scale_known=scale_known,
         found=best,
         covariance=covariance,
+        gravity=gravity,
+        gravity_covariance=gravity_covariance,
         before=_agreement(pictures, before, start),
         after=_agreement(pictures, best, start),
         rival=None if other is None else (ratio, float(np.degrees(_apart(best, other)))),
@@ -430,22 +442,29 @@ def register(
 
 class _Problem:
     """Residuals of pictures as a function of unknowns, in units of their own (`_UNITS`): a turn of the pose, changes of
-    place and velocity, the spin, the enlargement, and changes of the cameras' offsets but the first.
+    place and velocity, the spin, the enlargement, and changes of gravity and of the cameras' offsets but the first.
 
     Attributes:
         size: number of unknowns.
         all: places of those that are fitted.
         start: unknowns of what it begins with.
+        falling: directions along which gravity is fitted, rows (K, 3); none: it is known.
     """
 
     def __init__(
-        self, pictures: Pictures, begin: Found, time: float, fitted: Sequence[int], size: float = LIKELY_SIZE
+        self,
+        pictures: Pictures,
+        begin: Found,
+        time: float,
+        fitted: Sequence[int],
+        size: float = LIKELY_SIZE,
+        falling: np.ndarray = _NO_DIRECTIONS,
     ):
-        self.pictures, self.begin, self.time = pictures, begin, time
+        self.pictures, self.begin, self.time, self.falling = pictures, begin, time, falling
         cameras = len(begin.offsets)
         self.size = _OFFSETS + cameras - 1
-        self.units = np.concatenate([_UNITS, [size], np.full(cameras - 1, _OFFSET_UNIT)])
-        self.all = [*range(_OFFSETS), *(_OFFSETS + k - 1 for k in fitted)]
+        self.units = np.concatenate([_UNITS, [size], [_GRAVITY_UNIT] * 3, np.full(cameras - 1, _OFFSET_UNIT)])
+        self.all = [*range(_GRAVITY.start + len(falling)), *(_OFFSETS + k - 1 for k in fitted)]
         self.start = np.zeros(self.size)
         self.start[_SPIN], self.start[_SIZE] = begin.motion.spin, begin.enlargement
         self.start /= self.units
@@ -460,6 +479,7 @@ class _Problem:
             centre=begin.motion.centre + u[_PLACE],
             velocity=begin.motion.velocity + u[_VELOCITY],
             spin=u[_SPIN],
+            gravity=begin.motion.gravity + u[_GRAVITY][: len(self.falling)] @ self.falling,
         )
         offsets = begin.offsets + np.append(0.0, u[_OFFSETS:])
         return replace(begin, motion=motion, offsets=offsets, enlargement=float(u[_SIZE]))
@@ -479,6 +499,7 @@ class _Problem:
         G = np.zeros((len(times), LOCAL, self.size))
         G[:, :3, _TURN], G[:, :3, _SPIN] = self._turns(motion, times)
         G[:, 3:6, _PLACE], G[:, 3:6, _VELOCITY] = np.eye(3), times[:, None, None] * np.eye(3)
+        G[:, 3:6, _GRAVITY][..., : len(self.falling)] = times[:, None, None] ** 2 / 2 * self.falling.T
         G[:, 6, _SIZE] = 1.0
         for camera in range(1, pictures.cameras):
             of = pictures.camera == camera
@@ -636,6 +657,30 @@ def _distinct(found: Sequence[Found], count: int) -> tuple[list[Found], list[Fou
     return kept[:count], kept[count:]
 
 
+def _gravity(
+    pictures: Pictures,
+    best: Found,
+    start: float,
+    fitted: Sequence[int],
+    size: float,
+    view: np.ndarray | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Acceleration (3,) and its covariance (3, 3), everything else fitted along.
+
+    Args:
+        view: direction of one camera alone, which hardly sees what happens along it: there gravity is taken as known.
+    """
+    falling = np.eye(3)
+    if view is not None:
+        down = best.motion.gravity / np.linalg.norm(best.motion.gravity)
+        side = np.cross(down, view)
+        falling = np.stack([down, side / np.linalg.norm(side)])
+    free = _refined(_Problem(pictures, best, start, fitted, size, falling), STAGES[-1])
+    spread = _covariance(_Problem(pictures, free, start, fitted, size, falling))[_GRAVITY, _GRAVITY]
+    spread = spread[: len(falling), : len(falling)]
+    return free.motion.gravity, falling.T @ spread @ falling
+
+
 def _covariance(problem: _Problem) -> np.ndarray:
     """Covariance of all unknowns, by the jackknife over blocks of the pictures, in SI units; 0 for what was not fitted.
 
@@ -669,6 +714,7 @@ def _difference(a: Found, b: Found) -> np.ndarray:
     p, q = a.motion, b.motion
     turn = Rotation.from_matrix(q.rotation @ p.rotation.T).as_rotvec()
     rest = [q.centre - p.centre, q.velocity - p.velocity, q.spin - p.spin, [b.enlargement - a.enlargement]]
+    rest.append(q.gravity - p.gravity)
     return np.concatenate([turn, *rest, (b.offsets - a.offsets)[1:]])
 
 

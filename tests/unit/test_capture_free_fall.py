@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neuma_lib.capture.free_fall import GRAVITY, Track, check_gravity, fit_flight, fit_free_fall
+from neuma_lib.capture.free_fall import Track, fit_flight, fit_free_fall
+from neuma_lib.capture.gravity import GRAVITY, MOST_OUTLINE_MISMATCH, UP
 from neuma_lib.capture.timing import row_times
 from neuma_lib.errors import InputError
 
 X0, V0, A = np.array([0.1, 1.2, 0.0]), np.array([0.4, 0.3, -0.2]), np.array([0.0, -GRAVITY, 0.0])
-UP = (0.0, 1.0, 0.0)
 K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
 
 
@@ -45,7 +45,7 @@ def test_without_noise_the_motion_and_the_offset_are_exact():
     fall = fit_free_fall(two())
     np.testing.assert_allclose(np.stack([fall.x0, fall.v0, fall.a]), [X0, V0, A], atol=1e-5)
     np.testing.assert_allclose(fall.offsets, [0, 0.004], atol=1e-7)
-    assert fall.views == "triangulated" and check_gravity(fall, UP, "drop")
+    assert fall.views == "triangulated" and fall.gravity.checked("drop")
 
 
 def test_with_noise_the_fit_is_unbiased_and_its_covariance_holds():
@@ -63,7 +63,7 @@ def test_with_noise_the_fit_is_unbiased_and_its_covariance_holds():
 
 def test_a_time_base_off_by_3_percent_shows_as_6_percent_in_gravity():
     fall = fit_free_fall([track((2.0, 1.0, 0.3), stretch=1.03), track((0.2, 1.1, 2.2), stretch=1.03)])
-    assert fall.ratio[0] == pytest.approx(1.03**-2, abs=1e-4)
+    assert fall.gravity.ratio[0] == pytest.approx(1.03**-2, abs=1e-4)
 
 
 def test_one_camera_measures_gravity_in_the_plane_of_the_fall():
@@ -71,7 +71,7 @@ def test_one_camera_measures_gravity_in_the_plane_of_the_fall():
     one = track((0.2, 1.1, 2.2), v0=flat)
     fall = fit_free_fall([one], plane=(X0, np.array([0.0, 0, 1])))
     np.testing.assert_allclose(np.stack([fall.v0, fall.a]), [flat, A], atol=1e-5)
-    assert fall.views == "one view in a plane" and fall.angle(UP)[0] < 1e-3
+    assert fall.views == "one view in a plane" and fall.gravity.angle()[0] < 1e-3
     with pytest.raises(InputError, match="plane"):
         fit_free_fall([one])
 
@@ -79,9 +79,9 @@ def test_one_camera_measures_gravity_in_the_plane_of_the_fall():
 def test_a_mismatch_names_the_likely_causes():
     slow = fit_free_fall([track((2.0, 1.0, 0.3), stretch=4.0), track((0.2, 1.1, 2.2), stretch=4.0)])
     with pytest.raises(InputError, match=r"(?s)square size.*frame rate is 4\.00.*time base"):
-        check_gravity(slow, UP, "drop")
+        slow.gravity.checked("drop")
     with pytest.raises(InputError, match="floor or board"):
-        check_gravity(fit_free_fall(two()), (0.2, 1.0, 0.0), "drop")
+        fit_free_fall(two()).gravity.checked("drop", normal=(0.2, 1.0, 0.0))
 
 
 def test_a_wrong_square_size_shows_as_its_share_of_gravity():
@@ -90,9 +90,9 @@ def test_a_wrong_square_size_shows_as_its_share_of_gravity():
     for seen in tracks:
         seen.viewmat[:3, 3] *= 1.2
     fall = fit_free_fall(tracks)
-    assert fall.ratio[0] == pytest.approx(1.2, abs=1e-5)
+    assert fall.gravity.ratio[0] == pytest.approx(1.2, abs=1e-5)
     with pytest.raises(InputError, match=r"square size is 0\.83 of what is stated"):
-        check_gravity(fall, UP, "drop")
+        fall.gravity.checked("drop")
 
 
 def test_too_few_frames_are_refused():
@@ -109,9 +109,9 @@ def test_frames_of_the_hand_and_of_the_contact_are_left_out():
     fall, kept = fit_flight(tracks)
     # a frame beside them that is off by as little as the noise may stay
     assert np.abs(np.subtract([(k.start, k.stop) for k in kept], [(3, 36), (5, 35)])).max() <= 1
-    assert abs(fall.ratio[0] - 1) < 4 * fall.ratio[1] < 0.1
+    assert abs(fall.gravity.ratio[0] - 1) < 4 * fall.gravity.ratio[1] < 0.1
     spoiled = fit_free_fall(tracks)
-    assert abs(spoiled.ratio[0] - 1) > 0.1 > abs(fall.ratio[0] - 1)
+    assert abs(spoiled.gravity.ratio[0] - 1) > 0.1 > abs(fall.gravity.ratio[0] - 1)
 
 
 def test_videos_of_different_throws_are_refused():
@@ -131,7 +131,8 @@ def test_what_a_large_object_may_be_off_is_still_refused_by_gravity():
         except InputError:
             refused += 1
             with pytest.raises(InputError):
-                check_gravity(fit_flight([replace(each, radius=40.0) for each in tracks])[0], UP, "drop")
+                fall, _ = fit_flight([replace(each, radius=40.0) for each in tracks])
+                fall.gravity.checked("drop", MOST_OUTLINE_MISMATCH)
     assert refused >= 3
     fall, _ = fit_flight([replace(each, radius=40.0) for each in (
         track((2.0, 1.0, 0.3)), track((0.2, 1.1, 2.2), v0=np.array([-1.5, 2.5, 0.7]))
@@ -142,7 +143,7 @@ def test_what_a_large_object_may_be_off_is_still_refused_by_gravity():
 def test_an_offset_that_is_stated_is_kept():
     fall = fit_free_fall(two(), offsets=[0, 0.004], stated=[False, True])
     np.testing.assert_array_equal(fall.offsets, [0, 0.004])
-    assert fall.ratio[0] == pytest.approx(1, abs=1e-6) and fall.covariance[9, 9] == 0
+    assert fall.gravity.ratio[0] == pytest.approx(1, abs=1e-6) and fall.covariance[9, 9] == 0
     far = fit_free_fall(two(), offsets=[0, 0.03])  # the beginning, a few frames off, does not matter
     assert far.offsets[1] == pytest.approx(0.004, abs=1e-6)
 
@@ -156,7 +157,7 @@ def test_the_deviation_of_gravity_is_that_of_the_closed_form():
     found = []
     for _ in range(30):
         one = track((0.1, 0.8, 2.1), v0=flat, noise=noise, rng=rng, count=count)
-        found.append(fit_free_fall([one], plane=(X0, np.array([0.0, 0, 1]))).ratio[1])
+        found.append(fit_free_fall([one], plane=(X0, np.array([0.0, 0, 1]))).gravity.ratio[1])
     expected = noise * 2.1 / 800 * np.sqrt(720 / count) / ((count - 1) / 120) ** 2 / GRAVITY
     assert np.mean(found) == pytest.approx(expected, rel=0.1)
 
@@ -175,11 +176,11 @@ def test_a_rolling_shutter_is_undone_by_the_times_of_the_rows():
             p = (x @ whole.viewmat[:3, :3].T + whole.viewmat[:3, 3]) @ whole.K.T
             places = p[:, :2] / p[:, 2:]
         tracks.append(Track(whole.times, places, whole.viewmat, whole.K, whole.name))
-    assert abs(fit_free_fall(tracks).ratio[0] - 1) > 0.02
+    assert abs(fit_free_fall(tracks).gravity.ratio[0] - 1) > 0.02
     undone = [
         Track(row_times(t.times, t.places[:, 1], row_time, 480, rows), t.places, t.viewmat, t.K, t.name)
         for t in tracks
     ]
     fall = fit_free_fall(undone)
-    assert fall.ratio[0] == pytest.approx(1, abs=1e-4)
+    assert fall.gravity.ratio[0] == pytest.approx(1, abs=1e-4)
     assert fall.offsets[1] == pytest.approx(0.004, abs=1e-5)

@@ -128,8 +128,8 @@ def test_the_pages_checks_follow_what_was_found():
     }
     good = {what: fine for what, _, _, fine in flight.flight_checks("first", report)}
     assert good == {
-        "gravity in first": False,
-        "down in first": True,
+        "gravity in outlines of first": False,
+        "down in outlines of first": True,
         "flight in first": True,
         "mask of left at rest, first": True,
         "mask of right at rest, first": False,

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from flight_scene import GAINS, filmed, guess, photographed_in_light, thing, true_motion
+from flight_scene import GAINS, GRAVITY, filmed, guess, photographed_in_light, thing, true_motion
 from render_scenes import random_scene
 from scipy.spatial.transform import Rotation
 
@@ -42,12 +42,21 @@ def check_exact(found, errors, motion):
     assert np.linalg.norm(errors[9:]) <= 0.1 * np.linalg.norm(motion.spin)
 
 
+def check_gravity(found, true=GRAVITY):
+    off = found.gravity - true
+    assert np.linalg.norm(off) < 0.02 * 9.81
+    assert (
+        off @ np.linalg.pinv(found.gravity_covariance) @ off < 16.3
+    )  # one in a thousand of chi-squared, 3 degrees
+
+
 def test_pose_velocity_spin_offset_and_gains_are_those_that_were_rendered():
     body = thing(count=250)
     motion = true_motion(body, Rotation.random(random_state=1).as_matrix())
     found, errors = registered(body, motion, frames=8, offset=OFFSET, noise=0.02)
     check_exact(found, errors, motion)
     assert found.found.offsets == pytest.approx([0.0, OFFSET], abs=1e-4)
+    check_gravity(found)
     # Noise in the coverage is cut off at 1, which darkens edges.
     np.testing.assert_allclose(found.found.gains, GAINS[:2], rtol=0.02)
     assert found.before.iou.mean() < 0.85 and found.after.iou.min() > 0.97 and found.after.off.max() < 0.2
@@ -98,6 +107,10 @@ def test_one_camera_is_enough_and_less_sure_of_the_depth():
     assert np.linalg.norm(across) < 0.002
     std = found.deviations(slice(3, 6), found.axes)
     assert abs(depth @ errors[3:6]) < 4 * std[2] and std[2] > 5 * std[:2].max()
+    # Along its view gravity is taken as known.
+    level = depth - depth @ GRAVITY / (GRAVITY @ GRAVITY) * GRAVITY
+    assert abs(level @ found.gravity_covariance @ level) < 1e-9 and abs(level @ found.gravity) < 1e-9
+    check_gravity(found)
 
 
 def test_a_plain_ball_is_said_to_be_ambiguous():
@@ -107,6 +120,14 @@ def test_a_plain_ball_is_said_to_be_ambiguous():
     assert "explains the video nearly as well" in found.ambiguous or "any axis" in found.ambiguous
     assert found.turn_deviations[-1] > 20
     assert np.linalg.norm(errors[3:6]) < 0.01 and np.linalg.norm(errors[6:9]) < 0.1
+
+
+def test_gravity_that_is_not_what_was_assumed_is_measured():
+    """As a square size off by 15 percent shows it, or a floor that is not level."""
+    body, shown = thing(count=250), np.array([0.6, -8.4, 0.0])
+    motion = replace(true_motion(body, Rotation.random(random_state=6).as_matrix()), gravity=shown)
+    found, _ = registered(body, motion, frames=12, offset=OFFSET, noise=0.02)
+    check_gravity(found, shown)
 
 
 @pytest.mark.slow
@@ -164,10 +185,11 @@ def test_slopes_are_those_of_the_cost():
         rotation=Rotation.from_rotvec([0.05, -0.04, 0.06]).as_matrix() @ motion.rotation,
         centre=motion.centre + (0.002, -0.003, 0.002),
     )
-    problem = _Problem(pictures, Found(off, np.array([0.0, 0.002]), 0.01, GAINS[:2]), 3.0, [1])
+    begin = Found(off, np.array([0.0, 0.002]), 0.01, GAINS[:2])
+    problem = _Problem(pictures, begin, 3.0, [1], falling=np.eye(3))
     fit = problem.linearise(problem.start, problem.all, central=True)
     # steps of about a third of a pixel, over which the cost bends
-    steps = np.array([0.002] * 3 + [0.01] * 3 + [0.05] * 3 + [0.05] * 3 + [0.5, 0.1])
+    steps = np.array([0.002] * 3 + [0.01] * 3 + [0.05] * 3 + [0.05] * 3 + [0.5] + [1.0] * 3 + [0.1])
     for k in problem.all:
         e = steps[k] * np.eye(problem.size)[k]
         slope = (problem.cost(problem.start + e) - problem.cost(problem.start - e)) / (4 * steps[k])

@@ -5,7 +5,8 @@ import pytest
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from neuma_lib.capture.free_fall import GRAVITY, FreeFall, Track
+from neuma_lib.capture.free_fall import FreeFall, Track
+from neuma_lib.capture.gravity import GRAVITY
 
 pytest.importorskip("cv2")
 

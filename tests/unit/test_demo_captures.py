@@ -196,6 +196,8 @@ def test_a_registration_that_is_right_is_not_off():
         "rotation": rotation.tolist(),
         "translation": (center - rotation @ photographed).tolist(),
         "offsets_s": {"a": 0.0, "b": -0.002},
+        "gravity_m_s2": [0, -G, 0],
+        "gravity_ratio": 1.0,
     }
     velocity = {"v0": [0.2, -0.5 - G * time, 0.1], "angular_velocity": spin.tolist()}
     rows = {row.what: row for row in judged.compare_registration(found, velocity, known, truth, "first")}
@@ -206,8 +208,11 @@ def test_a_registration_that_is_right_is_not_off():
     worse = {row.what: row for row in judged.compare_registration(found, velocity, known, truth, "first")}
     assert worse["registration, place"].found == pytest.approx(4) and not worse["registration, place"].reached
     found["rotation"] = (tilt @ rotation).tolist()
+    found["gravity_m_s2"] = (tilt @ [0, -G, 0]).tolist()
     worse = {row.what: row for row in judged.compare_registration(found, velocity, known, truth, "first")}
-    assert worse["registration, turn"].found == pytest.approx(2) and not worse["registration, turn"].reached
+    down = worse["direction of gravity, from the placed object"]
+    for tilted in (worse["registration, turn"], down):
+        assert tilted.found == pytest.approx(2) and not tilted.reached
 
 
 def test_tracer_errors():

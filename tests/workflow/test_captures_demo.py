@@ -47,7 +47,7 @@ def test_free_flight_of_a_filmed_object(project):
     # Half as many pixels each way as the demo captures have, and a third of the photographs: twice their goals.
     assert rows["centres of photographs, largest"] < 10 and rows["centres of video cameras, largest"] < 10
     assert rows["scale, from the cameras"] < 1.0 and rows["up, from the cameras"] < 1.0
-    assert rows["gravity, from the fall"] < 1.0 and rows["size of gravity, from the fall"] < 3
+    assert rows["direction of gravity, from outlines"] < 1.0 and rows["size of gravity, from outlines"] < 3
     assert rows["v0 of the masks' centre"] < 6
     assert max(value for what, value in rows.items() if what.startswith("offset")) < 1.5
     assert np.isfinite(list(rows.values())).all()

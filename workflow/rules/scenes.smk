@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+from neuma_lib.capture.gravity import GRAVITY, UP
 from neuma_lib.config import places
 from neuma_lib.config.places import FIELD
 from neuma_lib.config.settings import NO_TRUTH
@@ -141,7 +142,9 @@ def frame_steps(wildcards):
 def simulation_settings(wildcards):
     """Constants of the simulator for a scene."""
     scene = SETTINGS.scene(wildcards.scene)
-    return simulator(scene.dt, scale=scene.captured.scale if scene.captured else 1.0)
+    if scene.captured:  # in a room, all of whose lengths are scaled
+        return {**simulator(scene.dt), "gravity": [-GRAVITY * scene.captured.scale * each for each in UP]}
+    return simulator(scene.dt)
 
 
 def filming(wildcards):
@@ -149,13 +152,9 @@ def filming(wildcards):
     return {"dt": SETTINGS.scene(wildcards.scene).dt, "sub_frames": SETTINGS.dataset.sub_frames}
 
 
-def simulator(dt, grid=None, scale=1.0):
-    """Constants of the simulator with a time step [s], on the reconstruction's grid unless another is given.
-
-    Where all lengths are scaled, gravity is as well.
-    """
+def simulator(dt, grid=None):
+    """Constants of the simulator with a time step [s], on the reconstruction's grid unless another is given."""
     section = SETTINGS.simulation.plain() | ({"grid": grid} if grid else {})
-    section["gravity"] = [scale * each for each in section["gravity"]]
     return {"dt": dt, **{name: section[name] for name in ("grid", "gravity", "boundary", "walls")}}
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from neuma_lib.capture.clock import frame_times
-from neuma_lib.capture.free_fall import GRAVITY
+from neuma_lib.capture.gravity import GRAVITY, Gravity
 from neuma_lib.capture.pictures import picture_sheet
 from neuma_lib.errors import InputError
 from neuma_lib.fitting.registration import Parabola, register
@@ -36,17 +36,25 @@ def main(inputs, output, params, run) -> None:
     )
     sights = [sight(*values, flight, params.name) for values in files]
     world = read_transforms(listed(inputs.transforms)[0]).get("world", {})
+    scale = world.get("scale", 1.0)
     scale_known = read_transforms(inputs.photographs).get("scale_known", True)
     found = register(
         gaussians,
         x.double().numpy(),
         vol0.double().numpy(),  # of one density
         sights,
-        parabola(flight, world.get("scale", 1.0), np.asarray(world.get("offset", 0.0)), scale_known),
+        parabola(flight, scale, np.asarray(world.get("offset", 0.0)), scale_known),
         params.name,
         scale_known,
         run.progress,
     )
+    gravity = Gravity(
+        found.gravity / scale,
+        found.gravity_covariance / scale**2,
+        f"the placed object in {found.pictures[0]} pictures",
+        len(sights) > 1,
+    )
+    line = gravity.checked(params.name) if scale_known else gravity.told(params.name)
     placed = found.place(x.double().numpy())
     if placed.min() < 0 or placed.max() > 1:
         raise InputError(
@@ -75,8 +83,9 @@ def main(inputs, output, params, run) -> None:
         )
     picture_sheet(output.picture, pictures, f"{params.name}: {found.summary()}", columns=3)
     write_json(output.velocity, found.velocity())
-    write_json(output.registration, found.report())
+    write_json(output.registration, {**found.report(), **gravity.report(), "gravity": line})
     run.say(found.summary())
+    run.say(line)
     if found.ambiguous:
         run.say(f"not told: {found.ambiguous}")
 
