@@ -97,7 +97,28 @@ rule demo_evaluation:
         "../scripts/demo_evaluation.py"
 
 
+rule demo_picture:
+    input:
+        photographs=[
+            f"{DEMO_CAPTURE}/photos/{photograph_files(DEMO)[0]}".format(item=item) for item in DEMO.objects
+        ],
+        stills=[f"{DEMO_CAPTURE}/stills/{DEMO_CAMERAS[0]}.png".format(item=item) for item in DEMO.objects],
+        videos=[
+            f"{DEMO_CAPTURE}/videos/{min(DEMO.objects[item].drops)}/{DEMO_CAMERAS[0]}.mp4".format(item=item)
+            for item in DEMO.objects
+        ],
+    output:
+        picture=f"{RESULTS}/captures_demo.png",
+    conda:
+        CAPTURE_ENVIRONMENT
+    params:
+        names=list(DEMO.objects),
+    script:
+        "../scripts/demo_picture.py"
+
+
 rule captures_demo:
     input:
         rules.demo_evaluation.output,
+        rules.demo_picture.output,
         [demo_file(item, f"{page}.md") for item in DEMO.objects for page in ("capture", "motion")],
