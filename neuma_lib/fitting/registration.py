@@ -54,6 +54,8 @@ LIKELY_SPIN = 10.0
 LIKELY_SIZE, ANY_SIZE = 0.01, 0.3
 """Standard deviations of the relative size of its Gaussians, before: in metres, and in a world of unknown scale."""
 
+FEWEST = 4
+"""Frames of a camera that are kept, wherever the floor is."""
 SHOWN = 3
 """Pictures of each camera that are shown beside their renders."""
 
@@ -347,6 +349,7 @@ def register(
     name: str,
     scale_known: bool = True,
     progress: Callable[[int, int, float], None] | None = None,
+    floor: float | None = None,
 ) -> Registration:
     """Find pose and motion of a photographed object in its video.
 
@@ -359,6 +362,8 @@ def register(
         scale_known: whether photographs and video are in the same metres; otherwise the size is found along, if it is
             right within a factor of 1.5 or so.
         progress: called with (step, steps, root mean square residual).
+        floor: height of it [m]; frames in which the placed object would reach below are those after the contact, and
+            are left out. None: all frames are of free flight.
 
     Raises:
         InputError: no common time; or the object does not look like what was filmed, in any pose.
@@ -383,7 +388,11 @@ def register(
     others: list[tuple[float, Found]] = []
     weights = np.full(len(sights), _FIRST_WEIGHT)
     for number, stage in enumerate(STAGES):
-        chosen = [sight.select(_near(sight.clock - start, stage, interval)) for sight in sights]
+        flying = sights
+        if floor is not None and stage.reach == np.inf:
+            arms = particles - pivot
+            flying = [_above(s, arms, candidates[0], k, start, floor) for k, s in enumerate(sights)]
+        chosen = [sight.select(_near(sight.clock - start, stage, interval)) for sight in flying]
         pictures = Pictures(body, chosen, stage.across, distances)
         pictures.weights = weights
         if number == 0:
@@ -584,6 +593,17 @@ def _near(times: np.ndarray, stage: Stage, interval: float) -> np.ndarray:
     if len(near) == 0 or stage.frames == 1:
         return np.array([np.abs(times).argmin()])
     return near[spread_frames(len(near), stage.frames)]
+
+
+def _above(sight: Sight, arms: np.ndarray, found: Found, camera: int, start: float, floor: float) -> Sight:
+    """A camera's frames before particles at ``arms`` (N, 3) [m] from the centre reach the floor, `FEWEST` at least."""
+    times = sight.times + found.offsets[camera] - start
+    centres, _ = found.motion.place(times)
+    turns, _ = found.motion.turn(times)
+    lowest = (1 + found.enlargement) * np.einsum("tj,nj->tn", turns[:, 1], arms).min(axis=1) + centres[:, 1]
+    after = np.flatnonzero((lowest < floor) & (times > 0))
+    before = after[0] if len(after) else len(times)
+    return sight.select(range(max(before, min(FEWEST, len(times)))))
 
 
 def _search(pictures: Pictures, nothing: Found, start: float, scale_known: bool) -> list[Found]:

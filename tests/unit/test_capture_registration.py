@@ -122,6 +122,22 @@ def test_a_plain_ball_is_said_to_be_ambiguous():
     assert np.linalg.norm(errors[3:6]) < 0.01 and np.linalg.norm(errors[6:9]) < 0.1
 
 
+def test_frames_after_the_contact_are_left_out():
+    """From the ninth frame on the body lies where it touched the floor, which outlines alone may take for flight."""
+    body = thing(count=250)
+    motion = true_motion(body, Rotation.random(random_state=8).as_matrix())
+    (turn,), (centre,) = motion.turn(np.array([8.5 / 120]))[0], motion.place(np.array([8.5 / 120]))[0]
+    floor = ((body.particles - body.pivot) @ turn.T + centre)[:, 1].min()
+    sights = filmed(body, motion, frames=12, noise=0.02)
+    for sight in sights:
+        sight.images[9:] = sight.images[8]
+    for height, bound in ((floor, 0.005), (None, np.inf)):
+        found = register(body.gaussians, body.particles, body.mass, sights, guess(), "one", floor=height)
+        off = np.linalg.norm(found.found.motion.velocity - motion.place(np.array([found.start - 3.0]))[1][0])
+        assert off < bound
+    assert off > 0.05
+
+
 def test_gravity_that_is_not_what_was_assumed_is_measured():
     """As a square size off by 15 percent shows it, or a floor that is not level."""
     body, shown = thing(count=250), np.array([0.6, -8.4, 0.0])

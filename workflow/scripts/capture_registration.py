@@ -47,6 +47,7 @@ def main(inputs, output, params, run) -> None:
         params.name,
         scale_known,
         run.progress,
+        floor=float(world.get("offset", [0.0, 0.0, 0.0])[1]),
     )
     gravity = Gravity(
         found.gravity / scale,
