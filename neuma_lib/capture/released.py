@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
 from neuma_lib.capture.agreement import nearest_point
@@ -54,6 +55,8 @@ MIDDLE = (0.15, 0.20)
 """x and y of the middle of the volume that Spring-Gaus' settings leave for the objects."""
 GROUND = {"bun": -0.010, "burger": -0.025, "dog": -0.025, "pig": -0.025, "potato": -0.010}
 """z of the floor under each object in Spring-Gaus' settings."""
+BESIDE = 3
+"""Width of the surroundings of a mask that may still show the object [px]."""
 _MODELS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV"}
 _PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8}
 _SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -436,3 +439,16 @@ def read_shots(shots: Sequence[Shot], longest: int) -> Iterator[tuple[np.ndarray
                 )
             pixels = np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.BOX))
         yield undistorted(pixels, shot.lens, longest), own_mask(shot.mask, shot.lens, longest)
+
+
+def plate_behind(pictures: Sequence[np.ndarray], masks: Sequence[np.ndarray]) -> np.ndarray:
+    """The empty scene (H, W, 3), uint8: the median of what masks do not cover; where all do, of everything.
+
+    Args:
+        pictures: (H, W, 3), uint8, each.
+        masks: (H, W), bool, each; their surroundings, `BESIDE` pixels wide, are not taken for empty.
+    """
+    covered = np.stack([binary_dilation(mask, iterations=BESIDE) for mask in masks])
+    covered[:, covered.all(axis=0)] = False
+    seen = np.ma.masked_array(np.stack(pictures), np.repeat(covered[..., None], 3, axis=-1))
+    return np.ma.median(seen, axis=0).filled(0).round().astype(np.uint8)

@@ -12,6 +12,7 @@ from neuma_lib.capture.released import (
     RATE,
     ROOM_FROM_WORLD,
     photographs_about_to_size,
+    plate_behind,
     read_configured,
     read_released,
     read_shots,
@@ -188,3 +189,18 @@ def test_times_and_contact_are_plain_json(folders):
     found = read_released(folders["spring_gaus"], "bun")
     frames, _ = video_frames(next(iter(found.videos.values())), found.ground, 0.75, LONGEST)
     assert json.loads(json.dumps(frames)) == frames
+
+
+def test_the_empty_scene_is_what_masks_do_not_cover():
+    """Also where the object lies in most of the frames, of which a plain median would keep it."""
+    scene = np.tile(np.arange(40, dtype=np.uint8)[None, :, None], (30, 1, 3))
+    pictures, masks = [], []
+    for left in (2, 20, 22, 22, 22):
+        mask = np.zeros((30, 40), bool)
+        mask[10:16, left : left + 6] = True
+        pictures.append(np.where(mask[..., None], 200, scene).astype(np.uint8))
+        masks.append(mask)
+    np.testing.assert_array_equal(plate_behind(pictures, masks), scene)
+    assert (np.median(pictures, axis=0) == 200).any()
+    always = plate_behind([pictures[2]] * 3, [masks[2]] * 3)
+    np.testing.assert_array_equal(always, pictures[2])

@@ -173,7 +173,6 @@ def report_facts(name, method):
         "dt": settings.dt,
         "width": settings.width,
         "held_out": list(settings.held_out),
-        "photographs": len(capture.photographs),
         "throws": {
             throw: {camera: exposures.get(camera, 0.0) for camera in cameras}
             for throw, cameras in capture.throws.items()

@@ -37,10 +37,9 @@ def main(inputs, output, params, run) -> None:
         if of_others
         else {"Frames, cameras, room": checks(read_json(inputs.room), by_video(inputs.timelines))}
     )
+    photographs = read_json(inputs.photographs)
     groups |= {
-        "Masks and free flight": motion_checks(
-            read_json(inputs.photographs), by_video(inputs.masks), flights
-        ),
+        "Masks and free flight": motion_checks(photographs, by_video(inputs.masks), flights),
         "The object as photographed": object_checks(read_json(inputs.object)),
         "Its place in the videos": registration_checks(registrations),
     }
@@ -87,13 +86,12 @@ def main(inputs, output, params, run) -> None:
         )
         for (throw, camera), file in zip(videos, listed(inputs.films), strict=True)
     ]
-    count = {camera for cameras in facts["throws"].values() for camera in cameras}
+    cameras = {camera for filming in facts["throws"].values() for camera in filming}
     held = f", {', '.join(facts['held_out'])} held out" if facts["held_out"] else ""
     summary = [
-        f"{facts['photographs']} photographs, {len(throws)} throws{held}, {len(count)} cameras. Prior: "
-        f"{facts['prior']}, "
-        f"density {facts['density']:g} kg/m³, steps of {1e3 * facts['dt']:g} ms, learned from pictures of "
-        f"{facts['width']} pixels."
+        f"{_counted(photographs['photographs'], 'photograph')}, {_counted(len(throws), 'throw')}{held}, "
+        f"{_counted(len(cameras), 'camera')}. Prior: {facts['prior']}, density {facts['density']:g} kg/m³, "
+        f"steps of {1e3 * facts['dt']:g} ms, learned from pictures of {facts['width']} pixels."
     ]
     report = Report(
         params.capture,
@@ -112,6 +110,10 @@ def main(inputs, output, params, run) -> None:
     write_text(output.page, page(report))
     off = sum(not check.good for found in groups.values() for check in found)
     run.say(f"{len(films)} videos, {off} checks are off, {len(said)} things to distrust: {output.page}")
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 run_script(main, snakemake)

@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from neuma_lib.capture.masks import median_plate
-from neuma_lib.capture.released import read_configured, read_shots
+from neuma_lib.capture.released import plate_behind, read_configured, read_shots
 from neuma_lib.capture.shown import numbers_of, shown_frames
 from neuma_lib.config.capture import ReleasedConfig
 from neuma_lib.io.files import read_json
@@ -19,13 +18,11 @@ def main(inputs, output, params, run) -> None:
     folder, entries = Path(output.transforms).parent, []
     Path(output.transforms).unlink(missing_ok=True)  # a folder without it is an unfinished one
     for camera, mattes in zip(params.cameras, listed(inputs.mattes), strict=True):
-        pictures = {
-            shot.number: pixels
-            for shot, (pixels, _) in zip(shots[camera], read_shots(shots[camera], params.longest))
-        }
-        frames = ((number, pictures[number]) for number in numbers_of(video, camera))
+        pictures, masks = zip(*read_shots(shots[camera], params.longest))
+        by_number = dict(zip([shot.number for shot in shots[camera]], pictures))
+        frames = ((number, by_number[number]) for number in numbers_of(video, camera))
         # Not all files have a picture of the empty scene.
-        plate = median_plate(list(pictures.values()))
+        plate = plate_behind(pictures, masks)
         entries += shown_frames(folder, camera, video, mattes, frames, plate, params.width, gains[camera])
         run.say(f"{camera}: {len(numbers_of(video, camera))} frames")
     write_transforms(output.transforms, {}, entries)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from neuma_lib.capture.frames import Frame, contact_sheet, sheet_numbers
-from neuma_lib.capture.masks import overlay
+from neuma_lib.capture.masks import area_jumps, overlay
 from neuma_lib.capture.mattes import write_mattes
 from neuma_lib.capture.released import RATE, read_configured, read_shots, video_frames
 from neuma_lib.config.capture import ReleasedConfig
@@ -27,8 +27,9 @@ def main(inputs, output, params, run) -> None:
     ]
     contact_sheet(output.sheet, sheet, f"{params.name}, {params.camera}: {said}")
     areas = [int(mask.sum()) for mask in masks]
+    jump = float(area_jumps(np.array(areas[: len(flying)])).max()) if len(flying) > 1 else None
     report = {"frames": len(shots), "shown": numbers, "arcs": [[flying[0], flying[-1]]], "areas": areas}
-    write_json(output.report, {**report, "largest_jump": None, "moving": 0.0, "own": len(shots)})
+    write_json(output.report, {**report, "largest_jump": jump, "moving": 0.0, "own": len(shots)})
     timeline = {"frames": len(shots), "rate": RATE, "steady": True, "lost_before": [], "stretch": 1.0}
     size = {"width": shots[0].lens.width, "height": shots[0].lens.height}
     times = [frame["time"] for frame in frames]
