@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from neuma_lib.config.simulation import GRAVITY
 from neuma_lib.errors import InputError
 
-GRAVITY = 9.81
-"""[m/s^2]"""
 UP = (0.0, 1.0, 0.0)
 """The floor's normal in the room."""
 MOST_MISMATCH = 0.1

@@ -49,13 +49,13 @@ def scenes_of(capture: Capture) -> dict[str, dict[str, Any]]:
     """Settings of the scenes of one capture, by name."""
     name, settings = capture.folder.name, capture.settings
     common = {"prior": settings.prior, "density": settings.density, "dt": settings.dt}
-    scenes = {name: {**common, "captured": {"capture": name, "scale": settings.scale}}}
+    world = {"capture": name, "scale": settings.scale, "grid": settings.grid}
+    scenes = {name: {**common, "captured": world}}
     trained = training_throws(capture)
     for throw, cameras in capture.throws.items():
-        captured = {"capture": name, "throw": throw, "cameras": list(cameras), "scale": settings.scale}
         scenes[scene_name(name, throw)] = {
             **common,
-            "captured": captured,
+            "captured": {**world, "throw": throw, "cameras": list(cameras)},
             "material": {"views": list(range(len(cameras)))},
             "videos": [scene_name(name, other) for other in trained[1:]] if throw in trained[:1] else [],
         }

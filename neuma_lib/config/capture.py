@@ -136,6 +136,9 @@ class CaptureConfig(Section):
         "alone",
     )
     dt: float = Field(5e-4, gt=0, lt=0.01, description="time step of the simulation [s]")
+    grid: int | None = Field(
+        None, ge=8, description="grid cells along each side of the simulator's box; null: `captures.grid`"
+    )
     held_out: tuple[str, ...] = Field(
         (), description="throws that the law is not learned from, but judged on"
     )
@@ -203,6 +206,7 @@ class ReleasedConfig(Section):
     prior: str = Field("jelly", description="as in capture.yaml")
     density: float = Field(1000.0, gt=0, description="as in capture.yaml [kg/m^3]")
     dt: float = Field(1 / 1920, gt=0, lt=0.01, description="time step [s]; a frame of 1/120 s has 16 of them")
+    grid: int | None = Field(None, ge=8, description="as in capture.yaml")
     longest: int = Field(
         1000, ge=64, le=8192, description="longer side of the photographs that are kept [px]"
     )
@@ -210,7 +214,7 @@ class ReleasedConfig(Section):
 
     def as_capture(self) -> CaptureConfig:
         """What a capture.yaml would say of it."""
-        same = ("prior", "density", "dt", "longest", "width")
+        same = ("prior", "density", "dt", "grid", "longest", "width")
         return CaptureConfig(
             poses="released", scale=self.enlarge, **{key: getattr(self, key) for key in same}
         )
@@ -220,6 +224,12 @@ class CapturesConfig(Section):
     """Own photographs and videos ([guide](capture.md)): where they lie, and the board that is printed for them."""
 
     root: str = Field("captures", description="folder with a folder for each capture")
+    grid: int = Field(
+        48,
+        ge=8,
+        description="grid cells along each side of the simulator's box, where a capture says nothing else: twice those "
+        "of the rendered scenes, since own objects are smaller. One of 0.3 m then has 14 of them",
+    )
     paper: Literal["A4", "A3"] = Field("A4", description="page that the board is printed on")
     released: dict[str, ReleasedConfig] = Field(
         {},

@@ -139,7 +139,7 @@ class DemoVideosConfig(Section):
 class DemoTruthConfig(Section):
     """How finely the drops are simulated."""
 
-    grid: int = Field(48, ge=8, description="cells along each side of the unit cube")
+    grid: int = Field(64, ge=8, description="cells along each side of the unit cube")
     steps: int = Field(24, ge=1, description="time steps from frame to frame of a video")
     particles: int = Field(12_000, gt=0, description="particles of the body")
     tracers: int = Field(5000, gt=0, description="passive tracers that measure the motion")

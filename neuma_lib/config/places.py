@@ -112,8 +112,7 @@ def law_origin(settings: Config, scene: str, method: str) -> dict[str, Any]:
     networks = law_files(settings, scene, method).prior is not None
     return {
         "dt": chosen.dt,
-        "grid": settings.simulation.grid,
-        "gravity": list(settings.simulation.gravity),
+        **settings.scene_world(source),
         "density": settings.method_density(source, method),
         "scale": chosen.captured.scale if chosen.captured else chosen.images.scale,
         "scene": source,

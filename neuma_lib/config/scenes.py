@@ -59,6 +59,9 @@ class CapturedConfig(Section):
     throw: str | None = Field(None, description="its throw; null: the object as photographed")
     cameras: tuple[str, ...] = Field((), description="cameras that filmed the throw, by name")
     scale: float = Field(1.0, gt=0, description="metres of the simulator to a metre of the room")
+    grid: int | None = Field(
+        None, ge=8, description="grid cells along each side of the box; null: captures.grid"
+    )
 
 
 OF_THE_TRUTH = ("shape", "height", "velocity", "law", "appearance")

@@ -33,7 +33,7 @@ from neuma_lib.config.priors import PriorsConfig
 from neuma_lib.config.radiance import RadianceConfig
 from neuma_lib.config.random_scenes import RandomConfig, draw_scenes
 from neuma_lib.config.scenes import SceneConfig
-from neuma_lib.config.simulation import SimulationConfig
+from neuma_lib.config.simulation import GRAVITY, SimulationConfig
 from neuma_lib.config.springs import SpringsConfig
 from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.config.tables import TableConfig
@@ -267,6 +267,14 @@ class Config(Section):
         """Time step of an experiment [s]."""
         experiment = self.experiment(name)
         return experiment.dt or min(self.scene(body.scene).dt for body in experiment.bodies)
+
+    def scene_world(self, name: str) -> dict[str, Any]:
+        """Grid and gravity of a scene's simulations: those of ``simulation``, or of the room of a capture."""
+        captured = self.scene(name).captured
+        if captured is None:
+            return {"grid": self.simulation.grid, "gravity": list(self.simulation.gravity)}
+        gravity = [0.0, -GRAVITY * captured.scale, 0.0]  # all lengths of the room are scaled
+        return {"grid": captured.grid or self.captures.grid, "gravity": gravity}
 
     def scene_truth(self, name: str) -> TruthConfig:
         """How finely the ground truth of a scene is simulated, with nothing left open."""

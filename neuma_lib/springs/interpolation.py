@@ -50,7 +50,7 @@ class Interpolation:
         columns = np.broadcast_to(index[:, None], rows.shape)
         self.points, self.anchors = points, anchors
         self._matrices = _compressed(
-            rows.reshape(4 * len(P), -1), columns.reshape(4 * len(P), -1), len(X), points
+            rows.reshape(4 * len(P), count), columns.reshape(4 * len(P), count), len(X), points
         )
 
     def __call__(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -66,7 +66,7 @@ class Interpolation:
     def _applied(self, u: Tensor) -> Tensor:
         """Values and gradients, shape (T, N, 4, 3), for values u (T, A, 3) at the anchors."""
         flat = _Product.apply(u.transpose(0, 1).reshape(len(self.anchors), -1), *self._matrices)
-        return flat.view(len(self.points), 4, len(u), 3).permute(2, 0, 1, 3)
+        return flat.reshape(len(self.points), 4, len(u), 3).permute(2, 0, 1, 3)
 
 
 class _Product(torch.autograd.Function):

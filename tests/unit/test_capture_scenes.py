@@ -44,6 +44,16 @@ def test_a_capture_is_a_scene_and_each_throw_of_it_another(captures):
     assert "mug_one" not in loaded(captures).plain_scenes
 
 
+def test_a_capture_falls_in_its_room_on_its_own_grid(captures):
+    settings(captures, "scale: 2\n")
+    found = loaded(captures)
+    assert found.scene_world("mug_two") == {"grid": found.captures.grid, "gravity": [0.0, -19.62, 0.0]}
+    settings(captures, "grid: 30\n")
+    assert loaded(captures).scene_world("mug_two") == {"grid": 30, "gravity": [0.0, -9.81, 0.0]}
+    own = found.simulation
+    assert found.scene_world("BouncyBall") == {"grid": own.grid, "gravity": list(own.gravity)}
+
+
 def test_what_is_held_out_trains_nothing(captures):
     settings(captures, "held_out: [one]\n")
     found = loaded(captures).scenes

@@ -284,6 +284,13 @@ def test_points_follow_affine_motions_of_their_anchors():
     assert (follow.velocities((anchors @ A.T)[None])[0] - points @ A.T).abs().max() < 1e-4
 
 
+def test_no_points_follow_as_none():
+    """As of a capture, which has no tracers."""
+    anchors = cloud(20)
+    positions, gradients = Interpolation(anchors[:0], anchors, 16)(torch.stack([anchors, anchors + 1]))
+    assert positions.shape == (2, 0, 3) and gradients.shape == (2, 0, 3, 3)
+
+
 def test_points_carry_their_gradients_to_the_anchors():
     anchors, points = cloud(40), cloud(9, seed=1)
     follow = Interpolation(points, anchors, 16)

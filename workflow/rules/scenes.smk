@@ -2,7 +2,6 @@
 
 from types import SimpleNamespace
 
-from neuma_lib.capture.gravity import GRAVITY, UP
 from neuma_lib.config import places
 from neuma_lib.config.places import FIELD
 from neuma_lib.config.settings import NO_TRUTH
@@ -141,10 +140,7 @@ def frame_steps(wildcards):
 
 def simulation_settings(wildcards):
     """Constants of the simulator for a scene."""
-    scene = SETTINGS.scene(wildcards.scene)
-    if scene.captured:  # in a room, all of whose lengths are scaled
-        return {**simulator(scene.dt), "gravity": [-GRAVITY * scene.captured.scale * each for each in UP]}
-    return simulator(scene.dt)
+    return {**simulator(SETTINGS.scene(wildcards.scene).dt), **SETTINGS.scene_world(wildcards.scene)}
 
 
 def filming(wildcards):
