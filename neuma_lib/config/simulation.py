@@ -8,7 +8,6 @@ from pydantic import Field
 
 from neuma_lib.config.base import Section, Vector
 
-
 GRAVITY = 9.81
 """Of the room that a capture was filmed in [m/s^2]."""
 
