@@ -34,3 +34,14 @@ class ImagesConfig(Section):
     width: int = Field(128, ge=8, description="image width [px]")
     height: int = Field(128, ge=8, description="image height [px]")
     samples: int = Field(16, ge=1, description="Cycles samples a pixel (denoised)")
+
+
+class BlenderConfig(Section):
+    """The processes that render; each makes one image set."""
+
+    device: Literal["cpu", "auto", "cuda"] = Field(
+        "cpu",
+        description="what renders: CPU cores, to the same bytes every time; a CUDA GPU, to slightly other images; "
+        "or `auto`, CUDA where `device` is not cpu and there is one",
+    )
+    threads: int = Field(1, ge=1, description="CPU cores of each")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field, model_validator
 
 from neuma_lib.config.base import Section
-from neuma_lib.config.blender import ImagesConfig
+from neuma_lib.config.blender import BlenderConfig, ImagesConfig
 
 
 class PackingConfig(Section):
@@ -64,6 +64,7 @@ class DatasetConfig(Section):
     dynamic: ImagesConfig = Field(
         ImagesConfig(views=3, width=96, height=96), description="videos, view 0 frontal"
     )
+    blender: BlenderConfig = Field(BlenderConfig(), description="how both sets of images are rendered")
     packed: str | None = Field(
         None,
         min_length=1,

@@ -233,6 +233,38 @@ def test_same_job_same_bytes_and_moving_mesh(tmp_path):
     assert times == [0.0, 0.0, 0.008, 0.008]
 
 
+def ball(size: int):
+    """A ball and two views of it."""
+    mesh = shapes.place("ball", 0.26, 0.3, (0.5, 0.5), 48)
+    colors = colors_at(mesh, mesh.vertices, AppearanceConfig(colors={"body": "#f4c534"}, accent="#3060c0"))
+    body = Surface(mesh.vertices[None], mesh.faces, colors)
+    return body, cameras.static_views(body.points, 2, size, size)
+
+
+@needs_blender
+@pytest.mark.skipif(torch.cuda.is_available(), reason="for machines without a GPU")
+def test_without_a_gpu_auto_is_the_cpu_and_cuda_an_error(tmp_path):
+    body, views = ball(32)
+    for device in ("cpu", "auto"):
+        render_static(body, views, tmp_path / device, 4, device=device)
+    for name in ("s_000.png", "s_001.png"):
+        assert (tmp_path / "cpu" / name).read_bytes() == (tmp_path / "auto" / name).read_bytes()
+    with pytest.raises(InputError, match=r"^dataset\.blender\.device: cuda .* no CUDA device; set cpu"):
+        render_static(body, views, tmp_path / "cuda", 4, device="cuda")
+    assert list((tmp_path / "cuda").iterdir()) == []
+
+
+@needs_blender
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
+def test_a_gpu_renders_what_the_cpu_does(tmp_path):
+    body, views = ball(128)
+    images = []
+    for device in ("cpu", "cuda"):
+        render_static(body, views, tmp_path / device, 16, device=device)
+        images.append(read_image_set(tmp_path / device / "transforms.json").images)
+    assert np.abs(images[0] - images[1]).mean() < 1 / 255
+
+
 @needs_blender
 def test_colours_on_the_image_are_those_of_the_surface(tmp_path):
     """Matt, mostly ambient light: a flat colour stays near itself, wherever the surface turns."""

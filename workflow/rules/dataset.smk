@@ -1,5 +1,9 @@
 """Ground truth of the synthetic benchmarks and its images; and the compiled kernels that all simulations share."""
 
+BLENDER = SETTINGS.dataset.blender
+RENDER_DEVICE = EITHER_DEVICE if BLENDER.device == "auto" else BLENDER.device
+RENDER_GPU = {"cpu": 0, "auto": EITHER_GPU, "cuda": 1}[RENDER_DEVICE]
+
 
 # Marker, log and benchmark lie with the data and not in the cache, which folders may share: where one of them is
 # missing, Snakemake compiles, and then repeats all that depends on it, whether or not anything changed. (ancient() is
@@ -54,10 +58,14 @@ rule render_static:
         transforms=f"{DATA}/{{scene}}/static/transforms.json",
     wildcard_constraints:
         scene=scenes_with("static", "made"),
+    threads: BLENDER.threads
+    resources:
+        gpu=RENDER_GPU,
     params:
         scene=scene_setting("shape", "size", "height", "center", "appearance"),
         images=SETTINGS.dataset.static.plain(),
-        threads=1,
+        threads=BLENDER.threads,
+        device=RENDER_DEVICE,
     script:
         "../scripts/render_static.py"
 
@@ -69,12 +77,15 @@ rule render_dynamic:
         transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
     wildcard_constraints:
         scene=scenes_with("dynamic", "made"),
+    threads: BLENDER.threads
     resources:
+        gpu=RENDER_GPU,
         runtime=240,
     params:
         scene=scene_setting("shape", "size", "height", "center", "appearance"),
         images=SETTINGS.dataset.dynamic.plain(),
-        threads=1,
+        threads=BLENDER.threads,
+        device=RENDER_DEVICE,
     script:
         "../scripts/render_dynamic.py"
 

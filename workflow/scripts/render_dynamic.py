@@ -21,7 +21,8 @@ def main(inputs, output, params, run) -> None:
     views = video_views(body.points, images.views, images.width, images.height)
     steps = arrays["frames"].tolist()
     folder = Path(output.transforms).parent
-    render_dynamic(body, views, steps, attributes["dt"], folder, images.samples, params.threads, run.progress)
+    how = (images.samples, params.threads, run.progress, params.device)
+    render_dynamic(body, views, steps, attributes["dt"], folder, *how)
     run.say(f"{len(views)} views, {len(steps)} frames of {views.width}x{views.height} px")
 
 

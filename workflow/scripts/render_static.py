@@ -18,7 +18,8 @@ def main(inputs, output, params, run) -> None:
     look = AppearanceConfig(**scene["appearance"])
     body = make_body(mesh, look, arrays["x"][:1], arrays["tracers"][:1])
     views = static_views(body.points, images.views, images.width, images.height)
-    render_static(body, views, Path(output.transforms).parent, images.samples, params.threads, run.progress)
+    folder = Path(output.transforms).parent
+    render_static(body, views, folder, images.samples, params.threads, run.progress, params.device)
     run.say(f"{len(views)} views of {views.width}x{views.height} px")
 
 

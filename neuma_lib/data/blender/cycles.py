@@ -8,6 +8,8 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
+from neuma_lib.errors import InputError
+
 SENSOR = 36.0  # width of the camera's sensor [mm]; only its ratio to the lens matters
 SEED = 0
 """Seed of the sampler; the same seed gives the same bytes."""
@@ -17,8 +19,16 @@ KEY = 0.35
 """Strength of one wide soft light from above the frontal camera, which gives the form its shade."""
 
 
-def start(width: int, height: int, samples: int, threads: int) -> None:
-    """An empty scene with the renderer's settings and the light."""
+def start(width: int, height: int, samples: int, threads: int, device: str = "cpu") -> None:
+    """An empty scene with the renderer's settings and the light.
+
+    Args:
+        device: what renders and denoises: "cpu"; "cuda", the first CUDA device that is visible; or "auto", CUDA where
+            there is a device.
+
+    Raises:
+        InputError: CUDA is asked for and Blender sees no device.
+    """
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     render, cycles = scene.render, scene.cycles
@@ -55,6 +65,29 @@ def start(width: int, height: int, samples: int, threads: int) -> None:
     lamp.rotation_mode = "QUATERNION"
     lamp.rotation_quaternion = towards.to_track_quat("Z", "Y")
     scene.collection.objects.link(lamp)
+    if device != "cpu" and not _use_cuda() and device == "cuda":
+        raise InputError(
+            "dataset.blender.device: cuda is asked for, but Blender sees no CUDA device; set cpu or auto, or mend the "
+            "driver"
+        )
+
+
+def _use_cuda() -> bool:
+    """Render and denoise on the first CUDA device; False, and nothing changes, where there is none.
+
+    Several devices would share every picture: pictures of this size gain more from one process a device.
+    """
+    preferences = bpy.context.preferences.addons["cycles"].preferences
+    devices = [each for each in preferences.get_devices_for_type("CUDA") if each.type == "CUDA"]
+    if not devices:
+        return False
+    preferences.compute_device_type = "CUDA"
+    for number, each in enumerate(devices):
+        each.use = number == 0
+    cycles = bpy.context.scene.cycles
+    cycles.device = "GPU"
+    cycles.denoising_use_gpu = True
+    return True
 
 
 def add_camera(focal: float, width: int) -> bpy.types.Object:

@@ -8,6 +8,7 @@ collects the images, which appear in the target folder only when all of them are
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -101,6 +102,7 @@ def render_images(
     samples: int,
     threads: int = 1,
     progress: Progress | None = None,
+    device: str = "cpu",
 ) -> None:
     """Render shots to RGBA PNG files.
 
@@ -113,9 +115,11 @@ def render_images(
         samples: samples a pixel, denoised (the alpha channel is not: 8 are usable, 16 clean).
         threads: CPU cores that Blender may use.
         progress: called with the number of finished images and of all.
+        device: what renders: "cpu", "cuda", or "auto", CUDA where Blender sees a device.
 
     Raises:
-        InputError: Blender cannot be imported; the message names the Debian package or pip package to install.
+        InputError: Blender cannot be imported, and the message names the Debian package or pip package to install; or
+            it sees no CUDA device where one is asked for.
         RuntimeError: Blender failed; the message ends with its last words.
     """
     out_dir = Path(out_dir)
@@ -133,6 +137,7 @@ def render_images(
             shots=np.asarray(shots, dtype=np.int64).reshape(-1, 2),
             samples=samples,
             threads=threads,
+            device=device,
         )
         run_worker(worker.__name__, job, len(shots), progress)
         for index, name in enumerate(names):
@@ -183,6 +188,10 @@ def run_worker(module: str, job: Path, total: int, progress: Progress | None) ->
         words = log.read_text(errors="replace")
         if hint := explain_import_error(words):
             raise InputError(hint)
+        if refused := re.search(
+            rf"^{re.escape(InputError.__module__)}\.InputError: (.+)", words, re.MULTILINE
+        ):
+            raise InputError(refused[1])
         tail = "\n".join(words.strip().splitlines()[-12:])
         raise RuntimeError(f"Blender ended with status {process.returncode}:\n{tail}")
 
@@ -194,11 +203,12 @@ def render_static(
     samples: int,
     threads: int = 1,
     progress: Progress | None = None,
+    device: str = "cpu",
 ) -> None:
     """Render frame 0 from every camera, and write transforms.json: files ``s_<view>.png``."""
     shots = [(0, view) for view in range(len(views))]
     names = [f"s_{view:03d}.png" for _, view in shots]
-    _render_set(geometry, views, shots, names, [0], [0.0], out_dir, samples, threads, progress)
+    _render_set(geometry, views, shots, names, [0], [0.0], out_dir, samples, threads, progress, device)
 
 
 def render_dynamic(
@@ -210,6 +220,7 @@ def render_dynamic(
     samples: int,
     threads: int = 1,
     progress: Progress | None = None,
+    device: str = "cpu",
 ) -> None:
     """Render every frame from every camera, and write transforms.json: files ``d_<view>_<step>.png``.
 
@@ -222,7 +233,7 @@ def render_dynamic(
     shots = [(frame, view) for frame in range(len(geometry)) for view in range(len(views))]
     names = [f"d_{view}_{steps[frame]:04d}.png" for frame, view in shots]
     times = [float(step) * dt for step in steps]
-    _render_set(geometry, views, shots, names, steps, times, out_dir, samples, threads, progress)
+    _render_set(geometry, views, shots, names, steps, times, out_dir, samples, threads, progress, device)
 
 
 def _render_set(geometry, views, shots, names, steps, times, out_dir, *options) -> None:

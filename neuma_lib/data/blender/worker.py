@@ -54,7 +54,7 @@ def main(path: str) -> None:
     from neuma_lib.data.blender import cycles
 
     folder = Path(path).parent
-    cycles.start(*(int(s) for s in job["size"]), int(job["samples"]), threads)
+    cycles.start(*(int(s) for s in job["size"]), int(job["samples"]), threads, str(job["device"]))
     body = cycles.Body(job)
     camera = cycles.add_camera(float(job["focal"]), int(job["size"][0]))
     shown = None
