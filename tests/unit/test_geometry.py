@@ -13,7 +13,7 @@ from silhouettes import cameras_around, mattes
 
 from neuma_lib.config.geometry import SurfaceConfig
 from neuma_lib.errors import InputError
-from neuma_lib.geometry import shapes
+from neuma_lib.geometry import shapes, volume
 from neuma_lib.geometry.surface import reconstruct
 from neuma_lib.geometry.visual_hull import visual_hull
 from neuma_lib.geometry.volume import inside, sample_tracers, sample_volume, volume_iou
@@ -193,6 +193,37 @@ def test_inside_of_overlapping_parts_is_their_union():
     parts = [trimesh.creation.icosphere(3, 0.1).apply_translation([x, 0, 0]) for x in (0.0, 0.1)]
     points = np.array([[0.05, 0, 0], [-0.09, 0, 0], [0.19, 0, 0], [0.0, 0.099, 0.05]])
     assert inside(trimesh.util.concatenate(parts), points).tolist() == [True, True, True, False]
+
+
+@pytest.mark.parametrize("count", [40, 60_000])
+def test_one_point_decides_for_all_that_no_face_separates(monkeypatch, count):
+    """Against the winding number of every point: holes, overlaps, large faces, a leaf, an island in a hollow."""
+    ball = trimesh.creation.icosphere(3, radius=0.1)
+    hole = trimesh.creation.icosphere(3, radius=0.08)
+    hole.invert()
+    meshes = {
+        "duck": shapes.place("duck", 0.3, 0.3, (0.5, 0.5), 48),
+        "torus": trimesh.creation.torus(0.2, 0.08),
+        "box": trimesh.creation.box((0.1, 0.2, 0.3)),
+        "leaf": trimesh.creation.box((0.3, 0.2, 1e-6)),
+        "overlap": trimesh.util.concatenate([ball, ball.copy().apply_translation((0.12, 0.0, 0.0))]),
+        "island": trimesh.util.concatenate([ball, hole, trimesh.creation.icosphere(2, radius=0.03)]),
+    }
+    asked = []
+    every = volume._winding_inside
+    monkeypatch.setattr(
+        volume, "_winding_inside", lambda mesh, points: asked.append(len(points)) or every(mesh, points)
+    )
+    for name, mesh in meshes.items():
+        low, high = mesh.bounds
+        points = np.random.default_rng(3).uniform(low - 0.01, high + 0.01, (count, 3))
+        points[: count // 2] = np.clip(points[: count // 2], low, high)  # on the bounds, too
+        within = ((points >= low) & (points <= high)).all(axis=1)
+        expected = within.copy()
+        expected[within] = every(mesh, points[within])
+        assert (inside(mesh, points) == expected).all(), name
+        if count > 1000 and name != "leaf":
+            assert asked[-1] < 0.35 * within.sum(), name
 
 
 @pytest.mark.parametrize("method", ["jittered", "uniform"])
