@@ -35,7 +35,8 @@ class IdentifyConfig(Section):
     particles: int = Field(
         8000,
         ge=0,
-        description="particles of the bodies that say what the coarseness of the reconstruction's changes; 0: ignored",
+        description="particles of the bodies that say what the coarseness of the reconstruction's changes, more than "
+        "`simulation.particles`; 0: ignored",
     )
     misplaced: float = Field(
         1e-3,

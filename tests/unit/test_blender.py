@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -146,6 +147,14 @@ def test_liquid_surface_is_closed_and_holds_the_volume():
 # ------------------------------------------------------------------------------------------- Blender
 
 
+def ball(size: int):
+    """A ball and two views of it."""
+    mesh = shapes.place("ball", 0.26, 0.3, (0.5, 0.5), 48)
+    colors = colors_at(mesh, mesh.vertices, AppearanceConfig(colors={"body": "#f4c534"}, accent="#3060c0"))
+    body = Surface(mesh.vertices[None], mesh.faces, colors)
+    return body, cameras.static_views(body.points, 2, size, size)
+
+
 def test_missing_libraries_are_named_with_their_package():
     text = "ImportError: libXi.so.6: cannot open shared object file: No such file or directory"
     assert "apt-get install libxi6" in explain_import_error(text)
@@ -167,6 +176,23 @@ def test_failing_import_reaches_the_user(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="libsm6"):
         render_static(body, views, tmp_path / "out", 4)
     assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_blender_may_have_another_python(tmp_path, monkeypatch):
+    """It is started with the project alone on its path, and must exist."""
+    other = tmp_path / "python"
+    other.write_text(f'#!/bin/sh\necho "$PYTHONPATH|$*" > {tmp_path}/seen\nexit 1\n')
+    other.chmod(0o755)
+    body, views = ball(16)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "packages"))
+    monkeypatch.setenv("NEUMA_BLENDER_PYTHON", str(other))
+    with pytest.raises(RuntimeError, match="status 1"):
+        render_static(body, views, tmp_path / "out", 4)
+    path, words = (tmp_path / "seen").read_text().split("|")
+    assert (Path(path) / "neuma_lib").is_dir() and words.startswith("-m neuma_lib.data.blender.worker ")
+    monkeypatch.setenv("NEUMA_BLENDER_PYTHON", str(tmp_path / "none"))
+    with pytest.raises(InputError, match="NEUMA_BLENDER_PYTHON=.*none: no such program"):
+        render_static(body, views, tmp_path / "out", 4)
 
 
 @needs_blender
@@ -231,14 +257,6 @@ def test_same_job_same_bytes_and_moving_mesh(tmp_path):
     np.testing.assert_allclose(middle, views.project(moved.mean(axis=1))[0], atol=0.15)
     times = [f["time"] for f in json.loads((tmp_path / "a" / "transforms.json").read_text())["frames"]]
     assert times == [0.0, 0.0, 0.008, 0.008]
-
-
-def ball(size: int):
-    """A ball and two views of it."""
-    mesh = shapes.place("ball", 0.26, 0.3, (0.5, 0.5), 48)
-    colors = colors_at(mesh, mesh.vertices, AppearanceConfig(colors={"body": "#f4c534"}, accent="#3060c0"))
-    body = Surface(mesh.vertices[None], mesh.faces, colors)
-    return body, cameras.static_views(body.points, 2, size, size)
 
 
 @needs_blender

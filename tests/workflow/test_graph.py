@@ -283,6 +283,31 @@ def test_a_method_can_start_as_identification_found(project):
         assert not any(file.endswith("velocity.json") for file in made[rule][0])
 
 
+def test_finer_bodies_must_be_finer(project):
+    for particles, accepted in {200: False, 201: True, 0: True}.items():
+        settings = f"identify={{particles: {particles}}}"
+        output = project.run(
+            "--dry-run", "--config", settings, "--", f"{SCENE}/identified.json", succeeds=accepted
+        )
+        told = "identify.particles: 200 are not more than the 200 of the reconstruction"
+        assert (told in output) != accepted
+
+
+def test_images_are_rendered_where_the_settings_say(project):
+    """On one CPU core unless a GPU or more cores are asked for; images alone, not what is computed from them."""
+    images = "tiny/data/BouncyBall/static/transforms.json"
+    for blender, resources in {
+        "{}": "gpu=0",
+        "{device: auto}": "gpu=0",
+        "{device: cuda, threads: 2}": "gpu=1",
+    }.items():
+        told = ("device=cpu", f"dataset={{blender: {blender}}}")
+        output = project.run("--dry-run", "--config", *told, "--", images)
+        block = re.search(r"^rule render_static:\n(?:    .*\n)+", output, re.MULTILINE)[0]
+        assert resources in block
+        assert ("threads: 2" in block) == ("threads: 2" in blender)
+
+
 CHAINS = ("--config", "tables={table1: {seeds: 3}}", "--")
 DATA_RULES = ("kernels", "ground_truth", "render_static", "render_dynamic")
 

@@ -92,8 +92,15 @@ def identification(file):
     return ("identify_views", {"scene": scene, "views": views}) if views else ("identify", {"scene": scene})
 
 
+@checked
 def identify_settings(wildcards):
     """Settings of an identification, in the views that its file names, if any."""
+    finer, own = SETTINGS.identify.particles, SETTINGS.simulation.particles
+    if 0 < finer <= own:
+        raise InputError(
+            f"identify.particles: {finer} are not more than the {own} of the reconstruction (simulation.particles), whose "
+            f"coarseness they are to tell; give {4 * own}, or 0 to ignore it"
+        )
     views = getattr(wildcards, "views", None)
     return SETTINGS.identify.plain() | ({"views": [int(view) for view in views.split(",")]} if views else {})
 

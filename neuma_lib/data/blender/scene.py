@@ -27,6 +27,8 @@ from neuma_lib.io.images import write_transforms
 from neuma_lib.splatting.viewpoints import Views
 
 Progress = Callable[[int, int], None]
+OTHER_PYTHON = "NEUMA_BLENDER_PYTHON"
+"""Environment variable with the interpreter that has bpy, where it is not this one."""
 
 
 @dataclass(frozen=True)
@@ -165,11 +167,16 @@ def run_worker(module: str, job: Path, total: int, progress: Progress | None) ->
         InputError, RuntimeError: see `render_images`.
     """
     root = str(Path(__file__).resolve().parents[3])
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
+    python, packages = sys.executable, [root, os.environ.get("PYTHONPATH", "")]
+    if other := os.environ.get(OTHER_PYTHON):
+        python, packages = shutil.which(other), [root]  # what is for this interpreter is not for another
+        if python is None:
+            raise InputError(f"{OTHER_PYTHON}={other}: no such program; name a Python 3.11 that has bpy")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(packages)}
     log = job.with_suffix(".log")
     with open(log, "wb") as sink:
         process = subprocess.Popen(
-            [sys.executable, "-m", module, str(job)],
+            [python, "-m", module, str(job)],
             stdout=subprocess.PIPE,
             stderr=sink,
             env=environment,
