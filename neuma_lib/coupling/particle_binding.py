@@ -87,9 +87,15 @@ def bind_two_pass(
     added = centres[orphans]
 
     if len(orphans):
-        # Every Gaussian is bound anew: an added particle may lie inside its neighbours' ellipsoids as well.
+        # An added particle may lie inside its neighbours' ellipsoids as well: these are bound anew.
         together = np.concatenate([points, added])
-        rows, columns = _pairs_inside(centres, shapes, together, settings)
+        reach = np.sqrt(_threshold(settings) * np.linalg.eigvalsh(shapes)[:, 2]) * (1 + 1e-9)
+        near = cKDTree(added).query_ball_point(centres, reach, return_length=True) > 0
+        kept = ~near[rows]
+        again, found = _pairs_inside(centres[near], shapes[near], together, settings)
+        rows = np.concatenate([rows[kept], np.flatnonzero(near)[again]])
+        order = np.argsort(rows, kind="stable")
+        rows, columns = rows[order], np.concatenate([columns[kept], found])[order]
         if settings.equal_mass:
             shares = np.full(len(together), shares.sum() / len(together))
         else:
@@ -151,6 +157,11 @@ def _whitening(shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.swapaxes(eigenvectors, 1, 2) / np.sqrt(eigenvalues)[:, :, None], largest
 
 
+def _threshold(settings: BindingConfig) -> float:
+    """Largest squared Mahalanobis distance of a bound particle."""
+    return float(chdtri(3, 1.0 - settings.confidence))
+
+
 def _pairs_inside(
     centres: np.ndarray, shapes: np.ndarray, points: np.ndarray, settings: BindingConfig
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -161,7 +172,7 @@ def _pairs_inside(
     found: the smallest Mahalanobis distance at a Euclidean distance r is r^2 / lambda_max. Otherwise it is
     asked again with more. The result is exact; only how much is read depends on the guess.
     """
-    threshold, most = float(chdtri(3, 1.0 - settings.confidence)), settings.max_neighbours
+    threshold, most = _threshold(settings), settings.max_neighbours
     whitening, largest = _whitening(shapes)
     tree = cKDTree(points)
     pending = np.arange(len(centres))

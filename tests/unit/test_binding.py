@@ -100,6 +100,8 @@ def test_two_passes_leave_no_gaussian_empty_and_rows_sum_to_one(equal_mass):
     assert binding.shape == (300, 500 + added) and enlarged.shape == (500 + added, 3)
     torch.testing.assert_close(enlarged[500:], means[first.counts == 0])
     assert (binding.counts > 0).all()
+    anew = bind(means, covars, enlarged)
+    assert torch.equal(binding.indptr, anew.indptr) and torch.equal(binding.indices, anew.indices)
     torch.testing.assert_close(dense(binding).sum(1), torch.ones(300, dtype=torch.float64))
     torch.testing.assert_close(dense(binding), algorithm_1(means, covars, enlarged, max_neighbours=10))
     assert (volumes > 0).all()
