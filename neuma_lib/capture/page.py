@@ -13,6 +13,8 @@ MOST_ERROR = 1.0
 """Mean reprojection error that good photographs stay below [px]."""
 MOST_RESIDUAL = 0.5
 """Distance of the board's corners from the print that a flat board, measured well, stays below [mm]."""
+MOST_UNSURE = 0.3
+"""Deviation of a fixed camera's direction that its picture and those of the photographs leave [degrees]."""
 LEAST_FLOOR = 0.2
 """Share of the points that lie on a floor with texture."""
 MOST_LEFT_OUT = 0.1
@@ -52,6 +54,10 @@ def checks(room: Mapping[str, Any], videos: Mapping[str, Mapping[str, Any]]) -> 
         found.append(
             Check("reprojection error", f"{error:.2f} px", f"< {MOST_ERROR:g} px", error < MOST_ERROR)
         )
+    for name, (x, y, turn) in room["unsure"].items():
+        text = f"+-{turn:.2f} degrees, the lens's centre +-{x:.1f} and +-{y:.1f} px"
+        wanted = f"< {MOST_UNSURE:g} degrees"
+        found.append(Check(f"direction of {name.split('/')[0]}", text, wanted, turn < MOST_UNSURE))
     if board := room["board"]:
         off = board["residual_mm"]
         text = f"{off:.2f} mm ({board['corners']} corners, {board['pictures']} pictures)"

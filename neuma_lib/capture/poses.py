@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from neuma_lib.capture.folder import PHOTOGRAPHS
 from neuma_lib.capture.lens import Lens, lens_of_colmap, read_lens
 from neuma_lib.capture.pictures import copy_pictures, group_of, name_pictures, picture_size, read_picture
 from neuma_lib.capture.placement import Similarity
+from neuma_lib.capture.resection import LEAST_POINTS, Sighting, resect, triangulated
 from neuma_lib.capture.tools import colmap
 from neuma_lib.config.capture import BoardConfig
 from neuma_lib.errors import InputError
@@ -33,7 +34,7 @@ LARGEST = 2400
 """Longer side at which features are sought [px]."""
 PHOTOGRAPH_MODEL, STILL_MODEL = "RADIAL", "SIMPLE_RADIAL"
 """COLMAP's camera models in the search, with square pixels and a centred lens: on ten photographs a second focal length
-went 4 % astray. One picture of a fixed camera does not tell more than focal length and one coefficient."""
+went 4 % astray."""
 REFINED_MODEL = "OPENCV"
 """That of the photographs in the end, with a lens off the centre, where there are enough of them."""
 MOST_OFF_CENTRE = 0.02
@@ -54,6 +55,8 @@ class Poses:
         colours: of the points, (P, 3), uint8.
         error: mean distance of the points in the pictures from where they were seen [px].
         lost: names of pictures that found no place.
+        unsure: of pictures of fixed cameras whose lens was found, by name: deviations of the lens's centre in x and y
+            [px], and of the direction about its worst axis [degrees].
     """
 
     names: tuple[str, ...]
@@ -63,6 +66,7 @@ class Poses:
     colours: np.ndarray
     error: float
     lost: tuple[str, ...] = ()
+    unsure: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
 
     def moved(self, by: Similarity) -> Poses:
         """The same, with all of the world moved."""
@@ -127,7 +131,8 @@ def save_poses(path: str | Path, points: str | Path, poses: Poses) -> None:
         for name, viewmat, lens in zip(poses.names, poses.viewmats, poses.lenses)
     ]
     error = poses.error if np.isfinite(poses.error) else None
-    write_json(path, {"reprojection_error_px": error, "lost": list(poses.lost), "pictures": pictures})
+    said = {"reprojection_error_px": error, "lost": list(poses.lost), "unsure": dict(poses.unsure)}
+    write_json(path, {**said, "pictures": pictures})
 
 
 def load_poses(path: str | Path, points: str | Path) -> Poses:
@@ -144,6 +149,7 @@ def load_poses(path: str | Path, points: str | Path) -> Poses:
             np.stack([rows[channel] for channel in ("red", "green", "blue")], axis=1),
             np.nan if data["reprojection_error_px"] is None else data["reprojection_error_px"],
             tuple(data["lost"]),
+            {name: tuple(values) for name, values in data["unsure"].items()},
         )
 
 
@@ -238,6 +244,8 @@ def structure_from_motion(
     if placed >= FEW_PHOTOGRAPHS and PHOTOGRAPHS not in lenses:
         best = _lens_refined(best, known)
     poses = _poses_of(best, pictures, lenses)
+    if placed >= FEW_PHOTOGRAPHS:
+        poses = _stills_resected(poses, best, lenses)
     check_registered(poses)
     return poses
 
@@ -281,6 +289,41 @@ def _lens_refined(model: Any, known: set[int]) -> Any:
             return model
     refined.update_point_3d_errors()
     return refined
+
+
+def _stills_resected(poses: Poses, model: Any, lenses: Mapping[str, Lens]) -> Poses:
+    """Poses in which each fixed camera whose lens is not known has been fitted to the points of the photographs."""
+    views = {}
+    for image in model.images.values():
+        if image.name in poses.names:
+            seen = [(point.point3D_id, *point.xy) for point in image.points2D if point.has_point3D()]
+            views[image.name] = np.array(seen, np.float64).reshape(-1, 3)
+    stills = [n for n in poses.names if group_of(n) != PHOTOGRAPHS and group_of(n) not in lenses]
+    wanted = np.unique(np.concatenate([views[name][:, 0] for name in stills] or [[]])).astype(np.int64)
+
+    def sighting(name: str) -> Sighting:
+        i, seen = poses.names.index(name), views[name]
+        seen = seen[np.isin(seen[:, 0], wanted)]
+        numbers = np.searchsorted(wanted, seen[:, 0].astype(np.int64))
+        return Sighting(poses.lenses[i], poses.viewmats[i], numbers, seen[:, 1:])
+
+    if len(wanted) == 0:
+        return poses
+    photographs = [sighting(name) for name in poses.names if group_of(name) == PHOTOGRAPHS]
+    first = np.array([model.points3D[int(number)].xyz for number in wanted])
+    points, covariances, known = triangulated(first, photographs)
+    viewmats, found, unsure = poses.viewmats.copy(), list(poses.lenses), {}
+    for name in stills:
+        i, seen = poses.names.index(name), sighting(name)
+        told = known[seen.points]
+        numbers = seen.points[told]
+        if told.sum() < LEAST_POINTS:
+            continue
+        camera = resect(points[numbers], covariances[numbers], seen.pixels[told], seen.lens, seen.viewmat)
+        if plausible(camera.lens):
+            viewmats[i], found[i] = camera.viewmat, camera.lens
+            unsure[name] = (*camera.centre_deviation.tolist(), camera.turn_deviation)
+    return replace(poses, viewmats=viewmats, lenses=tuple(found), unsure=unsure)
 
 
 def plausible(lens: Lens) -> bool:

@@ -167,6 +167,7 @@ def report(room: Room) -> dict[str, Any]:
         "points": len(poses.points),
         "reprojection_error_px": poses.error if np.isfinite(poses.error) else None,
         "lenses": lenses,
+        "unsure": {name: list(values) for name, values in poses.unsure.items()},
         "board": room.board.plain() if room.board else None,
         "share_of_points_on_floor": room.floor,
         "centres_m": dict(zip(poses.names, camera_centres(poses.viewmats).tolist())),

@@ -10,6 +10,7 @@ GOOD = {
     "pictures": 40,
     "lost": [],
     "reprojection_error_px": 0.6,
+    "unsure": {"left/left.png": [0.2, 0.9, 0.08]},
     "board": {"residual_mm": 0.2, "corners": 35, "pictures": 30},
     "share_of_points_on_floor": None,
 }
@@ -30,13 +31,14 @@ def test_only_what_is_off_is_marked():
     assert marked(videos={"first, left": steady}) == []
     assert marked({"registered": 38, "lost": ["photographs/a.jpg"] * 2}) == ["pictures with a place"]
     assert marked({"reprojection_error_px": 1.3}) == ["reprojection error"]
+    assert marked({"unsure": {"left/left.png": [0.3, 5.0, 0.45]}}) == ["direction of left"]
     assert marked({"board": {**GOOD["board"], "residual_mm": 0.9}}) == ["board's corners off the print"]
     assert marked({"board": None, "share_of_points_on_floor": 0.12}) == ["floor"]
     assert marked(videos={"first, left": steady, "first, right": gap}) == ["frames of first, right"]
 
 
 def test_poses_from_elsewhere_have_fewer_checks():
-    given = {**GOOD, "reprojection_error_px": None, "board": None}
+    given = {**GOOD, "reprojection_error_px": None, "unsure": {}, "board": None}
     assert [check.what for check in checks(given, {})] == ["pictures with a place"]
 
 
