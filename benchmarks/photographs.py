@@ -21,8 +21,8 @@ import trimesh
 
 from neuma_lib.capture.agreement import LEAST_AGREEMENT, agreement
 from neuma_lib.capture.folder import PHOTOGRAPHS
-from neuma_lib.capture.masks import photograph_mask
 from neuma_lib.capture.mattes import write_mattes
+from neuma_lib.capture.photograph_masks import photograph_mask
 from neuma_lib.capture.pictures import group_of, picture_sheet, read_picture, undistorted
 from neuma_lib.capture.poses import Poses, find_poses, load_poses, save_poses
 from neuma_lib.capture.saliency import Saliency, fetch_network

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from neuma_lib.capture.clock import reduced, reduced_intrinsics
-from neuma_lib.capture.masks import match_exposure
+from neuma_lib.capture.plate import match_exposure
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import atomic
 from neuma_lib.io.images import open_image, read_transforms

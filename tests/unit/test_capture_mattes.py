@@ -9,7 +9,7 @@ pytest.importorskip("cv2")
 from neuma_lib.capture import flight, mattes  # noqa: E402
 from neuma_lib.capture.folder import read_capture  # noqa: E402
 from neuma_lib.capture.lens import Lens  # noqa: E402
-from neuma_lib.capture.masks import given_masks  # noqa: E402
+from neuma_lib.capture.video_masks import given_masks  # noqa: E402
 from neuma_lib.errors import InputError  # noqa: E402
 from neuma_lib.io.images import OPENGL_TO_OPENCV, place, read_image_set, write_transforms  # noqa: E402
 

@@ -9,8 +9,9 @@ from neuma_lib.capture.board import board_outline
 from neuma_lib.capture.folder import PHOTOGRAPHS
 from neuma_lib.capture.frames import Frame
 from neuma_lib.capture.lens import read_lens
-from neuma_lib.capture.masks import overlay, photograph_mask
+from neuma_lib.capture.masks import overlay
 from neuma_lib.capture.mattes import metric_camera, own_mask, read_pixels, room_frames, world_of, write_mattes
+from neuma_lib.capture.photograph_masks import photograph_mask
 from neuma_lib.capture.pictures import picture_sheet
 from neuma_lib.capture.saliency import Saliency
 from neuma_lib.config.board import BoardConfig
