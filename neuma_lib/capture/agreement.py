@@ -16,6 +16,8 @@ from neuma_lib.errors import InputError
 
 LEAST_AGREEMENT = 0.7
 """Least IoU of a mask with the body of all that is not doubtful."""
+LEAST_SAME = 0.5
+"""Least IoU with which cameras that film at one time can be said to film one object."""
 LEAST_SHARES = (0.8, 0.95)
 """Share of the views which see a voxel that must have it in their masks: of all views, and without the doubtful."""
 _VOXELS = (24, 64)  # along a side of the cube, at first and then
@@ -52,6 +54,17 @@ def agreement(masks: Sequence[np.ndarray], viewmats: np.ndarray, Ks: np.ndarray)
         if len(chosen) < 2:
             break
     return found
+
+
+def check_one_object(found: Sequence[float], cameras: Sequence[str], name: str) -> None:
+    """Raises InputError where the `agreement` of cameras' masks at one time says that they show different things."""
+    worst = int(np.argmin(found))
+    if found[worst] < LEAST_SAME:
+        raise InputError(
+            f"{name}: the cameras do not show one object where it rests, the body that fits all masks fills that of"
+            f" {cameras[worst]} with an IoU of {found[worst]:.2f}: are the videos of one throw and of one object, have"
+            f" the cameras stood still, and is a hand or a shadow in a mask? Look at the contact sheets"
+        )
 
 
 _APART = (

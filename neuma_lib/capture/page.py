@@ -54,7 +54,7 @@ def checks(room: Mapping[str, Any], videos: Mapping[str, Mapping[str, Any]]) -> 
         found.append(
             Check("reprojection error", f"{error:.2f} px", f"< {MOST_ERROR:g} px", error < MOST_ERROR)
         )
-    for name, (x, y, turn) in room["unsure"].items():
+    for name, (x, y, turn) in room.get("unsure", {}).items():
         text = f"+-{turn:.2f} degrees, the lens's centre +-{x:.1f} and +-{y:.1f} px"
         wanted = f"< {MOST_UNSURE:g} degrees"
         found.append(Check(f"direction of {name.split('/')[0]}", text, wanted, turn < MOST_UNSURE))

@@ -149,7 +149,7 @@ def load_poses(path: str | Path, points: str | Path) -> Poses:
             np.stack([rows[channel] for channel in ("red", "green", "blue")], axis=1),
             np.nan if data["reprojection_error_px"] is None else data["reprojection_error_px"],
             tuple(data["lost"]),
-            {name: tuple(values) for name, values in data["unsure"].items()},
+            {name: tuple(values) for name, values in data.get("unsure", {}).items()},
         )
 
 

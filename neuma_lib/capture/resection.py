@@ -97,6 +97,8 @@ def triangulated(
         length = np.linalg.norm(step, axis=1, keepdims=True)
         points += step * np.minimum(1, _LONGEST_STEP * spread / np.maximum(length, 1e-12 * spread))
     off = np.concatenate(residuals)
+    if not known.any():
+        return points, np.linalg.inv(normal), known
     noise = _scatter(off) * np.sqrt(off.size / max(off.size - 3 * known.sum(), 1))
     return points, noise**2 * np.linalg.inv(normal), known
 

@@ -7,7 +7,7 @@ from neuma_lib.errors import InputError
 
 pytest.importorskip("cv2")
 
-from neuma_lib.capture.agreement import LEAST_AGREEMENT, agreement  # noqa: E402
+from neuma_lib.capture.agreement import LEAST_AGREEMENT, agreement, check_one_object  # noqa: E402
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
@@ -69,3 +69,16 @@ def test_masks_of_different_objects_have_no_common_place():
     masks = [ellipsoid_mask(views[0]), ellipsoid_mask(views[1], centre=(0.1, 0.35, 0))]
     with pytest.raises(InputError, match="not of one object"):
         agreement(masks, views, np.tile(K, (2, 1, 1)))
+
+
+def test_cameras_that_film_different_objects_at_one_place_are_named():
+    """The one sees the body, the other a ball of less than half its size where the body would be."""
+    views = np.stack([looking((1, 0.5, 0)), looking((0, 0.5, 1))])
+    same = agreement([ellipsoid_mask(v) for v in views], views, np.tile(K, (2, 1, 1)))
+    check_one_object(same, ["left", "right"], "mug, first")
+    masks = [ellipsoid_mask(views[0]), ellipsoid_mask(views[1], radii=np.full(3, 0.03))]
+    found = agreement(masks, views, np.tile(K, (2, 1, 1)))
+    with pytest.raises(
+        InputError, match=r"mug, first: the cameras do not show one object .* that of left .*one throw"
+    ):
+        check_one_object(found, ["left", "right"], "mug, first")

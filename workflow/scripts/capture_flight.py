@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from neuma_lib.capture.agreement import check_one_object
 from neuma_lib.capture.flight import Filmed, draw_flight, find_flight, report
 from neuma_lib.capture.mattes import metric_camera
 from neuma_lib.capture.timing import read_sound
@@ -27,6 +28,8 @@ def main(inputs, output, params, run) -> None:
     )
     views = [filmed(*values) for values in files]
     flight = find_flight(views, params.name, params.metric)
+    if params.metric and flight.agreement is not None:
+        check_one_object(flight.agreement, params.cameras, params.name)
     draw_flight(output.picture, flight, views, flight.gravity)
     write_json(output.flight, report(flight, views))
     for line in [*flight.offsets_from, flight.gravity]:
