@@ -4,7 +4,8 @@
 
 Dataset and reconstruction must exist (`snakemake results/SCENE/velocity.json`). Everything is done several times over
 in one process: the first time includes what a process does once (CUDA's start, loading compiled kernels). Parts are
-exclusive of each other, and the device is waited for at their ends.
+exclusive of each other, and the device is waited for at their ends. On a CPU its seconds are core seconds, which other
+work beside it does not change.
 """
 
 from __future__ import annotations
@@ -57,17 +58,18 @@ class Clock:
         self.seconds: Counter[str] = Counter()
         self.calls: Counter[str] = Counter()
         self._device, self._inner = device, [0.0]
+        self._now = time.process_time if device.type == "cpu" else time.perf_counter
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
         synchronize(self._device)
-        started = time.perf_counter()
+        started = self._now()
         self._inner.append(0.0)
         try:
             yield
         finally:
             synchronize(self._device)
-            whole = time.perf_counter() - started
+            whole = self._now() - started
             self.seconds[name] += whole - self._inner.pop()
             self.calls[name] += 1
             self._inner[-1] += whole
