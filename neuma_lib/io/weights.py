@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from neuma_lib.io.files import atomic, existing, parse_json, reading, zip_member
 
@@ -18,8 +18,9 @@ from neuma_lib.io.files import atomic, existing, parse_json, reading, zip_member
 def write_weights(path: str | Path, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
     """Write tensors to safetensors, with metadata as one JSON text (their own header has no fixed order)."""
     kept = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    content = save(kept, metadata={"neuma": json.dumps(metadata, sort_keys=True)})
     with atomic(path) as partial:
-        save_file(kept, partial, metadata={"neuma": json.dumps(metadata, sort_keys=True)})
+        partial.write_bytes(content)  # save_file would let nobody else read it
 
 
 def read_weights(path: str | Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:

@@ -357,6 +357,8 @@ def test_weights(tmp_path):
     path = tmp_path / "adaptor.safetensors"
     tensors = {"elasticity.A.0": torch.randn(4, 13), "elasticity.B.0": torch.zeros(64, 4)}
     write_weights(path, tensors, {"rank": 4, "settings": {"lr": 0.1}})
+    (tmp_path / "any").touch()
+    assert path.stat().st_mode == (tmp_path / "any").stat().st_mode, "read by whoever reads other files"
     found, metadata = read_weights(path)
     assert metadata == {"rank": 4, "settings": {"lr": 0.1}}
     assert all(torch.equal(found[name], tensors[name]) for name in tensors)
