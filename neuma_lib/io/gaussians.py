@@ -68,7 +68,9 @@ def load_gaussians(path: str | Path, remedy: str = "fit the Gaussians again") ->
         raw[key] = np.zeros((len(rows), len(columns)), np.float32)
         for i, column in enumerate(columns):
             raw[key][:, i] = rows[column]
-        if (bad := ~np.isfinite(raw[key]).all(axis=1)).any():
+        # converters from layouts with opacities of 8 bits write those of 0 and 1 as infinite logits
+        usable = ~np.isnan(raw[key]) if key == "opacities" else np.isfinite(raw[key])
+        if (bad := ~usable.all(axis=1)).any():
             raise InputError(f"{path}: {key} of Gaussian {np.argmax(bad)} is not finite: {remedy}")
     norm = np.linalg.norm(raw["quats"], axis=1, keepdims=True)
     if (norm == 0).any():

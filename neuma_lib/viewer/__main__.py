@@ -11,6 +11,7 @@ from pathlib import Path
 
 import torch
 
+from neuma_lib.device import choose_device
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.viewer.find import found_laws, found_scene
 from neuma_lib.viewer.page import write_page
@@ -35,6 +36,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--methods", nargs="+", help="methods to show; by default all that have moved it")
     parser.add_argument(
         "--configfile", nargs="+", default=(), help="settings over those of the project, as for snakemake"
+    )
+    parser.add_argument(
+        "--device",
+        default="auto",
+        choices=("auto", "cpu", "cuda"),
+        help="where the live mode simulates; by default on a GPU where there is one",
     )
     chosen = parser.parse_args(arguments)
     try:
@@ -61,9 +68,10 @@ def run(chosen: argparse.Namespace) -> int:
         size = write_page(Path(chosen.file), scene, viewer.particles, viewer.megabytes)
         print(f"{chosen.file}: {len(scene.motions)} motions, {size / 1e6:.1f} MB; open it in a browser")
         return 0
+    device = choose_device(chosen.device)
     torch.set_num_threads(1)  # two OpenMP threads beside the server's are slower than one
     laws = found_laws(settings)
-    playground = Playground(files, laws, first_law(files, laws)) if laws else None
+    playground = Playground(files, laws, first_law(files, laws), device) if laws else None
     server = ViewerServer(scene, playground, chosen.host, chosen.port)
     print(
         f"http://{server.host}:{server.port}  ({len(scene.motions)} motions, {len(laws)} laws; Ctrl-C ends it)"

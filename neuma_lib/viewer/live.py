@@ -19,8 +19,10 @@ import torch
 from torch import Tensor
 
 from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.io.exported import SAME_STEP
 from neuma_lib.mechanics.adaptor import AdaptableLaw
 from neuma_lib.mechanics.law import Law
+from neuma_lib.mechanics.time_step import step_dependence
 from neuma_lib.sim.model import MPMModel, consecutive
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
@@ -51,7 +53,8 @@ class Snapshot:
     Attributes:
         number: of the frame, from 0; grows with every one.
         time: simulated since the last reset [s].
-        x, v, F, total: positions [m], velocities [m/s], elastic and total deformation gradients of all particles.
+        x, v, F, total: positions [m], velocities [m/s], elastic and total deformation gradients of all particles, on
+            the CPU.
         counts: particles of each body.
         dt: time step [s].
         pace: simulated over real time.
@@ -74,6 +77,27 @@ class Snapshot:
     notice: str | None
 
 
+def _undeformed(x: Tensor) -> Tensor:
+    """Deformation gradients (N, 3, 3) of particles (N, 3) at rest."""
+    return torch.eye(3, dtype=x.dtype, device=x.device).expand(len(x), 3, 3)
+
+
+def _check_steps(laws: Sequence[Law], dts: Sequence[float]) -> None:
+    """Whether bodies can share the smallest of the steps that their laws were learned at.
+
+    Raises:
+        InputError: one that was learned at a longer step is another material at that one (`step_dependence`).
+    """
+    least = min(dts)
+    for law, dt in zip(laws, dts, strict=True):
+        if dt - least > SAME_STEP * least and step_dependence(law) != "none":
+            raise InputError(
+                f"bodies of one simulation share a time step, here {1e3 * least:g} ms, and the law {law.name} is another "
+                f"material than at the {1e3 * dt:g} ms that it was learned at: reset, which leaves one body, or take a "
+                "law of the same step"
+            )
+
+
 def tilted(about_x: float, about_z: float) -> np.ndarray:
     """Rotation (3, 3) of the box when its floor is tilted about the axes x and z [degrees]."""
     a, b = np.radians([about_x, about_z])
@@ -87,8 +111,8 @@ class LiveSimulation:
 
     Args:
         constants: of `MPMModel`, without dt and gravity.
-        start: the first body with its motion; a reset goes back to it.
-        law: of the first body.
+        start: the first body with its motion; a reset goes back to it. It is simulated on the device that it is on.
+        law: of the first body, on that device, too.
         dt: time step that the law was learned at [s].
 
     Attributes:
@@ -162,7 +186,10 @@ class LiveSimulation:
         self._tell(lambda: self._weigh(weight))
 
     def set_law(self, law: Law, dt: float) -> None:
-        """Another material for the first body, with the time step that it was learned at [s]."""
+        """Another material for the first body, with the time step that it was learned at [s].
+
+        Where other bodies cannot take that step (`_check_steps`) the snapshot says so, and nothing changes.
+        """
         self._tell(lambda: self._swap(law, dt))
 
     def throw(self, velocity: Sequence[float]) -> None:
@@ -178,7 +205,7 @@ class LiveSimulation:
         self._tell(lambda: setattr(self, "_hand", None if place is None else np.array(place, float)))
 
     def add(self, body: State, law: Law, dt: float) -> None:
-        """Put another body at rest above all others; where there is no room the snapshot says so."""
+        """Put another body at rest above all others; where there is no room, or no common step, the snapshot says so."""
         self._tell(lambda: self._add(body, law, dt))
 
     def to_box(self, vector: Sequence[float]) -> np.ndarray:
@@ -272,8 +299,9 @@ class LiveSimulation:
 
     def _publish(self) -> None:
         state = self._state
+        shown = (value.cpu() for value in (state.x, state.v.expand_as(state.x), state.F, self._total))
         snapshot = Snapshot(
-            self._number, self._time, state.x, state.v.expand_as(state.x), state.F, self._total,
+            self._number, self._time, *shown,
             tuple(self._counts), min(self._dts), self._pace, self._rate, self._trouble, self._notice,
         )  # fmt: skip
         self._number += 1
@@ -284,7 +312,7 @@ class LiveSimulation:
     def _restart(self) -> None:
         self._state, self._counts = self._start, [len(self._start.x)]
         self._laws, self._dts = [self._first_law], [self._first_dt]
-        self._total = torch.eye(3, dtype=self._start.x.dtype).expand(len(self._start.x), 3, 3)
+        self._total = _undeformed(self._start.x)
         self._time = self._measured_time = 0.0
         self._hand = self._trouble = None
         self._publish()
@@ -297,6 +325,7 @@ class LiveSimulation:
                 law.set_adaptor_weight(self._weight)
 
     def _swap(self, law: Law, dt: float) -> None:
+        _check_steps([law, *self._laws[1:]], [dt, *self._dts[1:]])
         self._first_law, self._first_dt = law, dt
         self._laws[0], self._dts[0] = law, dt
         self._weigh(self._weight)
@@ -321,40 +350,40 @@ class LiveSimulation:
     def _follow_hand(self, span: float) -> None:
         model, x = self.model, self._state.x[self._first()]
         centre, half = x.mean(dim=0), 0.5 * (x.amax(dim=0) - x.amin(dim=0))
-        margin = _GAP * model.dx + half.double().numpy()
+        margin = _GAP * model.dx + half.double().cpu().numpy()
         target = np.clip(self.place_in_box(self._hand), np.minimum(margin, 0.5), np.maximum(1 - margin, 0.5))
-        self._set_velocity((target - centre.double().numpy()) / max(_HAND, span))
+        self._set_velocity((target - centre.double().cpu().numpy()) / max(_HAND, span))
 
     def _lift(self, height: float) -> None:
         start, own = self._start, self._first()
         if not np.isfinite(height):
             raise InputError("drop: the height is not a number")
-        x = start.x - start.x.amin(dim=0) * torch.tensor([0.0, 1.0, 0.0])
-        top = float(x[:, 1].max())
-        highest = 1 - _GAP * self.model.dx - top
-        lifted = x + torch.tensor([0.0, min(max(height, 0.0), max(highest, 0.0)), 0.0], dtype=x.dtype)
+        low, high = (float(end) for end in torch.aminmax(start.x[:, 1]))
+        highest = 1 - _GAP * self.model.dx - (high - low)
+        lifted = start.x.clone()
+        lifted[:, 1] += min(max(height, 0.0), max(highest, 0.0)) - low
         values = {name: getattr(self._state, name).clone() for name in ("x", "F", "C")}
         v = self._state.v.expand_as(self._state.x).clone()
-        eye = torch.eye(3, dtype=x.dtype)
-        values["x"][own], v[own], values["F"][own], values["C"][own] = lifted, 0.0, eye, 0.0
+        rest = _undeformed(lifted)
+        values["x"][own], v[own], values["F"][own], values["C"][own] = lifted, 0.0, rest, 0.0
         total = self._total.clone()
-        total[own] = eye
+        total[own] = rest
         self._state, self._total, self._hand = replace(self._state, v=v, **values), total, None
         if len(self._counts) == 1:
             self._trouble = None  # nothing is left of what diverged
 
     def _add(self, body: State, law: Law, dt: float) -> None:
+        _check_steps([*self._laws, law], [*self._dts, dt])
         gap = _GAP * self.model.dx
         low, high = body.x.amin(dim=0), body.x.amax(dim=0)
         floor = float(self._state.x[:, 1].max()) + gap
         if floor + float(high[1] - low[1]) > 1 - gap:
             raise InputError("no room above what is there: reset, or wait until it lies lower")
-        shift = torch.tensor([0.0, floor - float(low[1]), 0.0], dtype=body.x.dtype)
-        shift[[0, 2]] = 0.5 - 0.5 * (low + high)[[0, 2]]
+        shift = 0.5 - 0.5 * (low + high)
+        shift[1] = floor - low[1]
         added = replace(body, x=body.x + shift, v=torch.zeros_like(body.x), F=None, C=None)
         self._state = State.joined([self._state, added])
-        eye = torch.eye(3, dtype=body.x.dtype).expand(len(body.x), 3, 3)
-        self._total = torch.cat([self._total, eye])
+        self._total = torch.cat([self._total, _undeformed(body.x)])
         self._counts, self._laws, self._dts = (
             [*self._counts, len(body.x)],
             [*self._laws, law],

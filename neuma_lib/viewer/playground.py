@@ -47,13 +47,20 @@ class Playground:
         files: of the scene.
         laws: what may be chosen, by name.
         chosen: the law at the start.
+        device: of the simulation; pictures are made on the CPU.
 
     Raises:
         InputError: files of the body or of the law that cannot be read, or that must not be (`files.inside`).
     """
 
-    def __init__(self, files: SceneFiles, laws: Mapping[str, LawFiles], chosen: str):
-        self.laws, self.roots = dict(laws), files.roots
+    def __init__(
+        self,
+        files: SceneFiles,
+        laws: Mapping[str, LawFiles],
+        chosen: str,
+        device: torch.device | str = "cpu",
+    ):
+        self.laws, self.roots, self.device = dict(laws), files.roots, device
         paths = [files.checked(path) for path in (files.particles, files.binding, files.gaussians)]
         first = load_body(*paths, files.density, gaussian_motion="affine").to(torch.float32)
         start = (
@@ -67,24 +74,31 @@ class Playground:
         self._loaded: dict[str, Law] = {}
         self._changing = threading.Lock()
         self.chosen = chosen
-        self.simulation = LiveSimulation(files.simulation, start, self.law(chosen), self.laws[chosen].dt)
+        self.simulation = LiveSimulation(
+            files.simulation, start.to(device), self.law(chosen), self.laws[chosen].dt
+        )
 
     def law(self, name: str) -> Law:
         """A law by its name, read when it is first wanted."""
         if name not in self.laws:
             raise InputError(f"no law '{name}': choose one of {', '.join(self.laws)}")
         if name not in self._loaded:
-            self._loaded[name] = law_of(self.laws[name], self._checked).requires_grad_(False)
+            law = law_of(self.laws[name], self._checked).requires_grad_(False)
+            self._loaded[name] = law.to(self.device)
         return self._loaded[name]
 
     def _checked(self, path: str | Path) -> Path:
         return inside(path, self.roots)
 
-    def choose(self, name: str) -> None:
-        """Give the first body another law, from its state as it is on."""
+    def choose(self, name: str) -> str | None:
+        """Give the first body another law, from its state as it is on; why it was not possible, or None."""
         law = self.law(name)
-        self.chosen = name
-        self.simulation.set_law(law, self.laws[name].dt)
+        with self._changing:
+            self.simulation.set_law(law, self.laws[name].dt)
+            notice = self.simulation.do().notice
+        if notice is None:
+            self.chosen = name
+        return notice
 
     def reset(self) -> None:
         """The first body alone, at its start."""
@@ -102,7 +116,7 @@ class Playground:
             body = coloured_solid(mesh, x0, self._density, colour.expand(len(x0), 3))
             self._bodies.append(body)
             self._whole.append(join(self._bodies))
-            at_rest = body.state((0.0, 0.0, 0.0))
+            at_rest = body.state((0.0, 0.0, 0.0)).to(self.device)
             self.simulation.add(at_rest, self.law(self.chosen), self.laws[self.chosen].dt)
             notice = self.simulation.do().notice
             if notice:
@@ -131,7 +145,7 @@ class Playground:
             return scalars.plastic_strain(snapshot.F, snapshot.total)
         if name == "volume_ratio":
             return scalars.volume_ratio(snapshot.F)
-        return scalars.von_mises(self.law(self.chosen), snapshot.F)
+        return scalars.von_mises(self.law(self.chosen), snapshot.F.to(self.device)).cpu()
 
 
 def first_law(files: SceneFiles, laws: Mapping[str, LawFiles], preferred: Sequence[str] = ("neuma",)) -> str:

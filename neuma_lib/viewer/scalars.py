@@ -55,7 +55,7 @@ def von_mises(law: Law, F: Tensor) -> Tensor:
         tau = law.elasticity.evaluate(flat, law.elasticity.weights())
     sigma = 0.5 * (tau + tau.mT) / torch.linalg.det(flat)[:, None, None]
     mean = sigma.diagonal(dim1=-2, dim2=-1).mean(dim=-1)
-    s = sigma - mean[:, None, None] * torch.eye(3, dtype=F.dtype)
+    s = sigma - mean[:, None, None] * torch.eye(3, dtype=F.dtype, device=F.device)
     return (1.5 * s.square().sum(dim=(-2, -1))).sqrt().reshape(F.shape[:-2])
 
 

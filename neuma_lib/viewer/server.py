@@ -178,7 +178,6 @@ class ViewerServer:
         value = lambda name: add[name].value  # noqa: E731
         reactions = {
             "running": lambda: simulation.run(value("running") and value("mode") == LIVE),
-            "law": lambda: play.choose(value("law")),
             "weight": lambda: simulation.set_weight(value("weight")),
             "gravity": lambda: simulation.set_gravity(value("gravity")),
             "tilt x": lambda: simulation.set_floor(value("tilt x"), value("tilt z")),
@@ -192,6 +191,8 @@ class ViewerServer:
         }
         for name, act in reactions.items():
             add[name].on_update(lambda event, act=act: self._act(act))
+        # not where it is put back after a refusal, which stays on the screen
+        add["law"].on_update(lambda event: value("law") != play.chosen and self._act(self._choose))
         for name, act in presses.items():
             add[name].on_click(lambda event, act=act: self._act(act))
         x = simulation.snapshot.x
@@ -204,6 +205,12 @@ class ViewerServer:
         @self._handle.on_drag
         async def dragged(event) -> None:  # async: phases in order
             simulation.hold(None if event.phase == "end" else event.end_position)
+
+    def _choose(self) -> None:
+        play, law = self.playground, self.gui["law"]
+        if notice := play.choose(law.value):
+            law.value = play.chosen
+            raise InputError(notice)
 
     def _act(self, act) -> None:
         """Do what somebody asked for; an input that cannot be used is told, and changes nothing."""

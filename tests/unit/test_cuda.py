@@ -27,6 +27,7 @@ from neuma_lib.splatting.observation import Observation
 from neuma_lib.springs.body import SpringBody
 from neuma_lib.springs.network import Springs
 from neuma_lib.springs.rollout import SpringModel, spring_rollout
+from neuma_lib.viewer.live import LiveSimulation
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
@@ -293,3 +294,30 @@ def test_springs_agree(dtype):
     bound = {torch.float32: 1e-3, torch.float64: 1e-9}[dtype]
     for cpu, cuda in zip(*found, strict=True):
         assert relative(cuda, cpu) < bound
+
+
+def test_the_live_mode_simulates_on_the_gpu_what_it_does_on_the_cpu():
+    found = []
+    for device in ("cpu", "cuda"):
+        body, law = ball(height=0.2, dtype=torch.float32), with_network("neural", torch.float32)
+        start = body.state(torch.tensor([0.3, -2.0, 0.1])).to(device)
+        live = LiveSimulation({"grid": MODEL.grid}, start, law.requires_grad_(False).to(device), MODEL.dt)
+        live.open()
+        try:
+            while live.wait(live.snapshot.number + 1).time < 0.1:
+                assert live.snapshot.trouble is None
+            live.add(body.state(torch.zeros(3)).to(device), law.to(device), MODEL.dt)
+            live.drop(0.3)
+            live.set_weight(0.5)
+            live.throw((1.0, 0.0, 0.0))
+            live.hold((0.6, 0.3, 0.5))
+            last = live.do()
+            assert last.counts == (len(body.x0),) * 2 and last.notice is last.trouble is None
+            live.hold(None)
+            live.reset()
+            live.run(False)
+            found.append(live.do().x)
+        finally:
+            live.close()
+        assert last.x.device == last.total.device == torch.device("cpu")
+    assert torch.equal(*found)

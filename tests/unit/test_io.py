@@ -15,7 +15,7 @@ from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.io.images import load_observation, read_image_set, write_transforms
 from neuma_lib.io.mesh import read_mesh, write_mesh
 from neuma_lib.io.particles import thrown
-from neuma_lib.io.ply import read_ply
+from neuma_lib.io.ply import read_ply, write_ply
 from neuma_lib.io.weights import read_weights, write_weights
 from neuma_lib.splatting.gaussians import Gaussians
 
@@ -344,6 +344,14 @@ def test_bad_gaussians(tmp_path):
     save_gaussians(path, broken)
     with pytest.raises(InputError, match=r"g\.ply: means of Gaussian 4 is not finite"):
         load_gaussians(path)
+    rows = read_ply(path)[0].copy()
+    rows["x"], rows["opacity"][:3] = 0.0, [np.inf, -np.inf, np.nan]
+    write_ply(path, rows)
+    with pytest.raises(InputError, match=r"g\.ply: opacities of Gaussian 2 is not finite"):
+        load_gaussians(path)
+    rows["opacity"][2] = 0.0
+    write_ply(path, rows)
+    assert load_gaussians(path).opacities[:3].tolist() == [1.0, 0.0, 0.5], "converters from .spz write these"
     save_gaussians(path, random_gaussians(bands=4))
     path.write_bytes(path.read_bytes().replace(b"property float f_rest_8\n", b"property float other\n"))
     with pytest.raises(InputError, match="8 f_rest_"):

@@ -202,6 +202,23 @@ def test_bodies_are_put_above_each_other_until_there_is_no_room(live):
     assert found.trouble is None
 
 
+def test_a_network_is_not_simulated_at_another_step_than_its_own(live):
+    simulation, network = live(height=0.2, paused=True), neural_law(seed=1)
+    simulation.set_law(network, DT)
+    assert simulation.do().notice is None
+    simulation.add(start(), make_law("hencky", torch.float32), DT / 2)
+    found = simulation.do()
+    assert "another material" in found.notice and found.counts == (200,) and found.dt == DT
+    simulation.add(start(), network, DT)
+    simulation.set_law(neural_law(seed=2), DT / 2)
+    found = simulation.do()
+    assert "reset" in found.notice and found.counts == (200, 200) and found.dt == DT
+    simulation.reset()
+    simulation.set_law(neural_law(seed=2), DT / 2)
+    found = simulation.do()
+    assert found.notice is None and found.dt == DT / 2
+
+
 def test_commands_are_not_held_up_by_a_slow_law(live):
     """Whatever a frame takes, the next command comes right after it."""
 
