@@ -4,7 +4,8 @@ EXPORT = f"{RESULTS}/{{scene}}/{{method}}/export"
 
 
 MOVED = {**body_files(), "rollout": f"{RESULTS}/{{scene}}/{{method}}/rollout.h5"}
-CARRIED = {"density": scene_setting("density"), "carrier": experiment_carrier}
+OF_EXPERIMENTS = f"{RESULTS}/experiments/{{experiment}}/{{method}}"
+MOVED_TOGETHER = {**body_files(), "rollout": f"{OF_EXPERIMENTS}/rollout.h5"}
 
 
 rule export_gaussians:
@@ -15,9 +16,8 @@ rule export_gaussians:
         frames=directory(f"{EXPORT}/{{layout}}"),
     wildcard_constraints:
         layout="gaussians|compressed",
-        method=LAW_METHOD,
     params:
-        **CARRIED,
+        carrier=experiment_carrier,
         gaussian_motion=exported_motion,
         rotate_harmonics=SETTINGS.exports.rotate_harmonics,
         compressed=lambda wildcards: wildcards.layout == "compressed",
@@ -28,13 +28,13 @@ rule export_gaussians:
 rule export_particles:
     input:
         **MOVED,
+        velocity=of_chain("velocity.json"),
     output:
         frames=directory(f"{EXPORT}/particles"),
         together=f"{EXPORT}/particles.h5",
-    wildcard_constraints:
-        method=LAW_METHOD,
     params:
-        **CARRIED,
+        densities=moved_densities,
+        carrier=experiment_carrier,
     script:
         "../scripts/export_particles.py"
 
@@ -47,9 +47,8 @@ rule export_surface:
         surface=f"{EXPORT}/surface.{{kind}}",
     wildcard_constraints:
         kind="glb|usda|usdc",
-        method=LAW_METHOD,
     params:
-        **CARRIED,
+        carrier=experiment_carrier,
     script:
         "../scripts/export_surface.py"
 
@@ -61,10 +60,8 @@ rule export_blend:
     output:
         blend=f"{EXPORT}/motion.blend",
         picture=f"{EXPORT}/motion.png",
-    wildcard_constraints:
-        method=LAW_METHOD,
     params:
-        **CARRIED,
+        carrier=experiment_carrier,
     script:
         "../scripts/export_blend.py"
 
@@ -76,12 +73,54 @@ rule export_film:
     output:
         film=f"{EXPORT}/motion.mp4",
         gif=f"{EXPORT}/motion.gif",
-    wildcard_constraints:
-        method=LAW_METHOD,
     params:
-        **CARRIED,
+        carrier=experiment_carrier,
         gaussian_motion=exported_motion,
         size=SETTINGS.exports.size,
         frame_rate=SETTINGS.evaluation.frame_rate,
     script:
         "../scripts/export_film.py"
+
+
+# The same of experiments, of all bodies together.
+use rule export_gaussians as export_experiment_gaussians with:
+    input:
+        **MOVED_TOGETHER,
+        kernels=kernels("rendering"),
+    output:
+        frames=directory(f"{OF_EXPERIMENTS}/export/{{layout}}"),
+
+
+use rule export_particles as export_experiment_particles with:
+    input:
+        **MOVED_TOGETHER,
+        velocity=of_chain("velocity.json"),
+    output:
+        frames=directory(f"{OF_EXPERIMENTS}/export/particles"),
+        together=f"{OF_EXPERIMENTS}/export/particles.h5",
+
+
+use rule export_surface as export_experiment_surface with:
+    input:
+        **MOVED_TOGETHER,
+        mesh=of_chain("mesh.ply"),
+    output:
+        surface=f"{OF_EXPERIMENTS}/export/surface.{{kind}}",
+
+
+use rule export_blend as export_experiment_blend with:
+    input:
+        **MOVED_TOGETHER,
+        mesh=of_chain("mesh.ply"),
+    output:
+        blend=f"{OF_EXPERIMENTS}/export/motion.blend",
+        picture=f"{OF_EXPERIMENTS}/export/motion.png",
+
+
+use rule export_film as export_experiment_film with:
+    input:
+        **MOVED_TOGETHER,
+        kernels=kernels("rendering"),
+    output:
+        film=f"{OF_EXPERIMENTS}/export/motion.mp4",
+        gif=f"{OF_EXPERIMENTS}/export/motion.gif",

@@ -36,4 +36,14 @@ def splat_frames(wildcards):
 @checked
 def exported_motion(wildcards):
     """How Gaussians follow their particles: those of a splat, of which many lie beside them, affinely."""
-    return "affine" if SETTINGS.scene(wildcards.scene).splat else gaussian_motion(wildcards)
+    scene = SETTINGS.body_scenes(subject(wildcards))[0]
+    if SETTINGS.scene(scene).splat:
+        return "affine"
+    return gaussian_motion(SimpleNamespace(scene=scene, method=wildcards.method))
+
+
+@checked
+def moved_densities(wildcards):
+    """Densities of the bodies of a scene or an experiment."""
+    scenes = SETTINGS.body_scenes(subject(wildcards))
+    return [SETTINGS.scene(scene).plain()["density"] for scene in scenes]

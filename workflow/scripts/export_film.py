@@ -14,7 +14,7 @@ SQUARE = 2
 
 def main(inputs, output, params, run) -> None:
     files = (inputs.particles, inputs.binding, inputs.gaussians)
-    body = load_body(*files, params.density, params.carrier, params.gaussian_motion)
+    body = load_body(*files, 1.0, params.carrier, params.gaussian_motion)
     x, F = load_motion(inputs.rollout)
     seen = np.concatenate([x.numpy().reshape(-1, 3), body.gaussians.means.numpy()])
     wide, high = np.ptp(seen, axis=0)[:2]

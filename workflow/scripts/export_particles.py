@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
-from neuma_lib.io.particles import load_body
+from neuma_lib.io.particles import load_start
 from neuma_lib.io.ply import write_ply
 from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
-    files = (inputs.particles, inputs.binding, inputs.gaussians)
-    body = load_body(*files, params.density, params.carrier)
+    files = (inputs.particles, inputs.binding, inputs.gaussians, inputs.velocity)
+    start, _ = load_start(*files, params.densities, params.carrier)
     names = ("x", "F", "frames")
     path, attributes = read_arrays(inputs.rollout, required=names, only=names)
     for k, (x, F) in enumerate(zip(path["x"], path["F"], strict=True)):
@@ -20,10 +20,10 @@ def main(inputs, output, params, run) -> None:
         for name, column in zip(rows.dtype.names, [*x.T, np.linalg.det(F.astype(np.float64))], strict=True):
             rows[name] = column
         write_ply(Path(output.frames, f"{k:04d}.ply"), rows)
-    vol0, mass = (getattr(body, name).numpy() for name in ("vol0", "mass"))
+    vol0, mass = (getattr(start, name).numpy() for name in ("vol0", "mass"))
     time = path["frames"] * attributes["dt"]
     write_arrays(output.together, {"x": path["x"], "time": time, "vol0": vol0, "mass": mass}, {})
-    run.say(f"{len(path['x'])} frames of {len(body.x0)} particles")
+    run.say(f"{len(path['x'])} frames of {len(start.x)} particles")
 
 
 run_script(main, snakemake)
