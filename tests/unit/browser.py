@@ -28,6 +28,7 @@ def opened(url, width=640, height=480):
             complaints = []
             page.on("console", lambda m: complaints.append(m.text) if m.type == "error" else None)
             page.on("pageerror", lambda error: complaints.append(str(error)))
+            page.set_default_timeout(90_000)  # a busy machine without a GPU
             page.goto(url)
             yield page, complaints
         finally:

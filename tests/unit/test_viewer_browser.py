@@ -16,7 +16,8 @@ from neuma_lib.viewer.scene import load_scene
 from neuma_lib.viewer.server import LIVE, ViewerServer
 
 OF_VISER = "THREE.BufferGeometry.computeBoundingSphere(): Computed radius is NaN"
-"""What viser's client 1.1.1 says now and then while it starts, whatever is in the scene."""
+"""What viser's client 1.1.1 says of every scene with splats, once: it draws them on quads whose corners have two
+coordinates, of which three.js wants the bounding sphere. Without a sphere it draws them always, as it should."""
 
 
 @pytest.fixture(scope="module")
@@ -105,14 +106,13 @@ def test_the_server_plays_moves_and_simulates(served):
     assert served.host == "127.0.0.1", "this machine alone, unless told otherwise"
     with opened(f"http://127.0.0.1:{served.port}", 800, 600) as (page, complaints):
         page.wait_for_selector("text=beside it", timeout=60_000)
-        page.wait_for_timeout(3000)  # it fades in
 
         def settled():
-            """The picture once it stands still."""
+            """The picture once it stands still, and something has faded in."""
             shown = picture(page)
-            for _ in range(40):
+            for _ in range(60):
                 before, shown = shown, picture(page)
-                if differ(before, shown) < 0.001:
+                if differ(before, shown) < 0.001 and differ(shown, np.full_like(shown, 255)) > 0.02:
                     break
             return shown
 
@@ -125,9 +125,11 @@ def test_the_server_plays_moves_and_simulates(served):
         page.wait_for_selector("text=30 ms")
         assert served.gui["frame"].value == len(STEPS) - 1
         assert differ(first, settled()) > 0.005, "the slider moves pixels"
-        page.get_by_role("button", name="Play").click()
-        page.wait_for_selector("text=10 ms", timeout=90_000)  # it plays, from the start again
+        page.get_by_role("button", name="Play").click()  # from the start again
+        assert reached(lambda: served.gui["frame"].value in range(1, len(STEPS) - 1)), "it plays"
         page.get_by_role("button", name="Pause").click()
+        assert reached(lambda: not served._playing)
+        page.wait_for_selector(f"text={STEPS[served.gui['frame'].value]} ms", timeout=90_000)
         served.gui["show"].value = "particles by speed"
         page.wait_for_selector("text=speed: 0 m/s", timeout=90_000)
 
@@ -135,10 +137,11 @@ def test_the_server_plays_moves_and_simulates(served):
         page.wait_for_selector("text=frames/s", timeout=90_000)
         simulation = served.playground.simulation
         begun = simulation.snapshot.time
-        simulation.wait(simulation.snapshot.number + 30, 20)
-        assert simulation.snapshot.time > begun and simulation.snapshot.trouble is None
+        assert reached(lambda: simulation.snapshot.time > begun) and simulation.snapshot.trouble is None
+        served.gui["running"].value = False  # what a slow machine sees late stands still
+        assert simulation.do().time > 0
         page.get_by_role("button", name="Reset").click()
-        assert reached(lambda: simulation.snapshot.time < begun + 0.05)
+        assert reached(lambda: simulation.snapshot.time == 0)
         page.get_by_role("button", name="Drop it on top").click()
         assert reached(lambda: len(simulation.snapshot.counts) == 2)
         simulation._trouble = "made up"
