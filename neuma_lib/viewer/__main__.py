@@ -70,7 +70,7 @@ def run(chosen: argparse.Namespace) -> int:
         return 0
     device = choose_device(chosen.device)
     torch.set_num_threads(1)  # two OpenMP threads beside the server's are slower than one
-    laws = found_laws(settings)
+    laws = found_laws(settings, files.name)
     playground = Playground(files, laws, first_law(files, laws), device) if laws else None
     server = ViewerServer(scene, playground, chosen.host, chosen.port)
     print(

@@ -108,10 +108,11 @@ def _known(settings: Config, method: str) -> bool:
     return True
 
 
-def found_laws(settings: Config) -> dict[str, LawFiles]:
+def found_laws(settings: Config, scene: str | None = None) -> dict[str, LawFiles]:
     """All laws in the folder of results whose files are complete, by a name for a list, in order.
 
-    Those that methods trained or identified in scenes, ``scene: title of the method``, and priors, ``prior: name``.
+    Those that methods trained or identified in scenes, ``scene: title of the method``, and priors, ``prior: name``,
+    with the time step of a scene that has them: of the given one, if it does, or else the first.
     """
     results = Path(places.results_root(settings))
     found: dict[str, LawFiles] = {}
@@ -131,10 +132,11 @@ def found_laws(settings: Config) -> dict[str, LawFiles]:
             trained = law and (law.adaptor or law.identified)
             if trained and all(Path(file).is_file() for file in law.files):
                 found[f"{folder.name}: {settings.method_title(method)}"] = law
-    steps = {scene.prior: scene.dt for scene in reversed(settings.scenes.values())}
+    own = [settings.scene(scene)] if scene else []
+    steps = {each.prior: each.dt for each in (*reversed(settings.scenes.values()), *own)}
     for file in sorted((results / "priors").glob("*.safetensors")):
         name = file.stem
         if name.partition("+")[0] in settings.priors.laws:
-            dt = steps.get(name.partition("+")[0], min(scene.dt for scene in settings.scenes.values()))
+            dt = steps.get(name.partition("+")[0], min(each.dt for each in settings.scenes.values()))
             found[f"prior: {name}"] = LawFiles(prior=str(file), dt=dt)
     return found

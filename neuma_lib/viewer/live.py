@@ -92,9 +92,9 @@ def _check_steps(laws: Sequence[Law], dts: Sequence[float]) -> None:
     for law, dt in zip(laws, dts, strict=True):
         if dt - least > SAME_STEP * least and step_dependence(law) != "none":
             raise InputError(
-                f"bodies of one simulation share a time step, here {1e3 * least:g} ms, and the law {law.name} is another "
-                f"material than at the {1e3 * dt:g} ms that it was learned at: reset, which leaves one body, or take a "
-                "law of the same step"
+                f"bodies of one simulation share a time step, here {1e3 * least:g} ms, and the law {law.name} is "
+                f"another material there than at the {1e3 * dt:g} ms that it was learned at: reset, which leaves one "
+                "body, or take a law of the same step"
             )
 
 
@@ -205,7 +205,7 @@ class LiveSimulation:
         self._tell(lambda: setattr(self, "_hand", None if place is None else np.array(place, float)))
 
     def add(self, body: State, law: Law, dt: float) -> None:
-        """Put another body at rest above all others; where there is no room, or no common step, the snapshot says so."""
+        """Put another body at rest above all others; where there is no room or no common step the snapshot says so."""
         self._tell(lambda: self._add(body, law, dt))
 
     def to_box(self, vector: Sequence[float]) -> np.ndarray:

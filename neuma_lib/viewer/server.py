@@ -12,6 +12,9 @@ from typing import Any
 import matplotlib
 import numpy as np
 import torch
+import trimesh
+from trimesh.visual.material import PBRMaterial
+from trimesh.visual.texture import TextureVisuals
 
 from neuma_lib.errors import InputError
 from neuma_lib.geometry.shapes import NAMES
@@ -197,10 +200,9 @@ class ViewerServer:
             add[name].on_click(lambda event, act=act: self._act(act))
         x = simulation.snapshot.x
         radius = _HANDLE * float((x.amax(dim=0) - x.amin(dim=0)).max())
-        self._handle = self.server.scene.add_icosphere(
-            "/left/box/handle", radius=radius, color=(255, 255, 255), opacity=0.02, cast_shadow=False,
-            receive_shadow=False, visible=False,
-        )  # fmt: skip
+        self._handle = self.server.scene.add_mesh_trimesh(
+            "/left/box/handle", unseen_ball(radius), cast_shadow=False, receive_shadow=False, visible=False
+        )
 
         @self._handle.on_drag
         async def dragged(event) -> None:  # async: phases in order
@@ -435,6 +437,14 @@ class ViewerServer:
     def _say(self, text: str) -> None:
         if self._status.content != text:
             self._status.content = text
+
+
+def unseen_ball(radius: float) -> trimesh.Trimesh:
+    """A ball to grab that hides nothing: viewers of glTF write no depth for what blends."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+    unseen = PBRMaterial(baseColorFactor=(255, 255, 255, 0), alphaMode="BLEND")
+    ball.visual = TextureVisuals(material=unseen)
+    return ball
 
 
 def quantity_named(shown: str) -> str | None:

@@ -41,6 +41,14 @@ def test_laws_of_the_results_are_found_with_their_time_steps(project):
         first_law(files, {})
 
 
+def test_a_prior_has_the_step_of_the_scene_that_is_shown(tmp_path):
+    settings, files = found_scene(make_project(tmp_path / "project"))
+    other = settings.scenes[SCENE].model_copy(update={"dt": 2e-3})
+    settings = settings.model_copy(update={"scenes": {**settings.scenes, "Other": other}})
+    assert found_laws(settings)[PRIOR].dt == found_laws(settings, SCENE)[PRIOR].dt == 1e-3
+    assert found_laws(settings, "Other+seed=1")[PRIOR].dt == 2e-3
+
+
 def test_a_law_outside_the_folders_is_not_read(project, playground, tmp_path):
     files, laws = project
     prior = tmp_path / "project" / "results" / "priors" / "jelly.safetensors"
