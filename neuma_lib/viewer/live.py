@@ -127,7 +127,7 @@ class LiveSimulation:
         self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._news, self._closing = threading.Condition(), False
         self._running, self._hand, self._trouble, self._notice = True, None, None, None
-        self._number, self._steps_a_frame, self._rate, self._pace = 0, 1, 0.0, 0.0
+        self._number, self._steps_a_frame, self._span, self._moved = 0, 1, FRAME, 0.0
         self._measured = time.perf_counter()
         self._restart()
         self._thread = threading.Thread(target=self._loop, name="live simulation", daemon=True)
@@ -290,19 +290,21 @@ class LiveSimulation:
         self._state = replace(self._state, x=x, v=v, F=F, C=C)
 
     def _measure(self) -> None:
-        """Frames a second and pace, as running means."""
+        """Running means of the time between frames and of what is simulated in it: frames a second and pace are their
+        ratios, which means of ratios would exceed where frames are uneven."""
         now = time.perf_counter()
-        span, moved = max(now - self._measured, 1e-6), max(self._time - self._measured_time, 0.0)
+        span, moved = now - self._measured, max(self._time - self._measured_time, 0.0)
         self._measured, self._measured_time = now, self._time
-        self._rate += _NEW * (1 / span - self._rate)
-        self._pace += _NEW * (moved / span - self._pace)
+        self._span += _NEW * (span - self._span)
+        self._moved += _NEW * (moved - self._moved)
 
     def _publish(self) -> None:
         state = self._state
         shown = (value.cpu() for value in (state.x, state.v.expand_as(state.x), state.F, self._total))
         snapshot = Snapshot(
             self._number, self._time, *shown,
-            tuple(self._counts), min(self._dts), self._pace, self._rate, self._trouble, self._notice,
+            tuple(self._counts), min(self._dts), self._moved / self._span, 1 / self._span, self._trouble,
+            self._notice,
         )  # fmt: skip
         self._number += 1
         with self._news:

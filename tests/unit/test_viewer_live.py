@@ -134,6 +134,19 @@ def test_reset_brings_the_start_back_bit_by_bit(live):
     assert torch.equal(found.F, torch.eye(3).expand(200, 3, 3))
 
 
+def test_uneven_frames_do_not_make_the_numbers_on_the_screen_larger(monkeypatch):
+    simulation = LiveSimulation(CONSTANTS, start(), make_law("hencky", torch.float32), DT)  # no thread
+    clock = simulation._measured
+    monkeypatch.setattr(time, "perf_counter", lambda: clock)
+    for k in range(100):
+        clock += 0.002 if k % 2 else 0.098  # 20 frames a second
+        simulation._time += 0.02
+        simulation._measure()
+    simulation._publish()
+    assert simulation.snapshot.rate == pytest.approx(20, rel=0.2)
+    assert simulation.snapshot.pace == pytest.approx(0.4, rel=0.2)
+
+
 def test_throw_drop_and_gravity(live):
     simulation = live(paused=True)
     simulation.throw((1.0, 2.0, 0.0))
