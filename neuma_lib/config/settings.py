@@ -442,7 +442,10 @@ class Config(Section):
     def _known_prior(self, prior: str | None, origin: str) -> None:
         known = [*self.priors.laws, IDENTIFIED]
         if prior is not None and prior not in known:
-            raise InputError(f"{origin}: no prior '{prior}' in priors.laws{hint(prior, known)}")
+            raise InputError(
+                f"{origin}: no prior '{prior}' in priors.laws{hint(prior, known)}; a law in a file is named as the "
+                "prior of a scene"
+            )
 
     def method_base(self, scene: str, method: str) -> dict[str, Any] | None:
         """The analytic law that a structured method corrects; None: the one that was found in the scene's video."""
@@ -451,8 +454,9 @@ class Config(Section):
             return None
         if prior not in self.priors.laws:
             raise InputError(
-                f"{method} corrects an analytic law, and the prior of {scene} is the file {prior}: take "
-                f"+prior={IDENTIFIED} or another of priors.laws"
+                f"{method} corrects an analytic law of priors.laws, or the one that was found in the video, and the "
+                f"prior of {scene} is the file {prior}: take +prior={IDENTIFIED} or another of priors.laws, or neuma, "
+                "which corrects the file's"
             )
         return self.priors.laws[prior].plain()
 

@@ -9,6 +9,7 @@ from project import SCENE, TABLE, copied
 from neuma_lib.config.places import law_files
 from neuma_lib.project import settings_around
 
+EXPERIMENT = f"{SCENE.rpartition('/')[0]}/experiments/letter_N_bouncy"
 SUPERVISED = "neuma_particle_supervision"  # the one method that trains on the truth
 # Blender films the truth, a dataset is packed of it, evaluation measures against it; figures and viewer show it.
 MAY_READ_THE_TRUTH = {
@@ -401,3 +402,16 @@ def test_timings_read_the_benchmark_of_every_job_behind_them(project, chains):
     assert all(
         file.startswith(("tiny/results/benchmarks/", "tiny/data/kernels/benchmarks/")) for file in read
     )
+
+
+def test_motions_of_springs_and_of_experiments_are_exported_too(project):
+    files = ("gaussians", "compressed", "particles.h5", "surface.glb", "motion.blend", "motion.gif")
+    moved = (f"{SCENE}/spring_gaus", f"{EXPERIMENT}/neuma", f"{EXPERIMENT}/spring_gaus")
+    for folder, of_experiment in zip(moved, (False, True, True), strict=True):
+        planned = project.plan(*(f"{folder}/export/{file}" for file in files))
+        exports = {rule: count for rule, count in planned.items() if rule.startswith("export_")}
+        kinds = ("gaussians", "particles", "surface", "blend", "film")
+        prefix = "export_experiment_" if of_experiment else "export_"
+        assert exports == {f"{prefix}{kind}": 2 if kind == "gaussians" else 1 for kind in kinds}
+    said = project.run("-n", f"{SCENE}/pac_nerf_own/export/gaussians", succeeds=False)
+    assert "its own particles are those of a field" in said
