@@ -235,7 +235,9 @@ def _predicted(files: SceneFiles, run: RunFiles, body: Reconstruction, notes: li
         means, covars = deform(*at_rest, Binding.identity(len(g), g.means), g.means, x, stretch)
     else:
         notes.append(f"{run.title}: particles of its own, which carry no Gaussians")
-    return Motion(run.name, run.title, steps, x, _values(x, F, total, None, steps, dt, law), means, covars)
+    # A law that was learned at another time step has steps of its own; the slider's are those of the scene.
+    shown = tuple(round(step * dt / files.simulation["dt"]) for step in steps)
+    return Motion(run.name, run.title, shown, x, _values(x, F, total, None, steps, dt, law), means, covars)
 
 
 def _values(

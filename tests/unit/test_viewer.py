@@ -12,6 +12,7 @@ from sim_scenes import SPECS, make_law
 from viewer_project import FALL, SCENE, STEPS, STRETCH, make_project
 
 from neuma_lib.errors import InputError
+from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.viewer import scalars
 from neuma_lib.viewer.files import SceneFiles, inside
 from neuma_lib.viewer.find import found_scene
@@ -92,6 +93,16 @@ def test_a_folder_gives_truth_and_methods_with_gaussians_that_follow(scene):
         assert torch.allclose(true[name][-1].mean(), found[name][-1].mean(), rtol=1e-5)
     assert true["speed"].allclose(torch.tensor(3.0).sqrt()), "the stored velocities"
     assert found["plastic_strain"].max() < 1e-3, "all of it is elastic"
+
+
+def test_a_law_of_another_time_step_is_shown_at_the_same_times(tmp_path, scene):
+    place = make_project(tmp_path, methods=("nclaw",))
+    arrays, attributes = read_arrays(place / "nclaw" / "rollout.h5", ("x", "F", "frames"))
+    finer = {**arrays, "frames": 2 * arrays["frames"]}
+    write_arrays(place / "nclaw" / "rollout.h5", finer, {"dt": attributes["dt"] / 2})
+    again = load_scene(found_scene(place)[1]).motion("nclaw")
+    assert again.steps == scene.motion("nclaw").steps
+    assert torch.allclose(again.scalars["speed"], scene.motion("nclaw").scalars["speed"])
 
 
 def test_cameras_have_their_images(scene):

@@ -76,7 +76,10 @@ def test_what_is_wrong_is_said_before_anything_runs(project, mug):
     (mug / "stills/left.png").rename(mug / "stills/right.png")
     assert "no picture of the empty scene for the camera 'left'" in refusal()
     mug.rename(mug.with_name("BouncyBall"))
-    assert "captures/BouncyBall: a scene is named so" in refusal()
+    assert (
+        "a capture makes the scene 'BouncyBall', and another scene is named so: rename its folder"
+        in refusal()
+    )
 
 
 def test_a_failing_stage_leaves_nothing_half_written(project, mug):
