@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from neuma_lib.capture.agreement import agreement
 from neuma_lib.capture.free_fall import FreeFall, Track, fit_flight
-from neuma_lib.capture.gravity import MOST_OUTLINE_MISMATCH, gravity_checks
+from neuma_lib.capture.gravity import gravity_checks
 from neuma_lib.capture.spin import Spin, fit_spin, follow
 from neuma_lib.capture.timing import Offset, choose_offset, offset_from_motion, offset_from_sound, row_times
 from neuma_lib.errors import InputError
@@ -98,7 +98,7 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flig
 
     Raises:
         InputError: a camera saw no free flight, nothing tells the time between two, no flight fits, or gravity is off
-            by more than `MOST_OUTLINE_MISMATCH`.
+            by more than 10 %.
     """
     tracks, inside = [], []
     for view in views:
@@ -121,7 +121,7 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flig
     stated = [view.offset is not None for view in views]
     plane = _plane(views[0]) if len(views) == 1 else None
     fall, kept = fit_flight(tracks, plane, offsets, stated)
-    gravity = fall.gravity.checked(name, MOST_OUTLINE_MISMATCH) if metric else fall.gravity.told(name)
+    gravity = fall.gravity.checked(name) if metric else fall.gravity.told(name)
     frames, paths = [], []
     for number, (view, flying, part) in enumerate(zip(views, inside, kept)):
         used = flying[part]

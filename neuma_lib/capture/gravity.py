@@ -19,9 +19,6 @@ UP = (0.0, 1.0, 0.0)
 """The floor's normal in the room."""
 MOST_MISMATCH = 0.1
 """Part by which the measured gravity may differ from the true one, as a vector."""
-MOST_OUTLINE_MISMATCH = 0.15
-"""The same for what the middle of the outline does before the object's shape is known: that middle is not the centre of
-mass, and moves against it as the object turns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,24 +71,24 @@ class Gravity:
             f" degrees from the floor's normal ({self.how})"
         )
 
-    def checked(self, name: str, most: float = MOST_MISMATCH, normal: Sequence[float] = UP) -> str:
+    def checked(self, name: str, normal: Sequence[float] = UP) -> str:
         """The line of `told`.
 
         Raises:
-            InputError: the acceleration differs from 9.81 m/s^2 downward by more than the part ``most``, as a vector.
+            InputError: the acceleration differs from 9.81 m/s^2 downward by more than `MOST_MISMATCH`, as a vector.
         """
         line, (ratio, _), (angle, _) = self.told(name, normal), self.ratio, self.angle(normal)
         up = np.asarray(normal, float) / np.linalg.norm(normal)
-        if np.linalg.norm(self.a / GRAVITY + up) <= most:
+        if np.linalg.norm(self.a / GRAVITY + up) <= MOST_MISMATCH:
             return line
         causes = []
-        if abs(ratio - 1) > most / 2:
+        if abs(ratio - 1) > MOST_MISMATCH / 2:
             causes.append(f"the board's square size is {1 / ratio:.2f} of what is stated (measure it)")
             causes.append(
                 f"the frame rate is {ratio**-0.5:.2f} of what is assumed (slow motion: state the true rate)"
             )
             causes.append("the time base is not steady (take the file as the camera wrote it)")
-        if angle > np.degrees(most / 2):
+        if angle > np.degrees(MOST_MISMATCH / 2):
             causes.append("the floor or board is not level, or the camera has moved since its pose was taken")
         if self.several:
             causes.append("the videos are of different throws or objects")
