@@ -11,7 +11,7 @@ from neuma_lib.evaluation.demo_captures import Truth, compare_cameras, compare_r
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import read_transforms
 
-PLACED = "tiny/results/demo_duck_first/registration.json"
+PLACED = "tiny/results/demo_fish_first/registration.json"
 
 
 @pytest.fixture
@@ -41,11 +41,11 @@ def test_a_filmed_object_is_found_where_it_was(project):
     fit = {"iterations": 300, "initial_count": 800, "hull_resolution": 64}
     tiny.write_text(yaml.safe_dump({**yaml.safe_load(tiny.read_text()), "gaussians": fit}))
     project.run(PLACED)
-    known = json.loads((project.root / "tiny/data/captures_demo/duck/truth.json").read_text())
-    room = read_transforms(project.root / "tiny/data/demo_duck/room/transforms.json")
+    known = json.loads((project.root / "tiny/data/captures_demo/fish/truth.json").read_text())
+    room = read_transforms(project.root / "tiny/data/demo_fish/room/transforms.json")
     photographs = {name.removesuffix(".jpg"): camera for name, camera in known["photographs"].items()}
     rows = {row.what: row for row in compare_cameras(room["frames"], photographs, known["cameras"])}
-    arrays, _ = read_arrays(project.root / "tiny/data/captures_demo/duck/first.h5")
+    arrays, _ = read_arrays(project.root / "tiny/data/captures_demo/fish/first.h5")
     truth = Truth(*(arrays[key] for key in ("time", "x", "mass", "tracers")))
     placed, velocity = (
         json.loads((project.root / path).read_text())
