@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.geometry.nearest import nearest
 
 CHAMFER_SCALE = 1e4
 """The paper reports squared metres times this."""
@@ -31,23 +31,31 @@ def chamfer(a: Tensor | np.ndarray, b: Tensor | np.ndarray) -> float:
         InputError: an empty set, a wrong shape, or values that are not finite.
     """
     a, b = _points(a, "the first set"), _points(b, "the second set")
-    to_b, _ = cKDTree(b).query(a)
-    to_a, _ = cKDTree(a).query(b)
-    return CHAMFER_SCALE * float(np.mean(to_b**2) + np.mean(to_a**2))
+    return float(chamfer_sequence(torch.from_numpy(a)[None], torch.from_numpy(b)[None]))
 
 
 def chamfer_sequence(a: Tensor, b: Tensor) -> Tensor:
-    """Chamfer distance of each frame: a (T, n, 3) and b (T, m, 3) [m] -> (T,) in 1e-4 m^2, float64."""
+    """Chamfer distance of each frame: a (T, n, 3) and b (T, m, 3) [m] -> (T,) in 1e-4 m^2, float64, on the CPU.
+
+    Raises:
+        InputError: another number of frames, or values that are not finite.
+    """
     if len(a) != len(b):
         raise InputError(f"chamfer: {len(a)} frames against {len(b)}")
-    return torch.tensor([chamfer(one, other) for one, other in zip(a, b, strict=True)], dtype=torch.float64)
+    for points, name in ((a, "the first set"), (b, "the second set")):
+        if not bool(points.isfinite().all()):
+            raise InputError(f"chamfer: {name} holds values that are not finite")
+    with torch.no_grad():
+        there, back = _squares(a.double(), b.double())
+    means = [x.mean() + y.mean() for x, y in zip(there, back, strict=True)]
+    return CHAMFER_SCALE * torch.stack(means).cpu()
 
 
 def chamfer_loss(x: Tensor, targets: Tensor | Sequence[Tensor]) -> Tensor:
     """Chamfer distance [m^2] of each frame, differentiable in x.
 
-    The nearest neighbours are found by a KD-tree and held fixed in the gradient, which is exact where no
-    point is equally near to two others.
+    The nearest neighbours are found for all frames at once, on the device of x, and held fixed in the gradient, which
+    is exact where no point is equally near to two others.
 
     Args:
         x: simulated particles [m], shape (T, N, 3).
@@ -62,18 +70,19 @@ def chamfer_loss(x: Tensor, targets: Tensor | Sequence[Tensor]) -> Tensor:
     """
     if len(x) != len(targets):
         raise InputError(f"chamfer_loss: {len(x)} frames against {len(targets)}")
-    positions = x.detach().cpu().numpy()
-    finite = np.isfinite(positions).all(axis=2)
-    if not finite.all():
-        frame, particle = np.argwhere(~finite)[0]
+    finite = x.detach().isfinite().all(dim=2)
+    if not bool(finite.all()):
+        frame, particle = (~finite).nonzero()[0].tolist()
         raise NonFiniteError("chamfer_loss", f"particle {particle} of frame {frame} is not finite")
-    losses = []
-    for t in range(len(x)):
-        goal = targets[t].to(x)
-        there = goal.detach().cpu().numpy()
-        nearest_goal = torch.from_numpy(cKDTree(there).query(positions[t])[1]).to(x.device)
-        nearest_x = torch.from_numpy(cKDTree(positions[t]).query(there)[1]).to(x.device)
-        forward = (x[t] - goal[nearest_goal]).square().sum(-1).mean()
-        backward = (x[t][nearest_x] - goal).square().sum(-1).mean()
-        losses.append(forward + backward)
-    return torch.stack(losses)
+    means = [a.mean() + b.mean() for a, b in zip(*_squares(x, targets), strict=True)]
+    return torch.stack(means)
+
+
+def _squares(x: Tensor, targets: Tensor | Sequence[Tensor]) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+    """Squared distances of each set of x to the nearest of its targets, and of these to the nearest of x [m^2]."""
+    own, there = [x.shape[1]] * len(x), [len(target) for target in targets]
+    points, goals = x.reshape(-1, 3), torch.cat([target.to(x) for target in targets])
+    fixed = points.detach()
+    forward = (points - goals[nearest(goals, there, fixed, own)]).square().sum(-1)
+    backward = (points[nearest(fixed, own, goals, there)] - goals).square().sum(-1)
+    return forward.split(own), backward.split(there)

@@ -1,13 +1,18 @@
-"""Kernels of points in closed surfaces."""
+"""Kernels of points in closed surfaces, and of nearest neighbours."""
 
 from __future__ import annotations
 
 import torch
 import trimesh
 
+from neuma_lib.geometry.nearest import nearest
 from neuma_lib.geometry.volume import inside
 
 
 def compile_kernels(device: torch.device) -> None:
-    """Whether a point is in a box; computed on the CPU whatever the device."""
+    """Whether a point is in a box, computed on the CPU whatever the device; neighbours there and on it."""
     inside(trimesh.creation.box(), trimesh.creation.box().centroid[None])
+    for place in {torch.device("cpu"), device}:
+        for dtype in (torch.float32, torch.float64):
+            point = torch.zeros(1, 3, dtype=dtype, device=place)
+            nearest(point, [1], point, [1])
