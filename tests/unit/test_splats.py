@@ -104,7 +104,7 @@ def test_splat_files_are_read(tmp_path):
     assert_close(load_splat(tmp_path / "a.splat"), told, *bounds)
 
 
-@pytest.mark.parametrize("version, degree", [(1, 0), (2, 1), (3, 0), (3, 3)])
+@pytest.mark.parametrize("version, degree", [(1, 0), (1, 3), (2, 1), (3, 0), (3, 3)])
 def test_spz_is_read(tmp_path, version, degree):
     """Positions have 12 fractional bits, or are half floats, 11 bits of at most 1; logarithms of scales 1/16."""
     told = ball(degree=degree)
