@@ -6,7 +6,7 @@ Each stage has a module of its own beside this one, so that what is computed aga
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -350,6 +350,42 @@ class Config(Section):
         """Folder of the scene whose law a method evaluates on a scene, in its chain."""
         source = self._law_from(method)
         return scene if source is None else folder(source, self.chain(scene)[1])
+
+    def learns_there(self, scene: str, method: str) -> bool:
+        """Whether a method's law is found in the scene's own video: it is neither another's nor the prior alone."""
+        trained = (
+            self.method_material(scene, method).train
+            or self.is_identified(method)
+            or self.is_pac_nerf(method)
+        )
+        return self.law_scene(scene, method) == scene and (
+            trained or self.true_law(scene, method) is not None
+        )
+
+    def gaussian_motion(self, scene: str, method: str) -> str:
+        """How Gaussians follow their particles in a method, as `material.gaussian_motion`; those of a splat, of which
+        many lie beside their particles, affinely."""
+        return "affine" if self.scene(scene).splat else self.method_material(scene, method).gaussian_motion
+
+    def moved_methods(self, scene: str, methods: Sequence[str]) -> list[str]:
+        """What moves a scene where methods are asked for: these, and a splat, which has no video, instead of one that
+        learns the same under the laws of ``figures.i23d``.
+
+        Raises:
+            InputError: a splat, and a method whose law cannot come from elsewhere.
+        """
+        if not self.scene(scene).splat:
+            return list(methods)
+        found = []
+        for method in methods:
+            if self.is_springs(method):
+                raise InputError(
+                    f"{scene}/{method}: a splat has no video to find springs in; leave this method out"
+                )
+            elsewhere = self.learns_there(scene, method)
+            laws = self.figures.i23d if elsewhere else (None,)
+            found += [f"{method}+{LAW_FROM}={law}" if law else method for law in laws]
+        return list(dict.fromkeys(found))
 
     def method_density(self, scene: str, method: str) -> float | dict[str, Any]:
         """Density that a method takes the scene's body to have: the scene's, unless it assumes another."""

@@ -11,7 +11,10 @@ class ViewerConfig(Section):
     """What the file results/<scene>/viewer.html holds; `python -m neuma_lib.viewer` shows all that there is."""
 
     methods: tuple[str, ...] = Field(
-        ("nclaw", "neuma"), min_length=1, description="methods or variants in the file, beside the truth"
+        ("nclaw", "neuma"),
+        min_length=1,
+        description="methods or variants in the file, beside the truth; on a splat, one that learns stands for its "
+        "laws of the scenes `figures.i23d`",
     )
     particles: int = Field(
         8000, gt=0, description="most particles of each that are shown; others are left out"

@@ -23,7 +23,8 @@ def law_files(settings: Config, scene: str, method: str) -> LawFiles | None:
     """The files of a method's law; None for springs, which have none."""
     if settings.is_springs(method):
         return None
-    return LawFiles(**asdict(places.law_files(settings, scene, method)), dt=settings.scene(scene).dt)
+    learned = settings.scene(settings.law_scene(scene, method))
+    return LawFiles(**asdict(places.law_files(settings, scene, method)), dt=learned.dt)
 
 
 def scene_files(settings: Config, scene: str, methods: Sequence[str]) -> SceneFiles:
@@ -41,7 +42,7 @@ def scene_files(settings: Config, scene: str, methods: Sequence[str]) -> SceneFi
             settings.method_title(method),
             f"{results}/{scene}/{method}/rollout.h5",
             law_files(settings, scene, method),
-            settings.method_material(scene, method).gaussian_motion,
+            settings.gaussian_motion(scene, method),
         )
         for method in methods
     )
@@ -52,8 +53,8 @@ def scene_files(settings: Config, scene: str, methods: Sequence[str]) -> SceneFi
         simulation={"dt": chosen.dt, **constants},
         density=chosen.plain()["density"],
         **{name.partition(".")[0]: places.home(settings, scene, name) for name in names},
-        truth=None if chosen.captured else f"{data}/{base}/particles.h5",
-        transforms=f"{data}/{base}/dynamic/transforms.json",
+        truth=f"{data}/{base}/particles.h5" if chosen.has_truth else None,
+        transforms=None if chosen.splat else f"{data}/{base}/dynamic/transforms.json",
         runs=runs,
         roots=(results, data),
     )
@@ -86,7 +87,7 @@ def found_scene(place: str | Path, configfiles: Sequence[str | Path] = ()) -> tu
     settings = settings.model_copy(update={"results_root": str(results), "data_root": data})
     files = scene_files(settings, place.name, found_methods(settings, place))
     for file in (files.particles, files.binding, files.gaussians):
-        existing(file, f"make it with `snakemake --cores 2 results/{place.name}/neuma/rollout.h5`")
+        existing(file, f"make it with `snakemake --cores 2 results/{place.name}/<method>/rollout.h5`")
     optional = {name: getattr(files, name) for name in ("velocity", "truth", "transforms")}
     missing = [name for name, file in optional.items() if not file or not Path(file).is_file()]
     return settings, replace(files, **dict.fromkeys(missing))

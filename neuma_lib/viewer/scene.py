@@ -143,8 +143,8 @@ def load_scene(
             notes.append(f"{run.title} is left out: {one_line(error)}")
     if not motions:
         raise InputError(
-            f"{files.name}: nothing moves here yet; make a motion with `snakemake --cores 2 results/{files.name}/neuma/"
-            "rollout.h5`"
+            f"{files.name}: nothing moves here yet; make a motion with `snakemake --cores 2 results/{files.name}/"
+            "<method>/rollout.h5`"
         )
     views = ()
     if files.transforms:

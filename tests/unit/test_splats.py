@@ -24,6 +24,7 @@ from neuma_lib.io.splats import load_splat
 from neuma_lib.splatting import culling
 from neuma_lib.splatting.gaussians import quaternions, rotations
 from neuma_lib.splatting.spherical_harmonics import colours, rotated
+from neuma_lib.viewer.find import scene_files
 
 ROOT = Path(__file__).resolve().parents[2]
 RULES = {"min_opacity": 0.1, "max_scale": 0.1, "reach": 3.0, "min_links": 4, "count": 10**9}
@@ -340,6 +341,22 @@ def test_a_law_moves_a_splat_in_the_step_that_it_was_learned_with():
     dt, frames = config.motion_clock("Guitar", "neuma+law_from=JellyDuck")
     assert dt == config.scenes["JellyDuck"].dt == 1e-3
     assert frames == tuple(step // 2 for step in own)
+
+
+def test_a_viewer_shows_a_splat_under_laws_from_elsewhere():
+    config = settings({"scenes": {"Guitar": {"splat": "guitar.ply", "dt": 2e-4}}})
+    asked = ["nclaw", "neuma", "constants+law_from=ClayCat"]
+    learned = [f"neuma+law_from={scene}" for scene in config.figures.i23d]
+    found = config.moved_methods("Guitar", asked)
+    assert found == ["nclaw", *learned, "constants+law_from=ClayCat"] and len(learned) > 1
+    assert config.moved_methods("ClayCat", asked) == asked
+    with pytest.raises(InputError, match="Guitar/spring_gaus: a splat has no video"):
+        config.moved_methods("Guitar", ["spring_gaus"])
+    files = scene_files(config, "Guitar", found)
+    assert files.truth is files.transforms is None
+    assert {run.gaussian_motion for run in files.runs} == {"affine"}
+    own, other = files.runs[0].law.dt, files.runs[-1].law.dt
+    assert (own, other) == (config.scenes["Guitar"].dt, config.scenes["ClayCat"].dt) and own != other
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from browser import opened
 from PIL import Image
-from viewer_project import STEPS, make_project
+from viewer_project import SCENE, STEPS, make_project, make_splat
 
 from neuma_lib.viewer.find import found_laws, found_scene
 from neuma_lib.viewer.page import write_page
@@ -85,6 +85,27 @@ def test_the_file_opens_without_a_server_plays_and_follows_its_controls(folder, 
         page.mouse.move(380, 270, steps=4)
         page.mouse.up()
         assert page.input_value("#camera") == "" and differ(filmed, picture(page)) > 0.02, "a drag turns"
+        assert not complaints
+
+
+def test_the_file_of_a_splat_has_the_motion_of_its_law_alone_and_plays(tmp_path):
+    folder, configured = make_splat(tmp_path)
+    scene = load_scene(found_scene(folder, [configured])[1])
+    assert [motion.title for motion in scene.motions] == [f"NCLaw, law_from {SCENE}"] and not scene.notes
+    assert scene.steps == tuple(2 * step for step in STEPS)  # its steps are half as long as those of the law
+    write_page(tmp_path / "viewer.html", scene)
+    with opened((tmp_path / "viewer.html").as_uri()) as (page, complaints):
+        page.wait_for_selector("body[data-state=ready]")
+        assert page.locator("#left option").all_inner_texts() == [scene.motions[0].title]
+        first = picture(page)
+        assert differ(first, np.full_like(first, 255)) > 0.02, "something is drawn"
+        page.select_option("#pace", "0.03125")
+        page.click("#play")
+        page.wait_for_selector("body[data-frame='2']", timeout=10_000)
+        page.click("#play")
+        assert differ(first, picture(page)) > 0.005, "it plays"
+        page.select_option("#show", "von_mises")
+        assert page.is_visible("#legend")
         assert not complaints
 
 

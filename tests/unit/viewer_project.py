@@ -40,10 +40,10 @@ def motion(x0):
     return 0.5 + (x0 - 0.5) @ F.mT + fall, F[:, None].expand(-1, len(x0), 3, 3).contiguous()
 
 
-def make_project(root, methods=("nclaw", "constants")):
+def make_project(root, methods=("nclaw", "constants"), scene=SCENE):
     """Write settings, data and results below a folder; the folder of the scene."""
     shutil.copytree(ROOT / "config", root / "config")
-    results, data = root / "results" / SCENE, root / "data" / SCENE
+    results, data = root / "results" / scene, root / "data" / scene
     x0 = block(400, 0)
     corner = torch.cartesian_prod(*[torch.linspace(0.42, 0.58, 4)] * 3)
     generator = torch.Generator().manual_seed(2)
@@ -76,6 +76,14 @@ def make_project(root, methods=("nclaw", "constants")):
     )
     write_images(data / "dynamic")
     return results
+
+
+def make_splat(root):
+    """A project with a scene that is a splat, without a truth and images: its folder, and the file of its settings."""
+    results = make_project(root, [f"nclaw+law_from={SCENE}"], "Splat")
+    shutil.rmtree(root / "data")
+    write_json(root / "splat.yaml", {"scenes": {"Splat": {"splat": "splat.ply", "dt": 5e-4, "steps": 60}}})
+    return results, root / "splat.yaml"
 
 
 def write_images(folder, name="d_{step}.png"):

@@ -37,6 +37,7 @@ def settings(**splat):
             "--config",
             f"scenes={json.dumps(scenes)}",
             'figures={"i23d": ["BouncyBall"], "methods": ["nclaw"]}',
+            'viewer={"methods": ["nclaw+law_from=BouncyBall"]}',
         ),
         'dataset={"frames": 11}',
     ]
@@ -55,7 +56,8 @@ def project(tmp_path_factory, kernels):
 
 def test_a_law_from_elsewhere_moves_a_splat_and_the_motion_can_be_taken_away(project):
     files = ["gaussians", "compressed", "particles.h5", "surface.glb", "motion.gif"]
-    project.run(FIGURE, *(f"{EXPORT}/{file}" for file in files), *settings())
+    viewer = f"{RESULTS}/Splat/viewer.html"
+    project.run(FIGURE, viewer, *(f"{EXPORT}/{file}" for file in files), *settings())
     gaussians = load_gaussians(project.root / f"{RESULTS}/Splat/gaussians.ply")
     assert len(gaussians) == 300
     report = json.loads((project.root / f"{RESULTS}/Splat/gaussians.json").read_text())
@@ -96,6 +98,10 @@ def test_a_law_from_elsewhere_moves_a_splat_and_the_motion_can_be_taken_away(pro
     )
     with Image.open(project.root / f"{EXPORT}/motion.gif") as image:
         assert image.n_frames == 11
+    page = (project.root / viewer).read_text()
+    told = json.loads(re.search(r'id="meta">(.*?)</script>', page)[1])
+    assert [motion["name"] for motion in told["motions"]] == ["nclaw+law_from=BouncyBall"]
+    assert told["steps"] == list(range(0, 101, 10)) and told["motions"][0]["means"]["count"] == 300
 
 
 def test_what_is_done_is_not_done_again_and_the_placement_repeats_what_it_moves(project):

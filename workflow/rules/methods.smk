@@ -270,7 +270,7 @@ def start_files(wildcards):
 
 @checked
 def gaussian_motion(wildcards):
-    return material_settings(wildcards)["gaussian_motion"]
+    return SETTINGS.gaussian_motion(wildcards.scene, wildcards.method)
 
 
 @checked
@@ -330,4 +330,5 @@ def own_result(file):
 @checked
 def viewer_files(wildcards):
     """What the viewer in a file shows of a scene."""
-    return replace(scene_files(SETTINGS, wildcards.scene, SETTINGS.viewer.methods), velocity=None)
+    methods = SETTINGS.moved_methods(wildcards.scene, SETTINGS.viewer.methods)
+    return replace(scene_files(SETTINGS, wildcards.scene, methods), velocity=None)

@@ -10,10 +10,7 @@ def splat_setting(choose):
 def splat_start(wildcards):
     """The start of a splat; its law comes from elsewhere, as it has no video to learn one from."""
     scene, method = wildcards.scene, wildcards.method
-    prior_alone = not SETTINGS.method_material(scene, method).train and not (
-        SETTINGS.true_law(scene, method) or SETTINGS.is_identified(method) or SETTINGS.is_pac_nerf(method)
-    )
-    if SETTINGS.law_scene(scene, method) == scene and not prior_alone:
+    if SETTINGS.learns_there(scene, method):
         raise InputError(
             f"{scene}/{method}: a splat has no video to learn a law from; take that of another scene, "
             f"{method}+law_from=<scene>, or the prior alone, nclaw"
@@ -35,11 +32,8 @@ def splat_frames(wildcards):
 
 @checked
 def exported_motion(wildcards):
-    """How Gaussians follow their particles: those of a splat, of which many lie beside them, affinely."""
-    scene = SETTINGS.body_scenes(subject(wildcards))[0]
-    if SETTINGS.scene(scene).splat:
-        return "affine"
-    return gaussian_motion(SimpleNamespace(scene=scene, method=wildcards.method))
+    """How Gaussians follow their particles in a scene, or as in the first one of an experiment."""
+    return SETTINGS.gaussian_motion(SETTINGS.body_scenes(subject(wildcards))[0], wildcards.method)
 
 
 @checked
