@@ -7,6 +7,8 @@ formed, and the ellipsoid test touches only particles near each Gaussian.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
@@ -17,10 +19,10 @@ from neuma_lib.config.binding import BindingConfig
 from neuma_lib.coupling.binding import Binding
 from neuma_lib.errors import InputError
 
-_FIRST_QUERY = 32
-"""Nearest particles asked for at first; Gaussians that need more are asked again with four times as many."""
-_CHUNK_ENTRIES = 2_000_000
-"""Gaussian-particle pairs held at one time, which bounds the memory of a search whatever its input."""
+_CHUNK_ENTRIES = 500_000
+"""Gaussian-particle pairs looked at at one time, which bounds the memory of a search whatever its input."""
+_FLATTEST = 1e-12
+"""Least eigenvalue of a covariance, relative to its largest one."""
 _SHARING_NEIGHBOURS = 16
 """Particles among which an added particle's volume is collected."""
 _LARGEST_SHARE = 0.5
@@ -87,17 +89,10 @@ def bind_two_pass(
     added = centres[orphans]
 
     if len(orphans):
-        # An added particle may lie inside its neighbours' ellipsoids as well: these are bound anew.
-        together = np.concatenate([points, added])
-        reach = np.sqrt(_threshold(settings) * np.linalg.eigvalsh(shapes)[:, 2]) * (1 + 1e-9)
-        near = cKDTree(added).query_ball_point(centres, reach, return_length=True) > 0
-        kept = ~near[rows]
-        again, found = _pairs_inside(centres[near], shapes[near], together, settings)
-        rows = np.concatenate([rows[kept], np.flatnonzero(near)[again]])
-        order = np.argsort(rows, kind="stable")
-        rows, columns = rows[order], np.concatenate([columns[kept], found])[order]
+        # An added particle may lie inside its neighbours' ellipsoids as well.
+        rows, columns = _pairs_inside(centres, shapes, np.concatenate([points, added]), settings)
         if settings.equal_mass:
-            shares = np.full(len(together), shares.sum() / len(together))
+            shares = np.full(len(points) + len(added), shares.sum() / (len(points) + len(added)))
         else:
             shares = _share_volumes(points, shares, added)
     count = len(points) + len(orphans)
@@ -153,7 +148,7 @@ def _whitening(shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             f"binding: the covariance of Gaussian {worst} is not positive definite; rerun the gaussians stage"
         )
     # A disc fitted flat has a third axis at round-off: its floor keeps the inverse finite.
-    eigenvalues = np.maximum(eigenvalues, 1e-12 * largest[:, None])
+    eigenvalues = np.maximum(eigenvalues, _FLATTEST * largest[:, None])
     return np.swapaxes(eigenvectors, 1, 2) / np.sqrt(eigenvalues)[:, :, None], largest
 
 
@@ -167,49 +162,105 @@ def _pairs_inside(
 ) -> tuple[np.ndarray, np.ndarray]:
     """All pairs (Gaussian, particle) of Algorithm 1, sorted by Gaussian, then by particle.
 
-    The k nearest particles of a Gaussian are enough when the k-th is so far away that anything beyond it
-    lies outside the ellipsoid, or is further in the Mahalanobis distance than ``most`` particles already
-    found: the smallest Mahalanobis distance at a Euclidean distance r is r^2 / lambda_max. Otherwise it is
-    asked again with more. The result is exact; only how much is read depends on the guess.
+    A Gaussian looks at the particles in those cells of a grid that the box of its ellipsoid meets, so that it costs no
+    more where others are many: splats have discs and needles many times longer than they are thick.
     """
     threshold, most = _threshold(settings), settings.max_neighbours
     whitening, largest = _whitening(shapes)
-    tree = cKDTree(points)
-    pending = np.arange(len(centres))
-    asked = min(_FIRST_QUERY, len(points))
+    variances = np.diagonal(shapes, axis1=1, axis2=2) + _FLATTEST * largest[:, None]
+    half = np.sqrt(threshold * variances) * (1 + 1e-9)
+    cells = _Cells(points)
     found_rows: list[np.ndarray] = []
     found_columns: list[np.ndarray] = []
-    while len(pending):
-        unfinished = []
-        chunk = max(1, _CHUNK_ENTRIES // asked)
-        for start in range(0, len(pending), chunk):
-            rows = pending[start : start + chunk]
-            reach, columns = tree.query(centres[rows], k=np.arange(1, asked + 1))
-            offsets = points[columns] - centres[rows, None, :]
-            distances = np.square(np.einsum("gab,gkb->gka", whitening[rows], offsets)).sum(2)
-            inside = distances <= threshold
-            unseen = np.square(reach[:, -1]) / largest[rows]
-            bound = np.full(len(rows), threshold)
-            if most is not None and most < asked:
-                bound = np.minimum(bound, np.partition(distances, most - 1, axis=1)[:, most - 1])
-            complete = (unseen > bound) | (asked == len(points))
-            unfinished.append(rows[~complete])
-            inside = inside[complete]
-            if most is not None and most < asked:
-                # Stable in (distance, index): the particle index breaks ties.
-                order = np.lexsort((columns[complete], distances[complete]), axis=1)
-                rank = np.empty_like(order)
-                np.put_along_axis(rank, order, np.arange(asked)[None, :], axis=1)
-                inside &= rank < most
-            local, slot = np.nonzero(inside)
-            found_rows.append(rows[complete][local])
-            found_columns.append(columns[complete][local, slot])
-        pending = np.concatenate(unfinished)
-        asked = min(4 * asked, len(points))
+    for near, first, last in cells.runs(centres - half, centres + half):
+        rows, columns, distances = [], [], []
+        for some in _parts(last - first):
+            begun, size = first[some], (last - first)[some]
+            pair = np.repeat(near[some], size)
+            place = np.arange(size.sum()) + np.repeat(begun - (np.cumsum(size) - size), size)
+            offset = cells.points[place] - centres[pair]
+            distance = np.zeros(len(pair))
+            for axis in range(3):  # the thinnest one first: discs leave most particles out
+                distance += np.square(np.einsum("pb,pb->p", whitening[pair, axis], offset))
+                inside = distance <= threshold
+                pair, place, offset, distance = (a[inside] for a in (pair, place, offset, distance))
+            rows.append(pair)
+            columns.append(cells.order[place])
+            distances.append(distance)
+        pair, column, distance = map(np.concatenate, (rows, columns, distances))
+        if most is not None:
+            # Stable in (distance, index): the particle index breaks ties.
+            order = np.lexsort((column, distance, pair))
+            pair, column = pair[order], column[order]
+            begins = np.flatnonzero(np.diff(pair, prepend=-1))
+            rank = np.arange(len(pair)) - np.repeat(begins, np.diff(begins, append=len(pair)))
+            pair, column = pair[rank < most], column[rank < most]
+        found_rows.append(pair)
+        found_columns.append(column)
     rows = np.concatenate(found_rows) if found_rows else np.empty(0, np.int64)
     columns = np.concatenate(found_columns) if found_columns else np.empty(0, np.int64)
     order = np.lexsort((columns, rows))
     return rows[order], columns[order]
+
+
+class _Cells:
+    """Points (N, 3) in the order of the cubic cells of a grid, those of a column along z one after the other.
+
+    Attributes:
+        order: indices of the points, (N,).
+        points: the points in that order.
+    """
+
+    def __init__(self, points: np.ndarray):
+        self._lower, extent = points.min(axis=0), np.ptp(points, axis=0)
+        # points in a body or on its surface: some to a few in a cell that is not empty
+        self._side = float(extent.max()) / max(1, round(0.5 * np.sqrt(len(points)))) or 1.0
+        self._counts = self._cell(points.max(axis=0)) + 1
+        keys = self._key(self._cell(points))
+        self.order = np.argsort(keys, kind="stable")
+        self.points, self._keys = points[self.order], keys[self.order]
+
+    def _cell(self, positions: np.ndarray) -> np.ndarray:
+        return np.floor((positions - self._lower) / self._side).clip(-1, 2**31).astype(np.int64)
+
+    def _key(self, cell: np.ndarray) -> np.ndarray:
+        return (cell[..., 0] * self._counts[1] + cell[..., 1]) * self._counts[2] + cell[..., 2]
+
+    def runs(
+        self, lower: np.ndarray, upper: np.ndarray
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Runs of points in the columns of cells that boxes (G, 3) to (G, 3) meet, some whole boxes at a time.
+
+        Yields:
+            index of the box, first point and last point but one of each run that is not empty.
+        """
+        first = np.maximum(self._cell(lower), 0)
+        spans = np.maximum(np.minimum(self._cell(upper), self._counts - 1) - first + 1, 0)
+        columns = np.where(spans[:, 2] > 0, spans[:, 0] * spans[:, 1], 0)
+        for boxes in _parts(columns):
+            count = columns[boxes]
+            box = np.repeat(np.arange(boxes.start, boxes.stop), count)
+            among = np.arange(len(box)) - np.repeat(np.cumsum(count) - count, count)
+            cell = first[box]
+            cell[:, 0] += among // spans[box, 1]
+            cell[:, 1] += among % spans[box, 1]
+            key = self._key(cell)
+            begins = np.searchsorted(self._keys, key)
+            ends = np.searchsorted(self._keys, key + spans[box, 2])
+            met = ends > begins
+            if met.any():
+                yield box[met], begins[met], ends[met]
+
+
+def _parts(sizes: np.ndarray) -> Iterator[slice]:
+    """Slices of entries that follow each other, whose sizes sum up to at most `_CHUNK_ENTRIES`, or one entry."""
+    ends = np.cumsum(sizes)
+    start = 0
+    while start < len(sizes):
+        before = ends[start - 1] if start else 0
+        stop = max(start + 1, int(np.searchsorted(ends, before + _CHUNK_ENTRIES, side="right")))
+        yield slice(start, stop)
+        start = stop
 
 
 def _binding_from_pairs(

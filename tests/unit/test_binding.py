@@ -163,21 +163,52 @@ def test_same_input_gives_the_same_bytes():
     assert torch.equal(runs[0][0].values, runs[1][0].values)
 
 
+def splat_of_a_ball(count, seed=20):
+    """Discs and needles of a splat on a sphere: in its surface, up to hundreds of times as long as they are thick."""
+    generator = torch.Generator().manual_seed(seed)
+    normal = torch.nn.functional.normalize(
+        torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=1
+    )
+    along = torch.linalg.cross(normal, torch.randn(count, 3, generator=generator, dtype=torch.float64))
+    along = torch.nn.functional.normalize(along, dim=1)
+    axes = torch.stack([normal, along, torch.linalg.cross(normal, along)], dim=2)
+    scales = torch.exp(torch.rand(count, 3, generator=generator, dtype=torch.float64) * 2) * torch.tensor(
+        [2e-4, 1e-2, 2e-3]
+    )
+    return 0.3 * normal, axes @ torch.diag_embed(scales**2) @ axes.transpose(1, 2)
+
+
+@pytest.mark.parametrize("entries", [None, 100])
+@pytest.mark.parametrize("max_neighbours", [None, 10])
+def test_the_flat_gaussians_of_a_splat_are_bound_as_the_dense_algorithm_binds_them(
+    monkeypatch, entries, max_neighbours
+):
+    if entries:  # in many parts, some of them of one Gaussian that is larger
+        monkeypatch.setattr(particle_binding, "_CHUNK_ENTRIES", entries)
+    means, covars = splat_of_a_ball(800)
+    particles = 0.6 * random_particles(400, seed=21) - 0.3
+    settings = BindingConfig(max_neighbours=max_neighbours)
+    binding, enlarged, added, _ = bind_two_pass(means, covars, particles, 0.1, settings)
+    assert added > 500 and binding.counts.max() > 3
+    expected = algorithm_1(means, covars, enlarged, max_neighbours=max_neighbours)
+    torch.testing.assert_close(dense(binding), expected, rtol=1e-14, atol=0)
+
+
 def test_the_search_looks_only_at_particles_near_each_gaussian(monkeypatch):
-    """At the paper's proportions, a tenth of its size: few Gaussians need more than the first query, in either pass."""
-    looked = []
+    """Particles in the boxes of the ellipsoids, widened to whole cells; a search by distance alone looks at more."""
+    means, covars = splat_of_a_ball(20000)
+    looked, runs = [], particle_binding._Cells.runs
 
-    class CountingTree(cKDTree):
-        def query(self, points, k):
-            looked.append(len(points) * len(k))
-            return super().query(points, k)
+    def counted(*arguments):
+        for near, first, last in runs(*arguments):
+            looked.append((last - first).sum())
+            yield near, first, last
 
-    monkeypatch.setattr(particle_binding, "cKDTree", CountingTree)
-    means, covars = random_gaussians(2000, seed=20, size=0.025, spread=0.5, anisotropy=0.8)
-    particles = random_particles(3000, seed=21, spread=0.5)
-    binding, _, _, _ = bind_two_pass(means, covars, particles, 0.125)
-    assert len(binding.indices) > 5 * 2000
-    assert sum(looked) < 1.5 * 2 * particle_binding._FIRST_QUERY * 2000
+    monkeypatch.setattr(particle_binding._Cells, "runs", counted)
+    binding = bind(means, covars, means, BindingConfig(max_neighbours=None))
+    reach = (chi2.ppf(0.95, 3) * torch.linalg.eigvalsh(covars)[:, 2]).sqrt()
+    within = cKDTree(means.numpy()).query_ball_point(means.numpy(), reach.numpy(), return_length=True).sum()
+    assert len(binding.indices) < sum(looked) < 0.5 * within
 
 
 @pytest.mark.parametrize(
