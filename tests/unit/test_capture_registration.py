@@ -11,7 +11,8 @@ from render_scenes import random_scene
 from scipy.spatial.transform import Rotation
 
 from neuma_lib.errors import InputError
-from neuma_lib.fitting.registration import Found, _Problem, first_common, register
+from neuma_lib.fitting.registration import first_common, register
+from neuma_lib.fitting.registration_problem import Found, Problem
 from neuma_lib.fitting.rigid_motion import RigidMotion, angle_between, spread_rotations, turned
 from neuma_lib.fitting.rigid_views import Body, Pictures
 from neuma_lib.fitting.throw import Throw
@@ -202,7 +203,7 @@ def test_slopes_are_those_of_the_cost():
         centre=motion.centre + (0.002, -0.003, 0.002),
     )
     begin = Found(off, np.array([0.0, 0.002]), 0.01, GAINS[:2])
-    problem = _Problem(pictures, begin, 3.0, [1], falling=np.eye(3))
+    problem = Problem(pictures, begin, 3.0, [1], falling=np.eye(3))
     fit = problem.linearise(problem.start, problem.all, central=True)
     # steps of about a third of a pixel, over which the cost bends
     steps = np.array([0.002] * 3 + [0.01] * 3 + [0.05] * 3 + [0.05] * 3 + [0.5] + [1.0] * 3 + [0.1])
