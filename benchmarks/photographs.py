@@ -25,6 +25,7 @@ from neuma_lib.capture.mattes import write_mattes
 from neuma_lib.capture.photograph_masks import photograph_mask
 from neuma_lib.capture.pictures import group_of, picture_sheet, read_picture, undistorted
 from neuma_lib.capture.poses import Poses, find_poses, load_poses, save_poses
+from neuma_lib.capture.redrawn_masks import redrawn_masks
 from neuma_lib.capture.saliency import Saliency, fetch_network
 from neuma_lib.config.settings import Config, load, merged, read_yaml
 from neuma_lib.fitting.gaussians import GaussianFitReport, fit_gaussians
@@ -100,11 +101,14 @@ def make_mattes(transforms: Path, folder: Path, longest: int, settings: Config) 
     for name, lens in zip(poses.names, poses.lenses):
         pixels.append(undistorted(read_picture(folder / Path(name).name), lens, longest))
         masks.append(photograph_mask(pixels[-1], network, name))
-    agreed = agreement(masks, poses.viewmats, np.stack([lens.K for lens in lenses]))
+    Ks = np.stack([lens.K for lens in lenses])
+    first = (agreement(masks, poses.viewmats, Ks) >= LEAST_AGREEMENT).sum()
+    masks = redrawn_masks(pixels, masks, poses.viewmats, Ks)
+    agreed = agreement(masks, poses.viewmats, Ks)
     chosen = np.flatnonzero(agreed >= LEAST_AGREEMENT)
     print(
-        f"{len(chosen)} of {len(masks)} masks agree (IoU {agreed[chosen].min():.2f} to {agreed[chosen].max():.2f},"
-        f" {time.process_time() - begun:.0f} s)"
+        f"{first} of {len(masks)} first masks agree, {len(chosen)} of those drawn anew (IoU"
+        f" {agreed[chosen].min():.2f} to {agreed[chosen].max():.2f}, {time.process_time() - begun:.0f} s)"
     )
     box = _placed(poses.viewmats[chosen], [lenses[i] for i in chosen], [masks[i] for i in chosen], settings)
     frames = []

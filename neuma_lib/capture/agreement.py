@@ -7,6 +7,7 @@ cover the camera's mask. A mask with the floor in it, of another object, or of a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,8 +26,38 @@ _MARGIN = 1.6  # half side of the first cube, in radii of the masks
 _CLOSING = np.ones((3, 3), np.uint8)
 
 
+@dataclass(frozen=True, eq=False)
+class CommonBody:
+    """What several views leave of a cube of space.
+
+    Attributes:
+        points: middles of its voxels, (P, 3).
+        voxel: their side.
+        agreement: IoU of each mask with the body as seen from there, (N,).
+    """
+
+    points: np.ndarray
+    voxel: float
+    agreement: np.ndarray
+
+    def seen(self, size: tuple[int, int], viewmat: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, float]:
+        """The body in a picture, known to about half a voxel, (H, W), and how large a voxel is there [px].
+
+        Args:
+            size: height and width of the picture [px].
+        """
+        body, shrink = _drawn(self.points, self.voxel, size, viewmat, K)
+        large = opencv().resize(body.astype(np.float32), size[::-1], interpolation=opencv().INTER_LINEAR)
+        return large > 0.5, 1 / shrink
+
+
 def agreement(masks: Sequence[np.ndarray], viewmats: np.ndarray, Ks: np.ndarray) -> np.ndarray:
-    """IoU of each mask with the body that all of them leave, seen from there, (N,).
+    """IoU of each mask with the body that all of them leave (`common_body`), (N,)."""
+    return common_body(masks, viewmats, Ks).agreement
+
+
+def common_body(masks: Sequence[np.ndarray], viewmats: np.ndarray, Ks: np.ndarray) -> CommonBody:
+    """The body that masks of several views leave together.
 
     The body is drawn at the size of its voxels, so that an IoU is known to some hundredths.
 
@@ -49,11 +80,11 @@ def agreement(masks: Sequence[np.ndarray], viewmats: np.ndarray, Ks: np.ndarray)
     chosen = views
     for share in LEAST_SHARES:
         points, voxel = _body(chosen, middle - reach, middle + reach, share)
-        found = np.array([iou(*_drawn(points, voxel, *view)) for view in views])
+        found = np.array([_agreed(points, voxel, *view) for view in views])
         chosen = [view for view, agreed in zip(views, found) if agreed >= LEAST_AGREEMENT]
         if len(chosen) < 2:
             break
-    return found
+    return CommonBody(points, voxel, found)
 
 
 def check_one_object(found: Sequence[float], cameras: Sequence[str], name: str) -> None:
@@ -123,17 +154,24 @@ def _body(
     return points, voxel
 
 
+def _agreed(points: np.ndarray, voxel: float, mask: np.ndarray, viewmat: np.ndarray, K: np.ndarray) -> float:
+    """IoU of a mask and of the body as its camera sees it."""
+    cv2 = opencv()
+    body, _ = _drawn(points, voxel, mask.shape, viewmat, K)
+    small = cv2.resize(mask.astype(np.float32), body.shape[::-1], interpolation=cv2.INTER_AREA) > 0.5
+    return iou(small, body)
+
+
 def _drawn(
-    points: np.ndarray, voxel: float, mask: np.ndarray, viewmat: np.ndarray, K: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The mask and the body as a camera sees them, in pixels as large as the voxels."""
+    points: np.ndarray, voxel: float, size: tuple[int, int], viewmat: np.ndarray, K: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """The body as a camera sees it, in pixels as large as the voxels, and by how much the picture (H, W) shrinks."""
     cv2 = opencv()
     pixels, depth = _projected(points, viewmat, K)
     shrink = min(1.0, float(np.median(depth)) / (voxel * K[0, 0])) if (depth > 0).all() else 1.0
-    width, height = (max(1, round(shrink * n)) for n in mask.shape[::-1])
-    small = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
+    width, height = (max(1, round(shrink * n)) for n in size[::-1])
     body = np.zeros((height, width), np.uint8)
-    x, y = np.floor(pixels * (width / mask.shape[1], height / mask.shape[0])).astype(int).T
+    x, y = np.floor(pixels * (width / size[1], height / size[0])).astype(int).T
     within = (depth > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
     body[y[within], x[within]] = 1
-    return small, cv2.morphologyEx(body, cv2.MORPH_CLOSE, _CLOSING) > 0
+    return cv2.morphologyEx(body, cv2.MORPH_CLOSE, _CLOSING) > 0, shrink

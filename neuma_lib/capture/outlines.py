@@ -126,17 +126,12 @@ def outline(frame: np.ndarray, plate: np.ndarray, mask: np.ndarray, palette: Pal
         plate: the empty scene at its exposure, float32, (H, W, 3).
         mask: the first one, not empty.
     """
-    cv2 = opencv()
     reach = max(3, round(_REACH * _radius(mask)))
     box = box_of(mask, reach + _WINDOW)
     picture, empty = frame[box].astype(np.float32), plate[box]
     background = _by_plate(picture, empty)
     difference = _by_palette(picture, palette) - np.minimum(background.cost, UNSEEN)
-    cost = np.where(grown(mask[box], reach), difference / _TEN, 0.5 * UNSEEN / _TEN)
-    grey = picture.mean(axis=2)
-    slope = np.hypot(*(cv2.Sobel(grey, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1))))
-    least, more, half = SMOOTH
-    inside = _least_cost(cost.astype(np.float32), least + more / (1 + (slope / half) ** 2))
+    inside = cheapest(np.where(grown(mask[box], reach), difference, 0.5 * UNSEEN), picture)
     if inside.any():
         inside = _mixed(picture, empty, background.shade, inside)
     return in_full(component(inside), box, mask.shape)
@@ -229,6 +224,20 @@ def _by_palette(picture: np.ndarray, palette: Palette) -> np.ndarray:
         cost += LIGHT_WEIGHT * np.log(factor[..., 0]) ** 2 - 2 * np.log(max(share, LEAST_SHARE))
         np.minimum(best, cost, out=best)
     return best
+
+
+def cheapest(cost: np.ndarray, picture: np.ndarray) -> np.ndarray:
+    """The region (H, W) with the least sum of what its pixels cost and of its outline, which is cheap along edges.
+
+    Args:
+        cost: of a pixel inside over one outside, in squared deviations, (H, W).
+        picture: in which edges are looked for, float32, (H, W, 3).
+    """
+    cv2 = opencv()
+    grey = picture.mean(axis=2)
+    slope = np.hypot(*(cv2.Sobel(grey, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1))))
+    least, more, half = SMOOTH
+    return _least_cost((cost / _TEN).astype(np.float32), least + more / (1 + (slope / half) ** 2))
 
 
 def _least_cost(cost: np.ndarray, length: np.ndarray) -> np.ndarray:

@@ -13,12 +13,15 @@ from neuma_lib.capture.masks import overlay
 from neuma_lib.capture.mattes import metric_camera, own_mask, read_pixels, room_frames, world_of, write_mattes
 from neuma_lib.capture.photograph_masks import photograph_mask
 from neuma_lib.capture.pictures import picture_sheet
+from neuma_lib.capture.redrawn_masks import redrawn_masks
 from neuma_lib.capture.saliency import Saliency
 from neuma_lib.config.board import BoardConfig
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import read_json, write_json
 from workflow.inputs import listed
 from workflow.stage import run_script
+
+_STEPS = 4  # of which the network's masks are one
 
 
 def main(inputs, output, params, run) -> None:
@@ -42,18 +45,21 @@ def main(inputs, output, params, run) -> None:
         names.append(file.stem)
         pictures.append(pixels)
         masks.append(mask)
-        run.progress(number + 1, len(frames))
+        run.progress(number + 1, _STEPS * len(frames))
     cameras, Ks = map(np.stack, zip(*(metric_camera(frame, {}) for frame in frames)))
-    agreed = agreement(masks, cameras, Ks) if len(masks) > 1 else np.ones(1)
     # Own masks are taken as they are.
-    doubtful = [n for n, value in zip(names, agreed) if value < LEAST_AGREEMENT and n not in own]
+    is_own = [name in own for name in names]
+    agreed = np.ones(1)
+    if len(masks) > 1:
+        _check(agreement(masks, cameras, Ks), names, is_own, params.name)
+
+        def drawn(done: int, total: int) -> None:
+            run.progress(total + (_STEPS - 1) * done, _STEPS * total)
+
+        masks = redrawn_masks(pictures, masks, cameras, Ks, is_own, drawn)
+        agreed = agreement(masks, cameras, Ks)
+    doubtful = _check(agreed, names, is_own, params.name)
     kept = [name not in doubtful for name in names]
-    if sum(kept) < 0.5 * len(names):
-        raise InputError(
-            f"{params.name}: {len(doubtful)} of {len(names)} masks of photographs do not belong to the body that the"
-            f" others show ({', '.join(doubtful[:5])}): photograph the object alone, whole, and before another"
-            f" colour; or put masks of your own into the folder masks/{PHOTOGRAPHS}"
-        )
     shown = [
         (f"{name}: {value:.2f}{'' if good else ', left out'}", overlay(Frame(0, 0.0, pixels), mask).pixels)
         for name, value, good, pixels, mask in zip(names, agreed, kept, pictures, masks)
@@ -77,6 +83,18 @@ def main(inputs, output, params, run) -> None:
         },
     )
     run.say(said + (f"; left out: {', '.join(doubtful)}" if doubtful else ""))
+
+
+def _check(agreed, names, is_own, name) -> list[str]:
+    """Photographs whose masks do not agree with the others."""
+    doubtful = [n for n, value, own in zip(names, agreed, is_own) if value < LEAST_AGREEMENT and not own]
+    if len(doubtful) > 0.5 * len(names):
+        raise InputError(
+            f"{name}: {len(doubtful)} of {len(names)} masks of photographs do not belong to the body that the"
+            f" others show ({', '.join(doubtful[:5])}): photograph the object alone, whole, and before another"
+            f" colour; or put masks of your own into the folder masks/{PHOTOGRAPHS}"
+        )
+    return doubtful
 
 
 run_script(main, snakemake)
