@@ -61,6 +61,7 @@ rule render_static:
     threads: BLENDER.threads
     resources:
         gpu=RENDER_GPU,
+        runtime=render_minutes(SETTINGS.dataset.static, 1),
     params:
         scene=scene_setting("shape", "size", "height", "center", "appearance"),
         images=SETTINGS.dataset.static.plain(),
@@ -80,7 +81,9 @@ rule render_dynamic:
     threads: BLENDER.threads
     resources:
         gpu=RENDER_GPU,
-        runtime=240,
+        runtime=lambda wildcards: render_minutes(
+            SETTINGS.dataset.dynamic, len(SETTINGS.frame_steps(wildcards.scene))
+        ),
     params:
         scene=scene_setting("shape", "size", "height", "center", "appearance"),
         images=SETTINGS.dataset.dynamic.plain(),
