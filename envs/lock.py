@@ -4,7 +4,7 @@ requirements.txt      everything that the workflow needs, exact versions
 requirements-dev.txt  the same, and what tests and style checks need
 requirements-capture.txt  the same as the first, and what own photographs and videos need
 requirements-viewer.txt  the same as the first, and what the viewer's server needs
-conda.yaml            requirements.txt inside a conda environment with Python 3.11 (`snakemake --sdm conda`)
+conda.yaml            requirements.txt inside a conda environment with Python 3.11 (`snakemake --sdm conda`, not tried)
 conda-capture.yaml    requirements-capture.txt so
 
 Local builds (``+cpu``) and the addresses of package indices are left out, so that the files resolve anywhere.

@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import yaml
@@ -27,11 +28,26 @@ TABLE = "tiny/results/table1.csv"
 SCENE = "tiny/results/BouncyBall"
 
 
-class Project:
-    """A copy of the working tree in a folder of its own."""
+def wait_for(condition, seconds: float = 60.0):
+    """Wait until the condition is true and return its value."""
+    end = time.monotonic() + seconds
+    while not (value := condition()):
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+    return value
 
-    def __init__(self, root: Path):
-        self.root = root
+
+class Project:
+    """A copy of the working tree in a folder of its own.
+
+    Args:
+        root: that folder.
+        executor: options of Snakemake that say where jobs run.
+        seconds: the longest that a run may take.
+    """
+
+    def __init__(self, root: Path, executor: tuple[str, ...] = ("--cores", "2"), seconds: float = 900.0):
+        self.root, self.executor, self.seconds = root, executor, seconds
 
     def command(self, *words: str) -> list[str]:
         return [
@@ -40,8 +56,7 @@ class Project:
             "snakemake",
             "--configfile",
             "tests/workflow/tiny.yaml",
-            "--cores",
-            "2",
+            *self.executor,
             *words,
         ]
 
@@ -53,7 +68,7 @@ class Project:
             text=True,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            timeout=900,
+            timeout=self.seconds,
         )
         assert (done.returncode == 0) == succeeds, done.stdout[-4000:]
         return done.stdout
@@ -98,7 +113,7 @@ class Project:
     def clone(self, root: Path) -> Project:
         """A copy of the project as it stands, with everything computed and Snakemake's records."""
         shutil.copytree(self.root, root)
-        return Project(root.resolve())
+        return Project(root.resolve(), self.executor, self.seconds)
 
 
 def copied(folder: Path, kernels: Path, origin: Path = ROOT) -> Project:

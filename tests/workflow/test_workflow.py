@@ -9,28 +9,17 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 import torch
-from project import ROOT, SCENE, TABLE, Project, copied
+from project import ROOT, SCENE, TABLE, Project, copied, wait_for
 
 from neuma_lib.evaluation.lpips import expected_shapes
 from neuma_lib.evaluation.plotting.image_grid import load_image_grid
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.weights import write_weights
-
-
-def wait_for(condition, seconds: float = 60.0):
-    """Wait until the condition is true and return its value."""
-    end = time.monotonic() + seconds
-    while not (value := condition()):
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
-    return value
-
 
 # ---- from nothing to a table
 

@@ -1,0 +1,204 @@
+"""The workflow through a real SLURM on this machine: profiles/slurm, as a user of a cluster runs it.
+
+One host, no cgroups, no accounting database and no GPU: what a second host, a filesystem between hosts and a real GPU
+would change is not tested. Beside the table itself these tests say what a job of SLURM asks for and what becomes of it.
+"""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+import torch
+from project import SCENE, TABLE, Project, copied, wait_for
+
+from workflow.stage import core_seconds
+
+LONG = "neuma+iterations=40+checkpoint_every=1"
+ADAPTOR = f"{SCENE}/{LONG}/adaptor.safetensors"
+
+
+def jobs(slurm) -> dict[str, dict[str, str]]:
+    """All jobs that SLURM remembers, the last first: number, and what ``scontrol show job`` says of each."""
+    lines = [
+        line for line in slurm.ask("scontrol", "-o", "show", "job").splitlines() if line.startswith("JobId=")
+    ]
+    told = [dict(re.findall(r"(\S+?)=(\S*)", line)) for line in lines]
+    return {job["JobId"]: job for job in sorted(told, key=lambda job: -int(job["JobId"]))}
+
+
+def job_of(slurm, rule: str) -> dict[str, str]:
+    """The last job of a rule."""
+    return next(job for job in jobs(slurm).values() if job["Comment"].startswith(f"rule_{rule}"))
+
+
+def seconds(clock: str) -> int:
+    """SLURM's ``[days-]hours:minutes:seconds``."""
+    days, _, rest = clock.rpartition("-")
+    hours, minutes, rest = map(int, rest.split(":"))
+    return ((int(days or 0) * 24 + hours) * 60 + minutes) * 60 + rest
+
+
+def comment(rule: str, wildcards: Sequence[str]) -> str:
+    """What a job of SLURM is called by the plugin, beside its number."""
+    return "_".join([f"rule_{rule}", *(["wildcards", *wildcards] if wildcards else [])])
+
+
+def said_by_rules(project: Project) -> dict[str, dict[str, int]]:
+    """Resources of all jobs behind the table, by their comment, as Snakemake plans them without SLURM."""
+    found = {}
+    for block in re.split(
+        r"^\[", Project(project.root).run("--dry-run", "--forceall", TABLE), flags=re.MULTILINE
+    ):
+        if rule := re.search(r"^rule (\w+):", block, re.MULTILINE):
+            lines = dict(re.findall(r"^ +(wildcards|resources): (.*)$", block, re.MULTILINE))
+            wildcards = re.findall(r"\w+=([^,]+)", lines.get("wildcards", ""))
+            resources = re.findall(r"(gpu|mem_mb|runtime)=(\d+)", lines["resources"])
+            found[comment(rule[1], wildcards)] = {name: int(value) for name, value in resources}
+    return found
+
+
+def measured(project: Project) -> dict[str, dict[str, float]]:
+    """Benchmarks of a run: the comment that the job of each has, and its seconds and MB."""
+    found = {}
+    for folder in (project.root / "tiny/results/benchmarks", project.root / "tiny/data/kernels/benchmarks"):
+        for file in folder.rglob("*.tsv"):
+            *wildcards, rule = file.relative_to(folder).with_suffix("").parts
+            names, values, *_ = (line.split("\t") for line in file.read_text().splitlines())
+            row = dict(zip(names, values))
+            found[comment(rule, wildcards)] = {name: float(row[name]) for name in ("s", "max_rss")}
+    return found
+
+
+def slurm_log(job: dict[str, str]) -> str:
+    return Path(job["StdOut"]).read_text()
+
+
+# ---- from nothing to a table
+
+
+def test_nothing_is_left_to_do_with_or_without_slurm(finished):
+    """What the nodes recorded of settings, inputs and code is what this machine would have recorded."""
+    assert finished.plan(TABLE) == {}
+    assert Project(finished.root).plan(TABLE) == {}
+
+
+def test_every_job_ends_well_and_its_log_arrives(finished, slurm):
+    ran = set(re.findall(r"has been submitted with SLURM jobid (\d+)", finished.output))
+    states = {job["JobId"]: job["JobState"] for job in slurm.completed()}
+    assert len(ran) == len(measured(finished)) >= 18
+    assert {states[number] for number in ran} == {"COMPLETED"}
+    logs = [*(finished.root / "tiny").rglob("*.log")]
+    assert len(logs) == len(ran)
+    for log in logs:
+        assert core_seconds(log), log
+    # SLURM's own logs of jobs that ended well are removed by the plugin.
+    assert not [*(finished.root / ".snakemake/slurm_logs").rglob("*.log")]
+
+
+def test_jobs_ask_for_what_their_rules_say_and_use_no_more(finished, slurm):
+    """Memory beyond what was asked for would have ended a job: SLURM looks at all its processes every second."""
+    planned = said_by_rules(finished)
+    ran = set(re.findall(r"has been submitted with SLURM jobid (\d+)", finished.output))
+    asked = {job["Comment"]: job for number, job in jobs(slurm).items() if number in ran}
+    used = measured(finished)
+    assert set(planned) == set(asked) == set(used)
+    assert planned[f"rule_material_wildcards_{Path(SCENE).name}_neuma"]["mem_mb"] == 6000
+    for name, job in asked.items():
+        said = planned[name]
+        assert f"cpu=1,mem={said['mem_mb']}M,node=1," in job["TRES"], name
+        assert seconds(job["TimeLimit"]) == 60 * said["runtime"], name
+        assert said["gpu"] == 0 and "TresPerJob" not in job, name
+        assert used[name]["max_rss"] < said["mem_mb"], name
+        assert used[name]["s"] <= seconds(job["RunTime"]) < seconds(job["TimeLimit"]), name
+
+
+# ---- stopped in the middle
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(finished, tmp_path_factory):
+    """The adaptor of a training that nobody disturbed, made without SLURM."""
+    root = tmp_path_factory.mktemp("uninterrupted") / "clone"
+    project = Project(finished.clone(root).root, seconds=finished.seconds)
+    project.run(ADAPTOR)
+    return (project.root / ADAPTOR).read_bytes()
+
+
+def started_training(project: Project, slurm) -> tuple[subprocess.Popen, dict[str, str]]:
+    """Start training, and wait until it has gone some way. Returns Snakemake and SLURM's job."""
+    snakemake = project.start(ADAPTOR)
+    checkpoint = project.root / SCENE / LONG / "checkpoint.pt"
+    first = wait_for(lambda: checkpoint.exists() and checkpoint.stat().st_mtime_ns, 600)
+    wait_for(lambda: checkpoint.stat().st_mtime_ns > first, 600)
+    job = job_of(slurm, "material")
+    assert job["JobState"] == "RUNNING"
+    return snakemake, job
+
+
+def resumed(project: Project) -> bytes:
+    project.run(ADAPTOR)
+    (log,) = (project.root / "tiny/results/logs").rglob(f"{LONG}/material.log")
+    assert re.search(r"resumed at iteration [1-9]\d* of 40", log.read_text())
+    return (project.root / ADAPTOR).read_bytes()
+
+
+def test_a_cancelled_job_goes_on_by_the_same_command(clone, slurm, uninterrupted):
+    snakemake, job = started_training(clone, slurm)
+    slurm.ask("scancel", job["JobId"])
+    assert snakemake.wait(300) != 0
+    said = (clone.root / "started.log").read_text()
+    assert f"SLURM-job '{job['JobId']}' failed, SLURM status is: 'CANCELLED'" in said
+    assert job["StdOut"] in said and "CANCELLED" in slurm_log(job)
+    assert resumed(clone) == uninterrupted
+
+
+@pytest.mark.skipif(
+    signal.getsignal(signal.SIGINT) is signal.SIG_IGN,
+    reason="Ctrl-C is ignored here: run it in the foreground",
+)
+def test_an_interrupted_snakemake_takes_its_jobs_along(clone, slurm, uninterrupted):
+    snakemake, job = started_training(clone, slurm)
+    snakemake.send_signal(signal.SIGINT)
+    assert snakemake.wait(300) != 0
+    wait_for(lambda: jobs(slurm)[job["JobId"]]["JobState"] == "CANCELLED", 60)
+    assert resumed(clone) == uninterrupted
+
+
+def test_a_job_that_needs_more_memory_than_it_asks_for_is_ended_and_says_so(clone, slurm):
+    target = f"{SCENE}/neuma+rank=3/adaptor.safetensors"
+    clone.run("--set-resources", "material:mem_mb=300", "--", target, succeeds=False)
+    job = job_of(slurm, "material")
+    assert "mem=300M" in job["TRES"] and job["JobState"] == "FAILED"
+    assert "Exceeded job memory limit" in slurm_log(job)
+    assert not (clone.root / target).exists()
+    clone.run(target)
+    assert "mem=6000M" in job_of(slurm, "material")["TRES"]
+
+
+# ---- GPUs
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_a_job_asks_for_a_gpu_where_the_settings_do_and_says_that_it_sees_none(clone, slurm):
+    """SLURM hands out a GPU in name: what is tested is that a job waits for one, and what it says without."""
+    prior = "tiny/results/priors/jelly.safetensors"
+    clone.run("--config", "device=cuda", "--", prior, succeeds=False)
+    job = job_of(slurm, "prior")
+    assert job["TresPerJob"] == "gres:gpu:1" and job["JobState"] == "FAILED"
+    assert "torch sees no CUDA device" in slurm_log(job)
+
+
+# ---- beside a run without SLURM
+
+
+def test_the_table_and_all_before_it_are_those_of_a_run_without_slurm(finished, kernels, tmp_path):
+    local = copied(tmp_path / "local", kernels)
+    local.seconds = finished.seconds
+    local.run(TABLE)
+    assert f"{SCENE}/neuma/metrics.json" in local.artifacts() and TABLE in local.artifacts()
+    assert finished.artifacts() == local.artifacts()
