@@ -34,11 +34,12 @@ EITHER_DEVICE = "cpu" if SETTINGS.device == "cpu" else "auto"
 EITHER_GPU = int(GPU and HAS_CUDA)
 
 # Scripts are processes of their own: they find the library, share one kernel cache, and keep to one thread each
-# (two OpenMP threads on a busy machine are far slower than one).
+# (two OpenMP threads on a busy machine are far slower than one). NEUMA_GPUS spreads them over so many GPUs.
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+SPREAD = [str(ROOT / "workflow" / "gpus")] if os.environ.get("NEUMA_GPUS") else []
 os.environ.update(
     {
-        "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]),
+        "PYTHONPATH": os.pathsep.join([*SPREAD, str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]),
         "NEUMA_KERNEL_CACHE": str(Path(SETTINGS.kernel_cache).resolve()),
         **{name: os.environ.get(name, "1") for name in THREAD_LIMITS},
     }
