@@ -44,6 +44,13 @@ class SplatConfig(Section):
     )
     views: int = Field(60, ge=4, description="views around it in which its outline and depth are rendered")
     pixels: int = Field(320, ge=32, description="width and height of these views [px]")
+    edge: float = Field(
+        0.01,
+        ge=0,
+        lt=0.5,
+        description="length of the edges of its surface after the repair with MeshLab, as a fraction of the longest "
+        "side; 0, and without pymeshlab (`make capture`): no repair",
+    )
     own_particles: bool = Field(
         False,
         description="whether Gaussians that hold no particle get one of their own, as the paper's Algorithm 1 has it; "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from types import ModuleType
 
 import numpy as np
@@ -51,8 +52,13 @@ def repaired(mesh: trimesh.Trimesh, edge: float, name: str = "mesh") -> trimesh.
             return whole if _is_sound(whole) else even
     raise InputError(
         f"{name}: cannot be closed to a body with edges of {1000 * edge:.1f} mm: look at the mattes, take more"
-        " photographs from all sides, or choose shorter edges (photographs.edge)"
+        " photographs from all sides, or choose shorter edges (photographs.edge, of a splat splat.edge)"
     )
+
+
+def has_meshlab() -> bool:
+    """Whether pymeshlab is installed."""
+    return importlib.util.find_spec("pymeshlab") is not None
 
 
 def meshlab() -> ModuleType:

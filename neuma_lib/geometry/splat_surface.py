@@ -1,4 +1,4 @@
-"""A watertight surface of Gaussians alone: outlines of renders from all around, for the surface from silhouettes."""
+"""A watertight surface of Gaussians alone, from opacity and depth in renders from all around."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from neuma_lib.geometry.surface import reconstruct
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.rasterizer import rasterize
+from neuma_lib.splatting.spherical_harmonics import SH_C0
 from neuma_lib.splatting.viewpoints import static_views
 
 PIXEL_BLUR = 0.3
@@ -25,10 +26,22 @@ def views_around(gaussians: Gaussians, count: int, pixels: int) -> Cameras:
 
 
 def splat_surface(gaussians: Gaussians, cameras: Cameras, settings: SurfaceConfig) -> trimesh.Trimesh:
-    """The surface that the opacity of Gaussians shows in all views (`reconstruct`)."""
+    """The surface that opacity and depth of Gaussians show in all views (`reconstruct`).
+
+    The depth of a pixel is that of the mean of the centres on its ray, with the weights that blend their colours: one
+    rendering gives both, with the centres as colours.
+    """
+    low, high = gaussians.means.amin(dim=0), gaussians.means.amax(dim=0)
+    span = float((high - low).max()) or 1.0
+    places = ((gaussians.means - low) / span - 0.5)[:, None] / SH_C0
     with torch.no_grad():
         colours, alphas = rasterize(
-            gaussians.means[None], gaussians.covars()[None], gaussians.opacities, gaussians.sh(),
+            gaussians.means[None], gaussians.covars()[None], gaussians.opacities, places,
             cameras.viewmats, cameras.Ks, cameras.width, cameras.height, background=(0, 0, 0), eps2d=PIXEL_BLUR,
         )  # fmt: skip
-    return reconstruct(gaussians, cameras, torch.cat([colours[0], alphas[0][..., None]], dim=-1), settings)
+    seen = alphas[0] > settings.matte_level
+    points = low + span * colours[0] / alphas[0].clamp_min(settings.matte_level)[..., None]
+    along = torch.einsum("vi,vhwi->vhw", cameras.viewmats[:, 2, :3], points)
+    depths = torch.where(seen, along + cameras.viewmats[:, 2, 3, None, None], torch.nan)
+    images = torch.cat([colours[0], alphas[0][..., None]], dim=-1)
+    return reconstruct(gaussians, cameras, images, settings, depths=list(depths))

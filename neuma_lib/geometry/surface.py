@@ -1,7 +1,8 @@
 """A watertight surface of a static object from its silhouettes: the zero level of the visual hull's signed distance.
 
 The surface lies more finely than pixels or voxels (see `neuma_lib.geometry.visual_hull`). What no silhouette shows, a
-dent seen only by its shading, stays filled. The Gaussians fitted to the same views say where to look.
+dent seen only by its shading, stays filled, unless depth maps tell it. The Gaussians fitted to the same views say where
+to look.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from neuma_lib.config.geometry import SurfaceConfig
 from neuma_lib.errors import InputError
+from neuma_lib.geometry.depth_fusion import fused_distance
 from neuma_lib.geometry.repair import repaired
 from neuma_lib.geometry.visual_hull import NO_COMMON_SPACE, contour_distances, distance_inside
 from neuma_lib.geometry.volume import check_mesh
@@ -29,6 +31,8 @@ Array = NDArray[np.float64]
 
 BOX_SIDE = 1.0
 """Side of the simulator's box [m]."""
+_REACH = 4.0
+"""Distance from a depth map's surface up to which it says something of what is behind, in voxels."""
 _COARSE_RESOLUTION = 32
 """Voxels along the longest side of the first look, which finds the body's box and the band around its surface."""
 
@@ -56,6 +60,7 @@ def reconstruct(
     images: Tensor | Sequence[Tensor],
     settings: SurfaceConfig,
     floor: float | None = None,
+    depths: Sequence[Tensor] | None = None,
 ) -> trimesh.Trimesh:
     """Surface of the body that the views show (paper, section 3.2, where a multi-view method makes it).
 
@@ -65,6 +70,8 @@ def reconstruct(
         images: RGBA with straight alpha in [0, 1] of V views, shape (H, W, 4) each.
         settings: resolution and smoothing.
         floor: height y [m] below which nothing is, where no camera sees the underside; None: there is no floor.
+        depths: of the surface along the optical axes [m] in V views, shape (H, W) each, not finite where a pixel shows
+            none; they tell dents. None: outlines alone.
 
     Returns:
         Watertight mesh in the world frame [m], one body without inner cavities, oriented outwards.
@@ -95,6 +102,11 @@ def reconstruct(
     band = np.flatnonzero(np.abs(field.ravel()) < reach)
     points = np.stack(np.unravel_index(band, field.shape), axis=1) * grid.spacing + grid.origin
     field.ravel()[band] = distance_inside(torch.from_numpy(points), contours, cameras, floor).numpy()
+    if depths is not None:
+        inside = np.flatnonzero(field.ravel() > -grid.spacing)
+        points = np.stack(np.unravel_index(inside, field.shape), axis=1) * grid.spacing + grid.origin
+        shown = fused_distance(torch.from_numpy(points), depths, cameras, _REACH * grid.spacing)
+        field.ravel()[inside] = np.minimum(field.ravel()[inside], shown.numpy())
 
     mesh = _polygonise(_one_solid_body(field), grid)
     if settings.smoothing:

@@ -28,6 +28,7 @@ rule splat_mesh:
     params:
         views=splat_setting(lambda scene: scene.splat.views),
         pixels=splat_setting(lambda scene: scene.splat.pixels),
+        edge=splat_setting(lambda scene: scene.splat.edge),
         surface=SETTINGS.geometry.surface.plain(),
     script:
         "../scripts/splat_mesh.py"
