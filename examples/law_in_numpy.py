@@ -15,10 +15,8 @@ def read(path):
     start = 8 + int.from_bytes(data[:8], "little")
     header = json.loads(data[8:start])
     about = json.loads(header.pop("__metadata__")["neuma"])
-    numbers = {
-        name: np.frombuffer(data[start:][slice(*x["data_offsets"])], "<f4") for name, x in header.items()
-    }
-    return {name: numbers[name].reshape(x["shape"]).astype(float) for name, x in header.items()}, about
+    numbers = lambda x: np.frombuffer(data[start:][slice(*x["data_offsets"])], "<f4")  # noqa: E731
+    return {name: numbers(x).reshape(x["shape"]).astype(float) for name, x in header.items()}, about
 
 
 def svd(F):
@@ -33,13 +31,10 @@ def load(path):
     """Elasticity, F (N, 3, 3) -> Kirchhoff stress [Pa], plasticity, trial F -> F once a time step, and metadata."""
     arrays, about = read(path)
     if about["export"]["kind"] != "networks" or "rank" in about:
-        raise SystemExit(
-            f"{path} is no pair of merged networks: see isotropic_in_numpy.py, or leave out --apart"
-        )
+        raise SystemExit(f"{path} is no pair of networks: see isotropic_in_numpy.py, or leave out --apart")
     W_e, W_p = ([arrays[f"{part}.{layer}"] for layer in LAYERS] for part in ("elasticity", "plasticity"))
-    elasticity = lambda F: network(F, W_e) @ F.swapaxes(1, 2)  # noqa: E731
-    plasticity = lambda F: F + 1e-3 * network(F, W_p)  # noqa: E731
-    return elasticity, plasticity, about["export"]
+    stress = lambda F: network(F, W_e) @ F.swapaxes(1, 2)  # noqa: E731
+    return stress, lambda F: F + 1e-3 * network(F, W_p), about["export"]
 
 
 def network(F, W):
