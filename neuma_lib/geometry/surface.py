@@ -31,8 +31,9 @@ Array = NDArray[np.float64]
 
 BOX_SIDE = 1.0
 """Side of the simulator's box [m]."""
-_REACH = 4.0
-"""Distance from a depth map's surface up to which it says something of what is behind, in voxels."""
+_REACH = 1 / 12
+"""Distance up to which a depth map says something of what is behind its surface, in longest sides: where it is shorter,
+the few views that look into a body through a gap of a sparse splat are not outvoted, where longer, thin walls swell."""
 _COARSE_RESOLUTION = 32
 """Voxels along the longest side of the first look, which finds the body's box and the band around its surface."""
 
@@ -103,9 +104,12 @@ def reconstruct(
     points = np.stack(np.unravel_index(band, field.shape), axis=1) * grid.spacing + grid.origin
     field.ravel()[band] = distance_inside(torch.from_numpy(points), contours, cameras, floor).numpy()
     if depths is not None:
-        inside = np.flatnonzero(field.ravel() > -grid.spacing)
+        inside, reach = (
+            np.flatnonzero(field.ravel() > -grid.spacing),
+            _REACH * grid.spacing * settings.resolution,
+        )
         points = np.stack(np.unravel_index(inside, field.shape), axis=1) * grid.spacing + grid.origin
-        shown = fused_distance(torch.from_numpy(points), depths, cameras, _REACH * grid.spacing)
+        shown = fused_distance(torch.from_numpy(points), depths, cameras, reach)
         field.ravel()[inside] = np.minimum(field.ravel()[inside], shown.numpy())
 
     mesh = _polygonise(_one_solid_body(field), grid)
