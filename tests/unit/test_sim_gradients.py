@@ -129,7 +129,8 @@ def assert_gradients_match(model, law, start, mass, vol0, frames, size=1e-6, **o
     def value(points):
         return random_loss()(simulate(model, law, points, mass, vol0, frames, **options))
 
-    assert_slopes_match(value, list(start), grads, [size] * 4)
+    # C moves particles by a time step of itself: a larger step stands out of the round-off.
+    assert_slopes_match(value, list(start), grads, [size] * 3 + [10 * size])
 
 
 @pytest.mark.parametrize("boundary", ["no_slip", "slip", "sticky"])
