@@ -68,8 +68,9 @@ def redrawn_masks(
     masks, total = list(masks), ROUNDS * len(masks)
     for done in range(ROUNDS):
         body = common_body(masks, viewmats, Ks)
-        seen = [body.seen(p.shape[:2], *camera) for p, camera in zip(pictures, zip(viewmats, Ks))]
-        views = {i: _view(p, *seen[i]) for i, p in enumerate(pictures) if seen[i][0].any()}
+        seen = (body.seen(p.shape[:2], *camera) for p, camera in zip(pictures, zip(viewmats, Ks)))
+        found = (_view(p, *each) for p, each in zip(pictures, seen))
+        views = {i: view for i, view in enumerate(found) if view is not None}
         ratio = _likelihood_ratio(list(views.values()))
         for i, view in views.items():
             if kept is None or not kept[i]:
@@ -88,12 +89,15 @@ def _drawn(view: _View, ratio: np.ndarray, shape: tuple[int, int]) -> np.ndarray
     return cv2.resize(inside.astype(np.float32), shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5
 
 
-def _view(picture: np.ndarray, body: np.ndarray, voxel: float) -> _View:
+def _view(picture: np.ndarray, body: np.ndarray, voxel: float) -> _View | None:
+    """None: the body is not in the picture."""
     cv2 = opencv()
     height, width = body.shape
     scale = min(1.0, _LONGEST / max(height, width))
     size = round(width * scale), round(height * scale)
     likely = cv2.resize(body.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
+    if not likely.any():
+        return None
     band = max(2, round(BAND * scale * voxel))
     box = box_of(likely, band + round(AROUND * float(np.sqrt(likely.sum() / np.pi))))
     pixels = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)[box]

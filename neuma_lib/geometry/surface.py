@@ -104,12 +104,10 @@ def reconstruct(
     points = np.stack(np.unravel_index(band, field.shape), axis=1) * grid.spacing + grid.origin
     field.ravel()[band] = distance_inside(torch.from_numpy(points), contours, cameras, floor).numpy()
     if depths is not None:
-        inside, reach = (
-            np.flatnonzero(field.ravel() > -grid.spacing),
-            _REACH * grid.spacing * settings.resolution,
-        )
+        inside = np.flatnonzero(field.ravel() > -grid.spacing)
+        behind = _REACH * grid.spacing * settings.resolution
         points = np.stack(np.unravel_index(inside, field.shape), axis=1) * grid.spacing + grid.origin
-        shown = fused_distance(torch.from_numpy(points), depths, cameras, reach)
+        shown = fused_distance(torch.from_numpy(points), depths, cameras, behind)
         field.ravel()[inside] = np.minimum(field.ravel()[inside], shown.numpy())
 
     mesh = _polygonise(_one_solid_body(field), grid)

@@ -61,3 +61,12 @@ def test_what_is_right_stays_right_and_progress_is_told():
     found = redrawn_masks(pictures, true, VIEWS, KS, progress=lambda *done: told.append(done))
     assert min(iou(a, b) for a, b in zip(found, true)) > 0.97
     assert told[-1] == (2 * COUNT, 2 * COUNT) and [done for done, _ in told] == list(range(1, 2 * COUNT + 1))
+
+
+def test_a_photograph_that_does_not_show_the_body_keeps_its_mask():
+    pictures, true, _ = photographs(np.random.default_rng(5))
+    views = VIEWS.copy()
+    views[3] = np.diag([-1.0, 1.0, -1.0, 1.0]) @ views[3]  # looks the other way
+    found = redrawn_masks(pictures, true, views, KS)
+    assert (found[3] == true[3]).all()
+    assert min(iou(a, b) for i, (a, b) in enumerate(zip(found, true)) if i != 3) > 0.96
