@@ -28,7 +28,7 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
 FRAME = 1 / 30
-"""Time between two pictures [s]: simulated where that is faster than the clock, else by the clock."""
+"""Time between two pictures [s], to a whole number of steps, where that much can be computed in it."""
 BUSY = 0.06
 """Seconds of computing that a frame may take: more than ten frames a second, with time left to draw."""
 PIVOT = np.array([0.5, 0.0, 0.5])
@@ -232,11 +232,13 @@ class LiveSimulation:
         return MPMModel(**self._constants, dt=min(self._dts), gravity=tuple(gravity.tolist()))
 
     def _loop(self) -> None:
-        command = None
+        due = time.perf_counter()
         while not self._closing:
-            began = time.perf_counter()
-            self._obey(command)
-            if self._running and not self._trouble:
+            due = min(due, time.perf_counter())
+            while not self._commands.empty():
+                self._obey(self._commands.get())
+            moving, before = self._running and not self._trouble, self._time
+            if moving:
                 try:
                     self._advance()
                 except (InputError, NonFiniteError) as error:
@@ -245,25 +247,27 @@ class LiveSimulation:
                     self._trouble = f"{type(error).__name__}: {error}"
             self._measure()
             self._publish()
-            rest = FRAME - (time.perf_counter() - began)
-            command = self._rest(max(rest, 0.0) if self._running and not self._trouble else IDLE)
+            # a frame lasts as long as what it simulates; of the time by which one is late, the next make up one frame
+            now = time.perf_counter()
+            due = max(due + self._time - before, now - FRAME) if moving else now + IDLE
+            self._rest(due, moving)
 
-    def _obey(self, command: Callable[[], None] | None) -> None:
-        """Carry out a command and all that wait; one that cannot be leaves everything as it is."""
-        while command or not self._commands.empty():
-            command = command or self._commands.get()
-            try:
-                command()
-            except InputError as error:
-                self._notice = str(error)
-            command = None
-
-    def _rest(self, seconds: float) -> Callable[[], None] | None:
-        """Rest until the next command, which is returned, at most some seconds."""
+    def _obey(self, command: Callable[[], None]) -> None:
+        """Carry out a command; one that cannot be leaves everything as it is."""
         try:
-            return self._commands.get(timeout=seconds) if seconds else None
-        except queue.Empty:
-            return None
+            command()
+        except InputError as error:
+            self._notice = str(error)
+
+    def _rest(self, until: float, moving: bool) -> None:
+        """Carry out commands until a time of the clock, or the first of them alone where nothing moves."""
+        while (left := until - time.perf_counter()) > 0:
+            try:
+                self._obey(self._commands.get(timeout=left))
+            except queue.Empty:
+                return
+            if not moving:
+                return
 
     def _advance(self) -> None:
         """The steps of one frame: as many as real time asks for, or as can be computed in time."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,11 +14,13 @@ from torch import Tensor
 from neuma_lib.coupling.bodies import coloured_solid, join
 from neuma_lib.coupling.deformation import arms_at_rest, deform
 from neuma_lib.coupling.reconstruction import Reconstruction
-from neuma_lib.errors import InputError
+from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.particles import load_body, thrown
 from neuma_lib.mechanics.law import Law
+from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.viewer import scalars
 from neuma_lib.viewer.files import LawFiles, SceneFiles, inside
@@ -72,10 +75,11 @@ class Playground:
         self._bodies, self._whole = [first], [first]
         self._arms: dict[int, Tensor] = {}
         self._loaded: dict[str, Law] = {}
+        self._constants, self._start = dict(files.simulation), start.to(device)
         self._changing = threading.Lock()
         self.chosen = chosen
         self.simulation = LiveSimulation(
-            files.simulation, start.to(device), self.law(chosen), self.laws[chosen].dt
+            files.simulation, self._start, self.law(chosen), self.laws[chosen].dt
         )
 
     def law(self, name: str) -> Law:
@@ -83,9 +87,17 @@ class Playground:
         if name not in self.laws:
             raise InputError(f"no law '{name}': choose one of {', '.join(self.laws)}")
         if name not in self._loaded:
-            law = law_of(self.laws[name], self._checked).requires_grad_(False)
-            self._loaded[name] = law.to(self.device)
+            law = law_of(self.laws[name], self._checked).requires_grad_(False).to(self.device)
+            self._try(law, self.laws[name].dt)
+            self._loaded[name] = law
         return self._loaded[name]
+
+    def _try(self, law: Law, dt: float) -> None:
+        """Take one step, which loads kernels: Warp must not load them first in two threads at once, and the thread
+        that simulates and the one that draws both use them."""
+        model = MPMModel(**{**self._constants, "dt": dt})
+        with torch.no_grad(), suppress(NonFiniteError):  # the simulation says so
+            rollout(model, law, self._start, steps=1, frames=[1], total=True, skip_free_flight=False)
 
     def _checked(self, path: str | Path) -> Path:
         return inside(path, self.roots)

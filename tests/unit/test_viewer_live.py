@@ -13,7 +13,7 @@ from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
-from neuma_lib.viewer.live import EARTH, FASTEST, PIVOT, LiveSimulation, tilted
+from neuma_lib.viewer.live import EARTH, FASTEST, FRAME, PIVOT, LiveSimulation, tilted
 
 CONSTANTS = {"grid": 16, "boundary": "no_slip", "walls": "outside"}
 DT = 1e-3
@@ -145,6 +145,26 @@ def test_uneven_frames_do_not_make_the_numbers_on_the_screen_larger(monkeypatch)
     simulation._publish()
     assert simulation.snapshot.rate == pytest.approx(20, rel=0.2)
     assert simulation.snapshot.pace == pytest.approx(0.4, rel=0.2)
+
+
+def test_it_runs_in_real_time_whatever_is_asked_meanwhile(live):
+    simulation, steps = live(paused=True), []
+
+    def quick():  # as on a machine that is never late
+        steps.append(simulation._time)
+        simulation._time += 0.011
+
+    simulation._advance = quick
+    simulation.do()
+    began = time.perf_counter()
+    simulation.run(True)
+    while time.perf_counter() - began < 0.5:
+        simulation.set_gravity(EARTH)  # a drag sends some sixty commands a second
+        time.sleep(0.002)
+    simulation.run(False)
+    moved, passed = simulation.do().time, time.perf_counter() - began
+    assert moved == pytest.approx(0.011 * len(steps))
+    assert 0.3 * passed < moved < passed + FRAME + 0.022
 
 
 def test_throw_drop_and_gravity(live):

@@ -1,10 +1,12 @@
 """A reconstructed body to play with: its laws, its Gaussians, and what is put on top of it."""
 
+import threading
+
 import pytest
 import torch
 from viewer_project import LAW, SCENE, make_project
 
-from neuma_lib.errors import InputError
+from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.viewer.find import found_laws, found_scene
 from neuma_lib.viewer.playground import ADDED_PARTICLES, Playground, first_law
@@ -60,6 +62,21 @@ def test_a_law_outside_the_folders_is_not_read(project, playground, tmp_path):
     with pytest.raises(InputError, match="lies outside"):
         playground._loaded.clear() or playground.choose(PRIOR)
     assert playground.chosen == before and playground.simulation.do().trouble is None
+
+
+def test_a_law_takes_its_first_step_in_the_thread_that_reads_it(project, monkeypatch):
+    files, laws = project
+    steps = []
+
+    def step(model, law, state, **options):
+        steps.append((threading.current_thread(), law.name, model.dt, options["steps"]))
+        raise NonFiniteError("step", "it diverges")
+
+    monkeypatch.setattr("neuma_lib.viewer.playground.rollout", step)
+    playground = Playground(files, laws, CONSTANTS)
+    assert [playground.law(name) for name in (PRIOR, PRIOR)] == [playground.law(PRIOR)] * 2
+    here = threading.current_thread()
+    assert steps == [(here, playground.law(name).name, 1e-3, 1) for name in (CONSTANTS, PRIOR)]
 
 
 def test_gaussians_follow_what_is_simulated(playground):
