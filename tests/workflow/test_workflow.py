@@ -336,6 +336,20 @@ def test_without_the_gpu_that_is_asked_for_nothing_is_begun(kernels, tmp_path):
     assert "ground_truth BouncyBall: " in output
 
 
+def test_what_a_failed_job_was_to_replace_counts_as_out_of_date(clone):
+    """Its outputs are gone, and what was made of them with former settings is still there."""
+    longer = ("--config", "material={iterations: 9}", "--", TABLE)
+    damaged = clone.root / SCENE / "neuma" / "checkpoint.pt"
+    damaged.write_text("damaged")
+    assert "cannot be read" in clone.run(*longer, succeeds=False)
+    assert not (clone.root / SCENE / "neuma" / "adaptor.safetensors").exists()
+    damaged.unlink()
+    assert clone.plan(*longer) == {"material": 1, "evaluation": 1, "chamfer_table": 1}
+    assert clone.plan(TABLE) == {}, "with the former settings the table is what it was"
+    clone.run(*longer)
+    assert clone.plan(*longer) == {}
+
+
 # ---- killed and run again
 
 LONG = "neuma+iterations=40+checkpoint_every=1"

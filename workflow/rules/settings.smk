@@ -16,6 +16,7 @@ from neuma_lib.config.validation import validate
 from neuma_lib.errors import InputError
 from workflow.defaults import complete
 from workflow.provenance import code_digest
+from workflow.records import keep_records_of_failed_jobs
 
 try:
     captures = validate(CapturesConfig, config.get("captures") or {}, "captures")
@@ -48,6 +49,7 @@ os.environ.update(
 
 # Runs when all jobs are known and none has started, and not in a dry run. A cluster's nodes are not this machine.
 onstart:
+    keep_records_of_failed_jobs(workflow.persistence)
     rules = sorted({job.rule.name for job in workflow.dag.needrun_jobs() if job.resources.get("gpu")})
     if SETTINGS.device == "cuda" and rules and workflow.local_exec:
         from neuma_lib.device import choose_device
