@@ -8,6 +8,7 @@ resources       `RESOURCES`, and one thread (Snakemake's own default)
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from workflow.provenance import code_digest
@@ -39,11 +40,19 @@ def complete(workflow, results: str) -> None:
         if not said.conda_env:
             rule.conda_env = CONDA
         if "code" not in rule.params.keys():
-            rule.set_params(code=code_digest(SCRIPTS / Path(rule.script).name))
+            rule.set_params(code=digest_of(SCRIPTS / Path(rule.script).name))
         resources = type(rule.resources).from_mapping(dict(RESOURCES))
         resources.update(said.resources[1] if said.resources else {})
         resources.update(workflow.resource_settings._parsed_overwrite_resources.get(rule.name, {}))
         rule.resources.update(resources)
+
+
+def digest_of(file: Path) -> Callable:
+    """`code_digest` of a file as a parameter of a rule: worked out where a job of the rule is planned, and only there.
+
+    Digests of all rules are more than half of what Snakemake takes to start, twice for each job of a cluster.
+    """
+    return lambda wildcards: code_digest(file)
 
 
 def _wildcard_path(rule) -> str:

@@ -67,6 +67,7 @@ def _library() -> Sources:
     return Sources()
 
 
+@cache
 def code_digest(script: str | Path) -> str:
     """Digest of a script and of all that it reaches of the library, read once a process."""
     return _library().digest(Path(script))

@@ -23,7 +23,7 @@ for figure, made_of in FIGURES.items():
         params:
             **made_of["params"],
             figure=made_of.get("module", figure),
-            module=code_digest(figure_module(made_of.get("module", figure))),
+            module=digest_of(figure_module(made_of.get("module", figure))),
         script:
             "../scripts/figure.py"
 

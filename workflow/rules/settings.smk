@@ -14,7 +14,7 @@ from neuma_lib.config.capture import CapturesConfig
 from neuma_lib.config.settings import load
 from neuma_lib.config.validation import validate
 from neuma_lib.errors import InputError
-from workflow.defaults import complete
+from workflow.defaults import complete, digest_of
 from workflow.provenance import code_digest
 from workflow.records import keep_records_of_failed_jobs
 
