@@ -7,8 +7,6 @@ rule prior:
     output:
         weights=f"{RESULTS}/priors/{{prior}}.safetensors",
         report=f"{RESULTS}/priors/{{prior}}.json",
-    resources:
-        gpu=GPU,
     params:
         name=lambda wildcards: prior_chain(wildcards)[0],
         law=lambda wildcards: SETTINGS.priors.laws[prior_chain(wildcards)[0]].plain(),
@@ -27,8 +25,6 @@ rule identified_prior:
     output:
         weights=f"{RESULTS}/{{scene}}/priors/identified.safetensors",
         report=f"{RESULTS}/{{scene}}/priors/identified.json",
-    resources:
-        gpu=GPU,
     params:
         name=IDENTIFIED,
         dt=lambda wildcards: SETTINGS.scene(wildcards.scene).dt,
