@@ -16,10 +16,16 @@ import pytest
 import torch
 from project import SCENE, TABLE, Project, copied, wait_for
 
+from neuma_lib.io.weights import read_torch
 from workflow.stage import core_seconds
 
-LONG = "neuma+iterations=40+checkpoint_every=1"
-ADAPTOR = f"{SCENE}/{LONG}/adaptor.safetensors"
+# Table 1 with a training that is long enough to be cancelled in the middle; all before it is there.
+LONGER = ("--config", "material={iterations: 400}", "--", TABLE)
+CHECKPOINT = f"{SCENE}/neuma/checkpoint.pt"
+SCENE_RULES = (
+    *("ground_truth", "render_static", "render_dynamic", "gaussians", "mesh", "sampled_particles"),
+    *("binding", "velocity", "tracers", "material", "evaluation"),
+)
 
 
 def jobs(slurm) -> dict[str, dict[str, str]]:
@@ -34,6 +40,11 @@ def jobs(slurm) -> dict[str, dict[str, str]]:
 def job_of(slurm, rule: str) -> dict[str, str]:
     """The last job of a rule."""
     return next(job for job in jobs(slurm).values() if job["Comment"].startswith(f"rule_{rule}"))
+
+
+def submitted(output: str) -> list[str]:
+    """Numbers of the jobs that a run of Snakemake has submitted."""
+    return re.findall(r"has been submitted with SLURM jobid (\d+)", output)
 
 
 def seconds(clock: str) -> int:
@@ -88,7 +99,7 @@ def test_nothing_is_left_to_do_with_or_without_slurm(finished):
 
 
 def test_every_job_ends_well_and_its_log_arrives(finished, slurm):
-    ran = set(re.findall(r"has been submitted with SLURM jobid (\d+)", finished.output))
+    ran = set(submitted(finished.output))
     states = {job["JobId"]: job["JobState"] for job in slurm.completed()}
     assert len(ran) == len(measured(finished)) >= 18
     assert {states[number] for number in ran} == {"COMPLETED"}
@@ -103,7 +114,7 @@ def test_every_job_ends_well_and_its_log_arrives(finished, slurm):
 def test_jobs_ask_for_what_their_rules_say_and_use_no_more(finished, slurm):
     """Memory beyond what was asked for would have ended a job: SLURM looks at all its processes every second."""
     planned = said_by_rules(finished)
-    ran = set(re.findall(r"has been submitted with SLURM jobid (\d+)", finished.output))
+    ran = set(submitted(finished.output))
     asked = {job["Comment"]: job for number, job in jobs(slurm).items() if number in ran}
     used = measured(finished)
     assert set(planned) == set(asked) == set(used)
@@ -122,29 +133,59 @@ def test_jobs_ask_for_what_their_rules_say_and_use_no_more(finished, slurm):
 
 @pytest.fixture(scope="module")
 def uninterrupted(finished, tmp_path_factory):
-    """The adaptor of a training that nobody disturbed, made without SLURM."""
+    """The artifacts of a run that nobody disturbed, made without SLURM."""
     root = tmp_path_factory.mktemp("uninterrupted") / "clone"
     project = Project(finished.clone(root).root, seconds=finished.seconds)
-    project.run(ADAPTOR)
-    return (project.root / ADAPTOR).read_bytes()
+    project.run(*LONGER)
+    return project.artifacts()
+
+
+@pytest.fixture
+def interruptible():
+    """Ctrl-C reaches processes that are started here, even where this one was told to ignore it (``nohup``, ``&``)."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def reached(project: Project) -> int:
+    """The iteration of the checkpoint; 0 where there is none."""
+    file = project.root / CHECKPOINT
+    return read_torch(file)["state"]["iteration"] if file.exists() else 0
 
 
 def started_training(project: Project, slurm) -> tuple[subprocess.Popen, dict[str, str]]:
-    """Start training, and wait until it has gone some way. Returns Snakemake and SLURM's job."""
-    snakemake = project.start(ADAPTOR)
-    checkpoint = project.root / SCENE / LONG / "checkpoint.pt"
-    first = wait_for(lambda: checkpoint.exists() and checkpoint.stat().st_mtime_ns, 600)
-    wait_for(lambda: checkpoint.stat().st_mtime_ns > first, 600)
+    """Start the run, and wait until its training has gone some way. Returns Snakemake and SLURM's job."""
+    snakemake = project.start(*LONGER)
+    wait_for(lambda: reached(project) >= 20, 600)
     job = job_of(slurm, "material")
     assert job["JobState"] == "RUNNING"
     return snakemake, job
 
 
-def resumed(project: Project) -> bytes:
-    project.run(ADAPTOR)
-    (log,) = (project.root / "tiny/results/logs").rglob(f"{LONG}/material.log")
-    assert re.search(r"resumed at iteration [1-9]\d* of 40", log.read_text())
-    return (project.root / ADAPTOR).read_bytes()
+def goes_on(project: Project, slurm, uninterrupted: dict[str, str]) -> None:
+    """The same command again: nothing that was finished is made again, and what comes out is the same."""
+    iteration, finished = reached(project), made(project)
+    assert 20 <= iteration < 400
+    output = project.run(*LONGER)
+    told = jobs(slurm)
+    names = {told[number]["Comment"].split("_wildcards_")[0] for number in submitted(output)}
+    assert names == {"rule_material", "rule_evaluation", "rule_chamfer_table"}
+    assert len(submitted(output)) == 3
+    (log,) = (project.root / "tiny/results/logs").rglob("neuma/material.log")
+    assert f"resumed at iteration {iteration} of 400" in log.read_text()
+    assert project.artifacts() == uninterrupted
+    remade = {name for name, time in made(project).items() if finished.get(name) != time}
+    assert remade == {
+        *(f"{SCENE}/neuma/{file}" for file in ("adaptor.safetensors", "history.json")),
+        *(f"{SCENE}/neuma/{file}" for file in ("rollout.h5", "metrics.json")),
+        *(str(Path(TABLE).with_suffix(end)) for end in (".csv", ".md")),
+    }
+
+
+def made(project: Project) -> dict[str, int]:
+    """When each artifact was written [ns]."""
+    return {name: (project.root / name).stat().st_mtime_ns for name in project.artifacts()}
 
 
 def test_a_cancelled_job_goes_on_by_the_same_command(clone, slurm, uninterrupted):
@@ -154,19 +195,15 @@ def test_a_cancelled_job_goes_on_by_the_same_command(clone, slurm, uninterrupted
     said = (clone.root / "started.log").read_text()
     assert f"SLURM-job '{job['JobId']}' failed, SLURM status is: 'CANCELLED'" in said
     assert job["StdOut"] in said and "CANCELLED" in slurm_log(job)
-    assert resumed(clone) == uninterrupted
+    goes_on(clone, slurm, uninterrupted)
 
 
-@pytest.mark.skipif(
-    signal.getsignal(signal.SIGINT) is signal.SIG_IGN,
-    reason="Ctrl-C is ignored here: run it in the foreground",
-)
-def test_an_interrupted_snakemake_takes_its_jobs_along(clone, slurm, uninterrupted):
+def test_an_interrupted_snakemake_takes_its_jobs_along(interruptible, clone, slurm, uninterrupted):
     snakemake, job = started_training(clone, slurm)
     snakemake.send_signal(signal.SIGINT)
     assert snakemake.wait(300) != 0
     wait_for(lambda: jobs(slurm)[job["JobId"]]["JobState"] == "CANCELLED", 60)
-    assert resumed(clone) == uninterrupted
+    goes_on(clone, slurm, uninterrupted)
 
 
 def test_a_job_that_needs_more_memory_than_it_asks_for_is_ended_and_says_so(clone, slurm):
@@ -180,15 +217,31 @@ def test_a_job_that_needs_more_memory_than_it_asks_for_is_ended_and_says_so(clon
     assert "mem=6000M" in job_of(slurm, "material")["TRES"]
 
 
+# ---- several of ours as one of SLURM's
+
+
+def test_all_of_a_scene_may_be_one_job(clone, slurm):
+    """``--groups``: one job asks for what its rules take side by side, and for the minutes of one after the other."""
+    before = clone.artifacts()
+    groups = [f"{rule}=scene" for rule in SCENE_RULES]
+    output = clone.run("--forcerun", "ground_truth", "--groups", *groups, "--", TABLE)
+    scene, table = (jobs(slurm)[number] for number in submitted(output))
+    assert scene["JobState"] == table["JobState"] == "COMPLETED"
+    assert table["Comment"].startswith("rule_chamfer_table")
+    # NeuMA's training beside the evaluation of the prior; and nine stages, of which training takes up to four hours.
+    assert "cpu=2,mem=10000M,node=1," in scene["TRES"]
+    assert seconds(scene["TimeLimit"]) == 60 * (8 * 60 + 240)
+    assert clone.artifacts() == before
+
+
 # ---- GPUs
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
 def test_a_job_asks_for_a_gpu_where_the_settings_do_and_says_that_it_sees_none(clone, slurm):
     """SLURM hands out a GPU in name: what is tested is that a job waits for one, and what it says without."""
-    prior = "tiny/results/priors/jelly.safetensors"
-    clone.run("--config", "device=cuda", "--", prior, succeeds=False)
-    job = job_of(slurm, "prior")
+    clone.run("--config", "device=cuda", "--", f"{SCENE}/gaussians.ply", succeeds=False)
+    job = job_of(slurm, "gaussians")
     assert job["TresPerJob"] == "gres:gpu:1" and job["JobState"] == "FAILED"
     assert "torch sees no CUDA device" in slurm_log(job)
 
