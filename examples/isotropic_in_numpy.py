@@ -1,4 +1,5 @@
-"""A structured law (or its analytic base alone), from the file of `python -m neuma_lib export-law`, with numpy alone.
+"""Any law from the file of `python -m neuma_lib export-law`, with numpy alone: law_in_numpy.py for networks, and here a
+structured law or its analytic base alone.
 
 What `identify` finds and `neuma_structured` learns: Hencky, neo-Hookean or fixed corotated elasticity, with no return
 map, von Mises', Drucker and Prager's, or viscous flow, and the correction of the form "stretch"; formulas as in
@@ -7,6 +8,7 @@ neuma_lib/mechanics/structured.py.
 
 import math
 
+import law_in_numpy
 import numpy as np
 from law_in_numpy import LAYERS, read, svd
 
@@ -18,6 +20,8 @@ LEAST, LIMIT, GROWTH, STRAIN, SMOOTH, COHESION = 0.05, 3.0, 2.0, 0.1, 0.05, 0.02
 def load(path, dt=None):
     """Elasticity, plasticity and metadata; a law that flows by a rate follows the time step dt [s]."""
     arrays, about = read(path)
+    if about["export"]["kind"] == "networks":
+        return law_in_numpy.load(path)
     spec = about.get("structured") or about.get("analytic")
     elastic, plastic = ((spec or {}).get(part, {}) for part in ("elasticity", "plasticity"))
     known = (

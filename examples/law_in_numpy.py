@@ -6,25 +6,24 @@ import math
 import numpy as np
 
 LAYERS = ("layers.0.fc.weight", "layers.1.fc.weight", "final_layer.fc.weight")
-erf = np.vectorize(math.erf, otypes=[float])  # scipy.special.erf is faster, if you have it
+gelu = np.vectorize(lambda z: 0.5 * z * (1 + math.erf(z / math.sqrt(2))), otypes=[float])
 
 
 def read(path):
     """Arrays and metadata of a .safetensors file: the length of a header, the header (JSON), numbers."""
     data = open(path, "rb").read()
     start = 8 + int.from_bytes(data[:8], "little")
-    header = json.loads(data[8:start])
+    header, data = json.loads(data[8:start]), data[start:]
     about = json.loads(header.pop("__metadata__")["neuma"])
-    numbers = lambda x: np.frombuffer(data[start:][slice(*x["data_offsets"])], "<f4")  # noqa: E731
-    return {name: numbers(x).reshape(x["shape"]).astype(float) for name, x in header.items()}, about
+    numbers = {name: np.frombuffer(data[slice(*x["data_offsets"])], "<f4") for name, x in header.items()}
+    return {name: numbers[name].reshape(x["shape"]) for name, x in header.items()}, about
 
 
 def svd(F):
     """U, sigma, Vh of F (N, 3, 3), with U Vh a rotation and the sign of det F in the last singular value."""
     U, sigma, Vh = np.linalg.svd(F)
-    U[:, :, 2] *= (sign := np.linalg.det(U @ Vh))[:, None]
-    sigma[:, 2] *= sign
-    return U, sigma, Vh
+    signs = np.where(np.linalg.det(F)[:, None] < 0, (1, 1, -1), 1)
+    return U * signs[:, None], sigma * signs, Vh
 
 
 def load(path):
@@ -42,8 +41,6 @@ def network(F, W):
     U, sigma, Vh = svd(F)
     strain = (F.swapaxes(1, 2) @ F - np.eye(3)).reshape(-1, 9)
     z = np.concatenate([sigma - 1, strain, np.linalg.det(F)[:, None] - 1], axis=1)
-    for W_layer in W[:2]:
-        z = z @ W_layer.T
-        z = 0.5 * z * (1 + erf(z / math.sqrt(2)))  # GELU
+    z = gelu(gelu(z @ W[0].T) @ W[1].T)
     Y = (z @ W[2].T).reshape(-1, 3, 3)
     return U @ Vh @ (Y + Y.swapaxes(1, 2)) / 2

@@ -2,25 +2,22 @@
 
 import sys
 
-import isotropic_in_numpy
-import law_in_numpy
+import isotropic_in_numpy as laws
 import numpy as np
 
-OFFSETS = np.stack(np.meshgrid(*[range(3)] * 3, indexing="ij"), axis=-1).reshape(27, 3)
+OFFSETS = np.indices((3, 3, 3)).reshape(3, 27).T[:, None]  # of the 27 nodes around a particle, (27, 1, 3)
 
 
-def step(law, x, v, C, F, mass, volume, dt, grid, gravity):
+def step(elasticity, plasticity, x, v, C, F, mass, volume, dt, grid, gravity):
     """One step of MLS-MPM on the unit cube, its floor at the third node from below.
 
     x, v (N, 3) [m, m/s], C, F (N, 3, 3), mass [kg] and initial volume [m^3] of a particle, grid cells along the cube.
     """
-    elasticity, plasticity, _ = law
-    base = np.floor(x * grid - 0.5).astype(int)
-    f = x * grid - base
-    weights = np.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2])
-    w = np.prod([weights[OFFSETS[:, axis], :, axis] for axis in range(3)], axis=0)  # (27, N)
-    nodes = np.ravel_multi_index(np.moveaxis(base + OFFSETS[:, None], -1, 0), [grid] * 3)
-    away = (OFFSETS[:, None] - f) / grid
+    base, f = np.divmod(x * grid - 0.5, 1)
+    weights = np.stack([0.5 * (1 - f) ** 2, 0.75 - (f - 0.5) ** 2, 0.5 * f**2])
+    w = np.prod([weights[OFFSETS[:, 0, axis], :, axis] for axis in range(3)], axis=0)  # (27, N)
+    nodes = np.ravel_multi_index(np.moveaxis(base.astype(int) + OFFSETS, -1, 0), [grid] * 3)
+    away = (OFFSETS - f - 0.5) / grid
     # The law gives Kirchhoff stresses, which go with the initial volume.
     affine = mass * C - dt * volume * 4 * grid**2 * elasticity(F)
     p = w[..., None] * (mass * v + np.einsum("nij,knj->kni", affine, away))
@@ -33,21 +30,14 @@ def step(law, x, v, C, F, mass, volume, dt, grid, gravity):
     return x + dt * v, v, C, plasticity(F + dt * C @ F)
 
 
-def main(path):
-    kind = law_in_numpy.read(path)[1]["export"]["kind"]
-    law = (law_in_numpy if kind == "networks" else isotropic_in_numpy).load(path)
-    about, grid, side = law[2], 24, 6
-    dt = about["dt"]  # networks know the step that they were learned at, and no other
-    ticks = 0.5 + 0.2 * ((np.arange(side) + 0.5) / side - 0.5)
-    x = np.stack(np.meshgrid(ticks, ticks - 0.2, ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-    volume = 0.2**3 / len(x)
-    density = about["density"] if isinstance(about["density"], float) else 1000.0
+if __name__ == "__main__":
+    elasticity, plasticity, about = laws.load(sys.argv[1])
+    grid, dt = 24, about["dt"]  # networks know the step that they were learned at, and no other
+    x = (0.4, 0.2, 0.4) + 0.2 * (np.indices((6, 6, 6)).reshape(3, -1).T + 0.5) / 6
+    volume, density = 0.2**3 / len(x), about["density"]
+    mass = volume * (density if isinstance(density, float) else 1000.0)
     v, C, F = np.zeros_like(x), np.zeros((len(x), 3, 3)), np.tile(np.eye(3), (len(x), 1, 1))
     for n in range(round(0.3 / dt) + 1):
         if n % round(0.04 / dt) == 0:
             print(f"{n * dt:.2f} s: lowest {x[:, 1].min():.3f} m, highest {x[:, 1].max():.3f} m")
-        x, v, C, F = step(law, x, v, C, F, density * volume, volume, dt, grid, (0, -9.8, 0))
-
-
-if __name__ == "__main__":
-    main(sys.argv[1])
+        x, v, C, F = step(elasticity, plasticity, x, v, C, F, mass, volume, dt, grid, (0, -9.8, 0))
