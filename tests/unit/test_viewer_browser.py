@@ -17,7 +17,8 @@ from neuma_lib.viewer.server import LIVE, ViewerServer
 
 OF_VISER = "THREE.BufferGeometry.computeBoundingSphere(): Computed radius is NaN"
 """What viser's client 1.1.1 says of every scene with splats, once: it draws them on quads whose corners have two
-coordinates, of which three.js wants the bounding sphere. Without a sphere it draws them always, as it should."""
+coordinates, of which three.js wants the bounding sphere. Without a sphere it draws them always, as it should. Once
+`test_viser_alone_says_it` fails, this exception can go."""
 
 
 @pytest.fixture(scope="module")
@@ -171,6 +172,21 @@ def test_the_server_plays_moves_and_simulates(served):
         page.wait_for_selector("text=Stopped: the simulation diverged", state="detached", timeout=90_000)
         assert reached(lambda: len(simulation.snapshot.counts) == 1)
         assert not [text for text in complaints if OF_VISER not in text]
+
+
+@pytest.mark.slow
+def test_viser_alone_says_it():
+    """A Gaussian, and nothing of ours."""
+    viser = pytest.importorskip("viser")
+    server = viser.ViserServer(port=8470, verbose=False)
+    one = np.ones((1, 3), np.float32)
+    server.scene.add_gaussian_splats("/one", 0 * one, 0.01 * np.eye(3)[None], one, one[:, :1])
+    with opened(f"http://127.0.0.1:{server.get_port()}") as (page, complaints):
+        until = time.monotonic() + 90.0
+        while not complaints and time.monotonic() < until:
+            page.wait_for_timeout(500)
+    server.stop()
+    assert complaints and OF_VISER in complaints[0]
 
 
 def reached(condition, timeout=90.0):
