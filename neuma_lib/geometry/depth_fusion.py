@@ -11,7 +11,7 @@ from neuma_lib.splatting.cameras import Cameras
 
 
 def fused_distance(
-    points: Tensor, depths: Sequence[Tensor], cameras: Sequence[Cameras], reach: float
+    points: Tensor, depths: Sequence[Tensor], cameras: Sequence[Cameras], reach: float, least: int = 1
 ) -> Tensor:
     """Mean signed distance [m] along the rays from points to the surface that depth maps show, positive inside.
 
@@ -24,11 +24,13 @@ def fused_distance(
             shows no surface.
         cameras: V cameras in float64.
         reach: [m].
+        least: views that have to see a point before their surface, or it is inside: fewer look through a gap between
+            Gaussians at what is behind.
 
     Returns:
-        distance (P,); ``reach`` where no view says anything.
+        distance (P,); ``reach`` where no view says anything, or too few that it is outside.
     """
-    total, seen = points.new_zeros(len(points)), points.new_zeros(len(points))
+    total, seen, outside = points.new_zeros(3, len(points))
     for depth, camera in zip(depths, cameras, strict=True):
         pixels, z = camera.project(points)
         size = torch.tensor([camera.width, camera.height])
@@ -39,4 +41,6 @@ def fused_distance(
         counts = within & (behind < reach)
         total += torch.where(counts, behind.clamp_min(-reach), 0.0)
         seen += counts
-    return torch.where(seen > 0, total / seen.clamp_min(1), reach)
+        outside += counts & (behind < 0)
+    told = (seen > 0) & ((total >= 0) | (outside >= least))
+    return torch.where(told, total / seen.clamp_min(1), reach)

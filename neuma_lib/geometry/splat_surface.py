@@ -9,6 +9,7 @@ import trimesh
 from neuma_lib.config.geometry import SurfaceConfig
 from neuma_lib.geometry.surface import reconstruct
 from neuma_lib.splatting.cameras import Cameras
+from neuma_lib.splatting.extent import outermost
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.rasterizer import rasterize
 from neuma_lib.splatting.spherical_harmonics import SH_C0
@@ -19,14 +20,17 @@ PIXEL_BLUR = 0.3
 
 
 def views_around(gaussians: Gaussians, count: int, pixels: int) -> Cameras:
-    """Cameras evenly all around Gaussians, each of ``pixels`` x ``pixels``, that see all of their centres."""
-    views = static_views(gaussians.means.detach().cpu().numpy(), count, pixels, pixels)
+    """Cameras evenly all around Gaussians, each of ``pixels`` x ``pixels``, that see all of them."""
+    around = outermost(gaussians.means.detach(), gaussians.covars().detach(), gaussians.opacities.detach())
+    views = static_views(around.cpu().numpy(), count, pixels, pixels)
     Ks = torch.from_numpy(np.repeat(views.K[None], count, axis=0))
     return Cameras(torch.from_numpy(views.viewmats), Ks, pixels, pixels).to(dtype=gaussians.means.dtype)
 
 
-def splat_surface(gaussians: Gaussians, cameras: Cameras, settings: SurfaceConfig) -> trimesh.Trimesh:
-    """The surface that opacity and depth of Gaussians show in all views (`reconstruct`).
+def splat_surface(
+    gaussians: Gaussians, cameras: Cameras, settings: SurfaceConfig, *, dents: bool = True
+) -> trimesh.Trimesh:
+    """The surface that opacity and depth of Gaussians show in all views (`reconstruct`); without ``dents``, opacity.
 
     The depth of a pixel is that of the mean of the centres on its ray, with the weights that blend their colours: one
     rendering gives both, with the centres as colours.
@@ -44,4 +48,4 @@ def splat_surface(gaussians: Gaussians, cameras: Cameras, settings: SurfaceConfi
     along = torch.einsum("vi,vhwi->vhw", cameras.viewmats[:, 2, :3], points)
     depths = torch.where(seen, along + cameras.viewmats[:, 2, 3, None, None], torch.nan)
     images = torch.cat([colours[0], alphas[0][..., None]], dim=-1)
-    return reconstruct(gaussians, cameras, images, settings, depths=list(depths))
+    return reconstruct(gaussians, cameras, images, settings, depths=list(depths) if dents else None)

@@ -31,9 +31,10 @@ Array = NDArray[np.float64]
 
 BOX_SIDE = 1.0
 """Side of the simulator's box [m]."""
-_REACH = 1 / 12
-"""Distance up to which a depth map says something of what is behind its surface, in longest sides: where it is shorter,
-the few views that look into a body through a gap of a sparse splat are not outvoted, where longer, thin walls swell."""
+_REACH = 1 / 16
+"""Distance up to which a depth map tells of what is behind its surface, in longest sides: thinner walls swell."""
+_GAPS = 1 / 20
+"""Fewer views than this share look through gaps of a sparse splat, where they see a place as empty."""
 _COARSE_RESOLUTION = 32
 """Voxels along the longest side of the first look, which finds the body's box and the band around its surface."""
 
@@ -107,7 +108,8 @@ def reconstruct(
         inside = np.flatnonzero(field.ravel() > -grid.spacing)
         behind = _REACH * grid.spacing * settings.resolution
         points = np.stack(np.unravel_index(inside, field.shape), axis=1) * grid.spacing + grid.origin
-        shown = fused_distance(torch.from_numpy(points), depths, cameras, behind)
+        least = max(1, round(_GAPS * len(depths)))
+        shown = fused_distance(torch.from_numpy(points), depths, cameras, behind, least)
         field.ravel()[inside] = np.minimum(field.ravel()[inside], shown.numpy())
 
     mesh = _polygonise(_one_solid_body(field), grid)

@@ -34,3 +34,18 @@ def test_views_are_averaged_and_those_that_look_from_behind_a_body_say_nothing()
     points = torch.tensor([[0.0, 0.0, 0.22], [0.0, 0.0, -0.22], [9.0, 0.0, 0.0]], dtype=torch.float64)
     found = fused_distance(points, [front, back, front - 0.02], list(seen), 0.1)
     torch.testing.assert_close(found, torch.tensor([0.04, 0.03, 0.1], dtype=torch.float64))
+
+
+def test_a_view_through_a_gap_is_not_believed_alone():
+    """A block from -0.25 to 0.25 m; one of three views sees through it, and a second one, too."""
+    seen = cameras(*[(0.0, 0.0, 1.0)] * 3)
+    front, through = (torch.full((64, 64), d, dtype=torch.float64) for d in (0.75, 1.75))
+    points = torch.tensor([[0.0, 0.0, z] for z in (0.35, 0.24, 0.0)], dtype=torch.float64)
+    one, two = ([front] * (3 - k) + [through] * k for k in (1, 2))
+    for depths, least, wanted in (
+        (one, 1, [-0.1, (2 * 0.01 - 0.1) / 3, -0.1]),
+        (one, 2, [-0.1, 0.1, 0.1]),
+        (two, 2, [-0.1, (0.01 - 2 * 0.1) / 3, -0.1]),
+    ):
+        found = fused_distance(points, depths, list(seen), 0.1, least)
+        torch.testing.assert_close(found, torch.tensor(wanted, dtype=torch.float64))

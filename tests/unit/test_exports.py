@@ -21,11 +21,13 @@ from neuma_lib.coupling.frames import axes_of, gaussians_at, local_rotations
 from neuma_lib.coupling.nearest_binding import bind_nearest
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.data.blender.blend import write_blend
+from neuma_lib.evaluation.plotting.rendering import frontal, renders, seen_around
 from neuma_lib.evaluation.video import write_gif, write_mp4
 from neuma_lib.geometry.moving_surface import moving_surface, vertex_colours
 from neuma_lib.io.gaussians import save_gaussians
 from neuma_lib.io.gltf import linear, write_glb
 from neuma_lib.io.usd import write_usd
+from neuma_lib.splatting.extent import SEEN, outermost
 from neuma_lib.splatting.gaussians import covariances, rotations
 from neuma_lib.splatting.spherical_harmonics import colours
 
@@ -207,6 +209,44 @@ def test_films_have_all_frames(tmp_path):
             assert np.asarray(image.convert("RGB"))[0, :, 0].argmin() == k  # the column that is not white
     write_mp4(tmp_path / "a.mp4", video, 30.0)
     assert len(imageio.mimread(tmp_path / "a.mp4")) == 12
+
+
+def test_the_outermost_points_are_where_gaussians_end():
+    """One ellipsoid: its points are on the surface of opacity SEEN, and nothing of it is far beyond their hull."""
+    torch.manual_seed(0)
+    axes = TURN @ torch.diag(torch.tensor([0.3, 0.1, 0.02], dtype=torch.float64))
+    covars = torch.stack([axes @ axes.T, 1e4 * torch.eye(3, dtype=torch.float64)])
+    means = torch.stack([SHIFT, 50 + SHIFT])
+    opacities = torch.tensor([0.8, 0.9 * SEEN], dtype=torch.float64)  # the second is too faint
+    points = outermost(means, covars, opacities)
+    r = torch.linalg.solve(axes, (points - SHIFT).T).norm(dim=0)
+    torch.testing.assert_close(0.8 * (-0.5 * r.square()).exp(), torch.full_like(r, SEEN))
+    seen_from = torch.nn.functional.normalize(torch.randn(500, 3, dtype=torch.float64), dim=1)
+    ends = r[0] * (seen_from @ covars[0] * seen_from).sum(dim=1).sqrt()
+    missed = ends - (seen_from @ (points - SHIFT).T).amax(dim=1)
+    assert -1e-12 < missed.min() and missed.max() < 0.04 * ends.max()
+    assert len(outermost(means[1:], covars[1:], torch.tensor([0.0]))) == 0
+
+
+def test_a_film_cuts_nothing_that_is_seen(body):
+    """Large Gaussians around few particles: the border of the picture stays white, and the body fills the picture."""
+    g = body.gaussians
+    large = dataclasses.replace(g, scales=0.25 + 0 * g.scales, sh0=-3 + 0 * g.sh0, shN=g.shN[:, :0])
+    body = dataclasses.replace(body, gaussians=large).to(torch.float32)
+    x, F = (
+        torch.stack([a, b])
+        for a, b in zip(moved(body, torch.eye(3)), moved(body, STRETCH.float()), strict=True)
+    )
+
+    def dark(points):
+        """Largest darkness of border and picture, and the share of columns that are dark."""
+        images = 255 - renders(body, frontal(points, 64, 64), x, F)[..., 0].astype(int)
+        border = max(images[:, :, edge].max() for edge in (0, -1))
+        return max(border, images[:, [0, -1]].max()), images.max(), (images.max(axis=(0, 1)) > 25).mean()
+
+    border, darkest, filled = dark(seen_around(body, x, F))
+    assert border < 0.1 * darkest and filled > 0.7
+    assert dark(x.numpy())[0] > 0.5 * darkest, "as centres would be framed"
 
 
 READ_BLEND = """

@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import trimesh
-from scipy.spatial import cKDTree
 from splat_files import ball, write_compressed, write_splat, write_spz
 
+from benchmarks.splat_surface import between, bowl, drawn_on
 from neuma_lib.config.geometry import SurfaceConfig
 from neuma_lib.config.settings import load, merged, read_yaml
 from neuma_lib.coupling.deformation import arms_at_rest, deform
@@ -25,7 +24,7 @@ from neuma_lib.io.compressed_splats import save_compressed
 from neuma_lib.io.gaussians import save_gaussians
 from neuma_lib.io.splats import load_splat
 from neuma_lib.splatting import culling
-from neuma_lib.splatting.gaussians import Gaussians, quaternions, rotations
+from neuma_lib.splatting.gaussians import quaternions, rotations
 from neuma_lib.splatting.spherical_harmonics import colours, rotated
 from neuma_lib.viewer.find import scene_files
 
@@ -301,51 +300,14 @@ def test_the_surface_of_a_ball_of_gaussians():
     assert np.abs(mesh.centroid - 0.5).max() < spacing
 
 
-def bowl():
-    """A bowl that is open upwards, 0.4 m wide and 0.2 m high, its wall 0.03 m thick."""
-    outline = [
-        [0, 0],
-        [0.15, 0],
-        [0.18, 0.05],
-        [0.2, 0.2],
-        [0.17, 0.2],
-        [0.15, 0.06],
-        [0.12, 0.03],
-        [0, 0.03],
-    ]
-    mesh = trimesh.creation.revolve(np.array(outline), sections=64)
-    mesh.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
-    mesh.apply_translation([0.5, 0.4, 0.5])
-    return mesh
-
-
-def drawn_on(mesh, count):
-    """A splat of opaque discs that lie in a surface, as trainers leave them, and the distance between them [m]."""
-    rng = np.random.default_rng(0)
-    points, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
-    normal = mesh.face_normals[faces]
-    along = np.cross(normal, rng.normal(size=normal.shape))
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    spacing = math.sqrt(mesh.area / count)
-    axes = torch.from_numpy(np.stack([normal, along, np.cross(normal, along)], axis=2))
-    made = {
-        "means": torch.from_numpy(points), "quats": quaternions(axes), "opacities": torch.full((count,), 0.95),
-        "scales": spacing * torch.tensor([0.1, 0.7, 0.7]).repeat(count, 1),
-        "sh0": torch.zeros(count, 1, 3), "shN": torch.zeros(count, 0, 3),
-    }  # fmt: skip
-    return Gaussians(**{name: value.float() for name, value in made.items()}), spacing
-
-
 def test_depth_shows_the_inside_of_a_bowl_which_no_outline_shows():
     truth = bowl()
     assert truth.is_watertight and truth.volume > 0
     g, spacing = drawn_on(truth, 3000)
     mesh = splat_surface(g, views_around(g, 24, 128), SurfaceConfig(resolution=40))
     assert mesh.is_watertight
-    points = [trimesh.sample.sample_surface(each, 5000, seed=1)[0] for each in (mesh, truth)]
-    for a, b in (points, points[::-1]):
-        distance, _ = cKDTree(b).query(a)
-        assert distance.mean() < spacing and np.quantile(distance, 0.95) < 2 * spacing
+    distance = between(mesh, truth)
+    assert distance.mean() < spacing and np.quantile(distance, 0.95) < 2 * spacing
     content, bottom = [0.5, 0.5, 0.5], [0.5, 0.415, 0.5]
     for each in (truth, mesh):
         assert inside(each, np.array([content, bottom])).tolist() == [False, True]

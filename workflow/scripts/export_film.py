@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from neuma_lib.evaluation.plotting.rendering import frontal, renders
+from neuma_lib.evaluation.plotting.rendering import frontal, renders, seen_around
 from neuma_lib.evaluation.video import write_gif, write_mp4
 from neuma_lib.io.files import atomic
 from neuma_lib.io.particles import load_body, load_motion
@@ -16,7 +16,7 @@ def main(inputs, output, params, run) -> None:
     files = (inputs.particles, inputs.binding, inputs.gaussians)
     body = load_body(*files, 1.0, params.carrier, params.gaussian_motion)
     x, F = load_motion(inputs.rollout)
-    seen = np.concatenate([x.numpy().reshape(-1, 3), body.gaussians.means.numpy()])
+    seen = seen_around(body, x, F)
     wide, high = np.ptp(seen, axis=0)[:2]
     height = params.size * float(np.clip(high / wide, 0.5, 2.0))
     width, height = (SQUARE * max(1, round(side / SQUARE)) for side in (params.size, height))

@@ -30,19 +30,20 @@ def data(inputs, params, say) -> ImageGrid:
     laws, splats = len(params.laws), list(params.splats)
     files = zip(inputs.particles, inputs.binding, inputs.gaussians, strict=True)
     bodies = [load_body(*of_body, DENSITY, gaussian_motion="affine") for of_body in files]
-    paths = [read_arrays(file, required=("x", "frames"), only=("x", "frames")) for file in inputs.rollouts]
-    clouds = []
-    for k, body in enumerate(bodies):
-        moved = [arrays["x"].reshape(-1, 3) for arrays, _ in paths[k * laws : (k + 1) * laws]]
-        clouds.append(np.concatenate([*moved, body.gaussians.means.numpy()]))
+    paths = [read_arrays(file, required=("frames",), only=("frames",)) for file in inputs.rollouts]
+    motions = []
+    for file, (arrays, _) in zip(inputs.rollouts, paths, strict=True):
+        shown = rendering.evenly(params.shown, len(arrays["frames"]))
+        motions.append([torch.as_tensor(state[shown]) for state in load_motion(file)])
+    around = [rendering.seen_around(bodies[k // laws], *motion) for k, motion in enumerate(motions)]
+    clouds = [np.concatenate(around[k : k + laws]) for k in range(0, len(around), laws)]
     wide, high = np.max([np.ptp(cloud, axis=0)[:2] for cloud in clouds], axis=0)
     width, height = params.size, round(params.size * float(np.clip(high / wide, WIDEST, TALLEST)))
     pictures, times = [], []
     for k, (arrays, attributes) in enumerate(paths):
         body, cameras = bodies[k // laws], rendering.frontal(clouds[k // laws], width, height)
-        shown = rendering.evenly(params.shown, len(arrays["x"]))
-        motion = [torch.as_tensor(state[shown]) for state in load_motion(inputs.rollouts[k])]
-        pictures.append(rendering.renders(body, cameras, *motion))
+        shown = rendering.evenly(params.shown, len(arrays["frames"]))
+        pictures.append(rendering.renders(body, cameras, *motions[k]))
         times = times or rendering.milliseconds(arrays["frames"][shown], attributes["dt"])
     diverged = [k for k, file in enumerate(inputs.reports) if read_json(file)["diverged"]]
     say(f"{len(splats)} splats under {laws} laws" + (f"; {len(diverged)} broke off" if diverged else ""))

@@ -9,12 +9,14 @@ import torch
 from matplotlib.colors import to_rgb
 from torch import Tensor
 
+from neuma_lib.coupling.deformation import arms_at_rest, deform
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.evaluation.plotting.spheres import draw_spheres
 from neuma_lib.io.images import load_observation
 from neuma_lib.io.particles import load_body
 from neuma_lib.mechanics.density import Density
 from neuma_lib.splatting.cameras import Cameras
+from neuma_lib.splatting.extent import outermost
 from neuma_lib.splatting.observation import Observation
 from neuma_lib.splatting.viewpoints import video_views
 
@@ -47,6 +49,19 @@ def frontal(points: np.ndarray, width: int, height: int) -> Cameras:
     return Cameras(
         torch.from_numpy(views.viewmats).float(), torch.from_numpy(views.K[None]).float(), width, height
     )
+
+
+def seen_around(body: Reconstruction, x: Tensor, F: Tensor) -> np.ndarray:
+    """Points (n, 3) [m] around what is seen of a body's Gaussians in states x (T, N, 3) [m] and F (T, N, 3, 3)."""
+    g, covars = body.gaussians, body.gaussians.covars()
+    arms = arms_at_rest(g.means, body.binding, body.x0) if body.affine else None
+    found = []
+    with torch.no_grad():
+        for k in range(len(x)):
+            state = x[k : k + 1].to(body.x0), F[k : k + 1].to(body.x0)
+            means, moved = deform(g.means, covars, body.binding, body.x0, *state, arms=arms)
+            found.append(outermost(means[0], moved[0], g.opacities))
+    return torch.cat(found).cpu().numpy()
 
 
 def as_bytes(images: Tensor) -> np.ndarray:

@@ -1,0 +1,184 @@
+"""Motions for other programs, made by the workflow and read by other readers: of springs, of an experiment with another
+body, and of several bodies."""
+
+import importlib.util
+import json
+import struct
+import subprocess
+import sys
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from plyfile import PlyData
+from project import SCENE
+
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.splats import load_splat
+
+EXPERIMENTS = "tiny/results/experiments"
+SPRINGS = "spring_gaus+iterations=2"
+MOVED = {  # folders, with the number of bodies
+    f"{SCENE}/{SPRINGS}": 1,
+    f"{EXPERIMENTS}/letter/{SPRINGS}": 1,
+    f"{EXPERIMENTS}/letter_and_ball/nclaw": 2,
+}
+LETTER = {
+    "title": "I",
+    "bodies": [{"scene": "BouncyBall", "shape": "letter_I", "height": 0.4, "velocity": [0, -2, 0]}],
+    "steps": 60,
+}
+FILES = ["gaussians", "compressed", "particles.h5", "surface.glb", "motion.gif", "motion.blend"]
+USD = importlib.util.find_spec("pxr") is not None  # comes with `make viewer`
+MARGIN = 0.05
+"""Gaussians and surface lie at most this far from the box of the particles [m]; these are about 0.02 m apart."""
+
+
+@pytest.fixture(scope="module")
+def project(finished, tmp_path_factory):
+    """The finished copy, with all exports of all motions."""
+    made = finished.clone(tmp_path_factory.mktemp("exports") / "project")
+    files = [*FILES, *(["surface.usdc", "surface.usda"] if USD else [])]
+    targets = [f"{folder}/export/{file}" for folder in MOVED for file in files]
+    settings = ("--config", f"experiments={json.dumps({'letter': LETTER})}", "--")
+    made.run(*settings, *targets)
+    assert made.plan(*settings, *targets) == {}
+    return made
+
+
+@pytest.fixture(params=MOVED, ids=["springs", "experiment", "bodies"])
+def moved(project, request):
+    """Its export folder, its bodies, positions (T, N, 3) [m] and times (T,) [s]."""
+    folder = project.root / request.param
+    path, attributes = read_arrays(folder / "rollout.h5")
+    assert len(path["x"]) == len(path["frames"]) > 5
+    return folder / "export", MOVED[request.param], path["x"], path["frames"] * attributes["dt"]
+
+
+def assert_around(points, x):
+    """Points (n, 3) and particles (N, 3) fill the same box."""
+    for end in (np.min, np.max):
+        np.testing.assert_allclose(end(points, axis=0), end(x, axis=0), atol=MARGIN)
+
+
+def test_particles(moved):
+    folder, _, x, time = moved
+    together, _ = read_arrays(folder / "particles.h5")
+    np.testing.assert_array_equal(together["x"], x)
+    np.testing.assert_allclose(together["time"], time, rtol=1e-6)
+    assert together["mass"].shape == together["vol0"].shape == (x.shape[1],) and together["mass"].min() > 0
+    files = sorted(folder.glob("particles/*.ply"))
+    assert [file.stem for file in files] == [f"{k:04d}" for k in range(len(x))]
+    for file, positions in zip(files, x, strict=True):
+        rows = PlyData.read(file)["vertex"]
+        np.testing.assert_array_equal(np.stack([rows[axis] for axis in "xyz"], axis=1), positions)
+        assert np.isfinite(rows["volume_ratio"]).all()
+
+
+def test_gaussians_plain_and_compressed(moved):
+    folder, _, x, _ = moved
+    plain, packed = (sorted(folder.glob(f"{name}/*.ply")) for name in ("gaussians", "compressed"))
+    assert len(plain) == len(packed) == len(x)
+    for k in (0, len(x) - 1):
+        rows = PlyData.read(plain[k])["vertex"]
+        means = np.stack([rows[axis] for axis in "xyz"], axis=1)
+        assert_around(means, x[k])
+        found = load_splat(packed[k])
+        ranges = np.ptp(means, axis=0) / 1023
+        assert len(found) == len(means)
+        nearest = np.linalg.norm((found.means.numpy()[:, None] - means) / ranges, axis=2).min(axis=1)
+        assert nearest.max() < 1.0  # half a step in each of three directions
+        assert found.scales.min() > 0 and np.isfinite(found.sh().numpy()).all()
+
+
+def shown(file):
+    """Vertices (T, n, 3) of a .glb with morph targets, its times (T,), and its faces."""
+    data = file.read_bytes()
+    magic, _, size, length, _ = struct.unpack("<4sIII4s", data[:20])
+    assert magic == b"glTF" and size == len(data)
+    content, body = json.loads(data[20 : 20 + length]), data[28 + length :]
+
+    def array(index):
+        entry = content["accessors"][index]
+        view = content["bufferViews"][entry["bufferView"]]
+        return np.frombuffer(body[view["byteOffset"] :][: view["byteLength"]], "<f4").reshape(
+            entry["count"], -1
+        )
+
+    (primitive,) = content["meshes"][0]["primitives"]
+    targets = np.stack([array(target["POSITION"]) for target in primitive["targets"]])
+    sampler = content["animations"][0]["samplers"][0]
+    time = array(sampler["input"])[:, 0]
+    weights = array(sampler["output"]).reshape(len(time), -1)
+    return array(primitive["attributes"]["POSITION"]) + np.einsum("tk,knc->tnc", weights, targets), time
+
+
+def test_surface_as_gltf(moved):
+    folder, bodies, x, time = moved
+    vertices, at = shown(folder / "surface.glb")
+    np.testing.assert_allclose(at, time, rtol=1e-6)
+    (mesh,) = trimesh.load(folder / "surface.glb", process=False).geometry.values()
+    np.testing.assert_array_equal(mesh.vertices, vertices[0])
+    parts = trimesh.graph.connected_components(mesh.face_adjacency, min_len=100)
+    assert len(parts) == bodies
+    for k in range(len(x)):
+        assert_around(vertices[k], x[k])
+
+
+@pytest.mark.skipif(not USD, reason="usd-core is not installed: make viewer")
+@pytest.mark.parametrize("kind", ["usdc", "usda"])
+def test_surface_as_usd(moved, kind):
+    from pxr import Usd, UsdGeom, UsdValidation
+
+    folder, _, _, time = moved
+    stage = Usd.Stage.Open(str(folder / f"surface.{kind}"))
+    mesh = UsdGeom.Mesh(stage.GetDefaultPrim().GetChild("surface"))
+    samples = mesh.GetPointsAttr().GetTimeSamples()
+    np.testing.assert_allclose(np.array(samples) / stage.GetTimeCodesPerSecond(), time, rtol=1e-6)
+    found = np.stack([np.array(mesh.GetPointsAttr().Get(sample)) for sample in samples])
+    np.testing.assert_allclose(found, shown(folder / "surface.glb")[0], atol=1e-6)
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    errors = UsdValidation.ValidationContext(validators).Validate(stage)
+    assert [error.GetMessage() for error in errors] == []
+
+
+def test_films(moved):
+    folder, _, x, _ = moved
+    film = np.stack(imageio.mimread(folder / "motion.mp4", memtest=False)).astype(int)
+    assert len(film) == len(x)
+    with Image.open(folder / "motion.gif") as image:
+        assert image.n_frames == len(x) and image.size == film.shape[2:0:-1]
+    seen = film.min(axis=3) < 200
+    assert seen.any(axis=(1, 2)).all(), "a body in every frame"
+    assert not seen[:, [0, -1]].any() and not seen[:, :, [0, -1]].any(), "and none cut at the border"
+    assert seen.any(axis=0).any(axis=0).mean() > 0.5 or seen.any(axis=0).any(axis=1).mean() > 0.5
+    assert abs(film[-1] - film[0]).max() > 100
+
+
+READ_BLEND = """
+import sys, json, bpy, numpy as np
+bpy.ops.wm.open_mainfile(filepath=sys.argv[1])
+scene, body = bpy.context.scene, bpy.data.objects["body"]
+seen = []
+for time in json.loads(sys.argv[2]):
+    frame = time * scene.render.fps
+    scene.frame_set(int(frame), subframe=frame % 1)
+    mesh = body.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    co = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.vertices.foreach_get("co", co)
+    seen.append(co.reshape(-1, 3))
+np.save(sys.argv[3], np.stack(seen))
+"""
+
+
+def test_blend(moved, tmp_path):
+    folder, _, _, time = moved
+    (tmp_path / "read.py").write_text(READ_BLEND)
+    files = [tmp_path / "read.py", folder / "motion.blend", json.dumps(time.tolist()), tmp_path / "found.npy"]
+    subprocess.run([sys.executable, *map(str, files)], check=True, stdout=subprocess.PIPE)
+    # times are single precision in Blender, a frame is 1/24 s
+    np.testing.assert_allclose(np.load(tmp_path / "found.npy"), shown(folder / "surface.glb")[0], atol=1e-4)
+    with Image.open(folder / "motion.png") as image:
+        assert 0.002 < (np.asarray(image)[..., 3] > 128).mean() < 0.9
