@@ -103,7 +103,7 @@ def main() -> None:
     device = choose_device(chosen.device)
     sizes = {name: getattr(chosen, name) for name in ("particles", "gaussians", "grid", "dt")}
     scene = make_scene(replace(SMALL, **sizes), torch.device("cpu"))
-    law, body = law_of(chosen.law, scene).requires_grad_(False), scene.body
+    law, body = law_of(chosen.law, scene).requires_grad_(False).to(device), scene.body
     g, model = body.gaussians, scene.model
     covars, arms = g.covars(), arms_at_rest(g.means, body.binding, body.x0)
     start = body.state(scene.v0)
@@ -126,7 +126,7 @@ def main() -> None:
         f"a frame of {steps} steps without the viewer's clock: {best:.2f} ms, {pace:.2f} x real time (best of "
         f"{FRAMES}); {median:.2f} ms, {usual:.2f} x (median)"
     )
-    live = LiveSimulation(constants, start.to(device), law.to(device), model.dt).open()
+    live = LiveSimulation(constants, start.to(device), law, model.dt).open()
     print(
         f"{'':26}{'frames/s':>10}{'x real time':>13}{'CPU ms a step':>15}{'a picture':>11}{'x at 10 frames/s':>18}"
     )
