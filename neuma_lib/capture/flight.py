@@ -12,12 +12,17 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from neuma_lib.capture.agreement import agreement
+from neuma_lib.capture.contact import contact_time, lowest_points
 from neuma_lib.capture.free_fall import FreeFall, Track, fit_flight
 from neuma_lib.capture.gravity import gravity_checks
 from neuma_lib.capture.spin import Spin, fit_spin, follow
 from neuma_lib.capture.timing import Offset, choose_offset, offset_from_motion, offset_from_sound, row_times
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import atomic
+
+DOUBT = 2.0
+"""Deviations by which gravity from outlines has to be beyond the bound: the middle of an outline is no centre of mass.
+The registration measures it again of the placed object, without a doubt, and decides."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +102,8 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flig
         metric: whether the room's lengths are metres, which gravity then checks.
 
     Raises:
-        InputError: a camera saw no free flight, nothing tells the time between two, no flight fits, or gravity is off
-            by more than 10 %.
+        InputError: a camera saw no free flight, nothing tells the time between two, no flight fits, or gravity is
+            surely off by more than 10 %.
     """
     tracks, inside = [], []
     for view in views:
@@ -121,7 +126,10 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flig
     stated = [view.offset is not None for view in views]
     plane = _plane(views[0]) if len(views) == 1 else None
     fall, kept = fit_flight(tracks, plane, offsets, stated)
-    gravity = fall.gravity.checked(name) if metric else fall.gravity.told(name)
+    contact = _contact(views, inside, fall)
+    if np.isfinite(contact):
+        fall, kept = fit_flight(tracks, plane, fall.offsets, stated, contact)
+    gravity = fall.gravity.checked(name, doubt=DOUBT) if metric else fall.gravity.told(name)
     frames, paths = [], []
     for number, (view, flying, part) in enumerate(zip(views, inside, kept)):
         used = flying[part]
@@ -129,6 +137,16 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flig
         paths += follow(list(view.pixels[used]), view.masks[used], view.row_times[used], number)
     spin = fit_spin(paths, tracks, fall)
     return Flight(fall, spin, frames, tracks, lines, _at_rest(views, fall.offsets), gravity)
+
+
+def _contact(views: Sequence[Filmed], inside: Sequence[np.ndarray], fall: FreeFall) -> float:
+    """When the object touches the floor by the first camera's clock [s]; infinite: not in the frames inside."""
+    times = [view.row_times[flying] + offset for view, flying, offset in zip(views, inside, fall.offsets)]
+    heights = [
+        lowest_points(view.masks[flying], fall.place(clock), view.viewmat, view.K)
+        for view, flying, clock in zip(views, inside, times)
+    ]
+    return contact_time(times, heights)
 
 
 def _offset(first: Filmed, second: Filmed, name: str) -> tuple[float, str]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
+from neuma_lib.capture.arcs import LEAST_FRAMES
 from neuma_lib.capture.gravity import Gravity
 from neuma_lib.errors import InputError
 
@@ -22,6 +23,7 @@ Different throws that fit so well show another gravity."""
 TRIANGULATED = "triangulated"
 _ENDS = 0.2  # part of a track at either end that the fit begins without
 _OFF = 4.0  # distance that is still on the fit, in root mean squares of both coordinates
+_MOST_ALIKE = 0.95  # correlation of neighbouring frames
 _LEAST_RMS = 0.2  # [px], where the fit is closer than masks are
 
 
@@ -53,7 +55,8 @@ class FreeFall:
     Attributes:
         x0, v0, a: [m], [m/s], [m/s^2], (3,) each.
         offsets: seconds to add to the times of each camera, the first 0, (cameras,).
-        covariance: of (x0, v0, a, offsets without the first), (8 + cameras,) squared; 0 for what was stated.
+        covariance: of (x0, v0, a, offsets without the first), (8 + cameras,) squared; 0 for what was stated. Residuals
+            of frames that follow each other are alike, as the middle of an outline wanders; that is part of it.
         start: [s].
         rms: of the residuals [px].
         views: `TRIANGULATED` or "one view in a plane".
@@ -159,6 +162,7 @@ def fit_free_fall(
             f" frames, or cameras that look from different sides"
         )
     variance = found.fun @ found.fun / (len(found.fun) - len(found.x))
+    variance *= _alike(np.split(found.fun.reshape(-1, 2), np.cumsum([len(t.times) for t in tracks])[:-1]))
     covariance = variance * np.linalg.inv((J / scale).T @ (J / scale)) / np.outer(scale, scale)
     full = np.zeros((8 + len(tracks), count + free))
     full[:9, :count] = basis
@@ -193,24 +197,49 @@ def _linear(
     return np.linalg.lstsq(M @ basis, y - M @ base, rcond=None)[0]
 
 
+def _alike(residuals: Sequence[np.ndarray]) -> float:
+    """Frames that count as one, 1 or more: (1 + r) / (1 - r) with the correlation r of neighbours, as of noise that
+    forgets exponentially (Bayley and Hammersley 1946).
+
+    Args:
+        residuals: of each track, (T, 2) [px].
+    """
+    residuals = [
+        part - part.mean(axis=0) for part in residuals
+    ]  # what stays moves the whole fall, not its shape
+    products = sum(float((part[1:] * part[:-1]).sum()) for part in residuals)
+    squares = sum(0.5 * float((part[1:] ** 2 + part[:-1] ** 2).sum()) for part in residuals)
+    r = np.clip(products / max(squares, 1e-300), 0.0, _MOST_ALIKE)
+    return float((1 + r) / (1 - r))
+
+
 def fit_flight(
     tracks: Sequence[Track],
     plane: tuple[np.ndarray, np.ndarray] | None = None,
     offsets: Sequence[float] | None = None,
     stated: Sequence[bool] | None = None,
+    contact: float = np.inf,
 ) -> tuple[FreeFall, list[slice]]:
     """`fit_free_fall` to the part of the tracks that is free flight: from the middle on, to both sides, as far as the
     next frame is where the fit of those before it says.
 
     At its ends a track may have a frame of the hand that lets go, or of the contact. One frame of contact, 1/120 s long
-    at 3 m/s, is off by up to 25 mm.
+    at 3 m/s, is off by up to 25 mm. A soft body is off by much less at first, so that its contact hides in the wander
+    of its outline's middle: it has to be known.
+
+    Args:
+        contact: frames from that time on are left out, by the first camera's clock, and by the offsets from the
+            beginning [s]; but not where less than `LEAST_FRAMES` would be left, as over another floor.
 
     Returns:
         The fit, and which frames of each track it is of.
     """
     kept = []
-    for track in tracks:
-        count = len(track.times)
+    shifts = np.zeros(len(tracks)) if offsets is None else offsets
+    counts = [int((track.times + shift < contact).sum()) for track, shift in zip(tracks, shifts)]
+    if min(counts) < LEAST_FRAMES:
+        counts = [len(track.times) for track in tracks]
+    for count in counts:
         cut = min(int(_ENDS * count), max(0, (count - 4) // 2))
         kept.append([cut, count - cut])
     chosen = [_part(track, *ends) for track, ends in zip(tracks, kept)]
@@ -221,7 +250,7 @@ def fit_flight(
         for k, track in enumerate(tracks):
             for end, step in ((0, -1), (1, 1)):
                 i = kept[k][0] - 1 if end == 0 else kept[k][1]
-                if not 0 <= i < len(track.times):
+                if not 0 <= i < counts[k]:
                     continue
                 off = float(np.linalg.norm(fall.seen(_part(track, i, i + 1), k) - track.places[i]))
                 if off <= _OFF * max(fall.rms, _LEAST_RMS):

@@ -19,6 +19,7 @@ UP = (0.0, 1.0, 0.0)
 """The floor's normal in the room."""
 MOST_MISMATCH = 0.1
 """Part by which the measured gravity may differ from the true one, as a vector."""
+_UNDECIDED = f"more than {MOST_MISMATCH:.0%} off, but not surely: the placed object will tell"
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,16 +72,34 @@ class Gravity:
             f" degrees from the floor's normal ({self.how})"
         )
 
-    def checked(self, name: str, normal: Sequence[float] = UP) -> str:
+    def mismatch(self, normal: Sequence[float] = UP) -> tuple[float, float]:
+        """Distance from 9.81 m/s^2 straight down as a part of that, and its deviation.
+
+        Args:
+            normal: of the floor, upward, (3,).
+        """
+        up = np.asarray(normal, float) / np.linalg.norm(normal)
+        off = self.a / GRAVITY + up
+        size = float(np.linalg.norm(off))
+        slope = off / max(size, 1e-12)
+        return size, float(np.sqrt(slope @ self.covariance @ slope) / GRAVITY)
+
+    def checked(self, name: str, normal: Sequence[float] = UP, doubt: float = 0.0) -> str:
         """The line of `told`.
+
+        Args:
+            name: of the videos.
+            normal: of the floor, upward, (3,).
+            doubt: how many of its deviations a mismatch has to be beyond the bound: above 0 where a better measurement
+                follows, which decides.
 
         Raises:
             InputError: the acceleration differs from 9.81 m/s^2 downward by more than `MOST_MISMATCH`, as a vector.
         """
         line, (ratio, _), (angle, _) = self.told(name, normal), self.ratio, self.angle(normal)
-        up = np.asarray(normal, float) / np.linalg.norm(normal)
-        if np.linalg.norm(self.a / GRAVITY + up) <= MOST_MISMATCH:
-            return line
+        mismatch, unsure = self.mismatch(normal)
+        if mismatch - doubt * unsure <= MOST_MISMATCH:
+            return line if mismatch <= MOST_MISMATCH else f"{line}; {_UNDECIDED}"
         causes = []
         if abs(ratio - 1) > MOST_MISMATCH / 2:
             causes.append(f"the board's square size is {1 / ratio:.2f} of what is stated (measure it)")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from neuma_lib.capture.free_fall import Track, fit_flight, fit_free_fall
-from neuma_lib.capture.gravity import GRAVITY, UP
+from neuma_lib.capture.gravity import GRAVITY, UP, Gravity
 from neuma_lib.capture.timing import row_times
 from neuma_lib.errors import InputError
 
@@ -184,3 +184,54 @@ def test_a_rolling_shutter_is_undone_by_the_times_of_the_rows():
     fall = fit_free_fall(undone)
     assert fall.gravity.ratio[0] == pytest.approx(1, abs=1e-4)
     assert fall.offsets[1] == pytest.approx(0.004, abs=1e-5)
+
+
+def wandering(rng, alike, deviation=1.0, frames=40):
+    """Noise of which neighbours have that correlation, (frames, 2) [px]."""
+    noise = rng.normal(0, deviation, (frames, 2))
+    for k in range(1, frames):
+        noise[k] = alike * noise[k - 1] + np.sqrt(1 - alike**2) * noise[k]
+    return noise
+
+
+def test_the_deviation_holds_where_neighbouring_frames_are_off_alike():
+    """The middle of an outline wanders; as if every frame were on its own, gravity would look three times as sure."""
+    rng = np.random.default_rng(4)
+    z, alone = [], []
+    for _ in range(60):
+        tracks = [replace(each, places=each.places + wandering(rng, 0.8)) for each in two()]
+        gravity = fit_free_fall(tracks).gravity
+        z.append((gravity.a - A) / np.sqrt(np.diag(gravity.covariance)))
+        shuffled = [replace(each, places=each.places + rng.normal(0, 1, each.places.shape)) for each in two()]
+        alone.append(gravity.ratio[1] / fit_free_fall(shuffled).gravity.ratio[1])
+    assert 0.6 < np.std(z) < 1.6
+    assert np.median(alone) > 1.5
+
+
+def test_a_soft_contact_that_looks_like_flight_is_left_out_once_it_is_known():
+    rng = np.random.default_rng(5)
+    spoiled, mended, late = [], [], np.maximum(np.arange(40) - 30, 0)[:, None]
+    for _ in range(20):
+        tracks = [
+            replace(each, places=each.places + wandering(rng, 0.8) + late**2 * (0.0, -0.25), radius=40.0)
+            for each in two()
+        ]
+        fall, kept = fit_flight(tracks)
+        assert max(k.stop for k in kept) > 32
+        spoiled.append(fall.gravity.ratio[0] - 1)
+        fall, kept = fit_flight(tracks, offsets=[0, 0.004], contact=5 + 30.5 / 120)
+        assert max(k.stop for k in kept) <= 31
+        mended.append(fall.gravity.ratio[0] - 1)
+    assert np.mean(spoiled) < -0.015 and abs(np.mean(mended)) < 0.4 * abs(np.mean(spoiled))
+    _, kept = fit_flight(tracks, contact=5 + 2 / 120)  # too early for a flight: the floor is elsewhere
+    assert max(k.stop for k in kept) > 32
+
+
+def test_a_mismatch_that_is_not_sure_is_left_to_a_better_measurement():
+    sure = Gravity(np.array([0.0, -0.86 * GRAVITY, 0.0]), np.eye(3) * (0.01 * GRAVITY) ** 2, "outlines")
+    unsure = replace(sure, covariance=np.eye(3) * (0.03 * GRAVITY) ** 2)
+    assert sure.mismatch() == pytest.approx((0.14, 0.01))
+    for gravity, doubt in ((sure, 0.0), (sure, 2.0), (unsure, 0.0)):
+        with pytest.raises(InputError, match="square size is 1.16"):
+            gravity.checked("drop", doubt=doubt)
+    assert "not surely" in unsure.checked("drop", doubt=2.0)

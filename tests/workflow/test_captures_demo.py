@@ -7,13 +7,12 @@ import pytest
 import yaml
 from project import copied
 
-from neuma_lib.config.settings import merged, read_yaml
+from neuma_lib.config.settings import read_yaml
 from neuma_lib.evaluation.demo_captures import Truth, compare_cameras, compare_registration
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import read_transforms
 
-DEVELOPMENT = "config/captures_development.yaml"
-PLACED = "tiny/results/demo_duck_first/registration.json"
+PLACED = "tiny/results/demo_fish_first/registration.json"
 
 
 @pytest.fixture
@@ -39,17 +38,16 @@ def test_a_capture_that_is_not_there_yet_is_planned(project):
 
 @pytest.mark.slow
 def test_a_filmed_object_is_found_where_it_was(project):
-    # The duck: at this size the fish's outlines show 0.86 of gravity, and its flight stops.
     tiny = project.root / "tests/workflow/tiny.yaml"
-    settings = merged(*(read_yaml(file) for file in (project.root / DEVELOPMENT, tiny)))
+    settings = read_yaml(tiny)
     fit = {"iterations": 300, "initial_count": 800, "hull_resolution": 64}
     tiny.write_text(yaml.safe_dump({**settings, "gaussians": fit}))
     project.run(PLACED)
-    known = json.loads((project.root / "tiny/data/captures_demo/duck/truth.json").read_text())
-    room = read_transforms(project.root / "tiny/data/demo_duck/room/transforms.json")
+    known = json.loads((project.root / "tiny/data/captures_demo/fish/truth.json").read_text())
+    room = read_transforms(project.root / "tiny/data/demo_fish/room/transforms.json")
     photographs = {name.removesuffix(".jpg"): camera for name, camera in known["photographs"].items()}
     rows = {row.what: row for row in compare_cameras(room["frames"], photographs, known["cameras"])}
-    arrays, _ = read_arrays(project.root / "tiny/data/captures_demo/duck/first.h5")
+    arrays, _ = read_arrays(project.root / "tiny/data/captures_demo/fish/first.h5")
     truth = Truth(*(arrays[key] for key in ("time", "x", "mass", "tracers")))
     placed, velocity = (
         json.loads((project.root / path).read_text())
