@@ -1,7 +1,7 @@
 """What a rule with a script need not say. What it says itself stands.
 
 log, benchmark  <results>/{logs,benchmarks}/<one folder for each wildcard>/<rule>.{log,tsv}
-conda           the locked environment
+conda           the locked environment, for `--sdm conda` (not tried)
 params.code     digest of the script and of the library modules behind it: an edit there reruns the rule
 resources       `RESOURCES`, and one thread (Snakemake's own default)
 """
@@ -50,7 +50,7 @@ def complete(workflow, results: str) -> None:
 def digest_of(file: Path) -> Callable:
     """`code_digest` of a file as a parameter of a rule: worked out where a job of the rule is planned, and only there.
 
-    Digests of all rules are more than half of what Snakemake takes to start, twice for each job of a cluster.
+    Digests of all rules would be two fifths of what Snakemake takes to start, twice for each job of a cluster.
     """
     return lambda wildcards: code_digest(file)
 

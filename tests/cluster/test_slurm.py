@@ -222,7 +222,7 @@ def test_a_job_that_needs_more_memory_than_it_asks_for_is_ended_and_says_so(clon
 
 def test_all_of_a_scene_may_be_one_job(clone, slurm):
     """``--groups``: one job asks for what its rules take side by side, and for the minutes of one after the other."""
-    before = clone.artifacts()
+    before, times = clone.artifacts(), made(clone)
     groups = [f"{rule}=scene" for rule in SCENE_RULES]
     output = clone.run("--forcerun", "ground_truth", "--groups", *groups, "--", TABLE)
     scene, table = (jobs(slurm)[number] for number in submitted(output))
@@ -232,6 +232,9 @@ def test_all_of_a_scene_may_be_one_job(clone, slurm):
     assert "cpu=2,mem=10000M,node=1," in scene["TRES"]
     assert seconds(scene["TimeLimit"]) == 60 * (8 * 60 + 240)
     assert clone.artifacts() == before
+    kept = {name for name, time in made(clone).items() if times[name] == time}
+    assert kept and all("/kernels/" in name or "/priors/" in name for name in kept)
+    assert all(core_seconds(log) for log in (clone.root / "tiny").rglob("*.log"))
 
 
 # ---- GPUs
