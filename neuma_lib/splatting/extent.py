@@ -31,11 +31,16 @@ def outermost(means: Tensor, covars: Tensor, opacities: Tensor) -> Tensor:
     if not len(means):
         return means
     reach = (2 * (opacities[shown].double() / SEEN).log()).sqrt()
-    axes = np.concatenate([np.eye(3), -np.eye(3), sphere_directions(DIRECTIONS)])
-    found = []
-    for normal in torch.from_numpy(axes).to(means):
-        along = covars @ normal
-        wide = (along @ normal).clamp_min(torch.finfo(along.dtype).tiny).sqrt()
-        first = (means @ normal + reach * wide).argmax()
-        found.append(means[first] + reach[first] / wide[first] * along[first])
-    return torch.stack(found)
+    axes = torch.from_numpy(np.concatenate([np.eye(3), -np.eye(3), sphere_directions(DIRECTIONS)])).to(means)
+    # first those alone whose surrounding ball is not inside of what the centres span
+    balls = reach * covars.diagonal(dim1=1, dim2=2).sum(dim=1).sqrt()
+    near = torch.zeros_like(balls, dtype=torch.bool)
+    for normal in axes:
+        height = means @ normal
+        near |= height + balls >= height.max()
+    means, covars, reach = means[near], covars[near], reach[near]
+    squares = (axes[:, :, None] * axes[:, None]).reshape(-1, 9)
+    wide = (covars.reshape(-1, 9) @ squares.T).clamp_min(torch.finfo(means.dtype).tiny).sqrt()
+    first = (means @ axes.T + reach[:, None] * wide).argmax(dim=0)
+    half = reach[first] / wide[first, torch.arange(len(axes))]
+    return means[first] + half[:, None] * torch.einsum("kij,kj->ki", covars[first], axes)
