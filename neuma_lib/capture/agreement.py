@@ -21,6 +21,8 @@ LEAST_SAME = 0.5
 """Least IoU with which cameras that film at one time can be said to film one object."""
 LEAST_SHARES = (0.8, 0.95)
 """Share of the views which see a voxel that must have it in their masks: of all views, and without the doubtful."""
+_CUT_OFF = 0.7  # part of the most views of a voxel below which it is one that many pictures cut off
+_MISSES = 2  # masks that may lack such a voxel, one of each five; of so few a share would let none
 _VOXELS = (24, 64)  # along a side of the cube, at first and then
 _MARGIN = 1.6  # half side of the first cube, in radii of the masks
 _CLOSING = np.ones((3, 3), np.uint8)
@@ -147,7 +149,9 @@ def _body(
             seen[within] += 1
             inside[np.flatnonzero(within)[mask[y, x]]] += 1
         # What few cameras see, they cannot make a body of.
-        points = points[(seen >= max(2, 0.25 * seen.max())) & (inside >= share * seen)]
+        missed = np.where(seen < _CUT_OFF * seen.max(), np.minimum(_MISSES, seen // 5), 0)
+        kept = (inside >= share * seen) | (seen - inside <= missed)
+        points = points[(seen >= max(2, 0.25 * seen.max())) & kept]
         if len(points) == 0:
             raise InputError(_APART)
         lower, upper = points.min(axis=0) - 1.5 * voxel, points.max(axis=0) + 1.5 * voxel

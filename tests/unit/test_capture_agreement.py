@@ -7,7 +7,7 @@ from neuma_lib.errors import InputError
 
 pytest.importorskip("cv2")
 
-from neuma_lib.capture.agreement import LEAST_AGREEMENT, agreement, check_one_object  # noqa: E402
+from neuma_lib.capture.agreement import LEAST_AGREEMENT, agreement, check_one_object, common_body  # noqa: E402
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
@@ -82,3 +82,21 @@ def test_cameras_that_film_different_objects_at_one_place_are_named():
         InputError, match=r"mug, first: the cameras do not show one object .* that of left .*one throw"
     ):
         check_one_object(found, ["left", "right"], "mug, first")
+
+
+def test_a_part_that_many_pictures_cut_off_is_not_lost_by_one_mask():
+    """Twelve of twenty pictures end below the top of the body; one of the other eight has a mask without it."""
+    views, cut = ring(20), K.copy()
+    cut[1, 2] = 1.0
+    Ks = np.stack([K if i % 5 < 2 else cut for i in range(20)])
+    masks = [ellipsoid_mask(v) for v in views]
+    for i in np.flatnonzero(Ks[:, 1, 2] == 1.0):
+        masks[i] = np.roll(masks[i], int(1 - K[1, 2]), axis=0)
+        masks[i][int(HEIGHT + 1 - K[1, 2]) :] = False
+        assert masks[i][0].any()
+    rows = np.flatnonzero(masks[5].any(axis=1))
+    masks[5][: rows[len(rows) // 5]] = False
+    body = common_body(masks, views, Ks)
+    top = body.points[:, 1].max()
+    assert abs(top - (0.1 + RADII[1])) < 1.5 * body.voxel
+    assert np.delete(body.agreement, 5).min() > 0.9 > body.agreement[5] > LEAST_AGREEMENT
