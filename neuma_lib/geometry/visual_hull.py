@@ -30,6 +30,11 @@ _JUDGED_RESOLUTION = 40
 """Voxels along the longest side of the body that masks are judged by."""
 _BAND = 6.0
 """Distance from a contour [px] up to which it is measured to a small part of a pixel."""
+_LEAST_TOLD = 0.25
+"""Share of the pictures, and two at least, that have to tell of a point: of what nearly all frames cut off, the few
+that show it leave long spikes."""
+_OUTSIDE = 1e-3
+"""How far outside points behind a camera are at least, and those that too few pictures tell of [m]."""
 _CONTOUR_STEPS = 8
 """Points on each segment of a contour; a segment is at most a pixel's diagonal long."""
 _FIELD_OF_VIEW = 0.75
@@ -115,7 +120,9 @@ def distance_inside(
 ) -> Tensor:
     """Least signed distance [m] of points to the silhouette cones and the floor, negative outside one, shape (P,).
 
-    A distance in the image is turned into metres at the point's depth. Points behind a camera are outside.
+    A distance in the image is turned into metres at the point's depth. Points behind a camera are outside. Of what lies
+    beyond a side of the frame that cuts the body off, a picture tells nothing; points that less than `_LEAST_TOLD` of
+    the pictures tell of are outside.
 
     Args:
         points: positions [m], float64, shape (P, 3).
@@ -124,19 +131,36 @@ def distance_inside(
         floor: height y [m] below which nothing is; None: there is no floor.
     """
     least = torch.full((len(points),), float("inf"), dtype=torch.float64)
+    told = torch.zeros(len(points), dtype=torch.long)
     for contour, camera in zip(contours, cameras, strict=True):
-        size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
-        pixels, depth = camera.project(points)
-        where = (2.0 * pixels / size - 1.0).nan_to_num(nan=2.0)[None]
-        distance = torch.nn.functional.grid_sample(
-            contour[None, None], where, mode="bilinear", padding_mode="border", align_corners=False
-        )
-        # beyond the frame the contour is at least as far again, unless the frame cuts the body off
-        beyond = (pixels[0] - pixels[0].clamp(min=torch.zeros(2, dtype=torch.float64), max=size)).norm(dim=-1)
-        distance = torch.where(distance[0, 0, 0] < 0, distance[0, 0, 0] - beyond, distance[0, 0, 0])
-        distance = distance * depth[0] / camera.Ks[0, 0, 0]
-        least = torch.minimum(least, torch.where(depth[0] > 0, distance, -depth[0].abs() - 1e-3))
+        distance = _distance_in_view(points, contour, camera)
+        told += distance.isfinite()
+        least = torch.minimum(least, distance)
+    least = torch.where(told >= _least_told(len(contours)), least, -_OUTSIDE)
     return least if floor is None else torch.minimum(least, points[:, 1] - floor)
+
+
+def _least_told(views: int) -> int:
+    """Pictures that have to tell of a point."""
+    return max(min(2, views), round(_LEAST_TOLD * views))
+
+
+def _distance_in_view(points: Tensor, contour: Tensor, camera: Cameras) -> Tensor:
+    """Signed distance [m] of points to the silhouette cone of one picture, (P,); infinite where it tells nothing."""
+    size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
+    pixels, depth = (values[0] for values in camera.project(points))
+    where = (2.0 * pixels / size - 1.0).nan_to_num(nan=2.0)[None, None]
+    distance = torch.nn.functional.grid_sample(
+        contour[None, None], where, mode="bilinear", padding_mode="border", align_corners=False
+    )[0, 0, 0]
+    # beyond the frame the contour is at least as far again
+    beyond = (pixels - pixels.clamp(min=torch.zeros(2, dtype=torch.float64), max=size)).norm(dim=-1)
+    distance = torch.where(distance < 0, distance - beyond, distance) * depth / camera.Ks[0, 0, 0]
+    # left, top, right, bottom
+    cut = [(edge > 0).any() for edge in (contour[:, 0], contour[0], contour[:, -1], contour[-1])]
+    sides = torch.cat([pixels < 0, pixels > size], dim=-1)
+    hidden = (sides & torch.stack(cut)).any(dim=-1)
+    return torch.where(depth > 0, distance.masked_fill(hidden, float("inf")), -depth.abs() - _OUTSIDE)
 
 
 def lacking(
@@ -159,7 +183,7 @@ def lacking(
     points = (hull.origin + (hull.occupied.nonzero() + 0.5) * hull.voxel).to("cpu", torch.float64)
     views = zip(contour_distances(masks), cameras, strict=True)
     outside = [
-        distance_inside(points, [contour], [camera.to("cpu", torch.float64)]) <= -0.5 * hull.voxel
+        _distance_in_view(points, contour, camera.to("cpu", torch.float64)) <= -0.5 * hull.voxel
         for contour, camera in views
     ]
     return torch.stack(outside).double().mean(dim=1)
@@ -176,7 +200,8 @@ def visual_hull(
 
     Args:
         masks: alpha in [0, 1] of V views, shape (H, W) each.
-        cameras: V cameras, or V sets of one where sizes differ; the object is wholly in view of at least one.
+        cameras: V cameras, or V sets of one where sizes differ; the object is wholly in view of at least one. A side of
+            the frame that the mask touches cuts it off.
         resolution: voxels along the longest side of the hull's bounding box.
         floor: height y [m] below which nothing is, where no camera sees the underside; None: there is no floor.
         spare: how many masks may lack a voxel.
@@ -210,13 +235,16 @@ def visual_hull(
             lower[k] + (torch.arange(n, dtype=torch.float64) + 0.5) * voxel for k, n in enumerate(counts)
         ]
         centres = torch.cartesian_prod(*ticks)
-        inside, missing = torch.arange(len(centres)), torch.zeros(len(centres), dtype=torch.long)
+        inside, (missing, told) = torch.arange(len(centres)), torch.zeros(2, len(centres), dtype=torch.long)
         if floor is not None:
             inside = inside[centres[:, 1] > floor - 0.5 * voxel]
         # most points are outside of the first few already
         for contour, camera in zip(contours, cameras, strict=True):
-            missing[inside] += distance_inside(centres[inside], [contour], [camera]) <= -0.5 * voxel
+            distance = _distance_in_view(centres[inside], contour, camera)
+            missing[inside] += distance <= -0.5 * voxel
+            told[inside] += distance.isfinite()
             inside = inside[missing[inside] <= spare]
+        inside = inside[told[inside] >= _least_told(len(cameras))]
         if len(inside) == 0:
             raise InputError(f"masks: {NO_COMMON_SPACE}")
         occupied = torch.zeros(counts, dtype=torch.bool)

@@ -17,6 +17,7 @@ from neuma_lib.geometry import shapes, volume
 from neuma_lib.geometry.surface import reconstruct
 from neuma_lib.geometry.visual_hull import visual_hull
 from neuma_lib.geometry.volume import inside, sample_tracers, sample_volume, volume_iou
+from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians
 
 SURFACE = SurfaceConfig()
@@ -102,6 +103,35 @@ def test_nothing_beyond_the_frame_is_in_the_hull():
     centres = hull.origin + (hull.occupied.nonzero() + 0.5) * hull.voxel
     # twelve cones touch the ball; between them the hull bulges out by less than 1 / cos(38 degrees)
     assert float(centres.norm(dim=1).max()) < 0.13 / np.cos(np.radians(38)) + hull.voxel
+
+
+def test_what_some_frames_cut_off_is_in_the_hull_as_others_show_it():
+    """A wide hat on a narrow neck: ten of twenty pictures end at the neck, and must not make the hat as narrow."""
+    neck = trimesh.creation.cylinder(0.03, 0.2, sections=48)
+    hat = trimesh.creation.cylinder(0.1, 0.06, sections=48).apply_translation([0, 0, 0.12])
+    truth = trimesh.util.concatenate([neck, hat])
+    truth.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
+    cameras = cameras_around(truth, views=20, size=64)
+    whole, cut, views = mattes(truth, cameras)[..., 3], [], []
+    for k in range(20):
+        first = 0
+        camera = cameras[k].to("cpu", torch.float64)
+        rows = camera.project(torch.tensor([[0.0, 0.06, 0.0]], dtype=torch.float64))[0][0, 0, 1]
+        if k % 2 and float(rows) > 4 and not whole[k, int(rows) - 1 :, 0].any():
+            first = int(rows)
+        Ks = camera.Ks.clone()
+        Ks[:, 1, 2] -= first
+        views.append(Cameras(camera.viewmats, Ks, camera.width, camera.height - first))
+        cut.append(whole[k, first:])
+    assert sum(len(mask) < 64 for mask in cut) >= 6
+    volumes = []
+    for masks, seen in ((list(whole), [cameras[k] for k in range(20)]), (cut, views)):
+        hull = visual_hull(masks, seen, 40)
+        centres = hull.origin + (hull.occupied.nonzero() + 0.5) * hull.voxel
+        volumes.append(float(hull.occupied.sum()) * hull.voxel**3)
+        assert float(centres[:, 1].max()) == pytest.approx(0.15, abs=2 * hull.voxel)
+        assert float(centres[:, [0, 2]].norm(dim=1).max()) == pytest.approx(0.1, abs=3 * hull.voxel)
+    assert volumes[1] == pytest.approx(volumes[0], rel=0.15)
 
 
 def test_surface_of_two_parts_keeps_the_larger():
