@@ -204,9 +204,8 @@ def _alike(residuals: Sequence[np.ndarray]) -> float:
     Args:
         residuals: of each track, (T, 2) [px].
     """
-    residuals = [
-        part - part.mean(axis=0) for part in residuals
-    ]  # what stays moves the whole fall, not its shape
+    # What stays moves the whole fall, not its shape.
+    residuals = [part - part.mean(axis=0) for part in residuals]
     products = sum(float((part[1:] * part[:-1]).sum()) for part in residuals)
     squares = sum(0.5 * float((part[1:] ** 2 + part[:-1] ** 2).sum()) for part in residuals)
     r = np.clip(products / max(squares, 1e-300), 0.0, _MOST_ALIKE)

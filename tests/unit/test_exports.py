@@ -3,8 +3,6 @@
 import dataclasses
 import json
 import struct
-import subprocess
-import sys
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -12,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from blends import read_blend
 from PIL import Image
 from plyfile import PlyData
 from splat_files import ball
@@ -249,22 +248,6 @@ def test_a_film_cuts_nothing_that_is_seen(body):
     assert dark(x.numpy())[0] > 0.5 * darkest, "as centres would be framed"
 
 
-READ_BLEND = """
-import sys, json, bpy, numpy as np
-bpy.ops.wm.open_mainfile(filepath=sys.argv[1])
-scene, body = bpy.context.scene, bpy.data.objects["body"]
-seen = []
-for time in json.loads(sys.argv[2]):
-    frame = time * scene.render.fps
-    scene.frame_set(int(frame), subframe=frame % 1)
-    mesh = body.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
-    co = np.empty(3 * len(mesh.vertices), np.float32)
-    mesh.vertices.foreach_get("co", co)
-    seen.append(co.reshape(-1, 3))
-np.savez(sys.argv[3], co=np.stack(seen), world=np.array(body.matrix_world))
-"""
-
-
 @pytest.mark.slow
 def test_blend_holds_the_motion(tmp_path, surface):
     """Read back by another Blender process; between two frames the surface is between them."""
@@ -273,11 +256,7 @@ def test_blend_holds_the_motion(tmp_path, surface):
     with Image.open(tmp_path / "a.png") as image:
         alpha = np.asarray(image)[..., 3]
     assert 0.005 < (alpha > 128).mean() < 0.5
-    (tmp_path / "read.py").write_text(READ_BLEND)
-    asked = [*times.tolist(), float(times[1:3].mean())]
-    files = [str(tmp_path / name) for name in ("read.py", "a.blend")]
-    subprocess.run([sys.executable, *files, json.dumps(asked), str(tmp_path / "a.npz")], check=True)
-    found = np.load(tmp_path / "a.npz")
+    found = read_blend(tmp_path / "a.blend", [*times.tolist(), float(times[1:3].mean())])
     # times are single precision in Blender, a frame is 1/24 s
     np.testing.assert_allclose(found["co"][:4], vertices, atol=1e-5)
     np.testing.assert_allclose(found["co"][4], vertices[1:3].mean(axis=0), atol=1e-5)

@@ -4,13 +4,12 @@ body, and of several bodies."""
 import importlib.util
 import json
 import struct
-import subprocess
-import sys
 
 import imageio.v2 as imageio
 import numpy as np
 import pytest
 import trimesh
+from blends import read_blend
 from PIL import Image
 from plyfile import PlyData
 from project import SCENE
@@ -157,28 +156,10 @@ def test_films(moved):
     assert abs(film[-1] - film[0]).max() > 100
 
 
-READ_BLEND = """
-import sys, json, bpy, numpy as np
-bpy.ops.wm.open_mainfile(filepath=sys.argv[1])
-scene, body = bpy.context.scene, bpy.data.objects["body"]
-seen = []
-for time in json.loads(sys.argv[2]):
-    frame = time * scene.render.fps
-    scene.frame_set(int(frame), subframe=frame % 1)
-    mesh = body.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
-    co = np.empty(3 * len(mesh.vertices), np.float32)
-    mesh.vertices.foreach_get("co", co)
-    seen.append(co.reshape(-1, 3))
-np.save(sys.argv[3], np.stack(seen))
-"""
-
-
-def test_blend(moved, tmp_path):
+def test_blend(moved):
     folder, _, _, time = moved
-    (tmp_path / "read.py").write_text(READ_BLEND)
-    files = [tmp_path / "read.py", folder / "motion.blend", json.dumps(time.tolist()), tmp_path / "found.npy"]
-    subprocess.run([sys.executable, *map(str, files)], check=True, stdout=subprocess.PIPE)
+    found = read_blend(folder / "motion.blend", time.tolist())
     # times are single precision in Blender, a frame is 1/24 s
-    np.testing.assert_allclose(np.load(tmp_path / "found.npy"), shown(folder / "surface.glb")[0], atol=1e-4)
+    np.testing.assert_allclose(found["co"], shown(folder / "surface.glb")[0], atol=1e-4)
     with Image.open(folder / "motion.png") as image:
         assert 0.002 < (np.asarray(image)[..., 3] > 128).mean() < 0.9

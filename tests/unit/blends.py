@@ -1,0 +1,34 @@
+"""A .blend file, read back by a Blender in a process of its own."""
+
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+READ = """
+import sys, json, bpy, numpy as np
+bpy.ops.wm.open_mainfile(filepath=sys.argv[1])
+scene, body = bpy.context.scene, bpy.data.objects["body"]
+seen = []
+for time in json.loads(sys.argv[2]):
+    frame = time * scene.render.fps
+    scene.frame_set(int(frame), subframe=frame % 1)
+    mesh = body.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    co = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.vertices.foreach_get("co", co)
+    seen.append(co.reshape(-1, 3))
+np.savez(sys.argv[3], co=np.stack(seen), world=np.array(body.matrix_world))
+"""
+
+
+def read_blend(path, times):
+    """Vertices "co" (T, n, 3) of the object "body" at times [s], and its matrix "world" (4, 4)."""
+    with tempfile.TemporaryDirectory() as folder:
+        script, found = Path(folder, "read.py"), Path(folder, "found.npz")
+        script.write_text(READ)
+        command = [sys.executable, str(script), str(path), json.dumps(times), str(found)]
+        subprocess.run(command, check=True, stdout=subprocess.PIPE)
+        return dict(np.load(found))
