@@ -9,14 +9,18 @@ from torch import Tensor
 
 from neuma_lib.splatting.cameras import Cameras
 
+REACH = 1 / 16
+"""Distance up to which a depth map tells of what is behind its surface, in longest sides of the body."""
+
 
 def fused_distance(
-    points: Tensor, depths: Sequence[Tensor], cameras: Sequence[Cameras], reach: float, least: int = 1
+    points: Tensor, depths: Sequence[Tensor], cameras: Sequence[Cameras], reach: float
 ) -> Tensor:
     """Mean signed distance [m] along the rays from points to the surface that depth maps show, positive inside.
 
-    A view says something of a point that lies before its surface, or not farther behind it than ``reach``; distances
-    are cut at ``reach``.
+    A view says something of a point that lies before its surface, or not farther behind it than ``reach``, and the less
+    the farther behind (so as to tell little of what another side of a thin wall looks into); distances are cut at
+    ``reach``.
 
     Args:
         points: positions [m], float64, shape (P, 3).
@@ -24,13 +28,11 @@ def fused_distance(
             shows no surface.
         cameras: V cameras in float64.
         reach: [m].
-        least: views that have to see a point before their surface, or it is inside: fewer look through a gap between
-            Gaussians at what is behind.
 
     Returns:
-        distance (P,); ``reach`` where no view says anything, or too few that it is outside.
+        distance (P,); ``reach`` where no view says anything.
     """
-    total, seen, outside = points.new_zeros(3, len(points))
+    total, weights = points.new_zeros(2, len(points))
     for depth, camera in zip(depths, cameras, strict=True):
         pixels, z = camera.project(points)
         size = torch.tensor([camera.width, camera.height])
@@ -38,9 +40,7 @@ def fused_distance(
         within = ((at >= 0) & (at < size)).all(dim=1) & (z[0] > 0)
         column, row = at.clamp_min(0).minimum(size - 1).unbind(dim=1)
         behind = z[0] - depth.to(points)[row, column]  # nan where there is no surface
-        counts = within & (behind < reach)
-        total += torch.where(counts, behind.clamp_min(-reach), 0.0)
-        seen += counts
-        outside += counts & (behind < 0)
-    told = (seen > 0) & ((total >= 0) | (outside >= least))
-    return torch.where(told, total / seen.clamp_min(1), reach)
+        weight = torch.where(within & (behind < reach), (1 - behind / reach).clamp_max(1), 0)
+        total += torch.where(weight > 0, weight * behind.clamp_min(-reach), 0)
+        weights += weight
+    return torch.where(weights > 0, total / weights, reach)

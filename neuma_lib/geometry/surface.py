@@ -20,7 +20,7 @@ from torch import Tensor
 
 from neuma_lib.config.geometry import SurfaceConfig
 from neuma_lib.errors import InputError
-from neuma_lib.geometry.depth_fusion import fused_distance
+from neuma_lib.geometry.depth_fusion import REACH, fused_distance
 from neuma_lib.geometry.repair import repaired
 from neuma_lib.geometry.visual_hull import NO_COMMON_SPACE, contour_distances, distance_inside
 from neuma_lib.geometry.volume import check_mesh
@@ -31,10 +31,6 @@ Array = NDArray[np.float64]
 
 BOX_SIDE = 1.0
 """Side of the simulator's box [m]."""
-_REACH = 1 / 16
-"""Distance up to which a depth map tells of what is behind its surface, in longest sides: thinner walls swell."""
-_GAPS = 1 / 20
-"""Fewer views than this share look through gaps of a sparse splat, where they see a place as empty."""
 _COARSE_RESOLUTION = 32
 """Voxels along the longest side of the first look, which finds the body's box and the band around its surface."""
 
@@ -106,10 +102,9 @@ def reconstruct(
     field.ravel()[band] = distance_inside(torch.from_numpy(points), contours, cameras, floor).numpy()
     if depths is not None:
         inside = np.flatnonzero(field.ravel() > -grid.spacing)
-        behind = _REACH * grid.spacing * settings.resolution
+        behind = REACH * grid.spacing * settings.resolution
         points = np.stack(np.unravel_index(inside, field.shape), axis=1) * grid.spacing + grid.origin
-        least = max(1, round(_GAPS * len(depths)))
-        shown = fused_distance(torch.from_numpy(points), depths, cameras, behind, least)
+        shown = fused_distance(torch.from_numpy(points), depths, cameras, behind)
         field.ravel()[inside] = np.minimum(field.ravel()[inside], shown.numpy())
 
     mesh = _polygonise(_one_solid_body(field), grid)

@@ -18,12 +18,14 @@ from neuma_lib.config.settings import load, merged, read_yaml
 from neuma_lib.coupling.deformation import arms_at_rest, deform
 from neuma_lib.coupling.nearest_binding import ENOUGH, bind_nearest
 from neuma_lib.errors import InputError
-from neuma_lib.geometry.splat_surface import splat_surface, views_around
+from neuma_lib.geometry.depth_fusion import REACH
+from neuma_lib.geometry.splat_surface import opacity_and_depth, splat_surface, views_around
 from neuma_lib.geometry.volume import inside
 from neuma_lib.io.compressed_splats import save_compressed
 from neuma_lib.io.gaussians import save_gaussians
 from neuma_lib.io.splats import load_splat
 from neuma_lib.splatting import culling
+from neuma_lib.splatting.cameras import Cameras, look_at
 from neuma_lib.splatting.gaussians import quaternions, rotations
 from neuma_lib.splatting.spherical_harmonics import colours, rotated
 from neuma_lib.viewer.find import scene_files
@@ -311,6 +313,27 @@ def test_depth_shows_the_inside_of_a_bowl_which_no_outline_shows():
     content, bottom = [0.5, 0.5, 0.5], [0.5, 0.415, 0.5]
     for each in (truth, mesh):
         assert inside(each, np.array([content, bottom])).tolist() == [False, True]
+
+
+@pytest.mark.parametrize("apart", [0.005, 0.3])
+def test_a_pixel_that_looks_partly_through_a_gap_tells_no_depth(apart):
+    """Half transparent discs before opaque ones: nearly one surface, or two, whose mean would lie where nothing is."""
+    eye, target, up = (torch.tensor(v) for v in ([[0.0, 0.0, 2.0]], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
+    K = torch.tensor([[[64.0, 0.0, 16.0], [0.0, 64.0, 16.0], [0.0, 0.0, 1.0]]])
+    sides = [[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]]  # so that the splat is 1 m wide
+    g = dataclasses.replace(
+        ball(4),
+        means=torch.tensor([[0.0, 0.0, apart], [0.0, 0.0, 0.0], *sides]),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(4, 1),
+        scales=torch.tensor([[0.2, 0.2, 1e-3]] * 2 + [[1e-3] * 3] * 2),
+        opacities=torch.tensor([0.5, 0.99, 0.9, 0.9]),
+    )
+    _, depths = opacity_and_depth(g, Cameras(look_at(eye, target, up), K, 32, 32), 0.5)
+    middle = depths[0, 16, 16]
+    if apart > 2 * REACH:
+        assert middle.isnan()
+    else:
+        assert 2 - apart < middle < 2
 
 
 def test_gaussians_without_particles_follow_the_nearest_affinely():
