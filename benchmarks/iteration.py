@@ -23,7 +23,7 @@ from benchmarks import torch_simulation
 from benchmarks.scene import SMALL, BenchmarkScene, Size, make_scene
 from benchmarks.timing import arithmetic, bandwidth, device_name, peak_memory, seconds, seconds_a_call
 from neuma_lib.config.material import MaterialConfig
-from neuma_lib.fitting.image_loss import mean_squared_error
+from neuma_lib.splatting.image_loss import mean_squared_error
 from neuma_lib.fitting.material import PixelLoss, train_material
 from neuma_lib.sim.memory import MemoryPlan
 from neuma_lib.sim.model import as_bodies

@@ -3,7 +3,8 @@
 Lists. A splat enters a tile where the ellipse with alpha >= alpha_min comes nearer than a hair to one of the tile's
 pixel centres: in every row of tiles an ellipse covers one interval of columns, which has a closed form, so the lists
 hold no tiles that only a bounding box would touch. All splats of all images are sorted by depth once, written to
-the lists in that order, and sorted stably by tile. The number of entries is read by the host, once a call.
+the lists in that order, and sorted stably by tile: by as many bits as tiles have. The number of entries is read by the
+host, once a call.
 
 Compositing. A warp owns a patch of 8 x (4 LANE_PIXELS) pixels, ``LANE_PIXELS`` a lane, and walks the list of its tile
 without waiting for other warps: 32 entries at a time, each lane fetches one splat and tests it against the patch
@@ -17,9 +18,14 @@ that nine sums take 12 exchanges instead of 45, and end in nine lanes that add t
 other good order, a lane a splat and pixels passed from lane to lane, needs the state of the pixels stored for every
 32 splats and does as much arithmetic at this patch size.) Sums end in memory in any order: last bits vary between runs.
 
+Comparison. The first pass has a pixel's colour in registers: where a squared error is all that is wanted, it subtracts
+the observed pixel there, sums the squares of a patch in a fixed order and keeps the difference, of which the adjoint
+makes the pixel's gradient. No image is written or read, and where no splat is nothing but the observation is read.
+
 Memory at the peak of a call, bytes: 24 a pixel (images, alphas, what the adjoint needs), 16 a pixel more for the
-gradients that come in, 130 a splat (of every image), 52 an entry of the lists, of which 4 stay for the adjoint. A
-splat of 3 px deviation has 4 to 5 entries: 40 images of 800 x 800 with 20,000 splats each take 1.3 GB.
+gradients that come in, 130 a splat (of every image), 16 an entry of the lists, of which 8 stay for the adjoint. A
+splat of 3 px deviation has 4 to 5 entries: 40 images of 800 x 800 with 20,000 splats each take 1.2 GB. A comparison
+takes 20 a pixel in all, of which it touches those of tiles that have splats.
 """
 
 from __future__ import annotations
@@ -30,7 +36,7 @@ import re
 import torch
 import warp as wp
 
-from neuma_lib.device import launch, native_source, start_warp
+from neuma_lib.device import launch, native_source, sort_pairs, start_warp
 from neuma_lib.errors import InputError
 from neuma_lib.splatting.compositing import Settings
 from neuma_lib.splatting.projection import CULLED, SPLAT_SIZE
@@ -72,6 +78,34 @@ def composite_adjoint(
     launch(finish, splats.shape[:2], splats, grad_splats)
 
 
+def compare(splats, depths, background, settings: Settings, observed, empty):
+    """See ``compositing``."""
+    ids, starts = lists(splats, depths, settings.width, settings.height, TILE)
+    tiles = len(starts) - 1
+    kernel, _, threads = comparing_kernels(TILE, LANE_PIXELS)
+    sums = empty("sums", (tiles, threads // 32), splats, torch.float64)
+    states = empty("states", (tiles, TILE**2, 4), splats)
+    kept = (ids, starts, states, empty("stops", (tiles, TILE**2), splats, torch.int32))
+    launch(
+        kernel, tiles * threads, splats, ids, starts, settings.alpha_min, settings.alpha_max,
+        settings.transmittance_min, background, observed, sums, *kept[2:], block_dim=threads,
+    )  # fmt: skip
+    return sums.view(len(observed), -1), kept
+
+
+def compare_adjoint(splats, kept, background, settings: Settings, scales, grad_splats, empty):
+    """See ``compositing``."""
+    _, starts, *_ = kept
+    grad_splats.zero_()
+    _, kernel, threads = comparing_kernels(TILE, LANE_PIXELS)
+    launch(
+        kernel, (len(starts) - 1) * threads, splats, *kept, settings.alpha_min, settings.alpha_max, background,
+        settings.width, settings.height, scales, grad_splats, block_dim=threads,
+    )  # fmt: skip
+    _, _, finish = list_kernels()
+    launch(finish, splats.shape[:2], splats, grad_splats)
+
+
 def lists(
     splats: torch.Tensor, depths: torch.Tensor, width: int, height: int, tile: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -92,8 +126,8 @@ def lists(
     images, count = depths.shape
     tiles = images * -(-width // tile) * -(-height // tile)
     count_tiles, list_tiles, _ = list_kernels()
-    order = torch.argsort(depths.view(-1), stable=True)
-    sizes = depths.new_empty(len(order), dtype=torch.int32)
+    order = by_depth(depths)
+    sizes = torch.empty_like(order)
     geometry = (order, splats, depths, width, height, tile)
     launch(count_tiles, len(order), *geometry, sizes)
     ends = torch.cumsum(sizes, dim=0, dtype=torch.int64)
@@ -105,11 +139,21 @@ def lists(
         )
     if total == 0:
         return sizes.new_empty(0), sizes.new_zeros(tiles + 1)
-    keys, ids = sizes.new_empty(total), sizes.new_empty(total)
+    keys, ids = sizes.new_empty(2 * total), sizes.new_empty(2 * total)
     launch(list_tiles, len(order), *geometry, sizes, ends, keys, ids)
-    keys, permutation = torch.sort(keys, stable=True)
+    sort_pairs(keys, ids, total, bits=(tiles - 1).bit_length())
     limits = torch.arange(tiles + 1, dtype=torch.int32, device=keys.device)
-    return ids[permutation], torch.searchsorted(keys, limits, out_int32=True)
+    return ids[:total], torch.searchsorted(keys[:total], limits, out_int32=True)
+
+
+def by_depth(depths: torch.Tensor) -> torch.Tensor:
+    """Splats of all images (I G,) int32 from near to far, by their depths (I, G), float32 and not negative."""
+    count = depths.numel()
+    keys = depths.new_empty(2 * count)
+    keys[:count] = depths.view(-1)
+    order = torch.arange(2 * count, dtype=torch.int32, device=depths.device)
+    sort_pairs(keys, order, count)
+    return order[:count]
 
 
 @functools.cache
@@ -156,7 +200,7 @@ def list_kernels():
 
     @wp.kernel(module=module, enable_backward=False)
     def count_tiles(
-        order: wp.array(dtype=wp.int64),  # (I G,) by depth
+        order: wp.array(dtype=int),  # (I G,) by depth
         splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
         depths: wp.array2d(dtype=float),  # (I, G)
         width: int,
@@ -165,7 +209,7 @@ def list_kernels():
         sizes: wp.array(dtype=int),  # (I G,) number of tiles, out
     ):
         rank = wp.tid()
-        splat = int(order[rank])
+        splat = order[rank]
         image = splat // splats.shape[1]
         g = splat - image * splats.shape[1]
         size = int(0)  # noqa: UP018, a constant would not be counted up in a loop by Warp
@@ -183,7 +227,7 @@ def list_kernels():
 
     @wp.kernel(module=module, enable_backward=False)
     def list_tiles(
-        order: wp.array(dtype=wp.int64),  # (I G,)
+        order: wp.array(dtype=int),  # (I G,)
         splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
         depths: wp.array2d(dtype=float),  # (I, G)
         width: int,
@@ -197,7 +241,7 @@ def list_kernels():
         rank = wp.tid()
         if sizes[rank] == 0:
             return
-        splat = int(order[rank])
+        splat = order[rank]
         image = splat // splats.shape[1]
         g = splat - image * splats.shape[1]
         tiles_x = (width + tile - 1) // tile
@@ -239,8 +283,8 @@ def list_kernels():
     return count_tiles, list_tiles, finish
 
 
-def source(name: str, tile: int, lane_pixels: int) -> str:
-    """CUDA code of a pass, "forward" or "backward", with its constants."""
+def source(name: str, tile: int, lane_pixels: int, compares: bool = False) -> str:
+    """CUDA code of a pass, "forward" or "backward", with its constants; of images, or of what compares them."""
     parts = native_source(__file__)
     text = parts["common"] + parts[name]
     height = 4 * lane_pixels
@@ -251,6 +295,7 @@ def source(name: str, tile: int, lane_pixels: int) -> str:
         "PATCH_HEIGHT": height,
         "WARPS": tile * tile // (PATCH_WIDTH * height),
         "SPLAT_SIZE": SPLAT_SIZE,
+        "COMPARES": int(compares),
     }
     for constant, value in values.items():
         text = re.sub(rf"\b{constant}\b", str(value), text)
@@ -326,3 +371,71 @@ def kernels(tile: int, lane_pixels: int):
         )  # fmt: skip
 
     return composite, composite_adjoint, threads
+
+
+@functools.cache
+def comparing_kernels(tile: int, lane_pixels: int):
+    """``(compare, compare_adjoint, threads)``: as `kernels`, with the observed pixels in place of pictures."""
+    module = wp.get_module(f"{__name__}.tile{tile}x{lane_pixels}.comparing")
+    threads = tile * tile // lane_pixels
+
+    @wp.func_native(source("forward", tile, lane_pixels, compares=True))
+    def compare_patch(
+        tile: int, thread: int, width: int, height: int,
+        splats: wp.array3d(dtype=float), ids: wp.array(dtype=int), starts: wp.array(dtype=int),
+        alpha_min: float, alpha_max: float, transmittance_min: float, background: wp.array(dtype=float),
+        observed: wp.array3d(dtype=int), sums: wp.array2d(dtype=wp.float64),
+        states: wp.array3d(dtype=float), stops: wp.array2d(dtype=int),
+    ): ...  # fmt: skip
+
+    @wp.func_native(source("backward", tile, lane_pixels, compares=True))
+    def compare_patch_adjoint(
+        tile: int, thread: int, width: int, height: int,
+        splats: wp.array3d(dtype=float), ids: wp.array(dtype=int), starts: wp.array(dtype=int),
+        states: wp.array3d(dtype=float), stops: wp.array2d(dtype=int),
+        alpha_min: float, alpha_max: float, background: wp.array(dtype=float),
+        scales: wp.array(dtype=float), grad_splats: wp.array3d(dtype=float),
+    ): ...  # fmt: skip
+
+    @wp.kernel(module=module, enable_backward=False, launch_bounds=threads)
+    def compare(
+        splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
+        ids: wp.array(dtype=int),  # (N,)
+        starts: wp.array(dtype=int),  # (tiles + 1,)
+        alpha_min: float,
+        alpha_max: float,
+        transmittance_min: float,
+        background: wp.array(dtype=float),  # (3,)
+        observed: wp.array3d(dtype=int),  # (I, H, W)
+        sums: wp.array2d(dtype=wp.float64),  # (tiles, warps), out
+        states: wp.array3d(dtype=float),  # (tiles, pixels, 4), out; tiles without splats are left out
+        stops: wp.array2d(dtype=int),  # (tiles, pixels), out, likewise
+    ):
+        i = wp.tid()
+        compare_patch(
+            i // threads, i % threads, observed.shape[2], observed.shape[1], splats, ids, starts, alpha_min, alpha_max,
+            transmittance_min, background, observed, sums, states, stops,
+        )  # fmt: skip
+
+    @wp.kernel(module=module, enable_backward=False, launch_bounds=threads)
+    def compare_adjoint(
+        splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
+        ids: wp.array(dtype=int),  # (N,)
+        starts: wp.array(dtype=int),  # (tiles + 1,)
+        states: wp.array3d(dtype=float),  # (tiles, pixels, 4)
+        stops: wp.array2d(dtype=int),  # (tiles, pixels)
+        alpha_min: float,
+        alpha_max: float,
+        background: wp.array(dtype=float),  # (3,)
+        width: int,
+        height: int,
+        scales: wp.array(dtype=float),  # (I,)
+        grad_splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE), sums that `finish` reads, added to
+    ):
+        i = wp.tid()
+        compare_patch_adjoint(
+            i // threads, i % threads, width, height, splats, ids, starts, states, stops, alpha_min, alpha_max,
+            background, scales, grad_splats,
+        )  # fmt: skip
+
+    return compare, compare_adjoint, threads

@@ -14,7 +14,7 @@ from neuma_lib.coupling.deformation import arms_at_rest, deform
 from neuma_lib.coupling.particle_binding import bind
 from neuma_lib.errors import InputError
 from neuma_lib.fitting.frame_batches import evaluate_in_batches, frame_batches
-from neuma_lib.fitting.image_loss import mean_squared_error
+from neuma_lib.splatting.image_loss import mean_squared_error
 from neuma_lib.fitting.material import PixelLoss
 from neuma_lib.sim.state import Trajectory
 from neuma_lib.splatting.observation import Observation, over_white
