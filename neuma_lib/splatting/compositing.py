@@ -8,10 +8,10 @@
 One that compares pictures with what was observed as it draws them, and keeps none, has two more:
 
 ``compare(splats, depths, background, settings, observed, empty)``
-    of straight-alpha RGBA (I, H, W) as int32, R the lowest byte, returns the squared differences from it over white
-    of the images' parts, float64 (I, parts), sums over channels and pixels, and a tuple of tensors kept for the adjoint;
+    takes straight-alpha RGBA (I, H, W) as int32, R the lowest byte, and returns sums of squared differences from it
+    over white, float64 (I, parts), an image's in as many parts as suit, and a tuple of tensors kept for the adjoint;
 ``compare_adjoint(splats, kept, background, settings, scales, grad_splats, empty)``
-    writes like ``composite_adjoint`` the gradients of half of these sums, each image's times its scale (I,).
+    writes, like ``composite_adjoint``, the gradients of half of these sums, times the scale (I,) of each image.
 
 ``splats`` and ``depths`` are as ``projection`` writes them, ``empty(name, shape, like, dtype)`` allocates.
 """

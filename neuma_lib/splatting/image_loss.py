@@ -44,7 +44,9 @@ def mean_squared_error(images: Tensor, observed: Tensor) -> Tensor:
 def check_fits(shape: tuple[int, ...], device: torch.device, observed: Tensor) -> None:
     """Raise InputError unless images rendered on a device, (T, V, H, W, C), can be compared with observed ones."""
     if observed.device != device:
-        raise InputError(f"image loss: images are rendered on {device}, observed ones are on {observed.device}")
+        raise InputError(
+            f"image loss: images are rendered on {device}, observed ones are on {observed.device}"
+        )
     if observed.shape != ((*shape[:-1], 4) if observed.dtype == torch.uint8 else shape):
         raise InputError(
             f"image loss: rendered images {tuple(shape)} do not fit observed ones {tuple(observed.shape)}"

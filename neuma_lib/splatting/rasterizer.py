@@ -92,7 +92,14 @@ class _Rasterize(torch.autograd.Function):
         grad_alphas = grad_alphas.contiguous().view(-1, height, width)
         grad_splats = empty("grad_splats", splats.shape, splats)
         options.compositor.composite_adjoint(
-            splats, ctx.saved_tensors[8:], background, settings, grad_pictures, grad_alphas, grad_splats, empty
+            splats,
+            ctx.saved_tensors[8:],
+            background,
+            settings,
+            grad_pictures,
+            grad_alphas,
+            grad_splats,
+            empty,
         )
         return *_scene_gradients(ctx, grad_splats), None, None, None, None
 
@@ -146,7 +153,9 @@ def _scene_gradients(ctx, grad_splats):
     grad_means = grad_covars = grad_opacities = grad_sh = None
     seen = (splats, depths, grad_splats)
     if any(ctx.needs_input_grad[:2]):
-        grad_means, grad_covars = projection.geometry_adjoint(means, covars, sh, viewmats, Ks, settings, *seen)
+        grad_means, grad_covars = projection.geometry_adjoint(
+            means, covars, sh, viewmats, Ks, settings, *seen
+        )
     if any(ctx.needs_input_grad[2:4]):
         grad_opacities, grad_sh = projection.appearance_adjoint(means, sh, viewmats, *seen)
     return grad_means, grad_covars, grad_opacities, grad_sh

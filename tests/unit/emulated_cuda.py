@@ -87,7 +87,10 @@ class EmulatedTiles:
         place = "const int tile = blockIdx.x, thread = threadIdx.x;\n"
         bodies = tuple(
             (prefix + name, parameters, place + compositor_cuda.source(name, tile, lane_pixels, compares))
-            for prefix, compares, passes in (("", False, self.parameters), ("comparing_", True, self.comparing))
+            for prefix, compares, passes in (
+                ("", False, self.parameters),
+                ("comparing_", True, self.comparing),
+            )
             for name, parameters in passes.items()
         )
         self.library = _library(folder, f"tiles{tile}x{lane_pixels}", bodies)
