@@ -1,6 +1,7 @@
 // Text of the compositing kernels of compositor_cuda.py, which replaces TILE, LANE_PIXELS, PATCH_WIDTH, PATCH_HEIGHT,
-// WARPS, SPLAT_SIZE and COMPARES. COMPARES 0: the first pass writes images, the second reads their gradients. COMPARES 1:
-// the first subtracts what was observed and sums the squares, the second takes the differences for gradients.
+// WARPS, SPLAT_SIZE, COMPARES and OPACITIES. COMPARES 0: the first pass writes images, the second reads their gradients.
+// COMPARES 1: the first subtracts what was observed and sums the squares, the second takes the differences for
+// gradients. OPACITIES 0: nobody wants the gradients of opacities, and the second pass leaves out the sum that is theirs.
 
 // Opens both passes. A thread knows its tile, its patch and its pixels: column x, rows y + 4 p. `fetch` puts the splat of
 // an entry on the warp's board, for powers of two: weights of dx^2, dx dy, dy^2 and log2 of the opacity.
@@ -193,8 +194,13 @@
     }
     for (int step = 16; step > 0; step /= 2) last = max(last, __shfl_xor_sync(ALL, last, step));
     const bool upper16 = lane & 16, upper8 = lane & 8, upper4 = lane & 4, upper2 = lane & 2;
+#if OPACITIES
     const bool writes = lane % 4 == 0 || lane == 2;
     const int slot = lane == 2 ? 8 : lane / 4;
+#else
+    const bool writes = lane % 4 == 0;
+    const int slot = 1 + lane / 4;
+#endif
 
     for (int base = (last - 1) & ~31; last > 0 && base >= 0; base -= 32) {
         __syncwarp();
@@ -239,7 +245,11 @@
                     w_blue = fmaf(weight, blue[p], w_blue);
                 }
             }
+#if OPACITIES
             float sums[8] = {s, s * dx, s_y, s * dx * dx, s_y * dx, s_yy, w_red, w_green};
+#else
+            float sums[8] = {s * dx, s_y, s * dx * dx, s_y * dx, s_yy, w_red, w_green, w_blue};
+#endif
 #pragma unroll
             for (int i = 0; i < 4; ++i) {
                 const float given = upper16 ? sums[i] : sums[i + 4];
@@ -254,12 +264,16 @@
                 const float given = upper4 ? sums[0] : sums[1];
                 sums[0] = (upper4 ? sums[1] : sums[0]) + __shfl_xor_sync(ALL, given, 4);
             }
+#if OPACITIES
             w_blue += __shfl_xor_sync(ALL, w_blue, 16);
             w_blue += __shfl_xor_sync(ALL, w_blue, 8);
             w_blue += __shfl_xor_sync(ALL, w_blue, 4);
             // the ninth sum joins: lanes with bit 1 carry it on, the others sum number lane / 4
             const float given = upper2 ? sums[0] : w_blue;
             float sum = (upper2 ? w_blue : sums[0]) + __shfl_xor_sync(ALL, given, 2);
+#else
+            float sum = sums[0] + __shfl_xor_sync(ALL, sums[0], 2);
+#endif
             sum += __shfl_xor_sync(ALL, sum, 1);
             if (writes) atomicAdd(grad_splats.data + (long long)SPLAT_SIZE * __float_as_int(other.y) + slot, sum);
         }

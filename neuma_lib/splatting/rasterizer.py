@@ -122,8 +122,9 @@ class _RasterizedError(torch.autograd.Function):
         scales = (grad * (2 / ctx.channels))[:, None].expand(-1, len(viewmats)).reshape(-1).contiguous()
         grad_splats = options.empty("grad_splats", splats.shape, splats)
         options.compositor.compare_adjoint(
-            splats, ctx.saved_tensors[8:], background, options.settings, scales, grad_splats, options.empty
-        )
+            splats, ctx.saved_tensors[8:], background, options.settings, scales, ctx.needs_input_grad[2],
+            grad_splats, options.empty,
+        )  # fmt: skip
         return *_scene_gradients(ctx, grad_splats), None, None, None, None, None
 
 

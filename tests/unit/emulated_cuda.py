@@ -85,12 +85,14 @@ class EmulatedTiles:
     ):
         self.tile, self.threads = tile, tile * tile // lane_pixels
         place = "const int tile = blockIdx.x, thread = threadIdx.x;\n"
+        variants = (
+            ("", False, True, self.parameters),
+            ("comparing_", True, True, self.comparing),
+            ("fixed_opacities_", True, False, {"backward": self.comparing["backward"]}),
+        )
         bodies = tuple(
-            (prefix + name, parameters, place + compositor_cuda.source(name, tile, lane_pixels, compares))
-            for prefix, compares, passes in (
-                ("", False, self.parameters),
-                ("comparing_", True, self.comparing),
-            )
+            (prefix + name, parameters, place + compositor_cuda.source(name, tile, lane_pixels, *flags))
+            for prefix, *flags, passes in variants
             for name, parameters in passes.items()
         )
         self.library = _library(folder, f"tiles{tile}x{lane_pixels}", bodies)
@@ -137,12 +139,14 @@ class EmulatedTiles:
         assert states[empty_tiles].isnan().all() and not states[~empty_tiles].isnan().any()
         return sums.view(len(observed), -1), (ids, starts, states, stops)
 
-    def compare_adjoint(self, splats, kept, background, settings, scales, grad_splats, empty):
+    def compare_adjoint(self, splats, kept, background, settings, scales, opacities, grad_splats, empty):
         ids, starts, states, stops = kept
         grad_splats.zero_()
+        library = self.library
         _launch(
-            self.library.comparing_backward, len(starts) - 1, self.threads, 0, settings.width, settings.height, splats,
-            ids, starts, states, stops, settings.alpha_min, settings.alpha_max, background, scales, grad_splats,
+            library.comparing_backward if opacities else library.fixed_opacities_backward, len(starts) - 1,
+            self.threads, 0, settings.width, settings.height, splats, ids, starts, states, stops, settings.alpha_min,
+            settings.alpha_max, background, scales, grad_splats,
         )  # fmt: skip
         _, _, finish = compositor_cuda.list_kernels()
         launch(finish, splats.shape[:2], splats, grad_splats)

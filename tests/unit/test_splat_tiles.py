@@ -198,6 +198,28 @@ def test_an_error_taken_while_drawing_is_that_of_the_images(name, device, monkey
     assert all(bool(grad.abs().max() > 0) == (name != "no splats at all") for grad in drawn[0][1:3])
 
 
+@pytest.mark.parametrize("device", [EMULATED, CUDA])
+@pytest.mark.parametrize("wanted", [[0], [1], [0, 1], [0, 1, 3], [2], [3]])
+def test_gradients_that_nobody_wants_change_no_other(wanted, device, monkeypatch, build_folder):
+    """Without those of opacities other code runs."""
+    if device == "emulated":
+        monkeypatch.setitem(rasterizer.COMPOSITORS, "rows", EmulatedTiles(build_folder))
+        device = "cpu"
+    scene = [tensor.float().to(device) for tensor in random_scene(2, 80, 2, 37, 29, 4, scale=0.04)]
+    observed = torch.full((2, 2, 29, 37, 4), 99, dtype=torch.uint8, device=device)
+    found = []
+    for leaves in (range(4), wanted):
+        inputs = [tensor.clone().requires_grad_(i in leaves) for i, tensor in enumerate(scene[:4])]
+        losses = rasterized_error(*inputs, *scene[4:], 37, 29, observed)
+        losses.sum().backward()
+        found.append([tensor.grad for tensor in inputs])
+    for i, (all_wanted, some_wanted) in enumerate(zip(*found, strict=True)):
+        if i not in wanted:
+            assert some_wanted is None
+        else:
+            assert (some_wanted - all_wanted).norm() <= 5e-6 * all_wanted.norm()
+
+
 @pytest.mark.parametrize("tile, lane_pixels", [(8, 1), (16, 4), (32, 2)])
 @pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
 def test_errors_of_other_tile_sizes(tile, lane_pixels, monkeypatch, build_folder):
