@@ -40,7 +40,8 @@ import warp as wp
 from neuma_lib.device import launch, native_source, sort_pairs, start_warp
 from neuma_lib.errors import InputError
 from neuma_lib.splatting.compositing import Settings
-from neuma_lib.splatting.projection import CULLED, SPLAT_SIZE
+from neuma_lib.splatting.projection import CULLED
+from neuma_lib.splatting.records import SPLAT_SIZE, functions
 
 start_warp()
 
@@ -167,6 +168,7 @@ def list_kernels():
     wp.set_module_options({"fuse_fp": False}, module)
     culled = wp.float32(CULLED)
     slack = wp.float32(SLACK)
+    load, store = functions(torch.float32)
 
     @wp.func(module=module)
     def pixels(low: float, high: float, extent: int):
@@ -183,14 +185,13 @@ def list_kernels():
         return wp.sqrt(reach / A) * wp.sqrt(wp.max(1.0 - part * part, 0.0))
 
     @wp.func(module=module)
-    def columns(splats: wp.array3d(dtype=float), image: int, g: int, low: float, high: float, width: int):
+    def columns(place: wp.vec4, C: float, ellipse: wp.vec4, low: float, high: float, width: int):
         # first and last pixel column of the ellipse between the heights low and high above its centre
-        mean = splats[image, g, 0]
-        A, B, C = splats[image, g, 2], splats[image, g, 3], splats[image, g, 4]
-        reach, half_height = splats[image, g, 9], splats[image, g, 11]
+        mean, A, B = place[0], place[2], place[3]
+        reach, half_height = ellipse[1], ellipse[3]
         bottom = wp.clamp(low, -half_height, half_height)
         top = wp.clamp(high, -half_height, half_height)
-        tilt = B / C * splats[image, g, 10]  # height of the leftmost point, and minus that of the rightmost
+        tilt = B / C * ellipse[2]  # height of the leftmost point, and minus that of the rightmost
         left = wp.clamp(tilt, bottom, top)
         right = wp.clamp(-tilt, bottom, top)
         slope = -B / A
@@ -217,13 +218,15 @@ def list_kernels():
         g = splat - image * splats.shape[1]
         size = int(0)  # noqa: UP018, a constant would not be counted up in a loop by Warp
         if depths[image, g] < culled:
-            centre, half_height = splats[image, g, 1], splats[image, g, 11]
+            place, ellipse = load(splats, image, g, 0), load(splats, image, g, 2)
+            C = splats[image, g, 4]
+            centre, half_height = place[1], ellipse[3]
             top, bottom = pixels(centre - half_height, centre + half_height, height)
             if top <= bottom:
                 for row in range(top // tile, bottom // tile + 1):
                     low = float(wp.max(row * tile, top)) + 0.5 - centre
                     high = float(wp.min(row * tile + tile - 1, bottom)) + 0.5 - centre
-                    first, last = columns(splats, image, g, low, high, width)
+                    first, last = columns(place, C, ellipse, low, high, width)
                     if first <= last:
                         size += last // tile - first // tile + 1
         sizes[rank] = size
@@ -250,12 +253,14 @@ def list_kernels():
         tiles_x = (width + tile - 1) // tile
         tiles_y = (height + tile - 1) // tile
         position = int(ends[rank]) - sizes[rank]
-        centre, half_height = splats[image, g, 1], splats[image, g, 11]
+        place, ellipse = load(splats, image, g, 0), load(splats, image, g, 2)
+        C = splats[image, g, 4]
+        centre, half_height = place[1], ellipse[3]
         top, bottom = pixels(centre - half_height, centre + half_height, height)
         for row in range(top // tile, bottom // tile + 1):
             low = float(wp.max(row * tile, top)) + 0.5 - centre
             high = float(wp.min(row * tile + tile - 1, bottom)) + 0.5 - centre
-            first, last = columns(splats, image, g, low, high, width)
+            first, last = columns(place, C, ellipse, low, high, width)
             if first <= last:
                 for column in range(first // tile, last // tile + 1):
                     keys[position] = (image * tiles_y + row) * tiles_x + column
@@ -268,20 +273,12 @@ def list_kernels():
         grad_splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE), sums of the adjoint in, gradients out
     ):
         image, g = wp.tid()
-        # one assignment a line: Warp copies the value then, while a tuple would refer to the array
-        s = grad_splats[image, g, 0]
-        s_x = grad_splats[image, g, 1]
-        s_y = grad_splats[image, g, 2]
-        s_xx = grad_splats[image, g, 3]
-        s_xy = grad_splats[image, g, 4]
-        s_yy = grad_splats[image, g, 5]
-        A, B, C = splats[image, g, 2], splats[image, g, 3], splats[image, g, 4]
-        grad_splats[image, g, 0] = A * s_x + B * s_y
-        grad_splats[image, g, 1] = B * s_x + C * s_y
-        grad_splats[image, g, 2] = -0.5 * s_xx
-        grad_splats[image, g, 3] = -s_xy
-        grad_splats[image, g, 4] = -0.5 * s_yy
-        grad_splats[image, g, 5] = s / splats[image, g, 5]
+        near, far = load(grad_splats, image, g, 0), load(grad_splats, image, g, 1)
+        s, s_x, s_y, s_xx, s_xy, s_yy = near[0], near[1], near[2], near[3], far[0], far[1]
+        place, shade = load(splats, image, g, 0), load(splats, image, g, 1)
+        A, B, C = place[2], place[3], shade[0]
+        store(grad_splats, image, g, 0, A * s_x + B * s_y, B * s_x + C * s_y, -0.5 * s_xx, -s_xy)
+        store(grad_splats, image, g, 1, -0.5 * s_yy, s / shade[1], far[2], far[3])
 
     return count_tiles, list_tiles, finish
 
