@@ -84,22 +84,14 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_pictures, grad_alphas):
-        *_, splats, depths, background = ctx.saved_tensors[:8]
-        options: _Options = ctx.options
-        settings, empty = options.settings, options.empty
-        width, height = settings.width, settings.height
-        grad_pictures = grad_pictures.contiguous().view(-1, height, width, 3)
-        grad_alphas = grad_alphas.contiguous().view(-1, height, width)
-        grad_splats = empty("grad_splats", splats.shape, splats)
+        *_, splats, _, background = ctx.saved_tensors[:8]
+        options, kept = ctx.options, ctx.saved_tensors[8:]
+        size = (options.settings.height, options.settings.width)
+        grad_pictures = grad_pictures.contiguous().view(-1, *size, 3)
+        grad_alphas = grad_alphas.contiguous().view(-1, *size)
+        grad_splats = options.empty("grad_splats", splats.shape, splats)
         options.compositor.composite_adjoint(
-            splats,
-            ctx.saved_tensors[8:],
-            background,
-            settings,
-            grad_pictures,
-            grad_alphas,
-            grad_splats,
-            empty,
+            splats, kept, background, options.settings, grad_pictures, grad_alphas, grad_splats, options.empty
         )
         return *_scene_gradients(ctx, grad_splats), None, None, None, None
 
@@ -118,13 +110,13 @@ class _RasterizedError(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad):
         *_, viewmats, _, splats, _, background = ctx.saved_tensors[:8]
-        options: _Options = ctx.options
+        options, kept = ctx.options, ctx.saved_tensors[8:]
         scales = (grad * (2 / ctx.channels))[:, None].expand(-1, len(viewmats)).reshape(-1).contiguous()
         grad_splats = options.empty("grad_splats", splats.shape, splats)
+        wanted = ctx.needs_input_grad[2]
         options.compositor.compare_adjoint(
-            splats, ctx.saved_tensors[8:], background, options.settings, scales, ctx.needs_input_grad[2],
-            grad_splats, options.empty,
-        )  # fmt: skip
+            splats, kept, background, options.settings, scales, wanted, grad_splats, options.empty
+        )
         return *_scene_gradients(ctx, grad_splats), None, None, None, None, None
 
 
@@ -311,12 +303,9 @@ def rasterized_error(
         InputError: shapes, dtypes or devices disagree.
     """
     scene = (means, covars, opacities, sh, viewmats, Ks)
-    thresholds = {
-        "alpha_min": float(alpha_min),
-        "alpha_max": float(alpha_max),
-        "transmittance_min": float(transmittance_min),
-        "eps2d": float(eps2d),
-    }
+    thresholds = dict(
+        alpha_min=alpha_min, alpha_max=alpha_max, transmittance_min=transmittance_min, eps2d=eps2d
+    )
     compositor = COMPOSITORS[_own_compositor(means)]
     can_compare = hasattr(compositor, "compare") and means.dtype == torch.float32
     if not can_compare or observed.dtype != torch.uint8:
@@ -324,5 +313,6 @@ def rasterized_error(
         return mean_squared_error(images, observed)
     check_shapes(*scene)
     check_fits((len(means), len(viewmats), height, width, 3), means.device, observed)
-    options = _Options(Settings(int(width), int(height), **thresholds), compositor, None, _fresh)
+    settings = Settings(int(width), int(height), *map(float, thresholds.values()))
+    options = _Options(settings, compositor, None, _fresh)
     return _RasterizedError.apply(*scene, _colour(background, means), observed, options)
