@@ -24,7 +24,8 @@ def functions(dtype: torch.dtype):
     vec4 = wp.types.vector(4, real)
 
     def text(name: str) -> str:
-        source = native_source(__file__)[name].replace("SPLAT_SIZE", str(SPLAT_SIZE))
+        parts = native_source(__file__, ".h")
+        source = (parts["piece"] + parts[name]).replace("SPLAT_SIZE", str(SPLAT_SIZE))
         return source.replace("REAL", {torch.float32: "float", torch.float64: "double"}[dtype])
 
     @wp.func_native(text("load"))
