@@ -27,7 +27,6 @@ from benchmarks.project_scenes import chosen_scenes, scene_parser, simulator
 from neuma_lib.config.settings import Config
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.fitting.frame_batches import frame_batches
-from neuma_lib.fitting.image_loss import mean_squared_error
 from neuma_lib.fitting.throw import Throw
 from neuma_lib.geometry.skinning import carry, skinning_matrix
 from neuma_lib.io.files import read_json
@@ -93,7 +92,7 @@ class Scene:
         renderer = replace(self.body, affine=MOTIONS[motion]).particle_gs(self.video.cameras)
         with torch.no_grad():
             return torch.cat([
-                mean_squared_error(renderer(x[part], F[part]), self.video.stored(part))
+                renderer.error(x[part], F[part], self.video.stored(part))
                 for part in frame_batches(len(x), renderer.frames_per_batch)
             ])  # fmt: skip
 

@@ -23,7 +23,6 @@ from benchmarks import torch_simulation
 from benchmarks.scene import SMALL, BenchmarkScene, Size, make_scene
 from benchmarks.timing import arithmetic, bandwidth, device_name, peak_memory, seconds, seconds_a_call
 from neuma_lib.config.material import MaterialConfig
-from neuma_lib.fitting.image_loss import mean_squared_error
 from neuma_lib.fitting.material import PixelLoss, train_material
 from neuma_lib.sim.memory import MemoryPlan
 from neuma_lib.sim.model import as_bodies
@@ -32,7 +31,7 @@ from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import Trajectory
 from neuma_lib.sim.workspace import SORT_EVERY, free_pool
 from neuma_lib.splatting import torch_reference
-from neuma_lib.splatting.observation import Observation
+from neuma_lib.splatting.image_loss import mean_squared_error
 from neuma_lib.splatting.rasterizer import rasterize
 
 NETWORK = 2 * (13 * 64 + 64 * 64 + 64 * 9)
@@ -143,14 +142,12 @@ def rendering_parts(scene: BenchmarkScene, device: torch.device, frames: int) ->
     N, G, pixels = size.particles, size.gaussians, size.pixels**2
     means, covars = renderer.deformed(x, F)
     inputs = [t.detach().requires_grad_() for t in (means, covars)]
-    images = renderer.splatted(*inputs)
-    part = slice(len(size.frame_steps) - frames, None)
-    detached = images.detach().requires_grad_()
-    grad_image = torch.randn_like(detached)
+    seen = scene.observation.images[len(size.frame_steps) - frames :]
+    losses = renderer.splatted_error(*inputs, seen)
     calls = len(size.frame_steps) / frames
     deformed = 4.0 * frames * G * 12
     states = 4.0 * frames * N * 12
-    image = 4.0 * frames * pixels * 3
+    observed = 4.0 * frames * pixels
 
     def back(outputs, leaves, grads):
         return lambda: torch.autograd.grad(outputs, leaves, grads, retain_graph=True)
@@ -159,20 +156,35 @@ def rendering_parts(scene: BenchmarkScene, device: torch.device, frames: int) ->
     rows = [
         ("binding", lambda: renderer.deformed(x.detach(), F.detach()), states + deformed),
         ("binding, adjoint", back((means, covars), (x, F), grad_deformed), states + deformed),
-        ("rasterizer", lambda: renderer.splatted(*(t.detach() for t in inputs)), deformed + image),
-        ("rasterizer, adjoint", back(images, inputs, grad_image), 2 * deformed + image),
         (
-            "loss and its gradient",
-            lambda: _loss_gradient(scene.observation, detached, part),
-            2 * image + image / 3,
+            "rasterizer and loss",
+            lambda: renderer.splatted_error(*(t.detach() for t in inputs), seen),
+            deformed + observed,
         ),
+        ("rasterizer and loss, adjoint", back(losses, inputs, torch.ones_like(losses)), 2 * deformed),
     ]
     return [Part(name, seconds(work, device), calls, moved) for name, work, moved in rows]
 
 
-def _loss_gradient(observation: Observation, images: torch.Tensor, part: slice) -> torch.Tensor:
-    value = mean_squared_error(images, observation.images[part])
-    return torch.autograd.grad(value.sum(), images)[0]
+def compared_renders(scene: BenchmarkScene, device: torch.device, frames: int) -> tuple[float, float]:
+    """Time of the loss of a batch of frames at rest and its gradient [s]: by `error`, and by way of images."""
+    body = scene.body
+    x = body.x0.expand(frames, -1, -1)
+    renderer = body.particle_gs(scene.observation.cameras)
+    with torch.no_grad():
+        deformed = renderer.deformed(x, torch.eye(3).to(x).expand(*x.shape, 3))
+    inputs = [t.detach().requires_grad_() for t in deformed]
+    seen = scene.observation.images[:frames]
+
+    def drawn() -> torch.Tensor:
+        return renderer.splatted_error(*inputs, seen)
+
+    def by_images() -> torch.Tensor:
+        return mean_squared_error(renderer.splatted(*inputs), seen)
+
+    return tuple(
+        seconds(lambda f=f: torch.autograd.grad(f().sum(), inputs), device) for f in (drawn, by_images)
+    )
 
 
 def _roll(scene: BenchmarkScene, **options) -> Trajectory:
@@ -275,6 +287,7 @@ def report(scene: BenchmarkScene, device: torch.device, batch: int) -> list[str]
         )
     gibibytes = f"{memory / 2**30:.2f} GiB" if memory == memory else "not counted"
     step, (slow, fast) = twin_step(scene, device), twin_render(device)
+    drawn, by_images = compared_renders(scene, device, batch)
     lines += [
         f"| **sum of the parts** | | | {1e3 * total:.1f} | 100 % | | |",
         "",
@@ -284,6 +297,8 @@ def report(scene: BenchmarkScene, device: torch.device, batch: int) -> list[str]
         f"| simulation and networks, there and back | {1e3 * simulation:.1f} ms | {step * size.steps:.2f} s | "
         f"{step * size.steps / simulation:.0f} |",
         f"| the same with half of the memory for states | {1e3 * bounded:.1f} ms | | |",
+        f"| rasterizer and loss of {batch} frames at rest, there and back | {1e3 * drawn:.2f} ms | | |",
+        f"| the same by way of images | {1e3 * by_images:.2f} ms | | |",
         f"| one image of 300 Gaussians at 48×48 and its gradient | {1e3 * fast:.2f} ms | {1e3 * slow:.0f} ms | "
         f"{slow / fast:.0f} |",
     ]

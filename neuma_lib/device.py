@@ -102,3 +102,18 @@ def launch(kernel: wp.Kernel, dim: int | Sequence[int], *arguments, block_dim: i
         device=wp.device_from_torch(device),
         stream=warp_stream(device),
     )
+
+
+def sort_pairs(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int = 32) -> None:
+    """Sort the first ``count`` pairs stably by the lowest bits of their keys, in place, in order with torch.
+
+    Reads and writes less than ``torch.sort``, whose keys count whole and whose values are 64-bit indices.
+
+    Args:
+        keys: float32 or int32, shape (2 count,), not negative; the second half is scratch.
+        values: int32, likewise.
+        count: how many pairs there are.
+        bits: all that keys have; higher ones are 0.
+    """
+    with wp.ScopedStream(warp_stream(keys.device), sync_enter=False):
+        wp.utils.radix_sort_pairs(wp.from_torch(keys), wp.from_torch(values), count, end_bit=bits)

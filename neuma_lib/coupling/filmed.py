@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 
 from neuma_lib.config.base import Compared
+from neuma_lib.coupling.particle_gs import ParticleGS
+from neuma_lib.splatting.image_loss import mean_squared_error
 from neuma_lib.splatting.observation import Observation
 
 
@@ -53,3 +55,15 @@ class Filmed:
             return self._picture(x, F)
         instants = self._picture(x.flatten(0, 1), F.flatten(0, 1)).unflatten(0, x.shape[:2])
         return (instants * self._shares.to(instants).view(-1, *[1] * (instants.ndim - 2))).sum(1)
+
+    def error(self, x: Tensor, F: Tensor, seen: Tensor) -> Tensor:
+        """Mean squared difference (T,) of each frame's images from ``seen``, those that stand for them in the video.
+
+        Differentiable with respect to the states, which are as above.
+
+        Args:
+            seen: as of `mean_squared_error`, in as many channels as are compared.
+        """
+        if x.ndim == 3 and self._picture is self.renderer and isinstance(self.renderer, ParticleGS):
+            return self.renderer.error(x, F, seen)
+        return mean_squared_error(self(x, F), seen)

@@ -11,7 +11,7 @@ from neuma_lib.coupling.binding import Binding
 from neuma_lib.coupling.deformation import arms_at_rest, deform
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians
-from neuma_lib.splatting.rasterizer import rasterize
+from neuma_lib.splatting.rasterizer import rasterize, rasterized_error
 
 _BATCH_BYTES = {"cpu": 16e6, "cuda": 1.5e9}
 """Memory of the buffers of one batch of frames: what stays in a CPU's cache, what keeps a GPU busy."""
@@ -43,7 +43,8 @@ class ParticleGS:
         eps2d: float = 0.0,
     ):
         self.gaussians, self.binding, self.x0, self.cameras = gaussians, binding, x0, cameras
-        self.background, self.covariance_gradient, self.eps2d = background, covariance_gradient, eps2d
+        self.covariance_gradient = covariance_gradient
+        self._look = {"background": background, "eps2d": eps2d}
         with torch.no_grad():
             self._covars0 = gaussians.covars()
             self._sh = gaussians.sh()
@@ -71,12 +72,20 @@ class ParticleGS:
         colours, alpha = self._rasterized(*self.deformed(x, F))
         return torch.cat([colours, alpha[..., None]], dim=-1)
 
+    def error(self, x: Tensor, F: Tensor, observed: Tensor) -> Tensor:
+        """Mean squared difference (T,) of each frame's images from the observed ones (`rasterized_error`)."""
+        return self.splatted_error(*self.deformed(x, F), observed)
+
+    def splatted_error(self, means: Tensor, covars: Tensor, observed: Tensor) -> Tensor:
+        """The same of deformed Gaussians, as `splatted` takes them."""
+        return rasterized_error(*self._arguments(means, covars), observed, **self._look)
+
     def _rasterized(self, means: Tensor, covars: Tensor) -> tuple[Tensor, Tensor]:
-        views = self.cameras
-        return rasterize(
-            means, covars, self.gaussians.opacities, self._sh, views.viewmats, views.Ks, views.width, views.height,
-            background=self.background, eps2d=self.eps2d,
-        )  # fmt: skip
+        return rasterize(*self._arguments(means, covars), **self._look)
+
+    def _arguments(self, means: Tensor, covars: Tensor) -> tuple:
+        views, opacities = self.cameras, self.gaussians.opacities
+        return means, covars, opacities, self._sh, views.viewmats, views.Ks, views.width, views.height
 
     @property
     def frames_per_batch(self) -> int:

@@ -32,7 +32,6 @@ from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.deviation import Deviation
 from neuma_lib.fitting.frame_batches import evaluate_in_batches
-from neuma_lib.fitting.image_loss import mean_squared_error
 from neuma_lib.fitting.training_loop import TrainingLoop
 from neuma_lib.geometry.chamfer import chamfer_loss
 from neuma_lib.io.checkpoint import Checkpoint
@@ -135,7 +134,7 @@ class PixelLoss:
 
         def losses(part: slice, x: Tensor, F: Tensor) -> Tensor:
             seen = video.stored(part) if self.compare == "colour" else video.coverage(part)
-            return mean_squared_error(filmed(x, F), seen)
+            return filmed.error(x, F, seen)
 
         states = (filmed.states(path.x), filmed.states(path.stretch))
         return evaluate_in_batches(losses, self.frames_per_batch or filmed.batch, *states)

@@ -16,7 +16,7 @@ import warp as wp
 
 from neuma_lib.device import launch, native_source, start_warp
 from neuma_lib.splatting.compositing import Settings, depth_order
-from neuma_lib.splatting.projection import SPLAT_SIZE
+from neuma_lib.splatting.records import SPLAT_SIZE
 
 start_warp()
 

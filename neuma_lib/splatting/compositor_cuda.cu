@@ -1,5 +1,7 @@
 // Text of the compositing kernels of compositor_cuda.py, which replaces TILE, LANE_PIXELS, PATCH_WIDTH, PATCH_HEIGHT,
-// WARPS and SPLAT_SIZE.
+// WARPS, SPLAT_SIZE, COMPARES and OPACITIES. COMPARES 0: the first pass writes images, the second reads their gradients.
+// COMPARES 1: the first subtracts what was observed and sums the squares, the second takes the differences for
+// gradients. OPACITIES 0: nobody wants the gradients of opacities, and the second pass leaves out the sum that is theirs.
 
 // Opens both passes. A thread knows its tile, its patch and its pixels: column x, rows y + 4 p. `fetch` puts the splat of
 // an entry on the warp's board, for powers of two: weights of dx^2, dx dy, dy^2 and log2 of the opacity.
@@ -18,6 +20,12 @@
     const int x = patch_x + lane % PATCH_WIDTH, y = patch_y + lane / PATCH_WIDTH;
     const int begin = starts.data[tile], end = starts.data[tile + 1];
     const float4* records = (const float4*)splats.data;
+    const long long corner = ((long long)image * height + y) * width + x;  // the lane's first pixel
+#if COMPARES
+    float4* differences = (float4*)states.data;  // of colours, and transmittance
+    // where pixel p has its state: tile by tile, so that lanes of a warp are neighbours
+    auto place_of = [&](int p) { return ((long long)tile * LANE_PIXELS + p) * (32 * WARPS) + thread; };
+#endif
 
     auto exp2_fast = [](float v) {
 #if defined(__CUDA_ARCH__)
@@ -52,7 +60,7 @@
     };
 
 //// forward
-    const long long corner = ((long long)image * height + y) * width + x;  // the lane's first pixel
+#if !COMPARES
     if (begin == end) {
         // no splats: the warp writes its rows of the tile one after another, so that stores are contiguous
         const int left = tile_column * TILE, columns = min(TILE, width - left);
@@ -63,15 +71,22 @@
         }
         return;
     }
+#endif
     float T[LANE_PIXELS], red[LANE_PIXELS], green[LANE_PIXELS], blue[LANE_PIXELS];
     int stop[LANE_PIXELS];  // list position after the last splat that was drawn
     bool open[LANE_PIXELS];
+#if COMPARES
+    unsigned seen[LANE_PIXELS];  // R, G, B, A from the lowest byte up; asked for early, used late
+#endif
 #pragma unroll
     for (int p = 0; p < LANE_PIXELS; ++p) {
         T[p] = 1.0f;
         red[p] = green[p] = blue[p] = 0.0f;
         stop[p] = 0;
         open[p] = x < width && y + 4 * p < height;
+#if COMPARES
+        seen[p] = open[p] ? observed.data[corner + 4LL * p * width] : 0;
+#endif
     }
     for (int base = begin; base < end; base += 32) {
         bool any_open = false;
@@ -110,6 +125,26 @@
             }
         }
     }
+#if COMPARES
+    double sum = 0.0;
+#pragma unroll
+    for (int p = 0; p < LANE_PIXELS; ++p) {
+        float4 state = make_float4(0.0f, 0.0f, 0.0f, T[p]);
+        if (x < width && y + 4 * p < height) {
+            const float unit = 1.0f / 255.0f, cover = unit * (seen[p] >> 24), white = 1.0f - cover;
+            state.x = fmaf(T[p], background.data[0], red[p]) - fmaf(unit * (seen[p] & 255), cover, white);
+            state.y = fmaf(T[p], background.data[1], green[p]) - fmaf(unit * (seen[p] >> 8 & 255), cover, white);
+            state.z = fmaf(T[p], background.data[2], blue[p]) - fmaf(unit * (seen[p] >> 16 & 255), cover, white);
+            sum += state.x * state.x + state.y * state.y + state.z * state.z;
+        }
+        if (begin < end) {
+            differences[place_of(p)] = state;
+            stops.data[place_of(p)] = stop[p];
+        }
+    }
+    for (int step = 16; step > 0; step /= 2) sum += __shfl_xor_sync(ALL, sum, step);
+    if (lane == 0) sums.data[(long long)tile * WARPS + warp] = sum;
+#else
 #pragma unroll
     for (int p = 0; p < LANE_PIXELS; ++p) {
         if (x < width && y + 4 * p < height) {
@@ -122,15 +157,26 @@
             stops.data[at] = stop[p];
         }
     }
+#endif
 
 //// backward
     if (begin == end) return;
-    const long long corner = ((long long)image * height + y) * width + x;
     float T[LANE_PIXELS], red[LANE_PIXELS], green[LANE_PIXELS], blue[LANE_PIXELS];  // colours: of the image's gradient
     float behind[LANE_PIXELS];  // gradient-weighted light that reaches the pixel from behind the current splat
     int stop[LANE_PIXELS], last = 0;
 #pragma unroll
     for (int p = 0; p < LANE_PIXELS; ++p) {
+#if COMPARES
+        const float4 state = differences[place_of(p)];  // beyond the image: 0, and no splat drawn
+        const float scale = scales.data[image];
+        stop[p] = stops.data[place_of(p)];
+        T[p] = state.w;
+        red[p] = scale * state.x;
+        green[p] = scale * state.y;
+        blue[p] = scale * state.z;
+        behind[p] = T[p] * (red[p] * background.data[0] + green[p] * background.data[1]
+            + blue[p] * background.data[2]);
+#else
         T[p] = red[p] = green[p] = blue[p] = behind[p] = 0.0f;
         stop[p] = 0;
         if (x < width && y + 4 * p < height) {
@@ -143,12 +189,18 @@
             behind[p] = T[p] * (red[p] * background.data[0] + green[p] * background.data[1]
                 + blue[p] * background.data[2] - grad_alphas.data[at]);
         }
+#endif
         last = max(last, stop[p]);
     }
     for (int step = 16; step > 0; step /= 2) last = max(last, __shfl_xor_sync(ALL, last, step));
     const bool upper16 = lane & 16, upper8 = lane & 8, upper4 = lane & 4, upper2 = lane & 2;
+#if OPACITIES
     const bool writes = lane % 4 == 0 || lane == 2;
     const int slot = lane == 2 ? 8 : lane / 4;
+#else
+    const bool writes = lane % 4 == 0;
+    const int slot = 1 + lane / 4;
+#endif
 
     for (int base = (last - 1) & ~31; last > 0 && base >= 0; base -= 32) {
         __syncwarp();
@@ -193,7 +245,11 @@
                     w_blue = fmaf(weight, blue[p], w_blue);
                 }
             }
+#if OPACITIES
             float sums[8] = {s, s * dx, s_y, s * dx * dx, s_y * dx, s_yy, w_red, w_green};
+#else
+            float sums[8] = {s * dx, s_y, s * dx * dx, s_y * dx, s_yy, w_red, w_green, w_blue};
+#endif
 #pragma unroll
             for (int i = 0; i < 4; ++i) {
                 const float given = upper16 ? sums[i] : sums[i + 4];
@@ -208,12 +264,16 @@
                 const float given = upper4 ? sums[0] : sums[1];
                 sums[0] = (upper4 ? sums[1] : sums[0]) + __shfl_xor_sync(ALL, given, 4);
             }
+#if OPACITIES
             w_blue += __shfl_xor_sync(ALL, w_blue, 16);
             w_blue += __shfl_xor_sync(ALL, w_blue, 8);
             w_blue += __shfl_xor_sync(ALL, w_blue, 4);
             // the ninth sum joins: lanes with bit 1 carry it on, the others sum number lane / 4
             const float given = upper2 ? sums[0] : w_blue;
             float sum = (upper2 ? w_blue : sums[0]) + __shfl_xor_sync(ALL, given, 2);
+#else
+            float sum = sums[0] + __shfl_xor_sync(ALL, sums[0], 2);
+#endif
             sum += __shfl_xor_sync(ALL, sum, 1);
             if (writes) atomicAdd(grad_splats.data + (long long)SPLAT_SIZE * __float_as_int(other.y) + slot, sum);
         }

@@ -3,7 +3,8 @@
 Lists. A splat enters a tile where the ellipse with alpha >= alpha_min comes nearer than a hair to one of the tile's
 pixel centres: in every row of tiles an ellipse covers one interval of columns, which has a closed form, so the lists
 hold no tiles that only a bounding box would touch. All splats of all images are sorted by depth once, written to
-the lists in that order, and sorted stably by tile. The number of entries is read by the host, once a call.
+the lists in that order, and sorted stably by tile: by as many bits as tiles have. The number of entries is read by the
+host, once a call.
 
 Compositing. A warp owns a patch of 8 x (4 LANE_PIXELS) pixels, ``LANE_PIXELS`` a lane, and walks the list of its tile
 without waiting for other warps: 32 entries at a time, each lane fetches one splat and tests it against the patch
@@ -17,9 +18,15 @@ that nine sums take 12 exchanges instead of 45, and end in nine lanes that add t
 other good order, a lane a splat and pixels passed from lane to lane, needs the state of the pixels stored for every
 32 splats and does as much arithmetic at this patch size.) Sums end in memory in any order: last bits vary between runs.
 
+Comparison. The first pass has a pixel's colour in registers: where a squared error is all that is wanted, it subtracts
+the observed pixel there, sums the squares of a patch in a fixed order and keeps the difference, of which the adjoint
+makes the pixel's gradient. No image is written or read, and where no splat is nothing but the observation is read. An
+adjoint for fixed opacities does without the sum that is theirs: eight are summed by 9 exchanges.
+
 Memory at the peak of a call, bytes: 24 a pixel (images, alphas, what the adjoint needs), 16 a pixel more for the
-gradients that come in, 130 a splat (of every image), 52 an entry of the lists, of which 4 stay for the adjoint. A
-splat of 3 px deviation has 4 to 5 entries: 40 images of 800 x 800 with 20,000 splats each take 1.3 GB.
+gradients that come in, 130 a splat (of every image), 16 an entry of the lists, of which 8 stay for the adjoint. A
+splat of 3 px deviation has 4 to 5 entries: 40 images of 800 x 800 with 20,000 splats each take 1.2 GB. A comparison
+takes 20 a pixel in all, of which it touches those of tiles that have splats.
 """
 
 from __future__ import annotations
@@ -30,10 +37,11 @@ import re
 import torch
 import warp as wp
 
-from neuma_lib.device import launch, native_source, start_warp
+from neuma_lib.device import launch, native_source, sort_pairs, start_warp
 from neuma_lib.errors import InputError
 from neuma_lib.splatting.compositing import Settings
-from neuma_lib.splatting.projection import CULLED, SPLAT_SIZE
+from neuma_lib.splatting.projection import CULLED
+from neuma_lib.splatting.records import SPLAT_SIZE, functions
 
 start_warp()
 
@@ -72,6 +80,36 @@ def composite_adjoint(
     launch(finish, splats.shape[:2], splats, grad_splats)
 
 
+def compare(splats, depths, background, settings: Settings, observed, empty):
+    """See ``compositing``."""
+    ids, starts = lists(splats, depths, settings.width, settings.height, TILE)
+    tiles = len(starts) - 1
+    kernel, threads = comparing_kernel(TILE, LANE_PIXELS)
+    sums = empty("sums", (tiles, threads // 32), splats, torch.float64)
+    states = empty("states", (tiles, TILE**2, 4), splats)
+    kept = (ids, starts, states, empty("stops", (tiles, TILE**2), splats, torch.int32))
+    launch(
+        kernel, tiles * threads, splats, ids, starts, settings.alpha_min, settings.alpha_max,
+        settings.transmittance_min, background, observed, sums, *kept[2:], block_dim=threads,
+    )  # fmt: skip
+    return sums.view(len(observed), -1), kept
+
+
+def compare_adjoint(
+    splats, kept, background, settings: Settings, scales, opacities: bool, grad_splats, empty
+):
+    """See ``compositing``."""
+    _, starts, *_ = kept
+    grad_splats.zero_()
+    kernel, threads = comparing_adjoint(TILE, LANE_PIXELS, opacities)
+    launch(
+        kernel, (len(starts) - 1) * threads, splats, *kept, settings.alpha_min, settings.alpha_max, background,
+        settings.width, settings.height, scales, grad_splats, block_dim=threads,
+    )  # fmt: skip
+    _, _, finish = list_kernels()
+    launch(finish, splats.shape[:2], splats, grad_splats)
+
+
 def lists(
     splats: torch.Tensor, depths: torch.Tensor, width: int, height: int, tile: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -92,8 +130,8 @@ def lists(
     images, count = depths.shape
     tiles = images * -(-width // tile) * -(-height // tile)
     count_tiles, list_tiles, _ = list_kernels()
-    order = torch.argsort(depths.view(-1), stable=True)
-    sizes = depths.new_empty(len(order), dtype=torch.int32)
+    order = by_depth(depths)
+    sizes = torch.empty_like(order)
     geometry = (order, splats, depths, width, height, tile)
     launch(count_tiles, len(order), *geometry, sizes)
     ends = torch.cumsum(sizes, dim=0, dtype=torch.int64)
@@ -105,11 +143,21 @@ def lists(
         )
     if total == 0:
         return sizes.new_empty(0), sizes.new_zeros(tiles + 1)
-    keys, ids = sizes.new_empty(total), sizes.new_empty(total)
+    keys, ids = sizes.new_empty(2 * total), sizes.new_empty(2 * total)
     launch(list_tiles, len(order), *geometry, sizes, ends, keys, ids)
-    keys, permutation = torch.sort(keys, stable=True)
+    sort_pairs(keys, ids, total, bits=(tiles - 1).bit_length())
     limits = torch.arange(tiles + 1, dtype=torch.int32, device=keys.device)
-    return ids[permutation], torch.searchsorted(keys, limits, out_int32=True)
+    return ids[:total], torch.searchsorted(keys[:total], limits, out_int32=True)
+
+
+def by_depth(depths: torch.Tensor) -> torch.Tensor:
+    """Splats of all images (I G,) int32 from near to far, by their depths (I, G), float32 and not negative."""
+    count = depths.numel()
+    keys = depths.new_empty(2 * count)
+    keys[:count] = depths.view(-1)
+    order = torch.arange(2 * count, dtype=torch.int32, device=depths.device)
+    sort_pairs(keys, order, count)
+    return order[:count]
 
 
 @functools.cache
@@ -120,6 +168,7 @@ def list_kernels():
     wp.set_module_options({"fuse_fp": False}, module)
     culled = wp.float32(CULLED)
     slack = wp.float32(SLACK)
+    load, store = functions(torch.float32)
 
     @wp.func(module=module)
     def pixels(low: float, high: float, extent: int):
@@ -136,14 +185,13 @@ def list_kernels():
         return wp.sqrt(reach / A) * wp.sqrt(wp.max(1.0 - part * part, 0.0))
 
     @wp.func(module=module)
-    def columns(splats: wp.array3d(dtype=float), image: int, g: int, low: float, high: float, width: int):
+    def columns(place: wp.vec4, C: float, ellipse: wp.vec4, low: float, high: float, width: int):
         # first and last pixel column of the ellipse between the heights low and high above its centre
-        mean = splats[image, g, 0]
-        A, B, C = splats[image, g, 2], splats[image, g, 3], splats[image, g, 4]
-        reach, half_height = splats[image, g, 9], splats[image, g, 11]
+        mean, A, B = place[0], place[2], place[3]
+        reach, half_height = ellipse[1], ellipse[3]
         bottom = wp.clamp(low, -half_height, half_height)
         top = wp.clamp(high, -half_height, half_height)
-        tilt = B / C * splats[image, g, 10]  # height of the leftmost point, and minus that of the rightmost
+        tilt = B / C * ellipse[2]  # height of the leftmost point, and minus that of the rightmost
         left = wp.clamp(tilt, bottom, top)
         right = wp.clamp(-tilt, bottom, top)
         slope = -B / A
@@ -156,7 +204,7 @@ def list_kernels():
 
     @wp.kernel(module=module, enable_backward=False)
     def count_tiles(
-        order: wp.array(dtype=wp.int64),  # (I G,) by depth
+        order: wp.array(dtype=int),  # (I G,) by depth
         splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
         depths: wp.array2d(dtype=float),  # (I, G)
         width: int,
@@ -165,25 +213,27 @@ def list_kernels():
         sizes: wp.array(dtype=int),  # (I G,) number of tiles, out
     ):
         rank = wp.tid()
-        splat = int(order[rank])
+        splat = order[rank]
         image = splat // splats.shape[1]
         g = splat - image * splats.shape[1]
         size = int(0)  # noqa: UP018, a constant would not be counted up in a loop by Warp
         if depths[image, g] < culled:
-            centre, half_height = splats[image, g, 1], splats[image, g, 11]
+            place, ellipse = load(splats, image, g, 0), load(splats, image, g, 2)
+            C = splats[image, g, 4]
+            centre, half_height = place[1], ellipse[3]
             top, bottom = pixels(centre - half_height, centre + half_height, height)
             if top <= bottom:
                 for row in range(top // tile, bottom // tile + 1):
                     low = float(wp.max(row * tile, top)) + 0.5 - centre
                     high = float(wp.min(row * tile + tile - 1, bottom)) + 0.5 - centre
-                    first, last = columns(splats, image, g, low, high, width)
+                    first, last = columns(place, C, ellipse, low, high, width)
                     if first <= last:
                         size += last // tile - first // tile + 1
         sizes[rank] = size
 
     @wp.kernel(module=module, enable_backward=False)
     def list_tiles(
-        order: wp.array(dtype=wp.int64),  # (I G,)
+        order: wp.array(dtype=int),  # (I G,)
         splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
         depths: wp.array2d(dtype=float),  # (I, G)
         width: int,
@@ -197,18 +247,20 @@ def list_kernels():
         rank = wp.tid()
         if sizes[rank] == 0:
             return
-        splat = int(order[rank])
+        splat = order[rank]
         image = splat // splats.shape[1]
         g = splat - image * splats.shape[1]
         tiles_x = (width + tile - 1) // tile
         tiles_y = (height + tile - 1) // tile
         position = int(ends[rank]) - sizes[rank]
-        centre, half_height = splats[image, g, 1], splats[image, g, 11]
+        place, ellipse = load(splats, image, g, 0), load(splats, image, g, 2)
+        C = splats[image, g, 4]
+        centre, half_height = place[1], ellipse[3]
         top, bottom = pixels(centre - half_height, centre + half_height, height)
         for row in range(top // tile, bottom // tile + 1):
             low = float(wp.max(row * tile, top)) + 0.5 - centre
             high = float(wp.min(row * tile + tile - 1, bottom)) + 0.5 - centre
-            first, last = columns(splats, image, g, low, high, width)
+            first, last = columns(place, C, ellipse, low, high, width)
             if first <= last:
                 for column in range(first // tile, last // tile + 1):
                     keys[position] = (image * tiles_y + row) * tiles_x + column
@@ -221,26 +273,21 @@ def list_kernels():
         grad_splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE), sums of the adjoint in, gradients out
     ):
         image, g = wp.tid()
-        # one assignment a line: Warp copies the value then, while a tuple would refer to the array
-        s = grad_splats[image, g, 0]
-        s_x = grad_splats[image, g, 1]
-        s_y = grad_splats[image, g, 2]
-        s_xx = grad_splats[image, g, 3]
-        s_xy = grad_splats[image, g, 4]
-        s_yy = grad_splats[image, g, 5]
-        A, B, C = splats[image, g, 2], splats[image, g, 3], splats[image, g, 4]
-        grad_splats[image, g, 0] = A * s_x + B * s_y
-        grad_splats[image, g, 1] = B * s_x + C * s_y
-        grad_splats[image, g, 2] = -0.5 * s_xx
-        grad_splats[image, g, 3] = -s_xy
-        grad_splats[image, g, 4] = -0.5 * s_yy
-        grad_splats[image, g, 5] = s / splats[image, g, 5]
+        near, far = load(grad_splats, image, g, 0), load(grad_splats, image, g, 1)
+        s, s_x, s_y, s_xx, s_xy, s_yy = near[0], near[1], near[2], near[3], far[0], far[1]
+        place, shade = load(splats, image, g, 0), load(splats, image, g, 1)
+        A, B, C = place[2], place[3], shade[0]
+        store(grad_splats, image, g, 0, A * s_x + B * s_y, B * s_x + C * s_y, -0.5 * s_xx, -s_xy)
+        store(grad_splats, image, g, 1, -0.5 * s_yy, s / shade[1], far[2], far[3])
 
     return count_tiles, list_tiles, finish
 
 
-def source(name: str, tile: int, lane_pixels: int) -> str:
-    """CUDA code of a pass, "forward" or "backward", with its constants."""
+def source(name: str, tile: int, lane_pixels: int, compares: bool = False, opacities: bool = True) -> str:
+    """CUDA code of a pass, "forward" or "backward", with its constants; of images, or of what compares them.
+
+    ``opacities``: whether the sum that their gradients need is taken.
+    """
     parts = native_source(__file__)
     text = parts["common"] + parts[name]
     height = 4 * lane_pixels
@@ -251,6 +298,8 @@ def source(name: str, tile: int, lane_pixels: int) -> str:
         "PATCH_HEIGHT": height,
         "WARPS": tile * tile // (PATCH_WIDTH * height),
         "SPLAT_SIZE": SPLAT_SIZE,
+        "COMPARES": int(compares),
+        "OPACITIES": int(opacities),
     }
     for constant, value in values.items():
         text = re.sub(rf"\b{constant}\b", str(value), text)
@@ -326,3 +375,80 @@ def kernels(tile: int, lane_pixels: int):
         )  # fmt: skip
 
     return composite, composite_adjoint, threads
+
+
+@functools.cache
+def comparing_kernel(tile: int, lane_pixels: int):
+    """``(compare, threads)``: as `kernels`, with the observed pixels in place of pictures."""
+    module = wp.get_module(f"{__name__}.tile{tile}x{lane_pixels}.compare")
+    threads = tile * tile // lane_pixels
+
+    @wp.func_native(source("forward", tile, lane_pixels, compares=True))
+    def compare_patch(
+        tile: int, thread: int, width: int, height: int,
+        splats: wp.array3d(dtype=float), ids: wp.array(dtype=int), starts: wp.array(dtype=int),
+        alpha_min: float, alpha_max: float, transmittance_min: float, background: wp.array(dtype=float),
+        observed: wp.array3d(dtype=int), sums: wp.array2d(dtype=wp.float64),
+        states: wp.array3d(dtype=float), stops: wp.array2d(dtype=int),
+    ): ...  # fmt: skip
+
+    @wp.kernel(module=module, enable_backward=False, launch_bounds=threads)
+    def compare(
+        splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
+        ids: wp.array(dtype=int),  # (N,)
+        starts: wp.array(dtype=int),  # (tiles + 1,)
+        alpha_min: float,
+        alpha_max: float,
+        transmittance_min: float,
+        background: wp.array(dtype=float),  # (3,)
+        observed: wp.array3d(dtype=int),  # (I, H, W)
+        sums: wp.array2d(dtype=wp.float64),  # (tiles, warps), out
+        states: wp.array3d(dtype=float),  # (tiles, pixels, 4), out; tiles without splats are left out
+        stops: wp.array2d(dtype=int),  # (tiles, pixels), out, likewise
+    ):
+        i = wp.tid()
+        compare_patch(
+            i // threads, i % threads, observed.shape[2], observed.shape[1], splats, ids, starts, alpha_min, alpha_max,
+            transmittance_min, background, observed, sums, states, stops,
+        )  # fmt: skip
+
+    return compare, threads
+
+
+@functools.cache
+def comparing_adjoint(tile: int, lane_pixels: int, opacities: bool):
+    """``(compare_adjoint, threads)``, with or without the sum that gradients of opacities need."""
+    module = wp.get_module(f"{__name__}.tile{tile}x{lane_pixels}.compare_adjoint{int(opacities)}")
+    threads = tile * tile // lane_pixels
+
+    @wp.func_native(source("backward", tile, lane_pixels, True, opacities))
+    def compare_patch_adjoint(
+        tile: int, thread: int, width: int, height: int,
+        splats: wp.array3d(dtype=float), ids: wp.array(dtype=int), starts: wp.array(dtype=int),
+        states: wp.array3d(dtype=float), stops: wp.array2d(dtype=int),
+        alpha_min: float, alpha_max: float, background: wp.array(dtype=float),
+        scales: wp.array(dtype=float), grad_splats: wp.array3d(dtype=float),
+    ): ...  # fmt: skip
+
+    @wp.kernel(module=module, enable_backward=False, launch_bounds=threads)
+    def compare_adjoint(
+        splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
+        ids: wp.array(dtype=int),  # (N,)
+        starts: wp.array(dtype=int),  # (tiles + 1,)
+        states: wp.array3d(dtype=float),  # (tiles, pixels, 4)
+        stops: wp.array2d(dtype=int),  # (tiles, pixels)
+        alpha_min: float,
+        alpha_max: float,
+        background: wp.array(dtype=float),  # (3,)
+        width: int,
+        height: int,
+        scales: wp.array(dtype=float),  # (I,)
+        grad_splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE), sums that `finish` reads, added to
+    ):
+        i = wp.tid()
+        compare_patch_adjoint(
+            i // threads, i % threads, width, height, splats, ids, starts, states, stops, alpha_min, alpha_max,
+            background, scales, grad_splats,
+        )  # fmt: skip
+
+    return compare_adjoint, threads

@@ -16,11 +16,11 @@ import torch
 import warp as wp
 
 from neuma_lib.device import launch, start_warp
+from neuma_lib.splatting.records import SPLAT_SIZE, functions
 from neuma_lib.splatting.spherical_harmonics import SH_C0, SH_C1, SH_C2, SH_C3
 
 start_warp()
 
-SPLAT_SIZE = 12
 NEAR_PLANE = 0.01
 """Depth [m] below which a Gaussian is culled."""
 REACH_SLACK = 0.02
@@ -92,6 +92,7 @@ def kernels(dtype: torch.dtype):
     mat316 = wp.types.matrix((3, 16), real)
     module = wp.get_module(f"{__name__}.{str(dtype).removeprefix('torch.')}")
 
+    _, store = functions(dtype)
     zero, half, one, two, three, four, six, eight = (real(v) for v in (0, 0.5, 1, 2, 3, 4, 6, 8))
     tangent_margin = real(0.3)
     near = real(NEAR_PLANE)
@@ -269,18 +270,11 @@ def kernels(dtype: torch.dtype):
                 colour += values[k] * sh[g, k]
 
         depths[image, g] = p[2]
-        splats[image, g, 0] = mean_x
-        splats[image, g, 1] = mean_y
-        splats[image, g, 2] = c * inv
-        splats[image, g, 3] = -b * inv
-        splats[image, g, 4] = a * inv
-        splats[image, g, 5] = opacity
-        for i in range(3):
-            splats[image, g, 6 + i] = wp.max(colour[i], zero)
+        red, green, blue = wp.max(colour[0], zero), wp.max(colour[1], zero), wp.max(colour[2], zero)
         reach += reach_slack
-        splats[image, g, 9] = reach
-        splats[image, g, 10] = wp.sqrt(reach * a)
-        splats[image, g, 11] = wp.sqrt(reach * c)
+        store(splats, image, g, 0, mean_x, mean_y, c * inv, -b * inv)
+        store(splats, image, g, 1, a * inv, opacity, red, green)
+        store(splats, image, g, 2, blue, reach, wp.sqrt(reach * a), wp.sqrt(reach * c))
 
     @wp.kernel(module=module, enable_backward=False)
     def geometry_adjoint(

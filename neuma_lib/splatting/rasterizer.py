@@ -2,7 +2,8 @@
 
 One autograd function holds the whole render: projection and compositing, Warp kernels with hand-written adjoints.
 A CPU composites splat by splat (``compositor_cpu``), a GPU tile by tile (``compositor_cuda``). ``gsplat_backend``
-renders by the gsplat package instead, where that is installed.
+renders by the gsplat package instead, where that is installed. Where only the squared error of the render is wanted, a
+compositor may compare it with the observation as it draws (``rasterized_error``).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from neuma_lib.errors import InputError
 from neuma_lib.splatting import compositor_cpu, compositor_cuda, gsplat_backend, projection
 from neuma_lib.splatting.arrays import check_tensors
 from neuma_lib.splatting.compositing import Settings
+from neuma_lib.splatting.image_loss import as_integers, check_fits, mean_squared_error
 
 Compositor = Literal["rows", "tiles", "gsplat"]
 COMPOSITORS = {"rows": compositor_cpu, "tiles": compositor_cuda}
@@ -71,14 +73,10 @@ class _Options:
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, covars, opacities, sh, viewmats, Ks, background, options: _Options):
-        sh = projection.for_device(sh.detach())
-        means, covars, opacities, viewmats, Ks, background = (
-            x.detach().contiguous() for x in (means, covars, opacities, viewmats, Ks, background)
-        )
+        scene, seen = _project(means, covars, opacities, sh, viewmats, Ks, options)
         settings, empty = options.settings, options.empty
-        splats, depths = projection.project(means, covars, opacities, sh, viewmats, Ks, settings, empty)
-        pictures, alphas, kept = options.compositor.composite(splats, depths, background, settings, empty)
-        ctx.save_for_backward(means, covars, sh, viewmats, Ks, background, splats, depths, *kept)
+        pictures, alphas, kept = options.compositor.composite(*seen, background, settings, empty)
+        ctx.save_for_backward(*scene, *seen, background, *kept)
         ctx.options = options
         shape = (len(means), len(viewmats), settings.height, settings.width)
         return pictures.view(*shape, 3), alphas.view(shape)
@@ -86,34 +84,84 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_pictures, grad_alphas):
-        means, covars, sh, viewmats, Ks, background, splats, depths, *kept = ctx.saved_tensors
-        options: _Options = ctx.options
-        settings, empty = options.settings, options.empty
-        width, height = settings.width, settings.height
-        grad_pictures = grad_pictures.contiguous().view(-1, height, width, 3)
-        grad_alphas = grad_alphas.contiguous().view(-1, height, width)
-
-        grad_splats = empty("grad_splats", splats.shape, means)
+        *_, splats, _, background = ctx.saved_tensors[:8]
+        options, kept = ctx.options, ctx.saved_tensors[8:]
+        size = (options.settings.height, options.settings.width)
+        grad_pictures = grad_pictures.contiguous().view(-1, *size, 3)
+        grad_alphas = grad_alphas.contiguous().view(-1, *size)
+        grad_splats = options.empty("grad_splats", splats.shape, splats)
         options.compositor.composite_adjoint(
-            splats, kept, background, settings, grad_pictures, grad_alphas, grad_splats, empty
+            splats, kept, background, options.settings, grad_pictures, grad_alphas, grad_splats, options.empty
         )
-        if options.statistics is not None:
-            visible = depths < projection.CULLED
-            scaled = torch.stack(
-                [grad_splats[..., 0] * (width / 2), grad_splats[..., 1] * (height / 2)], dim=-1
-            )
-            options.statistics.screen_gradients = torch.where(visible, scaled.norm(dim=-1), 0.0).sum(dim=0)
-            options.statistics.views = visible.sum(dim=0)
+        return *_scene_gradients(ctx, grad_splats), None, None, None, None
 
-        grad_means = grad_covars = grad_opacities = grad_sh = None
-        seen = (splats, depths, grad_splats)
-        if any(ctx.needs_input_grad[:2]):
-            grad_means, grad_covars = projection.geometry_adjoint(
-                means, covars, sh, viewmats, Ks, settings, *seen
-            )
-        if any(ctx.needs_input_grad[2:4]):
-            grad_opacities, grad_sh = projection.appearance_adjoint(means, sh, viewmats, *seen)
-        return grad_means, grad_covars, grad_opacities, grad_sh, None, None, None, None
+
+class _RasterizedError(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, means, covars, opacities, sh, viewmats, Ks, background, observed, options: _Options):
+        scene, seen = _project(means, covars, opacities, sh, viewmats, Ks, options)
+        pixels = as_integers(observed).flatten(0, 1)
+        sums, kept = options.compositor.compare(*seen, background, options.settings, pixels, options.empty)
+        ctx.save_for_backward(*scene, *seen, background, *kept)
+        ctx.options, ctx.channels = options, 3 * pixels.numel() // len(means)  # a frame's
+        return (sums.view(len(means), -1).sum(1) / ctx.channels).to(means.dtype)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad):
+        *_, viewmats, _, splats, _, background = ctx.saved_tensors[:8]
+        options, kept = ctx.options, ctx.saved_tensors[8:]
+        scales = (grad * (2 / ctx.channels))[:, None].expand(-1, len(viewmats)).reshape(-1).contiguous()
+        grad_splats = options.empty("grad_splats", splats.shape, splats)
+        wanted = ctx.needs_input_grad[2]
+        options.compositor.compare_adjoint(
+            splats, kept, background, options.settings, scales, wanted, grad_splats, options.empty
+        )
+        return *_scene_gradients(ctx, grad_splats), None, None, None, None, None
+
+
+def _project(means, covars, opacities, sh, viewmats, Ks, options: _Options):
+    """``(means, covars, sh, viewmats, Ks)`` as the kernels take them, and ``(splats, depths)``."""
+    sh = projection.for_device(sh.detach())
+    means, covars, opacities, viewmats, Ks = (
+        x.detach().contiguous() for x in (means, covars, opacities, viewmats, Ks)
+    )
+    settings, empty = options.settings, options.empty
+    seen = projection.project(means, covars, opacities, sh, viewmats, Ks, settings, empty)
+    return (means, covars, sh, viewmats, Ks), seen
+
+
+def _scene_gradients(ctx, grad_splats):
+    """Those of means, covars, opacities and sh that are wanted, of tensors saved as `_project` returns them."""
+    means, covars, sh, viewmats, Ks, splats, depths = ctx.saved_tensors[:7]
+    settings, statistics = ctx.options.settings, ctx.options.statistics
+    if statistics is not None:
+        visible = depths < projection.CULLED
+        scaled = torch.stack(
+            [grad_splats[..., 0] * (settings.width / 2), grad_splats[..., 1] * (settings.height / 2)], dim=-1
+        )
+        statistics.screen_gradients = torch.where(visible, scaled.norm(dim=-1), 0.0).sum(dim=0)
+        statistics.views = visible.sum(dim=0)
+
+    grad_means = grad_covars = grad_opacities = grad_sh = None
+    seen = (splats, depths, grad_splats)
+    if any(ctx.needs_input_grad[:2]):
+        grad_means, grad_covars = projection.geometry_adjoint(
+            means, covars, sh, viewmats, Ks, settings, *seen
+        )
+    if any(ctx.needs_input_grad[2:4]):
+        grad_opacities, grad_sh = projection.appearance_adjoint(means, sh, viewmats, *seen)
+    return grad_means, grad_covars, grad_opacities, grad_sh
+
+
+def _own_compositor(means: torch.Tensor) -> Compositor:
+    return "rows" if means.device.type == "cpu" else "tiles"
+
+
+def _colour(background: Sequence[float] | torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    if isinstance(background, torch.Tensor):
+        return background.detach().to(like).contiguous()
+    return _constant(tuple(background), like.dtype, like.device)
 
 
 @functools.lru_cache(maxsize=32)
@@ -200,13 +248,9 @@ def rasterize(
         on_cpu = (tensor.cpu() for tensor in (means, covars, opacities, sh, viewmats, Ks))
         images, alphas = rasterize(*on_cpu, width, height, **options)
         return images.to(means.device), alphas.to(means.device)
-    if isinstance(background, torch.Tensor):
-        background = background.to(means)
-    else:
-        background = _constant(tuple(background), means.dtype, means.device)
+    background = _colour(background, means)
     on_cpu, single = means.device.type == "cpu", means.dtype == torch.float32
-    if compositor is None:
-        compositor = "rows" if on_cpu else "tiles"
+    compositor = compositor or _own_compositor(means)
     works = {"rows": on_cpu, "tiles": not on_cpu and single, "gsplat": not on_cpu and single}
     if not works.get(compositor, False):
         raise InputError(
@@ -222,3 +266,53 @@ def rasterize(
     empty = _fresh if buffers is None else buffers.empty
     options = _Options(settings, COMPOSITORS[compositor], statistics, empty)
     return _Rasterize.apply(means, covars, opacities, sh, viewmats, Ks, background, options)
+
+
+def rasterized_error(
+    means: torch.Tensor,  # (T, G, 3) [m]
+    covars: torch.Tensor,  # (T, G, 3, 3) [m^2]
+    opacities: torch.Tensor,  # (G,) in (0, 1)
+    sh: torch.Tensor,  # (G, K, 3)
+    viewmats: torch.Tensor,  # (V, 4, 4)
+    Ks: torch.Tensor,  # (V, 3, 3) [px]
+    width: int,
+    height: int,
+    observed: torch.Tensor,  # (T, V, H, W, 4) uint8, or (T, V, H, W, 3)
+    *,
+    background: Sequence[float] | torch.Tensor = (1.0, 1.0, 1.0),
+    alpha_min: float = 1.0 / 255.0,
+    alpha_max: float = 0.99,
+    transmittance_min: float = 1e-4,
+    eps2d: float = 0.3,
+) -> torch.Tensor:
+    """Mean squared difference of each frame, as `rasterize` renders it, from what was observed (paper Eq. 2).
+
+    The value of ``mean_squared_error(rasterize(...)[0], observed)``, and differentiable like it. Where the observation
+    is bytes and the device's compositor can (CUDA in float32), it compares them as it draws and no image is made: sums
+    are then taken in another order.
+
+    Args:
+        observed: as of `mean_squared_error`.
+
+    The others are those of `rasterize`.
+
+    Returns:
+        Of each frame the mean over all its views, pixels and channels, shape (T,).
+
+    Raises:
+        InputError: shapes, dtypes or devices disagree.
+    """
+    scene = (means, covars, opacities, sh, viewmats, Ks)
+    thresholds = dict(
+        alpha_min=alpha_min, alpha_max=alpha_max, transmittance_min=transmittance_min, eps2d=eps2d
+    )
+    compositor = COMPOSITORS[_own_compositor(means)]
+    can_compare = hasattr(compositor, "compare") and means.dtype == torch.float32
+    if not can_compare or observed.dtype != torch.uint8:
+        images, _ = rasterize(*scene, width, height, background=background, **thresholds)
+        return mean_squared_error(images, observed)
+    check_shapes(*scene)
+    check_fits((len(means), len(viewmats), height, width, 3), means.device, observed)
+    settings = Settings(int(width), int(height), *map(float, thresholds.values()))
+    options = _Options(settings, compositor, None, _fresh)
+    return _RasterizedError.apply(*scene, _colour(background, means), observed, options)

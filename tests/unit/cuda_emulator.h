@@ -228,7 +228,10 @@ unsigned ballot(bool value, int line)
 
 template <class T> T shuffle(T value, int step, int line)
 {
-    return bits<T>(gather(bits<unsigned>(value), line)[current.x % WARP ^ step].value);
+    static_assert(sizeof(T) <= sizeof(Slot::b), "at most 8 bytes");
+    const Slot* lanes = exchange(line, [&](Slot& s) { memcpy(s.b, &value, sizeof value); });
+    memcpy(&value, lanes[current.x % WARP ^ step].b, sizeof value);
+    return value;
 }
 
 }  // namespace emulator

@@ -71,15 +71,29 @@ class EmulatedTiles:
         " Array<float> transmittances, Array<int> stops, float alpha_min, float alpha_max, Array<float> background,"
         " Array<float> grad_pictures, Array<float> grad_alphas, Array<float> grad_splats",
     }
+    comparing = {
+        "forward": "int width, int height, Array<float> splats, Array<int> ids, Array<int> starts, float alpha_min,"
+        " float alpha_max, float transmittance_min, Array<float> background, Array<int> observed, Array<double> sums,"
+        " Array<float> states, Array<int> stops",
+        "backward": "int width, int height, Array<float> splats, Array<int> ids, Array<int> starts,"
+        " Array<float> states, Array<int> stops, float alpha_min, float alpha_max, Array<float> background,"
+        " Array<float> scales, Array<float> grad_splats",
+    }
 
     def __init__(
         self, folder: Path, tile: int = compositor_cuda.TILE, lane_pixels: int = compositor_cuda.LANE_PIXELS
     ):
         self.tile, self.threads = tile, tile * tile // lane_pixels
         place = "const int tile = blockIdx.x, thread = threadIdx.x;\n"
+        variants = (
+            ("", False, True, self.parameters),
+            ("comparing_", True, True, self.comparing),
+            ("fixed_opacities_", True, False, {"backward": self.comparing["backward"]}),
+        )
         bodies = tuple(
-            (name, parameters, place + compositor_cuda.source(name, tile, lane_pixels))
-            for name, parameters in self.parameters.items()
+            (prefix + name, parameters, place + compositor_cuda.source(name, tile, lane_pixels, *flags))
+            for prefix, *flags, passes in variants
+            for name, parameters in passes.items()
         )
         self.library = _library(folder, f"tiles{tile}x{lane_pixels}", bodies)
 
@@ -105,6 +119,34 @@ class EmulatedTiles:
             self.library.backward, len(starts) - 1, self.threads, 0, settings.width, settings.height, splats, ids,
             starts, transmittances, stops, settings.alpha_min, settings.alpha_max, background, grad_pictures,
             grad_alphas, grad_splats,
+        )  # fmt: skip
+        _, _, finish = compositor_cuda.list_kernels()
+        launch(finish, splats.shape[:2], splats, grad_splats)
+
+    def compare(self, splats, depths, background, settings, observed, empty):
+        ids, starts = compositor_cuda.lists(splats, depths, settings.width, settings.height, self.tile)
+        tiles = len(starts) - 1
+        # no number: every sum must be written, and nothing be read that was not
+        sums = splats.new_full((tiles, self.threads // 32), torch.nan, dtype=torch.float64)
+        states = splats.new_full((tiles, self.tile**2, 4), torch.nan)
+        stops = splats.new_full((tiles, self.tile**2), 10**9, dtype=torch.int32)
+        _launch(
+            self.library.comparing_forward, tiles, self.threads, 0, settings.width, settings.height, splats, ids,
+            starts, settings.alpha_min, settings.alpha_max, settings.transmittance_min, background, observed, sums,
+            states, stops,
+        )  # fmt: skip
+        empty_tiles = starts[1:] == starts[:-1]
+        assert states[empty_tiles].isnan().all() and not states[~empty_tiles].isnan().any()
+        return sums.view(len(observed), -1), (ids, starts, states, stops)
+
+    def compare_adjoint(self, splats, kept, background, settings, scales, opacities, grad_splats, empty):
+        ids, starts, states, stops = kept
+        grad_splats.zero_()
+        library = self.library
+        _launch(
+            library.comparing_backward if opacities else library.fixed_opacities_backward, len(starts) - 1,
+            self.threads, 0, settings.width, settings.height, splats, ids, starts, states, stops, settings.alpha_min,
+            settings.alpha_max, background, scales, grad_splats,
         )  # fmt: skip
         _, _, finish = compositor_cuda.list_kernels()
         launch(finish, splats.shape[:2], splats, grad_splats)

@@ -11,6 +11,7 @@ from sim_scenes import make_law
 
 from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.velocity import VelocityConfig
+from neuma_lib.coupling.particle_gs import ParticleGS
 from neuma_lib.fitting.material import PixelLoss, train_material
 from neuma_lib.fitting.velocity import estimate_velocity
 from neuma_lib.io.checkpoint import Checkpoint
@@ -22,7 +23,8 @@ from neuma_lib.radiance.rendering import render as render_field
 from neuma_lib.sim.model import Body
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
-from neuma_lib.splatting import observation
+from neuma_lib.splatting import observation, rasterizer
+from neuma_lib.splatting.image_loss import mean_squared_error
 from neuma_lib.splatting.observation import Observation
 from neuma_lib.springs.body import SpringBody
 from neuma_lib.springs.network import Springs
@@ -181,6 +183,70 @@ def test_particle_gs_agrees():
     difference = (images_32.double() - images_cpu).abs()
     assert float(difference.mean()) < 1e-5
     assert float((difference.amax(-1) > 1 / 255).double().mean()) < 1e-3
+
+
+def falling(dtype=torch.float32, frames=5, out_of_sight=()):
+    """A falling ball before two cameras, each frame with a weight of its own, some frames far away."""
+    body = ball(dtype=dtype).to(dtype, "cuda")
+    views = camera(size=90, dtype=dtype)
+    turned = views.viewmats.clone()
+    turned[:, :3, 3] += torch.tensor([0.1, -0.05, 0.2], dtype=dtype)
+    views = replace(
+        views, viewmats=torch.cat([views.viewmats, turned]), Ks=views.Ks.repeat(2, 1, 1), width=101
+    ).to(device="cuda")
+    steps = torch.linspace(0, 1, frames).to(body.x0)[:, None, None]
+    x = body.x0 + steps * torch.tensor([0.02, -0.1, 0.01]).to(body.x0)
+    x[list(out_of_sight)] += 50.0
+    F = torch.eye(3).to(body.x0) + steps[..., None] * 0.1 * random(len(body.x0), 3, 3).to(body.x0)
+    generator = torch.Generator().manual_seed(4)
+    seen = torch.randint(256, (frames, 2, 90, 101, 4), dtype=torch.uint8, generator=generator).cuda()
+    return body.particle_gs(views), x.contiguous(), F.contiguous(), seen
+
+
+@pytest.mark.parametrize("out_of_sight", [(), (1, 4), range(5)], ids=["seen", "partly", "unseen"])
+def test_error_taken_while_drawing_is_that_of_the_images(out_of_sight, monkeypatch):
+    """Value, and gradients of Gaussians and particles, by way of images and without."""
+    renderer, x, F, seen = falling(out_of_sight=out_of_sight)
+    weight = torch.linspace(0.3, 2.0, len(x), device="cuda")
+    found = []
+    for drawn in (False, True):
+        states = x.clone().requires_grad_(), F.clone().requires_grad_()
+        deformed = renderer.deformed(*states)
+        if drawn:
+            with monkeypatch.context() as patch:
+                patch.setattr(rasterizer, "rasterize", lambda *_, **__: pytest.fail("images were made"))
+                losses = renderer.splatted_error(*deformed, seen)
+        else:
+            losses = mean_squared_error(renderer.splatted(*deformed), seen)
+        found.append([losses.detach(), *torch.autograd.grad(losses, (*deformed, *states), weight)])
+    for index, (by_images, at_once) in enumerate(zip(*found, strict=True)):
+        assert float((at_once - by_images).norm()) <= 1e-5 * float(by_images.norm()), index
+    empty = torch.zeros(len(x), dtype=torch.bool)
+    empty[list(out_of_sight)] = True
+    for grad in found[1][1:]:
+        assert torch.equal(grad.flatten(1).norm(dim=1).cpu() == 0, empty), (
+            "frames out of sight, and they alone"
+        )
+
+
+def test_equal_renders_have_equal_errors():
+    renderer, x, F, seen = falling()
+    with torch.no_grad():
+        first, *others = (renderer.error(x, F, seen) for _ in range(4))
+        assert all(torch.equal(first, other) for other in others)
+        one_by_one = [renderer.error(x[t : t + 1], F[t : t + 1], seen[t : t + 1]) for t in range(len(x))]
+    assert relative(torch.cat(one_by_one), first) < 1e-6, "a frame's loss does not depend on its batch"
+
+
+def test_error_of_a_large_image_of_one_colour():
+    """Nothing is drawn: what the sum of a million and more pixels must be is known."""
+    renderer, x, F, _ = falling(frames=1, out_of_sight=(0,))
+    size = 1203
+    views = replace(renderer.cameras, width=size, height=size)
+    large = ParticleGS(renderer.gaussians, renderer.binding, renderer.x0, views, background=(0.5,) * 3)
+    seen = torch.full((1, 2, size, size, 4), 255, dtype=torch.uint8, device="cuda")
+    seen[..., :3] = 102
+    assert float(large.error(x, F, seen)) == pytest.approx(0.01, rel=1e-6)
 
 
 def seen_particles(device, dtype):

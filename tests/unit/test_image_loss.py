@@ -7,17 +7,19 @@ import weakref
 import pytest
 import torch
 from grounding_scene import ball, camera
-from render_scenes import dense
+from render_scenes import dense, random_scene
 from test_binding import random_gaussians, random_particles
 
 from neuma_lib.coupling.deformation import arms_at_rest, deform
+from neuma_lib.coupling.filmed import Filmed
 from neuma_lib.coupling.particle_binding import bind
 from neuma_lib.errors import InputError
 from neuma_lib.fitting.frame_batches import evaluate_in_batches, frame_batches
-from neuma_lib.fitting.image_loss import mean_squared_error
 from neuma_lib.fitting.material import PixelLoss
 from neuma_lib.sim.state import Trajectory
+from neuma_lib.splatting.image_loss import mean_squared_error
 from neuma_lib.splatting.observation import Observation, over_white
+from neuma_lib.splatting.rasterizer import rasterize, rasterized_error
 
 DEVICES = [
     "cpu",
@@ -70,6 +72,83 @@ def test_a_large_image_keeps_its_precision_in_float32():
 def test_images_of_another_shape_are_refused():
     with pytest.raises(InputError, match="do not fit"):
         mean_squared_error(torch.zeros(2, 1, 4, 4, 3), random_pixels(3, 1, 4, 4))
+
+
+def test_observed_images_on_another_device_are_refused():
+    with pytest.raises(InputError, match="rendered on cpu, observed ones are on meta"):
+        mean_squared_error(torch.zeros(1, 1, 4, 4, 3), random_pixels(1, 1, 4, 4).to("meta"))
+
+
+# ---- squared error of a render
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("decoded", [True, False])
+def test_error_of_a_render_is_that_of_its_images(dtype, decoded):
+    """On a CPU to the last bit; `test_splat_tiles.py` has the twin of what a GPU does."""
+    scene = random_scene(3, 60, 2, 26, 21, 4, scale=0.05, dtype=dtype)
+    observed = random_pixels(3, 2, 21, 26)
+    if not decoded:
+        observed = over_white(observed.to(dtype) / 255)
+    found = []
+    for drawn in (False, True):
+        inputs = [tensor.clone().requires_grad_() for tensor in scene[:4]]
+        setting = (*inputs, *scene[4:], 26, 21)
+        if drawn:
+            losses = rasterized_error(*setting, observed, background=(0.2, 0.5, 0.9), eps2d=0.1)
+        else:
+            images, _ = rasterize(*setting, background=(0.2, 0.5, 0.9), eps2d=0.1)
+            losses = mean_squared_error(images, observed)
+        weight = torch.tensor([0.5, 0.0, 3.0], dtype=dtype)
+        found.append([losses.detach(), *torch.autograd.grad(losses, inputs, weight)])
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+
+
+@pytest.mark.parametrize("index", range(4), ids=["means", "covars", "opacities", "sh"])
+def test_gradient_of_the_error_of_a_render(index):
+    """Against central differences of fourth order, in float64, of a smooth render."""
+    scene = random_scene(2, 30, 2, 26, 21, 4, scale=0.05)
+    observed = random_pixels(2, 2, 21, 26)
+    direction = normal(*scene[index].shape, seed=3) * (1e-3 if index == 1 else 1.0)
+
+    def loss(step):
+        inputs = list(scene)
+        inputs[index] = (scene[index] + step * direction).requires_grad_()
+        smooth = dict(alpha_min=0.0, alpha_max=2.0, transmittance_min=0.0)
+        losses = rasterized_error(*inputs, 26, 21, observed, **smooth)
+        return (losses * torch.tensor([0.3, 2.0])).sum(), inputs[index]
+
+    value, leaf = loss(0.0)
+    exact = (torch.autograd.grad(value, leaf)[0] * direction).sum()
+    h = 1e-5
+    difference = (8 * (loss(h)[0] - loss(-h)[0]) - (loss(2 * h)[0] - loss(-2 * h)[0])) / (12 * h)
+    assert abs(exact - difference) < 1e-6 * abs(exact) + 1e-8
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_render_of_another_size_is_not_compared(device):
+    scene = [tensor.float().to(device) for tensor in random_scene(2, 5, 1, 8, 8, 1)]
+    for shape in ((1, 1, 8, 8), (2, 2, 8, 8), (2, 1, 8, 9)):
+        with pytest.raises(InputError, match="do not fit"):
+            rasterized_error(*scene, 8, 8, random_pixels(*shape).to(device))
+
+
+def test_error_of_an_exposure_is_that_of_its_mean():
+    """Renders are averaged before they are compared, and masks are compared as masks."""
+    body, x, F = moving_ball(torch.float64, "cpu", frames=3)
+    video = Observation((0,), random_pixels(1, 1, 32, 32), camera(), exposure=(0, 1, 2))
+    renderer = body.particle_gs(camera())
+    filmed = Filmed(renderer, video, (0, 1, 2))
+    states = filmed.states(x), filmed.states(F)
+    expected = mean_squared_error(renderer(x, F).mean(0)[None], video.images)
+    assert_near(filmed.error(*states, video.stored()), expected, torch.float64)
+    at_once = Filmed(renderer, Observation((0,), video.images, camera()), (0,))
+    assert torch.equal(
+        at_once.error(x[:1], F[:1], video.stored()), mean_squared_error(renderer(x[:1], F[:1]), video.images)
+    )
+    masks = Filmed(renderer, video, (0, 1, 2), "masks")
+    expected = mean_squared_error(renderer.coverage(x, F).mean(0)[None], video.coverage())
+    assert_near(masks.error(*states, video.coverage()), expected, torch.float64)
 
 
 # ---- deformation

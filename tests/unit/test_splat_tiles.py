@@ -11,7 +11,8 @@ from render_scenes import random_scene
 from neuma_lib.errors import InputError
 from neuma_lib.splatting import compositor_cuda, projection, rasterizer, torch_reference
 from neuma_lib.splatting.compositing import Settings
-from neuma_lib.splatting.rasterizer import RenderBuffers, Statistics, rasterize
+from neuma_lib.splatting.image_loss import mean_squared_error
+from neuma_lib.splatting.rasterizer import RenderBuffers, Statistics, rasterize, rasterized_error
 
 CUDA = pytest.param(
     "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -140,6 +141,95 @@ def test_statistics(render):
     assert torch.equal(of_tiles.views.cpu(), of_rows.views)
     difference = of_tiles.screen_gradients.cpu().double() - of_rows.screen_gradients
     assert difference.norm() < 1e-3 * of_rows.screen_gradients.norm()
+
+
+def frame_errors(function, device, scene, observed, width, height, **options):
+    """Losses (T,) of a render and gradients of all inputs, of frames with weights of their own."""
+    inputs = [tensor.float().to(device) for tensor in scene]
+    leaves = [tensor.requires_grad_() for tensor in inputs[:4]]
+    losses = function(*inputs, width, height, observed.to(device), background=BACKGROUND, **options)
+    weights = torch.linspace(0.2, 3.0, len(losses)).to(device)
+    grads = torch.autograd.grad((weights * losses).sum(), leaves)
+    return [value.detach().to("cpu", torch.float64) for value in (losses, *grads)]
+
+
+def error_of_images(*arguments, **options):
+    *scene, observed = arguments
+    return mean_squared_error(rasterize(*scene, **options)[0], observed)
+
+
+def aside(scene):
+    """The first frame out of sight."""
+    scene[0][0] += 100.0
+    return scene
+
+
+COMPARED = SCENES | {
+    "several frames and views": (lambda: random_scene(3, 150, 2, 53, 41, 4, scale=0.02), 53, 41, {}),
+    "a frame without splats": (lambda: aside(random_scene(2, 50, 2, 37, 29, 4, scale=0.03)), 37, 29, {}),
+    "empty tiles": (lambda: random_scene(2, 3, 1, 150, 90, 1, scale=0.01), 150, 90, {}),
+    "no splats at all": (lambda: aside(random_scene(1, 5, 2, 37, 29, 1)), 37, 29, {}),
+}
+
+
+@pytest.mark.parametrize("device", [EMULATED, CUDA])
+@pytest.mark.parametrize("name", COMPARED)
+def test_an_error_taken_while_drawing_is_that_of_the_images(name, device, monkeypatch, build_folder):
+    """Images, their loss and its gradient one after the other are the twin; only the order of sums differs."""
+    make, width, height, options = COMPARED[name]
+    scene = make()
+    if device == "emulated":
+        monkeypatch.setitem(rasterizer.COMPOSITORS, "rows", EmulatedTiles(build_folder))
+        device = "cpu"
+    shape = (len(scene[0]), len(scene[4]), height, width, 4)
+    observed = torch.randint(0, 256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(2))
+    setting = (device, scene, observed, width, height)
+    expected = frame_errors(error_of_images, *setting, **options)
+    drawn = []
+    with monkeypatch.context() as patch:
+        patch.setattr(rasterizer, "mean_squared_error", lambda *_: pytest.fail("images were compared"))
+        for _ in range(2):
+            drawn.append(frame_errors(rasterized_error, *setting, **options))
+    assert torch.equal(drawn[0][0], drawn[1][0]), "sums have a fixed order"
+    # covariances of needles are badly conditioned: the twin's own gradients are 1e-4 away from those in float64
+    bound = 1e-3 if name == "needles" else 5e-6
+    for found, twin in zip(drawn[0], expected, strict=True):
+        assert (found - twin).norm() <= bound * twin.norm()
+    assert all(bool(grad.abs().max() > 0) == (name != "no splats at all") for grad in drawn[0][1:3])
+
+
+@pytest.mark.parametrize("device", [EMULATED, CUDA])
+@pytest.mark.parametrize("wanted", [[0], [1], [0, 1], [0, 1, 3], [2], [3]])
+def test_gradients_that_nobody_wants_change_no_other(wanted, device, monkeypatch, build_folder):
+    """Without those of opacities other code runs."""
+    if device == "emulated":
+        monkeypatch.setitem(rasterizer.COMPOSITORS, "rows", EmulatedTiles(build_folder))
+        device = "cpu"
+    scene = [tensor.float().to(device) for tensor in random_scene(2, 80, 2, 37, 29, 4, scale=0.04)]
+    observed = torch.full((2, 2, 29, 37, 4), 99, dtype=torch.uint8, device=device)
+    found = []
+    for leaves in (range(4), wanted):
+        inputs = [tensor.clone().requires_grad_(i in leaves) for i, tensor in enumerate(scene[:4])]
+        losses = rasterized_error(*inputs, *scene[4:], 37, 29, observed)
+        losses.sum().backward()
+        found.append([tensor.grad for tensor in inputs])
+    for i, (all_wanted, some_wanted) in enumerate(zip(*found, strict=True)):
+        if i not in wanted:
+            assert some_wanted is None
+        else:
+            assert (some_wanted - all_wanted).norm() <= 5e-6 * all_wanted.norm()
+
+
+@pytest.mark.parametrize("tile, lane_pixels", [(8, 1), (16, 4), (32, 2)])
+@pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler")
+def test_errors_of_other_tile_sizes(tile, lane_pixels, monkeypatch, build_folder):
+    scene = random_scene(2, 60, 1, 37, 29, 1, scale=0.04)
+    observed = torch.full((2, 1, 29, 37, 4), 77, dtype=torch.uint8)
+    setting = ("cpu", scene, observed, 37, 29)
+    expected = frame_errors(error_of_images, *setting)
+    monkeypatch.setitem(rasterizer.COMPOSITORS, "rows", EmulatedTiles(build_folder, tile, lane_pixels))
+    for found, twin in zip(frame_errors(rasterized_error, *setting), expected, strict=True):
+        assert (found - twin).norm() <= 1e-4 * twin.norm()
 
 
 def project(scene, width, height, alpha_min=1 / 255, eps2d=0.3):

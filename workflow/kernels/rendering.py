@@ -6,8 +6,8 @@ import torch
 
 from neuma_lib.coupling.binding import Binding
 from neuma_lib.coupling.deformation import deform
-from neuma_lib.fitting.image_loss import mean_squared_error
-from neuma_lib.splatting.rasterizer import rasterize
+from neuma_lib.splatting.image_loss import mean_squared_error
+from neuma_lib.splatting.rasterizer import rasterize, rasterized_error
 
 SIZE = 16  # width and height of the image [px]
 INTRINSICS = [[16.0, 0.0, 8.0], [0.0, 16.0, 8.0], [0.0, 0.0, 1.0]]
@@ -23,6 +23,7 @@ def compile_kernels(device: torch.device) -> None:
         means, covars = deform(x0, 0.05**2 * eye, Binding.identity(4, x0), x0, x, F)
         opacities, sh = torch.full((4,), 0.5, **kind), torch.zeros(4, 4, 3, **kind, requires_grad=True)
         camera = torch.eye(4, **kind)[None], torch.tensor([INTRINSICS], **kind)
-        images, _ = rasterize(means, covars, opacities, sh, *camera, SIZE, SIZE)
+        scene = (means, covars, opacities, sh, *camera, SIZE, SIZE)
         observed = torch.zeros(1, 1, SIZE, SIZE, 4, dtype=torch.uint8, device=device)
-        mean_squared_error(images, observed).sum().backward()
+        compared = mean_squared_error(rasterize(*scene)[0], observed)
+        (compared + rasterized_error(*scene, observed)).sum().backward()

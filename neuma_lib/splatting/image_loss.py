@@ -1,7 +1,8 @@
 """Mean squared colour difference between rendered images and decoded files, without copies of either.
 
 The observed pixels stay as they were decoded, four bytes each; the kernels composite them over white on the way. One
-pass reads both images for the loss, one reads them again and writes the gradient.
+pass reads both images for the loss, one reads them again and writes the gradient. (``rasterizer.rasterized_error``
+does without rendered images where the compositor can.)
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -32,16 +33,29 @@ def mean_squared_error(images: Tensor, observed: Tensor) -> Tensor:
             so can be other channels, then of both.
 
     Raises:
-        InputError: shapes that do not fit.
+        InputError: shapes that do not fit, or another device.
     """
-    bytes_ = observed.dtype == torch.uint8
-    if observed.shape != ((*images.shape[:-1], 4) if bytes_ else images.shape):
-        raise InputError(
-            f"image loss: rendered images {tuple(images.shape)} do not fit observed ones {tuple(observed.shape)}"
-        )
-    if not bytes_:
+    check_fits(images.shape, images.device, observed)
+    if observed.dtype != torch.uint8:
         return (images - observed).square().flatten(1).mean(1)
     return _SquaredError.apply(images, observed)
+
+
+def check_fits(shape: tuple[int, ...], device: torch.device, observed: Tensor) -> None:
+    """Raise InputError unless images rendered on a device, (T, V, H, W, C), can be compared with observed ones."""
+    if observed.device != device:
+        raise InputError(
+            f"image loss: images are rendered on {device}, observed ones are on {observed.device}"
+        )
+    if observed.shape != ((*shape[:-1], 4) if observed.dtype == torch.uint8 else shape):
+        raise InputError(
+            f"image loss: rendered images {tuple(shape)} do not fit observed ones {tuple(observed.shape)}"
+        )
+
+
+def as_integers(observed: Tensor) -> Tensor:
+    """Straight-alpha bytes (..., 4) as an int32 a pixel (...), R its lowest byte."""
+    return observed.contiguous().view(torch.int32)[..., 0]
 
 
 class _SquaredError(torch.autograd.Function):
@@ -71,7 +85,7 @@ class _SquaredError(torch.autograd.Function):
 
 def _pair(images: Tensor, observed: Tensor) -> tuple[Tensor, Tensor]:
     """Colours (T, P, 3), and pixels (T, P) as one integer each."""
-    return images.view(len(images), -1, 3), observed.view(torch.int32).view(len(observed), -1)
+    return images.view(len(images), -1, 3), as_integers(observed).view(len(observed), -1)
 
 
 @functools.cache
