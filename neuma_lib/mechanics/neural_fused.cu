@@ -52,9 +52,11 @@
     auto at64 = [](int row, int chunk) { return row * ROW64 + ((chunk ^ (row & 7)) << 4); };
     auto at16 = [](int row, int chunk) { return row * ROW16 + ((chunk ^ ((row >> 2) & 1)) << 4); };
 
+    // Where HALF there are no low parts: they are neither computed nor stored, loaded or multiplied.
     auto split = [&](float x0, float x1, unsigned& high, unsigned& low) {
         float y0, y1;
         high = pack(x0, x1);
+        if (HALF) return;
         unpack(high, y0, y1);
         low = pack(x0 - y0, x1 - y1);
     };
@@ -72,14 +74,16 @@
     // c[m][n + q] += a[m] b[q], the small terms first
     auto multiply = [&](auto& c, int n, const auto& high, const auto& low, const auto& b) {
         const int M = sizeof(c) / sizeof(c[0]), Q = sizeof(b) / sizeof(b[0]);
-        #pragma unroll
-        for (int q = 0; q < Q; ++q)
+        if (!HALF) {
             #pragma unroll
-            for (int m = 0; m < M; ++m) mma(c[m][n + q], low[m], b[q]);
-        #pragma unroll
-        for (int q = 0; q < Q; ++q)
+            for (int q = 0; q < Q; ++q)
+                #pragma unroll
+                for (int m = 0; m < M; ++m) mma(c[m][n + q], low[m], b[q]);
             #pragma unroll
-            for (int m = 0; m < M; ++m) mma(c[m][n + q], high[m], b[q] + 2);
+            for (int q = 0; q < Q; ++q)
+                #pragma unroll
+                for (int m = 0; m < M; ++m) mma(c[m][n + q], high[m], b[q] + 2);
+        }
         #pragma unroll
         for (int q = 0; q < Q; ++q)
             #pragma unroll
@@ -101,7 +105,7 @@
         for (int m = 0; m < 2; ++m) {
             const int place = matrix + at16(32 * warp + 16 * m + (lane & 15), lane >> 4);
             matrices(high[m], place);
-            matrices(low[m], place + LOW16);
+            if (!HALF) matrices(low[m], place + LOW16);
         }
     };
     auto store16 = [&](int matrix, const float* x, float up) {
@@ -115,7 +119,7 @@
             }
             char* place = pool + matrix + at16(thread, chunk);
             *(uint4*)place = make_uint4(high[0], high[1], high[2], high[3]);
-            *(uint4*)(place + LOW16) = make_uint4(low[0], low[1], low[2], low[3]);
+            if (!HALF) *(uint4*)(place + LOW16) = make_uint4(low[0], low[1], low[2], low[3]);
         }
     };
     // Columns 16 j to 16 j + 15 of this warp's rows of a matrix with 64 columns
@@ -127,25 +131,39 @@
                 const int row = 32 * warp + 16 * m + g + 8 * (k & 1);
                 char* place = pool + matrix + at64(row, 2 * j + (k >> 1)) + 4 * t;
                 *(unsigned*)place = high[m][k];
-                *(unsigned*)(place + LOW64) = low[m][k];
+                if (!HALF) *(unsigned*)(place + LOW64) = low[m][k];
             }
     };
-    // Right operands: four tiles of 8 columns from tile n, rows 16 k to 16 k + 15; of W^T and of W
-    auto weights_T = [&](int matrix, int part, int k, int n, auto& b) {
-        #pragma unroll
-        for (int q = 0; q < (int)(sizeof(b) / sizeof(b[0])); ++q)
-            matrices(b[q], matrix + (lane >> 4) * part + at64(8 * (n + q) + (lane & 7), 2 * k + ((lane >> 3) & 1)));
+    // Right operands, an even number of tiles: place(q, part) is where this lane's chunk of the high (part 0) or low part
+    // of tile q lies. One load brings both parts of a tile, or the high parts of two.
+    auto right = [&](auto load, auto& b, auto place) {
+        const int Q = sizeof(b) / sizeof(b[0]);
+        if (HALF)
+            #pragma unroll
+            for (int q = 0; q < Q; q += 2) {
+                unsigned both[4];
+                load(both, place(q + (lane >> 4), 0));
+                #pragma unroll
+                for (int k = 0; k < 4; ++k) b[q + (k >> 1)][k & 1] = both[k];
+            }
+        else
+            #pragma unroll
+            for (int q = 0; q < Q; ++q) load(b[q], place(q, lane >> 4));
     };
-    auto weights = [&](int matrix, int part, int k, int n, auto& b) {
-        #pragma unroll
-        for (int q = 0; q < (int)(sizeof(b) / sizeof(b[0])); ++q)
-            transposed(b[q], matrix + (lane >> 4) * part + at64(16 * k + (lane & 15), n + q));
+    // Tiles of 8 columns from tile n, rows 16 k to 16 k + 15; of W^T and of W
+    auto weights_T = [&](int matrix, int low, int k, int n, auto& b) {
+        right(matrices, b, [&](int q, int part) {
+            return matrix + part * low + at64(8 * (n + q) + (lane & 7), 2 * k + ((lane >> 3) & 1));
+        });
+    };
+    auto weights = [&](int matrix, int low, int k, int n, auto& b) {
+        right(transposed, b, [&](int q, int part) { return matrix + part * low + at64(16 * k + (lane & 15), n + q); });
     };
     auto layer0 = [&](const auto& high, const auto& low, int n, auto& c, int to) {
         unsigned b[sizeof(c[0]) / sizeof(c[0][0]) < 4 ? 2 : 4][4];
-        #pragma unroll
-        for (int q = 0; q < (int)(sizeof(b) / sizeof(b[0])); ++q)
-            matrices(b[q], W0_AT + (lane >> 4) * W0_LOW + at16(8 * (n + q) + (lane & 7), (lane >> 3) & 1));
+        right(matrices, b, [&](int q, int part) {
+            return W0_AT + part * W0_LOW + at16(8 * (n + q) + (lane & 7), (lane >> 3) & 1);
+        });
         multiply(c, to, high, low, b);
     };
     // Standard normal distribution function: 2^q(|x|) is its tail, to 5e-8
@@ -295,7 +313,7 @@
                 split(x, 0.0f, high, low);
                 char* place = pool + W0_AT + at16(o, i >> 3) + 2 * (i & 7);
                 *(unsigned short*)place = (unsigned short)high;
-                *(unsigned short*)(place + W0_LOW) = (unsigned short)low;
+                if (!HALF) *(unsigned short*)(place + W0_LOW) = (unsigned short)low;
             };
             #pragma unroll
             for (int k = 0; k < W0_LOADS; ++k) {
@@ -309,7 +327,7 @@
                 split(x0, x1, high, low);
                 char* place = pool + matrix + at64(pair >> 5, (pair & 31) >> 2) + 4 * (pair & 3);
                 *(unsigned*)place = high;
-                *(unsigned*)(place + part) = low;
+                if (!HALF) *(unsigned*)(place + part) = low;
             };
             #pragma unroll
             for (int k = 0; k < W1_LOADS; ++k) put_pair(W1_AT, W1_LOW, thread + ROWS * k, w1[2 * k] * up1, w1[2 * k + 1] * up1);
@@ -494,12 +512,12 @@
                     const int place = gradient(
                         32 * w + 16 * k + (lane & 7) + ((lane >> 4) << 3), (lane >> 3) & 1);
                     transposed(a[0], place);
-                    transposed(a_low[0], place + low_g);
+                    if (!HALF) transposed(a_low[0], place + low_g);
                     #pragma unroll
                     for (int n8 = 0; n8 < N; n8 += Q) {
-                        #pragma unroll
-                        for (int q = 0; q < Q; ++q)
-                            transposed(b[q], input(32 * w + 16 * k + (lane & 15), n8 + q, lane >> 4));
+                        right(transposed, b, [&](int q, int part) {
+                            return input(32 * w + 16 * k + (lane & 15), n8 + q, part);
+                        });
                         multiply(c, n8, a, a_low, b);
                     }
                 }
@@ -624,9 +642,9 @@
                 unsigned b[2][4];
                 fragments(x, j, up, high, low);
                 stage(S1_AT, j, high, low);
-                #pragma unroll
-                for (int q = 0; q < 2; ++q)
-                    transposed(b[q], W0_AT + (lane >> 4) * W0_LOW + at16(16 * j + (lane & 15), q));
+                right(transposed, b, [&](int q, int part) {
+                    return W0_AT + part * W0_LOW + at16(16 * j + (lane & 15), q);
+                });
                 multiply(gz, 0, high, low, b);
             }
             put_rows(rows, gz, FEATURES, down * down0);

@@ -10,7 +10,9 @@ order in which the next layer wants its operand, so activations stay in register
 
 **Precision.** Each factor is scaled by a power of two (one a weight matrix, one an activation of a warp) and split
 into two halves of 11 bits, x = hi + lo; lo hi + hi lo + hi hi, accumulated in float32, keeps 22 bits. That costs half
-of the same split in TF32, and the scale replaces the exponent bits that float16 lacks.
+of the same split in TF32, and the scale replaces the exponent bits that float16 lacks. The backward pass can do with
+hi hi alone (precision "half"): a third of the products, and gradients to 11 bits. What it computes of the forward pass
+again, the network at F, is rounded likewise; sums, singular values and rotations stay in float32.
 
 **Weight gradients** are products over rows, G^T H. The warps of a block put G and H, already split, in shared memory
 and each takes a slice of the result; blocks write their sums apart, and a second kernel adds them in a fixed order.
@@ -92,12 +94,17 @@ def _constants(values: dict[str, int]) -> str:
     return "".join(f"    const int {name} = {value};\n" for name, value in values.items())
 
 
-def source(kind: str, backward: bool, machine: str | None = None) -> str:
-    """C++ text of the body of a kernel for ``kind`` "elasticity" or "plasticity"; ``machine``: see the ``.cu`` file."""
+def source(kind: str, backward: bool, machine: str | None = None, precision: str = "single") -> str:
+    """C++ text of the body of a kernel for ``kind`` "elasticity" or "plasticity".
+
+    ``machine``: see the ``.cu`` file; ``precision``: of the products, "single" or "half".
+    """
     parts = native_source(__file__)
     floor = torch.finfo(torch.float32).eps ** 0.5
     constants = _constants(CONSTANTS)
-    constants += f"    const bool ELASTIC = {str(kind == 'elasticity').lower()};\n    const float FLOOR = {floor!r}f;\n"
+    for name, value in {"ELASTIC": kind == "elasticity", "HALF": precision == "half"}.items():
+        constants += f"    const bool {name} = {str(value).lower()};\n"
+    constants += f"    const float FLOOR = {floor!r}f;\n"
     prefetch = "prefetch((const float*)grad_out + 9 * (size_t)row);" if backward else ""
     features = parts["features"].replace("{GRAM}", GRAM).replace("{SVD}", SVD).replace("{PREFETCH}", prefetch)
     rest = ("put_down", "layers", "vjp") if backward else ("layers", "evaluate")
@@ -129,10 +136,10 @@ def evaluate_kernel(kind: str):
 
 
 @cache
-def vjp_kernel(kind: str):
+def vjp_kernel(kind: str, precision: str = "single"):
     """Kernel (F, W0, W1, W2, grad_out, factor, n, grad_F, partials (blocks, WEIGHTS)) over blocks as above."""
 
-    @wp.func_native(source(kind, backward=True))
+    @wp.func_native(source(kind, backward=True, precision=precision))
     def vjp_rows(
         F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, grad_out: wp.uint64, factor: float, n: int,
         grad_F: wp.uint64, partials: wp.uint64, shared: wp.tile(dtype=wp.uint8, shape=(VJP_BYTES,)),
@@ -223,8 +230,12 @@ def vjp(
     factor: float,
     grad_F: Tensor | None = None,
     grad_weights: Weights | None = None,
+    precision: str = "single",
 ) -> tuple[Tensor, Weights]:
-    """Gradients of F and, added to ``grad_weights``, of the weights. See :class:`Constitutive`."""
+    """Gradients of F and, added to ``grad_weights``, of the weights. See :class:`Constitutive`.
+
+    ``precision`` is that of the products, see :attr:`Constitutive.adjoint_precision`.
+    """
     F, grad_out = F.detach().contiguous(), grad_out.contiguous()
     result = grad_F if grad_F is not None and grad_F.is_contiguous() else torch.empty_like(F)
     W = _packed(weights)
@@ -232,7 +243,8 @@ def vjp(
     if len(F):
         blocks = _blocks(len(F), F.device)
         partials = F.new_empty(blocks, WEIGHTS)
-        _launch(vjp_kernel(kind), blocks, ROWS, F.device, F, *W, grad_out, factor, len(F), result, partials)
+        kernel = vjp_kernel(kind, precision)
+        _launch(kernel, blocks, ROWS, F.device, F, *W, grad_out, factor, len(F), result, partials)
         sums = [total if total.is_contiguous() else total.contiguous() for total in totals]
         _launch(add_kernel(), WEIGHTS // 32, 1024, F.device, partials, blocks, *sums)
         for total, summed in zip(totals, sums, strict=True):

@@ -125,17 +125,23 @@ class EmulatedLaws:
         backward = f"{arrays}, Array<float> grad_out_, float factor, int n, Array<float> grad_F_"
         backward += ", Array<float> partials_"
 
-        def body(kind, is_backward, parameters):
-            return _addresses(parameters) + neural_fused.source(kind, is_backward, "EMULATED_MACHINE\n")
+        def body(kind, is_backward, parameters, precision):
+            text = neural_fused.source(kind, is_backward, "EMULATED_MACHINE\n", precision)
+            return _addresses(parameters) + text
 
+        passes = {
+            "evaluate": (False, forward, "single"),
+            "vjp_single": (True, backward, "single"),
+            "vjp_half": (True, backward, "half"),
+        }
         bodies = [
-            (f"{name}_{kind}", parameters, body(kind, name == "vjp", parameters))
+            (f"{name}_{kind}", parameters, body(kind, is_backward, parameters, precision))
             for kind in ("elasticity", "plasticity")
-            for name, parameters in (("evaluate", forward), ("vjp", backward))
+            for name, (is_backward, parameters, precision) in passes.items()
         ]
         self.library = _library(folder, "laws", tuple(bodies))
 
-    def __call__(self, part, F, g, blocks: int) -> list[torch.Tensor]:
+    def __call__(self, part, F, g, blocks: int, precision: str = "single") -> list[torch.Tensor]:
         """Result, gradient of F (n, 3, 3) and gradients of the weights, in float64; computed in float32."""
         F, g, *weights = (x.detach().float().contiguous() for x in (F, g, *part.weights()))
         result, grad_F = torch.empty_like(F), torch.empty_like(F)
@@ -146,7 +152,7 @@ class EmulatedLaws:
         )
         calls = (
             ("evaluate", (*common, float(part.scale), len(F), result)),
-            ("vjp", (*common, g, float(part.scale), len(F), grad_F, partials)),
+            (f"vjp_{precision}", (*common, g, float(part.scale), len(F), grad_F, partials)),
         )
         for size, (name, arguments) in zip(sizes, calls, strict=True):
             function = getattr(self.library, f"{name}_{part.kind}")

@@ -69,6 +69,36 @@ def test_emulated_kernels_are_as_near_to_float64_as_the_float32_twin(emulated, k
         assert distance(fast, exact) < 5 * distance(slow, exact) + 1e-7
 
 
+HALF_ERROR = 3e-3
+"""Of the adjoint in half precision, by norm: factors of 11 bits are off by 5e-4 at most, a few products in a row."""
+
+
+def check_half(half, single):
+    """(gradient of F, gradients of the weights) at g and at multiples of g."""
+    for size in (1.0, 1e-12, 1e6):
+        for rough, fine in zip(half(size), single(size), strict=True):
+            assert rough.isfinite().all() and 0 < distance(rough, fine) < HALF_ERROR
+    assert all(torch.equal(x, torch.zeros_like(x)) for x in half(0.0))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("regime", REGIMES)
+def test_emulated_half_adjoint_is_near_the_single_one(emulated, kind, regime):
+    part, F, g = law_part(kind), deformations(regime, 133), probe(133)
+
+    def gradients(precision):
+        return lambda size: emulated(part, F, size * g, 2, precision)[1:]
+
+    check_half(gradients("half"), gradients("single"))
+
+
+def test_small_gradients_beside_large_ones_survive_half_precision(emulated):
+    part, F, g = law_part("elasticity"), deformations("large strain", 64), probe(64)
+    g[:16] *= 1e-6
+    rough, fine = (emulated(part, F, g, 1, precision)[1][:16] for precision in ("half", "single"))
+    assert distance(rough, fine) < 3 * HALF_ERROR
+
+
 def test_a_cpu_and_float64_go_to_the_twin():
     part = law_part("elasticity")
     assert part.fused is None and not part.uses_fused(torch.zeros(1, 3, 3))
@@ -101,6 +131,28 @@ def test_fused_is_as_near_to_float64_as_the_float32_twin(kind, regime, n):
     truth, plain = (twin(part, F.cuda(), g.cuda(), dtype) for dtype in (torch.float64, torch.float32))
     for exact, slow, fast in zip(truth, plain, found, strict=True):
         assert distance(fast, exact) < 5 * distance(slow, exact) + 1e-7
+
+
+@CUDA
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("regime", REGIMES)
+@pytest.mark.parametrize("n", [31, 30_000])
+def test_half_adjoint_is_near_the_single_one(kind, regime, n):
+    part, F, g = law_part(kind), deformations(regime, n), probe(n)
+    F, weights, g = on_gpu(part, F, g)
+    before = part.evaluate(F, weights)
+
+    def gradients(precision):
+        def at(size):
+            part.adjoint_precision = precision
+            grad_F, grad_weights = part.vjp(F, weights, size * g)
+            return [x.double() for x in (grad_F, *grad_weights)]
+
+        return at
+
+    check_half(gradients("half"), gradients("single"))
+    part.adjoint_precision = "half"
+    assert torch.equal(part.evaluate(F, weights), before)
 
 
 @CUDA
