@@ -48,6 +48,9 @@
     #define LANE(x, l) (x)
     #define SQRT(x) sqrtf(x)
     const int g = lane >> 2, t = lane & 3;
+    // This thread's row among those of the warp and of the block. Where a warp has 16 rows, both of its halves do the work
+    // of a row, and write the same.
+    const int warp_rows = 16 * TILES, warp_row = lane & (warp_rows - 1), block_row = warp_rows * warp + warp_row;
     // Place [bytes] of a chunk of eight halves in a matrix with 64 or 16 columns; the order of chunks depends on the row
     auto at64 = [](int row, int chunk) { return row * ROW64 + ((chunk ^ (row & 7)) << 4); };
     auto at16 = [](int row, int chunk) { return row * ROW16 + ((chunk ^ ((row >> 2) & 1)) << 4); };
@@ -92,7 +95,7 @@
     // Left operand of columns 16 j to 16 j + 15 from accumulators x
     auto fragments = [&](const auto& x, int j, float up, auto& high, auto& low) {
         #pragma unroll
-        for (int m = 0; m < 2; ++m)
+        for (int m = 0; m < TILES; ++m)
             #pragma unroll
             for (int k = 0; k < 4; ++k) {
                 const float* c = x[m][2 * j + (k >> 1)] + 2 * (k & 1);
@@ -102,8 +105,8 @@
     // Rows of this warp of a matrix with 16 columns, as left operand
     auto load16 = [&](int matrix, auto& high, auto& low) {
         #pragma unroll
-        for (int m = 0; m < 2; ++m) {
-            const int place = matrix + at16(32 * warp + 16 * m + (lane & 15), lane >> 4);
+        for (int m = 0; m < TILES; ++m) {
+            const int place = matrix + at16(warp_rows * warp + 16 * m + (lane & 15), lane >> 4);
             matrices(high[m], place);
             if (!HALF) matrices(low[m], place + LOW16);
         }
@@ -117,7 +120,7 @@
                 const float* pair = x + 8 * chunk + 2 * k;
                 split(pair[0] * up, pair[1] * up, high[k], low[k]);
             }
-            char* place = pool + matrix + at16(thread, chunk);
+            char* place = pool + matrix + at16(block_row, chunk);
             *(uint4*)place = make_uint4(high[0], high[1], high[2], high[3]);
             if (!HALF) *(uint4*)(place + LOW16) = make_uint4(low[0], low[1], low[2], low[3]);
         }
@@ -125,10 +128,10 @@
     // Columns 16 j to 16 j + 15 of this warp's rows of a matrix with 64 columns
     auto stage = [&](int matrix, int j, const auto& high, const auto& low) {
         #pragma unroll
-        for (int m = 0; m < 2; ++m)
+        for (int m = 0; m < TILES; ++m)
             #pragma unroll
             for (int k = 0; k < 4; ++k) {
-                const int row = 32 * warp + 16 * m + g + 8 * (k & 1);
+                const int row = warp_rows * warp + 16 * m + g + 8 * (k & 1);
                 char* place = pool + matrix + at64(row, 2 * j + (k >> 1)) + 4 * t;
                 *(unsigned*)place = high[m][k];
                 if (!HALF) *(unsigned*)(place + LOW64) = low[m][k];
@@ -197,7 +200,7 @@
     };
     auto put_rows = [&](float* rows, const auto& c, int columns, float factor) {
         #pragma unroll
-        for (int m = 0; m < 2; ++m)
+        for (int m = 0; m < TILES; ++m)
             #pragma unroll
             for (int n = 0; n < 2; ++n)
                 #pragma unroll
@@ -229,8 +232,8 @@
         __syncthreads();
         const bool first = tile == (int)blockIdx.x;
         // rows past the end repeat the last one, and have no gradient and no result
-        const bool used = tile * ROWS + thread < n;
-        const int row = used ? tile * ROWS + thread : n - 1;
+        const bool used = tile * ROWS + block_row < n;
+        const int row = used ? tile * ROWS + block_row : n - 1;
         float f[9], R[9], V[9], z[16], sums[3];
         #pragma unroll
         for (int k = 0; k < 9; ++k) f[k] = ((const float*)F)[9 * (size_t)row + k];
@@ -239,18 +242,18 @@
         if (first) {
             #pragma unroll
             for (int k = 0; k < W0_LOADS; ++k) {
-                const int i = thread + ROWS * k;
+                const int i = thread + THREADS * k;
                 w0[k] = i < W1_START ? ((const float*)W0)[i] : 0.0f;
             }
             #pragma unroll
             for (int k = 0; k < W1_LOADS; ++k) {
-                const float2 pair = ((const float2*)W1)[thread + ROWS * k];
+                const float2 pair = ((const float2*)W1)[thread + THREADS * k];
                 w1[2 * k] = pair.x;
                 w1[2 * k + 1] = pair.y;
             }
             #pragma unroll
             for (int k = 0; k < W2_LOADS; ++k) {
-                const int i = thread + ROWS * k;
+                const int i = thread + THREADS * k;
                 const float2 pair = 2 * i < WEIGHTS - W2_START ? ((const float2*)W2)[i] : make_float2(0.0f, 0.0f);
                 w2[2 * k] = pair.x;
                 w2[2 * k + 1] = pair.y;
@@ -297,17 +300,20 @@
                            peak2 = warp_max(__float_as_uint(size2));
             if (lane == 0) {
                 peaks[warp] = peak0;
-                peaks[4 + warp] = peak1;
-                peaks[8 + warp] = peak2;
+                peaks[WARPS + warp] = peak1;
+                peaks[2 * WARPS + warp] = peak2;
             }
             __syncthreads();
             auto peak = [&](int k) {
-                return max(max(peaks[k], peaks[k + 1]), max(peaks[k + 2], peaks[k + 3]));
+                unsigned sofar = 0;
+                #pragma unroll
+                for (int w = 0; w < WARPS; ++w) sofar = max(sofar, peaks[WARPS * k + w]);
+                return sofar;
             };
             float up0, up1, up2;
             scales(peak(0), up0, down0);
-            scales(peak(4), up1, down1);
-            scales(peak(8), up2, down2);
+            scales(peak(1), up1, down1);
+            scales(peak(2), up2, down2);
             auto put_half = [&](int o, int i, float x) {
                 unsigned high, low;
                 split(x, 0.0f, high, low);
@@ -317,7 +323,7 @@
             };
             #pragma unroll
             for (int k = 0; k < W0_LOADS; ++k) {
-                const int i = thread + ROWS * k;
+                const int i = thread + THREADS * k;
                 if (i < W1_START) put_half(i / FEATURES, i % FEATURES, w0[k] * up0);
             }
             if (thread < HIDDEN)
@@ -330,17 +336,17 @@
                 if (!HALF) *(unsigned*)(place + part) = low;
             };
             #pragma unroll
-            for (int k = 0; k < W1_LOADS; ++k) put_pair(W1_AT, W1_LOW, thread + ROWS * k, w1[2 * k] * up1, w1[2 * k + 1] * up1);
+            for (int k = 0; k < W1_LOADS; ++k) put_pair(W1_AT, W1_LOW, thread + THREADS * k, w1[2 * k] * up1, w1[2 * k + 1] * up1);
             #pragma unroll
-            for (int k = 0; k < W2_LOADS; ++k) put_pair(W2_AT, W2_LOW, thread + ROWS * k, w2[2 * k] * up2, w2[2 * k + 1] * up2);
+            for (int k = 0; k < W2_LOADS; ++k) put_pair(W2_AT, W2_LOW, thread + THREADS * k, w2[2 * k] * up2, w2[2 * k + 1] * up2);
             __syncthreads();
         }
         __syncwarp();
 
 // Both kernels: the first two products, with h0 in x and what the second layer is before its gelu, unscaled, in y.
 //// layers
-        unsigned high[2][4], low[2][4];
-        float x[2][8][4], y[2][8][4], up_h0, down_h0, down;
+        unsigned high[TILES][4], low[TILES][4];
+        float x[TILES][8][4], y[TILES][8][4], up_h0, down_h0, down;
         clear(x);
         load16(Z_AT, high, low);
         layer0(high, low, 0, x, 0);
@@ -373,7 +379,7 @@
 //// evaluate
         size = activate(y, down_h0 * down1);
         warp_scales(size, up, down);
-        float Y[2][2][4];
+        float Y[TILES][2][4];
         clear(Y);
         #pragma unroll
         for (int j = 0; j < 4; ++j) {
@@ -382,28 +388,28 @@
             weights_T(W2_AT, W2_LOW, j, 0, b);
             multiply(Y, 0, high, low, b);
         }
-        float* rows = (float*)(pool + ROW_AT + 4 * 32 * ROW_STRIDE * warp);
+        float* rows = (float*)(pool + ROW_AT + 4 * warp_rows * ROW_STRIDE * warp);
         put_rows(rows, Y, OUTPUTS, down * down2);
         __syncwarp();
         float X[9], P[9], result[9];
-        output_of_row(rows + ROW_STRIDE * lane, X);
+        output_of_row(rows + ROW_STRIDE * warp_row, X);
         matmul(R, X, P, NN);
         if (ELASTIC)
             matmul(P, f, result, NT);
         else
             for (int k = 0; k < 9; ++k) result[k] = fmaf(factor, P[k], f[k]);
-        if (used)
+        if (used && lane < warp_rows)
             for (int k = 0; k < 9; ++k) ((float*)out)[9 * (size_t)row + k] = result[k];
     }
 
 // Backward only: what the end needs again is put down, and registers are free for the layers.
 //// put_down
-        float* state = (float*)(pool + STATE_AT) + thread;
+        float* state = (float*)(pool + STATE_AT) + block_row;
         float* downs = (float*)(pool + DOWNS_AT);
         // downs: what turns the scaled activations of each warp back
         enum { OF_Z, OF_H0, OF_H1, OF_GY, OF_G1, OF_G0 };
         auto publish = [&](int which, float value) {
-            if (lane == 0) downs[4 * which + warp] = value;
+            if (lane == 0) downs[WARPS * which + warp] = value;
         };
         #pragma unroll
         for (int k = 0; k < 9; ++k) {
@@ -431,9 +437,9 @@
         }
         warp_scales(size, up, down);
         publish(OF_H1, down);
-        float* rows = (float*)(pool + S0_AT + 32 * ROW64 * warp);
+        float* rows = (float*)(pool + S0_AT + warp_rows * ROW64 * warp);
         {
-            float Y[2][2][4];
+            float Y[TILES][2][4];
             clear(Y);
             #pragma unroll
             for (int j = 0; j < 4; ++j) {
@@ -449,7 +455,7 @@
         float down_gy;
         {
             float G[9], X[9], B[9], C[9], T[9], gy[16];
-            output_of_row(rows + ROW_STRIDE * lane, X);
+            output_of_row(rows + ROW_STRIDE * warp_row, X);
             #pragma unroll
             for (int k = 0; k < 9; ++k) {
                 R[k] = state[ROWS * (STATE_R + k)];
@@ -493,6 +499,7 @@
                 matmul(G, B, C, TN);
             } else
                 for (int k = 0; k < 9; ++k) C[k] = G[k];
+            __syncwarp();
             #pragma unroll
             for (int k = 0; k < 9; ++k) state[ROWS * (STATE_TURN + k)] = T[k] + C[k];
         }
@@ -503,25 +510,25 @@
             const int N = sizeof(total) / sizeof(total[0]), Q = N < 4 ? N : 4;
             clear(total);
             #pragma unroll 1
-            for (int w = 0; w < 4; ++w) {
+            for (int w = 0; w < WARPS; ++w) {
                 float c[1][N][4];
                 clear(c);
                 #pragma unroll
-                for (int k = 0; k < 2; ++k) {
+                for (int k = 0; k < TILES; ++k) {
                     unsigned a[1][4], a_low[1][4], b[Q][4];
                     const int place = gradient(
-                        32 * w + 16 * k + (lane & 7) + ((lane >> 4) << 3), (lane >> 3) & 1);
+                        warp_rows * w + 16 * k + (lane & 7) + ((lane >> 4) << 3), (lane >> 3) & 1);
                     transposed(a[0], place);
                     if (!HALF) transposed(a_low[0], place + low_g);
                     #pragma unroll
                     for (int n8 = 0; n8 < N; n8 += Q) {
                         right(transposed, b, [&](int q, int part) {
-                            return input(32 * w + 16 * k + (lane & 15), n8 + q, part);
+                            return input(warp_rows * w + 16 * k + (lane & 15), n8 + q, part);
                         });
                         multiply(c, n8, a, a_low, b);
                     }
                 }
-                const float both = downs[4 * which_g + w] * downs[4 * which_h + w];
+                const float both = downs[WARPS * which_g + w] * downs[WARPS * which_h + w];
                 #pragma unroll
                 for (int i = 0; i < 4 * N; ++i)
                     ((float*)total)[i] = fmaf(((float*)c)[i], both, ((float*)total)[i]);
@@ -533,8 +540,10 @@
         auto part16 = [&](int matrix) {
             return [=](int r, int chunk, int part) { return matrix + LOW16 * part + at16(r, chunk); };
         };
+        // four warps share the 64 columns of a gradient, or, of a product with 16 columns, those of the other factor
+        const int slice = warp & 3;
         auto slice64 = [&](int matrix) {
-            return [=](int r, int chunk) { return matrix + at64(r, 2 * warp + chunk); };
+            return [=](int r, int chunk) { return matrix + at64(r, 2 * slice + chunk); };
         };
         float* partial = (float*)partials + (size_t)blockIdx.x * WEIGHTS;
         auto add = [&](int i, float value) { partial[i] = first ? value : partial[i] + value; };
@@ -543,15 +552,15 @@
             const float2 before = first ? make_float2(0.0f, 0.0f) : *place;
             *place = make_float2(before.x + values[0], before.y + values[1]);
         };
-        {
+        if (warp == slice) {
             float total[2][4];
             outer([&](int r, int chunk) { return GY_AT + at16(r, chunk); }, LOW16,
-                  [&](int r, int chunk, int part) { return part64(S1_AT)(r, 2 * warp + chunk, part); }, total, OF_GY, OF_H1);
+                  [&](int r, int chunk, int part) { return part64(S1_AT)(r, 2 * slice + chunk, part); }, total, OF_GY, OF_H1);
             #pragma unroll
             for (int n8 = 0; n8 < 2; ++n8)
                 #pragma unroll
                 for (int k = 0; k < 4; k += 2) {
-                    const int o = g + 4 * k, i = 16 * warp + 8 * n8 + 2 * t;
+                    const int o = g + 4 * k, i = 16 * slice + 8 * n8 + 2 * t;
                     if (o < OUTPUTS) add_pair(W2_START + HIDDEN * o + i, total[n8] + k);
                 }
         }
@@ -562,12 +571,12 @@
         #pragma unroll
         for (int n8 = 0; n8 < 8; n8 += 4) {
             unsigned b[4][4];
-            float c[2][4][4];
+            float c[TILES][4][4];
             clear(c);
             weights(W2_AT, W2_LOW, 0, n8, b);
             multiply(c, 0, high, low, b);
             #pragma unroll
-            for (int m = 0; m < 2; ++m)
+            for (int m = 0; m < TILES; ++m)
                 #pragma unroll
                 for (int i = 0; i < 16; ++i) {
                     float& value = ((float*)y[m][n8])[i];
@@ -593,17 +602,17 @@
         // the first layer once more, four tiles at a time; x turns into g0
         {
             const float factor_g = down * down1;
-            unsigned z_high[2][4], z_low[2][4];
+            unsigned z_high[TILES][4], z_low[TILES][4];
             load16(Z_AT, z_high, z_low);
             factor_a = down_z * down0;
             size = 0.0f;
             #pragma unroll
             for (int n8 = 0; n8 < 8; n8 += 4) {
-                float c[2][4][4];
+                float c[TILES][4][4];
                 clear(c);
                 layer0(z_high, z_low, n8, c, 0);
                 #pragma unroll
-                for (int m = 0; m < 2; ++m)
+                for (int m = 0; m < TILES; ++m)
                     #pragma unroll
                     for (int i = 0; i < 16; ++i) {
                         float& a = ((float*)c[m])[i];
@@ -625,17 +634,19 @@
         publish(OF_G0, down);
         __syncthreads();
         {
-            float total[8][4];
-            outer(slice64(S1_AT), LOW64, part64(S0_AT), total, OF_G1, OF_H0);
+            const int count = 32 / WARPS, start = warp / 4 * count;
+            float total[count][4];
+            outer(slice64(S1_AT), LOW64,
+                  [&](int r, int chunk, int part) { return part64(S0_AT)(r, start + chunk, part); }, total, OF_G1, OF_H0);
             #pragma unroll
-            for (int n8 = 0; n8 < 8; ++n8)
+            for (int n8 = 0; n8 < count; ++n8)
                 #pragma unroll
                 for (int k = 0; k < 4; k += 2)
-                    add_pair(W1_START + HIDDEN * (16 * warp + g + 4 * k) + 8 * n8 + 2 * t, total[n8] + k);
+                    add_pair(W1_START + HIDDEN * (16 * slice + g + 4 * k) + 8 * (start + n8) + 2 * t, total[n8] + k);
         }
         __syncthreads();
         {
-            float gz[2][2][4];
+            float gz[TILES][2][4];
             clear(gz);
             #pragma unroll
             for (int j = 0; j < 4; ++j) {
@@ -650,19 +661,19 @@
             put_rows(rows, gz, FEATURES, down * down0);
         }
         __syncthreads();
-        {
+        if (warp == slice) {
             float total[2][4];
             outer(slice64(S1_AT), LOW64, part16(Z_AT), total, OF_G0, OF_Z);
             #pragma unroll
             for (int n8 = 0; n8 < 2; ++n8)
                 #pragma unroll
                 for (int k = 0; k < 4; ++k) {
-                    const int o = 16 * warp + g + 8 * (k >> 1), i = 8 * n8 + 2 * t + (k & 1);
+                    const int o = 16 * slice + g + 8 * (k >> 1), i = 8 * n8 + 2 * t + (k & 1);
                     if (i < FEATURES) add(FEATURES * o + i, total[n8][k]);
                 }
         }
-        if (used) {
-            const float* gz = rows + ROW_STRIDE * lane;
+        if (used && lane < warp_rows) {
+            const float* gz = rows + ROW_STRIDE * warp_row;
             float S[9], D[9], T[9];
             #pragma unroll
             for (int k = 0; k < 9; ++k) {

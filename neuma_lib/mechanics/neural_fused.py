@@ -4,8 +4,8 @@ The twin in :mod:`neuma_lib.mechanics.neural` writes every activation to memory 
 only F is read and only the result written, and the backward pass computes the activations again. The text of the
 kernels is ``neural_fused.cu``.
 
-A warp owns 32 rows. Each lane computes the features of one row; the matrix products run on the tensor cores, two
-tiles of 16 rows at a time; each lane ends with the output of its row. The accumulators of a layer hold a row in the
+A warp owns one or two tiles of 16 rows. Each lane computes the features of one row; the matrix products run on the
+tensor cores, a tile at a time; each lane ends with the output of its row. The accumulators of a layer hold a row in the
 order in which the next layer wants its operand, so activations stay in registers between layers.
 
 **Precision.** Each factor is scaled by a power of two (one a weight matrix, one an activation of a warp) and split
@@ -32,7 +32,11 @@ from neuma_lib.mechanics.neural_kernels import FEATURES, GRAM
 from neuma_lib.mechanics.singular_values_kernels import SVD, SWEEPS
 
 ROWS = 128
-"""Rows, and threads, of a block: four warps."""
+"""Rows of a block."""
+EVALUATE_TILES, VJP_TILES = 2, 1
+"""Tiles of 16 rows that a warp owns, forward and backward. With one there are twice as many warps, of half the
+registers, which hides more of the latency where rows are few for the GPU; but two lanes do the same for each row, its
+features and stress."""
 BLOCKS_PER_PROCESSOR = 2
 HIDDEN, OUTPUTS = 64, 9
 WEIGHTS = HIDDEN * (FEATURES + HIDDEN + OUTPUTS)
@@ -46,8 +50,8 @@ LAYOUT = {
     "W0_AT": 0,  # (64, 16)
     "W1_AT": 4096,  # (64, 64)
     "W2_AT": 20480,  # (16, 64)
-    "PEAKS_AT": 24576,  # largest weights, three numbers a warp
-    "DOWNS_AT": 24640,  # scales of the activations, six numbers a warp
+    "PEAKS_AT": 24576,  # largest weights, three numbers a warp, before the next
+    "DOWNS_AT": 24640,  # scales of the activations, six numbers for each of eight warps
     "Z_AT": 24832,  # features (128, 16)
     "ROW_AT": 33024,  # forward only: output of the network, by row
     "S0_AT": 33024,  # backward only: h0 (128, 64); before it, the output of the network and its gradient
@@ -76,10 +80,6 @@ CONSTANTS = {
     "W1_START": HIDDEN * FEATURES,
     "W2_START": HIDDEN * (FEATURES + HIDDEN),
     "WEIGHTS": WEIGHTS,
-    # loads of a thread: of single weights of the first matrix, of pairs of the others (the last padded to 16 rows)
-    "W0_LOADS": -(-HIDDEN * FEATURES // ROWS),
-    "W1_LOADS": HIDDEN * HIDDEN // 2 // ROWS,
-    "W2_LOADS": 16 * HIDDEN // 2 // ROWS,
     "ROWS": ROWS,
     "FEATURES": FEATURES,
     "HIDDEN": HIDDEN,
@@ -88,6 +88,17 @@ CONSTANTS = {
 }
 EVALUATE_BYTES = LAYOUT["ROW_AT"] + 4 * CONSTANTS["ROW_STRIDE"] * ROWS + ALIGNMENT
 VJP_BYTES = LAYOUT["STATE_AT"] + 4 * 27 * ROWS + ALIGNMENT
+
+
+def threads(tiles: int) -> int:
+    """Of a block whose warps own that many tiles of 16 rows."""
+    return 32 * ROWS // (16 * tiles)
+
+
+def _loads(threads: int) -> dict[str, int]:
+    """Loads of a thread: of single weights of the first matrix, of pairs of the others (the last padded to 16 rows)."""
+    counts = {"W0": HIDDEN * FEATURES, "W1": HIDDEN * HIDDEN // 2, "W2": 16 * HIDDEN // 2}
+    return {f"{name}_LOADS": -(-count // threads) for name, count in counts.items()}
 
 
 def _constants(values: dict[str, int]) -> str:
@@ -99,9 +110,13 @@ def source(kind: str, backward: bool, machine: str | None = None, precision: str
 
     ``machine``: see the ``.cu`` file; ``precision``: of the products, "single" or "half".
     """
+    tiles = VJP_TILES if backward else EVALUATE_TILES
+    size = threads(tiles)
     parts = native_source(__file__)
     floor = torch.finfo(torch.float32).eps ** 0.5
-    constants = _constants(CONSTANTS)
+    constants = _constants(
+        {**CONSTANTS, **_loads(size), "TILES": tiles, "THREADS": size, "WARPS": size // 32}
+    )
     for name, value in {"ELASTIC": kind == "elasticity", "HALF": precision == "half"}.items():
         constants += f"    const bool {name} = {str(value).lower()};\n"
     constants += f"    const float FLOOR = {floor!r}f;\n"
@@ -115,7 +130,7 @@ def source(kind: str, backward: bool, machine: str | None = None, precision: str
 # Arrays are handed over as addresses: Warp's array objects would cost more time than the launch.
 @cache
 def evaluate_kernel(kind: str):
-    """Kernel (F, W0, W1, W2, factor, n, out) over blocks of :data:`ROWS` threads."""
+    """Kernel (F, W0, W1, W2, factor, n, out) over blocks of :data:`ROWS` rows."""
 
     @wp.func_native(source(kind, backward=False))
     def evaluate_rows(
@@ -124,7 +139,10 @@ def evaluate_kernel(kind: str):
     ): ...  # fmt: skip
 
     @wp.kernel(
-        enable_backward=False, module="unique", launch_bounds=(ROWS, BLOCKS_PER_PROCESSOR), grid_stride=False
+        enable_backward=False,
+        module="unique",
+        launch_bounds=(threads(EVALUATE_TILES), BLOCKS_PER_PROCESSOR),
+        grid_stride=False,
     )
     def neural_evaluate(
         F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, factor: float, n: int, out: wp.uint64
@@ -146,7 +164,10 @@ def vjp_kernel(kind: str, precision: str = "single"):
     ): ...  # fmt: skip
 
     @wp.kernel(
-        enable_backward=False, module="unique", launch_bounds=(ROWS, BLOCKS_PER_PROCESSOR), grid_stride=False
+        enable_backward=False,
+        module="unique",
+        launch_bounds=(threads(VJP_TILES), BLOCKS_PER_PROCESSOR),
+        grid_stride=False,
     )
     def neural_vjp(
         F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, grad_out: wp.uint64, factor: float, n: int,
@@ -185,7 +206,7 @@ def supported(device: torch.device, dtype: torch.dtype) -> bool:
     if device.type != "cuda" or dtype != torch.float32:
         return False
     there = _device(device)
-    return there.arch >= 80 and there.max_shared_memory_per_block >= VJP_BYTES + 4 * ROWS
+    return there.arch >= 80 and there.max_shared_memory_per_block >= VJP_BYTES + 4 * threads(VJP_TILES)
 
 
 def _launch(kernel, blocks: int, threads: int, device: torch.device, *inputs) -> None:
@@ -217,7 +238,9 @@ def evaluate(F: Tensor, weights: Weights, kind: str, factor: float, out: Tensor 
     result = out if out is not None and out.is_contiguous() else torch.empty_like(F)
     if len(F):
         W, blocks = _packed(weights), _blocks(len(F), F.device)
-        _launch(evaluate_kernel(kind), blocks, ROWS, F.device, F, *W, factor, len(F), result)
+        _launch(
+            evaluate_kernel(kind), blocks, threads(EVALUATE_TILES), F.device, F, *W, factor, len(F), result
+        )
     return result if out is None or out is result else out.copy_(result)
 
 
@@ -244,7 +267,9 @@ def vjp(
         blocks = _blocks(len(F), F.device)
         partials = F.new_empty(blocks, WEIGHTS)
         kernel = vjp_kernel(kind, precision)
-        _launch(kernel, blocks, ROWS, F.device, F, *W, grad_out, factor, len(F), result, partials)
+        _launch(
+            kernel, blocks, threads(VJP_TILES), F.device, F, *W, grad_out, factor, len(F), result, partials
+        )
         sums = [total if total.is_contiguous() else total.contiguous() for total in totals]
         _launch(add_kernel(), WEIGHTS // 32, 1024, F.device, partials, blocks, *sums)
         for total, summed in zip(totals, sums, strict=True):

@@ -151,12 +151,16 @@ class EmulatedLaws:
             size - neural_fused.ALIGNMENT for size in (neural_fused.EVALUATE_BYTES, neural_fused.VJP_BYTES)
         )
         calls = (
-            ("evaluate", (*common, float(part.scale), len(F), result)),
-            (f"vjp_{precision}", (*common, g, float(part.scale), len(F), grad_F, partials)),
+            ("evaluate", neural_fused.EVALUATE_TILES, (*common, float(part.scale), len(F), result)),
+            (
+                f"vjp_{precision}",
+                neural_fused.VJP_TILES,
+                (*common, g, float(part.scale), len(F), grad_F, partials),
+            ),
         )
-        for size, (name, arguments) in zip(sizes, calls, strict=True):
+        for size, (name, tiles, arguments) in zip(sizes, calls, strict=True):
             function = getattr(self.library, f"{name}_{part.kind}")
-            _launch(function, blocks, neural_fused.ROWS, size, *arguments)
+            _launch(function, blocks, neural_fused.threads(tiles), size, *arguments)
         sums = partials.double().sum(0).split([w.numel() for w in weights])
         return [result.double(), grad_F.double(), *(x.view_as(w) for x, w in zip(sums, weights, strict=True))]
 
