@@ -91,7 +91,8 @@ def simulation_parts(scene: BenchmarkScene, device: torch.device) -> list[Part]:
         return call
 
     def law_back(part, value, weights, grad_out, grad_in, totals):
-        return lambda: part.vjp(value, weights, grad_out, grad_F=grad_in, grad_weights=totals)
+        sums = part.accumulators(value, tuple(totals))  # added up once an iteration
+        return lambda: part.vjp(value, weights, grad_out, grad_F=grad_in, grad_weights=sums)
 
     particle = 4.0 * N
     rows = [

@@ -82,7 +82,8 @@ class Constitutive(nn.Module):
             grad_out: (N, 3, 3) gradient of a scalar with respect to the result.
             cache: from :meth:`evaluate_with_cache` at the same F and weights; None recomputes.
             grad_F: (N, 3, 3) buffer that receives the first result if given.
-            grad_weights: accumulators shaped as the weights; if given, the gradients are added to them.
+            grad_weights: accumulators shaped as the weights, or what :meth:`accumulators` made of them; if given, the
+                gradients are added to them.
 
         Returns:
             the gradient with respect to F, and one gradient a weight (the accumulators if they were given).
@@ -101,6 +102,15 @@ class Constitutive(nn.Module):
         for total, grad in zip(grad_weights, grads[1:], strict=True):
             total.add_(grad)
         return result, grad_weights
+
+    def accumulators(self, F: Tensor, grad_weights: Weights) -> Weights:
+        """What many calls of `vjp`, each for as many rows as F (N, 3, 3), add to at the least cost, zero at the start;
+        `add_up` has the last word. By default the accumulators ``grad_weights`` themselves.
+        """
+        return grad_weights
+
+    def add_up(self, accumulators: Weights, grad_weights: Weights) -> None:
+        """Add to ``grad_weights`` what ``accumulators``, of :meth:`accumulators`, have received."""
 
 
 class Elasticity(Constitutive):

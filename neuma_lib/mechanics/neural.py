@@ -155,6 +155,14 @@ class NeuralConstitutive(AdaptableConstitutive):
         aten.gelu.out(state.a1, out=state.h1)
         torch.mm(state.h1, W2.mT, out=state.Y.view(-1, 9))
 
+    def accumulators(self, F, grad_weights):
+        return (neural_fused.partial_sums(F),) if self.uses_fused(F) else grad_weights
+
+    @torch.no_grad()
+    def add_up(self, accumulators, grad_weights):
+        if len(accumulators) != len(grad_weights):
+            neural_fused.add_up(*accumulators, grad_weights)
+
     @torch.no_grad()
     def vjp(self, F, weights, grad_out, cache=None, grad_F=None, grad_weights=None):
         if cache is None and self.uses_fused(F):

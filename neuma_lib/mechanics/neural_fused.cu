@@ -546,23 +546,42 @@
             return [=](int r, int chunk) { return matrix + at64(r, 2 * slice + chunk); };
         };
         float* partial = (float*)partials + (size_t)blockIdx.x * WEIGHTS;
-        auto add = [&](int i, float value) { partial[i] = first ? value : partial[i] + value; };
-        auto add_pair = [&](int i, const float* values) {
-            float2* place = (float2*)(partial + i);
-            const float2 before = first ? make_float2(0.0f, 0.0f) : *place;
-            *place = make_float2(before.x + values[0], before.y + values[1]);
+        const bool alone = first && fresh;
+        auto add = [&](int i, float value) { partial[i] = alone ? value : partial[i] + value; };
+        // Pairs (2k, 2k + 1) of total[n] are added at place(n, k), if that is not negative. What stands there is loaded
+        // before the product that fills the total.
+        auto add_pairs = [&](auto& total, auto place, auto product) {
+            const int N = sizeof(total) / sizeof(total[0]);
+            float2 before[N][2];
+            #pragma unroll
+            for (int n8 = 0; n8 < N; ++n8)
+                #pragma unroll
+                for (int k = 0; k < 2; ++k) {
+                    const int i = place(n8, k);
+                    before[n8][k] = alone || i < 0 ? make_float2(0.0f, 0.0f) : *(const float2*)(partial + i);
+                }
+            product();
+            #pragma unroll
+            for (int n8 = 0; n8 < N; ++n8)
+                #pragma unroll
+                for (int k = 0; k < 2; ++k) {
+                    const int i = place(n8, k);
+                    const float* pair = total[n8] + 2 * k;
+                    if (i >= 0)
+                        *(float2*)(partial + i) = make_float2(before[n8][k].x + pair[0], before[n8][k].y + pair[1]);
+                }
         };
         if (warp == slice) {
             float total[2][4];
-            outer([&](int r, int chunk) { return GY_AT + at16(r, chunk); }, LOW16,
-                  [&](int r, int chunk, int part) { return part64(S1_AT)(r, 2 * slice + chunk, part); }, total, OF_GY, OF_H1);
-            #pragma unroll
-            for (int n8 = 0; n8 < 2; ++n8)
-                #pragma unroll
-                for (int k = 0; k < 4; k += 2) {
-                    const int o = g + 4 * k, i = 16 * slice + 8 * n8 + 2 * t;
-                    if (o < OUTPUTS) add_pair(W2_START + HIDDEN * o + i, total[n8] + k);
-                }
+            auto place = [&](int n8, int k) {
+                const int o = g + 8 * k, i = 16 * slice + 8 * n8 + 2 * t;
+                return o < OUTPUTS ? W2_START + HIDDEN * o + i : -1;
+            };
+            add_pairs(total, place, [&] {
+                outer([&](int r, int chunk) { return GY_AT + at16(r, chunk); }, LOW16,
+                      [&](int r, int chunk, int part) { return part64(S1_AT)(r, 2 * slice + chunk, part); }, total,
+                      OF_GY, OF_H1);
+            });
         }
         // y turns into g1, the gradient before the second gelu
         load16(GY_AT, high, low);
@@ -636,13 +655,14 @@
         {
             const int count = 32 / WARPS, start = warp / 4 * count;
             float total[count][4];
-            outer(slice64(S1_AT), LOW64,
-                  [&](int r, int chunk, int part) { return part64(S0_AT)(r, start + chunk, part); }, total, OF_G1, OF_H0);
-            #pragma unroll
-            for (int n8 = 0; n8 < count; ++n8)
-                #pragma unroll
-                for (int k = 0; k < 4; k += 2)
-                    add_pair(W1_START + HIDDEN * (16 * slice + g + 4 * k) + 8 * (start + n8) + 2 * t, total[n8] + k);
+            auto place = [&](int n8, int k) {
+                return W1_START + HIDDEN * (16 * slice + g + 8 * k) + 8 * (start + n8) + 2 * t;
+            };
+            add_pairs(total, place, [&] {
+                outer(slice64(S1_AT), LOW64,
+                      [&](int r, int chunk, int part) { return part64(S0_AT)(r, start + chunk, part); }, total, OF_G1,
+                      OF_H0);
+            });
         }
         __syncthreads();
         {

@@ -15,7 +15,8 @@ hi hi alone (precision "half"): a third of the products, and gradients to 11 bit
 again, the network at F, is rounded likewise; sums, singular values and rotations stay in float32.
 
 **Weight gradients** are products over rows, G^T H. The warps of a block put G and H, already split, in shared memory
-and each takes a slice of the result; blocks write their sums apart, and a second kernel adds them in a fixed order.
+and each takes a slice of the result; blocks write their sums apart, and a second kernel adds them in a fixed order:
+after each call, or after many of them, which let their blocks go on adding to :func:`partial_sums`.
 """
 
 from __future__ import annotations
@@ -155,12 +156,15 @@ def evaluate_kernel(kind: str):
 
 @cache
 def vjp_kernel(kind: str, precision: str = "single"):
-    """Kernel (F, W0, W1, W2, grad_out, factor, n, grad_F, partials (blocks, WEIGHTS)) over blocks as above."""
+    """Kernel (F, W0, W1, W2, grad_out, factor, n, grad_F, fresh, partials (blocks, WEIGHTS)) over blocks as above.
+
+    ``fresh``: whether it sets ``partials``; otherwise it adds to them.
+    """
 
     @wp.func_native(source(kind, backward=True, precision=precision))
     def vjp_rows(
         F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, grad_out: wp.uint64, factor: float, n: int,
-        grad_F: wp.uint64, partials: wp.uint64, shared: wp.tile(dtype=wp.uint8, shape=(VJP_BYTES,)),
+        grad_F: wp.uint64, fresh: int, partials: wp.uint64, shared: wp.tile(dtype=wp.uint8, shape=(VJP_BYTES,)),
     ): ...  # fmt: skip
 
     @wp.kernel(
@@ -171,10 +175,10 @@ def vjp_kernel(kind: str, precision: str = "single"):
     )
     def neural_vjp(
         F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, grad_out: wp.uint64, factor: float, n: int,
-        grad_F: wp.uint64, partials: wp.uint64,
+        grad_F: wp.uint64, fresh: int, partials: wp.uint64,
     ):  # fmt: skip
         shared = wp.tile_empty(shape=(VJP_BYTES,), dtype=wp.uint8, storage="shared")
-        vjp_rows(F, W0, W1, W2, grad_out, factor, n, grad_F, partials, shared)
+        vjp_rows(F, W0, W1, W2, grad_out, factor, n, grad_F, fresh, partials, shared)
 
     return neural_vjp
 
@@ -257,22 +261,33 @@ def vjp(
 ) -> tuple[Tensor, Weights]:
     """Gradients of F and, added to ``grad_weights``, of the weights. See :class:`Constitutive`.
 
-    ``precision`` is that of the products, see :attr:`Constitutive.adjoint_precision`.
+    ``grad_weights`` may be :func:`partial_sums`; ``precision`` is that of the products, see
+    :attr:`Constitutive.adjoint_precision`.
     """
     F, grad_out = F.detach().contiguous(), grad_out.contiguous()
     result = grad_F if grad_F is not None and grad_F.is_contiguous() else torch.empty_like(F)
     W = _packed(weights)
     totals = tuple(torch.zeros_like(w) for w in W) if grad_weights is None else grad_weights
     if len(F):
-        blocks = _blocks(len(F), F.device)
-        partials = F.new_empty(blocks, WEIGHTS)
-        kernel = vjp_kernel(kind, precision)
-        _launch(
-            kernel, blocks, threads(VJP_TILES), F.device, F, *W, grad_out, factor, len(F), result, partials
-        )
-        sums = [total if total.is_contiguous() else total.contiguous() for total in totals]
-        _launch(add_kernel(), WEIGHTS // 32, 1024, F.device, partials, blocks, *sums)
-        for total, summed in zip(totals, sums, strict=True):
-            if total is not summed:
-                total.copy_(summed)
+        blocks, fresh = _blocks(len(F), F.device), len(totals) == len(W)
+        partials = F.new_empty(blocks, WEIGHTS) if fresh else totals[0]
+        inputs = (F, *W, grad_out, factor, len(F), result, int(fresh), partials)
+        _launch(vjp_kernel(kind, precision), blocks, threads(VJP_TILES), F.device, *inputs)
+        if fresh:
+            add_up(partials, totals)
     return (result if grad_F is None or grad_F is result else grad_F.copy_(result)), totals
+
+
+def partial_sums(F: Tensor) -> Tensor:
+    """Zero gradients of the weights for each block that `vjp` at F (n, 3, 3) has, (blocks, WEIGHTS)."""
+    return F.new_zeros(_blocks(len(F), F.device), WEIGHTS)
+
+
+@torch.no_grad()
+def add_up(partials: Tensor, totals: Weights) -> None:
+    """Add the sums over the blocks to the gradients of the three weight matrices."""
+    sums = [total if total.is_contiguous() else total.contiguous() for total in totals]
+    _launch(add_kernel(), WEIGHTS // 32, 1024, partials.device, partials, len(partials), *sums)
+    for total, summed in zip(totals, sums, strict=True):
+        if total is not summed:
+            total.copy_(summed)

@@ -69,6 +69,14 @@ def test_emulated_kernels_are_as_near_to_float64_as_the_float32_twin(emulated, k
         assert distance(fast, exact) < 5 * distance(slow, exact) + 1e-7
 
 
+def test_emulated_gradients_of_many_calls_add_up(emulated):
+    part, F, g = law_part("elasticity"), deformations("large strain", 133), probe(133)
+    once, twice = emulated(part, F, g, 1), emulated(part, F, g, 1, additions=2)
+    assert torch.equal(once[1], twice[1])
+    for single, double in zip(once[2:], twice[2:], strict=True):
+        assert distance(double, 2 * single) < 1e-6
+
+
 HALF_ERROR = 3e-3
 """Of the adjoint in half precision, by norm: factors of 11 bits are off by 5e-4 at most, a few products in a row."""
 
@@ -169,6 +177,13 @@ def test_fused_fills_buffers_accumulates_and_repeats_itself(kind):
     assert torch.equal(out, part.evaluate(F, weights)) and torch.equal(grad_F, plain_F)
     for total, grad in zip(totals, plain_weights, strict=True):
         assert torch.equal(total, grad + 1)
+    sums = part.accumulators(F, totals)
+    for _ in range(2):
+        part.vjp(F, weights, g, grad_weights=sums)
+    added = tuple(torch.ones_like(w) for w in weights)
+    part.add_up(sums, added)
+    for total, grad in zip(added, plain_weights, strict=True):
+        assert distance(total - 1, 2 * grad) < 1e-5
     strided = tuple(torch.zeros(*reversed(w.shape), device="cuda").mT for w in weights)
     part.vjp(F, weights, g, grad_weights=strided)
     assert all(torch.equal(a, b) for a, b in zip(strided, plain_weights, strict=True))
