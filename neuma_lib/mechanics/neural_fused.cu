@@ -508,8 +508,10 @@
         // total[n] += sum over the block's rows of G^T H; gradient and input give places of (row, chunk)
         auto outer = [&](auto gradient, int low_g, auto input, auto& total, int which_g, int which_h) {
             const int N = sizeof(total) / sizeof(total[0]), Q = N < 4 ? N : 4;
+            // as many products on their way at a time as registers allow
+            const int UNROLL = TILES > 1 ? 1 : N > 2 ? 2 : 4;
             clear(total);
-            #pragma unroll 1
+            #pragma unroll UNROLL
             for (int w = 0; w < WARPS; ++w) {
                 float c[1][N][4];
                 clear(c);
