@@ -35,6 +35,11 @@
         asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
         return y;
     };
+    auto root = [](float x) {
+        float y;
+        asm("sqrt.approx.f32 %0, %1;" : "=f"(y) : "f"(x));
+        return y;
+    };
     auto prefetch = [](const float* x) { asm volatile("prefetch.global.L1 [%0];" : : "l"(x)); };
     auto warp_max = [](unsigned x) { return __reduce_max_sync(0xffffffffu, x); };
 
@@ -46,7 +51,9 @@
     typedef float Real;
     const int WIDTH = 1;
     #define LANE(x, l) (x)
-    #define SQRT(x) sqrtf(x)
+    // two units in the last place will do where products have 11 bits
+    #define SQRT(x) (HALF ? root(x) : sqrtf(x))
+    #define DIVIDE(x, y) (HALF ? __fdividef(x, y) : (x) / (y))
     const int g = lane >> 2, t = lane & 3;
     // This thread's row among those of the warp and of the block. Where a warp has 16 rows, both of its halves do the work
     // of a row, and write the same.
@@ -488,7 +495,7 @@
             for (int i = 0; i < 3; ++i) {
                 float sum = state[ROWS * (STATE_TURN + i)];
                 if (fabsf(sum) < FLOOR) sum = sum < 0.0f ? -FLOOR : FLOOR;
-                const float kappa = (V[3 * i] * axial[0] + V[3 * i + 1] * axial[1] + V[3 * i + 2] * axial[2]) / sum;
+                const float kappa = DIVIDE(V[3 * i] * axial[0] + V[3 * i + 1] * axial[1] + V[3 * i + 2] * axial[2], sum);
                 #pragma unroll
                 for (int j = 0; j < 3; ++j) turn[j] = fmaf(kappa, V[3 * i + j], turn[j]);
             }
@@ -730,6 +737,7 @@
 //// end
     #undef LANE
     #undef SQRT
+    #undef DIVIDE
     #undef NN
     #undef NT
     #undef TN

@@ -12,7 +12,8 @@ order in which the next layer wants its operand, so activations stay in register
 into two halves of 11 bits, x = hi + lo; lo hi + hi lo + hi hi, accumulated in float32, keeps 22 bits. That costs half
 of the same split in TF32, and the scale replaces the exponent bits that float16 lacks. The backward pass can do with
 hi hi alone (precision "half"): a third of the products, and gradients to 11 bits. What it computes of the forward pass
-again, the network at F, is rounded likewise; sums, singular values and rotations stay in float32.
+again, the network at F, is rounded likewise. Sums, singular values and rotations stay in float32, with roots and
+quotients to two units in the last place.
 
 **Weight gradients** are products over rows, G^T H. The warps of a block put G and H, already split, in shared memory
 and each takes a slice of the result; blocks write their sums apart, and a second kernel adds them in a fixed order:
