@@ -2,6 +2,7 @@
 
     python -m benchmarks.iteration                      # the paper's scale on a GPU, the default scale on a CPU
     python -m benchmarks.iteration --particles 60000 --pixels 400
+    python -m benchmarks.iteration --adjoint-precision half
 
 Every part is timed alone, on the state in the middle of the motion, and compared with its floor: the bytes that it
 must move (each input read once, each result written once) over the bandwidth of a copy, or the operations of its
@@ -89,7 +90,8 @@ def simulation_parts(scene: BenchmarkScene, device: torch.device) -> list[Part]:
         return call
 
     def law_back(part, value, weights, grad_out, grad_in, totals):
-        return lambda: part.vjp(value, weights, grad_out, grad_F=grad_in, grad_weights=totals)
+        sums = part.accumulators(value, tuple(totals))  # added up once an iteration
+        return lambda: part.vjp(value, weights, grad_out, grad_F=grad_in, grad_weights=sums)
 
     particle = 4.0 * N
     rows = [
@@ -201,7 +203,8 @@ def simulate_and_back(scene: BenchmarkScene, **options) -> None:
 def iterations(scene: BenchmarkScene, count: int) -> list[float]:
     """Wall time of each of some training iterations [s], by the training loop itself."""
     loss = PixelLoss(scene.body, scene.observation)
-    settings = MaterialConfig(iterations=count, lr_elastic=1e-4, lr_plastic=1e-5)
+    precision = scene.law.elasticity.adjoint_precision
+    settings = MaterialConfig(iterations=count, lr_elastic=1e-4, lr_plastic=1e-5, adjoint_precision=precision)
     trained = train_material(
         scene.model, scene.law, scene.body.state(scene.v0), loss, settings, log=lambda _: None
     )
@@ -246,6 +249,12 @@ def main() -> None:
     parser.add_argument(
         "--batch", type=int, default=40, help="frames that are rendered at a time in the parts"
     )
+    parser.add_argument(
+        "--adjoint-precision",
+        default="single",
+        choices=("single", "half"),
+        help="of the products in the networks' adjoints, as the setting of the stage material",
+    )
     parser.add_argument("--output", type=Path, help="also write the table there, as Markdown")
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -253,6 +262,7 @@ def main() -> None:
     given = {f.name: value for f in dataclasses.fields(Size) if (value := getattr(args, f.name)) is not None}
     size = dataclasses.replace(Size() if device.type == "cuda" else SMALL, **given)
     scene = make_scene(size, device)
+    scene.law.set_adjoint_precision(args.adjoint_precision)
     lines = report(scene, device, min(args.batch, len(size.frame_steps)))
     print("\n".join(lines))
     if args.output:
@@ -274,7 +284,8 @@ def report(scene: BenchmarkScene, device: torch.device, batch: int) -> list[str]
     lines = [
         f"{size.particles} particles, {size.grid}³ grid, {size.steps} steps, {len(size.frame_steps)} renders of "
         f"{size.gaussians} Gaussians at {size.pixels}×{size.pixels}, float32, {device_name(device)}; copy "
-        f"{rate / 1e12:.2f} TB/s, matrix product {peak / 1e12:.2f} TFLOP/s.",
+        f"{rate / 1e12:.2f} TB/s, matrix product {peak / 1e12:.2f} TFLOP/s; adjoints of the networks in "
+        f"{scene.law.elasticity.adjoint_precision} precision.",
         "",
         "| part | a call [µs] | calls | iteration [ms] | share | floor of a call [µs] | call / floor |",
         "|---|---:|---:|---:|---:|---:|---:|",

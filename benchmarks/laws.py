@@ -2,6 +2,7 @@
 
     python -m benchmarks.laws                              # 2,000 rows on the CPU
     python -m benchmarks.laws --rows 30000 --device cuda
+    python -m benchmarks.laws --rows 30000 --device cuda --adjoint-precision half
 
 On a GPU the calls are recorded in a CUDA graph, so that the time is the kernels' own. The floors are those of an
 NVIDIA H200: F and the result once through memory at 4.3 TB/s; the products of the networks at 67 TFLOP/s, its peak
@@ -103,10 +104,12 @@ def main() -> None:
     parser.add_argument("--rows", type=int, nargs="+", default=[2000])
     parser.add_argument("--repetitions", type=int, default=10)
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--adjoint-precision", default="single", choices=("single", "half"))
     args = parser.parse_args()
 
     device = torch.device(args.device)
     neural = neural_law(seed=0).to(device)
+    neural.set_adjoint_precision(args.adjoint_precision)
     structured = {form: structured_law({**SOFT, "form": form}).to(device) for form in FORMS}
     networks = {f"{form} elasticity": law.elasticity for form, law in structured.items()}
     networks["return map"] = structured["stretch"].plasticity

@@ -102,6 +102,12 @@ class MaterialConfig(Section):
         description="after more returns to the best state than this, training ends there, marked as unstable",
     )
     checkpoint_every: int = Field(10, ge=1, description="iterations between checkpoints")
+    adjoint_precision: Literal["single", "half"] = Field(
+        "single",
+        description="matrix products in the adjoint of a neural law on a GPU: single takes factors of 22 bits, half of "
+        "11, which is faster. Motion and images stay as they are; with half, gradients of one call with respect to F "
+        "and to the weights are off by about 1e-3 of their norm",
+    )
     memory: float | None = Field(
         None,
         gt=0,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from neuma_lib.coupling.binding import Binding
-from neuma_lib.coupling.deformation_kernels import kernels
+from neuma_lib.coupling.deformation_kernels import PARTS, kernels
 from neuma_lib.device import launch
 from neuma_lib.splatting.arrays import check_tensors
 
@@ -80,29 +80,30 @@ class _Deform(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, binding: Binding, means, covars, x0, arms, x, F):
-        T, G = len(x), len(means)
-        carry, _, _ = kernels(x.dtype)
+        T, (G, N) = len(x), binding.shape
+        run = kernels(x.dtype)
         moved, stretched = x.new_empty(T, G, 3), x.new_empty(T, G, 3, 3)
-        F_bar = torch.empty_like(stretched) if ctx.needs_input_grad[6] else None
-        rows = binding.rows(x.dtype)
-        states = (x.contiguous(), F.contiguous())
-        launch(carry, (T, G), *rows, means, covars, x0, *states, arms, moved, stretched, F_bar)
-        ctx.save_for_backward(covars, F_bar, arms)
+        states, sums = x.new_empty(T, N * PARTS, 4), x.new_empty(T, G * PARTS, 4)
+        launch(run.pack, (T, N * PARTS), x0.view(-1), x.reshape(T, 3 * N), F.reshape(T, 9 * N), states)
+        launch(run.weighted_sums, (T, G * PARTS), *binding.rows(x.dtype), states, PARTS, sums)
+        results = (moved.view(T, 3 * G), stretched.view(T, 3 * G, 3))
+        launch(run.carry, (T, 3 * G), means.view(-1), covars, arms, sums, *results)
+        ctx.save_for_backward(covars, arms, sums if ctx.needs_input_grad[6] else None)
         ctx.binding = binding
         return moved, stretched
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_moved, grad_stretched):
-        covars, F_bar, arms = ctx.saved_tensors
-        T, N = len(grad_moved), ctx.binding.shape[1]
-        grad_moved = grad_moved.contiguous()
-        _, stretch_adjoint, carry_adjoint = kernels(grad_moved.dtype)
-        grad_x, grad_F, grad_F_bar = grad_moved.new_empty(T, N, 3), None, None
-        if F_bar is not None:
-            grad_F_bar, grad_F = torch.empty_like(F_bar), grad_moved.new_empty(T, N, 3, 3)
-            incoming = (grad_stretched.contiguous(), arms, grad_moved)
-            launch(stretch_adjoint, F_bar.shape[:2], covars, F_bar, *incoming, grad_F_bar)
+        covars, arms, sums = ctx.saved_tensors
+        T, (G, N) = len(grad_moved), ctx.binding.shape
+        run = kernels(grad_moved.dtype)
+        parts = 1 if sums is None else PARTS
+        grad_sums, grad_states = grad_moved.new_empty(T, G * parts, 4), grad_moved.new_empty(T, N * parts, 4)
+        incoming = (grad_moved.contiguous(), grad_stretched.contiguous())
+        launch(run.stretch_adjoint, (T, G), covars, arms, sums, *incoming, grad_sums)
         columns = ctx.binding.columns(grad_moved.dtype)
-        launch(carry_adjoint, (T, N), *columns, grad_moved, grad_F_bar, grad_x, grad_F)
-        return None, None, None, None, None, grad_x, grad_F
+        launch(run.weighted_sums, (T, N * parts), *columns, grad_sums, parts, grad_states)
+        grad_states = grad_states.view(T, N, 4 * parts)
+        grad_F = None if sums is None else grad_states[..., 3:].unflatten(-1, (3, 3))
+        return None, None, None, None, None, grad_states[..., :3], grad_F

@@ -2,95 +2,143 @@
 particle.
 
 Both directions gather through a compressed sparse matrix, so nothing is added atomically and equal inputs give equal
-bits. Frames are the slow index: the particles of one frame (48 bytes each) stay in the cache while all its Gaussians
-read them, about seven times each.
+bits. Both sum rows of twelve numbers, a vector and a matrix (only the vector and a zero where F needs no gradient),
+which lie side by side in memory; a thread sums four columns. Neighbouring threads so read one row at once, 16 bytes
+each in float32: single numbers from scattered rows would keep the GPU's cache busy with addresses. For the same reason
+results are written by neighbouring threads side by side. Frames are the slow index: the rows of one frame stay in the
+cache while all its Gaussians read them, about seven times each.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
 import functools
+from types import SimpleNamespace
 
 import torch
 import warp as wp
 
-from neuma_lib.device import start_warp
+from neuma_lib.device import native_source, start_warp
 from neuma_lib.mechanics.singular_values_kernels import warp_types
 
 start_warp()
 
+PARTS = 3
+"""Groups of four numbers in a row that holds a vector and a 3x3 matrix."""
+
 
 @functools.cache
-def kernels(dtype: torch.dtype):
-    """``(carry, stretch_adjoint, carry_adjoint)`` of a dtype; the first two run over (T, G), the last over (T, N)."""
+def kernels(dtype: torch.dtype) -> SimpleNamespace:
+    """Kernels of a dtype, over pairs of a frame and: `pack` and `weighted_sums` a part of a row, `carry` a coordinate
+    of a Gaussian, `stretch_adjoint` a Gaussian.
+    """
     real, vec3, mat33 = warp_types(dtype)
+    vec4 = wp.types.vector(length=4, dtype=real)
     module = wp.get_module(f"{__name__}.{str(dtype).removeprefix('torch.')}")
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
+    text = native_source(__file__, ".h")
+    quad = text["quad"].replace("REAL", {torch.float32: "float", torch.float64: "double"}[dtype])
+
+    @wp.func_native(quad + text["get"])
+    def get(rows: wp.array2d(dtype=vec4), frame: wp.int32, place: wp.int32) -> vec4: ...
+
+    @wp.func_native(quad + text["put"])
+    def put(rows: wp.array2d(dtype=vec4), frame: wp.int32, place: wp.int32, value: vec4): ...
+
+    # The sum of weights[k] rows[frame, indices[k] parts + part] over k from start to stop.
+    @wp.func_native(quad + text["sum"])
+    def weighted_sum(
+        indices: wp.array(dtype=wp.int32), weights: wp.array(dtype=real), start: wp.int32, stop: wp.int32,
+        rows: wp.array2d(dtype=vec4), frame: wp.int32, parts: wp.int32, part: wp.int32,
+    ) -> vec4: ...  # fmt: skip
+
+    @wp.func
+    def matrix_of(first: vec4, second: vec4, third: vec4):
+        return mat33(
+            first[3], second[0], second[1], second[2], second[3], third[0], third[1], third[2], third[3]
+        )
+
+    @wp.func
+    def one_of(i: wp.int32, a: real, b: real, c: real):
+        return wp.where(i == 0, a, wp.where(i == 1, b, c))
+
+    @kernel
+    def pack(
+        x0: wp.array(dtype=real),  # (3 N,)
+        x: wp.array2d(dtype=real),  # (T, 3 N)
+        F: wp.array2d(dtype=real),  # (T, 9 N)
+        rows: wp.array2d(dtype=vec4),  # (T, 3 N), out: x - x0 and F of each particle
+    ):
+        t, place = wp.tid()
+        j = place // PARTS
+        part = place - j * PARTS
+        value = vec4()
+        for k in range(4):
+            column = 4 * part + k
+            if column < 3:
+                value[k] = x[t, 3 * j + column] - x0[3 * j + column]
+            else:
+                value[k] = F[t, 9 * j + column - 3]
+        put(rows, t, place, value)
+
+    @kernel
+    def weighted_sums(
+        indptr: wp.array(dtype=wp.int32),  # (K + 1,) rows of B or B^T
+        indices: wp.array(dtype=wp.int32),
+        weights: wp.array(dtype=real),
+        rows: wp.array2d(dtype=vec4),  # (T, M parts)
+        parts: wp.int32,
+        sums: wp.array2d(dtype=vec4),  # (T, K parts), out
+    ):
+        t, place = wp.tid()
+        i = place // parts
+        part = place - i * parts
+        put(sums, t, place, weighted_sum(indices, weights, indptr[i], indptr[i + 1], rows, t, parts, part))
 
     @kernel
     def carry(
-        indptr: wp.array(dtype=wp.int32),  # (G + 1,) rows of B
-        indices: wp.array(dtype=wp.int32),
-        weights: wp.array(dtype=real),
-        means: wp.array(dtype=vec3),  # (G,)
+        means: wp.array(dtype=real),  # (3 G,)
         covars: wp.array(dtype=mat33),  # (G,)
-        x0: wp.array(dtype=vec3),  # (N,)
-        x: wp.array2d(dtype=vec3),  # (T, N)
-        F: wp.array2d(dtype=mat33),  # (T, N)
         arms: wp.array(dtype=vec3),  # (G,); None: Gaussians only shift
-        moved: wp.array2d(dtype=vec3),  # (T, G), out
-        stretched: wp.array2d(dtype=mat33),  # (T, G), out
-        F_bar: wp.array2d(dtype=mat33),  # (T, G), out; None where nobody needs it
+        sums: wp.array2d(dtype=vec4),  # (T, 3 G), mean shift and mean F of the particles
+        moved: wp.array2d(dtype=real),  # (T, 3 G), out
+        stretched: wp.array2d(dtype=vec3),  # (T, 3 G), out: rows of the covariances
     ):
-        t, g = wp.tid()
-        shift = vec3()
-        mean_F = mat33()
-        for k in range(indptr[g], indptr[g + 1]):
-            j = indices[k]
-            shift += weights[k] * (x[t, j] - x0[j])
-            mean_F += weights[k] * F[t, j]
+        t, place = wp.tid()
+        g = place // 3
+        i = place - 3 * g
+        first = get(sums, t, 3 * g)
+        mean_F = matrix_of(first, get(sums, t, 3 * g + 1), get(sums, t, 3 * g + 2))
+        row = wp.where(i == 0, mean_F[0], wp.where(i == 1, mean_F[1], mean_F[2]))
+        shift = one_of(i, first[0], first[1], first[2])
         if arms:
-            shift += mean_F * arms[g] - arms[g]
-        moved[t, g] = means[g] + shift
-        stretched[t, g] = mean_F * covars[g] * wp.transpose(mean_F)
-        if F_bar:
-            F_bar[t, g] = mean_F
+            arm = arms[g]
+            shift += wp.dot(row, arm) - one_of(i, arm[0], arm[1], arm[2])
+        moved[t, place] = means[place] + shift
+        stretched[t, place] = mean_F * (wp.transpose(covars[g]) * row)
 
     @kernel
     def stretch_adjoint(
         covars: wp.array(dtype=mat33),  # (G,)
-        F_bar: wp.array2d(dtype=mat33),  # (T, G)
-        grad_stretched: wp.array2d(dtype=mat33),  # (T, G)
         arms: wp.array(dtype=vec3),  # (G,) or None
+        sums: wp.array2d(dtype=vec4),  # (T, 3 G), as `carry` read them; None where F needs no gradient
         grad_moved: wp.array2d(dtype=vec3),  # (T, G)
-        grad_F_bar: wp.array2d(dtype=mat33),  # (T, G), out
+        grad_stretched: wp.array2d(dtype=mat33),  # (T, G)
+        grad_sums: wp.array2d(dtype=vec4),  # (T, 3 G), out; (T, G), vectors only, where F needs no gradient
     ):
         t, g = wp.tid()
-        grad = grad_stretched[t, g]
-        A = covars[g]
-        total = grad * F_bar[t, g] * wp.transpose(A) + wp.transpose(grad) * F_bar[t, g] * A
-        if arms:
-            total += wp.outer(grad_moved[t, g], arms[g])
-        grad_F_bar[t, g] = total
+        shift = grad_moved[t, g]
+        if sums:
+            mean_F = matrix_of(get(sums, t, 3 * g), get(sums, t, 3 * g + 1), get(sums, t, 3 * g + 2))
+            grad = grad_stretched[t, g]
+            A = covars[g]
+            total = grad * mean_F * wp.transpose(A) + wp.transpose(grad) * mean_F * A
+            if arms:
+                total += wp.outer(shift, arms[g])
+            put(grad_sums, t, 3 * g, vec4(shift[0], shift[1], shift[2], total[0, 0]))
+            put(grad_sums, t, 3 * g + 1, vec4(total[0, 1], total[0, 2], total[1, 0], total[1, 1]))
+            put(grad_sums, t, 3 * g + 2, vec4(total[1, 2], total[2, 0], total[2, 1], total[2, 2]))
+        else:
+            put(grad_sums, t, g, vec4(shift[0], shift[1], shift[2], real(0.0)))
 
-    @kernel
-    def carry_adjoint(
-        indptr: wp.array(dtype=wp.int32),  # (N + 1,) rows of B^T
-        indices: wp.array(dtype=wp.int32),
-        weights: wp.array(dtype=real),
-        grad_moved: wp.array2d(dtype=vec3),  # (T, G)
-        grad_F_bar: wp.array2d(dtype=mat33),  # (T, G); None together with grad_F
-        grad_x: wp.array2d(dtype=vec3),  # (T, N), out
-        grad_F: wp.array2d(dtype=mat33),  # (T, N), out
-    ):
-        t, j = wp.tid()
-        total_x = vec3()
-        total_F = mat33()
-        for k in range(indptr[j], indptr[j + 1]):
-            g = indices[k]
-            total_x += weights[k] * grad_moved[t, g]
-            if grad_F:
-                total_F += weights[k] * grad_F_bar[t, g]
-        grad_x[t, j] = total_x
-        if grad_F:
-            grad_F[t, j] = total_F
-
-    return carry, stretch_adjoint, carry_adjoint
+    return SimpleNamespace(
+        pack=pack, weighted_sums=weighted_sums, carry=carry, stretch_adjoint=stretch_adjoint
+    )

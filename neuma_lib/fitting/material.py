@@ -269,6 +269,7 @@ def train_material(
     # What was trained may pass the limit, which leaves a margin: a step too far is taken back.
     if not stretch.before:
         model.check_courant(law, min(float(start.density.min()) for start, _ in videos))
+    law.set_adjoint_precision(settings.adjoint_precision)
     loop = _Loop(model, law, videos, settings, log, stretch)
     if checkpoint is not None and (state := checkpoint.load()) is not None:
         loop.load_state_dict(state)

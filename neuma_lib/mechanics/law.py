@@ -11,7 +11,7 @@ tensors at every step and returns their gradients to autograd once.
 from __future__ import annotations
 
 from collections.abc import Hashable
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from neuma_lib.errors import NonFiniteError
 
 Weights = tuple[Tensor, ...]
+AdjointPrecision = Literal["single", "half"]
 
 
 class Constitutive(nn.Module):
@@ -29,6 +30,9 @@ class Constitutive(nn.Module):
 
     capturable = False
     """Whether `evaluate` and `vjp` can be recorded in a CUDA graph: no read from the device, all scratch reused."""
+    adjoint_precision: AdjointPrecision = "single"
+    """Of the matrix products in `vjp`: "half" takes factors of 11 bits where a law has such kernels, and sums them in
+    float32; elsewhere it changes nothing."""
 
     def graph_key(self) -> Hashable:
         """Equal for laws that do the same with the same weights, so that they can share recorded graphs."""
@@ -78,7 +82,8 @@ class Constitutive(nn.Module):
             grad_out: (N, 3, 3) gradient of a scalar with respect to the result.
             cache: from :meth:`evaluate_with_cache` at the same F and weights; None recomputes.
             grad_F: (N, 3, 3) buffer that receives the first result if given.
-            grad_weights: accumulators shaped as the weights; if given, the gradients are added to them.
+            grad_weights: accumulators shaped as the weights, or what :meth:`accumulators` made of them; if given, the
+                gradients are added to them.
 
         Returns:
             the gradient with respect to F, and one gradient a weight (the accumulators if they were given).
@@ -97,6 +102,15 @@ class Constitutive(nn.Module):
         for total, grad in zip(grad_weights, grads[1:], strict=True):
             total.add_(grad)
         return result, grad_weights
+
+    def accumulators(self, F: Tensor, grad_weights: Weights) -> Weights:
+        """What many calls of `vjp`, each for as many rows as F (N, 3, 3), add to at the least cost, zero at the start;
+        `add_up` has the last word. By default the accumulators ``grad_weights`` themselves.
+        """
+        return grad_weights
+
+    def add_up(self, accumulators: Weights, grad_weights: Weights) -> None:
+        """Add to ``grad_weights`` what ``accumulators``, of :meth:`accumulators`, have received."""
 
 
 class Elasticity(Constitutive):
@@ -119,6 +133,11 @@ class Law(nn.Module):
     def weights(self) -> tuple[Weights, Weights]:
         """Weights of the elasticity and of the plasticity."""
         return self.elasticity.weights(), self.plasticity.weights()
+
+    def set_adjoint_precision(self, precision: AdjointPrecision) -> None:
+        """Compute gradients in :attr:`Constitutive.adjoint_precision` from now on, in both parts."""
+        for part in (self.elasticity, self.plasticity):
+            part.adjoint_precision = precision
 
     def longitudinal_modulus(self) -> float:
         """Largest eigenvalue of the acoustic tensor Q_ik = n_j (d tau_ij / d F_kl) n_l at F = I over n [Pa].

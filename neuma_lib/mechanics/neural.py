@@ -96,7 +96,7 @@ class NeuralConstitutive(AdaptableConstitutive):
     """Whether evaluate and vjp use :mod:`neural_fused`: None where it runs, False never, True always."""
 
     def graph_key(self) -> Hashable:
-        return type(self), self.fused
+        return type(self), self.fused, self.adjoint_precision
 
     def __init__(self, weights: Weights | None = None, seed: int = 0):
         """Args: weights: three matrices of :data:`SHAPES`; Xavier-uniform from ``seed`` if not given."""
@@ -155,10 +155,19 @@ class NeuralConstitutive(AdaptableConstitutive):
         aten.gelu.out(state.a1, out=state.h1)
         torch.mm(state.h1, W2.mT, out=state.Y.view(-1, 9))
 
+    def accumulators(self, F, grad_weights):
+        return (neural_fused.partial_sums(F),) if self.uses_fused(F) else grad_weights
+
+    @torch.no_grad()
+    def add_up(self, accumulators, grad_weights):
+        if len(accumulators) != len(grad_weights):
+            neural_fused.add_up(*accumulators, grad_weights)
+
     @torch.no_grad()
     def vjp(self, F, weights, grad_out, cache=None, grad_F=None, grad_weights=None):
         if cache is None and self.uses_fused(F):
-            return neural_fused.vjp(F, weights, grad_out, self.kind, self.scale, grad_F, grad_weights)
+            grads = (grad_F, grad_weights, self.adjoint_precision)
+            return neural_fused.vjp(F, weights, grad_out, self.kind, self.scale, *grads)
         F, grad_out = F.detach().contiguous(), grad_out.contiguous()
         weights = tuple(w.detach() for w in weights)
         grad_F = torch.empty_like(F) if grad_F is None else grad_F

@@ -35,6 +35,11 @@
         asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
         return y;
     };
+    auto root = [](float x) {
+        float y;
+        asm("sqrt.approx.f32 %0, %1;" : "=f"(y) : "f"(x));
+        return y;
+    };
     auto prefetch = [](const float* x) { asm volatile("prefetch.global.L1 [%0];" : : "l"(x)); };
     auto warp_max = [](unsigned x) { return __reduce_max_sync(0xffffffffu, x); };
 
@@ -46,15 +51,22 @@
     typedef float Real;
     const int WIDTH = 1;
     #define LANE(x, l) (x)
-    #define SQRT(x) sqrtf(x)
+    // two units in the last place will do where products have 11 bits
+    #define SQRT(x) (HALF ? root(x) : sqrtf(x))
+    #define DIVIDE(x, y) (HALF ? __fdividef(x, y) : (x) / (y))
     const int g = lane >> 2, t = lane & 3;
+    // This thread's row among those of the warp and of the block. Where a warp has 16 rows, both of its halves do the work
+    // of a row, and write the same.
+    const int warp_rows = 16 * TILES, warp_row = lane & (warp_rows - 1), block_row = warp_rows * warp + warp_row;
     // Place [bytes] of a chunk of eight halves in a matrix with 64 or 16 columns; the order of chunks depends on the row
     auto at64 = [](int row, int chunk) { return row * ROW64 + ((chunk ^ (row & 7)) << 4); };
     auto at16 = [](int row, int chunk) { return row * ROW16 + ((chunk ^ ((row >> 2) & 1)) << 4); };
 
+    // Where HALF there are no low parts: they are neither computed nor stored, loaded or multiplied.
     auto split = [&](float x0, float x1, unsigned& high, unsigned& low) {
         float y0, y1;
         high = pack(x0, x1);
+        if (HALF) return;
         unpack(high, y0, y1);
         low = pack(x0 - y0, x1 - y1);
     };
@@ -72,14 +84,16 @@
     // c[m][n + q] += a[m] b[q], the small terms first
     auto multiply = [&](auto& c, int n, const auto& high, const auto& low, const auto& b) {
         const int M = sizeof(c) / sizeof(c[0]), Q = sizeof(b) / sizeof(b[0]);
-        #pragma unroll
-        for (int q = 0; q < Q; ++q)
+        if (!HALF) {
             #pragma unroll
-            for (int m = 0; m < M; ++m) mma(c[m][n + q], low[m], b[q]);
-        #pragma unroll
-        for (int q = 0; q < Q; ++q)
+            for (int q = 0; q < Q; ++q)
+                #pragma unroll
+                for (int m = 0; m < M; ++m) mma(c[m][n + q], low[m], b[q]);
             #pragma unroll
-            for (int m = 0; m < M; ++m) mma(c[m][n + q], high[m], b[q] + 2);
+            for (int q = 0; q < Q; ++q)
+                #pragma unroll
+                for (int m = 0; m < M; ++m) mma(c[m][n + q], high[m], b[q] + 2);
+        }
         #pragma unroll
         for (int q = 0; q < Q; ++q)
             #pragma unroll
@@ -88,7 +102,7 @@
     // Left operand of columns 16 j to 16 j + 15 from accumulators x
     auto fragments = [&](const auto& x, int j, float up, auto& high, auto& low) {
         #pragma unroll
-        for (int m = 0; m < 2; ++m)
+        for (int m = 0; m < TILES; ++m)
             #pragma unroll
             for (int k = 0; k < 4; ++k) {
                 const float* c = x[m][2 * j + (k >> 1)] + 2 * (k & 1);
@@ -98,10 +112,10 @@
     // Rows of this warp of a matrix with 16 columns, as left operand
     auto load16 = [&](int matrix, auto& high, auto& low) {
         #pragma unroll
-        for (int m = 0; m < 2; ++m) {
-            const int place = matrix + at16(32 * warp + 16 * m + (lane & 15), lane >> 4);
+        for (int m = 0; m < TILES; ++m) {
+            const int place = matrix + at16(warp_rows * warp + 16 * m + (lane & 15), lane >> 4);
             matrices(high[m], place);
-            matrices(low[m], place + LOW16);
+            if (!HALF) matrices(low[m], place + LOW16);
         }
     };
     auto store16 = [&](int matrix, const float* x, float up) {
@@ -113,39 +127,53 @@
                 const float* pair = x + 8 * chunk + 2 * k;
                 split(pair[0] * up, pair[1] * up, high[k], low[k]);
             }
-            char* place = pool + matrix + at16(thread, chunk);
+            char* place = pool + matrix + at16(block_row, chunk);
             *(uint4*)place = make_uint4(high[0], high[1], high[2], high[3]);
-            *(uint4*)(place + LOW16) = make_uint4(low[0], low[1], low[2], low[3]);
+            if (!HALF) *(uint4*)(place + LOW16) = make_uint4(low[0], low[1], low[2], low[3]);
         }
     };
     // Columns 16 j to 16 j + 15 of this warp's rows of a matrix with 64 columns
     auto stage = [&](int matrix, int j, const auto& high, const auto& low) {
         #pragma unroll
-        for (int m = 0; m < 2; ++m)
+        for (int m = 0; m < TILES; ++m)
             #pragma unroll
             for (int k = 0; k < 4; ++k) {
-                const int row = 32 * warp + 16 * m + g + 8 * (k & 1);
+                const int row = warp_rows * warp + 16 * m + g + 8 * (k & 1);
                 char* place = pool + matrix + at64(row, 2 * j + (k >> 1)) + 4 * t;
                 *(unsigned*)place = high[m][k];
-                *(unsigned*)(place + LOW64) = low[m][k];
+                if (!HALF) *(unsigned*)(place + LOW64) = low[m][k];
             }
     };
-    // Right operands: four tiles of 8 columns from tile n, rows 16 k to 16 k + 15; of W^T and of W
-    auto weights_T = [&](int matrix, int part, int k, int n, auto& b) {
-        #pragma unroll
-        for (int q = 0; q < (int)(sizeof(b) / sizeof(b[0])); ++q)
-            matrices(b[q], matrix + (lane >> 4) * part + at64(8 * (n + q) + (lane & 7), 2 * k + ((lane >> 3) & 1)));
+    // Right operands, an even number of tiles: place(q, part) is where this lane's chunk of the high (part 0) or low part
+    // of tile q lies. One load brings both parts of a tile, or the high parts of two.
+    auto right = [&](auto load, auto& b, auto place) {
+        const int Q = sizeof(b) / sizeof(b[0]);
+        if (HALF)
+            #pragma unroll
+            for (int q = 0; q < Q; q += 2) {
+                unsigned both[4];
+                load(both, place(q + (lane >> 4), 0));
+                #pragma unroll
+                for (int k = 0; k < 4; ++k) b[q + (k >> 1)][k & 1] = both[k];
+            }
+        else
+            #pragma unroll
+            for (int q = 0; q < Q; ++q) load(b[q], place(q, lane >> 4));
     };
-    auto weights = [&](int matrix, int part, int k, int n, auto& b) {
-        #pragma unroll
-        for (int q = 0; q < (int)(sizeof(b) / sizeof(b[0])); ++q)
-            transposed(b[q], matrix + (lane >> 4) * part + at64(16 * k + (lane & 15), n + q));
+    // Tiles of 8 columns from tile n, rows 16 k to 16 k + 15; of W^T and of W
+    auto weights_T = [&](int matrix, int low, int k, int n, auto& b) {
+        right(matrices, b, [&](int q, int part) {
+            return matrix + part * low + at64(8 * (n + q) + (lane & 7), 2 * k + ((lane >> 3) & 1));
+        });
+    };
+    auto weights = [&](int matrix, int low, int k, int n, auto& b) {
+        right(transposed, b, [&](int q, int part) { return matrix + part * low + at64(16 * k + (lane & 15), n + q); });
     };
     auto layer0 = [&](const auto& high, const auto& low, int n, auto& c, int to) {
         unsigned b[sizeof(c[0]) / sizeof(c[0][0]) < 4 ? 2 : 4][4];
-        #pragma unroll
-        for (int q = 0; q < (int)(sizeof(b) / sizeof(b[0])); ++q)
-            matrices(b[q], W0_AT + (lane >> 4) * W0_LOW + at16(8 * (n + q) + (lane & 7), (lane >> 3) & 1));
+        right(matrices, b, [&](int q, int part) {
+            return W0_AT + part * W0_LOW + at16(8 * (n + q) + (lane & 7), (lane >> 3) & 1);
+        });
         multiply(c, to, high, low, b);
     };
     // Standard normal distribution function: 2^q(|x|) is its tail, to 5e-8
@@ -179,7 +207,7 @@
     };
     auto put_rows = [&](float* rows, const auto& c, int columns, float factor) {
         #pragma unroll
-        for (int m = 0; m < 2; ++m)
+        for (int m = 0; m < TILES; ++m)
             #pragma unroll
             for (int n = 0; n < 2; ++n)
                 #pragma unroll
@@ -211,8 +239,8 @@
         __syncthreads();
         const bool first = tile == (int)blockIdx.x;
         // rows past the end repeat the last one, and have no gradient and no result
-        const bool used = tile * ROWS + thread < n;
-        const int row = used ? tile * ROWS + thread : n - 1;
+        const bool used = tile * ROWS + block_row < n;
+        const int row = used ? tile * ROWS + block_row : n - 1;
         float f[9], R[9], V[9], z[16], sums[3];
         #pragma unroll
         for (int k = 0; k < 9; ++k) f[k] = ((const float*)F)[9 * (size_t)row + k];
@@ -221,18 +249,18 @@
         if (first) {
             #pragma unroll
             for (int k = 0; k < W0_LOADS; ++k) {
-                const int i = thread + ROWS * k;
+                const int i = thread + THREADS * k;
                 w0[k] = i < W1_START ? ((const float*)W0)[i] : 0.0f;
             }
             #pragma unroll
             for (int k = 0; k < W1_LOADS; ++k) {
-                const float2 pair = ((const float2*)W1)[thread + ROWS * k];
+                const float2 pair = ((const float2*)W1)[thread + THREADS * k];
                 w1[2 * k] = pair.x;
                 w1[2 * k + 1] = pair.y;
             }
             #pragma unroll
             for (int k = 0; k < W2_LOADS; ++k) {
-                const int i = thread + ROWS * k;
+                const int i = thread + THREADS * k;
                 const float2 pair = 2 * i < WEIGHTS - W2_START ? ((const float2*)W2)[i] : make_float2(0.0f, 0.0f);
                 w2[2 * k] = pair.x;
                 w2[2 * k + 1] = pair.y;
@@ -279,27 +307,30 @@
                            peak2 = warp_max(__float_as_uint(size2));
             if (lane == 0) {
                 peaks[warp] = peak0;
-                peaks[4 + warp] = peak1;
-                peaks[8 + warp] = peak2;
+                peaks[WARPS + warp] = peak1;
+                peaks[2 * WARPS + warp] = peak2;
             }
             __syncthreads();
             auto peak = [&](int k) {
-                return max(max(peaks[k], peaks[k + 1]), max(peaks[k + 2], peaks[k + 3]));
+                unsigned sofar = 0;
+                #pragma unroll
+                for (int w = 0; w < WARPS; ++w) sofar = max(sofar, peaks[WARPS * k + w]);
+                return sofar;
             };
             float up0, up1, up2;
             scales(peak(0), up0, down0);
-            scales(peak(4), up1, down1);
-            scales(peak(8), up2, down2);
+            scales(peak(1), up1, down1);
+            scales(peak(2), up2, down2);
             auto put_half = [&](int o, int i, float x) {
                 unsigned high, low;
                 split(x, 0.0f, high, low);
                 char* place = pool + W0_AT + at16(o, i >> 3) + 2 * (i & 7);
                 *(unsigned short*)place = (unsigned short)high;
-                *(unsigned short*)(place + W0_LOW) = (unsigned short)low;
+                if (!HALF) *(unsigned short*)(place + W0_LOW) = (unsigned short)low;
             };
             #pragma unroll
             for (int k = 0; k < W0_LOADS; ++k) {
-                const int i = thread + ROWS * k;
+                const int i = thread + THREADS * k;
                 if (i < W1_START) put_half(i / FEATURES, i % FEATURES, w0[k] * up0);
             }
             if (thread < HIDDEN)
@@ -309,20 +340,20 @@
                 split(x0, x1, high, low);
                 char* place = pool + matrix + at64(pair >> 5, (pair & 31) >> 2) + 4 * (pair & 3);
                 *(unsigned*)place = high;
-                *(unsigned*)(place + part) = low;
+                if (!HALF) *(unsigned*)(place + part) = low;
             };
             #pragma unroll
-            for (int k = 0; k < W1_LOADS; ++k) put_pair(W1_AT, W1_LOW, thread + ROWS * k, w1[2 * k] * up1, w1[2 * k + 1] * up1);
+            for (int k = 0; k < W1_LOADS; ++k) put_pair(W1_AT, W1_LOW, thread + THREADS * k, w1[2 * k] * up1, w1[2 * k + 1] * up1);
             #pragma unroll
-            for (int k = 0; k < W2_LOADS; ++k) put_pair(W2_AT, W2_LOW, thread + ROWS * k, w2[2 * k] * up2, w2[2 * k + 1] * up2);
+            for (int k = 0; k < W2_LOADS; ++k) put_pair(W2_AT, W2_LOW, thread + THREADS * k, w2[2 * k] * up2, w2[2 * k + 1] * up2);
             __syncthreads();
         }
         __syncwarp();
 
 // Both kernels: the first two products, with h0 in x and what the second layer is before its gelu, unscaled, in y.
 //// layers
-        unsigned high[2][4], low[2][4];
-        float x[2][8][4], y[2][8][4], up_h0, down_h0, down;
+        unsigned high[TILES][4], low[TILES][4];
+        float x[TILES][8][4], y[TILES][8][4], up_h0, down_h0, down;
         clear(x);
         load16(Z_AT, high, low);
         layer0(high, low, 0, x, 0);
@@ -355,7 +386,7 @@
 //// evaluate
         size = activate(y, down_h0 * down1);
         warp_scales(size, up, down);
-        float Y[2][2][4];
+        float Y[TILES][2][4];
         clear(Y);
         #pragma unroll
         for (int j = 0; j < 4; ++j) {
@@ -364,28 +395,28 @@
             weights_T(W2_AT, W2_LOW, j, 0, b);
             multiply(Y, 0, high, low, b);
         }
-        float* rows = (float*)(pool + ROW_AT + 4 * 32 * ROW_STRIDE * warp);
+        float* rows = (float*)(pool + ROW_AT + 4 * warp_rows * ROW_STRIDE * warp);
         put_rows(rows, Y, OUTPUTS, down * down2);
         __syncwarp();
         float X[9], P[9], result[9];
-        output_of_row(rows + ROW_STRIDE * lane, X);
+        output_of_row(rows + ROW_STRIDE * warp_row, X);
         matmul(R, X, P, NN);
         if (ELASTIC)
             matmul(P, f, result, NT);
         else
             for (int k = 0; k < 9; ++k) result[k] = fmaf(factor, P[k], f[k]);
-        if (used)
+        if (used && lane < warp_rows)
             for (int k = 0; k < 9; ++k) ((float*)out)[9 * (size_t)row + k] = result[k];
     }
 
 // Backward only: what the end needs again is put down, and registers are free for the layers.
 //// put_down
-        float* state = (float*)(pool + STATE_AT) + thread;
+        float* state = (float*)(pool + STATE_AT) + block_row;
         float* downs = (float*)(pool + DOWNS_AT);
         // downs: what turns the scaled activations of each warp back
         enum { OF_Z, OF_H0, OF_H1, OF_GY, OF_G1, OF_G0 };
         auto publish = [&](int which, float value) {
-            if (lane == 0) downs[4 * which + warp] = value;
+            if (lane == 0) downs[WARPS * which + warp] = value;
         };
         #pragma unroll
         for (int k = 0; k < 9; ++k) {
@@ -413,9 +444,9 @@
         }
         warp_scales(size, up, down);
         publish(OF_H1, down);
-        float* rows = (float*)(pool + S0_AT + 32 * ROW64 * warp);
+        float* rows = (float*)(pool + S0_AT + warp_rows * ROW64 * warp);
         {
-            float Y[2][2][4];
+            float Y[TILES][2][4];
             clear(Y);
             #pragma unroll
             for (int j = 0; j < 4; ++j) {
@@ -431,7 +462,7 @@
         float down_gy;
         {
             float G[9], X[9], B[9], C[9], T[9], gy[16];
-            output_of_row(rows + ROW_STRIDE * lane, X);
+            output_of_row(rows + ROW_STRIDE * warp_row, X);
             #pragma unroll
             for (int k = 0; k < 9; ++k) {
                 R[k] = state[ROWS * (STATE_R + k)];
@@ -464,7 +495,7 @@
             for (int i = 0; i < 3; ++i) {
                 float sum = state[ROWS * (STATE_TURN + i)];
                 if (fabsf(sum) < FLOOR) sum = sum < 0.0f ? -FLOOR : FLOOR;
-                const float kappa = (V[3 * i] * axial[0] + V[3 * i + 1] * axial[1] + V[3 * i + 2] * axial[2]) / sum;
+                const float kappa = DIVIDE(V[3 * i] * axial[0] + V[3 * i + 1] * axial[1] + V[3 * i + 2] * axial[2], sum);
                 #pragma unroll
                 for (int j = 0; j < 3; ++j) turn[j] = fmaf(kappa, V[3 * i + j], turn[j]);
             }
@@ -475,6 +506,7 @@
                 matmul(G, B, C, TN);
             } else
                 for (int k = 0; k < 9; ++k) C[k] = G[k];
+            __syncwarp();
             #pragma unroll
             for (int k = 0; k < 9; ++k) state[ROWS * (STATE_TURN + k)] = T[k] + C[k];
         }
@@ -483,27 +515,29 @@
         // total[n] += sum over the block's rows of G^T H; gradient and input give places of (row, chunk)
         auto outer = [&](auto gradient, int low_g, auto input, auto& total, int which_g, int which_h) {
             const int N = sizeof(total) / sizeof(total[0]), Q = N < 4 ? N : 4;
+            // as many products on their way at a time as registers allow
+            const int UNROLL = TILES > 1 ? 1 : N > 2 ? 2 : 4;
             clear(total);
-            #pragma unroll 1
-            for (int w = 0; w < 4; ++w) {
+            #pragma unroll UNROLL
+            for (int w = 0; w < WARPS; ++w) {
                 float c[1][N][4];
                 clear(c);
                 #pragma unroll
-                for (int k = 0; k < 2; ++k) {
+                for (int k = 0; k < TILES; ++k) {
                     unsigned a[1][4], a_low[1][4], b[Q][4];
                     const int place = gradient(
-                        32 * w + 16 * k + (lane & 7) + ((lane >> 4) << 3), (lane >> 3) & 1);
+                        warp_rows * w + 16 * k + (lane & 7) + ((lane >> 4) << 3), (lane >> 3) & 1);
                     transposed(a[0], place);
-                    transposed(a_low[0], place + low_g);
+                    if (!HALF) transposed(a_low[0], place + low_g);
                     #pragma unroll
                     for (int n8 = 0; n8 < N; n8 += Q) {
-                        #pragma unroll
-                        for (int q = 0; q < Q; ++q)
-                            transposed(b[q], input(32 * w + 16 * k + (lane & 15), n8 + q, lane >> 4));
+                        right(transposed, b, [&](int q, int part) {
+                            return input(warp_rows * w + 16 * k + (lane & 15), n8 + q, part);
+                        });
                         multiply(c, n8, a, a_low, b);
                     }
                 }
-                const float both = downs[4 * which_g + w] * downs[4 * which_h + w];
+                const float both = downs[WARPS * which_g + w] * downs[WARPS * which_h + w];
                 #pragma unroll
                 for (int i = 0; i < 4 * N; ++i)
                     ((float*)total)[i] = fmaf(((float*)c)[i], both, ((float*)total)[i]);
@@ -515,27 +549,48 @@
         auto part16 = [&](int matrix) {
             return [=](int r, int chunk, int part) { return matrix + LOW16 * part + at16(r, chunk); };
         };
+        // four warps share the 64 columns of a gradient, or, of a product with 16 columns, those of the other factor
+        const int slice = warp & 3;
         auto slice64 = [&](int matrix) {
-            return [=](int r, int chunk) { return matrix + at64(r, 2 * warp + chunk); };
+            return [=](int r, int chunk) { return matrix + at64(r, 2 * slice + chunk); };
         };
         float* partial = (float*)partials + (size_t)blockIdx.x * WEIGHTS;
-        auto add = [&](int i, float value) { partial[i] = first ? value : partial[i] + value; };
-        auto add_pair = [&](int i, const float* values) {
-            float2* place = (float2*)(partial + i);
-            const float2 before = first ? make_float2(0.0f, 0.0f) : *place;
-            *place = make_float2(before.x + values[0], before.y + values[1]);
-        };
-        {
-            float total[2][4];
-            outer([&](int r, int chunk) { return GY_AT + at16(r, chunk); }, LOW16,
-                  [&](int r, int chunk, int part) { return part64(S1_AT)(r, 2 * warp + chunk, part); }, total, OF_GY, OF_H1);
+        const bool alone = first && fresh;
+        auto add = [&](int i, float value) { partial[i] = alone ? value : partial[i] + value; };
+        // Pairs (2k, 2k + 1) of total[n] are added at place(n, k), if that is not negative. What stands there is loaded
+        // before the product that fills the total.
+        auto add_pairs = [&](auto& total, auto place, auto product) {
+            const int N = sizeof(total) / sizeof(total[0]);
+            float2 before[N][2];
             #pragma unroll
-            for (int n8 = 0; n8 < 2; ++n8)
+            for (int n8 = 0; n8 < N; ++n8)
                 #pragma unroll
-                for (int k = 0; k < 4; k += 2) {
-                    const int o = g + 4 * k, i = 16 * warp + 8 * n8 + 2 * t;
-                    if (o < OUTPUTS) add_pair(W2_START + HIDDEN * o + i, total[n8] + k);
+                for (int k = 0; k < 2; ++k) {
+                    const int i = place(n8, k);
+                    before[n8][k] = alone || i < 0 ? make_float2(0.0f, 0.0f) : *(const float2*)(partial + i);
                 }
+            product();
+            #pragma unroll
+            for (int n8 = 0; n8 < N; ++n8)
+                #pragma unroll
+                for (int k = 0; k < 2; ++k) {
+                    const int i = place(n8, k);
+                    const float* pair = total[n8] + 2 * k;
+                    if (i >= 0)
+                        *(float2*)(partial + i) = make_float2(before[n8][k].x + pair[0], before[n8][k].y + pair[1]);
+                }
+        };
+        if (warp == slice) {
+            float total[2][4];
+            auto place = [&](int n8, int k) {
+                const int o = g + 8 * k, i = 16 * slice + 8 * n8 + 2 * t;
+                return o < OUTPUTS ? W2_START + HIDDEN * o + i : -1;
+            };
+            add_pairs(total, place, [&] {
+                outer([&](int r, int chunk) { return GY_AT + at16(r, chunk); }, LOW16,
+                      [&](int r, int chunk, int part) { return part64(S1_AT)(r, 2 * slice + chunk, part); }, total,
+                      OF_GY, OF_H1);
+            });
         }
         // y turns into g1, the gradient before the second gelu
         load16(GY_AT, high, low);
@@ -544,12 +599,12 @@
         #pragma unroll
         for (int n8 = 0; n8 < 8; n8 += 4) {
             unsigned b[4][4];
-            float c[2][4][4];
+            float c[TILES][4][4];
             clear(c);
             weights(W2_AT, W2_LOW, 0, n8, b);
             multiply(c, 0, high, low, b);
             #pragma unroll
-            for (int m = 0; m < 2; ++m)
+            for (int m = 0; m < TILES; ++m)
                 #pragma unroll
                 for (int i = 0; i < 16; ++i) {
                     float& value = ((float*)y[m][n8])[i];
@@ -575,17 +630,17 @@
         // the first layer once more, four tiles at a time; x turns into g0
         {
             const float factor_g = down * down1;
-            unsigned z_high[2][4], z_low[2][4];
+            unsigned z_high[TILES][4], z_low[TILES][4];
             load16(Z_AT, z_high, z_low);
             factor_a = down_z * down0;
             size = 0.0f;
             #pragma unroll
             for (int n8 = 0; n8 < 8; n8 += 4) {
-                float c[2][4][4];
+                float c[TILES][4][4];
                 clear(c);
                 layer0(z_high, z_low, n8, c, 0);
                 #pragma unroll
-                for (int m = 0; m < 2; ++m)
+                for (int m = 0; m < TILES; ++m)
                     #pragma unroll
                     for (int i = 0; i < 16; ++i) {
                         float& a = ((float*)c[m])[i];
@@ -607,44 +662,47 @@
         publish(OF_G0, down);
         __syncthreads();
         {
-            float total[8][4];
-            outer(slice64(S1_AT), LOW64, part64(S0_AT), total, OF_G1, OF_H0);
-            #pragma unroll
-            for (int n8 = 0; n8 < 8; ++n8)
-                #pragma unroll
-                for (int k = 0; k < 4; k += 2)
-                    add_pair(W1_START + HIDDEN * (16 * warp + g + 4 * k) + 8 * n8 + 2 * t, total[n8] + k);
+            const int count = 32 / WARPS, start = warp / 4 * count;
+            float total[count][4];
+            auto place = [&](int n8, int k) {
+                return W1_START + HIDDEN * (16 * slice + g + 8 * k) + 8 * (start + n8) + 2 * t;
+            };
+            add_pairs(total, place, [&] {
+                outer(slice64(S1_AT), LOW64,
+                      [&](int r, int chunk, int part) { return part64(S0_AT)(r, start + chunk, part); }, total, OF_G1,
+                      OF_H0);
+            });
         }
         __syncthreads();
         {
-            float gz[2][2][4];
+            float gz[TILES][2][4];
             clear(gz);
             #pragma unroll
             for (int j = 0; j < 4; ++j) {
                 unsigned b[2][4];
                 fragments(x, j, up, high, low);
                 stage(S1_AT, j, high, low);
-                #pragma unroll
-                for (int q = 0; q < 2; ++q)
-                    transposed(b[q], W0_AT + (lane >> 4) * W0_LOW + at16(16 * j + (lane & 15), q));
+                right(transposed, b, [&](int q, int part) {
+                    return W0_AT + part * W0_LOW + at16(16 * j + (lane & 15), q);
+                });
                 multiply(gz, 0, high, low, b);
             }
             put_rows(rows, gz, FEATURES, down * down0);
         }
         __syncthreads();
-        {
+        if (warp == slice) {
             float total[2][4];
             outer(slice64(S1_AT), LOW64, part16(Z_AT), total, OF_G0, OF_Z);
             #pragma unroll
             for (int n8 = 0; n8 < 2; ++n8)
                 #pragma unroll
                 for (int k = 0; k < 4; ++k) {
-                    const int o = 16 * warp + g + 8 * (k >> 1), i = 8 * n8 + 2 * t + (k & 1);
+                    const int o = 16 * slice + g + 8 * (k >> 1), i = 8 * n8 + 2 * t + (k & 1);
                     if (i < FEATURES) add(FEATURES * o + i, total[n8][k]);
                 }
         }
-        if (used) {
-            const float* gz = rows + ROW_STRIDE * lane;
+        if (used && lane < warp_rows) {
+            const float* gz = rows + ROW_STRIDE * warp_row;
             float S[9], D[9], T[9];
             #pragma unroll
             for (int k = 0; k < 9; ++k) {
@@ -679,6 +737,7 @@
 //// end
     #undef LANE
     #undef SQRT
+    #undef DIVIDE
     #undef NN
     #undef NT
     #undef TN

@@ -4,16 +4,20 @@ The twin in :mod:`neuma_lib.mechanics.neural` writes every activation to memory 
 only F is read and only the result written, and the backward pass computes the activations again. The text of the
 kernels is ``neural_fused.cu``.
 
-A warp owns 32 rows. Each lane computes the features of one row; the matrix products run on the tensor cores, two
-tiles of 16 rows at a time; each lane ends with the output of its row. The accumulators of a layer hold a row in the
+A warp owns one or two tiles of 16 rows. Each lane computes the features of one row; the matrix products run on the
+tensor cores, a tile at a time; each lane ends with the output of its row. The accumulators of a layer hold a row in the
 order in which the next layer wants its operand, so activations stay in registers between layers.
 
 **Precision.** Each factor is scaled by a power of two (one a weight matrix, one an activation of a warp) and split
 into two halves of 11 bits, x = hi + lo; lo hi + hi lo + hi hi, accumulated in float32, keeps 22 bits. That costs half
-of the same split in TF32, and the scale replaces the exponent bits that float16 lacks.
+of the same split in TF32, and the scale replaces the exponent bits that float16 lacks. The backward pass can do with
+hi hi alone (precision "half"): a third of the products, and gradients to 11 bits. What it computes of the forward pass
+again, the network at F, is rounded likewise. Sums, singular values and rotations stay in float32, with roots and
+quotients to two units in the last place.
 
 **Weight gradients** are products over rows, G^T H. The warps of a block put G and H, already split, in shared memory
-and each takes a slice of the result; blocks write their sums apart, and a second kernel adds them in a fixed order.
+and each takes a slice of the result; blocks write their sums apart, and a second kernel adds them in a fixed order:
+after each call, or after many of them, which let their blocks go on adding to :func:`partial_sums`.
 """
 
 from __future__ import annotations
@@ -30,7 +34,11 @@ from neuma_lib.mechanics.neural_kernels import FEATURES, GRAM
 from neuma_lib.mechanics.singular_values_kernels import SVD, SWEEPS
 
 ROWS = 128
-"""Rows, and threads, of a block: four warps."""
+"""Rows of a block."""
+EVALUATE_TILES, VJP_TILES = 2, 1
+"""Tiles of 16 rows that a warp owns, forward and backward. With one there are twice as many warps, of half the
+registers, which hides more of the latency where rows are few for the GPU; but two lanes do the same for each row, its
+features and stress."""
 BLOCKS_PER_PROCESSOR = 2
 HIDDEN, OUTPUTS = 64, 9
 WEIGHTS = HIDDEN * (FEATURES + HIDDEN + OUTPUTS)
@@ -44,8 +52,8 @@ LAYOUT = {
     "W0_AT": 0,  # (64, 16)
     "W1_AT": 4096,  # (64, 64)
     "W2_AT": 20480,  # (16, 64)
-    "PEAKS_AT": 24576,  # largest weights, three numbers a warp
-    "DOWNS_AT": 24640,  # scales of the activations, six numbers a warp
+    "PEAKS_AT": 24576,  # largest weights, three numbers a warp, before the next
+    "DOWNS_AT": 24640,  # scales of the activations, six numbers for each of eight warps
     "Z_AT": 24832,  # features (128, 16)
     "ROW_AT": 33024,  # forward only: output of the network, by row
     "S0_AT": 33024,  # backward only: h0 (128, 64); before it, the output of the network and its gradient
@@ -74,10 +82,6 @@ CONSTANTS = {
     "W1_START": HIDDEN * FEATURES,
     "W2_START": HIDDEN * (FEATURES + HIDDEN),
     "WEIGHTS": WEIGHTS,
-    # loads of a thread: of single weights of the first matrix, of pairs of the others (the last padded to 16 rows)
-    "W0_LOADS": -(-HIDDEN * FEATURES // ROWS),
-    "W1_LOADS": HIDDEN * HIDDEN // 2 // ROWS,
-    "W2_LOADS": 16 * HIDDEN // 2 // ROWS,
     "ROWS": ROWS,
     "FEATURES": FEATURES,
     "HIDDEN": HIDDEN,
@@ -88,16 +92,36 @@ EVALUATE_BYTES = LAYOUT["ROW_AT"] + 4 * CONSTANTS["ROW_STRIDE"] * ROWS + ALIGNME
 VJP_BYTES = LAYOUT["STATE_AT"] + 4 * 27 * ROWS + ALIGNMENT
 
 
+def threads(tiles: int) -> int:
+    """Of a block whose warps own that many tiles of 16 rows."""
+    return 32 * ROWS // (16 * tiles)
+
+
+def _loads(threads: int) -> dict[str, int]:
+    """Loads of a thread: of single weights of the first matrix, of pairs of the others (the last padded to 16 rows)."""
+    counts = {"W0": HIDDEN * FEATURES, "W1": HIDDEN * HIDDEN // 2, "W2": 16 * HIDDEN // 2}
+    return {f"{name}_LOADS": -(-count // threads) for name, count in counts.items()}
+
+
 def _constants(values: dict[str, int]) -> str:
     return "".join(f"    const int {name} = {value};\n" for name, value in values.items())
 
 
-def source(kind: str, backward: bool, machine: str | None = None) -> str:
-    """C++ text of the body of a kernel for ``kind`` "elasticity" or "plasticity"; ``machine``: see the ``.cu`` file."""
+def source(kind: str, backward: bool, machine: str | None = None, precision: str = "single") -> str:
+    """C++ text of the body of a kernel for ``kind`` "elasticity" or "plasticity".
+
+    ``machine``: see the ``.cu`` file; ``precision``: of the products, "single" or "half".
+    """
+    tiles = VJP_TILES if backward else EVALUATE_TILES
+    size = threads(tiles)
     parts = native_source(__file__)
     floor = torch.finfo(torch.float32).eps ** 0.5
-    constants = _constants(CONSTANTS)
-    constants += f"    const bool ELASTIC = {str(kind == 'elasticity').lower()};\n    const float FLOOR = {floor!r}f;\n"
+    constants = _constants(
+        {**CONSTANTS, **_loads(size), "TILES": tiles, "THREADS": size, "WARPS": size // 32}
+    )
+    for name, value in {"ELASTIC": kind == "elasticity", "HALF": precision == "half"}.items():
+        constants += f"    const bool {name} = {str(value).lower()};\n"
+    constants += f"    const float FLOOR = {floor!r}f;\n"
     prefetch = "prefetch((const float*)grad_out + 9 * (size_t)row);" if backward else ""
     features = parts["features"].replace("{GRAM}", GRAM).replace("{SVD}", SVD).replace("{PREFETCH}", prefetch)
     rest = ("put_down", "layers", "vjp") if backward else ("layers", "evaluate")
@@ -108,7 +132,7 @@ def source(kind: str, backward: bool, machine: str | None = None) -> str:
 # Arrays are handed over as addresses: Warp's array objects would cost more time than the launch.
 @cache
 def evaluate_kernel(kind: str):
-    """Kernel (F, W0, W1, W2, factor, n, out) over blocks of :data:`ROWS` threads."""
+    """Kernel (F, W0, W1, W2, factor, n, out) over blocks of :data:`ROWS` rows."""
 
     @wp.func_native(source(kind, backward=False))
     def evaluate_rows(
@@ -117,7 +141,10 @@ def evaluate_kernel(kind: str):
     ): ...  # fmt: skip
 
     @wp.kernel(
-        enable_backward=False, module="unique", launch_bounds=(ROWS, BLOCKS_PER_PROCESSOR), grid_stride=False
+        enable_backward=False,
+        module="unique",
+        launch_bounds=(threads(EVALUATE_TILES), BLOCKS_PER_PROCESSOR),
+        grid_stride=False,
     )
     def neural_evaluate(
         F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, factor: float, n: int, out: wp.uint64
@@ -129,24 +156,30 @@ def evaluate_kernel(kind: str):
 
 
 @cache
-def vjp_kernel(kind: str):
-    """Kernel (F, W0, W1, W2, grad_out, factor, n, grad_F, partials (blocks, WEIGHTS)) over blocks as above."""
+def vjp_kernel(kind: str, precision: str = "single"):
+    """Kernel (F, W0, W1, W2, grad_out, factor, n, grad_F, fresh, partials (blocks, WEIGHTS)) over blocks as above.
 
-    @wp.func_native(source(kind, backward=True))
+    ``fresh``: whether it sets ``partials``; otherwise it adds to them.
+    """
+
+    @wp.func_native(source(kind, backward=True, precision=precision))
     def vjp_rows(
         F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, grad_out: wp.uint64, factor: float, n: int,
-        grad_F: wp.uint64, partials: wp.uint64, shared: wp.tile(dtype=wp.uint8, shape=(VJP_BYTES,)),
+        grad_F: wp.uint64, fresh: int, partials: wp.uint64, shared: wp.tile(dtype=wp.uint8, shape=(VJP_BYTES,)),
     ): ...  # fmt: skip
 
     @wp.kernel(
-        enable_backward=False, module="unique", launch_bounds=(ROWS, BLOCKS_PER_PROCESSOR), grid_stride=False
+        enable_backward=False,
+        module="unique",
+        launch_bounds=(threads(VJP_TILES), BLOCKS_PER_PROCESSOR),
+        grid_stride=False,
     )
     def neural_vjp(
         F: wp.uint64, W0: wp.uint64, W1: wp.uint64, W2: wp.uint64, grad_out: wp.uint64, factor: float, n: int,
-        grad_F: wp.uint64, partials: wp.uint64,
+        grad_F: wp.uint64, fresh: int, partials: wp.uint64,
     ):  # fmt: skip
         shared = wp.tile_empty(shape=(VJP_BYTES,), dtype=wp.uint8, storage="shared")
-        vjp_rows(F, W0, W1, W2, grad_out, factor, n, grad_F, partials, shared)
+        vjp_rows(F, W0, W1, W2, grad_out, factor, n, grad_F, fresh, partials, shared)
 
     return neural_vjp
 
@@ -178,7 +211,7 @@ def supported(device: torch.device, dtype: torch.dtype) -> bool:
     if device.type != "cuda" or dtype != torch.float32:
         return False
     there = _device(device)
-    return there.arch >= 80 and there.max_shared_memory_per_block >= VJP_BYTES + 4 * ROWS
+    return there.arch >= 80 and there.max_shared_memory_per_block >= VJP_BYTES + 4 * threads(VJP_TILES)
 
 
 def _launch(kernel, blocks: int, threads: int, device: torch.device, *inputs) -> None:
@@ -210,7 +243,9 @@ def evaluate(F: Tensor, weights: Weights, kind: str, factor: float, out: Tensor 
     result = out if out is not None and out.is_contiguous() else torch.empty_like(F)
     if len(F):
         W, blocks = _packed(weights), _blocks(len(F), F.device)
-        _launch(evaluate_kernel(kind), blocks, ROWS, F.device, F, *W, factor, len(F), result)
+        _launch(
+            evaluate_kernel(kind), blocks, threads(EVALUATE_TILES), F.device, F, *W, factor, len(F), result
+        )
     return result if out is None or out is result else out.copy_(result)
 
 
@@ -223,19 +258,37 @@ def vjp(
     factor: float,
     grad_F: Tensor | None = None,
     grad_weights: Weights | None = None,
+    precision: str = "single",
 ) -> tuple[Tensor, Weights]:
-    """Gradients of F and, added to ``grad_weights``, of the weights. See :class:`Constitutive`."""
+    """Gradients of F and, added to ``grad_weights``, of the weights. See :class:`Constitutive`.
+
+    ``grad_weights`` may be :func:`partial_sums`; ``precision`` is that of the products, see
+    :attr:`Constitutive.adjoint_precision`.
+    """
     F, grad_out = F.detach().contiguous(), grad_out.contiguous()
     result = grad_F if grad_F is not None and grad_F.is_contiguous() else torch.empty_like(F)
     W = _packed(weights)
     totals = tuple(torch.zeros_like(w) for w in W) if grad_weights is None else grad_weights
     if len(F):
-        blocks = _blocks(len(F), F.device)
-        partials = F.new_empty(blocks, WEIGHTS)
-        _launch(vjp_kernel(kind), blocks, ROWS, F.device, F, *W, grad_out, factor, len(F), result, partials)
-        sums = [total if total.is_contiguous() else total.contiguous() for total in totals]
-        _launch(add_kernel(), WEIGHTS // 32, 1024, F.device, partials, blocks, *sums)
-        for total, summed in zip(totals, sums, strict=True):
-            if total is not summed:
-                total.copy_(summed)
+        blocks, fresh = _blocks(len(F), F.device), len(totals) == len(W)
+        partials = F.new_empty(blocks, WEIGHTS) if fresh else totals[0]
+        inputs = (F, *W, grad_out, factor, len(F), result, int(fresh), partials)
+        _launch(vjp_kernel(kind, precision), blocks, threads(VJP_TILES), F.device, *inputs)
+        if fresh:
+            add_up(partials, totals)
     return (result if grad_F is None or grad_F is result else grad_F.copy_(result)), totals
+
+
+def partial_sums(F: Tensor) -> Tensor:
+    """Zero gradients of the weights for each block that `vjp` at F (n, 3, 3) has, (blocks, WEIGHTS)."""
+    return F.new_zeros(_blocks(len(F), F.device), WEIGHTS)
+
+
+@torch.no_grad()
+def add_up(partials: Tensor, totals: Weights) -> None:
+    """Add the sums over the blocks to the gradients of the three weight matrices."""
+    sums = [total if total.is_contiguous() else total.contiguous() for total in totals]
+    _launch(add_kernel(), WEIGHTS // 32, 1024, partials.device, partials, len(partials), *sums)
+    for total, summed in zip(totals, sums, strict=True):
+        if total is not summed:
+            total.copy_(summed)

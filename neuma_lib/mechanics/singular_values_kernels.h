@@ -1,7 +1,7 @@
 // Text of the kernels that begin with the SVD of 3x3 matrices: a pack of matrices, one a SIMD lane on the CPU and one a
 // thread on a GPU. The module replaces REAL, CPU_WIDTH and SWEEPS.
 
-// The type `Pack`, its size `WIDTH`, and the macros LANE and SQRT.
+// The type `Pack`, its size `WIDTH`, and the macros LANE, SQRT and DIVIDE.
 //// types
     typedef REAL Real;
 #if defined(__CUDA_ARCH__)
@@ -15,6 +15,7 @@
     #define LANE(x, l) (x)[l]
     #define SQRT(x) __builtin_elementwise_sqrt(x)
 #endif
+    #define DIVIDE(x, y) ((x) / (y))
 
 // Opens a kernel over packs.
 //// pack
@@ -42,7 +43,7 @@
         scale = x > scale ? x : scale;
     }
     scale = scale > TINY ? scale : one;
-    for (int k = 0; k < 9; ++k) a[k] = a[k] / scale;
+    for (int k = 0; k < 9; ++k) a[k] = DIVIDE(a[k], scale);
 
     auto dot = [](const Pack* x, const Pack* y) { return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]; };
     // cosine and sine of the rotation that diagonalises [[app, apq], [apq, aqq]], of angle at most 45 degrees
@@ -52,7 +53,7 @@
         const Pack h = SQRT(d * d + p2 * p2);
         const Pack den = (d < Real(0) ? -d : d) + h;
         const Pack q = (h + h) * den;
-        const Pack inv = one / SQRT(q > TINY ? q : one);
+        const Pack inv = DIVIDE(one, SQRT(q > TINY ? q : one));
         c = q > TINY ? den * inv : one;
         sn = q > TINY ? p2 * inv : zero;
         sn = d < Real(0) ? -sn : sn;
@@ -75,7 +76,7 @@
         auto jacobi = [&](Pack& app, Pack& aqq, Pack& apq, Pack& arp, Pack& arq, Pack* vp, Pack* vq) {
             Pack c, sn;
             angle(app, aqq, apq, c, sn);
-            const Pack shift = sn / c * apq;
+            const Pack shift = DIVIDE(sn, c) * apq;
             app = app - shift;
             aqq = aqq + shift;
             apq = zero;
@@ -128,7 +129,7 @@
     Pack s[3];
     s[0] = SQRT(n0);
     const auto null = s[0] <= TINY;
-    for (int k = 0; k < 3; ++k) u0[k] = null ? (k == 0 ? one : zero) : u0[k] / (null ? one : s[0]);
+    for (int k = 0; k < 3; ++k) u0[k] = null ? (k == 0 ? one : zero) : DIVIDE(u0[k], null ? one : s[0]);
     const Pack overlap = dot(u0, u1);
     for (int k = 0; k < 3; ++k) u1[k] = u1[k] - overlap * u0[k];
     s[1] = SQRT(dot(u1, u1));
@@ -138,7 +139,7 @@
     const Pack along = dot(u0, e);
     for (int k = 0; k < 3; ++k) e[k] = e[k] - along * u0[k];
     const Pack length = SQRT(dot(e, e));
-    for (int k = 0; k < 3; ++k) u1[k] = flat ? e[k] / length : u1[k] / (flat ? one : s[1]);
+    for (int k = 0; k < 3; ++k) u1[k] = flat ? DIVIDE(e[k], length) : DIVIDE(u1[k], flat ? one : s[1]);
     const Pack b2[3] = {u2[0], u2[1], u2[2]};
     u2[0] = u0[1] * u1[2] - u0[2] * u1[1];
     u2[1] = u0[2] * u1[0] - u0[0] * u1[2];
@@ -166,3 +167,4 @@
 //// end
 #undef LANE
 #undef SQRT
+#undef DIVIDE

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from neuma_lib.sim.gather import gather_function
+from neuma_lib.sim.gather import gather_functions
 from neuma_lib.sim.kernels import grid_functions, warp_types
 from neuma_lib.sim.scatter import scatter_functions
 
@@ -27,7 +27,8 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
     run_of, deposit = vars(scatter_functions(dtype, scatter, 3)).values()
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
     base_node, copy_of, from_base = functions.base_node, functions.copy_of, functions.from_base
-    weights, slopes, gather = functions.weights, functions.slopes, gather_function(dtype)
+    weights, slopes = functions.weights, functions.slopes
+    gather, three_nodes = vars(gather_functions(dtype)).values()
     column, offsets, wall_mask = functions.column, functions.offsets, functions.wall_mask
     moved_mask = functions.moved_mask
     module = f"neuma_lib.sim.adjoint_{str(dtype).removeprefix('torch.')}_{scatter}"
@@ -85,7 +86,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
             for j in range(3):
                 row = ((plane + i) * c.n + bj + j) * c.n + bk
                 deposit(grad_grid_rows, side, row, (wi[i] * wj[j]) * (wp.outer(wk, u_ij) + slope_k), run)
-                nodes = grid_v_rows[cached, row]
+                nodes = three_nodes(grid_v_rows, cached, row)
                 vu = nodes * u_ij + wp.cw_mul(step_k, nodes * column(D, 2))
                 vu_w, vu_s = wp.dot(vu, wk), wp.dot(vu, sk)
                 moving += vec3(si[i] * wj[j] * vu_w, wi[i] * sj[j] * vu_w, wi[i] * wj[j] * vu_s)
@@ -157,7 +158,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         for i in range(3):
             q_ij = q_i
             for j in range(3):
-                nodes = grad_grid_rows[side, ((plane + i) * c.n + bj + j) * c.n + bk]
+                nodes = three_nodes(grad_grid_rows, side, ((plane + i) * c.n + bj + j) * c.n + bk)
                 gq = nodes * q_ij + wp.cw_mul(step_k, nodes * column(A, 2))
                 gq_w, gq_s = wp.dot(gq, wk), wp.dot(gq, sk)
                 moving += vec3(si[i] * wj[j] * gq_w, wi[i] * sj[j] * gq_w, wi[i] * wj[j] * gq_s)

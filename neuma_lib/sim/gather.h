@@ -1,5 +1,5 @@
-// Text of the function of gather.py. REAL is the scalar type.
-//// gather
+// Text of the functions of gather.py. REAL is the scalar type, VECTOR whether a node of it is one load on a GPU.
+//// node
     typedef REAL Real;
     // A node is one vector register on a CPU, where the compiler would otherwise take its numbers one by one.
 #if defined(__CUDA_ARCH__)
@@ -11,14 +11,28 @@
     #define EACH
     #define OF(x) (x)
 #endif
+    // Where the fourth number is not used, the compiler would take the others one by one on a GPU too.
+    auto load = [](const Node* place) {
+#if VECTOR && defined(__CUDA_ARCH__)
+        Node node;
+        asm("ld.global.v4.f32 {%0, %1, %2, %3}, [%4];"
+            : "=f"(node.c[0]), "=f"(node.c[1]), "=f"(node.c[2]), "=f"(node.c[3]) : "l"(place));
+        return node;
+#else
+        return *place;
+#endif
+    };
     const char* place = (const char*)rows.data + (size_t)index * rows.strides[0] + (size_t)row * rows.strides[1];
     const Node* first = (const Node*)place;
+
+//// gather
     Node sums[4] = {}, along, across;
     #pragma unroll
     for (int i = 0; i < 3; ++i)
         #pragma unroll
         for (int j = 0; j < 3; ++j) {
-            const Node* node = first + (i * n + j) * n;
+            const Node* line = first + (i * n + j) * n;
+            const Node node[3] = {load(line), load(line + 1), load(line + 2)};
             EACH OF(along) = OF(node[0]) * wk[0] + OF(node[1]) * wk[1] + OF(node[2]) * wk[2];
             EACH OF(across) = OF(node[0]) * wd_k[0] + OF(node[1]) * wd_k[1] + OF(node[2]) * wd_k[2];
             EACH OF(sums[0]) = OF(sums[0]) + OF(along) * (wi[i] * wj[j]);
@@ -29,6 +43,15 @@
     wp::mat_t<4, 4, Real> result;
     for (int s = 0; s < 4; ++s)
         for (int k = 0; k < 4; ++k) result.data[s][k] = ((const Real*)&sums[s])[k];
+
+//// three
+    wp::mat_t<3, 4, Real> result;
+    for (int s = 0; s < 3; ++s) {
+        const Node node = load(first + s);
+        for (int k = 0; k < 4; ++k) result.data[s][k] = ((const Real*)&node)[k];
+    }
+
+//// end
     return result;
 #undef EACH
 #undef OF

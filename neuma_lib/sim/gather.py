@@ -2,6 +2,7 @@
 
 # No `from __future__ import annotations` here: Warp reads the annotations of functions as objects.
 import functools
+from types import SimpleNamespace
 
 import torch
 import warp as wp
@@ -12,23 +13,30 @@ start_warp()
 
 
 @functools.cache
-def gather_function(dtype: torch.dtype):
-    """A function for kernels whose threads each hold one particle.
+def gather_functions(dtype: torch.dtype) -> SimpleNamespace:
+    """Functions `gather` and `three_nodes` for kernels whose threads each hold one particle.
 
     ``gather(rows, index, row, n, wi, wj, wk, wd_i, wd_j, wd_k)`` returns, as the rows of a 4 x 4 matrix, the sum of w q
     over the 27 nodes and those of w q d_i, w q d_j and w q d_k. Here q are the four numbers of a node, w = wi wj wk is
     its weight and d its offset from the particle; ``wd_i`` holds the products of weights and offsets along an axis.
     ``row`` is the first of the particle's nodes in a index of the grid, which has ``n`` nodes along an edge.
+
+    ``three_nodes(rows, index, row)`` is ``rows[index, row]``, the nodes from ``row`` on, in loads of a whole node.
     """
     real = {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
     vec3 = wp.types.vector(length=3, dtype=real)
     mat34, mat44 = (wp.types.matrix(shape=(rows, 4), dtype=real) for rows in (3, 4))
-    name = {torch.float32: "float", torch.float64: "double"}[dtype]
+    parts = native_source(__file__, ".h")
+    name, vector = {torch.float32: ("float", "1"), torch.float64: ("double", "0")}[dtype]
+    node = parts["node"].replace("REAL", name).replace("VECTOR", vector)
 
-    @wp.func_native(native_source(__file__, ".h")["gather"].replace("REAL", name))
+    @wp.func_native(node + parts["gather"] + parts["end"])
     def gather(
         rows: wp.array2d(dtype=mat34), index: wp.int32, row: wp.int32, n: wp.int32,
         wi: vec3, wj: vec3, wk: vec3, wd_i: vec3, wd_j: vec3, wd_k: vec3,
     ) -> mat44: ...  # fmt: skip
 
-    return gather
+    @wp.func_native(node + parts["three"] + parts["end"])
+    def three_nodes(rows: wp.array2d(dtype=mat34), index: wp.int32, row: wp.int32) -> mat34: ...
+
+    return SimpleNamespace(gather=gather, three_nodes=three_nodes)

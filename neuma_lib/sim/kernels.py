@@ -25,7 +25,7 @@ import torch
 import warp as wp
 
 from neuma_lib.device import start_warp
-from neuma_lib.sim.gather import gather_function
+from neuma_lib.sim.gather import gather_functions
 from neuma_lib.sim.scatter import scatter_functions
 
 start_warp()
@@ -179,7 +179,7 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
     run_of, deposit = vars(scatter_functions(dtype, scatter, 4)).values()
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
     base_node, copy_of, from_base = functions.base_node, functions.copy_of, functions.from_base
-    weights, offsets, gather = functions.weights, functions.offsets, gather_function(dtype)
+    weights, offsets, gather = functions.weights, functions.offsets, gather_functions(dtype).gather
     column, wall_mask, moved = functions.column, functions.wall_mask, functions.moved
     module = f"neuma_lib.sim.forward_{str(dtype).removeprefix('torch.')}_{scatter}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)

@@ -9,7 +9,7 @@ The state may also carry the total deformation, with all that has flowed: F_tota
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import is_dataclass
 from typing import Any
 
@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.errors import NonFiniteError
-from neuma_lib.mechanics.law import Constitutive
+from neuma_lib.mechanics.law import Constitutive, Weights
 from neuma_lib.sim.kernels import NO_FAULT
 from neuma_lib.sim.memory import MemoryPlan
 from neuma_lib.sim.model import Body, MPMModel, law_weights
@@ -191,8 +191,10 @@ class Simulation:
                     total.add_(grad[0])
         return tuple(total.clone() for total in totals), [grad.clone() for grad in grad_weights]
 
-    def step_adjoint(self, n: int, weights: Sequence[Tensor], grad_weights: Sequence[Tensor]) -> None:
-        """Gradients of state n + 1, in the workspace, to those of state n; those of the weights are added."""
+    def step_adjoint(self, n: int, weights: Sequence[Tensor], sums: Mapping[str, Sequence[Weights]]) -> None:
+        """Gradients of state n + 1, in the workspace, to those of state n. Those of the weights are added to `sums`: of
+        each part of the laws, the `Constitutive.accumulators` of all bodies.
+        """
         ws = self.workspace
         cached = ws.cached_at(n)
         F, F_trial = ws.F[ws.at(n)], ws.F_trial[cached]
@@ -200,9 +202,9 @@ class Simulation:
             self._evaluate("elasticity", n, F, weights, ws.tau[cached], fill_cache=True)
             ws.transfer_to_grid(n)
             ws.trial_deformation(n)
-        self._vjp("plasticity", n, F_trial, weights, ws.grad_F, ws.grad_F_trial, grad_weights)
+        self._vjp("plasticity", n, F_trial, weights, ws.grad_F, ws.grad_F_trial, sums)
         ws.transfer_adjoint(n)
-        self._vjp("elasticity", n, F, weights, ws.grad_tau, ws.grad_F_elastic, grad_weights)
+        self._vjp("elasticity", n, F, weights, ws.grad_tau, ws.grad_F_elastic, sums)
         ws.grad_F.add_(ws.grad_F_elastic)
 
     def _segments(self, frames: Sequence[int]) -> list[tuple[int, int]]:
@@ -244,12 +246,22 @@ class Simulation:
         frame_of = {n: index for index, n in enumerate(at)}
         ws.grad_grid.zero_()
         with ws.stream():
+            sums = {
+                part: [
+                    law.accumulators(ws.grad_F[here], tuple(grad_weights[own]))
+                    for law, here, own, _ in self._laws(part, 0)
+                ]
+                for part in PARTS
+            }
             for n in range(steps, 0, -1):
                 if n in frame_of:
                     for total, grad in zip(totals, added, strict=True):
                         if grad is not None:
                             total.add_(grad[frame_of[n]])
-                self.step_adjoint(n - 1, weights, grad_weights)
+                self.step_adjoint(n - 1, weights, sums)
+            for part in PARTS:
+                for (law, _, own, _), received in zip(self._laws(part, 0), sums[part], strict=True):
+                    law.add_up(received, tuple(grad_weights[own]))
 
     def _copy_frames(
         self, first: int, steps: Sequence[int], frames: Sequence[int], result: Sequence[Tensor]
@@ -287,17 +299,17 @@ class Simulation:
         weights: Sequence[Tensor],
         grad_out: Tensor,
         grad_F: Tensor,
-        grad_weights: Sequence[Tensor],
+        sums: Mapping[str, Sequence[Weights]],
     ) -> None:
-        """Adjoint of `_evaluate`; sets grad_F and adds to grad_weights."""
-        for law, here, own, key in self._laws(part, n):
+        """Adjoint of `_evaluate`; sets grad_F and adds to the sums."""
+        for (law, here, own, key), received in zip(self._laws(part, n), sums[part], strict=True):
             law.vjp(
                 F[here],
                 tuple(weights[own]),
                 grad_out[here],
                 cache=self.workspace.law_caches[key] if key in self._cached else None,
                 grad_F=grad_F[here],
-                grad_weights=tuple(grad_weights[own]),
+                grad_weights=received,
             )
 
     def _laws(self, part: str, n: int) -> list[tuple[Constitutive, slice, slice, tuple]]:

@@ -287,5 +287,6 @@ template <class T> struct Array {
         x1 = emulator::half_of(pair, 1);                                                                             \
     };                                                                                                               \
     auto power_of_two = [](float x) { return std::exp2(x); };                                                        \
+    auto root = [](float x) { return std::sqrt(x); };                                                                \
     auto prefetch = [](const float*) {};                                                                             \
     auto warp_max = [](unsigned x) { return emulator::warp_max(x); };

@@ -165,34 +165,52 @@ class EmulatedLaws:
         arrays = "Array<float> F_, Array<float> W0_, Array<float> W1_, Array<float> W2_"
         forward = f"{arrays}, float factor, int n, Array<float> out_"
         backward = f"{arrays}, Array<float> grad_out_, float factor, int n, Array<float> grad_F_"
-        backward += ", Array<float> partials_"
+        backward += ", int fresh, Array<float> partials_"
 
-        def body(kind, is_backward, parameters):
-            return _addresses(parameters) + neural_fused.source(kind, is_backward, "EMULATED_MACHINE\n")
+        def body(kind, is_backward, parameters, precision):
+            text = neural_fused.source(kind, is_backward, "EMULATED_MACHINE\n", precision)
+            return _addresses(parameters) + text
 
+        passes = {
+            "evaluate": (False, forward, "single"),
+            "vjp_single": (True, backward, "single"),
+            "vjp_half": (True, backward, "half"),
+        }
         bodies = [
-            (f"{name}_{kind}", parameters, body(kind, name == "vjp", parameters))
+            (f"{name}_{kind}", parameters, body(kind, is_backward, parameters, precision))
             for kind in ("elasticity", "plasticity")
-            for name, parameters in (("evaluate", forward), ("vjp", backward))
+            for name, (is_backward, parameters, precision) in passes.items()
         ]
         self.library = _library(folder, "laws", tuple(bodies))
 
-    def __call__(self, part, F, g, blocks: int) -> list[torch.Tensor]:
-        """Result, gradient of F (n, 3, 3) and gradients of the weights, in float64; computed in float32."""
+    def __call__(
+        self, part, F, g, blocks: int, precision: str = "single", additions: int = 0
+    ) -> list[torch.Tensor]:
+        """Result, gradient of F (n, 3, 3) and gradients of the weights, in float64; computed in float32.
+
+        The latter are set, or, so many times, added to zeros.
+        """
         F, g, *weights = (x.detach().float().contiguous() for x in (F, g, *part.weights()))
         result, grad_F = torch.empty_like(F), torch.empty_like(F)
-        partials = torch.full((blocks, neural_fused.WEIGHTS), torch.nan)
+        partials = torch.full((blocks, neural_fused.WEIGHTS), 0.0 if additions else torch.nan)
         common = (F, *weights)
         sizes = (
             size - neural_fused.ALIGNMENT for size in (neural_fused.EVALUATE_BYTES, neural_fused.VJP_BYTES)
         )
+        scale, fresh = float(part.scale), int(not additions)
         calls = (
-            ("evaluate", (*common, float(part.scale), len(F), result)),
-            ("vjp", (*common, g, float(part.scale), len(F), grad_F, partials)),
+            ("evaluate", neural_fused.EVALUATE_TILES, 1, (*common, scale, len(F), result)),
+            (
+                f"vjp_{precision}",
+                neural_fused.VJP_TILES,
+                max(additions, 1),
+                (*common, g, scale, len(F), grad_F, fresh, partials),
+            ),
         )
-        for size, (name, arguments) in zip(sizes, calls, strict=True):
+        for size, (name, tiles, times, arguments) in zip(sizes, calls, strict=True):
             function = getattr(self.library, f"{name}_{part.kind}")
-            _launch(function, blocks, neural_fused.ROWS, size, *arguments)
+            for _ in range(times):
+                _launch(function, blocks, neural_fused.threads(tiles), size, *arguments)
         sums = partials.double().sum(0).split([w.numel() for w in weights])
         return [result.double(), grad_F.double(), *(x.view_as(w) for x, w in zip(sums, weights, strict=True))]
 

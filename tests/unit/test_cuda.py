@@ -288,8 +288,9 @@ def train(device, settings, checkpoint=None):
     )
 
 
-def test_training_runs_on_the_gpu():
-    result = train("cuda", MaterialConfig(iterations=5))
+@pytest.mark.parametrize("precision", ["single", "half"])
+def test_training_runs_on_the_gpu(precision):
+    result = train("cuda", MaterialConfig(iterations=5, adjoint_precision=precision))
     assert result.best_loss < result.history.loss[0]
     assert len(result.history.seconds) == 5
 

@@ -226,6 +226,16 @@ def test_a_law_that_fails_from_the_start_stops_loudly(problem):
         train(problem, law)
 
 
+def test_the_setting_of_the_adjoint_reaches_both_networks(problem):
+    law = stiff_random_law()
+    train(problem, law, SETTINGS.model_copy(update={"iterations": 1, "adjoint_precision": "half"}))
+    parts = law.elasticity, law.plasticity
+    assert [part.adjoint_precision for part in parts] == ["half", "half"]
+    assert (
+        law.elasticity.graph_key() != stiff_random_law().elasticity.graph_key()
+    )  # graphs are recorded apart
+
+
 def test_nothing_to_train_is_an_input_error(problem):
     with pytest.raises(InputError, match="adaptor"):
         train(problem, neural_law(seed=0).to(torch.float64))

@@ -69,6 +69,44 @@ def test_emulated_kernels_are_as_near_to_float64_as_the_float32_twin(emulated, k
         assert distance(fast, exact) < 5 * distance(slow, exact) + 1e-7
 
 
+def test_emulated_gradients_of_many_calls_add_up(emulated):
+    part, F, g = law_part("elasticity"), deformations("large strain", 133), probe(133)
+    once, twice = emulated(part, F, g, 1), emulated(part, F, g, 1, additions=2)
+    assert torch.equal(once[1], twice[1])
+    for single, double in zip(once[2:], twice[2:], strict=True):
+        assert distance(double, 2 * single) < 1e-6
+
+
+HALF_ERROR = 3e-3
+"""Of the adjoint in half precision, by norm: factors of 11 bits are off by 5e-4 at most, a few products in a row."""
+
+
+def check_half(half, single):
+    """(gradient of F, gradients of the weights) at g and at multiples of g."""
+    for size in (1.0, 1e-12, 1e6):
+        for rough, fine in zip(half(size), single(size), strict=True):
+            assert rough.isfinite().all() and 0 < distance(rough, fine) < HALF_ERROR
+    assert all(torch.equal(x, torch.zeros_like(x)) for x in half(0.0))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("regime", REGIMES)
+def test_emulated_half_adjoint_is_near_the_single_one(emulated, kind, regime):
+    part, F, g = law_part(kind), deformations(regime, 133), probe(133)
+
+    def gradients(precision):
+        return lambda size: emulated(part, F, size * g, 2, precision)[1:]
+
+    check_half(gradients("half"), gradients("single"))
+
+
+def test_small_gradients_beside_large_ones_survive_half_precision(emulated):
+    part, F, g = law_part("elasticity"), deformations("large strain", 64), probe(64)
+    g[:16] *= 1e-6
+    rough, fine = (emulated(part, F, g, 1, precision)[1][:16] for precision in ("half", "single"))
+    assert distance(rough, fine) < 3 * HALF_ERROR
+
+
 def test_a_cpu_and_float64_go_to_the_twin():
     part = law_part("elasticity")
     assert part.fused is None and not part.uses_fused(torch.zeros(1, 3, 3))
@@ -105,6 +143,28 @@ def test_fused_is_as_near_to_float64_as_the_float32_twin(kind, regime, n):
 
 @CUDA
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("regime", REGIMES)
+@pytest.mark.parametrize("n", [31, 30_000])
+def test_half_adjoint_is_near_the_single_one(kind, regime, n):
+    part, F, g = law_part(kind), deformations(regime, n), probe(n)
+    F, weights, g = on_gpu(part, F, g)
+    before = part.evaluate(F, weights)
+
+    def gradients(precision):
+        def at(size):
+            part.adjoint_precision = precision
+            grad_F, grad_weights = part.vjp(F, weights, size * g)
+            return [x.double() for x in (grad_F, *grad_weights)]
+
+        return at
+
+    check_half(gradients("half"), gradients("single"))
+    part.adjoint_precision = "half"
+    assert torch.equal(part.evaluate(F, weights), before)
+
+
+@CUDA
+@pytest.mark.parametrize("kind", KINDS)
 def test_fused_fills_buffers_accumulates_and_repeats_itself(kind):
     part = law_part(kind)
     F, weights, g = on_gpu(part, deformations("large strain", 1000), probe(1000))
@@ -117,6 +177,13 @@ def test_fused_fills_buffers_accumulates_and_repeats_itself(kind):
     assert torch.equal(out, part.evaluate(F, weights)) and torch.equal(grad_F, plain_F)
     for total, grad in zip(totals, plain_weights, strict=True):
         assert torch.equal(total, grad + 1)
+    sums = part.accumulators(F, totals)
+    for _ in range(2):
+        part.vjp(F, weights, g, grad_weights=sums)
+    added = tuple(torch.ones_like(w) for w in weights)
+    part.add_up(sums, added)
+    for total, grad in zip(added, plain_weights, strict=True):
+        assert distance(total - 1, 2 * grad) < 1e-5
     strided = tuple(torch.zeros(*reversed(w.shape), device="cuda").mT for w in weights)
     part.vjp(F, weights, g, grad_weights=strided)
     assert all(torch.equal(a, b) for a, b in zip(strided, plain_weights, strict=True))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import torch
 
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.analytic_fused import side_by_side
-from neuma_lib.mechanics.law import Law
+from neuma_lib.mechanics.law import AdjointPrecision, Law
 from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.mechanics.structured import FORMS, structured_law
 
@@ -17,7 +19,9 @@ SPEC = {
 
 
 def compile_kernels(device: torch.device) -> None:
-    """All networks, forward and backward, in both precisions; analytic laws in the one of identification."""
+    """All networks, forward and backward, in both precisions of states and of adjoints; analytic laws in the one of
+    identification.
+    """
     laws: list[Law] = [neural_law(), *(structured_law({**SPEC, "form": form}) for form in FORMS)]
     for dtype in (torch.float32, torch.float64):
         for law in laws:
@@ -26,7 +30,8 @@ def compile_kernels(device: torch.device) -> None:
             for part in (law.elasticity, law.plasticity):
                 weights = tuple(w.detach() for w in part.weights())
                 value = part.evaluate(F, weights)
-                part.vjp(F, weights, torch.ones_like(value))
+                for part.adjoint_precision in get_args(AdjointPrecision):
+                    part.vjp(F, weights, torch.ones_like(value))
     F = torch.eye(3, device=device).repeat(4, 1, 1)
     law = side_by_side([analytic_law(SPEC)], device)
     for part in (law.elasticity, law.plasticity):
