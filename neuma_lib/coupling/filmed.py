@@ -24,7 +24,7 @@ class Filmed:
 
     Attributes:
         renderer: as given.
-        batch: frames to render together.
+        batch: frames to render, or to take the `error` of, together.
     """
 
     def __init__(
@@ -33,7 +33,10 @@ class Filmed:
         self.renderer = renderer
         self._picture: Callable[..., Tensor] = renderer if compared == "colour" else renderer.coverage
         offsets, shares = observation.exposure, observation.shares
-        self.batch = max(1, renderer.frames_per_batch // len(offsets))
+        self._sharp = len(offsets) == 1 and compared == "colour" and isinstance(renderer, ParticleGS)
+        self.batch = (
+            renderer.frames_per_error if self._sharp else max(1, renderer.frames_per_batch // len(offsets))
+        )
         place = {step: k for k, step in enumerate(steps)}
         rows = [[place[frame + offset] for offset in offsets] for frame in observation.frames]
         self._shares = torch.tensor(shares or [1 / len(offsets)] * len(offsets), dtype=torch.float64)
@@ -64,6 +67,6 @@ class Filmed:
         Args:
             seen: as of `mean_squared_error`, in as many channels as are compared.
         """
-        if x.ndim == 3 and self._picture is self.renderer and isinstance(self.renderer, ParticleGS):
+        if self._sharp:
             return self.renderer.error(x, F, seen)
         return mean_squared_error(self(x, F), seen)

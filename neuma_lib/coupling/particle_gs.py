@@ -13,8 +13,16 @@ from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.rasterizer import rasterize, rasterized_error
 
-_BATCH_BYTES = {"cpu": 16e6, "cuda": 1.5e9}
-"""Memory of the buffers of one batch of frames: what stays in a CPU's cache, what keeps a GPU busy."""
+_CACHE_BYTES = 16e6
+"""Memory of the buffers of one batch of frames on a CPU, so that they stay in its cache."""
+_GPU_SHARE, _GPU_BYTES = 1 / 16, 4e9
+"""The same on a GPU: part of its memory, and the most. Every batch costs the host about a millisecond."""
+
+
+def _batch_bytes(device: torch.device) -> float:
+    if device.type == "cpu":
+        return _CACHE_BYTES
+    return min(_GPU_BYTES, _GPU_SHARE * torch.cuda.get_device_properties(device).total_memory)
 
 
 class ParticleGS:
@@ -90,9 +98,17 @@ class ParticleGS:
     @property
     def frames_per_batch(self) -> int:
         """Frames to render together, forward and backward: estimated by the bytes of images and projected Gaussians."""
+        return self._frames(14)
+
+    @property
+    def frames_per_error(self) -> int:
+        """The same where only the `error` of images is wanted, which a GPU does not keep."""
+        return self._frames(14 if self.x0.device.type == "cpu" else 5)
+
+    def _frames(self, numbers: int) -> int:
         pixels = self.cameras.width * self.cameras.height
-        per_view = (14 * pixels + 60 * len(self.gaussians)) * self.x0.element_size()
-        return max(1, int(_BATCH_BYTES[self.x0.device.type] / (per_view * len(self.cameras))))
+        per_view = (numbers * pixels + 60 * len(self.gaussians)) * self.x0.element_size()
+        return max(1, int(_batch_bytes(self.x0.device) / (per_view * len(self.cameras))))
 
     def batches(self, x: Tensor, F: Tensor, size: int | None = None) -> Iterator[tuple[slice, Tensor]]:
         """Render ``size`` frames at a time (None: `frames_per_batch`): yields (slice of frames, images).
