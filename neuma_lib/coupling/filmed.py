@@ -24,7 +24,8 @@ class Filmed:
 
     Attributes:
         renderer: as given.
-        batch: frames to render, or to take the `error` of, together.
+        batch: frames to render together.
+        error_batch: frames to take the `error` of together.
     """
 
     def __init__(
@@ -34,9 +35,8 @@ class Filmed:
         self._picture: Callable[..., Tensor] = renderer if compared == "colour" else renderer.coverage
         offsets, shares = observation.exposure, observation.shares
         self._sharp = len(offsets) == 1 and compared == "colour" and isinstance(renderer, ParticleGS)
-        self.batch = (
-            renderer.frames_per_error if self._sharp else max(1, renderer.frames_per_batch // len(offsets))
-        )
+        self.batch = max(1, renderer.frames_per_batch // len(offsets))
+        self.error_batch = renderer.frames_per_error if self._sharp else self.batch
         place = {step: k for k, step in enumerate(steps)}
         rows = [[place[frame + offset] for offset in offsets] for frame in observation.frames]
         self._shares = torch.tensor(shares or [1 / len(offsets)] * len(offsets), dtype=torch.float64)

@@ -137,7 +137,7 @@ class PixelLoss:
             return filmed.error(x, F, seen)
 
         states = (filmed.states(path.x), filmed.states(path.stretch))
-        return evaluate_in_batches(losses, self.frames_per_batch or filmed.batch, *states)
+        return evaluate_in_batches(losses, self.frames_per_batch or filmed.error_batch, *states)
 
 
 @dataclass
