@@ -132,6 +132,7 @@ class Stage:
             )
         if loss is not None:
             self._bar.set_postfix_str(f"loss {loss:.4g}", refresh=False)
+        self._bar.total = total  # work may turn out to be more
         self._bar.update(done - self._bar.n)
 
     def close(self) -> None:

@@ -26,6 +26,12 @@ class RegressionConfig(Section):
         ge=1,
         description="rounds of data; from the second on, states that the networks' own rollouts visit are added",
     )
+    further_rounds: int = Field(
+        2,
+        ge=0,
+        description="longer rounds after these at most, with faster throws added to the data, while the networks crush "
+        "elements in such throws that the law does not",
+    )
     iterations: int = Field(2500, ge=1, description="SOAP iterations a network, in each round")
     batch: int = Field(1024, ge=1, description="pairs an iteration")
     learning_rate: float = Field(

@@ -2,6 +2,11 @@
 
 The pairs (F -> tau) and (F_trial -> F) lie at deformation gradients that thrown cubes visit. From the second round on
 those that rollouts of the networks visit are added.
+
+Outside these pairs a network is left to chance. Where it takes volume from an element in every step, and answers with
+tension, the element collapses for good: seen in water, whose pressure falls again below J = 1/2. So the networks are
+tried on throws that are harder than those of the training, and if they crush an element that their law does not, a
+longer round follows with the states of these throws added. A prior that passes is not changed by the trial.
 """
 
 from __future__ import annotations
@@ -18,6 +23,7 @@ from neuma_lib.config.priors import RegressionConfig
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.fitting.prior_throws import (
     Progress,
+    Throw,
     random_rotations,
     random_throw,
     reference_law,
@@ -35,6 +41,12 @@ _PURE_NOISE = 0.1
 """Part of the training stretches that are random alone, so that nothing far from a rollout is left to chance."""
 _LOG_STRETCHES = (-2.0, 1.5)
 """Range of the logarithms of the training stretches: 0.14 to 4.5."""
+_TRIAL_SEEDS = 30_000
+"""Added to a prior's seed: throws on which the networks are tried are not those of the training or of the judgement."""
+_TRIAL_SPEED = 1.25
+"""Speed of the trial throws over that of the others, so that an unseen throw does not go beyond the data."""
+_LONGER = 3
+"""Iterations of a further round over those of the others: its data are more various."""
 _WARM_UP = 0.05
 """Part of the iterations over which the learning rate rises."""
 _GRADIENT_CLIP = 1.0
@@ -54,34 +66,80 @@ def train_by_regression(
     pools = [visited_stretches(throw, reference) for throw in throws]
     elastic, plastic = (torch.cat(parts) for parts in zip(*pools, strict=True))
 
-    total = 2 * settings.rounds * settings.iterations
-    done = 0
+    trials = torch.Generator().manual_seed(_TRIAL_SEEDS + seed)
+    total, done = 2 * settings.rounds * settings.iterations, 0
     networks: dict[str, Network] = {}
     losses: dict[str, list[float]] = {"elasticity": [], "plasticity": []}
-    for index in range(settings.rounds):
+    how = settings
+    for index in range(settings.rounds + settings.further_rounds):
         if index:
             law = _law_of(networks)
-            for throw in throws:
-                try:
-                    more = visited_stretches(throw, law)
-                except NonFiniteError:
-                    continue  # a first round that is unstable in one throw is what the next round mends
-                elastic, plastic = torch.cat([elastic, more[0]]), torch.cat([plastic, more[1]])
+            if index < settings.rounds:
+                more = [states for throw in throws if (states := _visited(throw, law))]
+            else:
+                more = missing_states(law, reference, trials, settings)
+                if not more:
+                    break
+                how = settings.model_copy(update={"iterations": _LONGER * settings.iterations})
+                total += 2 * how.iterations
+            elastic, plastic = (
+                torch.cat([pool, *parts]) for pool, *parts in zip((elastic, plastic), *more, strict=True)
+            )
         for part, pool in (("elasticity", elastic), ("plasticity", plastic)):
             F = sample_deformations(pool, settings, generator)
             z, X = targets(reference, part, F)
             network = networks.get(part) or Network(z, X, generator)
 
-            def shown(iteration: int, loss: float, before: int = done) -> None:
+            def shown(iteration: int, loss: float, before: int = done, total: int = total) -> None:
                 progress(before + iteration, total, loss)
 
-            losses[part].append(network.fit(z, X, settings, generator, shown))
+            losses[part].append(network.fit(z, X, how, generator, shown))
             networks[part] = network
-            done += settings.iterations
+            done += how.iterations
     law = _law_of(networks)
     report = {"loss": losses, "pairs": settings.samples}
     report.update(plastic_errors(law, reference, plastic, generator))
     return law, report
+
+
+def _visited(throw: Throw, law: Law) -> tuple[Tensor, Tensor] | None:
+    """`visited_stretches`; None if the law is unstable, which is what the next round mends."""
+    try:
+        return visited_stretches(throw, law)
+    except NonFiniteError:
+        return None
+
+
+def missing_states(
+    law: Law, reference: Law, generator: torch.Generator, settings: RegressionConfig
+) -> list[tuple[Tensor, Tensor]]:
+    """States that the data of the networks ``law`` lack, if on faster throws these crush what their law does not.
+
+    Returns:
+        none if every throw in which ``law`` crushes an element is one in which ``reference`` does, too. Else the
+        principal stretches of F and of F_trial, (M, 3) each, that either law visits in each throw; without the crushed
+        states of ``law``, where its reference does not go.
+    """
+    throws = [random_throw(reference, generator, settings, _TRIAL_SPEED) for _ in range(settings.throws)]
+    tried = [_visited(throw, law) for throw in throws]
+    suspects = [index for index, states in enumerate(tried) if _crushes(states)]
+    if not suspects:
+        return []
+    true = [_visited(throw, reference) for throw in throws]
+    if all(_crushes(true[index]) for index in suspects):
+        return []
+    kept = [tuple(part[~_crushed(part)] for part in states) for states in tried if states]
+    return [states for states in true if states] + kept
+
+
+def _crushes(states: tuple[Tensor, Tensor] | None) -> bool:
+    """Whether a rollout crushed an element, or broke off, from what `_visited` returned."""
+    return states is None or bool(_crushed(states[0]).any())
+
+
+def _crushed(stretches: Tensor) -> Tensor:
+    """Which of the states (M, 3) are pressed together so far that laws know them no more, or turned inside out."""
+    return stretches.amin(1) < STRETCH_MIN
 
 
 def plastic_errors(

@@ -59,8 +59,10 @@ def longest_step(law: Law, settings: RegressionConfig) -> float:
     return min(settings.dt, _COURANT / (settings.grid * law.wave_speed(DENSITY)))
 
 
-def random_throw(law: Law, generator: torch.Generator, settings: RegressionConfig) -> Throw:
-    """A cube of random size, place, orientation, velocity and spin.
+def random_throw(
+    law: Law, generator: torch.Generator, settings: RegressionConfig, speed: float = 1.0
+) -> Throw:
+    """A cube of random size, place, orientation, velocity and spin, all of its motion times ``speed``.
 
     Half of the throws take half the time step, so that the trial states of both are seen; not if the law
     depends on the rate, because a network knows one step only.
@@ -83,7 +85,7 @@ def random_throw(law: Law, generator: torch.Generator, settings: RegressionConfi
     count = len(local)
     state = State(
         centre + local,
-        v + torch.linalg.cross(omega.expand_as(local), local),
+        speed * (v + torch.linalg.cross(omega.expand_as(local), local)),
         torch.full((count,), DENSITY * side**3 / count),
         torch.full((count,), side**3 / count),
     )

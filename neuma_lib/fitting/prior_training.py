@@ -21,6 +21,8 @@ from neuma_lib.geometry.chamfer import chamfer_sequence
 from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.neural import NeuralLaw
 
+CLOSE = 0.1
+"""Chamfer distance [1e-4 m^2] of a prior from its law that the closest of the authors' own priors have."""
 _JUDGE_SEEDS = 10_000
 """Added to a prior's seed: the throws that judge it are not those that it was trained on."""
 
@@ -91,3 +93,19 @@ def judge(
         "rmse": float(rmse.mean()),
         "rmse_worst": float(rmse.max()),
     }
+
+
+def remark(report: Mapping[str, Any]) -> str:
+    """How far a prior is from its law, in a line; with a warning if its Chamfer distance is not below `CLOSE`.
+
+    Args:
+        report: of :func:`train_prior`.
+    """
+    far = f"RMSE {1e3 * report['rmse']:.2f} mm, Chamfer {report['chamfer']:.4f}e-4 m^2"
+    text = f"rollout against its law: {far}"
+    if report["chamfer"] < CLOSE:
+        return text
+    return (
+        f"{text}. WARNING: this prior follows its law only roughly (below {CLOSE:g}e-4 m^2 is close); what is learned "
+        "from it starts there, not at the law (docs/guide.md, How close is a prior)"
+    )

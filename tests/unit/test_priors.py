@@ -7,11 +7,19 @@ import torch
 from safetensors.torch import save
 
 from neuma_lib.config.priors import RegressionConfig, TrajectoryConfig
-from neuma_lib.fitting.prior_regression import Network, sample_deformations, targets, train_by_regression
+from neuma_lib.fitting.prior_regression import (
+    Network,
+    missing_states,
+    sample_deformations,
+    targets,
+    train_by_regression,
+)
 from neuma_lib.fitting.prior_throws import random_rotations, random_throw, reference_law, visited_stretches
-from neuma_lib.fitting.prior_training import judge, train_prior
+from neuma_lib.fitting.prior_training import judge, remark, train_prior
 from neuma_lib.fitting.prior_trajectory import train_by_trajectory
 from neuma_lib.fitting.soap import SOAP
+from neuma_lib.mechanics.elasticity import STRETCH_MIN
+from neuma_lib.mechanics.law import Law, Plasticity
 from neuma_lib.mechanics.neural import PLASTIC_SCALE
 from neuma_lib.mechanics.singular_values import svd3
 
@@ -39,6 +47,8 @@ OTHERS = {
         "plasticity": {"name": "viscous_flow", "viscosity": 20.0},
     },
 }
+ROUGH = {"StVK + Drucker-Prager"}
+"""Laws whose return map a network of the published size follows only roughly: docs/guide.md, How close is a prior."""
 LAWS = {"jelly": JELLY, "plasticine": PLASTICINE, "sand": SAND, "water": WATER, **OTHERS}
 TINY = RegressionConfig(
     throws=2, side_particles=4, grid=12, duration=0.15, samples=4096, iterations=500, batch=512, rounds=2
@@ -135,6 +145,30 @@ def test_trained_law_is_nearer_to_its_law_than_an_elastic_one(tiny_plasticine):
     )
 
 
+class Sink(Plasticity):
+    """Takes a tenth of every stretch in a step: nothing but a crushed cube comes of it."""
+
+    def response(self, F, weights):
+        return 0.9 * F
+
+
+def test_states_are_missing_where_networks_crush_what_their_law_does_not():
+    law = reference_law(WATER, TINY)
+    sink = Law(law.elasticity, Sink())
+
+    def missing(tried, reference):
+        return missing_states(tried, reference, torch.Generator().manual_seed(0), TINY)
+
+    assert missing(law, law) == []
+    assert missing(sink, sink) == []
+    true, kept = missing(sink, law)[: TINY.throws], missing(sink, law)[TINY.throws :]
+    assert len(true) == len(kept) == TINY.throws
+    usual = random_throw(law, torch.Generator().manual_seed(0), TINY)
+    assert float(true[0][0].min()) < float(visited_stretches(usual, law)[0].min()), "trials are harder"
+    for part in (part for states in kept for part in states):
+        assert len(part) and float(part.min()) >= STRETCH_MIN
+
+
 def test_same_seed_same_bytes():
     short = TINY.model_copy(update={"iterations": 40})
     (law, report), (again, same) = (
@@ -184,9 +218,33 @@ def test_trajectory_training_lowers_its_loss():
     assert not any(w.requires_grad for w in (*law.elasticity.base, *law.plasticity.base))
 
 
+@pytest.mark.parametrize(("chamfer", "warns"), [(0.0546, False), (0.2092, True), (math.nan, True)])
+def test_a_rough_prior_is_called_rough_with_its_figure(chamfer, warns):
+    text = remark({"rmse": 2.27e-3, "chamfer": chamfer})
+    assert f"RMSE 2.27 mm, Chamfer {chamfer:.4f}e-4 m^2" in text
+    assert ("WARNING" in text) == warns
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", sorted(LAWS.keys() - ROUGH))
 def test_default_settings_reach_the_released_priors(name):
     """Rollouts of priors trained by the authors differ from their laws by a Chamfer distance of 0.1 to 0.5e-4 m^2."""
     _, report = train_prior(LAWS[name], RegressionConfig())
     assert report["chamfer"] < 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(ROUGH))
+def test_a_rough_prior_is_rough_by_its_return_map_alone(name):
+    """The elasticity is a tenth of the bound away; the whole is as far as the authors' own priors, and says so."""
+    settings = RegressionConfig()
+    law, report = train_prior(LAWS[name], settings)
+    reference = reference_law(LAWS[name], settings)
+    apart = {
+        "elasticity": Law(law.elasticity, reference.plasticity),
+        "plasticity": Law(reference.elasticity, law.plasticity),
+    }
+    apart = {part: judge(each, LAWS[name], settings)["chamfer"] for part, each in apart.items()}
+    assert apart["elasticity"] < 0.01 and apart["plasticity"] > 0.1
+    assert 0.1 <= report["chamfer"] < 0.5
+    assert f"Chamfer {report['chamfer']:.4f}e-4 m^2. WARNING" in remark(report)

@@ -54,6 +54,15 @@ def test_a_bar_with_loss_and_time_left(terminal, tmp_path):
     assert "loss 0.5 -> 0.25" in (tmp_path / "material.log").read_text()
 
 
+def test_work_may_turn_out_to_be_more(terminal):
+    stream, written = terminal
+    with progress.stage("prior water", None, stream) as run:
+        run.progress(9, 10, 0.5)
+        time.sleep(2 * progress.MOVING_INTERVAL)
+        run.progress(11, 20, 0.5)
+        assert "11/20" in written()
+
+
 def test_of_two_stages_on_one_terminal_the_second_prints_lines(terminal, monkeypatch):
     monkeypatch.setattr(progress, "PLAIN_INTERVAL", 0.0)
     stream, written = terminal

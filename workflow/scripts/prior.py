@@ -1,7 +1,7 @@
 """Train a neural constitutive law on an analytic one."""
 
 from neuma_lib.config.priors import RegressionConfig, TrajectoryConfig
-from neuma_lib.fitting.prior_training import train_prior
+from neuma_lib.fitting.prior_training import remark, train_prior
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.weights import write_weights
 from neuma_lib.mechanics.analytic import analytic_law
@@ -22,9 +22,7 @@ def main(inputs, output, params, run) -> None:
         output.weights, law.prior_state(), {"prior": params.name, "law": spec, "method": params.method}
     )
     write_json(output.report, report)
-    run.say(
-        f"rollout against its law: RMSE {1e3 * report['rmse']:.2f} mm, Chamfer {report['chamfer']:.4f}e-4 m^2"
-    )
+    run.say(remark(report))
 
 
 run_script(main, snakemake)
