@@ -11,7 +11,8 @@
     #define EACH
     #define OF(x) (x)
 #endif
-    // Where the fourth number is not used, the compiler would take the others one by one on a GPU too.
+    // Where the fourth number is not used, the compiler would take the others one by one on a GPU too. It may move the
+    // load: a kernel that reads these nodes writes none of them.
     auto load = [](const Node* place) {
 #if VECTOR && defined(__CUDA_ARCH__)
         Node node;
