@@ -26,8 +26,9 @@ from scipy.optimize import minimize
 
 from benchmarks.project_scenes import chosen_scenes, scene_parser, simulator
 from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.config.loading import merged
 from neuma_lib.config.scenes import SceneConfig
-from neuma_lib.config.settings import Config, merged
+from neuma_lib.config.settings import Config
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.metrics import tracer_errors

@@ -20,8 +20,9 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from benchmarks.project_scenes import simulator
+from neuma_lib.config.loading import load, read_yaml
 from neuma_lib.config.scenes import SceneConfig
-from neuma_lib.config.settings import Config, load, read_yaml
+from neuma_lib.config.settings import Config
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.evaluation.reports import as_markdown
 from neuma_lib.fitting.families import Family

@@ -20,8 +20,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from neuma_lib.config.loading import load, merged, read_yaml
 from neuma_lib.config.pac_nerf import PacFamilyConfig, PacNerfConfig
-from neuma_lib.config.settings import load, merged, read_yaml
 from neuma_lib.evaluation.reports import as_markdown
 from neuma_lib.fitting.carried_field import CarriedField
 from neuma_lib.fitting.pac_nerf import FamilyConstants, PacNerfFit, fit_pac_nerf

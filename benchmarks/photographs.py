@@ -27,7 +27,8 @@ from neuma_lib.capture.pictures import group_of, picture_sheet, read_picture, un
 from neuma_lib.capture.poses import Poses, find_poses, load_poses, save_poses
 from neuma_lib.capture.redrawn_masks import redrawn_masks
 from neuma_lib.capture.saliency import Saliency, fetch_network
-from neuma_lib.config.settings import Config, load, merged, read_yaml
+from neuma_lib.config.loading import load, merged, read_yaml
+from neuma_lib.config.settings import Config
 from neuma_lib.fitting.gaussians import GaussianFitReport, fit_gaussians
 from neuma_lib.geometry.surface import photographed, reconstruct
 from neuma_lib.geometry.visual_hull import visual_hull

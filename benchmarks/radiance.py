@@ -16,8 +16,8 @@ from pathlib import Path
 import torch
 
 from benchmarks.project_scenes import chosen_scenes, scene_parser
+from neuma_lib.config.loading import merged
 from neuma_lib.config.radiance import RadianceConfig
-from neuma_lib.config.settings import merged
 from neuma_lib.fitting.radiance import fit_radiance_field
 from neuma_lib.io.images import load_views
 

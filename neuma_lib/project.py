@@ -8,7 +8,8 @@ from typing import Any
 
 from neuma_lib.capture.scenes import captured_scenes
 from neuma_lib.config.capture import CapturesConfig
-from neuma_lib.config.settings import Config, load, merged, read_yaml
+from neuma_lib.config.loading import load, merged, read_yaml
+from neuma_lib.config.settings import Config
 from neuma_lib.errors import InputError
 
 SETTINGS_FILE = Path("config/config.yaml")

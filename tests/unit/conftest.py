@@ -4,16 +4,16 @@ from pathlib import Path
 
 import pytest
 
-from neuma_lib.config import settings
+from neuma_lib.config import loading
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
 def raw():
-    return settings.read_yaml(ROOT / "config" / "config.yaml")
+    return loading.read_yaml(ROOT / "config" / "config.yaml")
 
 
 @pytest.fixture(scope="module")
 def loaded(raw):
-    return settings.load(raw, ROOT)
+    return loading.load(raw, ROOT)

@@ -11,7 +11,8 @@ from neuma_lib.capture.clock import (
     without_gain,
 )
 from neuma_lib.capture.scenes import captured_scenes
-from neuma_lib.config.settings import NO_TRUTH, load, read_yaml
+from neuma_lib.config.loading import load, read_yaml
+from neuma_lib.config.settings import NO_TRUTH
 from neuma_lib.errors import InputError
 
 

@@ -6,10 +6,11 @@ from pathlib import Path
 import grimp
 import pytest
 
-from neuma_lib.config import settings
+from neuma_lib.config import loading
 from neuma_lib.config.base import Section
 from neuma_lib.config.methods import parse_method
 from neuma_lib.config.page import settings_markdown
+from neuma_lib.config.settings import Config
 from neuma_lib.config.variants import DRAWN, folder, parse_chain
 from neuma_lib.errors import InputError
 
@@ -27,8 +28,8 @@ def test_default_settings_are_valid(loaded):
 )
 def test_images_are_measured_in_at_least_two_views_that_training_does_not_see(raw, files):
     for file in files:
-        raw = settings.merged(raw, settings.read_yaml(ROOT / "config" / file))
-    chosen = settings.load(raw, ROOT)
+        raw = loading.merged(raw, loading.read_yaml(ROOT / "config" / file))
+    chosen = loading.load(raw, ROOT)
     assert chosen.dataset.dynamic.views - len(chosen.material.views) >= 2
 
 
@@ -114,26 +115,26 @@ def test_images_are_measured_in_at_least_two_views_that_training_does_not_see(ra
 )
 def test_mistakes_are_named(raw, change, message):
     with pytest.raises(InputError, match=message):
-        settings.load(settings.merged(raw, change), ROOT)
+        loading.load(loading.merged(raw, change), ROOT)
 
 
 def test_every_mistake_is_reported_at_once(raw):
     with pytest.raises(InputError) as error:
-        settings.load(settings.merged(raw, {"material": {"a": 1, "b": 2}}), ROOT)
+        loading.load(loading.merged(raw, {"material": {"a": 1, "b": 2}}), ROOT)
     assert "material.a" in str(error.value) and "material.b" in str(error.value)
 
 
 def test_invalid_yaml_names_the_file(tmp_path):
     (tmp_path / "broken.yaml").write_text("a: [1,\n")
     with pytest.raises(InputError, match=r"broken\.yaml is not valid YAML"):
-        settings.read_yaml(tmp_path / "broken.yaml")
+        loading.read_yaml(tmp_path / "broken.yaml")
 
 
 def test_numbers_without_a_point_are_numbers(raw):
     """YAML 1.1 reads 1e5 as text."""
     elasticity = {"name": "fixed_corotated", "E": "1e5", "nu": 0.2}
     change = {"priors": {"laws": {"jelly": {"elasticity": elasticity}}}}
-    jelly = settings.load(settings.merged(raw, change), ROOT).priors.laws["jelly"]
+    jelly = loading.load(loading.merged(raw, change), ROOT).priors.laws["jelly"]
     assert jelly.plain()["elasticity"] == {**elasticity, "E": 1e5}
 
 
@@ -164,7 +165,7 @@ class TestVariants:
             "scenes": {"BouncyBall": {"material": {"lr_plastic": 2.0, "alpha": 2.0, "iterations": 2}}},
             "methods": {"neuma": {"material": {"alpha": 3.0, "iterations": 3}}},
         }
-        loaded = settings.load(settings.merged(raw, layers), ROOT)
+        loaded = loading.load(loading.merged(raw, layers), ROOT)
         material = loaded.method_material("BouncyBall", "neuma+iterations=4")
         values = (material.lr_elastic, material.lr_plastic, material.alpha, material.iterations)
         assert values == (1.0, 2.0, 3.0, 4)
@@ -198,7 +199,7 @@ class TestVariants:
     )
     def test_a_law_that_is_not_there_to_take(self, raw, method, message):
         with pytest.raises(InputError, match=message):
-            settings.load(settings.merged(raw, {"methods": {"new": {"title": "new", **method}}}), ROOT)
+            loading.load(loading.merged(raw, {"methods": {"new": {"title": "new", **method}}}), ROOT)
 
     def test_prior(self, loaded):
         assert loaded.method_prior("BouncyBall", "neuma") == "jelly"
@@ -211,7 +212,7 @@ class TestVariants:
         assert loaded.identified_views("BouncyBall", "neuma_structured+views=0,2") == (0, 2)
         assert loaded.identified_views("BouncyBall", "constants+views=1") == (1,)
         change = {"identify": {"views": [0, 1]}, "scenes": {"ClayCat": {"material": {"views": [1, 2]}}}}
-        own = settings.load(settings.merged(raw, change), ROOT)
+        own = loading.load(loading.merged(raw, change), ROOT)
         assert own.identified_views("BouncyBall", "neuma_structured") is None, "those of identify.views"
         assert own.identified_views("BouncyBall", "neuma_structured+views=0,1") is None, "the same"
         assert own.identified_views("ClayCat", "constants") == (1, 2)
@@ -231,7 +232,7 @@ class TestVariants:
             ({"scenes": {"BouncyBall": {"prior": "identified"}}}, "no prior 'identified' in priors.laws"),
         ):
             with pytest.raises(InputError, match=message):
-                settings.load(settings.merged(raw, change), ROOT)
+                loading.load(loading.merged(raw, change), ROOT)
 
     def test_a_structured_method_corrects_the_analytic_law_of_its_prior(self, loaded):
         assert loaded.method_base("BouncyBall", "neuma_structured") is None
@@ -277,12 +278,12 @@ class TestVariants:
     )
     def test_mistakes_in_a_structured_method(self, raw, method, message):
         with pytest.raises(InputError, match=message):
-            settings.load(settings.merged(raw, {"methods": {"new": {"title": "new", **method}}}), ROOT)
+            loading.load(loading.merged(raw, {"methods": {"new": {"title": "new", **method}}}), ROOT)
 
     def test_a_structured_law_needs_an_analytic_one_and_training(self, raw, loaded):
         law = {"title": "new", "law": "structured"}
-        own = settings.load(
-            settings.merged(raw, {"scenes": {"BouncyBall": {"prior": "my/law.pt"}}, "methods": {"new": law}}),
+        own = loading.load(
+            loading.merged(raw, {"scenes": {"BouncyBall": {"prior": "my/law.pt"}}, "methods": {"new": law}}),
             ROOT,
         )
         with pytest.raises(InputError, match=r"the file my/law\.pt: take \+prior=identified"):
@@ -298,7 +299,7 @@ class TestVariants:
 class TestChains:
     def runs(self, raw, method, column="ClayCat", **table):
         change = {"tables": {"table1": {"seeds": 3, **table}}}
-        return settings.load(settings.merged(raw, change), ROOT).runs("table1", method, column)
+        return loading.load(loading.merged(raw, change), ROOT).runs("table1", method, column)
 
     @pytest.mark.parametrize("seeds", [(0, 0, 0, 0), (1, 1, 1, 1), (0, 0, 0, 2), (1, 2, 3, 0), (0, 11, 0, 0)])
     def test_names_say_the_seeds(self, seeds):
@@ -349,7 +350,7 @@ class TestChains:
         assert loaded.experiment("letter_N_sand+seed=1") == loaded.experiment("letter_N_sand")
 
     def test_a_chain_changes_seeds_alone(self, raw):
-        loaded = settings.load(settings.merged(raw, {"material": {"seed": 10}}), ROOT)
+        loaded = loading.load(loading.merged(raw, {"material": {"seed": 10}}), ROOT)
         plain = loaded.method_material("ClayCat", "neuma")
         other = loaded.method_material("ClayCat+seed=2", "neuma")
         assert (plain.seed, other.seed) == (10, 12)
@@ -362,7 +363,7 @@ class TestChains:
 class TestFrames:
     def frames(self, raw, scene=None, **dataset):
         changes = {"dataset": dataset, "scenes": {"BouncyBall": {"steps": 100, **(scene or {})}}}
-        return settings.load(settings.merged(raw, changes), ROOT).frame_steps("BouncyBall")
+        return loading.load(loading.merged(raw, changes), ROOT).frame_steps("BouncyBall")
 
     def test_a_number_of_frames_is_even_and_ends_with_the_video(self, raw):
         assert self.frames(raw, frames=5) == (0, 25, 50, 75, 100)
@@ -383,7 +384,7 @@ class TestFrames:
 class TestLike:
     def test_a_scene_like_another_has_its_settings_and_its_own(self, raw):
         change = {"Soft": {"like": "UnevenCat", "law": {"elasticity": {"E": 1e5}}}, "ClayCat": {"size": 0.3}}
-        loaded = settings.load(settings.merged(raw, {"scenes": change}), ROOT)
+        loaded = loading.load(loading.merged(raw, {"scenes": change}), ROOT)
         soft, cat = loaded.scene("Soft"), loaded.scene("ClayCat")
         assert (soft.size, soft.law.plasticity, soft.dt) == (0.3, cat.law.plasticity, cat.dt)
         assert soft.density == loaded.scene("UnevenCat").density
@@ -399,12 +400,12 @@ class TestLike:
     )
     def test_mistakes(self, raw, change, message):
         with pytest.raises(InputError, match=message):
-            settings.load(settings.merged(raw, {"scenes": change}), ROOT)
+            loading.load(loading.merged(raw, {"scenes": change}), ROOT)
 
 
 class TestVideos:
     def loaded(self, raw, **scenes):
-        return settings.load(settings.merged(raw, {"scenes": scenes}), ROOT)
+        return loading.load(loading.merged(raw, {"scenes": scenes}), ROOT)
 
     def test_another_throw_of_the_same_object_is_one_line(self, raw):
         again = {"velocity": [0.5, -1.0, 0.0], "steps": 300}
@@ -424,8 +425,8 @@ class TestVideos:
         assert not loaded.scene("ClayCat_throw2").videos
 
     def test_pairs_of_throws_that_are_shown(self, raw):
-        pairs = settings.read_yaml(ROOT / "config" / "two_throws.yaml")
-        loaded = settings.load(settings.merged(raw, pairs), ROOT)
+        pairs = loading.read_yaml(ROOT / "config" / "two_throws.yaml")
+        loaded = loading.load(loading.merged(raw, pairs), ROOT)
         for material in ("Paste", "Gel"):
             slow, both = loaded.scene(f"{material}Slow"), loaded.scene(f"{material}Both")
             assert both.videos == (f"{material}Fast",) and not slow.videos
@@ -475,7 +476,7 @@ class TestLawFrom:
 
     def test_everything_about_the_law_is_of_its_scene(self, raw):
         change = {"scenes": {"ClayCat": {"material": {"iterations": 7, "covariance_from": "total"}}}}
-        loaded = settings.load(settings.merged(raw, change), ROOT)
+        loaded = loading.load(loading.merged(raw, change), ROOT)
         method = "neuma+law_from=ClayCat+rank=4"
         assert loaded.law_scene("BouncyBall+seed=2", method) == "ClayCat+seed=2"
         assert loaded.law_scene("BouncyBall+seed=2", "neuma") == "BouncyBall+seed=2"
@@ -495,12 +496,12 @@ class TestLawFrom:
             loaded.law_scene("BouncyBall", "neuma+law_from=ClayCatt")
         table = {"scenes": ["BouncyBall"], "methods": ["neuma+law_from=ClayCatt"]}
         with pytest.raises(InputError, match="no scene 'ClayCatt'"):
-            settings.load(settings.merged(raw, {"tables": {"new": table}}), ROOT)
+            loading.load(loading.merged(raw, {"tables": {"new": table}}), ROOT)
 
 
 class TestFinerTruth:
     def loaded(self, raw, **changes):
-        return settings.load(settings.merged(raw, changes), ROOT)
+        return loading.load(loading.merged(raw, changes), ROOT)
 
     def values(self, truth):
         return truth.grid, truth.dt, truth.particles
@@ -584,8 +585,8 @@ class TestFinerTruth:
 class TestScaleOfThePaper:
     def overlay(self, raw, *names):
         for name in names:
-            raw = settings.merged(raw, settings.read_yaml(ROOT / "config" / f"{name}.yaml"))
-        return settings.load(raw, ROOT)
+            raw = loading.merged(raw, loading.read_yaml(ROOT / "config" / f"{name}.yaml"))
+        return loading.load(raw, ROOT)
 
     def test_paper(self, raw):
         paper = self.overlay(raw, "paper")
@@ -610,7 +611,7 @@ class TestScaleOfThePaper:
 
 def test_plain_values_build_the_section_again(loaded):
     """What a rule hands to its script, as text in between, gives the same settings."""
-    assert settings.Config(**json.loads(json.dumps(loaded.plain()))) == loaded
+    assert Config(**json.loads(json.dumps(loaded.plain()))) == loaded
 
 
 def test_a_stage_depends_on_its_own_settings_alone_and_settings_on_no_torch():

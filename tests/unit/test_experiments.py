@@ -10,7 +10,7 @@ import torch
 import yaml
 from render_scenes import dense
 
-from neuma_lib.config.settings import load, merged
+from neuma_lib.config.loading import load, merged
 from neuma_lib.coupling.bodies import coloured_solid, join
 from neuma_lib.coupling.particle_binding import bind_two_pass
 from neuma_lib.coupling.reconstruction import Reconstruction

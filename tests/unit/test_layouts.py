@@ -8,8 +8,8 @@ import pytest
 import yaml
 from PIL import Image
 
+from neuma_lib.config.loading import load
 from neuma_lib.config.scenes import SuppliedConfig
-from neuma_lib.config.settings import load
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import read_json
 from neuma_lib.io.images import list_images, load_observation, read_image_set

@@ -12,7 +12,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from neuma_lib.config import settings
+from neuma_lib.config import loading
 from neuma_lib.config.random_scenes import DENSITY, FLAWS, SHAPES, draw_scenes
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.random_scenes import RandomScene, failure, random_table
@@ -208,7 +208,7 @@ def test_every_reason_to_reject_a_draw_is_said(loaded, flaw):
 )
 def test_mistakes_are_named(raw, change, message):
     with pytest.raises(InputError, match=message):
-        settings.load(settings.merged(raw, {"random": change}), ROOT)
+        loading.load(loading.merged(raw, {"random": change}), ROOT)
 
 
 def test_a_family_is_needed(loaded):
@@ -220,7 +220,7 @@ def test_a_family_is_needed(loaded):
 
 def test_settings_change_a_random_scene_as_any_other(raw, loaded):
     name = loaded.random_scenes[3]
-    changed = settings.load(settings.merged(raw, {"scenes": {name: {"size": 0.3}}}), ROOT).scene(name)
+    changed = loading.load(loading.merged(raw, {"scenes": {name: {"size": 0.3}}}), ROOT).scene(name)
     assert changed == loaded.scene(name).model_copy(update={"size": 0.3})
 
 

@@ -14,7 +14,7 @@ from splat_files import ball, write_compressed, write_splat, write_spz
 
 from benchmarks.splat_surface import between, bowl, drawn_on
 from neuma_lib.config.geometry import SurfaceConfig
-from neuma_lib.config.settings import load, merged, read_yaml
+from neuma_lib.config.loading import load, merged, read_yaml
 from neuma_lib.coupling.deformation import arms_at_rest, deform
 from neuma_lib.coupling.nearest_binding import ENOUGH, bind_nearest
 from neuma_lib.errors import InputError

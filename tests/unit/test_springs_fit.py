@@ -6,9 +6,9 @@ import pytest
 import torch
 from grounding_scene import MODEL, TRUTH, ball, camera, observe
 
+from neuma_lib.config.loading import load
 from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.methods import MethodConfig
-from neuma_lib.config.settings import load
 from neuma_lib.config.springs import SpringsConfig
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.springs import evaluate_springs, predict_springs

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from neuma_lib.config.settings import load
+from neuma_lib.config.loading import load
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.paper import PAPER, Claim, PaperTable
 from neuma_lib.evaluation.tables import QUANTITIES, chamfer_table, shown

@@ -7,7 +7,7 @@ import pytest
 import yaml
 from project import copied
 
-from neuma_lib.config.settings import read_yaml
+from neuma_lib.config.loading import read_yaml
 from neuma_lib.evaluation.demo_captures import Truth, compare_cameras, compare_registration
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import read_transforms

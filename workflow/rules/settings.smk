@@ -11,7 +11,7 @@ sys.path.insert(0, str(ROOT))
 from neuma_lib.capture.planned import planned_captures
 from neuma_lib.capture.scenes import captured_scenes
 from neuma_lib.config.capture import CapturesConfig
-from neuma_lib.config.settings import load
+from neuma_lib.config.loading import load
 from neuma_lib.config.validation import validate
 from neuma_lib.errors import InputError
 from workflow.defaults import complete, digest_of
