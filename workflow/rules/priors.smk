@@ -13,7 +13,6 @@ rule prior:
         method=SETTINGS.priors.method,
         options=SETTINGS.priors.plain()[SETTINGS.priors.method],
         seed=lambda wildcards: SETTINGS.priors.seed + prior_chain(wildcards)[1]["prior"],
-        device=SETTINGS.device,
     script:
         "../scripts/prior.py"
 
@@ -31,6 +30,5 @@ rule identified_prior:
         method=SETTINGS.priors.method,
         options=SETTINGS.priors.plain()[SETTINGS.priors.method],
         seed=lambda wildcards: SETTINGS.priors.seed + SETTINGS.chain(wildcards.scene)[1]["prior"],
-        device=SETTINGS.device,
     script:
         "../scripts/prior.py"
