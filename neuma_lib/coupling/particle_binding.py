@@ -7,7 +7,7 @@ formed, and the ellipsoid test touches only particles near each Gaussian.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,12 +17,14 @@ from torch import Tensor
 
 from neuma_lib.config.binding import BindingConfig
 from neuma_lib.coupling.binding import Binding
+from neuma_lib.coupling.particle_binding_kernels import search
+from neuma_lib.device import launch
 from neuma_lib.errors import InputError
 
-_CHUNK_ENTRIES = 500_000
-"""Gaussian-particle pairs looked at at one time, which bounds the memory of a search whatever its input."""
 _FLATTEST = 1e-12
 """Least eigenvalue of a covariance, relative to its largest one."""
+_DEEPEST = 2**20
+"""Cells of a grid along z."""
 _SHARING_NEIGHBOURS = 16
 """Particles among which an added particle's volume is collected."""
 _LARGEST_SHARE = 0.5
@@ -41,7 +43,7 @@ def bind(means: Tensor, covars: Tensor, particles: Tensor, settings: BindingConf
     Args:
         means: Gaussian centres [m], shape (G, 3).
         covars: Gaussian covariances [m^2], shape (G, 3, 3).
-        particles: particle positions [m], shape (N, 3).
+        particles: particle positions [m], shape (N, 3); computed where they lie.
         settings: confidence of the ellipsoid and most particles in a row; None for the defaults.
 
     Returns:
@@ -51,8 +53,8 @@ def bind(means: Tensor, covars: Tensor, particles: Tensor, settings: BindingConf
         InputError: shapes that do not fit, non-finite values, a covariance that is not positive definite.
     """
     centres, shapes, points = _checked(means, covars, particles)
-    rows, columns = _pairs_inside(centres, shapes, points, settings or BindingConfig())
-    return _binding_from_pairs(rows, columns, (len(centres), len(points)), means)
+    settings = settings or BindingConfig()
+    return _Ellipsoids.of(centres, shapes, settings).bind(_Columns.of(points), settings, means)
 
 
 def bind_two_pass(
@@ -84,29 +86,27 @@ def bind_two_pass(
     centres, shapes, points = _checked(means, covars, particles)
     shares = _checked_volumes(volumes, len(points))
     settings = settings or BindingConfig()
-    rows, columns = _pairs_inside(centres, shapes, points, settings)
-    orphans = np.flatnonzero(np.bincount(rows, minlength=len(centres)) == 0)
-    added = centres[orphans]
+    ellipsoids, columns = _Ellipsoids.of(centres, shapes, settings), _Columns.of(points)
+    orphans = torch.nonzero(ellipsoids.counts(columns, most=1) == 0).flatten()
 
     if len(orphans):
         # An added particle may lie inside its neighbours' ellipsoids as well.
-        rows, columns = _pairs_inside(centres, shapes, np.concatenate([points, added]), settings)
+        added = centres[orphans]
+        columns = _Columns.of(torch.cat([points, added]))
         if settings.equal_mass:
-            shares = np.full(len(points) + len(added), shares.sum() / (len(points) + len(added)))
+            shares = np.full(len(columns.points), shares.sum() / len(columns.points))
         else:
-            shares = _share_volumes(points, shares, added)
-    count = len(points) + len(orphans)
-    enlarged = torch.cat([particles, means[torch.as_tensor(orphans, device=means.device)].to(particles)])
+            shares = _share_volumes(points.cpu().numpy(), shares, added.cpu().numpy())
     return (
-        _binding_from_pairs(rows, columns, (len(centres), count), means),
-        enlarged,
+        ellipsoids.bind(columns, settings, means),
+        torch.cat([particles, means[orphans.to(means.device)].to(particles)]),
         len(orphans),
         torch.as_tensor(shares, dtype=particles.dtype, device=particles.device),
     )
 
 
-def _checked(means: Tensor, covars: Tensor, particles: Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Inputs in float64 on the CPU, after checks of shapes and finiteness."""
+def _checked(means: Tensor, covars: Tensor, particles: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Inputs in float64 on the device of the particles, after checks of shapes and finiteness."""
     if means.ndim != 2 or means.shape[1] != 3 or covars.shape != (len(means), 3, 3):
         raise InputError(
             f"binding: Gaussian means {tuple(means.shape)} and covariances {tuple(covars.shape)} must be "
@@ -114,16 +114,16 @@ def _checked(means: Tensor, covars: Tensor, particles: Tensor) -> tuple[np.ndarr
         )
     if particles.ndim != 2 or particles.shape[1] != 3 or len(particles) == 0:
         raise InputError(f"binding: particles {tuple(particles.shape)} must be (N, 3) with N > 0")
-    arrays = []
+    checked = []
     for name, values in (("Gaussian mean", means), ("Gaussian covariance", covars), ("particle", particles)):
-        array = values.detach().to("cpu", torch.float64).numpy()
-        finite = np.isfinite(array).reshape(len(array), -1).all(1)
+        values = values.detach().to(particles.device, torch.float64).contiguous()
+        finite = values.isfinite().flatten(1).all(1)
         if not finite.all():
             raise InputError(
-                f"binding: {name} {int(np.argmin(finite))} is not finite; rerun the stage that made it"
+                f"binding: {name} {int(finite.int().argmin())} is not finite; rerun the stage that made it"
             )
-        arrays.append(array)
-    return arrays[0], arrays[1], arrays[2]
+        checked.append(values)
+    return checked[0], checked[1], checked[2]
 
 
 def _checked_volumes(volumes: Tensor | float, count: int) -> np.ndarray:
@@ -138,143 +138,120 @@ def _checked_volumes(volumes: Tensor | float, count: int) -> np.ndarray:
     return array
 
 
-def _whitening(shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Maps W with ``|W d|^2 = d^T A^-1 d``, and the largest eigenvalue of each covariance."""
-    eigenvalues, eigenvectors = np.linalg.eigh(shapes)
-    largest = eigenvalues[:, 2]
-    if not (largest > 0).all():
-        worst = int(np.argmin(largest))
-        raise InputError(
-            f"binding: the covariance of Gaussian {worst} is not positive definite; rerun the gaussians stage"
-        )
-    # A disc fitted flat has a third axis at round-off: its floor keeps the inverse finite.
-    eigenvalues = np.maximum(eigenvalues, _FLATTEST * largest[:, None])
-    return np.swapaxes(eigenvectors, 1, 2) / np.sqrt(eigenvalues)[:, :, None], largest
-
-
-def _threshold(settings: BindingConfig) -> float:
-    """Largest squared Mahalanobis distance of a bound particle."""
-    return float(chdtri(3, 1.0 - settings.confidence))
-
-
-def _pairs_inside(
-    centres: np.ndarray, shapes: np.ndarray, points: np.ndarray, settings: BindingConfig
-) -> tuple[np.ndarray, np.ndarray]:
-    """All pairs (Gaussian, particle) of Algorithm 1, sorted by Gaussian, then by particle.
-
-    A Gaussian looks at the particles in those cells of a grid that the box of its ellipsoid meets, so that it costs no
-    more where others are many: splats have discs and needles many times longer than they are thick.
-    """
-    threshold, most = _threshold(settings), settings.max_neighbours
-    whitening, largest = _whitening(shapes)
-    variances = np.diagonal(shapes, axis1=1, axis2=2) + _FLATTEST * largest[:, None]
-    half = np.sqrt(threshold * variances) * (1 + 1e-9)
-    cells = _Cells(points)
-    found_rows: list[np.ndarray] = []
-    found_columns: list[np.ndarray] = []
-    for near, first, last in cells.runs(centres - half, centres + half):
-        rows, columns, distances = [], [], []
-        for some in _parts(last - first):
-            begun, size = first[some], (last - first)[some]
-            pair = np.repeat(near[some], size)
-            place = np.arange(size.sum()) + np.repeat(begun - (np.cumsum(size) - size), size)
-            offset = cells.points[place] - centres[pair]
-            distance = np.zeros(len(pair))
-            for axis in range(3):  # the thinnest one first: discs leave most particles out
-                distance += np.square(np.einsum("pb,pb->p", whitening[pair, axis], offset))
-                inside = distance <= threshold
-                pair, place, offset, distance = (a[inside] for a in (pair, place, offset, distance))
-            rows.append(pair)
-            columns.append(cells.order[place])
-            distances.append(distance)
-        pair, column, distance = map(np.concatenate, (rows, columns, distances))
-        if most is not None:
-            # Stable in (distance, index): the particle index breaks ties.
-            order = np.lexsort((column, distance, pair))
-            pair, column = pair[order], column[order]
-            begins = np.flatnonzero(np.diff(pair, prepend=-1))
-            rank = np.arange(len(pair)) - np.repeat(begins, np.diff(begins, append=len(pair)))
-            pair, column = pair[rank < most], column[rank < most]
-        found_rows.append(pair)
-        found_columns.append(column)
-    rows = np.concatenate(found_rows) if found_rows else np.empty(0, np.int64)
-    columns = np.concatenate(found_columns) if found_columns else np.empty(0, np.int64)
-    order = np.lexsort((columns, rows))
-    return rows[order], columns[order]
-
-
-class _Cells:
-    """Points (N, 3) in the order of the cubic cells of a grid, those of a column along z one after the other.
+class _Columns(NamedTuple):
+    """Points (N, 3) in a grid: columns that stand on the squares of a plane, and cells one above the other in them.
 
     Attributes:
-        order: indices of the points, (N,).
-        points: the points in that order.
+        lower: corner of the grid [m], (3,).
+        sides: of a cell [m], (3,); those along z are so thin that points of a column are almost sorted by z.
+        shape: number of cells, (3,).
+        begins: of the points of each column, and the end, int32.
+        depths: cell of each point along z, int32, (N,).
+        order: index of each point, int32, (N,).
+        points: positions [m], column after column, upwards in each.
     """
 
-    def __init__(self, points: np.ndarray):
-        self._lower, extent = points.min(axis=0), np.ptp(points, axis=0)
-        # points in a body or on its surface: some to a few in a cell that is not empty
-        self._side = float(extent.max()) / max(1, round(0.5 * np.sqrt(len(points)))) or 1.0
-        self._counts = self._cell(points.max(axis=0)) + 1
-        keys = self._key(self._cell(points))
-        self.order = np.argsort(keys, kind="stable")
-        self.points, self._keys = points[self.order], keys[self.order]
+    lower: Tensor
+    sides: Tensor
+    shape: Tensor
+    begins: Tensor
+    depths: Tensor
+    order: Tensor
+    points: Tensor
 
-    def _cell(self, positions: np.ndarray) -> np.ndarray:
-        return np.floor((positions - self._lower) / self._side).clip(-1, 2**31).astype(np.int64)
+    @classmethod
+    def of(cls, points: Tensor) -> _Columns:
+        lower = points.amin(0)
+        extent = points.amax(0) - lower
+        # a square is about as wide as points in a body are apart
+        side = extent[:2].max() / max(1, round(len(points) ** (1 / 3)))
+        sides = torch.stack([side, side, extent[2] / _DEEPEST])
+        sides[sides == 0] = 1.0
+        shape = (extent / sides).floor().long() + 1
+        cell = ((points - lower) / sides).floor().long()
+        keys, order = torch.sort((cell[:, 0] * shape[1] + cell[:, 1]) * shape[2] + cell[:, 2], stable=True)
+        corners = torch.arange(int(shape[0] * shape[1]) + 1, device=points.device) * shape[2]
+        begins, depths = torch.searchsorted(keys, corners), keys % shape[2]
+        return cls(lower, sides, shape, begins.int(), depths.int(), order.int(), points[order])
 
-    def _key(self, cell: np.ndarray) -> np.ndarray:
-        return (cell[..., 0] * self._counts[1] + cell[..., 1]) * self._counts[2] + cell[..., 2]
+    def cells(self, positions: Tensor) -> Tensor:
+        """Cells (K, 3) of positions (K, 3), int32; beyond the grid -1, or the first number that no cell has."""
+        cells = ((positions - self.lower) / self.sides).floor().clamp(min=-1)
+        return cells.minimum(self.shape.to(cells)).int()
 
-    def runs(
-        self, lower: np.ndarray, upper: np.ndarray
-    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Runs of points in the columns of cells that boxes (G, 3) to (G, 3) meet, some whole boxes at a time.
 
-        Yields:
-            index of the box, first point and last point but one of each run that is not empty.
+class _Ellipsoids(NamedTuple):
+    """Confidence ellipsoids of Gaussians.
+
+    Attributes:
+        centres: [m], (G, 3).
+        whitening: maps W with ``|W d|^2 = d^T A^-1 d``, (G, 3, 3).
+        half: half the sides of the boxes about them [m], (G, 3).
+        threshold: largest squared Mahalanobis distance of a bound particle.
+    """
+
+    centres: Tensor
+    whitening: Tensor
+    half: Tensor
+    threshold: float
+
+    @classmethod
+    def of(cls, centres: Tensor, shapes: Tensor, settings: BindingConfig) -> _Ellipsoids:
+        eigenvalues, eigenvectors = np.linalg.eigh(shapes.cpu().numpy())
+        largest = eigenvalues[:, 2]
+        if not (largest > 0).all():
+            worst = int(np.argmin(largest))
+            raise InputError(
+                f"binding: the covariance of Gaussian {worst} is not positive definite; rerun the gaussians stage"
+            )
+        # A disc fitted flat has a third axis at round-off: its floor keeps the inverse finite.
+        eigenvalues = np.maximum(eigenvalues, _FLATTEST * largest[:, None])
+        whitening = np.ascontiguousarray(np.swapaxes(eigenvectors, 1, 2) / np.sqrt(eigenvalues)[:, :, None])
+        threshold = float(chdtri(3, 1.0 - settings.confidence))
+        floors = torch.from_numpy(_FLATTEST * largest[:, None]).to(shapes)
+        half = (threshold * (shapes.diagonal(dim1=1, dim2=2) + floors)).sqrt() * (1 + 1e-9)
+        return cls(centres, torch.from_numpy(whitening).to(shapes), half, threshold)
+
+    def counts(self, columns: _Columns, most: int | None) -> Tensor:
+        """How many points each ellipsoid holds, int32, (G,), counted up to ``most``."""
+        counts = torch.empty(len(self.centres), dtype=torch.int32, device=self.centres.device)
+        self._search(columns, most or torch.iinfo(counts.dtype).max, counts, None, None, None)
+        return counts
+
+    def bind(self, columns: _Columns, settings: BindingConfig, like: Tensor) -> Binding:
+        """The binding of Algorithm 1 to the points, on the device and with the dtype of ``like``.
+
+        An ellipsoid looks at the points in those cells that its box meets, so that it costs no more where others are
+        many: splats have discs and needles many times longer than they are thick.
         """
-        first = np.maximum(self._cell(lower), 0)
-        spans = np.maximum(np.minimum(self._cell(upper), self._counts - 1) - first + 1, 0)
-        columns = np.where(spans[:, 2] > 0, spans[:, 0] * spans[:, 1], 0)
-        for boxes in _parts(columns):
-            count = columns[boxes]
-            box = np.repeat(np.arange(boxes.start, boxes.stop), count)
-            among = np.arange(len(box)) - np.repeat(np.cumsum(count) - count, count)
-            cell = first[box]
-            cell[:, 0] += among // spans[box, 1]
-            cell[:, 1] += among % spans[box, 1]
-            key = self._key(cell)
-            begins = np.searchsorted(self._keys, key)
-            ends = np.searchsorted(self._keys, key + spans[box, 2])
-            met = ends > begins
-            if met.any():
-                yield box[met], begins[met], ends[met]
+        counts = self.counts(columns, settings.max_neighbours).long()
+        indptr = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+        distances = self.centres.new_empty(int(indptr[-1]))
+        indices = torch.empty_like(distances, dtype=torch.int32)
+        self._search(columns, 0, None, indptr.int(), distances, indices)
+        values = (1 / counts.double()).repeat_interleave(counts)
+        shape = len(counts), len(columns.points)
+        return Binding(indptr, indices.long(), values, shape).to(like.device, like.dtype)
 
-
-def _parts(sizes: np.ndarray) -> Iterator[slice]:
-    """Slices of entries that follow each other, whose sizes sum up to at most `_CHUNK_ENTRIES`, or one entry."""
-    ends = np.cumsum(sizes)
-    start = 0
-    while start < len(sizes):
-        before = ends[start - 1] if start else 0
-        stop = max(start + 1, int(np.searchsorted(ends, before + _CHUNK_ENTRIES, side="right")))
-        yield slice(start, stop)
-        start = stop
-
-
-def _binding_from_pairs(
-    rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int], like: Tensor
-) -> Binding:
-    counts = np.bincount(rows, minlength=shape[0])
-    indptr = np.concatenate([[0], np.cumsum(counts)])
-    values = 1.0 / counts[rows]
-    return Binding(
-        torch.as_tensor(indptr, dtype=torch.int64, device=like.device),
-        torch.as_tensor(columns, dtype=torch.int64, device=like.device),
-        torch.as_tensor(values, dtype=like.dtype, device=like.device),
-        shape,
-    )
+    def _search(self, columns: _Columns, most: int, *out: Tensor | None) -> None:
+        first = columns.cells(self.centres - self.half).clamp(min=0)
+        last = torch.minimum(columns.cells(self.centres + self.half), columns.shape.int() - 1)
+        launch(
+            search,
+            len(self.centres),
+            columns.begins,
+            columns.depths,
+            columns.order,
+            columns.points,
+            int(columns.shape[1]),
+            self.centres,
+            self.whitening,
+            first,
+            last,
+            self.threshold,
+            most,
+            *out,
+        )
 
 
 def _share_volumes(points: np.ndarray, volumes: np.ndarray, added: np.ndarray) -> np.ndarray:
@@ -286,7 +263,8 @@ def _share_volumes(points: np.ndarray, volumes: np.ndarray, added: np.ndarray) -
     than ``_LARGEST_SHARE`` of its volume.
     """
     size = min(_SHARING_NEIGHBOURS, len(points))
-    _, neighbours = cKDTree(points).query(added, k=np.arange(1, size + 1))
+    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)  # few ask it, so that building counts
+    _, neighbours = tree.query(added, k=np.arange(1, size + 1))
     offsets = points[neighbours] - added[:, None, :]
     scale = np.sqrt(np.square(offsets).sum(2).mean(1))
     scale[scale == 0.0] = 1.0

@@ -84,10 +84,10 @@ def _regions(mesh: trimesh.Trimesh, points: Array) -> NDArray[np.int64]:
     first = np.maximum(((corners.min(axis=1) - slack - origin) / cell).astype(int), 0)
     last = np.minimum(((corners.max(axis=1) + slack - origin) / cell).astype(int), np.array(shape) - 1) + 1
     # How many boxes of faces cover a cell: +1 and -1 at the boxes' corners, summed along each axis.
-    covers = np.zeros(np.add(shape, 1), np.int32)
-    for picks in product((0, 1), repeat=3):
-        at = np.where(picks, last, first)
-        np.add.at(covers, tuple(at.T), (-1) ** sum(picks))
+    picks, grid = list(product((0, 1), repeat=3)), tuple(np.add(shape, 1))
+    at = np.concatenate([np.ravel_multi_index(np.where(pick, last, first).T, grid) for pick in picks])
+    signs = np.repeat([(-1.0) ** sum(pick) for pick in picks], len(first))
+    covers = np.bincount(at, signs, np.prod(grid)).reshape(grid).astype(np.int32)
     for axis in range(3):
         np.cumsum(covers, axis=axis, out=covers)
     labels, count = ndimage.label(covers[:-1, :-1, :-1] == 0)

@@ -10,8 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from neuma_lib.config.binding import BindingConfig
-from neuma_lib.coupling import particle_binding
-from neuma_lib.coupling.particle_binding import bind, bind_two_pass
+from neuma_lib.coupling.particle_binding import _Columns, _Ellipsoids, bind, bind_two_pass
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.model import MPMModel
@@ -86,6 +85,25 @@ def test_ties_go_to_the_smaller_index():
         BindingConfig(max_neighbours=2),
     )
     assert binding.indices.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("max_neighbours", [None, 1, 5, 10, 27, 40])
+@pytest.mark.parametrize(
+    "shape", [(9, 9, 9), (30, 20, 1), (1, 30, 20), (20, 1, 30), (1, 1, 50), (50, 1, 1), (1, 1, 1)]
+)
+def test_lattices_are_bound_as_the_dense_algorithm_binds_them(shape, max_neighbours):
+    """Many particles equally far, to the last bit, in any order; bodies without a width, a depth or a height."""
+    generator = torch.Generator().manual_seed(23)
+    axes = [torch.arange(n, dtype=torch.float64) / 32 for n in shape]
+    particles = torch.cartesian_prod(*axes)
+    particles = particles[torch.randperm(len(particles), generator=generator)]
+    means = particles[torch.randint(len(particles), (40,), generator=generator)]
+    means[::4] += 1 / 64
+    sizes = 2.0 ** torch.randint(-3, 2, (40, 1, 1), generator=generator) / 32
+    covars = sizes**2 * torch.eye(3, dtype=torch.float64)
+    sparse = bind(means, covars, particles, BindingConfig(max_neighbours=max_neighbours))
+    expected = algorithm_1(means, covars, particles, max_neighbours=max_neighbours)
+    torch.testing.assert_close(dense(sparse), expected, rtol=1e-14, atol=0)
 
 
 @pytest.mark.parametrize("equal_mass", [False, True])
@@ -178,13 +196,8 @@ def splat_of_a_ball(count, seed=20):
     return 0.3 * normal, axes @ torch.diag_embed(scales**2) @ axes.transpose(1, 2)
 
 
-@pytest.mark.parametrize("entries", [None, 100])
 @pytest.mark.parametrize("max_neighbours", [None, 10])
-def test_the_flat_gaussians_of_a_splat_are_bound_as_the_dense_algorithm_binds_them(
-    monkeypatch, entries, max_neighbours
-):
-    if entries:  # in many parts, some of them of one Gaussian that is larger
-        monkeypatch.setattr(particle_binding, "_CHUNK_ENTRIES", entries)
+def test_the_flat_gaussians_of_a_splat_are_bound_as_the_dense_algorithm_binds_them(max_neighbours):
     means, covars = splat_of_a_ball(800)
     particles = 0.6 * random_particles(400, seed=21) - 0.3
     settings = BindingConfig(max_neighbours=max_neighbours)
@@ -194,21 +207,16 @@ def test_the_flat_gaussians_of_a_splat_are_bound_as_the_dense_algorithm_binds_th
     torch.testing.assert_close(dense(binding), expected, rtol=1e-14, atol=0)
 
 
-def test_the_search_looks_only_at_particles_near_each_gaussian(monkeypatch):
+def test_the_search_looks_only_at_particles_near_each_gaussian():
     """Particles in the boxes of the ellipsoids, widened to whole cells; a search by distance alone looks at more."""
     means, covars = splat_of_a_ball(20000)
-    looked, runs = [], particle_binding._Cells.runs
-
-    def counted(*arguments):
-        for near, first, last in runs(*arguments):
-            looked.append((last - first).sum())
-            yield near, first, last
-
-    monkeypatch.setattr(particle_binding._Cells, "runs", counted)
     binding = bind(means, covars, means, BindingConfig(max_neighbours=None))
+    ellipsoids = _Ellipsoids.of(means, covars, BindingConfig())
+    all_inside = ellipsoids._replace(whitening=torch.zeros_like(covars))
+    looked = int(all_inside.counts(_Columns.of(means), None).sum())
     reach = (chi2.ppf(0.95, 3) * torch.linalg.eigvalsh(covars)[:, 2]).sqrt()
     within = cKDTree(means.numpy()).query_ball_point(means.numpy(), reach.numpy(), return_length=True).sum()
-    assert len(binding.indices) < sum(looked) < 0.5 * within
+    assert len(binding.indices) < looked < 0.5 * within
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,12 @@ import torch
 from grounding_scene import MODEL, TRUTH, ball, camera, observe
 from radiance_scenes import CHANNELS, LATTICE, OPACITY, random, scattered, small_scene
 from sim_scenes import make_law
+from test_binding import random_gaussians, random_particles
 
+from neuma_lib.config.binding import BindingConfig
 from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.velocity import VelocityConfig
+from neuma_lib.coupling.particle_binding import bind_two_pass
 from neuma_lib.coupling.particle_gs import ParticleGS
 from neuma_lib.fitting.material import PixelLoss, train_material
 from neuma_lib.fitting.velocity import estimate_velocity
@@ -57,6 +60,20 @@ def throw(law, device, dtype):
 
 def relative(a, b):
     return float((a - b).norm() / b.norm())
+
+
+@pytest.mark.parametrize("max_neighbours", [None, 10])
+def test_binding_is_the_same(max_neighbours):
+    means, covars = random_gaussians(5000, seed=1, size=0.02)
+    particles, settings = random_particles(20000, seed=2), BindingConfig(max_neighbours=max_neighbours)
+    expected, enlarged, added, volumes = bind_two_pass(means, covars, particles, 0.3, settings)
+    binding, *others = bind_two_pass(means.cuda(), covars.cuda(), particles.cuda(), 0.3, settings)
+    assert binding.indices.is_cuda and added > 0
+    assert torch.equal(binding.indptr.cpu(), expected.indptr)
+    assert torch.equal(binding.indices.cpu(), expected.indices)
+    assert torch.equal(binding.values.cpu(), expected.values)
+    assert torch.equal(others[0].cpu(), enlarged) and others[1] == added
+    assert torch.equal(others[2].cpu(), volumes)
 
 
 def with_network(name, dtype=torch.float64):

@@ -3,6 +3,7 @@
 
 rule binding:
     input:
+        kernels=kernels("binding"),
         gaussians=of_chain("gaussians.ply"),
         sampled=of_chain("sampled_particles.h5"),
     output:

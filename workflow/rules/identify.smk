@@ -4,7 +4,7 @@
 rule identify:
     input:
         **{name: of_each_video(of_chain(file)) for name, file in BODY.items()},
-        kernels=kernels("geometry", "laws", "rendering"),
+        kernels=kernels("binding", "geometry", "laws", "rendering"),
         mesh=of_each_video(of_chain("mesh.ply")),
         transforms=of_each_video(of_scene("dynamic/transforms.json")),
         velocity=of_each_video(of_chain("velocity.json")),

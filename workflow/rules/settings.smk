@@ -91,7 +91,7 @@ wildcard_constraints:
     prior=f"({'|'.join(SETTINGS.priors.laws) or 'none'})([+]seed=[1-9][0-9]*)?",
     method=f"({'|'.join(SETTINGS.methods) or 'none'})([+][^/]*)?",
     experiment=f"({'|'.join(SETTINGS.experiments) or 'none'})([+][^/]*)?",
-    group="geometry|simulation|laws|rendering|radiance|springs",
+    group="binding|geometry|simulation|laws|rendering|radiance|springs",
     views="[0-9]+(,[0-9]+)*",
 
 

@@ -36,6 +36,7 @@ rule splat_mesh:
 
 rule splat_binding:
     input:
+        kernels=kernels("binding"),
         gaussians=of_chain("gaussians.ply"),
         sampled=of_chain("sampled_particles.h5"),
     output:

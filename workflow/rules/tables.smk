@@ -95,7 +95,8 @@ def table_records(table):
     """Benchmark file and log of each job behind the scenes of a table, in all chains."""
     pairs = [SimpleNamespace(**run) for run in table_runs(table) if run["scene"]]
     makers = {"made": "render", "supplied": "supplied", "packed": "unpack"}
-    jobs = [("kernels", {"group": group}) for group in ("geometry", "simulation", "laws", "rendering")]
+    groups = ("binding", "geometry", "simulation", "laws", "rendering")
+    jobs = [("kernels", {"group": group}) for group in groups]
     priors, laws, videos = [], [], []
     for pair in pairs:
         if SETTINGS.is_springs(pair.method):
