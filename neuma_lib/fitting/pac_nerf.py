@@ -26,7 +26,7 @@ from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.isotropic import lame
 from neuma_lib.mechanics.law import Law
 from neuma_lib.radiance.lattice import Lattice
-from neuma_lib.radiance.rendering import camera_rays
+from neuma_lib.radiance.rendering import camera_rays, sum_of_terms
 from neuma_lib.sim.model import COURANT_LIMIT, MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.observation import Observation
@@ -177,16 +177,23 @@ def choose_family(
 
 
 class Video:
-    """Pixels of a video and their rays."""
+    """Pixels of a video and their rays. Images stay as they are stored: bytes become colours a picture at a time."""
 
     def __init__(self, observation: Observation):
         self.frames = observation.frames
-        self.colours = observation.colours().flatten(2, 3)  # (T, V, P, 3)
-        self.rays = [camera_rays(observation.cameras, view) for view in range(len(observation.cameras))]
+        self.views = [
+            replace(observation, images=observation.images[:, view : view + 1], cameras=camera)
+            for view, camera in enumerate(observation.cameras)
+        ]
+        self.rays = [camera_rays(view.cameras, 0) for view in self.views]
 
-    def shows_body(self, k: int, view: int, lattice: Lattice) -> Tensor:
-        """Indices of the pixels of a frame that are not white, or whose ray meets a lattice."""
-        coloured = (self.colours[k, view] < 1 - 1 / 512).any(-1)
+    def picture(self, k: int, view: int) -> Tensor:
+        """Colours (P, 3) over white of the pixels of a frame, row by row."""
+        return self.views[view].colours(slice(k, k + 1)).flatten(0, 3)
+
+    def shows_body(self, picture: Tensor, view: int, lattice: Lattice) -> Tensor:
+        """Indices of the pixels of a picture that are not white, or whose ray meets a lattice."""
+        coloured = (picture < 1 - 1 / 512).any(-1)
         origins, directions = self.rays[view]
         low, high = (torch.tensor(corner).to(origins) for corner in (lattice.origin, lattice.far))
         one, other = (low - origins) / directions, (high - origins) / directions
@@ -201,21 +208,30 @@ class Video:
         view: int,
         pixels: int | None,
         generator: torch.Generator | None,
+        frames: int = 1,
     ) -> Tensor:
         """Squared error of a frame over all its pixels, for the body's particles at x (N, 3): PAC-NeRF's loss.
 
-        From at most ``pixels`` of those that show the body, drawn at random; the others are white in both.
+        From at most ``pixels`` of those that show the body, drawn at random; the others are white in both. Divided by
+        the number of ``frames`` whose mean it is a part of. Differentiable with respect to x; the gradient is taken as
+        the picture is rendered, and for one piece of it at a time (`rendering.POINTS_AT_ONCE`), so that memory does not
+        depend on its size.
         """
         lattice, values = body.shown.seen(x)
-        chosen = self.shows_body(k, view, lattice)
+        picture = self.picture(k, view)
+        chosen = self.shows_body(picture, view, lattice)
         count = len(chosen)
         if pixels is not None and count > pixels:
             drawn = torch.randperm(count, generator=generator)[:pixels]
             chosen = chosen[drawn.to(chosen.device)]
-        origins, directions = (part[chosen] for part in self.rays[view])
-        colours, _ = body.field.render(lattice, values, origins, directions)
-        squares = (colours - self.colours[k, view, chosen]).square().sum()
-        return squares * (count / max(1, len(chosen)) / self.colours.shape[2])
+        rays, seen = [part[chosen] for part in self.rays[view]], picture[chosen]
+
+        def terms(values):
+            for part, colours, _ in body.field.render_in_pieces(lattice, values, *rays):
+                squares = (colours - seen[part]).square().sum()
+                yield squares * (count / max(1, len(chosen)) / len(picture)) / frames
+
+        return sum_of_terms(terms, values)
 
 
 @dataclass
@@ -417,9 +433,9 @@ class _Fit:
         velocity.grad = None
         moved, loss = self._moved(velocity, self.flying, halvings), 0.0
         seen = moved.detach().requires_grad_()
-        for t, k in enumerate(self.flying):  # a picture at a time is in memory
+        for t, k in enumerate(self.flying):  # a piece of a picture at a time is in memory
             for view in range(len(self.video.rays)):
-                error = self.video.error(self.body, seen[t], k, view, None, None) / len(self.flying)
+                error = self.video.error(self.body, seen[t], k, view, None, None, len(self.flying))
                 error.backward()
                 loss += float(error.detach())
         moved.backward(seen.grad)
@@ -449,8 +465,8 @@ class _Fit:
         seen = moved.detach().requires_grad_()
         for t, k in enumerate(chosen):
             view = int(torch.randint(len(self.video.rays), (), generator=self.generator))
-            error = self.video.error(self.body, seen[t], k, view, self.settings.pixels, self.generator)
-            error = error / len(chosen)
+            pixels = self.settings.pixels
+            error = self.video.error(self.body, seen[t], k, view, pixels, self.generator, len(chosen))
             error.backward()
             loss += float(error.detach())
         moved.backward(seen.grad)

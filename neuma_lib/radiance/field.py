@@ -6,14 +6,21 @@ is: the fuzzy shell of a field is light and soft.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 from neuma_lib.radiance.lattice import Lattice, from_particles, interpolate
-from neuma_lib.radiance.rendering import FEATURES, ColourNetwork, Opacity, camera_rays, render
+from neuma_lib.radiance.rendering import (
+    FEATURES,
+    ColourNetwork,
+    Opacity,
+    camera_rays,
+    render,
+    render_in_pieces,
+)
 from neuma_lib.splatting.cameras import Cameras
 
 OCCUPIED = 1e-7
@@ -21,8 +28,6 @@ OCCUPIED = 1e-7
 (PAC-NeRF: this opacity)."""
 STIFFNESS_POWER = 3
 """Stiffness is that of the material times this power of a particle's opacity (PAC-NeRF's code)."""
-RENDERED_AT_ONCE = 4096
-"""Rays of a picture that are drawn together."""
 WHITE = (1.0, 1.0, 1.0)
 
 
@@ -143,6 +148,17 @@ class RadianceField(nn.Module):
         """`rendering.render` of values on a lattice, those of the field or of particles, in the field's colours."""
         return render(lattice, values, self.opacity, self.network, origins, directions, background)
 
+    def render_in_pieces(
+        self,
+        lattice: Lattice,
+        values: Tensor,
+        origins: Tensor,
+        directions: Tensor,
+        background: Sequence[float] = WHITE,
+    ) -> Iterator[tuple[slice, Tensor, Tensor]]:
+        """`rendering.render_in_pieces`, likewise."""
+        return render_in_pieces(lattice, values, self.opacity, self.network, origins, directions, background)
+
     @torch.no_grad()
     def draw(
         self,
@@ -151,8 +167,10 @@ class RadianceField(nn.Module):
         particles: FieldParticles | None = None,
         background: Sequence[float] = WHITE,
     ) -> Tensor:
-        """Picture (H, W, 3) of the field, or of the particles that carry it, where these are."""
+        """Picture (H, W, 3) of the field, or of the particles that carry it, where these are.
+
+        Memory, beside rays and picture, is that of a piece (`rendering.POINTS_AT_ONCE`), whatever the picture's size.
+        """
         lattice, values = (self.lattice, self.values()) if particles is None else particles.seen()
-        rays = zip(*(part.split(RENDERED_AT_ONCE) for part in camera_rays(cameras, view)), strict=True)
-        colours = [self.render(lattice, values, *part, background)[0] for part in rays]
-        return torch.cat(colours).view(cameras.height, cameras.width, 3)
+        pieces = self.render_in_pieces(lattice, values, *camera_rays(cameras, view), background)
+        return torch.cat([colours for _, colours, _ in pieces]).view(cameras.height, cameras.width, 3)

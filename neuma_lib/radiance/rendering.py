@@ -1,13 +1,15 @@
 """Volume rendering of a lattice of raw densities and colour features along rays (Sun et al. 2022, DVGO).
 
 Three steps: the points of each ray that count are chosen without gradient; opacity and colour there come from the
-lattice by interpolation, activation and a small network, by autograd; and they are composited.
+lattice by interpolation, activation and a small network, by autograd; and they are composited. What autograd keeps is
+in proportion to the points: `render_in_pieces` bounds how many there are at a time, and `sum_of_terms` differentiates
+one piece before the next one is rendered.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -33,6 +35,12 @@ LEAST_LIGHT = 1e-7
 """A point that sends no more than this part of its light is left out, without gradient."""
 END_LIGHT = 1e-3
 """A ray ends where less than this part of the light from behind would pass (DVGO)."""
+POINTS_AT_ONCE = 2**16
+"""Most points of a piece of a picture, a ray counting as one more.
+
+The gradient keeps 1.1 kB of each in single precision. On a CPU a layer's 128 activations of them stay just below the
+32 MiB from which on the C library has every buffer mapped anew.
+"""
 
 
 @dataclass(frozen=True)
@@ -111,8 +119,9 @@ def render(
     origins: Tensor,
     directions: Tensor,
     background: Sequence[float] = (1.0, 1.0, 1.0),
+    counts: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Light along rays.
+    """Light along rays, all at once: memory is in proportion to their points.
 
     Differentiable with respect to the values and to what `colours` closes over; points that are left out
     (`LEAST_LIGHT`, `END_LIGHT`) have no gradient.
@@ -124,6 +133,7 @@ def render(
         colours: network of the colours.
         origins, directions: (R, 3) starts [m] and unit directions of the rays.
         background: colour behind the lattice.
+        counts: points of each ray, (R,), where they are known (`count_points`).
 
     Returns:
         colours (R, 3), and the part of the background's light that comes through, (R,)
@@ -131,35 +141,122 @@ def render(
     Raises:
         InputError: shapes, types or devices that do not fit.
     """
-    if origins.shape != directions.shape or origins.dtype != values.dtype or origins.device != values.device:
-        raise InputError(
-            f"render: rays of shapes {tuple(origins.shape)} and {tuple(directions.shape)} ({origins.dtype} on"
-            f" {origins.device}) for values of {values.dtype} on {values.device}: give all alike"
-        )
-    points, rays, starts = march(lattice, values[..., 0], opacity, origins, directions)
+    points, rays, starts = march(lattice, values[..., 0], opacity, origins, directions, counts)
     read = interpolate(lattice, values, points)
     alphas = opacity(read[:, 0], opacity.ray_interval(lattice.voxel))
     return _Composite.apply(tuple(background), starts, alphas, colours(read[:, 1:], directions, rays))
 
 
+def render_in_pieces(
+    lattice: Lattice,
+    values: Tensor,
+    opacity: Opacity,
+    colours: Colours,
+    origins: Tensor,
+    directions: Tensor,
+    background: Sequence[float] = (1.0, 1.0, 1.0),
+) -> Iterator[tuple[slice, Tensor, Tensor]]:
+    """`render` rays of any number, a piece of them after another.
+
+    A piece has at most `POINTS_AT_ONCE` points and rays, or is one ray. Beside the rays themselves, memory is that of a
+    piece where its graph is gone before the next one is asked for; else that of `render`.
+
+    Yields:
+        which rays, their colours and the part of the background's light that comes through, as `render` has them
+    """
+    counts = count_points(lattice, values[..., 0], opacity, origins, directions)
+    ends = (counts + 1).cumsum(0).cpu()
+    first = done = 0
+    while first < len(ends):
+        last = max(first + 1, int(torch.searchsorted(ends, done + POINTS_AT_ONCE, right=True)))
+        part = slice(first, last)
+        rays = origins[part], directions[part]
+        yield part, *render(lattice, values, opacity, colours, *rays, background, counts[part])
+        first, done = last, int(ends[last - 1])
+
+
+def sum_of_terms(terms: Callable[[Tensor], Iterable[Tensor]], values: Tensor) -> Tensor:
+    """Sum of terms, whose gradient is taken a term at a time: one graph is in memory, whatever their number.
+
+    Args:
+        terms: scalars, one after another, of values that it is given, and of nothing else that has a gradient.
+        values: any shape.
+
+    Returns:
+        scalar, differentiable with respect to the values; the terms are computed once, with their gradients if those
+        are needed
+    """
+    return _SumOfTerms.apply(terms, values)
+
+
+@torch.no_grad()
+def count_points(
+    lattice: Lattice, density: Tensor, opacity: Opacity, origins: Tensor, directions: Tensor
+) -> Tensor:
+    """How many points of each ray count, (R,)."""
+    counts = torch.zeros(len(origins), dtype=torch.int32, device=origins.device)
+    nothing = origins[:0], torch.empty(0, dtype=torch.int64, device=origins.device)
+    _march(lattice, density, opacity, origins, directions, 0, counts, *nothing, counts)
+    return counts
+
+
 @torch.no_grad()
 def march(
-    lattice: Lattice, density: Tensor, opacity: Opacity, origins: Tensor, directions: Tensor
+    lattice: Lattice,
+    density: Tensor,
+    opacity: Opacity,
+    origins: Tensor,
+    directions: Tensor,
+    counts: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The points that count: positions (M, 3), their rays (M,), and where those of each ray start, (R + 1,)."""
-    dtype, R = density.dtype, len(origins)
-    density, origins, directions = (value.detach().contiguous() for value in (density, origins, directions))
-    place, interval = lattice.place(dtype), opacity.ray_interval(lattice.voxel)
-    constants = (place, NEAR, STEP * lattice.voxel, interval, opacity.shift, LEAST_LIGHT, END_LIGHT)
-    counts = torch.zeros(R + 1, dtype=torch.int32, device=density.device)
-    nothing = origins[:0], torch.empty(0, dtype=torch.int64, device=density.device)
-    field = (density.view(-1), origins, directions)
-    launch(kernels(dtype).march, R, *constants, 0, *field, counts, *nothing, counts[1:])
-    starts = counts.cumsum(0, dtype=torch.int32)
+    """The points that count: positions (M, 3), their rays (M,), and where those of each ray start, (R + 1,).
+
+    ``counts`` are those of `count_points`, where they are known.
+    """
+    if counts is None:
+        counts = count_points(lattice, density, opacity, origins, directions)
+    starts = nn.functional.pad(counts, (1, 0)).cumsum(0, dtype=torch.int32)
     M = int(starts[-1])
-    points, rays = origins.new_empty(M, 3), nothing[1].new_empty(M)
-    launch(kernels(dtype).march, R, *constants, 1, *field, starts, points, rays, counts)
+    points, rays = origins.new_empty(M, 3), torch.empty(M, dtype=torch.int64, device=origins.device)
+    _march(lattice, density, opacity, origins, directions, 1, starts, points, rays, counts)
     return points, rays, starts
+
+
+def _march(lattice, density, opacity, origins, directions, fill, starts, points, rays, counts) -> None:
+    if (
+        origins.shape != directions.shape
+        or origins.dtype != density.dtype
+        or origins.device != density.device
+    ):
+        raise InputError(
+            f"render: rays of shapes {tuple(origins.shape)} and {tuple(directions.shape)} ({origins.dtype} on"
+            f" {origins.device}) for values of {density.dtype} on {density.device}: give all alike"
+        )
+    density, origins, directions = (value.detach().contiguous() for value in (density, origins, directions))
+    place, interval = lattice.place(density.dtype), opacity.ray_interval(lattice.voxel)
+    constants = (place, NEAR, STEP * lattice.voxel, interval, opacity.shift, LEAST_LIGHT, END_LIGHT)
+    field = (density.view(-1), origins, directions)
+    launch(kernels(density.dtype).march, len(origins), *constants, fill, *field, starts, points, rays, counts)
+
+
+class _SumOfTerms(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, terms, values):
+        leaf = values.detach().requires_grad_(ctx.needs_input_grad[1])
+        total, grad = values.new_zeros(()), torch.zeros_like(values)
+        with torch.set_grad_enabled(leaf.requires_grad):
+            for term in terms(leaf):
+                if leaf.requires_grad:
+                    grad += torch.autograd.grad(term, leaf)[0]
+                total += term.detach()
+        ctx.save_for_backward(grad)
+        return total
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad_total):
+        (grad,) = ctx.saved_tensors
+        return None, grad_total * grad
 
 
 class _Composite(torch.autograd.Function):

@@ -1,4 +1,6 @@
-"""A small lattice of random densities and features, particles in it and rays through it."""
+"""A small lattice of random densities and features, particles in it and rays through it; what a gradient keeps."""
+
+from contextlib import contextmanager
 
 import torch
 
@@ -35,3 +37,24 @@ def small_scene(density=8.0):
     cameras = Cameras(look_at(eyes, middle, up), K.expand(2, 3, 3).contiguous(), 8, 7)
     rays = [torch.cat(parts) for parts in zip(camera_rays(cameras, 0), camera_rays(cameras, 1), strict=True)]
     return values, network, *rays
+
+
+@contextmanager
+def kept_for_gradient():
+    """Yields a list of one number: most bytes that autograd has kept at a time, tensors that share memory once."""
+    most, users = [0], {}
+
+    class Kept:
+        def __init__(self, tensor):
+            self.tensor, storage = tensor, tensor.untyped_storage()
+            self.memory = storage.data_ptr(), storage.nbytes()
+            users[self.memory] = users.get(self.memory, 0) + 1
+            most[0] = max(most[0], sum(size for _, size in users))
+
+        def __del__(self):
+            users[self.memory] -= 1
+            if not users[self.memory]:
+                del users[self.memory]
+
+    with torch.autograd.graph.saved_tensors_hooks(Kept, lambda kept: kept.tensor):
+        yield most

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from radiance_scenes import kept_for_gradient
 
 from benchmarks import pac_nerf as benchmark
 from benchmarks.pac_nerf import BOUNDS, DENSITY, LEAST_OPACITY, MODEL, spotted_ball
@@ -20,9 +21,11 @@ from neuma_lib.fitting.pac_nerf import (
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.radiance import save_field
 from neuma_lib.mechanics.isotropic import lame
+from neuma_lib.radiance import rendering
 from neuma_lib.radiance.rendering import camera_rays
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.cameras import Cameras
+from neuma_lib.splatting.observation import Observation
 
 V0 = torch.tensor(benchmark.V0, dtype=torch.float64)
 FRAMES = tuple(range(0, 145, 8))
@@ -110,6 +113,59 @@ def test_gradient_of_constants_and_velocity_against_differences(family, carried)
         difference = (values[0] - values[1]) / (2 * h)
         assert abs(difference) > 1e-6
         assert float((gradient * direction).sum()) == pytest.approx(difference, rel=1e-4)
+
+
+class TestMemory:
+    """Pictures are rendered in pieces, and stay bytes until they are looked at."""
+
+    @staticmethod
+    def video(carried, size):
+        """A picture of the body where it is in three views, and one of noise, as files have them."""
+        cameras = benchmark.cameras(size, torch.float64)
+        drawn = torch.stack([carried.field.draw(cameras, view, carried.shown) for view in range(3)])
+        opaque = torch.full((3, size, size, 1), 255, dtype=torch.uint8)
+        rgba = torch.cat([(255 * drawn.clamp(0, 1)).byte(), opaque], dim=-1)
+        other = torch.randint(256, rgba.shape, generator=torch.Generator().manual_seed(0)).byte()
+        return Observation((0, 8), torch.stack([rgba, other]), cameras)
+
+    @staticmethod
+    def error(carried, video):
+        """Loss of the body a little aside, its gradient in the positions, and the bytes that were kept for it."""
+        x = (carried.shown.x + 0.01).requires_grad_()
+        with kept_for_gradient() as kept:
+            error = video.error(carried, x, 0, 1, None, None, 3)
+            error.backward()
+        return float(error.detach()), x.grad, kept[0]
+
+    def test_a_picture_in_pieces_has_the_same_loss_and_gradient(self, carried, monkeypatch):
+        video, found = Video(self.video(carried, 24)), []
+        for most in (10**9, 300, 1):
+            monkeypatch.setattr(rendering, "POINTS_AT_ONCE", most)
+            found.append([*self.error(carried, video)[:2], carried.field.draw(video.views[0].cameras, 0)])
+        (loss, gradient, picture), *others = found
+        assert loss > 1e-4 and gradient.abs().max() > 1e-6
+        for other in others:
+            assert other[0] == pytest.approx(loss, rel=1e-12)
+            assert (other[1] - gradient).abs().max() < 1e-11 * gradient.abs().max()
+            assert (other[2] - picture).abs().max() < 1e-13
+
+    def test_memory_does_not_grow_with_the_picture(self, carried, monkeypatch):
+        """Nine times as many rays; rendered at once they keep nearly nine times as much."""
+        videos, kept = [Video(self.video(carried, size)) for size in (24, 72)], {}
+        for most in (500, 10**9):
+            monkeypatch.setattr(rendering, "POINTS_AT_ONCE", most)
+            kept[most] = [self.error(carried, video)[2] for video in videos]
+        assert kept[500][1] < 1.05 * kept[500][0] < kept[10**9][0]
+        assert kept[10**9][1] > 7 * kept[10**9][0]
+
+    def test_a_video_stays_in_bytes(self, carried):
+        seen = self.video(carried, 24)
+        video = Video(seen)
+        for k in range(2):
+            for view in range(3):
+                assert torch.equal(video.picture(k, view), seen.colours()[k, view].view(-1, 3))
+        memory = {view.images.untyped_storage().data_ptr() for view in video.views}
+        assert memory == {seen.images.untyped_storage().data_ptr()}
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import torch
 from radiance_scenes import CHANNELS, LATTICE, OPACITY, random, scattered, small_scene
 
 from neuma_lib.errors import InputError
+from neuma_lib.radiance import rendering
 from neuma_lib.radiance.lattice import EMPTY, Lattice, from_particles, interpolate
 from neuma_lib.radiance.rendering import (
     END_LIGHT,
@@ -17,6 +18,8 @@ from neuma_lib.radiance.rendering import (
     ColourNetwork,
     march,
     render,
+    render_in_pieces,
+    sum_of_terms,
 )
 from neuma_lib.splatting.cameras import Cameras, look_at
 
@@ -175,6 +178,49 @@ def test_opaque_points_end_a_ray():
     values[..., 0] = 2000.0
     points, rays, starts = march(LATTICE, values[..., 0], OPACITY, origins, directions)
     assert ((starts[1:] - starts[:-1]) <= 1).all() and len(points) == len(rays) > 0
+
+
+@pytest.mark.parametrize("most", [1, 40, 10**9])
+def test_pieces_are_the_whole(most, monkeypatch):
+    """All rays in their order, no more points at once than allowed unless one ray has them; one piece is `render`."""
+    monkeypatch.setattr(rendering, "POINTS_AT_ONCE", most)
+    values, network, *rays = small_scene()
+    scene = LATTICE, values, OPACITY, network, *rays, (0.2, 0.9, 0.4)
+    starts = march(LATTICE, values[..., 0], OPACITY, *rays)[2].tolist()
+    with torch.no_grad():
+        whole, pieces = render(*scene), list(render_in_pieces(*scene))
+    bounds = [(part.start, part.stop) for part, *_ in pieces]
+    assert bounds[0][0] == 0 and bounds[-1][1] == len(rays[0])
+    assert all(before[1] == after[0] for before, after in zip(bounds, bounds[1:], strict=False))
+    costs = [starts[last] - starts[first] + last - first for first, last in bounds]
+    assert all(cost <= most or last == first + 1 for cost, (first, last) in zip(costs, bounds, strict=True))
+    assert all(a + b > most for a, b in zip(costs, costs[1:], strict=False)), "no more pieces than it takes"
+    assert len(pieces) == {1: len(rays[0]), 40: len(pieces), 10**9: 1}[most]
+    for k, out in enumerate(whole, start=1):
+        assert (torch.cat([piece[k] for piece in pieces]) - out).abs().max() < 1e-14
+        assert most < 10**9 or torch.equal(pieces[0][k], out)
+
+
+@pytest.mark.parametrize("most", [1, 40, 10**9])
+def test_gradient_of_pieces_is_that_of_the_whole(most, monkeypatch):
+    """To round-off; to the bit where one piece holds all rays."""
+    monkeypatch.setattr(rendering, "POINTS_AT_ONCE", most)
+    values, network, *rays = small_scene()
+    network.requires_grad_(False)
+    values.requires_grad_()
+
+    def terms(leaf):
+        for _, colours, _ in render_in_pieces(LATTICE, leaf, OPACITY, network, *rays):
+            yield colours.square().sum()
+
+    for factor in (1.0, 3.0):
+        loss = sum_of_terms(terms, values)
+        expected = render(LATTICE, values, OPACITY, network, *rays)[0].square().sum()
+        (found,), (whole,) = (torch.autograd.grad(factor * value, values) for value in (loss, expected))
+        assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-14)
+        assert (found - whole).abs().max() < 1e-13 * whole.abs().max()
+        assert most < 10**9 or factor != 1 or (loss == expected and torch.equal(found, whole))
+    assert not sum_of_terms(terms, values.detach()).requires_grad
 
 
 @pytest.mark.parametrize("channels", [slice(0, 1), slice(1, CHANNELS)], ids=["density", "features"])
