@@ -140,7 +140,7 @@ class TestMemory:
     def test_a_picture_in_pieces_has_the_same_loss_and_gradient(self, carried, monkeypatch):
         video, found = Video(self.video(carried, 24)), []
         for most in (10**9, 300, 1):
-            monkeypatch.setattr(rendering, "POINTS_AT_ONCE", most)
+            monkeypatch.setitem(rendering.POINTS_AT_ONCE, "cpu", most)
             found.append([*self.error(carried, video)[:2], carried.field.draw(video.views[0].cameras, 0)])
         (loss, gradient, picture), *others = found
         assert loss > 1e-4 and gradient.abs().max() > 1e-6
@@ -153,7 +153,7 @@ class TestMemory:
         """Nine times as many rays; rendered at once they keep nearly nine times as much."""
         videos, kept = [Video(self.video(carried, size)) for size in (24, 72)], {}
         for most in (500, 10**9):
-            monkeypatch.setattr(rendering, "POINTS_AT_ONCE", most)
+            monkeypatch.setitem(rendering.POINTS_AT_ONCE, "cpu", most)
             kept[most] = [self.error(carried, video)[2] for video in videos]
         assert kept[500][1] < 1.05 * kept[500][0] < kept[10**9][0]
         assert kept[10**9][1] > 7 * kept[10**9][0]

@@ -183,7 +183,7 @@ def test_opaque_points_end_a_ray():
 @pytest.mark.parametrize("most", [1, 40, 10**9])
 def test_pieces_are_the_whole(most, monkeypatch):
     """All rays in their order, no more points at once than allowed unless one ray has them; one piece is `render`."""
-    monkeypatch.setattr(rendering, "POINTS_AT_ONCE", most)
+    monkeypatch.setitem(rendering.POINTS_AT_ONCE, "cpu", most)
     values, network, *rays = small_scene()
     scene = LATTICE, values, OPACITY, network, *rays, (0.2, 0.9, 0.4)
     starts = march(LATTICE, values[..., 0], OPACITY, *rays)[2].tolist()
@@ -204,7 +204,7 @@ def test_pieces_are_the_whole(most, monkeypatch):
 @pytest.mark.parametrize("most", [1, 40, 10**9])
 def test_gradient_of_pieces_is_that_of_the_whole(most, monkeypatch):
     """To round-off; to the bit where one piece holds all rays."""
-    monkeypatch.setattr(rendering, "POINTS_AT_ONCE", most)
+    monkeypatch.setitem(rendering.POINTS_AT_ONCE, "cpu", most)
     values, network, *rays = small_scene()
     network.requires_grad_(False)
     values.requires_grad_()
