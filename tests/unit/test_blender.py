@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image, ImageDraw
 
 from neuma_lib.config.blender import AppearanceConfig
 from neuma_lib.data.blender.appearance import colors_at, smooth_noise, to_linear
@@ -115,16 +116,32 @@ def test_srgb_decodes_to_linear_light():
 # ------------------------------------------------------------------------------------------- bodies
 
 
-def test_grains_stay_inside_the_rest_surface():
-    mesh = shapes.place("fish", 0.4, 0.28, (0.5, 0.5), 48)
+@pytest.mark.parametrize("shape, size", [("fish", 0.4), ("ball", 0.26)])
+def test_grains_show_the_outlines_of_the_body(shape, size):
+    mesh = shapes.place(shape, size, 0.3, (0.5, 0.5), 48)
     rng = np.random.default_rng(5)
-    points = rng.uniform(mesh.bounds[0], mesh.bounds[1], (30000, 3))
-    points = points[shapes.depth(mesh, points) > 0]
-    body = make_body(
-        mesh, AppearanceConfig(kind="grains", colors={"body": "#c9a86a"}), points[None], points[None]
-    )
-    assert shapes.depth(mesh, body.vertices[0]).min() > 0.75 * body.radius
-    assert len(body.colors) == body.vertices.shape[1]
+    points = rng.uniform(mesh.bounds[0], mesh.bounds[1], (80000, 3))
+    points = points[shapes.depth(mesh, points) > 0][:30000]
+    look = AppearanceConfig(kind="grains", colors={"body": "#c9a86a"})
+    body = make_body(mesh, look, points[None], points[None])
+    assert len(body.colors) == body.vertices.shape[1] < len(points)
+    covered = [
+        outline(body.vertices[0], axes, body.radius).sum() / outline(mesh.triangles, axes).sum()
+        for axes in ([0, 1], [1, 2], [0, 2])
+    ]
+    np.testing.assert_allclose(np.mean(covered), 1.0, atol=0.01)
+
+
+def outline(parts: np.ndarray, axes: list[int], radius: float = 0.0) -> np.ndarray:
+    """Mask of what balls (N, 3) or triangles (N, 3, 3) in the unit cube cover, seen along the third axis."""
+    image = Image.new("1", (1000, 1000))
+    draw = ImageDraw.Draw(image)
+    for part in 1000 * parts[..., axes]:
+        if radius:
+            draw.circle(tuple(part), 1000 * radius, fill=1)
+        else:
+            draw.polygon(list(map(tuple, part)), fill=1)
+    return np.asarray(image)
 
 
 def test_liquid_surface_is_closed_and_holds_the_volume():
