@@ -9,13 +9,14 @@ random by its own covariance and smaller by what keeps their area together.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from benchmarks.project_scenes import chosen_scenes, scene_parser
+from benchmarks.timing import seconds
 from neuma_lib.coupling.particle_binding import bind_two_pass
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.gaussians import load_gaussians
@@ -30,17 +31,6 @@ def drawn(means: Tensor, covars: Tensor, count: int) -> tuple[Tensor, Tensor]:
     noise = torch.randn(count, 3, generator=generator, dtype=torch.float64)
     shift = (axes * values.clamp(min=0).sqrt()[:, None] @ noise[:, :, None])[..., 0]
     return (means[pick] + shift).to(means), covars[pick] * (len(means) / count)
-
-
-def core_seconds(work: Callable[..., object], *arguments, repeat: int) -> float:
-    """Least of some repetitions, after one that does not count."""
-    work(*arguments)
-    taken = []
-    for _ in range(repeat):
-        started = time.process_time()
-        work(*arguments)
-        taken.append(time.process_time() - started)
-    return min(taken)
 
 
 def main() -> None:
@@ -62,8 +52,10 @@ def main() -> None:
         x = torch.from_numpy(sample_volume(*filling))
         bound = means, covars, x, float(mesh.volume), settings.binding
         binding, _, added, _ = bind_two_pass(*bound)
-        sampling = core_seconds(sample_volume, *filling, repeat=args.repeat)
-        binds = core_seconds(bind_two_pass, *bound, repeat=args.repeat)
+        sampling, binds = (
+            seconds(work, torch.device("cpu"), args.repeat, time.process_time)
+            for work in (partial(sample_volume, *filling), partial(bind_two_pass, *bound))
+        )
         print(
             f"{name}: {len(mesh.faces)} faces, {len(x)} particles {sampling:.3f} s; {len(means)} Gaussians, "
             f"{added} particles added, {len(binding.indices)} pairs {binds:.3f} s"
