@@ -24,7 +24,8 @@ from neuma_lib.config.loading import load, merged, read_yaml
 from neuma_lib.config.pac_nerf import PacFamilyConfig, PacNerfConfig
 from neuma_lib.evaluation.reports import as_markdown
 from neuma_lib.fitting.carried_field import CarriedField
-from neuma_lib.fitting.pac_nerf import FamilyConstants, PacNerfFit, fit_pac_nerf
+from neuma_lib.fitting.pac_families import FamilyConstants
+from neuma_lib.fitting.pac_nerf import PacNerfFit, fit_pac_nerf
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.radiance.field import FieldParticles, RadianceField
 from neuma_lib.radiance.lattice import Lattice

@@ -24,7 +24,8 @@ from neuma_lib.evaluation.motion import predict
 from neuma_lib.evaluation.springs import predict_springs
 from neuma_lib.fitting.carried_field import CarriedField
 from neuma_lib.fitting.material import PixelLoss
-from neuma_lib.fitting.pac_nerf import choose_family, fit_pac_nerf
+from neuma_lib.fitting.pac_families import choose_family
+from neuma_lib.fitting.pac_nerf import fit_pac_nerf
 from neuma_lib.fitting.radiance import fit_radiance_field
 from neuma_lib.fitting.springs import fit_springs
 from neuma_lib.io.files import read_json

@@ -11,13 +11,8 @@ from benchmarks.pac_nerf import BOUNDS, DENSITY, LEAST_OPACITY, MODEL, spotted_b
 from neuma_lib.config.pac_nerf import PacFamilyConfig, PacNerfConfig
 from neuma_lib.errors import InputError
 from neuma_lib.fitting.carried_field import CarriedField
-from neuma_lib.fitting.pac_nerf import (
-    FamilyConstants,
-    Video,
-    choose_family,
-    fit_pac_nerf,
-    spread,
-)
+from neuma_lib.fitting.pac_families import FamilyConstants, choose_family
+from neuma_lib.fitting.pac_nerf import Video, fit_pac_nerf, spread
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.radiance import save_field
 from neuma_lib.mechanics.isotropic import lame

@@ -8,7 +8,8 @@ from neuma_lib.config.pac_nerf import PacNerfConfig
 from neuma_lib.device import choose_device
 from neuma_lib.errors import InputError
 from neuma_lib.fitting.carried_field import CarriedField
-from neuma_lib.fitting.pac_nerf import choose_family, fit_pac_nerf
+from neuma_lib.fitting.pac_families import choose_family
+from neuma_lib.fitting.pac_nerf import fit_pac_nerf
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.images import load_videos
