@@ -1,10 +1,28 @@
-"""The two errors that users meet: an input that they can mend, and a number that is no longer one."""
+"""The errors that users meet: `InputError` for an input to correct, `NonFiniteError` for a diverged computation."""
 
 from __future__ import annotations
 
+from os import PathLike
+
 
 class InputError(ValueError):
-    """A file, key or value given by the user cannot be used; the message names it and says what to do."""
+    """A file, key or value given by the user cannot be used.
+
+    Args:
+        where: file, key or argument that is wrong.
+        problem: what is wrong with it, with the given value.
+        remedy: what the user can do. Empty if the problem already says it.
+    """
+
+    def __init__(self, where: str | PathLike, problem: str = "", remedy: str = ""):
+        self.where = str(where)
+        self.problem = str(problem)
+        self.remedy = str(remedy)
+        text = f"{self.where}: {self.problem}" if problem else self.where
+        super().__init__(f"{_sentence(text)} {_sentence(self.remedy)}" if remedy else text)
+
+    def __reduce__(self):
+        return type(self), (self.where, self.problem, self.remedy)
 
 
 class NonFiniteError(ArithmeticError):
@@ -32,3 +50,7 @@ class NonFiniteError(ArithmeticError):
         self.step = step
         self.particle = particle
         self.happened = happened
+
+
+def _sentence(text: str) -> str:
+    return text if text.endswith((".", "?", "!", ")")) else f"{text}."
