@@ -36,7 +36,6 @@ def project(tmp_path_factory, kernels):
 def test_only_evaluation_and_figures_of_it_and_one_ablation_read_the_truth(project):
     on_request = [
         f"{SCENE}/{SUPERVISED}/image_metrics.json",
-        f"{SCENE}/neuma/bias.json",
         f"{SCENE}/viewer.html",
     ]
     everything = ("tables", "figures", "videos", "packed", *on_request)
@@ -97,9 +96,9 @@ def test_springs_are_fitted_to_the_video_alone(project):
     graph = jobs(project.run("--dry-run", target.format("letter_N_bouncy")))
     made = {rule: (read, outputs) for rule, read, outputs in graph}
     assert f"{SCENE}/spring_gaus/springs.safetensors" in made["springs_experiment"][0]
-    for impossible in (target.format("letter_and_ball"), f"{SCENE}/spring_gaus/bias.json"):
+    for impossible in (target.format("letter_and_ball"), f"{SCENE}/spring_gaus/stress.json"):
         refused = project.run("--dry-run", impossible, succeeds=False)
-        assert "only springs in one body: it has no stress and no bias" in refused
+        assert "only springs in one body: it has no stress, and no experiment" in refused
 
 
 def test_springs_and_laws_of_a_table_are_put_to_use_elsewhere_as_their_scenes_taught_them(project):
@@ -276,10 +275,9 @@ def test_networks_can_start_from_what_the_video_shows(project):
 
 
 def test_a_method_can_start_as_identification_found(project):
-    graph = jobs(project.run("--dry-run", f"{SCENE}+seed=1/neuma+start=identified/bias.json"))
-    graph += jobs(project.run("--dry-run", f"{SCENE}+seed=1/neuma+start=identified/metrics.json"))
+    graph = jobs(project.run("--dry-run", f"{SCENE}+seed=1/neuma+start=identified/metrics.json"))
     made = {rule: (read, outputs) for rule, read, outputs in graph}
-    for rule in ("material", "evaluation", "bias"):
+    for rule in ("material", "evaluation"):
         assert f"{SCENE}+seed=1/identified.json" in made[rule][0]
         assert not any(file.endswith("velocity.json") for file in made[rule][0])
 

@@ -50,8 +50,8 @@ def training_settings(wildcards):
 def without_law(method):
     """The error of a method with springs where a law is asked for."""
     return InputError(
-        f"{method} has no law of a material, only springs in one body: it has no stress and no bias, and no experiment "
-        "with several bodies"
+        f"{method} has no law of a material, only springs in one body: it has no stress, and no experiment with several "
+        "bodies"
     )
 
 

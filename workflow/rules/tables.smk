@@ -1,7 +1,7 @@
 """What tables are made of: runs, files and records of their cells, titles. Needs methods.smk."""
 
 # Tables of distances; the others have rules of their own.
-OTHER_TABLES = ("table4", "learning_rates", "bias", "stress")
+OTHER_TABLES = ("table4", "stress")
 CHAMFER_TABLES = [name for name in SETTINGS.tables if name not in OTHER_TABLES]
 
 
@@ -145,23 +145,6 @@ def table_records(table):
 def table_cells(table):
     """Method and column of every run behind a table, in the order of `table_runs`."""
     return [[run["method"], run["column"]] for run in table_runs(table)]
-
-
-def bias_cells(table):
-    """Scene, as its chain is called, and method of every run behind a table, in the order of `table_runs`."""
-    return [{"scene": run["scene"], "method": run["method"]} for run in table_runs(table)]
-
-
-def learning_rate_cells(table):
-    """Method, learning-rate factor and scene of every run behind a table, in the order of `table_runs`."""
-    return [
-        {
-            "method": run["method"].partition("+")[0],
-            "lr_scale": SETTINGS.method_material(run["scene"], run["method"]).lr_scale,
-            "scene": run["column"],
-        }
-        for run in table_runs(table)
-    ]
 
 
 def table_titles(table):
