@@ -1,7 +1,6 @@
 """What rules read, over the graph of all jobs behind everything that can be asked for."""
 
 import re
-import shutil
 
 import pytest
 from project import SCENE, TABLE, copied
@@ -123,27 +122,6 @@ def test_springs_and_laws_of_a_table_are_put_to_use_elsewhere_as_their_scenes_ta
     assert len(table) == 6 * 5 and not any(
         f"tiny/results/{scene}/" in file for scene in scenes for file in table
     )
-
-
-def test_other_systems_have_rows_in_table1_once_all_their_results_are_there(project):
-    scenes = "BouncyBall", "JellyDuck"
-
-    def table():
-        columns = f"tables={{table1: {{scenes: [{', '.join(scenes)}]}}}}"
-        graph = jobs(project.run("--dry-run", "--config", columns, "--", "tiny/results/table1.csv"))
-        return next(read for rule, read, _ in graph if rule == "chamfer_table")
-
-    made = [project.root / f"tiny/results/{scene}/spring_gaus/metrics.json" for scene in scenes]
-    expected = table()
-    assert not any("spring_gaus" in file or "pac_nerf" in file for file in expected)
-    for file in made:
-        file.parent.mkdir(parents=True)
-        file.write_text("{}")
-        found = table()
-        assert (found == expected) == (file != made[-1])
-    assert set(found) - set(expected) == {str(file.relative_to(project.root)) for file in made}
-    for file in made:
-        shutil.rmtree(file.parent)
 
 
 def test_pac_nerf_needs_images_its_field_and_contact_alone(project):

@@ -69,21 +69,9 @@ def method_runs(table, method):
     ]
 
 
-def is_made(table, method):
-    """Whether all results of a row are there."""
-    return all(Path(run["folder"], "metrics.json").exists() for run in method_runs(table, method))
-
-
-# Looked up once, so that files which appear while jobs run change no job.
-TABLE_METHODS = {
-    name: [*table.methods, *(method for method in table.if_made if is_made(name, method))]
-    for name, table in SETTINGS.tables.items()
-}
-
-
 def table_runs(table):
     """Every run behind a table, row by row and chain by chain, see `method_runs`."""
-    return [run for method in TABLE_METHODS[table] for run in method_runs(table, method)]
+    return [run for method in SETTINGS.tables[table].methods for run in method_runs(table, method)]
 
 
 def table_files(table, name):
@@ -150,12 +138,12 @@ def table_cells(table):
 def table_titles(table):
     """Row names of a table by method."""
     chosen = SETTINGS.tables[table]
-    return {m: chosen.titles.get(m) or SETTINGS.method_title(m) for m in TABLE_METHODS[table]}
+    return {m: chosen.titles.get(m) or SETTINGS.method_title(m) for m in chosen.methods}
 
 
 def table_notes(table):
     """What readers must know of the rows of a table, by method."""
-    notes = {method: SETTINGS.method_note(method) for method in TABLE_METHODS[table]}
+    notes = {method: SETTINGS.method_note(method) for method in SETTINGS.tables[table].methods}
     return {method: note for method, note in notes.items() if note}
 
 
