@@ -41,7 +41,6 @@ MADE_BY = {
     "finer_truth": "results/finer_truth.csv",
     "random": "random",
     "initial_states": "tables figures",
-    "timings": "tables figures",
     "yardstick": "results/yardstick.csv",
     "stress": "results/stress.csv",
     "letters": "results/letters.csv",

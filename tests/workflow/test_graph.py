@@ -370,16 +370,6 @@ def test_identifications_behind_a_table_are_those_of_the_laws_that_its_constants
     assert sorted(read) == [f"{SCENE}/identified.json", f"{THROW}/identified.json"]
 
 
-@pytest.mark.parametrize("chains", [(), CHAINS, TWO_VIDEOS], ids=["one chain", "three chains", "two videos"])
-def test_timings_read_the_benchmark_of_every_job_behind_them(project, chains):
-    graph = jobs(project.run("--dry-run", *chains, "tiny/results/timings.csv"))
-    (read,) = [read for rule, read, _ in graph if rule == "timings"]
-    assert len(read) == len(set(read)) == len(graph) - 1
-    assert all(
-        file.startswith(("tiny/results/benchmarks/", "tiny/data/kernels/benchmarks/")) for file in read
-    )
-
-
 def test_motions_of_springs_and_of_experiments_are_exported_too(project):
     files = ("gaussians", "compressed", "particles.h5", "surface.glb", "motion.blend", "motion.gif")
     moved = (f"{SCENE}/spring_gaus", f"{EXPERIMENT}/neuma", f"{EXPERIMENT}/spring_gaus")

@@ -86,12 +86,6 @@ def identified_file(wildcards):
     return home(SETTINGS.law_scene(scene, method), identified_name(scene, method))
 
 
-def identification(file):
-    """The job that makes such a file: its rule and its wildcards."""
-    scene, views = Path(file).parent.name, Path(file).stem.partition("views=")[2]
-    return ("identify_views", {"scene": scene, "views": views}) if views else ("identify", {"scene": scene})
-
-
 @checked
 def identify_settings(wildcards):
     """Settings of an identification, in the views that its file names, if any."""

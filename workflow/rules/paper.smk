@@ -69,18 +69,6 @@ rule random:
         expand(f"{RESULTS}/figures/random_scenes.{{kind}}", kind=["png", "pdf"]),
 
 
-rule timings:
-    input:
-        benchmarks=lambda wildcards: [benchmark for benchmark, _ in table_records("table1")],
-    output:
-        csv=report(f"{RESULTS}/timings.csv", caption="../report/timings.rst", category="Run times"),
-        markdown=f"{RESULTS}/timings.md",
-    params:
-        logs=lambda wildcards: [log for _, log in table_records("table1")],
-    script:
-        "../scripts/timings.py"
-
-
 rule dataset:
     input:
         expand(
@@ -97,7 +85,6 @@ rule tables:
     input:
         expand(f"{RESULTS}/{{table}}.{{kind}}", table=[*TABLES, "table4"], kind=["csv", "md"]),
         rules.initial_states.output,
-        rules.timings.output,
 
 
 rule videos:

@@ -1,4 +1,4 @@
-"""What tables are made of: runs, files and records of their cells, titles. Needs methods.smk."""
+"""What tables are made of: runs and files of their cells, titles. Needs methods.smk."""
 
 # Tables of distances; the others have rules of their own.
 OTHER_TABLES = ("table4", "stress")
@@ -77,57 +77,6 @@ def table_runs(table):
 def table_files(table, name):
     """A file of every run behind a table, in the order of `table_runs`."""
     return [f"{run['folder']}/{name}" for run in table_runs(table)]
-
-
-def table_records(table):
-    """Benchmark file and log of each job behind the scenes of a table, in all chains."""
-    pairs = [SimpleNamespace(**run) for run in table_runs(table) if run["scene"]]
-    makers = {"made": "render", "supplied": "supplied", "packed": "unpack"}
-    groups = ("binding", "geometry", "simulation", "laws", "rendering")
-    jobs = [("kernels", {"group": group}) for group in groups]
-    priors, laws, videos = [], [], []
-    for pair in pairs:
-        if SETTINGS.is_springs(pair.method):
-            laws += [("kernels", {"group": "springs"}), ("springs", vars(pair))]
-            priors += [prior_file(pair.scene)]
-            continue
-        scene = SETTINGS.law_scene(pair.scene, pair.method)
-        own = Path(home(scene, "identified.json"))
-        networks = material_prior(pair) == f"{own.parent}/priors/identified.safetensors"
-        if SETTINGS.is_pac_nerf(pair.method):
-            fitted = {"scene": scene, "method": SETTINGS.method_training(pair.method)}
-            field = {"scene": Path(home(scene, FIELD)).parent.parent.name}
-            laws += [("kernels", {"group": "radiance"}), ("radiance_field", field), ("pac_nerf", fitted)]
-            priors += [prior_file(pair.scene)]
-            continue
-        identified = identified_law(pair) or identified_base(pair) or (networks and own)
-        trained = trained_adaptor(pair)
-        laws += [("identified_prior", {"scene": own.parent.name})] if networks else []
-        laws += [identification(identified)] if identified else []
-        method = SETTINGS.method_training(pair.method)
-        laws += [("material", {"scene": scene, "method": method})] if trained else []
-        priors += [prior_file(pair.scene), material_prior(pair)]
-        videos += SETTINGS.video_scenes(scene) if identified or trained else []
-    judged = [pair.scene for pair in pairs]
-    priors += [prior_file(video) for video in videos]
-    files = [Path(file) for file in priors if file]
-    jobs += [("prior", {"prior": file.stem}) for file in files if file.parent == Path(RESULTS, "priors")]
-    for run in dict.fromkeys([*judged, *videos]):
-        scene, _ = SETTINGS.chain(run)
-        origins = {part: origin_of(part, scene) for part in ("static", "dynamic")}
-        if run in judged or "made" in origins.values():
-            truth = "ground_truth" if origin_of("truth", scene) == "made" else "unpack_truth"
-            jobs += [(truth, {"scene": scene})]
-        jobs += [(f"{makers[origin]}_{part}", {"scene": scene}) for part, origin in origins.items()]
-        makes = {rule: file for rule, file in MAKERS.items() if run in judged or rule != "tracers"}
-        jobs += [(rule, {"scene": Path(home(run, file)).parent.name}) for rule, file in makes.items()]
-    jobs += laws
-    springs = {True: "springs_evaluation", False: "evaluation"}
-    jobs += [(springs[SETTINGS.is_springs(pair.method)], vars(pair)) for pair in pairs]
-    jobs += [("chamfer_table", {"table": table})]
-    made = [(getattr(rules, name), wildcards) for name, wildcards in jobs]
-    files = [(rule.benchmark, str(rule.log[0]), wildcards) for rule, wildcards in made]
-    return list(dict.fromkeys(tuple(file.format(**w) for file in pair) for *pair, w in files))
 
 
 def table_cells(table):
