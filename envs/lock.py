@@ -5,7 +5,7 @@ requirements-dev.txt      the same with the tools for tests and style checks
 requirements-capture.txt  requirements.txt with the packages for captures
 requirements-viewer.txt   requirements.txt with the packages for the viewer's server
 requirements-docs.txt     requirements.txt with the packages for the site
-conda.yaml, conda-capture.yaml  the same packages in a conda environment with Python 3.11 (`snakemake --sdm conda`, untested)
+conda.yaml, conda-capture.yaml  the same packages in a conda environment with Python 3.11, untested
 
 A version that is already in one of these files is kept while it satisfies the pins; `make lock UPGRADE=--upgrade`
 replaces dependencies by their newest versions. Local builds (``+cpu``) and the addresses of package indices are left

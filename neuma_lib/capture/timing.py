@@ -39,14 +39,8 @@ class Offset:
 def read_sound(path: str | Path) -> np.ndarray | None:
     """The sound of a video, mono at `RATE`, (N,), float32; None where it has none. Raises InputError on no video."""
     path = existing(path, "put the video there, or correct its name")
-    command = [
-        require("imageio_ffmpeg", "capture").get_ffmpeg_exe(),
-        "-v",
-        "error",
-        "-nostdin",
-        "-protocol_whitelist",
-        "file,pipe",
-    ]
+    ffmpeg = require("imageio_ffmpeg", "capture").get_ffmpeg_exe()
+    command = [ffmpeg, "-v", "error", "-nostdin", "-protocol_whitelist", "file,pipe"]
     # asetpts keeps the clock that sound and picture share: sound that begins later is preceded by silence
     command += ["-i", f"file:{path}", "-map", "0:a:0?", "-af", "aresample=async=1:first_pts=0", "-ac", "1"]
     done = subprocess.run([*command, "-ar", str(RATE), "-f", "f32le", "pipe:1"], capture_output=True)

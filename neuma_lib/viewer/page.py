@@ -160,13 +160,8 @@ def _filled(scene: Scene, steps: tuple[int, ...], particles: int) -> str:
 
 def colour_map(name: str) -> list[int]:
     """256 colours of matplotlib's map of that name, 768 numbers from 0 to 255."""
-    return (
-        (require("matplotlib", "viewer").colormaps[name](np.arange(256))[:, :3] * 255)
-        .round()
-        .astype(int)
-        .ravel()
-        .tolist()
-    )
+    colours = require("matplotlib", "viewer").colormaps[name](np.arange(256))[:, :3]
+    return (colours * 255).round().astype(int).ravel().tolist()
 
 
 def _motion(scene: Scene, motion: Motion, steps: tuple[int, ...], particles: int, blob: Blob) -> dict:
