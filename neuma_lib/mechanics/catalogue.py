@@ -18,6 +18,9 @@ import numpy as np
 
 from neuma_lib.errors import InputError
 
+COURANT_LIMIT = 0.8
+"""Largest stable c dt / dx. Between 1.0 and 1.2 a rollout still looks finite while its gradients explode."""
+
 
 @dataclass(frozen=True)
 class Constant:
