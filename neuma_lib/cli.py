@@ -289,7 +289,7 @@ def _check(options: argparse.Namespace) -> int:
 def _timings(options: argparse.Namespace) -> None:
     from neuma_lib.timings import timings_table
 
-    print(timings_table(Path(options.folder)))
+    print(timings_table(Path(options.folder)), end="")
 
 
 # ---- law -------------------------------------------------------------------------------------------------------------
