@@ -269,11 +269,11 @@ def _check(options: argparse.Namespace) -> int:
             read_capture(Path(file).parent)
         except InputError as error:
             found += checks.lines(error)
-    if captures and not files:
-        text = f"{', '.join(captures)}: no problems"
-    else:
+    text = f"{', '.join(captures)}: no problems"
+    if files or not captures:
+        root = _project()
         try:
-            settings, root = settings_around(_project(), files)
+            settings, _ = settings_around(root, files)
         except InputError as error:
             found += checks.lines(error)
         else:

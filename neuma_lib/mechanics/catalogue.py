@@ -37,6 +37,13 @@ class Constant:
             return self.low <= value <= self.high
         return self.low < value < self.high
 
+    @property
+    def bounds(self) -> str:
+        """The interval in words that follow "must"."""
+        if math.isfinite(self.high):
+            return f"lie between {self.low:g} and {self.high:g} {self.unit}"
+        return f"be {'at least' if self.closed else 'greater than'} {self.low:g} {self.unit}"
+
 
 YOUNG = Constant("Pa", 0.0)
 POISSON = Constant("1", -1.0, 0.5)
@@ -169,8 +176,7 @@ def check_constants(
         except (TypeError, ValueError):
             raise InputError(f"{law}.{name}", f"{value!r} is not a number") from None
         if not constant.admits(numbers[name]):
-            limits = f"{constant.low:g} and {constant.high:g} {constant.unit}"
-            raise InputError(f"{law}.{name}", f"{numbers[name]:g} must lie between {limits}")
+            raise InputError(f"{law}.{name}", f"{numbers[name]:g} must {constant.bounds}")
     if "dilation_angle" in constants and numbers["dilation_angle"] > numbers["friction_angle"]:
         raise InputError(
             f"{law}.dilation_angle",
@@ -210,5 +216,5 @@ def _known_name(part: str, values: Mapping[str, Any], choices: Mapping[str, Any]
     if name in choices:
         return name
     close = get_close_matches(str(name), choices, n=1)
-    hint = f" (did you mean {close[0]}?)" if close else ""
+    hint = f"; did you mean {close[0]}?" if close else ""
     raise InputError(f"{part}.name", f"{name!r} is unknown{hint}", f"Choose one of {', '.join(choices)}")
