@@ -9,18 +9,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.backends.backend_pdf import FigureCanvasPdf
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
 from neuma_lib.capture.lens import HALF_PIXEL, Lens
 from neuma_lib.capture.placement import Similarity, fit_similarity, triangulate
 from neuma_lib.capture.tools import opencv
 from neuma_lib.config.board import PAPERS, BoardConfig
 from neuma_lib.errors import InputError
+from neuma_lib.extras import require
 from neuma_lib.io.files import atomic
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MARGIN = 0.010
 """Border of the page that printers leave white [m]."""
@@ -142,8 +144,9 @@ def print_board(path: str | Path, board: BoardConfig, paper: str = "A4") -> None
         InputError: an unknown size of paper, or squares that it has no room for.
     """
     page = board_page(board, paper)
+    canvas = require("matplotlib.backends.backend_pdf", "capture").FigureCanvasPdf(page)
     with atomic(path) as partial:
-        FigureCanvasPdf(page).print_pdf(partial, metadata={"CreationDate": None, "Title": "ChArUco board"})
+        canvas.print_pdf(partial, metadata={"CreationDate": None, "Title": "ChArUco board"})
 
 
 def board_page(board: BoardConfig, paper: str) -> Figure:
@@ -158,7 +161,8 @@ def board_page(board: BoardConfig, paper: str) -> Figure:
             f"{columns} x {rows} squares of {1000 * board.square:.1f} mm do not fit on {paper}: at most "
             f"{int(1000 * room)} mm; set board.square or board.squares, or take {'A3' if paper == 'A4' else 'fewer'}"
         )
-    figure = Figure(figsize=(width / 0.0254, height / 0.0254))
+    Rectangle = require("matplotlib.patches", "capture").Rectangle
+    figure = require("matplotlib.figure", "capture").Figure(figsize=(width / 0.0254, height / 0.0254))
     axes = figure.add_axes((0, 0, 1, 1))
     axes.set(xlim=(0, 1000 * width), ylim=(0, 1000 * height))
     axes.axis("off")

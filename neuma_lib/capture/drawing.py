@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 
 from neuma_lib.capture.folder import PHOTOGRAPHS
@@ -16,6 +14,7 @@ from neuma_lib.capture.pictures import group_of, picture_sheet
 from neuma_lib.capture.placement import camera_centres, upright
 from neuma_lib.capture.poses import Poses
 from neuma_lib.capture.room import BOX_MIDDLE, Room
+from neuma_lib.extras import require
 from neuma_lib.io.files import atomic
 from neuma_lib.io.images import OPENGL_TO_OPENCV, read_transforms
 
@@ -58,7 +57,7 @@ def draw_cameras(path: str | Path, poses: Poses, unit: str, said: str = "", floo
     near = (np.abs(poses.points) < reach).all(axis=1)
     shown = np.concatenate([centres, np.quantile(poses.points[near], FAR, axis=0)]) if near.any() else centres
     low, high = shown.min(axis=0) - 0.1 * reach, shown.max(axis=0) + 0.1 * reach
-    figure = Figure(figsize=(12, 6), layout="constrained")
+    figure = require("matplotlib.figure", "capture").Figure(figsize=(12, 6), layout="constrained")
     for axes, (across, up, title) in zip(
         figure.subplots(1, 2), ((0, 2, "from above"), (0, 1, "from the side"))
     ):
@@ -90,7 +89,8 @@ def draw_cameras(path: str | Path, poses: Poses, unit: str, said: str = "", floo
     title += f", {poses.error:.2f} px" if np.isfinite(poses.error) else ""
     figure.suptitle(title + said)
     with atomic(path) as partial:
-        FigureCanvasAgg(figure).print_png(partial, metadata={"Software": None})
+        canvas = require("matplotlib.backends.backend_agg", "capture").FigureCanvasAgg(figure)
+        canvas.print_png(partial, metadata={"Software": None})
 
 
 def draw_floor(path: str | Path, transforms: str | Path) -> None:

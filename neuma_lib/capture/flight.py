@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from neuma_lib.capture.agreement import agreement
 from neuma_lib.capture.contact import contact_time, lowest_points
@@ -18,6 +16,7 @@ from neuma_lib.capture.gravity import gravity_checks
 from neuma_lib.capture.spin import Spin, fit_spin, follow
 from neuma_lib.capture.timing import Offset, choose_offset, offset_from_motion, offset_from_sound, row_times
 from neuma_lib.errors import InputError
+from neuma_lib.extras import require
 from neuma_lib.io.files import atomic
 
 DOUBT = 2.0
@@ -202,7 +201,9 @@ def report(flight: Flight, views: Sequence[Filmed]) -> dict[str, Any]:
 
 def draw_flight(path: str | Path, flight: Flight, views: Sequence[Filmed], title: str) -> None:
     """Write a picture: where each camera saw the object's centre, where the fit has it, and the distances between."""
-    figure = Figure(figsize=(5 * (len(views) + 1), 5), layout="constrained")
+    figure = require("matplotlib.figure", "capture").Figure(
+        figsize=(5 * (len(views) + 1), 5), layout="constrained"
+    )
     *cameras, last = figure.subplots(1, len(views) + 1)
     for number, (axes, view, track) in enumerate(zip(cameras, views, flight.tracks)):
         fitted = flight.fall.seen(track, number)
@@ -217,7 +218,8 @@ def draw_flight(path: str | Path, flight: Flight, views: Sequence[Filmed], title
     last.legend()
     figure.suptitle(title)
     with atomic(path) as partial:
-        FigureCanvasAgg(figure).print_png(partial, metadata={"Software": None})
+        canvas = require("matplotlib.backends.backend_agg", "capture").FigureCanvasAgg(figure)
+        canvas.print_png(partial, metadata={"Software": None})
 
 
 def flight_checks(name: str, found: Mapping[str, Any]) -> list[tuple[str, str, str, bool]]:

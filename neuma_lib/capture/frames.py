@@ -17,11 +17,11 @@ from pathlib import Path
 from queue import Queue
 from typing import Any, NamedTuple
 
-import imageio_ffmpeg
 import numpy as np
 
 from neuma_lib.capture.pictures import picture_sheet
 from neuma_lib.errors import InputError
+from neuma_lib.extras import require
 from neuma_lib.io.files import existing, one_line
 from neuma_lib.io.images import MAX_PIXELS
 
@@ -249,7 +249,7 @@ def _decoder(path: str | Path, pixels: bool) -> Iterator[_Decoder]:
     # A file's name must not be taken for a protocol's; V leaves out cover pictures; pictures are upright before they
     # come to a filter.
     command = [
-        imageio_ffmpeg.get_ffmpeg_exe(),
+        require("imageio_ffmpeg", "capture").get_ffmpeg_exe(),
         "-hide_banner",
         "-nostdin",
         "-xerror",

@@ -9,11 +9,11 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
-import imageio_ffmpeg
 import numpy as np
 from scipy import signal
 
 from neuma_lib.errors import InputError
+from neuma_lib.extras import require
 from neuma_lib.io.files import existing, one_line
 
 RATE = 16_000
@@ -39,7 +39,8 @@ class Offset:
 def read_sound(path: str | Path) -> np.ndarray | None:
     """The sound of a video, mono at `RATE`, (N,), float32; None where it has none. Raises InputError on no video."""
     path = existing(path, "put the video there, or correct its name")
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-nostdin", "-protocol_whitelist", "file,pipe"]
+    ffmpeg = require("imageio_ffmpeg", "capture").get_ffmpeg_exe()
+    command = [ffmpeg, "-v", "error", "-nostdin", "-protocol_whitelist", "file,pipe"]
     # asetpts keeps the clock that sound and picture share: sound that begins later is preceded by silence
     command += ["-i", f"file:{path}", "-map", "0:a:0?", "-af", "aresample=async=1:first_pts=0", "-ac", "1"]
     done = subprocess.run([*command, "-ar", str(RATE), "-f", "f32le", "pipe:1"], capture_output=True)

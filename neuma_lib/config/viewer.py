@@ -8,7 +8,7 @@ from neuma_lib.config.base import Section
 
 
 class ViewerConfig(Section):
-    """What the file results/<scene>/viewer.html holds; `python -m neuma_lib.viewer` shows all that there is."""
+    """What the file results/<scene>/viewer.html holds; `neuma view` shows all that there is."""
 
     methods: tuple[str, ...] = Field(
         ("nclaw", "neuma"),

@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 
 from neuma_lib.errors import InputError
+from neuma_lib.extras import require
 from neuma_lib.geometry.volume import check_mesh
 
 MOST_HOLE_EDGES = 1000
@@ -63,14 +64,7 @@ def has_meshlab() -> bool:
 
 def meshlab() -> ModuleType:
     """The module pymeshlab. Raises InputError where it is not installed."""
-    try:
-        import pymeshlab
-    except ImportError as error:
-        raise InputError(
-            f"the surface of what was photographed is repaired with pymeshlab ({error}): install the project's extra"
-            " with `make capture`"
-        ) from None
-    return pymeshlab
+    return require("pymeshlab", "capture")
 
 
 def crossing_faces(mesh: trimesh.Trimesh) -> int:

@@ -113,6 +113,6 @@ def fitting_step(about: Mapping[str, Any], dt: float | None, any_step: bool = Fa
         raise InputError(
             f"it was learned at a time step of {own:g} s, and its plastic part, a network, returns once a step: at "
             f"{dt:g} s it is another material. Use dt: {own:g}, or, if you want it nevertheless, any_step=True in "
-            "Python or a copy made with `python -m neuma_lib export-law ... --any-step`"
+            "Python or a copy made with `neuma law export ... --any-step`"
         )
     return dt

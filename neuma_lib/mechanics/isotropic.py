@@ -9,14 +9,12 @@ to round-off, calls :func:`coaxial_stress` and :func:`coaxial_deformation` inste
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from neuma_lib.errors import InputError
+from neuma_lib.mechanics.catalogue import Constant, check_constants
 from neuma_lib.mechanics.singular_values import away_from_zero, rotation_and_singular_values, svd3
 
 PrincipalFunction = Callable[[Tensor], Tensor]
@@ -144,26 +142,6 @@ def isotropic_deformation(F: Tensor, function: PrincipalFunction) -> Tensor:
     return coaxial_deformation(F, function(sigma), _moving_apart(function))
 
 
-@dataclass(frozen=True)
-class Constant:
-    """A material constant: its unit and admissible open interval (bounds included where closed is True)."""
-
-    unit: str
-    low: float
-    high: float = math.inf
-    closed: bool = False
-    default: float | None = None
-
-    def admits(self, value: float) -> bool:
-        if self.closed:
-            return self.low <= value <= self.high
-        return self.low < value < self.high
-
-
-YOUNG = Constant("Pa", 0.0)
-POISSON = Constant("1", -1.0, 0.5)
-
-
 class Constants(nn.Module):
     """Mix-in that checks and holds a law's constants.
 
@@ -175,25 +153,12 @@ class Constants(nn.Module):
 
     def __init__(self, **values: float | Tensor):
         super().__init__()
-        law = type(self).__name__
-        unknown = sorted(set(values) - set(self.constants))
-        if unknown:
-            names = ", ".join(self.constants) or "none"
-            raise InputError(f"{law} has no constant {', '.join(unknown)}; it has {names}")
-        self.values: dict[str, float | Tensor] = {}
-        for name, constant in self.constants.items():
-            value = values.get(name, constant.default)
-            if value is None:
-                raise InputError(f"{law} needs the constant {name} [{constant.unit}]")
-            try:
-                number = float(value.detach() if isinstance(value, Tensor) else value)
-            except (TypeError, ValueError):
-                raise InputError(f"{law}.{name} must be a number, not {value!r}") from None
-            if not constant.admits(number):
-                raise InputError(
-                    f"{law}.{name} = {number:g} must lie between {constant.low:g} and {constant.high:g} {constant.unit}"
-                )
-            self.values[name] = value if isinstance(value, Tensor) else number
+        plain = {key: value.detach() if isinstance(value, Tensor) else value for key, value in values.items()}
+        numbers = check_constants(type(self).__name__, self.constants, plain)
+        self.values: dict[str, float | Tensor] = {
+            name: values[name] if isinstance(values.get(name), Tensor) else number
+            for name, number in numbers.items()
+        }
 
     def _fitted(self) -> list[str]:
         return [n for n, v in self.values.items() if isinstance(v, Tensor) and v.requires_grad]

@@ -15,9 +15,9 @@ import math
 import torch
 from torch import Tensor
 
-from neuma_lib.errors import InputError
+from neuma_lib.mechanics.catalogue import PLASTICITY
 from neuma_lib.mechanics.elasticity import STRETCH_MIN
-from neuma_lib.mechanics.isotropic import POISSON, YOUNG, Constant, Constants, isotropic_deformation, lame
+from neuma_lib.mechanics.isotropic import Constants, isotropic_deformation, lame
 from neuma_lib.mechanics.law import Plasticity, Weights
 
 
@@ -59,7 +59,7 @@ class VonMises(AnalyticPlasticity):
     With Hencky elasticity this bounds the norm of the deviatoric Kirchhoff stress by ``yield_stress`` [Pa].
     """
 
-    constants = {"E": YOUNG, "nu": POISSON, "yield_stress": Constant("Pa", 0.0, closed=True)}
+    constants = PLASTICITY["von_mises"]
 
     def principal(self, sigma, E, nu, yield_stress):
         mu, _ = lame(E, nu)
@@ -75,12 +75,7 @@ class DruckerPrager(AnalyticPlasticity):
     ``friction_angle`` in degrees; ``cohesion`` is the volumetric log strain per axis that is borne in tension.
     """
 
-    constants = {
-        "E": YOUNG,
-        "nu": POISSON,
-        "friction_angle": Constant("degrees", 0.0, 90.0),
-        "cohesion": Constant("1", 0.0, closed=True, default=0.0),
-    }
+    constants = PLASTICITY["drucker_prager"]
 
     @staticmethod
     def slope(E, nu, friction_angle, **_) -> float | Tensor:
@@ -120,13 +115,7 @@ class ViscousFlow(AnalyticPlasticity):
     steady flow is then exactly viscosity times shear rate (a Bingham fluid if ``yield_stress`` > 0).
     """
 
-    constants = {
-        "E": YOUNG,
-        "nu": POISSON,
-        "viscosity": Constant("Pa s", 0.0),
-        "dt": Constant("s", 0.0),
-        "yield_stress": Constant("Pa", 0.0, closed=True, default=0.0),
-    }
+    constants = PLASTICITY["viscous_flow"]
 
     def principal(self, sigma, E, nu, viscosity, dt, yield_stress):
         mu, _ = lame(E, nu)
@@ -151,15 +140,7 @@ class CrushableFoam(AnalyticPlasticity):
     whose volume says the pressure and nothing of the volume that was lost.
     """
 
-    constants = {
-        "E": YOUNG,
-        "nu": POISSON,
-        "crush": Constant("Pa", 0.0),
-        "tension": Constant("Pa", 0.0),
-        "slope": Constant("1", 0.0),
-        "dt": Constant("s", 0.0),
-        "relaxation": Constant("s", 0.0, closed=True, default=0.0),
-    }
+    constants = PLASTICITY["crushable_foam"]
 
     def principal(self, sigma, E, nu, crush, tension, slope, dt, relaxation):
         mu, lam = lame(E, nu)
@@ -185,14 +166,7 @@ class HerschelBulkley(AnalyticPlasticity):
     length ``dt`` [s]; its equation is solved by Newton's method, and differentiated as an implicit function.
     """
 
-    constants = {
-        "E": YOUNG,
-        "nu": POISSON,
-        "consistency": Constant("Pa s^exponent", 0.0),
-        "exponent": Constant("1", 0.2, 3.0, closed=True),
-        "yield_stress": Constant("Pa", 0.0, closed=True),
-        "dt": Constant("s", 0.0),
-    }
+    constants = PLASTICITY["herschel_bulkley"]
 
     def principal(self, sigma, E, nu, consistency, exponent, yield_stress, dt):
         mu, _ = lame(E, nu)
@@ -240,22 +214,7 @@ class CohesiveDruckerPrager(AnalyticPlasticity):
     x). Every return dissipates. `DruckerPrager` is c = psi = 0 but for its apex, which takes all states of tension.
     """
 
-    constants = {
-        "E": YOUNG,
-        "nu": POISSON,
-        "friction_angle": Constant("degrees", 0.0, 90.0),
-        "cohesion": Constant("Pa", 0.0, closed=True),
-        "dilation_angle": Constant("degrees", 0.0, 90.0, closed=True, default=0.0),
-    }
-
-    def __init__(self, **values: float | Tensor):
-        super().__init__(**values)
-        friction, dilation = (float(self.values[f"{key}_angle"]) for key in ("friction", "dilation"))
-        if dilation > friction:
-            raise InputError(
-                f"CohesiveDruckerPrager.dilation_angle = {dilation:g} must not exceed friction_angle = {friction:g}: "
-                "shear under pressure would give energy"
-            )
+    constants = PLASTICITY["cohesive_drucker_prager"]
 
     def principal(self, sigma, E, nu, friction_angle, cohesion, dilation_angle):
         mu, lam = lame(E, nu)

@@ -443,7 +443,7 @@ def test_few_frames_and_unknown_constants_are_named():
     body = ball()
     with pytest.raises(InputError, match="four frames"):
         identify(MODEL, known(body), body, observe(body, V0, (0, 4, 8)), settings({"hencky": ELASTIC}))
-    with pytest.raises(InputError, match="no constant stiffness"):
+    with pytest.raises(InputError, match="unknown constant stiffness"):
         Family("x", {"elasticity": {"name": "hencky", "E": 1e4, "nu": 0.3, "stiffness": 2}})
     both = {"name": "von_mises", "yield_stress": 1e3, "nu": 0.2}
     with pytest.raises(InputError, match="leave out nu"):
