@@ -47,7 +47,7 @@ OTHERS = {
     },
 }
 ROUGH = {"StVK + Drucker-Prager"}
-"""Laws whose return map a network of the published size follows only roughly: docs/guide.md, How close is a prior."""
+"""Laws whose return map a network of the published size follows only roughly: docs/materials.md, Priors."""
 LAWS = {"jelly": JELLY, "plasticine": PLASTICINE, "sand": SAND, "water": WATER, **OTHERS}
 TINY = RegressionConfig(
     throws=2, side_particles=4, grid=12, duration=0.15, samples=4096, iterations=500, batch=512, rounds=2
