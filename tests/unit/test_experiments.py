@@ -20,7 +20,7 @@ from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.volume import check_apart, sample_volume
 from neuma_lib.io.files import write_json
 from neuma_lib.io.gaussians import save_gaussians
-from neuma_lib.io.particles import load_start, save_binding, save_particles
+from neuma_lib.io.particles import load_initial_state, save_binding, save_particles
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.density import density_at
 from neuma_lib.sim.model import MPMModel, consecutive
@@ -193,7 +193,7 @@ def test_a_start_has_the_densities_and_motions_of_its_bodies(tmp_path):
     ]
     files = [tmp_path / name for name in ("p.h5", "b.h5", "g.ply", "v.json")]
     write_json(files[-1], {"bodies": starts})
-    start, counts = load_start(*files, [1000.0, {**SPLIT, "axis": "y"}])
+    start, counts = load_initial_state(*files, [1000.0, {**SPLIT, "axis": "y"}])
     assert counts == [half, len(both.x0) - half]
     assert start.v[:half].unique(dim=0).tolist() == [[1, 0, 0]] and not start.C[:half].any()
     arm = start.x[half:] - torch.tensor(pivot)
@@ -205,13 +205,13 @@ def test_a_start_has_the_densities_and_motions_of_its_bodies(tmp_path):
     density = start.density.round()
     assert set(density[:half].tolist()) == {1000.0} and set(density[half:].tolist()) == {500.0, 1500.0}
     with pytest.raises(InputError, match="other bodies"):
-        load_start(*files, [1000.0])
+        load_initial_state(*files, [1000.0])
     with pytest.raises(InputError, match="of one body only"):
-        load_start(*files, [1000.0, 1000.0], "gaussians")
+        load_initial_state(*files, [1000.0, 1000.0], "gaussians")
     write_json(files[-1], {"v0": [0, 1.0, 0], **still})
-    start, counts = load_start(*files, [1000.0])
+    start, counts = load_initial_state(*files, [1000.0])
     assert counts == [len(both.x0)] and start.v.unique(dim=0).tolist() == [[0, 1, 0]]
-    splats, counts = load_start(*files, [500.0], "gaussians")
+    splats, counts = load_initial_state(*files, [500.0], "gaussians")
     assert counts == [len(both.gaussians)]
     torch.testing.assert_close(splats.x, both.gaussians.means)
     torch.testing.assert_close(splats.mass.sum(), 500.0 * both.vol0.sum())

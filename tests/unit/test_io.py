@@ -14,7 +14,7 @@ from neuma_lib.io.gaussians import load_gaussians, save_gaussians
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.io.images import load_observation, read_image_set, write_transforms
 from neuma_lib.io.mesh import read_mesh, write_mesh
-from neuma_lib.io.particles import thrown
+from neuma_lib.io.particles import with_motion
 from neuma_lib.io.ply import read_ply, write_ply
 from neuma_lib.io.weights import read_weights, write_weights
 from neuma_lib.splatting.gaussians import Gaussians
@@ -411,5 +411,5 @@ def test_an_identified_start_throws_as_a_velocity_does(tmp_path):
     motion = {"v0": [0.1, -1.0, 0.2], "angular_velocity": [1.0, 2.0, 3.0], "centre": [0.5, 0.3, 0.5]}
     write_json(tmp_path / "velocity.json", motion)
     write_json(tmp_path / "identified.json", {"law": {}, "start": motion})
-    one, other = (thrown(body, tmp_path / f"{name}.json") for name in ("velocity", "identified"))
+    one, other = (with_motion(body, tmp_path / f"{name}.json") for name in ("velocity", "identified"))
     assert torch.equal(one.v, other.v) and torch.equal(one.C, other.C) and one.C.any()

@@ -11,7 +11,7 @@ from neuma_lib.fitting.material import PixelLoss
 from neuma_lib.io.files import write_json
 from neuma_lib.io.images import load_videos
 from neuma_lib.io.laws import load_laws
-from neuma_lib.io.particles import load_body, thrown
+from neuma_lib.io.particles import load_body, with_motion
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.model import MPMModel
 from workflow.inputs import listed
@@ -29,7 +29,7 @@ def main(inputs, output, params, run) -> None:
         for video in load_videos(inputs.transforms, settings.views, **params.filming)
     ]
     loss = PixelLoss(body, videos, total=settings.covariance_from == "total", compare=settings.compare)
-    model, start = MPMModel(**params.simulation), thrown(body, inputs.velocity)
+    model, start = MPMModel(**params.simulation), with_motion(body, inputs.velocity)
     truth = analytic_law(params.truth, dt=params.simulation["dt"])
     found = [listed(inputs.get(name)) for name in ("identified", "prior", "adaptor")]
     (law,) = load_laws(params.simulation["dt"], params.laws, *found)
