@@ -95,7 +95,7 @@ class Twin:
     def bound(self, mesh: trimesh.Trimesh, seed: int) -> Reconstruction:
         """The reconstructed Gaussians on a body filled anew with many particles."""
         x = torch.from_numpy(sample_volume(mesh, MANY, seed))
-        return self.body.refilled(x, mesh.volume, self.scene.density, self.settings.binding)
+        return self.body.resampled(x, mesh.volume, self.scene.density, self.settings.binding)
 
     def moved(self, law: Mapping[str, Any], start: State) -> Tensor | None:
         """Tracers (T, M, 3) under a law; None where it diverges."""
@@ -147,7 +147,7 @@ class Twin:
         """Name, throw, body, and bodies that correct it, whose images are compared."""
         known, own = (
             self.true_throw,
-            self.body.refilled(self.own, self.true_mesh.volume, self.scene.density, self.settings.binding),
+            self.body.resampled(self.own, self.true_mesh.volume, self.scene.density, self.settings.binding),
         )
         larger = (self.true_mesh.volume / self.mesh.volume) ** (1 / 3)
         yield "truth's own particles", known, own, []

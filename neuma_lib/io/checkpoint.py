@@ -54,13 +54,14 @@ class Checkpoint:
             saved, generators, state = (content[key] for key in ("fingerprint", "generators", "state"))
             names = sorted({*saved.keys(), *self.fingerprint})
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            problem = f"the checkpoint cannot be read ({one_line(error)})"
+            reason = error.problem if isinstance(error, InputError) else error
+            problem = f"is not a valid checkpoint: {one_line(reason)}"
             raise InputError(self.path, problem, f"Start again with: {delete}") from None
         pairs = {k: (saved.get(k, "absent"), self.fingerprint.get(k, "absent")) for k in names}
         if changed := [f"{k} (was {was}, is {now})" for k, (was, now) in pairs.items() if was != now]:
             raise InputError(
                 self.path,
-                f"the checkpoint belongs to another run: {one_line(', '.join(changed), 500)} changed",
+                f"is the checkpoint of another run: {one_line(', '.join(changed), 500)} changed",
                 f"Restore the former settings to resume, or start again with: {delete}",
             )
         torch.set_rng_state(generators["torch"])

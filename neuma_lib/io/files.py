@@ -75,7 +75,7 @@ def reading(where: str | Path, kind: str) -> Iterator[None]:
         raise
     except Exception as error:
         reason = one_line(error) or type(error).__name__
-        raise InputError(where, f"cannot be read as {kind} ({reason})", "Replace or regenerate it") from None
+        raise InputError(where, f"cannot be read as {kind}: {reason}", "Replace or regenerate it") from None
 
 
 def located(error: InputError, path: str | Path) -> InputError:

@@ -124,7 +124,7 @@ def _read_law(path: str | Path, dt: float | None, any_step: bool) -> Law:
     elif path.suffix in PICKLED:
         state = _released(path, "prior")
     else:
-        raise InputError(f"prior {path}", "must be a .safetensors or .pt file")
+        raise InputError(f"prior {path}", "expected .safetensors or .pt")
     try:
         if EXPORT in metadata:
             dt = fitting_step(checked_export(metadata), dt, any_step)
@@ -159,7 +159,7 @@ def _released(path: Path, kind: str) -> dict[str, Tensor]:
     parts = {}
     for part in ("elasticity", "plasticity"):
         if not isinstance(content, dict) or not isinstance(content.get(part), dict):
-            raise InputError(f"{kind} {path}", "must be a dict with elasticity and plasticity")
+            raise InputError(f"{kind} {path}", "expected a dict with elasticity and plasticity")
         parts.update({f"{part}.{key}": value for key, value in content[part].items()})
     for key, value in parts.items():
         # an expanded tensor claims more than it stores

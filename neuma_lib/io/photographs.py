@@ -86,7 +86,7 @@ def load_static(transforms: str | Path, settings: PhotographsConfig) -> StaticVi
         raise InputError(
             transforms,
             f"{len(left_out)} of {len(names)} masks lack more than {100 * settings.lacking:.0f} % of the body that the"
-            f" others show ({', '.join(left_out[:5])})",
+            f" others show: {', '.join(left_out[:5])}",
             "Provide your own masks for them, photograph the whole object in front of another colour, or set"
             " photographs.lacking",
         )

@@ -35,6 +35,6 @@ def load_field(path: str | Path) -> tuple[RadianceField, dict[str, Any]]:
         field = RadianceField(lattice, Opacity(**metadata["opacity"]))
         field.load_state_dict(tensors)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        problem = f"is not a voxel radiance field ({one_line(error)})"
+        problem = f"is not a voxel radiance field: {one_line(error)}"
         raise InputError(path, problem, "Run the rule radiance_field again") from None
     return field.requires_grad_(False), metadata

@@ -25,7 +25,7 @@ def write_usd(
     try:
         from pxr import Gf, Usd, UsdGeom, Vt
     except ImportError as error:
-        problem = f"writing USD needs the package usd-core ({error})"
+        problem = f"writing USD needs the package usd-core: {error}"
         raise InputError(path, problem, "Install it with `make viewer`") from None
     codes = np.asarray(times, np.float64) * CODES_A_SECOND
     with atomic(path) as partial:
