@@ -53,10 +53,9 @@ def deform(
         "means": (means, (G, 3)),
         "covars": (covars, (G, 3, 3)),
     }
-    advice = f" for a binding of {G} Gaussians to {N} particles. Rerun the binding stage if either changed."
     if arms is not None:
         expected["arms"], arms = (arms, (G, 3)), arms.contiguous()
-    check_tensors("deform", expected, advice)
+    check_tensors("deform", expected, "Run the rule binding again if Gaussians or particles have changed")
     at_rest = (*(value.contiguous() for value in (means, covars, x0)), arms)
     return _Deform.apply(binding, *at_rest, x, F if covariance_gradient else F.detach())
 

@@ -267,12 +267,11 @@ def test_faint_oversized_and_isolated_gaussians_are_left_out():
 
 
 @pytest.mark.parametrize(
-    "change, says",
-    [({"min_opacity": 0.99}, "min_opacity"), ({"max_scale": 1e-6}, "max_scale"), ({"reach": 1e-9}, "reach")],
+    "change", [{"min_opacity": 0.99}, {"max_scale": 1e-6}, {"reach": 1e-9}], ids=lambda change: next(iter(change))
 )  # fmt: skip
-def test_a_splat_of_which_nothing_is_left_is_refused(change, says):
+def test_a_splat_of_which_nothing_is_left_is_refused(change):
     g = dataclasses.replace(ball(100), scales=torch.full((100, 3), 1e-5))
-    with pytest.raises(InputError, match=says):
+    with refused(f"splat.{next(iter(change))}"):
         culling.culled(g, **{**RULES, **change})
 
 
@@ -356,7 +355,7 @@ def test_gaussians_without_particles_follow_the_nearest_affinely():
     means, covars = deform(g.means, g.covars(), binding, x0, *state, arms=arms)
     torch.testing.assert_close(means[0], g.means @ A.T + b, atol=1e-12, rtol=0)
     torch.testing.assert_close(covars[0], A @ g.covars() @ A.T, atol=1e-12, rtol=1e-9)
-    with pytest.raises(InputError, match="too few"):
+    with refused("binding: particles"):
         bind_nearest(g.means, g.covars(), x0[:10])
 
 
