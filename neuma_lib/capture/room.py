@@ -26,7 +26,7 @@ from neuma_lib.capture.poses import Poses, find_boards
 from neuma_lib.config.capture import CaptureConfig, LengthConfig
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import atomic
-from neuma_lib.io.images import OPENGL_TO_OPENCV, place, write_transforms
+from neuma_lib.io.images import OPENGL_TO_OPENCV, transform_world, write_transforms
 
 FLOOR_TOLERANCE = 0.005
 """Distance from the floor that counts as near, as share of the distance from the cameras to the points."""
@@ -151,7 +151,7 @@ def write_room(
             }
         )
     offset = tuple(np.array(BOX_MIDDLE, np.float64).tolist())
-    world = place(frames, settings.scale, offset)
+    world = transform_world(frames, settings.scale, offset)
     write_transforms(path, {}, frames, room=room.room_from_world.plain(), **world)
     return report(room)
 

@@ -363,7 +363,7 @@ def test_torch_files(tmp_path, content, capsys):
     path = tmp_path / "bad.pt"
     path.write_bytes(content)
     refused(load_prior, path)
-    refused(lambda p: Checkpoint(p, {"a": 1}).load(), path, "remove it to start again")
+    refused(lambda p: Checkpoint(p, {"a": 1}).load(), path, "rm ")
     assert "unpickled" not in capsys.readouterr().out
 
 

@@ -11,7 +11,12 @@ from neuma_lib.capture.folder import read_capture  # noqa: E402
 from neuma_lib.capture.lens import Lens  # noqa: E402
 from neuma_lib.capture.video_masks import given_masks  # noqa: E402
 from neuma_lib.errors import InputError  # noqa: E402
-from neuma_lib.io.images import OPENGL_TO_OPENCV, place, read_image_set, write_transforms  # noqa: E402
+from neuma_lib.io.images import (  # noqa: E402
+    OPENGL_TO_OPENCV,
+    read_image_set,
+    transform_world,
+    write_transforms,
+)
 
 WIDTH, HEIGHT = 80, 60
 K = np.array([[70.0, 0, 41.0], [0, 71.0, 29.0], [0, 0, 1]])
@@ -34,7 +39,7 @@ def room(tmp_path):
     frame = {"file_path": "left/left.png", "group": "left", "view": 0, "step": 0, **lens.intrinsics()}
     frame["transform_matrix"] = (np.linalg.inv(view) @ OPENGL_TO_OPENCV).tolist()
     path = tmp_path / "transforms.json"
-    world = place([frame], 2.0, (0.5, 0.0, 0.5))
+    world = transform_world([frame], 2.0, (0.5, 0.0, 0.5))
     write_transforms(path, {}, [frame], **world)
     return path, view, world["world"]
 

@@ -167,7 +167,7 @@ def test_what_many_particles_change_is_added_and_its_scatter_is_uncertainty():
         at = torch.randn(count, 3, generator=generator, dtype=torch.float64)
         radius = RADIUS * torch.rand(count, 1, generator=generator, dtype=torch.float64) ** (1 / 3)
         x = torch.tensor([0.5, 0.3, 0.5]) + radius * at / at.norm(dim=1, keepdim=True)
-        return few.refilled(x, float(few.vol0.sum()), 1000.0)
+        return few.resampled(x, float(few.vol0.sum()), 1000.0)
 
     many = filled(3000)
     assert len(many.x0) >= 3000 and float(many.mass.sum()) == pytest.approx(float(few.mass.sum()))

@@ -28,6 +28,7 @@ from neuma_lib.mechanics.time_step import step_dependence
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
+from tests.support.errors import refused
 
 ROOT = Path(__file__).resolve().parents[2]
 DT = 5e-4
@@ -191,10 +192,9 @@ def test_another_step_is_refused(tmp_path, make, load):
     law, path = make(), tmp_path / "law.safetensors"
     save_law(path, law, about_law(law, DT))
     load(path, dt=DT * (1 + 1e-9))
-    with pytest.raises(
-        InputError, match=r"law\.safetensors: .* learned at a time step of 0\.0005 s.* at 0\.001 s"
-    ):
+    with refused("law.safetensors: dt") as error:
         load(path, dt=2 * DT)
+    assert "0.0005 s" in error.value.problem and "0.001 s" in error.value.problem
 
 
 @pytest.mark.parametrize("make", [networks, structured])
@@ -279,7 +279,7 @@ def test_other_files_are_no_released_adaptors(tmp_path, damage):
     lora = torch.load(tmp_path / "1000_lora.pt", weights_only=True)
     damage(lora)
     torch.save(lora, tmp_path / "1000_lora.pt")
-    with pytest.raises(InputError, match=r"1000_lora\.pt"):
+    with refused("1000_lora.pt"):
         load_law(tmp_path / "jelly_0300.pt", tmp_path / "1000_lora.pt")
 
 
@@ -299,9 +299,7 @@ def test_metadata_that_cannot_be_meant(tmp_path, about):
     path = tmp_path / "law.safetensors"
     write_weights(path, neural_law().prior_state(), {EXPORT: about})
     for read in (read_about, load_law, load_prior):
-        with pytest.raises(
-            InputError, match=r"law\.safetensors: its (metadata export have the schema|time step)"
-        ):
+        with refused("law.safetensors: export."):
             read(path)
 
 
@@ -313,10 +311,10 @@ def test_analytic_files_are_checked(tmp_path):
     for change in ({"E": -1.0}, {"E": "soft"}, {"name": "rubber"}, {"G": 3.0}):
         spec = {**metadata["analytic"], "elasticity": {**metadata["analytic"]["elasticity"], **change}}
         write_weights(path, {}, {**metadata, "analytic": spec})
-        with pytest.raises(InputError, match=r"law\.safetensors"):
+        with refused("law.safetensors"):
             load_prior(path)
-    with pytest.raises(InputError, match="without networks that could be adapted"):
-        save_law(path, law, about_law(law, DT))
+    save_law(path, law, about_law(law, DT))
+    with refused("law.safetensors"):
         load_adaptable(path)
 
 
@@ -329,7 +327,7 @@ def test_nothing_is_written_where_something_is_wrong(tmp_path, capsys):
         ([law, "new.safetensors", "--apart"], "no adaptor"),
         ([law, "new.safetensors", "--weight", "0.5"], "--weight"),
         ([law, "new.safetensors", "--weight", "0.5", "--separate"], "--separate"),
-        ([law, "new.safetensors", "--dt", "1e-3"], "learned at a time step"),
+        ([law, "new.safetensors", "--dt", "1e-3"], "trained at a time step"),
         ([law, "new.safetensors", "--dt=-1"], "--dt: -1"),
         (["missing.pt", "new.safetensors"], "does not exist"),
         ([tmp_path / "folder", "new.safetensors"], "config/config.yaml"),
@@ -496,5 +494,5 @@ def test_the_example_runs_from_the_command_line(tmp_path):
 
 def test_foreign_safetensors_say_nothing(tmp_path):
     save_file({"x": torch.zeros(2)}, tmp_path / "x.safetensors")
-    with pytest.raises(InputError, match="not written by export-law"):
+    with refused("x.safetensors"):
         read_about(tmp_path / "x.safetensors")
