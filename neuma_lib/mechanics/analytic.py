@@ -1,4 +1,4 @@
-"""Analytic laws from a specification, as written in the tables of scenes and priors."""
+"""Analytic laws from a specification, as used in the settings of scenes and priors."""
 
 from __future__ import annotations
 
@@ -15,25 +15,23 @@ NAMES = {kind: name for name, kind in (ELASTICITIES | PLASTICITIES).items()}
 
 
 def analytic_law(spec: Mapping[str, Any], dt: float | None = None, name: str | None = None) -> Law:
-    """Law of a specification such as
+    """Build a law from a specification such as
 
     ``{"elasticity": {"name": "hencky", "E": 3e5, "nu": 0.25}, "plasticity": {"name": "von_mises",
     "yield_stress": 5e3}}``
 
     Args:
-        spec: the two parts, each with its ``name`` and constants. A plasticity takes E and nu from the elasticity
-            unless it has its own; a missing plasticity is the identity.
-        dt: time step [s], needed by rate-dependent plasticity (one with the constant ``dt``).
-        name: for messages; made of the parts' names if not given.
+        spec: the two parts, each with its ``name`` and constants. A plasticity inherits E and nu from the elasticity
+            by default. A missing plasticity is the identity.
+        dt: time step [s], required by rate-dependent plasticity (with the constant ``dt``).
+        name: name used in messages, by default composed of the names of the parts.
 
     Raises:
-        InputError: unknown part, name or constant, a missing one, or one outside its interval.
+        InputError: a part, name or constant is unknown or missing, or a constant is outside its interval.
     """
-    unknown = sorted(set(spec) - {"elasticity", "plasticity"})
-    if unknown or "elasticity" not in spec:
-        raise InputError(
-            f"a material has the keys elasticity and plasticity, not {', '.join(map(str, spec)) or 'none'}"
-        )
+    if "elasticity" not in spec or not set(spec) <= {"elasticity", "plasticity"}:
+        keys = ", ".join(map(str, spec)) or "none"
+        raise InputError("law", f"its keys must be elasticity and optionally plasticity, not {keys}")
     elastic = dict(spec["elasticity"])
     plastic = dict(spec.get("plasticity") or {"name": "identity"})
     elastic_type = _choose("elasticity", elastic, ELASTICITIES)
@@ -45,13 +43,13 @@ def analytic_law(spec: Mapping[str, Any], dt: float | None = None, name: str | N
             plastic.setdefault(key, elasticity.values[key])
     if "dt" in plastic_type.constants and "dt" not in plastic:
         if dt is None:
-            raise InputError(f"plasticity {plastic_name} depends on the rate: give the time step dt")
+            raise InputError("dt", f"plasticity {plastic_name} is rate-dependent and needs the time step")
         plastic["dt"] = dt
     return Law(elasticity, plastic_type(**plastic), name or f"{elastic_name} + {plastic_name}")
 
 
 def specification(elasticity: AnalyticElasticity, plasticity: Plasticity) -> dict[str, Any]:
-    """The specification of two analytic parts, complete: with E, nu and dt where a plasticity has them."""
+    """Complete specification of two analytic parts, including inherited constants of the plasticity (E, nu, dt)."""
     parts = {"elasticity": elasticity, "plasticity": plasticity}
     return {
         name: {"name": NAMES[type(part)], **{key: float(value) for key, value in part.values.items()}}
@@ -65,4 +63,4 @@ def _choose(part: str, values: Mapping[str, Any], choices: Mapping[str, type]) -
         return choices[name]
     close = get_close_matches(str(name), choices, n=1)
     hint = f" (did you mean {close[0]}?)" if close else ""
-    raise InputError(f"{part}.name: {name!r} is unknown{hint}; choose from {', '.join(choices)}")
+    raise InputError(f"{part}.name", f"{name!r} is unknown{hint}", f"Choose one of {', '.join(choices)}")
