@@ -1,4 +1,4 @@
-"""The packages that only captures need; they are an extra of the project."""
+"""Optional packages for captures."""
 
 from __future__ import annotations
 
@@ -11,24 +11,23 @@ from neuma_lib.errors import InputError
 
 
 def opencv() -> ModuleType:
-    """The module cv2. Raises InputError where it is not installed."""
+    """The module cv2. Raises InputError if it is not installed."""
     return _module("cv2", "OpenCV")
 
 
 def colmap() -> ModuleType:
-    """The module pycolmap. Raises InputError where it is not installed."""
-    found = _module("pycolmap", "COLMAP")
-    # Its handler of SIGTERM writes a stack trace, for which it allocates memory; sent amid an allocation, it never
-    # ends.
+    """The module pycolmap. Raises InputError if it is not installed."""
+    module = _module("pycolmap", "COLMAP")
+    # Its handler of SIGTERM allocates memory for a stack trace and hangs if the signal interrupts an allocation.
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
-    return found
+    return module
 
 
-def _module(name: str, what: str) -> ModuleType:
+def _module(name: str, title: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except ImportError as error:
         raise InputError(
-            f"captures need {what} ({error}): install the project's extra with `make capture`"
+            name, f"captures require {title} ({error})", "Install the extra with `make capture`"
         ) from None
