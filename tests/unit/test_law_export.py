@@ -12,7 +12,6 @@ import torch
 from safetensors.torch import save_file
 
 from neuma_lib.cli import main
-from neuma_lib.errors import InputError
 from neuma_lib.evaluation.law_export import export_law
 from neuma_lib.io.exported import EXPORT, about_law, read_about
 from neuma_lib.io.files import write_json
