@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from neuma_lib.capture.folder import NAME, read_capture
-from neuma_lib.capture.scenes import training_throws
+from neuma_lib.capture.scenes import training_takes
 from neuma_lib.config.random_scenes import SHAPES, DrawnPart, Outline
 from neuma_lib.config.settings import Config
 from neuma_lib.config.validation import hint
@@ -45,7 +45,7 @@ def capture_problems(root: str | Path) -> list[str]:
         try:
             if not NAME.fullmatch(folder.name):
                 raise InputError(folder, "the name is invalid", "Use letters, digits, - and _")
-            training_throws(read_capture(folder))
+            training_takes(read_capture(folder))
         except InputError as error:
             found += lines(error)
     return found
