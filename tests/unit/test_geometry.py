@@ -20,6 +20,8 @@ from neuma_lib.geometry.volume import inside, sample_tracers, sample_volume, vol
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians
 
+pytestmark = pytest.mark.core
+
 SURFACE = SurfaceConfig()
 SIX = ("ball", "duck", "pawn", "cat", "bottle", "fish")
 

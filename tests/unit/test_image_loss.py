@@ -21,6 +21,8 @@ from neuma_lib.splatting.image_loss import mean_squared_error
 from neuma_lib.splatting.observation import Observation, over_white
 from neuma_lib.splatting.rasterizer import rasterize, rasterized_error
 
+pytestmark = pytest.mark.core
+
 DEVICES = [
     "cpu",
     pytest.param(

@@ -8,6 +8,8 @@ from neuma_lib.errors import InputError
 from neuma_lib.geometry import shapes
 from neuma_lib.geometry.skinning import carry, skinning_matrix
 
+pytestmark = pytest.mark.core
+
 SOLIDS = (*shapes.NAMES, "letter_N", "letter_B")
 
 

@@ -28,6 +28,8 @@ from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 
+pytestmark = pytest.mark.core
+
 E, NU, DT = 1e5, 0.3, 1e-3
 MU, LAM = lame(E, NU)
 EPS = torch.finfo(torch.float64).eps
