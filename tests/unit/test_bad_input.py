@@ -25,6 +25,8 @@ from neuma_lib.io.laws import load_law, load_prior
 from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.weights import read_weights
 
+pytestmark = pytest.mark.core
+
 HUGE = 2**26
 """Zeros that archives below hide [bytes]."""
 MEMORY = HUGE / 2

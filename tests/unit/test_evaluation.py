@@ -14,6 +14,8 @@ from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Elasticity, Law
 from neuma_lib.sim.rollout import rollout
 
+pytestmark = pytest.mark.core
+
 V0 = torch.tensor([0.3, -1.5, 0.1], dtype=torch.float64)
 LAW = analytic_law(TRUTH, MODEL.dt)
 IN_FLIGHT = [0, 5, 10, 20]

@@ -29,6 +29,8 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
 
+pytestmark = pytest.mark.core
+
 ROOT = Path(__file__).resolve().parents[2]
 DT = 5e-4
 HENCKY = {"name": "hencky", "E": 2e5, "nu": 0.3}

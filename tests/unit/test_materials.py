@@ -18,6 +18,8 @@ from neuma_lib.mechanics.neural import CPU_ROWS, SHAPES, neural_law
 from neuma_lib.mechanics.plasticity import DruckerPrager, FluidProjection, ViscousFlow, VonMises
 from tests.support.errors import refused
 
+pytestmark = pytest.mark.core
+
 E, NU = 1e5, 0.3
 MU, LAM = lame(E, NU)
 BESIDE_E_AND_NU = {

@@ -21,6 +21,8 @@ from neuma_lib.mechanics.plasticity import (
 )
 from tests.support.errors import refused
 
+pytestmark = pytest.mark.core
+
 NU = 0.3
 MU, LAM = lame(E, NU)
 BULK = LAM + 2 * MU / 3

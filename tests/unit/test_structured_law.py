@@ -29,6 +29,8 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
 
+pytestmark = pytest.mark.core
+
 E, NU, DT = 1e5, 0.3, 1e-3
 MU, LAM = lame(E, NU)
 EPS = torch.finfo(torch.float64).eps
