@@ -1,4 +1,4 @@
-"""From nothing to the tables of the paper. `snakemake --cores 2 results/table1.csv`; docs/guide.md tells the rest."""
+"""From nothing to the tables of the paper. `snakemake --cores 2 results/table1.csv`; docs/install.md explains more."""
 
 
 configfile: "config/config.yaml"
@@ -16,7 +16,6 @@ include: "workflow/rules/reports.smk"
 include: "workflow/rules/demo_files.smk"
 include: "workflow/rules/captures_demo.smk"
 include: "workflow/rules/dataset.smk"
-include: "workflow/rules/packing.smk"
 include: "workflow/rules/priors.smk"
 include: "workflow/rules/gaussians.smk"
 include: "workflow/rules/radiance.smk"

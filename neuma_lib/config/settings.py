@@ -148,7 +148,7 @@ class Config(Section):
         for method in (*self.figures.beside, *(self.demo.methods if "demo" in self.model_fields_set else ())):
             self._law_from(method)
         for table in self.tables.values():
-            for method in (*table.methods, *table.if_made, *table.titles):
+            for method in (*table.methods, *table.titles):
                 self._law_from(method)
         return self
 

@@ -24,7 +24,7 @@ STRESS_TESTS = {"uniaxial": "stretch", "shear": "shear", "yield": "yielding"}
 def of_checks(groups: Mapping[str, Sequence[Check]]) -> list[str]:
     """Every check that is off."""
     return [
-        f"{group}: {check.what} is {check.found}, good captures have {check.wanted}."
+        f"{group}: {check.what} is {check.value}, good captures have {check.wanted}."
         for group, found in groups.items()
         for check in found
         if not check.good

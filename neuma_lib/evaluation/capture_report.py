@@ -383,7 +383,7 @@ def _checks(groups: Mapping[str, Sequence[Check]]) -> str:
                 "",
                 [
                     '<span class="good">✓ ok</span>' if check.good else '<span class="bad">✗ look</span>',
-                    *map(escape, (check.what, check.found, check.wanted)),
+                    *map(escape, (check.what, check.value, check.wanted)),
                 ],
             )
             for check in found

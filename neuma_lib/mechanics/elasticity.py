@@ -14,7 +14,8 @@ import math
 import torch
 from torch import Tensor
 
-from neuma_lib.mechanics.isotropic import POISSON, YOUNG, Constant, Constants, isotropic_stress, lame
+from neuma_lib.mechanics.catalogue import ELASTICITY, MODULI
+from neuma_lib.mechanics.isotropic import Constants, isotropic_stress, lame
 from neuma_lib.mechanics.law import Elasticity, Weights
 
 STRETCH_MIN = 0.05
@@ -27,7 +28,7 @@ FIBRE_EXPONENT_MAX = 8.0
 class AnalyticElasticity(Constants, Elasticity):
     """An isotropic elasticity with Young's modulus E [Pa] and Poisson's ratio nu."""
 
-    constants = {"E": YOUNG, "nu": POISSON}
+    constants = MODULI
 
     def principal(
         self, sigma: Tensor, mu: float | Tensor, lam: float | Tensor, **others: float | Tensor
@@ -119,8 +120,7 @@ class Ogden(AnalyticElasticity):
     strain, for alpha = 12 by a factor of three in pure shear to a stretch of 1.16. alpha -> 0 is `Hencky`.
     """
 
-    # Above 20, powers of the stretches of a crushed element overflow in float32.
-    constants = {"E": YOUNG, "nu": POISSON, "alpha": Constant("1", 0.0, 20.0)}
+    constants = ELASTICITY["ogden"]
 
     def principal(self, sigma, mu, lam, alpha):
         strain, log_J = _isochoric_strain(sigma)
@@ -135,7 +135,7 @@ class MooneyRivlin(AnalyticElasticity):
     stiffer in compression than in tension. Nearly incompressible with nu near 0.5.
     """
 
-    constants = {"E": YOUNG, "nu": POISSON, "q": Constant("1", 0.0, 1.0, closed=True)}
+    constants = ELASTICITY["mooney_rivlin"]
 
     def principal(self, sigma, mu, lam, q):
         strain, log_J = _isochoric_strain(sigma)
@@ -154,14 +154,7 @@ class FibreReinforced(Hencky):
     ``azimuth`` degrees from x towards z.
     """
 
-    constants = {
-        "E": YOUNG,
-        "nu": POISSON,
-        "fibre_modulus": Constant("Pa", 0.0, closed=True),
-        "fibre_exponent": Constant("1", 0.0, closed=True),
-        "azimuth": Constant("degrees", -180.0, 180.0, closed=True, default=0.0),
-        "elevation": Constant("degrees", -90.0, 90.0, closed=True, default=0.0),
-    }
+    constants = ELASTICITY["fibre_reinforced"]
 
     def response(self, F: Tensor, weights: Weights) -> Tensor:
         constants = self.with_weights(weights)

@@ -9,14 +9,12 @@ because the quotient is an even function of the distance). Laws with closed-form
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from neuma_lib.errors import InputError
+from neuma_lib.mechanics.catalogue import Constant, check_constants
 from neuma_lib.mechanics.singular_values import away_from_zero, rotation_and_singular_values, svd3
 
 PrincipalFunction = Callable[[Tensor], Tensor]
@@ -145,26 +143,6 @@ def isotropic_deformation(F: Tensor, function: PrincipalFunction) -> Tensor:
     return coaxial_deformation(F, function(sigma), _numeric_quotients(function))
 
 
-@dataclass(frozen=True)
-class Constant:
-    """A material constant: its unit and admissible open interval (closed if ``closed``)."""
-
-    unit: str
-    low: float
-    high: float = math.inf
-    closed: bool = False
-    default: float | None = None
-
-    def admits(self, value: float) -> bool:
-        if self.closed:
-            return self.low <= value <= self.high
-        return self.low < value < self.high
-
-
-YOUNG = Constant("Pa", 0.0)
-POISSON = Constant("1", -1.0, 0.5)
-
-
 class Constants(nn.Module):
     """Mix-in that checks and holds the constants of a law.
 
@@ -176,24 +154,12 @@ class Constants(nn.Module):
 
     def __init__(self, **values: float | Tensor):
         super().__init__()
-        law = type(self).__name__
-        unknown = sorted(set(values) - set(self.constants))
-        if unknown:
-            names = ", ".join(self.constants) or "none"
-            raise InputError(law, f"unknown constant {', '.join(unknown)}; its constants are {names}")
-        self.values: dict[str, float | Tensor] = {}
-        for name, constant in self.constants.items():
-            value = values.get(name, constant.default)
-            if value is None:
-                raise InputError(f"{law}.{name}", f"the constant [{constant.unit}] is missing")
-            try:
-                number = float(value.detach() if isinstance(value, Tensor) else value)
-            except (TypeError, ValueError):
-                raise InputError(f"{law}.{name}", f"{value!r} is not a number") from None
-            if not constant.admits(number):
-                limits = f"{constant.low:g} and {constant.high:g} {constant.unit}"
-                raise InputError(f"{law}.{name}", f"{number:g} must lie between {limits}")
-            self.values[name] = value if isinstance(value, Tensor) else number
+        plain = {key: value.detach() if isinstance(value, Tensor) else value for key, value in values.items()}
+        numbers = check_constants(type(self).__name__, self.constants, plain)
+        self.values: dict[str, float | Tensor] = {
+            name: values[name] if isinstance(values.get(name), Tensor) else number
+            for name, number in numbers.items()
+        }
 
     def _fitted(self) -> list[str]:
         return [n for n, v in self.values.items() if isinstance(v, Tensor) and v.requires_grad]

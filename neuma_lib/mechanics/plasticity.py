@@ -15,9 +15,9 @@ import math
 import torch
 from torch import Tensor
 
-from neuma_lib.errors import InputError
+from neuma_lib.mechanics.catalogue import PLASTICITY
 from neuma_lib.mechanics.elasticity import STRETCH_MIN
-from neuma_lib.mechanics.isotropic import POISSON, YOUNG, Constant, Constants, isotropic_deformation, lame
+from neuma_lib.mechanics.isotropic import Constants, isotropic_deformation, lame
 from neuma_lib.mechanics.law import Plasticity, Weights
 
 
@@ -59,7 +59,7 @@ class VonMises(AnalyticPlasticity):
     With Hencky elasticity this bounds the norm of the deviatoric Kirchhoff stress by ``yield_stress`` [Pa].
     """
 
-    constants = {"E": YOUNG, "nu": POISSON, "yield_stress": Constant("Pa", 0.0, closed=True)}
+    constants = PLASTICITY["von_mises"]
 
     def principal(self, sigma, E, nu, yield_stress):
         mu, _ = lame(E, nu)
@@ -75,12 +75,7 @@ class DruckerPrager(AnalyticPlasticity):
     ``friction_angle`` in degrees; ``cohesion`` is the largest tensile logarithmic strain per axis.
     """
 
-    constants = {
-        "E": YOUNG,
-        "nu": POISSON,
-        "friction_angle": Constant("degrees", 0.0, 90.0),
-        "cohesion": Constant("1", 0.0, closed=True, default=0.0),
-    }
+    constants = PLASTICITY["drucker_prager"]
 
     @staticmethod
     def slope(E, nu, friction_angle, **_) -> float | Tensor:
@@ -120,13 +115,7 @@ class ViscousFlow(AnalyticPlasticity):
     steady flow is exactly viscosity times shear rate (a Bingham fluid if ``yield_stress`` > 0).
     """
 
-    constants = {
-        "E": YOUNG,
-        "nu": POISSON,
-        "viscosity": Constant("Pa s", 0.0),
-        "dt": Constant("s", 0.0),
-        "yield_stress": Constant("Pa", 0.0, closed=True, default=0.0),
-    }
+    constants = PLASTICITY["viscous_flow"]
 
     def principal(self, sigma, E, nu, viscosity, dt, yield_stress):
         mu, _ = lame(E, nu)
@@ -150,15 +139,7 @@ class CrushableFoam(AnalyticPlasticity):
     relaxation. Hardening by compaction is not possible because the elastic F contains no plastic volume.
     """
 
-    constants = {
-        "E": YOUNG,
-        "nu": POISSON,
-        "crush": Constant("Pa", 0.0),
-        "tension": Constant("Pa", 0.0),
-        "slope": Constant("1", 0.0),
-        "dt": Constant("s", 0.0),
-        "relaxation": Constant("s", 0.0, closed=True, default=0.0),
-    }
+    constants = PLASTICITY["crushable_foam"]
 
     def principal(self, sigma, E, nu, crush, tension, slope, dt, relaxation):
         mu, lam = lame(E, nu)
@@ -184,14 +165,7 @@ class HerschelBulkley(AnalyticPlasticity):
     step of length ``dt`` [s] is solved by Newton's method and differentiated as an implicit function.
     """
 
-    constants = {
-        "E": YOUNG,
-        "nu": POISSON,
-        "consistency": Constant("Pa s^exponent", 0.0),
-        "exponent": Constant("1", 0.2, 3.0, closed=True),
-        "yield_stress": Constant("Pa", 0.0, closed=True),
-        "dt": Constant("s", 0.0),
-    }
+    constants = PLASTICITY["herschel_bulkley"]
 
     def principal(self, sigma, E, nu, consistency, exponent, yield_stress, dt):
         mu, _ = lame(E, nu)
@@ -239,22 +213,7 @@ class CohesiveDruckerPrager(AnalyticPlasticity):
     dissipates. `DruckerPrager` is c = psi = 0, except that it returns all tensile states to its apex.
     """
 
-    constants = {
-        "E": YOUNG,
-        "nu": POISSON,
-        "friction_angle": Constant("degrees", 0.0, 90.0),
-        "cohesion": Constant("Pa", 0.0, closed=True),
-        "dilation_angle": Constant("degrees", 0.0, 90.0, closed=True, default=0.0),
-    }
-
-    def __init__(self, **values: float | Tensor):
-        super().__init__(**values)
-        friction, dilation = (float(self.values[f"{key}_angle"]) for key in ("friction", "dilation"))
-        if dilation > friction:
-            raise InputError(
-                "CohesiveDruckerPrager.dilation_angle",
-                f"{dilation:g} must not exceed friction_angle = {friction:g}, since shear would generate energy",
-            )
+    constants = PLASTICITY["cohesive_drucker_prager"]
 
     def principal(self, sigma, E, nu, friction_angle, cohesion, dilation_angle):
         mu, lam = lame(E, nu)

@@ -86,7 +86,6 @@ def test_images_are_measured_in_at_least_two_views_that_training_does_not_see(ra
             {"priors": {"regression": {"iteration": 3}}},
             r"priors\.regression\.iteration: .*did you mean iterations",
         ),
-        ({"priors": {"method": "guessing"}}, r"priors\.method: .*'regression' or 'trajectory'.*'guessing'"),
         (
             {"priors": {"laws": {"jelly": {"elasticity": {"E": "stiff"}}}}},
             r"priors\.laws\.jelly\.elasticity\.E: .*number.*'stiff'",
@@ -506,7 +505,7 @@ class TestFinerTruth:
     def values(self, truth):
         return truth.grid, truth.dt, truth.particles
 
-    def test_it_is_as_fine_as_simulation_and_scene_by_default(self, raw, loaded):
+    def test_it_is_as_fine_as_simulation_and_scene_by_default(self, loaded):
         assert self.values(loaded.scene_truth("BouncyBall")) == (24, 1e-3, 8000)
         assert self.values(loaded.experiment_truth("letter_N_sand")) == (24, 5e-4, 8000)
 

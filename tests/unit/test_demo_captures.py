@@ -136,7 +136,7 @@ def test_the_plan_is_what_lies_there(tmp_path):
     for file in (
         *plan.photographs,
         *plan.stills.values(),
-        *(v for t in plan.throws.values() for v in t.values()),
+        *(v for t in plan.takes.values() for v in t.values()),
     ):
         file.parent.mkdir(parents=True, exist_ok=True)
         file.touch()

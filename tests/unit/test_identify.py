@@ -167,7 +167,7 @@ def test_what_many_particles_change_is_added_and_its_scatter_is_uncertainty():
         at = torch.randn(count, 3, generator=generator, dtype=torch.float64)
         radius = RADIUS * torch.rand(count, 1, generator=generator, dtype=torch.float64) ** (1 / 3)
         x = torch.tensor([0.5, 0.3, 0.5]) + radius * at / at.norm(dim=1, keepdim=True)
-        return few.refilled(x, float(few.vol0.sum()), 1000.0)
+        return few.resampled(x, float(few.vol0.sum()), 1000.0)
 
     many = filled(3000)
     assert len(many.x0) >= 3000 and float(many.mass.sum()) == pytest.approx(float(few.mass.sum()))
@@ -443,7 +443,7 @@ def test_few_frames_and_unknown_constants_are_named():
     body = ball()
     with pytest.raises(InputError, match="four frames"):
         identify(MODEL, known(body), body, observe(body, V0, (0, 4, 8)), settings({"hencky": ELASTIC}))
-    with pytest.raises(InputError, match="no constant stiffness"):
+    with pytest.raises(InputError, match="unknown constant stiffness"):
         Family("x", {"elasticity": {"name": "hencky", "E": 1e4, "nu": 0.3, "stiffness": 2}})
     both = {"name": "von_mises", "yield_stress": 1e3, "nu": 0.2}
     with pytest.raises(InputError, match="leave out nu"):

@@ -18,10 +18,11 @@ from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.evaluation.image_metrics import psnr, ssim
 from neuma_lib.evaluation.metrics import mean_height, mechanical_energy, tracer_errors
 from neuma_lib.evaluation.paper import BALL_PARTICLES, BALL_RADIUS, PAPER
-from neuma_lib.evaluation.reports import benchmark_table, learning_rate_table, report_table
+from neuma_lib.evaluation.reports import benchmark_table, report_table
 from neuma_lib.evaluation.video import side_by_side, write_gif, write_mp4
 from neuma_lib.geometry.chamfer import chamfer, chamfer_loss, chamfer_sequence
 from neuma_lib.geometry.volume import sample_volume
+from tests.support.errors import refused
 
 
 def points(*shape, seed=0):
@@ -67,7 +68,7 @@ def test_chamfer_loss_and_its_gradient():
 
 
 def test_chamfer_loss_names_what_is_wrong():
-    with pytest.raises(InputError, match="2 frames against 1"):
+    with refused("chamfer_loss"):
         chamfer_loss(points(2, 5), [points(5)])
     broken = points(2, 5)
     broken[1, 3, 0] = float("nan")
@@ -191,11 +192,11 @@ def test_image_measures_agree_with_scikit_image():
 
 
 def test_unusable_points_and_images_are_named():
-    with pytest.raises(InputError, match="not finite"):
+    with refused("chamfer: b"):
         chamfer(points(4), torch.full((4, 3), float("inf")))
-    with pytest.raises(InputError, match="non-empty"):
+    with refused("chamfer: b"):
         chamfer(points(4), torch.zeros(0, 3))
-    with pytest.raises(InputError, match="frames against"):
+    with refused("chamfer"):
         chamfer_sequence(points(2, 4), points(3, 4))
     with pytest.raises(InputError, match="do not match"):
         psnr(np.zeros((4, 4, 3)), np.zeros((4, 5, 3)))
@@ -276,22 +277,6 @@ def test_a_gif_lasts_as_long_as_its_frames(tmp_path, rate):
     assert sum(delays) == 3000 and max(delays) - min(delays) <= 10
     assert min(delays) >= 20, "a browser would take 100 ms for less"
     assert len(delays) == count if rate <= 50 else len(delays) > 25 * 3
-
-
-def test_learning_rate_is_chosen_by_the_geometric_mean_of_the_training_loss():
-    def run(scale, scene, best, error):
-        return {
-            "method": "neuma", "lr_scale": scale, "scene": scene, "loss": [1.0, best], "best_loss": best,
-            "stable": True, "recoveries": [], "tracer_rmse_mm": error,
-        }  # fmt: skip
-
-    # The arithmetic mean and the RMSE, which knows the truth, would both choose the other factor.
-    rows = [run(0.5, "a", 0.001, 9), run(0.5, "b", 0.3, 9), run(1.0, "a", 0.1, 1), run(1.0, "b", 0.1, 1)]
-    table, markdown, best = learning_rate_table(rows)
-    assert best == {"neuma": 0.5}
-    read = list(csv.DictReader(io.StringIO(table)))
-    assert [float(row["ratio"]) for row in read] == [0.001, 0.3, 0.1, 0.1]
-    assert "neuma ×0.5" in markdown
 
 
 def test_unusable_videos_are_named(film):

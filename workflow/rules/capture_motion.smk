@@ -98,6 +98,6 @@ rule capture_motion_page:
     params:
         title="{capture}: masks and free flight",
         videos=of_capture(filmed_by),
-        throws=of_capture(lambda capture: list(capture.throws)),
+        throws=of_capture(lambda capture: list(capture.takes)),
     script:
         "../scripts/capture_motion_page.py"

@@ -72,7 +72,7 @@ def given_poses(capture):
 
 def filmed_by(capture):
     """Throw and camera of all videos."""
-    return [(throw, camera) for throw, cameras in capture.throws.items() for camera in cameras]
+    return [(throw, camera) for throw, cameras in capture.takes.items() for camera in cameras]
 
 
 def of_videos(ending, stage="frames"):
@@ -142,7 +142,7 @@ def of_throws(pattern):
     @checked
     def choose(wildcards):
         name = wildcards.capture
-        return [pattern.format(capture=name, throw=throw) for throw in capture_named(name).throws]
+        return [pattern.format(capture=name, throw=throw) for throw in capture_named(name).takes]
 
     return choose
 

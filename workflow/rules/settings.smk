@@ -10,6 +10,7 @@ sys.path.insert(0, str(ROOT))
 
 from neuma_lib.capture.planned import planned_captures
 from neuma_lib.capture.scenes import captured_scenes
+from neuma_lib.checks import law_problems
 from neuma_lib.config.capture import CapturesConfig
 from neuma_lib.config.loading import load
 from neuma_lib.config.validation import validate
@@ -24,6 +25,8 @@ try:
     SETTINGS = load(config, captured=captured_scenes(captures.root, captures.released, PLANNED))
 except InputError as error:
     raise WorkflowError(str(error)) from None
+if wrong_laws := law_problems(SETTINGS):
+    raise WorkflowError("\n".join(wrong_laws))
 
 DATA = SETTINGS.data_root.rstrip("/")
 RESULTS = SETTINGS.results_root.rstrip("/")
@@ -79,11 +82,6 @@ SPLAT_SCENE = scenes_that(lambda scene: scene.splat)
 OBJECT_SCENE = scenes_that(lambda scene: not (scene.captured and scene.captured.throw))
 PICTURED_SCENE = scenes_that(lambda scene: not scene.splat and not (scene.captured and scene.captured.throw))
 THROW_SCENE = scenes_that(lambda scene: scene.captured and scene.captured.throw, chains=False)
-
-
-def is_captured(name):
-    """Whether a scene, or a chain of it, is of a capture."""
-    return SETTINGS.scenes[name.split("+")[0]].captured is not None
 
 
 wildcard_constraints:

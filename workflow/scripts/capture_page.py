@@ -22,7 +22,7 @@ def main(inputs, output, params, run) -> None:
         output.page, markdown(params.title, found, pictures, None if names else "There are no videos yet.")
     )
     for check in found:
-        run.say(f"{check.what}: {check.found}" + ("" if check.good else f" (wanted: {check.wanted})"))
+        run.say(f"{check.what}: {check.value}" + ("" if check.good else f" (wanted: {check.wanted})"))
 
 
 run_script(main, snakemake)

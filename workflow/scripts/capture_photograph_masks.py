@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neuma_lib.capture.agreement import LEAST_AGREEMENT, agreement
+from neuma_lib.capture.agreement import MIN_AGREEMENT, agreement
 from neuma_lib.capture.board import board_outline
 from neuma_lib.capture.folder import PHOTOGRAPHS
 from neuma_lib.capture.frames import Frame
@@ -87,7 +87,7 @@ def main(inputs, output, params, run) -> None:
 
 def _check(agreed, names, is_own, name) -> list[str]:
     """Photographs whose masks do not agree with the others."""
-    doubtful = [n for n, value, own in zip(names, agreed, is_own) if value < LEAST_AGREEMENT and not own]
+    doubtful = [n for n, value, own in zip(names, agreed, is_own) if value < MIN_AGREEMENT and not own]
     if len(doubtful) > 0.5 * len(names):
         raise InputError(
             f"{name}: {len(doubtful)} of {len(names)} masks of photographs do not belong to the body that the"

@@ -11,7 +11,7 @@ from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import write_arrays
 from neuma_lib.io.images import filmed_steps, read_transforms
 from neuma_lib.io.laws import load_laws
-from neuma_lib.io.particles import load_start
+from neuma_lib.io.particles import load_initial_state
 from neuma_lib.io.weights import read_weights
 from neuma_lib.sim.model import MPMModel, consecutive
 from workflow.inputs import listed
@@ -21,7 +21,7 @@ from workflow.stage import run_script
 def main(inputs, output, params, run) -> None:
     device, dt = choose_device(params.device), params.simulation["dt"]
     files = [inputs[name] for name in ("particles", "binding", "gaussians", "velocity")]
-    start, counts = load_start(*files, [params.density], params.carrier)
+    start, counts = load_initial_state(*files, [params.density], params.carrier)
     adaptors = listed(inputs.get("adaptor"))
     laws = load_laws(dt, (), listed(inputs.get("identified")), listed(inputs.prior), adaptors)
     steps = filmed_steps(inputs.transforms, range(len(params.cameras)), **params.filming)

@@ -55,7 +55,7 @@ def main(inputs, output, params, run) -> None:
         f"the placed object in {found.pictures[0]} pictures",
         len(sights) > 1,
     )
-    line = gravity.checked(params.name) if scale_known else gravity.told(params.name)
+    line = gravity.check(params.name) if scale_known else gravity.describe(params.name)
     placed = found.place(x.double().numpy())
     if placed.min() < 0 or placed.max() > 1:
         raise InputError(

@@ -9,7 +9,7 @@ from neuma_lib.fitting.carried_field import CarriedField
 from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.io.laws import load_laws
-from neuma_lib.io.particles import load_start, thrown
+from neuma_lib.io.particles import load_initial_state, with_motion
 from neuma_lib.io.weights import read_weights
 from neuma_lib.sim.model import MPMModel, consecutive
 from workflow.inputs import listed
@@ -25,9 +25,9 @@ def main(inputs, output, params, run) -> None:
     files = [inputs[name] for name in ("particles", "binding", "gaussians", "velocity")]
     if params.own:
         body = CarriedField.load(inputs.field, params.own, params.densities[0])
-        start, counts = thrown(body, inputs.velocity), [len(body.moving.x)]
+        start, counts = with_motion(body, inputs.velocity), [len(body.moving.x)]
     else:
-        start, counts = load_start(*files, params.densities, params.carrier)
+        start, counts = load_initial_state(*files, params.densities, params.carrier)
     identified, adaptors = listed(inputs.get("identified")), listed(inputs.get("adaptor"))
     laws = load_laws(params.simulation["dt"], params.laws, identified, listed(inputs.prior), adaptors)
     evaluation = evaluate(

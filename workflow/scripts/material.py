@@ -15,7 +15,7 @@ from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_videos
 from neuma_lib.io.laws import load_adaptable, save_adaptor
-from neuma_lib.io.particles import load_body, thrown
+from neuma_lib.io.particles import load_body, with_motion
 from neuma_lib.mechanics.structured import structured_law
 from neuma_lib.sim.model import MPMModel
 from workflow.inputs import listed
@@ -60,7 +60,7 @@ def main(inputs, output, params, run) -> None:
         load_body(*files, density, settings.carrier, settings.gaussian_motion).to(torch.float32, device)
         for files, density in zip(parts, params.densities, strict=True)
     ]
-    starts = [thrown(body, file) for body, file in zip(bodies, listed(inputs.velocity), strict=True)]
+    starts = [with_motion(body, file) for body, file in zip(bodies, listed(inputs.velocity), strict=True)]
     if settings.supervision == "particles":
         losses = [particle_loss(file, device) for file in listed(inputs.truth)]
     else:

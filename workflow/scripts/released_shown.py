@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from neuma_lib.capture.released import plate_behind, read_configured, read_shots
+from neuma_lib.capture.released import background_behind, read_configured, read_shots
 from neuma_lib.capture.shown import numbers_of, shown_frames
 from neuma_lib.config.capture import ReleasedConfig
 from neuma_lib.io.files import read_json
@@ -22,7 +22,7 @@ def main(inputs, output, params, run) -> None:
         by_number = dict(zip([shot.number for shot in shots[camera]], pictures))
         frames = ((number, by_number[number]) for number in numbers_of(video, camera))
         # Not all files have a picture of the empty scene.
-        plate = plate_behind(pictures, masks)
+        plate = background_behind(pictures, masks)
         entries += shown_frames(folder, camera, video, mattes, frames, plate, params.width, gains[camera])
         run.say(f"{camera}: {len(numbers_of(video, camera))} frames")
     write_transforms(output.transforms, {}, entries)

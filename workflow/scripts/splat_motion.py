@@ -9,7 +9,7 @@ from neuma_lib.evaluation.motion import energy_gain_after, predict
 from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import write_arrays
 from neuma_lib.io.laws import load_laws
-from neuma_lib.io.particles import load_start
+from neuma_lib.io.particles import load_initial_state
 from neuma_lib.io.weights import read_weights
 from neuma_lib.sim.model import MPMModel, consecutive
 from workflow.inputs import listed
@@ -19,7 +19,7 @@ from workflow.stage import run_script
 def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
     files = [inputs[name] for name in ("particles", "binding", "gaussians", "velocity")]
-    start, counts = load_start(*files, [params.density], params.carrier)
+    start, counts = load_initial_state(*files, [params.density], params.carrier)
     identified, adaptors = listed(inputs.get("identified")), listed(inputs.get("adaptor"))
     laws = load_laws(params.simulation["dt"], params.laws, identified, listed(inputs.prior), adaptors)
     model, start = MPMModel(**params.simulation), start.to(device)

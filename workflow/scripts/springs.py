@@ -12,7 +12,7 @@ from neuma_lib.fitting.springs import fit_springs
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.files import write_json
 from neuma_lib.io.images import load_videos
-from neuma_lib.io.particles import load_body, thrown
+from neuma_lib.io.particles import load_body, with_motion
 from neuma_lib.io.springs import save_springs
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.springs.body import SpringBody
@@ -32,7 +32,7 @@ def main(inputs, output, params, run) -> None:
         video.to(torch.float32, device)
         for video in load_videos(inputs.transforms, settings.views, **params.filming)
     ]
-    start, density = thrown(body, inputs.velocity), float(body.mass.sum() / body.vol0.sum())
+    start, density = with_motion(body, inputs.velocity), float(body.mass.sum() / body.vol0.sum())
     network = (how.anchors, how.neighbours, how.hard_springs, how.exponent, how.carriers)
     anchored = SpringBody.of(body.x0, *network)
     springs = Springs.of_modulus(anchored.network, how.guess, density, how.resistance, how.gap)

@@ -8,7 +8,7 @@ from neuma_lib.device import choose_device
 from neuma_lib.evaluation.springs import evaluate_springs
 from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
-from neuma_lib.io.particles import load_start
+from neuma_lib.io.particles import load_initial_state
 from neuma_lib.io.springs import load_springs
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.springs.body import SpringBody
@@ -23,7 +23,7 @@ def main(inputs, output, params, run) -> None:
     )
     measure, _ = read_arrays(inputs.tracers, required=("starts", "floor"))
     files = [inputs[name] for name in ("particles", "binding", "gaussians", "velocity")]
-    start, _ = load_start(*files, params.densities)
+    start, _ = load_initial_state(*files, params.densities)
     start = start.to(device)
     index, springs, about = load_springs(inputs.springs, start.x)
     if params.other_body:

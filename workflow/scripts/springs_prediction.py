@@ -7,7 +7,7 @@ from neuma_lib.device import choose_device
 from neuma_lib.evaluation.springs import predict_springs
 from neuma_lib.io.hdf5 import write_arrays
 from neuma_lib.io.images import filmed_steps
-from neuma_lib.io.particles import load_start
+from neuma_lib.io.particles import load_initial_state
 from neuma_lib.io.springs import load_springs
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.springs.body import SpringBody
@@ -17,7 +17,7 @@ from workflow.stage import run_script
 
 def main(inputs, output, params, run) -> None:
     how, device = SpringsConfig(**params.springs), choose_device(params.device)
-    start, _ = load_start(
+    start, _ = load_initial_state(
         *(inputs[name] for name in ("particles", "binding", "gaussians", "velocity")), [params.density]
     )
     start = start.to(device)

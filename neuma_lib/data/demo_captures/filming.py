@@ -6,7 +6,6 @@ import subprocess
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import imageio_ffmpeg
 import numpy as np
 from PIL import Image
 
@@ -15,6 +14,7 @@ from neuma_lib.data.blender.room import Moving, Scenery, Shot, shoot
 from neuma_lib.data.blender.scene import Progress
 from neuma_lib.data.demo_captures.pictures import dead_leaves
 from neuma_lib.data.demo_captures.stage import MIDDLE, Eye, lens_row, video_cameras
+from neuma_lib.extras import require
 from neuma_lib.io.files import atomic
 
 PAPER = 0.0004
@@ -205,7 +205,7 @@ def write_video(path: str | Path, pictures: Sequence[np.ndarray], rate: int, qua
     height, width = pictures[0].shape[:2]
     with atomic(path) as partial:
         command = [
-            imageio_ffmpeg.get_ffmpeg_exe(),
+            require("imageio_ffmpeg", "capture").get_ffmpeg_exe(),
             "-y",
             "-v",
             "error",
