@@ -8,11 +8,11 @@ from neuma_lib.evaluation.captured_images import (
     COLUMNS,
     averaged,
     captured_metrics,
+    composited,
     error_picture,
     exposed,
     image_rows,
     images_csv,
-    laid_over,
     overlap,
 )
 from neuma_lib.evaluation.image_metrics import object_window, psnr, ssim
@@ -39,7 +39,7 @@ def scene():
         "colours": colours,
         "alpha": alpha,
         "matte": matte,
-        "picture": laid_over(seen, mask, empty),
+        "picture": composited(seen, mask, empty),
         "empty": empty,
     }
 

@@ -1,4 +1,4 @@
-"""Stress curves of the prior, the identified constants and the learned law of a capture, in the units of its room."""
+"""Stress curves of the prior, the identified constants and the learned law of a capture, in units of its room."""
 
 import torch
 
@@ -17,13 +17,12 @@ def main(inputs, output, params, run) -> None:
     drawn = {"dt": params.dt, "count": DRAWS, "seed": params.seed}
     laws, draws = {}, {}
     for method, kinds in params.laws.items():
-        # files of a law lie one after the other
-        parts = {kind: next(files) for kind in kinds}
+        parts = {kind: next(files) for kind in kinds}  # the files of all laws are in one list
         given = [[parts[kind]] if kind in parts else [] for kind in ("identified", "prior", "adaptor")]
         (laws[method],) = load_laws(params.dt, (), *given)
-        found = read_json(parts["identified"]) if "identified" in parts else {}
-        if "best" in found:  # constants that come with their covariance
-            draws[method] = constants_draws(found, params.model_std, **drawn)
+        identified = read_json(parts["identified"]) if "identified" in parts else {}
+        if "best" in identified:  # constants with their covariance
+            draws[method] = constants_draws(identified, params.model_std, **drawn)
         elif "base" in parts and laws[method].elasticity.form == "stretch":
             before = {"model_std": params.model_std, "spread": params.spread}
             draws[method] = corrected_draws(

@@ -1,4 +1,4 @@
-"""One page of a capture's masks and free flights: checks and pictures."""
+"""Page of a capture's masks and free flights: checks and pictures."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Predict a throw that was filmed, at every step that its frames and their exposures need."""
+"""Predict a take at every step required by its frames and their exposures."""
 
 from dataclasses import asdict
 
@@ -29,8 +29,8 @@ def main(inputs, output, params, run) -> None:
     model = MPMModel(**params.simulation)
     bodies = consecutive([law.to(device) for law in laws], counts)
     path, failure = predict(model, bodies, start.to(device), frames, total=params.total)
-    found = {name: getattr(path, name) for name in ("x", "F", "F_total")}
-    arrays = {name: values.cpu().numpy() for name, values in found.items() if values is not None}
+    states = {name: getattr(path, name) for name in ("x", "F", "F_total")}
+    arrays = {name: values.cpu().numpy() for name, values in states.items() if values is not None}
     write_arrays(output.rollout, {**arrays, "frames": np.asarray(frames)}, {"dt": dt})
     filmed = {camera: [] for camera in params.cameras}
     for frame in read_transforms(inputs.transforms)["frames"]:
@@ -40,10 +40,9 @@ def main(inputs, output, params, run) -> None:
     report["stable"] = all(read_weights(adaptor)[1]["stable"] for adaptor in adaptors)
     write_json(output.report, report)
     touched = f", touches {', '.join(report['touched'])}" if report["touched"] else ""
-    broken = f"; DIVERGED at step {failure.step}" if failure else ""
-    run.say(
-        f"{len(frames)} states to step {frames[-1]}, first contact at {report['contact_step']}{touched}{broken}"
-    )
+    diverged = f", DIVERGED at step {failure.step}" if failure else ""
+    contact = report["contact_step"]
+    run.say(f"{len(frames)} states to step {frames[-1]}, first contact at step {contact}{touched}{diverged}")
 
 
 run_script(main, snakemake)
