@@ -14,7 +14,7 @@ import hashlib
 import json
 import os
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
@@ -113,3 +113,8 @@ def one_line(error: object, limit: int = 200) -> str:
     """Text of an error or a value of a file, on one line and not longer than ``limit``, to quote in a message."""
     text = " ".join("".join(c if c.isprintable() else " " for c in str(error)).split())
     return text if len(text) <= limit else f"{text[:limit]}..."
+
+
+def listed(files: str | Iterable[str] | None) -> list[str]:
+    """Paths as a list. One path, which a workflow gives as text, is a list of one; None is empty."""
+    return [files] if isinstance(files, str) else list(files or ())
