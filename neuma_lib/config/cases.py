@@ -239,12 +239,12 @@ def body_cases(settings: Config, column: str, method: str) -> list[ProjectCase]:
     """A method on the scene of each body of a scene or experiment, in its replicate.
 
     Raises:
-        InputError: several bodies, and a model that moves the body of its own scene only.
+        InputError: several bodies, and a model without a material law.
     """
     cases = [case(settings, scene, method) for scene in settings.body_scenes(column)]
-    if len(cases) > 1 and not cases[0].method.moves_other_bodies:
+    if len(cases) > 1 and not cases[0].method.has_law:
         raise InputError(
-            f"{column}/{method}", "its model moves the body of one scene only, and the experiment has several"
+            f"{column}/{method}", "it has no material law, so that it cannot move several bodies together"
         )
     return cases
 

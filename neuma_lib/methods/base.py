@@ -197,8 +197,8 @@ class Method(ABC):
         presets: built-in presets by name.
         product: file that `fit` writes. None: nothing is fitted.
         fit_kernels, kernels: groups of Warp kernels that `fit` and predictions use.
-        moves_other_bodies: whether the model moves other bodies than the one it is obtained from. If not, there are no
-            ``+law_from=`` and no experiments with several bodies.
+        has_law: whether the motion follows from a material law (`MotionModel.law`). Only laws move several bodies.
+        moves_other_bodies: whether the model moves the bodies of other scenes (``+law_from=``).
     """
 
     name: ClassVar[str]
@@ -208,6 +208,7 @@ class Method(ABC):
     product: ClassVar[str | None] = None
     fit_kernels: ClassVar[tuple[str, ...]] = ("laws", "rendering")
     kernels: ClassVar[tuple[str, ...]] = ("laws",)
+    has_law: ClassVar[bool] = True
     moves_other_bodies: ClassVar[bool] = True
 
     # ---- planning, without torch
@@ -219,6 +220,10 @@ class Method(ABC):
     @abstractmethod
     def model_inputs(self, case: Case) -> Files:
         """Files of the model, for `load`: one path a name."""
+
+    def body_inputs(self, case: Case) -> Files:
+        """Further files of `load_start` and `load_body`: one path a name."""
+        return {}
 
     def fit_options(self, case: Case) -> dict[str, Any]:
         """Options of `fit` as plain values."""
@@ -271,7 +276,7 @@ class Method(ABC):
         """What a prediction starts from: particles in motion, and how many belong to each body.
 
         Args:
-            inputs: ``particles``, ``binding``, ``gaussians``, ``velocity`` and the files of `model_inputs`.
+            inputs: ``particles``, ``binding``, ``gaussians``, ``velocity`` and the files of `body_inputs`.
             densities: of each body.
         """
         from neuma_lib.io.particles import load_start

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from neuma_lib.config.motion import MotionOptions, WithPrior
-from neuma_lib.methods.base import Case, Files, Method, Preset
+from neuma_lib.methods.base import Case, Files, Method, ModelSource, Preset
 
 
 class PriorOptions(MotionOptions, WithPrior):
@@ -26,3 +26,8 @@ class Prior(Method):
         from neuma_lib.methods.model import LawOnGrid
 
         return LawOnGrid(load_law(inputs["prior"], dt=dt))
+
+
+def prior_source(path: str, dt: float) -> ModelSource:
+    """A law that is complete in one file: a prior, or a law to pass on."""
+    return ModelSource(Prior.__module__, {}, {"prior": path}, dt)

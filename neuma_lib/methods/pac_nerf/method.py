@@ -49,8 +49,10 @@ class PacNerf(Method):
         return {"prior": case.prior_law, "radiance": _seen(case), **super().fit_options(case)}
 
     def model_inputs(self, case: Case) -> Files:
-        field = {"field": case.result(FIELD)} if self.carrier(case) == "field" else {}
-        return {"constants": case.product(), **field}
+        return {"constants": case.product()}
+
+    def body_inputs(self, case: Case) -> Files:
+        return {"field": case.on_moved().result(FIELD)} if self.carrier(case) == "field" else {}
 
     def model_options(self, case: Case) -> dict:
         if self.carrier(case) != "field":

@@ -22,6 +22,7 @@ class SpringGaus(Method):
     product = "springs.safetensors"
     fit_kernels = ("springs", "rendering")
     kernels = ("springs",)
+    has_law = False
     moves_other_bodies = False
     presets = {
         "spring_gaus": Preset(
