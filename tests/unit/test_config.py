@@ -86,7 +86,6 @@ def test_images_are_measured_in_at_least_two_views_that_training_does_not_see(ra
             {"priors": {"regression": {"iteration": 3}}},
             r"priors\.regression\.iteration: .*did you mean iterations",
         ),
-        ({"priors": {"method": "guessing"}}, r"priors\.method: .*'regression' or 'trajectory'.*'guessing'"),
         (
             {"priors": {"laws": {"jelly": {"elasticity": {"E": "stiff"}}}}},
             r"priors\.laws\.jelly\.elasticity\.E: .*number.*'stiff'",

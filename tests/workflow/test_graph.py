@@ -11,9 +11,9 @@ from neuma_lib.project import settings_around
 
 EXPERIMENT = f"{SCENE.rpartition('/')[0]}/experiments/letter_N_bouncy"
 SUPERVISED = "neuma_particle_supervision"  # the one method that trains on the truth
-# Blender films the truth, a dataset is packed of it, evaluation measures against it; figures and viewer show it.
+# Blender films the truth, evaluation measures against it; figures and viewer show it.
 MAY_READ_THE_TRUTH = {
-    *("render_static", "render_dynamic", "pack", "initial_state", "evaluation", "viewer", "experiment"),
+    *("render_static", "render_dynamic", "initial_state", "evaluation", "viewer", "experiment"),
     *("tracers", "experiment_tracers"),
     *("particles_app", "lora_alphav", "ext_time"),
 }
@@ -39,7 +39,7 @@ def test_only_evaluation_and_figures_of_it_and_one_ablation_read_the_truth(proje
         f"{SCENE}/neuma/bias.json",
         f"{SCENE}/viewer.html",
     ]
-    everything = ("tables", "figures", "videos", "packed", *on_request)
+    everything = ("tables", "figures", "videos", *on_request)
     graph = jobs(project.run("--dry-run", *everything))
     assert len(graph) > 80
     truths = {

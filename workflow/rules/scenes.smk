@@ -93,7 +93,7 @@ def known_law(wildcards):
 
 
 def origin_of(part, scene):
-    """Whether a part ('static', 'dynamic', 'truth') of a scene is 'made', 'supplied' by the user or 'packed'.
+    """Whether a part ('static', 'dynamic', 'truth') of a scene is 'made' or 'supplied' by the user.
 
     A truth is not supplied: that of a scene with a video of the user's is simulated. All of a capture is 'captured', and
     a splat has neither images nor a truth.
@@ -102,7 +102,7 @@ def origin_of(part, scene):
         return "captured" if SETTINGS.scenes[scene].captured else "none"
     if getattr(SETTINGS.scenes[scene].images, "dynamic" if part == "truth" else part):
         return "made" if part == "truth" else "supplied"
-    return "packed" if SETTINGS.dataset.packed else "made"
+    return "made"
 
 
 def scenes_with(part, origin):

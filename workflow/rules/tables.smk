@@ -94,7 +94,7 @@ def table_files(table, name):
 def table_records(table):
     """Benchmark file and log of each job behind the scenes of a table, in all chains."""
     pairs = [SimpleNamespace(**run) for run in table_runs(table) if run["scene"]]
-    makers = {"made": "render", "supplied": "supplied", "packed": "unpack"}
+    makers = {"made": "render", "supplied": "supplied"}
     groups = ("binding", "geometry", "simulation", "laws", "rendering")
     jobs = [("kernels", {"group": group}) for group in groups]
     priors, laws, videos = [], [], []
@@ -128,8 +128,7 @@ def table_records(table):
         scene, _ = SETTINGS.chain(run)
         origins = {part: origin_of(part, scene) for part in ("static", "dynamic")}
         if run in judged or "made" in origins.values():
-            truth = "ground_truth" if origin_of("truth", scene) == "made" else "unpack_truth"
-            jobs += [(truth, {"scene": scene})]
+            jobs += [("ground_truth", {"scene": scene})]
         jobs += [(f"{makers[origin]}_{part}", {"scene": scene}) for part, origin in origins.items()]
         makes = {rule: file for rule, file in MAKERS.items() if run in judged or rule != "tracers"}
         jobs += [(rule, {"scene": Path(home(run, file)).parent.name}) for rule, file in makes.items()]
