@@ -38,22 +38,17 @@ MADE_BY = {
     "table5": "tables figures",
     "uneven_mass": "tables figures",
     "ablation_gradients": "tables figures",
-    "without_binding": "tables figures",
     "finer_truth": "results/finer_truth.csv",
     "random": "random",
     "initial_states": "tables figures",
-    "timings": "tables figures",
-    "learning_rates": "results/learning_rates.csv",
     "yardstick": "results/yardstick.csv",
     "stress": "results/stress.csv",
     "letters": "results/letters.csv",
     "views": "results/views.csv",
     "outside": "results/outside.csv",
     "identified": "results/identified.csv",
-    "bias": "results/bias.csv",
     "table1_systems": "results/table1_systems.csv",
     "table2_systems": "results/table2_systems.csv",
-    "honey_systems": "results/honey_systems.csv",
 }
 """Tables that are recorded, and the target of Snakemake that makes them."""
 VERDICT_HEAD = f"| {' | '.join(VERDICTS[:2])} |"

@@ -58,7 +58,7 @@ def check_methods(settings: Config) -> None:
     named["random.methods"] = settings.random.methods if settings.random.count else ()
     named["demo.methods"] = demo.methods if "demo" in settings.model_fields_set else ()
     for name, table in settings.tables.items():
-        named[f"tables.{name}"] = (*table.methods, *table.if_made, *table.titles)
+        named[f"tables.{name}"] = (*table.methods, *table.titles)
     for where, methods in named.items():
         for method in methods:
             try:

@@ -68,31 +68,6 @@ rule evaluation:
         "../scripts/evaluation.py"
 
 
-rule bias:
-    input:
-        **body_files(),
-        kernels=kernels("laws", "rendering"),
-        transforms=of_scene("dynamic/transforms.json"),
-        velocity=start_file,
-        prior=material_prior,
-        adaptor=trained_adaptor,
-        identified=identified_law,
-    output:
-        bias=f"{RESULTS}/{{scene}}/{{method}}/bias.json",
-    resources:
-        gpu=GPU,
-    params:
-        simulation=simulation_settings,
-        density=method_density,
-        material=material_settings,
-        truth=scene_setting("law"),
-        laws=lambda wildcards: [law for law in [true_law(wildcards)] if law],
-        filming=filming,
-        device=SETTINGS.device,
-    script:
-        "../scripts/bias.py"
-
-
 rule video:
     input:
         **body_files(),

@@ -50,8 +50,8 @@ def training_settings(wildcards):
 def without_law(method):
     """The error of a method with springs where a law is asked for."""
     return InputError(
-        f"{method} has no law of a material, only springs in one body: it has no stress and no bias, and no experiment "
-        "with several bodies"
+        f"{method} has no law of a material, only springs in one body: it has no stress, and no experiment with several "
+        "bodies"
     )
 
 
@@ -84,12 +84,6 @@ def identified_file(wildcards):
     """The same of the scene that a method's law is from, in its chain."""
     scene, method = wildcards.scene, wildcards.method
     return home(SETTINGS.law_scene(scene, method), identified_name(scene, method))
-
-
-def identification(file):
-    """The job that makes such a file: its rule and its wildcards."""
-    scene, views = Path(file).parent.name, Path(file).stem.partition("views=")[2]
-    return ("identify_views", {"scene": scene, "views": views}) if views else ("identify", {"scene": scene})
 
 
 @checked

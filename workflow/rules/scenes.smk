@@ -39,15 +39,6 @@ def subject(wildcards):
     return getattr(wildcards, "scene", None) or wildcards.experiment
 
 
-# The rules that reconstruct a scene and prepare its evaluation, and a file of each.
-MAKERS = {
-    "gaussians": "gaussians.ply",
-    "mesh": "mesh.ply",
-    "sampled_particles": "sampled_particles.h5",
-    "binding": "binding.h5",
-    "velocity": "velocity.json",
-    "tracers": "tracers.h5",
-}
 # Files of a reconstructed body: the particles that are simulated, the Gaussians, and what binds them.
 BODY = {"particles": "particles.h5", "binding": "binding.h5", "gaussians": "gaussians.ply"}
 
