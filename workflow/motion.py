@@ -39,7 +39,9 @@ class FitStage(FitRun):
         self._checkpoint, self._code, self._stage = checkpoint, code, stage
 
     def checkpoint(self, settings: Mapping[str, Any], inputs: Mapping[str, Any]) -> Checkpoint:
-        files = {f"{name} {k}": file for name, value in inputs.items() for k, file in enumerate(listed(value))}
+        files = {
+            f"{name} {k}": file for name, value in inputs.items() for k, file in enumerate(listed(value))
+        }
         return Checkpoint(self._checkpoint, fingerprint(settings, files, self._code))
 
     def progress(self, done: int, total: int, loss: float | None = None) -> None:
@@ -50,9 +52,9 @@ class FitStage(FitRun):
 
 
 def files_of(inputs, names: Iterable[str]) -> dict[str, Any]:
-    """Named input files of a job: paths, or lists of paths."""
-    found = {name: inputs[name] for name in names}
-    return {name: value if isinstance(value, str) else list(value) for name, value in found.items()}
+    """Named input files of a job: one path, or a list of several."""
+    found = {name: listed(inputs[name]) for name in names}
+    return {name: paths[0] if len(paths) == 1 else paths for name, paths in found.items()}
 
 
 class Prediction:
@@ -85,7 +87,9 @@ class Prediction:
         """The law of a job about one law. Raises InputError if the motion follows from no law."""
         law = self.model(dt).law
         if law is None:
-            raise InputError(self.method.name, "its motion follows from no material law", "Choose another method")
+            raise InputError(
+                self.method.name, "its motion follows from no material law", "Choose another method"
+            )
         return law
 
     def body(self, density, carrier: str, gaussian_motion: str, device: torch.device):

@@ -35,6 +35,7 @@ class ProjectCase(Case):
     scene: str
     moved: str
     name: str
+    folder: str
     options: Any
     evaluate_on: str
     method: Method
@@ -68,6 +69,9 @@ class ProjectCase(Case):
     def data(self, file: str) -> str:
         base, _ = self.settings.chain(self.scene)
         return f"{self.settings.data_root.rstrip('/')}/{base}/{file}"
+
+    def rollout(self) -> str:
+        return f"{places.results_root(self.settings)}/{self.moved}/{self.folder}/rollout.h5"
 
     def product(self) -> str:
         run = f"{self._folder(self.scene)}/{self.name}"
@@ -196,7 +200,7 @@ def case(settings: Config, scene: str, method: str) -> ProjectCase:
     chosen, _ = preset(settings, method)
     kind, source = kind_of(settings, method), source_scene(settings, scene, method)
     name, options = fit_name(settings, method), _options(settings, source, method)
-    found = ProjectCase(settings, source, scene, name, options, chosen.evaluate_on, kind)
+    found = ProjectCase(settings, source, scene, name, method, options, chosen.evaluate_on, kind)
     known = [*settings.priors.laws, IDENTIFIED]
     if getattr(options, "prior", None) not in (None, *known):
         raise InputError(

@@ -18,8 +18,10 @@ from neuma_lib.config.motion import MotionOptions
 
 if TYPE_CHECKING:
     import torch
+    from torch import Tensor
 
     from neuma_lib.io.checkpoint import Checkpoint
+    from neuma_lib.mechanics.law import Law
     from neuma_lib.methods.model import MotionModel
     from neuma_lib.sim.state import State
 
@@ -95,6 +97,10 @@ class Case(ABC):
     @abstractmethod
     def data(self, file: str) -> str:
         """Path of a file of the scene's data, for example ``dynamic/transforms.json``."""
+
+    @abstractmethod
+    def rollout(self) -> str:
+        """Path of the predicted motion."""
 
     @abstractmethod
     def product(self) -> str:
@@ -225,6 +231,10 @@ class Method(ABC):
         """Further files of `load_start` and `load_body`: one path a name."""
         return {}
 
+    def uncertainty_inputs(self, case: Case) -> Files:
+        """Files of `draws`: one path a name."""
+        return {}
+
     def fit_options(self, case: Case) -> dict[str, Any]:
         """Options of `fit` as plain values."""
         return case.options.plain()
@@ -300,6 +310,20 @@ class Method(ABC):
 
         files = (inputs[name] for name in ("particles", "binding", "gaussians"))
         return load_body(*files, density, carrier, gaussian_motion).to(torch.float32, device)
+
+    def draws(
+        self, inputs: Files, law: Law, F: Tensor | None, uncertainty: Mapping[str, Any], **drawn: Any
+    ) -> list[Law]:
+        """Laws drawn from what the video leaves open. Empty if the uncertainty is unknown.
+
+        Args:
+            inputs: the files of `uncertainty_inputs`.
+            law: from `load`.
+            F: deformation gradients that the body goes through, shape (T, N, 3, 3); None: read from `inputs`.
+            uncertainty: ``model_std`` and ``spread`` of the settings of `identify`.
+            drawn: ``dt`` [s], ``count`` and ``seed``.
+        """
+        return []
 
 
 def body_of_each_video(case: Case) -> Files:

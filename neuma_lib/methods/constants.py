@@ -25,3 +25,12 @@ class Constants(Method):
         from neuma_lib.methods.model import LawOnGrid
 
         return LawOnGrid(analytic_law(read_json(inputs["identified"])["law"], dt=dt))
+
+    def uncertainty_inputs(self, case: Case) -> Files:
+        return self.model_inputs(case)
+
+    def draws(self, inputs, law, F, uncertainty, **drawn):
+        from neuma_lib.evaluation.bands import constants_draws
+        from neuma_lib.io.files import read_json
+
+        return constants_draws(read_json(inputs["identified"]), uncertainty["model_std"], **drawn)

@@ -91,6 +91,24 @@ class Structured(Method):
         stable = read_weights(inputs["adaptor"])[1]["stable"]
         return LawOnGrid(load_law(None, inputs["adaptor"], dt), stable=stable)
 
+    def uncertainty_inputs(self, case: Case) -> Files:
+        if case.prior != IDENTIFIED:
+            return {}
+        return {"identified": case.result(case.identified()), "rollout": case.rollout()}
+
+    def draws(self, inputs, law, F, uncertainty, **drawn):
+        import torch
+
+        from neuma_lib.evaluation.bands import corrected_draws
+        from neuma_lib.io.files import read_json
+        from neuma_lib.io.hdf5 import read_arrays
+
+        if not inputs or law.elasticity.form != "stretch":
+            return []
+        if F is None:
+            F = torch.from_numpy(read_arrays(inputs["rollout"], required=("F",), only=("F",))[0]["F"])
+        return corrected_draws(law, read_json(inputs["identified"])["best"], F, **uncertainty, **drawn)
+
     def _base(self, case: Case) -> dict | None:
         """The analytic law of the prior, or None for the law identified in the video."""
         if case.prior == IDENTIFIED:

@@ -160,7 +160,9 @@ class Playground:
         return scalars.von_mises(self.law(self.chosen), snapshot.F.to(self.device)).cpu()
 
 
-def first_law(files: SceneFiles, laws: Mapping[str, ModelSource], preferred: Sequence[str] = ("neuma",)) -> str:
+def first_law(
+    files: SceneFiles, laws: Mapping[str, ModelSource], preferred: Sequence[str] = ("neuma",)
+) -> str:
     """The law that a scene's playground begins with: that of its own method, or else the first.
 
     Raises:
