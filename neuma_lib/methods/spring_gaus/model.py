@@ -9,6 +9,7 @@ import torch
 
 from neuma_lib.evaluation.motion import sound_frames
 from neuma_lib.io.springs import load_springs
+from neuma_lib.io.weights import read_weights
 from neuma_lib.methods.model import MotionModel
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.state import State, Trajectory
@@ -30,6 +31,7 @@ class SpringMotion(MotionModel):
 
     def __init__(self, path: str, options: Mapping[str, Any]):
         self._path, self._options = path, options
+        self.stable = read_weights(path)[1]["stable"]
 
     def predict(self, mpm: MPMModel, state: State, frames: Sequence[int], tracers=None, total=False):
         body, springs, about = self._on(state)
