@@ -69,12 +69,11 @@ class Lens:
         K[:2, 2] += HALF_PIXEL
         return Lens(self.width, self.height, K, np.zeros(5))
 
-    def undistort(self, image: np.ndarray, linear: bool = True) -> np.ndarray:
+    def undistort(self, image: np.ndarray) -> np.ndarray:
         """What the lens of `pinhole` would have seen.
 
         Args:
             image: (H, W) or (H, W, C), uint8 or float32.
-            linear: whether to interpolate between pixels; without it, labels stay labels.
         """
         if image.shape[:2] != (self.height, self.width):
             height, width = image.shape[:2]
@@ -89,8 +88,7 @@ class Lens:
         maps = cv2.initUndistortRectifyMap(
             self._opencv_K(), self.distortion, None, target, size, cv2.CV_32FC1
         )
-        method = cv2.INTER_LINEAR if linear else cv2.INTER_NEAREST
-        return cv2.remap(image, *maps, method, borderMode=cv2.BORDER_REPLICATE)
+        return cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def resized(self, longest: int) -> Lens:
         """The lens of pictures that were shrunk to a longer side of at most ``longest`` pixels."""

@@ -10,7 +10,7 @@ One that compares pictures with what was observed as it draws them, and keeps no
 ``compare(splats, depths, background, settings, observed, empty)``
     takes straight-alpha RGBA (I, H, W) as int32, R the lowest byte, and returns sums of squared differences from it
     over white, float64 (I, parts), an image's in as many parts as suit, and a tuple of tensors kept for the adjoint;
-``compare_adjoint(splats, kept, background, settings, scales, opacities, grad_splats, empty)``
+``compare_adjoint(splats, kept, background, settings, scales, opacities, grad_splats)``
     writes, like ``composite_adjoint``, the gradients of half of these sums, times the scale (I,) of each image; those
     with respect to the opacities mean nothing unless ``opacities`` asks for them.
 

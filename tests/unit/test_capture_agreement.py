@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from board_pictures import looking_at
 
 from neuma_lib.errors import InputError
 
@@ -14,15 +15,8 @@ K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
 RADII = np.array([0.12, 0.08, 0.06])
 
 
-def looking(eye, at=(0.1, 0.1, 0.0)):
-    eye, at = np.array(eye, float), np.array(at, float)
-    z = (at - eye) / np.linalg.norm(at - eye)
-    x = np.cross(z, (0, 1, 0))
-    x /= np.linalg.norm(x)
-    view = np.eye(4)
-    view[:3, :3] = np.stack([x, np.cross(z, x), z])
-    view[:3, 3] = -view[:3, :3] @ eye
-    return view
+def looking(eye):
+    return looking_at(np.array(eye, float), (0.1, 0.1, 0.0), up=(0.0, 1.0, 0.0))
 
 
 def ellipsoid_mask(view, centre=(0.1, 0.1, 0.0), radii=RADII):

@@ -24,11 +24,11 @@ pytest.importorskip("cv2")
 SETTINGS = CaptureConfig(board=BOARD)
 
 
-def reconstruction(viewmats, count=None, lens=LENS):
+def reconstruction(viewmats):
     """Poses as structure from motion gives them, of photographs and a camera `left`, the last."""
     names = [f"photographs/{i}.png" for i in range(len(viewmats) - 1)] + ["left/left.png"]
     points = np.random.default_rng(0).uniform(-0.1, 0.3, (50, 3))
-    return poses.Poses(tuple(names), (lens,) * len(names), viewmats, points, np.zeros((50, 3), np.uint8), 0.4)
+    return poses.Poses(tuple(names), (LENS,) * len(names), viewmats, points, np.zeros((50, 3), np.uint8), 0.4)
 
 
 def save(path, pixels, **options):

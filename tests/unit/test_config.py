@@ -318,7 +318,7 @@ class TestFinerTruth:
     def values(self, truth):
         return truth.grid, truth.dt, truth.particles
 
-    def test_it_is_as_fine_as_simulation_and_scene_by_default(self, raw, loaded):
+    def test_it_is_as_fine_as_simulation_and_scene_by_default(self, loaded):
         assert self.values(loaded.scene_truth("BouncyBall")) == (24, 1e-3, 8000)
         assert self.values(loaded.experiment_truth("letter_N_sand")) == (24, 5e-4, 8000)
 

@@ -83,11 +83,6 @@ PICTURED_SCENE = scenes_that(lambda scene: not scene.splat and not (scene.captur
 THROW_SCENE = scenes_that(lambda scene: scene.captured and scene.captured.throw, chains=False)
 
 
-def is_captured(name):
-    """Whether a scene, or a chain of it, is of a capture."""
-    return SETTINGS.scenes[name.split("+")[0]].captured is not None
-
-
 wildcard_constraints:
     scene=f"({'|'.join(SETTINGS.scenes) or 'none'})([+][^/]*)?",
     prior=f"({'|'.join(SETTINGS.priors.laws) or 'none'})([+]seed=[1-9][0-9]*)?",

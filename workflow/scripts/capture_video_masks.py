@@ -33,7 +33,7 @@ def main(inputs, output, params, run) -> None:
     down = -np.array(still["transform_matrix"])[1, :2] * [1.0, -1.0]
     own = {Path(file).stem: file for file in listed(inputs.own)}
     if own:
-        found = given_masks(_own(own, lens, params.longest, pixels, inputs.video), timeline.times, down)
+        found = given_masks(_own(own, lens, params.longest, pixels), timeline.times, down)
     else:
         plate = read_pixels(Path(inputs.room).parent / still["file_path"])
         found = video_masks(pixels, inputs.video, plate, timeline.times, down=down)
@@ -72,7 +72,7 @@ def main(inputs, output, params, run) -> None:
     run.say(said)
 
 
-def _own(own, lens, longest, pixels, video) -> np.ndarray:
+def _own(own, lens, longest, pixels) -> np.ndarray:
     masks = np.zeros((len(pixels), *pixels[0].shape[:2]), bool)
     for stem, file in own.items():
         if not stem.isdecimal() or int(stem) >= len(pixels):
