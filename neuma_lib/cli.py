@@ -315,9 +315,8 @@ def _export(options: argparse.Namespace) -> None:
 
 def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
     """The law of a method's folder, and what `export_law` needs to know of it."""
-    from neuma_lib.config.places import law_files, law_origin
+    from neuma_lib.config.cases import case, law_origin
     from neuma_lib.evaluation.law_export import head_commit
-    from neuma_lib.io.laws import load_laws
     from neuma_lib.project import settings_around
 
     if options.adaptor or options.dt:
@@ -330,13 +329,10 @@ def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
     settings, root = settings_around(place, options.configfile)
     settings = settings.model_copy(update={"results_root": str(place.parent.parent)})
     scene, method = place.parent.name, place.name
-    files = law_files(settings, scene, method)
     origin = law_origin(settings, scene, method)
-    law = load_laws(
-        origin["dt"],
-        [files.spec] if files.spec else [],
-        *([str(root / file)] if file else [] for file in (files.identified, files.prior, files.adaptor)),
-    )[0]
+    law = case(settings, scene, method).source().load(lambda file: root / file).law
+    if law is None:
+        raise InputError(options.source, "the motion of this method follows from no material law")
     beside = {"metrics": place / "metrics.json", "rollout": place / "rollout.h5"}
     of_this = {name: file for name, file in beside.items() if file.is_file() and origin["scene"] == scene}
     return law, {**origin, **of_this, "any_step": options.any_step, "commit": head_commit(root)}

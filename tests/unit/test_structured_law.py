@@ -8,7 +8,7 @@ from sim_scenes import cube, strained
 from test_materials import EYE, deformations, hencky_deviator, rotations, weights_of
 
 from neuma_lib.errors import InputError
-from neuma_lib.io.laws import load_law, load_laws, save_adaptor, save_prior
+from neuma_lib.io.laws import load_law, save_adaptor, save_prior
 from neuma_lib.io.weights import write_weights
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.isotropic import PAIRS, lame
@@ -633,7 +633,7 @@ def test_a_law_from_a_file_flows_as_much_in_a_second_at_any_time_step(tmp_path, 
     save_adaptor(path, law, rank, 16.0, {})
     half = load_law(None, path, dt=DT / 2)
     assert half.plasticity.rate == pytest.approx(2 * law.plasticity.rate)
-    (again,) = load_laws(DT, adaptors=[path])
+    again = load_law(None, path, DT)
     assert again.specification() == law.specification()
     for loaded in (half, again):
         for name, part in loaded.parts.items():

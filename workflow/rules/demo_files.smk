@@ -2,7 +2,6 @@
 
 from neuma_lib.capture.planned import PREFIX, photograph_files
 from neuma_lib.capture.scenes import scene_name, training_takes
-from neuma_lib.config.methods import LAW_FROM
 
 DEMO = SETTINGS.captures.demo
 DEMO_DATA = f"{DATA}/captures_demo"

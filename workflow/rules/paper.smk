@@ -57,7 +57,7 @@ rule random_table:
         markdown=f"{RESULTS}/random.md",
     params:
         scenes=random_scenes(),
-        titles={method: SETTINGS.method_title(method) for method in SETTINGS.random.methods},
+        titles={method: cases.title(SETTINGS, method) for method in SETTINGS.random.methods},
         seed=SETTINGS.random.seed,
     script:
         "../scripts/random_table.py"

@@ -8,9 +8,8 @@ from neuma_lib.capture.agreement import check_one_object
 from neuma_lib.capture.flight import Filmed, draw_flight, find_flight, report
 from neuma_lib.capture.mattes import metric_camera
 from neuma_lib.capture.timing import read_sound
-from neuma_lib.io.files import read_json, write_json
+from neuma_lib.io.files import listed, read_json, write_json
 from neuma_lib.io.images import read_image_set, read_transforms
-from workflow.inputs import listed
 from workflow.stage import run_script
 
 

@@ -17,8 +17,7 @@ from neuma_lib.capture.redrawn_masks import redrawn_masks
 from neuma_lib.capture.saliency import Saliency
 from neuma_lib.config.board import BoardConfig
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import read_json, write_json
-from workflow.inputs import listed
+from neuma_lib.io.files import listed, read_json, write_json
 from workflow.stage import run_script
 
 _STEPS = 4  # of progress, one for the network's masks

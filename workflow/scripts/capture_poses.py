@@ -7,7 +7,7 @@ from neuma_lib.capture.drawing import draw_poses
 from neuma_lib.capture.folder import PHOTOGRAPHS
 from neuma_lib.capture.poses import find_poses, save_poses
 from neuma_lib.config.capture import BoardConfig
-from workflow.inputs import listed
+from neuma_lib.io.files import listed
 from workflow.stage import run_script
 
 

@@ -11,13 +11,12 @@ from neuma_lib.capture.pictures import picture_sheet
 from neuma_lib.errors import InputError
 from neuma_lib.fitting.registration import Parabola, register
 from neuma_lib.fitting.rigid_views import Sight
-from neuma_lib.io.files import atomic, read_json, write_json
+from neuma_lib.io.files import atomic, listed, read_json, write_json
 from neuma_lib.io.gaussians import load_gaussians, save_gaussians
 from neuma_lib.io.images import read_image_set, read_transforms
 from neuma_lib.io.particles import load_particles, save_particles
 from neuma_lib.io.ply import read_ply, write_ply
 from neuma_lib.splatting.rigid import moved
-from workflow.inputs import listed
 from workflow.stage import run_script
 
 KNOWN_SPIN = 3.0

@@ -11,8 +11,7 @@ from neuma_lib.evaluation.capture_doubts import (
     prediction_warnings,
 )
 from neuma_lib.evaluation.capture_report import Film, Report, page
-from neuma_lib.io.files import read_json, write_text
-from workflow.inputs import listed
+from neuma_lib.io.files import listed, read_json, write_text
 from workflow.stage import run_script
 
 

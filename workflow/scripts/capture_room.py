@@ -8,8 +8,7 @@ from neuma_lib.capture.pictures import name_pictures
 from neuma_lib.capture.poses import load_poses
 from neuma_lib.capture.room import find_room, write_room
 from neuma_lib.config.capture import CaptureConfig
-from neuma_lib.io.files import write_json
-from workflow.inputs import listed
+from neuma_lib.io.files import listed, write_json
 from workflow.stage import run_script
 
 

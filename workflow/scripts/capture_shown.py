@@ -7,9 +7,8 @@ from neuma_lib.capture.lens import read_lens
 from neuma_lib.capture.mattes import read_pixels, room_frames
 from neuma_lib.capture.pictures import undistorted
 from neuma_lib.capture.shown import numbers_of, shown_frames
-from neuma_lib.io.files import read_json
+from neuma_lib.io.files import listed, read_json
 from neuma_lib.io.images import read_transforms, write_transforms
-from workflow.inputs import listed
 from workflow.stage import run_script
 
 

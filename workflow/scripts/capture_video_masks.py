@@ -11,8 +11,7 @@ from neuma_lib.capture.mattes import own_mask, read_pixels, room_frames, world_o
 from neuma_lib.capture.pictures import undistorted
 from neuma_lib.capture.video_masks import given_masks, video_masks
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import read_json, write_json
-from workflow.inputs import listed
+from neuma_lib.io.files import listed, read_json, write_json
 from workflow.stage import run_script
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from neuma_lib.capture.frames import read_frames, read_timeline
 from neuma_lib.capture.pictures import picture_sheet, read_picture
-from workflow.inputs import listed
+from neuma_lib.io.files import listed
 from workflow.stage import run_script
 
 COLUMNS = 4

@@ -201,5 +201,6 @@ def write_video(path: str | Path, pictures: Sequence[np.ndarray], rate: int, qua
     with atomic(path) as partial:
         source = f"-y -v error -f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {rate} -i -"
         target = f"-c:v libx264 -crf {quality} -pix_fmt yuv420p -threads 1 -f mp4"
-        command = [require("imageio_ffmpeg", "capture").get_ffmpeg_exe(), *source.split(), *target.split(), str(partial)]
+        ffmpeg = require("imageio_ffmpeg", "capture").get_ffmpeg_exe()
+        command = [ffmpeg, *source.split(), *target.split(), str(partial)]
         subprocess.run(command, input=np.stack(pictures).tobytes(), check=True)
