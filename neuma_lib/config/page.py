@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import typing
 from collections.abc import Iterator
@@ -39,7 +40,7 @@ def settings_markdown() -> str:
     lines = [INTRODUCTION]
     for kind, (first, *others) in places.items():
         heading = f"`{first}`" if "<" in first else first  # a bare <name> would be read as HTML
-        lines += [f"## {heading}", "", kind.__doc__ or ""]
+        lines += [f"## {heading}", "", inspect.cleandoc(kind.__doc__ or "")]
         lines += ["", f"Also {', '.join(f'`{path}`' for path in others)}."] if others else []
         lines += ["", "| key | type | default | meaning |", "|---|---|---|---|"]
         for key, entry in kind.model_fields.items():
