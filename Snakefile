@@ -1,4 +1,4 @@
-"""From nothing to the tables of the paper. `snakemake --cores 2 results/table1.csv`; docs/guide.md tells the rest."""
+"""From nothing to the tables of the paper. `snakemake --cores 2 results/table1.csv`; docs/install.md explains more."""
 
 
 configfile: "config/config.yaml"

@@ -63,7 +63,7 @@ def judge(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str, 
     data, results = Path(settings.data_root) / name, Path(settings.results_root) / name
     mesh = read_mesh(results / "mesh.ply")
     finer = [
-        body.refilled(
+        body.resampled(
             torch.from_numpy(sample_volume(mesh, chosen.particles, seed)),
             mesh.volume,
             scene.density,

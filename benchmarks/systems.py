@@ -31,7 +31,7 @@ from neuma_lib.fitting.springs import fit_springs
 from neuma_lib.io.files import read_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_observation, load_views
-from neuma_lib.io.particles import load_body, thrown
+from neuma_lib.io.particles import load_body, with_motion
 from neuma_lib.io.radiance import load_field, save_field
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.springs.body import SpringBody
@@ -65,7 +65,7 @@ def judge_pac_nerf(name: str, settings: Config, method: str, fields: Path) -> st
     body, truth = load_body(*files, density).to(torch.float32), _tracers(data)
     law = analytic_law(constants.specification(), dt=model.dt)
     errors = {}
-    for start in (body.state(fit.velocity), thrown(body, results / "velocity.json")):
+    for start in (body.state(fit.velocity), with_motion(body, results / "velocity.json")):
         path, failure = predict(model, law, start, video.frames, truth[0])
         errors[len(errors)] = tracer_errors(path.tracers, truth)
     said = f"{errors[0]['tracer_rmse_mm']:.2f} mm, last frame {errors[0]['tracer_rmse_last_mm']:.2f} mm (thrown as our"
@@ -85,7 +85,7 @@ def judge(name: str, settings: Config, method: str) -> str:
         torch.float32
     )
     video = load_observation(data / "dynamic/transforms.json", material.views).to(torch.float32)
-    start, density = thrown(body, results / "velocity.json"), float(body.mass.sum() / body.vol0.sum())
+    start, density = with_motion(body, results / "velocity.json"), float(body.mass.sum() / body.vol0.sum())
     network = (how.anchors, how.neighbours, how.hard_springs, how.exponent, how.carriers)
     model = SpringModel.of(simulator(settings, scene), how.substeps)
     before = _core_seconds()

@@ -116,7 +116,7 @@ def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
     with clock.part("finer bodies"):
         mesh = read_mesh(results / "mesh.ply")
         finer = [
-            body.refilled(
+            body.resampled(
                 torch.from_numpy(sample_volume(mesh, chosen.particles, seed)),
                 mesh.volume,
                 scene.density,

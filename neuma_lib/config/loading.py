@@ -116,8 +116,9 @@ def _complete(scenes: Mapping[str, Any]) -> dict[str, Any]:
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
     """A YAML file as a dict. Raises InputError naming the file when it is missing or not a mapping."""
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same values, several times as fast
     try:
-        content = yaml.safe_load(Path(path).read_text())
+        content = yaml.load(Path(path).read_text(), Loader=loader)
     except FileNotFoundError:
         raise InputError(f"{path} does not exist: give the path of an existing settings file") from None
     except yaml.YAMLError as error:

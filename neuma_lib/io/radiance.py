@@ -15,27 +15,26 @@ from neuma_lib.radiance.rendering import Opacity
 
 
 def save_field(path: str | Path, field: RadianceField, metadata: Mapping[str, Any]) -> None:
-    """Write densities, features and network to safetensors, with where the nodes are and more metadata."""
+    """Write densities, features and network to safetensors, with the lattice, the opacity and more metadata."""
     lattice, opacity = field.lattice, field.opacity
-    place = {"origin": lattice.origin, "voxel": lattice.voxel, "nodes": lattice.nodes}
+    nodes = {"origin": lattice.origin, "voxel": lattice.voxel, "nodes": lattice.nodes}
     activation = {"initial": opacity.initial, "base_voxel": opacity.base_voxel}
-    write_weights(path, field.state_dict(), {**metadata, "lattice": place, "opacity": activation})
+    write_weights(path, field.state_dict(), {**metadata, "lattice": nodes, "opacity": activation})
 
 
 def load_field(path: str | Path) -> tuple[RadianceField, dict[str, Any]]:
-    """A field, without gradient, and the metadata of its file.
+    """A field without gradients, and the metadata of its file.
 
     Raises:
         InputError: missing, damaged or foreign file.
     """
     tensors, metadata = read_weights(path)
     try:
-        place = metadata["lattice"]
-        lattice = Lattice(tuple(place["origin"]), float(place["voxel"]), tuple(place["nodes"]))
+        nodes = metadata["lattice"]
+        lattice = Lattice(tuple(nodes["origin"]), float(nodes["voxel"]), tuple(nodes["nodes"]))
         field = RadianceField(lattice, Opacity(**metadata["opacity"]))
         field.load_state_dict(tensors)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise InputError(
-            f"{path} is no voxel radiance field ({one_line(error)}): run the rule radiance_field again"
-        ) from None
+        problem = f"is not a voxel radiance field: {one_line(error)}"
+        raise InputError(path, problem, "Run the rule radiance_field again") from None
     return field.requires_grad_(False), metadata

@@ -29,10 +29,10 @@ def save_springs(path: str | Path, body: SpringBody, springs: Springs, metadata:
 
 
 def load_springs(path: str | Path, like: Tensor) -> tuple[Tensor, Springs, dict[str, Any]]:
-    """Springs with their network, in the precision and on the device of a tensor.
+    """Springs with their network, with the dtype and device of ``like``.
 
     Returns:
-        the particles that are anchors, int64, shape (A,); the springs; the metadata of their file.
+        indices of the particles that are anchors, int64, shape (A,); the springs; the metadata of the file.
 
     Raises:
         InputError: missing or foreign file.
@@ -44,10 +44,10 @@ def load_springs(path: str | Path, like: Tensor) -> tuple[Tensor, Springs, dict[
     expected |= dict(zip(_PARAMETERS, [(A,), *4 * [(1,)]], strict=True))
     hard, exponent = metadata.get("hard"), metadata.get("exponent")
     if shapes != expected or not A or type(hard) is not int or not isinstance(exponent, float):
-        raise InputError(f"{path} holds no network of springs: run the rule springs again")
+        raise InputError(path, "is not a network of springs", "Run the rule springs again")
     neighbours, index = tensors["neighbours"], tensors["index"]
     if not (0 <= int(neighbours.min()) and int(neighbours.max()) < A and 0 <= int(index.min())):
-        raise InputError(f"{path} names anchors that it does not hold: run the rule springs again")
+        raise InputError(path, "refers to anchors that do not exist", "Run the rule springs again")
     network = SpringNetwork(tensors["anchors"], neighbours, tensors["rest"], hard, exponent)
     springs = Springs(network.to(like.dtype, like.device), 1.0, 1.0)
     with torch.no_grad():

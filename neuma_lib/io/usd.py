@@ -1,4 +1,4 @@
-"""A moving surface as USD (Universal Scene Description): a mesh whose points have time samples."""
+"""A moving surface as USD (Universal Scene Description): a mesh with time samples of its points."""
 
 from __future__ import annotations
 
@@ -6,26 +6,23 @@ from pathlib import Path
 
 import numpy as np
 
-from neuma_lib.errors import InputError
+from neuma_lib.extras import require
 from neuma_lib.io.files import atomic
 from neuma_lib.io.gltf import linear
 
 CODES_A_SECOND = 24.0
-"""Time codes of USD to a second; frames lie between them where their times do."""
+"""USD time codes per second; frames may have fractional codes."""
 
 
 def write_usd(
     path: str | Path, vertices: np.ndarray, faces: np.ndarray, times: np.ndarray, colors: np.ndarray
 ) -> None:
-    """Write a moving surface, y up, in metres; arguments as of `write_glb`. The ending says the format: usda, usdc.
+    """Write a moving surface, y up, in metres; arguments as for `write_glb`. The suffix sets the format: usda, usdc.
 
     Raises:
         InputError: usd-core is missing.
     """
-    try:
-        from pxr import Gf, Usd, UsdGeom, Vt
-    except ImportError as error:
-        raise InputError(f"USD is written with usd-core ({error}): install it with `make viewer`") from None
+    Gf, Usd, UsdGeom, Vt = (require(f"pxr.{name}", "viewer") for name in ("Gf", "Usd", "UsdGeom", "Vt"))
     codes = np.asarray(times, np.float64) * CODES_A_SECOND
     with atomic(path) as partial:
         partial.unlink(missing_ok=True)

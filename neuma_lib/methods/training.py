@@ -14,7 +14,7 @@ from neuma_lib.fitting.material import ParticleLoss, PixelLoss
 from neuma_lib.io.files import listed, write_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_videos
-from neuma_lib.io.particles import load_body, thrown
+from neuma_lib.io.particles import load_body, with_motion
 from neuma_lib.mechanics.adaptor import AdaptableLaw
 from neuma_lib.methods.base import Files, FitRun, Problem
 from neuma_lib.sim.model import MPMModel
@@ -47,7 +47,7 @@ class Training:
             )
             for files, density in zip(parts, problem.densities, strict=True)
         ]
-        self.starts = [thrown(body, f) for body, f in zip(bodies, listed(inputs["velocity"]), strict=True)]
+        self.starts = [with_motion(body, f) for body, f in zip(bodies, listed(inputs["velocity"]), strict=True)]
         if settings.supervision == "particles":
             self.losses = [particle_loss(file, run.device) for file in listed(inputs["truth"])]
         else:

@@ -1,12 +1,12 @@
-"""The rasterizer by the gsplat package (1.5.3), for comparison and as an alternative on CUDA in float32.
+"""The rasterizer of the gsplat package (1.5.3), for comparison and as an alternative on CUDA in float32.
 
-gsplat is imported at the first call only. Projection, colours, blur, near plane and depth order follow the same
-conventions as ours. Constants that gsplat fixes in its kernels:
+gsplat is imported at the first call. Projection, colours, blur, near plane and depth order follow our conventions.
+Constants in the kernels of gsplat:
 
-- alpha counts from 1/255 on, as our default;
-- alpha is limited to 0.999, ours to 0.99 by default: images differ where a Gaussian is more opaque than that;
-- a pixel ends where its transmittance would become 1e-4 or less, ours where it would fall below 1e-4;
-- a splat ends 3.33 standard deviations from its centre, which is where an opacity of 1 reaches 1/255.
+- alpha below 1/255 is ignored, as by default here;
+- alpha is limited to 0.999, here to 0.99 by default, so images of more opaque Gaussians differ;
+- a pixel ends before its transmittance becomes <= 1e-4, here before < 1e-4;
+- a splat ends 3.33 standard deviations from its centre, where an opacity of 1 gives 1/255.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ TRANSMITTANCE_MIN = 1e-4
 
 
 def rasterize(means, covars, opacities, sh, viewmats, Ks, background, settings: Settings):
-    """Images (T, V, H, W, 3) and alphas (T, V, H, W); arguments as of ``rasterizer.rasterize``, checked by it.
+    """Images (T, V, H, W, 3) and alphas (T, V, H, W); arguments as for ``rasterizer.rasterize``, which checks them.
 
     ``settings.alpha_max`` has no effect (see above).
 
     Raises:
-        InputError: gsplat is not installed, or a threshold is not the one that gsplat fixes.
+        InputError: gsplat is not installed, or a threshold differs from that of gsplat.
     """
     try:
         import gsplat
     except ImportError as error:
-        raise InputError(
-            f"rasterize: compositor 'gsplat' cannot import that package ({error}); "
-            "install gsplat==1.5.3 and a CUDA compiler, or leave the compositor out"
-        ) from error
+        problem = f"gsplat cannot be imported: {error}"
+        remedy = "Install gsplat==1.5.3 and a CUDA compiler, or omit the compositor"
+        raise InputError("rasterize: compositor", problem, remedy) from error
     if not (
         math.isclose(settings.alpha_min, ALPHA_MIN)
         and math.isclose(settings.transmittance_min, TRANSMITTANCE_MIN)
     ):
         raise InputError(
-            "rasterize: compositor 'gsplat' has alpha_min = 1/255 and transmittance_min = 1e-4 built in, "
-            f"not {settings.alpha_min:g} and {settings.transmittance_min:g}; leave them out or change the compositor"
+            "rasterize: alpha_min, transmittance_min",
+            "the compositor 'gsplat' requires 1/255 and 1e-4, not "
+            f"{settings.alpha_min:g} and {settings.transmittance_min:g}",
         )
     T, G, V = means.shape[0], means.shape[1], viewmats.shape[0]
-    # quaternions and scales are not read where covariances are given
+    # quaternions and scales are unused if covariances are given
     images, alphas, _ = gsplat.rasterization(
         means,
         None,

@@ -17,7 +17,7 @@ from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.volume import sample_volume
-from neuma_lib.io.particles import load_body, thrown
+from neuma_lib.io.particles import load_body, with_motion
 from neuma_lib.mechanics.law import Law
 from neuma_lib.methods.base import ModelSource
 from neuma_lib.sim.model import MPMModel
@@ -67,7 +67,9 @@ class Playground:
         paths = [files.checked(path) for path in (files.particles, files.binding, files.gaussians)]
         first = load_body(*paths, files.density, gaussian_motion="affine").to(torch.float32)
         start = (
-            thrown(first, files.checked(files.velocity)) if files.velocity else first.state((0.0, 0.0, 0.0))
+            with_motion(first, files.checked(files.velocity))
+            if files.velocity
+            else first.state((0.0, 0.0, 0.0))
         )
         self._density = (
             files.density if isinstance(files.density, int | float) else float(start.density.mean())

@@ -5,7 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import grimp
 import pytest
 
 from neuma_lib.config import cases, loading
@@ -14,6 +13,8 @@ from neuma_lib.config.page import settings_markdown
 from neuma_lib.config.settings import Config
 from neuma_lib.config.variants import DRAWN, folder, parse_chain
 from neuma_lib.errors import InputError
+
+pytestmark = pytest.mark.core
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -413,6 +414,7 @@ def test_plain_values_build_the_section_again(loaded):
 
 def test_a_stage_depends_on_its_own_settings_alone_and_settings_on_no_torch():
     """So an edit of the figures' settings does not fit the Gaussians anew, and a plan is made in no time."""
+    grimp = pytest.importorskip("grimp")
     graph = grimp.build_graph("neuma_lib", include_external_packages=True)
     reached = graph.find_upstream_modules("neuma_lib.fitting.gaussians")
     assert {m for m in reached if m.startswith("neuma_lib.config")} == {

@@ -16,6 +16,8 @@ from neuma_lib.methods.model import LawOnGrid
 from neuma_lib.sim.rollout import rollout
 from tests.support.errors import refused
 
+pytestmark = pytest.mark.core
+
 V0 = torch.tensor([0.3, -1.5, 0.1], dtype=torch.float64)
 LAW = analytic_law(TRUTH, MODEL.dt)
 IN_FLIGHT = [0, 5, 10, 20]

@@ -8,16 +8,18 @@ import torch
 from grounding_scene import ball
 from PIL import Image
 
-from neuma_lib.errors import InputError
 from neuma_lib.io.files import atomic, read_json, write_json
 from neuma_lib.io.gaussians import load_gaussians, save_gaussians
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.io.images import load_observation, read_image_set, write_transforms
 from neuma_lib.io.mesh import read_mesh, write_mesh
-from neuma_lib.io.particles import thrown
+from neuma_lib.io.particles import with_motion
 from neuma_lib.io.ply import read_ply, write_ply
 from neuma_lib.io.weights import read_weights, write_weights
 from neuma_lib.splatting.gaussians import Gaussians
+from tests.support.errors import refused
+
+pytestmark = pytest.mark.core
 
 RNG = np.random.default_rng(0)
 
@@ -51,9 +53,9 @@ def test_the_name_keeps_its_ending_while_written(tmp_path):
 
 def test_json(tmp_path):
     (tmp_path / "broken.json").write_text('{"a": ')
-    with pytest.raises(InputError, match=r"broken\.json cannot be read as JSON"):
+    with refused("broken.json"):
         read_json(tmp_path / "broken.json")
-    with pytest.raises(InputError, match=r"absent\.json does not exist"):
+    with refused("absent.json"):
         read_json(tmp_path / "absent.json")
 
 
@@ -89,16 +91,15 @@ def test_arrays_round_trip_with_units(tmp_path):
 def test_arrays_problems(tmp_path):
     path = tmp_path / "particles.h5"
     write_arrays(path, trajectory())
-    with pytest.raises(InputError, match=r"particles\.h5 has no dataset v, tracers"):
+    with refused("particles.h5") as error:
         read_arrays(path, required=("x", "v", "tracers"))
+    assert "v, tracers" in error.value.problem
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match=r"particles\.h5 cannot be read as HDF5"):
+    with refused("particles.h5"):
         read_arrays(path)
     write_arrays(path, {"x": np.full((2, 3), np.nan)})
-    with pytest.raises(
-        InputError, match=r"particles\.h5 cannot be read as HDF5 \(x holds values that are not finite"
-    ):
+    with refused("particles.h5"):
         read_arrays(path)
 
 
@@ -169,38 +170,36 @@ def test_camera_angle_and_own_intrinsics_of_a_frame(image_set):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "where"),
     [
+        (lambda d: [d.pop(k) for k in ("fl_x", "fl_y")], "transforms.json: frame 0 (d_1_005.png)"),
+        (lambda d: d.update(fl_x=-3), "frame 0 (d_1_005.png): fl_x"),
+        (lambda d: d.update(frames=[]), "transforms.json: frames"),
+        (lambda d: d["frames"][2].pop("file_path"), "frame 2"),
+        (lambda d: d["frames"][2].pop("transform_matrix"), "frame 2 (d_1_000.png): transform_matrix"),
         (
-            lambda d: [d.pop(k) for k in ("fl_x", "fl_y")],
-            r"transforms\.json: frame 0 \(d_1_005\.png\) has no intrinsics",
+            lambda d: d["frames"][1].update(transform_matrix=(2 * np.eye(4)).tolist()),
+            "frame 1 (d_0_005.png): transform_matrix",
         ),
-        (lambda d: d.update(fl_x=-3), r"fl_x must be a positive number, not -3"),
-        (lambda d: d.update(frames=[]), "'frames' is missing or empty"),
-        (lambda d: d["frames"][2].pop("file_path"), "frame 2 has no file_path"),
-        (
-            lambda d: d["frames"][2].pop("transform_matrix"),
-            r"frame 2 \(d_1_000\.png\) needs a 4x4 transform_matrix",
-        ),
-        (lambda d: d["frames"][1].update(transform_matrix=(2 * np.eye(4)).tolist()), "not a rigid motion"),
-        (lambda d: d.update(w=32), "w, h of d_1_005.png are 32x12, the image is 16x12"),
+        (lambda d: d.update(w=32), "w, h of d_1_005.png"),
     ],
 )
-def test_bad_transforms(image_set, change, message):
+def test_bad_transforms(image_set, change, where):
     edit(image_set, change)
-    with pytest.raises(InputError, match=message):
+    with refused(where):
         read_image_set(image_set)
 
 
 def test_missing_image(image_set):
     (image_set.parent / "d_1_002.png").unlink()
-    with pytest.raises(InputError, match=r"d_1_002\.png is missing although .*--forcerun"):
+    with refused("d_1_002.png") as error:
         read_image_set(image_set)
+    assert "--forcerun" in error.value.remedy
 
 
 def test_changed_image(image_set):
     Image.new("RGBA", (16, 12), (1, 2, 3, 255)).save(image_set.parent / "d_0_000.png")
-    with pytest.raises(InputError, match=r"d_0_000\.png is damaged or was changed"):
+    with refused("d_0_000.png"):
         read_image_set(image_set)
 
 
@@ -213,33 +212,34 @@ def test_truncated_png(image_set):
     edit(image_set, without_checksums)
     path = image_set.parent / "d_0_000.png"
     path.write_bytes(path.read_bytes()[:-40])
-    with pytest.raises(InputError, match=r"d_0_000\.png cannot be read as an image"):
+    with refused("d_0_000.png"):
         read_image_set(image_set)
 
 
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        (Image.new("RGB", (16, 12)), "has no alpha channel"),
-        (Image.new("RGBA", (16, 12), (9, 9, 9, 0)), r"the mask \(alpha\) is empty"),
-        (Image.new("RGBA", (12, 16), (9, 9, 9, 255)), "is 12x16, others 16x12"),
+        (Image.new("RGB", (16, 12)), "alpha channel"),
+        (Image.new("RGBA", (16, 12), (9, 9, 9, 0)), "empty"),
+        (Image.new("RGBA", (12, 16), (9, 9, 9, 255)), "12x16"),
         (Image.new("I;16", (16, 12)), "16 bits"),
     ],
 )
 def test_unusable_images(image_set, image, message):
     edit(image_set, without_checksums)
     image.save(image_set.parent / "d_0_000.png")
-    with pytest.raises(InputError, match=rf"d_0_000\.png.*{message}"):
+    with refused("d_0_000.png") as error:
         read_image_set(image_set)
+    assert message in error.value.problem
 
 
 def test_views_that_do_not_exist_or_do_not_match(image_set):
-    with pytest.raises(InputError, match="view 7 is not among the filmed views"):
+    with refused("views"):
         read_image_set(image_set).video([7])
-    with pytest.raises(InputError, match=r"transforms\.json: view 7 is not .*dataset\.dynamic\.views"):
+    with refused("transforms.json: view 7"):
         load_observation(image_set, [0, 7])
     edit(image_set, lambda d: d["frames"].pop(0))
-    with pytest.raises(InputError, match="not filmed at the same steps"):
+    with refused("views"):
         read_image_set(image_set).video([0, 1])
 
 
@@ -267,22 +267,27 @@ def test_bad_meshes(tmp_path):
     vertices = mesh.vertices.copy()
     vertices[3, 1] = np.nan
     write_mesh(path, vertices, mesh.faces)
-    with pytest.raises(InputError, match=r"mesh\.ply: vertex 3 of 8 is not finite"):
+    with refused("mesh.ply") as error:
         read_mesh(path)
+    assert "vertex 3 of 8" in error.value.problem
     write_mesh(path, mesh.vertices, mesh.faces[1:])
-    with pytest.raises(InputError, match=r"mesh\.ply is not watertight.*close its holes"):
+    with refused("mesh.ply") as error:
         read_mesh(path)
+    assert "watertight" in error.value.problem
     assert len(read_mesh(path, watertight=False).faces) == 11
     write_mesh(path, mesh.vertices, mesh.faces[:, ::-1])
-    with pytest.raises(InputError, match="faces point inwards"):
+    with refused("mesh.ply") as error:
         read_mesh(path)
+    assert "inwards" in error.value.problem
     write_mesh(path, mesh.vertices, mesh.faces)
     path.write_bytes(path.read_bytes()[:-7])
-    with pytest.raises(InputError, match=r"mesh\.ply cannot be read as PLY .*claims"):
+    with refused("mesh.ply") as error:
         read_mesh(path)
+    assert "claims" in error.value.problem
     path.write_bytes(b"solid nothing")
-    with pytest.raises(InputError, match="cannot be read as PLY .*no header"):
+    with refused("mesh.ply") as error:
         read_mesh(path)
+    assert "no header" in error.value.problem
 
 
 # ---- Gaussians
@@ -337,25 +342,29 @@ def test_gaussians_have_the_layout_of_the_3dgs_release(tmp_path):
 def test_bad_gaussians(tmp_path):
     path = tmp_path / "g.ply"
     write_mesh(path, cube().vertices, cube().faces)
-    with pytest.raises(InputError, match=r"g\.ply misses the properties f_dc_0, .*opacity.*rot_3"):
+    with refused("g.ply") as error:
         load_gaussians(path)
+    assert all(name in error.value.problem for name in ("f_dc_0", "opacity", "rot_3"))
     broken = random_gaussians()
     broken.means[4, 0] = np.inf
     save_gaussians(path, broken)
-    with pytest.raises(InputError, match=r"g\.ply: means of Gaussian 4 is not finite"):
+    with refused("g.ply") as error:
         load_gaussians(path)
+    assert "means of Gaussian 4" in error.value.problem
     rows = read_ply(path)[0].copy()
     rows["x"], rows["opacity"][:3] = 0.0, [np.inf, -np.inf, np.nan]
     write_ply(path, rows)
-    with pytest.raises(InputError, match=r"g\.ply: opacities of Gaussian 2 is not finite"):
+    with refused("g.ply") as error:
         load_gaussians(path)
+    assert "opacities of Gaussian 2" in error.value.problem
     rows["opacity"][2] = 0.0
     write_ply(path, rows)
     assert load_gaussians(path).opacities[:3].tolist() == [1.0, 0.0, 0.5], "converters from .spz write these"
     save_gaussians(path, random_gaussians(bands=4))
     path.write_bytes(path.read_bytes().replace(b"property float f_rest_8\n", b"property float other\n"))
-    with pytest.raises(InputError, match="8 f_rest_"):
+    with refused("g.ply") as error:
         load_gaussians(path)
+    assert "8 f_rest_" in error.value.problem
 
 
 # ---- weights
@@ -371,11 +380,12 @@ def test_weights(tmp_path):
     assert metadata == {"rank": 4, "settings": {"lr": 0.1}}
     assert all(torch.equal(found[name], tensors[name]) for name in tensors)
     path.write_bytes(path.read_bytes()[:-9])
-    with pytest.raises(InputError, match=r"adaptor\.safetensors cannot be read as safetensors"):
+    with refused("adaptor.safetensors"):
         read_weights(path)
     write_weights(path, {"B": torch.tensor([1.0, float("nan")])}, {})
-    with pytest.raises(InputError, match="B is not finite"):
+    with refused("adaptor.safetensors") as error:
         read_weights(path)
+    assert "B is not finite" in error.value.problem
 
 
 # ---- same content, same bytes
@@ -411,5 +421,5 @@ def test_an_identified_start_throws_as_a_velocity_does(tmp_path):
     motion = {"v0": [0.1, -1.0, 0.2], "angular_velocity": [1.0, 2.0, 3.0], "centre": [0.5, 0.3, 0.5]}
     write_json(tmp_path / "velocity.json", motion)
     write_json(tmp_path / "identified.json", {"law": {}, "start": motion})
-    one, other = (thrown(body, tmp_path / f"{name}.json") for name in ("velocity", "identified"))
+    one, other = (with_motion(body, tmp_path / f"{name}.json") for name in ("velocity", "identified"))
     assert torch.equal(one.v, other.v) and torch.equal(one.C, other.C) and one.C.any()

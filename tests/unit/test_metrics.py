@@ -22,6 +22,7 @@ from neuma_lib.evaluation.reports import benchmark_table, report_table
 from neuma_lib.evaluation.video import side_by_side, write_gif, write_mp4
 from neuma_lib.geometry.chamfer import chamfer, chamfer_loss, chamfer_sequence
 from neuma_lib.geometry.volume import sample_volume
+from tests.support.errors import refused
 
 
 def points(*shape, seed=0):
@@ -67,7 +68,7 @@ def test_chamfer_loss_and_its_gradient():
 
 
 def test_chamfer_loss_names_what_is_wrong():
-    with pytest.raises(InputError, match="2 frames against 1"):
+    with refused("chamfer_loss"):
         chamfer_loss(points(2, 5), [points(5)])
     broken = points(2, 5)
     broken[1, 3, 0] = float("nan")
@@ -191,11 +192,11 @@ def test_image_measures_agree_with_scikit_image():
 
 
 def test_unusable_points_and_images_are_named():
-    with pytest.raises(InputError, match="not finite"):
+    with refused("chamfer: b"):
         chamfer(points(4), torch.full((4, 3), float("inf")))
-    with pytest.raises(InputError, match="non-empty"):
+    with refused("chamfer: b"):
         chamfer(points(4), torch.zeros(0, 3))
-    with pytest.raises(InputError, match="frames against"):
+    with refused("chamfer"):
         chamfer_sequence(points(2, 4), points(3, 4))
     with pytest.raises(InputError, match="do not match"):
         psnr(np.zeros((4, 4, 3)), np.zeros((4, 5, 3)))

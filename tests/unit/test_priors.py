@@ -22,6 +22,8 @@ from neuma_lib.mechanics.law import Law, Plasticity
 from neuma_lib.mechanics.neural import PLASTIC_SCALE
 from neuma_lib.mechanics.singular_values import svd3
 
+pytestmark = pytest.mark.core
+
 JELLY = {"elasticity": {"name": "fixed_corotated", "E": 1e5, "nu": 0.2}, "plasticity": {"name": "identity"}}
 PLASTICINE = {
     "elasticity": {"name": "hencky", "E": 3e5, "nu": 0.25},
@@ -47,7 +49,7 @@ OTHERS = {
     },
 }
 ROUGH = {"StVK + Drucker-Prager"}
-"""Laws whose return map a network of the published size follows only roughly: docs/guide.md, How close is a prior."""
+"""Laws whose return map a network of the published size follows only roughly: docs/materials.md, Priors."""
 LAWS = {"jelly": JELLY, "plasticine": PLASTICINE, "sand": SAND, "water": WATER, **OTHERS}
 TINY = RegressionConfig(
     throws=2, side_particles=4, grid=12, duration=0.15, samples=4096, iterations=500, batch=512, rounds=2

@@ -7,8 +7,8 @@ import pytest
 import torch
 from PIL import Image
 
-from neuma_lib.errors import InputError
 from neuma_lib.io.images import list_images, load_observation, read_image_set
+from tests.support.errors import refused
 
 K = [[40.0, 0.0, 16.0], [0.0, 41.0, 15.0], [0.0, 0.0, 1.0]]
 
@@ -61,24 +61,24 @@ def test_names_without_view_and_step_are_views_at_the_start(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "where"),
     [
-        (lambda e: e.pop("file_path"), r"data_dynamic\.json: entry 1 has no file_path"),
-        (lambda e: e.pop("c2w"), r"entry 1 \(.*d_0_002\.png\): c2w must be a 4x4 matrix of numbers"),
-        (lambda e: e.update(c2w=[[1, 2]]), "c2w must be a 4x4 matrix"),
-        (lambda e: e.update(intrinsic=[["a"] * 3] * 3), "intrinsic must be a 3x3 matrix of numbers"),
-        (lambda e: e.update(intrinsic=[[40, 1, 16], [0, 41, 15], [0, 0, 1]]), "pinhole camera without skew"),
-        (lambda e: e.update(intrinsic=[[-4, 0, 16], [0, 41, 15], [0, 0, 1]]), "fl_x must be a positive"),
-        (lambda e: e.update(c2w=(2 * np.eye(4)).tolist()), "is not a rigid motion"),
-        (lambda e: e.update(file_path="./d_0_009.png"), r"d_0_009\.png is missing although .*data_dynamic"),
+        (lambda e: e.pop("file_path"), "data_dynamic.json: entry 1"),
+        (lambda e: e.pop("c2w"), "d_0_002.png): c2w"),
+        (lambda e: e.update(c2w=[[1, 2]]), "c2w"),
+        (lambda e: e.update(intrinsic=[["a"] * 3] * 3), "intrinsic"),
+        (lambda e: e.update(intrinsic=[[40, 1, 16], [0, 41, 15], [0, 0, 1]]), "intrinsic"),
+        (lambda e: e.update(intrinsic=[[-4, 0, 16], [0, 41, 15], [0, 0, 1]]), "fl_x"),
+        (lambda e: e.update(c2w=(2 * np.eye(4)).tolist()), "transform_matrix"),
+        (lambda e: e.update(file_path="./d_0_009.png"), "d_0_009.png"),
     ],
 )
-def test_mistakes_are_named(tmp_path, change, message):
+def test_mistakes_are_named(tmp_path, change, where):
     path = write_release(tmp_path)
     entries = json.loads(path.read_text())
     change(entries[1])
     path.write_text(json.dumps(entries))
-    with pytest.raises(InputError, match=message):
+    with refused(where):
         read_image_set(path)
 
 
@@ -92,5 +92,5 @@ def test_listed_images_stay_where_they_are(tmp_path):
     assert (ours.Ks == theirs.Ks).all() and (ours.steps == theirs.steps).all()
     image = tmp_path / "release/data_dynamic/d_0_000.png"
     image.write_bytes(image.read_bytes() + b"\0")
-    with pytest.raises(InputError, match="was changed"):
+    with refused("d_0_000.png"):
         read_image_set(listed)

@@ -6,9 +6,11 @@ from render_scenes import dense
 
 from neuma_lib.coupling.binding import Binding
 from neuma_lib.coupling.deformation import arms_at_rest, deform
-from neuma_lib.errors import InputError
 from neuma_lib.splatting import spherical_harmonics as harmonics
 from neuma_lib.splatting.gaussians import Gaussians, rotations
+from tests.support.errors import refused
+
+pytestmark = pytest.mark.core
 
 
 def some_gaussians(count=7, coefficients=4, seed=0):
@@ -48,7 +50,7 @@ def test_cull_and_index_keep_everything_together():
 
 def test_wrong_shape_is_named():
     gaussians = some_gaussians()
-    with pytest.raises(InputError, match="quats"):
+    with refused("gaussians: quats"):
         Gaussians(
             gaussians.means,
             gaussians.scales,

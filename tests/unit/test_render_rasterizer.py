@@ -6,9 +6,11 @@ import pytest
 import torch
 from render_scenes import random_scene
 
-from neuma_lib.errors import InputError
 from neuma_lib.splatting import torch_reference
 from neuma_lib.splatting.rasterizer import RenderBuffers, Statistics, rasterize
+from tests.support.errors import refused
+
+pytestmark = pytest.mark.core
 
 SMOOTH = dict(alpha_min=0.0, alpha_max=2.0, transmittance_min=0.0)
 LOOSE = dict(alpha_min=1 / 255, alpha_max=0.6, transmittance_min=0.05)
@@ -214,7 +216,7 @@ def test_empty_image_is_background():
 
 def test_shape_errors_name_the_argument():
     scene = random_scene(1, 10, 1, WIDTH, HEIGHT, 1)
-    with pytest.raises(InputError, match="opacities"):
+    with refused("rasterize: opacities"):
         rasterize(scene[0], scene[1], scene[2][:5], *scene[3:], WIDTH, HEIGHT)
-    with pytest.raises(InputError, match="sh is torch.float32"):
+    with refused("rasterize: sh"):
         rasterize(*scene[:3], scene[3].float(), *scene[4:], WIDTH, HEIGHT)

@@ -8,11 +8,13 @@ import torch
 from emulated_cuda import COMPILER, EmulatedTiles
 from render_scenes import random_scene
 
-from neuma_lib.errors import InputError
 from neuma_lib.splatting import compositor_cuda, projection, rasterizer, torch_reference
 from neuma_lib.splatting.compositing import Settings
 from neuma_lib.splatting.image_loss import mean_squared_error
 from neuma_lib.splatting.rasterizer import RenderBuffers, Statistics, rasterize, rasterized_error
+from tests.support.errors import refused
+
+pytestmark = pytest.mark.core
 
 CUDA = pytest.param(
     "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -295,8 +297,9 @@ def test_splats_that_are_no_numbers_stay_out():
 def test_errors_name_compositors_that_work():
     scene = random_scene(1, 10, 1, 16, 16, 1)
     for compositor in ("tiles", "gsplat", "columns"):
-        with pytest.raises(InputError, match="choose rows, or leave"):
+        with refused("rasterize: compositor") as error:
             rasterize(*scene, 16, 16, compositor=compositor)
+        assert "rows" in error.value.remedy
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")

@@ -3,6 +3,7 @@
 import dataclasses
 import gzip
 import math
+import re
 import struct
 import zlib
 from pathlib import Path
@@ -30,6 +31,7 @@ from neuma_lib.splatting.cameras import Cameras, look_at
 from neuma_lib.splatting.gaussians import quaternions, rotations
 from neuma_lib.splatting.spherical_harmonics import colours, rotated
 from neuma_lib.viewer.find import scene_files
+from tests.support.errors import refused
 
 ROOT = Path(__file__).resolve().parents[2]
 RULES = {"min_opacity": 0.1, "max_scale": 0.1, "reach": 3.0, "min_links": 4, "count": 10**9}
@@ -165,21 +167,21 @@ def damaged(tmp_path, kind):
 @pytest.mark.parametrize(
     "kind, says",
     [
-        ("obj", "ends in"), ("splat cut", "bytes are not 32"), ("splat nan", "Gaussian 7 is not finite"),
-        ("splat empty", "no Gaussians"), ("spz cut", "ends after|incomplete|Error"), ("spz claims", "more than it can"),
+        ("obj", "must end in"), ("splat cut", "multiple of 32"), ("splat nan", "Gaussian 7 is not finite"),
+        ("splat empty", "no Gaussians"), ("spz cut", "ends after|incomplete|Error"), ("spz claims", "claims"),
         ("spz extensions", "no extensions"), ("spz zstd", "version 4"), ("spz other", "NGSP"), ("spz text", "header"),
-        ("ply cut", "claims"), ("ply chunks", "miss min_scale_y"), ("ply points", "misses the properties"),
+        ("ply cut", "claims"), ("ply chunks", "min_scale_y"), ("ply points", "has no property"),
     ],
 )  # fmt: skip
 def test_bad_files_are_named(tmp_path, kind, says):
     path = damaged(tmp_path, kind)
-    with pytest.raises(InputError, match=says) as error:
+    with refused(path) as error:
         load_splat(path)
-    assert str(path) in str(error.value) and "\n" not in str(error.value)
+    assert re.search(says, error.value.problem)
 
 
 def test_missing_file():
-    with pytest.raises(InputError, match="nowhere.spz does not exist"):
+    with refused("nowhere.spz"):
         load_splat("nowhere.spz")
 
 
@@ -266,12 +268,11 @@ def test_faint_oversized_and_isolated_gaussians_are_left_out():
 
 
 @pytest.mark.parametrize(
-    "change, says",
-    [({"min_opacity": 0.99}, "min_opacity"), ({"max_scale": 1e-6}, "max_scale"), ({"reach": 1e-9}, "reach")],
+    "change", [{"min_opacity": 0.99}, {"max_scale": 1e-6}, {"reach": 1e-9}], ids=lambda change: next(iter(change))
 )  # fmt: skip
-def test_a_splat_of_which_nothing_is_left_is_refused(change, says):
+def test_a_splat_of_which_nothing_is_left_is_refused(change):
     g = dataclasses.replace(ball(100), scales=torch.full((100, 3), 1e-5))
-    with pytest.raises(InputError, match=says):
+    with refused(f"splat.{next(iter(change))}"):
         culling.culled(g, **{**RULES, **change})
 
 
@@ -355,7 +356,7 @@ def test_gaussians_without_particles_follow_the_nearest_affinely():
     means, covars = deform(g.means, g.covars(), binding, x0, *state, arms=arms)
     torch.testing.assert_close(means[0], g.means @ A.T + b, atol=1e-12, rtol=0)
     torch.testing.assert_close(covars[0], A @ g.covars() @ A.T, atol=1e-12, rtol=1e-9)
-    with pytest.raises(InputError, match="too few"):
+    with refused("binding: particles"):
         bind_nearest(g.means, g.covars(), x0[:10])
 
 

@@ -23,6 +23,7 @@ from neuma_lib.splatting.observation import Observation
 from neuma_lib.springs.body import SpringBody
 from neuma_lib.springs.network import SpringNetwork, Springs
 from neuma_lib.springs.rollout import SpringModel, spring_rollout
+from tests.support.errors import refused
 
 FRAMES = tuple(range(0, 91, 5))
 V0 = (0.3, -1.5, 0.1)
@@ -179,7 +180,7 @@ def test_file_gives_the_same_motion_and_refuses_other_particles(small, tmp_path)
     with pytest.raises(InputError, match="their anchors are not the body's particles: run the rule springs"):
         SpringBody.with_network(small.body.x0 + 1e-3, index, springs.network, 12)
     write_weights(file, {"index": torch.arange(3)}, {})
-    with pytest.raises(InputError, match="holds no network of springs: run the rule springs again"):
+    with refused("springs.safetensors"):
         load_springs(file, small.body.x0)
 
 

@@ -270,6 +270,24 @@ def test_finer_bodies_must_be_finer(project):
         assert (told in output) != accepted
 
 
+def test_rules_with_a_script_get_what_they_leave_out(project):
+    """Fails where a Snakemake no longer reads what `workflow.defaults.complete` writes."""
+    target = f"{SCENE}+seed=1/neuma/video.mp4"
+    plan = project.run("--dry-run", "--set-resources", "mesh:runtime=7", "--", target)
+    blocks = dict(re.findall(r"^rule (\w+):\n((?:    .*\n)*)", plan, re.MULTILINE))
+    for rule, expected in {
+        "video": (
+            "log: tiny/results/logs/BouncyBall+seed=1/neuma/video.log",
+            "benchmark: tiny/results/benchmarks/BouncyBall+seed=1/neuma/video.tsv",
+            *("mem_mb=4000,", "runtime=60,", "gpu="),
+        ),
+        "material": ("mem_mb=6000,", "runtime=240,"),
+        "mesh": ("mem_mb=4000,", "runtime=7,"),
+        "kernels": ("log: tiny/data/kernels/logs/",),
+    }.items():
+        assert all(text in blocks[rule] for text in expected), blocks[rule]
+
+
 def test_images_are_rendered_where_the_settings_say(project):
     """On one CPU core unless a GPU or more cores are asked for; images alone, not what is computed from them."""
     images = "tiny/data/BouncyBall/static/transforms.json"

@@ -127,7 +127,7 @@ def test_what_a_splat_cannot_have_is_said(project, target, says):
 def test_a_damaged_file_is_one_line(project):
     (project.root / "made/bad.spz").write_bytes(b"nothing")
     said = project.run(f"{RESULTS}/Splat/gaussians.ply", *settings(file="made/bad.spz"), succeeds=False)
-    assert re.search(r"splat_gaussians Splat: ERROR: made/bad.spz cannot be read", said)
+    assert re.search(r"splat_gaussians Splat: ERROR: made/bad.spz: cannot be read", said)
     assert not (project.root / f"{RESULTS}/Splat/gaussians.ply").exists()
 
 

@@ -301,7 +301,7 @@ def test_the_demo_leaves_something_to_look_at_and_a_law_that_a_scene_can_start_f
     refused = clone.run(
         "--config", "scenes={BouncyBall: {prior: law.safetensors, dt: 1.0e-3}}", "--", variant, succeeds=False
     )
-    assert "law.safetensors: it was learned at a time step of 0.002 s" in refused
+    assert "law.safetensors: dt: the law was trained at a time step of 0.002 s" in refused
 
 
 def test_assumed_densities_are_runs_of_their_own(finished):
@@ -455,6 +455,6 @@ def test_checkpoint_of_other_settings(clone):
         {"iteration": 1, "weights": torch.zeros(3)}
     )
     output = clone.run(f"{SCENE}/neuma+seed=7/adaptor.safetensors", succeeds=False)
-    assert f"checkpoint {path} belongs to another run" in output and f"rm '{path}'" in output
+    assert f"{path}: is the checkpoint of another run" in output and f"rm '{path}'" in output
     assert "Traceback (most recent call last)" not in output
     assert [f.name for f in (clone.root / path).parent.iterdir()] == ["checkpoint.pt"]

@@ -1,4 +1,4 @@
-"""Predictions of filmed throws beside their videos, and the report of a capture. Needs capture_motion.smk."""
+"""Comparison of predictions with the videos of takes, and the report of a capture. Needs capture_motion.smk."""
 
 SHOWN = f"{DATA}/{{scene}}/shown/transforms.json"
 
@@ -169,7 +169,7 @@ rule capture_report:
         "../scripts/capture_report.py"
 
 
-# Poses and masks came with the files: nothing of them was found here.
+# Poses and masks come with the files and are not part of the report.
 use rule capture_report as released_report with:
     input:
         timelines=of_videos("json"),

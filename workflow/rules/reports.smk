@@ -1,6 +1,6 @@
 """What the report of a capture is made of: its laws, their runs on all throws, and files of these. Needs captures.smk."""
 
-from neuma_lib.capture.scenes import scene_name, training_throws
+from neuma_lib.capture.scenes import scene_name, training_takes
 
 # Methods that the learned one is compared with: the prior as it is, and the constants identified in the video.
 PRIOR = next(iter(cases.of_kind(SETTINGS, "prior")), None)
@@ -16,7 +16,7 @@ def reported_methods(method):
 def training_scene(name):
     """The scene that the law of a capture is learned in, with its further videos."""
     capture = capture_named(name)
-    trained = training_throws(capture)
+    trained = training_takes(capture)
     if not trained:
         raise InputError(
             f"{capture.folder} has no videos: a report needs at least one throw, see docs/capture.md"
@@ -118,7 +118,7 @@ def own_files(file, cameras=False):
 
     def choose(name, method):
         capture = capture_named(name)
-        places = filmed_by(capture) if cameras else [(throw, "") for throw in capture.throws]
+        places = filmed_by(capture) if cameras else [(throw, "") for throw in capture.takes]
         return [
             f"{RESULTS}/{thrown_method(name, throw, method)}/{file.format(camera=camera)}"
             for throw, camera in places
@@ -131,7 +131,7 @@ def thrown_files(file):
     """A function of wildcards: a file of the scene of each throw."""
     return of_report(
         lambda name, method: [
-            f"{RESULTS}/{scene_name(name, throw)}/{file}" for throw in capture_named(name).throws
+            f"{RESULTS}/{scene_name(name, throw)}/{file}" for throw in capture_named(name).takes
         ]
     )
 
@@ -158,6 +158,6 @@ def report_facts(name, method):
         "held_out": list(settings.held_out),
         "throws": {
             throw: {camera: exposures.get(camera, 0.0) for camera in cameras}
-            for throw, cameras in capture.throws.items()
+            for throw, cameras in capture.takes.items()
         },
     }

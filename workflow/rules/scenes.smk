@@ -132,7 +132,7 @@ def truth_memory(wildcards):
 def render_minutes(images, frames):
     """Minutes that the renders of all frames may take: an hour, and a minute a megapixel at 16 samples.
 
-    At the paper's scale a core took 0.2 minutes a megapixel, and 0.8 for a liquid (docs/guide.md).
+    At the paper's scale a core took 0.2 minutes a megapixel, and 0.8 for a liquid (docs/scale.md).
     """
     samples = frames * images.views * images.width * images.height * images.samples
     return 60 + round(samples / 16e6)

@@ -10,6 +10,7 @@ sys.path.insert(0, str(ROOT))
 
 from neuma_lib.capture.planned import planned_captures
 from neuma_lib.capture.scenes import captured_scenes
+from neuma_lib.checks import law_problems
 from neuma_lib.config import cases
 from neuma_lib.config.capture import CapturesConfig
 from neuma_lib.config.loading import load
@@ -26,6 +27,8 @@ try:
     SETTINGS = load(config, captured=captured_scenes(captures.root, captures.released, PLANNED))
 except InputError as error:
     raise WorkflowError(str(error)) from None
+if wrong_laws := law_problems(SETTINGS):
+    raise WorkflowError("\n".join(wrong_laws))
 
 DATA = SETTINGS.data_root.rstrip("/")
 RESULTS = SETTINGS.results_root.rstrip("/")

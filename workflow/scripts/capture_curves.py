@@ -1,4 +1,4 @@
-"""Stress curves of the prior, the identified constants and the learned law of a capture, in the units of its room."""
+"""Stress curves of the prior, the identified constants and the learned law of a capture, in units of its room."""
 
 import torch
 

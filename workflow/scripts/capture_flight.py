@@ -1,4 +1,4 @@
-"""Fit the free flight of a throw to what all cameras saw, and check gravity."""
+"""Fit the free flight of a take in all cameras, and check gravity."""
 
 from pathlib import Path
 
@@ -54,7 +54,7 @@ def filmed(camera, video, transforms, masks, timeline, offset, row_time) -> Film
         K,
         timeline["height"],
         row_time,
-        # Sound is not slowed with the picture.
+        # The sound of slow motion is not slowed.
         read_sound(Path(video)) if video and timeline["stretch"] == 1 else None,
         offset,
     )

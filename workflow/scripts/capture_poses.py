@@ -1,4 +1,4 @@
-"""Find the cameras of photographs and stills, and the points that they see."""
+"""Estimate the cameras of photographs and stills, and points of the scene."""
 
 import tempfile
 from pathlib import Path
@@ -28,8 +28,8 @@ def main(inputs, output, params, run) -> None:
     draw_poses(output.picture, poses)
     save_poses(output.poses, output.points, poses)
     run.say(
-        f"{len(poses.names)} of {len(poses.names) + len(poses.lost)} pictures have their place, {len(poses.points)}"
-        f" points, reprojection error {poses.error:.2f} px"
+        f"{len(poses.names)} of {len(poses.names) + len(poses.lost)} pictures registered, {len(poses.points)} points,"
+        f" reprojection error {poses.error:.2f} px"
     )
 
 

@@ -37,7 +37,7 @@ def main(inputs, output, params, run) -> None:
     meshes = [read_mesh(file) for file in listed(inputs.mesh)]
     finer = [
         [
-            body.refilled(
+            body.resampled(
                 torch.from_numpy(sample_volume(mesh, settings.particles, seed)), mesh.volume, density, binding
             )
             for seed in seeds

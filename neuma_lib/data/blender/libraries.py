@@ -44,8 +44,9 @@ def explain_import_error(text: str) -> str:
         )
     if re.search(r"ModuleNotFoundError: No module named 'bpy'", text):
         return (
-            "Blender's Python module is not installed: bpy 4.5 needs Python 3.11; make the project's environment "
-            "(`make env`) and run with its interpreter, or name one that has it in NEUMA_BLENDER_PYTHON."
+            "Blender's Python module is not installed. bpy 4.5 needs Python 3.11: install it with `make env` or "
+            '`pip install "neuma[blender]"` and run with that interpreter, or name one that has it in '
+            "NEUMA_BLENDER_PYTHON."
         )
     return ""
 

@@ -20,7 +20,7 @@ from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.evaluation.plotting.image_grid import GAP, ImageGrid, draw_images, note, place
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.laws import load_law
-from neuma_lib.io.particles import thrown
+from neuma_lib.io.particles import with_motion
 from neuma_lib.sim.model import MPMModel
 
 LEFT, LEGEND, TITLE, PICTURES, CURVES, BETWEEN = 0.5, 0.2, 0.34, 4.0, 1.85, 0.38
@@ -41,7 +41,7 @@ def data(inputs, params, say) -> ImageGrid:
         video, body, cameras = rendering.film(inputs, params, k, setting["density"])
         body, cameras = body.to(torch.float32, device), cameras.to(device)
         law = load_law(inputs.prior[k] if inputs.prior else None, inputs.adaptor[k], model.dt).to(device)
-        start = thrown(body, inputs.start[k])
+        start = with_motion(body, inputs.start[k])
         truth, _ = read_arrays(inputs.truth[k], required=("x", "mass"), only=("x", "mass"))
         shown = rendering.evenly(params.shown, len(video.frames))[1:]  # the start is the same for all
         columns, heights = [], []

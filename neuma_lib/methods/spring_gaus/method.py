@@ -56,7 +56,7 @@ class SpringGaus(Method):
         from neuma_lib.fitting.springs import fit_springs
         from neuma_lib.io.files import write_json
         from neuma_lib.io.images import load_videos
-        from neuma_lib.io.particles import load_body, thrown
+        from neuma_lib.io.particles import load_body, with_motion
         from neuma_lib.io.springs import save_springs
         from neuma_lib.sim.model import MPMModel
         from neuma_lib.springs.body import SpringBody
@@ -69,7 +69,7 @@ class SpringGaus(Method):
         body = body.to(torch.float32, run.device)
         videos = load_videos(inputs["transforms"], settings.views, **problem.filming)
         videos = [video.to(torch.float32, run.device) for video in videos]
-        start, density = thrown(body, inputs["velocity"]), float(body.mass.sum() / body.vol0.sum())
+        start, density = with_motion(body, inputs["velocity"]), float(body.mass.sum() / body.vol0.sum())
         anchored = SpringBody.of(body.x0, *(getattr(settings, name) for name in OF_NETWORK))
         springs = Springs.of_modulus(
             anchored.network, settings.guess, density, settings.resistance, settings.gap
