@@ -315,7 +315,7 @@ def _export(options: argparse.Namespace) -> None:
 
 def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
     """The law of a method's folder, and what `export_law` needs to know of it."""
-    from neuma_lib.config.cases import case, law_origin
+    from neuma_lib.config import cases
     from neuma_lib.evaluation.law_export import head_commit
     from neuma_lib.project import settings_around
 
@@ -329,10 +329,10 @@ def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
     settings, root = settings_around(place, options.configfile)
     settings = settings.model_copy(update={"results_root": str(place.parent.parent)})
     scene, method = place.parent.name, place.name
-    origin = law_origin(settings, scene, method)
-    law = case(settings, scene, method).source().load(lambda file: root / file).law
+    law = cases.case(settings, scene, method).source().load(lambda file: str(root / file)).law
     if law is None:
-        raise InputError(options.source, "the motion of this method follows from no material law")
+        raise InputError(options.source, "its motion follows from no material law", "Choose another method")
+    origin = cases.law_origin(settings, scene, method)
     beside = {"metrics": place / "metrics.json", "rollout": place / "rollout.h5"}
     of_this = {name: file for name, file in beside.items() if file.is_file() and origin["scene"] == scene}
     return law, {**origin, **of_this, "any_step": options.any_step, "commit": head_commit(root)}

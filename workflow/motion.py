@@ -75,7 +75,7 @@ class Prediction:
     def start(self, densities: list, carrier: str) -> tuple[State, list[int]]:
         """Particles in motion, and how many belong to each body."""
         files = self._files[0] | {name: self._inputs[name] for name in START}
-        return self.method.load_start(files, self._options[0], densities, carrier)
+        return self.method.load_initial_state(files, self._options[0], densities, carrier)
 
     def model(self, dt: float, counts: list[int] | None = None) -> MotionModel:
         """The model of all bodies, at a time step [s]."""

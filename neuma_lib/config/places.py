@@ -21,7 +21,7 @@ DRAWN_IN = {
         ["prior", "gaussians", "particles"],
     ),
 }
-"""What a chain's seeds change in a file of a scene or an experiment; runs of methods have `Config.run_folder`."""
+"""Seeds that change a file of a scene or an experiment. For runs of methods see `neuma_lib.config.cases.run_folder`."""
 
 
 def home(settings: Config, name: str, file: str) -> str:

@@ -228,7 +228,7 @@ class Method(ABC):
         """Files of the model, for `load`: one path a name."""
 
     def body_inputs(self, case: Case) -> Files:
-        """Further files of `load_start` and `load_body`: one path a name."""
+        """Further files of `load_initial_state` and `load_body`: one path a name."""
         return {}
 
     def uncertainty_inputs(self, case: Case) -> Files:
@@ -240,7 +240,7 @@ class Method(ABC):
         return case.options.plain()
 
     def model_options(self, case: Case) -> dict[str, Any]:
-        """Options of `load`, `load_start` and `load_body` as plain values."""
+        """Options of `load`, `load_initial_state` and `load_body` as plain values."""
         return {}
 
     def start_file(self, case: Case) -> str:
@@ -280,7 +280,7 @@ class Method(ABC):
             dt: time step of the prediction [s].
         """
 
-    def load_start(
+    def load_initial_state(
         self, inputs: Files, options: Mapping[str, Any], densities: Sequence[Any], carrier: str
     ) -> tuple[State, list[int]]:
         """What a prediction starts from: particles in motion, and how many belong to each body.

@@ -136,9 +136,9 @@ class PacNerf(Method):
 
         return LawOnGrid(analytic_law(read_json(inputs["constants"])["law"], dt=dt))
 
-    def load_start(self, inputs, options, densities, carrier):
+    def load_initial_state(self, inputs, options, densities, carrier):
         if carrier != "field":
-            return super().load_start(inputs, options, densities, carrier)
+            return super().load_initial_state(inputs, options, densities, carrier)
         from neuma_lib.io.particles import with_motion
 
         body = self.load_body(inputs, options, densities[0], carrier, "mean")
