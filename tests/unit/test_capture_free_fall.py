@@ -235,4 +235,4 @@ def test_a_mismatch_that_is_not_sure_is_left_to_a_better_measurement():
     for gravity, tolerated in ((sure, 0.0), (sure, 2.0), (unsure, 0.0)):
         with pytest.raises(InputError, match="square size is 1.16"):
             gravity.check("drop", tolerated=tolerated)
-    assert "not surely" in unsure.check("drop", tolerated=2.0)
+    assert "within its uncertainty" in unsure.check("drop", tolerated=2.0)
