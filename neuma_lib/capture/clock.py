@@ -44,10 +44,8 @@ def chosen_frames(times: np.ndarray, duration: float, most: int, name: str) -> n
     if len(inside) < MIN_FRAMES:
         raise InputError(
             name,
-            f"{len(inside)} frames show the object in the {duration:g} s after the start of its flight, {MIN_FRAMES}"
-            " are required",
-            "Film until the object rests, increase `duration` in capture.yaml, and look at the contact sheet of the"
-            " masks",
+            f"{len(inside)} frames show the object in the first {duration:g} s of flight, {MIN_FRAMES} are required",
+            "Film until the object rests, increase `duration` in capture.yaml, and check the masks' contact sheet",
         )
     places = np.linspace(0, len(inside) - 1, min(most, len(inside)))
     return inside[np.round(places).astype(int)]

@@ -112,10 +112,8 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flig
         if view.arc is None:
             raise InputError(
                 f"{name}, {view.camera}",
-                "no free flight detected, that is at least 5 frames in which the object moves along a parabola by more"
-                " than its size",
-                "Film the whole fall from at least 0.3 m at 60 frames per second or more, and look at the contact"
-                " sheet of the masks",
+                "no free flight detected: 5 frames or more in which the object moves along a parabola by its size",
+                "Film the whole fall from 0.3 m at 60 frames per second or more, and check the masks' contact sheet",
             )
         flying = (view.numbers >= view.arc[0]) & (view.numbers <= view.arc[1])
         inside.append(np.flatnonzero(flying))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
+from neuma_lib.capture.agreement import CHECK_VIDEOS
 from neuma_lib.capture.arcs import MIN_FRAMES
 from neuma_lib.capture.gravity import Gravity
 from neuma_lib.errors import InputError
@@ -262,8 +263,7 @@ def fit_flight(
         raise InputError(
             ", ".join(track.name for track in tracks),
             f"no free flight fits the tracks: the error is {fall.rms:.1f} px, the limit {limit:.1f} px",
-            "Check on the contact sheets that the videos show the same take and object, that the cameras did not move"
-            " since their poses were estimated, and that the masks are correct",
+            CHECK_VIDEOS,
         )
     return fall, [slice(*ends) for ends in kept]
 

