@@ -125,12 +125,12 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flig
         offset, line = _offset(views[0], view, f"{name}, {view.camera}")
         offsets.append(offset)
         lines.append(line)
-    stated = [view.offset is not None for view in views]
+    fixed = [view.offset is not None for view in views]
     plane = _plane(views[0]) if len(views) == 1 else None
-    fall, kept = fit_flight(tracks, plane, offsets, stated)
+    fall, kept = fit_flight(tracks, plane, offsets, fixed)
     contact = _contact(views, inside, fall)
     if np.isfinite(contact):
-        fall, kept = fit_flight(tracks, plane, fall.offsets, stated, contact)
+        fall, kept = fit_flight(tracks, plane, fall.offsets, fixed, contact)
     gravity = (
         fall.gravity.check(name, tolerated=TOLERATED_DEVIATIONS) if metric else fall.gravity.describe(name)
     )
@@ -155,7 +155,7 @@ def _contact(views: Sequence[Filmed], inside: Sequence[np.ndarray], fall: FreeFa
 
 def _offset(first: Filmed, second: Filmed, name: str) -> tuple[float, str]:
     if second.offset is not None:
-        return second.offset, f"{name}: time between the cameras as stated"
+        return second.offset, f"{name}: time between the cameras from the settings"
     by_sound: Offset | None = None
     if first.sound is not None and second.sound is not None:
         by_sound = offset_from_sound(first.sound, second.sound)

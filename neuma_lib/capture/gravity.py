@@ -60,9 +60,9 @@ class Gravity:
         return f"{name}: {self._description(normal)}"
 
     def _description(self, normal: Sequence[float]) -> str:
-        (ratio, deviation), (angle, unsure) = self.ratio, self.angle(normal)
+        (ratio, deviation), (angle, angle_std) = self.ratio, self.angle(normal)
         return (
-            f"gravity is {ratio:.3f} +- {deviation:.3f} of {GRAVITY} m/s^2, {angle:.1f} +- {unsure:.1f}"
+            f"gravity is {ratio:.3f} +- {deviation:.3f} of {GRAVITY} m/s^2, {angle:.1f} +- {angle_std:.1f}"
             f" degrees from the floor's normal ({self.source})"
         )
 
@@ -87,8 +87,8 @@ class Gravity:
             InputError: the mismatch is larger.
         """
         line, (ratio, _), (angle, _) = self.describe(name, normal), self.ratio, self.angle(normal)
-        mismatch, unsure = self.mismatch(normal)
-        if mismatch - tolerated * unsure <= MAX_MISMATCH:
+        mismatch, mismatch_std = self.mismatch(normal)
+        if mismatch - tolerated * mismatch_std <= MAX_MISMATCH:
             return line if mismatch <= MAX_MISMATCH else f"{line}; {_UNDECIDED}"
         causes = []
         if abs(ratio - 1) > MAX_MISMATCH / 2:
@@ -106,23 +106,23 @@ class Gravity:
 
     def report(self) -> dict[str, Any]:
         """JSON report. Metres of the room, y up."""
-        (ratio, deviation), (angle, unsure) = self.ratio, self.angle()
+        (ratio, deviation), (angle, angle_std) = self.ratio, self.angle()
         return {
             "gravity_m_s2": self.a.tolist(),
             "gravity_ratio": ratio,
             "gravity_ratio_deviation": deviation,
             "gravity_angle_deg": angle,
-            "gravity_angle_deviation_deg": unsure,
+            "gravity_angle_deviation_deg": angle_std,
         }
 
 
 def gravity_checks(name: str, report: Mapping[str, Any]) -> list[tuple[str, str, str, bool]]:
     """Checks of a `Gravity.report`, with the fields of `neuma_lib.capture.page.Check`."""
     ratio, spread = report["gravity_ratio"], report["gravity_ratio_deviation"]
-    angle, unsure = report["gravity_angle_deg"], report["gravity_angle_deviation_deg"]
+    angle, angle_std = report["gravity_angle_deg"], report["gravity_angle_deviation_deg"]
     size = f"{ratio:.3f} +- {spread:.3f} of {GRAVITY} m/s^2"
-    direction = f"{angle:.1f} +- {unsure:.1f} degrees off the floor's normal"
+    direction = f"{angle:.1f} +- {angle_std:.1f} degrees off the floor's normal"
     return [
         (f"gravity in {name}", size, "1 +- 0.03", abs(ratio - 1) < 0.03 + 2 * spread),
-        (f"down in {name}", direction, "< 1.5 degrees", angle < 1.5 + 2 * unsure),
+        (f"down in {name}", direction, "< 1.5 degrees", angle < 1.5 + 2 * angle_std),
     ]

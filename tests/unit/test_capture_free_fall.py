@@ -141,8 +141,8 @@ def test_what_a_large_object_may_be_off_is_still_refused_by_gravity():
     assert 0.004 * 480 < fall.rms < 4.0
 
 
-def test_an_offset_that_is_stated_is_kept():
-    fall = fit_free_fall(two(), offsets=[0, 0.004], stated=[False, True])
+def test_a_fixed_offset_is_kept():
+    fall = fit_free_fall(two(), offsets=[0, 0.004], fixed=[False, True])
     np.testing.assert_array_equal(fall.offsets, [0, 0.004])
     assert fall.gravity.ratio[0] == pytest.approx(1, abs=1e-6) and fall.covariance[9, 9] == 0
     far = fit_free_fall(two(), offsets=[0, 0.03])  # the beginning, a few frames off, does not matter
