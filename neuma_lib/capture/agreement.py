@@ -22,19 +22,16 @@ MIN_SAME_OBJECT = 0.5
 """IoU below which simultaneous cameras are considered to film different objects."""
 MIN_SHARES = (0.8, 0.95)
 """Share of the views of a voxel whose masks must contain it: first for all views, then without doubtful views."""
-_TRUNCATED = 0.7  # voxels seen by a smaller share of the maximum view count are outside many pictures
-_MAX_MISSES = (
-    2  # masks that may lack such a voxel, at most one in five; a share of so few views would allow none
+CHECK_VIDEOS = (
+    "Check on the contact sheets that the videos show the same take and object, that the cameras did not move since"
+    " their poses were estimated, and that no hand or shadow is in a mask"
 )
+_TRUNCATED = 0.7  # voxels seen by a smaller share of the maximum view count are outside many pictures
+_MAX_MISSES = 2  # masks that may lack such a voxel, at most one in five
 _VOXELS = (24, 64)  # along a side of the cube, in the coarse and the fine pass
 _MARGIN = 1.6  # half side of the coarse cube, in radii of the masks
 _CLOSING = np.ones((3, 3), np.uint8)
-_NO_COMMON_VOLUME = (
-    "masks",
-    "no point in space lies in most of the masks, so they show different objects or the cameras have moved since their"
-    " poses were estimated",
-    "Look at the contact sheets of the masks",
-)
+_NO_COMMON_VOLUME = ("masks", "no point in space lies in most of the masks", CHECK_VIDEOS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +103,7 @@ def check_one_object(ious: Sequence[float], cameras: Sequence[str], name: str) -
             name,
             f"the masks at rest do not show one object: that of {cameras[worst]} has an IoU of {ious[worst]:.2f} with"
             f" the common body, at least {MIN_SAME_OBJECT} is required",
-            "Check on the contact sheets that the videos show the same take and object, that the cameras did not move,"
-            " and that no hand or shadow is in a mask",
+            CHECK_VIDEOS,
         )
 
 

@@ -10,7 +10,7 @@ Positions are (x, y) [px], pixel centres at +0.5.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -77,15 +77,7 @@ def find_arcs(
     while (best := _longest(table, times, down)) is not None:
         first, last = best.frames
         table[first : last + 1] = np.nan
-        arcs.append(
-            Arc(
-                best.frames,
-                {i: int(order[i][c]) for i, c in best.candidates.items()},
-                best.start,
-                best.coefficients,
-                best.area,
-            )
-        )
+        arcs.append(replace(best, candidates={i: int(order[i][c]) for i, c in best.candidates.items()}))
     return sorted(arcs, key=lambda arc: arc.frames)
 
 

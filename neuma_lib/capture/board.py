@@ -330,13 +330,9 @@ def fit_board(
     world = np.stack(points)
     placed = fit_similarity(world, printed)
     residuals = placed.apply(world) - printed
-    fit = BoardFit(
-        placed,
-        np.array(numbers),
-        float(np.sqrt((residuals**2).sum(axis=1).mean())),
-        float(np.sqrt((residuals[:, 2] ** 2).mean())),
-        pictures,
-    )
+    residual = float(np.sqrt((residuals**2).sum(axis=1).mean()))
+    flatness = float(np.sqrt((residuals[:, 2] ** 2).mean()))
+    fit = BoardFit(placed, np.array(numbers), residual, flatness, pictures)
     if fit.residual > MAX_MISFIT * board.square:
         raise InputError(
             "board.squares",

@@ -44,10 +44,8 @@ def chosen_frames(times: np.ndarray, duration: float, most: int, name: str) -> n
     if len(inside) < MIN_FRAMES:
         raise InputError(
             name,
-            f"{len(inside)} frames show the object in the {duration:g} s after the start of its flight, {MIN_FRAMES}"
-            " are required",
-            "Film until the object rests, increase `duration` in capture.yaml, and look at the contact sheet of the"
-            " masks",
+            f"{len(inside)} frames show the object in the first {duration:g} s of flight, {MIN_FRAMES} are required",
+            "Film until the object rests, increase `duration` in capture.yaml, and check the masks' contact sheet",
         )
     places = np.linspace(0, len(inside) - 1, min(most, len(inside)))
     return inside[np.round(places).astype(int)]
@@ -65,13 +63,8 @@ def reduced(rgba: np.ndarray, width: int) -> np.ndarray:
     size = (max(1, round(across * factor)), max(1, round(height * factor)))
     plain = rgba.astype(np.float32)
     plain[..., :3] *= plain[..., 3:] / 255
-    small = np.stack(
-        [
-            np.asarray(Image.fromarray(plain[..., k]).resize(size, Image.Resampling.BOX), np.float32)
-            for k in range(4)
-        ],
-        axis=-1,
-    )
+    planes = (Image.fromarray(plain[..., k]).resize(size, Image.Resampling.BOX) for k in range(4))
+    small = np.stack([np.asarray(plane, np.float32) for plane in planes], axis=-1)
     small[..., :3] *= 255 / np.maximum(small[..., 3:], 1e-6)
     small = np.clip(np.rint(small), 0, 255).astype(np.uint8)
     small[small[..., 3] == 0] = 0
@@ -80,15 +73,9 @@ def reduced(rgba: np.ndarray, width: int) -> np.ndarray:
 
 def reduced_intrinsics(frame: Mapping[str, Any], size: tuple[int, int]) -> dict[str, float]:
     """Intrinsics of an entry, scaled to a picture of another width and height [px]."""
-    across, down = size[0] / frame["w"], size[1] / frame["h"]
-    return {
-        "fl_x": frame["fl_x"] * across,
-        "fl_y": frame["fl_y"] * down,
-        "cx": frame["cx"] * across,
-        "cy": frame["cy"] * down,
-        "w": size[0],
-        "h": size[1],
-    }
+    factors = {"x": size[0] / frame["w"], "y": size[1] / frame["h"]}
+    scaled = {key: frame[key] * factors[key[-1]] for key in ("fl_x", "fl_y", "cx", "cy")}
+    return {**scaled, "w": size[0], "h": size[1]}
 
 
 def without_gain(rgba: np.ndarray, gain: Sequence[float]) -> np.ndarray:

@@ -60,24 +60,15 @@ def draw_cameras(path: str | Path, poses: Poses, unit: str, suffix: str = "", fl
         extent = np.concatenate([centres, np.quantile(poses.points[near], QUANTILES, axis=0)])
     low, high = extent.min(axis=0) - 0.1 * reach, extent.max(axis=0) + 0.1 * reach
     figure = require("matplotlib.figure", "capture").Figure(figsize=(12, 6), layout="constrained")
-    for axes, (across, up, title) in zip(
-        figure.subplots(1, 2), ((0, 2, "from above"), (0, 1, "from the side"))
-    ):
+    groups = ((~fixed, "tab:blue", "photographs"), (fixed, "tab:red", "fixed cameras"))
+    arrows = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.004}
+    sides = ((0, 2, "from above"), (0, 1, "from the side"))
+    for axes, (across, up, title) in zip(figure.subplots(1, 2), sides):
         axes.scatter(*poses.points[near][:, [across, up]].T, s=1, c=poses.colours[near] / 255.0, linewidths=0)
-        for chosen, colour, label in (
-            (~fixed, "tab:blue", "photographs"),
-            (fixed, "tab:red", "fixed cameras"),
-        ):
-            axes.quiver(
-                *centres[chosen][:, [across, up]].T,
-                *(0.15 * reach * forward[chosen][:, [across, up]]).T,
-                angles="xy",
-                scale_units="xy",
-                scale=1,
-                color=colour,
-                width=0.004,
-                label=label,
-            )
+        for chosen, colour, label in groups:
+            starts = centres[chosen][:, [across, up]].T
+            ends = (0.15 * reach * forward[chosen][:, [across, up]]).T
+            axes.quiver(*starts, *ends, color=colour, label=label, **arrows)
         axes.set(title=title, xlabel=f"x [{unit}]", ylabel=f"{'xyz'[up]} [{unit}]", aspect="equal")
         # From above, x points right and z towards the viewer.
         limits = (low[1], high[1]) if up == 1 else (high[2], low[2])
@@ -117,9 +108,7 @@ def draw_floor(path: str | Path, transforms: str | Path) -> None:
         for ends, colour, lines in _box_lines(GRID * scale):
             _draw_line(draw, ends, viewmat, frame, colour, lines * wide)
         pictures.append((frame["file_path"], np.asarray(picture)))
-    title = (
-        f"lines of the floor every {GRID:g} m; x red, y (up) green, z blue; the box is {1 / scale:g} m wide"
-    )
+    title = f"floor lines every {GRID:g} m, x red, y (up) green, z blue, the box is {1 / scale:g} m wide"
     picture_sheet(path, pictures, title, columns=3)
 
 

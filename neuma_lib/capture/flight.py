@@ -111,10 +111,8 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flig
         if view.arc is None:
             raise InputError(
                 f"{name}, {view.camera}",
-                "no free flight detected, that is at least 5 frames in which the object moves along a parabola by more"
-                " than its size",
-                "Film the whole fall from at least 0.3 m at 60 frames per second or more, and look at the contact"
-                " sheet of the masks",
+                "no free flight detected: 5 frames or more in which the object moves along a parabola by its size",
+                "Film the whole fall from 0.3 m at 60 frames per second or more, and check the masks' contact sheet",
             )
         flying = (view.numbers >= view.arc[0]) & (view.numbers <= view.arc[1])
         inside.append(np.flatnonzero(flying))
@@ -126,12 +124,12 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flig
         offset, line = _offset(views[0], view, f"{name}, {view.camera}")
         offsets.append(offset)
         lines.append(line)
-    stated = [view.offset is not None for view in views]
+    fixed = [view.offset is not None for view in views]
     plane = _plane(views[0]) if len(views) == 1 else None
-    fall, kept = fit_flight(tracks, plane, offsets, stated)
+    fall, kept = fit_flight(tracks, plane, offsets, fixed)
     contact = _contact(views, inside, fall)
     if np.isfinite(contact):
-        fall, kept = fit_flight(tracks, plane, fall.offsets, stated, contact)
+        fall, kept = fit_flight(tracks, plane, fall.offsets, fixed, contact)
     gravity = (
         fall.gravity.check(name, tolerated=TOLERATED_DEVIATIONS) if metric else fall.gravity.describe(name)
     )
@@ -156,7 +154,7 @@ def _contact(views: Sequence[Filmed], inside: Sequence[np.ndarray], fall: FreeFa
 
 def _offset(first: Filmed, second: Filmed, name: str) -> tuple[float, str]:
     if second.offset is not None:
-        return second.offset, f"{name}: time between the cameras as stated"
+        return second.offset, f"{name}: time between the cameras from the settings"
     by_sound: Offset | None = None
     if first.sound is not None and second.sound is not None:
         by_sound = offset_from_sound(first.sound, second.sound)

@@ -54,9 +54,8 @@ class Capture:
                 f"no photographs ({', '.join(PICTURES)})",
                 "Put them there",
             )
-        for camera in sorted(
-            {camera for videos in self.takes.values() for camera in videos} - self.stills.keys()
-        ):
+        filmed = {camera for videos in self.takes.values() for camera in videos}
+        for camera in sorted(filmed - self.stills.keys()):
             raise InputError(
                 self.folder / self.settings.stills,
                 f"no picture of the empty scene for the camera '{camera}'",
@@ -96,11 +95,7 @@ def _no_videos(folder: Path) -> InputError:
 
 
 def read_settings(path: str | Path) -> CaptureConfig:
-    """Settings of a capture.yaml.
-
-    Raises:
-        InputError: names the file and each invalid, missing or unknown key.
-    """
+    """Settings of a capture.yaml. Raises InputError: names the file and each invalid, missing or unknown key."""
     content = existing(path, "Create it as in the example of docs/capture.md").read_bytes()
     with reading(path, "YAML"):
         raw = yaml.safe_load(content)
@@ -111,11 +106,7 @@ def read_settings(path: str | Path) -> CaptureConfig:
 
 
 def inside(folder: str | Path, name: str | Path) -> Path:
-    """A path below a capture's folder.
-
-    Raises:
-        InputError: it is outside the folder, possibly through a link.
-    """
+    """A path below a capture's folder. Raises InputError: it is outside the folder, possibly through a link."""
     root = Path(folder).resolve()
     path = (root / name).resolve()
     if path != root and root not in path.parents:
@@ -142,9 +133,8 @@ def read_capture(folder: str | Path) -> Capture:
         takes = _default_takes(folder)
     for name, videos in takes.items():
         if not videos:
-            raise _no_videos(
-                folder / (settings.throws[name].folder if name in settings.throws else f"videos/{name}")
-            )
+            take = settings.throws.get(name)
+            raise _no_videos(folder / (take.folder if take else f"videos/{name}"))
     stills = _by_camera(folder, settings.stills, PICTURES)
     filmed = {camera for videos in takes.values() for camera in videos}
     cameras = sorted(filmed | stills.keys())

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
+from neuma_lib.capture.agreement import CHECK_VIDEOS
 from neuma_lib.capture.arcs import MIN_FRAMES
 from neuma_lib.capture.gravity import Gravity
 from neuma_lib.errors import InputError
@@ -90,7 +91,7 @@ def fit_free_fall(
     tracks: Sequence[Track],
     plane: tuple[np.ndarray, np.ndarray] | None = None,
     offsets: Sequence[float] | None = None,
-    stated: Sequence[bool] | None = None,
+    fixed: Sequence[bool] | None = None,
 ) -> FreeFall:
     """Fit the parabola by least squares of the reprojection errors.
 
@@ -102,7 +103,7 @@ def fit_free_fall(
         plane: a point (3,) and a normal (3,), for one camera.
         offsets: seconds to add to the times of each camera, from sound, motion or the user, the first 0. None: zeros.
             The fit refines them below one frame, except the first.
-        stated: whether the offset of each camera is fixed. None: all but the first are fitted.
+        fixed: whether the offset of each camera is fixed. None: all but the first are fitted.
 
     Raises:
         InputError: too few frames, one camera without a plane, or motion that does not determine the fit.
@@ -127,7 +128,7 @@ def fit_free_fall(
         across = np.linalg.svd(normal[None] / np.linalg.norm(normal))[2][1:]  # two directions in the plane
         basis, base = np.kron(np.eye(3), across.T), np.concatenate([point, np.zeros(6)])
     known = np.zeros(len(tracks)) if offsets is None else np.asarray(offsets, float)
-    fitted = [k for k in range(1, len(tracks)) if stated is None or not stated[k]]
+    fitted = [k for k in range(1, len(tracks)) if fixed is None or not fixed[k]]
     count, free = basis.shape[1], len(fitted)
 
     def motion(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -216,7 +217,7 @@ def fit_flight(
     tracks: Sequence[Track],
     plane: tuple[np.ndarray, np.ndarray] | None = None,
     offsets: Sequence[float] | None = None,
-    stated: Sequence[bool] | None = None,
+    fixed: Sequence[bool] | None = None,
     contact: float = np.inf,
 ) -> tuple[FreeFall, list[slice]]:
     """Fit the free flight within tracks that may start before release or end after contact.
@@ -241,7 +242,7 @@ def fit_flight(
         cut = min(int(_ENDS * count), max(0, (count - 4) // 2))
         kept.append([cut, count - cut])
     chosen = [_part(track, *ends) for track, ends in zip(tracks, kept)]
-    fall = fit_free_fall(chosen, plane, offsets, stated)
+    fall = fit_free_fall(chosen, plane, offsets, fixed)
     growing = True
     while growing:
         growing = False
@@ -256,14 +257,13 @@ def fit_flight(
                     growing = True
         if growing:
             chosen = [_part(track, *ends) for track, ends in zip(tracks, kept)]
-            fall = fit_free_fall(chosen, plane, fall.offsets, stated)
+            fall = fit_free_fall(chosen, plane, fall.offsets, fixed)
     limit = min(max(MAX_RMS * _height(track), MAX_RMS_OF_RADIUS * track.radius) for track in tracks)
     if fall.rms > limit:
         raise InputError(
             ", ".join(track.name for track in tracks),
             f"no free flight fits the tracks: the error is {fall.rms:.1f} px, the limit {limit:.1f} px",
-            "Check on the contact sheets that the videos show the same take and object, that the cameras did not move"
-            " since their poses were estimated, and that the masks are correct",
+            CHECK_VIDEOS,
         )
     return fall, [slice(*ends) for ends in kept]
 

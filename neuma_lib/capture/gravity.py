@@ -19,7 +19,7 @@ UP = (0.0, 1.0, 0.0)
 """The floor's normal in the room."""
 MAX_MISMATCH = 0.1
 """Tolerated relative difference between measured and true gravity, as a vector."""
-_UNDECIDED = f"more than {MAX_MISMATCH:.0%} off, but not surely: the placed object will tell"
+_UNDECIDED = f"more than {MAX_MISMATCH:.0%} off, but within its uncertainty: registration measures it again"
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +46,7 @@ class Gravity:
         return float(size / GRAVITY), float(np.sqrt(slope @ self.covariance @ slope) / GRAVITY)
 
     def angle(self, normal: Sequence[float] = UP) -> tuple[float, float]:
-        """Angle between the acceleration and straight down, and its standard deviation [deg].
-
-        Args:
-            normal: of the floor, upward, (3,).
-        """
+        """Angle between the acceleration and the downward normal of the floor, and its standard deviation [deg]."""
         up = np.asarray(normal, float) / np.linalg.norm(normal)
         size = np.linalg.norm(self.a)
         down = self.a / size
@@ -60,27 +56,18 @@ class Gravity:
         return float(np.degrees(angle)), float(np.degrees(np.sqrt(spread) / size))
 
     def describe(self, name: str, normal: Sequence[float] = UP) -> str:
-        """One line of text.
-
-        Args:
-            name: of the videos.
-            normal: of the floor, upward, (3,).
-        """
+        """One line of text, for the name of the videos and the upward normal (3,) of the floor."""
         return f"{name}: {self._description(normal)}"
 
     def _description(self, normal: Sequence[float]) -> str:
-        (ratio, deviation), (angle, unsure) = self.ratio, self.angle(normal)
+        (ratio, deviation), (angle, angle_std) = self.ratio, self.angle(normal)
         return (
-            f"gravity is {ratio:.3f} +- {deviation:.3f} of {GRAVITY} m/s^2, {angle:.1f} +- {unsure:.1f}"
+            f"gravity is {ratio:.3f} +- {deviation:.3f} of {GRAVITY} m/s^2, {angle:.1f} +- {angle_std:.1f}"
             f" degrees from the floor's normal ({self.source})"
         )
 
     def mismatch(self, normal: Sequence[float] = UP) -> tuple[float, float]:
-        """Relative distance from 9.81 m/s^2 straight down, and its standard deviation.
-
-        Args:
-            normal: of the floor, upward, (3,).
-        """
+        """Relative distance from 9.81 m/s^2 against the upward normal (3,), and its standard deviation."""
         up = np.asarray(normal, float) / np.linalg.norm(normal)
         difference = self.a / GRAVITY + up
         size = float(np.linalg.norm(difference))
@@ -100,8 +87,8 @@ class Gravity:
             InputError: the mismatch is larger.
         """
         line, (ratio, _), (angle, _) = self.describe(name, normal), self.ratio, self.angle(normal)
-        mismatch, unsure = self.mismatch(normal)
-        if mismatch - tolerated * unsure <= MAX_MISMATCH:
+        mismatch, mismatch_std = self.mismatch(normal)
+        if mismatch - tolerated * mismatch_std <= MAX_MISMATCH:
             return line if mismatch <= MAX_MISMATCH else f"{line}; {_UNDECIDED}"
         causes = []
         if abs(ratio - 1) > MAX_MISMATCH / 2:
@@ -119,31 +106,23 @@ class Gravity:
 
     def report(self) -> dict[str, Any]:
         """JSON report. Metres of the room, y up."""
-        (ratio, deviation), (angle, unsure) = self.ratio, self.angle()
+        (ratio, deviation), (angle, angle_std) = self.ratio, self.angle()
         return {
             "gravity_m_s2": self.a.tolist(),
             "gravity_ratio": ratio,
             "gravity_ratio_deviation": deviation,
             "gravity_angle_deg": angle,
-            "gravity_angle_deviation_deg": unsure,
+            "gravity_angle_deviation_deg": angle_std,
         }
 
 
 def gravity_checks(name: str, report: Mapping[str, Any]) -> list[tuple[str, str, str, bool]]:
     """Checks of a `Gravity.report`, with the fields of `neuma_lib.capture.page.Check`."""
     ratio, spread = report["gravity_ratio"], report["gravity_ratio_deviation"]
-    angle, unsure = report["gravity_angle_deg"], report["gravity_angle_deviation_deg"]
+    angle, angle_std = report["gravity_angle_deg"], report["gravity_angle_deviation_deg"]
+    size = f"{ratio:.3f} +- {spread:.3f} of {GRAVITY} m/s^2"
+    direction = f"{angle:.1f} +- {angle_std:.1f} degrees off the floor's normal"
     return [
-        (
-            f"gravity in {name}",
-            f"{ratio:.3f} +- {spread:.3f} of {GRAVITY} m/s^2",
-            "1 +- 0.03",
-            abs(ratio - 1) < 0.03 + 2 * spread,
-        ),
-        (
-            f"down in {name}",
-            f"{angle:.1f} +- {unsure:.1f} degrees off the floor's normal",
-            "< 1.5 degrees",
-            angle < 1.5 + 2 * unsure,
-        ),
+        (f"gravity in {name}", size, "1 +- 0.03", abs(ratio - 1) < 0.03 + 2 * spread),
+        (f"down in {name}", direction, "< 1.5 degrees", angle < 1.5 + 2 * angle_std),
     ]

@@ -102,13 +102,8 @@ class Lens:
     def intrinsics(self) -> dict[str, float]:
         """Entries of a transforms.json, for a lens without distortion."""
         assert not self.distortion.any(), "a transforms.json contains pinhole cameras only"
-        focal, centre = self.K[[0, 1], [0, 1]].tolist(), self.K[:2, 2].tolist()
-        return {
-            **dict(zip(("fl_x", "fl_y"), focal)),
-            **dict(zip(("cx", "cy"), centre)),
-            "w": self.width,
-            "h": self.height,
-        }
+        values = [*self.K[[0, 1], [0, 1]].tolist(), *self.K[:2, 2].tolist(), self.width, self.height]
+        return dict(zip(("fl_x", "fl_y", "cx", "cy", "w", "h"), values))
 
     def plain(self) -> dict[str, Any]:
         """The lens as JSON values, read by `read_lens`."""

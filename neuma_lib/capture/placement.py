@@ -169,7 +169,9 @@ def upright(normal: np.ndarray, origin: np.ndarray) -> Similarity:
     return Similarity(1.0, rotation, -(rotation @ origin))
 
 
-def stated_length(viewmats: Sequence[np.ndarray], directions: Sequence[np.ndarray], metres: float) -> float:
+def scale_from_length(
+    viewmats: Sequence[np.ndarray], directions: Sequence[np.ndarray], metres: float
+) -> float:
     """Metres per unit of a reconstruction, from the two ends of a known length in several views.
 
     Args:

@@ -430,10 +430,10 @@ def poses_from_board(
             if group_of(name) != PHOTOGRAPHS:
                 raise
             lost.append(name)
-            continue
-        names.append(name)
-        poses.append(pose)
-        errors.append(error)
+        else:
+            names.append(name)
+            poses.append(pose)
+            errors.append(error)
     if not names:
         raise InputError(
             "board",

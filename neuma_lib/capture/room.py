@@ -18,7 +18,7 @@ from neuma_lib.capture.placement import (
     camera_centres,
     fit_floor,
     identity,
-    stated_length,
+    scale_from_length,
     upright,
 )
 from neuma_lib.capture.poses import Poses, find_boards
@@ -75,7 +75,7 @@ def room_of(poses: Poses, detections: Mapping[str, Detection], settings: Capture
         detections: corners of the board by picture, unused without a board.
 
     Raises:
-        InputError: see `fit_board`, `stated_length`, `fit_floor`.
+        InputError: see `fit_board`, `scale_from_length`, `fit_floor`.
     """
     if settings.board is not None:
         corners = [detections[name] for name in poses.names]
@@ -108,7 +108,7 @@ def _metres_per_unit(poses: Poses, length: LengthConfig) -> float:
             f"{len(views)} of the marked photographs were registered, at least two are required",
             "Mark the points in other photographs",
         )
-    return stated_length(views, directions, length.metres)
+    return scale_from_length(views, directions, length.metres)
 
 
 def write_room(

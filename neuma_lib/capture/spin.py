@@ -98,21 +98,15 @@ def follow(frames: Sequence[np.ndarray], masks: np.ndarray, times: np.ndarray, c
             back, again, _ = cv2.calcOpticalFlowPyrLK(grey[i + 1], grey[i], there, there - shift, **options)
             x, y = np.rint(there[:, 0]).astype(int).T
             within = (x >= 0) & (y >= 0) & (x < grey[0].shape[1]) & (y < grey[0].shape[0])
-            kept = (
-                (good & again)[:, 0].astype(bool)
-                & within
-                & (np.linalg.norm(back - here, axis=2)[:, 0] < _MAX_RETURN_ERROR)
-            )
+            returned = np.linalg.norm(back - here, axis=2)[:, 0] < _MAX_RETURN_ERROR
+            kept = (good & again)[:, 0].astype(bool) & within & returned
             kept[kept] &= inner[i + 1][y[kept], x[kept]] > 0
             alive = alive[kept]
             for k, place in zip(alive, there[kept, 0].astype(np.float64)):
                 places[k].append(place)
         radius = float(np.sqrt(masks[first].sum() / np.pi))
-        paths += [
-            Path(camera, times[first : first + len(p)], np.array(p) + 0.5, radius)
-            for p in places
-            if len(p) > 2
-        ]
+        long = [p for p in places if len(p) > 2]
+        paths += [Path(camera, times[first : first + len(p)], np.array(p) + 0.5, radius) for p in long]
     return paths
 
 

@@ -117,16 +117,13 @@ def video_masks(
     arcs = [_mask_arc(arc, frames, background, seen, times, masks, known) for arc in arcs]
     for i in [] if places is None else np.flatnonzero(~np.isnan(places).any(axis=1)):
         masks[i], known[i] = _mask(frames[i], background, seen[i], places[i]), True
-    begins = [arc.frames[0] for arc in arcs[:1]]
-    for order in (
-        range(begins[0] if begins else 0, len(frames)),
-        range(begins[0] - 1 if begins else -1, -1, -1),
-    ):
+    begin = arcs[0].frames[0] if arcs else 0
+    for order in (range(begin, len(frames)), range(begin - 1, -1, -1)):
         _follow(order, frames, background, seen, masks, known)
     drafts, masks = masks, _outlined(frames, background, seen, masks, arcs)
     moving = np.array([(c.strong & ~grown(m, 5)).mean() for c, m in zip(seen, drafts)])
     # A hand that holds the object before its flight is allowed.
-    check_background(np.where(np.arange(len(frames)) < (arcs[0].frames[0] if arcs else 0), 0, moving), name)
+    check_background(np.where(np.arange(len(frames)) < begin, 0, moving), name)
     check_not_empty(masks, name)
     exposures = (np.stack([getattr(change, key) for change in seen]) for key in ("gain", "offset"))
     return VideoMasks(masks, moving, *exposures, tuple(arcs))

@@ -268,15 +268,15 @@ def test_triangulation():
     assert np.isnan(placement.triangulate(poses[[0, 0]], (seen[:, :2] / seen[:, 2:])[[0, 0]])[0]).all()
 
 
-def test_stated_length_gives_the_scale():
+def test_a_known_length_gives_the_scale():
     """A rod of 12 cm, in a world 2.5 times as large."""
     poses = placement.Similarity(2.5, np.eye(3), np.zeros(3)).move_cameras(around(3))
     ends = 2.5 * np.array([[0.02, 0.1, 0.0], [0.02, 0.1, 0.12]])
     seen = np.einsum("nij,ej->nei", poses[:, :3, :3], ends) + poses[:, None, :3, 3]
     directions = seen[..., :2] / seen[..., 2:]
-    assert placement.stated_length(poses, directions, 0.12) == pytest.approx(1 / 2.5, rel=1e-9)
+    assert placement.scale_from_length(poses, directions, 0.12) == pytest.approx(1 / 2.5, rel=1e-9)
     with refused("length.ends"):
-        placement.stated_length(poses[[0, 0]], directions[[0, 0]], 0.12)
+        placement.scale_from_length(poses[[0, 0]], directions[[0, 0]], 0.12)
 
 
 def test_floor_is_found_among_other_points():

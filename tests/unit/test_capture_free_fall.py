@@ -141,8 +141,8 @@ def test_what_a_large_object_may_be_off_is_still_refused_by_gravity():
     assert 0.004 * 480 < fall.rms < 4.0
 
 
-def test_an_offset_that_is_stated_is_kept():
-    fall = fit_free_fall(two(), offsets=[0, 0.004], stated=[False, True])
+def test_a_fixed_offset_is_kept():
+    fall = fit_free_fall(two(), offsets=[0, 0.004], fixed=[False, True])
     np.testing.assert_array_equal(fall.offsets, [0, 0.004])
     assert fall.gravity.ratio[0] == pytest.approx(1, abs=1e-6) and fall.covariance[9, 9] == 0
     far = fit_free_fall(two(), offsets=[0, 0.03])  # the beginning, a few frames off, does not matter
@@ -235,4 +235,4 @@ def test_a_mismatch_that_is_not_sure_is_left_to_a_better_measurement():
     for gravity, tolerated in ((sure, 0.0), (sure, 2.0), (unsure, 0.0)):
         with pytest.raises(InputError, match="square size is 1.16"):
             gravity.check("drop", tolerated=tolerated)
-    assert "not surely" in unsure.check("drop", tolerated=2.0)
+    assert "within its uncertainty" in unsure.check("drop", tolerated=2.0)

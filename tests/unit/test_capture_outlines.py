@@ -40,7 +40,7 @@ def test_a_disc_stays_where_its_area_outweighs_its_outline(cost, stays):
     radius = 12.0
     disc = ellipse((160, 120), radius, radius)[80:160, 120:200]
     gain = np.where(disc, -2 / radius * cost, 1.0).astype(np.float32)
-    found = outlines._least_cost(gain, np.ones(gain.shape, np.float32))
+    found = outlines._minimum_cost(gain, np.ones(gain.shape, np.float32))
     assert (found.sum() > 0.9 * disc.sum()) if stays else not found.any()
 
 

@@ -50,16 +50,14 @@ def main(inputs, output, params, run) -> None:
             )
         rows += [(capture, "", row) for row in cameras + compare_masks(agreements)]
         for drop in demo.objects[name].drops:
-            rows += [
-                (capture, drop, row)
-                for row in compare_drop(demo, name, drop, known, lenses, files[name], params)
-            ]
+            of_drop = compare_drop(demo, name, drop, known, lenses, files[name], params)
+            rows += [(capture, drop, row) for row in of_drop]
         run.progress(number + 1, len(demo.objects))
     markdown, cells = table(rows)
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(cells)
     write_text(output.csv, text.getvalue())
-    write_text(output.page, "# The demo captures beside their truth\n\n" + markdown)
+    write_text(output.page, "# The demo captures compared with the ground truth\n\n" + markdown)
     missed = [row.what for _, _, row in rows if row.reached is False]
     run.say(f"{sum(row.reached is True for _, _, row in rows)} goals reached, {len(missed)} missed")
 
