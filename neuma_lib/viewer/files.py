@@ -26,7 +26,7 @@ class LawFiles(places.LawFiles):
 
 @dataclass(frozen=True)
 class RunFiles:
-    """A predicted motion: name and title of the method, file of the motion, law (None: springs), motion of Gaussians."""
+    """A predicted motion: name and title of the method, file, law (None: springs), motion of the Gaussians."""
 
     name: str
     title: str

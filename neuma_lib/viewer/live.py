@@ -1,8 +1,8 @@
 """Interactive simulation in a background thread.
 
-Other threads put commands into a queue, which are executed between two frames, and read the last `Snapshot`. Lengths are
-metres in the simulated box. A tilt of the floor rotates gravity in the opposite direction; the display rotates the box
-(`LiveSimulation.floor`).
+Other threads put commands into a queue, which are executed between two frames, and read the last `Snapshot`. Lengths
+are metres in the simulated box. A tilt of the floor rotates gravity in the opposite direction; the display rotates the
+box (`LiveSimulation.floor`).
 """
 
 from __future__ import annotations
