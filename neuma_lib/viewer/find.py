@@ -73,9 +73,7 @@ def found_scene(place: str | Path, configfiles: Sequence[str | Path] = ()) -> tu
     """
     place = Path(place).absolute()
     if not place.is_dir():
-        raise InputError(
-            place, "is not a folder", "Give the folder of a scene, for example results/BouncyBall"
-        )
+        raise InputError(place, "is not a folder", "Give that of a scene, for example results/BouncyBall")
     settings, _ = settings_around(place, configfiles)
     base, results = place.name.partition("+")[0], place.parent
     if base not in settings.scenes:

@@ -384,9 +384,7 @@ class LiveSimulation:
         low, high = body.x.amin(dim=0), body.x.amax(dim=0)
         floor = float(self._state.x[:, 1].max()) + gap
         if floor + float(high[1] - low[1]) > 1 - gap:
-            raise InputError(
-                "add", "there is no room above the other bodies", "Reset, or wait until they are lower"
-            )
+            raise InputError("add", "there is no room above the other bodies", "Reset, or wait")
         shift = 0.5 - 0.5 * (low + high)
         shift[1] = floor - low[1]
         added = replace(body, x=body.x + shift, v=torch.zeros_like(body.x), F=None, C=None)

@@ -57,11 +57,7 @@ class Playground:
     """
 
     def __init__(
-        self,
-        files: SceneFiles,
-        laws: Mapping[str, LawFiles],
-        chosen: str,
-        device: torch.device | str = "cpu",
+        self, files: SceneFiles, laws: Mapping[str, LawFiles], chosen: str, device: torch.device | str = "cpu"
     ):
         self.laws, self.roots, self.device = dict(laws), files.roots, device
         paths = [files.checked(path) for path in (files.particles, files.binding, files.gaussians)]

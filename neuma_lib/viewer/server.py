@@ -27,7 +27,7 @@ from neuma_lib.viewer.scene import Motion, Scene, frame_at
 
 RECORDED, LIVE = "recorded", "live"
 NOTHING, SEEN, DISTANCE = "nothing", "Gaussians", "Gaussians by distance of both"
-BESIDE = 1.15
+OFFSET = 1.15
 """Offset of the second box from the first [m]."""
 PACES = {"1/32": 1 / 32, "1/16": 1 / 16, "1/8": 1 / 8, "1/4": 1 / 4, "real time": 1.0}
 MAX_RATE = 15
@@ -47,9 +47,7 @@ def viser() -> ModuleType:
         return importlib.import_module("viser")
     except ImportError as error:
         problem = f"the viewer's server needs this package: {error}"
-        raise InputError(
-            "viser", problem, "Install it with `make viewer`, or write a file with --file"
-        ) from None
+        raise InputError("viser", problem, "Run `make viewer`, or write a file with --file") from None
 
 
 class ViewerServer:
@@ -102,7 +100,7 @@ class ViewerServer:
     def _room(self) -> None:
         scene = self.server.scene
         scene.set_up_direction("+y")
-        for name, shift in (("left", 0.0), ("right", BESIDE)):
+        for name, shift in (("left", 0.0), ("right", OFFSET)):
             scene.add_frame(f"/{name}", show_axes=False, position=(shift, 0.0, 0.0))
             self._nodes[name, "box"] = scene.add_frame(f"/{name}/box", show_axes=False)
             scene.add_grid(
@@ -283,16 +281,16 @@ class ViewerServer:
     def _draw_recorded(self) -> None:
         step = self.scene.steps[self.gui["frame"].value]
         left = self._titled(self.gui["left"].value)
-        beside = None if self.gui["right"].value == NOTHING else self._titled(self.gui["right"].value)
+        right = None if self.gui["right"].value == NOTHING else self._titled(self.gui["right"].value)
         shown = self.gui["show"].value
         text = [f"**{1e3 * self.scene.dt * step:.0f} ms**"]
         self._turn(np.eye(3))
         with self.server.atomic():
             pair = shown == DISTANCE
-            self._draw_motion("left", left, step, shown, beside, text)
-            if beside and not pair:
-                self._draw_motion("right", beside, step, shown, left, text)
-            self._nodes["right", "frame"].visible = bool(beside and not pair)
+            self._draw_motion("left", left, step, shown, right, text)
+            if right and not pair:
+                self._draw_motion("right", right, step, shown, left, text)
+            self._nodes["right", "frame"].visible = bool(right and not pair)
             for view in self.scene.views:
                 at = frame_at(tuple(sorted(view.images)), step)
                 image = view.images[sorted(view.images)[at]]

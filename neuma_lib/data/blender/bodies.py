@@ -20,10 +20,7 @@ body within 1 % (letters: 1.1 %), because protrusions compensate gaps. A depth o
 
 
 def make_body(
-    mesh: trimesh.Trimesh,
-    appearance: AppearanceConfig,
-    x: np.ndarray,
-    tracers: np.ndarray | None = None,
+    mesh: trimesh.Trimesh, appearance: AppearanceConfig, x: np.ndarray, tracers: np.ndarray | None = None
 ) -> Surface | Liquid:
     """Geometry for Blender.
 

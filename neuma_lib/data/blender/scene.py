@@ -176,11 +176,7 @@ def run_worker(module: str, job: Path, total: int, progress: Progress | None) ->
     log = job.with_suffix(".log")
     with open(log, "wb") as sink:
         process = subprocess.Popen(
-            [python, "-m", module, str(job)],
-            stdout=subprocess.PIPE,
-            stderr=sink,
-            env=environment,
-            text=True,
+            [python, "-m", module, str(job)], stdout=subprocess.PIPE, stderr=sink, env=environment, text=True
         )
         try:
             for line in process.stdout:
