@@ -1,4 +1,4 @@
-"""Simulation of the true motion of a drop."""
+"""The true motion of a drop."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from neuma_lib.sim.model import MPMModel
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Surface of the body at some steps.
+    """The surface of the body at steps of its motion.
 
     Attributes:
         steps: (T,).
@@ -31,24 +31,24 @@ class Surfaces:
     velocities: np.ndarray
 
     def at(self, steps: np.ndarray) -> np.ndarray:
-        """Indices of the frames at some steps."""
+        """Numbers of the frames of some steps."""
         return np.searchsorted(self.steps, steps)
 
 
 def simulate_drop(
     demo: DemoCapturesConfig, name: str, drop: str, device: torch.device | str = "cpu"
 ) -> GroundTruth:
-    """Simulate a drop, with the start and all frames of all cameras."""
+    """Simulate a drop, with a frame for each frame of each camera, and one at the start."""
     item, settings = demo.objects[name], demo.truth
-    motion, dt = item.drops[drop], time_step(demo)
+    thrown, dt = item.drops[drop], time_step(demo)
     mesh = solid(item)
-    mesh.vertices = start(item, motion, mesh).apply(mesh.vertices)
+    mesh.vertices = start(item, thrown, mesh).apply(mesh.vertices)
     model = MPMModel(grid=settings.grid, dt=dt, gravity=(0.0, -settings.gravity, 0.0))
     law = analytic_law(item.law.plain(), dt=dt)
     frames = sorted({0, *(int(s) for camera in demo.cameras for s in frame_steps(demo, camera))})
     return simulate_ground_truth(
         model,
-        [TrueBody(mesh, law, motion.velocity, item.density, motion.spin)],
+        [TrueBody(mesh, law, thrown.velocity, item.density, thrown.spin)],
         frames,
         particles=settings.particles,
         tracers=settings.tracers,
@@ -58,11 +58,11 @@ def simulate_drop(
 
 
 def surfaces(rest: trimesh.Trimesh, steps: np.ndarray, x: np.ndarray, v: np.ndarray) -> Surfaces:
-    """Surface that moves with particles.
+    """The surface that particles carry.
 
     Args:
-        rest: surface at the start [m].
-        steps: of the states; the first is at rest in the mesh, (T,).
+        rest: where the motion starts [m].
+        steps: of the states, the first at rest in the mesh, (T,).
         x, v: particles [m], [m/s], (T, N, 3).
     """
     matrix = skinning_matrix(rest.vertices, x[0])

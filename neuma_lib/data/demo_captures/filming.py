@@ -1,4 +1,4 @@
-"""Photographs and videos of the demo captures: renders with a camera's exposure and noise."""
+"""Photographs and videos of the demo captures: what Blender renders, with a camera's exposure and noise."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from neuma_lib.data.demo_captures.stage import MIDDLE, Eye, lens_row, video_came
 from neuma_lib.io.files import atomic
 
 PAPER = 0.0004
-"""Height of the page above the floor, to avoid coincident surfaces [m]."""
+"""How far the page lies above the floor, so that the two do not meet [m]."""
 MARGIN = 10
-"""Margin around the body and its shadow in the rendered regions of a video [px]."""
-REGION_COST = 15_000
-"""Approximate cost of another region in pixels; regions are merged if that is cheaper."""
+"""Pixels around the body and its shadow that are rendered anew for a video."""
+START = 15_000
+"""About what another region costs in pixels; two that cost more apart are rendered as one."""
 EVERY = 5
-"""Stride of the vertices that bound the body; they are some millimetres apart."""
+"""One of so many vertices tells where the body is; they lie some millimetres apart."""
 RIM = 8
-"""Number of points on a lamp's rim for the shadows."""
+"""Points of a lamp's rim from which shadows are cast."""
 WALL_TEXEL = 2.0
-"""Pixel size of the walls over that of the floor."""
+"""Side of a wall's pixels, in those of the floor."""
 
 
 def scenery(room: DemoRoomConfig, page: np.ndarray, size: tuple[float, float]) -> Scenery:
@@ -36,7 +36,7 @@ def scenery(room: DemoRoomConfig, page: np.ndarray, size: tuple[float, float]) -
 
     Args:
         page: the printed page, sRGB (H, W, 3), uint8.
-        size: width and height of the page [m].
+        size: its width and height [m].
     """
     half, wall = room.half, room.wall
     texel = 2 * half / room.texels
@@ -73,7 +73,7 @@ def photograph(
     threads: int,
     progress: Progress | None,
 ) -> Iterator[tuple[np.ndarray, float]]:
-    """Photographs (H, W, 3), uint8, of the body's first frame, each with its relative exposure."""
+    """Photographs (H, W, 3), uint8, of the body's first frame, each with the share of light that it got."""
     rng = np.random.default_rng([demo.seed, 1, len(eyes)])
     settings = demo.photographs
     shots = [Shot(eye.c2w, lens_row(eye.lens), 0) for eye in eyes]
@@ -86,7 +86,7 @@ def photograph(
 def plates(
     demo: DemoCapturesConfig, where: Scenery, threads: int, progress: Progress | None
 ) -> dict[str, np.ndarray]:
-    """Images of the empty room in each video camera, linear (H, W, 3), float32."""
+    """What each video camera sees of the empty room, linear (H, W, 3), float32."""
     eyes = video_cameras(demo)
     shots = [Shot(eye.c2w, lens_row(eye.lens), -1) for eye in eyes.values()]
     return dict(
@@ -109,13 +109,13 @@ def film(
 ) -> dict[str, list[np.ndarray]]:
     """Frames (H, W, 3), uint8, of each camera.
 
-    Only regions with the body or its shadow are rendered. The rest is the empty scene.
+    Only what the body or its shadow can be in is rendered; the rest is the empty scene.
 
     Args:
         body: at all frames of all cameras.
-        frames: camera -> indices of its frames in those of the body.
-        empty: result of `plates`.
-        seed: of the noise.
+        frames: numbers of the body's frames that each camera takes.
+        empty: of `plates`.
+        seed: of noise.
     """
     eyes, exposure, rng = video_cameras(demo), demo.videos.exposure, np.random.default_rng(seed)
     shots: list[list[Shot]] = []
@@ -149,12 +149,12 @@ def film(
 def regions(
     eye: Eye, points: np.ndarray, lamps: np.ndarray, lamp_size: float
 ) -> list[tuple[int, int, int, int]]:
-    """Regions x0, y0, x1, y1 [px] of an image that contain a body and its shadow on the floor.
+    """Parts of a picture outside of which neither a body nor its shadow on the floor is seen: x0, y0, x1, y1 [px].
 
     Args:
         points: of the body's surface [m], (N, 3).
-        lamps: centres of lamps above all points [m], (L, 3).
-        lamp_size: diameter of the lamps [m].
+        lamps: middles of lamps above all points [m], (L, 3).
+        lamp_size: their diameter [m].
     """
     angles = 2 * np.pi * np.arange(RIM) / RIM
     rim = lamp_size / 2 * np.stack([np.cos(angles), 0 * angles, np.sin(angles)], axis=1)
@@ -165,7 +165,7 @@ def regions(
     if len(boxes) == 2:
         a, b = boxes
         both = (min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3]))
-        if _area(both) < _area(a) + _area(b) + REGION_COST:
+        if _area(both) < _area(a) + _area(b) + START:
             return [both]
     return boxes
 
@@ -184,11 +184,11 @@ def _area(box: tuple[int, int, int, int]) -> int:
 
 
 def developed(linear: np.ndarray, noise: float, rng: np.random.Generator) -> np.ndarray:
-    """Image file of a camera, sRGB (H, W, 3), uint8.
+    """A picture as a camera writes it, sRGB (H, W, 3), uint8.
 
     Args:
         linear: radiance, 1 is white.
-        noise: standard deviation of the noise of a pixel [1/255].
+        noise: standard deviation of a pixel's noise [1/255].
     """
     light = np.clip(linear, 0.0, 1.0)
     srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
@@ -201,10 +201,30 @@ def write_jpeg(path: str | Path, pixels: np.ndarray, quality: int) -> None:
 
 
 def write_video(path: str | Path, pictures: Sequence[np.ndarray], rate: int, quality: int) -> None:
-    """Write H.264 video without sound; pictures (H, W, 3), uint8, of even size."""
+    """An H.264 file without sound; pictures (H, W, 3), uint8, of even size."""
     height, width = pictures[0].shape[:2]
     with atomic(path) as partial:
-        options = f"-y -v error -f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {rate} -i -"
-        options += f" -c:v libx264 -crf {quality} -pix_fmt yuv420p -threads 1 -f mp4"
-        command = [imageio_ffmpeg.get_ffmpeg_exe(), *options.split(), str(partial)]
+        command = [
+            imageio_ffmpeg.get_ffmpeg_exe(),
+            "-y",
+            "-v",
+            "error",
+            "-f",
+            "rawvideo",
+            "-pix_fmt",
+            "rgb24",
+        ]
+        command += [
+            "-s",
+            f"{width}x{height}",
+            "-r",
+            str(rate),
+            "-i",
+            "-",
+            "-c:v",
+            "libx264",
+            "-crf",
+            str(quality),
+        ]
+        command += ["-pix_fmt", "yuv420p", "-threads", "1", "-f", "mp4", str(partial)]
         subprocess.run(command, input=np.stack(pictures).tobytes(), check=True)

@@ -1,4 +1,4 @@
-"""Internal data of the demo captures: the room, and the body in Blender."""
+"""Files of the demo captures that are not for the pipeline: the room, and the body in Blender."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PLATE = "plate_"
 
 
 def write_room(path: str | Path, where: Scenery, plates: dict[str, np.ndarray]) -> None:
-    """Write the room and the background images of the video cameras to .npz."""
+    """Write the room and the plates of the video cameras (an .npz)."""
     values = {name: getattr(where, name) for name in Scenery.__dataclass_fields__ if name != "pictures"}
     pictures = {f"picture{number}": picture for number, picture in enumerate(where.pictures)}
     with atomic(path) as partial, open(partial, "wb") as file:
@@ -26,7 +26,7 @@ def write_room(path: str | Path, where: Scenery, plates: dict[str, np.ndarray]) 
 
 
 def read_room(path: str | Path) -> tuple[Scenery, dict[str, np.ndarray]]:
-    """Inverse of `write_room`."""
+    """What `write_room` wrote."""
     with np.load(path) as file:
         values = {name: file[name][()] for name in Scenery.__dataclass_fields__ if name != "pictures"}
         pictures = [file[f"picture{number}"] for number in range(len(values["corners"]))]
@@ -35,7 +35,7 @@ def read_room(path: str | Path) -> tuple[Scenery, dict[str, np.ndarray]]:
 
 
 def body_at_rest(demo: DemoCapturesConfig, name: str) -> Moving:
-    """An object in its pose in the photographs."""
+    """An object as it lies in its photographs."""
     mesh = solid(demo.objects[name])
     colors = colors_at(mesh, mesh.vertices, demo.objects[name].appearance)
     vertices = lying(demo.objects[name], mesh).apply(mesh.vertices)[None]
@@ -45,10 +45,10 @@ def body_at_rest(demo: DemoCapturesConfig, name: str) -> Moving:
 def body_of_drop(
     demo: DemoCapturesConfig, name: str, drop: str, particles: str | Path
 ) -> tuple[Moving, dict[str, np.ndarray]]:
-    """The body in a drop, and for each camera the indices of its frames in those of the body.
+    """The body in a drop, and the numbers of its frames that each camera takes.
 
     Args:
-        particles: file of the simulated motion.
+        particles: the simulated motion.
     """
     item = demo.objects[name]
     mesh = solid(item)

@@ -1,7 +1,7 @@
-"""Geometry of the demo captures: cameras, board, and the poses of the object at rest and at the start of its drops.
+"""Where everything is in the demo captures: cameras, the board, the object at rest and at the start of its drops.
 
-The world frame is the simulator's box: y up, the floor at y = 0, x along the board's width, z opposite to its height.
-Positions in the settings are relative to the centre of the floor.
+The world is the simulator's box, as a capture's room is placed into it: y up, the floor at y = 0, axes along the
+board's width (x) and against its height (z). Places of the settings count from the middle of the floor.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from neuma_lib.config.demo_captures import DemoCapturesConfig, DemoDropConfig, D
 from neuma_lib.geometry import shapes
 
 MIDDLE = np.array([0.5, 0.0, 0.5])
-"""Centre of the floor in the simulator's box [m]."""
+"""The middle of the floor in the simulator's box [m]."""
 POLYNOMIAL = 4
-"""Degree of the polynomial from image distance to angle that represents a lens."""
+"""Degree of the polynomial from distance in the picture to angle that stands for a lens."""
 BEYOND = 1.05
-"""Range of the polynomial fit, relative to the corners of the image."""
+"""How far past the corners of the picture the polynomial is fitted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,14 +31,14 @@ class Eye:
 
     Attributes:
         c2w: camera to world (4, 4), OpenGL axes.
-        lens: settings of the lens.
+        lens: its settings.
     """
 
     c2w: np.ndarray
     lens: LensConfig
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Pixels (N, 2) of points (N, 3) [m] in front of the camera; pixel centres at +0.5."""
+        """Pixels (N, 2) of points (N, 3) [m] before the camera; pixel centres at +0.5."""
         seen = (points - self.c2w[:3, 3]) @ self.c2w[:3, :3]
         flat = seen[:, :2] / -seen[:, 2:] * [1.0, -1.0]
         r2 = (flat**2).sum(axis=1, keepdims=True)
@@ -46,7 +46,7 @@ class Eye:
         return self.lens.focal * flat * (1 + r2 * (k1 + r2 * k2)) + self.lens.center
 
     def plain(self) -> dict:
-        """Pose and intrinsics in the format of transforms.json, with k1 and k2."""
+        """Pose and intrinsics as a transforms.json has them, with k1 and k2."""
         lens = self.lens
         return {
             "transform_matrix": self.c2w.tolist(),
@@ -56,28 +56,36 @@ class Eye:
 
 
 def lens_row(lens: LensConfig) -> np.ndarray:
-    """A lens for Cycles: a polynomial from image distance to angle, in a larger image centred at the optical axis.
+    """A lens as Cycles takes it: a polynomial from distance in the picture to angle, in the middle of a larger picture.
 
     Returns:
-        width, height, width and height of the larger image, left and top in it [px], and the coefficients k0 to k4
-        [rad / px^n], (11,). The fit error is below 0.01 px for lenses of phones.
+        width, height, those of the larger picture, left and top of the lens's picture in it [px], and the coefficients
+        k0 to k4 [rad / px^n], (11,). The fit is within a hundredth of a pixel for lenses of phones.
     """
     cx, cy = lens.center
     half = np.array([max(cx, lens.width - cx), max(cy, lens.height - cy)])
-    full = 2 * half  # integer, because the centre is at a multiple of half a pixel
+    full = 2 * half  # whole pixels, since the centre is in the middle of one or between two
     reach = BEYOND * np.linalg.norm(half)
     slope = np.linspace(0, 3 * reach / lens.focal, 20_000)
     k1, k2 = lens.distortion
     distance = lens.focal * slope * (1 + slope**2 * (k1 + slope**2 * k2))
     kept = slice(0, int(np.argmax(distance > reach)))
     powers = (distance[kept, None] / reach) ** np.arange(1, POLYNOMIAL + 1)
-    fitted = np.linalg.lstsq(powers, np.arctan(slope[kept]), rcond=None)[0]
-    coefficients = fitted / reach ** np.arange(1, POLYNOMIAL + 1)
-    return np.array([lens.width, lens.height, *full, *(full / 2 - [cx, cy]), 0.0, *coefficients])
+    found = np.linalg.lstsq(powers, np.arctan(slope[kept]), rcond=None)[0]
+    return np.array(
+        [
+            lens.width,
+            lens.height,
+            *full,
+            *(full / 2 - [cx, cy]),
+            0.0,
+            *found / reach ** np.arange(1, POLYNOMIAL + 1),
+        ]
+    )
 
 
 def looking(place: Sequence[float], target: Sequence[float], roll: float = 0.0) -> np.ndarray:
-    """Camera to world (4, 4), OpenGL axes, rotated by ``roll`` [rad] about the viewing direction."""
+    """Camera to world (4, 4), OpenGL axes, turned by ``roll`` [rad] about the direction of view."""
     place, target = np.asarray(place, float), np.asarray(target, float)
     back = (place - target) / np.linalg.norm(place - target)
     right = np.cross([0.0, 1.0, 0.0], back)
@@ -91,7 +99,7 @@ def looking(place: Sequence[float], target: Sequence[float], roll: float = 0.0) 
 
 
 def video_cameras(demo: DemoCapturesConfig) -> dict[str, Eye]:
-    """The static cameras by name, sorted."""
+    """The fixed cameras, by name, in order."""
     return {
         name: Eye(looking(MIDDLE + c.place, MIDDLE + c.target), c.lens.resized(demo.resolution))
         for name, c in sorted(demo.cameras.items())
@@ -99,7 +107,7 @@ def video_cameras(demo: DemoCapturesConfig) -> dict[str, Eye]:
 
 
 def photographers(demo: DemoCapturesConfig, name: str) -> list[Eye]:
-    """Cameras of the photographs of an object, on rings and near the video cameras."""
+    """Cameras of the photographs of an object: rings, and some beside the video cameras."""
     settings = demo.photographs
     rng = np.random.default_rng([demo.seed, *name.encode()])
     target = MIDDLE + settings.target
@@ -112,7 +120,7 @@ def photographers(demo: DemoCapturesConfig, name: str) -> list[Eye]:
             flat = np.cos(elevation) * np.array([np.sin(around), 0.0, np.cos(around)])
             places.append(target + distance * (flat + [0.0, np.sin(elevation), 0.0]))
     for camera in video_cameras(demo).values():
-        # closer to the scene, because phones have a wider field of view than video cameras
+        # A step towards the scene: phones see wider than cameras of videos.
         places += [target + 0.85 * (camera.c2w[:3, 3] - target)] * settings.beside_cameras
     lens = settings.lens.resized(demo.resolution)
     eyes = []
@@ -134,7 +142,7 @@ class Pose:
         return points @ self.rotation.T + self.translation
 
     def after(self, first: Pose) -> Pose:
-        """Composition: this motion after ``first``."""
+        """This one after another."""
         return Pose(self.rotation @ first.rotation, self.rotation @ first.translation + self.translation)
 
     def inverse(self) -> Pose:
@@ -145,31 +153,31 @@ class Pose:
 
 
 def solid(item: DemoObjectConfig) -> trimesh.Trimesh:
-    """The object's mesh, centred at the origin [m]."""
+    """The object's mesh around the origin [m]."""
     return shapes.build(item.shape, item.size)
 
 
 def lying(item: DemoObjectConfig, mesh: trimesh.Trimesh) -> Pose:
-    """Pose of the object for its photographs: the stable equilibrium closest to its orientation as built."""
+    """Where the object rests for its photographs: stable, in the pose that it falls into when set down as built."""
     corners = mesh.convex_hull.vertices - mesh.center_mass
 
     def lift(tilt: np.ndarray) -> float:
-        """Height of the centre of mass above the floor."""
+        """How high the centre of mass is above the floor."""
         return -(corners @ _upward(tilt)).min()
 
-    result = minimize(lift, (0.0, 0.0), method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-12})
-    level = Rotation.align_vectors([[0.0, 1.0, 0.0]], [_upward(result.x)])[0].as_matrix()
+    found = minimize(lift, (0.0, 0.0), method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-12})
+    level = Rotation.align_vectors([[0.0, 1.0, 0.0]], [_upward(found.x)])[0].as_matrix()
     turn = Rotation.from_euler("y", item.heading, degrees=True).as_matrix() @ level
     return _put(mesh, turn, item.place, 0.0)
 
 
 def _upward(tilt: np.ndarray) -> np.ndarray:
-    """Unit vector (3,) tilted from +y by two angles, about z and about x [rad]."""
+    """The unit vector (3,) that has been tilted from +y by two angles, about z and about x [rad]."""
     return Rotation.from_rotvec([tilt[1], 0.0, tilt[0]]).apply([0.0, 1.0, 0.0])
 
 
 def start(item: DemoObjectConfig, drop: DemoDropConfig, mesh: trimesh.Trimesh) -> Pose:
-    """Pose at the start of a drop."""
+    """Where a drop begins."""
     turn = Rotation.from_euler("xyz", drop.turn, degrees=True).as_matrix() @ lying(item, mesh).rotation
     return _put(mesh, turn, drop.center, drop.height)
 
@@ -182,10 +190,10 @@ def _put(mesh: trimesh.Trimesh, turn: np.ndarray, center: Sequence[float], heigh
 
 
 def frame_steps(demo: DemoCapturesConfig, camera: str) -> np.ndarray:
-    """Steps of the truth at the centres of the exposures of a camera's frames, (T,)."""
+    """Steps of the truth in the middle of the exposures of a camera's frames, (T,)."""
     return demo.cameras[camera].late + demo.truth.steps * np.arange(demo.videos.frames)
 
 
 def time_step(demo: DemoCapturesConfig) -> float:
-    """Time step of the truth [s]."""
+    """Of the truth [s]."""
     return 1.0 / (demo.videos.rate * demo.truth.steps)

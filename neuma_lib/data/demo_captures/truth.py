@@ -1,4 +1,4 @@
-"""Ground truth of a demo capture as plain values."""
+"""What is true of a demo capture, as plain values."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from neuma_lib.data.demo_captures.stage import lying, solid, start, time_step, v
 
 
 def truth_of(demo: DemoCapturesConfig, name: str, photographs: dict[str, Any]) -> dict[str, Any]:
-    """True values of all that the pipeline estimates for an object, in the simulator's box [m], y up.
+    """Everything that the pipeline is to find of an object, in the simulator's box [m], y up.
 
-    ``offset_s`` of a camera is the time of its first frame after the start of a drop. ``rotation`` and ``translation``
-    of a drop map the object from its pose in the photographs to the start.
+    ``offset_s`` of a camera is the true time of its first frame after the start of a drop. ``rotation`` and
+    ``translation`` of a drop take the object as photographed to that start.
 
     Args:
-        photographs: file -> true camera of the photograph.
+        photographs: true cameras of the photographs, by file.
     """
     item = demo.objects[name]
     mesh = solid(item)
     rest = lying(item, mesh)
     drops = {}
-    for drop, motion in sorted(item.drops.items()):
-        moved = start(item, motion, mesh).after(rest.inverse())
+    for drop, thrown in sorted(item.drops.items()):
+        moved = start(item, thrown, mesh).after(rest.inverse())
         drops[drop] = {
             **moved.plain(),
             "center_m": moved.apply(rest.apply(np.asarray(mesh.center_mass)[None]))[0].tolist(),
-            "v0_m_s": list(motion.velocity),
-            "spin_rad_s": list(motion.spin),
+            "v0_m_s": list(thrown.velocity),
+            "spin_rad_s": list(thrown.spin),
         }
     dt = time_step(demo)
     return {
