@@ -4,17 +4,20 @@
 # make env      the environment alone        make lint    style checks
 # make capture  the environment, with OpenCV, COLMAP and MeshLab for own photographs and videos (docs/capture.md)
 # make viewer   the environment, with viser for the viewer in a browser (docs/viewer.md)
-# make lock     envs/ again from the pins in pyproject.toml
+# make docs-env the environment, with mkdocs for the site
+# make test-core  build the package, install it without extras in a fresh environment, run the tests marked `core` there
+# make lock     write envs/ from pyproject.toml and envs/pins.txt
 # make unlock   after a killed Snakemake     make clean   everything computed, but not the environment
 
 PYTHON ?= python3.11
 VENV ?= .venv
 CORES ?= 2
 BIN := $(VENV)/bin
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 READY := $(VENV)/.ready
 SNAKEMAKE := $(BIN)/snakemake --cores $(CORES)
 
-.PHONY: table1 demo all dataset test test-all lint env capture viewer check unlock lock clean
+.PHONY: table1 demo all dataset test test-all test-core lint env capture viewer docs-env check unlock lock clean
 
 table1: env unlock
 	$(SNAKEMAKE) results/table1.csv
@@ -52,12 +55,15 @@ unlock: env
 env: $(READY)
 
 capture: env envs/requirements-capture.txt
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r envs/requirements-capture.txt
+	$(INSTALL) -r envs/requirements-capture.txt
 
 viewer: env envs/requirements-viewer.txt
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r envs/requirements-viewer.txt
+	$(INSTALL) -r envs/requirements-viewer.txt
 
-$(READY): envs/requirements.txt envs/requirements-dev.txt
+docs-env: env envs/requirements-docs.txt
+	$(INSTALL) -r envs/requirements-docs.txt
+
+$(READY): envs/requirements.txt envs/requirements-dev.txt pyproject.toml
 	@command -v $(PYTHON) >/dev/null 2>&1 && $(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { \
 	  echo "Python 3.11 is needed (Blender's module bpy 4.5 has no other), and '$(PYTHON)' is not one." >&2; \
 	  echo "Debian 12: apt-get install python3.11 python3.11-venv   elsewhere: pyenv install 3.11, or conda create -n neuma python=3.11" >&2; \
@@ -65,15 +71,16 @@ $(READY): envs/requirements.txt envs/requirements-dev.txt
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
 	  echo "Python's venv module is missing: apt-get install python3.11-venv" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r envs/requirements-dev.txt
+	$(INSTALL) -r envs/requirements-dev.txt
+	$(INSTALL) --no-deps --no-build-isolation --editable .
 	@$(MAKE) --no-print-directory check
 	@touch $(READY)
 
 check:
 	@$(BIN)/python -m neuma_lib.data.blender.libraries
 
-lock: envs/lock.py pyproject.toml
-	$(BIN)/python envs/lock.py
+lock: envs/lock.py pyproject.toml envs/pins.txt
+	$(BIN)/python envs/lock.py $(UPGRADE)
 
 clean:
 	rm -rf data results .cache .snakemake .pytest_cache .ruff_cache

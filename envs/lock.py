@@ -1,13 +1,15 @@
-"""Write the locked environments from the pins in pyproject.toml: `make lock`.
+"""Write the locked environments from the extras in pyproject.toml and the versions in pins.txt: `make lock`.
 
-requirements.txt      everything that the workflow needs, exact versions
-requirements-dev.txt  the same, and what tests and style checks need
-requirements-capture.txt  the same as the first, and what own photographs and videos need
-requirements-viewer.txt  the same as the first, and what the viewer's server needs
-conda.yaml            requirements.txt inside a conda environment with Python 3.11 (`snakemake --sdm conda`, not tried)
-conda-capture.yaml    requirements-capture.txt so
+requirements.txt          the workflow and Blender: everything but captures and the viewer's server
+requirements-dev.txt      the same with the tools for tests and style checks
+requirements-capture.txt  requirements.txt with the packages for captures
+requirements-viewer.txt   requirements.txt with the packages for the viewer's server
+requirements-docs.txt     requirements.txt with the packages for the site
+conda.yaml, conda-capture.yaml  the same packages in a conda environment with Python 3.11, untested
 
-Local builds (``+cpu``) and the addresses of package indices are left out, so that the files resolve anywhere.
+A version that is already in one of these files is kept while it satisfies the pins; `make lock UPGRADE=--upgrade`
+replaces dependencies by their newest versions. Local builds (``+cpu``) and the addresses of package indices are left
+out, so that the files resolve anywhere.
 """
 
 from __future__ import annotations
@@ -16,46 +18,54 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 HERE = Path(__file__).resolve().parent
-HEADER = "# Made by `make lock` from the pins in pyproject.toml; do not edit.\n"
+HEADER = "# Written by `make lock` from pyproject.toml and pins.txt; do not edit.\n"
+RUN = ("workflow", "blender")
+EXTRAS = {
+    "requirements.txt": RUN,
+    "requirements-dev.txt": (*RUN, "dev"),
+    "requirements-capture.txt": (*RUN, "capture"),
+    "requirements-viewer.txt": (*RUN, "viewer"),
+    "requirements-docs.txt": (*RUN, "docs"),
+}
+CONDA = {"conda.yaml": "requirements.txt", "conda-capture.yaml": "requirements-capture.txt"}
+OPTIONS = (
+    "--quiet --no-header --no-annotate --strip-extras --no-emit-index-url --no-emit-find-links "
+    "--no-emit-trusted-host --allow-unsafe --resolver=backtracking"
+).split()
 
 
-def resolve(extras: list[str]) -> list[str]:
-    """Exact requirements of the project with some extras, one a line, sorted."""
-    command = [
-        sys.executable,
-        "-m",
-        "piptools",
-        "compile",
-        "--quiet",
-        "--dry-run",
-        "--no-header",
-        "--no-annotate",
-    ]
-    command += ["--strip-extras", "--no-emit-index-url", "--no-emit-find-links", "--no-emit-trusted-host"]
-    command += ["--allow-unsafe", "--resolver=backtracking", "--output-file=-"]
-    command += [f"--extra={extra}" for extra in extras]
-    done = subprocess.run([*command, "pyproject.toml"], cwd=HERE.parent, capture_output=True, text=True)
-    if done.returncode:
-        raise SystemExit(done.stderr)
-    found = re.findall(r"^([A-Za-z0-9._-]+)==([^\s+;]+)", done.stdout + done.stderr, re.MULTILINE)
-    return sorted({f"{name.lower()}=={version}" for name, version in found})
+def resolve(file: str, options: list[str]) -> list[str]:
+    """Exact requirements of an environment, one a line, sorted. Every file but the first agrees with the first."""
+    first = next(iter(EXTRAS))
+    constraints = ["pins.txt"] if file == first else ["pins.txt", first]
+    with TemporaryDirectory() as folder:
+        output = Path(folder, "output.txt")
+        if (HERE / file).is_file():
+            output.write_text((HERE / file).read_text())  # the versions to keep
+        command = [sys.executable, "-m", "piptools", "compile", *OPTIONS, f"--output-file={output}", *options]
+        command += [f"--extra={extra}" for extra in EXTRAS[file]]
+        command += [f"--constraint={HERE / name}" for name in constraints]
+        done = subprocess.run([*command, "pyproject.toml"], cwd=HERE.parent, capture_output=True, text=True)
+        if done.returncode:
+            raise SystemExit(done.stderr)
+        pins = re.findall(r"^([A-Za-z0-9._-]+)==([^\s+;]+)", output.read_text(), re.MULTILINE)
+    return sorted({f"{name.lower()}=={version}" for name, version in pins})
 
 
 def main() -> None:
-    run, dev, capture, viewer = resolve([]), resolve(["dev"]), resolve(["capture"]), resolve(["viewer"])
-    for kind, packages in (("", run), ("-dev", dev), ("-capture", capture), ("-viewer", viewer)):
-        (HERE / f"requirements{kind}.txt").write_text(HEADER + "".join(f"{line}\n" for line in packages))
-    for name, packages in (("conda.yaml", run), ("conda-capture.yaml", capture)):
-        pins = "".join(f"      - {line}\n" for line in packages)
-        (HERE / name).write_text(
+    for file in EXTRAS:
+        packages = resolve(file, sys.argv[1:])
+        (HERE / file).write_text(HEADER + "".join(f"{line}\n" for line in packages))
+        print(f"{file}: {len(packages)} packages")
+    for file, source in CONDA.items():
+        lines = (HERE / source).read_text().removeprefix(HEADER).splitlines()
+        pins = "".join(f"      - {line}\n" for line in lines)
+        (HERE / file).write_text(
             f"{HEADER}channels:\n  - conda-forge\ndependencies:\n  - python=3.11\n  - pip\n  - pip:\n{pins}"
         )
-    print(
-        f"{len(run)} packages, {len(dev)} with those of development, {len(capture)} with those of captures, "
-        f"{len(viewer)} with those of the viewer"
-    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Any law from the file of `python -m neuma_lib export-law`, with numpy alone: law_in_numpy.py for networks, and here a
+"""Any law from the file of `neuma law export`, with numpy alone: law_in_numpy.py for networks, and here a
 structured law or its analytic base alone.
 
 What `identify` finds and `neuma_structured` learns: Hencky, neo-Hookean or fixed corotated elasticity, with no return

@@ -1,4 +1,4 @@
-"""A law of two networks, from the file of `python -m neuma_lib export-law`, with numpy alone."""
+"""A law of two networks, from the file of `neuma law export`, with numpy alone."""
 
 import json
 import math

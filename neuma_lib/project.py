@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from neuma_lib.capture.planned import planned_captures
 from neuma_lib.capture.scenes import captured_scenes
 from neuma_lib.config.capture import CapturesConfig
 from neuma_lib.config.loading import load, merged, read_yaml
 from neuma_lib.config.settings import Config
+from neuma_lib.config.validation import validate
 from neuma_lib.errors import InputError
 
 SETTINGS_FILE = Path("config/config.yaml")
@@ -34,5 +36,11 @@ def settings_around(place: str | Path, configfiles: Sequence[str | Path] = ()) -
     raw: dict[str, Any] = {}
     for file in (root / SETTINGS_FILE, *configfiles):
         raw = merged(raw, read_yaml(file))
-    captures = root / str((raw.get("captures") or {}).get("root", CapturesConfig().root))
-    return load(raw, root, captured=captured_scenes(captures)), root
+    captures = validate(CapturesConfig, raw.get("captures") or {}, "captures")
+    planned = planned_captures(captures.demo, root / captures.root)
+    released = {
+        name: item.model_copy(update={"folder": str(root / item.folder)})
+        for name, item in captures.released.items()
+    }
+    scenes = captured_scenes(root / captures.root, released, planned)
+    return load(raw, root, captured=scenes), root

@@ -1,6 +1,15 @@
 """Settings of every test run."""
 
+from pathlib import Path
+
 import torch
 
 # Two OpenMP threads on a busy machine cost far more than one.
 torch.set_num_threads(1)
+
+
+def pytest_ignore_collect(collection_path: Path, config):
+    """With ``-m core``, leave out the files without such tests, whose imports may need an extra."""
+    if "core" in config.option.markexpr and collection_path.suffix == ".py":
+        return "mark.core" not in collection_path.read_text() or None
+    return None

@@ -8,11 +8,6 @@ COUNTED = ("all_data.json", "camera.json")
 """Lists of images whose frames are counted, not named by simulated steps (`neuma_lib.io.layouts`)."""
 
 
-def listed(files) -> list[str]:
-    """Named input files as a list: Snakemake gives one file as a text."""
-    return [files] if isinstance(files, str) else list(files or ())
-
-
 def image_list(place: str, stride: int | None, key: str, stride_key: str) -> str:
     """The list of images that a setting names, itself or by its folder; one that counts frames needs ``stride``.
 

@@ -39,17 +39,17 @@ class Sources:
     def _graph(self) -> grimp.ImportGraph:
         return grimp.build_graph(self._package, cache_dir=None, exclude_type_checking_imports=True)
 
-    def reached(self, script: Path) -> list[str]:
-        """Names of the modules that a script imports, directly or through others, sorted."""
-        direct = _imports(script, self._graph.modules)
+    def reached(self, script: Path, modules: tuple[str, ...] = ()) -> list[str]:
+        """Names of some modules, and of those that they and a script import, directly or through others, sorted."""
+        direct = _imports(script, self._graph.modules) | set(modules)
         through = (self._graph.find_upstream_modules(module) for module in direct)
         return sorted(direct.union(*through))
 
-    def digest(self, script: Path) -> str:
-        """Digest of a script and of all modules that it reaches."""
+    def digest(self, script: Path, modules: tuple[str, ...] = ()) -> str:
+        """Digest of a script and of all modules that it reaches, and of further modules that it loads by name."""
         parts = [
             _file_digest(script),
-            *(f"{name} {self._module_digest(name)}" for name in self.reached(script)),
+            *(f"{name} {self._module_digest(name)}" for name in self.reached(script, modules)),
         ]
         return _hash("\n".join(parts).encode())
 
@@ -68,9 +68,13 @@ def _library() -> Sources:
 
 
 @cache
-def code_digest(script: str | Path) -> str:
-    """Digest of a script and of all that it reaches of the library, read once a process."""
-    return _library().digest(Path(script))
+def code_digest(script: str | Path, *modules: str) -> str:
+    """Digest of a script and of all that it reaches of the library, read once a process.
+
+    Args:
+        modules: of the library, which the script loads by name.
+    """
+    return _library().digest(Path(script), modules)
 
 
 def fingerprint(settings: Mapping[str, Any], inputs: Mapping[str, str | Path], code: str) -> dict[str, str]:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import fcntl
 import logging
 import os
-import re
 import resource
 import sys
 from collections.abc import Callable, Iterator
@@ -35,7 +34,7 @@ LOG_FORMAT = "[%(asctime)s] %(message)s"
 
 _LOGGER = logging.getLogger("neuma_lib.stage")
 _SECONDS_LOGGER = logging.getLogger("neuma_lib.seconds")  # for the log alone
-_SECONDS = "core seconds: {:.2f} to start, {:.2f} of work"
+_SECONDS = "core seconds: {:.2f} to start, {:.2f} of work"  # read by neuma_lib.timings
 
 
 @contextmanager
@@ -81,13 +80,6 @@ def run_script(main: Callable, snakemake) -> None:
     with stage(name, snakemake.log[0]) as run:
         main(snakemake.input, snakemake.output, snakemake.params, run)
         _SECONDS_LOGGER.info(_SECONDS.format(started, _core_seconds() - started))
-
-
-def core_seconds(log: str | Path) -> tuple[float, float] | None:
-    """Core seconds [s] that a script took to start and to work, from its log; None if it did not get to its end."""
-    said = re.escape(_SECONDS).replace(r"\{:\.2f\}", r"([\d.]+)")
-    found = re.findall(said, Path(log).read_text()) if Path(log).exists() else []
-    return tuple(map(float, found[-1])) if found else None
 
 
 def _core_seconds() -> float:

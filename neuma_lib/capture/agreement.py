@@ -1,7 +1,8 @@
-"""Whether masks of several views are of one thing: each against the body that the views together leave.
+"""Check that masks of several views show the same object.
 
-Voxels that lie in nearly all masks make the body (a visual hull that bears some bad masks); seen by a camera, it should
-cover the camera's mask. A mask with the floor in it, of another object, or of a camera with a wrong pose, does not fit.
+The voxels that lie in nearly all masks form a visual hull that tolerates some bad masks. Projected into a camera, the
+hull should cover that camera's mask. A mask that contains floor or another object, or whose camera pose is wrong, does
+not fit.
 """
 
 from __future__ import annotations
@@ -15,27 +16,35 @@ from neuma_lib.capture.masks import centroid, iou
 from neuma_lib.capture.tools import opencv
 from neuma_lib.errors import InputError
 
-LEAST_AGREEMENT = 0.7
-"""Least IoU of a mask with the body of all that is not doubtful."""
-LEAST_SAME = 0.5
-"""Least IoU with which cameras that film at one time can be said to film one object."""
-LEAST_SHARES = (0.8, 0.95)
-"""Share of the views which see a voxel that must have it in their masks: of all views, and without the doubtful."""
-_CUT_OFF = 0.7  # part of the most views of a voxel below which it is one that many pictures cut off
-_MISSES = 2  # masks that may lack such a voxel, one of each five; of so few a share would let none
-_VOXELS = (24, 64)  # along a side of the cube, at first and then
-_MARGIN = 1.6  # half side of the first cube, in radii of the masks
+MIN_AGREEMENT = 0.7
+"""IoU with the common body below which a mask is considered doubtful."""
+MIN_SAME_OBJECT = 0.5
+"""IoU below which simultaneous cameras are considered to film different objects."""
+MIN_SHARES = (0.8, 0.95)
+"""Share of the views of a voxel whose masks must contain it: first for all views, then without doubtful views."""
+_TRUNCATED = 0.7  # voxels seen by a smaller share of the maximum view count are outside many pictures
+_MAX_MISSES = (
+    2  # masks that may lack such a voxel, at most one in five; a share of so few views would allow none
+)
+_VOXELS = (24, 64)  # along a side of the cube, in the coarse and the fine pass
+_MARGIN = 1.6  # half side of the coarse cube, in radii of the masks
 _CLOSING = np.ones((3, 3), np.uint8)
+_NO_COMMON_VOLUME = (
+    "masks",
+    "no point in space lies in most of the masks, so they show different objects or the cameras have moved since their"
+    " poses were estimated",
+    "Look at the contact sheets of the masks",
+)
 
 
 @dataclass(frozen=True, eq=False)
 class CommonBody:
-    """What several views leave of a cube of space.
+    """Visual hull of several views.
 
     Attributes:
-        points: middles of its voxels, (P, 3).
-        voxel: their side.
-        agreement: IoU of each mask with the body as seen from there, (N,).
+        points: voxel centres, (P, 3).
+        voxel: voxel side.
+        agreement: IoU of each mask with the projected hull, (N,).
     """
 
     points: np.ndarray
@@ -43,25 +52,25 @@ class CommonBody:
     agreement: np.ndarray
 
     def seen(self, size: tuple[int, int], viewmat: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, float]:
-        """The body in a picture, known to about half a voxel, (H, W), and how large a voxel is there [px].
+        """Silhouette in a picture, accurate to about half a voxel, (H, W), and the size of a voxel there [px].
 
         Args:
             size: height and width of the picture [px].
         """
-        body, shrink = _drawn(self.points, self.voxel, size, viewmat, K)
+        body, shrink = _silhouette(self.points, self.voxel, size, viewmat, K)
         large = opencv().resize(body.astype(np.float32), size[::-1], interpolation=opencv().INTER_LINEAR)
         return large > 0.5, 1 / shrink
 
 
 def agreement(masks: Sequence[np.ndarray], viewmats: np.ndarray, Ks: np.ndarray) -> np.ndarray:
-    """IoU of each mask with the body that all of them leave (`common_body`), (N,)."""
+    """IoU of each mask with the `common_body` of all, (N,)."""
     return common_body(masks, viewmats, Ks).agreement
 
 
 def common_body(masks: Sequence[np.ndarray], viewmats: np.ndarray, Ks: np.ndarray) -> CommonBody:
-    """The body that masks of several views leave together.
+    """Visual hull of masks that tolerates bad masks.
 
-    The body is drawn at the size of its voxels, so that an IoU is known to some hundredths.
+    Silhouettes are drawn at the resolution of the voxels, so an IoU is accurate to a few hundredths.
 
     Args:
         masks: of N >= 2 pinhole cameras, Boolean, (H, W), of any sizes, none empty.
@@ -69,45 +78,41 @@ def common_body(masks: Sequence[np.ndarray], viewmats: np.ndarray, Ks: np.ndarra
         Ks: [px], pixel centres at +0.5, (N, 3, 3).
 
     Raises:
-        InputError: no place in space lies in most of the masks.
+        InputError: no point in space lies in most of the masks.
     """
     centres = np.stack([centroid(mask) for mask in masks])
     middle = nearest_point(centres, viewmats, Ks)
     depths = viewmats[:, 2, :3] @ middle + viewmats[:, 2, 3]
     radii = np.array([np.sqrt(mask.sum() / np.pi) for mask in masks]) * depths / Ks[:, 0, 0]
     if not (depths > 0).any():
-        raise InputError(_APART)
+        raise InputError(*_NO_COMMON_VOLUME)
     reach = _MARGIN * 2 * float(np.median(radii[depths > 0]))
     views = list(zip(masks, viewmats, Ks))
     chosen = views
-    for share in LEAST_SHARES:
+    for share in MIN_SHARES:
         points, voxel = _body(chosen, middle - reach, middle + reach, share)
-        found = np.array([_agreed(points, voxel, *view) for view in views])
-        chosen = [view for view, agreed in zip(views, found) if agreed >= LEAST_AGREEMENT]
+        ious = np.array([_iou_with_body(points, voxel, *view) for view in views])
+        chosen = [view for view, value in zip(views, ious) if value >= MIN_AGREEMENT]
         if len(chosen) < 2:
             break
-    return CommonBody(points, voxel, found)
+    return CommonBody(points, voxel, ious)
 
 
-def check_one_object(found: Sequence[float], cameras: Sequence[str], name: str) -> None:
-    """Raises InputError where the `agreement` of cameras' masks at one time says that they show different things."""
-    worst = int(np.argmin(found))
-    if found[worst] < LEAST_SAME:
+def check_one_object(ious: Sequence[float], cameras: Sequence[str], name: str) -> None:
+    """Raises InputError if the `agreement` of simultaneous masks shows that cameras film different objects."""
+    worst = int(np.argmin(ious))
+    if ious[worst] < MIN_SAME_OBJECT:
         raise InputError(
-            f"{name}: the cameras do not show one object where it rests, the body that fits all masks fills that of"
-            f" {cameras[worst]} with an IoU of {found[worst]:.2f}: are the videos of one throw and of one object, have"
-            f" the cameras stood still, and is a hand or a shadow in a mask? Look at the contact sheets"
+            name,
+            f"the masks at rest do not show one object: that of {cameras[worst]} has an IoU of {ious[worst]:.2f} with"
+            f" the common body, at least {MIN_SAME_OBJECT} is required",
+            "Check on the contact sheets that the videos show the same take and object, that the cameras did not move,"
+            " and that no hand or shadow is in a mask",
         )
 
 
-_APART = (
-    "no place in space lies in most of the masks: they are not of one object, or the cameras have moved since their"
-    " poses were found; look at the contact sheets of the masks"
-)
-
-
 def nearest_point(centres: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> np.ndarray:
-    """The point nearest to the rays through places in the pictures; weights make single bad ones harmless."""
+    """Point nearest to the rays through pixels (N, 2) of N cameras, robust against single outliers, (3,)."""
     rays = np.concatenate(
         [(centres - Ks[:, :2, 2]) / Ks[:, [0, 1], [0, 1]], np.ones((len(centres), 1))], axis=1
     )
@@ -135,7 +140,7 @@ def _body(
     upper: np.ndarray,
     share: float,
 ) -> tuple[np.ndarray, float]:
-    """Voxels' middles (P, 3) that lie in a share of the masks, and their side."""
+    """Centres (P, 3) of the voxels that lie in a share of the masks, and the voxel side."""
     for count in _VOXELS:
         voxel = float((upper - lower).max()) / count
         ticks = [lower[k] + (np.arange(np.ceil((upper - lower)[k] / voxel)) + 0.5) * voxel for k in range(3)]
@@ -148,28 +153,28 @@ def _body(
             x, y = pixels[within].astype(int).T
             seen[within] += 1
             inside[np.flatnonzero(within)[mask[y, x]]] += 1
-        # What few cameras see, they cannot make a body of.
-        missed = np.where(seen < _CUT_OFF * seen.max(), np.minimum(_MISSES, seen // 5), 0)
+        missed = np.where(seen < _TRUNCATED * seen.max(), np.minimum(_MAX_MISSES, seen // 5), 0)
         kept = (inside >= share * seen) | (seen - inside <= missed)
         points = points[(seen >= max(2, 0.25 * seen.max())) & kept]
         if len(points) == 0:
-            raise InputError(_APART)
+            raise InputError(*_NO_COMMON_VOLUME)
         lower, upper = points.min(axis=0) - 1.5 * voxel, points.max(axis=0) + 1.5 * voxel
     return points, voxel
 
 
-def _agreed(points: np.ndarray, voxel: float, mask: np.ndarray, viewmat: np.ndarray, K: np.ndarray) -> float:
-    """IoU of a mask and of the body as its camera sees it."""
+def _iou_with_body(
+    points: np.ndarray, voxel: float, mask: np.ndarray, viewmat: np.ndarray, K: np.ndarray
+) -> float:
     cv2 = opencv()
-    body, _ = _drawn(points, voxel, mask.shape, viewmat, K)
+    body, _ = _silhouette(points, voxel, mask.shape, viewmat, K)
     small = cv2.resize(mask.astype(np.float32), body.shape[::-1], interpolation=cv2.INTER_AREA) > 0.5
     return iou(small, body)
 
 
-def _drawn(
+def _silhouette(
     points: np.ndarray, voxel: float, size: tuple[int, int], viewmat: np.ndarray, K: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """The body as a camera sees it, in pixels as large as the voxels, and by how much the picture (H, W) shrinks."""
+    """Silhouette with pixels as large as the voxels, and the factor by which the picture (H, W) is reduced."""
     cv2 = opencv()
     pixels, depth = _projected(points, viewmat, K)
     shrink = min(1.0, float(np.median(depth)) / (voxel * K[0, 0])) if (depth > 0).all() else 1.0

@@ -1,7 +1,7 @@
-"""The ChArUco board: printing it, finding it, and what it tells: metres, the floor, and where down is.
+"""ChArUco board: print, detect, and use it to determine scale, floor and vertical direction.
 
-The board's frame: origin at the left lower corner of the squares, x right and y up the page, z out of the print;
-metres. (OpenCV's own has y down the page and z into the table.) A print that lies on the floor face up has z up.
+Frame of the board: origin at the lower left corner of the squares, x to the right, y up the page, z out of the print,
+in metres. (In OpenCV, y points down the page and z into the table.) On the floor, face up, z is up.
 """
 
 from __future__ import annotations
@@ -9,39 +9,41 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.backends.backend_pdf import FigureCanvasPdf
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
 from neuma_lib.capture.lens import HALF_PIXEL, Lens
 from neuma_lib.capture.placement import Similarity, fit_similarity, triangulate
 from neuma_lib.capture.tools import opencv
 from neuma_lib.config.board import PAPERS, BoardConfig
 from neuma_lib.errors import InputError
+from neuma_lib.extras import require
 from neuma_lib.io.files import atomic
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 MARGIN = 0.010
-"""Border of the page that printers leave white [m]."""
+"""Unprintable border of the page [m]."""
 FOOT = 0.024
 """Strip under the squares for the ruler and the text [m]."""
 RULER = 0.100
 """Length of the printed ruler [m]."""
-LEAST_CORNERS = 6
-"""Fewest corners of the board from which a pose is taken."""
+MIN_CORNERS = 6
+"""Corners required for a pose."""
 NEIGHBOURS = 13
-"""A corner and the nearest others from which its place is predicted."""
-OFF_NEIGHBOURS = (0.4, 0.005)
-"""How far a corner may lie from where its neighbours predict it: pixels, and share of a square's side."""
-LEAST_ANGLE = np.deg2rad(3.0)
-"""Least angle between rays to a corner from which its place is taken; flatter ones say little of its distance."""
-MOST_PIXELS = 2.0
-"""A pose from which corners are further away than this, root mean square, is refused [px]."""
-MOST_MISFIT = 0.05
-"""Root-mean-square misfit of the board's corners above which it was bent, moved or of other squares [squares]."""
+"""Number of nearest corners, including itself, used to predict the position of a corner."""
+NEIGHBOUR_TOLERANCE = (0.4, 0.005)
+"""Tolerated distance of a corner from its prediction: pixels, and share of a square's side."""
+MIN_ANGLE = np.deg2rad(3.0)
+"""Angle between rays required to triangulate a corner. Smaller angles determine its distance poorly."""
+MAX_PIXELS = 2.0
+"""Tolerated root-mean-square reprojection error of a pose [px]."""
+MAX_MISFIT = 0.05
+"""Tolerated root-mean-square misfit of the board's corners [squares]. A bent or moved print exceeds it."""
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""From z up to y up: a turn by -90 degrees about x."""
+"""Rotation from z up to y up, by -90 degrees about x."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +51,7 @@ class Detection:
     """Corners of the board in a picture.
 
     Attributes:
-        ids: (N,), in rows from the page's top, as OpenCV counts them.
+        ids: OpenCV's corner numbers, row by row from the top of the page, (N,).
         pixels: (N, 2), pixel centres at +0.5.
     """
 
@@ -59,14 +61,14 @@ class Detection:
 
 @dataclass(frozen=True, eq=False)
 class BoardFit:
-    """Where the board is in a reconstruction.
+    """Pose and scale of the board in a reconstruction.
 
     Attributes:
         board_from_world: the similarity from the reconstruction to the board's frame.
-        corners: numbers of the corners that were used, (N,).
-        residual: root-mean-square distance between corners in space and on the print [m].
-        flatness: the part of it that is normal to the print [m].
-        pictures: how many pictures show the board.
+        corners: numbers of the corners used, (N,).
+        residual: root-mean-square distance between triangulated and printed corners [m].
+        flatness: its component normal to the print [m].
+        pictures: number of pictures that show the board.
     """
 
     board_from_world: Similarity
@@ -76,7 +78,7 @@ class BoardFit:
     pictures: int
 
     def plain(self) -> dict:
-        """What a report says of it; lengths in millimetres."""
+        """Entries of a report, lengths in millimetres."""
         return {
             "corners": len(self.corners),
             "pictures": self.pictures,
@@ -87,7 +89,7 @@ class BoardFit:
 
 
 def corner_positions(board: BoardConfig) -> np.ndarray:
-    """Inner corners of the chessboard in the board's frame, (N, 3) [m], by their numbers."""
+    """Inner corners of the chessboard in the board's frame, indexed by their numbers, (N, 3) [m]."""
     columns, rows = board.squares
     j, i = np.mgrid[1:rows, 1:columns]
     flat = np.stack([i, rows - j, np.zeros_like(i)], axis=-1).reshape(-1, 3)
@@ -95,11 +97,11 @@ def corner_positions(board: BoardConfig) -> np.ndarray:
 
 
 def black_rectangles(board: BoardConfig) -> tuple[np.ndarray, np.ndarray]:
-    """What is to be printed, in the board's frame.
+    """Rectangles to print, in the board's frame.
 
     Returns:
-        Black rectangles, and white ones over them, as x, y of the left lower corner, width and height [m], (N, 4) each.
-        White ones overlap, so that no hair lines are left between them.
+        Black rectangles, and white ones drawn over them, as x, y of the lower left corner, width and height [m],
+        (N, 4) each. White rectangles overlap to avoid hair lines.
     """
     cv2 = opencv()
     dictionary = _dictionary(board)
@@ -107,7 +109,7 @@ def black_rectangles(board: BoardConfig) -> tuple[np.ndarray, np.ndarray]:
     side = board.marker
     black, white = [], []
     number = 0
-    for row in range(rows):  # from the page's top
+    for row in range(rows):  # from the top of the page
         for column in range(columns):
             left, bottom = column, rows - 1 - row
             if (row + column) % 2 == 0:
@@ -127,38 +129,42 @@ def black_rectangles(board: BoardConfig) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _runs(picture: np.ndarray) -> list[tuple[int, int, int]]:
-    """Runs of ones: first, behind the last, and the row."""
-    found = []
+    """Runs of ones: start, end (exclusive) and row."""
+    runs = []
     for line, row in enumerate(picture):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(int), [0]])))
-        found += [(int(a), int(b), line) for a, b in zip(edges[::2], edges[1::2])]
-    return found
+        runs += [(int(a), int(b), line) for a, b in zip(edges[::2], edges[1::2])]
+    return runs
 
 
 def print_board(path: str | Path, board: BoardConfig, paper: str = "A4") -> None:
-    """Write a PDF page with the board at its true size, and a ruler to measure the print with.
+    """Write a PDF page with the board at its true size, and a ruler for measuring the print.
 
     Raises:
-        InputError: an unknown size of paper, or squares that it has no room for.
+        InputError: unknown paper size, or squares that do not fit on the paper.
     """
     page = board_page(board, paper)
+    canvas = require("matplotlib.backends.backend_pdf", "capture").FigureCanvasPdf(page)
     with atomic(path) as partial:
-        FigureCanvasPdf(page).print_pdf(partial, metadata={"CreationDate": None, "Title": "ChArUco board"})
+        canvas.print_pdf(partial, metadata={"CreationDate": None, "Title": "ChArUco board"})
 
 
 def board_page(board: BoardConfig, paper: str) -> Figure:
-    """The page of `print_board`; its axes are millimetres from the left lower corner."""
+    """The page of `print_board`, with axes in millimetres from the lower left corner."""
     if paper not in PAPERS:
-        raise InputError(f"paper {paper!r}: known are {', '.join(PAPERS)}")
+        raise InputError("paper", f"unknown size {paper!r}", f"Use one of {', '.join(PAPERS)}")
     width, height = PAPERS[paper]
     columns, rows = board.squares
     room = min((width - 2 * MARGIN) / columns, (height - 2 * MARGIN - FOOT) / rows)
     if board.square > room:
         raise InputError(
-            f"{columns} x {rows} squares of {1000 * board.square:.1f} mm do not fit on {paper}: at most "
-            f"{int(1000 * room)} mm; set board.square or board.squares, or take {'A3' if paper == 'A4' else 'fewer'}"
+            "board.square",
+            f"{columns} x {rows} squares of {1000 * board.square:.1f} mm do not fit on {paper}, the maximum is"
+            f" {int(1000 * room)} mm",
+            f"Reduce board.square or board.squares{', or print on A3' if paper == 'A4' else ''}",
         )
-    figure = Figure(figsize=(width / 0.0254, height / 0.0254))
+    Rectangle = require("matplotlib.patches", "capture").Rectangle
+    figure = require("matplotlib.figure", "capture").Figure(figsize=(width / 0.0254, height / 0.0254))
     axes = figure.add_axes((0, 0, 1, 1))
     axes.set(xlim=(0, 1000 * width), ylim=(0, 1000 * height))
     axes.axis("off")
@@ -186,7 +192,7 @@ def board_page(board: BoardConfig, paper: str) -> Figure:
 
 
 def find_board(image: np.ndarray, board: BoardConfig) -> Detection:
-    """Corners of the board in a picture, below a pixel; none where it is not to be seen.
+    """Detect the corners of the board in a picture with sub-pixel accuracy. Empty if the board is not visible.
 
     Args:
         image: (H, W, 3) RGB or (H, W), uint8.
@@ -206,10 +212,10 @@ def find_board(image: np.ndarray, board: BoardConfig) -> Detection:
 
 
 def _refined(grey: np.ndarray, ids: np.ndarray, corners: np.ndarray, board: BoardConfig) -> Detection:
-    """Corners of the board's detector, refined once more, without those that are not where their neighbours say.
+    """Refine detected corners and drop those that disagree with the homography of their neighbours.
 
-    The detector leaves some unrefined, and whether half a pixel is in its results depends on its version. The window
-    stops before the markers. A homography over a few squares leaves little of a lens's distortion.
+    The detector leaves some corners unrefined, and its versions differ by half a pixel. The search window excludes the
+    markers. Over a few squares, a homography absorbs most of the lens distortion.
     """
     cv2 = opencv()
     places = np.stack(np.divmod(ids, board.squares[0] - 1), axis=1)
@@ -223,55 +229,57 @@ def _refined(grey: np.ndarray, ids: np.ndarray, corners: np.ndarray, board: Boar
             start = corner.reshape(1, 1, 2).astype(np.float32)
             refined[i] = cv2.cornerSubPix(grey, start, (window, window), (-1, -1), (3, 50, 1e-3)).ravel()
     kept = []
-    for i in range(len(ids) if len(ids) >= LEAST_CORNERS else 0):
+    for i in range(len(ids) if len(ids) >= MIN_CORNERS else 0):
         others = np.argsort(distances[i], kind="stable")[1:NEIGHBOURS]
         homography, _ = cv2.findHomography(places[others].astype(np.float32), refined[others], cv2.LMEDS)
         if homography is None:
             continue
         predicted = homography @ [*places[i], 1.0]
-        off = np.linalg.norm(refined[i] - predicted[:2] / predicted[2])
-        if sides[i] > 0 and off < OFF_NEIGHBOURS[0] + OFF_NEIGHBOURS[1] * sides[i]:
+        distance = np.linalg.norm(refined[i] - predicted[:2] / predicted[2])
+        if sides[i] > 0 and distance < NEIGHBOUR_TOLERANCE[0] + NEIGHBOUR_TOLERANCE[1] * sides[i]:
             kept.append(i)
     return Detection(ids[kept], refined[kept].astype(np.float64) + HALF_PIXEL)
 
 
-def board_pose(found: Detection, board: BoardConfig, lens: Lens, where: str) -> tuple[np.ndarray, float]:
+def board_pose(detection: Detection, board: BoardConfig, lens: Lens, where: str) -> tuple[np.ndarray, float]:
     """Pose of one camera from the board alone.
 
     Args:
-        found: the corners in its picture.
-        where: the picture, for messages.
+        detection: the corners in its picture.
+        where: name of the picture for messages.
 
     Returns:
-        Board's frame to camera (4, 4), and the root-mean-square distance of the corners in the picture [px].
+        Transform from the board's frame to the camera (4, 4), and root-mean-square reprojection error [px].
 
     Raises:
         InputError: too few corners, or they do not fit a flat board seen from above.
     """
     cv2 = opencv()
-    points = corner_positions(board)[found.ids]
-    if len(points) < LEAST_CORNERS or np.linalg.matrix_rank(points - points.mean(axis=0), 1e-9) < 2:
+    points = corner_positions(board)[detection.ids]
+    if len(points) < MIN_CORNERS or np.linalg.matrix_rank(points - points.mean(axis=0), 1e-9) < 2:
         raise InputError(
-            f"{where}: {len(points)} corners of the board are seen, {LEAST_CORNERS} in two rows are needed: is it the "
-            "board of capture.yaml, sharp, and without glare?"
+            where,
+            f"{len(points)} corners of the board are detected, {MIN_CORNERS} in two rows are required",
+            "Check that the board is the one of capture.yaml, in focus and without glare",
         )
-    seen = lens.directions(found.pixels)
+    seen = lens.directions(detection.pixels)
     flat = points.reshape(-1, 1, 3), seen.reshape(-1, 1, 2), np.eye(3), None
     _, rotations, shifts, _ = cv2.solvePnPGeneric(*flat, flags=cv2.SOLVEPNP_IPPE)
     best = None
-    for rotation, shift in zip(rotations, shifts):  # a flat board has two; noise decides between them
+    for rotation, shift in zip(rotations, shifts):  # a planar target has two solutions
         rotation, shift = cv2.solvePnPRefineLM(*flat, rotation, shift)
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(rotation)[0], shift.ravel()
-        error = _pixel_error(pose, points, found.pixels, lens)
+        error = _pixel_error(pose, points, detection.pixels, lens)
         from_above = (pose[:3, :3].T @ pose[:3, 3])[2] < 0
         if from_above and (best is None or error < best[1]):
             best = pose, error
-    if best is None or not best[1] < MOST_PIXELS:
+    if best is None or not best[1] < MAX_PIXELS:
+        error = f" (error {best[1]:.1f} px, limit {MAX_PIXELS:g} px)" if best else ""
         raise InputError(
-            f"{where}: the corners do not fit a flat board seen from above"
-            + (f" ({best[1]:.1f} px)" if best else "")
-            + ": check board.squares, the lens, and that the print lies flat"
+            where,
+            f"the corners do not fit a flat board seen from above{error}",
+            "Check board.squares, the lens, and that the print lies flat",
         )
     return best
 
@@ -284,60 +292,63 @@ def _pixel_error(pose: np.ndarray, points: np.ndarray, pixels: np.ndarray, lens:
 
 
 def fit_board(
-    found: Sequence[Detection], lenses: Sequence[Lens], viewmats: np.ndarray, board: BoardConfig
+    detections: Sequence[Detection], lenses: Sequence[Lens], viewmats: np.ndarray, board: BoardConfig
 ) -> BoardFit:
-    """The similarity from a reconstruction to the board's frame, from its corners in many pictures.
+    """Fit the similarity from a reconstruction to the board's frame, from its corners in many pictures.
 
     Args:
-        found: the corners in each picture, (N) of them; empty ones are left out.
+        detections: corners in each of N pictures, possibly empty.
         lenses: of each picture.
         viewmats: world to camera, (N, 4, 4).
 
     Raises:
-        InputError: the board is seen too rarely, or its corners do not lie as printed.
+        InputError: the board is visible in too few pictures, or its corners do not lie as printed.
     """
     seen: dict[int, list[tuple[int, np.ndarray]]] = {}
-    for picture, (corners, lens) in enumerate(zip(found, lenses)):
+    for picture, (corners, lens) in enumerate(zip(detections, lenses)):
         if len(corners.ids):
             for number, direction in zip(corners.ids, lens.directions(corners.pixels)):
                 seen.setdefault(int(number), []).append((picture, direction))
-    pictures = sum(len(corners.ids) > 0 for corners in found)
+    pictures = sum(len(corners.ids) > 0 for corners in detections)
     numbers, points = [], []
     for number, views in sorted(seen.items()):
         if len(views) < 2:
             continue
         index = [picture for picture, _ in views]
         point, angle = triangulate(viewmats[index], np.stack([direction for _, direction in views]))
-        if angle > LEAST_ANGLE and np.isfinite(point).all():
+        if angle > MIN_ANGLE and np.isfinite(point).all():
             numbers.append(number)
             points.append(point)
     printed = corner_positions(board)[numbers] if numbers else np.empty((0, 3))
-    if len(numbers) < LEAST_CORNERS or np.linalg.matrix_rank(printed - printed.mean(axis=0), 1e-9) < 2:
+    if len(numbers) < MIN_CORNERS or np.linalg.matrix_rank(printed - printed.mean(axis=0), 1e-9) < 2:
         raise InputError(
-            f"the board is seen in {pictures} of {len(found)} pictures, and {len(numbers)} of its corners from two "
-            f"sides ({LEAST_CORNERS} in two rows are needed): photograph it with the object, uncovered, from all "
-            "sides; or state a length instead"
+            "board",
+            f"it is visible in {pictures} of {len(detections)} pictures, and {len(numbers)} of its corners from two"
+            f" sides, {MIN_CORNERS} in two rows are required",
+            "Photograph the uncovered board with the object from all sides, or set `length` instead",
         )
     world = np.stack(points)
     placed = fit_similarity(world, printed)
-    off = placed.apply(world) - printed
+    residuals = placed.apply(world) - printed
     fit = BoardFit(
         placed,
         np.array(numbers),
-        float(np.sqrt((off**2).sum(axis=1).mean())),
-        float(np.sqrt((off[:, 2] ** 2).mean())),
+        float(np.sqrt((residuals**2).sum(axis=1).mean())),
+        float(np.sqrt((residuals[:, 2] ** 2).mean())),
         pictures,
     )
-    if fit.residual > MOST_MISFIT * board.square:
+    if fit.residual > MAX_MISFIT * board.square:
         raise InputError(
-            f"the board's corners are {1000 * fit.residual:.1f} mm off the print, root mean square: it was moved or "
-            "bent between the photographs, or board.squares is not as printed"
+            "board.squares",
+            f"the corners deviate from the print by {1000 * fit.residual:.1f} mm (root mean square), the limit is"
+            f" {1000 * MAX_MISFIT * board.square:.1f} mm",
+            "Check that the board was not moved or bent between the photographs, and that board.squares is as printed",
         )
     return fit
 
 
 def room_from_board(board: BoardConfig, center: tuple[float, float] | None) -> Similarity:
-    """From the board's frame to the room: y up, the floor at y = 0, the origin under ``center`` (None: its middle)."""
+    """From the board's frame to the room: y up, floor at y = 0, origin below ``center`` (None: middle of the board)."""
     columns, rows = board.squares
     x, y = center or (board.square * columns / 2, board.square * rows / 2)
     return Similarity(1.0, Y_UP, -Y_UP @ [x, y, -board.thickness])
@@ -346,7 +357,7 @@ def room_from_board(board: BoardConfig, center: tuple[float, float] | None) -> S
 def board_outline(
     board: BoardConfig, center: tuple[float, float] | None, viewmat: np.ndarray, K: np.ndarray
 ) -> np.ndarray | None:
-    """Corners (4, 2) [px] of the printed board with a margin of a square, in order; None where it is behind the camera.
+    """Corners (4, 2) [px] of the printed board with a margin of a square, in order. None if behind the camera.
 
     Args:
         viewmat: the room's metres to camera, OpenCV axes, (4, 4).

@@ -1,4 +1,4 @@
-"""The video of a throw on the simulator's clock: from mattes by each camera's clock to frames for training."""
+"""Frames of a take in simulation time: convert the mattes of each camera to frames for training."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from PIL import Image
 from neuma_lib.capture.timing import row_times
 from neuma_lib.errors import InputError
 
-LEAST_FRAMES = 8
-"""Frames after the start that a camera must have: fewer show no contact."""
+MIN_FRAMES = 8
+"""Frames after the start required of each camera: fewer show no contact."""
 
 
 def frame_times(
     frames: Sequence[Mapping[str, Any]], rows: np.ndarray, row_time: float, sensor_rows: int
 ) -> np.ndarray:
-    """When a camera saw the object in each frame, by its clock, (T,) [s].
+    """Exposure times of the object in each frame, on the camera's clock, (T,) [s].
 
     Args:
         frames: entries with ``time`` [s] and ``h`` [px].
         rows: y of the object's centre [px], (T,).
         row_time: of a rolling shutter [s].
-        sensor_rows: rows of a frame as filmed.
+        sensor_rows: rows of the recorded frames.
     """
     times = np.array([frame["time"] for frame in frames])
     return row_times(times, rows, row_time, frames[0]["h"], sensor_rows)
@@ -34,26 +34,29 @@ def chosen_frames(times: np.ndarray, duration: float, most: int, name: str) -> n
     """Indices of at most ``most`` frames, evenly spread over the time from 0 to ``duration`` [s].
 
     Args:
-        times: after the start, ascending, (T,) [s].
-        name: of throw and camera, for messages.
+        times: since the start, ascending, (T,) [s].
+        name: of take and camera for messages.
 
     Raises:
-        InputError: fewer than `LEAST_FRAMES` lie in it.
+        InputError: fewer than `MIN_FRAMES` lie in this interval.
     """
     inside = np.flatnonzero((times >= 0) & (times <= duration))
-    if len(inside) < LEAST_FRAMES:
+    if len(inside) < MIN_FRAMES:
         raise InputError(
-            f"{name}: only {len(inside)} frames show the object in the {duration:g} s after the start of its flight: "
-            "film until it rests, state a longer `duration` in capture.yaml, and look at the contact sheet of the masks"
+            name,
+            f"{len(inside)} frames show the object in the {duration:g} s after the start of its flight, {MIN_FRAMES}"
+            " are required",
+            "Film until the object rests, increase `duration` in capture.yaml, and look at the contact sheet of the"
+            " masks",
         )
     places = np.linspace(0, len(inside) - 1, min(most, len(inside)))
     return inside[np.round(places).astype(int)]
 
 
 def reduced(rgba: np.ndarray, width: int) -> np.ndarray:
-    """Straight-alpha RGBA (H, W, 4), uint8, averaged to a longer side of ``width`` pixels; never enlarged.
+    """Straight-alpha RGBA (H, W, 4), uint8, averaged to a longer side of ``width`` pixels, never enlarged.
 
-    Colours are averaged by coverage, so none of what lies under the background enters.
+    Colours are weighted by coverage, so the background does not contribute.
     """
     height, across = rgba.shape[:2]
     factor = width / max(height, across)
@@ -76,7 +79,7 @@ def reduced(rgba: np.ndarray, width: int) -> np.ndarray:
 
 
 def reduced_intrinsics(frame: Mapping[str, Any], size: tuple[int, int]) -> dict[str, float]:
-    """Intrinsics of an entry for a picture of another width and height [px]."""
+    """Intrinsics of an entry, scaled to a picture of another width and height [px]."""
     across, down = size[0] / frame["w"], size[1] / frame["h"]
     return {
         "fl_x": frame["fl_x"] * across,
@@ -89,7 +92,7 @@ def reduced_intrinsics(frame: Mapping[str, Any], size: tuple[int, int]) -> dict[
 
 
 def without_gain(rgba: np.ndarray, gain: Sequence[float]) -> np.ndarray:
-    """RGBA, uint8, with its colours divided by a camera's gain against the photographs, (3,)."""
+    """RGBA, uint8, with colours divided by the camera's gain relative to the photographs, (3,)."""
     pixels = rgba.copy()
     pixels[..., :3] = np.clip(np.rint(rgba[..., :3] / np.asarray(gain, np.float32)), 0, 255).astype(np.uint8)
     return pixels

@@ -1,4 +1,4 @@
-"""When a falling object reaches the floor, as its outlines show it."""
+"""Time at which a falling object touches the floor, from its masks."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 def lowest_points(
     masks: Sequence[np.ndarray], centres: np.ndarray, viewmat: np.ndarray, K: np.ndarray
 ) -> np.ndarray:
-    """Heights of the lowest points of an object, as if they were as far from the camera as its centre, (T,) [m].
+    """Heights of the lowest points of an object, assuming the distance of its centre from the camera, (T,) [m].
 
-    A camera that looks down on the object sees its lowest points on the near side, where they are a little higher than
-    that: what is above the floor by these heights has not touched it.
+    A camera that looks down sees the lowest points on the near side, where the assumption underestimates their height.
+    An object above the floor by these heights has not touched it.
 
     Args:
         masks: Boolean, (H, W), T of them, none empty.
@@ -35,10 +35,10 @@ def lowest_points(
 
 
 def contact_time(times: Sequence[np.ndarray], heights: Sequence[np.ndarray]) -> float:
-    """When an object touches the floor at y = 0 [s], the middle of what its cameras say; infinite: not in the videos.
+    """Time at which an object touches the floor at y = 0, median over the cameras [s]. Infinite if never observed.
 
     Args:
-        times: of the frames of each camera, by one clock [s], (T,).
+        times: of the frames of each camera, on a common clock [s], (T,).
         heights: `lowest_points` of each camera (T,) [m].
     """
     touched = [clock[low < 0] for clock, low in zip(times, heights)]

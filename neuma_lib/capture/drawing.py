@@ -1,4 +1,4 @@
-"""Pictures of what was found: cameras and points, and the floor in the photographs."""
+"""Draw reconstructed cameras and points, and the floor in the photographs."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 
 from neuma_lib.capture.folder import PHOTOGRAPHS
@@ -16,25 +14,26 @@ from neuma_lib.capture.pictures import group_of, picture_sheet
 from neuma_lib.capture.placement import camera_centres, upright
 from neuma_lib.capture.poses import Poses
 from neuma_lib.capture.room import BOX_MIDDLE, Room
+from neuma_lib.extras import require
 from neuma_lib.io.files import atomic
 from neuma_lib.io.images import OPENGL_TO_OPENCV, read_transforms
 
 GRID = 0.1
-"""Distance between the lines of the floor that are drawn into pictures [m of the room]."""
-FAR = (0.02, 0.98)
-"""Quantiles of the points that a picture of cameras and points reaches to."""
-SHOWN = 8
-"""Most photographs into which the floor is drawn."""
+"""Spacing of the floor lines [m of the room]."""
+QUANTILES = (0.02, 0.98)
+"""Quantiles of the points that limit a plot of cameras and points."""
+MAX_PHOTOGRAPHS = 8
+"""Photographs into which the floor is drawn."""
 
 
 def draw_room(path: str | Path, room: Room) -> None:
-    """Write a picture of a room's cameras and points, from above and from the side, in metres."""
-    said = f", board {1000 * room.board.residual:.2f} mm" if room.board else ""
-    draw_cameras(path, room.poses, "m", said, floor=True)
+    """Plot a room's cameras and points, from above and from the side, in metres."""
+    suffix = f", board {1000 * room.board.residual:.2f} mm" if room.board else ""
+    draw_cameras(path, room.poses, "m", suffix, floor=True)
 
 
 def draw_poses(path: str | Path, poses: Poses) -> None:
-    """Write a picture of cameras and points in a world without metres and floor: up is where the cameras have it."""
+    """Plot cameras and points in a world without metric scale and floor. The mean up axis of the cameras is up."""
     up = -poses.viewmats[:, 1, :3].mean(axis=0)
     size = np.linalg.norm(up)
     middle = np.median(poses.points if len(poses.points) else camera_centres(poses.viewmats), axis=0)
@@ -42,23 +41,25 @@ def draw_poses(path: str | Path, poses: Poses) -> None:
     draw_cameras(path, poses.moved(level), "not yet metres")
 
 
-def draw_cameras(path: str | Path, poses: Poses, unit: str, said: str = "", floor: bool = False) -> None:
-    """Write a picture of cameras and points, from above and from the side.
+def draw_cameras(path: str | Path, poses: Poses, unit: str, suffix: str = "", floor: bool = False) -> None:
+    """Plot cameras and points, from above and from the side.
 
     Args:
         poses: y up, the scene around the origin.
         unit: of their lengths.
-        said: what the title ends with.
-        floor: whether there is one, at y = 0.
+        suffix: end of the title.
+        floor: draw a floor at y = 0.
     """
     centres = camera_centres(poses.viewmats)
     forward = poses.viewmats[:, 2, :3]
     fixed = np.array([group_of(name) != PHOTOGRAPHS for name in poses.names])
     reach = 1.2 * max(np.abs(centres).max(), 0.1)
     near = (np.abs(poses.points) < reach).all(axis=1)
-    shown = np.concatenate([centres, np.quantile(poses.points[near], FAR, axis=0)]) if near.any() else centres
-    low, high = shown.min(axis=0) - 0.1 * reach, shown.max(axis=0) + 0.1 * reach
-    figure = Figure(figsize=(12, 6), layout="constrained")
+    extent = centres
+    if near.any():
+        extent = np.concatenate([centres, np.quantile(poses.points[near], QUANTILES, axis=0)])
+    low, high = extent.min(axis=0) - 0.1 * reach, extent.max(axis=0) + 0.1 * reach
+    figure = require("matplotlib.figure", "capture").Figure(figsize=(12, 6), layout="constrained")
     for axes, (across, up, title) in zip(
         figure.subplots(1, 2), ((0, 2, "from above"), (0, 1, "from the side"))
     ):
@@ -78,7 +79,7 @@ def draw_cameras(path: str | Path, poses: Poses, unit: str, said: str = "", floo
                 label=label,
             )
         axes.set(title=title, xlabel=f"x [{unit}]", ylabel=f"{'xyz'[up]} [{unit}]", aspect="equal")
-        # from above, x right and z towards the reader
+        # From above, x points right and z towards the viewer.
         limits = (low[1], high[1]) if up == 1 else (high[2], low[2])
         axes.set(xlim=(low[0], high[0]), ylim=limits)
         axes.grid(alpha=0.3)
@@ -88,24 +89,26 @@ def draw_cameras(path: str | Path, poses: Poses, unit: str, said: str = "", floo
             axes.axhline(0, color="black", linewidth=1)
     title = f"{len(poses.names)} of {len(poses.names) + len(poses.lost)} pictures"
     title += f", {poses.error:.2f} px" if np.isfinite(poses.error) else ""
-    figure.suptitle(title + said)
+    figure.suptitle(title + suffix)
     with atomic(path) as partial:
-        FigureCanvasAgg(figure).print_png(partial, metadata={"Software": None})
+        canvas = require("matplotlib.backends.backend_agg", "capture").FigureCanvasAgg(figure)
+        canvas.print_png(partial, metadata={"Software": None})
 
 
 def draw_floor(path: str | Path, transforms: str | Path) -> None:
-    """Write the pictures of a transforms.json with the floor's lines and the simulator's box in them.
+    """Draw floor lines and the simulation box into the pictures of a transforms.json.
 
-    It shows what later stages read: where the floor, up and a metre are taken to be.
+    This shows the floor, vertical direction and scale that later stages use.
     """
     data = read_transforms(transforms)
     scale = data.get("world", {}).get("scale", 1.0)
     photographs = [frame for frame in data["frames"] if frame["group"] == PHOTOGRAPHS]
-    some = sorted({round(i) for i in np.linspace(0, len(photographs) - 1, min(SHOWN, len(photographs)))})
-    shown = [frame for frame in data["frames"] if frame["group"] != PHOTOGRAPHS]
-    shown += [photographs[i] for i in some]
+    count = min(MAX_PHOTOGRAPHS, len(photographs))
+    some = sorted({round(i) for i in np.linspace(0, len(photographs) - 1, count)})
+    frames = [frame for frame in data["frames"] if frame["group"] != PHOTOGRAPHS]
+    frames += [photographs[i] for i in some]
     pictures = []
-    for frame in shown:
+    for frame in frames:
         with Image.open(Path(transforms).parent / frame["file_path"]) as image:
             picture = image.convert("RGB")
         viewmat = np.linalg.inv(np.array(frame["transform_matrix"]) @ OPENGL_TO_OPENCV)
@@ -121,7 +124,7 @@ def draw_floor(path: str | Path, transforms: str | Path) -> None:
 
 
 def _box_lines(spacing: float) -> list[tuple[np.ndarray, str, int]]:
-    """Ends (2, 3), colour and width of lines of the floor, of the box [0, 1]^3, and of axes from BOX_MIDDLE."""
+    """Ends (2, 3), colour and width of floor lines, edges of the box [0, 1]^3, and axes from BOX_MIDDLE."""
     lines = []
     count = int(0.5 / spacing)
     for k in range(-count, count + 1):
@@ -148,7 +151,7 @@ def _draw_line(
     colour: str,
     width: int,
 ) -> None:
-    """A line in space, clipped where it goes behind the camera."""
+    """Draw a line in space, clipped at the camera plane."""
     a, b = ends @ viewmat[:3, :3].T + viewmat[:3, 3]
     nearest = 1e-3
     if max(a[2], b[2]) <= nearest:
@@ -157,7 +160,7 @@ def _draw_line(
         a = b + (a - b) * (b[2] - nearest) / (b[2] - a[2])
     if b[2] < nearest:
         b = a + (b - a) * (a[2] - nearest) / (a[2] - b[2])
-    # Pillow's pixel centres lie at whole numbers
+    # Pillow's pixel centres lie at integers.
     pixels = [
         (frame["fl_x"] * x / z + frame["cx"] - 0.5, frame["fl_y"] * y / z + frame["cy"] - 0.5)
         for x, y, z in (a, b)

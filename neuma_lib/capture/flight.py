@@ -1,4 +1,4 @@
-"""Free flight of one throw, from the masks of all its cameras: offsets, gravity, velocity, spin; and its picture."""
+"""Free flight of one take, from the masks of all its cameras: time offsets, gravity, velocity and spin."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from neuma_lib.capture.agreement import agreement
 from neuma_lib.capture.contact import contact_time, lowest_points
@@ -18,29 +16,32 @@ from neuma_lib.capture.gravity import gravity_checks
 from neuma_lib.capture.spin import Spin, fit_spin, follow
 from neuma_lib.capture.timing import Offset, choose_offset, offset_from_motion, offset_from_sound, row_times
 from neuma_lib.errors import InputError
+from neuma_lib.extras import require
 from neuma_lib.io.files import atomic
 
-DOUBT = 2.0
-"""Deviations by which gravity from outlines has to be beyond the bound: the middle of an outline is no centre of mass.
-The registration measures it again of the placed object, without a doubt, and decides."""
+TOLERATED_DEVIATIONS = 2.0
+"""Standard deviations by which gravity from masks must exceed its limit to be refused.
+
+The centroid of a mask is not the centre of mass. Registration measures gravity again, for the placed object, without
+this tolerance."""
 
 
 @dataclass(frozen=True, eq=False)
 class Filmed:
-    """What one camera saw of a throw, undistorted, in the frames that have a mask.
+    """Undistorted frames of a take by one camera, those with a mask.
 
     Attributes:
         camera: its name.
         numbers: of the frames, (T,).
-        times: by its clock [s], (T,).
+        times: on its clock [s], (T,).
         pixels: (T, H, W, 3), uint8.
         masks: (T, H, W).
-        arc: numbers of the first and last frame of its first free flight; None: there is none.
+        arc: numbers of the first and last frame of its first free flight. None without free flight.
         viewmat, K: in the room, (4, 4) and (3, 3).
-        sensor_rows: rows of a frame as filmed.
+        sensor_rows: rows of the recorded frames.
         row_time: of a rolling shutter [s].
-        sound: mono, (N,); None: none, or not by the clock of the picture.
-        offset: stated [s]; None: it is to be found.
+        sound: mono, (N,). None if missing or not on the clock of the picture.
+        offset: set by the user [s]. None if it is to be estimated.
     """
 
     camera: str
@@ -63,23 +64,23 @@ class Filmed:
 
     @property
     def row_times(self) -> np.ndarray:
-        """When the row of the object's centre was read, (T,) [s]."""
+        """Read-out times of the row of the object's centre, (T,) [s]."""
         rows = self.centroids[:, 1]
         return row_times(self.times, rows, self.row_time, self.masks.shape[1], self.sensor_rows)
 
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """A throw's free flight.
+    """Free flight of a take.
 
     Attributes:
         fall: in the room.
-        spin: None where the object has too little texture.
-        frames: numbers of the first and last frame of the fit, of each camera.
-        tracks: of the cameras, in whole.
-        offsets_from: a line for each camera but the first.
-        agreement: IoU of each camera's mask with the body of all, where the object rests; None of one camera.
-        gravity: a line that tells the check.
+        spin: None if the object has too little texture.
+        frames: numbers of the first and last frame of the fit, for each camera.
+        tracks: of the cameras, all frames.
+        offsets_from: source of the time offset of each camera but the first, as text.
+        agreement: IoU of each camera's mask at rest with the common body. None with one camera.
+        gravity: result of the gravity check, as text.
     """
 
     fall: FreeFall
@@ -92,26 +93,28 @@ class Flight:
 
 
 def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flight:
-    """Fit the free flight of a throw.
+    """Fit the free flight of a take.
 
-    One camera alone is taken to see the object fall above the middle of the room, across its view.
+    A single camera requires a plane: the vertical one through the middle of the room that faces the camera.
 
     Args:
-        views: of the cameras, the first of which keeps the time.
-        name: of the throw, for messages.
-        metric: whether the room's lengths are metres, which gravity then checks.
+        views: of the cameras. The first one is the time reference.
+        name: of the take for messages.
+        metric: whether the room's lengths are metres, so that gravity is checked.
 
     Raises:
-        InputError: a camera saw no free flight, nothing tells the time between two, no flight fits, or gravity is
-            surely off by more than 10 %.
+        InputError: a camera shows no free flight, the time between two cameras is undetermined, no flight fits, or
+            gravity is significantly off by more than 10 %.
     """
     tracks, inside = [], []
     for view in views:
         if view.arc is None:
             raise InputError(
-                f"{name}, {view.camera}: no free flight was seen, in which the object moves along a parabola for at"
-                " least 5 frames by more than its size: film the whole fall, from 0.3 m or more, at 60 frames a second"
-                " or more, and look at the contact sheet of the masks"
+                f"{name}, {view.camera}",
+                "no free flight detected, that is at least 5 frames in which the object moves along a parabola by more"
+                " than its size",
+                "Film the whole fall from at least 0.3 m at 60 frames per second or more, and look at the contact"
+                " sheet of the masks",
             )
         flying = (view.numbers >= view.arc[0]) & (view.numbers <= view.arc[1])
         inside.append(np.flatnonzero(flying))
@@ -129,7 +132,9 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flig
     contact = _contact(views, inside, fall)
     if np.isfinite(contact):
         fall, kept = fit_flight(tracks, plane, fall.offsets, stated, contact)
-    gravity = fall.gravity.checked(name, doubt=DOUBT) if metric else fall.gravity.told(name)
+    gravity = (
+        fall.gravity.check(name, tolerated=TOLERATED_DEVIATIONS) if metric else fall.gravity.describe(name)
+    )
     frames, paths = [], []
     for number, (view, flying, part) in enumerate(zip(views, inside, kept)):
         used = flying[part]
@@ -140,7 +145,7 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flig
 
 
 def _contact(views: Sequence[Filmed], inside: Sequence[np.ndarray], fall: FreeFall) -> float:
-    """When the object touches the floor by the first camera's clock [s]; infinite: not in the frames inside."""
+    """Contact time on the first camera's clock [s]. Infinite if there is no contact in the given frames."""
     times = [view.row_times[flying] + offset for view, flying, offset in zip(views, inside, fall.offsets)]
     heights = [
         lowest_points(view.masks[flying], fall.place(clock), view.viewmat, view.K)
@@ -152,17 +157,17 @@ def _contact(views: Sequence[Filmed], inside: Sequence[np.ndarray], fall: FreeFa
 def _offset(first: Filmed, second: Filmed, name: str) -> tuple[float, str]:
     if second.offset is not None:
         return second.offset, f"{name}: time between the cameras as stated"
-    heard: Offset | None = None
+    by_sound: Offset | None = None
     if first.sound is not None and second.sound is not None:
-        heard = offset_from_sound(first.sound, second.sound)
+        by_sound = offset_from_sound(first.sound, second.sound)
     speeds = [np.linalg.norm(np.gradient(v.centroids, v.times, axis=0), axis=1) for v in (first, second)]
-    moved = offset_from_motion((first.times, second.times), (speeds[0], speeds[1]))
-    best, line = choose_offset(heard, moved, name)
+    by_motion = offset_from_motion((first.times, second.times), (speeds[0], speeds[1]))
+    best, line = choose_offset(by_sound, by_motion, name)
     return best.seconds, line
 
 
 def _plane(view: Filmed) -> tuple[np.ndarray, np.ndarray]:
-    """Upright, through the middle of the room, towards the camera."""
+    """The vertical plane through the middle of the room that faces the camera: point and normal."""
     eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
     return np.zeros(3), np.array([eye[0], 0.0, eye[2]])
 
@@ -176,7 +181,7 @@ def _at_rest(views: Sequence[Filmed], offsets: np.ndarray) -> np.ndarray | None:
 
 
 def report(flight: Flight, views: Sequence[Filmed]) -> dict[str, Any]:
-    """What is known of a flight, for people and for later stages; the room's metres, y up."""
+    """JSON report of a flight. Metres of the room, y up."""
     fall, spin = flight.fall, flight.spin
     deviations = np.sqrt(np.diag(fall.covariance))
     names = [view.camera for view in views]
@@ -201,8 +206,9 @@ def report(flight: Flight, views: Sequence[Filmed]) -> dict[str, Any]:
 
 
 def draw_flight(path: str | Path, flight: Flight, views: Sequence[Filmed], title: str) -> None:
-    """Write a picture: where each camera saw the object's centre, where the fit has it, and the distances between."""
-    figure = Figure(figsize=(5 * (len(views) + 1), 5), layout="constrained")
+    """Plot observed and fitted positions of the object's centre in each camera, and their distances."""
+    size = (5 * (len(views) + 1), 5)
+    figure = require("matplotlib.figure", "capture").Figure(figsize=size, layout="constrained")
     *cameras, last = figure.subplots(1, len(views) + 1)
     for number, (axes, view, track) in enumerate(zip(cameras, views, flight.tracks)):
         fitted = flight.fall.seen(track, number)
@@ -217,15 +223,16 @@ def draw_flight(path: str | Path, flight: Flight, views: Sequence[Filmed], title
     last.legend()
     figure.suptitle(title)
     with atomic(path) as partial:
-        FigureCanvasAgg(figure).print_png(partial, metadata={"Software": None})
+        canvas = require("matplotlib.backends.backend_agg", "capture").FigureCanvasAgg(figure)
+        canvas.print_png(partial, metadata={"Software": None})
 
 
-def flight_checks(name: str, found: Mapping[str, Any]) -> list[tuple[str, str, str, bool]]:
-    """Checks of a flight's `report`: what, found, wanted, good."""
+def flight_checks(name: str, flight: Mapping[str, Any]) -> list[tuple[str, str, str, bool]]:
+    """Checks of a flight's `report`, with the fields of `neuma_lib.capture.page.Check`."""
     checks = [
-        *gravity_checks(f"outlines of {name}", found),
-        (f"flight in {name}", f"{found['rms_px']:.2f} px off the fit", "< 1 px", found["rms_px"] < 1),
+        *gravity_checks(f"outlines of {name}", flight),
+        (f"flight in {name}", f"{flight['rms_px']:.2f} px off the fit", "< 1 px", flight["rms_px"] < 1),
     ]
-    for camera, value in (found["agreement"] or {}).items():
+    for camera, value in (flight["agreement"] or {}).items():
         checks.append((f"mask of {camera} at rest, {name}", f"IoU {value:.2f}", "> 0.7", value > 0.7))
     return checks

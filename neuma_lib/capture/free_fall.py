@@ -1,7 +1,4 @@
-"""Free flight of an object's centre in metres.
-
-Between release and contact the centre moves as x(t) = x0 + v0 t + a t^2 / 2, whatever the object is.
-"""
+"""Fit the free flight of an object's centre, x(t) = x0 + v0 t + a t^2 / 2 between release and contact."""
 
 from __future__ import annotations
 
@@ -11,33 +8,33 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from neuma_lib.capture.arcs import LEAST_FRAMES
+from neuma_lib.capture.arcs import MIN_FRAMES
 from neuma_lib.capture.gravity import Gravity
 from neuma_lib.errors import InputError
 
-MOST_RMS = 0.004
-"""Distance of the places from the fit, as part of the picture's height, above which there is no one flight."""
-MOST_OFF = 0.1
-"""The same as part of the object's radius: the middle of its outline is not its centre, and wanders as it turns.
-Different throws that fit so well show another gravity."""
+MAX_RMS = 0.004
+"""Tolerated root-mean-square residual, as share of the picture height."""
+MAX_RMS_OF_RADIUS = 0.1
+"""The same as share of the object's radius, since the centroid of a mask moves relative to the centre as the object
+turns. Different takes that fit so well are refused by the check of gravity."""
 TRIANGULATED = "triangulated"
-_ENDS = 0.2  # part of a track at either end that the fit begins without
-_OFF = 4.0  # distance that is still on the fit, in root mean squares of both coordinates
-_MOST_ALIKE = 0.95  # correlation of neighbouring frames
-_LEAST_RMS = 0.2  # [px], where the fit is closer than masks are
+_ENDS = 0.2  # share of a track at either end that the first fit leaves out
+_MAX_DEVIATION = 4.0  # distance from the fit, in root mean squares of both coordinates
+_MAX_CORRELATION = 0.95  # of neighbouring frames
+_MIN_RMS = 0.2  # [px], accuracy of masks
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Where a camera saw the object's centre, undistorted.
+    """Undistorted positions of the object's centre in the pictures of one camera.
 
     Attributes:
-        times: by the camera's clock [s], (T,).
+        times: on the camera's clock [s], (T,).
         places: (x, y) [px], pixel centres at +0.5, (T, 2).
         viewmat: world to camera, OpenCV axes, (4, 4).
         K: intrinsics [px], (3, 3).
-        name: of the video, for messages.
-        radius: of the object's outline, as of a circle of its area [px]; 0: not known.
+        name: of the video for messages.
+        radius: of a circle with the area of the object [px]. 0 if unknown.
     """
 
     times: np.ndarray
@@ -50,13 +47,13 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class FreeFall:
-    """x(t) = x0 + v0 t + a t^2 / 2, t from ``start`` by the clock of the first camera.
+    """x(t) = x0 + v0 t + a t^2 / 2, with t relative to ``start`` on the clock of the first camera.
 
     Attributes:
         x0, v0, a: [m], [m/s], [m/s^2], (3,) each.
         offsets: seconds to add to the times of each camera, the first 0, (cameras,).
-        covariance: of (x0, v0, a, offsets without the first), (8 + cameras,) squared; 0 for what was stated. Residuals
-            of frames that follow each other are alike, as the middle of an outline wanders; that is part of it.
+        covariance: of (x0, v0, a, offsets without the first), (8 + cameras,) squared, including the correlation of
+            consecutive residuals. 0 for fixed values.
         start: [s].
         rms: of the residuals [px].
         views: `TRIANGULATED` or "one view in a plane".
@@ -72,21 +69,21 @@ class FreeFall:
     views: str
 
     def place(self, times: np.ndarray) -> np.ndarray:
-        """Places (T, 3) [m] at times by the first camera's clock [s]."""
+        """Positions (T, 3) [m] at times on the first camera's clock [s]."""
         t = np.asarray(times, float)[:, None] - self.start
         return self.x0 + self.v0 * t + self.a * t**2 / 2
 
     def seen(self, track: Track, camera: int) -> np.ndarray:
-        """Where a camera, by its number, sees the fall at the times of a track, (T, 2) [px]."""
+        """Projection of the fall into a camera, by its number, at the times of a track, (T, 2) [px]."""
         x = self.place(track.times + self.offsets[camera])
         p = (x @ track.viewmat[:3, :3].T + track.viewmat[:3, 3]) @ track.K.T
         return p[:, :2] / p[:, 2:]
 
     @property
     def gravity(self) -> Gravity:
-        """The acceleration."""
-        how = f"{self.views}, {self.rms:.2f} px"
-        return Gravity(self.a, self.covariance[6:9, 6:9], how, self.views == TRIANGULATED)
+        """The acceleration with its covariance."""
+        source = f"{self.views}, {self.rms:.2f} px"
+        return Gravity(self.a, self.covariance[6:9, 6:9], source, self.views == TRIANGULATED)
 
 
 def fit_free_fall(
@@ -95,17 +92,17 @@ def fit_free_fall(
     offsets: Sequence[float] | None = None,
     stated: Sequence[bool] | None = None,
 ) -> FreeFall:
-    """Fit the parabola to what cameras saw, by least squares of the distances in the pictures.
+    """Fit the parabola by least squares of the reprojection errors.
 
-    Several cameras triangulate within the fit. One camera needs the plane of the fall: a point (3,) and a normal (3,);
-    what happens along the normal is then taken as known, and the covariance does not hold an error of the plane.
+    Several cameras triangulate within the fit. One camera needs the plane of the fall. Motion along its normal is then
+    fixed, and the covariance does not include an error of the plane.
 
     Args:
-        tracks: of one camera or more, of frames before contact only.
-        plane: for one camera.
-        offsets: what is to be added to each camera's times [s], from sound, motion or the user; None: nothing. The
-            first is 0; the others are refined, below a frame, by when each camera saw the object at a height.
-        stated: whether the offset of a camera is kept as it is; None: none of them.
+        tracks: of one camera or more, frames before contact only.
+        plane: a point (3,) and a normal (3,), for one camera.
+        offsets: seconds to add to the times of each camera, from sound, motion or the user, the first 0. None: zeros.
+            The fit refines them below one frame, except the first.
+        stated: whether the offset of each camera is fixed. None: all but the first are fitted.
 
     Raises:
         InputError: too few frames, one camera without a plane, or motion that does not determine the fit.
@@ -113,13 +110,15 @@ def fit_free_fall(
     for track in tracks:
         if len(track.times) < 4:
             raise InputError(
-                f"{track.name}: {len(track.times)} frames before contact, at least 4 are needed: film at more frames"
-                f" a second, or drop the object from higher"
+                track.name,
+                f"{len(track.times)} frames before contact, at least 4 are required",
+                "Film at more frames per second, or drop the object from a greater height",
             )
     if not tracks or (len(tracks) == 1 and plane is None):
         raise InputError(
-            "free fall: one camera cannot tell how far the object is: state the plane of the fall, or film with a"
-            " second camera at about 90 degrees"
+            "plane",
+            "one camera does not determine the distance of the object",
+            "Give the plane of the fall, or film with a second camera at about 90 degrees",
         )
     start = float(tracks[0].times[0])
     basis, base = np.eye(9), np.zeros(9)
@@ -146,7 +145,7 @@ def fit_free_fall(
         return np.concatenate(parts).ravel()
 
     linear = _linear(tracks, start, known, basis, base)
-    found = least_squares(
+    solution = least_squares(
         residuals,
         np.concatenate([linear, known[fitted]]),
         x_scale="jac",
@@ -154,20 +153,23 @@ def fit_free_fall(
         xtol=1e-12,
         ftol=1e-12,
     )
-    J, scale = found.jac, np.linalg.norm(found.jac, axis=0)
+    u, errors, J = solution.x, solution.fun, solution.jac
+    scale = np.linalg.norm(J, axis=0)
     singular = np.linalg.svd(J / np.maximum(scale, 1e-300), compute_uv=False)
-    if not np.isfinite(found.x).all() or len(found.fun) <= len(found.x) or singular[-1] < 1e-7 * singular[0]:
+    if not np.isfinite(u).all() or len(errors) <= len(u) or singular[-1] < 1e-7 * singular[0]:
         raise InputError(
-            f"free fall of {', '.join(t.name for t in tracks)}: the tracks do not determine the motion: use more"
-            f" frames, or cameras that look from different sides"
+            ", ".join(track.name for track in tracks),
+            "the tracks do not determine the motion",
+            "Use more frames, or cameras that look from different sides",
         )
-    variance = found.fun @ found.fun / (len(found.fun) - len(found.x))
-    variance *= _alike(np.split(found.fun.reshape(-1, 2), np.cumsum([len(t.times) for t in tracks])[:-1]))
+    variance = errors @ errors / (len(errors) - len(u))
+    lengths = [len(track.times) for track in tracks]
+    variance *= _correlated_frames(np.split(errors.reshape(-1, 2), np.cumsum(lengths)[:-1]))
     covariance = variance * np.linalg.inv((J / scale).T @ (J / scale)) / np.outer(scale, scale)
     full = np.zeros((8 + len(tracks), count + free))
     full[:9, :count] = basis
     full[[8 + k for k in fitted], range(count, count + free)] = 1.0
-    (x0, v0, a), shift = motion(found.x)
+    (x0, v0, a), shift = motion(u)
     return FreeFall(
         x0=x0,
         v0=v0,
@@ -175,7 +177,7 @@ def fit_free_fall(
         offsets=shift,
         covariance=full @ covariance @ full.T,
         start=start,
-        rms=float(np.sqrt(np.mean(found.fun**2))),
+        rms=float(np.sqrt(np.mean(errors**2))),
         views="one view in a plane" if len(tracks) == 1 else TRIANGULATED,
     )
 
@@ -183,7 +185,7 @@ def fit_free_fall(
 def _linear(
     tracks: Sequence[Track], start: float, offsets: np.ndarray, basis: np.ndarray, base: np.ndarray
 ) -> np.ndarray:
-    """Unknowns of the parabola at these offsets, from equations that are linear in them (as of triangulation)."""
+    """Unknowns of the parabola at these offsets by linear triangulation."""
     rows, values = [], []
     for track, offset in zip(tracks, offsets):
         P = track.K @ track.viewmat[:3]
@@ -197,18 +199,16 @@ def _linear(
     return np.linalg.lstsq(M @ basis, y - M @ base, rcond=None)[0]
 
 
-def _alike(residuals: Sequence[np.ndarray]) -> float:
-    """Frames that count as one, 1 or more: (1 + r) / (1 - r) with the correlation r of neighbours, as of noise that
-    forgets exponentially (Bayley and Hammersley 1946).
+def _correlated_frames(residuals: Sequence[np.ndarray]) -> float:
+    """Frames per independent frame, (1 + r) / (1 - r) with the correlation r of neighbours in residuals (T, 2) [px].
 
-    Args:
-        residuals: of each track, (T, 2) [px].
+    Exact for exponentially correlated noise (Bayley and Hammersley 1946).
     """
-    # What stays moves the whole fall, not its shape.
+    # A constant residual moves the whole fall but does not change its shape.
     residuals = [part - part.mean(axis=0) for part in residuals]
     products = sum(float((part[1:] * part[:-1]).sum()) for part in residuals)
     squares = sum(0.5 * float((part[1:] ** 2 + part[:-1] ** 2).sum()) for part in residuals)
-    r = np.clip(products / max(squares, 1e-300), 0.0, _MOST_ALIKE)
+    r = np.clip(products / max(squares, 1e-300), 0.0, _MAX_CORRELATION)
     return float((1 + r) / (1 - r))
 
 
@@ -219,24 +219,23 @@ def fit_flight(
     stated: Sequence[bool] | None = None,
     contact: float = np.inf,
 ) -> tuple[FreeFall, list[slice]]:
-    """`fit_free_fall` to the part of the tracks that is free flight: from the middle on, to both sides, as far as the
-    next frame is where the fit of those before it says.
+    """Fit the free flight within tracks that may start before release or end after contact.
 
-    At its ends a track may have a frame of the hand that lets go, or of the contact. One frame of contact, 1/120 s long
-    at 3 m/s, is off by up to 25 mm. A soft body is off by much less at first, so that its contact hides in the wander
-    of its outline's middle: it has to be known.
+    `fit_free_fall` starts with the middle of each track, which is extended in both directions while the fit predicts
+    the next frame. One frame of contact, 1/120 s at 3 m/s, deviates by up to 25 mm and stops this. The contact of a
+    soft body deviates less at first than the centroid of its mask varies, so its time must be given.
 
     Args:
-        contact: frames from that time on are left out, by the first camera's clock, and by the offsets from the
-            beginning [s]; but not where less than `LEAST_FRAMES` would be left, as over another floor.
+        contact: time on the first camera's clock from which frames are left out, with the given offsets [s]. Ignored
+            if fewer than `MIN_FRAMES` remain, as when the contact is with another surface than the floor.
 
     Returns:
-        The fit, and which frames of each track it is of.
+        The fit, and the frames of each track that it uses.
     """
     kept = []
     shifts = np.zeros(len(tracks)) if offsets is None else offsets
     counts = [int((track.times + shift < contact).sum()) for track, shift in zip(tracks, shifts)]
-    if min(counts) < LEAST_FRAMES:
+    if min(counts) < MIN_FRAMES:
         counts = [len(track.times) for track in tracks]
     for count in counts:
         cut = min(int(_ENDS * count), max(0, (count - 4) // 2))
@@ -251,18 +250,20 @@ def fit_flight(
                 i = kept[k][0] - 1 if end == 0 else kept[k][1]
                 if not 0 <= i < counts[k]:
                     continue
-                off = float(np.linalg.norm(fall.seen(_part(track, i, i + 1), k) - track.places[i]))
-                if off <= _OFF * max(fall.rms, _LEAST_RMS):
+                distance = float(np.linalg.norm(fall.seen(_part(track, i, i + 1), k) - track.places[i]))
+                if distance <= _MAX_DEVIATION * max(fall.rms, _MIN_RMS):
                     kept[k][end] += step
                     growing = True
         if growing:
             chosen = [_part(track, *ends) for track, ends in zip(tracks, kept)]
             fall = fit_free_fall(chosen, plane, fall.offsets, stated)
-    if fall.rms > min(max(MOST_RMS * _height(track), MOST_OFF * track.radius) for track in tracks):
+    limit = min(max(MAX_RMS * _height(track), MAX_RMS_OF_RADIUS * track.radius) for track in tracks)
+    if fall.rms > limit:
         raise InputError(
-            f"{', '.join(t.name for t in tracks)}: no free flight fits what the cameras saw, {fall.rms:.1f} px off:"
-            f" are the videos of one throw and one object, have the cameras stood still since their poses were"
-            f" found, and are the masks right? Look at the contact sheets"
+            ", ".join(track.name for track in tracks),
+            f"no free flight fits the tracks: the error is {fall.rms:.1f} px, the limit {limit:.1f} px",
+            "Check on the contact sheets that the videos show the same take and object, that the cameras did not move"
+            " since their poses were estimated, and that the masks are correct",
         )
     return fall, [slice(*ends) for ends in kept]
 
@@ -272,5 +273,5 @@ def _part(track: Track, first: int, end: int) -> Track:
 
 
 def _height(track: Track) -> float:
-    """About the picture's height: the optical axis is near its middle."""
+    """Approximate picture height: the optical axis is near the middle."""
     return 2 * float(track.K[1, 2])

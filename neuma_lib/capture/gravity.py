@@ -1,7 +1,7 @@
-"""Gravity as a fall shows it: the check of scale, time base and floor together.
+"""Gravity measured in free fall, a joint check of scale, time base and floor.
 
-Whatever the object is, its centre of mass falls with 9.81 m/s^2 straight down. With that the squares of the board, the
-frame rate and the floor are right; times that are off by a part e show as 2 e.
+The centre of mass of any object accelerates at 9.81 m/s^2 straight down, if the board's square size, the frame rate and
+the floor are right. A relative error e of the times appears as 2 e.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from neuma_lib.errors import InputError
 
 UP = (0.0, 1.0, 0.0)
 """The floor's normal in the room."""
-MOST_MISMATCH = 0.1
-"""Part by which the measured gravity may differ from the true one, as a vector."""
-_UNDECIDED = f"more than {MOST_MISMATCH:.0%} off, but not surely: the placed object will tell"
+MAX_MISMATCH = 0.1
+"""Tolerated relative difference between measured and true gravity, as a vector."""
+_UNDECIDED = f"more than {MAX_MISMATCH:.0%} off, but not surely: the placed object will tell"
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,24 +29,24 @@ class Gravity:
     Attributes:
         a: [m/s^2], (3,).
         covariance: (3, 3).
-        how: it was measured, for people.
-        several: whether cameras that could show different throws were compared.
+        source: how it was measured, for messages.
+        several: whether it is from several cameras, which may show different takes.
     """
 
     a: np.ndarray
     covariance: np.ndarray
-    how: str
+    source: str
     several: bool = True
 
     @property
     def ratio(self) -> tuple[float, float]:
-        """|a| / 9.81 and its deviation."""
+        """|a| / 9.81 and its standard deviation."""
         size = np.linalg.norm(self.a)
         slope = self.a / size
         return float(size / GRAVITY), float(np.sqrt(slope @ self.covariance @ slope) / GRAVITY)
 
     def angle(self, normal: Sequence[float] = UP) -> tuple[float, float]:
-        """Angle between the acceleration and straight down, and its deviation (root mean square of both ways) [deg].
+        """Angle between the acceleration and straight down, and its standard deviation [deg].
 
         Args:
             normal: of the floor, upward, (3,).
@@ -59,65 +59,66 @@ class Gravity:
         angle = np.arctan2(np.linalg.norm(np.cross(down, -up)), -down @ up)
         return float(np.degrees(angle)), float(np.degrees(np.sqrt(spread) / size))
 
-    def told(self, name: str, normal: Sequence[float] = UP) -> str:
-        """A line for people.
+    def describe(self, name: str, normal: Sequence[float] = UP) -> str:
+        """One line of text.
 
         Args:
             name: of the videos.
             normal: of the floor, upward, (3,).
         """
+        return f"{name}: {self._description(normal)}"
+
+    def _description(self, normal: Sequence[float]) -> str:
         (ratio, deviation), (angle, unsure) = self.ratio, self.angle(normal)
         return (
-            f"{name}: gravity is {ratio:.3f} +- {deviation:.3f} of {GRAVITY} m/s^2, {angle:.1f} +- {unsure:.1f}"
-            f" degrees from the floor's normal ({self.how})"
+            f"gravity is {ratio:.3f} +- {deviation:.3f} of {GRAVITY} m/s^2, {angle:.1f} +- {unsure:.1f}"
+            f" degrees from the floor's normal ({self.source})"
         )
 
     def mismatch(self, normal: Sequence[float] = UP) -> tuple[float, float]:
-        """Distance from 9.81 m/s^2 straight down as a part of that, and its deviation.
+        """Relative distance from 9.81 m/s^2 straight down, and its standard deviation.
 
         Args:
             normal: of the floor, upward, (3,).
         """
         up = np.asarray(normal, float) / np.linalg.norm(normal)
-        off = self.a / GRAVITY + up
-        size = float(np.linalg.norm(off))
-        slope = off / max(size, 1e-12)
+        difference = self.a / GRAVITY + up
+        size = float(np.linalg.norm(difference))
+        slope = difference / max(size, 1e-12)
         return size, float(np.sqrt(slope @ self.covariance @ slope) / GRAVITY)
 
-    def checked(self, name: str, normal: Sequence[float] = UP, doubt: float = 0.0) -> str:
-        """The line of `told`.
+    def check(self, name: str, normal: Sequence[float] = UP, tolerated: float = 0.0) -> str:
+        """Compare with 9.81 m/s^2 straight down and return `describe`.
 
         Args:
             name: of the videos.
             normal: of the floor, upward, (3,).
-            doubt: how many of its deviations a mismatch has to be beyond the bound: above 0 where a better measurement
-                follows, which decides.
+            tolerated: standard deviations by which the mismatch may exceed `MAX_MISMATCH`, above 0 if a more accurate
+                measurement follows.
 
         Raises:
-            InputError: the acceleration differs from 9.81 m/s^2 downward by more than `MOST_MISMATCH`, as a vector.
+            InputError: the mismatch is larger.
         """
-        line, (ratio, _), (angle, _) = self.told(name, normal), self.ratio, self.angle(normal)
+        line, (ratio, _), (angle, _) = self.describe(name, normal), self.ratio, self.angle(normal)
         mismatch, unsure = self.mismatch(normal)
-        if mismatch - doubt * unsure <= MOST_MISMATCH:
-            return line if mismatch <= MOST_MISMATCH else f"{line}; {_UNDECIDED}"
+        if mismatch - tolerated * unsure <= MAX_MISMATCH:
+            return line if mismatch <= MAX_MISMATCH else f"{line}; {_UNDECIDED}"
         causes = []
-        if abs(ratio - 1) > MOST_MISMATCH / 2:
-            causes.append(f"the board's square size is {1 / ratio:.2f} of what is stated (measure it)")
+        if abs(ratio - 1) > MAX_MISMATCH / 2:
+            causes.append(f"the board's square size is {1 / ratio:.2f} of the given one (measure it)")
             causes.append(
-                f"the frame rate is {ratio**-0.5:.2f} of what is assumed (slow motion: state the true rate)"
+                f"the frame rate is {ratio**-0.5:.2f} of the assumed one (set the true rate of slow motion)"
             )
-            causes.append("the time base is not steady (take the file as the camera wrote it)")
-        if angle > np.degrees(MOST_MISMATCH / 2):
-            causes.append("the floor or board is not level, or the camera has moved since its pose was taken")
+            causes.append("the time base is not constant (use the original file of the camera)")
+        if angle > np.degrees(MAX_MISMATCH / 2):
+            causes.append("the floor or board is not level, or the camera moved after its pose was estimated")
         if self.several:
-            causes.append("the videos are of different throws or objects")
-        causes.append(
-            "frames after contact, or while a hand still holds the object, are among those of free flight"
-        )
-        raise InputError(f"{line}. Likely causes: {'; '.join(causes)}")
+            causes.append("the videos show different takes or objects")
+        causes.append("the frames of free flight include contact, or a hand that holds the object")
+        raise InputError(name, self._description(normal), f"Likely causes: {'; '.join(causes)}")
 
     def report(self) -> dict[str, Any]:
-        """For JSON; the room's metres, y up."""
+        """JSON report. Metres of the room, y up."""
         (ratio, deviation), (angle, unsure) = self.ratio, self.angle()
         return {
             "gravity_m_s2": self.a.tolist(),
@@ -128,10 +129,10 @@ class Gravity:
         }
 
 
-def gravity_checks(name: str, found: Mapping[str, Any]) -> list[tuple[str, str, str, bool]]:
-    """Checks of a `Gravity.report`: what, found, wanted, good."""
-    ratio, spread = found["gravity_ratio"], found["gravity_ratio_deviation"]
-    angle, unsure = found["gravity_angle_deg"], found["gravity_angle_deviation_deg"]
+def gravity_checks(name: str, report: Mapping[str, Any]) -> list[tuple[str, str, str, bool]]:
+    """Checks of a `Gravity.report`, with the fields of `neuma_lib.capture.page.Check`."""
+    ratio, spread = report["gravity_ratio"], report["gravity_ratio_deviation"]
+    angle, unsure = report["gravity_angle_deg"], report["gravity_angle_deviation_deg"]
     return [
         (
             f"gravity in {name}",

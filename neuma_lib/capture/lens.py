@@ -1,8 +1,8 @@
-"""Lenses with distortion, and the conventions of everything that this package calls.
+"""Lenses with distortion, and conventions of pixels and axes.
 
-Pixels: the centre of the left upper pixel is (0.5, 0.5), as in COLMAP and in all of this project; OpenCV has it at
-(0, 0), so what goes to OpenCV is shifted by half a pixel here and nowhere else. Cameras look along +z, x is right and y
-down (COLMAP, OpenCV); `transforms.json` has OpenGL axes (`neuma_lib.io.images`).
+The centre of the upper left pixel is at (0.5, 0.5), as in COLMAP and all of this project. OpenCV has it at (0, 0), so
+pixels are shifted by half a pixel where they are passed to OpenCV. Cameras look along +z with x to the right and y down
+(COLMAP, OpenCV). `transforms.json` has OpenGL axes (`neuma_lib.io.images`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from neuma_lib.capture.tools import opencv
 from neuma_lib.errors import InputError
 
 HALF_PIXEL = 0.5
-"""What OpenCV's pixel coordinates lack."""
+"""Offset from OpenCV's pixel coordinates to ours."""
 COLMAP_MODELS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -24,9 +24,9 @@ COLMAP_MODELS = {
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
 }
-"""COLMAP's camera models that are polynomials of Brown and Conrady as OpenCV's is, with their parameters in order."""
+"""COLMAP's camera models with Brown-Conrady distortion, as in OpenCV, and the order of their parameters."""
 _INVERSION = (3, 100, 1e-12)
-"""Both criteria, iterations and precision of the inverse of the distortion."""
+"""OpenCV's termination criteria for inverting the distortion: both, iterations, precision."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class Lens:
     distortion: np.ndarray
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Pixels (N, 2) of points (N, 3) in the camera's frame, z > 0."""
+        """Project points (N, 3) in the camera's frame, z > 0, to pixels (N, 2)."""
         x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
         k1, k2, p1, p2, k3 = self.distortion
         r2 = x * x + y * y
@@ -55,13 +55,13 @@ class Lens:
         return np.stack([distorted_x, distorted_y], axis=1) * self.K[[0, 1], [0, 1]] + self.K[:2, 2]
 
     def directions(self, pixels: np.ndarray) -> np.ndarray:
-        """x/z and y/z (N, 2) in the camera's frame of pixels (N, 2): the inverse of `project`."""
+        """x/z and y/z (N, 2) in the camera's frame for pixels (N, 2). Inverse of `project`."""
         cv2 = opencv()
         points = np.asarray(pixels, np.float64).reshape(-1, 1, 2)
         return cv2.undistortPointsIter(points, self.K, self.distortion, None, None, _INVERSION).reshape(-1, 2)
 
     def pinhole(self) -> Lens:
-        """The lens without distortion and of the same size all of whose pixels this one sees."""
+        """The lens of the same size without distortion whose picture lies completely within this one's."""
         if not self.distortion.any():
             return self
         size = (self.width, self.height)
@@ -69,17 +69,16 @@ class Lens:
         K[:2, 2] += HALF_PIXEL
         return Lens(self.width, self.height, K, np.zeros(5))
 
-    def undistort(self, image: np.ndarray, linear: bool = True) -> np.ndarray:
-        """What the lens of `pinhole` would have seen.
+    def undistort(self, image: np.ndarray) -> np.ndarray:
+        """Resample an image to the lens of `pinhole`.
 
         Args:
             image: (H, W) or (H, W, C), uint8 or float32.
-            linear: whether to interpolate between pixels; without it, labels stay labels.
         """
         if image.shape[:2] != (self.height, self.width):
             height, width = image.shape[:2]
             raise InputError(
-                f"a picture of {width}x{height} is not of the lens of {self.width}x{self.height}"
+                "image", f"a picture of {width}x{height} does not fit the lens of {self.width}x{self.height}"
             )
         if not self.distortion.any():
             return image
@@ -89,21 +88,20 @@ class Lens:
         maps = cv2.initUndistortRectifyMap(
             self._opencv_K(), self.distortion, None, target, size, cv2.CV_32FC1
         )
-        method = cv2.INTER_LINEAR if linear else cv2.INTER_NEAREST
-        return cv2.remap(image, *maps, method, borderMode=cv2.BORDER_REPLICATE)
+        return cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def resized(self, longest: int) -> Lens:
-        """The lens of pictures that were shrunk to a longer side of at most ``longest`` pixels."""
+        """The lens for pictures reduced to a longer side of at most ``longest`` pixels."""
         factor = min(1.0, longest / max(self.width, self.height))
         width, height = max(1, round(factor * self.width)), max(1, round(factor * self.height))
-        K = self.K.copy()  # pixel centres at +0.5: edges stay edges, and no shift is needed
+        K = self.K.copy()  # with pixel centres at +0.5, scaling needs no shift
         K[0] *= width / self.width
         K[1] *= height / self.height
         return Lens(width, height, K, self.distortion)
 
     def intrinsics(self) -> dict[str, float]:
-        """Entries of a transforms.json; of a lens without distortion."""
-        assert not self.distortion.any(), "a transforms.json holds pinhole cameras"
+        """Entries of a transforms.json, for a lens without distortion."""
+        assert not self.distortion.any(), "a transforms.json contains pinhole cameras only"
         focal, centre = self.K[[0, 1], [0, 1]].tolist(), self.K[:2, 2].tolist()
         return {
             **dict(zip(("fl_x", "fl_y"), focal)),
@@ -113,7 +111,7 @@ class Lens:
         }
 
     def plain(self) -> dict[str, Any]:
-        """The lens as JSON has it; `read` undoes it."""
+        """The lens as JSON values, read by `read_lens`."""
         names = ("k1", "k2", "p1", "p2", "k3")
         pinhole = Lens(self.width, self.height, self.K, np.zeros(5)).intrinsics()
         return {**pinhole, **dict(zip(names, self.distortion.tolist()))}
@@ -125,21 +123,22 @@ class Lens:
 
 
 def read_lens(values: Any, where: str) -> Lens:
-    """A lens from ``fl_x``, ``fl_y``, ``cx``, ``cy``, ``w``, ``h`` and k1, k2, p1, p2, k3 (0 where they are missing).
+    """A lens from ``fl_x``, ``fl_y``, ``cx``, ``cy``, ``w``, ``h`` and optional k1, k2, p1, p2, k3 (default 0).
 
     Raises:
         InputError: names ``where`` and the key.
     """
-    known = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+    required = ("fl_x", "fl_y", "cx", "cy", "w", "h")
     coefficients = ("k1", "k2", "p1", "p2", "k3")
     if not isinstance(values, dict):
-        raise InputError(f"{where}: expected intrinsics, {', '.join(known)} in pixels")
-    for key in (*known, *coefficients):
-        value = values.get(key, None if key in known else 0.0)
-        if type(value) not in (int, float) or not np.isfinite(value) or (key in known and value <= 0):
-            raise InputError(f"{where}: {key} must be a {'positive ' * (key in known)}number")
+        raise InputError(where, f"expected intrinsics {', '.join(required)} in pixels")
+    for key in (*required, *coefficients):
+        value = values.get(key, None if key in required else 0.0)
+        if type(value) not in (int, float) or not np.isfinite(value) or (key in required and value <= 0):
+            kind = "a positive number" if key in required else "a number"
+            raise InputError(f"{where}: {key}", f"{value!r} must be {kind}")
     if int(values["w"]) != values["w"] or int(values["h"]) != values["h"]:
-        raise InputError(f"{where}: w and h must be whole numbers")
+        raise InputError(f"{where}: w, h", f"{values['w']:g} x {values['h']:g} must be integers")
     K = np.array(
         [[values["fl_x"], 0, values["cx"]], [0, values["fl_y"], values["cy"]], [0, 0, 1]], np.float64
     )
@@ -148,9 +147,9 @@ def read_lens(values: Any, where: str) -> Lens:
 
 
 def lens_of_colmap(model: str, parameters: np.ndarray, width: int, height: int) -> Lens:
-    """The lens of one of COLMAP's cameras. Raises InputError for a model that is none of `COLMAP_MODELS`."""
+    """The lens of a COLMAP camera. Raises InputError for a model that is not in `COLMAP_MODELS`."""
     if model not in COLMAP_MODELS:
-        raise InputError(f"camera model {model} is not read; known: {', '.join(COLMAP_MODELS)}")
+        raise InputError("camera model", f"{model} is not supported, only {', '.join(COLMAP_MODELS)} are")
     named = dict(zip(COLMAP_MODELS[model], np.asarray(parameters, np.float64)))
     fx, fy = named.get("fx", named.get("f")), named.get("fy", named.get("f"))
     K = np.array([[fx, 0, named["cx"]], [0, fy, named["cy"]], [0, 0, 1]])

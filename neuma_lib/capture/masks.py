@@ -1,6 +1,6 @@
-"""Masks, and what is done with them: parts, edges, mattes, overlaps, and whether they can be right.
+"""Operations on masks (components, morphology, mattes, overlap) and checks of their plausibility.
 
-Pictures are RGB, uint8, (H, W, 3); masks are Boolean, (H, W); places are (x, y) [px], pixel centres at +0.5.
+Pictures are RGB, uint8, (H, W, 3). Masks are Boolean, (H, W). Positions are (x, y) [px], pixel centres at +0.5.
 """
 
 from __future__ import annotations
@@ -17,43 +17,43 @@ from neuma_lib.errors import InputError
 from neuma_lib.io.files import existing, reading
 from neuma_lib.io.images import open_image
 
-LEAST_AREA = 2e-5
-"""Part of the picture that an object covers at least."""
-MOST_MOVING = 0.1
-"""Part of the picture outside object and shadows that may differ from the plate."""
-MOST_JUMP = 1.0
-"""Change of a mask's area from one frame of free flight to the next that is an error: something else has come in. In
-sharp pictures 0.03 is usual; blur and a ground of a like colour make it 0.3."""
+MIN_AREA = 2e-5
+"""Minimum area of an object, as share of the picture."""
+MAX_MOVING = 0.1
+"""Tolerated share of the picture outside object and shadows that differs from the background."""
+MAX_JUMP = 1.0
+"""Tolerated relative change of a mask's area between frames of free flight. 0.03 is usual in sharp pictures, 0.3 with
+blur or a background of similar colour. A larger one means that something else is in the mask."""
 EDGE = 0.7
-"""Deviation of the blur that makes a mask's edge soft [px]."""
-RATIO = 3.0
-"""Of areas from frame to frame that may be the same object's, at most."""
+"""Standard deviation of the blur that softens a mask's edge [px]."""
+MAX_AREA_RATIO = 3.0
+"""Maximum ratio of areas of the same object from frame to frame."""
 _GRABCUT_ROUNDS = 4
 
 
 def centroid(mask: np.ndarray) -> np.ndarray:
-    """Mean place (x, y) of a mask, (2,); NaN where it is empty."""
+    """Mean position (x, y) of a mask, (2,). NaN if empty."""
     y, x = np.nonzero(mask)
     return np.array([x.mean(), y.mean()]) + 0.5 if len(x) else np.full(2, np.nan)
 
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:
-    """Intersection over union of two masks; 1 where both are empty."""
+    """Intersection over union of two masks. 1 if both are empty."""
     union = np.logical_or(a, b).sum()
     return float(np.logical_and(a, b).sum() / union) if union else 1.0
 
 
 def area_jumps(areas: np.ndarray) -> np.ndarray:
-    """|Change| of the area (T,) from frame to frame, as a part of the smaller one, (T - 1,)."""
+    """Absolute change of the area (T,) from frame to frame, relative to the smaller one, (T - 1,)."""
     areas = np.asarray(areas, float)
     return np.abs(np.diff(areas)) / np.maximum(np.minimum(areas[1:], areas[:-1]), 1)
 
 
 def matted(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """The object with a soft edge, straight-alpha RGBA (H, W, 4), uint8.
+    """Matte of the object with a soft edge, straight-alpha RGBA (H, W, 4), uint8.
 
-    Colours within two pixels of the edge, and outside, are those of the nearest pixel further in: a pixel at the edge
-    shows the floor, too, which must not bleed into the object.
+    Colours outside, and within two pixels of the edge, are those of the nearest pixel further inside, since pixels at
+    the edge also show the background.
     """
     cv2 = opencv()
     alpha = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), EDGE)
@@ -68,31 +68,33 @@ def matted(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def overlay(frame: Frame, mask: np.ndarray) -> Frame:
-    """A frame with the ground darkened and the mask outlined in red, for `neuma_lib.capture.frames.contact_sheet`."""
-    shown = np.where(mask[..., None], frame.pixels, frame.pixels // 2)
-    width = max(1, frame.pixels.shape[1] // 400)  # to be seen on a contact sheet
-    shown[ndimage.binary_dilation(mask, iterations=width) & ~mask] = (255, 0, 0)
-    return frame._replace(pixels=shown.astype(np.uint8))
+    """A frame with darkened background and the mask outlined in red, for `neuma_lib.capture.frames.contact_sheet`."""
+    pixels = np.where(mask[..., None], frame.pixels, frame.pixels // 2)
+    width = max(1, frame.pixels.shape[1] // 400)  # visible on a contact sheet
+    pixels[ndimage.binary_dilation(mask, iterations=width) & ~mask] = (255, 0, 0)
+    return frame._replace(pixels=pixels.astype(np.uint8))
 
 
 def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
-    """A mask of the user's: opaque where the picture has transparency, else where it is brighter than half, (H, W).
+    """Read a mask of the user: opaque pixels of a picture with alpha, else pixels brighter than half, (H, W).
 
     Args:
         path: PNG, JPEG or WebP.
-        size: width and height of the picture that it belongs to [px].
+        size: width and height of its picture [px].
 
     Raises:
         InputError: missing, damaged, of another size, or empty.
     """
-    content = existing(path, "put the mask there, or remove it from the settings").read_bytes()
+    content = existing(path, "Put the mask there, or remove it from the settings").read_bytes()
     with open_image(content, path) as image, reading(path, "a mask"):
         image.load()
-        clear = "A" in image.mode or "transparency" in image.info
-        mask = np.asarray(image.convert("RGBA").getchannel("A") if clear else image.convert("L")) > 127
+        has_alpha = "A" in image.mode or "transparency" in image.info
+        mask = np.asarray(image.convert("RGBA").getchannel("A") if has_alpha else image.convert("L")) > 127
     if mask.shape[::-1] != tuple(size):
         raise InputError(
-            f"{path} is {mask.shape[1]}x{mask.shape[0]}, its picture {size[0]}x{size[1]}: make the mask at that size"
+            path,
+            f"the mask is {mask.shape[1]}x{mask.shape[0]}, its picture {size[0]}x{size[1]}",
+            "Save the mask at the size of its picture",
         )
     check_not_empty(mask, path)
     return mask
@@ -101,13 +103,13 @@ def read_mask(path: str | Path, size: tuple[int, int]) -> np.ndarray:
 def component(
     strong: np.ndarray, place: np.ndarray | None = None, area: float | None = None, gate: float | None = None
 ) -> np.ndarray:
-    """The connected part that is nearest to a place and to an area; the largest where neither is known.
+    """The connected component nearest to a position and an area, with holes filled. The largest if neither is given.
 
-    With a gate [px], a part whose middle is farther from the place, or whose area is another by more than `RATIO`, is
-    not taken.
+    With a gate [px], components whose centre is farther from the position, or whose area differs by more than
+    `MAX_AREA_RATIO`, are excluded. Empty if there is none.
     """
     labels, sizes, middles = parts_of(strong)
-    enough = np.flatnonzero(sizes >= least_area(strong))
+    enough = np.flatnonzero(sizes >= min_area(strong))
     if len(enough) == 0:
         return np.zeros_like(strong)
     score = np.log(sizes[enough])
@@ -115,17 +117,18 @@ def component(
         score = -np.abs(score - np.log(area))
     if place is not None:
         reach = np.sqrt((sizes[enough] if area is None else area) / np.pi)
-        off = np.linalg.norm(middles[enough] - place, axis=1)
-        score = score - (off / (2 * reach)) ** 2
+        distance = np.linalg.norm(middles[enough] - place, axis=1)
+        score = score - (distance / (2 * reach)) ** 2
         if gate is not None:
-            score[(off > gate) | (np.abs(np.log(sizes[enough] / area)) > np.log(RATIO))] = -np.inf
+            other_size = np.abs(np.log(sizes[enough] / area)) > np.log(MAX_AREA_RATIO)
+            score[(distance > gate) | other_size] = -np.inf
     if not np.isfinite(score).any():
         return np.zeros_like(strong)
     return ndimage.binary_fill_holes(labels == enough[np.argmax(score)] + 1)
 
 
 def parts_of(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Labels (H, W) of the connected parts, from 1, their areas (N,) [px] and their middles (N, 2)."""
+    """Labels (H, W) of the connected components, from 1, their areas (N,) [px] and centres (N, 2)."""
     _, labels, stats, middles = opencv().connectedComponentsWithStats(mask.view(np.uint8))
     return labels, stats[1:, -1].astype(float), middles[1:] + 0.5
 
@@ -133,12 +136,12 @@ def parts_of(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def grabcut(
     image: np.ndarray, sure: np.ndarray, foreground: np.ndarray, background: np.ndarray
 ) -> np.ndarray:
-    """GrabCut from what is certainly the object, probably the object, and certainly not; its largest part, filled."""
+    """Largest component of GrabCut from pixels that are certainly, probably and certainly not the object, filled."""
     cv2 = opencv()
     labels = np.full(image.shape[:2], cv2.GC_PR_BGD, np.uint8)
     labels[foreground], labels[background], labels[sure] = cv2.GC_PR_FGD, cv2.GC_BGD, cv2.GC_FGD
     inside = np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))
-    # GrabCut fits colours to both sides: it needs some pixels of each.
+    # GrabCut fits colour models to both sides, so each needs some pixels.
     if min(inside.sum(), (~inside).sum()) >= 10:
         cv2.setRNGSeed(0)
         models = np.zeros((1, 65)), np.zeros((1, 65))
@@ -152,7 +155,7 @@ def grown(mask: np.ndarray, by: int) -> np.ndarray:
 
 
 def shrunk(mask: np.ndarray, by: int) -> np.ndarray:
-    """What is farther than some pixels from an edge; the picture's border is one."""
+    """Erode a mask by some pixels. The picture's border counts as an edge."""
     return opencv().erode(mask.view(np.uint8), cross(), iterations=by, borderValue=0).view(bool)
 
 
@@ -177,12 +180,12 @@ def in_full(part: np.ndarray, box: tuple[slice, slice], shape: tuple[int, int]) 
     return full
 
 
-def least_area(picture: np.ndarray) -> float:
-    return max(9, LEAST_AREA * picture.size)
+def min_area(picture: np.ndarray) -> float:
+    return max(9, MIN_AREA * picture.size)
 
 
 def whole(mask: np.ndarray) -> bool:
-    """Whether there is something, and the picture's border does not cut it."""
+    """Whether a mask is not empty and does not touch the picture's border."""
     return bool(mask.any() and not cut_off(mask))
 
 
@@ -191,31 +194,34 @@ def cut_off(mask: np.ndarray) -> bool:
 
 
 def check_not_empty(mask: np.ndarray, name: str | Path, frame: int | None = None) -> None:
-    """Raises InputError where a mask has no pixel."""
+    """Raises InputError if a mask has no pixel."""
     if not mask.any():
         raise InputError(
-            f"{_where(name, frame)}: the mask is empty, the object was not found: cut the video to the frames that"
-            f" show it, film against a ground of another colour, or give a mask of your own"
+            _where(name, frame),
+            "the mask is empty, the object was not detected",
+            "Cut the video to the frames that show it, film against a background of another colour, or provide a mask",
         )
 
 
 def check_background(moving: np.ndarray, name: str | Path) -> None:
-    """Raises InputError where more than `MOST_MOVING` of a picture moves besides the object, (T,)."""
+    """Raises InputError if a share of more than `MAX_MOVING` of a picture moves outside the object, (T,)."""
     worst = int(np.argmax(moving))
-    if moving[worst] > MOST_MOVING:
+    if moving[worst] > MAX_MOVING:
         raise InputError(
-            f"{_where(name, worst)}: the background moves, {moving[worst]:.0%} of the picture differ from the empty"
-            f" one besides the object: fix the camera, take the empty picture from the same place, lock focus and"
-            f" exposure, and keep hands out of the picture"
+            _where(name, worst),
+            f"the background moves: outside the object, {moving[worst]:.0%} of the picture differ from the empty scene,"
+            f" the limit is {MAX_MOVING:.0%}",
+            "Fix the camera, take the empty picture from the same position, lock focus and exposure, and keep hands out"
+            " of the picture",
         )
 
 
 def check_flight(masks: np.ndarray, name: str | Path, frames: Sequence[int]) -> np.ndarray:
-    """Check the masks of free flight: none empty, none at the picture's border, no sudden change of area.
+    """Check the masks of free flight: not empty, not at the picture's border, without sudden changes of area.
 
     Args:
         masks: of the whole video, (T, H, W).
-        name: of the file, for messages.
+        name: of the file for messages.
         frames: numbers of the frames before contact.
 
     Returns:
@@ -228,15 +234,19 @@ def check_flight(masks: np.ndarray, name: str | Path, frames: Sequence[int]) -> 
         check_not_empty(masks[i], name, i)
         if cut_off(masks[i]):
             raise InputError(
-                f"{_where(name, i)}: the object leaves the picture: leave this frame out, or film from farther away"
+                _where(name, i),
+                "the object leaves the picture",
+                "Leave this frame out, or film from farther away",
             )
     jumps = area_jumps(masks[list(frames)].sum(axis=(1, 2)))
-    if len(jumps) and jumps.max() > MOST_JUMP:
+    if len(jumps) and jumps.max() > MAX_JUMP:
         worst = int(np.argmax(jumps))
         raise InputError(
-            f"{_where(name, frames[worst + 1])}: the mask's area changes by {jumps[worst]:.0%} from the frame before,"
-            f" in free flight: look at the contact sheet; a hand, a shadow or a ground of the object's colour may be"
-            f" in the mask; leave such frames out, or give masks of your own"
+            _where(name, frames[worst + 1]),
+            f"the mask's area changes by {jumps[worst]:.0%} from the previous frame in free flight, the limit is"
+            f" {MAX_JUMP:.0%}",
+            "Look at the contact sheet for a hand, a shadow or the background in the mask, leave such frames out, or"
+            " provide masks",
         )
     return jumps
 

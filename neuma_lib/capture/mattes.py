@@ -1,4 +1,4 @@
-"""Pictures with their masks on disk: a transforms.json that lists mattes, and what a flight reads of it."""
+"""Read and write mattes: pictures with masks, listed in a transforms.json."""
 
 from __future__ import annotations
 
@@ -23,10 +23,12 @@ def room_frames(path: str | Path, group: str) -> list[dict[str, Any]]:
     Raises:
         InputError: there are none.
     """
-    found = [frame for frame in read_transforms(path)["frames"] if frame.get("group") == group]
-    if not found:
-        raise InputError(f"{path}: no picture of '{group}' has found its place")
-    return found
+    frames = [frame for frame in read_transforms(path)["frames"] if frame.get("group") == group]
+    if not frames:
+        raise InputError(
+            path, f"no pose was estimated for the pictures of '{group}'", "See the report of the poses"
+        )
+    return frames
 
 
 def read_pixels(path: str | Path) -> np.ndarray:
@@ -36,13 +38,13 @@ def read_pixels(path: str | Path) -> np.ndarray:
 
 
 def own_mask(path: str | Path, lens: Lens, longest: int) -> np.ndarray:
-    """A mask of the user's, undistorted as its picture is, (H, W). Raises InputError as `read_mask` does."""
+    """A mask of the user, undistorted like its picture, (H, W). Raises InputError as `read_mask`."""
     mask = read_mask(path, (lens.width, lens.height))
     return undistorted(255 * mask.astype(np.uint8), lens, longest) > 127
 
 
 def metric_camera(frame: Mapping[str, Any], world: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Camera of an entry in the room's metres, before it was placed into the simulator's box.
+    """Camera of an entry in the room's metres, before placement into the simulation box.
 
     Args:
         world: ``world`` of the file, with scale and offset.
@@ -57,7 +59,7 @@ def metric_camera(frame: Mapping[str, Any], world: Mapping[str, Any]) -> tuple[n
 
 
 def world_of(room: str | Path) -> dict[str, Any]:
-    """What the room's transforms.json says of its world, which is that of all that is made from it."""
+    """Entries of the room's transforms.json that describe its world, shared by all files derived from it."""
     data = read_transforms(room)
     return {key: data[key] for key in ("world", "room") if key in data}
 
@@ -71,16 +73,16 @@ def write_mattes(
 
     Args:
         path: .../transforms.json.
-        mattes: entry, with the ``file_path`` to write to, pixels (H, W, 3), uint8, and mask (H, W) of each picture.
-        world: entries of the file that say which world its cameras are in, see `world_of`.
+        mattes: entry with the ``file_path`` to write to, pixels (H, W, 3), uint8, and mask (H, W) of each picture.
+        world: entries of the file that describe the world of its cameras, see `world_of`.
     """
     folder = Path(path).parent
     folder.mkdir(parents=True, exist_ok=True)
-    Path(path).unlink(missing_ok=True)  # a folder without it is an unfinished one
+    Path(path).unlink(missing_ok=True)  # a folder without it is incomplete
     frames = []
     for frame, pixels, mask in mattes:
         rgba = matted(pixels, mask)
-        rgba[rgba[..., 3] == 0] = 0  # to be small
+        rgba[rgba[..., 3] == 0] = 0  # compresses better
         with atomic(folder / frame["file_path"]) as partial:
             Image.fromarray(rgba).save(partial, "PNG")
         frames.append({key: value for key, value in frame.items() if key != "sha256"})

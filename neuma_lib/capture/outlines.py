@@ -1,18 +1,16 @@
-"""The outline of an object before a plate, its shadow left out.
+"""Segment an object in front of a known background, without its shadow.
 
-A first mask says where the object is. Each pixel around it is then explained twice:
+An initial mask localises the object. Two models explain each pixel near it:
 
-- by the plate, lit as in the empty picture or shaded: a shadow is one factor for all channels that changes smoothly,
-  and the plate's texture shows through it (Jacques et al. 2005, Sanin et al. 2012). What other surfaces throw back on
-  to the floor lights it, too, and gives a dark shadow a tint;
-- by the colours of the object, learned where it flies and no shadow touches it, a little brighter or darker.
+- the background, lit as in the empty picture or shaded. A shadow is a smooth factor common to all channels that keeps
+  the background's texture (Jacques et al. 2005, Sanin et al. 2012). Light reflected by other surfaces may tint it.
+- the colours of the object, slightly brighter or darker, learned in free flight, where no shadow touches it.
 
-The difference of the two, with the length of the outline, has one global minimum that does not depend on the first mask
-(Chan, Esedoglu and Nikolova 2006; found as by Chambolle and Pock 2011). At the edge a pixel shows both; since the plate
-is known, how much of it is the object is known as well (difference matting, Qian and Sezan 1992), also where motion has
-blurred it.
+The difference of the two costs plus the length of the outline has a global minimum that does not depend on the initial
+mask (Chan, Esedoglu and Nikolova 2006; minimised as in Chambolle and Pock 2011). A pixel at the edge, possibly with
+motion blur, is a mixture whose coverage follows from the known background (difference matting, Qian and Sezan 1992).
 
-Shades and mixtures are those of light: pixels are sRGB, and their noise is that of levels.
+Shading and mixing are computed in linear light, noise in sRGB levels.
 """
 
 from __future__ import annotations
@@ -26,39 +24,39 @@ from neuma_lib.capture.masks import box_of, component, grown, in_full, shrunk
 from neuma_lib.capture.tools import opencv
 
 NOISE = 3.0
-"""Deviation between a frame and what explains it, least [levels]: noise of both, and of compression."""
-MISPLACED = 0.25
-"""Deviation of the camera and its compression from where it stood [px], at edges of the plate."""
+"""Minimum standard deviation between a frame and a model: noise of both, and compression [levels]."""
+POSE_TOLERANCE = 0.25
+"""Standard deviation of the background's position in the picture [px], relevant at its edges."""
 DARKEST = 0.02
-"""Least share of its light that a shadow leaves."""
+"""Minimum share of the light that a shadow leaves."""
 TINT = 0.05
-"""Deviation between the shades of the channels, as share of either."""
+"""Relative standard deviation between the shades of the channels."""
 BOUNCE = 0.03
-"""Deviation of the light that other surfaces throw on to the plate, as share of that of the empty picture."""
+"""Standard deviation of light reflected by other surfaces, as share of the light in the empty picture."""
 COLOURS = 24
-"""Colours that an object is described with."""
-LEAST_SHARE = 0.003
-"""Least share that a colour counts with: what is rare costs more."""
+"""Number of colours that describe an object."""
+MIN_SHARE = 0.003
+"""Minimum share assumed for a colour. Rare colours cost more."""
 SHADED = (6.0, 2.0)
-"""Cost of a shadow, which could have many shades, against none, and of a deeper one by its negative logarithm."""
+"""Cost of a shadow, which has many possible shades, and of its depth by the negative logarithm of the shade."""
 LIGHT = (0.6, 1.3)
-"""How much darker and brighter the object's colours become."""
+"""Range of brightness of the object's colours."""
 LIGHT_WEIGHT = 4.0
 """Cost of such a change, by its squared logarithm."""
 UNSEEN = 40.0
-"""Cost of a colour that neither side explains, in squared deviations."""
-LEAST_LEARNED = 200
-"""Pixels that the colours are learned from at least; with fewer, masks stay as they are."""
+"""Cost of a colour that neither model explains, in squared standard deviations."""
+MIN_LEARNED = 200
+"""Pixels required to learn the colours. With fewer, masks are not changed."""
 SMOOTH = (0.3, 2.0, 8.0)
-"""Cost of the outline by its length [px], in tens of squared deviations: where the frame has a sharp edge, what is
-added where it has none, and the slope that is halfway between [levels/px]."""
-TELLING = 40.0
-"""Difference between object and plate from which a mixture of them is told [levels]."""
-_WINDOW = 5  # of the shade, which is a plane there
+"""Cost of the outline by its length [px], in tens of squared deviations: at a sharp edge of the frame, the addition
+where there is none, and the slope halfway between [levels/px]."""
+MIN_CONTRAST = 40.0
+"""Difference between object and background required to determine their mixture [levels]."""
+_WINDOW = 5  # in which the logarithm of the shade is a plane
 _TEN = 10.0
 _ROUNDS = 150
-_REACH = 0.3  # how far beyond the first mask the outline may lie, in radii
-_AWAY = 15.0  # squared deviations from the plate of a pixel that is learned from
+_REACH = 0.3  # distance of the outline from the initial mask, in radii
+_AWAY = 15.0  # squared deviations from the background required of a pixel for learning
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +65,7 @@ class Palette:
 
     Attributes:
         colours: sRGB, (K, 3), float32.
-        shares: of them, (K,).
+        shares: relative frequencies, (K,).
     """
 
     colours: np.ndarray
@@ -75,8 +73,8 @@ class Palette:
 
 
 @dataclass(frozen=True, eq=False)
-class _ByPlate:
-    """How well the plate explains a picture: squared deviations (H, W), if lit and if shaded, and that shade (H, W)."""
+class _BackgroundFit:
+    """Squared deviations (H, W) of a picture from the lit and the shaded background, and the shade (H, W)."""
 
     lit: np.ndarray
     shaded: np.ndarray
@@ -88,27 +86,27 @@ class _ByPlate:
 
 
 def learn_palette(
-    frames: Sequence[np.ndarray], plates: Sequence[np.ndarray], masks: Sequence[np.ndarray]
+    frames: Sequence[np.ndarray], backgrounds: Sequence[np.ndarray], masks: Sequence[np.ndarray]
 ) -> Palette | None:
-    """Colours of the object in frames where no shadow touches it; None where too little of it is seen.
+    """Learn the colours of the object from frames in which no shadow touches it. None if there are too few pixels.
 
-    What the plate explains as well is not learned from: a shadow in a mask would make shadows the object's.
+    Pixels that the background also explains are left out, so that shadows in a mask do not become object colours.
 
     Args:
         frames: RGB, uint8, (H, W, 3).
-        plates: the empty scene at the exposure of each frame, float32, (H, W, 3).
-        masks: first ones, Boolean, (H, W).
+        backgrounds: the empty scene at the exposure of each frame, float32, (H, W, 3).
+        masks: initial masks, Boolean, (H, W).
     """
     cv2 = opencv()
     seen = [np.empty((0, 3), np.float32)]
-    for frame, plate, mask in zip(frames, plates, masks):
+    for frame, background, mask in zip(frames, backgrounds, masks):
         if mask.any():
             box = box_of(mask, _WINDOW)
             picture = frame[box].astype(np.float32)
             inside = shrunk(mask, max(1, round(0.1 * _radius(mask))))[box]
-            seen.append(picture[inside & (_by_plate(picture, plate[box]).cost > _AWAY)])
+            seen.append(picture[inside & (_explain_by_background(picture, background[box]).cost > _AWAY)])
     pixels = np.concatenate(seen)
-    if len(pixels) < LEAST_LEARNED:
+    if len(pixels) < MIN_LEARNED:
         return None
     rng = np.random.default_rng(0)
     pixels = pixels[rng.choice(len(pixels), min(len(pixels), 20_000), replace=False)]
@@ -118,22 +116,22 @@ def learn_palette(
     return Palette(colours, np.bincount(labels.ravel(), minlength=COLOURS) / len(labels))
 
 
-def outline(frame: np.ndarray, plate: np.ndarray, mask: np.ndarray, palette: Palette) -> np.ndarray:
-    """The mask of the object, (H, W), near a first one that may have shadows in it.
+def outline(frame: np.ndarray, background: np.ndarray, mask: np.ndarray, palette: Palette) -> np.ndarray:
+    """Mask of the object, (H, W), from an initial mask that may contain shadows.
 
     Args:
         frame: RGB, uint8, (H, W, 3).
-        plate: the empty scene at its exposure, float32, (H, W, 3).
-        mask: the first one, not empty.
+        background: the empty scene at its exposure, float32, (H, W, 3).
+        mask: the initial one, not empty.
     """
     reach = max(3, round(_REACH * _radius(mask)))
     box = box_of(mask, reach + _WINDOW)
-    picture, empty = frame[box].astype(np.float32), plate[box]
-    background = _by_plate(picture, empty)
-    difference = _by_palette(picture, palette) - np.minimum(background.cost, UNSEEN)
+    picture, empty = frame[box].astype(np.float32), background[box]
+    fit = _explain_by_background(picture, empty)
+    difference = _palette_cost(picture, palette) - np.minimum(fit.cost, UNSEEN)
     inside = cheapest(np.where(grown(mask[box], reach), difference, 0.5 * UNSEEN), picture)
     if inside.any():
-        inside = _mixed(picture, empty, background.shade, inside)
+        inside = _mixed(picture, empty, fit.shade, inside)
     return in_full(component(inside), box, mask.shape)
 
 
@@ -142,13 +140,13 @@ def _radius(mask: np.ndarray) -> float:
 
 
 def linear(levels: np.ndarray) -> np.ndarray:
-    """Light, from 0 to 1, of sRGB levels, from 0 to 255 (IEC 61966-2-1), float32."""
+    """Linear light in [0, 1] from sRGB levels in [0, 255] (IEC 61966-2-1), float32."""
     v = np.clip(levels, 0, 255) / np.float32(255)
     return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def coded(light: np.ndarray) -> np.ndarray:
-    """sRGB levels, from 0 to 255, of light, float32."""
+    """sRGB levels in [0, 255] from linear light, float32."""
     light = np.maximum(light, 0)
     v = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     return (255 * v).astype(np.float32)
@@ -160,19 +158,19 @@ def _levels_by_light(light: np.ndarray) -> np.ndarray:
     return 255 * np.where(light <= 0.0031308, 12.92, slope).astype(np.float32)
 
 
-def _by_plate(picture: np.ndarray, plate: np.ndarray) -> _ByPlate:
-    """How well a plate, lit or shaded, explains a picture; both float32, (H, W, 3).
+def _explain_by_background(picture: np.ndarray, background: np.ndarray) -> _BackgroundFit:
+    """Fit a background, lit or shaded, to a picture, both float32, (H, W, 3).
 
-    The logarithm of a shade is a plane in a window. Of the nine windows that hold a pixel that one counts which is
-    explained best, as at the edge of the object only those on one side are of one thing (Kuwahara et al. 1976).
+    The logarithm of a shade is a plane within a window. The best of nine windows around a pixel counts, since at the
+    edge of the object only windows on one side are uniform (Kuwahara et al. 1976).
     """
     cv2 = opencv()
-    plate = np.maximum(plate, 1.0)
-    light, full = linear(picture), linear(plate)
-    edges = MISPLACED * np.hypot(
-        *(cv2.Sobel(plate, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1)))
+    background = np.maximum(background, 1.0)
+    light, full = linear(picture), linear(background)
+    edges = POSE_TOLERANCE * np.hypot(
+        *(cv2.Sobel(background, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1)))
     )
-    lit = ((picture - plate) ** 2 / (NOISE**2 + edges**2 + (0.4 * TINT * plate) ** 2)).sum(axis=2)
+    lit = ((picture - background) ** 2 / (NOISE**2 + edges**2 + (0.4 * TINT * background) ** 2)).sum(axis=2)
 
     def window(values: np.ndarray, side: int = _WINDOW) -> np.ndarray:
         return cv2.blur(values, (side, side), borderType=cv2.BORDER_REFLECT_101)
@@ -208,11 +206,11 @@ def _by_plate(picture: np.ndarray, plate: np.ndarray) -> _ByPlate:
             whole = 0.5 * (own + shifted(residual, x, y))
             better = whole < best
             best[better], cost[better], shade[better] = whole[better], own[better], factor[better]
-    return _ByPlate(lit, np.maximum(cost, best) + SHADED[0] - SHADED[1] * np.log(shade), shade)
+    return _BackgroundFit(lit, np.maximum(cost, best) + SHADED[0] - SHADED[1] * np.log(shade), shade)
 
 
-def _by_palette(picture: np.ndarray, palette: Palette) -> np.ndarray:
-    """Squared deviations (H, W) from the nearest colour, at most `UNSEEN`; rare colours cost a little more."""
+def _palette_cost(picture: np.ndarray, palette: Palette) -> np.ndarray:
+    """Squared deviations (H, W) from the nearest colour, at most `UNSEEN`. Rare colours cost slightly more."""
     light = linear(picture)
     best = np.full(picture.shape[:2], UNSEEN, np.float32)
     for colour, share in zip(palette.colours, palette.shares):
@@ -221,29 +219,29 @@ def _by_palette(picture: np.ndarray, palette: Palette) -> np.ndarray:
         expected = factor * own
         variance = 2 * NOISE**2 + (TINT * _levels_by_light(expected) * expected) ** 2
         cost = ((picture - coded(expected)) ** 2 / variance).sum(axis=2)
-        cost += LIGHT_WEIGHT * np.log(factor[..., 0]) ** 2 - 2 * np.log(max(share, LEAST_SHARE))
+        cost += LIGHT_WEIGHT * np.log(factor[..., 0]) ** 2 - 2 * np.log(max(share, MIN_SHARE))
         np.minimum(best, cost, out=best)
     return best
 
 
 def cheapest(cost: np.ndarray, picture: np.ndarray) -> np.ndarray:
-    """The region (H, W) with the least sum of what its pixels cost and of its outline, which is cheap along edges.
+    """The region (H, W) with the minimum total cost of its pixels and its outline, which is cheap along edges.
 
     Args:
-        cost: of a pixel inside over one outside, in squared deviations, (H, W).
-        picture: in which edges are looked for, float32, (H, W, 3).
+        cost: of a pixel inside relative to outside, in squared deviations, (H, W).
+        picture: whose edges attract the outline, float32, (H, W, 3).
     """
     cv2 = opencv()
     grey = picture.mean(axis=2)
     slope = np.hypot(*(cv2.Sobel(grey, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1))))
     least, more, half = SMOOTH
-    return _least_cost((cost / _TEN).astype(np.float32), least + more / (1 + (slope / half) ** 2))
+    return _minimum_cost((cost / _TEN).astype(np.float32), least + more / (1 + (slope / half) ** 2))
 
 
-def _least_cost(cost: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """The region (H, W) with the least sum of costs inside and of lengths along its outline.
+def _minimum_cost(cost: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """The region (H, W) with the minimum sum of costs inside and of length weights along its outline.
 
-    The minimum over u in [0, 1] of sum(length |grad u| + cost u), cut at a half, is that region (Chan et al. 2006).
+    It is the minimum over u in [0, 1] of sum(length |grad u| + cost u), thresholded at 1/2 (Chan et al. 2006).
     """
     u = (cost < 0).astype(np.float32)
     ahead, x, y = u, np.zeros_like(u), np.zeros_like(u)
@@ -262,8 +260,8 @@ def _least_cost(cost: np.ndarray, length: np.ndarray) -> np.ndarray:
     return u > 0.5
 
 
-def _mixed(picture: np.ndarray, plate: np.ndarray, shade: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """The region whose pixels at the edge are at least half the object's, where that is told."""
+def _mixed(picture: np.ndarray, background: np.ndarray, shade: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """Move the edge of a region to the pixels with at least half coverage, where contrast is sufficient."""
     cv2 = opencv()
     sure, away = shrunk(inside, 2).astype(np.float32), 1 - grown(inside, 2).astype(np.float32)
     band = grown(inside, 1) & ~shrunk(inside, 1)
@@ -276,9 +274,9 @@ def _mixed(picture: np.ndarray, plate: np.ndarray, shade: np.ndarray, inside: np
     light = linear(picture)
     own, known = near(light, sure)
     log, shaded = near(np.log(shade)[..., None], away)
-    behind = linear(plate) * np.where(shaded[..., None], np.exp(log), 1.0)
-    told = band & known & (((coded(own) - coded(behind)) ** 2).sum(axis=2) > TELLING**2)
+    behind = linear(background) * np.where(shaded[..., None], np.exp(log), 1.0)
+    decided = band & known & (((coded(own) - coded(behind)) ** 2).sum(axis=2) > MIN_CONTRAST**2)
     towards = own - behind
     share = ((light - behind) * towards).sum(axis=2) / np.maximum((towards**2).sum(axis=2), 1e-9)
-    mixed = np.where(told, np.clip(share, 0, 1), inside).astype(np.float32)
+    mixed = np.where(decided, np.clip(share, 0, 1), inside).astype(np.float32)
     return cv2.GaussianBlur(mixed, (0, 0), 0.6) > 0.5

@@ -1,7 +1,6 @@
-"""Masks of the object in photographs, whose cameras move: what a network says stands out, its edge drawn by GrabCut
-(Rother et al. 2004).
+"""Masks of the object in photographs: salient object by a network, edge by GrabCut (Rother et al. 2004).
 
-Pictures are RGB, uint8, (H, W, 3); masks are Boolean, (H, W).
+Pictures are RGB, uint8, (H, W, 3). Masks are Boolean, (H, W).
 """
 
 from __future__ import annotations
@@ -15,9 +14,9 @@ from neuma_lib.capture.masks import component, cross, grabcut, grown, shrunk
 from neuma_lib.capture.tools import opencv
 from neuma_lib.errors import InputError
 
-_LONGEST = 800  # side of a photograph that GrabCut works on [px]
-_AROUND = 1.3  # size of the floor around a board, in boards
-_NEUTRAL = (12.0, 0.12)  # range of the channels of a neutral pixel: levels, and part of the largest
+_LONGEST = 800  # side of a photograph for GrabCut [px]
+_AROUND = 1.3  # size of the sampled floor around a board, in boards
+_NEUTRAL = (12.0, 0.12)  # range of the channels of a neutral pixel: levels, and share of the largest channel
 
 
 def photograph_mask(
@@ -30,12 +29,12 @@ def photograph_mask(
 
     Args:
         pixels: the picture.
-        saliency: `neuma_lib.capture.saliency.Saliency`, or another that gives (H, W) in [0, 1].
-        name: of the file, for messages.
-        board: corners of the printed board in the picture, (4, 2) [px]; None: there is none, or it is not in view.
+        saliency: `neuma_lib.capture.saliency.Saliency`, or another function that returns (H, W) in [0, 1].
+        name: of the file for messages.
+        board: corners of the printed board in the picture, (4, 2) [px]. None if there is none or it is not visible.
 
     Raises:
-        InputError: nothing stands out.
+        InputError: no salient object.
     """
     cv2 = opencv()
     height, width = pixels.shape[:2]
@@ -45,8 +44,9 @@ def photograph_mask(
     likely = component(probability > 0.5)
     if not likely.any():
         raise InputError(
-            f"{name}: the mask is empty, nothing stands out: photograph the object closer and before a plain ground,"
-            f" leave the picture out, or give a mask of your own"
+            name,
+            "the mask is empty, no salient object was detected",
+            "Photograph the object closer and in front of a plain background, leave the picture out, or provide a mask",
         )
     radius = np.sqrt(likely.sum() / np.pi)
     reach = grown(likely, max(3, round(0.1 * radius)))
@@ -58,15 +58,14 @@ def photograph_mask(
 
 
 def without_print(pixels: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """A picture whose printed board is hidden under floor: it stands out more than most objects.
+    """Replace the printed board in a picture by floor, since it is more salient than most objects.
 
-    What is neutral inside the board is taken for print, under the tint of its white; what has colour and lies on the
-    board stays. A hidden pixel has the colour of one around the board, drawn at random, so that neither pattern nor
-    edge is left.
+    Pixels inside the board that are neutral relative to its white are print. Coloured ones belong to objects on the
+    board and are kept. Print is replaced by random pixels around the board, which leaves no pattern and no edge.
 
     Args:
         pixels: (H, W, 3), uint8.
-        corners: of the board in the picture, in their order, (4, 2) [px]; they may lie outside.
+        corners: of the board in the picture, in order, (4, 2) [px], possibly outside the picture.
     """
     cv2 = opencv()
     outlines = [np.zeros(pixels.shape[:2], np.uint8) for _ in range(2)]

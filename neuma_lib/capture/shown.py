@@ -1,4 +1,4 @@
-"""A throw's video as it was filmed, at the size of the report: frames, mattes, the empty scene."""
+"""Video of a take for display in the report: original frames, mattes and background at reduced size."""
 
 from __future__ import annotations
 
@@ -22,45 +22,49 @@ def shown_frames(
     video: Sequence[Mapping[str, Any]],
     mattes: str | Path,
     frames: Iterable[tuple[int, np.ndarray]],
-    plate: np.ndarray,
+    background: np.ndarray,
     width: int,
     gain: Sequence[float],
 ) -> list[dict[str, Any]]:
-    """Write the frames of one camera that a law is judged by, with their mattes and the empty scene.
+    """Write the evaluated frames of one camera, with their mattes and the background.
 
     Args:
-        folder: where to.
+        folder: output folder.
         camera: its name.
-        video: entries of the video on the simulator's clock.
+        video: entries of the video in simulation time.
         mattes: transforms.json of the camera's mattes.
         frames: number and undistorted picture (H, W, 3), uint8, of each of these frames.
-        plate: the empty scene, (H, W, 3), uint8.
-        width: longer side of what is written [px].
-        gain: of the camera against the photographs, (3,).
+        background: the empty scene, (H, W, 3), uint8.
+        width: longer side of the output [px].
+        gain: of the camera relative to the photographs, (3,).
 
     Returns:
-        An entry of a transforms.json for each frame: ``picture`` and ``plate`` beside the matte, and the picture's
-        exposure against the plate.
+        An entry of a transforms.json for each frame, with the files ``picture`` and ``plate`` (background) and the
+        exposure of the picture relative to the background.
 
     Raises:
-        InputError: frames of another size than the empty scene.
+        InputError: frames and background differ in size.
     """
     filmed = {entry["frame"]: entry for entry in video if entry["camera"] == camera}
     listing = {frame["step"]: frame for frame in read_transforms(mattes)["frames"]}
-    entries, small_plate = [], None
+    entries, background_file = [], None
     for number, pixels in frames:
         source = listing[number]
         place = Path(mattes).parent / source["file_path"]
         with open_image(place.read_bytes(), place, source.get("sha256")) as image:
             matte = reduced(np.asarray(image.convert("RGBA")), width)
-        if pixels.shape != plate.shape:
-            raise InputError(f"{mattes}: frames of {camera} are not of the size of its empty picture")
+        if pixels.shape != background.shape:
+            raise InputError(
+                mattes,
+                f"frames of {camera} have {pixels.shape[1]}x{pixels.shape[0]} pixels, its empty picture"
+                f" {background.shape[1]}x{background.shape[0]}",
+            )
         size = matte.shape[1::-1]
         picture, empty = (
-            np.asarray(Image.fromarray(p).resize(size, Image.Resampling.BOX)) for p in (pixels, plate)
+            np.asarray(Image.fromarray(p).resize(size, Image.Resampling.BOX)) for p in (pixels, background)
         )
-        if small_plate is None:
-            small_plate = _save(folder, f"{camera}.png", empty)
+        if background_file is None:
+            background_file = _save(folder, f"{camera}.png", empty)
         exposure, offset = match_exposure(picture, empty)
         stem = f"{camera}_{number:05d}"
         entries.append(
@@ -69,7 +73,7 @@ def shown_frames(
                 **reduced_intrinsics(source, size),
                 "file_path": _save(folder, f"{stem}_matte.png", matte),
                 "picture": _save(folder, f"{stem}.png", picture),
-                "plate": small_plate,
+                "plate": background_file,
                 "plate_gain": exposure.tolist(),
                 "plate_offset": offset.tolist(),
                 "gain": list(gain),
@@ -79,7 +83,7 @@ def shown_frames(
 
 
 def numbers_of(video: Sequence[Mapping[str, Any]], camera: str) -> list[int]:
-    """Numbers of a camera's frames in a video on the simulator's clock."""
+    """Numbers of a camera's frames in a video in simulation time."""
     return [entry["frame"] for entry in video if entry["camera"] == camera]
 
 

@@ -1,8 +1,8 @@
-"""Spin of an object in free flight, from points of its surface that are followed in the pictures.
+"""Angular velocity of an object in free flight, from tracked points of its surface.
 
-With no force but gravity an object turns about its centre, which keeps to the parabola of `FreeFall`. Over some tenths
-of a second the angular velocity of a compact object hardly changes, and is taken as constant. How deep a followed point
-lies is not known: it begins on a sphere of the mask's area and is fitted along with the spin.
+Under gravity alone an object rotates about its centre, which follows the parabola of `FreeFall`. The angular velocity
+of a compact object is nearly constant over a few tenths of a second. The depths of the points are unknown: they start
+on a sphere with the area of the mask and are fitted together with the angular velocity.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ from scipy.spatial.transform import Rotation
 from neuma_lib.capture.free_fall import FreeFall, Track
 from neuma_lib.capture.tools import opencv
 
-LONGEST = 8
-"""Frames over which a point is followed; its neighbourhood turns away from the camera then."""
+MAX_FRAMES = 8
+"""Frames over which a point is tracked before its neighbourhood rotates out of view."""
 POINTS = 25
-"""Points that are followed from one frame."""
+"""Points tracked from one frame."""
 DEPTH_SPREAD = 0.4
-"""Deviation of the depth of a surface from that of a sphere, in radii."""
-FOLLOWED = 0.3
-"""Deviation of a followed point [px]."""
-_LEAST_POINTS = 8
-_WINDOW = 15  # side of what is compared around a point [px]
-_RETURN = 0.5  # most distance of a point that was followed there and back [px]
+"""Standard deviation of the depth of a surface from that of a sphere, in radii."""
+PIXEL_SPREAD = 0.3
+"""Standard deviation of a tracked point [px]."""
+_MIN_POINTS = 8
+_WINDOW = 15  # side of the window compared around a point [px]
+_MAX_RETURN_ERROR = 0.5  # after tracking forward and backward [px]
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """A point of the surface as one camera saw it.
+    """Track of a surface point in one camera.
 
     Attributes:
         camera: its number in the list of tracks.
-        times: by that camera's clock [s], (T,).
+        times: on that camera's clock [s], (T,).
         places: undistorted [px], (T, 2).
-        radius: of a disc of the mask's area, at the first time [px].
+        radius: of a disc with the area of the mask, at the first time [px].
     """
 
     camera: int
@@ -49,7 +49,7 @@ class Path:
 
 @dataclass(frozen=True, eq=False)
 class Spin:
-    """Angular velocity (3,) [rad/s], its covariance (3, 3), residual [px], and how many points it is from."""
+    """Angular velocity (3,) [rad/s], its covariance (3, 3), residual [px], and number of points."""
 
     velocity: np.ndarray
     covariance: np.ndarray
@@ -58,7 +58,7 @@ class Spin:
 
     @property
     def rate(self) -> tuple[float, float]:
-        """Its size and deviation [rad/s]; along the axis, or all around where it hardly turns."""
+        """Magnitude and standard deviation [rad/s], along the axis, or the mean over all axes for a small spin."""
         size = float(np.linalg.norm(self.velocity))
         axis = self.velocity / max(size, 1e-300)
         along = float(np.sqrt(axis @ self.covariance @ axis))
@@ -66,7 +66,7 @@ class Spin:
 
 
 def follow(frames: Sequence[np.ndarray], masks: np.ndarray, times: np.ndarray, camera: int) -> list[Path]:
-    """Follow points inside the masks (Lucas and Kanade 1981, on pyramids), from every fourth frame on.
+    """Track points inside the masks (pyramidal Lucas and Kanade 1981), starting at every fourth frame.
 
     Args:
         frames: of free flight, undistorted, T pictures (H, W, 3), uint8.
@@ -76,20 +76,20 @@ def follow(frames: Sequence[np.ndarray], masks: np.ndarray, times: np.ndarray, c
     """
     cv2 = opencv()
     grey = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames]
-    # What is compared around a point should be the object; of a small one that would leave nothing.
+    # Windows should be inside the object, but a small object must keep some pixels.
     edge = 2 * max(2, min(_WINDOW // 2, round(0.25 * float(np.sqrt(masks[0].sum() / np.pi))))) + 1
     shape = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (edge, edge))
     inner = [cv2.erode(mask.astype(np.uint8), shape) for mask in masks]
     middles = [np.argwhere(mask).mean(axis=0)[::-1] for mask in masks]
     options = {"winSize": (_WINDOW, _WINDOW), "maxLevel": 2, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
     paths = []
-    for first in range(0, len(frames) - 2, max(1, LONGEST // 2)):
-        found = cv2.goodFeaturesToTrack(grey[first], POINTS, 0.02, 4, mask=inner[first])
-        if found is None:
+    for first in range(0, len(frames) - 2, max(1, MAX_FRAMES // 2)):
+        features = cv2.goodFeaturesToTrack(grey[first], POINTS, 0.02, 4, mask=inner[first])
+        if features is None:
             continue
-        places = [[p] for p in found.reshape(-1, 2).astype(np.float64)]
+        places = [[p] for p in features.reshape(-1, 2).astype(np.float64)]
         alive = np.arange(len(places))
-        for i in range(first, min(first + LONGEST, len(frames)) - 1):
+        for i in range(first, min(first + MAX_FRAMES, len(frames)) - 1):
             here = np.array([places[k][-1] for k in alive], np.float32).reshape(-1, 1, 2)
             if len(here) == 0:
                 break
@@ -101,7 +101,7 @@ def follow(frames: Sequence[np.ndarray], masks: np.ndarray, times: np.ndarray, c
             kept = (
                 (good & again)[:, 0].astype(bool)
                 & within
-                & (np.linalg.norm(back - here, axis=2)[:, 0] < _RETURN)
+                & (np.linalg.norm(back - here, axis=2)[:, 0] < _MAX_RETURN_ERROR)
             )
             kept[kept] &= inner[i + 1][y[kept], x[kept]] > 0
             alive = alive[kept]
@@ -117,19 +117,19 @@ def follow(frames: Sequence[np.ndarray], masks: np.ndarray, times: np.ndarray, c
 
 
 def fit_spin(paths: Sequence[Path], tracks: Sequence[Track], fall: FreeFall) -> Spin | None:
-    """Angular velocity by least squares of the distances in the pictures, robust against points that slipped.
+    """Angular velocity by robust least squares of the reprojection errors.
 
     Args:
         paths: of `follow`, of all cameras.
-        tracks: of the cameras, for where they stand.
+        tracks: of the cameras, for their poses.
         fall: of the same flight.
 
     Returns:
-        None where fewer than `_LEAST_POINTS` points were followed, as on an object without texture.
+        None if fewer than `_MIN_POINTS` points were tracked, as on an object without texture.
     """
-    if len(paths) < _LEAST_POINTS:
+    if len(paths) < _MIN_POINTS:
         return None
-    # One row for each place but the first of its path, which fixes the ray.
+    # One row for each position of a path but the first, which fixes the ray.
     path = np.concatenate([np.full(len(p.times) - 1, k) for k, p in enumerate(paths)])
     camera = np.array([p.camera for p in paths])
     R, t = (np.stack([track.viewmat[:3, c] for track in tracks]) for c in (slice(0, 3), 3))
@@ -140,7 +140,7 @@ def fit_spin(paths: Sequence[Path], tracks: Sequence[Track], fall: FreeFall) -> 
     start = np.stack([p.places[0] for p in paths])
     centres, later = fall.place(begin), fall.place(clock)
 
-    # A point is eye + depth * ray, where the ray has z = 1 in the camera.
+    # A point is eye + depth * ray, with z = 1 for the ray in the camera's frame.
     rays = np.concatenate(
         [(start - K[camera, :2, 2]) / K[camera][:, [0, 1], [0, 1]], np.ones((len(start), 1))], axis=1
     )
@@ -158,10 +158,10 @@ def fit_spin(paths: Sequence[Path], tracks: Sequence[Track], fall: FreeFall) -> 
         turned = Rotation.from_rotvec((clock - begin[path])[:, None] * u[:3]).apply(arm)
         x = np.einsum("nij,nj->ni", R[camera[path]], later + turned) + t[camera[path]]
         p = x[:, :2] / x[:, 2:] * K[camera[path]][:, [0, 1], [0, 1]] + K[camera[path], :2, 2]
-        return np.concatenate([((p - seen) / FOLLOWED).ravel(), u[3:] / DEPTH_SPREAD])
+        return np.concatenate([((p - seen) / PIXEL_SPREAD).ravel(), u[3:] / DEPTH_SPREAD])
 
     def jacobian(u: np.ndarray) -> np.ndarray:
-        # Depths act on the rows of their own paths only: one difference serves them all.
+        # A depth only affects the rows of its path, so one finite difference covers all depths.
         J = np.zeros((2 * len(path) + len(paths), 3 + len(paths)))
         step = 1e-5
         for k in range(3):
@@ -179,14 +179,13 @@ def fit_spin(paths: Sequence[Path], tracks: Sequence[Track], fall: FreeFall) -> 
         J[2 * len(path) + np.arange(len(paths)), 3 + np.arange(len(paths))] = 1 / DEPTH_SPREAD
         return J
 
-    found = least_squares(residuals, np.zeros(3 + len(paths)), jacobian, loss="soft_l1")
-    off = residuals(found.x)[: 2 * len(path)]
-    J = jacobian(found.x)
-    weights = 1 / np.sqrt(1 + np.concatenate([off, found.x[3:] / DEPTH_SPREAD]) ** 2)
+    u = least_squares(residuals, np.zeros(3 + len(paths)), jacobian, loss="soft_l1").x
+    errors = residuals(u)[: 2 * len(path)]
+    J = jacobian(u)
+    weights = 1 / np.sqrt(1 + np.concatenate([errors, u[3:] / DEPTH_SPREAD]) ** 2)
     inverse = np.linalg.inv(J.T @ (weights[:, None] * J))
-    # Errors of a path's places are alike, as all are against its first: as good as one place, not as many.
-    spread = max(1.0, float(np.median(np.abs(off)) * 1.4826) ** 2)
-    alike = len(path) / len(paths)
-    return Spin(
-        found.x[:3], inverse[:3, :3] * spread * alike, float(FOLLOWED * np.sqrt(np.mean(off**2))), len(paths)
-    )
+    # All positions of a path share the error of the first, so a path counts as one independent position.
+    spread = max(1.0, float(np.median(np.abs(errors)) * 1.4826) ** 2)
+    correlated = len(path) / len(paths)
+    rms = float(PIXEL_SPREAD * np.sqrt(np.mean(errors**2)))
+    return Spin(u[:3], inverse[:3, :3] * spread * correlated, rms, len(paths))

@@ -1,6 +1,6 @@
-"""Time offsets between cameras, from what both heard or from what both saw move.
+"""Time offsets between cameras, from their sound or from motion.
 
-An offset is what must be added to the second camera's times to have the first one's.
+An offset is added to the second camera's times to convert them to the first camera's clock.
 """
 
 from __future__ import annotations
@@ -9,27 +9,27 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
-import imageio_ffmpeg
 import numpy as np
 from scipy import signal
 
 from neuma_lib.errors import InputError
+from neuma_lib.extras import require
 from neuma_lib.io.files import existing, one_line
 
 RATE = 16_000
-"""Samples a second of the sound that is compared."""
+"""Sampling rate of the compared sound [Hz]."""
 BAND = (300.0, 6000.0)
-"""Band of claps and impacts, above hum and below what phones filter [Hz]."""
+"""Band of claps and impacts, above hum and below the filters of phones [Hz]."""
 SOUND_SPREAD = 0.005
-"""Sound takes 2.9 ms a metre, and phones delay it: deviation of an offset from sound beside that of its peak [s]."""
-LEAST_PEAK = 6.0
-"""Height of a correlation's peak over its spread elsewhere that counts as one."""
-LEAST_CORRELATION = 0.5
+"""Standard deviation of an offset due to the travel time of sound, 2.9 ms per metre, and delays in phones [s]."""
+MIN_PEAK = 6.0
+"""Required height of a correlation peak, relative to the root mean square."""
+MIN_CORRELATION = 0.5
 
 
 @dataclass(frozen=True)
 class Offset:
-    """Seconds to add to the second camera's times, their deviation [s], and whence: "sound" or "motion"."""
+    """Seconds to add to the second camera's times, their standard deviation [s], and source: "sound" or "motion"."""
 
     seconds: float
     deviation: float
@@ -37,16 +37,17 @@ class Offset:
 
 
 def read_sound(path: str | Path) -> np.ndarray | None:
-    """The sound of a video, mono at `RATE`, (N,), float32; None where it has none. Raises InputError on no video."""
-    path = existing(path, "put the video there, or correct its name")
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-nostdin", "-protocol_whitelist", "file,pipe"]
-    # asetpts keeps the clock that sound and picture share: sound that begins later is preceded by silence
+    """The sound of a video, mono at `RATE`, (N,), float32. None without sound. Raises InputError if it is no video."""
+    path = existing(path, "Put the video there, or correct its name")
+    ffmpeg = require("imageio_ffmpeg", "capture").get_ffmpeg_exe()
+    command = [ffmpeg, "-v", "error", "-nostdin", "-protocol_whitelist", "file,pipe"]
+    # first_pts=0 keeps the clock that sound and picture share: sound that starts later is preceded by silence.
     command += ["-i", f"file:{path}", "-map", "0:a:0?", "-af", "aresample=async=1:first_pts=0", "-ac", "1"]
     done = subprocess.run([*command, "-ar", str(RATE), "-f", "f32le", "pipe:1"], capture_output=True)
     message = done.stderr.decode(errors="replace")
     if done.returncode and "does not contain any stream" not in message:
         raise InputError(
-            f"{path} cannot be read as a video ({one_line(message)}): copy it from the camera again"
+            path, f"cannot be read as a video ({one_line(message)})", "Copy it from the camera again"
         )
     return np.frombuffer(done.stdout, np.float32) if done.stdout else None
 
@@ -54,15 +55,15 @@ def read_sound(path: str | Path) -> np.ndarray | None:
 def offset_from_sound(
     first: np.ndarray, second: np.ndarray, rate: float = RATE, longest: float = 10.0
 ) -> Offset | None:
-    """Offset by the generalised cross-correlation with phase transform (Knapp and Carter 1976), band-passed.
+    """Offset by the band-passed generalised cross-correlation with phase transform (Knapp and Carter 1976).
 
     Args:
         first, second: sound, (N,) and (M,).
-        rate: samples a second.
-        longest: largest offset that is looked for [s].
+        rate: sampling rate [Hz].
+        longest: largest offset considered [s].
 
     Returns:
-        None where no peak stands out.
+        None without a significant peak.
     """
     if min(len(first), len(second)) < rate / 10:
         return None
@@ -72,13 +73,13 @@ def offset_from_sound(
     frequencies = np.fft.rfftfreq(size, 1 / rate)
     band = (frequencies >= BAND[0]) & (frequencies <= BAND[1])
     whitened = np.where(band, cross / np.maximum(np.abs(cross), 1e-12 * max(np.abs(cross).max(), 1e-300)), 0)
-    correlation = np.abs(signal.hilbert(np.fft.irfft(whitened, size)))  # the carrier must not choose the peak
+    correlation = np.abs(signal.hilbert(np.fft.irfft(whitened, size)))  # envelope, without the carrier
     reach = min(int(longest * rate), size // 2 - 2)
     lags = np.arange(-reach, reach + 1)
     values = correlation[lags]
     peak = int(np.argmax(values))
     spread = np.sqrt(np.mean(np.square(values)))
-    if not 0 < peak < len(values) - 1 or values[peak] < LEAST_PEAK * spread:
+    if not 0 < peak < len(values) - 1 or values[peak] < MIN_PEAK * spread:
         return None
     width = 1 / (BAND[1] - BAND[0])
     deviation = np.hypot(width, SOUND_SPREAD)
@@ -90,15 +91,15 @@ def offset_from_sound(
 def offset_from_motion(
     times: tuple[np.ndarray, np.ndarray], signals: tuple[np.ndarray, np.ndarray], longest: float = 2.0
 ) -> Offset | None:
-    """Offset by the correlation of what changes in both pictures, such as the speed of a mask's centre.
+    """Offset by the correlation of a signal in both videos, such as the speed of a mask's centre.
 
     Args:
         times: of each camera's values [s], ascending.
-        signals: one value a frame; those that are not finite are left out.
-        longest: largest offset that is looked for [s].
+        signals: one value per frame. Values that are not finite are left out.
+        longest: largest offset considered [s].
 
     Returns:
-        None where no offset correlates by `LEAST_CORRELATION`. The deviation is a third of a frame.
+        Offset with a standard deviation of a third of a frame. None if no correlation reaches `MIN_CORRELATION`.
     """
     kept = [(t[np.isfinite(s)], s[np.isfinite(s)]) for t, s in zip(times, signals)]
     if min(len(t) for t, _ in kept) < 5:
@@ -106,7 +107,7 @@ def offset_from_motion(
     interval = max(float(np.median(np.diff(t))) for t, _ in kept)
     (t1, s1), (t2, s2) = kept
     step = interval / 4
-    # positions of the lags are relative to the files' own times
+    # Lags are relative to the times of the files.
     lags = np.arange(-np.ceil(longest / step), np.ceil(longest / step) + 1) * step
     values = np.full(len(lags), -1.0)
     for i, lag in enumerate(lags):
@@ -117,7 +118,7 @@ def offset_from_motion(
         if a.std() > 0 and b.std() > 0:
             values[i] = np.corrcoef(a, b)[0, 1]
     peak = int(np.argmax(values))
-    if not 0 < peak < len(lags) - 1 or values[peak] < LEAST_CORRELATION:
+    if not 0 < peak < len(lags) - 1 or values[peak] < MIN_CORRELATION:
         return None
     return Offset(float(lags[peak] + _vertex(values[peak - 1 : peak + 2]) * step), interval / 3, "motion")
 
@@ -125,44 +126,47 @@ def offset_from_motion(
 def row_times(
     times: np.ndarray, rows: np.ndarray, row_time: float, height: int, sensor_rows: int
 ) -> np.ndarray:
-    """When a rolling shutter, which reads row after row from the top, saw what lies in a row.
+    """Read-out times of rows by a rolling shutter, which reads from the top, (T,) [s].
+
+    Distortion of the rows by the lens is neglected: 10 rows at 10 us are 0.1 ms.
 
     Args:
-        times: of the frames, which are those of their first rows, (T,) [s].
+        times: of the frames, that is of their first rows, (T,) [s].
         rows: y in the undistorted pictures, (T,) [px].
-        row_time: from one of the sensor's rows to the next [s].
+        row_time: read-out time per row of the sensor [s].
         height: of the undistorted pictures [px].
-        sensor_rows: rows of a frame as filmed. Where the lens bends rows, by some of them, is left out: 10 rows at
-            10 us are 0.1 ms.
+        sensor_rows: rows of the recorded frames.
     """
     return times + row_time * rows * (sensor_rows / height)
 
 
 def choose_offset(sound: Offset | None, motion: Offset | None, name: str) -> tuple[Offset, str]:
-    """The offset that is surer, and a line that says which and why.
+    """The offset with the smaller standard deviation, and a line of text that lists both.
 
     Raises:
-        InputError: there is none, or the two disagree by more than four deviations.
+        InputError: there is none, or the two differ by more than four standard deviations.
     """
-    found = [o for o in (sound, motion) if o is not None]
-    if not found:
+    offsets = [o for o in (sound, motion) if o is not None]
+    if not offsets:
         raise InputError(
-            f"{name}: neither sound nor motion tells the time between the cameras: clap in view of all of them while"
-            f" they film, or state the offset"
+            name,
+            "neither sound nor motion determines the time offset between the cameras",
+            "Clap in view of all cameras while they film, or set the offset",
         )
-    told = ", ".join(f"{o.source} {1e3 * o.seconds:.1f} +- {1e3 * o.deviation:.1f} ms" for o in found)
-    if len(found) == 2:
-        apart = abs(sound.seconds - motion.seconds)
-        if apart > 4 * np.hypot(sound.deviation, motion.deviation):
+    listed = ", ".join(f"{o.source} {1e3 * o.seconds:.1f} +- {1e3 * o.deviation:.1f} ms" for o in offsets)
+    if len(offsets) == 2:
+        difference = abs(sound.seconds - motion.seconds)
+        if difference > 4 * np.hypot(sound.deviation, motion.deviation):
             raise InputError(
-                f"{name}: sound and motion disagree on the time between the cameras ({told}): state the offset, or"
-                f" check that the videos show the same fall"
+                name,
+                f"the time offsets from sound and motion disagree ({listed})",
+                "Set the offset, or check that the videos show the same fall",
             )
-    best = min(found, key=lambda o: o.deviation)
-    return best, f"{name}: time between the cameras by {best.source} ({told})"
+    best = min(offsets, key=lambda o: o.deviation)
+    return best, f"{name}: time between the cameras by {best.source} ({listed})"
 
 
 def _vertex(three: np.ndarray) -> float:
-    """Place of the top of a parabola through three values at -1, 0, 1."""
+    """Position of the maximum of a parabola through three values at -1, 0, 1."""
     bend = three[0] - 2 * three[1] + three[2]
     return float(0.5 * (three[0] - three[2]) / bend) if bend < 0 else 0.0

@@ -8,17 +8,6 @@ from neuma_lib.config.base import Section
 from neuma_lib.config.blender import BlenderConfig, ImagesConfig
 
 
-class PackingConfig(Section):
-    """How much of a ground truth travels in a packed dataset; all tracers do."""
-
-    particles: int = Field(
-        30_000,
-        gt=0,
-        description="particles kept, drawn at random, with volumes and masses scaled to the same total",
-    )
-    deformations: int = Field(1000, gt=0, description="those of them whose deformation gradient is kept")
-
-
 class TruthConfig(Section):
     """How finely the ground truth of one scene is simulated."""
 
@@ -65,13 +54,6 @@ class DatasetConfig(Section):
         ImagesConfig(views=3, width=96, height=96), description="videos, view 0 frontal"
     )
     blender: BlenderConfig = Field(BlenderConfig(), description="how both sets of images are rendered")
-    packed: str | None = Field(
-        None,
-        min_length=1,
-        description="folder of packed datasets, `<scene>.images.zip` and `<scene>.truth.h5`, to unpack in place of "
-        "simulating and rendering; null: the dataset is made here",
-    )
-    packing: PackingConfig = Field(PackingConfig(), description="what the target `packed` keeps")
 
     @model_validator(mode="after")
     def _one_rule_for_frames(self) -> DatasetConfig:

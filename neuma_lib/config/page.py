@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import typing
 from collections.abc import Iterator
@@ -38,7 +39,8 @@ def settings_markdown() -> str:
         places.setdefault(kind, []).append(path)
     lines = [INTRODUCTION]
     for kind, (first, *others) in places.items():
-        lines += [f"## {first}", "", kind.__doc__ or ""]
+        heading = f"`{first}`" if "<" in first else first  # a bare <name> would be read as HTML
+        lines += [f"## {heading}", "", inspect.cleandoc(kind.__doc__ or "")]
         lines += ["", f"Also {', '.join(f'`{path}`' for path in others)}."] if others else []
         lines += ["", "| key | type | default | meaning |", "|---|---|---|---|"]
         for key, entry in kind.model_fields.items():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from pydantic import Field
 
 from neuma_lib.config.base import Section
@@ -44,31 +42,9 @@ class RegressionConfig(Section):
     )
 
 
-class TrajectoryConfig(Section):
-    """NCLaw's training on the positions of one thrown cube."""
-
-    epochs: int = Field(300, ge=1, description="passes over the trajectory, one optimiser step each")
-    steps: int = Field(1000, ge=1, description="time steps of the trajectory")
-    dt: float = Field(5e-4, gt=0, description="time step [s]")
-    side_particles: int = Field(10, ge=1, description="particles along the cube's edge")
-    grid: int = Field(20, ge=8, description="grid nodes along the box")
-    reset_first: int = Field(
-        25, ge=1, description="steps from one reset to the true state to the next, in the first epoch"
-    )
-    reset_last: int = Field(200, ge=1, description="the same in the last epoch")
-    learning_rate_elastic: float = Field(1.0, gt=0, description="of Adam, decayed to zero by a cosine")
-    learning_rate_plastic: float = Field(0.1, gt=0, description="of Adam, decayed to zero by a cosine")
-    gradient_clip: float = Field(0.1, gt=0, description="largest norm of each network's gradient")
-
-
 class PriorsConfig(Section):
     """Pre-trained neural constitutive laws."""
 
     laws: dict[str, LawConfig] = Field({}, description="analytic law that each prior is trained on, by name")
-    method: Literal["regression", "trajectory"] = Field(
-        "regression",
-        description="regression on stress and return-map pairs, or NCLaw's training on trajectories",
-    )
     seed: int = Field(0, description="seed of the data and of the initial weights")
     regression: RegressionConfig = Field(RegressionConfig(), description="the regression")
-    trajectory: TrajectoryConfig = Field(TrajectoryConfig(), description="the training on trajectories")

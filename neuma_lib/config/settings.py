@@ -7,7 +7,7 @@ so that what is computed again after an edit is what uses it. ``docs/settings.md
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, Literal, TypeVar
 
 from pydantic import Field, model_validator
@@ -25,7 +25,7 @@ from neuma_lib.config.gaussians import GaussiansConfig
 from neuma_lib.config.geometry import GeometryConfig
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.material import MaterialConfig
-from neuma_lib.config.methods import IDENTIFIED, LAW_FROM, MethodConfig, parse_method, variant_title
+from neuma_lib.config.methods import PresetConfig
 from neuma_lib.config.pac_nerf import PacNerfConfig
 from neuma_lib.config.photographs import PhotographsConfig
 from neuma_lib.config.priors import PriorsConfig
@@ -37,10 +37,11 @@ from neuma_lib.config.springs import SpringsConfig
 from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.config.tables import TableConfig
 from neuma_lib.config.validation import hint, validate
-from neuma_lib.config.variants import DRAWN, folder, parse_chain
+from neuma_lib.config.variants import folder, parse_chain
 from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.config.viewer import ViewerConfig
 from neuma_lib.errors import InputError
+from neuma_lib.methods.registry import methods
 
 Changed = TypeVar("Changed", MaterialConfig, StructuredConfig, SpringsConfig, PacNerfConfig)
 
@@ -91,7 +92,9 @@ class Config(Section):
     exports: ExportsConfig = Field(ExportsConfig(), description="motions for other programs")
     figures: FiguresConfig = Field(FiguresConfig(), description="figures")
     demo: DemoConfig = Field(DemoConfig(), description="the first minute: `make demo`")
-    methods: dict[str, MethodConfig] = Field({}, description="methods by name")
+    methods: dict[str, PresetConfig] = Field(
+        {}, description="presets of methods by name, besides the built-in"
+    )
     experiments: dict[str, ExperimentConfig] = Field({}, description="uses of learned laws by name")
     tables: dict[str, TableConfig] = Field({}, description="tables by name")
 
@@ -105,9 +108,9 @@ class Config(Section):
                     raise ValueError(
                         f"{kind}.{name}: it names a folder, and + begins a variant; leave out + and /"
                     )
-        if IDENTIFIED in self.priors.laws:
+        if "identified" in self.priors.laws:
             raise ValueError(
-                f"priors.laws.{IDENTIFIED}: this names the law found in the video; choose another name"
+                "priors.laws.identified: this name stands for the law identified in the video; choose another name"
             )
         for name in self.scenes.keys() & self.experiments.keys():
             raise ValueError(f"experiments.{name}: a scene has this name")
@@ -120,37 +123,46 @@ class Config(Section):
             _changed(self.material, scene.material, f"scenes.{name}.material")
             self.scene_truth(name)
             self._check_videos(name)
-        for name, method in self.methods.items():
-            _changed(self.material, method.material, f"methods.{name}.material")
-            _changed(self.structured, method.structured, f"methods.{name}.structured")
-            _changed(self.springs, method.springs, f"methods.{name}.springs")
-            _changed(self.pac_nerf, method.pac_nerf, f"methods.{name}.pac_nerf")
-            self._known_prior(method.prior, f"methods.{name}.prior")
-            own = [known for known, entry in self.methods.items() if entry.trained_as is None]
-            if method.trained_as not in (None, *own):
-                unknown = f"no method '{method.trained_as}' with a training of its own"
-                raise ValueError(f"methods.{name}.trained_as: {unknown}{hint(method.trained_as, own)}")
-            for key in (
-                ("material", "structured", "springs", "pac_nerf", "prior") if method.trained_as else ()
-            ):
-                if getattr(method, key):
-                    raise ValueError(
-                        f"methods.{name}.{key}: that of '{method.trained_as}' counts; leave it out"
-                    )
+        for name in self.methods:
+            self._check_preset(name)
         for where, kind, name in self._mentioned():
             known = self.scenes if kind == "scene" else self.experiments
             if name not in known:
                 raise ValueError(f"{where}: no {kind} '{name}'{hint(name, known)}")
         for name in self.experiments:
             self.experiment_truth(name)
-        for method in self.random.methods if self.random.count else ():
-            self._law_from(method)
-        for method in (*self.figures.beside, *(self.demo.methods if "demo" in self.model_fields_set else ())):
-            self._law_from(method)
-        for table in self.tables.values():
-            for method in (*table.methods, *table.if_made, *table.titles):
-                self._law_from(method)
         return self
+
+    def _check_preset(self, name: str) -> None:
+        """The kind of a preset exists, and its options are those of the kind."""
+        preset, where = self.methods[name], f"methods.{name}"
+        if preset.same_fit_as is not None:
+            own = [known for known, entry in self.methods.items() if entry.same_fit_as is None]
+            if preset.same_fit_as not in own:
+                unknown = f"no preset '{preset.same_fit_as}' with a fit of its own"
+                raise ValueError(f"{where}.same_fit_as: {unknown}{hint(preset.same_fit_as, own)}")
+            kind = self.methods[preset.same_fit_as].kind
+            if preset.kind not in (None, kind):
+                raise ValueError(
+                    f"{where}.kind: it must be {kind}, as of '{preset.same_fit_as}'; leave it out"
+                )
+            return
+        if preset.kind not in methods():
+            raise ValueError(f"{where}.kind: no method '{preset.kind}'{hint(preset.kind, methods())}")
+        Options = methods()[preset.kind].Options
+        sections = (getattr(self, section).plain() for section in methods()[preset.kind].sections)
+        values = {
+            key: value
+            for section in sections
+            for key, value in section.items()
+            if key in Options.model_fields
+        }
+        options = validate(Options, values | preset.options, f"{where}.options")
+        priors = (*self.priors.laws, "identified")
+        if getattr(options, "prior", None) not in (None, *priors):
+            raise ValueError(
+                f"{where}.options.prior: no prior '{options.prior}' in priors.laws{hint(options.prior, priors)}"
+            )
 
     def _check_videos(self, name: str) -> None:
         """Further videos of a scene are others, of its material, in its time step."""
@@ -299,97 +311,10 @@ class Config(Section):
             particles=own.particles or self.dataset.particles,
         )
 
-    def true_law(self, scene: str, method: str) -> dict[str, Any] | None:
-        """The true law of the scene, where this is what a method evaluates."""
-        base, _ = parse_method(method, self.methods)
-        if self.methods[base].law != "true":
-            return None
-        law = self.scene(self.law_scene(scene, method)).law
-        if law is None:
-            raise InputError(f"{scene}/{method}: {NO_TRUTH}")
-        return law.plain()
-
-    def is_identified(self, method: str) -> bool:
-        """Whether a method evaluates the analytic law that was identified in the video."""
-        return self.methods[parse_method(method, self.methods)[0]].law == "identified"
-
-    def is_pac_nerf(self, method: str) -> bool:
-        """Whether a method evaluates the analytic law, and the throw, that PAC-NeRF found in the video."""
-        base, _ = parse_method(self.method_training(method), self.methods)
-        return self.methods[base].law == "pac_nerf"
-
-    def identified_views(self, scene: str, method: str) -> tuple[int, ...] | None:
-        """Views that a method's law is identified in, if it trains on others than methods do by default; None: those
-        of ``identify.views``."""
-        views = self.method_material(scene, method).views
-        return None if views in (self.material.views, self.identify.views) else views
-
-    def is_structured(self, method: str) -> bool:
-        """Whether a method's law is a structured correction of an analytic one."""
-        base, _ = parse_method(self.method_training(method), self.methods)
-        return self.methods[base].law == "structured"
-
-    def is_springs(self, method: str) -> bool:
-        """Whether a method moves the body by springs, and has no law of a material."""
-        return self.methods[parse_method(method, self.methods)[0]].law == "springs"
-
     def video_scenes(self, name: str) -> list[str]:
         """Folders of the scenes whose videos the law of a scene is found in, in its chain: itself, then the others."""
         base, seeds = self.chain(name)
         return [name, *(folder(video, seeds) for video in self.scenes[base].videos)]
-
-    def _law_from(self, method: str) -> str | None:
-        """The scene whose law a variant evaluates everywhere; None: each scene's own."""
-        source = parse_method(method, self.methods)[1].get(LAW_FROM)
-        if source is not None and source not in self.scenes:
-            raise InputError(f"{method}: no scene '{source}'{hint(source, self.scenes)}")
-        return source
-
-    def law_scene(self, scene: str, method: str) -> str:
-        """Folder of the scene whose law a method evaluates on a scene, in its chain."""
-        source = self._law_from(method)
-        return scene if source is None else folder(source, self.chain(scene)[1])
-
-    def learns_there(self, scene: str, method: str) -> bool:
-        """Whether a method's law is found in the scene's own video: it is neither another's nor the prior alone."""
-        trained = (
-            self.method_material(scene, method).train
-            or self.is_identified(method)
-            or self.is_pac_nerf(method)
-        )
-        return self.law_scene(scene, method) == scene and (
-            trained or self.true_law(scene, method) is not None
-        )
-
-    def gaussian_motion(self, scene: str, method: str) -> str:
-        """How Gaussians follow their particles in a method, as `material.gaussian_motion`; those of a splat, of which
-        many lie beside their particles, affinely."""
-        return "affine" if self.scene(scene).splat else self.method_material(scene, method).gaussian_motion
-
-    def moved_methods(self, scene: str, methods: Sequence[str]) -> list[str]:
-        """What moves a scene where methods are asked for: these, and a splat, which has no video, instead of one that
-        learns the same under the laws of ``figures.i23d``.
-
-        Raises:
-            InputError: a splat, and a method whose law cannot come from elsewhere.
-        """
-        if not self.scene(scene).splat:
-            return list(methods)
-        found = []
-        for method in methods:
-            if self.is_springs(method):
-                raise InputError(
-                    f"{scene}/{method}: a splat has no video to find springs in; leave this method out"
-                )
-            elsewhere = self.learns_there(scene, method)
-            laws = self.figures.i23d if elsewhere else (None,)
-            found += [f"{method}+{LAW_FROM}={law}" if law else method for law in laws]
-        return list(dict.fromkeys(found))
-
-    def method_density(self, scene: str, method: str) -> float | dict[str, Any]:
-        """Density that a method takes the scene's body to have: the scene's, unless it assumes another."""
-        assumed = self.method_material(scene, method).assumed_density
-        return self.scene(scene).plain()["density"] if assumed is None else assumed
 
     def body_scenes(self, column: str) -> list[str]:
         """Folders of the scenes whose laws the bodies of a scene or experiment have, in its chain."""
@@ -397,31 +322,6 @@ class Config(Section):
         if base in self.scenes:
             return [column]
         return [folder(body.scene, seeds) for body in self.experiments[base].bodies]
-
-    def run_folder(self, column: str, method: str) -> str:
-        """The one home, below the results' or the experiments' folder, of a method's run in a chain.
-
-        Args:
-            column: scene or experiment, or folder of a chain of it.
-            method: method or variant. One that draws no adaptor is the same for all of its seeds.
-        """
-        base, seeds = self.chain(column)
-        chosen = [self.method_material(scene, method) for scene in self.body_scenes(column)]
-        random = self.is_structured(method)  # the first layers, whatever the rank
-        adaptor = any(material.train and (material.rank is not None or random) for material in chosen)
-        return f"{folder(base, seeds, DRAWN if adaptor else DRAWN[:-1])}/{method}"
-
-    def runs(self, table: str, method: str, column: str) -> list[str]:
-        """Folders of the runs behind a cell of a table, in the order of its chains, each once."""
-        chosen = self.tables[table]
-        chains = (folder(column, dict.fromkeys(chosen.vary, k)) for k in range(chosen.seeds))
-        return list(dict.fromkeys(self.run_folder(chain, method) for chain in chains))
-
-    def motion_clock(self, scene: str, method: str) -> tuple[float, tuple[int, ...]]:
-        """Time step of a method's prediction of a splat [s], and the steps of its frames: those of the scene the law
-        is from, since a law holds at the step it was learned at; the frames' times are the scene's."""
-        dt, law_dt = self.scene(scene).dt, self.scene(self.law_scene(scene, method)).dt
-        return law_dt, tuple(round(step * dt / law_dt) for step in self.frame_steps(scene))
 
     def frame_steps(self, name: str) -> tuple[int, ...]:
         """Steps of the frames of a scene's video. Raises InputError for a captured one, whose files tell them."""
@@ -431,124 +331,6 @@ class Config(Section):
         if scene.frames is None and scene.images.stride is not None:
             return tuple(range(0, steps + 1, scene.images.stride))
         return scene.frames or self.dataset.frame_steps(steps)
-
-    def method_title(self, method: str) -> str:
-        """Name of a method or variant for tables, for example "NeuMA, rank 4"."""
-        base, variant = parse_method(method, self.methods)
-        return variant_title(self.methods[base].title, variant)
-
-    def method_training(self, method: str) -> str:
-        """The method or variant whose training gives a method's law: itself, unless it takes another's.
-
-        In the scene that the law is from, `law_scene`.
-        """
-        base, *variant = (piece for piece in method.split("+") if not piece.startswith(f"{LAW_FROM}="))
-        parse_method(method, self.methods)
-        return "+".join([self.methods[base].trained_as or base, *variant])
-
-    def judged_carrier(self, scene: str, method: str) -> str:
-        """What is simulated when a method is judged, as in ``material.carrier``; or "field", see `carries_field`."""
-        if self.carries_field(method):
-            return "field"
-        base, _ = parse_method(method, self.methods)
-        carrier = self.methods[base].judged_on == "carrier"
-        return self.method_material(scene, method).carrier if carrier else "binding"
-
-    def carries_field(self, method: str) -> bool:
-        """Whether a method is judged on the particles of PAC-NeRF's field, and shows what they carry."""
-        base, _ = parse_method(method, self.methods)
-        return self.methods[base].judged_on == "carrier" and self.is_pac_nerf(method)
-
-    def method_note(self, method: str) -> str | None:
-        """What a reader must know of a method's numbers, if anything."""
-        base, _ = parse_method(method, self.methods)
-        return self.methods[base].note
-
-    def method_prior(self, scene: str, method: str) -> str:
-        """The prior that a method starts from: the scene's, unless the method or its variant names another.
-
-        `IDENTIFIED` is the law that was found in the scene's video.
-        """
-        base, variant = parse_method(self.method_training(method), self.methods)
-        named = variant.get("prior", self.methods[base].prior)
-        self._known_prior(named, method)
-        return self.scene(self.law_scene(scene, method)).prior if named is None else named
-
-    def _known_prior(self, prior: str | None, origin: str) -> None:
-        known = [*self.priors.laws, IDENTIFIED]
-        if prior is not None and prior not in known:
-            raise InputError(
-                f"{origin}: no prior '{prior}' in priors.laws{hint(prior, known)}; a law in a file is named as the "
-                "prior of a scene"
-            )
-
-    def method_base(self, scene: str, method: str) -> dict[str, Any] | None:
-        """The analytic law that a structured method corrects; None: the one that was found in the scene's video."""
-        prior = self.method_prior(scene, method)
-        if prior == IDENTIFIED:
-            return None
-        if prior not in self.priors.laws:
-            raise InputError(
-                f"{method} corrects an analytic law of priors.laws, or the one that was found in the video, and the "
-                f"prior of {scene} is the file {prior}: take +prior={IDENTIFIED} or another of priors.laws, or neuma, "
-                "which corrects the file's"
-            )
-        return self.priors.laws[prior].plain()
-
-    def method_material(self, scene: str, method: str) -> MaterialConfig:
-        """Effective material settings: the section, changed by the scene, then the method, then its variant.
-
-        The scene is that of the law (`law_scene`). The seed of the scene's chain is added to the one that these give.
-
-        Raises:
-            InputError: a variant with settings of another kind of law, or a structured law without training.
-        """
-        base, variant = parse_method(self.method_training(method), self.methods)
-        scene = self.law_scene(scene, method)
-        for law in ("structured", "springs"):
-            self._of_law(law, getattr(self, law), method)  # refuses settings that only those methods have
-        section = self.material
-        for changes, origin in (
-            (self.scene(scene).material, f"scenes.{scene}.material"),
-            (self.methods[base].material, f"methods.{base}.material"),
-            ({key: value for key, value in variant.items() if key in MaterialConfig.model_fields}, method),
-        ):
-            section = _changed(section, changes, origin)
-        if not section.train and self.is_structured(method):
-            raise InputError(
-                f"{method}: without training it is its analytic law; take a method with that law"
-            )
-        return section.model_copy(update={"seed": section.seed + self.chain(scene)[1]["adaptor"]})
-
-    def method_structured(self, method: str) -> StructuredConfig | None:
-        """Settings of a method's structured law: the section, changed by the method, then its variant; None without."""
-        return self._of_law("structured", self.structured, method)
-
-    def method_springs(self, method: str) -> SpringsConfig | None:
-        """The same of a method with springs in place of a law, which are those of one body.
-
-        Raises:
-            InputError: also where the variant takes the springs of another scene.
-        """
-        found = self._of_law("springs", self.springs, method)
-        if found and self._law_from(method):
-            raise InputError(f"{method}: springs are those of the scene's own body; leave out {LAW_FROM}")
-        return found
-
-    def method_pac_nerf(self, method: str) -> PacNerfConfig | None:
-        """The same of a method with PAC-NeRF's law."""
-        return self._of_law("pac_nerf", self.pac_nerf, method)
-
-    def _of_law(self, law: str, section: Changed, method: str) -> Changed | None:
-        """Settings that only methods with one kind of law have."""
-        base, variant = parse_method(self.method_training(method), self.methods)
-        changes = {key: value for key, value in variant.items() if key in type(section).model_fields}
-        if self.methods[base].law != law:
-            if changes:
-                raise InputError(f"{method}: its law is not {law}, leave out {', '.join(changes)}")
-            return None
-        section = _changed(section, getattr(self.methods[base], law), f"methods.{base}.{law}")
-        return _changed(section, changes, method)
 
 
 def _changed(section: Changed, changes: Mapping[str, Any], origin: str) -> Changed:

@@ -16,10 +16,6 @@ class TableConfig(Section):
     scenes: tuple[str, ...] = Field((), description="columns, in order")
     experiments: tuple[str, ...] = Field((), description="columns after the scenes, in order")
     methods: tuple[str, ...] = Field((), description="rows, in order; variants such as neuma+rank=4 too")
-    if_made: tuple[str, ...] = Field(
-        (),
-        description="rows after these that are shown, and kept up to date, once all their results are there",
-    )
     titles: dict[str, str] = Field({}, description="names of rows other than the methods' own, by method")
     note: str | None = Field(None, description="what a reader must know of the whole table; stands below it")
     on_request: bool = Field(

@@ -1,4 +1,4 @@
-"""The report of a capture: one HTML file that holds its pictures and videos, and asks for nothing from elsewhere."""
+"""The report of a capture: a self-contained HTML file with its pictures and videos."""
 
 from __future__ import annotations
 
@@ -18,35 +18,21 @@ from neuma_lib.io.files import reading
 from neuma_lib.io.images import open_image
 
 PICTURE_WIDTH = 1000
-"""Most width of a picture in the page [px]."""
+"""Maximum width of a picture in the page [px]."""
 QUALITY = 80
-"""Of its JPEG."""
+"""JPEG quality of pictures."""
 STRESS_UNITS = {
-    **dict.fromkeys(
-        (
-            "E",
-            "G",
-            "K",
-            "mu",
-            "lam",
-            "kappa",
-            "yield_stress",
-            "cohesion",
-            "crush",
-            "tension",
-            "fibre_modulus",
-        ),
-        "Pa",
-    ),
+    **dict.fromkeys(("E", "G", "K", "mu", "lam", "kappa", "yield_stress", "cohesion"), "Pa"),
+    **dict.fromkeys(("crush", "tension", "fibre_modulus"), "Pa"),
     "viscosity": "Pa s",
     "consistency": "Pa sⁿ",
 }
-"""Units of constants that are in proportion to stress."""
+"""Units of constants that are proportional to stress."""
 OTHER_UNITS = {"friction_angle": "°", "dilation_angle": "°", "relaxation_time": "s"}
 BARS = 2
 """Standard deviations of an error bar."""
 UNKNOWN = 100.0
-"""Factor from which an error bar says that nothing is known."""
+"""Factor of an error bar above which a constant is unknown."""
 MEASURES = {
     "psnr": ("PSNR, object [dB]", 1),
     "ssim": ("SSIM, object", 3),
@@ -56,7 +42,7 @@ MEASURES = {
     "scene_ssim": ("SSIM, whole picture", 3),
     "scene_lpips_alex": ("LPIPS, whole picture", 3),
 }
-"""Columns of the table of measures: heading and digits."""
+"""Columns of the table of measures: heading and number of decimals."""
 
 STYLE = """
 :root { color-scheme: light; }
@@ -87,7 +73,7 @@ figure { margin: .8rem 0; }
 figcaption { font-size: .88rem; color: #555; }
 details { margin: .5rem 0; }
 summary { cursor: pointer; color: #0a58a0; }
-.doubts li::marker { color: #a35a00; }
+.warnings li::marker { color: #a35a00; }
 .open { color: #a35a00; white-space: nowrap; }
 .missing { color: #777; font-style: italic; }
 """
@@ -95,45 +81,45 @@ summary { cursor: pointer; color: #0a58a0; }
 
 @dataclass(frozen=True)
 class Film:
-    """Prediction beside the video of a camera.
+    """Comparison of prediction and video for a camera.
 
     Attributes:
-        throw, camera: whose.
+        take, camera: of the video.
         learned: whether the law was learned from it.
-        video: the mp4; None: it is missing.
-        said: a line below it.
+        video: the mp4. None if missing.
+        caption: line below it.
     """
 
-    throw: str
+    take: str
     camera: str
     learned: bool
     video: Path | None
-    said: str = ""
+    caption: str = ""
 
 
 @dataclass(frozen=True)
 class Report:
-    """What the page tells.
+    """Content of the page.
 
     Attributes:
         title: name of the capture.
         method: title of the learned law.
         summary: lines below the title.
-        doubts: what to distrust.
+        warnings: of `neuma_lib.evaluation.capture_doubts`.
         checks: by stage.
-        pictures: caption -> file, by stage; files that are not there are said to be missing.
-        films: prediction beside every video.
+        pictures: caption -> file, by stage. Missing files are reported in the page.
+        films: comparisons of prediction and video.
         rows: measures, of `neuma_lib.evaluation.captured_images.image_rows`.
-        own: the learned method, whose rows stand out.
-        curves: picture of the stress curves; None: there are none.
-        identified: content of identified.json; None: nothing was identified.
-        scale: metres of the simulator to a metre of the room.
+        own: the learned method, whose rows are highlighted.
+        curves: picture of the stress curves, if any.
+        identified: content of identified.json, if any.
+        scale: simulated metres per metre of the room.
     """
 
     title: str
     method: str
     summary: Sequence[str] = ()
-    doubts: Sequence[str] = ()
+    warnings: Sequence[str] = ()
     checks: Mapping[str, Sequence[Check]] = field(default_factory=dict)
     pictures: Mapping[str, Mapping[str, Path]] = field(default_factory=dict)
     films: Sequence[Film] = ()
@@ -146,17 +132,17 @@ class Report:
 
 def page(report: Report) -> str:
     """The report as HTML."""
-    off = sum(not check.good for found in report.checks.values() for check in found)
+    failed = sum(not check.good for checks in report.checks.values() for check in checks)
     parts = {
         "Prediction": _films(report.films),
         "Measures": _measures(report.rows, report.own),
         "The law": _law(report),
-        "What to distrust": _doubts(report.doubts),
+        "Warnings": _warnings(report.warnings),
         "Checks": _checks(report.checks),
         "Input": _pictures(report.pictures),
     }
-    say = {0: "All checks are good.", 1: "One check is off."}.get(off, f"{off} checks are off.")
-    summary = [*report.summary, say] if report.checks else report.summary
+    result = {0: "All checks passed.", 1: "One check failed."}.get(failed, f"{failed} checks failed.")
+    summary = [*report.summary, result] if report.checks else report.summary
     names = {heading: heading.lower().replace(" ", "-") for heading in parts}
     links = " ".join(f'<a href="#{anchor}">{escape(heading)}</a>' for heading, anchor in names.items())
     body = "\n".join(
@@ -172,7 +158,7 @@ def page(report: Report) -> str:
 
 
 def picture_uri(path: str | Path, width: int = PICTURE_WIDTH) -> str:
-    """A picture as a data URI, at most ``width`` pixels wide. Raises InputError for a file that is no picture."""
+    """A picture as a data URI of at most ``width`` pixels. Raises InputError for a file that is no picture."""
     with open_image(Path(path).read_bytes(), path) as image:
         with reading(path, "an image"):
             pixels = image.convert("RGB")
@@ -184,10 +170,9 @@ def picture_uri(path: str | Path, width: int = PICTURE_WIDTH) -> str:
 
 
 def room_value(name: str, value: float, scale: float) -> tuple[float, str]:
-    """A constant of the simulator's in the units of the room, and its unit.
+    """Convert a constant of the simulation to units of the room, and return its unit.
 
-    Stresses in the room are the simulator's over the square of the scale, since lengths are scaled and times and
-    densities are not.
+    Stresses are divided by the square of the scale, since lengths are scaled and times and densities are not.
     """
     if name in STRESS_UNITS:
         return value / scale**2, STRESS_UNITS[name]
@@ -195,7 +180,7 @@ def room_value(name: str, value: float, scale: float) -> tuple[float, str]:
 
 
 def number(value: float) -> str:
-    """Three digits; powers of ten where there are many zeros."""
+    """Three significant digits, with a power of ten for large and small values."""
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
     if 1e-3 <= abs(value) < 1e4:
@@ -206,7 +191,7 @@ def number(value: float) -> str:
 
 
 def prefixed(value: float, unit: str) -> tuple[float, str]:
-    """A prefix of SI for a value: the factor on it and its likes, and the unit with the prefix."""
+    """Factor and unit with an SI prefix that suit a value."""
     if unit.startswith("Pa") and value > 0:
         for power, letter in ((9, "G"), (6, "M"), (3, "k")):
             if value >= 10**power:
@@ -227,7 +212,7 @@ def _missing(what: str) -> str:
 
 
 def _table(head: Sequence[str], rows: Iterable[tuple[str, Sequence[str]]], numbers: int) -> str:
-    """A table; its last ``numbers`` columns are flush right. Rows are (class, cells), and cells are HTML."""
+    """A table whose last ``numbers`` columns are right-aligned. Rows are (class, cells), cells are HTML."""
     first = len(head) - numbers
     kinds = ["" if k < first else ' class="n"' for k in range(len(head))]
     lines = ["<tr>" + "".join(f"<th{k}>{cell}</th>" for k, cell in zip(kinds, head, strict=True)) + "</tr>"]
@@ -241,13 +226,13 @@ def _films(films: Sequence[Film]) -> str:
     if not films:
         return _missing("There are no videos.")
     parts = [
-        "<p>Above: the video, and the prediction laid over the picture of the empty scene. Below: where they differ, "
-        "darker the more they do, and the prediction of the prior, if it is another.</p>"
+        "<p>Top: the video, and the prediction over the empty scene. Bottom: their difference, from white (none) to "
+        "black, and the prediction of the prior, if it differs.</p>"
     ]
-    for throw in dict.fromkeys(film.throw for film in films):
-        mine = [film for film in films if film.throw == throw]
-        kind = "learned from" if mine[0].learned else "held out"
-        parts.append(f"<h3>{escape(throw)} ({kind})</h3>")
+    for take in dict.fromkeys(film.take for film in films):
+        mine = [film for film in films if film.take == take]
+        kind = "training" if mine[0].learned else "held out"
+        parts.append(f"<h3>{escape(take)} ({kind})</h3>")
         for film in mine:
             if film.video is None or not Path(film.video).is_file():
                 parts.append(_missing(f"The video of {film.camera} is missing."))
@@ -255,7 +240,8 @@ def _films(films: Sequence[Film]) -> str:
             source = _uri("video/mp4", Path(film.video).read_bytes())
             parts.append(
                 f'<figure><video controls autoplay loop muted playsinline preload="auto" src="{source}"></video>'
-                f"<figcaption>{escape(film.camera)}{': ' if film.said else ''}{escape(film.said)}</figcaption></figure>"
+                f"<figcaption>{escape(film.camera)}{': ' if film.caption else ''}{escape(film.caption)}</figcaption>"
+                "</figure>"
             )
     return "\n".join(parts)
 
@@ -267,29 +253,29 @@ def _measures(rows: Sequence[Mapping[str, Any]], own: str) -> str:
     parts = {whole: [place for place in places if (place[0] == "all") == whole] for whole in (True, False)}
     tables = {whole: _places(rows, own, part) for whole, part in parts.items() if part}
     return (
-        "<p>PSNR, SSIM and mask IoU: more is better. LPIPS (VGG of the object, AlexNet of the whole picture): less is "
-        "better. The object: colours over white, on the bounding box of the predicted and the filmed one. The whole "
-        "picture: the frame as it was filmed against the prediction over the empty scene; most of it is background, "
-        "which is equal whatever is predicted, and the object's shadow is in the frame alone.</p>\n"
+        "<p>PSNR, SSIM and mask IoU: higher is better. LPIPS (VGG for the object, AlexNet for the whole picture): lower"
+        " is better. The object is compared over white, on the bounding box of predicted and true object. For the whole"
+        " picture, the frame is compared with the prediction over the empty scene. Most of it is background, which is"
+        " the same for any prediction, and the object's shadow is missing in the prediction.</p>\n"
         + tables.get(True, "")
         + (f"\n<details><summary>Each camera</summary>{tables[False]}</details>" if False in tables else "")
     )
 
 
 def _places(rows: Sequence[Mapping[str, Any]], own: str, places: Iterable[tuple[str, str, bool]]) -> str:
-    """Table of the measures of some throws and cameras: a line for each, and one for each law below it."""
+    """Table of measures by take and camera, with a row for each law."""
     lines = []
-    for throw, camera, learned in places:
-        kind = "learned from" if learned else "held out"
-        where = f"All frames {kind}" if throw == "all" else f"{throw}, {camera} ({kind})"
+    for take, camera, learned in places:
+        kind = "training" if learned else "held out"
+        where = f"All frames ({kind})" if take == "all" else f"{take}, {camera} ({kind})"
         lines.append(f'<tr class="first"><th colspan="{1 + len(MEASURES)}">{escape(where)}</th></tr>')
         for row in rows:
-            if (row["throw"], row["camera"], row["learned"]) == (throw, camera, learned):
-                found = (
+            if (row["throw"], row["camera"], row["learned"]) == (take, camera, learned):
+                values = (
                     f"{row[name]:.{digits}f}" if name in row else "–"
                     for name, (_, digits) in MEASURES.items()
                 )
-                cells = "".join(f'<td class="n">{cell}</td>' for cell in found)
+                cells = "".join(f'<td class="n">{cell}</td>' for cell in values)
                 mark = ' class="own"' if row["method"] == own else ""
                 lines.append(f"<tr{mark}><td>{escape(row['title'])}</td>{cells}</tr>")
     head = "".join(f'<th class="n">{escape(heading)}</th>' for heading, _ in MEASURES.values())
@@ -302,13 +288,10 @@ def _law(report: Report) -> str:
     if report.curves is not None and Path(report.curves).is_file():
         parts += [
             "<h3>Stress curves</h3>",
-            f'<figure><img alt="stress curves" src="{picture_uri(report.curves)}"><figcaption>Kirchhoff stress, in the '
-            "units of the room. Top: the elastic law under axial stretch, the sides free. Middle: the elastic "
-            "law under "
-            "shear. Bottom: shear at a constant rate with yielding and flow. Blue ground: what the object went "
-            "through. "
-            "Coloured bands: 95 % of the laws that the video leaves possible, where a law has such an account."
-            "</figcaption></figure>",
+            f'<figure><img alt="stress curves" src="{picture_uri(report.curves)}"><figcaption>Kirchhoff stress in'
+            " units of the room. Top: elastic law under axial stretch with free sides. Middle: elastic law under shear."
+            " Bottom: shear at a constant rate with yielding and flow. Blue: the range of deformation of the object."
+            " Coloured bands: 95 % intervals, for laws with an estimate of uncertainty.</figcaption></figure>",
         ]
     else:
         parts.append(_missing("There are no stress curves."))
@@ -319,21 +302,16 @@ def _law(report: Report) -> str:
     return "\n".join(parts)
 
 
-def _identified(found: Mapping[str, Any], scale: float) -> str:
-    family = escape(found["family"])
-    tied = f", which {escape(', '.join(found['ties']))} equal" if found.get("ties") else ""
+def _identified(identified: Mapping[str, Any], scale: float) -> str:
+    family = escape(identified["family"])
+    tied = f", tied with {escape(', '.join(identified['ties']))}" if identified.get("ties") else ""
     lines = []
-    for name, entry in found["best"]["quantities"].items():
+    for name, entry in identified["best"]["quantities"].items():
         value, unit = room_value(name, entry["value"], scale)
         prefix, unit = prefixed(value, unit)
         value *= prefix
-        # an exponent that floats have room for
-        factor = math.exp(min(BARS * entry["log_std"], 700.0))
-        ends = (
-            "nothing is known"
-            if factor > UNKNOWN
-            else f"{number(value / factor)} to {number(value * factor)}"
-        )
+        factor = math.exp(min(BARS * entry["log_std"], 700.0))  # without overflow
+        ends = "unknown" if factor > UNKNOWN else f"{number(value / factor)} to {number(value * factor)}"
         mark = (
             '<span class="good">determined</span>'
             if entry["determined"]
@@ -342,53 +320,48 @@ def _identified(found: Mapping[str, Any], scale: float) -> str:
         lines.append(("", [escape(name), f"{number(value)} {escape(unit)}".strip(), ends, mark]))
     constants = _table(["constant", "value", "two standard deviations", ""], lines, 0)
     families = [
-        ("own" if name == found["family"] else "", [escape(name), f"{fit['held_out_loss']:.2e}"])
+        ("own" if name == identified["family"] else "", [escape(name), f"{fit['held_out_loss']:.2e}"])
         for name, fit in sorted(
-            ((n, f) for n, f in found["families"].items() if "held_out_loss" in f),
+            ((n, f) for n, f in identified["families"].items() if "held_out_loss" in f),
             key=lambda pair: pair[1].get("score", pair[1]["held_out_loss"]),
         )
     ]
-    given_up = [name for name, fit in found["families"].items() if "held_out_loss" not in fit]
-    rest = f"<p>Given up early: {escape(', '.join(given_up))}.</p>" if given_up else ""
-    judged = _table(["family", "mean squared residual of the last frames"], families, 1) if families else ""
+    dropped = [name for name, fit in identified["families"].items() if "held_out_loss" not in fit]
+    rest = f"<p>Dropped early: {escape(', '.join(dropped))}.</p>" if dropped else ""
+    table = _table(["family", "mean squared residual of the last frames"], families, 1) if families else ""
     scaled = (
-        f"<p>The simulator's lengths are {number(scale)} times those of the room; stresses here are the room's, the "
-        f"simulator's over {number(scale**2)}.</p>"
+        f"<p>Simulated lengths are {number(scale)} times those of the room. Stresses are in units of the room, those "
+        f"of the simulation divided by {number(scale**2)}.</p>"
         if scale != 1
         else ""
     )
     return (
         f"<h3>Identified family: {family}{tied}</h3>\n{scaled}{constants}\n"
-        f"<details><summary>All families</summary>{judged}{rest}</details>"
+        f"<details><summary>All families</summary>{table}{rest}</details>"
     )
 
 
-def _doubts(doubts: Sequence[str]) -> str:
-    if not doubts:
-        return "<p>Nothing was found that speaks against the result.</p>"
-    return '<ul class="doubts">\n' + "\n".join(f"<li>{escape(line)}</li>" for line in doubts) + "\n</ul>"
+def _warnings(warnings: Sequence[str]) -> str:
+    if not warnings:
+        return "<p>There are no warnings.</p>"
+    return '<ul class="warnings">\n' + "\n".join(f"<li>{escape(line)}</li>" for line in warnings) + "\n</ul>"
 
 
 def _checks(groups: Mapping[str, Sequence[Check]]) -> str:
     if not groups:
         return _missing("There are no checks.")
     parts = []
-    for group, found in groups.items():
+    marks = {True: '<span class="good">✓ passed</span>', False: '<span class="bad">✗ failed</span>'}
+    for group, checks in groups.items():
         parts.append(f"<h3>{escape(group)}</h3>")
-        if not found:
+        if not checks:
             parts.append(_missing("Nothing was checked."))
             continue
         lines = [
-            (
-                "",
-                [
-                    '<span class="good">✓ ok</span>' if check.good else '<span class="bad">✗ look</span>',
-                    *map(escape, (check.what, check.found, check.wanted)),
-                ],
-            )
-            for check in found
+            ("", [marks[bool(check.good)], *map(escape, (check.what, check.value, check.wanted))])
+            for check in checks
         ]
-        parts.append(_table(["", "check", "found", "wanted"], lines, 0))
+        parts.append(_table(["", "check", "measured", "expected"], lines, 0))
     return "\n".join(parts)
 
 
@@ -397,12 +370,12 @@ def _pictures(groups: Mapping[str, Mapping[str, Path]]) -> str:
         return _missing("There are no pictures.")
     parts = []
     for group, files in groups.items():
-        shown = [
+        figures = [
             f'<figure><figcaption>{escape(caption)}</figcaption><img alt="{escape(caption)}" loading="lazy" '
             f'src="{picture_uri(file)}"></figure>'
             if Path(file).is_file()
             else _missing(f"{caption}: the picture is missing.")
             for caption, file in files.items()
         ]
-        parts.append(f"<details><summary>{escape(group)}</summary>\n" + "\n".join(shown) + "\n</details>")
+        parts.append(f"<details><summary>{escape(group)}</summary>\n" + "\n".join(figures) + "\n</details>")
     return "\n".join(parts)

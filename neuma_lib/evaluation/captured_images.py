@@ -1,10 +1,9 @@
-"""How alike a prediction and the video of a real throw are: the object alone, and the whole picture.
+"""Image measures between a prediction and a real video, for the object and for the whole picture.
 
-**The object** is cut out: predicted and filmed colours over white, on the bounding box of both
-(`neuma_lib.evaluation.image_metrics`). **The whole picture** is the frame as it was filmed, without the lens's
-distortion, against the prediction laid over the picture of the empty scene. That background is nearly the same in both,
-so its PSNR and SSIM are high whatever is predicted and only compare methods on one video; shadows and reflections of
-the object are in the frame alone.
+Measures of **the object** compare colours over white on the bounding box of predicted and true object
+(`neuma_lib.evaluation.image_metrics`). Measures of **the whole picture** compare the undistorted frame with the
+prediction composited over the empty scene. The common background makes their PSNR and SSIM high for any prediction, so
+they only rank methods on one video. Shadows and reflections of the object are missing in the prediction.
 """
 
 from __future__ import annotations
@@ -22,28 +21,28 @@ from neuma_lib.evaluation.lpips import LPIPS
 from neuma_lib.evaluation.reports import as_csv
 
 SCENE = "scene_"
-"""What the names of measures of the whole picture begin with."""
+"""Prefix of measures of the whole picture."""
 WHOLE = ("psnr", "ssim", "lpips_alex")
-"""Measures of the whole picture; VGG would take a second for each on a core."""
+"""Measures of the whole picture, without VGG, which takes a second per frame on one core."""
 COLUMNS = (*MEASURES, "iou", *(f"{SCENE}{name}" for name in WHOLE))
-"""Measures of a frame by name; ``iou`` is that of predicted and filmed mask."""
+"""Names of the measures of a frame. ``iou`` is that of predicted and true mask."""
 DIGITS = {"psnr": 2, "ssim": 4, "lpips_vgg": 4, "lpips_alex": 4, "iou": 4}
 OPAQUE = 0.5
-"""Opacity from which a pixel belongs to a mask."""
+"""Opacity above which a pixel belongs to a mask."""
 
 
-def laid_over(colours: Tensor, alpha: Tensor, background: Tensor | float) -> Tensor:
-    """Colours over black (..., 3) with their opacity (...) over another background (..., 3)."""
+def composited(colours: Tensor, alpha: Tensor, background: Tensor | float) -> Tensor:
+    """Composite premultiplied colours (..., 3) with opacity (...) over a background (..., 3)."""
     return colours + (1 - alpha[..., None]) * background
 
 
-def exposed(plate: np.ndarray, gain: Sequence[float], offset: Sequence[float]) -> np.ndarray:
-    """The picture of the empty scene (H, W, 3), uint8, at the exposure of a frame, in [0, 1].
+def exposed(background: np.ndarray, gain: Sequence[float], offset: Sequence[float]) -> np.ndarray:
+    """The empty scene (H, W, 3), uint8, at the exposure of a frame, in [0, 1].
 
     Args:
-        gain, offset: of each channel, (3,), so that frame = gain * plate + offset [0 to 255].
+        gain, offset: of each channel, (3,), with frame = gain * background + offset in [0, 255].
     """
-    return np.clip(plate * np.asarray(gain, np.float32) + np.asarray(offset, np.float32), 0, 255) / 255
+    return np.clip(background * np.asarray(gain, np.float32) + np.asarray(offset, np.float32), 0, 255) / 255
 
 
 def captured_metrics(
@@ -55,62 +54,64 @@ def captured_metrics(
     networks: Mapping[str, LPIPS],
     margin: float,
 ) -> dict[str, float]:
-    """Measures of one frame, by the names of `COLUMNS` of which there are networks.
+    """Measures of one frame, those of `COLUMNS` for which there are networks.
 
     Args:
-        colours: predicted, over black, in [0, 1], shape (H, W, 3).
-        alpha: their opacity, (H, W).
-        matte: the object as filmed, straight-alpha RGBA in [0, 1], (H, W, 4).
-        picture: the frame as filmed, in [0, 1], (H, W, 3).
-        empty: the empty scene at the frame's exposure, likewise.
-        networks, margin: as of `image_metrics`.
+        colours: prediction over black, in [0, 1], (H, W, 3).
+        alpha: its opacity, (H, W).
+        matte: the true object, straight-alpha RGBA in [0, 1], (H, W, 4).
+        picture: the true frame, in [0, 1], (H, W, 3).
+        empty: the empty scene at the frame's exposure, in [0, 1], (H, W, 3).
+        networks, margin: see `image_metrics`.
 
     Raises:
-        InputError: shapes differ, or the object is nowhere.
+        InputError: shapes differ, or the object is in neither picture.
     """
     if not (colours.shape == picture.shape == empty.shape == matte[..., :3].shape):
         shapes = [tuple(each.shape) for each in (colours, picture, empty, matte)]
-        raise InputError(f"image measures: prediction, frame, empty scene and matte differ in size: {shapes}")
+        raise InputError(
+            "image measures", f"prediction, frame, empty scene and matte differ in size: {shapes}"
+        )
     mask = matte[..., 3]
-    filmed = laid_over(matte[..., :3] * mask[..., None], mask, 1.0)
-    found = image_metrics(laid_over(colours, alpha, 1.0), alpha, filmed, mask, networks, margin)
-    pair = [each.clamp(0, 1) for each in (laid_over(colours, alpha, empty), picture)]
+    true = composited(matte[..., :3] * mask[..., None], mask, 1.0)
+    metrics = image_metrics(composited(colours, alpha, 1.0), alpha, true, mask, networks, margin)
+    pair = [each.clamp(0, 1) for each in (composited(colours, alpha, empty), picture)]
     arrays = [each.cpu().numpy() for each in pair]
     planes = [each.permute(2, 0, 1)[None] for each in pair]
-    found["iou"] = overlap(alpha > OPAQUE, mask > OPAQUE)
-    found |= {f"{SCENE}psnr": psnr(*arrays), f"{SCENE}ssim": ssim(*arrays)}
+    metrics["iou"] = overlap(alpha > OPAQUE, mask > OPAQUE)
+    metrics |= {f"{SCENE}psnr": psnr(*arrays), f"{SCENE}ssim": ssim(*arrays)}
     networks = {name: network for name, network in networks.items() if f"lpips_{name}" in WHOLE}
-    return found | {f"{SCENE}lpips_{name}": float(network(*planes)) for name, network in networks.items()}
+    return metrics | {f"{SCENE}lpips_{name}": float(network(*planes)) for name, network in networks.items()}
 
 
 def overlap(a: Tensor, b: Tensor) -> float:
-    """Intersection over union of two masks, 1 where both are empty."""
+    """Intersection over union of two masks. 1 if both are empty."""
     union = int((a | b).sum())
     return int((a & b).sum()) / union if union else 1.0
 
 
 def averaged(frames: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Mean of each measure over frames. Raises InputError where there are none."""
+    """Mean of each measure over frames. Raises InputError if there are none."""
     if not frames:
-        raise InputError("image measures: there are no frames to average")
+        raise InputError("image measures", "there are no frames to average")
     return {name: float(np.mean([frame[name] for frame in frames])) for name in frames[0]}
 
 
-def image_rows(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Rows of the table: each camera of each throw, then all frames that were learned from, and all that were not.
+def image_rows(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of the table: each camera of each take, then all training frames, and all held-out frames.
 
     Args:
-        found: of each method, throw and camera ``method``, ``title``, ``throw``, ``camera``, ``learned`` (whether the
-            law was learned from these frames) and ``frames``, a list of measures.
+        entries: for each method, take and camera ``method``, ``title``, ``throw`` (the take), ``camera``, ``learned``
+            (whether these are training frames) and ``frames``, a list of measures.
 
     Returns:
-        ``method``, ``title``, ``throw``, ``camera``, ``learned``, ``frames`` (their number) and the measures; throw and
-        camera are "all" in the sums.
+        The same keys, with ``frames`` the number of frames, and the mean measures. Take and camera are "all" in rows of
+        all frames.
     """
-    rows = [_row(entry, entry["frames"]) for entry in found]
-    for method in dict.fromkeys(entry["method"] for entry in found):
+    rows = [_row(entry, entry["frames"]) for entry in entries]
+    for method in dict.fromkeys(entry["method"] for entry in entries):
         for learned in (True, False):
-            part = [entry for entry in found if (entry["method"], entry["learned"]) == (method, learned)]
+            part = [entry for entry in entries if (entry["method"], entry["learned"]) == (method, learned)]
             if part:
                 whole = {**part[0], "throw": "all", "camera": "all"}
                 rows.append(_row(whole, [frame for entry in part for frame in entry["frames"]]))
@@ -139,12 +140,12 @@ def images_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     return as_csv([(*heads, *COLUMNS), *lines])
 
 
-def error_picture(predicted: np.ndarray, filmed: np.ndarray, factor: float = 3.0) -> np.ndarray:
-    """Where two pictures (..., 3) in [0, 1] differ: white where they agree, darker the more they do not."""
-    difference = np.abs(predicted - filmed).mean(axis=-1, keepdims=True)
+def error_picture(predicted: np.ndarray, true: np.ndarray, factor: float = 3.0) -> np.ndarray:
+    """Absolute difference of two pictures (..., 3) in [0, 1], from white (none) to black."""
+    difference = np.abs(predicted - true).mean(axis=-1, keepdims=True)
     return np.repeat(1 - np.clip(factor * difference, 0, 1), 3, axis=-1)
 
 
 def as_planes(pixels: np.ndarray) -> Tensor:
-    """Pixels, uint8, as floats in [0, 1]."""
+    """Convert uint8 pixels to floats in [0, 1]."""
     return torch.from_numpy(np.ascontiguousarray(pixels)).float() / 255

@@ -1,4 +1,4 @@
-"""What a predicted motion says of the video that it stands beside."""
+"""Statistics of a predicted motion that is compared with a video."""
 
 from __future__ import annotations
 
@@ -22,25 +22,27 @@ def motion_report(
     filmed: Mapping[str, Sequence[int]],
     scale: float = 1.0,
 ) -> dict[str, Any]:
-    """First contact, the frames after it, the largest speed, and walls that are none in the room; as plain values.
+    """First contact, frames after it, maximum speed, and contacts with walls of the box that the room does not have.
 
     Args:
         path: the prediction at ``frames``.
-        mass: of its particles [kg], shape (N,).
+        mass: of its particles [kg], (N,).
         frames: simulation steps.
         filmed: steps of the frames of each camera.
-        scale: metres of the simulator to a metre of the room.
+        scale: simulated metres per metre of the room.
 
     Returns:
-        ``contact_step`` (None: there is none), ``frames_after_contact`` by camera, ``fastest_m_s`` of the centre
-        of mass in the room, and ``touched``, names of walls other than the floor.
+        ``contact_step`` (None without contact), ``frames_after_contact`` by camera, ``fastest_m_s``, the maximum speed
+        of the centre of mass in the room, and ``touched``, names of walls other than the floor.
     """
     first = first_contact(model, path.x)
     contact = frames[first] if first < len(frames) else None
     v = (path.v * (mass / mass.sum())[:, None]).sum(dim=1)
     low, high = model.free_range
-    least, most = path.x.amin(dim=(0, 1)).tolist(), path.x.amax(dim=(0, 1)).tolist()
-    reached = [each for pair in zip((x <= low for x in least), (x >= high for x in most)) for each in pair]
+    lowest, highest = path.x.amin(dim=(0, 1)).tolist(), path.x.amax(dim=(0, 1)).tolist()
+    reached = [
+        each for pair in zip((x <= low for x in lowest), (x >= high for x in highest)) for each in pair
+    ]
     return {
         "frames": list(frames),
         "contact_step": contact,
@@ -49,5 +51,5 @@ def motion_report(
             for camera, steps in filmed.items()
         },
         "fastest_m_s": float(v.norm(dim=1).max()) / scale,
-        "touched": [wall for wall, is_it in zip(WALLS, reached, strict=True) if is_it and wall != FLOOR],
+        "touched": [wall for wall, hit in zip(WALLS, reached, strict=True) if hit and wall != FLOOR],
     }

@@ -1,10 +1,9 @@
-"""Plain tables of numbers as CSV and Markdown: reports of stages, the sweep of learning rates, the benchmarks."""
+"""Plain tables of numbers as CSV and Markdown: reports of stages, the benchmarks."""
 
 from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -39,38 +38,6 @@ def report_table(
     cells = [[v if isinstance(v, int | str) else f"{v:.4g}" for v in row] for row in values]
     lines = as_markdown([corner, *columns.values()], cells, numbers=True)
     return as_csv([[corner, *columns], *values]), "\n".join(lines) + "\n"
-
-
-def learning_rate_table(rows: Sequence[Mapping]) -> tuple[str, str, dict[str, float]]:
-    """Compare learning rates: what every method reaches on every scene.
-
-    Args:
-        rows: one run each, with method, scene, lr_scale, loss (its history), best_loss, stable, recoveries and
-            tracer_rmse_mm.
-
-    Returns:
-        CSV, Markdown, and for each method the factor whose best training loss, relative to the loss of the prior and
-        averaged over the scenes geometrically, is lowest.
-    """
-    header = (
-        "method", "lr_scale", "scene", "loss of the prior", "best loss", "ratio", "recoveries", "stable", "RMSE (mm)",
-    )  # fmt: skip
-    table = []
-    logs: dict[str, dict[float, list[float]]] = {}
-    for row in rows:
-        first, best = row["loss"][0], row["best_loss"]
-        logs.setdefault(row["method"], {}).setdefault(row["lr_scale"], []).append(math.log(best / first))
-        table.append((
-            row["method"], f"{row['lr_scale']:g}", row["scene"], f"{first:.3e}", f"{best:.3e}", f"{best / first:.4f}",
-            len(row["recoveries"]), "yes" if row["stable"] else "no", f"{row['tracer_rmse_mm']:.2f}",
-        ))  # fmt: skip
-    chosen = {
-        method: min(scales, key=lambda scale: sum(scales[scale]) / len(scales[scale]))
-        for method, scales in logs.items()
-    }
-    verdict = "Best by training loss: " + ", ".join(f"{m} ×{s:g}" for m, s in chosen.items()) + "."
-    text = [*as_markdown(header, table), "", verdict, ""]
-    return as_csv([header, *table]), "\n".join(text), chosen
 
 
 def benchmark_table(scenes: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:

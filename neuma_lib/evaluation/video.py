@@ -6,11 +6,11 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-import imageio.v2 as imageio
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from neuma_lib.errors import InputError
+from neuma_lib.extras import require
 
 _LABEL_HEIGHT = 18
 """Line of text above each panel [px]."""
@@ -57,7 +57,11 @@ def write_mp4(path: str | Path, video: np.ndarray, frame_rate: float, quality: i
     Args:
         frame_rate: frames a second.
         quality: constant rate factor of x264; 6 more halve the size of the file.
+
+    Raises:
+        InputError: imageio is not installed.
     """
+    imageio = require("imageio.v2", "workflow")
     rate = ["-crf", str(quality), "-preset", "medium"]
     options = {"fps": frame_rate, "codec": "libx264", "output_params": [*rate, *_REPEATABLE]}
     with imageio.get_writer(path, format="FFMPEG", mode="I", macro_block_size=2, **options) as writer:

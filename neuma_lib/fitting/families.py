@@ -10,13 +10,11 @@ import numpy as np
 
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.catalogue import ELASTICITY, PLASTICITY, POISSON, Constant
 from neuma_lib.mechanics.combinations import Values
-from neuma_lib.mechanics.elasticity import ELASTICITIES
-from neuma_lib.mechanics.isotropic import POISSON, Constant
-from neuma_lib.mechanics.plasticity import PLASTICITIES
 from neuma_lib.sim.model import COURANT_LIMIT, MPMModel
 
-_PARTS = {"elasticity": ELASTICITIES, "plasticity": PLASTICITIES}
+_PARTS = {"elasticity": ELASTICITY, "plasticity": PLASTICITY}
 _AT_THE_LIMIT = 0.999  # of the stiffness that the time step bears, since constants are rounded
 _UNBOUNDED = 12.0  # logits beyond it are the bound, to six digits
 
@@ -40,7 +38,7 @@ class Family:
             given = spec.get(part) or {"name": "identity"}
             for key, value in given.items():
                 if key != "name":
-                    self._admitted[key] = (part, known[given["name"]].constants[key])
+                    self._admitted[key] = (part, known[given["name"]][key])
                     self.guess[key] = float(value)
         self.constants = tuple(self.guess)
         if own := {"E", "nu", "dt"} & set(spec.get("plasticity") or ()):

@@ -1,8 +1,7 @@
 """Priors: neural constitutive laws trained on published analytic ones (the paper's M_0, NCLaw).
 
-Two ways lead from an analytic law to a pair of networks, `neuma_lib.fitting.prior_regression` (default, seconds) and
-`neuma_lib.fitting.prior_trajectory` (NCLaw's). Either way the result is judged by its rollout against the law's, on
-throws that training has not seen.
+A regression (`neuma_lib.fitting.prior_regression`) leads from an analytic law to a pair of networks, whose rollout is
+compared with the law's on throws that training has not seen.
 """
 
 from __future__ import annotations
@@ -12,15 +11,16 @@ from typing import Any
 
 import torch
 
-from neuma_lib.config.priors import RegressionConfig, TrajectoryConfig
+from neuma_lib.config.priors import RegressionConfig
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.fitting.prior_regression import train_by_regression
 from neuma_lib.fitting.prior_throws import Progress, random_throw, reference_law
-from neuma_lib.fitting.prior_trajectory import train_by_trajectory
 from neuma_lib.geometry.chamfer import chamfer_sequence
 from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.neural import NeuralLaw
 
+METHOD = "regression"
+"""How priors are trained, in their files."""
 CLOSE = 0.1
 """Chamfer distance [1e-4 m^2] of a prior from its law that the closest of the authors' own priors have."""
 _JUDGE_SEEDS = 10_000
@@ -29,7 +29,7 @@ _JUDGE_SEEDS = 10_000
 
 def train_prior(
     spec: Mapping[str, Any],
-    settings: RegressionConfig | TrajectoryConfig,
+    settings: RegressionConfig,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> tuple[NeuralLaw, dict[str, Any]]:
@@ -37,7 +37,7 @@ def train_prior(
 
     Args:
         spec: the analytic law, see :func:`neuma_lib.mechanics.analytic.analytic_law`.
-        settings: of one of the two ways, which chooses the way.
+        settings: of the regression.
         seed: of throws, noise, initial weights and batches.
         progress: called with (iterations done, iterations in all, loss).
 
@@ -49,12 +49,9 @@ def train_prior(
         InputError: unknown material.
         NonFiniteError: training or a rollout diverged.
     """
-    regression = isinstance(settings, RegressionConfig)
-    train = train_by_regression if regression else train_by_trajectory
-    law, report = train(spec, settings, seed, progress or (lambda done, total, loss: None))
-    report["method"] = "regression" if regression else "trajectory"
-    how = settings if regression else RegressionConfig(grid=settings.grid, dt=settings.dt)
-    report.update(judge(law, spec, how, seed))
+    law, report = train_by_regression(spec, settings, seed, progress or (lambda done, total, loss: None))
+    report["method"] = METHOD
+    report.update(judge(law, spec, settings, seed))
     return law, report
 
 
@@ -107,5 +104,5 @@ def remark(report: Mapping[str, Any]) -> str:
         return text
     return (
         f"{text}. WARNING: this prior follows its law only roughly (below {CLOSE:g}e-4 m^2 is close); what is learned "
-        "from it starts there, not at the law (docs/guide.md, How close is a prior)"
+        "from it starts there, not at the law (docs/materials.md, Priors)"
     )

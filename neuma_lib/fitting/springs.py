@@ -111,16 +111,7 @@ def fit_springs(
         NonFiniteError: already the first rollout runs away.
     """
     loop = _Loop(model, body, springs, start, loss, settings, how, log)
-    if checkpoint is not None and (state := checkpoint.load()) is not None:
-        loop.load_state_dict(state)
-        log(f"resumed at iteration {loop.iteration} of {settings.iterations}")
-    while loop.iteration < settings.iterations and not loop.ended:
-        loop.advance()
-        if progress and loop.history.loss:
-            progress(loop.iteration, settings.iterations, loop.history.loss[-1])
-        if checkpoint is not None and loop.iteration % settings.checkpoint_every == 0:
-            checkpoint.save(loop.state_dict())
-    loop.judge_last_step()
+    loop.run(checkpoint, progress)
     best = loop.best
     springs.load_state_dict(best["springs"])
     return FittedSprings(
@@ -173,15 +164,8 @@ class _Loop(TrainingLoop):
             self.history.seconds.append(time.perf_counter() - started)
             self.iteration += 1
 
-    def judge_last_step(self) -> None:
-        """Whether the springs after the last pass are the best ones."""
-        if self.ended:
-            return
-        try:
-            with torch.no_grad():
-                self.best = self._better_state(float(self._frame_losses().mean()))
-        except NonFiniteError:
-            return
+    def _mean_loss(self) -> float:
+        return float(self._frame_losses().mean())
 
     def _frame_losses(self) -> Tensor:
         """Losses of all frames, shape (T,)."""

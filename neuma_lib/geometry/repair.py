@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 
 from neuma_lib.errors import InputError
+from neuma_lib.extras import require
 from neuma_lib.geometry.volume import check_mesh
 
 MAX_HOLE_EDGES = 1000
@@ -63,13 +64,8 @@ def has_meshlab() -> bool:
 
 
 def meshlab() -> ModuleType:
-    """The module pymeshlab. Raises InputError if it is not installed."""
-    try:
-        import pymeshlab
-    except ImportError as error:
-        problem = f"repairing the surface of a photographed object needs this package: {error}"
-        raise InputError("pymeshlab", problem, "Install it with `make capture`") from None
-    return pymeshlab
+    """The module pymeshlab. Raises InputError where it is not installed."""
+    return require("pymeshlab", "capture")
 
 
 def crossing_faces(mesh: trimesh.Trimesh) -> int:

@@ -23,6 +23,7 @@ from scipy import ndimage
 from skimage import measure
 
 from neuma_lib.errors import InputError
+from neuma_lib.extras import require
 
 Array = np.ndarray
 Distance = Callable[[Array], Array]
@@ -385,11 +386,9 @@ def _fish() -> Shape:
 
 
 def _letter(character: str) -> Shape:
-    """A capital letter as a rounded block, from the outline in matplotlib's bold font."""
-    from matplotlib.font_manager import FontProperties
-    from matplotlib.textpath import TextPath
-
-    outline = TextPath((0, 0), character, size=1.0, prop=FontProperties(family="DejaVu Sans", weight="bold"))
+    """A capital letter as a rounded block, from the outline of the bold font that comes with matplotlib."""
+    bold = require("matplotlib.font_manager", "workflow").FontProperties(family="DejaVu Sans", weight="bold")
+    outline = require("matplotlib.textpath", "workflow").TextPath((0, 0), character, size=1.0, prop=bold)
     box = outline.get_extents()
     cell, margin = 0.004, 0.15
     xs = np.arange(box.x0 - margin, box.x1 + margin, cell)

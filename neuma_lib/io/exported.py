@@ -106,6 +106,6 @@ def fitting_step(about: Mapping[str, Any], dt: float | None, any_step: bool = Fa
             f"the law was trained at a time step of {own:g} s and its plastic network is applied once a step, so at "
             f"{dt:g} s it is another material",
             f"Use dt: {own:g}, or allow other steps by any_step=True in Python or by "
-            "`python -m neuma_lib export-law ... --any-step`",
+            "`neuma law export ... --any-step`",
         )
     return dt

@@ -35,36 +35,24 @@ QUANTITIES = {
     "images": ("1", "pictures of a figure, colours 0 to 255, shape (rows, columns, H, W, 3)"),
 }
 
-COMPRESSION = {"compression": "gzip", "compression_opts": 6, "shuffle": True}
-"""Level 9 takes three times as long for 1.4 % less."""
-CHECKED_VERSION = ("v110", "v110")
-"""Version of HDF5 with checksums of all metadata; the checksums of the data come from gzip."""
 MAX_RATIO = 1032
 """Maximum compression ratio of a deflate stream (bound given by zlib)."""
 
 
 def write_arrays(
-    path: str | Path,
-    arrays: Mapping[str, Any],
-    attributes: Mapping[str, Any] | None = None,
-    compress: bool = False,
+    path: str | Path, arrays: Mapping[str, Any], attributes: Mapping[str, Any] | None = None
 ) -> None:
     """Write named quantities (see `QUANTITIES`) to HDF5, each with its unit, and file attributes.
 
     Args:
         arrays: quantity name -> array; None entries are skipped.
         attributes: numbers and texts; anything else is stored as JSON text.
-        compress: lossless, each component of vectors and matrices separately, with checksums.
     """
-    libver = CHECKED_VERSION if compress else None
-    with atomic(path) as partial, h5py.File(partial, "w", track_order=True, libver=libver) as file:
+    with atomic(path) as partial, h5py.File(partial, "w", track_order=True) as file:
         for name, array in arrays.items():
             if array is None:
                 continue
-            array, options = np.asarray(array), dict(COMPRESSION) if compress else {}
-            if compress and array.ndim > 2:
-                options["chunks"] = (*array.shape[:2], *[1] * (array.ndim - 2))  # values of one size
-            data = file.create_dataset(name, data=array, track_times=False, **options)
+            data = file.create_dataset(name, data=np.asarray(array), track_times=False)
             data.attrs["unit"], data.attrs["description"] = QUANTITIES[name]
         for key, value in (attributes or {}).items():
             file.attrs[key] = value if isinstance(value, str | int | float) else json.dumps(value)

@@ -11,16 +11,11 @@ from neuma_lib.errors import InputError
 from neuma_lib.io.ply import read_ply, write_ply
 
 
-def write_mesh(
-    path: str | Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray | None = None
-) -> None:
-    """Write a triangle mesh: vertices (N, 3) [m], faces (M, 3), optional colours (N, 3) in [0, 255]."""
-    columns = [(axis, "<f4", vertices[:, i]) for i, axis in enumerate("xyz")]
-    if colors is not None:
-        columns += [(channel, "u1", colors[:, i]) for i, channel in enumerate(("red", "green", "blue"))]
-    rows = np.empty(len(vertices), dtype=[(name, kind) for name, kind, _ in columns])
-    for name, _, column in columns:
-        rows[name] = column
+def write_mesh(path: str | Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Write a triangle mesh: vertices (N, 3) [m], faces (M, 3)."""
+    rows = np.empty(len(vertices), dtype=[(axis, "<f4") for axis in "xyz"])
+    for i, axis in enumerate("xyz"):
+        rows[axis] = vertices[:, i]
     write_ply(path, rows, faces)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neuma_lib.errors import InputError
+from neuma_lib.extras import require
 from neuma_lib.io.files import atomic
 from neuma_lib.io.gltf import linear
 
@@ -22,11 +22,7 @@ def write_usd(
     Raises:
         InputError: usd-core is missing.
     """
-    try:
-        from pxr import Gf, Usd, UsdGeom, Vt
-    except ImportError as error:
-        problem = f"writing USD needs the package usd-core: {error}"
-        raise InputError(path, problem, "Install it with `make viewer`") from None
+    Gf, Usd, UsdGeom, Vt = (require(f"pxr.{name}", "viewer") for name in ("Gf", "Usd", "UsdGeom", "Vt"))
     codes = np.asarray(times, np.float64) * CODES_A_SECOND
     with atomic(path) as partial:
         partial.unlink(missing_ok=True)

@@ -1,20 +1,25 @@
 """Constitutive laws: F -> tau and F_trial -> F, analytic, neural and structured."""
 
-from neuma_lib.mechanics.adaptor import Adaptor
-from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.mechanics.law import Constitutive, Elasticity, Law, Plasticity
-from neuma_lib.mechanics.neural import NeuralLaw, neural_law
-from neuma_lib.mechanics.structured import StructuredLaw, structured_law
+from __future__ import annotations
 
-__all__ = [
-    "Adaptor",
-    "Constitutive",
-    "Elasticity",
-    "Law",
-    "NeuralLaw",
-    "Plasticity",
-    "StructuredLaw",
-    "analytic_law",
-    "neural_law",
-    "structured_law",
-]
+import importlib
+
+_HOMES = {
+    "Adaptor": "adaptor",
+    "Constitutive": "law",
+    "Elasticity": "law",
+    "Law": "law",
+    "NeuralLaw": "neural",
+    "Plasticity": "law",
+    "StructuredLaw": "structured",
+    "analytic_law": "analytic",
+    "neural_law": "neural",
+    "structured_law": "structured",
+}
+__all__ = list(_HOMES)
+
+
+def __getattr__(name: str):
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -26,11 +26,14 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
     ordered = scatter != "atomic"
     run_of, deposit = vars(scatter_functions(dtype, scatter, 3)).values()
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
-    base_node, copy_of, from_base = functions.base_node, functions.copy_of, functions.from_base
-    weights, slopes = functions.weights, functions.slopes
+    copy_of, stencil, slopes, moments = (
+        functions.copy_of,
+        functions.stencil,
+        functions.slopes,
+        functions.moments,
+    )
+    column, wall_mask, moved_mask = functions.column, functions.wall_mask, functions.moved_mask
     gather, three_nodes = vars(gather_functions(dtype)).values()
-    column, offsets, wall_mask = functions.column, functions.offsets, functions.wall_mask
-    moved_mask = functions.moved_mask
     module = f"neuma_lib.sim.adjoint_{str(dtype).removeprefix('torch.')}_{scatter}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
 
@@ -61,11 +64,9 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         if wp.static(ordered):
             p = order[sort, wp.min(p, grad_x.shape[0] - 1)]
         xp = x[now, p]
-        bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
+        bi, bj, bk, f, wi, wj, wk = stencil(c, xp)
         plane = copy_of(c, p) * c.n + bi
         run = run_of(wp.where(alive, (plane * c.n + bj) * c.n + bk, -1))
-        f = from_base(c, xp, bi, bj, bk)
-        wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
         si, sj, sk = slopes(f[0]), slopes(f[1]), slopes(f[2])
         # F_trial = (I + dt C) F and x = x + dt v pass their gradients on to C, F and v.
         g_trial = grad_F_trial[p]
@@ -137,14 +138,10 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         """Gradients of the nodes' momentum and mass to those of x (added), v, C and tau (set)."""
         p = wp.tid()
         xp = x[now, p]
-        bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
+        bi, bj, bk, f, wi, wj, wk = stencil(c, xp)
         plane = copy_of(c, p) * c.n + bi
-        f = from_base(c, xp, bi, bj, bk)
-        wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
         si, sj, sk = slopes(f[0]), slopes(f[1]), slopes(f[2])
-        wd_i = wp.cw_mul(wi, offsets(f[0]))
-        wd_j = wp.cw_mul(wj, offsets(f[1]))
-        wd_k = wp.cw_mul(wk, offsets(f[2]))
+        wd_i, wd_j, wd_k = moments(wi, f[0]), moments(wj, f[1]), moments(wk, f[2])
         # The scattered q_i = (m v + A d_i, m), as in p2g.
         m = mass[p]
         stress = real(4.0) * c.dt * c.inv_dx * c.inv_dx * vol0[p]

@@ -90,11 +90,6 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
         return copy
 
     @wp.func
-    def from_base(c: GridConstants, x: vec3, i: wp.int32, j: wp.int32, k: wp.int32):
-        """Distance of x from the node (i, j, k) [dx]."""
-        return x * c.inv_dx - vec3(real(i) + c.first, real(j) + c.first, real(k) + c.first)
-
-    @wp.func
     def weights(f: real):
         """Quadratic B-spline N at the three nodes of an axis; f: distance to the first of them [dx]."""
         return vec3(
@@ -109,9 +104,16 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
         return vec3(f - real(1.5), real(2.0) - real(2.0) * f, f - real(0.5))
 
     @wp.func
-    def offsets(f: real):
-        """Offsets d of the three nodes of an axis from the particle [dx]."""
-        return vec3(-f, real(1.0) - f, real(2.0) - f)
+    def stencil(c: GridConstants, x: vec3):
+        """First of the 27 nodes (i, j, k) around x, distance of x from it [dx], and weights along each axis."""
+        i, j, k = base_node(c, x[0]), base_node(c, x[1]), base_node(c, x[2])
+        f = x * c.inv_dx - vec3(real(i) + c.first, real(j) + c.first, real(k) + c.first)
+        return i, j, k, f, weights(f[0]), weights(f[1]), weights(f[2])
+
+    @wp.func
+    def moments(w: vec3, f: real):
+        """Products of the weights of an axis and the offsets of its nodes from the particle [dx]."""
+        return wp.cw_mul(w, vec3(-f, real(1.0) - f, real(2.0) - f))
 
     @wp.func
     def column(A: mat33, a: wp.int32):
@@ -158,10 +160,9 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
     return SimpleNamespace(
         base_node=base_node,
         copy_of=copy_of,
-        from_base=from_base,
-        weights=weights,
+        stencil=stencil,
         slopes=slopes,
-        offsets=offsets,
+        moments=moments,
         column=column,
         wall_mask=wall_mask,
         moved=moved,
@@ -178,8 +179,8 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
     ordered = scatter != "atomic"
     run_of, deposit = vars(scatter_functions(dtype, scatter, 4)).values()
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
-    base_node, copy_of, from_base = functions.base_node, functions.copy_of, functions.from_base
-    weights, offsets, gather = functions.weights, functions.offsets, gather_functions(dtype).gather
+    base_node, copy_of, gather = functions.base_node, functions.copy_of, gather_functions(dtype).gather
+    stencil, moments = functions.stencil, functions.moments
     column, wall_mask, moved = functions.column, functions.wall_mask, functions.moved
     module = f"neuma_lib.sim.forward_{str(dtype).removeprefix('torch.')}_{scatter}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
@@ -213,11 +214,9 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         if wp.static(ordered):
             p = order[sort, wp.min(p, mass.shape[0] - 1)]
         xp = x[now, p]
-        bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
+        bi, bj, bk, f, wi, wj, wk = stencil(c, xp)
         plane = copy_of(c, p) * c.n + bi
         run = run_of(wp.where(alive, (plane * c.n + bj) * c.n + bk, -1))
-        f = from_base(c, xp, bi, bj, bk)
-        wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
         m = mass[p]
         A = c.dx * (m * C[now, p] - (real(4.0) * c.dt * c.inv_dx * c.inv_dx * vol0[p]) * tau[cached, p])
         # q = (m v + A d, m) grows by a column of A from node to node.
@@ -264,14 +263,10 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         """v = sum w_i v_i,  C = (4/dx^2) sum w_i v_i d_i^T,  x += dt v (clamped),  F_trial = (I + dt C) F."""
         p = wp.tid()
         xp = x[now, p]
-        bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
+        bi, bj, bk, f, wi, wj, wk = stencil(c, xp)
         copy = copy_of(c, p)
         plane = copy * c.n + bi
-        f = from_base(c, xp, bi, bj, bk)
-        wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
-        wd_i = wp.cw_mul(wi, offsets(f[0]))
-        wd_j = wp.cw_mul(wj, offsets(f[1]))
-        wd_k = wp.cw_mul(wk, offsets(f[2]))
+        wd_i, wd_j, wd_k = moments(wi, f[0]), moments(wj, f[1]), moments(wk, f[2])
         # rows: sum w v, then the columns of B = sum w v d^T / dx
         S = gather(grid_v_rows, cached, (plane * c.n + bj) * c.n + bk, c.n, wi, wj, wk, wd_i, wd_j, wd_k)
         v_new = vec3(S[0, 0], S[0, 1], S[0, 2])
@@ -319,9 +314,7 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         """
         p = wp.tid()
         xp = x[p]
-        bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
-        f = from_base(c, xp, bi, bj, bk)
-        wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
+        bi, bj, bk, f, wi, wj, wk = stencil(c, xp)
         total = vec4()
         for i in range(3):
             for j in range(3):

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.errors import InputError
+from neuma_lib.mechanics.catalogue import COURANT_LIMIT
 from neuma_lib.mechanics.law import Law, Weights
 
 WALLS = ("x_min", "x_max", "y_min", "y_max", "z_min", "z_max")
@@ -18,8 +19,6 @@ CONDITIONS = ("no_slip", "slip", "sticky")
 FORMS = ("outside", "released")
 _OUTSIDE = 2
 """Nodes outside the cube at either end of an axis, all of them wall nodes, for the form of that name."""
-COURANT_LIMIT = 0.8
-"""Largest stable c dt / dx. Between 1.0 and 1.2 a rollout still looks finite while its gradients explode."""
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,6 @@ from neuma_lib.device import native_source, start_warp
 
 start_warp()
 
-SCATTERS = ("atomic", "runs", "runs_scalar")
-
 
 def scatter_for(device: torch.device, dtype: torch.dtype) -> str:
     """The fastest way to scatter in a precision on a device."""
@@ -35,7 +33,7 @@ def scatter_functions(dtype: torch.dtype, scatter: str, components: int) -> Simp
 
     Args:
         dtype: precision.
-        scatter: one of `SCATTERS`.
+        scatter: "atomic", "runs" or "runs_scalar".
         components: 4 where nodes carry momentum and mass, 3 where the last of their four numbers stays zero.
 
     Returns:

@@ -10,7 +10,7 @@ A compositor that compares images with an observation without storing them has t
 ``compare(splats, depths, background, settings, observed, empty)``
     takes straight-alpha RGBA (I, H, W) as int32, R in the lowest byte, and returns sums of squared differences from it
     over white, float64 (I, parts) with any number of parts, and a tuple of tensors for the adjoint;
-``compare_adjoint(splats, kept, background, settings, scales, opacities, grad_splats, empty)``
+``compare_adjoint(splats, kept, background, settings, scales, opacities, grad_splats)``
     writes, like ``composite_adjoint``, the gradients of half of these sums, times the scale (I,) of each image; those
     with respect to the opacities are undefined unless ``opacities`` is true.
 

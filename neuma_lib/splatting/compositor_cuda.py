@@ -95,9 +95,7 @@ def compare(splats, depths, background, settings: Settings, observed, empty):
     return sums.view(len(observed), -1), kept
 
 
-def compare_adjoint(
-    splats, kept, background, settings: Settings, scales, opacities: bool, grad_splats, empty
-):
+def compare_adjoint(splats, kept, background, settings: Settings, scales, opacities: bool, grad_splats):
     """See ``compositing``."""
     _, starts, *_ = kept
     grad_splats.zero_()

@@ -115,7 +115,7 @@ class _RasterizedError(torch.autograd.Function):
         grad_splats = options.empty("grad_splats", splats.shape, splats)
         wanted = ctx.needs_input_grad[2]
         options.compositor.compare_adjoint(
-            splats, kept, background, options.settings, scales, wanted, grad_splats, options.empty
+            splats, kept, background, options.settings, scales, wanted, grad_splats
         )
         return *_scene_gradients(ctx, grad_splats), None, None, None, None, None
 

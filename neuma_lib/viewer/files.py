@@ -7,31 +7,26 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from neuma_lib.config import places
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import existing
-
-
-@dataclass(frozen=True)
-class LawFiles(places.LawFiles):
-    """The files of a law, and ``dt``, the time step of its training [s]."""
-
-    dt: float = 0.0
-
-    @property
-    def files(self) -> list[str]:
-        """All required files."""
-        return [file for file in (self.identified, self.prior, self.adaptor) if file]
+from neuma_lib.methods.base import ModelSource
 
 
 @dataclass(frozen=True)
 class RunFiles:
-    """A predicted motion: name and title of the method, file, law (None: springs), motion of the Gaussians."""
+    """A predicted motion.
+
+    Attributes:
+        name, title: of the method.
+        rollout: file of the motion.
+        law: source of its law; None: the motion follows from no law.
+        gaussian_motion: how Gaussians follow their particles.
+    """
 
     name: str
     title: str
     rollout: str
-    law: LawFiles | None
+    law: ModelSource | None
     gaussian_motion: str = "mean"
 
 
@@ -65,7 +60,7 @@ class SceneFiles:
     def files(self) -> list[str]:
         """All files except the images, without duplicates."""
         body = (self.particles, self.binding, self.gaussians, self.velocity, self.truth, self.transforms)
-        laws = [file for run in self.runs for file in (run.rollout, *(run.law.files if run.law else ()))]
+        laws = [file for run in self.runs for file in (run.rollout, *(run.law.paths if run.law else ()))]
         return list(dict.fromkeys([*filter(None, body), *laws]))
 
     def plain(self) -> dict[str, Any]:
@@ -75,7 +70,7 @@ class SceneFiles:
     @classmethod
     def of_plain(cls, plain: Mapping[str, Any]) -> SceneFiles:
         """Inverse of `plain`."""
-        runs = (RunFiles(**{**run, "law": run["law"] and LawFiles(**run["law"])}) for run in plain["runs"])
+        runs = (RunFiles(**{**run, "law": run["law"] and ModelSource(**run["law"])}) for run in plain["runs"])
         return cls(**{**plain, "runs": tuple(runs), "roots": tuple(plain["roots"])})
 
     def checked(self, path: str | Path) -> Path:

@@ -7,23 +7,23 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
-from neuma_lib.config import places
+from neuma_lib.config import cases, places
 from neuma_lib.config.settings import Config
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import existing
+from neuma_lib.methods.base import ModelSource
+from neuma_lib.methods.prior import prior_source
 from neuma_lib.project import settings_around
-from neuma_lib.viewer.files import LawFiles, RunFiles, SceneFiles
+from neuma_lib.viewer.files import RunFiles, SceneFiles
 
 
-def law_files(settings: Config, scene: str, method: str) -> LawFiles | None:
-    """The files of a method's law; None for springs."""
-    if settings.is_springs(method):
-        return None
-    learned = settings.scene(settings.law_scene(scene, method))
-    return LawFiles(**asdict(places.law_files(settings, scene, method)), dt=learned.dt)
+def law_source(settings: Config, scene: str, method: str) -> ModelSource | None:
+    """The source of a method's law; None if its motion follows from no law."""
+    case = cases.case(settings, scene, method)
+    return case.source() if case.method.has_law else None
 
 
 def scene_files(settings: Config, scene: str, methods: Sequence[str]) -> SceneFiles:
@@ -38,10 +38,10 @@ def scene_files(settings: Config, scene: str, methods: Sequence[str]) -> SceneFi
     runs = tuple(
         RunFiles(
             method,
-            settings.method_title(method),
+            cases.title(settings, method),
             f"{results}/{scene}/{method}/rollout.h5",
-            law_files(settings, scene, method),
-            settings.gaussian_motion(scene, method),
+            law_source(settings, scene, method),
+            cases.gaussian_motion(settings, scene, method),
         )
         for method in methods
     )
@@ -99,20 +99,20 @@ def found_methods(settings: Config, place: Path) -> list[str]:
 
 def _known(settings: Config, method: str) -> bool:
     try:
-        settings.method_title(method)
+        cases.title(settings, method)
     except InputError:
         return False
     return True
 
 
-def found_laws(settings: Config, scene: str | None = None) -> dict[str, LawFiles]:
+def found_laws(settings: Config, scene: str | None = None) -> dict[str, ModelSource]:
     """All laws with complete files in the folder of results, by display name, in order.
 
     Includes laws trained or identified in scenes, ``scene: title of the method``, and priors, ``prior: name``, with the
     time step of a scene that uses them, preferably the given one.
     """
     results = Path(places.results_root(settings))
-    laws: dict[str, LawFiles] = {}
+    laws: dict[str, ModelSource] = {}
     for folder in sorted(results.glob("*/")):
         if folder.name.partition("+")[0] not in settings.scenes:
             continue
@@ -123,17 +123,17 @@ def found_laws(settings: Config, scene: str | None = None) -> dict[str, LawFiles
         }
         for method in sorted(name for name in methods if _known(settings, name)):
             try:
-                law = law_files(settings, folder.name, method)
+                law = law_source(settings, folder.name, method)
             except InputError:
                 continue  # unknown variant
-            trained = law and (law.adaptor or law.identified)
-            if trained and all(Path(file).is_file() for file in law.files):
-                laws[f"{folder.name}: {settings.method_title(method)}"] = law
+            learned = law and law.paths and cases.case(settings, folder.name, method).learns_there
+            if learned and all(Path(file).is_file() for file in law.paths):
+                laws[f"{folder.name}: {cases.title(settings, method)}"] = law
     own = [settings.scene(scene)] if scene else []
     steps = {each.prior: each.dt for each in (*reversed(settings.scenes.values()), *own)}
     for file in sorted((results / "priors").glob("*.safetensors")):
         name = file.stem
         if name.partition("+")[0] in settings.priors.laws:
             dt = steps.get(name.partition("+")[0], min(each.dt for each in settings.scenes.values()))
-            laws[f"prior: {name}"] = LawFiles(prior=str(file), dt=dt)
+            laws[f"prior: {name}"] = prior_source(str(file), dt)
     return laws

@@ -14,13 +14,13 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
 
 from neuma_lib.errors import InputError
+from neuma_lib.extras import require
 from neuma_lib.io.files import write_text
 from neuma_lib.viewer.scalars import QUANTITIES
 from neuma_lib.viewer.scene import Motion, Scene, View, frame_at
@@ -161,7 +161,8 @@ def _filled(scene: Scene, steps: tuple[int, ...], particles: int) -> str:
 
 def colour_map(name: str) -> list[int]:
     """256 colours of a matplotlib colour map, 768 integers from 0 to 255."""
-    return (matplotlib.colormaps[name](np.arange(256))[:, :3] * 255).round().astype(int).ravel().tolist()
+    colours = require("matplotlib", "viewer").colormaps[name](np.arange(256))[:, :3]
+    return (colours * 255).round().astype(int).ravel().tolist()
 
 
 def _motion(scene: Scene, motion: Motion, steps: tuple[int, ...], particles: int, blob: Blob) -> dict:

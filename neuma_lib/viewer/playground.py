@@ -19,13 +19,13 @@ from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.particles import load_body, with_motion
 from neuma_lib.mechanics.law import Law
+from neuma_lib.methods.base import ModelSource
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.viewer import scalars
-from neuma_lib.viewer.files import LawFiles, SceneFiles, inside
+from neuma_lib.viewer.files import SceneFiles, inside
 from neuma_lib.viewer.live import LiveSimulation, Snapshot
-from neuma_lib.viewer.scene import law_of
 
 ADDED_SIZE = 0.22
 """Longest side of an added solid [m]."""
@@ -57,7 +57,11 @@ class Playground:
     """
 
     def __init__(
-        self, files: SceneFiles, laws: Mapping[str, LawFiles], chosen: str, device: torch.device | str = "cpu"
+        self,
+        files: SceneFiles,
+        laws: Mapping[str, ModelSource],
+        chosen: str,
+        device: torch.device | str = "cpu",
     ):
         self.laws, self.roots, self.device = dict(laws), files.roots, device
         paths = [files.checked(path) for path in (files.particles, files.binding, files.gaussians)]
@@ -85,7 +89,7 @@ class Playground:
         if name not in self.laws:
             raise InputError("law", f"'{name}' is unknown", f"Choose one of {', '.join(self.laws)}")
         if name not in self._loaded:
-            law = law_of(self.laws[name], self._checked).requires_grad_(False).to(self.device)
+            law = self.laws[name].load(self._checked).law.requires_grad_(False).to(self.device)
             self._try(law, self.laws[name].dt)
             self._loaded[name] = law
         return self._loaded[name]
@@ -158,7 +162,9 @@ class Playground:
         return scalars.von_mises(self.law(self.chosen), snapshot.F.to(self.device)).cpu()
 
 
-def first_law(files: SceneFiles, laws: Mapping[str, LawFiles], preferred: Sequence[str] = ("neuma",)) -> str:
+def first_law(
+    files: SceneFiles, laws: Mapping[str, ModelSource], preferred: Sequence[str] = ("neuma",)
+) -> str:
     """Initial law of a scene's playground: that of one of its methods, or else the first.
 
     Raises:

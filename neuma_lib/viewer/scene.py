@@ -19,13 +19,12 @@ from neuma_lib.errors import InputError
 from neuma_lib.io.files import one_line, parse_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import read_image_set, read_transforms
-from neuma_lib.io.laws import load_laws
 from neuma_lib.io.particles import load_body
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Law
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.viewer import scalars
-from neuma_lib.viewer.files import LawFiles, RunFiles, SceneFiles
+from neuma_lib.viewer.files import RunFiles, SceneFiles
 
 TRUTH = "truth"
 _BOUND = 8
@@ -157,14 +156,6 @@ def load_scene(
     )
 
 
-def law_of(files: LawFiles, checked: Callable[[str], Path]) -> Law:
-    """The law of some files. Raises InputError, see `load_laws` and ``checked``."""
-    prior, adaptor, identified = (
-        [checked(file)] if file else [] for file in (files.prior, files.adaptor, files.identified)
-    )
-    return load_laws(files.dt, [files.spec] if files.spec else [], identified, prior, adaptor)[0]
-
-
 def true_motion(path: Path, body: Reconstruction, dt: float) -> Motion:
     """The ground truth, with the fitted Gaussians of the reconstruction.
 
@@ -219,7 +210,7 @@ def _predicted(files: SceneFiles, run: RunFiles, body: Reconstruction, notes: li
         notes.append(f"{run.title}: springs have no stress")
     else:
         try:
-            law = law_of(run.law, files.checked)
+            law = run.law.load(files.checked).law
         except InputError as error:
             notes.append(f"{run.title}: no stress, as its law cannot be read ({one_line(error)})")
     means = covars = None

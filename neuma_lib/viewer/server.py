@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 import string
 import threading
 import time
 from types import ModuleType
 from typing import Any
 
-import matplotlib
 import numpy as np
 import torch
 import trimesh
@@ -17,6 +15,7 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from neuma_lib.errors import InputError
+from neuma_lib.extras import require
 from neuma_lib.geometry.shapes import NAMES
 from neuma_lib.splatting.spherical_harmonics import sh0_to_rgb
 from neuma_lib.viewer.live import EARTH, PIVOT, Snapshot
@@ -43,11 +42,7 @@ _HANDLE = 0.55
 
 def viser() -> ModuleType:
     """The module viser. Raises InputError if it is not installed."""
-    try:
-        return importlib.import_module("viser")
-    except ImportError as error:
-        problem = f"the viewer's server needs this package: {error}"
-        raise InputError("viser", problem, "Run `make viewer`, or write a file with --file") from None
+    return require("viser", "viewer")
 
 
 class ViewerServer:
@@ -452,7 +447,7 @@ def quantity_named(shown: str) -> str | None:
 
 def colours(name: str, share: np.ndarray) -> np.ndarray:
     """RGB (N, 3) in [0, 1] of values (N,) in [0, 1] in a matplotlib colour map."""
-    return matplotlib.colormaps[name](np.clip(share, 0, 1))[:, :3]
+    return require("matplotlib", "viewer").colormaps[name](np.clip(share, 0, 1))[:, :3]
 
 
 def colour_bar(name: str) -> np.ndarray:

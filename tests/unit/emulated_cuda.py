@@ -139,7 +139,7 @@ class EmulatedTiles:
         assert states[empty_tiles].isnan().all() and not states[~empty_tiles].isnan().any()
         return sums.view(len(observed), -1), (ids, starts, states, stops)
 
-    def compare_adjoint(self, splats, kept, background, settings, scales, opacities, grad_splats, empty):
+    def compare_adjoint(self, splats, kept, background, settings, scales, opacities, grad_splats):
         ids, starts, states, stops = kept
         grad_splats.zero_()
         library = self.library

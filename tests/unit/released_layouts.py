@@ -5,6 +5,7 @@ import struct
 from pathlib import Path
 
 import numpy as np
+from board_pictures import looking_at
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -24,17 +25,6 @@ CAMERAS = ("C0733", "C0787", "C0801")
 PHOTOGRAPHS = 10
 STATIC_UNIT = 3.0  # the photographs' world to the files' unit
 TURN = Rotation.from_rotvec([0.3, -1.0, 0.5])  # in which the object lies in the photographs
-
-
-def looking(eye, target, down=(0.0, 0.0, 1.0)):
-    """World to camera (4, 4), of a camera that keeps ``down`` downwards."""
-    forward = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
-    right = np.cross(down, forward)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ eye
-    return pose
 
 
 def motion(k):
@@ -72,7 +62,8 @@ def poses():
     target = START + (0, 0, 0.1)
     angles = dict(zip(CAMERAS, (0.2, 1.6, 2.9)))
     return {
-        name: looking(START + (0.7 * np.cos(a), 0.7 * np.sin(a), -0.15), target) for name, a in angles.items()
+        name: looking_at(START + (0.7 * np.cos(a), 0.7 * np.sin(a), -0.15), target, up=(0.0, 0.0, -1.0))
+        for name, a in angles.items()
     }
 
 
@@ -103,7 +94,7 @@ def static_poses():
     angles = np.linspace(0, 2 * np.pi, PHOTOGRAPHS, endpoint=False)
     rings = [0.25 if k % 2 else -0.3 for k in range(PHOTOGRAPHS)]
     eyes = [STATIC_UNIT * np.array([0.5 * np.cos(a), h, 0.5 * np.sin(a)]) for a, h in zip(angles, rings)]
-    return [looking(eye, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)) for eye in eyes]
+    return [looking_at(eye, (0.0, 0.0, 0.0), up=(0.0, -1.0, 0.0)) for eye in eyes]
 
 
 def write_spring_gaus(root):

@@ -23,8 +23,9 @@ from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import list_images, read_image_set
 from neuma_lib.io.laws import load_law, load_prior
 from neuma_lib.io.mesh import read_mesh
-from neuma_lib.io.packed import FORMAT, pack_images, unpack_images, unpack_truth
 from neuma_lib.io.weights import read_weights
+
+pytestmark = pytest.mark.core
 
 HUGE = 2**26
 """Zeros that archives below hide [bytes]."""
@@ -296,140 +297,6 @@ def test_images(tmp_path, content):
     refused(lambda p: read_image_set(p.parent / "transforms.json"), path)
 
 
-# ---- packed sets
-
-
-def edited(path, change):
-    """The archive with another transforms.json, and members added by ``change``."""
-    with zipfile.ZipFile(path) as archive:
-        members = {info.filename: archive.read(info) for info in archive.infolist()}
-    data = json.loads(members["static/transforms.json"])
-    change(data, members)
-    members["static/transforms.json"] = json.dumps(data).encode()
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, content in members.items():
-            large = len(content) > 10**6
-            archive.writestr(name, content, zipfile.ZIP_DEFLATED if large else zipfile.ZIP_STORED)
-
-
-def named(name, add=True):
-    def change(data, members):
-        data["frames"][0]["file_path"] = name
-        if add:
-            members[f"static/{name}"] = members["static/a.webp"]
-
-    return change
-
-
-def bomb(member):
-    return lambda data, members: members.update({f"static/{member}": bytes(HUGE)})
-
-
-def json_bomb(path):
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("static/transforms.json", bytes(HUGE), zipfile.ZIP_DEFLATED, 1)
-
-
-def denied(archive):
-    """The same archive with headers that claim 9 bytes where there are 64 MiB."""
-    return archive.replace(struct.pack("<L", HUGE), struct.pack("<L", 9))
-
-
-def denied_bomb(path):
-    json_bomb(path)
-    path.write_bytes(denied(path.read_bytes()))
-
-
-def bzip2_bomb(path):
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("static/transforms.json", bytes(2**24), zipfile.ZIP_BZIP2, 9)
-
-
-def not_an_image(data, members):
-    import hashlib
-
-    members["static/a.webp"] = b"no image"
-    data["frames"][0]["sha256"] = hashlib.sha256(b"no image").hexdigest()
-
-
-ARCHIVES = {
-    **{
-        f"named {name!r}": named(name)
-        for name in ("..", "../a.webp", "/tmp/a.webp", "transforms.json", ".hidden.webp", "b/a.webp", "a.png",
-                     "C:\\a.webp", "..\\a.webp", "x" * 300 + ".webp", "a.webp\n")
-    },
-    "an image that is not there": named("b.webp", add=False),
-    "an image that is listed twice": lambda data, members: data["frames"].append(data["frames"][0]),
-    "claims 10^6 x 10^6": lambda data, members: data.update(w=10**6, h=10**6),
-    "an image of 64 MiB": bomb("a.webp"),
-    "other bytes": lambda data, members: members.update({"static/a.webp": b"other"}),
-    "not an image": not_an_image,
-    "no checksum": lambda data, members: data["frames"][0].pop("sha256"),
-    "no frames": lambda data, members: data.pop("frames"),
-    "frames 5": lambda data, members: data.update(frames=[5]),
-}  # fmt: skip
-
-
-@pytest.fixture
-def packed(tmp_path):
-    source = tmp_path / "source"
-    source.mkdir()
-    (source / "a.png").write_bytes(picture())
-    (source / "transforms.json").write_text(json.dumps(image_list()))
-    pack_images(tmp_path / "bad.zip", {"static": source / "transforms.json"})
-    return tmp_path / "bad.zip"
-
-
-def unpack(path):
-    unpack_images(path, "static", path.parent / "out" / "transforms.json")
-
-
-@pytest.mark.parametrize("change", ARCHIVES.values(), ids=ARCHIVES)
-def test_archives(packed, change):
-    edited(packed, change)
-    refused(unpack, packed)
-
-
-@pytest.mark.parametrize(
-    "write", [json_bomb, denied_bomb, bzip2_bomb, lambda p: p.write_bytes(b"PK\5\6" + bytes(18))]
-)
-def test_lists_in_archives(tmp_path, write):
-    write(tmp_path / "bad.zip")
-    refused(unpack, tmp_path / "bad.zip")
-
-
-def test_an_image_that_is_there_already_stays(packed):
-    (packed.parent / "out").mkdir()
-    (packed.parent / "out" / "a.webp").write_bytes(b"of someone else")
-    refused(unpack, packed, "is there already")
-    (packed.parent / "out" / "a.webp").unlink()
-    unpack(packed)
-    unpack(packed)  # its own image is no other
-
-
-TRUTHS = {
-    "no format": lambda file: file.attrs.pop("format"),
-    "another format": lambda file: file.attrs.update(format="NeuMA ground truth 99"),
-    "no positions": lambda file: file.pop("x"),
-    "positions that are not packed": lambda file: file.update(F=file.pop("x")[()].astype("f4")),
-    "positions of another shape": lambda file: file.update(x=file.pop("x")[0]),
-    "claims 22 TiB": lambda file: (file.pop("x"), file.create_dataset("x", (2**40, 2, 3), "u4")),
-}
-
-
-@pytest.mark.parametrize("change", TRUTHS.values(), ids=TRUTHS)
-def test_truths(tmp_path, change):
-    path = tmp_path / "bad.h5"
-    with h5py.File(path, "w") as file:
-        file.attrs.update({"format": FORMAT, "dt": 1e-3})
-        file.update({name: np.zeros((2, 2, 3), "u4") for name in ("x", "tracers", "tracers_again")})
-        file.update({name: np.zeros(2) for name in ("frames", "time", "vol0", "mass")})
-        if "F" not in file and change is not TRUTHS["positions that are not packed"]:
-            file["F"] = np.zeros((2, 2, 3, 3), "u4")
-        change(file)
-    refused(lambda p: unpack_truth(p, p.parent / "out" / "particles.h5"), path)
-
-
 # ---- weights
 
 
@@ -451,6 +318,11 @@ def torch_file(content):
     file = BytesIO()
     torch.save(content, file)
     return file.getvalue()
+
+
+def denied(archive):
+    """The same archive with headers that claim 9 bytes where there are 64 MiB."""
+    return archive.replace(struct.pack("<L", HUGE), struct.pack("<L", 9))
 
 
 def deflated(content, part="/data/"):

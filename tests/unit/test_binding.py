@@ -17,6 +17,8 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
 
+pytestmark = pytest.mark.core
+
 
 def random_gaussians(count, seed, spread=1.0, size=0.05, anisotropy=1.0, dtype=torch.float64):
     """Centres in a cube and covariances with scales over ``exp(+-anisotropy)``."""

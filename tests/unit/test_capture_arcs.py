@@ -32,8 +32,8 @@ def test_the_arc_is_found_beside_a_larger_hand_and_flicker():
     (first, *others) = find_arcs(
         candidates((hand, 9000.0), (ball, 500.0), (flicker, 400.0), noise=0.3), TIMES
     )
-    assert first.frames == (0, 39) and len(first.found) >= 38 and not others
-    assert all(number == 1 for number in first.found.values())  # its number among the candidates
+    assert first.frames == (0, 39) and len(first.candidates) >= 38 and not others
+    assert all(number == 1 for number in first.candidates.values())  # its number among the candidates
     # noise of 0.3 px on 40 places: a place at the middle of the fit is known to about 0.3 * 3 / sqrt(40) px
     np.testing.assert_allclose(first.place(TIMES[20]), ball[20], atol=0.5)
 
@@ -58,7 +58,7 @@ def test_a_soft_bounce_is_no_flight():
     y = np.where(after >= 0, -speed * after + a * after**2 / 2, y)
     body = np.stack([100.0 + 20 * times, 200 + y], axis=1)
     seen = [np.array([[*place, 700.0]]) for place in body]
-    (longest,) = sorted(find_arcs(seen, times), key=lambda arc: len(arc.found))[-1:]
+    (longest,) = sorted(find_arcs(seen, times), key=lambda arc: len(arc.candidates))[-1:]
     assert longest.frames[0] < 18 < 42 < longest.frames[1] and longest.coefficients[2, 1] < 0
     first, *_ = arcs = find_arcs(seen, times, down=np.array([0.1, 0.9]))
     assert all(arc.coefficients[2, 1] > 0 for arc in arcs)
@@ -71,7 +71,7 @@ def test_missed_frames_are_bridged():
     ball = flight(TIMES)
     ball[[10, 11, 25]] = np.nan
     (arc,) = find_arcs(candidates((ball, 500.0)), TIMES)
-    assert arc.frames == (0, 39) and 10 not in arc.found and len(arc.found) == 37
+    assert arc.frames == (0, 39) and 10 not in arc.candidates and len(arc.candidates) == 37
 
 
 def test_times_that_vary_do_not_break_an_arc():
@@ -92,4 +92,4 @@ def test_what_changes_its_size_is_not_the_same_thing():
     frames = candidates((ball, 500.0))
     for i in range(0, 40, 2):
         frames[i][:, 2] = 5000.0
-    assert all(len(arc.found) <= 20 for arc in find_arcs(frames, TIMES))
+    assert all(len(arc.candidates) <= 20 for arc in find_arcs(frames, TIMES))

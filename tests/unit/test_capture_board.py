@@ -11,6 +11,7 @@ from neuma_lib.capture import lens as lenses
 from neuma_lib.capture import placement
 from neuma_lib.config.capture import BoardConfig
 from neuma_lib.errors import InputError
+from tests.support.errors import refused
 
 cv2 = pytest.importorskip("cv2")
 
@@ -71,7 +72,7 @@ def test_lenses_are_written_and_read():
     np.testing.assert_array_equal(again.K, LENS.K)
     np.testing.assert_array_equal(again.distortion, LENS.distortion)
     for change in ({"fl_x": -1}, {"k1": float("nan")}, {"w": 1.5}, {"cx": "a"}):
-        with pytest.raises(InputError, match=f"here: .*{next(iter(change))}"):
+        with refused("here", next(iter(change))):
             lenses.read_lens({**LENS.plain(), **change}, "here")
 
 
@@ -134,10 +135,10 @@ def test_page_has_true_size(tmp_path):
 
 
 def test_a_board_that_does_not_fit_the_page(tmp_path):
-    with pytest.raises(InputError, match="at most 31 mm"):
+    with pytest.raises(InputError, match="the maximum is 31 mm"):
         boards.print_board(tmp_path / "a.pdf", BoardConfig(square=0.032))
     boards.print_board(tmp_path / "a.pdf", BoardConfig(square=0.04), "A3")
-    with pytest.raises(InputError, match="A4, A3"):
+    with refused("paper"):
         boards.print_board(tmp_path / "a.pdf", BOARD, "A5")
 
 
@@ -171,18 +172,18 @@ def test_pictures_without_board_and_from_below_are_refused():
     grey = np.full((600, 800, 3), 127, np.uint8)
     nothing = boards.find_board(grey, BOARD)
     assert len(nothing.ids) == 0 and nothing.pixels.shape == (0, 2)
-    with pytest.raises(InputError, match="still.jpg: 0 corners"):
+    with refused("still.jpg"):
         boards.board_pose(nothing, BOARD, LENS, "still.jpg")
     found = exact(around(1))[0]
     row = boards.Detection(found.ids[:5], found.pixels[:5])
-    with pytest.raises(InputError, match="5 corners"):
+    with pytest.raises(InputError, match="still.jpg: 5 corners"):
         boards.board_pose(row, BOARD, LENS, "still.jpg")
     mirrored = boards.Detection(found.ids, found.pixels * [-1, 1] + [800, 0])
-    with pytest.raises(InputError, match="seen from above"):
+    with pytest.raises(InputError, match="do not fit a flat board"):
         boards.board_pose(mirrored, BOARD, LENS, "still.jpg")
     other = BoardConfig(square=0.03, squares=(5, 8))
     wrong = boards.Detection(found.ids[found.ids < 28], found.pixels[found.ids < 28])
-    with pytest.raises(InputError, match="board.squares"):
+    with pytest.raises(InputError, match="Check board.squares"):
         boards.board_pose(wrong, other, LENS, "still.jpg")
 
 
@@ -215,16 +216,16 @@ def test_similarity_from_noisy_corners():
 def test_a_moved_board_or_too_few_views_are_refused():
     poses = around(6)
     found = exact(poses)
-    with pytest.raises(InputError, match="seen in 1 of 6"):
+    with pytest.raises(InputError, match="board: it is visible in 1 of 6"):
         nothing = boards.Detection(np.empty(0, int), np.empty((0, 2)))
         boards.fit_board([found[0]] + [nothing] * 5, [LENS] * 6, poses, BOARD)
-    with pytest.raises(InputError, match="from two sides"):
+    with refused("board"):
         boards.fit_board(found[:1] * 2, [LENS] * 2, poses[[0, 0]], BOARD)
     moved = poses.copy()
     moved[3:, :3, 3] += moved[3:, :3, :3] @ [0.02, 0.0, 0.0]
     bent = BoardConfig(square=0.03, squares=(7, 8))  # numbers stand for other places
     wrong = [boards.Detection(f.ids, f.pixels) for f in found]
-    with pytest.raises(InputError, match="mm off the print"):
+    with refused("board.squares"):
         boards.fit_board(wrong, [LENS] * 6, poses, bent)
 
 
@@ -251,7 +252,7 @@ def test_similarities_compose_and_invert():
     np.testing.assert_allclose(placement.camera_centres(a.move_cameras(poses)), a.apply(centres), atol=1e-12)
     fitted = placement.fit_similarity(points, a.apply(points))
     np.testing.assert_allclose(fitted.apply(points), a.apply(points), atol=1e-12)
-    with pytest.raises(InputError, match="not on a line"):
+    with refused("source"):
         placement.fit_similarity(np.outer([0, 1, 2, 3], [1.0, 2, 3]), np.outer([0, 1, 2, 3], [1.0, 0, 0]))
 
 
@@ -274,7 +275,7 @@ def test_stated_length_gives_the_scale():
     seen = np.einsum("nij,ej->nei", poses[:, :3, :3], ends) + poses[:, None, :3, 3]
     directions = seen[..., :2] / seen[..., 2:]
     assert placement.stated_length(poses, directions, 0.12) == pytest.approx(1 / 2.5, rel=1e-9)
-    with pytest.raises(InputError, match="different sides"):
+    with refused("length.ends"):
         placement.stated_length(poses[[0, 0]], directions[[0, 0]], 0.12)
 
 
@@ -297,9 +298,9 @@ def test_floor_is_found_among_other_points():
     level = placement.upright(normal, point)
     assert np.linalg.det(level.rotation) == pytest.approx(1)
     np.testing.assert_allclose(level.rotation @ normal, [0, 1, 0], atol=1e-12)
-    with pytest.raises(InputError, match="no floor"):
+    with refused("photographs"):
         placement.fit_floor(rng.normal(size=(500, 3)), cameras, 1e-4, seed=0)
-    with pytest.raises(InputError, match="no floor"):
+    with refused("photographs"):
         placement.fit_floor(floor[:2], cameras, 1e-3, seed=0)
 
 

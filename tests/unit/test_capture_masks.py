@@ -12,6 +12,7 @@ pytest.importorskip("cv2")
 
 from neuma_lib.capture import masks as module  # noqa: E402
 from neuma_lib.capture.frames import Frame  # noqa: E402
+from tests.support.errors import refused  # noqa: E402
 
 
 def test_bad_flights_name_the_frame():
@@ -19,13 +20,13 @@ def test_bad_flights_name_the_frame():
     assert module.check_flight(flat, "a.mp4", range(8)).max() < 0.02
     cut = flat.copy()
     cut[4] = ellipse((2, 100))
-    with pytest.raises(InputError, match=r"a\.mp4, frame 4: the object leaves the picture"):
+    with pytest.raises(InputError, match=r"a\.mp4, frame 4: the object leaves"):
         module.check_flight(cut, "a.mp4", range(8))
     cut[4] = False
     with pytest.raises(InputError, match=r"a\.mp4, frame 4: the mask is empty"):
         module.check_flight(cut, "a.mp4", range(8))
     cut[4] = ellipse((112, 100), 30, 20)
-    with pytest.raises(InputError, match=r"a\.mp4, frame 4: the mask's area changes by \d+%.*hand"):
+    with pytest.raises(InputError, match=r"a\.mp4, frame 4: .*area changes by \d+%"):
         module.check_flight(cut, "a.mp4", range(8))
     module.check_flight(cut, "a.mp4", range(4))  # only the frames that are asked for
 
@@ -39,15 +40,15 @@ def test_own_masks_are_taken_as_they_are(tmp_path):
     )
     np.testing.assert_array_equal(module.read_mask(grey, (WIDTH, HEIGHT)), mask)
     np.testing.assert_array_equal(module.read_mask(clear, (WIDTH, HEIGHT)), mask)
-    with pytest.raises(InputError, match=r"grey\.png is 320x240, its picture 64x48"):
+    with pytest.raises(InputError, match=r"grey\.png: .* 320x240, .* 64x48"):
         module.read_mask(grey, (64, 48))
-    with pytest.raises(InputError, match=r"none\.png"):
+    with refused("none.png"):
         module.read_mask(tmp_path / "none.png", (WIDTH, HEIGHT))
     (tmp_path / "bad.png").write_bytes(grey.read_bytes()[:60])
-    with pytest.raises(InputError, match=r"bad\.png"):
+    with refused("bad.png"):
         module.read_mask(tmp_path / "bad.png", (WIDTH, HEIGHT))
     Image.new("L", (WIDTH, HEIGHT)).save(tmp_path / "empty.png")
-    with pytest.raises(InputError, match=r"empty\.png: the mask is empty"):
+    with refused("empty.png"):
         module.read_mask(tmp_path / "empty.png", (WIDTH, HEIGHT))
 
 

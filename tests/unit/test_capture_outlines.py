@@ -21,7 +21,7 @@ def explained(light):
     plate = stony().astype(np.float32)
     picture = outlines.coded(light * outlines.linear(plate))
     picture += np.random.default_rng(1).normal(0, 2, picture.shape).astype(np.float32)
-    return outlines._by_plate(picture, plate)
+    return outlines._explain_by_background(picture, plate)
 
 
 def test_a_shade_that_changes_smoothly_is_found_and_another_surface_is_not():
@@ -30,7 +30,7 @@ def test_a_shade_that_changes_smoothly_is_found_and_another_surface_is_not():
     by_plate = explained(shade)
     assert np.abs(np.log(by_plate.shade / shade[..., 0])).mean() < 0.1
     flat = np.full((HEIGHT, WIDTH, 3), (200, 60, 40), np.float32)
-    other = outlines._by_plate(flat, stony().astype(np.float32))
+    other = outlines._explain_by_background(flat, stony().astype(np.float32))
     assert np.median(by_plate.shaded) < 0.25 * np.median(other.cost)
 
 

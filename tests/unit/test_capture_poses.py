@@ -18,17 +18,18 @@ from neuma_lib.capture.lens import Lens, read_lens
 from neuma_lib.config.capture import CaptureConfig
 from neuma_lib.errors import InputError
 from neuma_lib.io.images import OPENGL_TO_OPENCV, read_transforms
+from tests.support.errors import refused
 
 pytest.importorskip("cv2")
 
 SETTINGS = CaptureConfig(board=BOARD)
 
 
-def reconstruction(viewmats, count=None, lens=LENS):
+def reconstruction(viewmats):
     """Poses as structure from motion gives them, of photographs and a camera `left`, the last."""
     names = [f"photographs/{i}.png" for i in range(len(viewmats) - 1)] + ["left/left.png"]
     points = np.random.default_rng(0).uniform(-0.1, 0.3, (50, 3))
-    return poses.Poses(tuple(names), (lens,) * len(names), viewmats, points, np.zeros((50, 3), np.uint8), 0.4)
+    return poses.Poses(tuple(names), (LENS,) * len(names), viewmats, points, np.zeros((50, 3), np.uint8), 0.4)
 
 
 def save(path, pixels, **options):
@@ -62,17 +63,17 @@ def test_notes_to_turn_pictures_are_removed(tmp_path):
 def test_pictures_of_other_sizes_or_none_are_refused(tmp_path):
     a = save(tmp_path / "a.png", np.zeros((48, 64, 3), np.uint8))
     b = save(tmp_path / "b.png", np.zeros((64, 48, 3), np.uint8))
-    with pytest.raises(InputError, match="a.png is 64x48, .*b.png is 48x64"):
+    with pytest.raises(InputError, match="b.png: 48x64 .*a.png has 64x48"):
         pics.name_pictures({"photographs": [a, b]})
     text = tmp_path / "c.png"
     text.write_text("no picture")
-    with pytest.raises(InputError, match="c.png cannot be read"):
+    with refused("c.png"):
         pics.name_pictures({"photographs": [text]})
 
 
 def test_too_few_photographs():
     few = {f"photographs/{i}.png": Path(f"{i}.png") for i in range(7)}
-    with pytest.raises(InputError, match="7 photographs are too few"):
+    with refused("photographs"):
         poses.structure_from_motion({**few, "left/left.png": Path("left.png")}, "nowhere")
 
 
@@ -80,10 +81,10 @@ def test_what_found_no_place_is_named():
     whole = reconstruction(around(8))
     poses.check_registered(whole)
     lost = tuple(f"photographs/{i}.png" for i in range(10, 20))
-    with pytest.raises(InputError, match=r"only 7 of 17 .* \(not 10.png, .* and 5 more\)"):
+    with pytest.raises(InputError, match=r"7 of 17 .* \(not 10.png, .* and 5 more\)"):
         poses.check_registered(poses.replace(whole, lost=lost))
     poses.check_registered(poses.replace(whole, lost=lost[:3]))
-    with pytest.raises(InputError, match="fixed camera of left/left.png"):
+    with refused("left/left.png"):
         poses.check_registered(poses.replace(whole, lost=("left/left.png",)))
 
 
@@ -142,7 +143,7 @@ def test_room_from_a_stated_length():
     assert room.floor == pytest.approx(400 / 600)
     unplaced = {"x.png": marks["0.png"], "0.png": marks["0.png"]}
     lost = CaptureConfig(length={"metres": 0.15, "ends": unplaced})
-    with pytest.raises(InputError, match="fewer than two of the marked"):
+    with refused("length.ends"):
         rooms.room_of(base, {}, lost)
 
 
@@ -168,10 +169,10 @@ def test_given_poses(tmp_path):
     np.testing.assert_allclose(got.lenses[0].K, LENS.K)
     np.testing.assert_allclose(got.lenses[1].distortion, LENS.distortion)
     path.write_text(json.dumps({"frames": frames[:1]}))
-    with pytest.raises(InputError, match="no frame for left.png"):
+    with refused(path):
         poses.given_poses(path, files)
     path.write_text(json.dumps({"frames": [{**f, "w": 400} for f in frames]}))
-    with pytest.raises(InputError, match="w, h of photographs/0.png"):
+    with refused(path, "photographs/0.png"):
         poses.given_poses(path, files)
 
 
@@ -195,7 +196,7 @@ def test_poses_are_written_and_read(tmp_path):
     drawing.draw_poses(tmp_path / "poses.png", again)
     assert Image.open(tmp_path / "poses.png").width > 500
     (tmp_path / "poses.json").write_text("{}")
-    with pytest.raises(InputError, match="poses.json cannot be read as poses"):
+    with refused("poses.json"):
         poses.load_poses(tmp_path / "poses.json", tmp_path / "points.ply")
 
 
@@ -302,16 +303,15 @@ def test_lenses_that_do_not_fit_are_refused(filmed, tmp_path):
     root, _ = filmed
     capture = capture_folder.read_capture(root)
 
-    def refusal(lenses):
+    def check_refused(lenses, *where):
         (tmp_path / "wrong.json").write_text(json.dumps(lenses))
-        with pytest.raises(InputError) as error:
+        with refused("wrong.json", *where):
             poses.find_poses(capture.pictures(), "board", tmp_path, tmp_path / "wrong.json", BOARD)
-        return str(error.value)
 
     known = json.loads((root / "lenses.json").read_text())
     wide = {**known, "left": {**known["left"], "w": 1280}}
-    assert "wrong.json: the lens of 'left' is of 1280x600 pixels" in refusal(wide)
-    assert "wrong.json: no lens for 'left'" in refusal({"photographs": known["photographs"]})
+    check_refused(wide, "left")
+    check_refused({"photographs": known["photographs"]})
 
 
 @pytest.fixture(scope="module")

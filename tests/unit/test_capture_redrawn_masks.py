@@ -6,7 +6,7 @@ from test_capture_agreement import HEIGHT, WIDTH, K, ellipsoid_mask, ring
 
 pytest.importorskip("cv2")
 
-from neuma_lib.capture.agreement import LEAST_AGREEMENT, agreement  # noqa: E402
+from neuma_lib.capture.agreement import MIN_AGREEMENT, agreement  # noqa: E402
 from neuma_lib.capture.masks import grown, iou  # noqa: E402
 from neuma_lib.capture.redrawn_masks import redrawn_masks  # noqa: E402
 
@@ -45,7 +45,7 @@ def test_lost_parts_come_back_shadows_go_and_own_masks_stay():
         first[i] |= shadows[i]
     first[5] = np.roll(true[5], 60, axis=1)  # something else
     kept = [i == 4 for i in range(COUNT)]
-    assert agreement(first, VIEWS, KS)[5] < LEAST_AGREEMENT
+    assert agreement(first, VIEWS, KS)[5] < MIN_AGREEMENT
     before = np.array([iou(a, b) for a, b in zip(first, true)])
     found = redrawn_masks(pictures, first, VIEWS, KS, kept)
     after = np.array([iou(a, b) for a, b in zip(found, true)])

@@ -9,6 +9,7 @@ import pytest
 from neuma_lib.capture import folder as capture_folder
 from neuma_lib.capture import tools
 from neuma_lib.errors import InputError
+from tests.support.errors import refused
 
 MINIMAL = "board: {square: 0.0298}\n"
 
@@ -37,7 +38,7 @@ def test_one_line_suffices_and_files_are_found(mug):
     found = capture_folder.read_capture(mug)
     assert [p.name for p in found.photographs] == ["a.JPG", "b.jpg"]
     assert {c: p.name for c, p in found.stills.items()} == {"left": "left.jpg", "right": "right.png"}
-    assert {t: list(v) for t, v in found.throws.items()} == {"first": ["left", "right"]}
+    assert {t: list(v) for t, v in found.takes.items()} == {"first": ["left", "right"]}
     assert list(found.pictures()) == ["photographs", "left", "right"]
     assert found.video("first", "left").name == "left.MOV"
     assert found.settings.board.square == 0.0298 and found.settings.board.squares == (6, 8)
@@ -49,10 +50,11 @@ def test_folders_of_videos_are_throws(mug):
     for camera in ("left.MOV", "right.mp4"):
         (mug / "videos" / camera).rename(mug / "videos" / "one" / camera)
     (mug / "videos/two/left.mp4").touch()
-    throws = capture_folder.read_capture(mug).throws
+    throws = capture_folder.read_capture(mug).takes
     assert {t: list(v) for t, v in throws.items()} == {"one": ["left", "right"], "two": ["left"]}
     (mug / "videos/right.mp4").touch()
-    assert "a folder of its own" in refusal(mug)
+    with refused(mug / "videos"):
+        capture_folder.read_capture(mug)
 
 
 @pytest.mark.parametrize(
@@ -67,7 +69,8 @@ def test_links_stay_in_the_folder(mug, tmp_path):
     outside = tmp_path / "outside.jpg"
     outside.touch()
     (mug / "photos/c.jpg").symlink_to(outside)
-    assert "leads out of the capture's folder" in refusal(mug)
+    with refused(mug / "photos/c.jpg"):
+        capture_folder.read_capture(mug)
     (mug / "photos/c.jpg").unlink()
     (mug / "photos/c.jpg").symlink_to(mug / "photos/b.jpg")
     assert len(capture_folder.read_capture(mug).photographs) == 3
@@ -76,26 +79,26 @@ def test_links_stay_in_the_folder(mug, tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", ["nothing says how large the scene is", "square"]),
-        ("board: {}\n", ["board.square: this key is missing"]),
+        ("", ["square"]),
+        ("board: {}\n", ["board.square"]),
         ("board: {square: 30}\n", ["board.square"]),
-        ("board: {square: 0.03, sqares: [6, 8]}\n", ["board.sqares: unknown key", "squares"]),
-        ("board: {square: 0.03, squares: [2, 8]}\n", ["board", "at least 3"]),
+        ("board: {square: 0.03, sqares: [6, 8]}\n", ["board.sqares", "squares"]),
+        ("board: {square: 0.03, squares: [2, 8]}\n", ["board", "3"]),
         ("board: {square: 0.03}\nposes: board\n", ["lens"]),
-        ("length: {metres: 1, ends: {a.JPG: [[0, 0], [1, 1]]}}\n", ["at least two photographs"]),
+        ("length: {metres: 1, ends: {a.JPG: [[0, 0], [1, 1]]}}\n", ["length"]),
         (
             "length: {metres: 1, ends: {a.JPG: [[0, 0], [1, 1]], c.jpg: [[0, 0], [1, 1]]}}\n",
-            ["length.ends.c.jpg: there is no such photograph"],
+            ["length.ends.c.jpg"],
         ),
         (
             MINIMAL + "length: {metres: 1, ends: {a.JPG: [[0, 0], [1, 1]], b.jpg: [[0, 0], [1, 1]]}}\n",
-            ["length: the board"],
+            ["length", "board"],
         ),
-        ("poses: t.json\ncenter: [0, 0]\n", ["center: it is a place in the frame of the board"]),
-        (MINIMAL + "cameras: {lefft: {rate: 240}}\n", ["cameras.lefft", "did you mean left"]),
+        ("poses: t.json\ncenter: [0, 0]\n", ["center"]),
+        (MINIMAL + "cameras: {lefft: {rate: 240}}\n", ["cameras.lefft", "mean left"]),
         (MINIMAL + "cameras: {left: {rate: 0}}\n", ["cameras.left.rate"]),
-        (MINIMAL + "throws: {one: {folder: none}}\n", ["none has no videos"]),
-        ("board: [", ["cannot be read as YAML"]),
+        (MINIMAL + "throws: {one: {folder: none}}\n", ["none: no videos"]),
+        ("board: [", ["YAML"]),
         ("- 1\n", ["capture.yaml"]),
     ],
 )
@@ -107,26 +110,27 @@ def test_messages_name_file_and_key(mug, text, words):
 
 def test_what_is_missing_is_named(mug):
     (mug / "stills/left.jpg").unlink()
-    with pytest.raises(InputError, match="no picture of the empty scene for the camera 'left'"):
+    with refused(mug / "stills"):
         capture_folder.read_capture(mug).pictures()
     (mug / "capture.yaml").unlink()
-    assert "capture.yaml does not exist" in refusal(mug)
+    with refused(mug / "capture.yaml"):
+        capture_folder.read_capture(mug)
 
 
 def test_photographs_and_videos_can_come_one_after_the_other(mug):
     """Each is missed where it is needed, and not before."""
     (mug / "videos").rename(mug / "later")
     photographed = capture_folder.read_capture(mug)
-    assert list(photographed.pictures()) == ["photographs", "left", "right"] and photographed.throws == {}
-    with pytest.raises(InputError, match="videos has no videos"):
+    assert list(photographed.pictures()) == ["photographs", "left", "right"] and photographed.takes == {}
+    with refused(mug / "videos"):
         photographed.video("first", "left")
     (mug / "later").rename(mug / "videos")
     (mug / "photos").rename(mug / "elsewhere")
     filmed = capture_folder.read_capture(mug)
-    with pytest.raises(InputError, match="photos has no photographs"):
+    with refused(mug / "photos"):
         filmed.pictures()
     for wrong, words in (
-        (("second", "left"), "no throw 'second'"),
+        (("second", "left"), "no take 'second'"),
         (("first", "lefft"), "did you mean left"),
     ):
         with pytest.raises(InputError, match=words):
@@ -136,26 +140,29 @@ def test_photographs_and_videos_can_come_one_after_the_other(mug):
 def test_names_of_cameras_can_name_results(mug):
     for file in ("videos/left.MOV", "stills/left.jpg"):
         (mug / file).rename((mug / file).with_stem("left {0}"))
-    assert "'left {0}' is to name folders" in refusal(mug)
+    assert "'left {0}'" in refusal(mug)
 
 
 def test_files_that_cannot_be_told_apart_or_read(mug):
     (mug / "videos/left.mp4").touch()
-    assert "same camera" in refusal(mug)
+    with refused(mug / "videos/left"):
+        capture_folder.read_capture(mug)
     (mug / "videos/left.mp4").unlink()
     (mug / "photos/b.png").touch()
-    assert "differs from it in its ending only" in refusal(mug)
+    with refused(mug / "photos/b."):
+        capture_folder.read_capture(mug)
     (mug / "photos/b.png").unlink()
     for name in ("videos/left.MOV", "stills/left.jpg"):
         (mug / name).rename((mug / name).with_stem("photographs"))
-    assert "cannot be named" in refusal(mug)
+    assert "'photographs'" in refusal(mug)
     (mug / "photos/c.HEIC").touch()
-    assert "convert it to JPEG" in refusal(mug)
+    with refused(mug / "photos/c.HEIC"):
+        capture_folder.read_capture(mug)
 
 
 def test_a_missing_extra_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "cv2", None)
-    with pytest.raises(InputError, match="make capture"):
+    with refused("cv2"):
         tools.opencv()
 
 

@@ -10,7 +10,7 @@ from neuma_lib.capture.gravity import GRAVITY
 
 pytest.importorskip("cv2")
 
-from neuma_lib.capture.spin import FOLLOWED, Path, fit_spin, follow  # noqa: E402
+from neuma_lib.capture.spin import PIXEL_SPREAD, Path, fit_spin, follow  # noqa: E402
 
 WIDTH, HEIGHT = 240, 200
 K = np.array([[400.0, 0, WIDTH / 2], [0, 400, HEIGHT / 2], [0, 0, 1]])
@@ -82,7 +82,7 @@ def test_noise_stays_within_the_deviation():
     tracks, rng = cameras(), np.random.default_rng(4)
     z = []
     for _ in range(12):
-        found = fit_spin(exact_paths(tracks, FOLLOWED, rng), tracks, FALL)
+        found = fit_spin(exact_paths(tracks, PIXEL_SPREAD, rng), tracks, FALL)
         z.append((found.velocity - SPIN) / np.sqrt(np.diag(found.covariance)))
     # The deviation is a bound rather than an estimate: errors of a path are taken to be alike.
     assert np.abs(np.mean(z)) < 0.6 and np.square(z).mean() < 1.3

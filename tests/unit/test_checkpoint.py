@@ -6,6 +6,8 @@ import torch
 from neuma_lib.io.checkpoint import Checkpoint
 from tests.support.errors import refused
 
+pytestmark = pytest.mark.core
+
 
 def test_training_resumes_bit_for_bit(tmp_path):
     """Killed after any number of iterations and resumed, a noisy training ends with the same weights."""

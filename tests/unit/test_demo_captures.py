@@ -136,7 +136,7 @@ def test_the_plan_is_what_lies_there(tmp_path):
     for file in (
         *plan.photographs,
         *plan.stills.values(),
-        *(v for t in plan.throws.values() for v in t.values()),
+        *(v for t in plan.takes.values() for v in t.values()),
     ):
         file.parent.mkdir(parents=True, exist_ok=True)
         file.touch()
@@ -201,18 +201,18 @@ def test_a_registration_that_is_right_is_not_off():
     }
     velocity = {"v0": [0.2, -0.5 - G * time, 0.1], "angular_velocity": spin.tolist()}
     rows = {row.what: row for row in judged.compare_registration(found, velocity, known, truth, "first")}
-    assert all(row.found < 1e-3 for row in rows.values()), rows
+    assert all(row.value < 1e-3 for row in rows.values()), rows
     assert all(row.reached for row in rows.values() if row.goal)
     found["translation"][0] += 0.004
     tilt = Rotation.from_rotvec(np.radians([0, 0, 2.0])).as_matrix()
     worse = {row.what: row for row in judged.compare_registration(found, velocity, known, truth, "first")}
-    assert worse["registration, place"].found == pytest.approx(4) and not worse["registration, place"].reached
+    assert worse["registration, place"].value == pytest.approx(4) and not worse["registration, place"].reached
     found["rotation"] = (tilt @ rotation).tolist()
     found["gravity_m_s2"] = (tilt @ [0, -G, 0]).tolist()
     worse = {row.what: row for row in judged.compare_registration(found, velocity, known, truth, "first")}
     down = worse["direction of gravity, from the placed object"]
     for tilted in (worse["registration, turn"], down):
-        assert tilted.found == pytest.approx(2) and not tilted.reached
+        assert tilted.value == pytest.approx(2) and not tilted.reached
 
 
 def test_tracer_errors():
@@ -238,7 +238,7 @@ def test_a_flight_that_is_right_is_not_off():
         "offsets_s": {"a": 0.0, "b": -0.0015},
         "spin_rad_s": spin.tolist(),
     }
-    rows = {row.what: row.found for row in judged.compare_flight(flight, known, truth, "first")}
+    rows = {row.what: row.value for row in judged.compare_flight(flight, known, truth, "first")}
     assert rows.pop("offset of b, from the fall") == pytest.approx(0.5)
     assert max(rows.values()) < 1e-3
 
@@ -251,13 +251,13 @@ def test_cameras_that_are_right_are_not_off():
         {"group": "photographs", "file_path": f"photographs/{k}.png", **v} for k, v in photographs.items()
     ]
     cameras = {name: eye.plain() for name, eye in eyes.items()}
-    rows = {row.what: row.found for row in judged.compare_cameras(frames, photographs, cameras)}
+    rows = {row.what: row.value for row in judged.compare_cameras(frames, photographs, cameras)}
     assert max(rows.values()) < 1e-5
     for frame in frames:
         pose = np.array(frame["transform_matrix"])
         pose[:3, 3] = 1.01 * pose[:3, 3]
         frame["transform_matrix"] = pose.tolist()
-    rows = {row.what: row.found for row in judged.compare_cameras(frames, photographs, cameras)}
+    rows = {row.what: row.value for row in judged.compare_cameras(frames, photographs, cameras)}
     assert rows["scale, from the cameras"] == pytest.approx(1.0, rel=0.02)
     assert rows["up, from the cameras"] < 1e-5
 

@@ -1,9 +1,12 @@
 """Depth maps fused to a signed distance: planes and balls whose distances are known."""
 
+import pytest
 import torch
 
 from neuma_lib.geometry.depth_fusion import fused_distance
 from neuma_lib.splatting.cameras import Cameras, look_at
+
+pytestmark = pytest.mark.core
 
 K = torch.tensor([[40.0, 0.0, 32.0], [0.0, 40.0, 32.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)

@@ -12,6 +12,8 @@ from neuma_lib.fitting.material import PixelLoss, train_material
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.structured import structured_law
 
+pytestmark = pytest.mark.core
+
 HENCKY = {"name": "hencky", "E": 3e5, "nu": 0.3}
 PLASTIC = {"elasticity": HENCKY, "plasticity": {"name": "von_mises", "yield_stress": 8e3}}
 

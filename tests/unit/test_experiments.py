@@ -10,6 +10,7 @@ import torch
 import yaml
 from render_scenes import dense
 
+from neuma_lib.config import cases
 from neuma_lib.config.loading import load, merged
 from neuma_lib.coupling.bodies import coloured_solid, join
 from neuma_lib.coupling.particle_binding import bind_two_pass
@@ -87,8 +88,9 @@ def test_mistakes_in_experiments_and_tables_are_named():
 
 def test_what_a_method_believes_of_the_density():
     found = settings()
-    assert found.method_density("UnevenCat", "neuma") == found.scene("UnevenCat").plain()["density"]
-    assert found.method_density("UnevenCat", "neuma+assumed_density=900") == 900
+    own = found.scene("UnevenCat").plain()["density"]
+    assert cases.case(found, "UnevenCat", "neuma").density("UnevenCat") == own
+    assert cases.case(found, "UnevenCat", "neuma+assumed_density=900").density("UnevenCat") == 900
 
 
 def test_densities_on_both_sides_of_a_plane():

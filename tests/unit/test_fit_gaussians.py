@@ -15,6 +15,8 @@ from neuma_lib.fitting.gaussians import fit_gaussians
 from neuma_lib.geometry.visual_hull import visual_hull
 from neuma_lib.splatting.spherical_harmonics import coefficient_count
 
+pytestmark = pytest.mark.core
+
 SIZE = 64
 SMALL = GaussiansConfig(
     iterations=400,

@@ -20,6 +20,8 @@ from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians
 from tests.support.errors import refused
 
+pytestmark = pytest.mark.core
+
 SURFACE = SurfaceConfig()
 SIX = ("ball", "duck", "pawn", "cat", "bottle", "fish")
 

@@ -21,6 +21,8 @@ from neuma_lib.splatting.observation import Observation, over_white
 from neuma_lib.splatting.rasterizer import rasterize, rasterized_error
 from tests.support.errors import refused
 
+pytestmark = pytest.mark.core
+
 DEVICES = [
     "cpu",
     pytest.param(

@@ -28,6 +28,8 @@ from neuma_lib.evaluation.lpips import (
 from neuma_lib.io.packages import download
 from neuma_lib.io.weights import read_weights
 
+pytestmark = pytest.mark.core
+
 ROOT = Path(__file__).resolve().parents[2]
 WEIGHTS = ROOT / "data" / "weights" / "lpips.safetensors"
 REFERENCE = {

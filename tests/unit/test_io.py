@@ -19,6 +19,8 @@ from neuma_lib.io.weights import read_weights, write_weights
 from neuma_lib.splatting.gaussians import Gaussians
 from tests.support.errors import refused
 
+pytestmark = pytest.mark.core
+
 RNG = np.random.default_rng(0)
 
 

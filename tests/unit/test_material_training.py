@@ -20,6 +20,8 @@ from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 
+pytestmark = pytest.mark.core
+
 FRAMES = (0, 20, 40, 60)
 V0 = torch.tensor([0.0, -1.5, 0.0], dtype=torch.float64)
 

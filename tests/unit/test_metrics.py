@@ -18,7 +18,7 @@ from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.evaluation.image_metrics import psnr, ssim
 from neuma_lib.evaluation.metrics import mean_height, mechanical_energy, tracer_errors
 from neuma_lib.evaluation.paper import BALL_PARTICLES, BALL_RADIUS, PAPER
-from neuma_lib.evaluation.reports import benchmark_table, learning_rate_table, report_table
+from neuma_lib.evaluation.reports import benchmark_table, report_table
 from neuma_lib.evaluation.video import side_by_side, write_gif, write_mp4
 from neuma_lib.geometry.chamfer import chamfer, chamfer_loss, chamfer_sequence
 from neuma_lib.geometry.volume import sample_volume
@@ -277,22 +277,6 @@ def test_a_gif_lasts_as_long_as_its_frames(tmp_path, rate):
     assert sum(delays) == 3000 and max(delays) - min(delays) <= 10
     assert min(delays) >= 20, "a browser would take 100 ms for less"
     assert len(delays) == count if rate <= 50 else len(delays) > 25 * 3
-
-
-def test_learning_rate_is_chosen_by_the_geometric_mean_of_the_training_loss():
-    def run(scale, scene, best, error):
-        return {
-            "method": "neuma", "lr_scale": scale, "scene": scene, "loss": [1.0, best], "best_loss": best,
-            "stable": True, "recoveries": [], "tracer_rmse_mm": error,
-        }  # fmt: skip
-
-    # The arithmetic mean and the RMSE, which knows the truth, would both choose the other factor.
-    rows = [run(0.5, "a", 0.001, 9), run(0.5, "b", 0.3, 9), run(1.0, "a", 0.1, 1), run(1.0, "b", 0.1, 1)]
-    table, markdown, best = learning_rate_table(rows)
-    assert best == {"neuma": 0.5}
-    read = list(csv.DictReader(io.StringIO(table)))
-    assert [float(row["ratio"]) for row in read] == [0.001, 0.3, 0.1, 0.1]
-    assert "neuma ×0.5" in markdown
 
 
 def test_unusable_videos_are_named(film):

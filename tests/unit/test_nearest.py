@@ -6,6 +6,8 @@ from scipy.spatial import cKDTree
 
 from neuma_lib.geometry.nearest import nearest
 
+pytestmark = pytest.mark.core
+
 BOXES = {  # of points: sides and offset
     "one": (1, (1.0, 1.0, 1.0), 0.0),
     "box": (500, (0.3, 0.2, 0.1), 0.5),

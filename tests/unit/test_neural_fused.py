@@ -7,6 +7,8 @@ from emulated_cuda import COMPILER, EmulatedLaws
 from neuma_lib.mechanics import neural_fused as fused
 from neuma_lib.mechanics.neural import neural_law
 
+pytestmark = pytest.mark.core
+
 KINDS = ("elasticity", "plasticity")
 REGIMES = ("near identity", "large strain", "inverted")
 

@@ -8,7 +8,6 @@ import torch
 from scipy.optimize import nnls
 from test_materials import EYE, E, deformations, hencky_deviator, rotations
 
-from neuma_lib.errors import InputError
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.elasticity import FibreReinforced, Hencky, MooneyRivlin, NeoHookean, Ogden
 from neuma_lib.mechanics.isotropic import lame
@@ -20,6 +19,9 @@ from neuma_lib.mechanics.plasticity import (
     VonMises,
     _positive_root,
 )
+from tests.support.errors import refused
+
+pytestmark = pytest.mark.core
 
 NU = 0.3
 MU, LAM = lame(E, NU)
@@ -376,26 +378,18 @@ def test_fibres_of_the_scene_lie_askew_and_bear_most(loaded):
 
 
 @pytest.mark.parametrize(
-    ("law", "constants", "message"),
+    ("law", "constants", "key"),
     [
-        (Ogden, dict(E=E, nu=NU), "Ogden needs the constant alpha"),
-        (Ogden, dict(E=E, nu=NU, alpha=-2), r"Ogden\.alpha = -2 must lie between 0 and 20"),
-        (MooneyRivlin, dict(E=E, nu=NU, q=1.5), r"MooneyRivlin\.q = 1\.5"),
-        (
-            FibreReinforced,
-            dict(E=E, nu=NU, fibre_modulus=1, fibre_exponent=1, elevation=120),
-            r"FibreReinforced\.elevation = 120 must lie between -90 and 90 degrees",
-        ),
-        (CrushableFoam, {**FOAM, "tension": 0.0}, r"CrushableFoam\.tension = 0"),
-        (HerschelBulkley, {**PASTE, "exponent": 0.05}, r"HerschelBulkley\.exponent = 0\.05"),
-        (
-            CohesiveDruckerPrager,
-            {**SAND, "dilation_angle": 40.0},
-            "dilation_angle = 40 must not exceed friction_angle",
-        ),
-        (CohesiveDruckerPrager, {**SAND, "cohesion": -1.0}, r"CohesiveDruckerPrager\.cohesion = -1"),
+        (Ogden, dict(E=E, nu=NU), "alpha"),
+        (Ogden, dict(E=E, nu=NU, alpha=-2), "alpha"),
+        (MooneyRivlin, dict(E=E, nu=NU, q=1.5), "q"),
+        (FibreReinforced, dict(E=E, nu=NU, fibre_modulus=1, fibre_exponent=1, elevation=120), "elevation"),
+        (CrushableFoam, {**FOAM, "tension": 0.0}, "tension"),
+        (HerschelBulkley, {**PASTE, "exponent": 0.05}, "exponent"),
+        (CohesiveDruckerPrager, {**SAND, "dilation_angle": 40.0}, "dilation_angle"),
+        (CohesiveDruckerPrager, {**SAND, "cohesion": -1.0}, "cohesion"),
     ],
 )
-def test_bad_constants_are_named(law, constants, message):
-    with pytest.raises(InputError, match=message):
+def test_bad_constants_are_named(law, constants, key):
+    with refused(f"{law.__name__}.{key}"):
         law(**constants)

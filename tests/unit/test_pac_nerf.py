@@ -338,14 +338,6 @@ def test_bad_input_is_named(carried, loaded):
         PacFamilyConfig(elasticity={"name": "hencky", "E": 1e5, "nu": 0.3}, fitted=("E", "mu"))
 
 
-def test_method_and_its_variants(loaded):
-    assert loaded.method_pac_nerf("pac_nerf").guesses == "stock" and loaded.method_pac_nerf("neuma") is None
-    assert loaded.method_pac_nerf("pac_nerf+guesses=prior+family=non_newtonian").family == "non_newtonian"
-    assert loaded.run_folder("BouncyBall+adaptor_seed=2", "pac_nerf") == "BouncyBall/pac_nerf"  # draws none
-    with pytest.raises(InputError, match="its law is not pac_nerf, leave out guesses"):
-        loaded.method_pac_nerf("neuma+guesses=prior")
-
-
 def test_frames_are_spread_evenly():
     assert spread(range(5), 9) == [0, 1, 2, 3, 4]
     assert spread(range(12), 3) == [3, 7, 11]
@@ -446,14 +438,3 @@ class TestOwnParticles:
     def test_bad_input_is_named(self, carried):
         with pytest.raises(InputError, match="rollout of 7 particles is not that of a field that"):
             self.rendered(carried, torch.zeros(1, 7, 3, dtype=torch.float64))
-
-    def test_it_is_a_row_of_its_own(self, loaded):
-        for own, base in (
-            ("pac_nerf_own", "pac_nerf"),
-            ("pac_nerf_own+guesses=prior", "pac_nerf+guesses=prior"),
-        ):
-            assert loaded.method_training(own) == base and loaded.is_pac_nerf(own)
-            assert loaded.judged_carrier("BouncyBall", own) == "field" and loaded.carries_field(own)
-            assert loaded.judged_carrier("BouncyBall", base) == "binding" and not loaded.carries_field(base)
-            assert loaded.method_pac_nerf(own) == loaded.method_pac_nerf(base)
-            assert {own, base} <= set(loaded.tables["table1_systems"].methods)

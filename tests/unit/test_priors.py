@@ -6,7 +6,7 @@ import pytest
 import torch
 from safetensors.torch import save
 
-from neuma_lib.config.priors import RegressionConfig, TrajectoryConfig
+from neuma_lib.config.priors import RegressionConfig
 from neuma_lib.fitting.prior_regression import (
     Network,
     missing_states,
@@ -16,12 +16,13 @@ from neuma_lib.fitting.prior_regression import (
 )
 from neuma_lib.fitting.prior_throws import random_rotations, random_throw, reference_law, visited_stretches
 from neuma_lib.fitting.prior_training import judge, remark, train_prior
-from neuma_lib.fitting.prior_trajectory import train_by_trajectory
 from neuma_lib.fitting.soap import SOAP
 from neuma_lib.mechanics.elasticity import STRETCH_MIN
 from neuma_lib.mechanics.law import Law, Plasticity
 from neuma_lib.mechanics.neural import PLASTIC_SCALE
 from neuma_lib.mechanics.singular_values import svd3
+
+pytestmark = pytest.mark.core
 
 JELLY = {"elasticity": {"name": "fixed_corotated", "E": 1e5, "nu": 0.2}, "plasticity": {"name": "identity"}}
 PLASTICINE = {
@@ -48,7 +49,7 @@ OTHERS = {
     },
 }
 ROUGH = {"StVK + Drucker-Prager"}
-"""Laws whose return map a network of the published size follows only roughly: docs/guide.md, How close is a prior."""
+"""Laws whose return map a network of the published size follows only roughly: docs/materials.md, Priors."""
 LAWS = {"jelly": JELLY, "plasticine": PLASTICINE, "sand": SAND, "water": WATER, **OTHERS}
 TINY = RegressionConfig(
     throws=2, side_particles=4, grid=12, duration=0.15, samples=4096, iterations=500, batch=512, rounds=2
@@ -207,15 +208,6 @@ def test_identity_is_learned_exactly_and_can_still_be_adapted():
     )
     torch.autograd.backward(weights, grads)
     assert float(law.plasticity.adaptor.B[2].grad.abs().max()) > 0
-
-
-def test_trajectory_training_lowers_its_loss():
-    options = TrajectoryConfig(
-        epochs=6, steps=160, side_particles=4, grid=10, dt=2e-3, reset_first=40, reset_last=40
-    )
-    law, report = train_by_trajectory(JELLY, options, 0, lambda done, total, loss: None)
-    assert report["loss"][-1] < report["loss"][0]
-    assert not any(w.requires_grad for w in (*law.elasticity.base, *law.plasticity.base))
 
 
 @pytest.mark.parametrize(("chamfer", "warns"), [(0.0546, False), (0.2092, True), (math.nan, True)])

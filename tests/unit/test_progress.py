@@ -142,28 +142,3 @@ def test_a_script_ends_with_its_snakemake(tmp_path):
     assert free.poll() is None
     free.kill()
     free.wait()
-
-
-def test_a_script_logs_its_core_seconds_for_the_start_and_for_the_work(tmp_path):
-    log = tmp_path / "rule.log"
-    script = f"""
-import time
-from types import SimpleNamespace
-from workflow.stage import run_script
-
-def burn(seconds):
-    end = time.process_time() + seconds
-    while time.process_time() < end:
-        pass
-
-def main(inputs, output, params, run):
-    burn(0.5)
-
-burn(1.0)
-run_script(main, SimpleNamespace(rule="rule", wildcards=[], log=[{str(log)!r}], input=0, output=0, params=0))
-"""
-    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0 and "core seconds" not in done.stderr
-    start, work = progress.core_seconds(log)
-    assert start >= 1.0 and 0.5 <= work < 1.0
-    assert progress.core_seconds(tmp_path / "none.log") is None

@@ -79,12 +79,19 @@ def test_changes_that_count(project, file, text, changes):
 
 
 class TestThisProject:
-    def reached(self, script):
-        return set(Sources().reached(SCRIPTS / f"{script}.py"))
+    def reached(self, script, *modules):
+        return set(Sources().reached(SCRIPTS / f"{script}.py", modules))
 
-    @pytest.mark.parametrize("script", ["gaussians", "velocity", "material", "video"])
+    @pytest.mark.parametrize("script", ["gaussians", "velocity", "video"])
     def test_what_renders_depends_on_the_rasterizer(self, script):
         assert "neuma_lib.splatting.rasterizer" in self.reached(script)
+
+    def test_a_fit_depends_on_its_own_method_alone(self):
+        springs = "neuma_lib.methods.spring_gaus.method"
+        assert springs not in self.reached("fit", "neuma_lib.methods.neuma")
+        assert "neuma_lib.fitting.material" in self.reached("fit", "neuma_lib.methods.neuma")
+        assert "neuma_lib.splatting.rasterizer" in self.reached("fit", springs)
+        assert "neuma_lib.fitting.material" not in self.reached("evaluate", "neuma_lib.methods.true_law")
 
     @pytest.mark.parametrize(
         "script",
@@ -93,9 +100,9 @@ class TestThisProject:
     def test_what_does_not_render_is_free_of_it(self, script):
         assert "neuma_lib.splatting.rasterizer" not in self.reached(script)
 
-    @pytest.mark.parametrize("script", ["gaussians", "mesh", "binding", "velocity", "material"])
+    @pytest.mark.parametrize("script", ["gaussians", "mesh", "binding", "velocity", "fit"])
     def test_no_stage_can_reach_the_truth(self, script):
-        reached = self.reached(script)
+        reached = self.reached(script, *(["neuma_lib.methods.structured"] if script == "fit" else []))
         assert "neuma_lib.data.ground_truth" not in reached and "neuma_lib.geometry.shapes" not in reached
 
 

@@ -23,6 +23,8 @@ from neuma_lib.radiance.rendering import (
 )
 from neuma_lib.splatting.cameras import Cameras, look_at
 
+pytestmark = pytest.mark.core
+
 
 def corners(x):
     """Indices (N, 8, 3) of the nodes about the points, and their weights (N, 8), in differentiable torch."""

@@ -145,7 +145,7 @@ def test_both_the_true_law_and_the_prior_are_stable(loaded, many):
             assert model.courant(analytic_law(law, dt=scene["dt"]), DENSITY) <= 0.6 * (1 + 1e-3)
 
 
-def test_bodies_start_inside_and_land_in_time(loaded, many):
+def test_bodies_start_inside_and_land_in_time(many):
     """Of the turning mesh itself: six frames of 33 before it is at y = 0, no later than in half of the video.
 
     The stencil feels the ground half a cell above: five frames; till the body is at y = 0, it feels no other wall. The

@@ -13,13 +13,13 @@ from tests.support.errors import refused
 K = [[40.0, 0.0, 16.0], [0.0, 41.0, 15.0], [0.0, 0.0, 1.0]]
 
 
-def write_release(folder, letter="d", kind="dynamic", views=(0, 2), steps=(0, 2, 4)):
+def write_release(folder, kind="dynamic"):
     """A set as the authors lay it out; pixel (0, 0) tells view and step. Returns its list."""
     (folder / f"data_{kind}").mkdir(parents=True)
     entries = []
-    for view in views:
-        for step in steps:
-            name = f"./data_{kind}/{letter}_{view}_{step:03d}.png"
+    for view in (0, 2):
+        for step in (0, 2, 4):
+            name = f"./data_{kind}/d_{view}_{step:03d}.png"
             pixels = np.zeros((30, 32, 4), dtype=np.uint8)
             pixels[8:20, 9 + step : 19 + step] = (200, 90, 30, 255)
             pixels[0, 0] = (view, step, 0, 0)

@@ -11,8 +11,8 @@ from neuma_lib.capture.released import (
     MIDDLE,
     RATE,
     ROOM_FROM_WORLD,
+    background_behind,
     photographs_about_to_size,
-    plate_behind,
     read_configured,
     read_released,
     read_shots,
@@ -22,8 +22,8 @@ from neuma_lib.capture.released import (
     video_frames,
 )
 from neuma_lib.config.capture import ReleasedConfig
-from neuma_lib.errors import InputError
 from neuma_lib.io.images import OPENGL_TO_OPENCV
+from tests.support.errors import refused
 
 pytest.importorskip("cv2")
 LONGEST = 1000
@@ -109,7 +109,7 @@ def test_photographs_come_to_the_middle_and_to_size(folders):
 
 def test_the_copy_takes_its_photographs_from_the_original(folders):
     settings = ReleasedConfig(folder=str(folders["neuma"]))
-    with pytest.raises(InputError, match="no photographs.*real_capture"):
+    with refused("captures.released.bun"):
         read_configured("bun", settings)
     settings = settings.model_copy(update={"photographs": str(folders["spring_gaus"])})
     found = read_configured("bun", settings)
@@ -119,7 +119,7 @@ def test_the_copy_takes_its_photographs_from_the_original(folders):
 
 def test_they_are_captures_like_others(folders):
     found = released_captures({"bun": ReleasedConfig(folder=str(folders["spring_gaus"]), density=300)})
-    assert list(found["bun"].throws["first"]) == list(layouts.CAMERAS)
+    assert list(found["bun"].takes["first"]) == list(layouts.CAMERAS)
     assert found["bun"].settings.density == 300
 
 
@@ -131,38 +131,42 @@ def change(path, content):
 
 
 @pytest.mark.parametrize(
-    ("file", "content", "says"),
+    ("file", "content", "where"),
     [
-        ("dynamic/cameras_calib.json", None, "cameras_calib.json does not exist"),
-        ("dynamic/cameras_calib.json", b"{}", "'C0733' has no pose"),
+        ("dynamic/cameras_calib.json", None, ("cameras_calib.json",)),
+        ("dynamic/cameras_calib.json", b"{}", ("0.json", "C0733")),
         (
             "dynamic/cameras_calib.json",
             b'{"C0733": {"rvecs": [1], "tvecs": [1, 2, 3]}}',
-            "C0733.*three numbers",
+            ("cameras_calib.json", "C0733"),
         ),
-        ("static/colmap/bun/cameras.bin", b"\1", "cameras.bin cannot be read"),
-        ("static/colmap/bun/images.bin", b"\1\0\0\0\0\0\0\0\1", "images.bin cannot be read"),
-        ("dynamic/videos_masks/C0787/00003.png", None, "videos_masks/C0787/00003: there is no such picture"),
-        ("dynamic/sequences/bun/0.json", b'{"hit_frame": -1, "C0733": ["00000.jpg"]}', "hit_frame must be"),
-        ("dynamic/sequences/bun/0.json", b'{"C0733": 3}', "C0733: expected the names"),
-        ("dynamic/sequences/bun/0.json", b'{"C0733": []}', "no pictures"),
+        ("static/colmap/bun/cameras.bin", b"\1", ("cameras.bin",)),
+        ("static/colmap/bun/images.bin", b"\1\0\0\0\0\0\0\0\1", ("images.bin",)),
+        ("dynamic/videos_masks/C0787/00003.png", None, ("videos_masks/C0787/00003",)),
+        (
+            "dynamic/sequences/bun/0.json",
+            b'{"hit_frame": -1, "C0733": ["00000.jpg"]}',
+            ("0.json", "hit_frame"),
+        ),
+        ("dynamic/sequences/bun/0.json", b'{"C0733": 3}', ("0.json", "C0733")),
+        ("dynamic/sequences/bun/0.json", b'{"C0733": []}', ("0.json", "C0733")),
     ],
 )
-def test_damaged_files_are_named(folders, file, content, says):
+def test_damaged_files_are_named(folders, file, content, where):
     path, before = change(folders["spring_gaus"] / file, content)
     try:
-        with pytest.raises(InputError, match=says):
+        with refused(*where):
             read_released(folders["spring_gaus"], "bun")
     finally:
         path.write_bytes(before)
 
 
 def test_what_is_in_no_layout_or_of_no_object_is_said(folders, tmp_path):
-    with pytest.raises(InputError, match="in neither layout"):
+    with refused(tmp_path):
         read_released(tmp_path, "bun")
-    with pytest.raises(InputError, match="no object 'pig'"):
+    with refused("dynamic/sequences"):
         read_released(folders["spring_gaus"], "pig")
-    with pytest.raises(InputError, match="state `ground`"):
+    with refused("mug"):
         read_released(folders["spring_gaus"], "mug")
 
 
@@ -172,14 +176,14 @@ def test_an_empty_mask_and_a_picture_of_another_shape_are_named(folders):
 
     Image.new("L", layouts.SIZE).save(path)
     try:
-        with pytest.raises(InputError, match="r_0_2.png.*empty"):
+        with refused("r_0_2.png"):
             list(read_shots([shot], LONGEST))
     finally:
         path.write_bytes(before)
     path, before = change(shot.picture, None)
     Image.new("RGB", (40, 40)).save(path)
     try:
-        with pytest.raises(InputError, match="not of one picture"):
+        with refused(shot.picture):
             list(read_shots([shot], LONGEST))
     finally:
         path.write_bytes(before)
@@ -200,7 +204,7 @@ def test_the_empty_scene_is_what_masks_do_not_cover():
         mask[10:16, left : left + 6] = True
         pictures.append(np.where(mask[..., None], 200, scene).astype(np.uint8))
         masks.append(mask)
-    np.testing.assert_array_equal(plate_behind(pictures, masks), scene)
+    np.testing.assert_array_equal(background_behind(pictures, masks), scene)
     assert (np.median(pictures, axis=0) == 200).any()
-    always = plate_behind([pictures[2]] * 3, [masks[2]] * 3)
+    always = background_behind([pictures[2]] * 3, [masks[2]] * 3)
     np.testing.assert_array_equal(always, pictures[2])

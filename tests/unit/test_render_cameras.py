@@ -1,11 +1,14 @@
 """Camera conventions: OpenCV and OpenGL poses, pixel centres."""
 
 import numpy as np
+import pytest
 import torch
 
 from neuma_lib.splatting.cameras import Cameras, look_at
 from neuma_lib.splatting.rasterizer import rasterize
 from neuma_lib.splatting.viewpoints import Views
+
+pytestmark = pytest.mark.core
 
 
 def ring(count=4, width=40, height=30):

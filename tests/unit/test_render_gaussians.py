@@ -10,6 +10,8 @@ from neuma_lib.splatting import spherical_harmonics as harmonics
 from neuma_lib.splatting.gaussians import Gaussians, rotations
 from tests.support.errors import refused
 
+pytestmark = pytest.mark.core
+
 
 def some_gaussians(count=7, coefficients=4, seed=0):
     generator = torch.Generator().manual_seed(seed)

@@ -10,6 +10,8 @@ from neuma_lib.splatting import torch_reference
 from neuma_lib.splatting.rasterizer import RenderBuffers, Statistics, rasterize
 from tests.support.errors import refused
 
+pytestmark = pytest.mark.core
+
 SMOOTH = dict(alpha_min=0.0, alpha_max=2.0, transmittance_min=0.0)
 LOOSE = dict(alpha_min=1 / 255, alpha_max=0.6, transmittance_min=0.05)
 WIDTH, HEIGHT = 26, 21

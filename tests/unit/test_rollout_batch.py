@@ -14,6 +14,8 @@ from neuma_lib.sim.rollout import RolloutFunction, rollout
 from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import State
 
+pytestmark = pytest.mark.core
+
 MODEL = MPMModel(16, DT)
 FRAMES = (0, 10, 25, 40)
 RUN = dict(steps=FRAMES[-1], frames=FRAMES)

@@ -8,6 +8,8 @@ from neuma_lib.geometry import shapes
 from neuma_lib.geometry.skinning import carry, skinning_matrix
 from tests.support.errors import refused
 
+pytestmark = pytest.mark.core
+
 SOLIDS = (*shapes.NAMES, "letter_N", "letter_B")
 
 

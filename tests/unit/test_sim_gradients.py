@@ -13,6 +13,8 @@ from neuma_lib.sim.model import Body, MPMModel, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 
+pytestmark = pytest.mark.core
+
 IN_THE_AIR = MPMModel(14, DT)
 ON_A_STICKY_FLOOR = MPMModel(14, DT, boundary={"y_min": "sticky"})  # stops its nodes always: no switch
 ON_A_RELEASED_FLOOR = MPMModel(14, DT, boundary={"y_min": "sticky"}, walls="released")

@@ -24,6 +24,8 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, cross_matrix
 from neuma_lib.sim.workspace import Workspace, WorkspaceSize
 
+pytestmark = pytest.mark.core
+
 WEIGHTLESS = MPMModel(16, DT, gravity=(0.0, 0.0, 0.0))
 EPS = {torch.float32: 1.2e-7, torch.float64: 2.2e-16}
 

@@ -12,6 +12,8 @@ from neuma_lib.sim.model import CONDITIONS, WALLS, MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 
+pytestmark = pytest.mark.core
+
 RADIUS = 0.13
 SOFT = {"elasticity": {"name": "fixed_corotated", "E": 3e4, "nu": 0.45}}  # the softest body of the benchmarks
 DT = 5e-4

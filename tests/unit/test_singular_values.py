@@ -5,6 +5,8 @@ import torch
 
 from neuma_lib.mechanics.singular_values import rotation_and_singular_values, svd3
 
+pytestmark = pytest.mark.core
+
 ROUNDINGS = 32  # units of eps: some 15 rotations of three-vectors, each rounding a few times
 
 

@@ -14,6 +14,8 @@ from neuma_lib.splatting.image_loss import mean_squared_error
 from neuma_lib.splatting.rasterizer import RenderBuffers, Statistics, rasterize, rasterized_error
 from tests.support.errors import refused
 
+pytestmark = pytest.mark.core
+
 CUDA = pytest.param(
     "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 )

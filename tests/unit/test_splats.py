@@ -14,6 +14,7 @@ import torch
 from splat_files import ball, write_compressed, write_splat, write_spz
 
 from benchmarks.splat_surface import between, bowl, drawn_on
+from neuma_lib.config import cases
 from neuma_lib.config.geometry import SurfaceConfig
 from neuma_lib.config.loading import load, merged, read_yaml
 from neuma_lib.coupling.deformation import arms_at_rest, deform
@@ -376,8 +377,8 @@ def test_a_law_moves_a_splat_in_the_step_that_it_was_learned_with():
     scenes = {"Guitar": {"splat": "guitar.ply", "dt": 5e-4, "steps": 640}}
     config = settings({"scenes": scenes, "dataset": {"frames": None, "stride": 64}})
     own = tuple(range(0, 641, 64))
-    assert config.motion_clock("Guitar", "nclaw") == (5e-4, own)
-    dt, frames = config.motion_clock("Guitar", "neuma+law_from=JellyDuck")
+    assert cases.motion_clock(config, "Guitar", "nclaw") == (5e-4, own)
+    dt, frames = cases.motion_clock(config, "Guitar", "neuma+law_from=JellyDuck")
     assert dt == config.scenes["JellyDuck"].dt == 1e-3
     assert frames == tuple(step // 2 for step in own)
 
@@ -386,11 +387,11 @@ def test_a_viewer_shows_a_splat_under_laws_from_elsewhere():
     config = settings({"scenes": {"Guitar": {"splat": "guitar.ply", "dt": 2e-4}}})
     asked = ["nclaw", "neuma", "constants+law_from=ClayCat"]
     learned = [f"neuma+law_from={scene}" for scene in config.figures.i23d]
-    found = config.moved_methods("Guitar", asked)
+    found = cases.moving_methods(config, "Guitar", asked)
     assert found == ["nclaw", *learned, "constants+law_from=ClayCat"] and len(learned) > 1
-    assert config.moved_methods("ClayCat", asked) == asked
+    assert cases.moving_methods(config, "ClayCat", asked) == asked
     with pytest.raises(InputError, match="Guitar/spring_gaus: a splat has no video"):
-        config.moved_methods("Guitar", ["spring_gaus"])
+        cases.moving_methods(config, "Guitar", ["spring_gaus"])
     files = scene_files(config, "Guitar", found)
     assert files.truth is files.transforms is None
     assert {run.gaussian_motion for run in files.runs} == {"affine"}

@@ -10,6 +10,8 @@ from neuma_lib.springs.interpolation import Interpolation
 from neuma_lib.springs.network import SpringNetwork, Springs, farthest_points
 from neuma_lib.springs.rollout import MOST_SUBSTEPS, SpringModel, spring_rollout
 
+pytestmark = pytest.mark.core
+
 FREE = (0.0, 0.0, 0.0)
 G = (0.0, -9.8, 0.0)
 

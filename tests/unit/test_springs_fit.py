@@ -1,23 +1,23 @@
 """Springs fitted to a video: gradients of the whole chain, recovered motions, resuming, files, and their judging."""
 
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
 from grounding_scene import MODEL, TRUTH, ball, camera, observe
 
-from neuma_lib.config.loading import load
 from neuma_lib.config.material import MaterialConfig
-from neuma_lib.config.methods import MethodConfig
 from neuma_lib.config.springs import SpringsConfig
 from neuma_lib.errors import InputError
-from neuma_lib.evaluation.springs import evaluate_springs, predict_springs
+from neuma_lib.evaluation.motion import evaluate
 from neuma_lib.fitting.material import PixelLoss
 from neuma_lib.fitting.springs import fit_springs
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.springs import load_springs, save_springs
 from neuma_lib.io.weights import write_weights
 from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.methods.spring_gaus.method import SpringGaus
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.observation import Observation
 from neuma_lib.springs.body import SpringBody
@@ -184,52 +184,41 @@ def test_file_gives_the_same_motion_and_refuses_other_particles(small, tmp_path)
         load_springs(file, small.body.x0)
 
 
-def test_judged_as_any_method_is(small):
-    """Tracers that the truth carries by the same springs are met; where springs run away the last sound frame stays."""
+@pytest.fixture
+def motion(small, tmp_path):
+    """The true springs, from a file."""
+    file = tmp_path / "springs.safetensors"
+    save_springs(file, small.anchored, small.truth, {"stable": True, "substeps": 1, "density": DENSITY})
+    options = {"anchors": 80, "neighbours": 16, "hard_springs": 6, "exponent": 0.5, "carriers": 12}
+    return SpringGaus().load({"springs": str(file)}, options, MODEL.dt)
+
+
+def test_springs_are_evaluated_as_any_model_is(small, motion):
     frames, tracers = small.path.frames, small.body.x0[::3] + 1e-3
-    known = (BOX, small.anchored, small.truth, small.start, frames)
-    path, failure = predict_springs(*known, tracers, 12)
-    assert failure is None
-    judged = evaluate_springs(*known, path.tracers, path.tracers, tracers, 12)
-    assert judged.metrics["tracer_rmse_mm"] == judged.metrics["chamfer"] == 0
-    assert judged.metrics["diverged"] is None and judged.path.F.shape == (4, len(small.body.x0), 3, 3)
-    assert judged.metrics["energy_gain_after_step"] is None
+    path, failure = motion.predict(MODEL, small.start, frames, tracers)
+    assert failure is None and torch.equal(path.x, small.path.x)
+    result = evaluate(MODEL, motion, small.start, frames, path.tracers, path.tracers, tracers)
+    assert result.metrics["tracer_rmse_mm"] == result.metrics["chamfer"] == 0
+    assert result.metrics["diverged"] is None and result.path.F.shape == (4, len(small.body.x0), 3, 3)
+    assert result.metrics["energy_gain_after_step"] is result.metrics["courant"] is None and motion.stable
 
 
-def test_springs_that_run_away_are_held_at_the_last_sound_frame(small, monkeypatch):
+def test_springs_move_another_body_with_one_stiffness(small, motion):
+    start = replace(small.start, x=small.start.x + torch.tensor([0.01, 0.0, 0.0]))
+    path, failure = motion.predict(MODEL, start, small.path.frames)
+    assert failure is None and path.x.shape == small.path.x.shape
+    assert torch.equal(path.x[0], start.x) and not torch.equal(path.x[-1], small.path.x[-1])
+
+
+def test_springs_that_diverge_are_held_at_the_last_sound_frame(small, motion, monkeypatch):
     monkeypatch.setattr("neuma_lib.springs.rollout.MOST_SUBSTEPS", 1)
     monkeypatch.setattr(SpringNetwork, "stable_step", lambda *_: 1.0)
     stiff = Springs.of_modulus(small.anchored.network, 1e8, DENSITY, 0.1)
+    save_springs(motion._path, small.anchored, stiff, {"stable": True, "substeps": 1, "density": DENSITY})
     frames = small.path.frames
-    path, failure = predict_springs(BOX, small.anchored, stiff, small.start, frames, small.body.x0[:9], 12)
+    path, failure = motion.predict(MODEL, small.start, frames, small.body.x0[:9])
     sound = sum(n < failure.step for n in frames)
     assert 0 < sound < len(frames) and "spacing of the anchors" in failure.happened
     assert torch.equal(
         path.tracers[sound:], path.tracers[sound - 1 : sound].expand(len(frames) - sound, 9, 3)
     )
-
-
-def test_settings_of_the_method():
-    with pytest.raises(ValueError, match="springs: only a method with law: springs"):
-        MethodConfig(title="x", springs={"anchors": 9})
-    with pytest.raises(ValueError, match="prior: the springs law has none"):
-        MethodConfig(title="x", law="springs", prior="jelly")
-    methods = {
-        "spring_gaus": {"title": "Spring-Gaus", "law": "springs", "springs": {"anchors": 99}},
-        "neuma": {"title": "NeuMA"},
-    }
-    config = load({"methods": methods, "scenes_file": "config/scenes.yaml", "priors": {"laws": PRIORS}})
-    found = config.method_springs("spring_gaus+neighbours=7+iterations=3")
-    assert (found.anchors, found.neighbours) == (99, 7)
-    assert config.method_material("BouncyBall", "spring_gaus+neighbours=7+iterations=3").iterations == 3
-    assert config.method_springs("neuma") is None
-    with pytest.raises(InputError, match="its law is not springs, leave out anchors"):
-        config.method_springs("neuma+anchors=7")
-    with pytest.raises(InputError, match="springs are those of the scene's own body; leave out law_from"):
-        config.method_springs("spring_gaus+law_from=ClayCat")
-
-
-PRIORS = {
-    name: {"elasticity": {"name": "hencky", "E": 1e5, "nu": 0.2}, "plasticity": {"name": "identity"}}
-    for name in ("jelly", "plasticine", "sand")
-}

@@ -22,6 +22,8 @@ from neuma_lib.mechanics.isotropic import lame
 from neuma_lib.mechanics.law import Law, Plasticity
 from neuma_lib.sim.state import State
 
+pytestmark = pytest.mark.core
+
 E, NU, YIELD = 3e4, 0.3, 300.0
 FRAMES = (0, 20, 40, 60)
 V0 = torch.tensor([0.0, -1.5, 0.0], dtype=torch.float64)

@@ -26,6 +26,8 @@ from neuma_lib.fitting.structured_fit import (
 from neuma_lib.mechanics.structured import structured_law
 from neuma_lib.sim.rollout import rollout
 
+pytestmark = pytest.mark.core
+
 FRAMES = (0, 50, 60, 70, 80, 90, 100, 110)  # it touches the ground at about 50
 V0 = torch.tensor([0.0, -1.5, 0.0], dtype=torch.float64)
 SETTINGS = MaterialConfig(

@@ -10,6 +10,8 @@ from neuma_lib.mechanics.law import Constitutive
 from neuma_lib.mechanics.plasticity import hencky_strain
 from neuma_lib.mechanics.structured_kernels import STRAIN
 
+pytestmark = pytest.mark.core
+
 NAMES = [f"{base} {form}" for base, form in ELASTIC] + list(RETURNS)
 DTYPES = torch.float32, torch.float64
 

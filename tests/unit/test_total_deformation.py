@@ -14,6 +14,8 @@ from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 
+pytestmark = pytest.mark.core
+
 FRAMES = (0, 30, 60)
 V0 = torch.tensor([0.0, -1.5, 0.0], dtype=torch.float64)
 ELASTIC = {"elasticity": {"name": "hencky", "E": 3e4, "nu": 0.3}}

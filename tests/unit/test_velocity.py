@@ -13,6 +13,8 @@ from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.observation import Observation
 
+pytestmark = pytest.mark.core
+
 FRAMES = (0, 4, 8, 12, 16, 20, 60)
 
 

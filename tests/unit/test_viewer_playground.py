@@ -10,7 +10,6 @@ from neuma_lib.errors import NonFiniteError
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.viewer.find import found_laws, found_scene
 from neuma_lib.viewer.playground import ADDED_PARTICLES, Playground, first_law
-from neuma_lib.viewer.scene import law_of
 from tests.support.errors import refused
 
 CONSTANTS = f"{SCENE}: Constants"
@@ -37,7 +36,7 @@ def test_laws_of_the_results_are_found_with_their_time_steps(project):
     files, laws = project
     assert list(laws) == [CONSTANTS, PRIOR]
     assert {law.dt for law in laws.values()} == {1e-3}
-    law = law_of(laws[CONSTANTS], files.checked)
+    law = laws[CONSTANTS].load(files.checked).law
     assert law.elasticity.values["E"] == LAW["elasticity"]["E"]
     assert first_law(files, laws, ("constants",)) == CONSTANTS
     with refused(files.name):

@@ -54,13 +54,13 @@ def test_a_filmed_object_is_found_where_it_was(project):
         for path in (PLACED, PLACED.replace("registration", "velocity"))
     )
     rows |= {row.what: row for row in compare_registration(placed, velocity, known, truth, "first")}
-    print("\n".join(f"{row.what}: {row.found:.3g} {row.unit}" for row in rows.values()))
+    print("\n".join(f"{row.what}: {row.value:.3g} {row.unit}" for row in rows.values()))
     # Half as many pixels each way as the demo captures have, and a third of the photographs: twice their goals. Fewer
     # than 20 photographs do not tell the centre of their lens, by which all cameras are turned.
     judged = {
-        what: row.found / row.goal for what, row in rows.items() if row.goal and "directions" not in what
+        what: row.value / row.goal for what, row in rows.items() if row.goal and "directions" not in what
     }
     assert len(judged) == 8 and max(judged.values()) < 2, judged
-    assert rows["size of gravity, from the placed object"].found < 3
-    assert max(row.found for what, row in rows.items() if what.startswith("offset")) < 1.5
-    assert np.isfinite([row.found for row in rows.values()]).all()
+    assert rows["size of gravity, from the placed object"].value < 3
+    assert max(row.value for what, row in rows.items() if what.startswith("offset")) < 1.5
+    assert np.isfinite([row.value for row in rows.values()]).all()

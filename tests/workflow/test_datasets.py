@@ -1,40 +1,14 @@
-"""Datasets that are not made here: packed ones, and images that the user supplies."""
-
-import shutil
+"""Datasets of images that the user supplies."""
 
 import numpy as np
 import pytest
 import yaml
 from project import copied
 from test_layouts import WRITERS, centre_of, ours
-from test_packing import FRAMES, assert_same_images, scene  # noqa: F401 (a fixture)
 from test_released import write_release
 
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import read_image_set
-
-
-def test_workflow_packs_and_takes_a_packed_dataset_without_blender(scene, tmp_path):  # noqa: F811
-    project = copied(tmp_path / "project", tmp_path / "kernels")
-    data = project.root / "tiny/data/BouncyBall"
-    shutil.copytree(scene, data)
-    # With no other rule allowed, the files at hand count as the dataset.
-    project.run("--allowed-rules", "pack", "packed", "--", "packed")
-    assert {file.name for file in (project.root / "tiny/data/packed").iterdir()} == {
-        "BouncyBall.images.zip",
-        "BouncyBall.truth.h5",
-    }
-    (project.root / "tiny/data/packed").rename(project.root / "dropped")
-    shutil.rmtree(project.root / "tiny")
-    settings = yaml.safe_load((project.root / "tests/workflow/tiny.yaml").read_text())
-    settings["dataset"]["packed"] = "dropped"
-    (project.root / "tests/workflow/tiny.yaml").write_text(yaml.safe_dump(settings))
-    project.run("dataset")
-    assert_same_images(scene, data)
-    assert read_arrays(data / "particles.h5")[0]["tracers"].shape == (len(FRAMES), 100, 3)
-    plan = project.plan("tiny/results/table1.csv")
-    assert "gaussians" in plan
-    assert not {"ground_truth", "render_static", "render_dynamic", "unpack_truth"} & set(plan)
 
 
 def test_workflow_takes_supplied_images_in_place_of_blenders(tmp_path):

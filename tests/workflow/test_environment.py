@@ -1,4 +1,4 @@
-"""The locked environments: made from the pins, usable elsewhere; and what is told when something is missing."""
+"""The locked environments follow pyproject.toml and the pins; messages name what is missing on the machine."""
 
 import re
 import subprocess
@@ -16,27 +16,38 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
 def requirements(name):
-    lines = (ENVS / name).read_text().splitlines()
-    return [line for line in lines if line and not line.startswith("#")]
+    lines = (line.partition("#")[0].strip() for line in (ENVS / name).read_text().splitlines())
+    return [line for line in lines if line]
 
 
-@pytest.mark.parametrize("name", [f"requirements{kind}.txt" for kind in ("", "-dev", "-capture", "-viewer")])
+PINS = requirements("pins.txt")
+
+
+@pytest.mark.parametrize("name", [file.name for file in sorted(ENVS.glob("requirements*.txt"))])
 def test_every_line_is_an_exact_version_that_any_index_can_serve(name):
     for line in requirements(name):
         assert re.fullmatch(r"[a-z0-9._-]+==[0-9][0-9a-z.]*", line), line
 
 
-@pytest.mark.parametrize(
-    ("pins", "name"),
-    [
-        (PROJECT["dependencies"], "requirements.txt"),
-        (PROJECT["dependencies"] + PROJECT["optional-dependencies"]["dev"], "requirements-dev.txt"),
-        (PROJECT["dependencies"] + PROJECT["optional-dependencies"]["capture"], "requirements-capture.txt"),
-        (PROJECT["dependencies"] + PROJECT["optional-dependencies"]["viewer"], "requirements-viewer.txt"),
-    ],
-)
-def test_locked_files_follow_the_pins(pins, name):
-    assert set(pins) <= set(requirements(name)), "run: make lock"
+def names(requirements):
+    """Names of packages, without versions, extras and markers."""
+    return {re.match(r"[A-Za-z0-9._-]+", line)[0].lower() for line in requirements}
+
+
+def test_every_package_of_the_project_has_one_exact_pin():
+    wanted = names(PROJECT["dependencies"]).union(*map(names, PROJECT["optional-dependencies"].values()))
+    assert names(PINS) == wanted
+    assert len(PINS) == len(wanted)
+
+
+@pytest.mark.parametrize("extra", ["dev", "capture", "viewer", "docs"])
+def test_locked_files_follow_the_pins(extra):
+    locked = requirements(f"requirements-{extra}.txt")
+    extras = PROJECT["optional-dependencies"]
+    wanted = names(PROJECT["dependencies"]).union(*(names(extras[e]) for e in ("workflow", "blender", extra)))
+    pins = {line for line in PINS if names([line]) <= wanted}
+    assert pins <= set(locked), "run: make lock"
+    assert set(requirements("requirements.txt")) <= set(locked), "run: make lock"
 
 
 @pytest.mark.parametrize("kind", ["", "-capture"])

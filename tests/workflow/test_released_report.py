@@ -23,7 +23,7 @@ def test_a_released_capture_goes_to_its_report_and_into_the_figure(tmp_path):
     tiny.write_text(yaml.safe_dump(settings))
     made.run(PAGE, FIGURE)
     page = (made.root / PAGE).read_text()
-    assert "10 photographs, 1 throw, 3 cameras" in page and "What to distrust" in page
+    assert "10 photographs, 1 take, 3 cameras" in page and "Warnings" in page
     assert (made.root / FIGURE).stat().st_size > 10_000
     results = made.root / "tiny/results"
     placed = json.loads((results / "bun_first/registration.json").read_text())

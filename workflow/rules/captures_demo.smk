@@ -1,4 +1,4 @@
-"""Captures that Blender makes: photographs, stills and videos of simulated objects, and their truth. Needs demo_files.smk."""
+"""Demo captures, rendered by Blender: photographs, stills and videos of simulated objects. Needs demo_files.smk."""
 
 
 wildcard_constraints:
@@ -8,7 +8,7 @@ wildcard_constraints:
 rule demo_room:
     output:
         room=f"{DEMO_DATA}/room.npz",
-    priority: 10  # all that is rendered waits for it
+    priority: 10  # all renders wait for it
     conda:
         CAPTURE_ENVIRONMENT
     params:

@@ -1,8 +1,7 @@
 """Files and settings of the captures that Blender makes. Needs captures.smk."""
 
 from neuma_lib.capture.planned import PREFIX, photograph_files
-from neuma_lib.capture.scenes import scene_name, training_throws
-from neuma_lib.config.methods import LAW_FROM
+from neuma_lib.capture.scenes import scene_name, training_takes
 
 DEMO = SETTINGS.captures.demo
 DEMO_DATA = f"{DATA}/captures_demo"
@@ -27,7 +26,7 @@ def demo_file(item, file):
 
 def demo_drop_files(item, drop):
     """What is known of a drop and what was found of it, by kind."""
-    capture, trained = PREFIX + item, training_throws(PLANNED[PREFIX + item])[0]
+    capture, trained = PREFIX + item, training_takes(PLANNED[PREFIX + item])[0]
     scene, source = scene_name(capture, drop), scene_name(capture, trained)
     under = "" if drop == trained else f"+{LAW_FROM}={source}"
     filmed = f"{DATA}/{capture}/videos/{drop}/{{}}/transforms.json"

@@ -57,7 +57,7 @@ rule random_table:
         markdown=f"{RESULTS}/random.md",
     params:
         scenes=random_scenes(),
-        titles={method: SETTINGS.method_title(method) for method in SETTINGS.random.methods},
+        titles={method: cases.title(SETTINGS, method) for method in SETTINGS.random.methods},
         seed=SETTINGS.random.seed,
     script:
         "../scripts/random_table.py"
@@ -67,45 +67,6 @@ rule random:
     input:
         rules.random_table.output,
         expand(f"{RESULTS}/figures/random_scenes.{{kind}}", kind=["png", "pdf"]),
-
-
-rule learning_rates:
-    input:
-        histories=lambda wildcards: table_files("learning_rates", "history.json"),
-        metrics=lambda wildcards: table_files("learning_rates", "metrics.json"),
-    output:
-        csv=f"{RESULTS}/learning_rates.csv",
-        markdown=f"{RESULTS}/learning_rates.md",
-    params:
-        cells=lambda wildcards: learning_rate_cells("learning_rates"),
-    script:
-        "../scripts/learning_rates.py"
-
-
-rule bias_table:
-    input:
-        bias=lambda wildcards: table_files("bias", "bias.json"),
-        metrics=lambda wildcards: table_files("bias", "metrics.json"),
-    output:
-        csv=f"{RESULTS}/bias.csv",
-        markdown=f"{RESULTS}/bias.md",
-    params:
-        cells=lambda wildcards: bias_cells("bias"),
-        titles=lambda wildcards: table_titles("bias"),
-    script:
-        "../scripts/bias_table.py"
-
-
-rule timings:
-    input:
-        benchmarks=lambda wildcards: [benchmark for benchmark, _ in table_records("table1")],
-    output:
-        csv=report(f"{RESULTS}/timings.csv", caption="../report/timings.rst", category="Run times"),
-        markdown=f"{RESULTS}/timings.md",
-    params:
-        logs=lambda wildcards: [log for _, log in table_records("table1")],
-    script:
-        "../scripts/timings.py"
 
 
 rule dataset:
@@ -124,7 +85,6 @@ rule tables:
     input:
         expand(f"{RESULTS}/{{table}}.{{kind}}", table=[*TABLES, "table4"], kind=["csv", "md"]),
         rules.initial_states.output,
-        rules.timings.output,
 
 
 rule videos:

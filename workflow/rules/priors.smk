@@ -10,8 +10,7 @@ rule prior:
     params:
         name=lambda wildcards: prior_chain(wildcards)[0],
         law=lambda wildcards: SETTINGS.priors.laws[prior_chain(wildcards)[0]].plain(),
-        method=SETTINGS.priors.method,
-        options=SETTINGS.priors.plain()[SETTINGS.priors.method],
+        options=SETTINGS.priors.regression.plain(),
         seed=lambda wildcards: SETTINGS.priors.seed + prior_chain(wildcards)[1]["prior"],
     script:
         "../scripts/prior.py"
@@ -27,8 +26,7 @@ rule identified_prior:
     params:
         name=IDENTIFIED,
         dt=lambda wildcards: SETTINGS.scene(wildcards.scene).dt,
-        method=SETTINGS.priors.method,
-        options=SETTINGS.priors.plain()[SETTINGS.priors.method],
+        options=SETTINGS.priors.regression.plain(),
         seed=lambda wildcards: SETTINGS.priors.seed + SETTINGS.chain(wildcards.scene)[1]["prior"],
     script:
         "../scripts/prior.py"

@@ -3,7 +3,6 @@
 from types import SimpleNamespace
 
 from neuma_lib.config import places
-from neuma_lib.config.places import FIELD
 from neuma_lib.config.settings import NO_TRUTH
 from workflow.inputs import image_list
 
@@ -11,6 +10,11 @@ from workflow.inputs import image_list
 def home(name, file):
     """The one path of a file of a scene or experiment in a chain."""
     return places.home(SETTINGS, name, file)
+
+
+def scene_prior(scene):
+    """The file of the prior of a scene in its chain."""
+    return places.prior_file(SETTINGS, scene, SETTINGS.scene(scene).prior)
 
 
 def of_chain(file):
@@ -39,15 +43,6 @@ def subject(wildcards):
     return getattr(wildcards, "scene", None) or wildcards.experiment
 
 
-# The rules that reconstruct a scene and prepare its evaluation, and a file of each.
-MAKERS = {
-    "gaussians": "gaussians.ply",
-    "mesh": "mesh.ply",
-    "sampled_particles": "sampled_particles.h5",
-    "binding": "binding.h5",
-    "velocity": "velocity.json",
-    "tracers": "tracers.h5",
-}
 # Files of a reconstructed body: the particles that are simulated, the Gaussians, and what binds them.
 BODY = {"particles": "particles.h5", "binding": "binding.h5", "gaussians": "gaussians.ply"}
 
@@ -93,7 +88,7 @@ def known_law(wildcards):
 
 
 def origin_of(part, scene):
-    """Whether a part ('static', 'dynamic', 'truth') of a scene is 'made', 'supplied' by the user or 'packed'.
+    """Whether a part ('static', 'dynamic', 'truth') of a scene is 'made' or 'supplied' by the user.
 
     A truth is not supplied: that of a scene with a video of the user's is simulated. All of a capture is 'captured', and
     a splat has neither images nor a truth.
@@ -102,7 +97,7 @@ def origin_of(part, scene):
         return "captured" if SETTINGS.scenes[scene].captured else "none"
     if getattr(SETTINGS.scenes[scene].images, "dynamic" if part == "truth" else part):
         return "made" if part == "truth" else "supplied"
-    return "packed" if SETTINGS.dataset.packed else "made"
+    return "made"
 
 
 def scenes_with(part, origin):
@@ -137,7 +132,7 @@ def truth_memory(wildcards):
 def render_minutes(images, frames):
     """Minutes that the renders of all frames may take: an hour, and a minute a megapixel at 16 samples.
 
-    At the paper's scale a core took 0.2 minutes a megapixel, and 0.8 for a liquid (docs/guide.md).
+    At the paper's scale a core took 0.2 minutes a megapixel, and 0.8 for a liquid (docs/scale.md).
     """
     samples = frames * images.views * images.width * images.height * images.samples
     return 60 + round(samples / 16e6)

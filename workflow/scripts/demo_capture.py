@@ -1,4 +1,4 @@
-"""What else a demo capture has: pictures of the empty scene and capture.yaml; and its truth, which is nowhere in it."""
+"""Write pictures of the empty scene and capture.yaml of a demo capture, and its ground truth outside of it."""
 
 import numpy as np
 import yaml
@@ -15,14 +15,14 @@ from workflow.stage import run_script
 
 def main(inputs, output, params, run) -> None:
     demo = DemoCapturesConfig(**params.demo)
-    _, plates = read_room(inputs.room)
+    _, backgrounds = read_room(inputs.room)
     rng = np.random.default_rng([demo.seed, 3])
     for path, camera in zip(output.stills, sorted(demo.cameras)):
         with atomic(path) as partial:
-            Image.fromarray(developed(plates[camera], demo.videos.noise, rng)).save(partial, "PNG")
+            Image.fromarray(developed(backgrounds[camera], demo.videos.noise, rng)).save(partial, "PNG")
     write_json(output.truth, truth_of(demo, params.name, read_json(inputs.photographs)))
     write_text(output.settings, yaml.safe_dump(capture_settings(demo, params.name), sort_keys=False))
-    run.say(f"{len(plates)} stills, capture.yaml and truth.json")
+    run.say(f"{len(backgrounds)} stills, capture.yaml and truth.json")
 
 
 run_script(main, snakemake)

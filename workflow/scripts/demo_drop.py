@@ -1,4 +1,4 @@
-"""Simulate the true motion of a drop of the demo captures."""
+"""Simulate the ground-truth motion of a drop of the demo captures."""
 
 import numpy as np
 
@@ -21,7 +21,7 @@ def main(inputs, output, params, run) -> None:
     lowest = arrays["x"][..., 1].min(axis=1)
     landed = arrays["time"][np.argmax(lowest < 0.5 / demo.truth.grid)]
     run.say(
-        f"{len(arrays['mass'])} particles, {steps[-1]} steps, {len(steps)} states; on the floor after {landed:.3f} s"
+        f"{len(arrays['mass'])} particles, {steps[-1]} steps, {len(steps)} states, on the floor after {landed:.3f} s"
     )
 
 

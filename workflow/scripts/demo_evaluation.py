@@ -1,4 +1,4 @@
-"""What the pipeline found of the demo captures beside the truth: each figure with its goal."""
+"""Compare results of the demo captures with the ground truth and with goals."""
 
 import csv
 import io
@@ -24,7 +24,7 @@ from neuma_lib.io.images import read_image_set, read_transforms
 from workflow.stage import run_script
 
 EVERY = 4
-"""One of so many frames of a video is compared with its silhouette."""
+"""Stride of the video frames that are compared with true silhouettes."""
 
 
 def main(inputs, output, params, run) -> None:
@@ -38,7 +38,7 @@ def main(inputs, output, params, run) -> None:
         }
         room = read_transforms(files[name]["room"])
         photographs = {Path(file).stem: camera for file, camera in known["photographs"].items()}
-        found = compare_cameras(room["frames"], photographs, known["cameras"])
+        cameras = compare_cameras(room["frames"], photographs, known["cameras"])
         rest = body_at_rest(demo, name)
         agreements = {"photographs": []}
         for frame, alpha in mattes(files[name]["static"]):
@@ -48,7 +48,7 @@ def main(inputs, output, params, run) -> None:
                     alpha, rest.vertices[0], rest.faces, true, lenses["photographs"], params.longest[name]
                 )
             )
-        rows += [(capture, "", row) for row in found + compare_masks(agreements)]
+        rows += [(capture, "", row) for row in cameras + compare_masks(agreements)]
         for drop in demo.objects[name].drops:
             rows += [
                 (capture, drop, row)

@@ -1,4 +1,4 @@
-"""Photographs of an object at rest, for a demo capture, and where they were really taken from."""
+"""Render photographs of an object at rest for a demo capture, and write their true cameras."""
 
 from pathlib import Path
 

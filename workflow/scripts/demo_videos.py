@@ -1,4 +1,4 @@
-"""Videos of a drop by all cameras, for a demo capture."""
+"""Render the videos of a drop by all cameras for a demo capture."""
 
 from neuma_lib.config.demo_captures import DemoCapturesConfig
 from neuma_lib.data.demo_captures.filming import film, write_video
@@ -8,10 +8,10 @@ from workflow.stage import run_script
 
 def main(inputs, output, params, run) -> None:
     demo = DemoCapturesConfig(**params.demo)
-    where, plates = read_room(inputs.room)
+    where, backgrounds = read_room(inputs.room)
     body, frames = body_of_drop(demo, params.name, params.drop, inputs.particles)
     seed = [demo.seed, 2, *f"{params.name} {params.drop}".encode()]
-    pictures = film(demo, where, body, frames, plates, seed, params.threads, run.progress)
+    pictures = film(demo, where, body, frames, backgrounds, seed, params.threads, run.progress)
     for path, camera in zip(output.videos, sorted(demo.cameras)):
         write_video(path, pictures[camera], demo.videos.rate, demo.videos.quality)
     run.say(f"{len(pictures)} videos of {demo.videos.frames} frames")

@@ -1,7 +1,7 @@
 """Train a neural constitutive law on an analytic one."""
 
-from neuma_lib.config.priors import RegressionConfig, TrajectoryConfig
-from neuma_lib.fitting.prior_training import remark, train_prior
+from neuma_lib.config.priors import RegressionConfig
+from neuma_lib.fitting.prior_training import METHOD, remark, train_prior
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.weights import write_weights
 from neuma_lib.mechanics.analytic import analytic_law
@@ -15,12 +15,9 @@ def at_step(spec: dict, dt: float) -> dict:
 
 
 def main(inputs, output, params, run) -> None:
-    kind = {"regression": RegressionConfig, "trajectory": TrajectoryConfig}[params.method]
     spec = params.get("law") or at_step(read_json(inputs.identified)["law"], params.dt)
-    law, report = train_prior(spec, kind(**params.options), params.seed, run.progress)
-    write_weights(
-        output.weights, law.prior_state(), {"prior": params.name, "law": spec, "method": params.method}
-    )
+    law, report = train_prior(spec, RegressionConfig(**params.options), params.seed, run.progress)
+    write_weights(output.weights, law.prior_state(), {"prior": params.name, "law": spec, "method": METHOD})
     write_json(output.report, report)
     run.say(remark(report))
 

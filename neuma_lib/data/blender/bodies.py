@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from neuma_lib.config.blender import AppearanceConfig
 from neuma_lib.data.blender.appearance import colors_at
 from neuma_lib.data.blender.scene import Liquid, Surface
+from neuma_lib.extras import require
 from neuma_lib.geometry.shapes import depth
 from neuma_lib.geometry.skinning import carry, skinning_matrix
 
@@ -70,10 +71,8 @@ def _liquid(mesh: trimesh.Trimesh, appearance: AppearanceConfig, points: np.ndar
 
 def _liquid_surface(points: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     """Smooth surface of a fluid of particles: vertices (n, 3) [m] and faces (m, 3)."""
-    import pysplashsurf
-
     # one thread, for deterministic results
-    result = pysplashsurf.reconstruction_pipeline(
+    result = require("pysplashsurf", "blender").reconstruction_pipeline(
         np.ascontiguousarray(points, dtype=np.float64),
         particle_radius=spacing / 2,
         smoothing_length=2.5,

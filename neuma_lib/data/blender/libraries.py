@@ -45,8 +45,8 @@ def explain_import_error(text: str) -> InputError | None:
         return InputError(
             "Blender (bpy)",
             "the Python module is not installed (bpy 4.5 needs Python 3.11)",
-            "Create the project's environment (`make env`) and run with its interpreter, or set NEUMA_BLENDER_PYTHON to"
-            " one that has it",
+            'Install it with `make env` or `pip install "neuma[blender]"` and run with that interpreter, or set '
+            "NEUMA_BLENDER_PYTHON to one that has it",
         )
     return None
 

@@ -1,4 +1,4 @@
-"""The true motion of a drop."""
+"""Ground-truth motion of a drop."""
 
 from __future__ import annotations
 
@@ -31,24 +31,24 @@ class Surfaces:
     velocities: np.ndarray
 
     def at(self, steps: np.ndarray) -> np.ndarray:
-        """Numbers of the frames of some steps."""
+        """Indices of the given steps."""
         return np.searchsorted(self.steps, steps)
 
 
 def simulate_drop(
     demo: DemoCapturesConfig, name: str, drop: str, device: torch.device | str = "cpu"
 ) -> GroundTruth:
-    """Simulate a drop, with a frame for each frame of each camera, and one at the start."""
+    """Simulate a drop, with a state at the start and for each frame of each camera."""
     item, settings = demo.objects[name], demo.truth
-    thrown, dt = item.drops[drop], time_step(demo)
+    initial, dt = item.drops[drop], time_step(demo)
     mesh = solid(item)
-    mesh.vertices = start(item, thrown, mesh).apply(mesh.vertices)
+    mesh.vertices = start(item, initial, mesh).apply(mesh.vertices)
     model = MPMModel(grid=settings.grid, dt=dt, gravity=(0.0, -settings.gravity, 0.0))
     law = analytic_law(item.law.plain(), dt=dt)
     frames = sorted({0, *(int(s) for camera in demo.cameras for s in frame_steps(demo, camera))})
     return simulate_ground_truth(
         model,
-        [TrueBody(mesh, law, thrown.velocity, item.density, thrown.spin)],
+        [TrueBody(mesh, law, initial.velocity, item.density, initial.spin)],
         frames,
         particles=settings.particles,
         tracers=settings.tracers,
@@ -58,11 +58,11 @@ def simulate_drop(
 
 
 def surfaces(rest: trimesh.Trimesh, steps: np.ndarray, x: np.ndarray, v: np.ndarray) -> Surfaces:
-    """The surface that particles carry.
+    """Surfaces moved by particles.
 
     Args:
-        rest: where the motion starts [m].
-        steps: of the states, the first at rest in the mesh, (T,).
+        rest: surface at the start of the motion [m].
+        steps: of the states, (T,).
         x, v: particles [m], [m/s], (T, N, 3).
     """
     matrix = skinning_matrix(rest.vertices, x[0])

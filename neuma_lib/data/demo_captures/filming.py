@@ -1,4 +1,4 @@
-"""Photographs and videos of the demo captures: what Blender renders, with a camera's exposure and noise."""
+"""Photographs and videos of the demo captures: renders of Blender with a camera's exposure and noise."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import subprocess
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import imageio_ffmpeg
 import numpy as np
 from PIL import Image
 
@@ -15,24 +14,25 @@ from neuma_lib.data.blender.room import Moving, Scenery, Shot, shoot
 from neuma_lib.data.blender.scene import Progress
 from neuma_lib.data.demo_captures.pictures import dead_leaves
 from neuma_lib.data.demo_captures.stage import MIDDLE, Eye, lens_row, video_cameras
+from neuma_lib.extras import require
 from neuma_lib.io.files import atomic
 
 PAPER = 0.0004
-"""How far the page lies above the floor, so that the two do not meet [m]."""
+"""Height of the page above the floor, which separates the two surfaces [m]."""
 MARGIN = 10
-"""Pixels around the body and its shadow that are rendered anew for a video."""
+"""Margin of the rendered regions around the body and its shadow [px]."""
 START = 15_000
-"""About what another region costs in pixels; two that cost more apart are rendered as one."""
+"""Overhead of a rendered region, in pixels. Two regions are merged if that is cheaper."""
 EVERY = 5
-"""One of so many vertices tells where the body is; they lie some millimetres apart."""
+"""Stride of the vertices that bound the body. Vertices are some millimetres apart."""
 RIM = 8
 """Points of a lamp's rim from which shadows are cast."""
 WALL_TEXEL = 2.0
-"""Side of a wall's pixels, in those of the floor."""
+"""Side of a wall's pixels, in pixels of the floor."""
 
 
 def scenery(room: DemoRoomConfig, page: np.ndarray, size: tuple[float, float]) -> Scenery:
-    """The room.
+    """The room with its textures and lamps.
 
     Args:
         page: the printed page, sRGB (H, W, 3), uint8.
@@ -73,7 +73,7 @@ def photograph(
     threads: int,
     progress: Progress | None,
 ) -> Iterator[tuple[np.ndarray, float]]:
-    """Photographs (H, W, 3), uint8, of the body's first frame, each with the share of light that it got."""
+    """Photographs (H, W, 3), uint8, of the body's first frame, each with its relative exposure."""
     rng = np.random.default_rng([demo.seed, 1, len(eyes)])
     settings = demo.photographs
     shots = [Shot(eye.c2w, lens_row(eye.lens), 0) for eye in eyes]
@@ -83,18 +83,13 @@ def photograph(
         yield developed(light * pixels, settings.noise, rng), float(light)
 
 
-def plates(
+def backgrounds(
     demo: DemoCapturesConfig, where: Scenery, threads: int, progress: Progress | None
 ) -> dict[str, np.ndarray]:
-    """What each video camera sees of the empty room, linear (H, W, 3), float32."""
-    eyes = video_cameras(demo)
+    """The empty room in each video camera, linear (H, W, 3), float32."""
+    eyes, samples = video_cameras(demo), demo.videos.plate_samples
     shots = [Shot(eye.c2w, lens_row(eye.lens), -1) for eye in eyes.values()]
-    return dict(
-        zip(
-            eyes,
-            shoot(where, None, shots, samples=demo.videos.plate_samples, threads=threads, progress=progress),
-        )
-    )
+    return dict(zip(eyes, shoot(where, None, shots, samples=samples, threads=threads, progress=progress)))
 
 
 def film(
@@ -109,12 +104,12 @@ def film(
 ) -> dict[str, list[np.ndarray]]:
     """Frames (H, W, 3), uint8, of each camera.
 
-    Only what the body or its shadow can be in is rendered; the rest is the empty scene.
+    Only the regions of the body and its shadow are rendered. The rest is the empty scene.
 
     Args:
         body: at all frames of all cameras.
-        frames: numbers of the body's frames that each camera takes.
-        empty: of `plates`.
+        frames: numbers of the body's frames for each camera.
+        empty: of `backgrounds`.
         seed: of noise.
     """
     eyes, exposure, rng = video_cameras(demo), demo.videos.exposure, np.random.default_rng(seed)
@@ -122,8 +117,8 @@ def film(
     for name, eye in eyes.items():
         for frame in frames[name]:
             moved = 0.5 * exposure * body.velocities[frame, ::EVERY]
-            shown = np.concatenate([body.vertices[frame, ::EVERY] + side * moved for side in (-1, 1)])
-            parts = regions(eye, shown, where.lamps, where.lamp_size)
+            swept = np.concatenate([body.vertices[frame, ::EVERY] + side * moved for side in (-1, 1)])
+            parts = regions(eye, swept, where.lamps, where.lamp_size)
             shots.append([Shot(eye.c2w, lens_row(eye.lens), int(frame), part) for part in parts])
     rendered = shoot(
         where,
@@ -149,11 +144,11 @@ def film(
 def regions(
     eye: Eye, points: np.ndarray, lamps: np.ndarray, lamp_size: float
 ) -> list[tuple[int, int, int, int]]:
-    """Parts of a picture outside of which neither a body nor its shadow on the floor is seen: x0, y0, x1, y1 [px].
+    """Regions of a picture that contain a body and its shadow on the floor: x0, y0, x1, y1 [px].
 
     Args:
         points: of the body's surface [m], (N, 3).
-        lamps: middles of lamps above all points [m], (L, 3).
+        lamps: centres of lamps above all points [m], (L, 3).
         lamp_size: their diameter [m].
     """
     angles = 2 * np.pi * np.arange(RIM) / RIM
@@ -184,7 +179,7 @@ def _area(box: tuple[int, int, int, int]) -> int:
 
 
 def developed(linear: np.ndarray, noise: float, rng: np.random.Generator) -> np.ndarray:
-    """A picture as a camera writes it, sRGB (H, W, 3), uint8.
+    """Convert radiance to a camera's picture, sRGB (H, W, 3), uint8, with noise.
 
     Args:
         linear: radiance, 1 is white.
@@ -201,30 +196,11 @@ def write_jpeg(path: str | Path, pixels: np.ndarray, quality: int) -> None:
 
 
 def write_video(path: str | Path, pictures: Sequence[np.ndarray], rate: int, quality: int) -> None:
-    """An H.264 file without sound; pictures (H, W, 3), uint8, of even size."""
+    """Write an H.264 file without sound from pictures (H, W, 3), uint8, of even size."""
     height, width = pictures[0].shape[:2]
     with atomic(path) as partial:
-        command = [
-            imageio_ffmpeg.get_ffmpeg_exe(),
-            "-y",
-            "-v",
-            "error",
-            "-f",
-            "rawvideo",
-            "-pix_fmt",
-            "rgb24",
-        ]
-        command += [
-            "-s",
-            f"{width}x{height}",
-            "-r",
-            str(rate),
-            "-i",
-            "-",
-            "-c:v",
-            "libx264",
-            "-crf",
-            str(quality),
-        ]
-        command += ["-pix_fmt", "yuv420p", "-threads", "1", "-f", "mp4", str(partial)]
+        source = f"-y -v error -f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {rate} -i -"
+        target = f"-c:v libx264 -crf {quality} -pix_fmt yuv420p -threads 1 -f mp4"
+        ffmpeg = require("imageio_ffmpeg", "capture").get_ffmpeg_exe()
+        command = [ffmpeg, *source.split(), *target.split(), str(partial)]
         subprocess.run(command, input=np.stack(pictures).tobytes(), check=True)

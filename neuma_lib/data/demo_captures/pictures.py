@@ -1,4 +1,4 @@
-"""Pictures of floors and walls that SIFT finds much in, never the same thing twice."""
+"""Textures of floors and walls with many distinct SIFT features."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 LARGEST, SMALLEST = 0.10, 0.006
-"""Radii of the things that lie on one another [m]."""
-LEAST = 1.5
+"""Radii of the shapes [m]."""
+MIN_RADIUS = 1.5
 """Smallest radius that is drawn [px]."""
 COVER = 1.8
-"""How often a place is covered, counted over all sizes."""
+"""Mean number of shapes that cover a point."""
 SIZES = 14
-"""Sizes between the largest and the smallest, evenly in their logarithm; large ones lie below."""
+"""Number of sizes, evenly spaced in the logarithm. Small shapes are drawn over large ones."""
 BLACK, WHITE = 28, 225
-"""Of print and paper, sRGB."""
+"""Levels of print and paper, sRGB."""
 TONES = np.array(
     [[196, 190, 178], [150, 140, 126], [106, 100, 94], [172, 158, 134], [128, 132, 138], [78, 74, 70]]
 )
-"""Colours of wood, stone and dust; the objects are brighter in colour than all of them."""
+"""Colours of wood, stone and dust, less saturated than those of the objects."""
 
 
 def dead_leaves(width: float, height: float, texel: float, seed: int) -> np.ndarray:
-    """A picture of shapes of all sizes that lie on one another (the dead leaves model), sRGB (H, W, 3), uint8.
+    """A picture of overlapping shapes of all sizes (dead leaves model), sRGB (H, W, 3), uint8.
 
     Args:
         width, height: of the picture [m].
@@ -35,7 +35,7 @@ def dead_leaves(width: float, height: float, texel: float, seed: int) -> np.ndar
     draw = ImageDraw.Draw(image)
     for radius in np.geomspace(LARGEST, SMALLEST, SIZES):
         pixels = radius / texel
-        if pixels < LEAST:
+        if pixels < MIN_RADIUS:
             break
         count = int(COVER / SIZES * columns * rows / (2 * pixels**2)) + 1
         middles = rng.random((count, 2)) * [columns, rows]
@@ -57,13 +57,14 @@ def dead_leaves(width: float, height: float, texel: float, seed: int) -> np.ndar
 def page_picture(
     black: np.ndarray, white: np.ndarray, board: tuple[float, float], paper: tuple[float, float], texel: float
 ) -> np.ndarray:
-    """A printed page with a board in its middle, sRGB (H, W, 3), uint8; its sides are whole numbers of pixels.
+    """A printed page with a board in its middle, sRGB (H, W, 3), uint8.
 
     Args:
-        black, white: rectangles, white ones over black ones: x, y of the left lower corner, width, height [m].
-        board: width and height of the board, whose left lower corner the rectangles start from [m].
-        paper: width and height of the paper, which is cut to whole pixels [m].
-        texel: side of a pixel [m]; edges of rectangles should lie on edges of pixels.
+        black, white: rectangles, white ones over black ones: x, y of the lower left corner, width, height [m],
+            relative to the lower left corner of the board.
+        board: width and height of the board [m].
+        paper: width and height of the paper [m], rounded down to whole pixels.
+        texel: side of a pixel [m]. Edges of rectangles should lie on edges of pixels.
     """
     columns, rows = (round(side / texel) for side in board)
     left, bottom = (int((whole - side) / 2 / texel) for whole, side in zip(paper, board))

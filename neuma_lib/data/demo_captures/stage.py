@@ -1,7 +1,7 @@
-"""Where everything is in the demo captures: cameras, the board, the object at rest and at the start of its drops.
+"""Geometry of the demo captures: cameras, the board, the object at rest and at the start of its drops.
 
-The world is the simulator's box, as a capture's room is placed into it: y up, the floor at y = 0, axes along the
-board's width (x) and against its height (z). Places of the settings count from the middle of the floor.
+The world is the simulation box: y up, the floor at y = 0, x along the board's width and z against its height. Positions
+in the settings are relative to the middle of the floor.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from neuma_lib.config.demo_captures import DemoCapturesConfig, DemoDropConfig, D
 from neuma_lib.geometry import shapes
 
 MIDDLE = np.array([0.5, 0.0, 0.5])
-"""The middle of the floor in the simulator's box [m]."""
+"""The middle of the floor in the simulation box [m]."""
 POLYNOMIAL = 4
-"""Degree of the polynomial from distance in the picture to angle that stands for a lens."""
+"""Degree of the lens polynomial, from distance in the picture to angle."""
 BEYOND = 1.05
-"""How far past the corners of the picture the polynomial is fitted."""
+"""Range of the polynomial fit, relative to the distance of the picture's corners."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Eye:
     lens: LensConfig
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Pixels (N, 2) of points (N, 3) [m] before the camera; pixel centres at +0.5."""
+        """Pixels (N, 2) of points (N, 3) [m] in front of the camera, pixel centres at +0.5."""
         seen = (points - self.c2w[:3, 3]) @ self.c2w[:3, :3]
         flat = seen[:, :2] / -seen[:, 2:] * [1.0, -1.0]
         r2 = (flat**2).sum(axis=1, keepdims=True)
@@ -46,7 +46,7 @@ class Eye:
         return self.lens.focal * flat * (1 + r2 * (k1 + r2 * k2)) + self.lens.center
 
     def plain(self) -> dict:
-        """Pose and intrinsics as a transforms.json has them, with k1 and k2."""
+        """Pose and intrinsics as in a transforms.json, with k1 and k2."""
         lens = self.lens
         return {
             "transform_matrix": self.c2w.tolist(),
@@ -56,11 +56,11 @@ class Eye:
 
 
 def lens_row(lens: LensConfig) -> np.ndarray:
-    """A lens as Cycles takes it: a polynomial from distance in the picture to angle, in the middle of a larger picture.
+    """A lens for Cycles: a polynomial from distance in the picture to angle, centred in a larger picture.
 
     Returns:
-        width, height, those of the larger picture, left and top of the lens's picture in it [px], and the coefficients
-        k0 to k4 [rad / px^n], (11,). The fit is within a hundredth of a pixel for lenses of phones.
+        Width and height of the lens's picture and of the larger picture, left and top of the former in the latter [px],
+        and the coefficients k0 to k4 [rad / px^n], (11,). The fit is within 0.01 px for lenses of phones.
     """
     cx, cy = lens.center
     half = np.array([max(cx, lens.width - cx), max(cy, lens.height - cy)])
@@ -71,21 +71,13 @@ def lens_row(lens: LensConfig) -> np.ndarray:
     distance = lens.focal * slope * (1 + slope**2 * (k1 + slope**2 * k2))
     kept = slice(0, int(np.argmax(distance > reach)))
     powers = (distance[kept, None] / reach) ** np.arange(1, POLYNOMIAL + 1)
-    found = np.linalg.lstsq(powers, np.arctan(slope[kept]), rcond=None)[0]
-    return np.array(
-        [
-            lens.width,
-            lens.height,
-            *full,
-            *(full / 2 - [cx, cy]),
-            0.0,
-            *found / reach ** np.arange(1, POLYNOMIAL + 1),
-        ]
-    )
+    scaled = np.linalg.lstsq(powers, np.arctan(slope[kept]), rcond=None)[0]
+    coefficients = scaled / reach ** np.arange(1, POLYNOMIAL + 1)
+    return np.array([lens.width, lens.height, *full, *(full / 2 - [cx, cy]), 0.0, *coefficients])
 
 
 def looking(place: Sequence[float], target: Sequence[float], roll: float = 0.0) -> np.ndarray:
-    """Camera to world (4, 4), OpenGL axes, turned by ``roll`` [rad] about the direction of view."""
+    """Camera to world (4, 4), OpenGL axes, rotated by ``roll`` [rad] about the viewing direction."""
     place, target = np.asarray(place, float), np.asarray(target, float)
     back = (place - target) / np.linalg.norm(place - target)
     right = np.cross([0.0, 1.0, 0.0], back)
@@ -99,7 +91,7 @@ def looking(place: Sequence[float], target: Sequence[float], roll: float = 0.0) 
 
 
 def video_cameras(demo: DemoCapturesConfig) -> dict[str, Eye]:
-    """The fixed cameras, by name, in order."""
+    """The fixed cameras, sorted by name."""
     return {
         name: Eye(looking(MIDDLE + c.place, MIDDLE + c.target), c.lens.resized(demo.resolution))
         for name, c in sorted(demo.cameras.items())
@@ -107,7 +99,7 @@ def video_cameras(demo: DemoCapturesConfig) -> dict[str, Eye]:
 
 
 def photographers(demo: DemoCapturesConfig, name: str) -> list[Eye]:
-    """Cameras of the photographs of an object: rings, and some beside the video cameras."""
+    """Cameras of the photographs of an object: rings, and some next to the video cameras."""
     settings = demo.photographs
     rng = np.random.default_rng([demo.seed, *name.encode()])
     target = MIDDLE + settings.target
@@ -120,7 +112,7 @@ def photographers(demo: DemoCapturesConfig, name: str) -> list[Eye]:
             flat = np.cos(elevation) * np.array([np.sin(around), 0.0, np.cos(around)])
             places.append(target + distance * (flat + [0.0, np.sin(elevation), 0.0]))
     for camera in video_cameras(demo).values():
-        # A step towards the scene: phones see wider than cameras of videos.
+        # Closer to the scene, since phones have a wider view than the video cameras.
         places += [target + 0.85 * (camera.c2w[:3, 3] - target)] * settings.beside_cameras
     lens = settings.lens.resized(demo.resolution)
     eyes = []
@@ -133,7 +125,7 @@ def photographers(demo: DemoCapturesConfig, name: str) -> list[Eye]:
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """A rigid motion x -> rotation x + translation; rotation (3, 3), translation (3,) [m]."""
+    """A rigid motion x -> rotation x + translation, with rotation (3, 3) and translation (3,) [m]."""
 
     rotation: np.ndarray
     translation: np.ndarray
@@ -142,7 +134,7 @@ class Pose:
         return points @ self.rotation.T + self.translation
 
     def after(self, first: Pose) -> Pose:
-        """This one after another."""
+        """The composition: first ``first``, then this one."""
         return Pose(self.rotation @ first.rotation, self.rotation @ first.translation + self.translation)
 
     def inverse(self) -> Pose:
@@ -158,26 +150,26 @@ def solid(item: DemoObjectConfig) -> trimesh.Trimesh:
 
 
 def lying(item: DemoObjectConfig, mesh: trimesh.Trimesh) -> Pose:
-    """Where the object rests for its photographs: stable, in the pose that it falls into when set down as built."""
+    """Pose of the object in its photographs: the stable pose reached from the mesh's own orientation."""
     corners = mesh.convex_hull.vertices - mesh.center_mass
 
     def lift(tilt: np.ndarray) -> float:
-        """How high the centre of mass is above the floor."""
+        """Height of the centre of mass above the floor."""
         return -(corners @ _upward(tilt)).min()
 
-    found = minimize(lift, (0.0, 0.0), method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-12})
-    level = Rotation.align_vectors([[0.0, 1.0, 0.0]], [_upward(found.x)])[0].as_matrix()
+    tilt = minimize(lift, (0.0, 0.0), method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-12}).x
+    level = Rotation.align_vectors([[0.0, 1.0, 0.0]], [_upward(tilt)])[0].as_matrix()
     turn = Rotation.from_euler("y", item.heading, degrees=True).as_matrix() @ level
     return _put(mesh, turn, item.place, 0.0)
 
 
 def _upward(tilt: np.ndarray) -> np.ndarray:
-    """The unit vector (3,) that has been tilted from +y by two angles, about z and about x [rad]."""
+    """The unit vector (3,) tilted from +y by two angles, about z and about x [rad]."""
     return Rotation.from_rotvec([tilt[1], 0.0, tilt[0]]).apply([0.0, 1.0, 0.0])
 
 
 def start(item: DemoObjectConfig, drop: DemoDropConfig, mesh: trimesh.Trimesh) -> Pose:
-    """Where a drop begins."""
+    """Pose of the object at the start of a drop."""
     turn = Rotation.from_euler("xyz", drop.turn, degrees=True).as_matrix() @ lying(item, mesh).rotation
     return _put(mesh, turn, drop.center, drop.height)
 
@@ -190,10 +182,10 @@ def _put(mesh: trimesh.Trimesh, turn: np.ndarray, center: Sequence[float], heigh
 
 
 def frame_steps(demo: DemoCapturesConfig, camera: str) -> np.ndarray:
-    """Steps of the truth in the middle of the exposures of a camera's frames, (T,)."""
+    """Simulation steps at the middle of the exposures of a camera's frames, (T,)."""
     return demo.cameras[camera].late + demo.truth.steps * np.arange(demo.videos.frames)
 
 
 def time_step(demo: DemoCapturesConfig) -> float:
-    """Of the truth [s]."""
+    """Time step of the ground truth [s]."""
     return 1.0 / (demo.videos.rate * demo.truth.steps)

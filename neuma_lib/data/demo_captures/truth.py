@@ -1,4 +1,4 @@
-"""What is true of a demo capture, as plain values."""
+"""Ground truth of a demo capture, as plain values."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from neuma_lib.data.demo_captures.stage import lying, solid, start, time_step, v
 
 
 def truth_of(demo: DemoCapturesConfig, name: str, photographs: dict[str, Any]) -> dict[str, Any]:
-    """Everything that the pipeline is to find of an object, in the simulator's box [m], y up.
+    """All quantities of an object that the pipeline estimates, in the simulation box [m], y up.
 
-    ``offset_s`` of a camera is the true time of its first frame after the start of a drop. ``rotation`` and
-    ``translation`` of a drop take the object as photographed to that start.
+    ``offset_s`` of a camera is the time of its first frame since the start of a drop. ``rotation`` and ``translation``
+    of a drop map the photographed object to its pose at this start.
 
     Args:
         photographs: true cameras of the photographs, by file.
@@ -23,13 +23,13 @@ def truth_of(demo: DemoCapturesConfig, name: str, photographs: dict[str, Any]) -
     mesh = solid(item)
     rest = lying(item, mesh)
     drops = {}
-    for drop, thrown in sorted(item.drops.items()):
-        moved = start(item, thrown, mesh).after(rest.inverse())
+    for drop, initial in sorted(item.drops.items()):
+        moved = start(item, initial, mesh).after(rest.inverse())
         drops[drop] = {
             **moved.plain(),
             "center_m": moved.apply(rest.apply(np.asarray(mesh.center_mass)[None]))[0].tolist(),
-            "v0_m_s": list(thrown.velocity),
-            "spin_rad_s": list(thrown.spin),
+            "v0_m_s": list(initial.velocity),
+            "spin_rad_s": list(initial.spin),
         }
     dt = time_step(demo)
     return {

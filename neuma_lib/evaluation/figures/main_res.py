@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 
 from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.evaluation.plotting.image_grid import GAP, ImageGrid, draw_images, note
-from neuma_lib.fitting.carried_field import CarriedField
 from neuma_lib.io.particles import load_motion
+from neuma_lib.methods.base import method_of
 
 LEFT, TOP, BETWEEN = 0.92, 0.3, 0.06
 
@@ -26,8 +26,8 @@ def data(inputs, params, say) -> ImageGrid:
         rows = [rendering.observed(video, shown, params.magnify)]
         for method in params.titles:
             states = (state[shown] for state in load_motion(next(rollouts)))
-            own = params.own.get(method)
-            seen = CarriedField.load(inputs.fields[k], own, setting["density"]) if own else body
+            own = params.own.get(method, {}).get(scene)
+            seen = own_body(own, setting["density"]) if own else body
             rows.append(rendering.renders(seen, cameras, *states))
         blocks.append(np.stack(rows))
         times += rendering.milliseconds([video.frames[i] for i in shown], setting["dt"])
@@ -35,6 +35,12 @@ def data(inputs, params, say) -> ImageGrid:
     images = np.concatenate(rendering.cropped(blocks), axis=1)
     say(f"{images.shape[0]} x {images.shape[1]} pictures")
     return ImageGrid(images, ("Observation", *params.titles.values()), tuple(times), {"groups": groups})
+
+
+def own_body(source, density):
+    """A body of particles that a method was fitted with."""
+    method = method_of(source["module"])
+    return method.load_body(source["files"], source["options"][0], density, source["carrier"], "mean")
 
 
 @style.styled

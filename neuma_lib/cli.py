@@ -1,0 +1,416 @@
+"""The command ``neuma``, also ``python -m neuma_lib``. Each subcommand loads what it needs when it runs."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neuma_lib import __version__
+from neuma_lib.errors import InputError, NonFiniteError
+
+if TYPE_CHECKING:
+    from neuma_lib.mechanics.law import Law
+
+CONFIGFILE = "settings on top of config/config.yaml, as for snakemake"
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run a command.
+
+    Args:
+        words: its arguments; None: those of the process.
+
+    Returns:
+        exit status: 0, or 1 after an error that the user can correct, which is printed.
+    """
+    options = _parser().parse_args(words)
+    try:
+        return options.run(options) or 0
+    except (InputError, NonFiniteError) as error:
+        print(f"ERROR: {error}", file=sys.stderr)
+        return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="neuma",
+        description="Learn the material of a deformable object from video. `neuma COMMAND --help` explains a command.",
+    )
+    parser.add_argument("--version", action="version", version=f"neuma {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    demo = _command(
+        commands,
+        "demo",
+        _demo,
+        "run a small example, from a rendered video to a learned material (minutes)",
+        "Runs the small example of the project: renders a video of a falling duck, learns its material, and writes a "
+        "film, a table and a viewer page to results/demo. Takes a few minutes on two cores. Run it in the project's "
+        "folder.",
+    )
+    demo.add_argument("--cores", type=int, default=2, help="CPU cores to use (default %(default)s)")
+
+    new = _group(commands, "new", "create the settings of a scene or a capture")
+    scene = _command(
+        new,
+        "scene",
+        _new_scene,
+        "create config/NAME.yaml with a scene to edit",
+        "Writes config/NAME.yaml: a scene that runs as it is, with comments on what to change. Prints the commands to "
+        "run next.",
+    )
+    scene.add_argument("name", metavar="NAME", help="name of the scene and of its folder in results/")
+    capture = _command(
+        new,
+        "capture",
+        _new_capture,
+        "create captures/NAME for your own photographs and videos",
+        "Writes captures/NAME/capture.yaml and creates the folders for photographs, stills and videos. Prints what to "
+        "do next.",
+    )
+    capture.add_argument("name", metavar="NAME", help="name of the capture and of its folder in captures/")
+
+    check = _command(
+        commands,
+        "check",
+        _check,
+        "check settings without running anything",
+        "Checks the settings of the project: keys and values, laws and their constants, shapes, start positions and "
+        "velocities, time steps, captures, and the GPU. Takes seconds and runs nothing. Prints each problem on a line "
+        "and exits with status 1 if there is one.",
+    )
+    check.add_argument(
+        "files",
+        nargs="*",
+        metavar="FILE",
+        help=f"{CONFIGFILE}; or a capture.yaml. None: config/config.yaml alone",
+    )
+
+    law = _group(commands, "law", "export a learned material to one file, or show such a file")
+    export = _command(
+        law,
+        "export",
+        _export,
+        "write a learned law to one file",
+        "Writes a learned law to one .safetensors file, with its time step, origin and the range of deformations that "
+        "it was learned from. Example: neuma law export results/RubberPawn/neuma law.safetensors --page law.png",
+    )
+    export.add_argument(
+        "source",
+        metavar="SOURCE",
+        help="folder of a method, such as results/RubberPawn/neuma, or file of a law",
+    )
+    export.add_argument("target", metavar="TARGET", help="file to write, .safetensors")
+    export.add_argument("--page", metavar="FILE", help="also draw the law's stress curves, .png or .pdf")
+    export.add_argument(
+        "--separate",
+        "--apart",
+        dest="apart",
+        action="store_true",
+        help="keep prior and adaptor separate, so that the adaptor's weight can be changed later",
+    )
+    export.add_argument(
+        "--weight",
+        type=float,
+        default=1.0,
+        help="weight of the adaptor when it is merged (default %(default)g)",
+    )
+    export.add_argument(
+        "--any-step", action="store_true", help="allow time steps other than the one that it was learned with"
+    )
+    export.add_argument("--configfile", nargs="+", default=[], metavar="FILE", help=CONFIGFILE)
+    export.add_argument(
+        "--adaptor",
+        metavar="FILE",
+        help="if SOURCE is the file of a prior: adaptor, ours or a released *_lora.pt",
+    )
+    export.add_argument("--alpha", type=float, help="scale of a released adaptor (default 16)")
+    export.add_argument(
+        "--dt", type=float, help="if SOURCE is a file: time step that it was learned with [s]"
+    )
+    show = _command(
+        law,
+        "show",
+        _show,
+        "print what an exported file states about its law",
+        "Prints the metadata of a file that `neuma law export` wrote.",
+    )
+    show.add_argument("law", metavar="FILE", help="file written by `neuma law export`")
+    show.add_argument("--page", metavar="FILE", help="also draw the law's stress curves, .png or .pdf")
+
+    view = _command(
+        commands,
+        "view",
+        _view,
+        "show a scene's motions in a browser",
+        "Serves the motions of a scene to a browser, with a live mode that simulates its object under any learned law. "
+        "Example: neuma view results/BouncyBall. With --file it writes one HTML page instead, without a server.",
+    )
+    view.add_argument("scene", metavar="FOLDER", help="folder of a scene, such as results/BouncyBall")
+    view.add_argument("--file", help="write one HTML file that needs no server, and exit")
+    view.add_argument(
+        "--host", default="127.0.0.1", help="address to serve at (default %(default)s, this machine)"
+    )
+    view.add_argument(
+        "--port", type=int, default=8080, help="port, or the next free one (default %(default)s)"
+    )
+    view.add_argument(
+        "--methods", nargs="+", metavar="METHOD", help="methods to show (default: all with a motion)"
+    )
+    view.add_argument("--configfile", nargs="+", default=(), metavar="FILE", help=CONFIGFILE)
+    view.add_argument(
+        "--device",
+        default="auto",
+        choices=("auto", "cpu", "cuda"),
+        help="where the live mode simulates (default: a GPU if there is one)",
+    )
+
+    timings = _command(
+        commands,
+        "timings",
+        _timings,
+        "print how long each stage took",
+        "Prints a table of run times and memory of all stages, from the benchmark files below a folder of results.",
+    )
+    timings.add_argument(
+        "folder",
+        nargs="?",
+        default="results",
+        metavar="FOLDER",
+        help="folder of results (default %(default)s)",
+    )
+    return parser
+
+
+def _command(commands: Any, name: str, run: Any, summary: str, description: str) -> argparse.ArgumentParser:
+    parser = commands.add_parser(name, help=summary, description=description)
+    parser.set_defaults(run=run)
+    return parser
+
+
+def _group(commands: Any, name: str, summary: str) -> Any:
+    parser = commands.add_parser(name, help=summary, description=f"{summary.capitalize()}.")
+    return parser.add_subparsers(required=True, metavar="COMMAND")
+
+
+# ---- demo, new, check, timings ---------------------------------------------------------------------------------------
+
+
+def _project() -> Path:
+    """The folder of the project that the current folder is in. Raises InputError outside of one."""
+    here = Path.cwd()
+    for folder in (here, *here.parents):
+        if (folder / "Snakefile").is_file() and (folder / "config/config.yaml").is_file():
+            return folder
+    raise InputError(
+        here,
+        "this folder is not in a project: it has no Snakefile and no config/config.yaml",
+        "Clone the repository and run the command in its folder",
+    )
+
+
+def _demo(options: argparse.Namespace) -> int:
+    from neuma_lib.extras import require
+
+    root = _project()
+    require("snakemake", "workflow")
+    command = [sys.executable, "-m", "snakemake", f"--cores={options.cores}", "--configfile=config/demo.yaml"]
+    subprocess.run([sys.executable, "-m", "workflow.unlock"], cwd=root, check=True)
+    status = subprocess.run([*command, "--", "demo"], cwd=root).returncode
+    if status == 0:
+        page = root / "results/demo/SoftDuck/viewer.html"
+        print(f"Open {page} in a browser. Film and numbers: results/demo/demo.md")
+    return status
+
+
+def _new_scene(options: argparse.Namespace) -> None:
+    from neuma_lib.project import settings_around
+    from neuma_lib.scaffold import new_scene
+
+    settings, root = settings_around(_project())
+    path = new_scene(root, options.name, settings)
+    file, name = path.relative_to(root), options.name
+    print(f"Created {file}. Edit it, then run in {root}:")
+    print(f"  neuma check {file}")
+    print(f"  snakemake --cores 2 --configfile {file} -- results/{name}/film.mp4 results/{name}/viewer.html")
+
+
+def _new_capture(options: argparse.Namespace) -> None:
+    from neuma_lib.project import settings_around
+    from neuma_lib.scaffold import new_capture
+
+    settings, root = settings_around(_project())
+    path = new_capture(root, options.name, settings)
+    folder = path.parent.relative_to(root)
+    print(f"Created {path.relative_to(root)}. docs/capture.md explains how to photograph and film. Next:")
+    print(f"  snakemake --cores 2 {settings.captures.root}/board.pdf   # print it and lay it on the floor")
+    print(f"  copy your files to {folder}/photos, {folder}/stills and {folder}/videos")
+    print(f"  neuma check {path.relative_to(root)}")
+    print(f"  snakemake --cores 2 results/{options.name}/capture.md")
+
+
+def _check(options: argparse.Namespace) -> int:
+    from neuma_lib import checks
+    from neuma_lib.capture.folder import read_capture
+    from neuma_lib.project import settings_around
+
+    captures = [file for file in options.files if Path(file).name == "capture.yaml"]
+    files = [file for file in options.files if file not in captures]
+    found: list[str] = []
+    for file in captures:
+        try:
+            read_capture(Path(file).parent)
+        except InputError as error:
+            found += checks.lines(error)
+    text = f"{', '.join(captures)}: no problems"
+    if files or not captures:
+        root = _project()
+        try:
+            settings, _ = settings_around(root, files)
+        except InputError as error:
+            found += checks.lines(error)
+        else:
+            found += checks.problems(settings) + checks.capture_problems(root / settings.captures.root)
+            text = checks.summary(settings, ["config/config.yaml", *files])
+    if found:
+        print("\n".join(dict.fromkeys(found)))
+        return 1
+    print(text)
+    return 0
+
+
+def _timings(options: argparse.Namespace) -> None:
+    from neuma_lib.timings import timings_table
+
+    print(timings_table(Path(options.folder)), end="")
+
+
+# ---- law -------------------------------------------------------------------------------------------------------------
+
+
+def _export(options: argparse.Namespace) -> None:
+    from neuma_lib.evaluation.law_export import export_law
+    from neuma_lib.mechanics.adaptor import AdaptableLaw
+
+    source = Path(options.source)
+    law, known = _of_method(options) if source.is_dir() else _of_file(options)
+    if options.weight != 1.0:
+        if options.apart:
+            raise InputError("--weight", "a separate adaptor has no fixed weight", "Leave out --separate")
+        if not isinstance(law, AdaptableLaw):
+            raise InputError("--weight", f"{source} is an analytic law without an adaptor")
+        law.set_adaptor_weight(options.weight)
+        known["weight"] = options.weight
+    about = export_law(options.target, law, apart=options.apart, page=options.page, **known)
+    step = "" if about["dt"] is None else f", learned at dt = {about['dt']:g} s"
+    print(f"{options.target}: {about['kind']}{step}" + (f"; {options.page}" if options.page else ""))
+
+
+def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
+    """The law of a method's folder, and what `export_law` needs to know of it."""
+    from neuma_lib.config.cases import case, law_origin
+    from neuma_lib.evaluation.law_export import head_commit
+    from neuma_lib.project import settings_around
+
+    if options.adaptor or options.dt:
+        raise InputError(
+            options.source,
+            "it is a method's folder, whose adaptor and time step are known",
+            "Leave out --adaptor and --dt",
+        )
+    place = Path(options.source).absolute()
+    settings, root = settings_around(place, options.configfile)
+    settings = settings.model_copy(update={"results_root": str(place.parent.parent)})
+    scene, method = place.parent.name, place.name
+    origin = law_origin(settings, scene, method)
+    law = case(settings, scene, method).source().load(lambda file: root / file).law
+    if law is None:
+        raise InputError(options.source, "the motion of this method follows from no material law")
+    beside = {"metrics": place / "metrics.json", "rollout": place / "rollout.h5"}
+    of_this = {name: file for name, file in beside.items() if file.is_file() and origin["scene"] == scene}
+    return law, {**origin, **of_this, "any_step": options.any_step, "commit": head_commit(root)}
+
+
+def _of_file(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
+    """The same of a file, with what an exported one already states."""
+    from neuma_lib.io.exported import EXPORT, checked_export
+    from neuma_lib.io.files import existing
+    from neuma_lib.io.laws import RELEASED_ALPHA, load_law
+    from neuma_lib.io.weights import read_weights
+
+    source = existing(options.source, "name a method's folder in results/, or the file of a law")
+    stated: dict[str, Any] = {}
+    if source.suffix == ".safetensors":
+        _, metadata = read_weights(source)
+        stated = checked_export(metadata) if EXPORT in metadata else {}
+    if options.dt is not None and options.dt <= 0:
+        raise InputError("--dt", f"{options.dt:g} must be a positive time step in seconds")
+    dt = options.dt or stated.get("dt")
+    alpha = RELEASED_ALPHA if options.alpha is None else options.alpha
+    law = load_law(source, options.adaptor, dt, options.any_step, alpha)
+    of_the_law = ("grid", "gravity", "density", "scale")
+    if not options.adaptor:
+        of_the_law += ("scene", "method", "prior", "weight", "commit", "metrics", "visited")
+    kept = {key: stated[key] for key in of_the_law if key in stated}
+    kept |= {"prior": source.name} if options.adaptor else {}
+    any_step = options.any_step or stated.get("any_step") is True
+    return law, {**kept, "dt": stated.get("dt") or dt, "any_step": any_step}
+
+
+def _show(options: argparse.Namespace) -> None:
+    from neuma_lib.evaluation.law_export import show_law
+
+    print(json.dumps(show_law(options.law, options.page), indent=1))
+
+
+# ---- view ------------------------------------------------------------------------------------------------------------
+
+
+def _view(options: argparse.Namespace) -> None:
+    import torch
+
+    from neuma_lib.device import choose_device
+    from neuma_lib.viewer.find import found_laws, found_scene
+    from neuma_lib.viewer.page import write_page
+    from neuma_lib.viewer.playground import Playground, first_law
+    from neuma_lib.viewer.scene import load_scene
+    from neuma_lib.viewer.server import ViewerServer, viser
+
+    if not options.file:
+        viser()  # fails before anything is read
+    settings, files = found_scene(options.scene, options.configfile)
+    if options.methods:
+        known = {run.name: run for run in files.runs}
+        if unknown := [name for name in options.methods if name not in known]:
+            raise InputError(f"--methods {unknown[0]}", f"{options.scene} has {', '.join(known) or 'none'}")
+        files = replace(files, runs=tuple(known[name] for name in options.methods))
+    viewer = settings.viewer
+    scene = load_scene(files, say=print, side=viewer.image_side, skip_damaged=True)
+    for note in scene.notes:
+        print(note, file=sys.stderr)
+    if options.file:
+        size = write_page(Path(options.file), scene, viewer.particles, viewer.megabytes)
+        print(f"{options.file}: {len(scene.motions)} motions, {size / 1e6:.1f} MB; open it in a browser")
+        return
+    device = choose_device(options.device)
+    torch.set_num_threads(1)  # two OpenMP threads next to the server's are slower than one
+    laws = found_laws(settings, files.name)
+    playground = Playground(files, laws, first_law(files, laws), device) if laws else None
+    server = ViewerServer(scene, playground, options.host, options.port)
+    counts = f"{len(scene.motions)} motions, {len(laws)} laws"
+    print(f"http://{server.host}:{server.port}  ({counts}; Ctrl-C ends it)")
+    try:
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        server.close()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

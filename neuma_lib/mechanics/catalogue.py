@@ -1,0 +1,220 @@
+"""The built-in analytic laws: names, constants, units and bounds. Imports no torch, so that settings can be checked
+before it is loaded.
+
+A specification has the two parts ``elasticity`` and ``plasticity``, each with its ``name`` and constants:
+``{"elasticity": {"name": "hencky", "E": 3e5, "nu": 0.25}, "plasticity": {"name": "von_mises", "yield_stress": 5e3}}``
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from neuma_lib.errors import InputError
+
+COURANT_LIMIT = 0.8
+"""Largest stable c dt / dx. Between 1.0 and 1.2 a rollout still looks finite while its gradients explode."""
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A material constant: its unit and admissible open interval (closed if ``closed``)."""
+
+    unit: str
+    low: float
+    high: float = math.inf
+    closed: bool = False
+    default: float | None = None
+
+    def admits(self, value: float) -> bool:
+        if self.closed:
+            return self.low <= value <= self.high
+        return self.low < value < self.high
+
+    @property
+    def bounds(self) -> str:
+        """The interval in words that follow "must"."""
+        if math.isfinite(self.high):
+            return f"lie between {self.low:g} and {self.high:g} {self.unit}"
+        return f"be {'at least' if self.closed else 'greater than'} {self.low:g} {self.unit}"
+
+
+YOUNG = Constant("Pa", 0.0)
+POISSON = Constant("1", -1.0, 0.5)
+MODULI = {"E": YOUNG, "nu": POISSON}
+_STRESS = Constant("Pa", 0.0, closed=True)
+_STEP = Constant("s", 0.0)
+
+ELASTICITY: dict[str, dict[str, Constant]] = {
+    "fixed_corotated": MODULI,
+    "stvk": MODULI,
+    "hencky": MODULI,
+    "neo_hookean": MODULI,
+    "fluid": MODULI,
+    "tait": MODULI,
+    # Above 20, powers of the stretches of a crushed element overflow in float32.
+    "ogden": {**MODULI, "alpha": Constant("1", 0.0, 20.0)},
+    "mooney_rivlin": {**MODULI, "q": Constant("1", 0.0, 1.0, closed=True)},
+    "fibre_reinforced": {
+        **MODULI,
+        "fibre_modulus": _STRESS,
+        "fibre_exponent": Constant("1", 0.0, closed=True),
+        "azimuth": Constant("degrees", -180.0, 180.0, closed=True, default=0.0),
+        "elevation": Constant("degrees", -90.0, 90.0, closed=True, default=0.0),
+    },
+}
+"""Constants of the elasticities by name."""
+
+PLASTICITY: dict[str, dict[str, Constant]] = {
+    "identity": {},
+    "von_mises": {**MODULI, "yield_stress": _STRESS},
+    "drucker_prager": {
+        **MODULI,
+        "friction_angle": Constant("degrees", 0.0, 90.0),
+        "cohesion": Constant("1", 0.0, closed=True, default=0.0),
+    },
+    "fluid_projection": {},
+    "viscous_flow": {
+        **MODULI,
+        "viscosity": Constant("Pa s", 0.0),
+        "dt": _STEP,
+        "yield_stress": Constant("Pa", 0.0, closed=True, default=0.0),
+    },
+    "crushable_foam": {
+        **MODULI,
+        "crush": Constant("Pa", 0.0),
+        "tension": Constant("Pa", 0.0),
+        "slope": Constant("1", 0.0),
+        "dt": _STEP,
+        "relaxation": Constant("s", 0.0, closed=True, default=0.0),
+    },
+    "herschel_bulkley": {
+        **MODULI,
+        "consistency": Constant("Pa s^exponent", 0.0),
+        "exponent": Constant("1", 0.2, 3.0, closed=True),
+        "yield_stress": _STRESS,
+        "dt": _STEP,
+    },
+    "cohesive_drucker_prager": {
+        **MODULI,
+        "friction_angle": Constant("degrees", 0.0, 90.0),
+        "cohesion": _STRESS,
+        "dilation_angle": Constant("degrees", 0.0, 90.0, closed=True, default=0.0),
+    },
+}
+"""Constants of the return maps by name. E, nu and dt default to those of the elasticity and of the simulation."""
+
+
+def complete(spec: Mapping[str, Any], dt: float | None = None) -> dict[str, dict[str, Any]]:
+    """A specification with both parts, and E, nu and dt in a plasticity that has these constants.
+
+    Args:
+        spec: a plasticity inherits E and nu from the elasticity by default. A missing plasticity is the identity.
+        dt: time step [s], required by a plasticity with the constant ``dt``.
+
+    Raises:
+        InputError: a part or its name is unknown or missing, or the time step is. Constants are not checked.
+    """
+    if "elasticity" not in spec or not set(spec) <= {"elasticity", "plasticity"}:
+        keys = ", ".join(map(str, spec)) or "none"
+        raise InputError("law", f"its keys must be elasticity and optionally plasticity, not {keys}")
+    elastic = dict(spec["elasticity"])
+    plastic = dict(spec.get("plasticity") or {"name": "identity"})
+    _known_name("elasticity", elastic, ELASTICITY)
+    needed = PLASTICITY[_known_name("plasticity", plastic, PLASTICITY)]
+    for key in MODULI:
+        if key in needed and key in elastic:
+            plastic.setdefault(key, elastic[key])
+    if "dt" in needed and "dt" not in plastic:
+        if dt is None:
+            raise InputError("dt", f"plasticity {plastic['name']} is rate-dependent and needs the time step")
+        plastic["dt"] = dt
+    return {"elasticity": elastic, "plasticity": plastic}
+
+
+def check_law(spec: Mapping[str, Any], dt: float | None = None) -> dict[str, dict[str, Any]]:
+    """The complete specification of a law, with numbers and defaults; arguments as of `complete`.
+
+    Raises:
+        InputError: what `complete` refuses, or a constant is unknown, missing, no number or outside its interval.
+    """
+    parts = complete(spec, dt)
+    found = {}
+    for part, known in (("elasticity", ELASTICITY), ("plasticity", PLASTICITY)):
+        name = parts[part].pop("name")
+        found[part] = {"name": name, **check_constants(part, known[name], parts[part])}
+    return found
+
+
+def check_constants(
+    law: str, constants: Mapping[str, Constant], values: Mapping[str, Any]
+) -> dict[str, float]:
+    """Numbers of a law's constants in their order, defaults included.
+
+    Args:
+        law: what to call it in messages.
+
+    Raises:
+        InputError: a constant is unknown, missing, no number or outside its interval.
+    """
+    if unknown := sorted(set(values) - set(constants)):
+        names = ", ".join(constants) or "none"
+        raise InputError(law, f"unknown constant {', '.join(unknown)}; its constants are {names}")
+    numbers: dict[str, float] = {}
+    for name, constant in constants.items():
+        value = values.get(name, constant.default)
+        if value is None:
+            raise InputError(f"{law}.{name}", f"the constant [{constant.unit}] is missing")
+        try:
+            numbers[name] = float(value)
+        except (TypeError, ValueError):
+            raise InputError(f"{law}.{name}", f"{value!r} is not a number") from None
+        if not constant.admits(numbers[name]):
+            raise InputError(f"{law}.{name}", f"{numbers[name]:g} must {constant.bounds}")
+    if "dilation_angle" in constants and numbers["dilation_angle"] > numbers["friction_angle"]:
+        raise InputError(
+            f"{law}.dilation_angle",
+            f"{numbers['dilation_angle']:g} must not exceed friction_angle = {numbers['friction_angle']:g}, since "
+            "shear would generate energy",
+        )
+    return numbers
+
+
+def longitudinal_modulus(elasticity: Mapping[str, Any]) -> float:
+    """Largest eigenvalue of the acoustic tensor of a checked elasticity at F = I [Pa], as `Law.longitudinal_modulus`.
+
+    Isotropic laws: lam + 2 mu, or lam of a fluid. Fibres along a with modulus H add H (a . n)^2 a (x) a to the acoustic
+    tensor of the direction n; the same 26 directions are evaluated.
+    """
+    E, nu = elasticity["E"], elasticity["nu"]
+    mu, lam = E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
+    if elasticity["name"] == "fluid":
+        return max(lam, 0.0)
+    if "fibre_modulus" not in elasticity:
+        return lam + 2 * mu
+    azimuth, elevation = (math.radians(elasticity[key]) for key in ("azimuth", "elevation"))
+    a = np.array([
+        math.cos(elevation) * math.cos(azimuth),
+        math.sin(elevation),
+        math.cos(elevation) * math.sin(azimuth),
+    ])  # fmt: skip
+    n = np.array([d for d in product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    Q = (lam + mu) * n[:, :, None] * n[:, None] + mu * np.eye(3)
+    Q += elasticity["fibre_modulus"] * ((n @ a) ** 2)[:, None, None] * np.outer(a, a)
+    return float(np.linalg.eigvalsh(Q).max())
+
+
+def _known_name(part: str, values: Mapping[str, Any], choices: Mapping[str, Any]) -> str:
+    name = values.get("name")
+    if name in choices:
+        return name
+    close = get_close_matches(str(name), choices, n=1)
+    hint = f"; did you mean {close[0]}?" if close else ""
+    raise InputError(f"{part}.name", f"{name!r} is unknown{hint}", f"Choose one of {', '.join(choices)}")
