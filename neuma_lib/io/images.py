@@ -173,9 +173,7 @@ def checked_transforms(data: Any, path: str | Path) -> dict[str, Any]:
             raise InputError(f"{where}: sha256", "must be a text")
         pose = matrix_of_numbers(frame.get("transform_matrix"))
         if pose.shape != (4, 4):
-            raise InputError(
-                f"{where}: transform_matrix", "must be a 4x4 matrix of numbers (camera to world)"
-            )
+            raise InputError(f"{where}: transform_matrix", "must be a 4x4 matrix (camera to world)")
         rotation = pose[:3, :3]
         if not np.isfinite(pose).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
             raise InputError(f"{where}: transform_matrix", "is not a rigid motion")

@@ -114,9 +114,7 @@ def _pac_nerf(path: Path, numbers: Sequence[int]) -> tuple[Frames, dict[int, Pat
         elif number == OCCLUDER:
             _refuse_occluder(path.parent / name)
         elif (view, number) in listed:
-            raise InputError(
-                f"{where}: file_path", "is the same as in an earlier entry", "Remove one of them"
-            )
+            raise InputError(f"{where}: file_path", "occurs in an earlier entry", "Remove one of them")
         else:
             listed[view, number] = {"file_path": name, **camera(entry, where)}
     chosen = {}

@@ -185,9 +185,7 @@ def check_shapes(means, covars, opacities, sh, viewmats, Ks) -> None:
     if means.dtype not in (torch.float32, torch.float64):
         raise InputError("rasterize: means", f"must be float32 or float64, not {means.dtype}")
     if sh.shape[1] not in (1, 4, 9, 16):
-        raise InputError(
-            "rasterize: sh", f"has {sh.shape[1]} coefficients per channel, expected 1, 4, 9 or 16"
-        )
+        raise InputError("rasterize: sh", f"must have 1, 4, 9 or 16 coefficients, not {sh.shape[1]}")
 
 
 def rasterize(

@@ -1,4 +1,4 @@
-"""Which files a viewer reads, and that it reads no others."""
+"""The files that a viewer reads, and access control for them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class RunFiles:
     Attributes:
         name, title: of the method.
         rollout: file of the motion.
-        law: what its law is loaded from. None: it follows from no law.
+        law: source of its law; None: the motion follows from no law.
         gaussian_motion: how Gaussians follow their particles.
     """
 
@@ -32,16 +32,16 @@ class RunFiles:
 
 @dataclass(frozen=True)
 class SceneFiles:
-    """All that is shown of a scene.
+    """The files of a scene.
 
     Attributes:
-        name: the scene, with the seeds of its chain.
-        simulation: constants of the simulator, as `MPMModel` takes them.
-        density: of the body, as `load_body` takes it.
+        name: the scene, with the seeds of its replicate.
+        simulation: arguments of `MPMModel`.
+        density: of the body, as for `load_body`.
         particles, binding, gaussians, velocity: files of the reconstructed body.
         truth, transforms: files of the true motion and of the observed images, or None.
         runs: predicted motions.
-        roots: folders below which files may be read; others, and links to others, are refused.
+        roots: folders that may be read; other files, and links to them, are rejected.
     """
 
     name: str
@@ -58,34 +58,34 @@ class SceneFiles:
 
     @property
     def files(self) -> list[str]:
-        """Every file but the images, each once."""
+        """All files except the images, without duplicates."""
         body = (self.particles, self.binding, self.gaussians, self.velocity, self.truth, self.transforms)
         laws = [file for run in self.runs for file in (run.rollout, *(run.law.paths if run.law else ()))]
         return list(dict.fromkeys([*filter(None, body), *laws]))
 
     def plain(self) -> dict[str, Any]:
-        """Dicts, lists and scalars; `of_plain` undoes it."""
+        """Dicts, lists and scalars; inverse of `of_plain`."""
         return asdict(self)
 
     @classmethod
     def of_plain(cls, plain: Mapping[str, Any]) -> SceneFiles:
-        """What `plain` gave."""
+        """Inverse of `plain`."""
         runs = (RunFiles(**{**run, "law": run["law"] and ModelSource(**run["law"])}) for run in plain["runs"])
         return cls(**{**plain, "runs": tuple(runs), "roots": tuple(plain["roots"])})
 
     def checked(self, path: str | Path) -> Path:
-        """A file that may be read.
+        """Resolved path of a file in the folders.
 
         Raises:
-            InputError: it does not exist, or lies outside the folders.
+            InputError: it does not exist, or is outside the folders.
         """
         return inside(path, self.roots)
 
 
 def inside(path: str | Path, roots: Sequence[str | Path]) -> Path:
-    """A file with all links followed. Raises InputError where there is none, or it lies outside all of the folders."""
-    found = existing(path).resolve()
-    if not any(found.is_relative_to(Path(root).resolve()) for root in roots):
-        allowed = " and ".join(map(str, roots))
-        raise InputError(f"{path} lies outside {allowed}: the viewer reads only below these; copy it there")
-    return found
+    """Path of a file with links resolved. Raises InputError if it does not exist or is outside all folders."""
+    resolved = existing(path).resolve()
+    if not any(resolved.is_relative_to(Path(root).resolve()) for root in roots):
+        problem = f"is outside {' and '.join(map(str, roots))}, the only folders that the viewer reads"
+        raise InputError(path, problem, "Copy it there")
+    return resolved

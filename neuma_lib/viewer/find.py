@@ -1,7 +1,6 @@
-"""The files of a scene's viewer by the project's settings.
+"""Locate the files of a scene by the project's settings.
 
-They lie below two folders: the one of the results that the scene is in, and the one of the data that the settings pair
-with it.
+They are in two folders: that of the results with the scene, and the corresponding folder of the data.
 """
 
 from __future__ import annotations
@@ -22,16 +21,16 @@ from neuma_lib.viewer.files import RunFiles, SceneFiles
 
 
 def law_source(settings: Config, scene: str, method: str) -> ModelSource | None:
-    """What a method's law is loaded from. None: its motion follows from no law."""
-    found = cases.case(settings, scene, method)
-    return found.source() if found.method.has_law else None
+    """The source of a method's law; None if its motion follows from no law."""
+    case = cases.case(settings, scene, method)
+    return case.source() if case.method.has_law else None
 
 
 def scene_files(settings: Config, scene: str, methods: Sequence[str]) -> SceneFiles:
-    """Names of all files of a scene and some of its methods, whether they exist or not.
+    """Paths of all files of a scene and some of its methods, which need not exist.
 
     Args:
-        scene: with the seeds of its chain.
+        scene: with the seeds of its replicate.
     """
     base, _ = settings.chain(scene)
     results, data = places.results_root(settings), settings.data_root.rstrip("/")
@@ -61,40 +60,37 @@ def scene_files(settings: Config, scene: str, methods: Sequence[str]) -> SceneFi
 
 
 def found_scene(place: str | Path, configfiles: Sequence[str | Path] = ()) -> tuple[Config, SceneFiles]:
-    """A scene's folder that somebody names, with all methods that have a motion in it.
+    """Settings and files of a scene's folder, with all methods that have a motion there.
 
-    The settings say where the data are relative to the results, so that a folder of another clone has its own.
+    The settings define the position of the data relative to the results, so the folder may be in another clone.
 
     Args:
         place: folder of a scene, for example results/BouncyBall.
-        configfiles: settings laid over those of the project that the folder lies in.
+        configfiles: settings that override those of the folder's project.
 
     Raises:
-        InputError: no such folder, no settings, a scene that these do not know, a body that is not complete.
+        InputError: no such folder, no settings, an unknown scene, an incomplete body.
     """
     place = Path(place).absolute()
     if not place.is_dir():
-        raise InputError(f"{place} is no folder: name that of a scene, for example results/BouncyBall")
+        raise InputError(place, "is not a folder", "Give that of a scene, for example results/BouncyBall")
     settings, _ = settings_around(place, configfiles)
     base, results = place.name.partition("+")[0], place.parent
     if base not in settings.scenes:
-        known = ", ".join(sorted(settings.scenes))
-        raise InputError(
-            f"{place}: the settings know no scene '{base}' (they have {known}); give the --configfile that it was made "
-            "with"
-        )
+        problem = f"the settings have no scene '{base}', only {', '.join(sorted(settings.scenes))}"
+        raise InputError(place, problem, "Give the --configfile of the folder")
     data = os.path.abspath(results / os.path.relpath(settings.data_root, settings.results_root))
     settings = settings.model_copy(update={"results_root": str(results), "data_root": data})
     files = scene_files(settings, place.name, found_methods(settings, place))
     for file in (files.particles, files.binding, files.gaussians):
-        existing(file, f"make it with `snakemake --cores 2 results/{place.name}/<method>/rollout.h5`")
+        existing(file, f"Generate it with `snakemake --cores 2 results/{place.name}/<method>/rollout.h5`")
     optional = {name: getattr(files, name) for name in ("velocity", "truth", "transforms")}
     missing = [name for name, file in optional.items() if not file or not Path(file).is_file()]
     return settings, replace(files, **dict.fromkeys(missing))
 
 
 def found_methods(settings: Config, place: Path) -> list[str]:
-    """Methods with a motion in a scene's folder, in the order of the settings; what these do not know is left out."""
+    """Methods with a motion in a scene's folder, in the order of the settings, without unknown ones."""
     order = list(settings.methods)
     names = (file.parent.name for file in place.glob("*/rollout.h5"))
     known = [name for name in names if _known(settings, name)]
@@ -110,34 +106,34 @@ def _known(settings: Config, method: str) -> bool:
 
 
 def found_laws(settings: Config, scene: str | None = None) -> dict[str, ModelSource]:
-    """All laws in the folder of results whose files are complete, by a name for a list, in order.
+    """All laws with complete files in the folder of results, by display name, in order.
 
-    Those that methods trained or identified in scenes, ``scene: title of the method``, and priors, ``prior: name``,
-    with the time step of a scene that has them: of the given one, if it does, or else the first.
+    Includes laws trained or identified in scenes, ``scene: title of the method``, and priors, ``prior: name``, with the
+    time step of a scene that uses them, preferably the given one.
     """
     results = Path(places.results_root(settings))
-    found: dict[str, ModelSource] = {}
+    laws: dict[str, ModelSource] = {}
     for folder in sorted(results.glob("*/")):
         if folder.name.partition("+")[0] not in settings.scenes:
             continue
-        made = {
+        methods = {
             file.parent.name
             for name in ("adaptor.safetensors", "rollout.h5")
             for file in folder.glob(f"*/{name}")
         }
-        for method in sorted(name for name in made if _known(settings, name)):
+        for method in sorted(name for name in methods if _known(settings, name)):
             try:
                 law = law_source(settings, folder.name, method)
             except InputError:
-                continue  # a variant that these settings do not know
+                continue  # unknown variant
             learned = law and law.paths and cases.case(settings, folder.name, method).learns_there
             if learned and all(Path(file).is_file() for file in law.paths):
-                found[f"{folder.name}: {cases.title(settings, method)}"] = law
+                laws[f"{folder.name}: {cases.title(settings, method)}"] = law
     own = [settings.scene(scene)] if scene else []
     steps = {each.prior: each.dt for each in (*reversed(settings.scenes.values()), *own)}
     for file in sorted((results / "priors").glob("*.safetensors")):
         name = file.stem
         if name.partition("+")[0] in settings.priors.laws:
             dt = steps.get(name.partition("+")[0], min(each.dt for each in settings.scenes.values()))
-            found[f"prior: {name}"] = prior_source(str(file), dt)
-    return found
+            laws[f"prior: {name}"] = prior_source(str(file), dt)
+    return laws

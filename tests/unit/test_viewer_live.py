@@ -13,7 +13,7 @@ from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
-from neuma_lib.viewer.live import EARTH, FASTEST, FRAME, PIVOT, LiveSimulation, tilted
+from neuma_lib.viewer.live import EARTH, FRAME, MAX_SPEED, PIVOT, LiveSimulation, tilted
 
 CONSTANTS = {"grid": 16, "boundary": "no_slip", "walls": "outside"}
 DT = 1e-3
@@ -125,7 +125,7 @@ def test_reset_brings_the_start_back_bit_by_bit(live):
     simulation = live()
     reached(simulation, lambda s: s.time > 0.1)
     simulation.add(start(), make_law("von_mises", torch.float32), DT)
-    simulation.throw((1.0, 0.0, 0.0))
+    simulation.launch((1.0, 0.0, 0.0))
     assert simulation.do().counts == (200, 200)
     simulation.run(False)
     simulation.reset()
@@ -167,13 +167,13 @@ def test_it_runs_in_real_time_whatever_is_asked_meanwhile(live):
     assert 0.3 * passed < moved < passed + FRAME + 0.022
 
 
-def test_throw_drop_and_gravity(live):
+def test_launch_drop_and_gravity(live):
     simulation = live(paused=True)
-    simulation.throw((1.0, 2.0, 0.0))
+    simulation.launch((1.0, 2.0, 0.0))
     assert torch.allclose(simulation.do().v, torch.tensor([1.0, 2.0, 0.0]))
-    simulation.throw((0.0, 1000.0, 0.0))
-    assert torch.allclose(simulation.do().v, torch.tensor([0.0, FASTEST, 0.0]))
-    simulation.throw((float("nan"), 0.0, 0.0))
+    simulation.launch((0.0, 1000.0, 0.0))
+    assert torch.allclose(simulation.do().v, torch.tensor([0.0, MAX_SPEED, 0.0]))
+    simulation.launch((float("nan"), 0.0, 0.0))
     found = simulation.do()
     assert "not finite" in found.notice and found.v.isfinite().all() and found.trouble is None
     simulation.drop(0.4)

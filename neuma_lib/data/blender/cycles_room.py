@@ -1,4 +1,4 @@
-"""A filmed room in Blender: textured rectangles, lamps, one body that moves. Imports bpy: use it through `room`."""
+"""A room in Blender: textured rectangles, lamps and a moving body. Imports bpy and is used through `room`."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from mathutils import Matrix, Vector
 from neuma_lib.data.blender import cycles
 
 SENSOR = 36.0
-"""Width of the sensor of every camera [mm]; only its ratio to the pixels matters."""
+"""Width of the sensor of all cameras [mm]; only its ratio to the pixels matters."""
 PER_SECOND = 24.0
-"""Frames a second of Blender's clock, of which the shutter is a part."""
+"""Blender's frames per second; the shutter time is a fraction of a frame."""
 
 
 def start(job: dict[str, np.ndarray]) -> None:
-    """An empty scene with the renderer's settings, the lamps and the surroundings."""
+    """An empty scene with the renderer's settings, the lamps and the ambient light."""
     cycles.start(64, 64, 1, int(job["threads"]))
     scene = bpy.context.scene
     render = scene.render
@@ -43,11 +43,11 @@ def start(job: dict[str, np.ndarray]) -> None:
 
 
 def add_rectangle(name: str, corners: np.ndarray, pixels: np.ndarray) -> None:
-    """A matt rectangle with a picture on it.
+    """A diffuse textured rectangle.
 
     Args:
-        corners: of the picture's left upper, right upper, right lower and left lower corner [m], (4, 3).
-        pixels: the picture, sRGB (H, W, 3), uint8.
+        corners: left upper, right upper, right lower and left lower corner of the texture [m], (4, 3).
+        pixels: texture, sRGB (H, W, 3), uint8.
     """
     height, width = pixels.shape[:2]
     image = bpy.data.images.new(name, width, height, float_buffer=False)
@@ -74,10 +74,10 @@ def add_rectangle(name: str, corners: np.ndarray, pixels: np.ndarray) -> None:
 
 
 class Cameras:
-    """One camera that becomes each of a job's lenses, as Cycles' fisheye polynomial: nothing is sampled twice."""
+    """A camera that takes each of a job's lenses in turn, as fisheye polynomial of Cycles, without resampling."""
 
     def __init__(self, lenses: np.ndarray):
-        """Args: lenses: rows of width, height, full width and height [px], left, top [px], k0 to k4 [rad by px^n]."""
+        """Args: lenses: rows of width, height, full width and height [px], left, top [px], k0 to k4 [rad / px^n]."""
         self.lenses = lenses
         self.data = bpy.data.cameras.new("camera")
         self.data.type, self.data.panorama_type = "PANO", "FISHEYE_LENS_POLYNOMIAL"
@@ -89,26 +89,26 @@ class Cameras:
         bpy.context.scene.camera = self.object
 
     def become(self, lens: int, c2w: np.ndarray, region: np.ndarray) -> None:
-        """Take a lens, a pose (4, 4, OpenGL axes), and the part of its picture to render: x0, y0, x1, y1 [px]."""
+        """Set the lens, the pose (4, 4, OpenGL axes), and the rendered region x0, y0, x1, y1 [px]."""
         _, _, full_width, full_height, left, top, *polynomial = self.lenses[lens]
         millimetre = full_width / SENSOR  # in pixels
-        for power, value in enumerate(polynomial):  # Blender's angle is minus ours
+        for power, value in enumerate(polynomial):  # Blender's angle has the opposite sign
             setattr(self.data, f"fisheye_polynomial_k{power}", -float(value) * millimetre**power)
         self.object.matrix_world = Matrix(c2w.tolist())
         render = bpy.context.scene.render
         render.resolution_x, render.resolution_y = int(full_width), int(full_height)
         x0, y0, x1, y1 = region + np.array([left, top, left, top])
-        tiny = 0.01  # Blender cuts off the fraction of a pixel
+        tiny = 0.01  # Blender truncates to pixels
         render.border_min_x, render.border_max_x = (x0 + tiny) / full_width, (x1 + tiny) / full_width
         render.border_min_y = (full_height - y1 + tiny) / full_height
         render.border_max_y = (full_height - y0 + tiny) / full_height
 
 
 class MovingBody(cycles.Body):
-    """The body of a job, which may be left out, and moves while the shutter is open."""
+    """The body of a job, which may be hidden, with motion blur."""
 
     def pose(self, frame: int, exposure: float) -> None:
-        """Show a frame of the geometry, or nothing (-1), with an exposure [s]."""
+        """Set the geometry of a frame, or hide the body (-1), with an exposure [s]."""
         render = bpy.context.scene.render
         if frame >= 0:
             self.show(frame)
@@ -127,7 +127,7 @@ class MovingBody(cycles.Body):
 
 
 def shoot(path: str, samples: int) -> np.ndarray:
-    """Render; linear radiance (H, W, 3), float32. ``path``: a file for Blender to write in between, .exr."""
+    """Render linear radiance (H, W, 3), float32. ``path``: temporary .exr file."""
     scene = bpy.context.scene
     scene.cycles.samples = samples
     scene.render.filepath = path

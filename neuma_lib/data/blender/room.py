@@ -1,4 +1,4 @@
-"""Film a room with one moving body in it, in a Blender process of its own (`room_worker`)."""
+"""Render images of a room with a moving body, in a separate Blender process (`room_worker`)."""
 
 from __future__ import annotations
 
@@ -16,18 +16,17 @@ from neuma_lib.data.blender.scene import Progress, run_worker
 
 @dataclass(frozen=True, eq=False)
 class Scenery:
-    """What stands still.
+    """The static scene.
 
     Attributes:
-        corners: of each rectangle, those of its picture's left upper, right upper, right lower and left lower corner
-            [m], (R, 4, 3).
-        pictures: of each rectangle, sRGB (H, W, 3), uint8.
-        lamps: middles of round lamps [m], (L, 3).
-        lamp_size: their diameter [m].
-        lamp_target: what they face [m], (3,).
-        power: of each [W].
-        ambient: radiance of what is above and beyond all rectangles.
-        bounces: of light.
+        corners: left upper, right upper, right lower and left lower corner of each rectangle's texture [m], (R, 4, 3).
+        pictures: texture of each rectangle, sRGB (H, W, 3), uint8.
+        lamps: centres of circular lamps [m], (L, 3).
+        lamp_size: diameter of the lamps [m].
+        lamp_target: point that the lamps face [m], (3,).
+        power: of each lamp [W].
+        ambient: radiance outside the rectangles.
+        bounces: maximum number of light bounces.
     """
 
     corners: np.ndarray
@@ -58,14 +57,14 @@ class Moving:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One picture, or a part of it.
+    """An image or a region of it.
 
     Attributes:
         c2w: camera to world (4, 4), OpenGL axes.
-        lens: width, height, those of the larger picture in whose middle the optical axis is, left and top in it [px],
+        lens: width, height, width and height of the larger image centred at the optical axis, left and top in it [px],
             and the coefficients k0 to k4 of the polynomial from distance to angle [rad / px^n], (11,).
-        frame: of the body; -1: it is not there.
-        region: x0, y0, x1, y1 [px]; None: all of the picture.
+        frame: of the body; -1: without it.
+        region: x0, y0, x1, y1 [px]; None: the whole image.
     """
 
     c2w: np.ndarray
@@ -84,15 +83,14 @@ def shoot(
     threads: int = 1,
     progress: Progress | None = None,
 ) -> Iterator[np.ndarray]:
-    """Render shots: linear radiance (H, W, 3), float32, of each, in turn, once all are there.
+    """Render shots and yield the linear radiance (H, W, 3), float32, of each, after all are rendered.
 
     Args:
-        body: None where no shot shows it.
-        shots: those of one frame of the body should stand together.
-        samples: samples a pixel, denoised.
-        exposure: how long the body moves while a shot is taken [s], half of it before the frame's time; the motion is
-            straight, and 0 stops it.
-        threads: CPU cores that Blender may use.
+        body: None if no shot shows it.
+        shots: those of one frame of the body should be consecutive.
+        samples: samples per pixel, denoised.
+        exposure: exposure time [s] centred at the frame, with linear motion; 0: no motion blur.
+        threads: CPU cores for Blender.
 
     Raises:
         InputError, RuntimeError: see `neuma_lib.data.blender.scene.render_images`.

@@ -1,6 +1,6 @@
 """The Blender process of `room`: ``python -m neuma_lib.data.blender.room_worker job.npz``.
 
-Prints the number of finished shots, a line each, on standard output. A shot is left as ``<number>.npy``.
+Prints the number of finished shots on standard output, one line per shot, and writes each to ``<number>.npy``.
 """
 
 from __future__ import annotations
