@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from neuma_lib.capture.lens import Lens
+from neuma_lib.capture.calibration.lens import Lens
 from neuma_lib.capture.tools import opencv
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import atomic, reading

@@ -31,19 +31,19 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
-from neuma_lib.capture.agreement import nearest_point
-from neuma_lib.capture.folder import PHOTOGRAPHS, Capture
-from neuma_lib.capture.lens import Lens, lens_of_colmap
-from neuma_lib.capture.masks import centroid
-from neuma_lib.capture.mattes import own_mask
+from neuma_lib.capture.calibration.lens import Lens, lens_of_colmap
+from neuma_lib.capture.calibration.placement import Similarity
+from neuma_lib.capture.calibration.room import BOX_MIDDLE
+from neuma_lib.capture.masks.agreement import nearest_point
+from neuma_lib.capture.masks.mattes import own_mask
+from neuma_lib.capture.masks.regions import centroid
 from neuma_lib.capture.pictures import picture_size, read_picture, undistorted
-from neuma_lib.capture.placement import Similarity
-from neuma_lib.capture.room import BOX_MIDDLE
 from neuma_lib.config.capture import ReleasedConfig
 from neuma_lib.config.validation import hint
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import existing, read_json, reading
 from neuma_lib.io.images import OPENGL_TO_OPENCV
+from neuma_lib.project.capture_folder import PHOTOGRAPHS, Capture
 
 RATE = 120.0
 """Frames per second of the videos."""
@@ -157,7 +157,7 @@ def read_configured(name: str, settings: ReleasedConfig) -> Released:
 
 
 def released_captures(released: Mapping[str, ReleasedConfig]) -> dict[str, Capture]:
-    """Released captures of the settings, in the form of `neuma_lib.capture.folder.read_capture`."""
+    """Released captures of the settings, in the form of `neuma_lib.project.capture_folder.read_capture`."""
     captures = {}
     for name, settings in released.items():
         shots = read_released(settings.folder, settings.object or name, settings.ground).videos

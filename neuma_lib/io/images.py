@@ -17,8 +17,8 @@ import torch
 from PIL import Image
 
 from neuma_lib.errors import InputError
+from neuma_lib.io.datasets.released import image_name, matrix_of_numbers, released_frames
 from neuma_lib.io.files import one_line, read_json, reading, sha256_file, write_json
-from neuma_lib.io.released import image_name, matrix_of_numbers, released_frames
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.observation import Observation, exposed_steps
 
@@ -144,7 +144,7 @@ def transform_world(
 def read_transforms(path: str | Path) -> dict[str, Any]:
     """Read and check transforms.json: a file, a pose and intrinsics (its own or common ones) for every frame.
 
-    A list in the layout of the authors' release is converted (`neuma_lib.io.released`).
+    A list in the layout of the authors' release is converted (`neuma_lib.io.datasets.released`).
 
     Raises:
         InputError: a missing or wrong entry; names the file, the frame and the entry.

@@ -20,11 +20,11 @@ from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.particles import load_body, with_motion
 from neuma_lib.mechanics.law import Law
 from neuma_lib.methods.base import ModelSource
+from neuma_lib.project.files import SceneFiles, inside
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.viewer import scalars
-from neuma_lib.viewer.files import SceneFiles, inside
 from neuma_lib.viewer.live import LiveSimulation, Snapshot
 
 ADDED_SIZE = 0.22

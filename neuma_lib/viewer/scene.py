@@ -22,9 +22,9 @@ from neuma_lib.io.images import read_image_set, read_transforms
 from neuma_lib.io.particles import load_body
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Law
+from neuma_lib.project.files import RunFiles, SceneFiles
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.viewer import scalars
-from neuma_lib.viewer.files import RunFiles, SceneFiles
 
 TRUTH = "truth"
 _BOUND = 8

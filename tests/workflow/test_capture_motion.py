@@ -6,10 +6,11 @@ import subprocess
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from board_pictures import BOARD, LENS, around, looking_at, picture
 from PIL import Image
-from project import copied
 from scipy.spatial.transform import Rotation
+
+from tests.support.board_pictures import BOARD, LENS, around, looking_at, picture
+from tests.support.project import copied
 
 PAGE = "tiny/results/mug/motion.md"
 SETTINGS = "board: {square: 0.03}\nposes: board\nlens: lenses.json\nlongest: 400\n"

@@ -4,12 +4,12 @@ import json
 
 import numpy as np
 import pytest
-from board_pictures import LENS, around, picture
 from PIL import Image
-from project import copied
-from test_capture_frames import film
 
 from neuma_lib.io.images import read_transforms
+from tests.support.board_pictures import LENS, around, picture
+from tests.support.films import film
+from tests.support.project import copied
 
 PAGE = "tiny/results/mug/capture.md"
 BOARD_ALONE = "board: {square: 0.03}\nposes: board\nlens: lenses.json\nlongest: 400\n"
