@@ -393,7 +393,7 @@ def test_the_live_mode_simulates_on_the_gpu_what_it_does_on_the_cpu():
             live.add(body.state(torch.zeros(3)).to(device), law.to(device), MODEL.dt)
             live.drop(0.3)
             live.set_weight(0.5)
-            live.throw((1.0, 0.0, 0.0))
+            live.launch((1.0, 0.0, 0.0))
             live.hold((0.6, 0.3, 0.5))
             last = live.do()
             assert last.counts == (len(body.x0),) * 2 and last.notice is last.trouble is None
