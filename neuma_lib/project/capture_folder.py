@@ -43,11 +43,7 @@ class Capture:
     takes: dict[str, dict[str, Path]]
 
     def pictures(self) -> dict[str, tuple[Path, ...]]:
-        """Photographs and stills, by group.
-
-        Raises:
-            InputError: there are no photographs, or a camera with videos has no picture of the empty scene.
-        """
+        """Photographs and stills, by group. Raises InputError if photographs, or the still of a camera, are missing."""
         if not self.photographs:
             raise InputError(
                 self.folder / self.settings.photographs,
@@ -80,11 +76,7 @@ class Capture:
         return tuple(self.takes[take])
 
     def own_masks(self, name: str) -> dict[str, Path]:
-        """Masks supplied by the user in a subfolder of the masks, by file stem.
-
-        Raises:
-            InputError: two masks of one picture, or a path outside the capture.
-        """
+        """Masks of the user in a subfolder, by file stem. Raises InputError for two masks of one picture."""
         return _by_camera(self.folder, f"{self.settings.masks}/{name}", PICTURES)
 
 

@@ -68,11 +68,7 @@ def scene_name(capture: str, take: str) -> str:
 
 
 def training_takes(capture: Capture) -> list[str]:
-    """Takes that the law is learned from, by name.
-
-    Raises:
-        InputError: a held-out take does not exist, all are held out, or training takes have different cameras.
-    """
+    """Takes that the law is learned from, by name. Raises InputError if ``held_out`` of the capture is invalid."""
     where = f"{capture.folder / 'capture.yaml'}: held_out"
     for take in capture.settings.held_out:
         if take not in capture.takes:

@@ -18,13 +18,7 @@ from studies.capture_benchmark.stage import frame_steps, solid, start, time_step
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """The surface of the body at steps of its motion.
-
-    Attributes:
-        steps: (T,).
-        vertices: [m], (T, n, 3).
-        velocities: [m/s], (T, n, 3).
-    """
+    """Vertices (T, n, 3) [m] and velocities (T, n, 3) [m/s] of the body's surface at simulation steps (T,)."""
 
     steps: np.ndarray
     vertices: np.ndarray

@@ -73,14 +73,7 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Flying:
-    """The true rigid motion at a time of free flight.
-
-    Attributes:
-        center: of mass [m], (3,).
-        turn: rotation from the start.
-        velocity: [m/s], (3,).
-        spin: [rad/s], (3,).
-    """
+    """True rigid motion in flight: centre of mass [m], rotation from the start, velocity [m/s], spin [rad/s]."""
 
     center: np.ndarray
     turn: Rotation
@@ -89,13 +82,7 @@ class Flying:
 
 
 def flying(truth: Truth, time: float, velocity: Sequence[float], gravity: Sequence[float]) -> Flying:
-    """The true motion at a time before contact.
-
-    Args:
-        time: since the start [s].
-        velocity: at the start [m/s].
-        gravity: [m/s^2].
-    """
+    """The true motion at a time before contact [s], from velocity [m/s] and gravity [m/s^2] at the start."""
     k = int(np.clip(np.searchsorted(truth.times, time), 1, len(truth.times) - 1))
     before, after = truth.turn(k - 1), truth.turn(k)
     spin = (after * before.inv()).as_rotvec() / (truth.times[k] - truth.times[k - 1])
@@ -113,13 +100,7 @@ def angle(a: np.ndarray, b: np.ndarray) -> float:
 def compare_cameras(
     frames: Sequence[Mapping[str, Any]], photographs: Mapping[str, Any], cameras: Mapping[str, Any]
 ) -> list[Row]:
-    """Errors of the cameras in a room's transforms.json.
-
-    Args:
-        frames: entries of the transforms.json.
-        photographs: true cameras, by the stem of their files.
-        cameras: true video cameras, by name.
-    """
+    """Errors of the cameras in a room's transforms.json, given true ones by file stem and by camera."""
     rows, centres, true_centres = [], [], []
     for kind in ("photographs", "video cameras"):
         centre, turn = [], []
@@ -194,11 +175,7 @@ def compare_masks(agreements: Mapping[str, Sequence[float]]) -> list[Row]:
 
 
 def compare_flight(flight: Mapping[str, Any], known: Mapping[str, Any], truth: Truth, drop: str) -> list[Row]:
-    """Errors of a flight/<take>.json.
-
-    Args:
-        known: truth.json.
-    """
+    """Errors of a flight/<take>.json, given the truth.json."""
     first = min(flight["offsets_s"])
     late = {name: camera["offset_s"] for name, camera in known["cameras"].items()}
     true_drop = known["drops"][drop]
@@ -292,12 +269,7 @@ def _relative_error(value: Sequence[float], true: Sequence[float]) -> float:
 
 
 def compare_motion(errors: Mapping[str, float], prior: str, held_out: bool) -> list[Row]:
-    """Tracer errors [m] of predictions of a drop, by method.
-
-    Args:
-        prior: method that evaluates the unchanged prior.
-        held_out: whether the drop is held out.
-    """
+    """Tracer errors [m] of predictions of a drop, by method. ``prior`` evaluates the unchanged prior."""
     rows = []
     for method, error in errors.items():
         goal = None if method == prior else 15.0 if held_out else 12.0

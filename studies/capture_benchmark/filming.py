@@ -32,12 +32,7 @@ WALL_TEXEL = 2.0
 
 
 def scenery(room: DemoRoomConfig, page: np.ndarray, size: tuple[float, float]) -> Scenery:
-    """The room with its textures and lamps.
-
-    Args:
-        page: the printed page, sRGB (H, W, 3), uint8.
-        size: its width and height [m].
-    """
+    """The room with textures and lamps, from the printed page, sRGB (H, W, 3), uint8, and its size [m]."""
     half, wall = room.half, room.wall
     texel = 2 * half / room.texels
     corners = [np.array([[-half, 0, -half], [half, 0, -half], [half, 0, half], [-half, 0, half]])]

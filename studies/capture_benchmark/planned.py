@@ -14,11 +14,7 @@ PREFIX = "demo_"
 
 
 def planned_captures(demo: DemoCapturesConfig, root: str | Path) -> dict[str, Capture]:
-    """Settings and files of the demo captures, by name.
-
-    Args:
-        root: folder of all captures.
-    """
+    """Settings and files of the demo captures, by name, in the folder of all captures."""
     captures = {}
     for name, item in demo.objects.items():
         folder = Path(root) / f"{PREFIX}{name}"

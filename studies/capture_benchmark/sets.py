@@ -45,11 +45,7 @@ def body_at_rest(demo: DemoCapturesConfig, name: str) -> Moving:
 def body_of_drop(
     demo: DemoCapturesConfig, name: str, drop: str, particles: str | Path
 ) -> tuple[Moving, dict[str, np.ndarray]]:
-    """The body in a drop, and the numbers of its frames for each camera.
-
-    Args:
-        particles: file of the simulated motion.
-    """
+    """The body in a drop, from the file of its particles, and the numbers of its frames for each camera."""
     item = demo.objects[name]
     mesh = solid(item)
     colors = colors_at(mesh, mesh.vertices, item.appearance)

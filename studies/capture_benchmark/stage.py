@@ -32,12 +32,7 @@ BEYOND = 1.05
 
 @dataclass(frozen=True, eq=False)
 class Eye:
-    """A camera.
-
-    Attributes:
-        c2w: camera to world (4, 4), OpenGL axes.
-        lens: its settings.
-    """
+    """A camera: camera to world (4, 4), OpenGL axes, and the settings of its lens."""
 
     c2w: np.ndarray
     lens: LensConfig

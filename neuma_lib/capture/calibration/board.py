@@ -48,12 +48,7 @@ Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """Corners of the board in a picture.
-
-    Attributes:
-        ids: OpenCV's corner numbers, row by row from the top of the page, (N,).
-        pixels: (N, 2), pixel centres at +0.5.
-    """
+    """Corners of the board in a picture: OpenCV's numbers (N,), and pixels (N, 2) with centres at +0.5."""
 
     ids: np.ndarray
     pixels: np.ndarray
@@ -138,11 +133,7 @@ def _runs(picture: np.ndarray) -> list[tuple[int, int, int]]:
 
 
 def print_board(path: str | Path, board: BoardConfig, paper: str = "A4") -> None:
-    """Write a PDF page with the board at its true size, and a ruler for measuring the print.
-
-    Raises:
-        InputError: unknown paper size, or squares that do not fit on the paper.
-    """
+    """Write a PDF page with the board at its true size, and a ruler. Raises InputError if it does not fit."""
     page = board_page(board, paper)
     canvas = require("matplotlib.backends.backend_pdf", "capture").FigureCanvasPdf(page)
     with atomic(path) as partial:
@@ -192,11 +183,7 @@ def board_page(board: BoardConfig, paper: str) -> Figure:
 
 
 def find_board(image: np.ndarray, board: BoardConfig) -> Detection:
-    """Detect the corners of the board in a picture with sub-pixel accuracy. Empty if the board is not visible.
-
-    Args:
-        image: (H, W, 3) RGB or (H, W), uint8.
-    """
+    """Detect corners of the board in a picture, (H, W, 3) RGB or (H, W), uint8, with sub-pixel accuracy."""
     cv2 = opencv()
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
     parameters = cv2.aruco.DetectorParameters()
@@ -353,11 +340,9 @@ def room_from_board(board: BoardConfig, center: tuple[float, float] | None) -> S
 def board_outline(
     board: BoardConfig, center: tuple[float, float] | None, viewmat: np.ndarray, K: np.ndarray
 ) -> np.ndarray | None:
-    """Corners (4, 2) [px] of the printed board with a margin of a square, in order. None if behind the camera.
+    """Corners (4, 2) [px] of the printed board with a margin of a square in a pinhole camera, in order.
 
-    Args:
-        viewmat: the room's metres to camera, OpenCV axes, (4, 4).
-        K: of a pinhole, (3, 3) [px].
+    ``viewmat`` (4, 4) is from the room's metres to the camera, OpenCV axes. None if the board is behind the camera.
     """
     columns, rows = board.squares
     ends = [(-1, -1), (columns + 1, -1), (columns + 1, rows + 1), (-1, rows + 1)]

@@ -42,14 +42,7 @@ def draw_poses(path: str | Path, poses: Poses) -> None:
 
 
 def draw_cameras(path: str | Path, poses: Poses, unit: str, suffix: str = "", floor: bool = False) -> None:
-    """Plot cameras and points, from above and from the side.
-
-    Args:
-        poses: y up, the scene around the origin.
-        unit: of their lengths.
-        suffix: end of the title.
-        floor: draw a floor at y = 0.
-    """
+    """Plot cameras and points from above and from the side, y up, the scene around the origin, floor at y = 0."""
     centres = camera_centres(poses.viewmats)
     forward = poses.viewmats[:, 2, :3]
     fixed = np.array([group_of(name) != PHOTOGRAPHS for name in poses.names])

@@ -15,13 +15,7 @@ RANSAC_DRAWS = 2000
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """x -> scale rotation x + translation.
-
-    Attributes:
-        scale: positive.
-        rotation: (3, 3), proper.
-        translation: (3,).
-    """
+    """x -> scale rotation x + translation, with scale > 0, a proper rotation (3, 3) and translation (3,)."""
 
     scale: float
     rotation: np.ndarray
@@ -61,11 +55,7 @@ def identity() -> Similarity:
 
 
 def fit_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
-    """Least-squares similarity from points (N, 3) to points (N, 3) (Umeyama 1991).
-
-    Raises:
-        InputError: fewer than three points, or all on a line.
-    """
+    """Least-squares similarity between points (N, 3) (Umeyama 1991). Raises InputError for points on a line."""
     middle, aim = source.mean(axis=0), target.mean(axis=0)
     spread = np.linalg.svd(source - middle, compute_uv=False) if len(source) > 2 else np.zeros(3)
     if spread[1] <= 1e-6 * spread[0] or spread[0] == 0:

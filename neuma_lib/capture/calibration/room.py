@@ -51,15 +51,7 @@ class Room:
 
 
 def find_room(poses: Poses, pictures: Mapping[str, Path], settings: CaptureConfig) -> Room:
-    """The room of poses by the method in the settings.
-
-    Args:
-        poses: of `find_poses`.
-        pictures: name -> file.
-
-    Raises:
-        InputError: see `room_of`.
-    """
+    """The room of poses by the method in the settings, from pictures by name. Raises InputError as `room_of`."""
     if settings.poses == "photographs":
         placed = {name: pictures[name] for name in poses.names}
         return room_of(poses, find_boards(placed, settings.board) if settings.board else {}, settings)
@@ -114,15 +106,10 @@ def _metres_per_unit(poses: Poses, length: LengthConfig) -> float:
 def write_room(
     path: str | Path, room: Room, pictures: Mapping[str, Path], settings: CaptureConfig
 ) -> dict[str, Any]:
-    """Write undistorted pictures and their transforms.json, with the room placed into the simulation box.
+    """Write undistorted pictures and the transforms.json at ``path``, with the room in the simulation box.
 
     ``world`` of the file is the transform from the room to the box, ``room`` that from the reconstruction to the room.
-
-    Args:
-        path: .../transforms.json.
-
-    Returns:
-        The report: pictures, errors, lenses, board or floor.
+    Returns the `report`.
     """
     folder = Path(path).parent
     folder.mkdir(parents=True, exist_ok=True)

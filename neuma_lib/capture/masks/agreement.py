@@ -49,11 +49,7 @@ class CommonBody:
     agreement: np.ndarray
 
     def seen(self, size: tuple[int, int], viewmat: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, float]:
-        """Silhouette in a picture, accurate to about half a voxel, (H, W), and the size of a voxel there [px].
-
-        Args:
-            size: height and width of the picture [px].
-        """
+        """Silhouette (H, W) in a picture of a size (height, width), and the size of a voxel in it [px]."""
         body, shrink = _silhouette(self.points, self.voxel, size, viewmat, K)
         large = opencv().resize(body.astype(np.float32), size[::-1], interpolation=opencv().INTER_LINEAR)
         return large > 0.5, 1 / shrink

@@ -18,11 +18,7 @@ from neuma_lib.io.images import OPENGL_TO_OPENCV, open_image, read_transforms, w
 
 
 def room_frames(path: str | Path, group: str) -> list[dict[str, Any]]:
-    """Entries of the room's transforms.json of one group, `photographs` or a camera's name.
-
-    Raises:
-        InputError: there are none.
-    """
+    """Entries of the room's transforms.json of `photographs` or a camera. Raises InputError if there are none."""
     frames = [frame for frame in read_transforms(path)["frames"] if frame.get("group") == group]
     if not frames:
         raise InputError(

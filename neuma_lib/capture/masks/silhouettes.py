@@ -61,12 +61,7 @@ _AWAY = 15.0  # squared deviations from the background required of a pixel for l
 
 @dataclass(frozen=True, eq=False)
 class Palette:
-    """Colours of an object.
-
-    Attributes:
-        colours: sRGB, (K, 3), float32.
-        shares: relative frequencies, (K,).
-    """
+    """Colours of an object, sRGB (K, 3), float32, and their relative frequencies (K,)."""
 
     colours: np.ndarray
     shares: np.ndarray

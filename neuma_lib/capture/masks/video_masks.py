@@ -136,12 +136,7 @@ def video_masks(
 
 
 def given_masks(masks: np.ndarray, times: np.ndarray, down: np.ndarray | None = None) -> VideoMasks:
-    """Masks (T, H, W) supplied by the user, with the arcs detected in them.
-
-    Args:
-        times: of the frames [s], ascending, (T,).
-        down: direction of gravity in the picture, see `find_arcs`.
-    """
+    """Masks (T, H, W) of the user at ascending times (T,) [s], with arcs detected by `find_arcs`."""
     seen = [np.array([[*centroid(mask), mask.sum()]]) if whole(mask) else np.empty((0, 3)) for mask in masks]
     still = np.ones((len(masks), 3))
     return VideoMasks(masks, np.zeros(len(masks)), still, 0 * still, tuple(find_arcs(seen, times, down)))

@@ -35,11 +35,9 @@ def lowest_points(
 
 
 def contact_time(times: Sequence[np.ndarray], heights: Sequence[np.ndarray]) -> float:
-    """Time at which an object touches the floor at y = 0, median over the cameras [s]. Infinite if never observed.
+    """Time of contact with the floor [s], median over the cameras, or infinity.
 
-    Args:
-        times: of the frames of each camera, on a common clock [s], (T,).
-        heights: `lowest_points` of each camera (T,) [m].
+    From the times of frames (T,) of each camera on a common clock [s] and their `lowest_points` (T,) [m].
     """
     touched = [clock[low < 0] for clock, low in zip(times, heights)]
     return float(np.median([clock[0] if len(clock) else np.inf for clock in touched]))

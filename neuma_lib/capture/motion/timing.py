@@ -141,11 +141,7 @@ def row_times(
 
 
 def choose_offset(sound: Offset | None, motion: Offset | None, name: str) -> tuple[Offset, str]:
-    """The offset with the smaller standard deviation, and a line of text that lists both.
-
-    Raises:
-        InputError: there is none, or the two differ by more than four standard deviations.
-    """
+    """The offset with the smaller standard deviation, and a line of text. Raises InputError if both disagree."""
     offsets = [o for o in (sound, motion) if o is not None]
     if not offsets:
         raise InputError(

@@ -37,11 +37,7 @@ def composited(colours: Tensor, alpha: Tensor, background: Tensor | float) -> Te
 
 
 def exposed(background: np.ndarray, gain: Sequence[float], offset: Sequence[float]) -> np.ndarray:
-    """The empty scene (H, W, 3), uint8, at the exposure of a frame, in [0, 1].
-
-    Args:
-        gain, offset: of each channel, (3,), with frame = gain * background + offset in [0, 255].
-    """
+    """The empty scene (H, W, 3), uint8, times gain plus offset (3,) [0 to 255], clipped and converted to [0, 1]."""
     return np.clip(background * np.asarray(gain, np.float32) + np.asarray(offset, np.float32), 0, 255) / 255
 
 

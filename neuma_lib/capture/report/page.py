@@ -39,12 +39,7 @@ class Check(NamedTuple):
 
 
 def checks(room: Mapping[str, Any], videos: Mapping[str, Mapping[str, Any]]) -> list[Check]:
-    """Checks of a capture.
-
-    Args:
-        room: report of `neuma_lib.capture.calibration.room.report`.
-        videos: `Timeline.plain` by name of the video.
-    """
+    """Checks of a capture, from the report of its room and `Timeline.plain` by name of the video."""
     registered, pictures = room["registered"], room["pictures"]
     lost = f" (not {', '.join(room['lost'])})" if room["lost"] else ""
     result = [
@@ -82,13 +77,7 @@ def motion_checks(
     videos: Mapping[str, Mapping[str, Any]],
     flights: Mapping[str, Mapping[str, Any]],
 ) -> list[Check]:
-    """Checks of masks and free flight.
-
-    Args:
-        photographs: report of the masks of the photographs.
-        videos: of the masks of each video, by its name.
-        flights: `neuma_lib.capture.motion.flight.report` by take.
-    """
+    """Checks of masks and free flight, from reports of photographs, of videos by name, and of flights by take."""
     count, out = photographs["photographs"], photographs["left_out"]
     text = f"{count - len(out)} of {count}" + (f" (not {', '.join(out)})" if out else "")
     what = f"masks of photographs that agree (IoU > {MIN_AGREEMENT})"
@@ -126,14 +115,7 @@ def registration_checks(placed: Mapping[str, Mapping[str, Any]]) -> list[Check]:
 
 
 def markdown(title: str, checks: list[Check], pictures: Mapping[str, str], missing: str | None = None) -> str:
-    """A page of checks and pictures.
-
-    Args:
-        title: of the page.
-        checks: rows of the table.
-        pictures: caption -> file, relative to the page.
-        missing: note on what the capture still lacks.
-    """
+    """A page with a table of checks, a note on what is missing, and pictures: caption -> path relative to the page."""
     lines = [f"# {title}", "", "| check | found | wanted | |", "|---|---|---|---|"]
     for check in checks:
         lines.append(
