@@ -11,6 +11,7 @@ from neuma_lib.sim.model import WALLS, Body, MPMModel, as_bodies, contact_cleara
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, cross_matrix
 from neuma_lib.sim.workspace import Workspace, WorkspaceSize
+from tests.support.errors import refused
 from tests.support.sim_scenes import (
     DENSITY,
     DT,
@@ -307,62 +308,61 @@ def test_same_start_same_bytes():
 def test_courant_number_names_the_largest_step():
     model = MPMModel(24, 5e-3)
     law = make_law("hencky")
-    with pytest.raises(InputError, match="largest stable step is dt = ") as error:
+    with refused("dt") as error:
         model.check_courant(law, DENSITY)
-    stable = float(str(error.value).split("dt = ")[-1].split()[0])
+    stable = float(error.value.remedy.split("dt <= ")[-1].split()[0])
     assert MPMModel(24, 0.99 * stable).check_courant(law, DENSITY) == pytest.approx(0.792, rel=0.01)
     with pytest.raises(InputError):
         MPMModel(24, 1.01 * stable).check_courant(law, DENSITY)
 
 
 @pytest.mark.parametrize(
-    "settings, words",
+    "settings, where",
     [
-        (dict(boundary="glue"), ["glue", "no_slip, slip, sticky"]),
-        (dict(boundary={"floor": "slip"}), ["floor", "y_min"]),
-        (dict(grid=4), ["grid"]),
-        (dict(dt=-1.0), ["dt"]),
-        (dict(dt=float("nan")), ["dt"]),
-        (dict(gravity=(0.0, -9.8)), ["gravity"]),
-        (dict(walls="padded"), ["padded", "outside, released"]),
-        (dict(walls="released", wall_cells=0), ["wall_cells"]),
-        (dict(wall_cells=2), ["wall_cells", "outside"]),
+        (dict(boundary="glue"), "boundary"),
+        (dict(boundary={"floor": "slip"}), "boundary"),
+        (dict(boundary=("slip", "slip")), "boundary"),
+        (dict(grid=4), "grid"),
+        (dict(dt=-1.0), "dt"),
+        (dict(dt=float("nan")), "dt"),
+        (dict(gravity=(0.0, -9.8)), "gravity"),
+        (dict(walls="padded"), "walls"),
+        (dict(walls="released", wall_cells=0), "wall_cells"),
+        (dict(wall_cells=2), "wall_cells"),
     ],
 )
-def test_wrong_model_is_named(settings, words):
-    with pytest.raises(InputError) as error:
+def test_wrong_model_is_named(settings, where):
+    with refused(where):
         MPMModel(**{"grid": 16, "dt": DT, **settings})
-    assert all(word in str(error.value) for word in words)
 
 
 @pytest.mark.parametrize(
-    "change, words",
+    "change, where",
     [
-        (dict(x=lambda x: x + 0.5), ["outside the grid", "m on every axis"]),
-        (dict(x=lambda x: x * float("nan")), ["x has", "not finite"]),
-        (dict(x=lambda x: x[:, :2]), ["x has shape", "(N, 3)"]),
-        (dict(v=lambda x: x[:5]), ["v has", "(300, 3) or (3,)"]),
-        (dict(v=lambda x: x.float()), ["v is", "float32"]),
-        (dict(v=lambda x: x / 0), ["v has", "not finite"]),
-        (dict(F=lambda x: x), ["F has", "(300, 3, 3)"]),
-        (dict(mass=lambda x: -x[:, 0]), ["mass", "positive"]),
-        (dict(vol0=lambda x: x), ["vol0", "(300, 3)"]),
-        (dict(frames=lambda x: (3, 2)), ["frames", "strictly increasing"]),
-        (dict(frames=lambda x: (0, 21)), ["frames", "21", "20 steps"]),
-        (dict(tracers=lambda x: x[:, :2]), ["tracers", "(M, 3)"]),
-        (dict(law=lambda x: [Body(make_law("hencky"), 0, 299)]), ["299", "300"]),
-        (dict(law=lambda x: [Body(make_law("hencky"), 0, 200), Body(make_law("hencky"), 199, 300)]), ["200"]),
+        (dict(x=lambda x: x + 0.5), "state.x"),
+        (dict(x=lambda x: x * float("nan")), "state.x"),
+        (dict(x=lambda x: x[:, :2]), "state.x"),
+        (dict(v=lambda x: x[:5]), "state.v"),
+        (dict(v=lambda x: x.float()), "state.v"),
+        (dict(v=lambda x: x / 0), "state.v"),
+        (dict(F=lambda x: x), "state.F"),
+        (dict(mass=lambda x: -x[:, 0]), "state.mass"),
+        (dict(vol0=lambda x: x), "state.vol0"),
+        (dict(frames=lambda x: (3, 2)), "frames"),
+        (dict(frames=lambda x: (0, 21)), "frames"),
+        (dict(tracers=lambda x: x[:, :2]), "tracers"),
+        (dict(law=lambda x: [Body(make_law("hencky"), 0, 299)]), "bodies"),
+        (dict(law=lambda x: [Body(make_law("hencky"), 0, 200), Body(make_law("hencky"), 199, 300)]), "body"),
     ],
 )
-def test_wrong_start_is_named(change, words):
+def test_wrong_start_is_named(change, where):
     x0, mass, vol0 = cube()
     state = dict(x=x0, v=torch.zeros_like(x0), mass=mass, vol0=vol0)
     rest = dict(law=make_law("hencky"), steps=20, frames=(20,))
     for key, make in change.items():
         (state if key in (*state, "F") else rest)[key] = make(x0)
-    with pytest.raises(InputError) as error:
+    with refused(where):
         rollout(MPMModel(16, DT), state=State(**state), **rest)
-    assert all(word in str(error.value) for word in words), error.value
 
 
 class BreaksAt(Plasticity):
