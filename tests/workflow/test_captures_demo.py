@@ -28,7 +28,7 @@ def test_a_capture_that_is_not_there_yet_is_planned(project):
     assert plan["demo_photographs"] == 2 and plan["demo_videos"] == 4 and plan["capture_poses"] == 2
     assert (
         plan["capture_registration"] == 4
-        and plan["capture_prediction"] == 12
+        and plan["predict"] == 12
         and plan["demo_evaluation"] == 1
     )
     assert not [
