@@ -28,6 +28,7 @@ from neuma_lib.evaluation.plotting import style
 from neuma_lib.evaluation.plotting.rendering import cropped, evenly, frontal, magnified
 from neuma_lib.evaluation.plotting.spheres import draw_spheres
 from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.methods.registry import built_in_presets
 from neuma_lib.paper.figures import ablation_gradients, ch_dist_curve, image_quality, material_response
 from neuma_lib.paper.figures.lora_alphav import monotone_frames
 from neuma_lib.paper.image_grid import (
@@ -190,7 +191,7 @@ DATA = {
         row_titles=["I\ninitial\nstate", "II\nsimulation", "III\nrendering", "\nobservation", "\ndifference"],
     ),  # fmt: skip
     "material_response": lambda: {
-        "titles": {law: SETTINGS["methods"].get(law, {"title": law})["title"] for law in RESPONDING},
+        "titles": {law: built_in_presets().get(law, {"title": law})["title"] for law in RESPONDING},
         "scenes": {scene: response() for scene in SCENES},
     },
     "random_scenes": lambda: {
@@ -354,7 +355,7 @@ def test_responses_are_of_their_law_and_bands_of_all_chains(tmp_path):
 
 
 def test_one_look_a_method():
-    drawn = {name for name, method in SETTINGS["methods"].items() if "trained_as" not in method}
+    drawn = {name for name, preset in built_in_presets().items() if preset["same_fit_as"] is None}
     assert drawn <= set(style.METHODS)
     for part in ("color", "marker"):
         looks = [getattr(kind, part) for kind in style.METHODS.values()]

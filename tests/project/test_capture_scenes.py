@@ -11,6 +11,7 @@ from neuma_lib.capture.motion.synchronisation import (
     without_gain,
 )
 from neuma_lib.errors import InputError
+from neuma_lib.project import cases
 from neuma_lib.project.capture_scenes import captured_scenes
 from neuma_lib.project.loading import load, read_yaml
 from neuma_lib.project.settings import NO_TRUTH
@@ -65,7 +66,10 @@ def test_what_is_held_out_trains_nothing(captures):
 
 def test_nobody_knows_the_truth_of_a_capture(captures):
     found = loaded(captures)
-    for ask in (lambda: found.frame_steps("mug_one"), lambda: found.true_law("mug_one", "true_law")):
+    for ask in (
+        lambda: found.frame_steps("mug_one"),
+        lambda: cases.case(found, "mug_one", "true_law").source(),
+    ):
         with pytest.raises(InputError, match=NO_TRUTH):
             ask()
 

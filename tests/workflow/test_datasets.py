@@ -50,7 +50,7 @@ def test_a_scene_is_made_of_another_systems_folder(tmp_path, layout):
     own.write_text(yaml.safe_dump(settings))
     plan = project.plan("tiny/results/Theirs/neuma/metrics.json")
     assert (
-        plan["supplied_static"] == plan["supplied_dynamic"] == plan["material"] == plan["ground_truth"] == 1
+        plan["supplied_static"] == plan["supplied_dynamic"] == plan["fit_neuma"] == plan["ground_truth"] == 1
     )
     assert not any(rule.startswith("render") for rule in plan)
     output = project.run(*(f"tiny/data/Theirs/{kind}/transforms.json" for kind in images if kind != "stride"))
