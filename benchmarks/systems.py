@@ -57,7 +57,7 @@ def judge_pac_nerf(name: str, settings: Config, method: str, fields: Path) -> st
     law = settings.priors.laws.get(settings.method_prior(name, method))
     before = _core_seconds()
     family, constants = choose_family(how, law.plain() if law else None)
-    carried = CarriedField(field, settings.radiance.spacing, settings.radiance.least_opacity, how, density)
+    carried = CarriedField(field, settings.radiance.spacing, settings.radiance.min_opacity, how, density)
     video = load_observation(data / "dynamic/transforms.json", material.views).to(torch.float32)
     fit = fit_pac_nerf(model, carried, video, found["frames"][-1], constants, how, settings.seed)
     seconds = _core_seconds() - before

@@ -42,7 +42,7 @@ class DatasetConfig(Section):
     stride: int | None = Field(
         None, ge=1, description="steps between two frames; in place of frames, which is null then"
     )
-    sub_frames: int = Field(
+    exposure_samples: int = Field(
         5,
         ge=1,
         description="most renders that are averaged to one frame where transforms.json states its exposure; they are "

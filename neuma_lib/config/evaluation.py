@@ -17,7 +17,7 @@ class EvaluationConfig(Section):
         None,
         min_length=1,
         description="views of the image metrics; null: those that training does not see. Where there are none, those "
-        "that `material.views` leaves out are taken, or else the training views, and results and figures say so",
+        "that `training.views` leaves out are taken, or else the training views, and results and figures say so",
     )
     margin: float = Field(
         0.1,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from neuma_lib.config.base import Section
+from neuma_lib.config.base import Section, internal
 
 
 class DensificationConfig(Section):
@@ -12,7 +12,7 @@ class DensificationConfig(Section):
 
     start: float = Field(0.1, ge=0, description="fraction of the iterations at which adding begins")
     stop: float = Field(0.6, ge=0, description="fraction of the iterations at which adding ends")
-    every: int = Field(100, ge=1, description="iterations between two rounds")
+    every: int = internal(100, "iterations between two rounds", ge=1)
     max_count: int = Field(2000, ge=1, description="Gaussians at most")
     growth: float = Field(0.15, ge=0, description="largest fraction of Gaussians added in a round")
     split_scale: float = Field(

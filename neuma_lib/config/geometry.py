@@ -25,5 +25,6 @@ class SurfaceConfig(Section):
 class GeometryConfig(Section):
     """Surface mesh and volume particles."""
 
+    particles: int = Field(2000, gt=0, description="particles of the reconstructed body")
     surface: SurfaceConfig = Field(SurfaceConfig(), description="reconstruction of the surface")
     sampling: Literal["jittered", "uniform"] = Field("jittered", description="how particles fill the volume")

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from neuma_lib.config.base import Compared, Section
+from neuma_lib.config.base import Compared, Section, internal
 from neuma_lib.config.laws import LawConfig
 
 
@@ -22,42 +22,44 @@ class IdentifyConfig(Section):
         (0,),
         min_length=1,
         description="views of the video that are used; for a method that trains on "
-        "other views than material.views, such as neuma_structured+views=0,1, those",
+        "other views than training.views, such as neuma_structured+views=0,1, those",
     )
-    compare: Compared = Field("colour", description="what of the images counts, as `material.compare`")
+    compare: Compared = Field("colour", description="what of the images counts, as `training.compare`")
     covariance_from: Literal["elastic", "total"] = Field(
-        "total", description="deformation that stretches the Gaussians, as `material.covariance_from`"
+        "total", description="deformation that stretches the Gaussians, as `training.covariance_from`"
     )
     gaussian_motion: Literal["mean", "affine"] = Field(
-        "affine", description="how Gaussians follow their particles, as `material.gaussian_motion`"
+        "affine", description="how Gaussians follow their particles, as `training.gaussian_motion`"
     )
     frames: int = Field(33, ge=4, description="most frames that are compared, spread evenly over the video")
-    particles: int = Field(
+    refined_particles: int = Field(
         8000,
         ge=0,
         description="particles of the bodies that say what the coarseness of the reconstruction's changes, more than "
-        "`simulation.particles`; 0: ignored",
+        "`geometry.particles`; 0: ignored",
     )
-    misplaced: float = Field(
+    pose_tolerance: float = Field(
         1e-3,
         ge=0,
         description="expected constant shift [m] and relative enlargement of the rendered body, fitted along",
     )
-    samplings: int = Field(2, ge=1, description="such bodies: their difference is a part of the uncertainty")
+    resamplings: int = Field(
+        2, ge=1, description="such bodies: their difference is a part of the uncertainty"
+    )
     held_out: float = Field(
         0.25,
         gt=0,
         lt=1,
         description="part of the frames after the first contact, the last ones, that families are judged by",
     )
-    squares: tuple[int, ...] = Field(
+    pyramid: tuple[int, ...] = Field(
         (6, 12, 24, 96),
         min_length=1,
         description="images are averaged over squares, so many across, in turn: blurred images are what makes the fit "
         "converge from afar. An image with fewer pixels across is taken as it is",
     )
     iterations: int = Field(6, ge=1, description="most Levenberg-Marquardt steps at each size of the squares")
-    least_gain: float = Field(
+    min_gain: float = Field(
         0.01,
         gt=0,
         description="part of the squared residuals that a step must promise to save; a tenth of it in the last round",
@@ -70,13 +72,8 @@ class IdentifyConfig(Section):
     longest_step: float = Field(
         1.0, gt=0, description="largest change of an unbounded constant in a step (of a logarithm: factor e)"
     )
-    spread: float = Field(
-        3.0,
-        gt=0,
-        description="expected distance of the unbounded constants from their start; it holds what the video does "
-        "not show, and bounds how uncertain they are",
-    )
-    give_up: float = Field(
+    spread: float = internal(3.0, "expected distance of the unbounded constants from their start", gt=0)
+    prune_factor: float = Field(
         4.0,
         gt=1,
         description="a family whose squared residuals exceed the best one's by this factor is not refined further; "

@@ -12,7 +12,7 @@ from neuma_lib.config.base import Section
 class MotionOptions(Section):
     """How bodies are simulated, and how their Gaussians follow."""
 
-    carrier: Literal["binding", "gaussians"] = Field(
+    particle_source: Literal["binding", "gaussians"] = Field(
         "binding", description="bound volume particles, or the Gaussians themselves as particles (w/o Bind)"
     )
     views: tuple[int, ...] = Field((0,), min_length=1, description="training views of the video")

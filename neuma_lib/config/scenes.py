@@ -133,8 +133,8 @@ class SceneConfig(Section):
         "the scene `<name>_throw2`, or 3, ... by its place in the list. Not handed on by `like`",
     )
     story: str = Field("", description="in which way the prior is wrong, in words")
-    material: dict[str, Any] = Field(
-        {}, description="settings of the section material that this scene overrides"
+    training: dict[str, Any] = Field(
+        {}, description="settings of the section training that this scene overrides"
     )
 
     @property

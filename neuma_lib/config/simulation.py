@@ -15,7 +15,6 @@ GRAVITY = 9.81
 class SimulationConfig(Section):
     """The material point method."""
 
-    particles: int = Field(2000, gt=0, description="particles of the reconstructed body")
     grid: int = Field(24, ge=8, description="grid cells along each side of the unit cube")
     gravity: Vector = Field((0.0, -9.8, 0.0), description="acceleration [m/s^2]")
     boundary: str | dict[str, str] = Field(

@@ -27,7 +27,7 @@ class StructuredConfig(Section):
         10,
         ge=1,
         description="optimiser steps of all parts' corrections together, without the held-out frames, before the parts "
-        "are judged; `material.iterations` more follow on all frames, of those that are chosen",
+        "are judged; `training.iterations` more follow on all frames, of those that are chosen",
     )
     margin: float = Field(
         0.05,
@@ -43,6 +43,6 @@ class StructuredConfig(Section):
     )
     penalties: tuple[float, ...] = Field(
         (),
-        description="weights of `material.penalty` that are tried beside it, each for as many steps as a trial: of "
+        description="weights of `training.penalty` that are tried beside it, each for as many steps as a trial: of "
         "those that the held-out frames do as well with, the largest is taken",
     )

@@ -18,8 +18,9 @@ class TableConfig(Section):
     methods: tuple[str, ...] = Field((), description="rows, in order; variants such as neuma+rank=4 too")
     titles: dict[str, str] = Field({}, description="names of rows other than the methods' own, by method")
     note: str | None = Field(None, description="what a reader must know of the whole table; stands below it")
-    on_request: bool = Field(
-        False, description="true: made when it is asked for by name, not by the targets `tables` and `all`"
+    default_target: bool = Field(
+        True,
+        description="whether the targets `tables` and `all` include it; false: on request by its file name",
     )
     seeds: int = Field(
         1,

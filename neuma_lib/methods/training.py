@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.fitting.material import ParticleLoss, PixelLoss
 from neuma_lib.io.files import listed, write_json
@@ -34,7 +34,7 @@ class Training:
         self,
         inputs: Files,
         options: Mapping[str, Any],
-        settings: MaterialConfig,
+        settings: TrainingConfig,
         problem: Problem,
         run: FitRun,
         stamp: Mapping[str, Any] | None = None,
@@ -42,7 +42,7 @@ class Training:
         self.settings, self.run, self._problem = settings, run, problem
         parts = zip(*(listed(inputs[name]) for name in ("particles", "binding", "gaussians")), strict=True)
         bodies = [
-            load_body(*files, density, settings.carrier, settings.gaussian_motion).to(
+            load_body(*files, density, settings.particle_source, settings.gaussian_motion).to(
                 torch.float32, run.device
             )
             for files, density in zip(parts, problem.densities, strict=True)
@@ -54,13 +54,13 @@ class Training:
             self.losses = [particle_loss(file, run.device) for file in listed(inputs["truth"])]
         else:
             videos = zip(bodies, listed(inputs["transforms"]), strict=True)
-            self.losses = [pixel_loss(body, file, settings, problem.filming) for body, file in videos]
+            self.losses = [pixel_loss(body, file, settings, problem.exposure) for body, file in videos]
         files = {
             f"{name} {k}": file for name, found in inputs.items() for k, file in enumerate(listed(found))
         }
         known = {
             "simulation": problem.simulation,
-            "filming": problem.filming,
+            "exposure": problem.exposure,
             "densities": problem.densities,
             **options,
         }
@@ -101,10 +101,10 @@ def particle_loss(truth: str, device: torch.device) -> ParticleLoss:
 
 
 def pixel_loss(
-    body: Reconstruction, transforms: str, settings: MaterialConfig, filming: Mapping[str, Any]
+    body: Reconstruction, transforms: str, settings: TrainingConfig, exposure: Mapping[str, Any]
 ) -> PixelLoss:
     """The loss of a video."""
-    videos = load_videos(transforms, settings.views, **filming)
+    videos = load_videos(transforms, settings.views, **exposure)
     videos = [video.to(body.x0.dtype, body.x0.device) for video in videos]
     total = settings.covariance_from == "total"
     return PixelLoss(body, videos, settings.covariance_gradient, total=total, compare=settings.compare)

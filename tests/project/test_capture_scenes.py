@@ -41,7 +41,7 @@ def test_a_capture_is_a_scene_and_each_throw_of_it_another(captures):
     found = loaded(captures).scenes
     assert found["mug"].captured.throw is None and found["mug_one"].captured.throw == "one"
     assert found["mug_one"].videos == ("mug_two",) and found["mug_two"].videos == ()
-    assert found["mug_one"].material["views"] == [0, 1]
+    assert found["mug_one"].training["views"] == [0, 1]
     assert found["mug_two"].density == 900 and found["mug_two"].captured.scale == 2
     assert "mug_one" not in loaded(captures).plain_scenes
 

@@ -259,11 +259,11 @@ def test_a_method_can_start_as_identification_found(project):
 
 def test_finer_bodies_must_be_finer(project):
     for particles, accepted in {200: False, 201: True, 0: True}.items():
-        settings = f"identify={{particles: {particles}}}"
+        settings = f"identify={{refined_particles: {particles}}}"
         output = project.run(
             "--dry-run", "--config", settings, "--", f"{SCENE}/identified.json", succeeds=accepted
         )
-        told = "identify.particles: 200 are not more than the 200 of the reconstruction"
+        told = "identify.refined_particles: 200 must exceed geometry.particles = 200"
         assert (told in output) != accepted
 
 

@@ -113,7 +113,7 @@ class RadianceField(nn.Module):
         return field
 
     def particles(
-        self, spacing: float, least_opacity: float, generator: torch.Generator | None = None
+        self, spacing: float, min_opacity: float, generator: torch.Generator | None = None
     ) -> FieldParticles:
         """Particles in the occupied part; their features and opacities are differentiable with respect to the field.
 
@@ -121,7 +121,7 @@ class RadianceField(nn.Module):
 
         Args:
             spacing: side of such a cell [voxels]; the authors take 0.5, eight particles a voxel.
-            least_opacity: particles less opaque than this part of the most opaque one are left out.
+            min_opacity: particles less opaque than this part of the most opaque one are left out.
             generator: of the places, on the CPU; None draws the same ones every time.
         """
         generator = torch.Generator().manual_seed(0) if generator is None else generator
@@ -129,12 +129,12 @@ class RadianceField(nn.Module):
         counts = [max(1, int((n - 1) / spacing + 1e-6)) for n in self.lattice.nodes]
         ticks = [spacing * torch.arange(count, dtype=like.dtype, device=like.device) for count in counts]
         cells = torch.cartesian_prod(*ticks)
-        cells = cells[self.occupied(least_opacity)[tuple((cells + spacing / 2).round().long().unbind(1))]]
+        cells = cells[self.occupied(min_opacity)[tuple((cells + spacing / 2).round().long().unbind(1))]]
         jitter = torch.rand(len(cells), 3, generator=generator).to(like)
         x = torch.tensor(self.lattice.origin).to(like) + voxel * (cells + spacing * jitter)
         features = interpolate(self.lattice, self.values(), x)
         opacities = self.opacity(features[:, 0], 1.0)
-        kept = (opacities >= least_opacity * opacities.max()).detach().nonzero()[:, 0]
+        kept = (opacities >= min_opacity * opacities.max()).detach().nonzero()[:, 0]
         return FieldParticles(x[kept], features[kept], opacities[kept], (spacing * voxel) ** 3, voxel)
 
     def render(

@@ -44,7 +44,7 @@ class RadianceConfig(Section):
         le=1,
         description="mean distance between neighbouring particles [voxels] (authors: 0.5, eight a voxel)",
     )
-    least_opacity: float = Field(
+    min_opacity: float = Field(
         1e-3,
         ge=0,
         lt=1,
@@ -72,7 +72,7 @@ class RadianceConfig(Section):
     entropy_doublings: int = Field(
         6, ge=0, description="times that this weight doubles, evenly over the iterations"
     )
-    entropy_most: float = Field(0.1, ge=0, description="largest weight of the entropy")
+    max_entropy_weight: float = Field(0.1, ge=0, description="largest weight of the entropy")
     volume_weight: float = Field(
         1e-3,
         ge=0,

@@ -51,7 +51,7 @@ class PacNerfConfig(Section):
         2000, ge=10, description="about how many particles move; all of the field's follow them (all of them)"
     )
     followed: int = Field(16, ge=4, description="nearest moving particles that one of the field's follows")
-    least_opacity: float = Field(
+    min_opacity: float = Field(
         0.1,
         ge=0,
         lt=1,
@@ -68,7 +68,7 @@ class PacNerfConfig(Section):
     after_contact: float = Field(
         0.125, ge=0, description="how much that little is [s] (3 frames at 24 a second)"
     )
-    most_frames: int = Field(
+    max_frames: int = Field(
         12, ge=1, description="most frames of a step, evenly spread from contact on (12 to 18)"
     )
     pixels: int = Field(

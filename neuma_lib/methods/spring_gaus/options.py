@@ -9,7 +9,7 @@ from neuma_lib.config.base import Section
 
 class SpringsConfig(Section):
     """A network of springs between anchors in the body, and how it is fitted. Iterations and views are those of
-    `material`. In brackets what Spring-Gaus has published."""
+    `training`. In brackets what Spring-Gaus has published."""
 
     anchors: int = Field(
         400, ge=4, description="particles of the body that are anchors, far from each other (2048)"

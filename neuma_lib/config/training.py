@@ -10,7 +10,7 @@ from neuma_lib.config.base import Compared
 from neuma_lib.config.motion import MotionOptions
 
 
-class MaterialConfig(MotionOptions):
+class TrainingConfig(MotionOptions):
     """Adaptation of the material law: what is trained, on what, how."""
 
     supervision: Literal["pixels", "particles"] = Field(
