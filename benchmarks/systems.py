@@ -18,25 +18,25 @@ from pathlib import Path
 import torch
 
 from benchmarks.project_scenes import chosen_scenes, scene_parser, simulator
-from neuma_lib.config.settings import Config
 from neuma_lib.evaluation.metrics import tracer_errors
 from neuma_lib.evaluation.motion import predict
-from neuma_lib.evaluation.springs import predict_springs
-from neuma_lib.fitting.carried_field import CarriedField
 from neuma_lib.fitting.material import PixelLoss
-from neuma_lib.fitting.pac_families import choose_family
-from neuma_lib.fitting.pac_nerf import fit_pac_nerf
-from neuma_lib.fitting.radiance import fit_radiance_field
-from neuma_lib.fitting.springs import fit_springs
 from neuma_lib.io.files import read_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_observation, load_views
 from neuma_lib.io.particles import load_body, with_motion
-from neuma_lib.io.radiance import load_field, save_field
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.springs.body import SpringBody
-from neuma_lib.springs.network import Springs
-from neuma_lib.springs.rollout import SpringModel
+from neuma_lib.methods.pac_nerf.carried_field import CarriedField
+from neuma_lib.methods.pac_nerf.families import choose_family
+from neuma_lib.methods.pac_nerf.field_fit import fit_radiance_field
+from neuma_lib.methods.pac_nerf.fit import fit_pac_nerf
+from neuma_lib.methods.pac_nerf.io import load_field, save_field
+from neuma_lib.methods.spring_gaus.body import SpringBody
+from neuma_lib.methods.spring_gaus.evaluation import predict_springs
+from neuma_lib.methods.spring_gaus.fit import fit_springs
+from neuma_lib.methods.spring_gaus.network import Springs
+from neuma_lib.methods.spring_gaus.rollout import SpringModel
+from neuma_lib.project.settings import Config
 
 TRACERS = 2000  # of the truth's, for the motion
 

@@ -13,7 +13,7 @@ import hashlib
 import json
 import os
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
@@ -112,3 +112,8 @@ def one_line(error: object, limit: int = 200) -> str:
     """Text of an error or of a value in a file, on one line of at most ``limit`` characters, for messages."""
     text = " ".join("".join(c if c.isprintable() else " " for c in str(error)).split())
     return text if len(text) <= limit else f"{text[:limit]}..."
+
+
+def listed(files: str | Iterable[str] | None) -> list[str]:
+    """Paths as a list. One path, which a workflow gives as text, is a list of one; None is empty."""
+    return [files] if isinstance(files, str) else list(files or ())

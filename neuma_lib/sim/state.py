@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -164,6 +165,11 @@ class Trajectory:
         """Repeat the last frame `count` times, for a rollout that stopped early."""
         held = self._each(lambda value: torch.cat([value, value[-1:].expand(count, *value.shape[1:])]))
         return replace(held, frames=self.frames + (self.frames[-1],) * count)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What files of rollouts keep: positions and deformation gradients of the particles."""
+        values = {"x": self.x, "F": self.F, "F_total": self.F_total}
+        return {name: value.cpu().numpy() for name, value in values.items() if value is not None}
 
     def cpu(self) -> Trajectory:
         """Copy to main memory."""

@@ -1,4 +1,4 @@
-"""Masks of photographs and videos of a capture, the time between its cameras, and free flight. Needs captures.smk."""
+"""Masks of photographs and videos, time offsets between cameras, and free flight of a capture. Needs captures.smk."""
 
 MATTES = f"{DATA}/{{capture}}/videos/{{throw}}/{{camera}}/transforms.json"
 VIDEO_MASKS = f"{RESULTS}/{{capture}}/masks/{{throw}}/{{camera}}"

@@ -2,15 +2,19 @@
 
 from types import SimpleNamespace
 
-from neuma_lib.config import places
-from neuma_lib.config.places import FIELD
-from neuma_lib.config.settings import NO_TRUTH
+from neuma_lib.project import paths as places
+from neuma_lib.project.settings import NO_TRUTH
 from workflow.inputs import image_list
 
 
 def home(name, file):
     """The one path of a file of a scene or experiment in a chain."""
     return places.home(SETTINGS, name, file)
+
+
+def scene_prior(scene):
+    """The file of the prior of a scene in its chain."""
+    return places.prior_file(SETTINGS, scene, SETTINGS.scene(scene).prior)
 
 
 def of_chain(file):

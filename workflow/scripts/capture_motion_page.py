@@ -1,10 +1,9 @@
-"""One page of a capture's masks and free flights: checks and pictures."""
+"""Page of a capture's masks and free flights: checks and pictures."""
 
 from pathlib import Path
 
-from neuma_lib.capture.page import markdown, motion_checks
-from neuma_lib.io.files import read_json, write_text
-from workflow.inputs import listed
+from neuma_lib.capture.report.page import markdown, motion_checks
+from neuma_lib.io.files import listed, read_json, write_text
 from workflow.stage import run_script
 
 

@@ -4,16 +4,15 @@ import torch
 
 from neuma_lib.config.binding import BindingConfig
 from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.coupling.initial_motion import Throw
 from neuma_lib.device import choose_device
 from neuma_lib.fitting.identify import identify
-from neuma_lib.fitting.throw import Throw
 from neuma_lib.geometry.volume import sample_volume
-from neuma_lib.io.files import read_json, write_json
+from neuma_lib.io.files import listed, read_json, write_json
 from neuma_lib.io.images import load_videos
 from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_body
 from neuma_lib.sim.model import MPMModel
-from workflow.inputs import listed
 from workflow.stage import run_script
 
 
