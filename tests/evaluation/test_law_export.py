@@ -394,7 +394,7 @@ def test_constants_are_exported_with_their_step(project):
 
 
 def test_a_law_cannot_be_that_of_springs_or_of_nobody(project, capsys):
-    for name, complaint in {"spring_gaus": "no law of a material", "neumaa": "no method 'neumaa'"}.items():
+    for name, complaint in {"spring_gaus": "no material law", "neumaa": "no method 'neumaa'"}.items():
         (project / "results/ClayCat" / name).mkdir()
         assert (
             main(["law", "export", str(project / "results/ClayCat" / name), str(project / "x.safetensors")])
