@@ -326,7 +326,7 @@ def test_nothing_is_written_where_something_is_wrong(tmp_path, capsys):
     for words, complaint in (
         ([law, "new.npz"], "written as .safetensors"),
         ([law, "new.safetensors", "--apart"], "no adaptor"),
-        ([law, "new.safetensors", "--weight", "0.5"], "--weight"),
+        ([law, "new.safetensors", "--weight", "0.5"], "no adaptor"),
         ([law, "new.safetensors", "--weight", "0.5", "--separate"], "--separate"),
         ([law, "new.safetensors", "--dt", "1e-3"], "trained at a time step"),
         ([law, "new.safetensors", "--dt=-1"], "--dt: -1"),
