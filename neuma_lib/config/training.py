@@ -6,89 +6,63 @@ from typing import Literal
 
 from pydantic import Field
 
-from neuma_lib.config.base import Compared
+from neuma_lib.config.base import Compared, internal
 from neuma_lib.config.motion import MotionOptions
 
 
 class TrainingConfig(MotionOptions):
-    """Adaptation of the material law: what is trained, on what, how."""
+    """Adaptation of the material law."""
 
-    supervision: Literal["pixels", "particles"] = Field(
-        "pixels", description="images, or ground-truth particles"
+    supervision: Literal["pixels", "particles"] = internal(
+        "pixels", "images, or particles of the ground truth"
     )
     compare: Compared = Field(
         "colour",
-        description="what of the images counts: colours over white, or masks alone, how far the body covers a pixel, "
-        "where the light differs from that of the photographs",
+        description="compared quantity: colours over white, or masks (coverage), for light that differs from the "
+        "photographs",
     )
     rank: int | None = Field(
-        16, ge=1, description="rank of the adaptor; null trains the base weights (w/o dM)"
+        16, ge=1, description="rank of the adaptor; null: train the base weights (w/o dM)"
     )
-    alpha: float = Field(16.0, gt=0, description="the adaptor's scale is alpha / rank")
-    seed: int = Field(0, description="seed of the adaptor's initial weights")
-    lr_scale: float = Field(1.0, gt=0, description="factor on both learning rates (sweeps, ablations)")
-    covariance_gradient: bool = Field(True, description="let image gradients reach F through the covariances")
-    iterations: int = Field(50, ge=1, description="optimiser steps, one full rollout each")
+    alpha: float = internal(16.0, "the scale of the adaptor is alpha / rank", gt=0)
+    seed: int = Field(0, description="seed of the initial weights of the adaptor")
+    lr_scale: float = Field(1.0, gt=0, description="factor of both learning rates")
+    covariance_gradient: bool = internal(True, "propagate image gradients to F through the covariances")
+    iterations: int = Field(50, ge=1, description="optimiser steps, each with a full rollout")
     lr_elastic: float = Field(0.01, ge=0, description="learning rate of the elastic network")
     lr_plastic: float = Field(0.0005, ge=0, description="learning rate of the plastic network")
-    lr_floor: float = Field(
-        0.05, ge=0, le=1, description="fraction of the learning rates that the cosine schedule ends at"
+    lr_floor: float = internal(0.05, "fraction of the rates at the end of the cosine schedule", ge=0, le=1)
+    betas: tuple[float, float] = internal((0.9, 0.99), "averaging factors of Adam")
+    zero_gradients: bool = internal(
+        True, "false: accumulate the clipped gradients of all iterations (authors)"
     )
-    betas: tuple[float, float] = Field((0.9, 0.99), description="Adam's averaging factors")
-    zero_gradients: bool = Field(
-        True,
-        description="false adds every iteration's gradient to the clipped ones before it, as the authors' released "
-        "loop does",
+    # The loss is divided by its first value before.
+    gradient_clip: float = internal(1.0, "maximum gradient norm of each network", gt=0)
+    # The weight of frame k is d^k. Early frames are fitted first.
+    frame_weight_start: float = internal(
+        0.5, "first d; it rises to 1 over a third of the iterations", gt=0, le=1
     )
-    gradient_clip: float = Field(
-        1.0,
-        gt=0,
-        description="largest gradient norm of each network; the loss is divided by its first value before",
+    frame_weight_periods: int = internal(5, "k counts this many equal parts of the video", ge=1)
+    warm_up: int = internal(5, "iterations in which the rates rise linearly from zero", ge=0)
+    # A return to the best state halves the rates.
+    recovery_growth: float = internal(1.1, "factor of halved rates for each accepted iteration", ge=1)
+    # The loss is divided by its first value. 0: none (paper).
+    penalty: float = internal(
+        0.0, "weight of the squared relative change of the law on unvisited states", ge=0
     )
-    frame_weight_start: float = Field(
-        0.5,
-        gt=0,
-        le=1,
-        description="d of the frame weights d^k at the first iteration; it rises to 1 over the first third",
-    )
-    frame_weight_periods: int = Field(
-        5,
-        ge=1,
-        description="k counts this many equal parts of the video, so that early frames are fitted first",
-    )
-    warm_up: int = Field(5, ge=0, description="iterations over which the rates rise linearly from zero")
-    recovery_growth: float = Field(
-        1.1,
-        ge=1,
-        description="after a return to the best state the rates are halved; each accepted iteration multiplies "
-        "them by this, up to their full size",
-    )
-    penalty: float = Field(
-        0.0,
-        ge=0,
-        description="weight of the mean squared relative change of stress and return map on states that the video did "
-        "not visit, beside the loss divided by its first value; 0: none (paper)",
-    )
-    diverged_ratio: float = Field(
-        5.0,
-        gt=1,
-        description="a loss above this multiple of the best one so far (at equal frame weights) counts as diverged",
-    )
-    max_recoveries: int = Field(
-        6,
-        ge=0,
-        description="after more returns to the best state than this, training ends there, marked as unstable",
+    diverged_ratio: float = internal(5.0, "multiple of the best loss that counts as diverged", gt=1)
+    max_recoveries: int = internal(
+        6, "maximum number of returns to the best state, then training is unstable", ge=0
     )
     checkpoint_every: int = Field(10, ge=1, description="iterations between checkpoints")
     adjoint_precision: Literal["single", "half"] = Field(
         "single",
-        description="matrix products in the adjoint of a neural law on a GPU: single takes factors of 22 bits, half of "
-        "11, which is faster. Motion and images stay as they are; with half, gradients of one call with respect to F "
-        "and to the weights are off by about 1e-3 of their norm",
+        description="factors of the matrix products in the adjoint of a neural law on a GPU: 22 bits, or 11 bits, "
+        "which "
+        "is faster and has relative gradient errors of 1e-3",
     )
     memory: float | None = Field(
         None,
         gt=0,
-        description="most GiB for what a rollout's gradient keeps; with less, steps are computed again, see `rollout`. "
-        "null: no limit",
+        description="memory for the gradient of a rollout [GiB]; with less, steps are computed twice. null: no limit",
     )

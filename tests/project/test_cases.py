@@ -55,7 +55,8 @@ def test_a_wrong_value_names_the_variant(loaded, name):
 def test_options_are_layers_of_section_scene_preset_and_variant(raw):
     loaded = changed(
         raw,
-        training={"lr_elastic": 1.0, "lr_plastic": 1.0, "alpha": 1.0, "iterations": 1},
+        training={"lr_elastic": 1.0, "lr_plastic": 1.0, "iterations": 1},
+        advanced={"training.alpha": 1.0},
         scenes={"BouncyBall": {"training": {"lr_plastic": 2.0, "alpha": 2.0, "iterations": 2}}},
         methods={"neuma": {"options": {"alpha": 3.0, "iterations": 3}}},
     )

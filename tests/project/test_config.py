@@ -12,7 +12,7 @@ from neuma_lib.config.base import Section
 from neuma_lib.config.variants import DRAWN, folder, parse_chain
 from neuma_lib.errors import InputError
 from neuma_lib.project import cases, loading
-from neuma_lib.project.page import settings_markdown
+from neuma_lib.project.page import PAGE, SCHEMA, settings_markdown, settings_schema
 from neuma_lib.project.settings import Config
 from tests.support.errors import refused
 
@@ -433,6 +433,15 @@ def test_every_section_and_key_is_explained():
         assert kind.__doc__ and all(entry.description for entry in kind.model_fields.values()), kind.__name__
 
 
-def test_settings_page_is_up_to_date():
-    page = ROOT / "docs" / "settings.md"
-    assert page.read_text() == settings_markdown(), "run: python -m neuma_lib.project.page > docs/settings.md"
+@pytest.mark.parametrize(("file", "text"), [(PAGE, settings_markdown), (SCHEMA, settings_schema)])
+def test_page_and_schema_are_up_to_date(file, text):
+    assert (ROOT / file).read_text() == text(), "run: python -m neuma_lib.project.page"
+
+
+def test_page_and_schema_have_public_keys_alone():
+    page, schema = settings_markdown(), json.loads(settings_schema())
+    assert page.count("\n| `") <= 200
+    assert "| `penalty` |" in page and "| `spread` |" not in page
+    known = schema["$defs"]["IdentifyConfig"]["properties"]
+    assert "penalty" in known and "spread" not in known
+    assert {"training", "scenes", "advanced"} <= schema["properties"].keys()

@@ -226,9 +226,10 @@ def test_pac_nerf_is_judged_and_shown_on_its_own_particles(clone):
     """In so short a fit that nothing is found: what moves, carries tracers and is seen are the field's particles."""
     own = "pac_nerf_own+views=0,1"
     small = (
-        'radiance={"iterations": 60, "rays": 256, "particles": 500}',
-        'pac_nerf={"particles": 100, "followed": 8, "velocity_iterations": 3, "iterations_contact": 1, '
-        '"iterations_all": 2, "max_frames": 3, "pixels": 200}',
+        'radiance={"iterations": 60}',
+        'advanced={"radiance.rays": 256, "radiance.particles": 500, "pac_nerf.particles": 100, '
+        '"pac_nerf.followed": 8, "pac_nerf.velocity_iterations": 3, "pac_nerf.iterations_contact": 1, '
+        '"pac_nerf.iterations_all": 2, "pac_nerf.max_frames": 3, "pac_nerf.pixels": 200}',
         f'figures={{beside: ["{own}"]}}',
     )
     files = [f"{SCENE}/{own}/{name}" for name in ("metrics.json", "video.mp4")]
