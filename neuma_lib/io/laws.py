@@ -9,8 +9,7 @@ file may contain an adaptor and the weights that it corrects, as that of a struc
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from itertools import zip_longest
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from torch import Tensor
 
 from neuma_lib.errors import InputError
 from neuma_lib.io.exported import EXPORT, checked_export, fitting_step
-from neuma_lib.io.files import existing, located, one_line, read_json
+from neuma_lib.io.files import existing, located, one_line
 from neuma_lib.io.weights import read_torch, read_weights, write_weights
 from neuma_lib.mechanics.adaptor import LAYER_KEYS, AdaptableLaw
 from neuma_lib.mechanics.analytic import analytic_law, specification
@@ -31,28 +30,6 @@ STRUCTURED, ANALYTIC = "structured", "analytic"
 PICKLED = (".pt", ".pth")
 RELEASED_ALPHA = 16.0
 """alpha of all released settings. Their files do not contain it; the rank follows from the shapes."""
-
-
-def load_laws(
-    dt: float,
-    specs: Sequence[Mapping[str, Any]] = (),
-    identified: Sequence[str | Path] = (),
-    priors: Sequence[str | Path] = (),
-    adaptors: Sequence[str | Path] = (),
-) -> list[Law]:
-    """The laws of a method, one per body: analytic ones from specifications or identified.json, or trained ones.
-
-    Args:
-        dt: time step [s].
-        specs: arguments of `analytic_law`; empty if the method has no such law.
-        identified: files of the stage `identify`; used if ``specs`` is empty.
-        priors, adaptors: files of trained laws; used if both are empty. No adaptors: unmodified priors. No priors:
-            adaptors of structured laws.
-    """
-    specs = specs or [read_json(file)["law"] for file in identified]
-    if specs:
-        return [analytic_law(spec, dt=dt) for spec in specs]
-    return [load_law(prior, adaptor, dt) for prior, adaptor in zip_longest(priors, adaptors)]
 
 
 def save_prior(path: str | Path, law: AdaptableLaw, metadata: Mapping[str, Any]) -> None:

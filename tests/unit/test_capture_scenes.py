@@ -66,7 +66,10 @@ def test_what_is_held_out_trains_nothing(captures):
 
 def test_nobody_knows_the_truth_of_a_capture(captures):
     found = loaded(captures)
-    for ask in (lambda: found.frame_steps("mug_one"), lambda: cases.case(found, "mug_one", "true_law").source()):
+    for ask in (
+        lambda: found.frame_steps("mug_one"),
+        lambda: cases.case(found, "mug_one", "true_law").source(),
+    ):
         with pytest.raises(InputError, match=NO_TRUTH):
             ask()
 

@@ -26,11 +26,7 @@ def test_a_capture_that_is_not_there_yet_is_planned(project):
     """All jobs up to the comparison are known before Blender has run, and Table 1 needs none of them."""
     plan = project.plan("captures_demo")
     assert plan["demo_photographs"] == 2 and plan["demo_videos"] == 4 and plan["capture_poses"] == 2
-    assert (
-        plan["capture_registration"] == 4
-        and plan["predict"] == 12
-        and plan["demo_evaluation"] == 1
-    )
+    assert plan["capture_registration"] == 4 and plan["predict"] == 12 and plan["demo_evaluation"] == 1
     assert not [
         rule for rule in project.plan("tiny/results/table1.csv") if rule.startswith(("demo_", "capture_"))
     ]

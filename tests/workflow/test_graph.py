@@ -109,7 +109,11 @@ def test_springs_and_laws_of_a_table_are_put_to_use_elsewhere_as_their_scenes_ta
         {"spring_gaus/springs.safetensors", "pac_nerf/constants.json"},
     )
     assert sorted(fitted) == sorted(f"tiny/results/{scene}/{file}" for scene in scenes for file in files)
-    used = {outputs[0].split("/")[3]: read for rule, read, outputs in graph if rule == "evaluate_experiment" and "/spring_gaus/" in outputs[0]}
+    used = {
+        outputs[0].split("/")[3]: read
+        for rule, read, outputs in graph
+        if rule == "evaluate_experiment" and "/spring_gaus/" in outputs[0]
+    }
     assert len(used) == 5 and sum(rule == "evaluate_experiment" for rule, *_ in graph) == 6 * 5
     for experiment, scene in (
         ("letter_N_jelly", "JellyDuck"),
@@ -130,7 +134,9 @@ def test_pac_nerf_needs_images_its_field_and_contact_alone(project):
     graph = jobs(project.run("--dry-run", f"{run}/metrics.json"))
     made = {rule: (read, outputs) for rule, read, outputs in graph}
     read, outputs = made["fit_pac_nerf"]
-    assert outputs[0] == f"{run}/constants.json" and not {"fit_neuma", "fit_structured", "identify"} & set(made)
+    assert outputs[0] == f"{run}/constants.json" and not {"fit_neuma", "fit_structured", "identify"} & set(
+        made
+    )
     assert made["radiance_field"][1][0] == f"{SCENE}+seed=1/pac_nerf/field.safetensors" in read
     assert "tiny/data/BouncyBall/dynamic/transforms.json" in read and f"{SCENE}+seed=1/velocity.json" in read
     assert not any("/priors/" in file or "/data/BouncyBall/particles.h5" in file for file in read)
