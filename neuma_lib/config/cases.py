@@ -145,7 +145,7 @@ def kind_of(settings: Config, method: str) -> Method:
     """The method of a preset or variant."""
     name = method.partition("+")[0]
     chosen = settings.methods[settings.methods[name].same_fit_as or name]
-    return methods()[chosen.kind]
+    return methods(settings.extensions)[chosen.kind]
 
 
 def of_kind(settings: Config, name: str) -> list[str]:

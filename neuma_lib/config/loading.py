@@ -18,6 +18,7 @@ from neuma_lib.config.settings import Config
 from neuma_lib.config.simulation import SimulationConfig
 from neuma_lib.config.validation import hint, validate
 from neuma_lib.errors import InputError
+from neuma_lib.extensions import load_laws
 from neuma_lib.methods.registry import built_in_presets
 
 
@@ -45,8 +46,11 @@ def load(
     scenes |= captured or {}
     if isinstance(changes, Mapping):
         changes = _complete(_with_throws(merged(scenes, changes)))
-    presets = merged(built_in_presets(), raw.get("methods") or {})
-    settings = validate(Config, {**raw, "scenes": changes, "methods": presets})
+    extensions = _extensions(raw, root)
+    presets = merged(built_in_presets(extensions), _presets(raw))
+    settings = validate(
+        Config, {**raw, "extensions": extensions, "scenes": changes, "methods": presets}
+    )
     check_methods(settings)
     return settings
 
@@ -65,6 +69,25 @@ def check_methods(settings: Config) -> None:
                 law_from(settings, method)
             except InputError as error:
                 raise InputError(where, str(error)) from None
+
+
+def _extensions(raw: Mapping[str, Any], root: str | Path) -> tuple[str, ...]:
+    """Paths of the extensions, which are loaded."""
+    files = raw.get("extensions") or ()
+    if not isinstance(files, list | tuple) or not all(isinstance(file, str) for file in files):
+        raise InputError("extensions", f"{files!r} is not a list of Python files", "Write [my_method.py]")
+    paths = tuple(str(Path(root) / file) for file in files)
+    load_laws(paths)
+    return paths
+
+
+def _presets(raw: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The user's presets. Raises InputError for keys of former versions."""
+    presets = raw.get("methods") or {}
+    for name, preset in presets.items() if isinstance(presets, Mapping) else ():
+        for key in RENAMED.keys() & (preset.keys() if isinstance(preset, Mapping) else ()):
+            raise InputError(f"methods.{name}.{key}", f"was {RENAMED[key]}")
+    return presets
 
 
 def _random_scenes(raw: Mapping[str, Any]) -> dict[str, Any]:
