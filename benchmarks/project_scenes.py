@@ -6,9 +6,9 @@ import argparse
 from functools import reduce
 from typing import Any
 
-from neuma_lib.config.loading import load, merged, read_yaml
 from neuma_lib.config.scenes import SceneConfig
-from neuma_lib.config.settings import Config
+from neuma_lib.project.loading import load, merged, read_yaml
+from neuma_lib.project.settings import Config
 from neuma_lib.sim.model import MPMModel
 
 

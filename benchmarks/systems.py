@@ -18,16 +18,16 @@ from tempfile import TemporaryDirectory
 import torch
 
 from benchmarks.project_scenes import chosen_scenes, scene_parser, simulation, simulator
-from neuma_lib.config import cases
-from neuma_lib.config.settings import Config
 from neuma_lib.evaluation.metrics import tracer_errors
-from neuma_lib.fitting.radiance import fit_radiance_field
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_views
 from neuma_lib.io.particles import load_initial_state
-from neuma_lib.io.radiance import save_field
 from neuma_lib.methods.base import FitRun, Problem, body_of_each_video
+from neuma_lib.methods.pac_nerf.field_fit import fit_radiance_field
+from neuma_lib.methods.pac_nerf.io import save_field
+from neuma_lib.project import cases
+from neuma_lib.project.settings import Config
 
 TRACERS = 2000  # of the truth, for the motion
 

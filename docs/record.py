@@ -22,12 +22,12 @@ from statistics import mean, median
 
 from PIL import Image
 
-from neuma_lib.evaluation.figures import image_quality, lora_alphav, material_response
-from neuma_lib.evaluation.paper import PAPER
-from neuma_lib.evaluation.plotting.image_grid import load_image_grid
-from neuma_lib.evaluation.reports import as_markdown
-from neuma_lib.evaluation.tables import ABSORBED, VERDICTS
+from neuma_lib.evaluation.text_tables import as_markdown
 from neuma_lib.io.files import read_json
+from neuma_lib.paper.figures import image_quality, lora_alphav, material_response
+from neuma_lib.paper.image_grid import load_image_grid
+from neuma_lib.paper.published import PAPER
+from neuma_lib.paper.tables import ABSORBED, VERDICTS
 
 MADE_BY = {
     "table1": "tables figures",

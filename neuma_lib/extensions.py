@@ -30,7 +30,9 @@ def load_module(name: str) -> ModuleType:
     if known is not None and known.__file__ == str(path):
         return known
     if not path.is_file():
-        raise InputError(f"extensions: {name}", "the file does not exist", "Paths are relative to the project")
+        raise InputError(
+            f"extensions: {name}", "the file does not exist", "Paths are relative to the project"
+        )
     spec = importlib.util.spec_from_file_location(name, path)
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module

@@ -5,7 +5,7 @@ from pathlib import Path
 from neuma_lib.errors import InputError
 
 COUNTED = ("all_data.json", "camera.json")
-"""Lists of images whose frames are counted, not named by simulated steps (`neuma_lib.io.layouts`)."""
+"""Lists of images whose frames are counted, not named by simulated steps (`neuma_lib.io.datasets.layouts`)."""
 
 
 def image_list(place: str, stride: int | None, key: str, stride_key: str) -> str:

@@ -22,7 +22,7 @@ import grimp
 
 from neuma_lib.io.files import sha256_file
 
-PACKAGE = "neuma_lib"
+PACKAGES = ("neuma_lib", "studies")
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 DIGITS = 16  # hexadecimal digits of a digest
 
@@ -30,14 +30,14 @@ DIGITS = 16  # hexadecimal digits of a digest
 class Sources:
     """The modules of a package as they stand when they are first read."""
 
-    def __init__(self, package: str = PACKAGE):
-        self._root = Path(next(iter(find_spec(package).submodule_search_locations))).parent
+    def __init__(self, *packages: str):
+        self._packages = packages or PACKAGES
+        self._root = Path(next(iter(find_spec(self._packages[0]).submodule_search_locations))).parent
         self._digests: dict[str, str] = {}
-        self._package = package
 
     @cached_property
     def _graph(self) -> grimp.ImportGraph:
-        return grimp.build_graph(self._package, cache_dir=None, exclude_type_checking_imports=True)
+        return grimp.build_graph(*self._packages, cache_dir=None, exclude_type_checking_imports=True)
 
     def reached(self, script: Path, modules: tuple[str, ...] = ()) -> list[str]:
         """Names of some modules, and of those that they and a script import, directly or through others, sorted."""

@@ -113,11 +113,7 @@ def read_timeline(path: str | Path, rate: float | None = None) -> Timeline:
 
 
 def check_times(times: Sequence[float], path: str | Path) -> np.ndarray:
-    """Times (N,) of a video as an array.
-
-    Raises:
-        InputError: fewer than two, one is missing, or they do not ascend.
-    """
+    """Times (N,) of a video as an array. Raises InputError: fewer than two, one is missing, or they do not ascend."""
     times = np.asarray(times, np.float64)
     if len(times) < 2:
         raise InputError(path, f"{len(times)} frames, at least two are required", "Film the whole fall")
@@ -252,19 +248,12 @@ def _decoder(path: str | Path, pixels: bool) -> Iterator[_Decoder]:
     output = ["-f", "rawvideo", "-pix_fmt", "rgb24", "pipe:1"] if pixels else ["-f", "null", "-"]
     # The prefix file: keeps a file name from being parsed as a protocol, and V excludes cover pictures. ffmpeg rotates
     # pictures upright before they reach a filter.
-    command = [
-        require("imageio_ffmpeg", "capture").get_ffmpeg_exe(),
-        "-hide_banner",
-        "-nostdin",
-        "-xerror",
-        "-protocol_whitelist",
-        "file",
-    ]
-    command += ["-i", f"file:{path.resolve()}", "-map", "0:V:0", "-vf", "showinfo=checksum=0"]
-    command += ["-fps_mode", "passthrough", "-threads", "1", *output]
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE if pixels else subprocess.DEVNULL, stderr=subprocess.PIPE
-    )
+    options = "-hide_banner -nostdin -xerror -protocol_whitelist file".split()
+    ffmpeg = require("imageio_ffmpeg", "capture").get_ffmpeg_exe()
+    command = [ffmpeg, *options, "-i", f"file:{path.resolve()}", "-map", "0:V:0"]
+    command += ["-vf", "showinfo=checksum=0", "-fps_mode", "passthrough", "-threads", "1", *output]
+    stdout = subprocess.PIPE if pixels else subprocess.DEVNULL
+    process = subprocess.Popen(command, stdout=stdout, stderr=subprocess.PIPE)
     try:
         yield _Decoder(path, process)
     finally:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from neuma_lib.capture.lens import Lens
+from neuma_lib.capture.calibration.lens import Lens
 from neuma_lib.capture.tools import opencv
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import atomic, reading
@@ -32,11 +32,7 @@ def group_of(name: str) -> str:
 
 
 def name_pictures(groups: Mapping[str, Sequence[Path]]) -> dict[str, Path]:
-    """Name of each picture -> its file.
-
-    Raises:
-        InputError: a file is no picture, or pictures of a group differ in size.
-    """
+    """Name of each picture -> its file. Raises InputError if a file is no picture or sizes in a group differ."""
     named: dict[str, Path] = {}
     for group, files in groups.items():
         sizes: dict[tuple[int, int], Path] = {}
@@ -60,14 +56,7 @@ def picture_size(file: Path) -> tuple[int, int]:
 
 
 def copy_pictures(pictures: Mapping[str, Path], target: str | Path) -> dict[str, Path]:
-    """Copy pictures into a folder for each group, without EXIF orientation.
-
-    Returns:
-        Name of each picture -> its copy.
-
-    Raises:
-        InputError: a file is no picture, or its EXIF data are damaged.
-    """
+    """Copy pictures by name to <target>/<name>, without EXIF orientation. Raises InputError for damaged files."""
     copies = {name: Path(target) / name for name in pictures}
     for name, file in pictures.items():
         content = file.read_bytes()

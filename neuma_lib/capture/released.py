@@ -31,19 +31,19 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
-from neuma_lib.capture.agreement import nearest_point
-from neuma_lib.capture.folder import PHOTOGRAPHS, Capture
-from neuma_lib.capture.lens import Lens, lens_of_colmap
-from neuma_lib.capture.masks import centroid
-from neuma_lib.capture.mattes import own_mask
+from neuma_lib.capture.calibration.lens import Lens, lens_of_colmap
+from neuma_lib.capture.calibration.placement import Similarity
+from neuma_lib.capture.calibration.room import BOX_MIDDLE
+from neuma_lib.capture.masks.agreement import nearest_point
+from neuma_lib.capture.masks.mattes import own_mask
+from neuma_lib.capture.masks.regions import centroid
 from neuma_lib.capture.pictures import picture_size, read_picture, undistorted
-from neuma_lib.capture.placement import Similarity
-from neuma_lib.capture.room import BOX_MIDDLE
 from neuma_lib.config.capture import ReleasedConfig
 from neuma_lib.config.validation import hint
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import existing, read_json, reading
 from neuma_lib.io.images import OPENGL_TO_OPENCV
+from neuma_lib.project.capture_folder import PHOTOGRAPHS, Capture
 
 RATE = 120.0
 """Frames per second of the videos."""
@@ -136,11 +136,7 @@ CONTACT = 5
 
 
 def read_configured(name: str, settings: ReleasedConfig) -> Released:
-    """The capture of a section of the settings, completed by photographs from another folder and a contact frame.
-
-    Raises:
-        InputError: as `read_released`, or there are no photographs.
-    """
+    """The capture of a section of the settings, with photographs and a contact frame, or InputError."""
     object_name = settings.object or name
     capture = read_released(settings.folder, object_name, settings.ground)
     photographs = capture.photographs
@@ -157,7 +153,7 @@ def read_configured(name: str, settings: ReleasedConfig) -> Released:
 
 
 def released_captures(released: Mapping[str, ReleasedConfig]) -> dict[str, Capture]:
-    """Released captures of the settings, in the form of `neuma_lib.capture.folder.read_capture`."""
+    """Released captures of the settings, in the form of `neuma_lib.project.capture_folder.read_capture`."""
     captures = {}
     for name, settings in released.items():
         shots = read_released(settings.folder, settings.object or name, settings.ground).videos
@@ -297,11 +293,7 @@ def read_cameras(path: Path) -> dict[int, Lens]:
 
 
 def read_images(path: Path) -> list[tuple[str, int, np.ndarray]]:
-    """Name, number of the camera, and world to camera (4, 4) of each picture in COLMAP's images.bin.
-
-    Raises:
-        InputError: missing or damaged.
-    """
+    """Name, camera number and world to camera (4, 4) of each picture in COLMAP's images.bin, or InputError."""
     content = existing(path, _UNPACK).read_bytes()
     images = []
     with reading(path, "COLMAP's images"):
@@ -446,11 +438,9 @@ def read_shots(shots: Sequence[Shot], longest: int) -> Iterator[tuple[np.ndarray
 
 
 def background_behind(pictures: Sequence[np.ndarray], masks: Sequence[np.ndarray]) -> np.ndarray:
-    """The empty scene (H, W, 3), uint8: median of pixels outside the masks, or of all pixels where all masks overlap.
+    """The empty scene (H, W, 3), uint8: median of pixels outside the masks (H, W), dilated by `MASK_MARGIN`.
 
-    Args:
-        pictures: (H, W, 3), uint8, each.
-        masks: (H, W), bool, each, dilated by `MASK_MARGIN`.
+    Where all masks overlap, it is the median of all pixels.
     """
     covered = np.stack([binary_dilation(mask, iterations=MASK_MARGIN) for mask in masks])
     covered[:, covered.all(axis=0)] = False

@@ -37,9 +37,7 @@ def bind_nearest(
         InputError: see `bind`; too few particles.
     """
     if len(particles) <= NEAREST:
-        raise InputError(
-            "binding: particles", f"{len(particles)} are too few, at least {NEAREST + 1} are needed"
-        )
+        raise InputError("binding: particles", f"{len(particles)} are too few, {NEAREST + 1} are needed")
     first = bind(means, covars, particles, settings)
     isolated = (first.counts < ENOUGH).cpu().numpy()
     points, centres = particles.double().cpu().numpy(), means.double().cpu().numpy()[isolated]

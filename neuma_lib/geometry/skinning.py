@@ -32,9 +32,7 @@ def skinning_matrix(vertices: np.ndarray, particles: np.ndarray, neighbours: int
     """
     vertices, particles = np.asarray(vertices, dtype=np.float64), np.asarray(particles, dtype=np.float64)
     if len(particles) < 8:
-        raise InputError(
-            "skinning: particles", f"{len(particles)} particles are too few, at least 8 are needed"
-        )
+        raise InputError("skinning: particles", f"{len(particles)} are too few, at least 8 are needed")
     k = min(neighbours, len(particles) - 1)
     distance, index = cKDTree(particles).query(vertices, k=k + 1)
     radius = distance[:, -1:]

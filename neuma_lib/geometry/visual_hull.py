@@ -63,21 +63,16 @@ def check_masks(masks: Tensor | Sequence[Tensor], level: float = MATTE_LEVEL) ->
         if not torch.isfinite(mask).all():
             raise InputError(where, "alpha has values that are not finite")
         if not (mask > level).any():
-            raise InputError(
-                where, f"the mask is empty (no alpha > {level})", "Remove the view or redo its matte"
-            )
+            raise InputError(where, f"the mask is empty (no alpha > {level})", "Remove or correct it")
         if (mask > level).all():
-            raise InputError(
-                where, "the mask covers the whole frame", "Use images with an alpha matte of the object"
-            )
+            raise InputError(where, "the mask covers the whole frame", "Use an alpha matte of the object")
 
 
 def no_common_space(remedy: str = "") -> InputError:
     """Error for masks without a common point of space."""
     check = "Check that the masks show the object alone and that the camera poses belong to these images"
-    return InputError(
-        "masks", "no point of space lies inside all masks", f"{check}. {remedy}" if remedy else check
-    )
+    remedy = f"{check}. {remedy}" if remedy else check
+    return InputError("masks", "no point of space lies inside all masks", remedy)
 
 
 def contour_distances(masks: Tensor | Sequence[Tensor], level: float = MATTE_LEVEL) -> list[Tensor]:

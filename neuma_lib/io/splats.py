@@ -98,9 +98,7 @@ def _read_splat(path: Path) -> dict[str, np.ndarray]:
 def _read_spz(path: Path) -> dict[str, np.ndarray]:
     packed = path.read_bytes()
     if packed[:4] == struct.pack("<I", _SPZ_MAGIC):
-        raise InputError(
-            path, "has version 4 or later, which is not supported", "Export it as version 3 or PLY"
-        )
+        raise InputError(path, "version 4 or later is not supported", "Export it as version 3 or PLY")
     stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
     head = stream.decompress(packed, _SPZ_HEADER.size)
     magic, version, count, degree, fractional, flags, _ = _SPZ_HEADER.unpack(head)

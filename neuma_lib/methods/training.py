@@ -47,7 +47,9 @@ class Training:
             )
             for files, density in zip(parts, problem.densities, strict=True)
         ]
-        self.starts = [with_motion(body, f) for body, f in zip(bodies, listed(inputs["velocity"]), strict=True)]
+        self.starts = [
+            with_motion(body, f) for body, f in zip(bodies, listed(inputs["velocity"]), strict=True)
+        ]
         if settings.supervision == "particles":
             self.losses = [particle_loss(file, run.device) for file in listed(inputs["truth"])]
         else:

@@ -1,8 +1,8 @@
-"""Adjoints of the transfers in `kernels`, written by hand and run in the opposite order.
+"""Hand-written adjoints of the transfers in `kernels`, run in reverse order.
 
-``grad_y`` is the derivative of the loss with respect to ``y``. The adjoint of a gather is a scatter over the
-same stencil and the other way round, so `g2p_adjoint` reads like P2G and `p2g_adjoint` like G2P. When the
-particle moves, a weight changes by dw_i/dx = N'_i / dx and an offset d_i = x_i - x by -I.
+``grad_y`` is the derivative of the loss with respect to ``y``. The adjoint of a gather is a scatter over the same
+stencil and vice versa, so `g2p_adjoint` reads like P2G and `p2g_adjoint` like G2P. The derivative of a weight by the
+position is dw_i/dx = N'_i / dx, that of an offset d_i = x_i - x is -I.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -19,9 +19,7 @@ from neuma_lib.sim.scatter import scatter_functions
 
 @functools.cache
 def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamespace:
-    """Kernels `g2p_adjoint`, `grid_adjoint`, `p2g_adjoint` and `total_adjoint` for one precision and one way to
-    scatter.
-    """
+    """Kernels `g2p_adjoint`, `grid_adjoint`, `p2g_adjoint` and `total_adjoint` for a precision and a scatter method."""
     t, functions = warp_types(dtype), grid_functions(dtype)
     ordered = scatter != "atomic"
     run_of, deposit = vars(scatter_functions(dtype, scatter, 3)).values()
@@ -58,7 +56,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         grad_F: wp.array(dtype=mat33),
         grad_grid_rows: wp.array2d(dtype=mat34),
     ):
-        """Gradients of x, v, C after the step and of F_trial to those of grid_v (added), x and F (set)."""
+        """From gradients of x, v, C after the step and of F_trial to those of grid_v (added), x and F (set)."""
         p = wp.tid()
         alive = p < grad_x.shape[0]
         if wp.static(ordered):
@@ -68,14 +66,14 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         plane = copy_of(c, p) * c.n + bi
         run = run_of(wp.where(alive, (plane * c.n + bj) * c.n + bk, -1))
         si, sj, sk = slopes(f[0]), slopes(f[1]), slopes(f[2])
-        # F_trial = (I + dt C) F and x = x + dt v pass their gradients on to C, F and v.
+        # gradients of C, F and v from F_trial = (I + dt C) F and x = x + dt v
         g_trial = grad_F_trial[p]
         if alive:
             grad_F[p] = g_trial + c.dt * (wp.transpose(C[after, p]) * g_trial)
         g_C = grad_C[p] + c.dt * (g_trial * wp.transpose(F[now, p]))
         g_x = wp.cw_mul(moved_mask(c, x[after, p]), grad_x[p])
         g_v = grad_v[p] + c.dt * g_x
-        # Node i gets w_i u_i with u_i = g_v + D d_i / dx, which grows by a column of D from node to node.
+        # Node i receives w_i u_i with u_i = g_v + D d_i / dx. u grows by a column of D from node to node.
         D = (real(4.0) * c.inv_dx) * g_C
         u0 = g_v - D * f
         u_i = vec4(u0[0], u0[1], u0[2], real(0.0))
@@ -104,9 +102,9 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         grid: wp.array2d(dtype=vec4),
         grad_grid: wp.array2d(dtype=vec4),
     ):
-        """In place: gradient of a node's velocity to the gradients of its momentum and mass.
+        """In place: from the gradient of a node's velocity to those of its momentum and mass.
 
-        The other side of `grad_grid` is cleared for the step before this one.
+        Clears the other side of `grad_grid` for the previous step.
         """
         node = wp.tid()
         mv = grid[cached, node]
@@ -135,14 +133,14 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         grad_C: wp.array(dtype=mat33),
         grad_tau: wp.array(dtype=mat33),
     ):
-        """Gradients of the nodes' momentum and mass to those of x (added), v, C and tau (set)."""
+        """From gradients of momentum and mass of the nodes to those of x (added), v, C and tau (set)."""
         p = wp.tid()
         xp = x[now, p]
         bi, bj, bk, f, wi, wj, wk = stencil(c, xp)
         plane = copy_of(c, p) * c.n + bi
         si, sj, sk = slopes(f[0]), slopes(f[1]), slopes(f[2])
         wd_i, wd_j, wd_k = moments(wi, f[0]), moments(wj, f[1]), moments(wk, f[2])
-        # The scattered q_i = (m v + A d_i, m), as in p2g.
+        # q_i = (m v + A d_i, m) as in p2g
         m = mass[p]
         stress = real(4.0) * c.dt * c.inv_dx * c.inv_dx * vol0[p]
         A = c.dx * (m * C[now, p] - stress * tau[cached, p])
@@ -178,7 +176,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         grad_C: wp.array(dtype=mat33),
         grad_F_total: wp.array(dtype=mat33),
     ):
-        """In place: gradient of F_total after the step to those of C after it (added) and of F_total before it."""
+        """In place: from the gradient of F_total after the step to those of C (added) and of F_total before it."""
         p = wp.tid()
         g = grad_F_total[p]
         grad_C[p] = grad_C[p] + c.dt * (g * wp.transpose(F_total[now, p]))

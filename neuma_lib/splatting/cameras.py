@@ -29,9 +29,7 @@ class Cameras:
         count = self.viewmats.shape[0]
         if tuple(self.viewmats.shape) != (count, 4, 4) or tuple(self.Ks.shape) != (count, 3, 3):
             shapes = f"{tuple(self.viewmats.shape)} and {tuple(self.Ks.shape)}"
-            raise InputError(
-                "cameras: viewmats, Ks", f"have shapes {shapes}, expected (V, 4, 4) and (V, 3, 3)"
-            )
+            raise InputError("cameras: viewmats, Ks", f"have {shapes}, expected (V, 4, 4) and (V, 3, 3)")
         if self.width <= 0 or self.height <= 0:
             raise InputError("cameras: width, height", f"must be positive, not {self.width} x {self.height}")
         self.width, self.height = int(self.width), int(self.height)

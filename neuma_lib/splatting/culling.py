@@ -62,9 +62,7 @@ def culled(
     read = len(gaussians)
     opaque = gaussians.cull(min_opacity)
     if len(opaque) == 0:
-        raise InputError(
-            "splat.min_opacity", f"none of {read} Gaussians is more opaque than {min_opacity}", "Reduce it"
-        )
+        raise InputError("splat.min_opacity", f"all {read} Gaussians are below {min_opacity}", "Reduce it")
     shares = torch.tensor([_OUTSIDE_SHARE, 1 - _OUTSIDE_SHARE]).double()
     ends = torch.quantile(_subsampled(opaque.means.double()), shares, dim=0)
     longest = float((ends[1] - ends[0]).max())
@@ -94,9 +92,7 @@ def _largest_cluster(gaussians: Gaussians, reach: float, min_links: int) -> Tens
     settled = linked.sum(axis=1) >= min(min_links, k)
     linked &= settled[:, None] & settled[index]
     if not linked.any():
-        raise InputError(
-            "splat.reach", "every Gaussian is isolated", "Increase it, or reduce splat.min_links"
-        )
+        raise InputError("splat.reach", "all Gaussians are isolated", "Increase it or reduce min_links")
     rows, columns = np.nonzero(linked)
     graph = csr_matrix((np.ones(len(rows), bool), (rows, index[rows, columns])), shape=(len(means),) * 2)
     _, labels = connected_components(graph, directed=False)

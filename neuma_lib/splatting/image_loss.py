@@ -44,9 +44,7 @@ def mean_squared_error(images: Tensor, observed: Tensor) -> Tensor:
 def check_fits(shape: tuple[int, ...], device: torch.device, observed: Tensor) -> None:
     """Raise InputError unless images rendered on a device, (T, V, H, W, C), can be compared with observed ones."""
     if observed.device != device:
-        raise InputError(
-            "image loss: observed", f"is on {observed.device}, but images are rendered on {device}"
-        )
+        raise InputError("image loss: observed", f"is on {observed.device}, but renders are on {device}")
     if observed.shape != ((*shape[:-1], 4) if observed.dtype == torch.uint8 else shape):
         problem = f"has shape {tuple(observed.shape)}, but rendered images have {tuple(shape)}"
         raise InputError("image loss: observed", problem)

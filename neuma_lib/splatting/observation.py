@@ -88,9 +88,7 @@ class Observation:
         """
         images = self.stored(part)
         if images.dtype != torch.uint8:
-            raise InputError(
-                "observation: images", "have no alpha channel, which the comparison of masks needs"
-            )
+            raise InputError("observation: images", "comparing masks needs an alpha channel")
         return images[..., 3:].to(self.cameras.viewmats.dtype) / 255
 
     def stored(self, part: slice | Sequence[int] = slice(None)) -> Tensor:

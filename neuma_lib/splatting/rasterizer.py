@@ -17,12 +17,12 @@ from typing import Literal
 import torch
 
 from neuma_lib.errors import InputError
-from neuma_lib.splatting import compositor_cpu, compositor_cuda, gsplat_backend, projection
+from neuma_lib.splatting import compositor_cpu, compositor_cuda, projection
 from neuma_lib.splatting.arrays import check_tensors
 from neuma_lib.splatting.compositing import Settings
 from neuma_lib.splatting.image_loss import as_integers, check_fits, mean_squared_error
 
-Compositor = Literal["rows", "tiles", "gsplat"]
+Compositor = Literal["rows", "tiles"]
 COMPOSITORS = {"rows": compositor_cpu, "tiles": compositor_cuda}
 
 
@@ -185,9 +185,7 @@ def check_shapes(means, covars, opacities, sh, viewmats, Ks) -> None:
     if means.dtype not in (torch.float32, torch.float64):
         raise InputError("rasterize: means", f"must be float32 or float64, not {means.dtype}")
     if sh.shape[1] not in (1, 4, 9, 16):
-        raise InputError(
-            "rasterize: sh", f"has {sh.shape[1]} coefficients per channel, expected 1, 4, 9 or 16"
-        )
+        raise InputError("rasterize: sh", f"must have 1, 4, 9 or 16 coefficients, not {sh.shape[1]}")
 
 
 def rasterize(
@@ -229,8 +227,8 @@ def rasterize(
         eps2d: blur added to the projected covariance [px^2].
         statistics: filled by the backward pass if given.
         buffers: memory reused between calls, which then contains the returned images.
-        compositor: "rows" (CPU), "tiles" (CUDA, float32) or "gsplat" (CUDA, float32; other limit of alpha, see
-            ``gsplat_backend``). Default: rows on CPU, tiles on CUDA. Tiles and gsplat synchronise once per call with
+        compositor: "rows" (CPU) or "tiles" (CUDA, float32).
+            Default: rows on CPU, tiles on CUDA. Tiles synchronise once per call with
             the GPU, so they cannot be captured in a CUDA graph. In float64 on CUDA, the computation runs on the CPU,
             for comparisons only.
 
@@ -252,7 +250,7 @@ def rasterize(
     background = _colour(background, means)
     on_cpu, single = means.device.type == "cpu", means.dtype == torch.float32
     compositor = compositor or _own_compositor(means)
-    works = {"rows": on_cpu, "tiles": not on_cpu and single, "gsplat": not on_cpu and single}
+    works = {"rows": on_cpu, "tiles": not on_cpu and single}
     if not works.get(compositor, False):
         raise InputError(
             "rasterize: compositor",
@@ -261,10 +259,6 @@ def rasterize(
         )
     thresholds = map(float, (alpha_min, alpha_max, transmittance_min, eps2d))
     settings = Settings(int(width), int(height), *thresholds)
-    if compositor == "gsplat":
-        if statistics is not None:
-            raise InputError("rasterize: statistics", "are not supported by the compositor 'gsplat'")
-        return gsplat_backend.rasterize(means, covars, opacities, sh, viewmats, Ks, background, settings)
     empty = _fresh if buffers is None else buffers.empty
     options = _Options(settings, COMPOSITORS[compositor], statistics, empty)
     return _Rasterize.apply(means, covars, opacities, sh, viewmats, Ks, background, options)

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from project import SCENE, TABLE, Project, copied, wait_for
 
 from neuma_lib.io.weights import read_torch
-from neuma_lib.timings import core_seconds
+from neuma_lib.project.timings import core_seconds
+from tests.support.project import SCENE, TABLE, Project, copied, wait_for
 
 # Table 1 with a training that is long enough to be cancelled in the middle; all before it is there.
 LONGER = ("--config", "material={iterations: 400}", "--", TABLE)

@@ -4,8 +4,9 @@ import re
 from collections import Counter
 
 import pytest
-from project import copied
-from test_graph import jobs
+
+from tests.support.job_graph import jobs
+from tests.support.project import copied
 
 SETTINGS = "board: {square: 0.03}\nheld_out: [two]\n"
 REPORT = "tiny/results/mug/{method}/report.html"

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 import yaml
-from project import copied
-from test_layouts import WRITERS, centre_of, ours
-from test_released import write_release
 
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import read_image_set
+from tests.support.image_layouts import WRITERS, centre_of, ours
+from tests.support.project import copied
+from tests.support.released_images import write_release
 
 
 def test_workflow_takes_supplied_images_in_place_of_blenders(tmp_path):

@@ -3,10 +3,11 @@
 import re
 
 import pytest
-from project import SCENE, TABLE, copied
 
-from neuma_lib.config import cases
-from neuma_lib.project import settings_around
+from neuma_lib.project import cases
+from neuma_lib.project.project import settings_around
+from tests.support.job_graph import jobs
+from tests.support.project import SCENE, TABLE, copied
 
 EXPERIMENT = f"{SCENE.rpartition('/')[0]}/experiments/letter_N_bouncy"
 SUPERVISED = "neuma_particle_supervision"  # the one method that trains on the truth
@@ -16,15 +17,6 @@ MAY_READ_THE_TRUTH = {
     *("tracers", "experiment_tracers"),
     *("particles_app", "lora_alphav", "ext_time"),
 }
-
-
-def jobs(plan: str) -> list[tuple[str, list[str], list[str]]]:
-    """Rule, inputs and outputs of every job of a dry run."""
-    found = []
-    for rule, said in re.findall(r"^(?:local)?rule (\w+):\n((?:    .*\n)*)", plan, re.MULTILINE):
-        listed = dict(re.findall(r"^    (input|output): (.*)$", said, re.MULTILINE))
-        found.append((rule, *(listed.get(key, "").split(", ") for key in ("input", "output"))))
-    return found
 
 
 @pytest.fixture(scope="module")

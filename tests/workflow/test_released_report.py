@@ -4,8 +4,9 @@ import json
 
 import pytest
 import yaml
-from project import copied
-from released_layouts import write_spring_gaus
+
+from tests.support.project import copied
+from tests.support.released_layouts import write_spring_gaus
 
 PAGE, FIGURE = "tiny/results/bun/neuma/report.html", "tiny/results/figures/realworld.png"
 

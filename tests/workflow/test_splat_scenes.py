@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 from PIL import Image
 from plyfile import PlyData
-from project import copied
-from splat_files import ball, write_spz
 
 from neuma_lib.io.exported import about_law
 from neuma_lib.io.gaussians import load_gaussians
@@ -17,6 +15,8 @@ from neuma_lib.io.laws import save_law
 from neuma_lib.io.splats import load_splat
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.splatting.culling import morton_order
+from tests.support.project import copied
+from tests.support.splat_files import ball, write_spz
 
 RESULTS = "tiny/results"
 FIGURE = f"{RESULTS}/figures/i23d.png"

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from project import ROOT, SCENE, TABLE, Project, copied, wait_for
 
 from neuma_lib.evaluation.lpips import expected_shapes
-from neuma_lib.evaluation.plotting.image_grid import load_image_grid
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.weights import write_weights
+from neuma_lib.paper.image_grid import load_image_grid
+from tests.support.project import ROOT, SCENE, TABLE, Project, copied, wait_for
 
 # ---- from nothing to a table
 
@@ -152,7 +152,7 @@ def test_editing_the_rasterizer_reruns_what_renders(clone):
             {"evaluate", "chamfer_table"},
             {"fit_neuma", "velocity", "ground_truth"},
         ),
-        ("neuma_lib/evaluation/tables.py", {"chamfer_table"}, {"evaluate"}),
+        ("neuma_lib/paper/tables.py", {"chamfer_table"}, {"evaluate"}),
         (
             "neuma_lib/coupling/particle_binding.py",
             {"binding", "velocity", "fit_neuma", "evaluate"},
@@ -316,7 +316,7 @@ def test_all_tables_can_be_planned(finished):
 
 
 def test_all_figures_can_be_planned(finished):
-    modules = (ROOT / "neuma_lib/evaluation/figures").glob("[!_]*.py")
+    modules = (ROOT / "neuma_lib/paper/figures").glob("[!_]*.py")
     planned = finished.plan("--forceall", "figures", "random", "tiny/results/figures/realworld.png")
     # i23d needs a splat: test_splat_scenes.py makes it.
     assert {module.stem for module in modules} - {"i23d"} <= set(planned)

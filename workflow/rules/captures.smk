@@ -3,7 +3,7 @@
 from functools import cache
 from types import SimpleNamespace
 
-from neuma_lib.capture.folder import NAME, inside, read_capture
+from neuma_lib.project.capture_folder import NAME, inside, read_capture
 
 CAPTURES = SETTINGS.captures.root.rstrip("/")
 CAPTURE_ENVIRONMENT = "../../envs/conda-capture.yaml"

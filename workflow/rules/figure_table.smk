@@ -116,7 +116,7 @@ def caption(figure):
 
 
 def figure_module(figure):
-    return ROOT / "neuma_lib" / "evaluation" / "figures" / f"{figure}.py"
+    return ROOT / "neuma_lib" / "paper" / "figures" / f"{figure}.py"
 
 
 # ---- the figures: kind of the data file, inputs and parameters of `data`, resources other than the default, the module

@@ -3,10 +3,10 @@
 from dataclasses import replace
 from functools import cache
 
-from neuma_lib.config.cases import LAW_FROM
-from neuma_lib.config.places import IDENTIFIED
+from neuma_lib.project.cases import LAW_FROM
+from neuma_lib.project.paths import IDENTIFIED
 from neuma_lib.config.variants import parse_chain
-from neuma_lib.viewer.find import scene_files
+from neuma_lib.project.find import scene_files
 
 
 @cache

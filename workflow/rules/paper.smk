@@ -1,6 +1,6 @@
 """Tables of the paper, and the targets that name many results at once."""
 
-from neuma_lib.evaluation.paper import PAPER
+from neuma_lib.paper.published import PAPER
 
 SCENES = list(SETTINGS.tables["table1"].scenes) if "table1" in SETTINGS.tables else SETTINGS.plain_scenes
 BENCHMARK_SCENES = list(SETTINGS.tables["table4"].scenes) if "table4" in SETTINGS.tables else SCENES

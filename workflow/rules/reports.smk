@@ -1,6 +1,6 @@
 """What the report of a capture is made of: its laws, their runs on all throws, and files of these. Needs captures.smk."""
 
-from neuma_lib.capture.scenes import scene_name, training_takes
+from neuma_lib.project.capture_scenes import scene_name, training_takes
 
 # Methods that the learned one is compared with: the prior as it is, and the constants identified in the video.
 PRIOR = next(iter(cases.of_kind(SETTINGS, "prior")), None)

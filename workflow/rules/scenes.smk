@@ -2,8 +2,8 @@
 
 from types import SimpleNamespace
 
-from neuma_lib.config import places
-from neuma_lib.config.settings import NO_TRUTH
+from neuma_lib.project import paths as places
+from neuma_lib.project.settings import NO_TRUTH
 from workflow.inputs import image_list
 
 

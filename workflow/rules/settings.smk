@@ -5,15 +5,14 @@ import shutil
 import sys
 from pathlib import Path
 
-ROOT = Path(workflow.basedir).resolve()
+ROOT = Path(workflow.current_basedir.get_path_or_uri(secret_free=True)).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from neuma_lib.capture.planned import planned_captures
-from neuma_lib.capture.scenes import captured_scenes
-from neuma_lib.checks import law_problems
-from neuma_lib.config import cases
+from neuma_lib.project.capture_scenes import captured_scenes
+from neuma_lib.project.checks import law_problems
+from neuma_lib.project import cases
 from neuma_lib.config.capture import CapturesConfig
-from neuma_lib.config.loading import load
+from neuma_lib.project.loading import load
 from neuma_lib.config.validation import validate
 from neuma_lib.errors import InputError
 from neuma_lib.methods.registry import methods as all_methods
@@ -23,7 +22,8 @@ from workflow.records import keep_records_of_failed_jobs
 
 try:
     captures = validate(CapturesConfig, config.get("captures") or {}, "captures")
-    PLANNED = planned_captures(captures.demo, captures.root)
+    # A workflow that includes this one may plan captures before their files exist.
+    PLANNED = plan_captures(config, captures.root) if "plan_captures" in globals() else {}
     SETTINGS = load(config, captured=captured_scenes(captures.root, captures.released, PLANNED))
 except InputError as error:
     raise WorkflowError(str(error)) from None

@@ -1,6 +1,6 @@
 """Print the board for the floor at its true size."""
 
-from neuma_lib.capture.board import print_board
+from neuma_lib.capture.calibration.board import print_board
 from neuma_lib.config.capture import BoardConfig
 from workflow.stage import run_script
 

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
-from neuma_lib.capture.agreement import check_one_object
-from neuma_lib.capture.flight import Filmed, draw_flight, find_flight, report
-from neuma_lib.capture.mattes import metric_camera
-from neuma_lib.capture.timing import read_sound
+from neuma_lib.capture.masks.agreement import check_one_object
+from neuma_lib.capture.masks.mattes import metric_camera
+from neuma_lib.capture.motion.flight import Filmed, draw_flight, find_flight, report
+from neuma_lib.capture.motion.timing import read_sound
 from neuma_lib.io.files import listed, read_json, write_json
 from neuma_lib.io.images import read_image_set, read_transforms
 from workflow.stage import run_script

@@ -1,6 +1,6 @@
 """Collect the image measures of all cameras and takes of a capture in one table."""
 
-from neuma_lib.evaluation.captured_images import image_rows, images_csv
+from neuma_lib.capture.report.images import image_rows, images_csv
 from neuma_lib.io.files import listed, read_json, write_json, write_text
 from workflow.stage import run_script
 

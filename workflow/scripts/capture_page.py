@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from neuma_lib.capture.page import checks, markdown
+from neuma_lib.capture.report.page import checks, markdown
 from neuma_lib.io.files import listed, read_json, write_text
 from workflow.stage import run_script
 

@@ -4,20 +4,27 @@ from pathlib import Path
 
 import numpy as np
 
-from neuma_lib.capture.agreement import MIN_AGREEMENT, agreement
-from neuma_lib.capture.board import board_outline
-from neuma_lib.capture.folder import PHOTOGRAPHS
+from neuma_lib.capture.calibration.board import board_outline
+from neuma_lib.capture.calibration.lens import read_lens
 from neuma_lib.capture.frames import Frame
-from neuma_lib.capture.lens import read_lens
-from neuma_lib.capture.masks import overlay
-from neuma_lib.capture.mattes import metric_camera, own_mask, read_pixels, room_frames, world_of, write_mattes
-from neuma_lib.capture.photograph_masks import photograph_mask
+from neuma_lib.capture.masks.agreement import MIN_AGREEMENT, agreement
+from neuma_lib.capture.masks.mask_refinement import redrawn_masks
+from neuma_lib.capture.masks.mattes import (
+    metric_camera,
+    own_mask,
+    read_pixels,
+    room_frames,
+    world_of,
+    write_mattes,
+)
+from neuma_lib.capture.masks.photograph_masks import photograph_mask
+from neuma_lib.capture.masks.regions import overlay
+from neuma_lib.capture.masks.saliency import Saliency
 from neuma_lib.capture.pictures import picture_sheet
-from neuma_lib.capture.redrawn_masks import redrawn_masks
-from neuma_lib.capture.saliency import Saliency
 from neuma_lib.config.board import BoardConfig
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import listed, read_json, write_json
+from neuma_lib.project.capture_folder import PHOTOGRAPHS
 from workflow.stage import run_script
 
 _STEPS = 4  # of progress, one for the network's masks

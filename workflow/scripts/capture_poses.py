@@ -3,11 +3,11 @@
 import tempfile
 from pathlib import Path
 
-from neuma_lib.capture.drawing import draw_poses
-from neuma_lib.capture.folder import PHOTOGRAPHS
-from neuma_lib.capture.poses import find_poses, save_poses
+from neuma_lib.capture.calibration.drawing import draw_poses
+from neuma_lib.capture.calibration.poses import find_poses, save_poses
 from neuma_lib.config.capture import BoardConfig
 from neuma_lib.io.files import listed
+from neuma_lib.project.capture_folder import PHOTOGRAPHS
 from workflow.stage import run_script
 
 

@@ -5,12 +5,12 @@ import shutil
 import numpy as np
 import torch
 
-from neuma_lib.capture.clock import frame_times
-from neuma_lib.capture.gravity import GRAVITY, Gravity
+from neuma_lib.capture.motion.gravity import GRAVITY, Gravity
+from neuma_lib.capture.motion.synchronisation import frame_times
 from neuma_lib.capture.pictures import picture_sheet
+from neuma_lib.capture.registration.registration import Parabola, register
+from neuma_lib.capture.registration.rigid_views import Sight
 from neuma_lib.errors import InputError
-from neuma_lib.fitting.registration import Parabola, register
-from neuma_lib.fitting.rigid_views import Sight
 from neuma_lib.io.files import atomic, listed, read_json, write_json
 from neuma_lib.io.gaussians import load_gaussians, save_gaussians
 from neuma_lib.io.images import read_image_set, read_transforms

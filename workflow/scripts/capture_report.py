@@ -2,15 +2,15 @@
 
 from pathlib import Path
 
-from neuma_lib.capture.page import checks, motion_checks, object_checks, registration_checks
-from neuma_lib.evaluation.capture_doubts import (
+from neuma_lib.capture.report.page import checks, motion_checks, object_checks, registration_checks
+from neuma_lib.capture.report.report import Film, Report, page
+from neuma_lib.capture.report.warnings import (
     check_warnings,
     constants_warnings,
     curve_warnings,
     filming_warnings,
     prediction_warnings,
 )
-from neuma_lib.evaluation.capture_report import Film, Report, page
 from neuma_lib.io.files import listed, read_json, write_text
 from workflow.stage import run_script
 

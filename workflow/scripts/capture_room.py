@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-from neuma_lib.capture.drawing import draw_floor, draw_room
-from neuma_lib.capture.folder import PHOTOGRAPHS
+from neuma_lib.capture.calibration.drawing import draw_floor, draw_room
+from neuma_lib.capture.calibration.poses import load_poses
+from neuma_lib.capture.calibration.room import find_room, write_room
 from neuma_lib.capture.pictures import name_pictures
-from neuma_lib.capture.poses import load_poses
-from neuma_lib.capture.room import find_room, write_room
 from neuma_lib.config.capture import CaptureConfig
 from neuma_lib.io.files import listed, write_json
+from neuma_lib.project.capture_folder import PHOTOGRAPHS
 from workflow.stage import run_script
 
 

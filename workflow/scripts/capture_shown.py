@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
+from neuma_lib.capture.calibration.lens import read_lens
 from neuma_lib.capture.frames import read_frames, read_timeline
-from neuma_lib.capture.lens import read_lens
-from neuma_lib.capture.mattes import read_pixels, room_frames
+from neuma_lib.capture.masks.mattes import read_pixels, room_frames
 from neuma_lib.capture.pictures import undistorted
-from neuma_lib.capture.shown import numbers_of, shown_frames
+from neuma_lib.capture.report.display_video import numbers_of, shown_frames
 from neuma_lib.io.files import listed, read_json
 from neuma_lib.io.images import read_transforms, write_transforms
 from workflow.stage import run_script

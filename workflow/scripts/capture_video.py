@@ -5,7 +5,13 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from neuma_lib.capture.clock import chosen_frames, frame_times, reduced, reduced_intrinsics, without_gain
+from neuma_lib.capture.motion.synchronisation import (
+    chosen_frames,
+    frame_times,
+    reduced,
+    reduced_intrinsics,
+    without_gain,
+)
 from neuma_lib.io.files import atomic, listed, read_json
 from neuma_lib.io.images import read_image_set, read_transforms, write_transforms
 from workflow.stage import run_script

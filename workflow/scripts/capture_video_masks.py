@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
+from neuma_lib.capture.calibration.lens import read_lens
 from neuma_lib.capture.frames import contact_sheet, read_frames, read_timeline, sheet_numbers
-from neuma_lib.capture.lens import read_lens
-from neuma_lib.capture.masks import area_jumps, check_flight, overlay
-from neuma_lib.capture.mattes import own_mask, read_pixels, room_frames, world_of, write_mattes
+from neuma_lib.capture.masks.mattes import own_mask, read_pixels, room_frames, world_of, write_mattes
+from neuma_lib.capture.masks.regions import area_jumps, check_flight, overlay
+from neuma_lib.capture.masks.video_masks import given_masks, video_masks
 from neuma_lib.capture.pictures import undistorted
-from neuma_lib.capture.video_masks import given_masks, video_masks
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import listed, read_json, write_json
 from workflow.stage import run_script

@@ -7,10 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from neuma_lib.coupling.filmed import Filmed
-from neuma_lib.device import choose_device
-from neuma_lib.errors import InputError
-from neuma_lib.evaluation.captured_images import (
+from neuma_lib.capture.report.images import (
     as_planes,
     averaged,
     captured_metrics,
@@ -18,6 +15,9 @@ from neuma_lib.evaluation.captured_images import (
     error_picture,
     exposed,
 )
+from neuma_lib.coupling.filmed import Filmed
+from neuma_lib.device import choose_device
+from neuma_lib.errors import InputError
 from neuma_lib.evaluation.lpips import LPIPS
 from neuma_lib.evaluation.video import side_by_side, write_mp4
 from neuma_lib.fitting.frame_batches import frame_batches, spread_frames

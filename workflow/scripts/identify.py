@@ -4,9 +4,9 @@ import torch
 
 from neuma_lib.config.binding import BindingConfig
 from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.coupling.initial_motion import Throw
 from neuma_lib.device import choose_device
 from neuma_lib.fitting.identify import identify
-from neuma_lib.fitting.throw import Throw
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import listed, read_json, write_json
 from neuma_lib.io.images import load_videos

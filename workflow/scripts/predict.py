@@ -4,8 +4,8 @@ from dataclasses import asdict
 
 import numpy as np
 
+from neuma_lib.capture.report.motion import motion_report
 from neuma_lib.device import choose_device
-from neuma_lib.evaluation.captured_motion import motion_report
 from neuma_lib.evaluation.motion import energy_gain_after
 from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import write_arrays

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from neuma_lib.capture.agreement import agreement
 from neuma_lib.capture.frames import Frame
-from neuma_lib.capture.masks import overlay
-from neuma_lib.capture.mattes import metric_camera, write_mattes
+from neuma_lib.capture.masks.agreement import agreement
+from neuma_lib.capture.masks.mattes import metric_camera, write_mattes
+from neuma_lib.capture.masks.regions import overlay
 from neuma_lib.capture.pictures import picture_sheet
 from neuma_lib.capture.released import (
     photographs_about_to_size,

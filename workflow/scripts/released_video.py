@@ -3,8 +3,8 @@
 import numpy as np
 
 from neuma_lib.capture.frames import Frame, contact_sheet, sheet_numbers
-from neuma_lib.capture.masks import area_jumps, overlay
-from neuma_lib.capture.mattes import write_mattes
+from neuma_lib.capture.masks.mattes import write_mattes
+from neuma_lib.capture.masks.regions import area_jumps, overlay
 from neuma_lib.capture.released import RATE, read_configured, read_shots, video_frames
 from neuma_lib.config.capture import ReleasedConfig
 from neuma_lib.io.files import write_json

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from neuma_lib.config.motion import MotionOptions
-from neuma_lib.config.pac_nerf import PacNerfConfig
 from neuma_lib.errors import InputError
 from neuma_lib.methods.base import Case, Files, Method, Preset
+from neuma_lib.methods.pac_nerf.options import PacNerfConfig
 
 FIELD = "pac_nerf/field.safetensors"
 
@@ -71,12 +71,12 @@ class PacNerf(Method):
 
         import torch
 
-        from neuma_lib.fitting.carried_field import CarriedField
-        from neuma_lib.fitting.pac_families import choose_family
-        from neuma_lib.fitting.pac_nerf import fit_pac_nerf
         from neuma_lib.io.files import read_json, write_json
         from neuma_lib.io.images import load_videos
-        from neuma_lib.io.radiance import load_field
+        from neuma_lib.methods.pac_nerf.carried_field import CarriedField
+        from neuma_lib.methods.pac_nerf.families import choose_family
+        from neuma_lib.methods.pac_nerf.fit import fit_pac_nerf
+        from neuma_lib.methods.pac_nerf.io import load_field
         from neuma_lib.sim.model import MPMModel
 
         options = dict(options)
@@ -147,7 +147,7 @@ class PacNerf(Method):
     def load_body(self, inputs, options, density, carrier, gaussian_motion, device="cpu"):
         if carrier != "field":
             return super().load_body(inputs, options, density, carrier, gaussian_motion, device)
-        from neuma_lib.fitting.carried_field import CarriedField
+        from neuma_lib.methods.pac_nerf.carried_field import CarriedField
 
         return CarriedField.load(inputs["field"], options, density, device)
 

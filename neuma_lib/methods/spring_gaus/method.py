@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from neuma_lib.config.material import MaterialConfig
-from neuma_lib.config.springs import SpringsConfig
 from neuma_lib.methods.base import Case, Files, Method, Preset
+from neuma_lib.methods.spring_gaus.options import SpringsConfig
 
 BODY = {"particles": "particles.h5", "binding": "binding.h5", "gaussians": "gaussians.ply"}
 OF_NETWORK = ("anchors", "neighbours", "hard_springs", "exponent", "carriers")
@@ -53,15 +53,15 @@ class SpringGaus(Method):
         import torch
 
         from neuma_lib.fitting.material import PixelLoss
-        from neuma_lib.fitting.springs import fit_springs
         from neuma_lib.io.files import write_json
         from neuma_lib.io.images import load_videos
         from neuma_lib.io.particles import load_body, with_motion
-        from neuma_lib.io.springs import save_springs
+        from neuma_lib.methods.spring_gaus.body import SpringBody
+        from neuma_lib.methods.spring_gaus.fit import fit_springs
+        from neuma_lib.methods.spring_gaus.io import save_springs
+        from neuma_lib.methods.spring_gaus.network import Springs
+        from neuma_lib.methods.spring_gaus.rollout import SpringModel
         from neuma_lib.sim.model import MPMModel
-        from neuma_lib.springs.body import SpringBody
-        from neuma_lib.springs.network import Springs
-        from neuma_lib.springs.rollout import SpringModel
 
         settings = SpringGausOptions(**options)
         files = (inputs[name] for name in ("particles", "binding", "gaussians"))

@@ -7,16 +7,16 @@ from typing import Any
 
 import torch
 
+from neuma_lib.coupling.interpolation import Interpolation
 from neuma_lib.evaluation.motion import sound_frames
-from neuma_lib.io.springs import load_springs
 from neuma_lib.io.weights import read_weights
 from neuma_lib.methods.model import MotionModel
+from neuma_lib.methods.spring_gaus.body import SpringBody
+from neuma_lib.methods.spring_gaus.io import load_springs
+from neuma_lib.methods.spring_gaus.network import Springs
+from neuma_lib.methods.spring_gaus.rollout import SpringModel, spring_rollout
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.state import State, Trajectory
-from neuma_lib.springs.body import SpringBody
-from neuma_lib.springs.interpolation import Interpolation
-from neuma_lib.springs.network import Springs
-from neuma_lib.springs.rollout import SpringModel, spring_rollout
 
 
 class SpringMotion(MotionModel):
