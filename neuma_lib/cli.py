@@ -329,9 +329,10 @@ def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
     settings, root = settings_around(place, options.configfile)
     settings = settings.model_copy(update={"results_root": str(place.parent.parent)})
     scene, method = place.parent.name, place.name
-    law = cases.case(settings, scene, method).source().load(lambda file: str(root / file)).law
-    if law is None:
+    case = cases.case(settings, scene, method)
+    if not case.method.has_law:
         raise InputError(options.source, "its motion follows from no material law", "Choose another method")
+    law = case.source().load(lambda file: str(root / file)).law
     origin = cases.law_origin(settings, scene, method)
     beside = {"metrics": place / "metrics.json", "rollout": place / "rollout.h5"}
     of_this = {name: file for name, file in beside.items() if file.is_file() and origin["scene"] == scene}

@@ -1,7 +1,7 @@
-"""A voxel radiance field, and the particles that carry it into a simulation (PAC-NeRF, Li et al. 2023, Sec. 3).
+"""A voxel radiance field, and the particles that represent it in a simulation (PAC-NeRF, Li et al. 2023, Sec. 3).
 
-The raw density of a particle decides what is seen of it, and its opacity over one interval how heavy and how stiff it
-is: the fuzzy shell of a field is light and soft.
+The raw density of a particle determines its appearance. Its opacity over one interval scales its mass and stiffness, so
+that the diffuse shell of a field is light and soft.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from neuma_lib.methods.pac_nerf.rendering import (
 from neuma_lib.splatting.cameras import Cameras
 
 OCCUPIED = 1e-7
-"""A halved lattice keeps the nodes that have at least this part of the largest opacity, and those next to them
-(PAC-NeRF: this opacity)."""
+"""Refinement keeps the nodes with at least this share of the largest opacity and their neighbours (an absolute opacity
+in PAC-NeRF)."""
 STIFFNESS_POWER = 3
-"""Stiffness is that of the material times this power of a particle's opacity (PAC-NeRF's code)."""
+"""Stiffness scales with this power of the opacity of a particle (PAC-NeRF's code)."""
 WHITE = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class FieldParticles:
-    """What a field hands to a simulation.
+    """Particles of a field for a simulation.
 
     Attributes:
         x: positions [m], (N, 3).
         features: raw density and colour features, (N, 1 + C).
-        opacities: over one interval, (N,), which weigh mass and stiffness.
-        volume: of space that each stands for [m^3].
-        voxel: of the lattice that they are seen on [m].
+        opacities: opacities over one interval, (N,), which scale mass and stiffness.
+        volume: volume of space per particle [m^3].
+        voxel: voxel of the lattice that renders them [m].
     """
 
     x: Tensor
@@ -50,34 +50,33 @@ class FieldParticles:
     voxel: float
 
     def masses(self, density: float) -> Tensor:
-        """alpha rho V [kg], (N,), of a body of the density rho [kg/m^3]."""
+        """alpha rho V [kg], (N,), for a body of density rho [kg/m^3]."""
         return self.opacities * density * self.volume
 
     def volumes(self) -> Tensor:
-        """alpha^3 V [m^3], (N,): volumes at rest that give a law of full stiffness the force of alpha^3 of it.
+        """alpha^3 V [m^3], (N,): rest volumes that scale the forces of a law by alpha^3.
 
-        The force of a particle is its volume at rest times its Kirchhoff stress, and all stresses here are linear in
-        the moduli. Strains at yield stay as they are (the authors' code weighs the moduli and not the yield stress, so
-        there they grow as alpha^-3 in the shell).
+        The force of a particle is its rest volume times its Kirchhoff stress, which is linear in the moduli. This does
+        not change the yield strain, which grows as alpha^-3 in the authors' code because it scales only the moduli.
         """
         return self.opacities**STIFFNESS_POWER * self.volume
 
     def seen(self, x: Tensor | None = None) -> tuple[Lattice, Tensor]:
-        """The lattice about the particles, where they are or at other positions (N, 3), and its values, to `render`."""
+        """Lattice around the particles, optionally at other positions (N, 3), and its values, for `render`."""
         x = self.x if x is None else x
         lattice = Lattice.spanning(x.amin(0), x.amax(0), self.voxel)
         return lattice, from_particles(lattice, x, self.features)
 
 
 class RadianceField(nn.Module):
-    """Raw densities and colour features at the nodes of a lattice, and the network that turns features into colours.
+    """Raw densities and colour features at the nodes of a lattice, and the network that maps features to colours.
 
     Attributes:
-        lattice: where the nodes are.
+        lattice: positions of the nodes.
         opacity: activation of the density.
-        density: (X, Y, Z, 1) raw.
-        features: (X, Y, Z, C).
-        network: the colours.
+        density: raw densities (X, Y, Z, 1).
+        features: colour features (X, Y, Z, C).
+        network: colour network.
     """
 
     def __init__(self, lattice: Lattice, opacity: Opacity, network: ColourNetwork | None = None):
@@ -88,26 +87,26 @@ class RadianceField(nn.Module):
         self.features = nn.Parameter(torch.zeros(*lattice.nodes, FEATURES))
 
     def values(self) -> Tensor:
-        """Raw density and features side by side, (X, Y, Z, 1 + C)."""
+        """Raw density and features, (X, Y, Z, 1 + C)."""
         return torch.cat([self.density, self.features], dim=3)
 
     @torch.no_grad()
-    def occupied(self, least: float) -> Tensor:
-        """Nodes (X, Y, Z) that have at least a part of the largest opacity, and those next to them."""
+    def occupied(self, share: float) -> Tensor:
+        """Mask (X, Y, Z) of the nodes with at least a share of the largest opacity, and of their neighbours."""
         alphas = self.opacity(self.density[..., 0], 1.0)
         near = nn.functional.max_pool3d(alphas[None, None], kernel_size=3, stride=1, padding=1)[0, 0]
-        return near >= least * alphas.max()
+        return near >= share * alphas.max()
 
     @torch.no_grad()
     def halved(self) -> RadianceField:
-        """The occupied part of the field on a lattice of half the voxel, with the same network."""
-        found, lattice = self.occupied(OCCUPIED).nonzero(), self.lattice
-        low = found.amin(0).clamp(max=torch.tensor(lattice.nodes, device=found.device) - 2)
-        spans = (found.amax(0) - low).clamp(min=1)
+        """The occupied part of the field on a lattice of half the voxel size, with the same network."""
+        nodes, lattice = self.occupied(OCCUPIED).nonzero(), self.lattice
+        low = nodes.amin(0).clamp(max=torch.tensor(lattice.nodes, device=nodes.device) - 2)
+        spans = (nodes.amax(0) - low).clamp(min=1)
         origin = tuple(o + lattice.voxel * k for o, k in zip(lattice.origin, low.tolist(), strict=True))
-        finer = Lattice(origin, lattice.voxel / 2, tuple(2 * n + 1 for n in spans.tolist()))
-        field = RadianceField(finer, self.opacity, self.network).to(self.density)
-        values = interpolate(lattice, self.values(), finer.points(self.density).view(-1, 3))
+        refined = Lattice(origin, lattice.voxel / 2, tuple(2 * n + 1 for n in spans.tolist()))
+        field = RadianceField(refined, self.opacity, self.network).to(self.density)
+        values = interpolate(lattice, self.values(), refined.points(self.density).view(-1, 3))
         field.density.copy_(values[:, :1].view_as(field.density))
         field.features.copy_(values[:, 1:].view_as(field.features))
         return field
@@ -115,14 +114,14 @@ class RadianceField(nn.Module):
     def particles(
         self, spacing: float, least_opacity: float, generator: torch.Generator | None = None
     ) -> FieldParticles:
-        """Particles in the occupied part; their features and opacities are differentiable with respect to the field.
+        """Particles in the occupied part, one at a random position in each cell of a cubic grid.
 
-        One in each cell of a cubic grid, at a random place in it.
+        Their features and opacities are differentiable with respect to the field.
 
         Args:
-            spacing: side of such a cell [voxels]; the authors take 0.5, eight particles a voxel.
-            least_opacity: particles less opaque than this part of the most opaque one are left out.
-            generator: of the places, on the CPU; None draws the same ones every time.
+            spacing: side of a cell [voxels]; PAC-NeRF uses 0.5, i.e. eight particles per voxel.
+            least_opacity: particles with less than this share of the largest opacity are omitted.
+            generator: generator of the positions, on the CPU. None always gives the same positions.
         """
         generator = torch.Generator().manual_seed(0) if generator is None else generator
         voxel, like = self.lattice.voxel, self.density
@@ -145,7 +144,7 @@ class RadianceField(nn.Module):
         directions: Tensor,
         background: Sequence[float] = WHITE,
     ) -> tuple[Tensor, Tensor]:
-        """`rendering.render` of values on a lattice, those of the field or of particles, in the field's colours."""
+        """`rendering.render` of values on a lattice, of the field or of particles, with the colours of the field."""
         return render(lattice, values, self.opacity, self.network, origins, directions, background)
 
     def render_in_pieces(
@@ -156,7 +155,7 @@ class RadianceField(nn.Module):
         directions: Tensor,
         background: Sequence[float] = WHITE,
     ) -> Iterator[tuple[slice, Tensor, Tensor]]:
-        """`rendering.render_in_pieces`, likewise."""
+        """`rendering.render_in_pieces` with the colours of the field."""
         return render_in_pieces(lattice, values, self.opacity, self.network, origins, directions, background)
 
     @torch.no_grad()
@@ -167,9 +166,9 @@ class RadianceField(nn.Module):
         particles: FieldParticles | None = None,
         background: Sequence[float] = WHITE,
     ) -> Tensor:
-        """Picture (H, W, 3) of the field, or of the particles that carry it, where these are.
+        """Image (H, W, 3) of the field, or of its particles at their positions.
 
-        Memory, beside rays and picture, is that of a piece (`rendering.POINTS_AT_ONCE`), whatever the picture's size.
+        In addition to rays and image, it needs memory for `rendering.POINTS_AT_ONCE` points.
         """
         lattice, values = (self.lattice, self.values()) if particles is None else particles.seen()
         pieces = self.render_in_pieces(lattice, values, *camera_rays(cameras, view), background)

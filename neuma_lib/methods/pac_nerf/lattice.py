@@ -1,4 +1,4 @@
-"""Values on a regular lattice of nodes: read at points by trilinear interpolation, made from those of particles."""
+"""Values on a regular lattice of nodes: trilinear interpolation at points, and means of values of particles."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from neuma_lib.errors import InputError
 from neuma_lib.methods.pac_nerf.lattice_kernels import kernels, lattice_types
 
 EMPTY = -100.0
-"""Value of all channels at a node that no particle sees: as raw density, no opacity (PAC-NeRF)."""
-LEAST_WEIGHT = 1e-10
-"""Sum of weights up to which a node counts as empty (PAC-NeRF)."""
+"""Value of all channels at a node without particles, which as raw density has no opacity (PAC-NeRF)."""
+MIN_WEIGHT = 1e-10
+"""Sum of weights up to which a node is empty (PAC-NeRF)."""
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Where nodes are: two or more along each axis, corners of voxels.
+    """A regular lattice of nodes, the corners of voxels.
 
     Attributes:
-        origin: of node (0, 0, 0) [m].
-        voxel: distance between neighbours [m].
-        nodes: along each axis.
+        origin: position of node (0, 0, 0) [m].
+        voxel: distance between neighbouring nodes [m].
+        nodes: number of nodes along each axis, at least two.
     """
 
     origin: tuple[float, float, float]
@@ -36,15 +36,13 @@ class Lattice:
     def __post_init__(self):
         if self.voxel <= 0 or min(self.nodes) < 2:
             raise InputError(
-                f"lattice: {self.nodes} nodes {self.voxel} m apart; give two along each axis and a positive voxel"
+                "lattice",
+                f"nodes = {self.nodes} must be at least 2 per axis and voxel = {self.voxel} m positive",
             )
 
     @classmethod
     def spanning(cls, low: Tensor, high: Tensor, voxel: float) -> Lattice:
-        """The lattice of multiples of the voxel that holds the points between two corners (3,) [m].
-
-        Its nodes do not depend on the corners, only how far it reaches does.
-        """
+        """The smallest lattice with nodes at multiples of the voxel that contains two corners (3,) [m]."""
         first = torch.floor(low.detach().double() / voxel).long().tolist()
         last = torch.floor(high.detach().double() / voxel).long().tolist()
         nodes = tuple(b - a + 2 for a, b in zip(first, last, strict=True))
@@ -56,7 +54,7 @@ class Lattice:
         return tuple(o + (n - 1) * self.voxel for o, n in zip(self.origin, self.nodes, strict=True))
 
     def points(self, like: Tensor) -> Tensor:
-        """Positions of the nodes [m], (X, Y, Z, 3), with the type and device of a tensor."""
+        """Positions of the nodes [m], (X, Y, Z, 3), with the dtype and device of ``like``."""
         ticks = [
             o + self.voxel * torch.arange(n, dtype=like.dtype, device=like.device)
             for o, n in zip(self.origin, self.nodes, strict=True)
@@ -64,7 +62,7 @@ class Lattice:
         return torch.stack(torch.meshgrid(*ticks, indexing="ij"), dim=-1)
 
     def place(self, dtype: torch.dtype):
-        """The same as kernels take it."""
+        """The lattice as a struct for kernels."""
         t = lattice_types(dtype)
         place = t.Place()
         place.origin, place.inv_voxel = t.vec3(*self.origin), 1.0 / self.voxel
@@ -73,59 +71,48 @@ class Lattice:
 
 
 def interpolate(lattice: Lattice, values: Tensor, points: Tensor) -> Tensor:
-    """Values between the nodes, differentiable with respect to those of the nodes, not to the points.
+    """Interpolated values (M, C), differentiable with respect to those of the nodes, not to the points.
 
     Args:
-        lattice: where the nodes are.
-        values: (X, Y, Z, C) at the nodes.
-        points: (M, 3) [m]; the cells at the border go on beyond it.
-
-    Returns:
-        (M, C)
+        lattice: positions of the nodes.
+        values: values at the nodes (X, Y, Z, C).
+        points: positions (M, 3) [m], with linear extrapolation outside the lattice.
 
     Raises:
-        InputError: shapes, types or devices that do not fit.
+        InputError: shapes, dtypes or devices do not match.
     """
-    _check("interpolate", lattice, values, points)
+    _check(lattice, values, points)
     return _Interpolate.apply(lattice, values.contiguous(), points.detach().contiguous())
 
 
 def from_particles(lattice: Lattice, x: Tensor, features: Tensor) -> Tensor:
-    """Means of the particles' features about each node, with the weights of trilinear interpolation.
+    """Means (X, Y, Z, C) of the features of particles at each node, with the weights of trilinear interpolation.
 
-    sum_p w_np f_p / sum_p w_np in each channel, and `EMPTY` at nodes that no particle sees (PAC-NeRF, Sec. 3.2).
+    sum_p w_np f_p / sum_p w_np in each channel, and `EMPTY` at nodes without particles (PAC-NeRF, Sec. 3.2).
     Differentiable with respect to features and positions.
 
     Args:
-        lattice: where the nodes are; it holds all particles (`Lattice.spanning`).
-        x: (N, 3) positions [m].
-        features: (N, C).
-
-    Returns:
-        (X, Y, Z, C)
+        lattice: positions of the nodes, which contains all particles (`Lattice.spanning`).
+        x: positions (N, 3) [m].
+        features: features (N, C).
 
     Raises:
-        InputError: shapes, types or devices that do not fit.
+        InputError: shapes, dtypes or devices do not match.
     """
     if features.shape[:1] != x.shape[:1] or features.dtype != x.dtype or features.device != x.device:
-        raise InputError(
-            f"features {tuple(features.shape)}, {features.dtype} on {features.device}, are not those of positions"
-            f" {tuple(x.shape)}, {x.dtype} on {x.device}"
-        )
+        raise InputError("features", f"{_kind(features)} do not match positions {_kind(x)}")
     return _FromParticles.apply(lattice, x.contiguous(), features.contiguous())
 
 
-def _check(user: str, lattice: Lattice, values: Tensor, points: Tensor) -> None:
-    if tuple(values.shape[:3]) != lattice.nodes or points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(
-            f"{user}: values {tuple(values.shape)} and points {tuple(points.shape)} do not fit a lattice of"
-            f" {lattice.nodes} nodes: give (X, Y, Z, C) and (M, 3)"
-        )
-    if values.dtype != points.dtype or values.device != points.device:
-        raise InputError(
-            f"{user}: values are {values.dtype} on {values.device}, points {points.dtype} on {points.device}:"
-            " give both alike"
-        )
+def _kind(value: Tensor) -> str:
+    return f"{tuple(value.shape)} {value.dtype} on {value.device}"
+
+
+def _check(lattice: Lattice, values: Tensor, points: Tensor) -> None:
+    shapes_match = tuple(values.shape[:3]) == lattice.nodes and points.ndim == 2 and points.shape[1] == 3
+    if not shapes_match or values.dtype != points.dtype or values.device != points.device:
+        given = f"{_kind(values)} at {lattice.nodes} nodes do not match points {_kind(points)}"
+        raise InputError("values", given, "Use shapes (X, Y, Z, C) and (M, 3), one dtype and one device")
 
 
 class _Interpolate(torch.autograd.Function):
@@ -136,15 +123,8 @@ class _Interpolate(torch.autograd.Function):
         channels = values.shape[3]
         out = values.new_empty(len(points), channels)
         if len(points):
-            place = lattice.place(values.dtype)
-            launch(
-                kernels(values.dtype, channels).read,
-                len(points),
-                place,
-                values.view(-1, channels),
-                points,
-                out,
-            )
+            kernel, place = kernels(values.dtype, channels).read, lattice.place(values.dtype)
+            launch(kernel, len(points), place, values.view(-1, channels), points, out)
         return out
 
     @staticmethod
@@ -165,12 +145,12 @@ class _FromParticles(torch.autograd.Function):
     def forward(ctx, lattice, x, features):
         x, features = x.detach(), features.detach()
         channels, place = features.shape[1], lattice.place(x.dtype)
-        made = kernels(x.dtype, channels)
+        k = kernels(x.dtype, channels)
         values = features.new_zeros(*lattice.nodes, channels)
         weights = features.new_zeros(values[..., 0].numel())
         flat = values.view(-1, channels)
-        launch(made.deposit, len(x), place, x, features, weights, flat)
-        launch(made.normalise, len(flat), LEAST_WEIGHT, EMPTY, weights, flat)
+        launch(k.deposit, len(x), place, x, features, weights, flat)
+        launch(k.normalise, len(flat), MIN_WEIGHT, EMPTY, weights, flat)
         ctx.lattice = lattice
         ctx.save_for_backward(x, features, weights, values)
         return values
@@ -182,7 +162,7 @@ class _FromParticles(torch.autograd.Function):
         channels = features.shape[1]
         grad_x, grad_features = torch.empty_like(x), torch.empty_like(features)
         launch(
-            kernels(x.dtype, channels).deposit_adjoint, len(x), ctx.lattice.place(x.dtype), LEAST_WEIGHT, x, features,
+            kernels(x.dtype, channels).deposit_adjoint, len(x), ctx.lattice.place(x.dtype), MIN_WEIGHT, x, features,
             weights, values.view(-1, channels), grad.contiguous().view(-1, channels), grad_x, grad_features,
         )  # fmt: skip
         return None, grad_x, grad_features

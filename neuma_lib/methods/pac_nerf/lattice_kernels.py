@@ -1,7 +1,7 @@
-"""Kernels of :mod:`neuma_lib.methods.pac_nerf.lattice`: nodes to points and points to nodes, with their adjoints.
+"""Kernels of :mod:`neuma_lib.methods.pac_nerf.lattice`: nodes to points and points to nodes, with adjoints.
 
-A point sees the eight nodes about it with the weights of trilinear interpolation. A node holds all its channels side by
-side, so that a weight is multiplied with one vector.
+They use the eight nodes around a point with the weights of trilinear interpolation. The channels of a node form one
+vector.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -18,7 +18,7 @@ start_warp()
 
 @functools.cache
 def lattice_types(dtype: torch.dtype) -> SimpleNamespace:
-    """Warp's types for a torch precision, and the struct that places nodes in space."""
+    """Warp's types for a torch precision, and the struct of the lattice."""
     real = {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
     types = SimpleNamespace(real=real, vec3=wp.types.vector(length=3, dtype=real))
 
@@ -26,7 +26,7 @@ def lattice_types(dtype: torch.dtype) -> SimpleNamespace:
     class Place:
         origin: types.vec3  # position of node (0, 0, 0) [m]
         inv_voxel: real  # [1/m]
-        nodes: wp.vec3i  # along each axis, the last one runs fastest
+        nodes: wp.vec3i  # along each axis, the last index is contiguous
 
     types.Place = Place
     return types
@@ -34,13 +34,13 @@ def lattice_types(dtype: torch.dtype) -> SimpleNamespace:
 
 @functools.cache
 def lattice_functions(dtype: torch.dtype) -> SimpleNamespace:
-    """Functions that kernels on lattices share: the cell of a point, where it lies in it, and weights."""
+    """Functions shared by kernels on lattices: cell of a point, position in the cell, and weights."""
     t = lattice_types(dtype)
     real, vec3, Place = t.real, t.vec3, t.Place
 
     @wp.func
     def cell(place: Place, x: vec3):
-        """First of the eight nodes about x; clamped, so that no point indexes outside."""
+        """First of the eight nodes around x, clamped to valid indices."""
         c = wp.vec3i()
         for a in range(3):
             c[a] = wp.clamp(
@@ -50,18 +50,18 @@ def lattice_functions(dtype: torch.dtype) -> SimpleNamespace:
 
     @wp.func
     def within(place: Place, x: vec3, c: wp.vec3i):
-        """Position of x in its cell [voxels], between 0 and 1 for a point of the lattice."""
+        """Position of x in its cell [voxels], in [0, 1] for points within the lattice."""
         f = (x - place.origin) * place.inv_voxel
         return vec3(f[0] - real(c[0]), f[1] - real(c[1]), f[2] - real(c[2]))
 
     @wp.func
     def share(f: real, far: wp.int32):
-        """Weight along one axis of the near (0) or far (1) node."""
+        """Weight of the near (0) or far (1) node along one axis."""
         return wp.where(far == 1, f, real(1.0) - f)
 
     @wp.func
     def slope(far: wp.int32):
-        """Its derivative with respect to f."""
+        """Derivative of `share` with respect to f."""
         return wp.where(far == 1, real(1.0), real(-1.0))
 
     @wp.func
@@ -74,8 +74,7 @@ def lattice_functions(dtype: torch.dtype) -> SimpleNamespace:
 
 @functools.cache
 def kernels(dtype: torch.dtype, channels: int) -> SimpleNamespace:
-    """Kernels `read`, `read_adjoint`, `deposit`, `normalise` and `deposit_adjoint` for a precision and a number of
-    channels. All but `normalise`, of the nodes, run over the points."""
+    """Kernels `read`, `read_adjoint`, `deposit` and `deposit_adjoint` over points, and `normalise` over nodes."""
     t, functions = lattice_types(dtype), lattice_functions(dtype)
     real, vec3, Place = t.real, t.vec3, t.Place
     cell, within, share, slope, row = vars(functions).values()
@@ -135,7 +134,7 @@ def kernels(dtype: torch.dtype, channels: int) -> SimpleNamespace:
 
     @kernel
     def normalise(least: real, empty: real, weights: wp.array(dtype=real), values: wp.array(dtype=vec)):
-        """In place: sums to means, and `empty` where the weights add up to `least` or less."""
+        """In place: sums to means, and `empty` where the sum of weights is at most `least`."""
         n = wp.tid()
         if weights[n] > least:
             values[n] = values[n] / weights[n]

@@ -1,5 +1,4 @@
-"""Kernels of :mod:`neuma_lib.methods.pac_nerf.rendering`: which points of a ray count, and the light they
-send along it."""
+"""Kernels of :mod:`neuma_lib.methods.pac_nerf.rendering`: selection of the points of a ray, and compositing."""
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
 import functools
@@ -16,7 +15,7 @@ start_warp()
 
 @functools.cache
 def kernels(dtype: torch.dtype) -> SimpleNamespace:
-    """Kernels `march`, `composite` and `composite_adjoint` for a precision; all run over the rays."""
+    """Kernels `march`, `composite` and `composite_adjoint` over rays."""
     t, functions = lattice_types(dtype), lattice_functions(dtype)
     real, vec3, Place = t.real, t.vec3, t.Place
     cell, within, share, row = functions.cell, functions.within, functions.share, functions.row
@@ -59,9 +58,9 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
         rays: wp.array(dtype=wp.int64),
         counts: wp.array(dtype=wp.int32),
     ):
-        """Points of a ray that send at least `least` of their light, to where less than `end` would pass.
+        """Select points of a ray with a weight T alpha above `least`, until the transmittance T is below `end`.
 
-        Counts them, or writes them from `starts` on where `fill` is 1: both passes decide alike.
+        Counts the points, or writes them from `starts` on if `fill` is 1. Both passes select the same points.
         """
         r = wp.tid()
         o, d = origins[r], directions[r]
@@ -100,7 +99,7 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
         pictures: wp.array(dtype=vec3),
         passed: wp.array(dtype=real),
     ):
-        """C = sum_i T_i alpha_i c_i + T background with T_i = prod_{j < i} (1 - alpha_j), kept in `reaching`."""
+        """C = sum_i T_i alpha_i c_i + T background with T_i = prod_{j < i} (1 - alpha_j), stored in `reaching`."""
         r = wp.tid()
         transmitted = real(1.0)
         light = vec3()
@@ -123,7 +122,7 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
         grad_alphas: wp.array(dtype=real),
         grad_colours: wp.array(dtype=vec3),
     ):
-        """From far to near with the light B from behind and the part P that passes: no division by 1 - alpha.
+        """Back to front, with the colour B and the transmittance P behind point i, which avoids division by 1 - alpha.
 
         dC/dalpha_i = T_i (c_i - B),  dT/dalpha_i = -T_i P,  dC/dc_i = T_i alpha_i.
         """

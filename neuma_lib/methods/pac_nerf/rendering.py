@@ -1,9 +1,9 @@
 """Volume rendering of a lattice of raw densities and colour features along rays (Sun et al. 2022, DVGO).
 
-Three steps: the points of each ray that count are chosen without gradient; opacity and colour there come from the
-lattice by interpolation, activation and a small network, by autograd; and they are composited. What autograd keeps is
-in proportion to the points: `render_in_pieces` bounds how many there are at a time, and `sum_of_terms` differentiates
-one piece before the next one is rendered.
+Rendering has three steps: select the relevant points of each ray without gradient, compute their opacity and colour by
+interpolation, activation and a small network with autograd, and composite them. The memory of autograd is proportional
+to the number of points. `render_in_pieces` limits the number at a time, and `sum_of_terms` differentiates one piece
+before the next is rendered.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from neuma_lib.methods.pac_nerf.marching_kernels import kernels
 from neuma_lib.splatting.cameras import Cameras
 
 FEATURES = 12
-"""Colour features of a node, beside its raw density."""
+"""Number of colour features of a node, in addition to its raw density."""
 STEP = 0.5
 """Distance between two points of a ray [voxels]."""
 INTERVAL = 0.1
-"""Exponent of the transmittance of a voxel on the coarsest lattice (PAC-NeRF); it is in proportion to the voxel."""
+"""Exponent of the transmittance of a voxel on the coarsest lattice (PAC-NeRF), proportional to the voxel."""
 NEAR = 0.1
-"""Distance from the camera at which rays begin [m]."""
-LEAST_LIGHT = 1e-7
-"""A point that sends no more than this part of its light is left out, without gradient."""
+"""Distance from the camera at which rays start [m]."""
+MIN_LIGHT = 1e-7
+"""Weight T alpha up to which a point is omitted, without gradient."""
 END_LIGHT = 1e-3
-"""A ray ends where less than this part of the light from behind would pass (DVGO)."""
+"""Transmittance below which a ray ends (DVGO)."""
 POINTS_AT_ONCE = {"cpu": 2**16, "cuda": 2**20}
-"""Most points of a piece of a picture on a kind of device, a ray counting as one more.
+"""Maximum number of points plus rays in a piece of an image, by type of device.
 
-The gradient keeps 1.1 kB of each in single precision. On a CPU a layer's 128 activations of them stay just below the
-32 MiB from which on the C library has every buffer mapped anew. On a GPU a picture of 800 x 800 pixels is usually one
-piece: every piece costs launches.
+The gradient needs 1.1 kB per point in single precision. On a CPU the 128 activations of a layer then stay below 32 MiB,
+above which the C library maps every buffer again. On a GPU an image of 800 x 800 pixels is usually one piece, which
+saves launches.
 """
 
 
@@ -50,7 +50,7 @@ class Opacity:
 
     Attributes:
         initial: opacity of raw density 0 over an interval of 1.
-        base_voxel: voxel of the coarsest lattice [m], over which a ray's exponent is `INTERVAL`.
+        base_voxel: voxel of the coarsest lattice [m], over which the exponent of a ray is `INTERVAL`.
     """
 
     initial: float
@@ -62,21 +62,21 @@ class Opacity:
 
     def __call__(self, density: Tensor, interval: float) -> Tensor:
         """Opacities of raw densities over an interval."""
-        # beyond 40, softplus is its argument to round-off of float64; torch would say so from 20 on
+        # above 40, softplus equals its argument to round-off in float64; torch's default threshold is 20
         return -torch.expm1(-interval * nn.functional.softplus(density + self.shift, threshold=40.0))
 
     def ray_interval(self, voxel: float) -> float:
-        """The interval of one point of a ray through voxels of this size [m]."""
+        """Interval of one point of a ray for a voxel size [m]."""
         return INTERVAL * STEP * voxel / self.base_voxel
 
 
 class ColourNetwork(nn.Module):
-    """Features and viewing direction to a colour: three linear layers with ReLU between them, a sigmoid behind.
+    """Maps features and viewing direction to a colour: three linear layers with ReLU between them, then a sigmoid.
 
     Args:
         features: number of features of a point.
-        width: neurons of a layer.
-        frequencies: the direction comes along with sine and cosine of 2^k times it, k < frequencies.
+        width: width of the hidden layers.
+        frequencies: number of powers 2^k of the positional encoding of the direction.
     """
 
     def __init__(self, features: int = FEATURES, width: int = 128, frequencies: int = 4):
@@ -92,8 +92,8 @@ class ColourNetwork(nn.Module):
     def forward(self, features: Tensor, directions: Tensor, rays: Tensor) -> Tensor:
         """Colours (M, 3) of points with features (M, C) on rays (M,) of directions (R, 3)."""
         waves = (directions[:, :, None] * self.frequencies).flatten(1)
-        seen_from = torch.cat([directions, waves.sin(), waves.cos()], dim=1)
-        return torch.sigmoid(self.layers(torch.cat([features, seen_from[rays]], dim=1)))
+        encoded = torch.cat([directions, waves.sin(), waves.cos()], dim=1)
+        return torch.sigmoid(self.layers(torch.cat([features, encoded[rays]], dim=1)))
 
 
 Colours = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -122,25 +122,25 @@ def render(
     background: Sequence[float] = (1.0, 1.0, 1.0),
     counts: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Light along rays, all at once: memory is in proportion to their points.
+    """Render rays at once, with memory proportional to the number of their points.
 
-    Differentiable with respect to the values and to what `colours` closes over; points that are left out
-    (`LEAST_LIGHT`, `END_LIGHT`) have no gradient.
+    Differentiable with respect to the values and the tensors that `colours` closes over. Omitted points (`MIN_LIGHT`,
+    `END_LIGHT`) have no gradient.
 
     Args:
-        lattice: where the nodes are.
+        lattice: positions of the nodes.
         values: raw density and features at the nodes, (X, Y, Z, 1 + C).
         opacity: activation of the density.
-        colours: network of the colours.
-        origins, directions: (R, 3) starts [m] and unit directions of the rays.
+        colours: colour network.
+        origins, directions: origins [m] and unit directions of the rays, (R, 3).
         background: colour behind the lattice.
-        counts: points of each ray, (R,), where they are known (`count_points`).
+        counts: number of points of each ray, (R,), if known (`count_points`).
 
     Returns:
-        colours (R, 3), and the part of the background's light that comes through, (R,)
+        Colours (R, 3) and transmittances (R,) of the rays.
 
     Raises:
-        InputError: shapes, types or devices that do not fit.
+        InputError: shapes, dtypes or devices do not match.
     """
     points, rays, starts = march(lattice, values[..., 0], opacity, origins, directions, counts)
     read = interpolate(lattice, values, points)
@@ -157,20 +157,19 @@ def render_in_pieces(
     directions: Tensor,
     background: Sequence[float] = (1.0, 1.0, 1.0),
 ) -> Iterator[tuple[slice, Tensor, Tensor]]:
-    """`render` rays of any number, a piece of them after another.
+    """`render` any number of rays in pieces of at most `POINTS_AT_ONCE` points and rays, or of one ray.
 
-    A piece has at most `POINTS_AT_ONCE` points and rays, or is one ray. Beside the rays themselves, memory is that of a
-    piece where its graph is gone before the next one is asked for; else that of `render`.
+    The memory is that of one piece if its graph is released before the next piece is requested.
 
     Yields:
-        which rays, their colours and the part of the background's light that comes through, as `render` has them
+        Slice of the rays, their colours and their transmittances, as in `render`.
     """
-    most = POINTS_AT_ONCE[values.device.type]
+    limit = POINTS_AT_ONCE[values.device.type]
     counts = count_points(lattice, values[..., 0], opacity, origins, directions)
     ends = (counts + 1).cumsum(0).cpu()
     first = done = 0
     while first < len(ends):
-        last = max(first + 1, int(torch.searchsorted(ends, done + most, right=True)))
+        last = max(first + 1, int(torch.searchsorted(ends, done + limit, right=True)))
         part = slice(first, last)
         rays = origins[part], directions[part]
         yield part, *render(lattice, values, opacity, colours, *rays, background, counts[part])
@@ -178,15 +177,14 @@ def render_in_pieces(
 
 
 def sum_of_terms(terms: Callable[[Tensor], Iterable[Tensor]], values: Tensor) -> Tensor:
-    """Sum of terms, whose gradient is taken a term at a time: one graph is in memory, whatever their number.
+    """Sum of terms, differentiated term by term so that only one graph is in memory.
 
     Args:
-        terms: scalars, one after another, of values that it is given, and of nothing else that has a gradient.
+        terms: function from values to an iterable of scalars that depend on no other tensor with a gradient.
         values: any shape.
 
     Returns:
-        scalar, differentiable with respect to the values; the terms are computed once, with their gradients if those
-        are needed
+        Scalar, differentiable with respect to the values. Terms and required gradients are computed once.
     """
     return _SumOfTerms.apply(terms, values)
 
@@ -195,7 +193,7 @@ def sum_of_terms(terms: Callable[[Tensor], Iterable[Tensor]], values: Tensor) ->
 def count_points(
     lattice: Lattice, density: Tensor, opacity: Opacity, origins: Tensor, directions: Tensor
 ) -> Tensor:
-    """How many points of each ray count, (R,)."""
+    """Number of selected points of each ray, (R,)."""
     counts = torch.zeros(len(origins), dtype=torch.int32, device=origins.device)
     nothing = origins[:0], torch.empty(0, dtype=torch.int64, device=origins.device)
     _march(lattice, density, opacity, origins, directions, 0, counts, *nothing, counts)
@@ -211,9 +209,9 @@ def march(
     directions: Tensor,
     counts: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The points that count: positions (M, 3), their rays (M,), and where those of each ray start, (R + 1,).
+    """Selected points: positions (M, 3), their rays (M,), and the start index of each ray, (R + 1,).
 
-    ``counts`` are those of `count_points`, where they are known.
+    ``counts`` is the result of `count_points` if known.
     """
     if counts is None:
         counts = count_points(lattice, density, opacity, origins, directions)
@@ -231,12 +229,13 @@ def _march(lattice, density, opacity, origins, directions, fill, starts, points,
         or origins.device != density.device
     ):
         raise InputError(
-            f"render: rays of shapes {tuple(origins.shape)} and {tuple(directions.shape)} ({origins.dtype} on"
-            f" {origins.device}) for values of {density.dtype} on {density.device}: give all alike"
+            "rays",
+            f"origins {tuple(origins.shape)} and directions {tuple(directions.shape)}, {origins.dtype} on"
+            f" {origins.device}, do not match each other or values of {density.dtype} on {density.device}",
         )
     density, origins, directions = (value.detach().contiguous() for value in (density, origins, directions))
     place, interval = lattice.place(density.dtype), opacity.ray_interval(lattice.voxel)
-    constants = (place, NEAR, STEP * lattice.voxel, interval, opacity.shift, LEAST_LIGHT, END_LIGHT)
+    constants = (place, NEAR, STEP * lattice.voxel, interval, opacity.shift, MIN_LIGHT, END_LIGHT)
     field = (density.view(-1), origins, directions)
     launch(kernels(density.dtype).march, len(origins), *constants, fill, *field, starts, points, rays, counts)
 

@@ -1,4 +1,4 @@
-"""A body of particles that follow the anchors of a network of springs."""
+"""A body whose particles follow the anchors of a network of springs."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from neuma_lib.sim.state import State, Trajectory
 
 @dataclass(frozen=True)
 class SpringBody:
-    """Some of a body's particles are anchors, all follow these.
+    """A body with particles of which some are anchors.
 
     Attributes:
         index: particles that are anchors, int64, shape (A,).
-        network: springs between them.
-        follow: how all N particles follow them.
+        network: springs between the anchors.
+        follow: interpolation from the anchors to all N particles.
     """
 
     index: Tensor
@@ -31,35 +31,31 @@ class SpringBody:
     def of(
         cls, x0: Tensor, anchors: int, neighbours: int, hard: int, exponent: float, carriers: int
     ) -> SpringBody:
-        """Anchors among the particles x0 (N, 3) [m], far from each other, and springs between them."""
+        """Choose anchors by farthest-point sampling of the particles x0 (N, 3) [m], and connect them by springs."""
         index = farthest_points(x0, anchors).to(x0.device)
         network = SpringNetwork.of(x0[index], neighbours, hard, exponent)
         return cls(index, network, Interpolation(x0, network.anchors, carriers))
 
     @classmethod
     def with_network(cls, x0: Tensor, index: Tensor, network: SpringNetwork, carriers: int) -> SpringBody:
-        """The body that a network was made for.
-
-        Raises:
-            InputError: its anchors are not these particles.
-        """
+        """The body of an existing network. Raises InputError if its anchors are not the particles ``index``."""
         if index.max() >= len(x0) or not torch.equal(x0[index], network.anchors):
             raise InputError(
-                "springs: their anchors are not the body's particles: run the rule springs again"
+                "springs", "the anchors are not particles of the body", "Run the rule springs again"
             )
         return cls(index, network, Interpolation(x0, network.anchors, carriers))
 
     def start(self, state: State) -> tuple[Tensor, Tensor]:
-        """Positions [m] and velocities [m/s] of the anchors, shape (A, 3), of the particles in motion."""
+        """Positions [m] and velocities [m/s] of the anchors, shape (A, 3), in a state of the particles."""
         x, v, *_ = state.motion
         return x[self.index], v[self.index]
 
     def path(
         self, frames: tuple[int, ...], x: Tensor, v: Tensor, tracers: Tensor | None = None
     ) -> Trajectory:
-        """States of the particles for those of the anchors at frames, x and v (T, A, 3).
+        """States of the particles from those of the anchors at frames, x and v (T, A, 3).
 
-        F is the gradient of the fitted motion, which has no part that flows. C is left at zero.
+        F is the gradient of the interpolated motion, without a plastic part. C is zero.
         """
         positions, F = self.follow(x)
         return Trajectory(frames, positions, self.follow.velocities(v), F, torch.zeros_like(F), tracers)

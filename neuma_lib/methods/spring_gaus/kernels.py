@@ -1,14 +1,14 @@
-"""A substep of a network of springs as one Warp kernel, and its adjoint, written by hand.
+"""Warp kernel of a substep of a network of springs, and its hand-written adjoint.
 
-Anchors have unit mass. A substep is semi-implicit Euler, v <- v + dt (f(x, v) + g), x <- x + dt v, and then the planes
-of the box, all moved inwards by one gap: a coordinate beyond one is put on it and loses its velocity, the others keep a
-part of theirs.
+Anchors have unit mass. A substep is semi-implicit Euler, v <- v + dt (f(x, v) + g), x <- x + dt v, followed by contact
+with the planes of the box, moved inwards by a gap: a coordinate beyond a plane is set to it and its velocity to zero,
+and friction scales the other velocity components.
 
-Anchor i feels its own list of neighbours j, with its own stiffness k_i (Spring-Gaus, Zhong et al. 2024):
+Anchor i has a list of neighbours j and a stiffness k_i (Spring-Gaus, Zhong et al. 2024):
 
     f_i = sum_j [ eta_j (k_i / l_ij) (L - l_ij) (1 + |L / l_ij - 1|)^p + (c / l_ij) (v_j - v_i) . n ] n
 
-with L n = x_j - x_i and the length at rest l_ij. An elongation below `SLACK` counts as none, as in the authors' code.
+with L n = x_j - x_i and the rest length l_ij. Elongations below `SLACK` have no force, as in the authors' code.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -23,9 +23,9 @@ from neuma_lib.device import start_warp
 start_warp()
 
 SLACK = 1e-6
-"""Elongation that a spring does not feel [m]."""
-SHORTEST = 1e-12
-"""Two anchors nearer than this have no direction between them [m]."""
+"""Elongation below which a spring has no force [m]."""
+MIN_LENGTH = 1e-12
+"""Distance of two anchors below which their direction is undefined [m]."""
 
 
 @functools.cache
@@ -48,7 +48,7 @@ def warp_types(dtype: torch.dtype) -> SimpleNamespace:
 
 @functools.cache
 def kernels(dtype: torch.dtype) -> SimpleNamespace:
-    """Kernels `step` and `step_adjoint` of a dtype; both run over the anchors."""
+    """Kernels `step` and `step_adjoint` over the anchors."""
     t = warp_types(dtype)
     real, vec3, SpringConstants = t.real, t.vec3, t.SpringConstants
     module = wp.get_module(f"{__name__}.{str(dtype).removeprefix('torch.')}")
@@ -56,15 +56,15 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
 
     @wp.func(module=module)
     def power(u: real, p: real):
-        """u^p; the square root, as published, is several times faster than a power."""
+        """u^p. The published exponent 1/2 uses the square root, which is several times faster."""
         result = wp.sqrt(u)
         if p != real(0.5):
             result = wp.pow(u, p)
         return result
 
     @wp.func(module=module)
-    def felt(elongation: real):
-        """The elongation that a spring feels."""
+    def effective(elongation: real):
+        """Elongation, zero below `SLACK`."""
         result = elongation
         if wp.abs(elongation) < real(wp.static(SLACK)):
             result = real(0.0)
@@ -72,7 +72,7 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
 
     @wp.func(module=module)
     def beyond(c: SpringConstants, gap: real, x: vec3):
-        """For each coordinate, 1 on or beyond the lower plane, -1 for the upper one, 0 between them."""
+        """Per coordinate: 1 on or beyond the lower plane, -1 for the upper plane, 0 between them."""
         result = vec3()
         for a in range(3):
             if x[a] <= c.low + gap:
@@ -102,12 +102,12 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
             j = neighbours[i, slot]
             d = x[now, j] - xi
             length = wp.length(d)
-            if length > real(wp.static(SHORTEST)):
+            if length > real(wp.static(MIN_LENGTH)):
                 n = d / length
                 per_rest = real(1.0) / rest[i, slot]
                 elongation = length - rest[i, slot]
                 u = real(1.0) + wp.abs(elongation) * per_rest
-                pull = eta[slot] * ki * felt(elongation) * power(u, c.exponent)
+                pull = eta[slot] * ki * effective(elongation) * power(u, c.exponent)
                 force += (per_rest * (pull + damp * wp.dot(v[now, j] - vi, n))) * n
         v_new = vi + c.dt * (force + c.gravity)
         x_new = xi + c.dt * v_new
@@ -136,19 +136,17 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
         gap: wp.array(dtype=real),
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
-        grad_x: wp.array2d(
-            dtype=vec3
-        ),  # (2, A): the side of the state after the step, and the other, all zero
+        grad_x: wp.array2d(dtype=vec3),  # (2, A): gradient of the state after the step, and zeros
         grad_v: wp.array2d(dtype=vec3),
-        grad_stiffness: wp.array(dtype=real),  # (A,), added to, as are the four below
-        grad_eta: wp.array2d(dtype=real),  # (A, K), the part of each anchor
+        grad_stiffness: wp.array(dtype=real),  # (A,), accumulated like the four below
+        grad_eta: wp.array2d(dtype=real),  # (A, K), contribution of each anchor
         grad_damping: wp.array(dtype=real),  # (A,)
         grad_friction: wp.array(dtype=real),  # (A,)
         grad_gap: wp.array(dtype=real),  # (A,)
     ):
-        """Gradients of the state after a step to those of the state before it, on the other side; clears the first.
+        """From gradients of the state after a step (cleared) to those of the state before it.
 
-        Of the neighbours' gradients each thread adds its part, on a GPU in no fixed order.
+        Threads add to the gradients of neighbours, on a GPU in no fixed order.
         """
         i = wp.tid()
         before = 1 - after_side
@@ -165,20 +163,20 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
         for _ in range(planes):
             slope = slope * kept + passed
             passed *= kept
-        g_v = passed * g_after + c.dt * g_x  # of the velocity before the planes
-        a = c.dt * g_v  # of the force
+        g_v = passed * g_after + c.dt * g_x  # gradient of the velocity before contact
+        a = c.dt * g_v  # gradient of the force
         force, own_x, own_v = vec3(), g_x, g_v
         of_stiffness, of_damping = real(0.0), real(0.0)
         for slot in range(neighbours.shape[1]):
             j = neighbours[i, slot]
             d = x[now, j] - xi
             length = wp.length(d)
-            if length > real(wp.static(SHORTEST)):
+            if length > real(wp.static(MIN_LENGTH)):
                 n = d / length
                 per_rest = real(1.0) / rest[i, slot]
                 strain = (length - rest[i, slot]) * per_rest
                 u = real(1.0) + wp.abs(strain)
-                shape = felt(length - rest[i, slot]) * per_rest * power(u, c.exponent)
+                shape = effective(length - rest[i, slot]) * per_rest * power(u, c.exponent)
                 dv = v[now, j] - vi
                 rate = per_rest * wp.dot(dv, n)
                 size = eta[slot] * ki * shape + damp * rate

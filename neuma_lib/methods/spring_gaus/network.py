@@ -1,6 +1,6 @@
-"""Networks of springs between anchors in a body, and what decides their strength (Spring-Gaus, Zhong et al. 2024).
+"""Networks of springs between anchors in a body, and their trainable parameters (Spring-Gaus, Zhong et al. 2024).
 
-Anchors have unit mass, so that stiffnesses are forces per unit mass and strain [m/s^2].
+Anchors have unit mass, so stiffnesses are forces per unit mass and strain [m/s^2].
 """
 
 from __future__ import annotations
@@ -16,16 +16,11 @@ from torch.nn.functional import softplus
 from neuma_lib.errors import InputError
 
 FRICTION_START = -1.0
-"""Published start of the parameter behind the part of its velocity that an anchor keeps on a wall: 0.22 of it."""
+"""Published initial friction parameter, for which an anchor on a wall keeps 0.22 of its velocity per substep."""
 
 
 def farthest_points(x: Tensor, count: int) -> Tensor:
-    """Indices, ascending, of points that lie far from each other: each next one is the farthest from all before.
-
-    Args:
-        x: positions [m], shape (N, 3).
-        count: how many are wanted; all N if there are fewer.
-    """
+    """Ascending indices of ``count`` points, at most N, of x (N, 3) [m], by farthest-point sampling."""
     points = x.detach().to("cpu", torch.float64).numpy()
     if count >= len(points):
         return torch.arange(len(points))
@@ -39,17 +34,17 @@ def farthest_points(x: Tensor, count: int) -> Tensor:
 
 @dataclass(frozen=True)
 class SpringNetwork:
-    """Springs from each anchor to its nearest ones, the nearest first.
+    """Springs from each anchor to its nearest neighbours in order of distance.
 
-    The lists are directed: anchor i pulls itself towards j with its own stiffness, j pulls back only if i is in its
-    list, with its own. So neither momentum nor angular momentum is conserved exactly, as published.
+    Springs are directed: the force on i from j has the stiffness of i, and j is pulled by i only if i is in its list.
+    Momentum and angular momentum are therefore not exactly conserved, as published.
 
     Attributes:
         anchors: positions at rest [m], shape (A, 3).
-        neighbours: of each anchor, int32, shape (A, K).
-        rest: lengths of the springs at rest [m], shape (A, K).
-        hard: springs of each list, from the nearest on, that always pull fully.
-        exponent: p of the law of the springs, see `kernels`.
+        neighbours: indices of the neighbours, int32, shape (A, K).
+        rest: rest lengths [m], shape (A, K).
+        hard: number of nearest springs per anchor whose eta is always 1.
+        exponent: p of the force, see `kernels`.
     """
 
     anchors: Tensor
@@ -60,41 +55,43 @@ class SpringNetwork:
 
     @classmethod
     def of(cls, anchors: Tensor, neighbours: int, hard: int, exponent: float = 0.5) -> SpringNetwork:
-        """Springs to the ``neighbours`` nearest anchors, or to all others where there are fewer.
+        """Springs to the ``neighbours`` nearest anchors, or to all others if there are fewer.
 
         Raises:
-            InputError: fewer than two anchors, or two in one place.
+            InputError: fewer than two anchors, or two at the same position.
         """
         points = anchors.detach().to("cpu", torch.float64).numpy()
         if len(points) < 2:
-            raise InputError(f"springs: {len(points)} anchors make no network; give more springs.anchors")
+            raise InputError("springs.anchors", f"{len(points)} must be at least 2")
         count = min(neighbours, len(points) - 1)
         distance, index = cKDTree(points).query(points, k=count + 1)
         others = index != np.arange(len(points))[:, None]
-        # An anchor may be pushed out of its own list by others in its place.
+        # An anchor may be missing in its own list if others have the same position.
         others[others.all(1), -1] = False
         shape = (len(points), count)
         if not (distance[others] > 0).all():
-            raise InputError("springs: two anchors are in one place; sample the particles again")
+            raise InputError(
+                "springs.anchors", "two anchors have the same position", "Sample the particles again"
+            )
         rest, index = (
             torch.as_tensor(a[others].reshape(shape)).to(anchors.device) for a in (distance, index)
         )
         return cls(anchors, index.int(), rest.to(anchors), min(hard, count), exponent)
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> SpringNetwork:
-        """The same in another precision or on another device."""
+        """Copy to another precision or device."""
         anchors, rest = (value.to(device=device, dtype=dtype) for value in (self.anchors, self.rest))
         return SpringNetwork(anchors, self.neighbours.to(device), rest, self.hard, self.exponent)
 
     @property
     def reach(self) -> float:
-        """Mean length of the hard springs [m]: the spacing of the anchors."""
+        """Mean length of the hard springs, the spacing of the anchors [m]."""
         return float(self.rest[:, : self.hard or 1].mean())
 
     def soft_vector(self, kappa: Tensor) -> Tensor:
-        """Parts eta of their stiffness that the springs of a list pull with, shape (K,), from the parameter kappa.
+        """Factors eta of the stiffness by position in a list, shape (K,), from the parameter kappa.
 
-        1 for the hard ones; for the j-th of the m others, clamp(2 - (1 + e^kappa)^(j / m), 0, 1).
+        1 for hard springs, clamp(2 - (1 + e^kappa)^(j / m), 0, 1) for the j-th of the m others.
         """
         soft = self.rest.shape[1] - self.hard
         place = torch.arange(soft, dtype=kappa.dtype, device=kappa.device) / max(soft, 1)
@@ -102,7 +99,7 @@ class SpringNetwork:
         return torch.cat([eta.new_ones(self.hard), eta])
 
     def youngs_modulus(self, stiffness: Tensor, eta: Tensor, density: float) -> float:
-        """Young's modulus [Pa] of a body of this mass density [kg/m^3] with these springs, at small strains.
+        """Young's modulus [Pa] at small strains for a mass density [kg/m^3].
 
         An isotropic network of central springs K has lambda = mu = sum K l^2 / (15 V), thus E = sum K l^2 / (6 V) with
         each pair counted once. Here K = (rho V / A) eta k / l, and every pair is in two lists.
@@ -112,8 +109,8 @@ class SpringNetwork:
     def stable_step(self, stiffness: Tensor, eta: Tensor, damping: Tensor) -> float:
         """A time step [s] below which small motions are stable, by Gershgorin's bound of the highest frequency.
 
-        The rows of the stiffness and the damping matrix bound omega^2 and the highest rate of decay d; the
-        semi-implicit step is stable for dt^2 omega^2 + 2 dt d < 4.
+        The rows of the stiffness and damping matrices bound omega^2 and the highest decay rate d. The semi-implicit
+        step is stable for dt^2 omega^2 + 2 dt d < 4.
         """
         omega2 = 2 * float((stiffness[:, None] * eta / self.rest).sum(1).max())
         decay = 2 * float((damping / self.rest).sum(1).max())
@@ -121,13 +118,13 @@ class SpringNetwork:
 
 
 class Springs(nn.Module):
-    """What is learned of a network: a stiffness for each anchor, and four numbers that all share.
+    """Trainable parameters of a network: a stiffness per anchor, and four shared numbers.
 
     Args:
-        network: gives number of anchors, precision and device.
-        stiffness: of every anchor at the start [m/s^2].
+        network: the network.
+        stiffness: initial stiffness of every anchor [m/s^2].
         damping: c [m/s].
-        gap: how far inside the box anchors are stopped [m].
+        gap: distance from the box at which anchors are in contact [m].
     """
 
     def __init__(self, network: SpringNetwork, stiffness: float, damping: float, gap: float = 0.0):
@@ -144,7 +141,7 @@ class Springs(nn.Module):
     def of_modulus(
         cls, network: SpringNetwork, E: float, density: float, damping: float, gap: float = 0.0
     ) -> Springs:
-        """Springs of one stiffness, that of a body of Young's modulus E [Pa] and a mass density [kg/m^3]."""
+        """Springs with a uniform stiffness that gives a Young's modulus E [Pa] for a mass density [kg/m^3]."""
         springs = cls(network, 1.0, damping, gap)
         with torch.no_grad():
             unit, eta, *_ = springs.values()
@@ -152,10 +149,11 @@ class Springs(nn.Module):
         return springs
 
     def for_network(self, network: SpringNetwork, density: float, other_density: float) -> Springs:
-        """Springs of another body of the same material: the shared numbers, and one stiffness of the same modulus.
+        """Springs of another body of the same material, with the shared numbers and a uniform stiffness of the same
+        modulus.
 
         Args:
-            network: of the other body.
+            network: network of the other body.
             density, other_density: mass densities of this body and of the other one [kg/m^3].
         """
         other = Springs(network, 1.0, 1.0)
@@ -167,11 +165,11 @@ class Springs(nn.Module):
         return other
 
     def values(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """What a rollout needs, differentiable.
+        """Differentiable parameters of a rollout.
 
         Returns:
-            stiffnesses (A,) [m/s^2], soft vector (K,), damping (1,) [m/s]; friction (1,), the part of its velocity
-            along a wall that an anchor keeps in a substep on it; gap (1,) [m].
+            Stiffnesses (A,) [m/s^2], soft vector (K,), damping (1,) [m/s], friction (1,), which is the factor of the
+            tangential velocity per substep in contact, and gap (1,) [m].
         """
         friction = (1.2 * self.grip.sigmoid() - 0.1).clamp(0, 1)
         eta = self.network.soft_vector(self.softness)

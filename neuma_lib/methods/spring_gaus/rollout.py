@@ -1,4 +1,4 @@
-"""Simulation of a network of springs in the box, differentiable, with a guard against steps that are too long."""
+"""Differentiable simulation of a network of springs in the box, with adaptive substeps."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from neuma_lib.methods.spring_gaus.kernels import kernels, warp_types
 from neuma_lib.methods.spring_gaus.network import SpringNetwork, Springs
 from neuma_lib.sim.model import MPMModel
 
-MOST_SUBSTEPS = 256
-"""Substeps of a time step beyond which a network counts as unstable."""
+MAX_SUBSTEPS = 256
+"""Maximum number of substeps per time step. A network that needs more is considered unstable."""
 
 
 @dataclass(frozen=True)
@@ -26,10 +26,10 @@ class SpringModel:
     """Constants of the simulation.
 
     Attributes:
-        dt: time step that frames are counted in [s].
+        dt: time step between consecutive frame numbers [s].
         gravity: acceleration [m/s^2].
-        low, high: coordinates on every axis of the planes, before the gap of the springs [m].
-        substeps: equal parts that a time step is taken in, at least.
+        low, high: coordinates of the planes on every axis, without the gap of the springs [m].
+        substeps: minimum number of substeps per time step.
     """
 
     dt: float
@@ -40,7 +40,7 @@ class SpringModel:
 
     @classmethod
     def of(cls, model: MPMModel, substeps: int = 1) -> SpringModel:
-        """Gravity, time step and box of another simulator, with planes where bodies come to rest in it."""
+        """Gravity, time step and box of an MPM model, with planes where bodies come to rest in it."""
         low, high = model.free_range  # half a cell before the walls
         half = 0.5 * model.dx
         return cls(model.dt, model.gravity, low - half, high + half, substeps)
@@ -60,45 +60,45 @@ def spring_rollout(
     Differentiable with respect to x0, v0 and the parameters of the springs.
 
     Args:
-        model: time step, gravity and box. A time step is taken in as many substeps as `SpringNetwork.stable_step`
-            needs, but no fewer than ``model.substeps``. Where anchors still run away, in twice as many, and so on.
-        springs: network and what is learned of it.
-        x0, v0: anchors at the start, shape (A, 3) [m], [m/s].
-        frames: time steps of the frames, increasing, from ``first`` on, which is the start.
-        first: time step of the start.
-        log: receives a line for every halving of the step.
+        model: time step, gravity and box. The number of substeps is that of `SpringNetwork.stable_step`, at least
+            ``model.substeps``, and is doubled while the simulation diverges.
+        springs: network and its parameters.
+        x0, v0: initial positions [m] and velocities [m/s] of the anchors, shape (A, 3).
+        frames: time steps of the frames, increasing, not less than ``first``.
+        first: time step of the initial state.
+        log: receives a line for every halving of the substep.
 
     Returns:
-        x and v at the frames, shape (T, A, 3); the model with the substeps that they were found with.
+        x and v at the frames, shape (T, A, 3), and the model with the number of substeps used.
 
     Raises:
-        NonFiniteError: anchors run away even in `MOST_SUBSTEPS` substeps; has `step` and `particle`.
+        NonFiniteError: the simulation diverges in `MAX_SUBSTEPS` substeps; has `step` and `particle`.
     """
     values = springs.values()
     safe = springs.network.stable_step(*(value.detach() for value in values[:3]))
-    needed = model.dt / safe if safe > 0 else math.inf  # NaN where a stiffness is infinite
-    substeps = max(model.substeps, math.ceil(min(needed, MOST_SUBSTEPS + 1)))
+    needed = model.dt / safe if safe > 0 else math.inf  # NaN if a stiffness is infinite
+    substeps = max(model.substeps, math.ceil(min(needed, MAX_SUBSTEPS + 1)))
     counts = [n - first for n in frames]
     while True:
-        if substeps > MOST_SUBSTEPS:
+        if substeps > MAX_SUBSTEPS:
             raise NonFiniteError(
                 "springs",
-                f"too stiff for {MOST_SUBSTEPS} substeps of {model.dt:g} s; lower springs.lr_springs or springs.guess",
+                f"too stiff for {MAX_SUBSTEPS} substeps of {model.dt:g} s. Lower springs.lr_springs or springs.guess",
             )
         model = replace(model, substeps=substeps)
         try:
             x, v = _Rollout.apply(model, springs.network, counts, first, x0, v0, *values)
             return x, v, model
         except NonFiniteError as error:
-            if 2 * substeps > MOST_SUBSTEPS:
+            if 2 * substeps > MAX_SUBSTEPS:
                 raise
             substeps *= 2
             if log:
-                log(f"{error}; each step is taken in {substeps} parts from here on")
+                log(f"{error}. Retrying with {substeps} substeps per time step")
 
 
 class _Rollout(torch.autograd.Function):
-    """All substeps as one function of the start and the values of the springs."""
+    """All substeps as one function of the initial state and the values of the springs."""
 
     @staticmethod
     def forward(ctx, model, network, counts, first, x0, v0, *values):
@@ -120,7 +120,7 @@ class _Rollout(torch.autograd.Function):
 
 
 def _check(model: SpringModel, network: SpringNetwork, x: Tensor, v: Tensor, first: int) -> None:
-    """Whether any anchor ran away: in a closed box a wild one need not become infinite."""
+    """Raise NonFiniteError if an anchor diverged, i.e. is not finite or too fast for the closed box."""
     fast = v.abs().amax(-1) * (model.dt / model.substeps) > network.reach
     wrong = fast | ~(x.isfinite() & v.isfinite()).all(-1)
     if wrong.any():
@@ -135,7 +135,7 @@ def _check(model: SpringModel, network: SpringNetwork, x: Tensor, v: Tensor, fir
 
 
 class _Launcher:
-    """Launches over the buffers of a rollout."""
+    """Kernel launches on the buffers of a rollout."""
 
     def __init__(self, model, network, values, x, v):
         self.x, self.v, self.values, self.network = x, v, values, network
@@ -147,17 +147,17 @@ class _Launcher:
         self._shared = (network.neighbours, network.rest, *values, x, v)
 
     def forward(self, steps: int) -> None:
-        launch = self._recorded(kernels(self.x.dtype).step, 0, *self._shared)
+        launch = self._record(kernels(self.x.dtype).step, 0, *self._shared)
         for step in range(steps):
             self._run(launch, step)
 
     def backward(self, kept: list[int], grad_x: Tensor, grad_v: Tensor) -> tuple[Tensor, ...]:
-        """Gradients of x0, v0 and the values of the springs, for those of the kept states."""
+        """Gradients of x0, v0 and the values of the springs from those of the kept states."""
         A, K = self.network.rest.shape
         like = self.x
         of_x, of_v = like.new_zeros(2, A, 3), like.new_zeros(2, A, 3)
         sums = [like.new_zeros(shape) for shape in ((A,), (A, K), (A,), (A,), (A,))]
-        launch = self._recorded(kernels(like.dtype).step_adjoint, 0, 0, *self._shared, of_x, of_v, *sums)
+        launch = self._record(kernels(like.dtype).step_adjoint, 0, 0, *self._shared, of_x, of_v, *sums)
         frames = {step: i for i, step in enumerate(kept)}
         for step in range(kept[-1], -1, -1):
             side = step % 2
@@ -169,7 +169,7 @@ class _Launcher:
         stiffness, eta, *single = sums
         return of_x[0], of_v[0], stiffness, eta.sum(0), *(value.sum(0, keepdim=True) for value in single)
 
-    def _recorded(self, kernel: wp.Kernel, *arguments) -> wp.Launch:
+    def _record(self, kernel: wp.Kernel, *arguments) -> wp.Launch:
         parameters = kernel.adj.args[1:]
         inputs = [
             wp.from_torch(a, p.type.dtype, requires_grad=False) if torch.is_tensor(a) else a
@@ -184,7 +184,7 @@ class _Launcher:
         )
 
     def _run(self, launch: wp.Launch, *indices: int) -> None:
-        """Launch with these values of the integer parameters that follow the constants."""
+        """Launch with the given values of the integer parameters that follow the constants."""
         for i, index in enumerate(indices):
             launch.set_param_at_index_from_ctype(i + 1, index)
         launch.launch(warp_stream(self.x.device))
