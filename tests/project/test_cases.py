@@ -213,4 +213,4 @@ def test_every_method_states_its_files_without_torch(loaded):
         found = cases.case(loaded, "ClayCat", name)
         assert all(isinstance(path, str) for path in found.source().paths)
         assert bool(found.method.product) == bool(found.method.fit_inputs(found))
-        assert found.method is methods()[found.method.name]
+        assert type(found.method) is type(methods()[found.method.name])
