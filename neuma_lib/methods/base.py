@@ -84,7 +84,7 @@ class Case(ABC):
 
     @property
     @abstractmethod
-    def true_law(self) -> dict[str, Any]:
+    def scene_law(self) -> dict[str, Any]:
         """Specification of the scene's true law. Raises InputError if nobody knows it."""
 
     @abstractmethod

@@ -171,7 +171,7 @@ class TestLawFrom:
             "BouncyBall+seed=2",
             "neuma+rank=4",
         )
-        assert found.prior == "plasticine" and not found.learns_there
+        assert found.prior == "plasticine" and not found.learned_from_moved_scene
         assert found.options == cases.case(loaded, "ClayCat+seed=2", "neuma+rank=4").options
         assert found.product() == "results/ClayCat+seed=2/neuma+rank=4/adaptor.safetensors"
         true = cases.case(loaded, "BouncyBall", "true_law+law_from=ClayCat")
