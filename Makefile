@@ -34,11 +34,11 @@ all dataset: env unlock
 	$(SNAKEMAKE) $@
 
 test: env
-	$(BIN)/python -m pytest -m "not slow" -n $(CORES) tests/unit
+	$(BIN)/python -m pytest -m "not slow" -n $(CORES) --ignore=tests/workflow
 	$(BIN)/python -m pytest -m "not slow" tests/workflow
 
 test-all: env
-	$(BIN)/python -m pytest -n $(CORES) tests/unit
+	$(BIN)/python -m pytest -n $(CORES) --ignore=tests/workflow
 	$(BIN)/python -m pytest tests/workflow
 
 # In a fresh environment; VERSIONS=lowest takes the lower bounds of pyproject.toml.
@@ -49,7 +49,7 @@ test-core:
 lint: env
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/snakefmt --check Snakefile workflow
+	$(BIN)/snakefmt --check Snakefile studies workflow
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/snakemake --lint
 

@@ -14,10 +14,10 @@ import trimesh
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from neuma_lib.evaluation.reports import as_markdown
-from neuma_lib.evaluation.tables import shown
+from neuma_lib.evaluation.text_tables import as_markdown
 from neuma_lib.geometry.chamfer import chamfer
 from neuma_lib.geometry.volume import sample_volume
+from neuma_lib.paper.tables import shown
 
 
 def moved(x: np.ndarray, amount: float) -> np.ndarray:

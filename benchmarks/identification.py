@@ -26,9 +26,8 @@ from scipy.optimize import minimize
 
 from benchmarks.project_scenes import chosen_scenes, scene_parser, simulator
 from neuma_lib.config.identify import IdentifyConfig
-from neuma_lib.config.loading import merged
 from neuma_lib.config.scenes import SceneConfig
-from neuma_lib.config.settings import Config
+from neuma_lib.coupling.initial_motion import Throw
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.metrics import tracer_errors
@@ -36,7 +35,6 @@ from neuma_lib.evaluation.motion import predict
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.identified import Identified
 from neuma_lib.fitting.identify import _LAST_GAIN, _Run, identify
-from neuma_lib.fitting.throw import Throw
 from neuma_lib.fitting.thrown_video import NUISANCES, ThrownVideo, Try, averaged
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import read_json, write_json
@@ -46,6 +44,8 @@ from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_body
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import named_combinations, physical
+from neuma_lib.project.loading import merged
+from neuma_lib.project.settings import Config
 from neuma_lib.splatting.observation import Observation
 
 TRACERS = 2000  # of the truth's, for the motion
@@ -63,7 +63,7 @@ def judge(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str, 
     data, results = Path(settings.data_root) / name, Path(settings.results_root) / name
     mesh = read_mesh(results / "mesh.ply")
     finer = [
-        body.refilled(
+        body.resampled(
             torch.from_numpy(sample_volume(mesh, chosen.particles, seed)),
             mesh.volume,
             scene.density,

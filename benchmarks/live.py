@@ -132,7 +132,7 @@ def main() -> None:
     )
     for name, draw in kinds.items():
         live.reset()
-        live.throw(scene.v0.tolist())
+        live.launch(scene.v0.tolist())
         measured(live, draw, WARM)
         frames, pace, step, picture = measured(live, draw, chosen.seconds)
         fitting = int((1e3 * ASKED - picture) / step)

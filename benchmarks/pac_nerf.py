@@ -20,16 +20,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuma_lib.config.loading import load, merged, read_yaml
-from neuma_lib.config.pac_nerf import PacFamilyConfig, PacNerfConfig
-from neuma_lib.evaluation.reports import as_markdown
-from neuma_lib.fitting.carried_field import CarriedField
-from neuma_lib.fitting.pac_families import FamilyConstants
-from neuma_lib.fitting.pac_nerf import PacNerfFit, fit_pac_nerf
+from neuma_lib.evaluation.text_tables import as_markdown
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.radiance.field import FieldParticles, RadianceField
-from neuma_lib.radiance.lattice import Lattice
-from neuma_lib.radiance.rendering import Opacity, camera_rays
+from neuma_lib.methods.pac_nerf.carried_field import CarriedField
+from neuma_lib.methods.pac_nerf.families import FamilyConstants
+from neuma_lib.methods.pac_nerf.field import FieldParticles, RadianceField
+from neuma_lib.methods.pac_nerf.fit import PacNerfFit, fit_pac_nerf
+from neuma_lib.methods.pac_nerf.lattice import Lattice
+from neuma_lib.methods.pac_nerf.options import PacFamilyConfig, PacNerfConfig
+from neuma_lib.methods.pac_nerf.rendering import Opacity, camera_rays
+from neuma_lib.project.loading import load, merged, read_yaml
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State

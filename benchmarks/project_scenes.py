@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from functools import reduce
 
-from neuma_lib.config.loading import load, merged, read_yaml
 from neuma_lib.config.scenes import SceneConfig
-from neuma_lib.config.settings import Config
+from neuma_lib.project.loading import load, merged, read_yaml
+from neuma_lib.project.settings import Config
 from neuma_lib.sim.model import MPMModel
 
 

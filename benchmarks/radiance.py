@@ -16,10 +16,10 @@ from pathlib import Path
 import torch
 
 from benchmarks.project_scenes import chosen_scenes, scene_parser
-from neuma_lib.config.loading import merged
-from neuma_lib.config.radiance import RadianceConfig
-from neuma_lib.fitting.radiance import fit_radiance_field
 from neuma_lib.io.images import load_views
+from neuma_lib.methods.pac_nerf.field_fit import fit_radiance_field
+from neuma_lib.methods.pac_nerf.field_options import RadianceConfig
+from neuma_lib.project.loading import merged
 
 COLUMNS = "{:34} {:>6} {:>9} {:>7} {:>7} {:>7} {:>7} {:>7}"
 HEADINGS = ("scene", "cores", "particles", "litres", "dB", "inside", "direct", "inside")

@@ -19,6 +19,7 @@ from collections.abc import Callable
 
 import torch
 
+from benchmarks import gsplat_backend
 from neuma_lib.splatting import compositor_cuda, projection
 from neuma_lib.splatting.cameras import Cameras, look_at
 from neuma_lib.splatting.compositing import Settings
@@ -133,9 +134,10 @@ def whole(
     device = inputs[0].device
 
     def forward():
-        return rasterize(
-            *leaves, cameras.viewmats, cameras.Ks, cameras.width, cameras.height, background=BACKGROUND, compositor=name
-        )[0]  # fmt: skip
+        scene = (*leaves, cameras.viewmats, cameras.Ks, cameras.width, cameras.height)
+        if name == "gsplat":
+            return gsplat_backend.rasterize(*scene, background=BACKGROUND)[0]
+        return rasterize(*scene, background=BACKGROUND, compositor=name)[0]
 
     images = forward()
     weights, first = torch.randn_like(images), images[0, 0].detach().clone()

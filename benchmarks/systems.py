@@ -18,25 +18,25 @@ from pathlib import Path
 import torch
 
 from benchmarks.project_scenes import chosen_scenes, scene_parser, simulator
-from neuma_lib.config.settings import Config
 from neuma_lib.evaluation.metrics import tracer_errors
 from neuma_lib.evaluation.motion import predict
-from neuma_lib.evaluation.springs import predict_springs
-from neuma_lib.fitting.carried_field import CarriedField
 from neuma_lib.fitting.material import PixelLoss
-from neuma_lib.fitting.pac_families import choose_family
-from neuma_lib.fitting.pac_nerf import fit_pac_nerf
-from neuma_lib.fitting.radiance import fit_radiance_field
-from neuma_lib.fitting.springs import fit_springs
 from neuma_lib.io.files import read_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_observation, load_views
-from neuma_lib.io.particles import load_body, thrown
-from neuma_lib.io.radiance import load_field, save_field
+from neuma_lib.io.particles import load_body, with_motion
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.springs.body import SpringBody
-from neuma_lib.springs.network import Springs
-from neuma_lib.springs.rollout import SpringModel
+from neuma_lib.methods.pac_nerf.carried_field import CarriedField
+from neuma_lib.methods.pac_nerf.families import choose_family
+from neuma_lib.methods.pac_nerf.field_fit import fit_radiance_field
+from neuma_lib.methods.pac_nerf.fit import fit_pac_nerf
+from neuma_lib.methods.pac_nerf.io import load_field, save_field
+from neuma_lib.methods.spring_gaus.body import SpringBody
+from neuma_lib.methods.spring_gaus.evaluation import predict_springs
+from neuma_lib.methods.spring_gaus.fit import fit_springs
+from neuma_lib.methods.spring_gaus.network import Springs
+from neuma_lib.methods.spring_gaus.rollout import SpringModel
+from neuma_lib.project.settings import Config
 
 TRACERS = 2000  # of the truth's, for the motion
 
@@ -65,7 +65,7 @@ def judge_pac_nerf(name: str, settings: Config, method: str, fields: Path) -> st
     body, truth = load_body(*files, density).to(torch.float32), _tracers(data)
     law = analytic_law(constants.specification(), dt=model.dt)
     errors = {}
-    for start in (body.state(fit.velocity), thrown(body, results / "velocity.json")):
+    for start in (body.state(fit.velocity), with_motion(body, results / "velocity.json")):
         path, failure = predict(model, law, start, video.frames, truth[0])
         errors[len(errors)] = tracer_errors(path.tracers, truth)
     said = f"{errors[0]['tracer_rmse_mm']:.2f} mm, last frame {errors[0]['tracer_rmse_last_mm']:.2f} mm (thrown as our"
@@ -85,7 +85,7 @@ def judge(name: str, settings: Config, method: str) -> str:
         torch.float32
     )
     video = load_observation(data / "dynamic/transforms.json", material.views).to(torch.float32)
-    start, density = thrown(body, results / "velocity.json"), float(body.mass.sum() / body.vol0.sum())
+    start, density = with_motion(body, results / "velocity.json"), float(body.mass.sum() / body.vol0.sum())
     network = (how.anchors, how.neighbours, how.hard_springs, how.exponent, how.carriers)
     model = SpringModel.of(simulator(settings, scene), how.substeps)
     before = _core_seconds()

@@ -22,14 +22,13 @@ import torch
 
 from benchmarks.project_scenes import chosen_scenes, scene_parser, simulator
 from benchmarks.timing import device_name, synchronize
-from neuma_lib.config.settings import Config
+from neuma_lib.coupling.initial_motion import Throw
 from neuma_lib.device import choose_device
 from neuma_lib.fitting import identify as identification
 from neuma_lib.fitting import structured_fit
 from neuma_lib.fitting.identify import identify
 from neuma_lib.fitting.material import PixelLoss
 from neuma_lib.fitting.structured_fit import rival_bases, train_structured
-from neuma_lib.fitting.throw import Throw
 from neuma_lib.fitting.thrown_video import ThrownVideo
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import read_json, write_json
@@ -37,6 +36,7 @@ from neuma_lib.io.images import load_videos
 from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_body
 from neuma_lib.mechanics.structured import structured_law
+from neuma_lib.project.settings import Config
 
 METHOD = "neuma_structured"
 IDENTIFYING = {
@@ -116,7 +116,7 @@ def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
     with clock.part("finer bodies"):
         mesh = read_mesh(results / "mesh.ply")
         finer = [
-            body.refilled(
+            body.resampled(
                 torch.from_numpy(sample_volume(mesh, chosen.particles, seed)),
                 mesh.volume,
                 scene.density,

@@ -1,11 +1,10 @@
-"""Copy tables and figures of a run to docs/results, and fill the numbers of README.md and docs/results/README.md.
+"""Copy the tables and figures of a run to docs/results, and update the numbers on the pages that show them.
 
 python -m docs.record            # after: snakemake --cores 2 tables figures random results/finer_truth.csv
 python -m docs.record --configfile config/three_chains.yaml     # after the same with this option
 
-A table gets the machine, the commit and the date in its first line. On the two pages everything between `<!-- name -->`
-and `<!-- /name -->` is replaced by what is in the recorded tables and in the data of the figures; no verdict and no
-number in there is written by hand.
+The first line of a recorded table names date, commit and machine. Text between `<!-- name -->` and `<!-- /name -->` is
+generated: `table1` in README.md, `verdicts` in docs/results/claims.md, `figures` in docs/results/figures.md.
 """
 
 from __future__ import annotations
@@ -16,19 +15,19 @@ import platform
 import re
 import shutil
 import subprocess
-from itertools import takewhile
+from itertools import dropwhile, takewhile
 from math import nan
 from pathlib import Path
 from statistics import mean, median
 
 from PIL import Image
 
-from neuma_lib.evaluation.figures import image_quality, lora_alphav, material_response
-from neuma_lib.evaluation.paper import PAPER
-from neuma_lib.evaluation.plotting.image_grid import load_image_grid
-from neuma_lib.evaluation.reports import as_markdown
-from neuma_lib.evaluation.tables import ABSORBED, VERDICTS
+from neuma_lib.evaluation.text_tables import as_markdown
 from neuma_lib.io.files import read_json
+from neuma_lib.paper.figures import image_quality, lora_alphav, material_response
+from neuma_lib.paper.image_grid import load_image_grid
+from neuma_lib.paper.published import PAPER
+from neuma_lib.paper.tables import ABSORBED, VERDICTS
 
 MADE_BY = {
     "table1": "tables figures",
@@ -85,10 +84,27 @@ def filled(page: str, name: str, content: str) -> str:
     return page
 
 
-def without_heading(markdown: str) -> str:
-    """A recorded table without its heading: where it is from becomes the last paragraph."""
-    origin, _, table = markdown.partition("\n\n")
-    return re.sub("^# .*\n+", "", table).strip() + f"\n\n{origin}"
+def fill(page: Path, name: str, content: str) -> None:
+    """Replace the generated text `name` in a file."""
+    page.write_text(filled(page.read_text(), name, content))
+
+
+def overview(markdown: str) -> str:
+    """The RMSE of a recorded table for the README: a mean for each column, the average with its spread."""
+    origin = ", ".join(markdown.split(", ")[:2])
+    lines = dropwhile(lambda line: not line.startswith("| Method |"), markdown.splitlines())
+    head, _, *rows = (line[2:-2].split(" | ") for line in takewhile(bool, lines))
+    last = head.index("Average")
+    short = [
+        [
+            re.sub(r" \(\d+\)$", "", row[0]),
+            *(re.sub(r" ± [\d.]+", "", cell) for cell in row[1:last]),
+            row[last],
+        ]
+        for row in rows
+    ]
+    source = f"{origin}: [all columns, spreads and commands](docs/results/table1.md)."
+    return "\n".join([*as_markdown(head[: last + 1], short, numbers=True), "", source])
 
 
 def verdicts(tables: dict[str, str]) -> str:
@@ -215,13 +231,11 @@ def main() -> None:
         small.save(out / "figures" / picture.name, optimize=True)
 
     recorded = {name: (out / f"{name}.md").read_text() for name in MADE_BY if (out / f"{name}.md").exists()}
-    readme, page = Path(options.readme), out / "README.md"
     if "table1" in options.tables and (results / "table1.md").exists():
-        readme.write_text(filled(readme.read_text(), "table1", without_heading(recorded["table1"])))
-    text = filled(page.read_text(), "verdicts", verdicts(recorded))
+        fill(Path(options.readme), "table1", overview(recorded["table1"]))
+    fill(out / "claims.md", "verdicts", verdicts(recorded))
     if numbers := figure_numbers(results / "figures"):
-        text = filled(text, "figures", numbers)
-    page.write_text(text)
+        fill(out / "figures.md", "figures", numbers)
 
 
 if __name__ == "__main__":

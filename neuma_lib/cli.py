@@ -231,8 +231,8 @@ def _demo(options: argparse.Namespace) -> int:
 
 
 def _new_scene(options: argparse.Namespace) -> None:
-    from neuma_lib.project import settings_around
-    from neuma_lib.scaffold import new_scene
+    from neuma_lib.project.project import settings_around
+    from neuma_lib.project.scaffold import new_scene
 
     settings, root = settings_around(_project())
     path = new_scene(root, options.name, settings)
@@ -243,8 +243,8 @@ def _new_scene(options: argparse.Namespace) -> None:
 
 
 def _new_capture(options: argparse.Namespace) -> None:
-    from neuma_lib.project import settings_around
-    from neuma_lib.scaffold import new_capture
+    from neuma_lib.project.project import settings_around
+    from neuma_lib.project.scaffold import new_capture
 
     settings, root = settings_around(_project())
     path = new_capture(root, options.name, settings)
@@ -257,9 +257,9 @@ def _new_capture(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from neuma_lib import checks
-    from neuma_lib.capture.folder import read_capture
-    from neuma_lib.project import settings_around
+    from neuma_lib.project import checks
+    from neuma_lib.project.capture_folder import read_capture
+    from neuma_lib.project.project import settings_around
 
     captures = [file for file in options.files if Path(file).name == "capture.yaml"]
     files = [file for file in options.files if file not in captures]
@@ -287,7 +287,7 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _timings(options: argparse.Namespace) -> None:
-    from neuma_lib.timings import timings_table
+    from neuma_lib.project.timings import timings_table
 
     print(timings_table(Path(options.folder)), end="")
 
@@ -315,10 +315,9 @@ def _export(options: argparse.Namespace) -> None:
 
 def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
     """The law of a method's folder, and what `export_law` needs to know of it."""
-    from neuma_lib.config.places import law_files, law_origin
     from neuma_lib.evaluation.law_export import head_commit
-    from neuma_lib.io.laws import load_laws
-    from neuma_lib.project import settings_around
+    from neuma_lib.project import cases
+    from neuma_lib.project.project import settings_around
 
     if options.adaptor or options.dt:
         raise InputError(
@@ -330,13 +329,10 @@ def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
     settings, root = settings_around(place, options.configfile)
     settings = settings.model_copy(update={"results_root": str(place.parent.parent)})
     scene, method = place.parent.name, place.name
-    files = law_files(settings, scene, method)
-    origin = law_origin(settings, scene, method)
-    law = load_laws(
-        origin["dt"],
-        [files.spec] if files.spec else [],
-        *([str(root / file)] if file else [] for file in (files.identified, files.prior, files.adaptor)),
-    )[0]
+    law = cases.case(settings, scene, method).source().load(lambda file: str(root / file)).law
+    if law is None:
+        raise InputError(options.source, "its motion follows from no material law", "Choose another method")
+    origin = cases.law_origin(settings, scene, method)
     beside = {"metrics": place / "metrics.json", "rollout": place / "rollout.h5"}
     of_this = {name: file for name, file in beside.items() if file.is_file() and origin["scene"] == scene}
     return law, {**origin, **of_this, "any_step": options.any_step, "commit": head_commit(root)}
@@ -381,7 +377,7 @@ def _view(options: argparse.Namespace) -> None:
     import torch
 
     from neuma_lib.device import choose_device
-    from neuma_lib.viewer.find import found_laws, found_scene
+    from neuma_lib.project.find import found_laws, found_scene
     from neuma_lib.viewer.page import write_page
     from neuma_lib.viewer.playground import Playground, first_law
     from neuma_lib.viewer.scene import load_scene

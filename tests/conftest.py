@@ -2,7 +2,10 @@
 
 from pathlib import Path
 
+import pytest
 import torch
+
+from neuma_lib.project import loading
 
 # Two OpenMP threads on a busy machine cost far more than one.
 torch.set_num_threads(1)
@@ -13,3 +16,16 @@ def pytest_ignore_collect(collection_path: Path, config):
     if "core" in config.option.markexpr and collection_path.suffix == ".py":
         return "mark.core" not in collection_path.read_text() or None
     return None
+
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def raw():
+    return loading.read_yaml(ROOT / "config" / "config.yaml")
+
+
+@pytest.fixture(scope="module")
+def loaded(raw):
+    return loading.load(raw, ROOT)

@@ -8,17 +8,16 @@ resources       `RESOURCES`, and one thread (Snakemake's own default)
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 from workflow.provenance import code_digest
 
 RESOURCES = {"gpu": 0, "mem_mb": 4000, "runtime": 60}  # GPUs, MB, minutes
-SCRIPTS = Path(__file__).resolve().parent / "scripts"
 CONDA = "../../envs/conda.yaml"  # relative to the files of the rules
 
 
-def complete(workflow, results: str) -> None:
+def complete(workflow, results: str, known: Collection[str] = ()) -> None:
     """Give every rule of a workflow what it left out. To be called when all rules are known.
 
     Snakemake makes a rule of what its directives say (`rule.ruleinfo`) in `snakemake.workflow.Workflow.rule`. This
@@ -27,9 +26,10 @@ def complete(workflow, results: str) -> None:
     Args:
         workflow: Snakemake's.
         results: folder of the results, which holds logs and benchmarks.
+        known: names of rules that are complete already.
     """
     for rule in workflow.rules:
-        if not rule.script:
+        if not rule.script or rule.name in known:
             continue
         said, path = rule.ruleinfo, _wildcard_path(rule)
         rule.log_modifier = rule.benchmark_modifier = rule.output_modifier
@@ -40,11 +40,16 @@ def complete(workflow, results: str) -> None:
         if not said.conda_env:
             rule.conda_env = CONDA
         if "code" not in rule.params.keys():
-            rule.set_params(code=digest_of(SCRIPTS / Path(rule.script).name))
+            rule.set_params(code=digest_of(_script(rule)))
         resources = type(rule.resources).from_mapping(dict(RESOURCES))
         resources.update(said.resources[1] if said.resources else {})
         resources.update(workflow.resource_settings._parsed_overwrite_resources.get(rule.name, {}))
         rule.resources.update(resources)
+
+
+def _script(rule) -> Path:
+    path = rule.basedir.join(rule.script).get_path_or_uri(secret_free=True)
+    return Path(path).resolve()
 
 
 def digest_of(file: Path) -> Callable:

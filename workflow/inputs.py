@@ -5,12 +5,7 @@ from pathlib import Path
 from neuma_lib.errors import InputError
 
 COUNTED = ("all_data.json", "camera.json")
-"""Lists of images whose frames are counted, not named by simulated steps (`neuma_lib.io.layouts`)."""
-
-
-def listed(files) -> list[str]:
-    """Named input files as a list: Snakemake gives one file as a text."""
-    return [files] if isinstance(files, str) else list(files or ())
+"""Lists of images whose frames are counted, not named by simulated steps (`neuma_lib.io.datasets.layouts`)."""
 
 
 def image_list(place: str, stride: int | None, key: str, stride_key: str) -> str:

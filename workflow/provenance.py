@@ -22,7 +22,7 @@ import grimp
 
 from neuma_lib.io.files import sha256_file
 
-PACKAGE = "neuma_lib"
+PACKAGES = ("neuma_lib", "studies")
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 DIGITS = 16  # hexadecimal digits of a digest
 
@@ -30,26 +30,26 @@ DIGITS = 16  # hexadecimal digits of a digest
 class Sources:
     """The modules of a package as they stand when they are first read."""
 
-    def __init__(self, package: str = PACKAGE):
-        self._root = Path(next(iter(find_spec(package).submodule_search_locations))).parent
+    def __init__(self, *packages: str):
+        self._packages = packages or PACKAGES
+        self._root = Path(next(iter(find_spec(self._packages[0]).submodule_search_locations))).parent
         self._digests: dict[str, str] = {}
-        self._package = package
 
     @cached_property
     def _graph(self) -> grimp.ImportGraph:
-        return grimp.build_graph(self._package, cache_dir=None, exclude_type_checking_imports=True)
+        return grimp.build_graph(*self._packages, cache_dir=None, exclude_type_checking_imports=True)
 
-    def reached(self, script: Path) -> list[str]:
-        """Names of the modules that a script imports, directly or through others, sorted."""
-        direct = _imports(script, self._graph.modules)
+    def reached(self, script: Path, modules: tuple[str, ...] = ()) -> list[str]:
+        """Names of some modules, and of those that they and a script import, directly or through others, sorted."""
+        direct = _imports(script, self._graph.modules) | set(modules)
         through = (self._graph.find_upstream_modules(module) for module in direct)
         return sorted(direct.union(*through))
 
-    def digest(self, script: Path) -> str:
-        """Digest of a script and of all modules that it reaches."""
+    def digest(self, script: Path, modules: tuple[str, ...] = ()) -> str:
+        """Digest of a script and of all modules that it reaches, and of further modules that it loads by name."""
         parts = [
             _file_digest(script),
-            *(f"{name} {self._module_digest(name)}" for name in self.reached(script)),
+            *(f"{name} {self._module_digest(name)}" for name in self.reached(script, modules)),
         ]
         return _hash("\n".join(parts).encode())
 
@@ -68,9 +68,13 @@ def _library() -> Sources:
 
 
 @cache
-def code_digest(script: str | Path) -> str:
-    """Digest of a script and of all that it reaches of the library, read once a process."""
-    return _library().digest(Path(script))
+def code_digest(script: str | Path, *modules: str) -> str:
+    """Digest of a script and of all that it reaches of the library, read once a process.
+
+    Args:
+        modules: of the library, which the script loads by name.
+    """
+    return _library().digest(Path(script), modules)
 
 
 def fingerprint(settings: Mapping[str, Any], inputs: Mapping[str, str | Path], code: str) -> dict[str, str]:

@@ -34,7 +34,7 @@ LOG_FORMAT = "[%(asctime)s] %(message)s"
 
 _LOGGER = logging.getLogger("neuma_lib.stage")
 _SECONDS_LOGGER = logging.getLogger("neuma_lib.seconds")  # for the log alone
-_SECONDS = "core seconds: {:.2f} to start, {:.2f} of work"  # read by neuma_lib.timings
+_SECONDS = "core seconds: {:.2f} to start, {:.2f} of work"  # read by neuma_lib.project.timings
 
 
 @contextmanager

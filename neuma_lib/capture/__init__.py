@@ -1,1 +1,1 @@
-"""Own photographs and videos: frames, lenses, the printed board, camera poses, metres and the floor."""
+"""Capture of objects from photographs and videos: frames, lenses, printed board, camera poses, masks and motion."""

@@ -1,8 +1,8 @@
-"""Frames of a video with the times at which they were taken.
+"""Frames of a video with their capture times.
 
-Phones film at a variable rate, and write slow motion at another rate than they film: a frame's time is its time stamp,
-never its number over a rate. The ffmpeg that imageio-ffmpeg brings decodes: unlike OpenCV it says of each frame whether
-it has a time stamp, in ticks of the file's clock, and what the phone has noted of the rate of filming.
+Phones record at a variable rate and store slow motion at another rate, so the time of a frame is its time stamp, not
+its number divided by a rate. Videos are decoded with the ffmpeg of imageio-ffmpeg. Unlike OpenCV, it reports whether a
+frame has a time stamp, in ticks of the file's clock, and the recording rate noted by the phone.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ from neuma_lib.io.files import existing, one_line
 from neuma_lib.io.images import MAX_PIXELS
 
 MAX_FRAMES = 100_000
-"""Most frames of a video that is read: a quarter of an hour at 120 a second."""
+"""Frames of a video that are accepted: a quarter of an hour at 120 per second."""
 STEADY = 0.1
-"""Intervals between frames that differ by less than this share count as one rate."""
-_SHOWN = re.compile(r"\bn:\s*(\d+)\s+pts:\s*(-?\d+|NOPTS)\s.*\bs:(\d+)x(\d+)\b")
+"""Relative variation of the frame interval below which the rate is considered constant."""
+_FRAME_INFO = re.compile(r"\bn:\s*(\d+)\s+pts:\s*(-?\d+|NOPTS)\s.*\bs:(\d+)x(\d+)\b")
 _TIME_BASE = re.compile(r"config in time_base:\s*(\d+)/(\d+)")
-_FILMED = re.compile(
+_NOTED_RATE = re.compile(
     r"^\s*com\.(?:android\.capture\.fps|apple\.quicktime\.capture-?fps)\s*:\s*([\d.]+)", re.MULTILINE
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Timeline:
-    """When the frames of a video were taken.
+    """Capture times of the frames of a video.
 
     Attributes:
-        times: of the frames, ascending, the first as in the file (sound and picture share the clock), (N,) [s].
+        times: ascending, the first as in the file (sound and picture share the clock), (N,) [s].
         width, height: of the upright picture [px].
-        stretch: what the file's times were divided by: 8 where 240 frames a second are stored as 30.
+        stretch: divisor of the file's times: 8 if 240 frames per second are stored as 30.
     """
 
     times: np.ndarray
@@ -53,17 +53,17 @@ class Timeline:
 
     @property
     def rate(self) -> float:
-        """Frames a second, of the usual interval."""
+        """Frames per second, from the median interval."""
         return float(1 / np.median(np.diff(self.times)))
 
     @property
     def steady(self) -> bool:
-        """Whether all intervals are alike."""
+        """Whether the rate is constant."""
         gaps = np.diff(self.times)
         return bool((np.abs(gaps * self.rate - 1) < STEADY).all())
 
     def plain(self) -> dict[str, Any]:
-        """What a report says of it, with all times."""
+        """Entries of a report."""
         return {
             "frames": len(self.times),
             "rate": self.rate,
@@ -77,7 +77,7 @@ class Timeline:
 
     @property
     def lost(self) -> np.ndarray:
-        """Numbers of the frames before which at least one is missing."""
+        """Numbers of the frames with at least one missing frame before them."""
         return np.flatnonzero(np.diff(self.times) * self.rate > 1.5) + 1
 
 
@@ -90,103 +90,101 @@ class Frame(NamedTuple):
 
 
 def read_timeline(path: str | Path, rate: float | None = None) -> Timeline:
-    """Times of all frames of a video, all of which are decoded.
+    """Times of all frames of a video, which is decoded completely.
 
     Args:
         path: a file that ffmpeg reads.
-        rate: frames a second that were really filmed; None: as the file says, in its time stamps and, for slow motion,
-            in what phones note of the rate of filming.
+        rate: true recording rate [frames per second]. None: from the time stamps and, for slow motion, from the
+            recording rate noted by the phone.
 
     Raises:
-        InputError: no video, fewer than two frames, damaged ones, or times that do not ascend.
+        InputError: no video, fewer than two frames, damaged frames, or times that do not ascend.
     """
     with _decoder(path, pixels=False) as decoder:
-        shown = list(decoder.shown())
-    if len({(s.width, s.height) for s in shown}) > 1:
-        raise InputError(f"{path}: the picture changes its size within the video: film it again, or cut it")
-    times = check_times([s.time for s in shown], path)
+        infos = list(decoder.infos())
+    if len({(info.width, info.height) for info in infos}) > 1:
+        raise InputError(path, "the picture size changes within the video", "Film it again, or cut it")
+    times = check_times([info.time for info in infos], path)
     usual = float(1 / np.median(np.diff(times)))
-    filmed = rate if rate is not None else decoder.filmed_rate()
-    # A note of the rate that agrees with the time stamps is less exact than they are.
+    filmed = rate if rate is not None else decoder.noted_rate()
+    # Time stamps are more accurate than a noted rate that agrees with them.
     stretch = filmed / usual if filmed and (rate is not None or filmed > 1.5 * usual) else 1.0
-    return Timeline(times / stretch, shown[0].width, shown[0].height, stretch)
+    return Timeline(times / stretch, infos[0].width, infos[0].height, stretch)
 
 
 def check_times(times: Sequence[float], path: str | Path) -> np.ndarray:
-    """Times (N,) of a video, if they are any.
-
-    Raises:
-        InputError: fewer than two, or they do not ascend.
-    """
+    """Times (N,) of a video as an array. Raises InputError: fewer than two, one is missing, or they do not ascend."""
     times = np.asarray(times, np.float64)
     if len(times) < 2:
-        raise InputError(f"{path} has {len(times)} frames: at least two are needed, film the whole fall")
+        raise InputError(path, f"{len(times)} frames, at least two are required", "Film the whole fall")
     if not np.isfinite(times).all():
-        raise InputError(
-            f"{path}: frame {np.flatnonzero(~np.isfinite(times))[0]} has no time stamp: {_REWRITE}"
-        )
+        raise InputError(path, f"frame {np.flatnonzero(~np.isfinite(times))[0]} has no time stamp", _ORIGINAL)
     back = np.flatnonzero(np.diff(times) <= 0)
     if len(back):
         i = int(back[0])
         raise InputError(
-            f"{path}: the times go back from frame {i} ({times[i]:.4f} s) to frame {i + 1} ({times[i + 1]:.4f} s): "
-            + _REWRITE
+            path,
+            f"times decrease from frame {i} ({times[i]:.4f} s) to frame {i + 1} ({times[i + 1]:.4f} s)",
+            _ORIGINAL,
         )
     return times
 
 
-_REWRITE = "take the file as the camera wrote it, not one that a program joined or converted"
+_ORIGINAL = "Use the original file of the camera, not one that was joined or converted"
 
 
 def read_frames(
     path: str | Path, timeline: Timeline, numbers: Sequence[int] | None = None
 ) -> Iterator[Frame]:
-    """Frames of a video one after the other; no more than one is held.
+    """Iterate over frames of a video, with one frame in memory at a time.
 
     Args:
         path: the file of the timeline.
         timeline: of `read_timeline`.
-        numbers: frames to give, in ascending order; None gives all.
+        numbers: frames to yield, in ascending order. None yields all.
 
     Raises:
-        InputError: the file is not that of the timeline, or damaged.
+        InputError: the file does not match the timeline, or is damaged.
     """
     wanted = None if numbers is None else sorted(set(int(n) for n in numbers))
     if wanted is not None and wanted and not 0 <= wanted[0] <= wanted[-1] < len(timeline.times):
-        raise InputError(f"{path} has {len(timeline.times)} frames, and no frame {wanted[-1]}")
+        raise InputError(path, f"no frame {wanted[-1]}, the video has {len(timeline.times)} frames")
     if wanted == []:
         return
     size = timeline.width * timeline.height * 3
     given = 0
     with _decoder(path, pixels=True) as decoder:
-        for shown in decoder.shown():
+        for info in decoder.infos():
             content = decoder.process.stdout.read(size)
-            if (shown.width, shown.height) != (timeline.width, timeline.height) or len(content) != size:
-                raise InputError(f"{path}: frame {shown.number} is damaged or was changed")
-            if wanted is None or shown.number in wanted:
+            if (info.width, info.height) != (timeline.width, timeline.height) or len(content) != size:
+                raise InputError(path, f"frame {info.number} is damaged, or the file has changed", _AGAIN)
+            if wanted is None or info.number in wanted:
                 pixels = np.frombuffer(content, np.uint8).reshape(timeline.height, timeline.width, 3)
-                yield Frame(shown.number, float(timeline.times[shown.number]), pixels)
+                yield Frame(info.number, float(timeline.times[info.number]), pixels)
                 given += 1
-                if wanted is not None and shown.number == wanted[-1]:
+                if wanted is not None and info.number == wanted[-1]:
                     return
     if given != len(timeline.times if wanted is None else wanted):
-        raise InputError(f"{path} has fewer frames than before: it was changed")
+        raise InputError(path, "it has fewer frames than before, so the file has changed", _AGAIN)
+
+
+_AGAIN = "Copy it from the camera again"
 
 
 def contact_sheet(path: str | Path, frames: Sequence[Frame], title: str, columns: int = 6) -> None:
-    """Write a picture with frames in rows, each under its number and time."""
+    """Write frames in rows, each under its number and time."""
     if not frames:
-        raise InputError(f"{path}: there are no frames to show")
+        raise InputError(path, "there are no frames to show")
     lines = [f"{frame.number}: {frame.time:.4f} s" for frame in frames]
     picture_sheet(path, [(line, frame.pixels) for line, frame in zip(lines, frames)], title, columns)
 
 
 def sheet_numbers(count: int, most: int = 24) -> list[int]:
-    """Numbers of at most ``most`` frames of ``count``, evenly, the first and the last among them."""
+    """Numbers of at most ``most`` of ``count`` frames, evenly spaced, including the first and the last."""
     return sorted({round(i) for i in np.linspace(0, count - 1, min(most, count))})
 
 
-class _Shown(NamedTuple):
+class _FrameInfo(NamedTuple):
     number: int
     time: float
     width: int
@@ -194,13 +192,13 @@ class _Shown(NamedTuple):
 
 
 class _Decoder:
-    """A running ffmpeg; its messages tell of each frame before its pixels come."""
+    """A running ffmpeg. It reports each frame on stderr before its pixels arrive."""
 
     def __init__(self, path: Path, process: subprocess.Popen):
         self.path = path
         self.process = process
         self._messages: Queue[str | None] = Queue()
-        self._heard: list[str] = []
+        self._other_messages: list[str] = []
         threading.Thread(target=self._listen, daemon=True).start()
 
     def _listen(self) -> None:
@@ -208,59 +206,54 @@ class _Decoder:
             self._messages.put(line.decode(errors="replace").rstrip())
         self._messages.put(None)
 
-    def shown(self) -> Iterator[_Shown]:
-        """The frames in the order of their output."""
+    def infos(self) -> Iterator[_FrameInfo]:
+        """Information on the frames in the order of their output."""
         count, tick = 0, np.nan
         while (message := self._messages.get()) is not None:
             if "Parsed_showinfo" not in message:
-                self._heard.append(message)
+                self._other_messages.append(message)
                 continue
-            if found := _TIME_BASE.search(message):
-                tick = int(found[1]) / int(found[2])
-            elif found := _SHOWN.search(message):
-                number, width, height = int(found[1]), int(found[3]), int(found[4])
+            if match := _TIME_BASE.search(message):
+                tick = int(match[1]) / int(match[2])
+            elif match := _FRAME_INFO.search(message):
+                number, width, height = int(match[1]), int(match[3]), int(match[4])
                 if width * height > MAX_PIXELS or number >= MAX_FRAMES:
                     raise InputError(
-                        f"{self.path}: {width} x {height} pixels, frame {number}: at most {MAX_PIXELS} pixels and "
-                        f"{MAX_FRAMES} frames are read; cut the video to the throw"
+                        self.path,
+                        f"frame {number} of {width} x {height} pixels exceeds the limits of {MAX_PIXELS} pixels and"
+                        f" {MAX_FRAMES} frames",
+                        "Cut the video to the take",
                     )
                 count += 1
-                # not pts_time, which has six digits only
-                yield _Shown(number, int(found[2]) * tick if found[2] != "NOPTS" else np.nan, width, height)
+                # pts_time has six digits only
+                yield _FrameInfo(
+                    number, int(match[2]) * tick if match[2] != "NOPTS" else np.nan, width, height
+                )
         if self.process.wait() or count == 0:
-            reasons = [m for m in self._heard if "rror" in m or "nvalid" in m or "no streams" in m]
+            reasons = [m for m in self._other_messages if "rror" in m or "nvalid" in m or "no streams" in m]
             reason = one_line(reasons[-1]) if reasons else "it has no frames"
-            raise InputError(
-                f"{self.path} cannot be read as a video ({reason}): copy it from the camera again, or leave it out"
-            )
+            raise InputError(self.path, f"cannot be read as a video ({reason})", f"{_AGAIN}, or remove it")
 
-    def filmed_rate(self) -> float | None:
-        """Frames a second that were filmed, if the file notes them."""
-        found = _FILMED.search("\n".join(self._heard))
-        return float(found[1]) if found and float(found[1]) > 0 else None
+    def noted_rate(self) -> float | None:
+        """Recording rate noted in the file [frames per second], if any."""
+        match = _NOTED_RATE.search("\n".join(self._other_messages))
+        return float(match[1]) if match and float(match[1]) > 0 else None
 
 
 @contextmanager
 def _decoder(path: str | Path, pixels: bool) -> Iterator[_Decoder]:
-    path = existing(path, "put the video there, or correct its name")
+    path = existing(path, "Put the video there, or correct its name")
     if path.stat().st_size == 0:
-        raise InputError(f"{path} is empty: copy it from the camera again")
+        raise InputError(path, "the file is empty", _AGAIN)
     output = ["-f", "rawvideo", "-pix_fmt", "rgb24", "pipe:1"] if pixels else ["-f", "null", "-"]
-    # A file's name must not be taken for a protocol's; V leaves out cover pictures; pictures are upright before they
-    # come to a filter.
-    command = [
-        require("imageio_ffmpeg", "capture").get_ffmpeg_exe(),
-        "-hide_banner",
-        "-nostdin",
-        "-xerror",
-        "-protocol_whitelist",
-        "file",
-    ]
-    command += ["-i", f"file:{path.resolve()}", "-map", "0:V:0", "-vf", "showinfo=checksum=0"]
-    command += ["-fps_mode", "passthrough", "-threads", "1", *output]
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE if pixels else subprocess.DEVNULL, stderr=subprocess.PIPE
-    )
+    # The prefix file: keeps a file name from being parsed as a protocol, and V excludes cover pictures. ffmpeg rotates
+    # pictures upright before they reach a filter.
+    options = "-hide_banner -nostdin -xerror -protocol_whitelist file".split()
+    ffmpeg = require("imageio_ffmpeg", "capture").get_ffmpeg_exe()
+    command = [ffmpeg, *options, "-i", f"file:{path.resolve()}", "-map", "0:V:0"]
+    command += ["-vf", "showinfo=checksum=0", "-fps_mode", "passthrough", "-threads", "1", *output]
+    stdout = subprocess.PIPE if pixels else subprocess.DEVNULL
+    process = subprocess.Popen(command, stdout=stdout, stderr=subprocess.PIPE)
     try:
         yield _Decoder(path, process)
     finally:

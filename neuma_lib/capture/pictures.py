@@ -1,8 +1,7 @@
-"""Photographs and stills in groups that share a lens: `photographs`, and each fixed camera with its picture of the
-empty scene. A picture's name is ``<group>/<file>``.
+"""Photographs and stills in groups that share a lens: `photographs`, and one group per fixed camera.
 
-Pictures are taken as the sensor wrote them: a note to turn them is removed, since the tools disagree about it, and a
-phone's lens is the same however it is held.
+The name of a picture is ``<group>/<file>``. Pictures keep the orientation of the sensor. EXIF orientation is removed,
+because tools interpret it differently, and because the lens does not depend on how a phone is held.
 """
 
 from __future__ import annotations
@@ -15,14 +14,14 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from neuma_lib.capture.lens import Lens
+from neuma_lib.capture.calibration.lens import Lens
 from neuma_lib.capture.tools import opencv
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import atomic, reading
 from neuma_lib.io.images import open_image
 
 ORIENTATION = 0x0112
-"""EXIF's note of how to turn a picture."""
+"""EXIF tag of the orientation."""
 SHEET_WIDTH = 1600
 """Width of a contact sheet [px]."""
 
@@ -33,53 +32,43 @@ def group_of(name: str) -> str:
 
 
 def name_pictures(groups: Mapping[str, Sequence[Path]]) -> dict[str, Path]:
-    """Name of each picture -> its file.
-
-    Raises:
-        InputError: a file that is no picture; pictures of different sizes in a group.
-    """
-    found: dict[str, Path] = {}
+    """Name of each picture -> its file. Raises InputError if a file is no picture or sizes in a group differ."""
+    named: dict[str, Path] = {}
     for group, files in groups.items():
         sizes: dict[tuple[int, int], Path] = {}
         for file in map(Path, files):
             sizes.setdefault(picture_size(file), file)
-            found[f"{group}/{file.name}"] = file
+            named[f"{group}/{file.name}"] = file
         if len(sizes) > 1:
             (first, a), (second, b) = list(sizes.items())[:2]
             raise InputError(
-                f"{a} is {first[0]}x{first[1]}, {b} is {second[0]}x{second[1]}: all pictures of '{group}' must be of "
-                "one camera, at one zoom and size, and not cropped or turned by a program"
+                b,
+                f"{second[0]}x{second[1]} pixels, but {a} has {first[0]}x{first[1]}",
+                f"Take all pictures of '{group}' with one camera at one zoom and size, and do not crop or rotate them",
             )
-    return found
+    return named
 
 
 def picture_size(file: Path) -> tuple[int, int]:
-    """Width and height as the sensor wrote it [px]. Raises InputError for a file that is no picture."""
+    """Width and height in sensor orientation [px]. Raises InputError for a file that is no picture."""
     with open_image(file.read_bytes(), file) as image:
         return image.size
 
 
 def copy_pictures(pictures: Mapping[str, Path], target: str | Path) -> dict[str, Path]:
-    """Copy pictures into a folder for each group, without notes to turn them.
-
-    Returns:
-        Name of each picture -> its copy.
-
-    Raises:
-        InputError: a file that is no picture, or has damaged notes.
-    """
+    """Copy pictures by name to <target>/<name>, without EXIF orientation. Raises InputError for damaged files."""
     copies = {name: Path(target) / name for name in pictures}
     for name, file in pictures.items():
         content = file.read_bytes()
         with open_image(content, file) as image:
-            turned = image.getexif().get(ORIENTATION, 1) != 1
+            rotated = image.getexif().get(ORIENTATION, 1) != 1
             with atomic(copies[name]) as partial:
-                if not turned:
+                if not rotated:
                     shutil.copyfile(file, partial)
                 elif image.format == "JPEG":
                     with reading(file, "an image"):
-                        upright_content = _unturned(content, image.info["exif"])
-                    partial.write_bytes(upright_content)
+                        reset_content = _reset_orientation(content, image.info["exif"])
+                    partial.write_bytes(reset_content)
                 else:
                     with reading(file, "an image"):
                         pixels = image.convert("RGB")
@@ -87,14 +76,13 @@ def copy_pictures(pictures: Mapping[str, Path], target: str | Path) -> dict[str,
     return copies
 
 
-def _unturned(content: bytes, exif: bytes) -> bytes:
-    """A JPEG file whose first directory of notes (TIFF 6.0, section 2) says that the picture is upright; no pixel of it
-    is touched.
+def _reset_orientation(content: bytes, exif: bytes) -> bytes:
+    """Reset the orientation in the first EXIF directory of a JPEG file (TIFF 6.0, section 2), without recoding it.
 
-    Raises ValueError or struct.error where the notes are damaged.
+    Raises ValueError or struct.error for damaged EXIF data.
     """
     if exif not in content:
-        raise ValueError("its EXIF notes are in several parts")
+        raise ValueError("its EXIF data are in several parts")
     tiff = exif.index(b"Exif\0\0") + 6
     order = "<" if exif[tiff : tiff + 2] == b"II" else ">"
     directory = tiff + struct.unpack_from(f"{order}I", exif, tiff + 4)[0]
@@ -107,13 +95,13 @@ def _unturned(content: bytes, exif: bytes) -> bytes:
 
 
 def read_picture(file: Path) -> np.ndarray:
-    """RGB (H, W, 3), uint8, as the sensor wrote it."""
+    """RGB (H, W, 3), uint8, in sensor orientation."""
     with open_image(file.read_bytes(), file) as image, reading(file, "an image"):
         return np.asarray(image.convert("RGB"))
 
 
 def undistorted(pixels: np.ndarray, lens: Lens, longest: int) -> np.ndarray:
-    """A picture (H, W, 3), uint8, as the pinhole of `Lens.pinhole` and `Lens.resized` sees it."""
+    """Resample a picture (H, W, 3), uint8, to the lens of `Lens.pinhole` and `Lens.resized`."""
     smaller = lens.pinhole().resized(longest)
     whole = lens.undistort(pixels)
     if (smaller.width, smaller.height) == (lens.width, lens.height):
@@ -128,9 +116,9 @@ def picture_sheet(
     """Write pictures in rows, each under a line of text.
 
     Args:
-        pictures: the line, and RGB pixels (H, W, 3), uint8, of each.
+        pictures: line of text and RGB pixels (H, W, 3), uint8, of each picture.
         title: first line of the sheet.
-        columns: most pictures in a row.
+        columns: maximum number of pictures in a row.
     """
     font = ImageFont.load_default(14)
     columns = min(columns, len(pictures))

@@ -1,20 +1,20 @@
-"""The real captures of Spring-Gaus and the copy of them by NeuMA's authors, read as they lie in their folders.
+"""Reader of the real captures of Spring-Gaus and of their copy by NeuMA's authors.
 
-Both show an object that is dropped before three fixed cameras at 120 frames a second, with a mask for each frame, in a
-world that a checkerboard gives: z points down, the floor is a plane of constant z.
+Both show a dropped object in front of three fixed cameras at 120 frames per second, with a mask for each frame. A
+checkerboard defines the world: z points down, the floor is a plane of constant z.
 
 - Spring-Gaus (github.com/Colmar-zlicheng/Spring-Gaus), ``real_capture/``: ``dynamic/cameras_calib.json`` has the pose
   of each camera (OpenCV's rvecs and tvecs), ``dynamic/sequences/<object>/0.json`` the names of its frames and the frame
   of the first contact, ``dynamic/videos_images/<camera>`` and ``videos_masks/<camera>`` the pictures. ``static/`` has
-  photographs with masks and COLMAP's cameras, in a world of their own.
+  photographs with masks and COLMAP's cameras, in another world.
 - NeuMA (github.com/XJay18/NeuMA), a folder for each object: ``sparse/0/cameras.bin``, ``cameras_calib.json`` with the
   keys r_0, r_1, ..., and ``dynamics/r_<view>_<step>.jpg``, ``dynamic_masks/r_<view>_<step>.png``. No photographs.
 
-Neither file has the intrinsics of the video: both codes take those of the photographs' camera, of 4752 x 2672 pixels,
-scaled to the video, with the principal point in the middle and without distortion. So does this module.
+Neither contains the intrinsics of the videos. Like the code of both papers, this module scales those of the
+photographs' camera (4752 x 2672 pixels) to the video, with a centred principal point and without distortion.
 
-The world is not metric. What NeuMA's settings do about it is to let 10 ms pass from frame to frame where the camera let
-pass 8.33: gravity then is 1.44 times as strong as it would be in metres.
+The world is not metric. NeuMA's settings compensate with a frame interval of 10 ms instead of 8.33 ms, which scales
+gravity by 1.44 relative to metres.
 """
 
 from __future__ import annotations
@@ -31,35 +31,36 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
-from neuma_lib.capture.agreement import nearest_point
-from neuma_lib.capture.folder import PHOTOGRAPHS, Capture
-from neuma_lib.capture.lens import Lens, lens_of_colmap
-from neuma_lib.capture.masks import centroid
-from neuma_lib.capture.mattes import own_mask
+from neuma_lib.capture.calibration.lens import Lens, lens_of_colmap
+from neuma_lib.capture.calibration.placement import Similarity
+from neuma_lib.capture.calibration.room import BOX_MIDDLE
+from neuma_lib.capture.masks.agreement import nearest_point
+from neuma_lib.capture.masks.mattes import own_mask
+from neuma_lib.capture.masks.regions import centroid
 from neuma_lib.capture.pictures import picture_size, read_picture, undistorted
-from neuma_lib.capture.placement import Similarity
-from neuma_lib.capture.room import BOX_MIDDLE
 from neuma_lib.config.capture import ReleasedConfig
 from neuma_lib.config.validation import hint
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import existing, read_json, reading
 from neuma_lib.io.images import OPENGL_TO_OPENCV
+from neuma_lib.project.capture_folder import PHOTOGRAPHS, Capture
 
 RATE = 120.0
-"""Frames a second of the videos."""
+"""Frames per second of the videos."""
 CALIBRATED_SIZE = (4752, 2672)
-"""Pictures that the intrinsics in cameras.bin are of [px]."""
+"""Picture size of the intrinsics in cameras.bin [px]."""
 ROOM_FROM_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""Their axes (z down) to the room's (y up)."""
+"""From the axes of the files (z down) to the room's (y up)."""
 MIDDLE = (0.15, 0.20)
-"""x and y of the middle of the volume that Spring-Gaus' settings leave for the objects."""
+"""x and y of the middle of the volume for objects in Spring-Gaus' settings."""
 GROUND = {"bun": -0.010, "burger": -0.025, "dog": -0.025, "pig": -0.025, "potato": -0.010}
 """z of the floor under each object in Spring-Gaus' settings."""
-BESIDE = 3
-"""Width of the surroundings of a mask that may still show the object [px]."""
+MASK_MARGIN = 3
+"""Width of the border around a mask that may still show the object [px]."""
 _MODELS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV"}
 _PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8}
 _SUFFIXES = (".jpg", ".jpeg", ".png")
+_UNPACK = "Unpack the archive again"
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +70,8 @@ class Shot:
     Attributes:
         picture, mask: files.
         lens: of the picture.
-        viewmat: world to camera, OpenCV axes, (4, 4), in the files' world.
-        number: of the frame; of a photograph, its place in the list.
+        viewmat: world to camera, OpenCV axes, (4, 4), in the world of the files.
+        number: of the frame, or index of the photograph.
     """
 
     picture: Path
@@ -82,12 +83,12 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class Released:
-    """What is in the files of one object.
+    """The files of one object.
 
     Attributes:
-        videos: camera -> its frames, in the order of their numbers.
-        photographs: of the object at rest, in a world of their own; there may be none.
-        contact: number of the first frame of contact; None: not said.
+        videos: camera -> its frames, ordered by number.
+        photographs: of the object at rest, in another world, possibly none.
+        contact: number of the first frame of contact. None if not given.
         ground: z of the floor.
     """
 
@@ -101,17 +102,19 @@ def read_released(folder: str | Path, name: str, ground: float | None = None) ->
     """The capture of one object, in either layout.
 
     Args:
-        folder: ``real_capture`` of Spring-Gaus; or NeuMA's folder of the object, or the one above it.
+        folder: ``real_capture`` of Spring-Gaus, or NeuMA's folder of the object, or its parent folder.
         name: of the object.
-        ground: z of the floor; None: as in Spring-Gaus' settings.
+        ground: z of the floor. None: as in Spring-Gaus' settings.
 
     Raises:
-        InputError: names the file that is missing or damaged; there is no such object, or no floor is known for it.
+        InputError: a file is missing or damaged, there is no such object, or its floor is unknown.
     """
     folder = Path(folder)
     if ground is None and name not in GROUND:
         raise InputError(
-            f"{name}: no floor is known for this object: state `ground`, z of the floor in the files' world"
+            name,
+            "the floor of this object is unknown",
+            "Set `ground`, z of the floor in the world of the files",
         )
     ground = GROUND[name] if ground is None else ground
     if (folder / "dynamic/sequences").is_dir():
@@ -120,55 +123,51 @@ def read_released(folder: str | Path, name: str, ground: float | None = None) ->
         if (own / "dynamics").is_dir():
             return _neuma(own, ground)
     raise InputError(
-        f"{folder} is in neither layout: Spring-Gaus' has dynamic/sequences/, NeuMA's {name}/dynamics/; name the folder"
-        " that holds these"
+        folder,
+        f"the layout is neither that of Spring-Gaus (dynamic/sequences/) nor that of NeuMA ({name}/dynamics/)",
+        "Give the folder that contains one of these",
     )
 
 
-THROW = "first"
-"""Name of the one throw."""
+TAKE = "first"
+"""Name of the only take."""
 CONTACT = 5
-"""Frames that NeuMA's settings take for free flight."""
+"""Number of frames of free flight in NeuMA's settings."""
 
 
 def read_configured(name: str, settings: ReleasedConfig) -> Released:
-    """The capture that settings name, with photographs from elsewhere where they say so, and a frame of contact.
-
-    Raises:
-        InputError: as of `read_released`; there are no photographs.
-    """
-    known_as = settings.object or name
-    found = read_released(settings.folder, known_as, settings.ground)
-    photographs = found.photographs
+    """The capture of a section of the settings, with photographs and a contact frame, or InputError."""
+    object_name = settings.object or name
+    capture = read_released(settings.folder, object_name, settings.ground)
+    photographs = capture.photographs
     if settings.photographs:
-        photographs = read_released(settings.photographs, known_as, settings.ground).photographs
+        photographs = read_released(settings.photographs, object_name, settings.ground).photographs
     if not photographs:
         raise InputError(
-            f"captures.released.{name}: {settings.folder} has no photographs of the object at rest: name Spring-Gaus' "
-            "folder real_capture, which has them, as `photographs`"
+            f"captures.released.{name}",
+            f"{settings.folder} has no photographs of the object at rest",
+            "Set `photographs` to the folder real_capture of Spring-Gaus, which contains them",
         )
-    contact = settings.contact or found.contact or CONTACT
-    return replace(found, photographs=photographs, contact=contact)
+    contact = settings.contact or capture.contact or CONTACT
+    return replace(capture, photographs=photographs, contact=contact)
 
 
 def released_captures(released: Mapping[str, ReleasedConfig]) -> dict[str, Capture]:
-    """Captures that settings name, as those of own folders are (`neuma_lib.capture.folder.read_capture`)."""
-    found = {}
+    """Released captures of the settings, in the form of `neuma_lib.project.capture_folder.read_capture`."""
+    captures = {}
     for name, settings in released.items():
         shots = read_released(settings.folder, settings.object or name, settings.ground).videos
         videos = {camera: frames[0].picture for camera, frames in sorted(shots.items())}
-        found[name] = Capture(Path(name), settings.as_capture(), (), {}, {THROW: videos})
-    return found
+        captures[name] = Capture(Path(name), settings.as_capture(), (), {}, {TAKE: videos})
+    return captures
 
 
 def _spring_gaus(folder: Path, name: str, ground: float) -> Released:
     sequences = folder / "dynamic/sequences"
     if not (sequences / name).is_dir():
-        raise InputError(
-            f"{sequences} has no object '{name}'{hint(name, [p.name for p in sequences.iterdir()])}"
-        )
+        raise InputError(sequences, f"no object '{name}'{hint(name, [p.name for p in sequences.iterdir()])}")
     listed = sequences / name / "0.json"
-    frames = read_json(existing(listed, "unpack the archive again"))
+    frames = read_json(existing(listed, _UNPACK))
     colmap = folder / "static/colmap" / name
     lens = read_cameras(colmap / "cameras.bin")
     poses = _poses(folder / "dynamic/cameras_calib.json")
@@ -177,15 +176,17 @@ def _spring_gaus(folder: Path, name: str, ground: float) -> Released:
         if camera == "hit_frame":
             continue
         if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
-            raise InputError(f"{listed}: {camera}: expected the names of its pictures")
+            raise InputError(f"{listed}: {camera}", "expected a list of names of pictures")
         if camera not in poses:
-            raise InputError(f"{listed}: '{camera}' has no pose in cameras_calib.json{hint(camera, poses)}")
-        pictures = [_found(folder / "dynamic/videos_images" / camera, file) for file in files]
-        masks = [_found(folder / "dynamic/videos_masks" / camera, Path(file).stem) for file in files]
+            raise InputError(f"{listed}: {camera}", f"no pose in cameras_calib.json{hint(camera, poses)}")
+        pictures = [_picture(folder / "dynamic/videos_images" / camera, file) for file in files]
+        masks = [_picture(folder / "dynamic/videos_masks" / camera, Path(file).stem) for file in files]
+        if not pictures:
+            raise InputError(f"{listed}: {camera}", "it has no pictures", _UNPACK)
         videos[camera] = _video(pictures, masks, range(len(files)), next(iter(lens.values())), poses[camera])
     contact = frames.get("hit_frame")
     if contact is not None and (type(contact) is not int or contact < 0):
-        raise InputError(f"{listed}: hit_frame must be the number of a frame")
+        raise InputError(f"{listed}: hit_frame", f"{contact!r} must be the number of a frame")
     return Released(videos, _photographs(folder, name, lens), contact, ground)
 
 
@@ -201,10 +202,10 @@ def _neuma(folder: Path, ground: float) -> Released:
             if match and file.suffix.lower() in _SUFFIXES:
                 files[int(match[1])] = file
         if not files:
-            raise InputError(f"{folder / 'dynamics'} has no picture {camera}_<step>.jpg")
+            raise InputError(folder / "dynamics", f"no picture {camera}_<step>.jpg", _UNPACK)
         numbers = sorted(files)
         pictures = [files[k] for k in numbers]
-        masks = [_found(folder / "dynamic_masks", file.stem) for file in pictures]
+        masks = [_picture(folder / "dynamic_masks", file.stem) for file in pictures]
         videos[camera] = _video(pictures, masks, numbers, lens, poses[camera])
     return Released(videos, ground=ground)
 
@@ -212,15 +213,12 @@ def _neuma(folder: Path, ground: float) -> Released:
 def _video(
     pictures: Sequence[Path], masks: Sequence[Path], numbers, lens: Lens, viewmat: np.ndarray
 ) -> list[Shot]:
-    if not pictures:
-        raise InputError("a camera of the capture has no pictures: unpack the archive again")
-    size = picture_size(pictures[0])
-    pinhole = video_lens(lens, size)
+    pinhole = video_lens(lens, picture_size(pictures[0]))
     return [Shot(p, m, pinhole, viewmat, int(k)) for p, m, k in zip(pictures, masks, numbers, strict=True)]
 
 
 def video_lens(lens: Lens, size: tuple[int, int]) -> Lens:
-    """The lens of a video of another size [px]: the photographs' focal lengths scaled, its middle, no distortion."""
+    """The lens of a video: focal lengths scaled to its size [px], centred principal point, no distortion."""
     width, height = size
     fx, fy = lens.K[0, 0] * width / CALIBRATED_SIZE[0], lens.K[1, 1] * height / CALIBRATED_SIZE[1]
     return Lens(width, height, np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]]), np.zeros(5))
@@ -231,9 +229,9 @@ def _photographs(folder: Path, name: str, lenses: dict[int, Lens]) -> list[Shot]
     shots = []
     for k, (file, camera, viewmat) in enumerate(sorted(read_images(path), key=lambda image: image[0])):
         if camera not in lenses:
-            raise InputError(f"{path}: {file} is of camera {camera}, which cameras.bin does not have")
-        picture = _found(folder / "static/images" / name, Path(file).stem)
-        mask = _found(folder / "static/masks" / name, Path(file).stem)
+            raise InputError(f"{path}: {file}", f"its camera {camera} is not in cameras.bin", _UNPACK)
+        picture = _picture(folder / "static/images" / name, Path(file).stem)
+        mask = _picture(folder / "static/masks" / name, Path(file).stem)
         width, height = picture_size(mask)
         lens, K = lenses[camera], lenses[camera].K.copy()
         K[0] *= width / lens.width
@@ -242,46 +240,44 @@ def _photographs(folder: Path, name: str, lenses: dict[int, Lens]) -> list[Shot]
     return shots
 
 
-def _found(folder: Path, name: str) -> Path:
-    """A picture of a name, with or without its ending."""
+def _picture(folder: Path, name: str) -> Path:
+    """Path of a picture, whose name may lack the suffix."""
     stem = Path(name).stem if Path(name).suffix.lower() in _SUFFIXES else name
     candidates = [folder / f"{stem}{suffix}" for s in _SUFFIXES for suffix in (s, s.upper())]
     for file in candidates:
         if file.is_file():
             if folder.resolve() not in file.resolve().parents:
-                raise InputError(f"{file} leads out of its folder: copy the file there")
+                raise InputError(file, f"it is a link to a file outside {folder}", "Copy the file there")
             return file
-    raise InputError(
-        f"{folder / stem}: there is no such picture ({', '.join(_SUFFIXES)}): unpack the archive again"
-    )
+    raise InputError(folder / stem, f"no such picture ({', '.join(_SUFFIXES)})", _UNPACK)
 
 
 def _poses(path: Path) -> dict[str, np.ndarray]:
     """World to camera (4, 4) of each camera."""
-    found = {}
-    for camera, entry in read_json(existing(path, "unpack the archive again")).items():
+    poses = {}
+    for camera, entry in read_json(existing(path, _UNPACK)).items():
         if not isinstance(entry, dict) or not {"rvecs", "tvecs"} <= entry.keys():
-            raise InputError(f"{path}: {camera}: expected rvecs and tvecs")
+            raise InputError(f"{path}: {camera}", "expected rvecs and tvecs")
         try:
             turn, shift = (np.asarray(entry[key], np.float64).ravel() for key in ("rvecs", "tvecs"))
         except (TypeError, ValueError):
             turn = shift = np.empty(0)
         if turn.shape != (3,) or shift.shape != (3,) or not np.isfinite([*turn, *shift]).all():
-            raise InputError(f"{path}: {camera}: rvecs and tvecs must be three numbers each")
-        found[camera] = np.eye(4)
-        found[camera][:3, :3] = Rotation.from_rotvec(turn).as_matrix()
-        found[camera][:3, 3] = shift
-    return found
+            raise InputError(f"{path}: {camera}", "rvecs and tvecs must be three numbers each")
+        poses[camera] = np.eye(4)
+        poses[camera][:3, :3] = Rotation.from_rotvec(turn).as_matrix()
+        poses[camera][:3, 3] = shift
+    return poses
 
 
 def read_cameras(path: Path) -> dict[int, Lens]:
-    """Lenses in COLMAP's cameras.bin, by their numbers; pycolmap reads whole reconstructions alone.
+    """Lenses in COLMAP's cameras.bin by their numbers. pycolmap only reads complete reconstructions.
 
     Raises:
         InputError: missing, damaged, or of another model than `COLMAP_MODELS`.
     """
-    content = existing(path, "unpack the archive again").read_bytes()
-    found = {}
+    content = existing(path, _UNPACK).read_bytes()
+    lenses = {}
     with reading(path, "COLMAP's cameras"):
         (count,), at = struct.unpack_from("<Q", content), 8
         for _ in range(count):
@@ -290,20 +286,16 @@ def read_cameras(path: Path) -> dict[int, Lens]:
                 raise ValueError(f"camera model number {model}")
             values = struct.unpack_from(f"<{_PARAMETERS[model]}d", content, at + 24)
             at += 24 + 8 * _PARAMETERS[model]
-            found[number] = lens_of_colmap(_MODELS[model], np.array(values), width, height)
-    if not found:
-        raise InputError(f"{path} has no camera")
-    return found
+            lenses[number] = lens_of_colmap(_MODELS[model], np.array(values), width, height)
+    if not lenses:
+        raise InputError(path, "it has no camera", _UNPACK)
+    return lenses
 
 
 def read_images(path: Path) -> list[tuple[str, int, np.ndarray]]:
-    """Name, number of the camera, and world to camera (4, 4) of each picture in COLMAP's images.bin.
-
-    Raises:
-        InputError: missing or damaged.
-    """
-    content = existing(path, "unpack the archive again").read_bytes()
-    found = []
+    """Name, camera number and world to camera (4, 4) of each picture in COLMAP's images.bin, or InputError."""
+    content = existing(path, _UNPACK).read_bytes()
+    images = []
     with reading(path, "COLMAP's images"):
         (count,), at = struct.unpack_from("<Q", content), 8
         for _ in range(count):
@@ -315,19 +307,19 @@ def read_images(path: Path) -> list[tuple[str, int, np.ndarray]]:
             viewmat = np.eye(4)
             viewmat[:3, :3] = Rotation.from_quat((x, y, z, w)).as_matrix()
             viewmat[:3, 3] = shift
-            found.append((name, camera, viewmat))
+            images.append((name, camera, viewmat))
         if at > len(content):
             raise ValueError("it ends too early")
-    return found
+    return images
 
 
 def room_cameras(viewmats: np.ndarray, ground: float, scale: float) -> np.ndarray:
-    """World to camera (N, 4, 4) in the room, y up, the floor at y = 0, the middle of their volume above its origin.
+    """World to camera (N, 4, 4) in the room: y up, the floor at y = 0, the origin below the middle of the volume.
 
     Args:
-        viewmats: in the files' world, (N, 4, 4).
+        viewmats: in the world of the files, (N, 4, 4).
         ground: z of the floor there.
-        scale: metres to their unit.
+        scale: metres per unit of the files.
     """
     origin = np.array([*MIDDLE, ground])
     moved = viewmats.copy()
@@ -337,7 +329,7 @@ def room_cameras(viewmats: np.ndarray, ground: float, scale: float) -> np.ndarra
 
 
 def seen_size(masks: Sequence[np.ndarray], viewmats: np.ndarray, Ks: np.ndarray) -> tuple[np.ndarray, float]:
-    """Middle (3,) of what masks of several cameras show, and its usual radius, in the cameras' unit.
+    """Centre (3,) and median radius of the object in masks of several cameras, in the cameras' unit.
 
     Args:
         masks: Boolean, (H, W), of any sizes, none empty.
@@ -348,26 +340,28 @@ def seen_size(masks: Sequence[np.ndarray], viewmats: np.ndarray, Ks: np.ndarray)
     depths = viewmats[:, 2, :3] @ middle + viewmats[:, 2, 3]
     radii = np.sqrt([mask.sum() / np.pi for mask in masks]) * depths / Ks[:, 0, 0]
     if not (radii > 0).all():
-        raise InputError("the cameras do not look at one thing: poses and masks are of different captures")
+        raise InputError(
+            "masks", "the object is behind a camera", "Check that poses and masks are of the same capture"
+        )
     return middle, float(np.median(radii))
 
 
 def photographs_about_to_size(
     shots: Sequence[Shot], masks: Sequence[np.ndarray], longest: int, radius: float, height: float
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Entries of a transforms.json for photographs whose world has a scale and directions of its own.
+    """Entries of a transforms.json for photographs in a world of other scale and orientation.
 
-    The object comes to the middle of the simulator's box and about to the size at which it was filmed; registration
-    finds the rest.
+    The object is placed in the middle of the simulation box at approximately the size in the videos. Registration
+    estimates the exact pose and scale.
 
     Args:
         masks: at the size of ``longest``.
         longest: longer side of the pictures [px].
-        radius: of the object as filmed, see `seen_size` [m].
-        height: at which it is put [m].
+        radius: of the object in the videos, see `seen_size` [m].
+        height: of the object's centre [m].
 
     Returns:
-        The entries, and what the file says of its world.
+        The entries, and the entries that describe the world of the file.
     """
     lenses = [shot.lens.pinhole().resized(longest) for shot in shots]
     viewmats = np.stack([shot.viewmat for shot in shots])
@@ -393,15 +387,15 @@ def photographs_about_to_size(
 def video_frames(
     shots: Sequence[Shot], ground: float, scale: float, longest: int, enlarge: float = 1.0
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Entries of a transforms.json for the frames of one camera, in the box, with their times from 0 on [s].
+    """Entries of a transforms.json for the frames of one camera, in the simulation box, with times from 0 on [s].
 
     Args:
         ground, scale: of `room_cameras`.
         longest: longer side of the pictures [px].
-        enlarge: metres of the simulator to a metre.
+        enlarge: simulated metres per metre.
 
     Returns:
-        The entries, and what the file says of its world.
+        The entries, and the entries that describe the world of the file.
     """
     viewmat = room_cameras(shots[0].viewmat[None], ground, scale)
     in_box = Similarity(enlarge, np.eye(3), np.array(BOX_MIDDLE)).move_cameras(viewmat)[0]
@@ -422,11 +416,12 @@ def video_frames(
 
 
 def read_shots(shots: Sequence[Shot], longest: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Picture (H, W, 3), uint8, and mask (H, W) of each, undistorted and reduced; a photograph is brought to the size
-    of its mask before, as the authors' code does.
+    """Iterate over pictures (H, W, 3), uint8, and masks (H, W), undistorted and reduced.
+
+    Photographs are first resized to the size of their masks, as in the authors' code.
 
     Raises:
-        InputError: a file that is no picture, an empty mask, a picture of another shape than its mask.
+        InputError: a file is no picture, a mask is empty, or a picture has another aspect ratio than its mask.
     """
     for shot in shots:
         width, height = shot.lens.width, shot.lens.height
@@ -434,21 +429,20 @@ def read_shots(shots: Sequence[Shot], longest: int) -> Iterator[tuple[np.ndarray
         if pixels.shape[:2] != (height, width):
             if abs(pixels.shape[1] * height - pixels.shape[0] * width) > 2 * max(width, height):
                 raise InputError(
-                    f"{shot.picture} is {pixels.shape[1]}x{pixels.shape[0]}, its mask {width}x{height}: they are not "
-                    "of one picture"
+                    shot.picture,
+                    f"{pixels.shape[1]}x{pixels.shape[0]} pixels, which does not fit the mask of {width}x{height}",
+                    _UNPACK,
                 )
             pixels = np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.BOX))
         yield undistorted(pixels, shot.lens, longest), own_mask(shot.mask, shot.lens, longest)
 
 
-def plate_behind(pictures: Sequence[np.ndarray], masks: Sequence[np.ndarray]) -> np.ndarray:
-    """The empty scene (H, W, 3), uint8: the median of what masks do not cover; where all do, of everything.
+def background_behind(pictures: Sequence[np.ndarray], masks: Sequence[np.ndarray]) -> np.ndarray:
+    """The empty scene (H, W, 3), uint8: median of pixels outside the masks (H, W), dilated by `MASK_MARGIN`.
 
-    Args:
-        pictures: (H, W, 3), uint8, each.
-        masks: (H, W), bool, each; their surroundings, `BESIDE` pixels wide, are not taken for empty.
+    Where all masks overlap, it is the median of all pixels.
     """
-    covered = np.stack([binary_dilation(mask, iterations=BESIDE) for mask in masks])
+    covered = np.stack([binary_dilation(mask, iterations=MASK_MARGIN) for mask in masks])
     covered[:, covered.all(axis=0)] = False
     seen = np.ma.masked_array(np.stack(pictures), np.repeat(covered[..., None], 3, axis=-1))
     return np.ma.median(seen, axis=0).filled(0).round().astype(np.uint8)

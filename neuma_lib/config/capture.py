@@ -9,7 +9,6 @@ from pydantic import AfterValidator, Field, model_validator
 
 from neuma_lib.config.base import Section
 from neuma_lib.config.board import BoardConfig
-from neuma_lib.config.demo_captures import DemoCapturesConfig
 
 
 def _inside(name: str) -> str:
@@ -244,7 +243,4 @@ class CapturesConfig(Section):
     )
     measured: int = Field(
         20, ge=1, description="most frames of a camera that the report measures, evenly spread over its video"
-    )
-    demo: DemoCapturesConfig = Field(
-        DemoCapturesConfig(), description="captures that Blender makes, with a known truth"
     )

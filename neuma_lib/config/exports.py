@@ -8,7 +8,7 @@ from neuma_lib.config.base import Section
 
 
 class ExportsConfig(Section):
-    """Files below results/<scene>/<method>/export/ (docs/splats.md)."""
+    """Files in `results/<scene>/<method>/export/` ([exports](splats.md))."""
 
     rotate_harmonics: bool = Field(
         True,

@@ -6,20 +6,16 @@ from typing import Literal
 
 from pydantic import Field
 
-from neuma_lib.config.base import Compared, Section
+from neuma_lib.config.base import Compared
+from neuma_lib.config.motion import MotionOptions
 
 
-class MaterialConfig(Section):
+class MaterialConfig(MotionOptions):
     """Adaptation of the material law: what is trained, on what, how."""
 
-    train: bool = Field(True, description="false: the prior as it is (NCLaw)")
     supervision: Literal["pixels", "particles"] = Field(
         "pixels", description="images, or ground-truth particles"
     )
-    carrier: Literal["binding", "gaussians"] = Field(
-        "binding", description="bound volume particles, or the Gaussians themselves as particles (w/o Bind)"
-    )
-    views: tuple[int, ...] = Field((0,), min_length=1, description="training views of the video")
     compare: Compared = Field(
         "colour",
         description="what of the images counts: colours over white, or masks alone, how far the body covers a pixel, "
@@ -32,24 +28,6 @@ class MaterialConfig(Section):
     seed: int = Field(0, description="seed of the adaptor's initial weights")
     lr_scale: float = Field(1.0, gt=0, description="factor on both learning rates (sweeps, ablations)")
     covariance_gradient: bool = Field(True, description="let image gradients reach F through the covariances")
-    covariance_from: Literal["elastic", "total"] = Field(
-        "elastic",
-        description="deformation that stretches the Gaussians: the elastic F (paper), or the total one, with all that "
-        "has flowed",
-    )
-    gaussian_motion: Literal["mean", "affine"] = Field(
-        "mean",
-        description="how Gaussians follow their particles: shifted by their mean displacement (paper), or by their "
-        "affine motion, which also turns and stretches a Gaussian's distance from them",
-    )
-    start: Literal["estimated", "identified"] = Field(
-        "estimated",
-        description="initial motion: as the frames before contact tell it (paper), or as the stage `identify` fitted "
-        "it to all frames, along with the constants",
-    )
-    assumed_density: float | None = Field(
-        None, gt=0, description="density believed everywhere [kg/m^3]; null: the scene's is told"
-    )
     iterations: int = Field(50, ge=1, description="optimiser steps, one full rollout each")
     lr_elastic: float = Field(0.01, ge=0, description="learning rate of the elastic network")
     lr_plastic: float = Field(0.0005, ge=0, description="learning rate of the plastic network")

@@ -8,7 +8,7 @@ from neuma_lib.config.base import Section
 
 
 class ViewerConfig(Section):
-    """What the file results/<scene>/viewer.html holds; `neuma view` shows all that there is."""
+    """Content of the file `results/<scene>/viewer.html`. `neuma view` shows everything."""
 
     methods: tuple[str, ...] = Field(
         ("nclaw", "neuma"),

@@ -1,4 +1,4 @@
-"""The binding matrix B: which particles carry a Gaussian, and with what weights (paper Algorithm 1)."""
+"""The binding matrix B: the weights of the particles that move a Gaussian (paper Algorithm 1)."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Binding:
-    """Sparse binding matrix B in compressed rows.
+    """Sparse binding matrix B in compressed sparse row (CSR) format.
 
     Attributes:
         indptr: start of each row in ``indices``, int64, shape (G + 1,).
-        indices: bound particles, ascending inside a row, int64, shape (nnz,).
+        indices: bound particles, ascending in each row, int64, shape (nnz,).
         values: weights, shape (nnz,); every non-empty row sums to 1.
         shape: (Gaussian count G, particle count N).
     """
@@ -27,28 +27,28 @@ class Binding:
 
     @classmethod
     def identity(cls, count: int, like: Tensor) -> Binding:
-        """Each of ``count`` Gaussians is its own particle (the paper's "w/o Bind"); device and dtype of ``like``."""
+        """One particle for each of ``count`` Gaussians (the paper's "w/o Bind"), with device and dtype of ``like``."""
         index = torch.arange(count + 1, device=like.device)
         return cls(index, index[:-1].clone(), like.new_ones(count), (count, count))
 
     @property
     def counts(self) -> Tensor:
-        """Bound particles of every Gaussian, int64, shape (G,)."""
+        """Number of bound particles of each Gaussian, int64, shape (G,)."""
         return self.indptr[1:] - self.indptr[:-1]
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Binding:
-        """The same matrix on another device or with weights of another floating type."""
+        """The same matrix on another device or with weights of another dtype."""
         values = self.values.to(device=device, dtype=dtype)
         return Binding(self.indptr.to(device), self.indices.to(device), values, self.shape)
 
     def rows(self, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-        """B in compressed rows for a kernel: indptr and indices as int32, weights of the given dtype; made once."""
+        """B in CSR format for kernels: indptr and indices as int32, weights of the given dtype; cached."""
         if ("rows", dtype) not in self._compressed:
             self._compressed["rows", dtype] = (self.indptr.int(), self.indices.int(), self.values.to(dtype))
         return self._compressed["rows", dtype]
 
     def columns(self, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-        """B^T likewise, the Gaussians of each particle: what adjoints multiply with."""
+        """B^T in the same format, for adjoints; cached."""
         if ("columns", dtype) not in self._compressed:
             rows = torch.repeat_interleave(
                 torch.arange(self.shape[0], device=self.indptr.device), self.counts

@@ -1,4 +1,4 @@
-"""Several bodies on one grid, and bodies without a video: solids with one Gaussian on each particle."""
+"""Several bodies on one grid, and solids without a video, with one Gaussian per particle."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.spherical_harmonics import rgb_to_sh0
 
 _WIDTH = 0.55
-"""Standard deviation of a Gaussian in distances between particles: closed surfaces, edges still sharp."""
+"""Standard deviation of a Gaussian in particle spacings, for closed surfaces with sharp edges."""
 _OPACITY = 0.95
 _LIGHT = (0.35, 0.8, 0.5)
-"""Direction to the light that shades these solids: from above, a little to the right of the camera."""
+"""Direction to the light: from above, slightly to the right of the camera."""
 _AMBIENT = 0.45
-"""Brightness of what faces away from the light."""
+"""Brightness of surfaces that face away from the light."""
 
 
 def join(bodies: Sequence[Reconstruction]) -> Reconstruction:
-    """Bodies as one: particles and Gaussians of one after those of another, each Gaussian bound as it was."""
+    """Concatenate bodies: particles, Gaussians and bindings, in the given order."""
     offsets = np.cumsum([0, *(len(body.x0) for body in bodies)])
     entries = np.cumsum([0, *(len(body.binding.indices) for body in bodies)])
     bindings = [body.binding for body in bodies]
@@ -38,9 +38,9 @@ def join(bodies: Sequence[Reconstruction]) -> Reconstruction:
         torch.cat([b.values for b in bindings]),
         (sum(b.shape[0] for b in bindings), int(offsets[-1])),
     )
-    most = max(body.gaussians.shN.shape[1] for body in bodies)
+    coefficients = max(body.gaussians.shN.shape[1] for body in bodies)
     parts = [body.gaussians for body in bodies]
-    padded = [torch.nn.functional.pad(g.shN, (0, 0, 0, most - g.shN.shape[1])) for g in parts]
+    padded = [torch.nn.functional.pad(g.shN, (0, 0, 0, coefficients - g.shN.shape[1])) for g in parts]
     names = ("means", "quats", "scales", "opacities", "sh0")
     gaussians = Gaussians(
         **{name: torch.cat([getattr(g, name) for g in parts]) for name in names}, shN=torch.cat(padded)
@@ -50,13 +50,13 @@ def join(bodies: Sequence[Reconstruction]) -> Reconstruction:
 
 
 def coloured_solid(mesh: trimesh.Trimesh, x0: Tensor, density: Density, colors: Tensor) -> Reconstruction:
-    """A solid filled with particles, with one round Gaussian on each of them, so that it can be rendered.
+    """A solid filled with particles, with one isotropic Gaussian per particle for rendering.
 
     Args:
         mesh: surface of the solid, watertight [m].
         x0: particles inside it [m], shape (N, 3).
         density: mass density [kg/m^3].
-        colors: of the particles, RGB in [0, 1], shape (N, 3); a fixed light shades each by the surface nearest to it.
+        colors: RGB of the particles in [0, 1], shape (N, 3), shaded by a fixed light and the nearest surface normal.
     """
     volume = float(mesh.volume) / len(x0)
     vol0 = torch.full_like(x0[:, 0], volume)

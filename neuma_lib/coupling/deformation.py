@@ -23,11 +23,10 @@ def deform(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Move and stretch Gaussians with the particles that they are bound to.
 
-    x_t = x_0 + B (p_t - p_0); F_bar = B F_t; A_t = F_bar A_0 F_bar^T. The first is the sum of the paper's
-    increments, because B does not change. It holds where a Gaussian lies amid its particles; one beside them, as most
-    of those on the surface do, keeps its distance a = x_0 - B p_0 from them as it was, however the body turns or
-    stretches. With `arms` a follows too, x_t = B p_t + F_bar a, which is exact for affine motions.
-    Differentiable with respect to x and F, not to what is at rest.
+    x_t = x_0 + B (p_t - p_0); F_bar = B F_t; A_t = F_bar A_0 F_bar^T. The first equation is the sum of the paper's
+    increments, because B is constant. It is accurate for a Gaussian amid its particles. The offset a = x_0 - B p_0 of a
+    Gaussian on the surface from its particles stays constant although the body rotates and stretches. With `arms` it is
+    transformed too, x_t = B p_t + F_bar a, which is exact for affine motions. Differentiable with respect to x and F.
 
     Args:
         means: (G, 3) Gaussian centres at rest [m].
@@ -35,16 +34,16 @@ def deform(
         binding: B (G x N, rows sum to 1).
         x0: (N, 3) particle positions at rest [m].
         x: (T, N, 3) particle positions of the frames [m].
-        F: (T, N, 3, 3) their deformation gradients.
-        arms: (G, 3) distances a at rest [m], of `arms_at_rest`; None: the paper's equation.
-        covariance_gradient: let image gradients reach F through the covariances, and through arms. The authors'
-            released code does not (its deformation kernel is not taped); False reproduces that.
+        F: (T, N, 3, 3) deformation gradients of the frames.
+        arms: (G, 3) offsets a at rest [m] from `arms_at_rest`; None: the paper's equation.
+        covariance_gradient: propagate gradients to F through covariances and arms. False reproduces the authors'
+            released code, whose deformation kernel is not taped.
 
     Returns:
         means (T, G, 3), covars (T, G, 3, 3)
 
     Raises:
-        InputError: numbers of particles, Gaussians or frames that disagree.
+        InputError: inconsistent numbers of particles, Gaussians or frames.
     """
     T, (G, N) = len(x), binding.shape
     expected = {
@@ -54,29 +53,28 @@ def deform(
         "means": (means, (G, 3)),
         "covars": (covars, (G, 3, 3)),
     }
-    advice = f" for a binding of {G} Gaussians to {N} particles. Rerun the binding stage if either changed."
     if arms is not None:
         expected["arms"], arms = (arms, (G, 3)), arms.contiguous()
-    check_tensors("deform", expected, advice)
+    check_tensors("deform", expected, "Run the rule binding again if Gaussians or particles have changed")
     at_rest = (*(value.contiguous() for value in (means, covars, x0)), arms)
     return _Deform.apply(binding, *at_rest, x, F if covariance_gradient else F.detach())
 
 
 def arms_at_rest(means: torch.Tensor, binding: Binding, x0: torch.Tensor) -> torch.Tensor:
-    """From the mean of a Gaussian's particles to its centre [m], shape (G, 3); zero for one without particles.
+    """Offsets from the mean of a Gaussian's particles to its centre [m], shape (G, 3); zero without particles.
 
     Args:
         means: (G, 3) Gaussian centres at rest [m].
         binding: B (G x N, rows sum to 1).
         x0: (N, 3) particle positions at rest [m].
     """
-    nothing, F = means.new_zeros(len(means), 3, 3), x0.new_zeros(1, len(x0), 3, 3)
-    anchors, _ = deform(torch.zeros_like(means), nothing, binding, torch.zeros_like(x0), x0[None], F)
+    covars, F = means.new_zeros(len(means), 3, 3), x0.new_zeros(1, len(x0), 3, 3)
+    anchors, _ = deform(torch.zeros_like(means), covars, binding, torch.zeros_like(x0), x0[None], F)
     return torch.where(binding.counts[:, None].to(means.device) > 0, means - anchors[0], 0.0)
 
 
 class _Deform(torch.autograd.Function):
-    """`deform` by the kernels of `deformation_kernels`."""
+    """`deform` with the kernels of `deformation_kernels`."""
 
     @staticmethod
     def forward(ctx, binding: Binding, means, covars, x0, arms, x, F):

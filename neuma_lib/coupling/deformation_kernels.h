@@ -1,5 +1,4 @@
-// Text of the functions of deformation_kernels.py. REAL is the scalar type.
-// Four numbers are one access of 16 bytes on a GPU, where they would otherwise be taken one by one.
+// Functions of deformation_kernels.py. REAL is the scalar type. Four numbers are one access of 16 bytes on a GPU.
 //// quad
     typedef REAL Real;
     struct alignas(16) Quad { Real c[4]; };

@@ -1,12 +1,11 @@
 """Kernels of :mod:`neuma_lib.coupling.deformation`: sums over the particles of a Gaussian, and over the Gaussians of a
 particle.
 
-Both directions gather through a compressed sparse matrix, so nothing is added atomically and equal inputs give equal
-bits. Both sum rows of twelve numbers, a vector and a matrix (only the vector and a zero where F needs no gradient),
-which lie side by side in memory; a thread sums four columns. Neighbouring threads so read one row at once, 16 bytes
-each in float32: single numbers from scattered rows would keep the GPU's cache busy with addresses. For the same reason
-results are written by neighbouring threads side by side. Frames are the slow index: the rows of one frame stay in the
-cache while all its Gaussians read them, about seven times each.
+Both directions gather through a sparse matrix in CSR format, without atomic additions, so the result is deterministic.
+Both sum rows of twelve contiguous numbers, a vector and a matrix (the vector and a zero if F needs no gradient); a
+thread sums four columns. Memory accesses are coalesced: neighbouring threads read one row, 16 bytes each in float32,
+and write neighbouring results. Frames are the slow index, so the rows of a frame stay in the cache while all its
+Gaussians read them, about seven times each.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -22,13 +21,13 @@ from neuma_lib.mechanics.singular_values_kernels import warp_types
 start_warp()
 
 PARTS = 3
-"""Groups of four numbers in a row that holds a vector and a 3x3 matrix."""
+"""Groups of four numbers in a row of a vector and a 3x3 matrix."""
 
 
 @functools.cache
 def kernels(dtype: torch.dtype) -> SimpleNamespace:
-    """Kernels of a dtype, over pairs of a frame and: `pack` and `weighted_sums` a part of a row, `carry` a coordinate
-    of a Gaussian, `stretch_adjoint` a Gaussian.
+    """Kernels for a dtype. A thread processes one frame and: a part of a row (`pack`, `weighted_sums`), a coordinate of
+    a Gaussian (`carry`), or a Gaussian (`stretch_adjoint`).
     """
     real, vec3, mat33 = warp_types(dtype)
     vec4 = wp.types.vector(length=4, dtype=real)
@@ -43,7 +42,7 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
     @wp.func_native(quad + text["put"])
     def put(rows: wp.array2d(dtype=vec4), frame: wp.int32, place: wp.int32, value: vec4): ...
 
-    # The sum of weights[k] rows[frame, indices[k] parts + part] over k from start to stop.
+    # sum of weights[k] rows[frame, indices[k] parts + part] over k from start to stop
     @wp.func_native(quad + text["sum"])
     def weighted_sum(
         indices: wp.array(dtype=wp.int32), weights: wp.array(dtype=real), start: wp.int32, stop: wp.int32,
@@ -97,7 +96,7 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
     def carry(
         means: wp.array(dtype=real),  # (3 G,)
         covars: wp.array(dtype=mat33),  # (G,)
-        arms: wp.array(dtype=vec3),  # (G,); None: Gaussians only shift
+        arms: wp.array(dtype=vec3),  # (G,) or None
         sums: wp.array2d(dtype=vec4),  # (T, 3 G), mean shift and mean F of the particles
         moved: wp.array2d(dtype=real),  # (T, 3 G), out
         stretched: wp.array2d(dtype=vec3),  # (T, 3 G), out: rows of the covariances
@@ -119,10 +118,10 @@ def kernels(dtype: torch.dtype) -> SimpleNamespace:
     def stretch_adjoint(
         covars: wp.array(dtype=mat33),  # (G,)
         arms: wp.array(dtype=vec3),  # (G,) or None
-        sums: wp.array2d(dtype=vec4),  # (T, 3 G), as `carry` read them; None where F needs no gradient
+        sums: wp.array2d(dtype=vec4),  # (T, 3 G), input of `carry`; None if F needs no gradient
         grad_moved: wp.array2d(dtype=vec3),  # (T, G)
         grad_stretched: wp.array2d(dtype=mat33),  # (T, G)
-        grad_sums: wp.array2d(dtype=vec4),  # (T, 3 G), out; (T, G), vectors only, where F needs no gradient
+        grad_sums: wp.array2d(dtype=vec4),  # (T, 3 G), out; (T, G), vectors only, if F needs no gradient
     ):
         t, g = wp.tid()
         shift = grad_moved[t, g]

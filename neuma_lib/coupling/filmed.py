@@ -1,4 +1,4 @@
-"""What the cameras of an observation would have seen of a simulated body, frame by frame, exposure included."""
+"""Renders of a simulated body for the cameras and frames of an observation, with motion blur."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from neuma_lib.splatting.observation import Observation
 
 
 class Filmed:
-    """Renders that stand beside the frames of an observation.
+    """Renders of the frames of an observation.
 
     Args:
-        renderer: `ParticleGS` of the body for the observation's cameras, or what renders as it does.
-        observation: whose frames and exposure count.
-        steps: those whose states are given, ascending; a frame's exposure must be among them.
-        compared: what is rendered, colours over white or how far the body covers a pixel.
+        renderer: `ParticleGS` of the body for the observation's cameras, or an equivalent.
+        observation: defines frames and exposure.
+        steps: steps of the given states, ascending; must include those of all exposures.
+        compared: rendered quantity, colours over white or coverage.
 
     Attributes:
         renderer: as given.
-        batch: frames to render together.
-        error_batch: frames to take the `error` of together.
+        batch: number of frames to render together.
+        error_batch: number of frames to compute the `error` of together.
     """
 
     def __init__(
@@ -37,22 +37,22 @@ class Filmed:
         self._sharp = len(offsets) == 1 and compared == "colour" and isinstance(renderer, ParticleGS)
         self.batch = max(1, renderer.frames_per_batch // len(offsets))
         self.error_batch = renderer.frames_per_error if self._sharp else self.batch
-        place = {step: k for k, step in enumerate(steps)}
-        rows = [[place[frame + offset] for offset in offsets] for frame in observation.frames]
+        index = {step: k for k, step in enumerate(steps)}
+        rows = [[index[frame + offset] for offset in offsets] for frame in observation.frames]
         self._shares = torch.tensor(shares or [1 / len(offsets)] * len(offsets), dtype=torch.float64)
-        # The usual case, every state for one frame, is spared a copy of the states.
+        # None avoids a copy of the states in the usual case of one state per frame
         self._rows = None
         if rows != [[k] for k in range(len(steps))]:
             self._rows = torch.tensor(rows) if len(offsets) > 1 else torch.tensor(rows)[:, 0]
 
     def states(self, values: Tensor, part: slice = slice(None)) -> Tensor:
-        """Of states (S, ...) at the steps, those of some frames: (T, ...), or (T, K, ...) if K steps are exposed."""
+        """Select the states of some frames, (T, ...) or (T, K, ...) for K exposed steps, from those at all steps."""
         return values[part] if self._rows is None else values[self._rows[part].to(values.device)]
 
     def __call__(self, x: Tensor, F: Tensor) -> Tensor:
         """Images (T, V, H, W, C) of the `states` x (T, N, 3) [m] and F (T, N, 3, 3) of some frames.
 
-        C is 3 for colours in [0, 1], 1 for coverage. Those of K steps, x (T, K, N, 3), are averaged.
+        C is 3 for colours in [0, 1], 1 for coverage. Images of K exposed steps, x (T, K, N, 3), are averaged.
         """
         if x.ndim == 3:
             return self._picture(x, F)
@@ -60,12 +60,9 @@ class Filmed:
         return (instants * self._shares.to(instants).view(-1, *[1] * (instants.ndim - 2))).sum(1)
 
     def error(self, x: Tensor, F: Tensor, seen: Tensor) -> Tensor:
-        """Mean squared difference (T,) of each frame's images from ``seen``, those that stand for them in the video.
+        """Mean squared difference (T,) of each frame's images from the video ``seen`` (see `mean_squared_error`).
 
-        Differentiable with respect to the states, which are as above.
-
-        Args:
-            seen: as of `mean_squared_error`, in as many channels as are compared.
+        Differentiable with respect to the states.
         """
         if self._sharp:
             return self.renderer.error(x, F, seen)

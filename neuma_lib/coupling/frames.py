@@ -1,4 +1,4 @@
-"""The Gaussians of a moving body at one time, as Gaussians of their own: to be stored, and opened elsewhere."""
+"""The Gaussians of a moving body at one time as standalone Gaussians, for export."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from neuma_lib.splatting.gaussians import Gaussians, quaternions
 from neuma_lib.splatting.spherical_harmonics import rotated
 
 _FLATTEST = 1e-6
-"""Least ratio of the shortest axis to the longest one: what is below is round-off of a covariance."""
+"""Minimum ratio of the shortest axis to the longest one; smaller ratios are round-off of a covariance."""
 
 
 def gaussians_at(body: Reconstruction, x: Tensor, F: Tensor, rotate_harmonics: bool = True) -> Gaussians:
-    """Gaussians carried by particles to a state, covariances turned back into scales and rotations; on the CPU.
+    """Gaussians deformed with the particles, with covariances decomposed into scales and rotations; on the CPU.
 
     Args:
         body: the body at rest.
         x: (N, 3) particle positions [m].
-        F: (N, 3, 3) deformations that stretch the Gaussians.
-        rotate_harmonics: whether harmonics turn by the rotation next to F_bar = B F (its polar decomposition).
+        F: (N, 3, 3) deformation gradients.
+        rotate_harmonics: rotate harmonics by the rotation in the polar decomposition of F_bar = B F.
 
     Returns:
-        As many Gaussians, in the same order, with the body's dtype.
+        Gaussians in the same order, with the body's dtype.
     """
     g, binding = body.gaussians, body.binding
     arms = arms_at_rest(g.means, binding, body.x0) if body.affine else None
@@ -45,14 +45,12 @@ def axes_of(covars: Tensor) -> tuple[Tensor, Tensor]:
     values, axes = torch.linalg.eigh(covars.double())
     longest = values[:, -1:].clamp(min=torch.finfo(torch.float32).tiny)
     scales = torch.maximum(values, _FLATTEST**2 * longest).sqrt()
-    axes = (
-        axes * torch.linalg.det(axes).sign()[:, None, None]
-    )  # a rotation: three axes turned over are the same axes
+    axes = axes * torch.linalg.det(axes).sign()[:, None, None]  # a proper rotation with the same axes
     return scales.to(covars), quaternions(axes).to(covars)
 
 
 def local_rotations(body: Reconstruction, F: Tensor) -> Tensor:
-    """Rotations (G, 3, 3), float64, next to the mean deformations of the Gaussians' particles F (N, 3, 3)."""
+    """Rotations (G, 3, 3), float64, closest to F_bar = B F of deformation gradients F (N, 3, 3)."""
     b = body.binding
     matrix = csr_matrix((b.values.double().numpy(), b.indices.numpy(), b.indptr.numpy()), shape=b.shape)
     F_bar = torch.from_numpy(matrix @ F.double().flatten(1).numpy()).unflatten(1, (3, 3))

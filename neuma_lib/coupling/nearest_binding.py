@@ -1,7 +1,7 @@
-"""Binding without particles of the Gaussians' own, for splats with many more and smaller Gaussians than particles.
+"""Binding without additional particles, for splats with many more and smaller Gaussians than particles.
 
-Algorithm 1 of the paper gives every Gaussian that holds no particle one at its centre. A splat of a photograph or of an
-image-to-3D model has tens of thousands of such, thin ones on the surface: they would be the simulation.
+Algorithm 1 of the paper adds a particle at the centre of every Gaussian that contains none. A splat of photographs or
+of an image-to-3D model has tens of thousands of such Gaussians on the surface, which would dominate the simulation.
 """
 
 from __future__ import annotations
@@ -17,40 +17,38 @@ from neuma_lib.coupling.particle_binding import bind
 from neuma_lib.errors import InputError
 
 ENOUGH = 4
-"""Particles in its ellipsoid by which a Gaussian is carried as in Algorithm 1."""
+"""Minimum number of particles in a Gaussian's ellipsoid for a binding by Algorithm 1."""
 NEAREST = 10
-"""Particles that carry one with fewer."""
+"""Number of particles bound to a Gaussian with fewer."""
 
 
 def bind_nearest(
     means: Tensor, covars: Tensor, particles: Tensor, settings: BindingConfig | None = None
 ) -> Binding:
-    """The first pass of Algorithm 1, and for Gaussians with too few particles the nearest ones.
+    """The first pass of Algorithm 1, with the nearest particles for Gaussians with too few.
 
-    Weights of the nearest fall smoothly to zero at the distance of the next one. Gaussians beside their particles
-    should follow the affine motion of these (`deform` with arms).
+    Weights of the nearest particles decrease smoothly to zero at the distance of the next one. Use `deform` with arms,
+    because such Gaussians are outside their particles.
 
     Args:
-        means, covars, particles, settings: as of `bind`.
+        means, covars, particles, settings: see `bind`.
 
     Raises:
-        InputError: as of `bind`, or too few particles.
+        InputError: see `bind`; too few particles.
     """
     if len(particles) <= NEAREST:
-        raise InputError(
-            f"binding: {len(particles)} particles are too few; {NEAREST + 1} at least are needed"
-        )
+        raise InputError("binding: particles", f"{len(particles)} are too few, {NEAREST + 1} are needed")
     first = bind(means, covars, particles, settings)
-    alone = (first.counts < ENOUGH).cpu().numpy()
-    points, centres = particles.double().cpu().numpy(), means.double().cpu().numpy()[alone]
+    isolated = (first.counts < ENOUGH).cpu().numpy()
+    points, centres = particles.double().cpu().numpy(), means.double().cpu().numpy()[isolated]
     distance, index = cKDTree(points).query(centres, k=NEAREST + 1)
     weights = np.square(1 - np.square(distance[:, :-1] / distance[:, -1:].clip(1e-30)))
     weights = np.where(weights.sum(axis=1, keepdims=True) > 0, weights, 1.0)
     weights /= weights.sum(axis=1, keepdims=True)
     order = np.argsort(index[:, :-1], axis=1)
     rows = np.repeat(np.arange(len(means)), first.counts.cpu().numpy())
-    kept = ~alone[rows]
-    rows = np.concatenate([rows[kept], np.repeat(np.flatnonzero(alone), NEAREST)])
+    kept = ~isolated[rows]
+    rows = np.concatenate([rows[kept], np.repeat(np.flatnonzero(isolated), NEAREST)])
     columns = np.concatenate([first.indices.cpu().numpy()[kept], np.take_along_axis(index, order, 1).ravel()])
     values = np.concatenate([first.values.cpu().numpy()[kept], np.take_along_axis(weights, order, 1).ravel()])
     by_row = np.argsort(rows, kind="stable")

@@ -1,4 +1,4 @@
-"""Kernel of :mod:`neuma_lib.coupling.particle_binding`: the points in an ellipsoid, looked for in columns of cells."""
+"""Kernel of :mod:`neuma_lib.coupling.particle_binding`: search for the points in an ellipsoid in columns of cells."""
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
 import warp as wp
@@ -18,7 +18,7 @@ def _sink(
     key: wp.float64,
     value: wp.int32,
 ):
-    """Put a pair at a place of a heap, the last in (key, value) first; what is below the place is a heap."""
+    """Insert a pair at a place of a max-heap ordered by (key, value), whose part below the place is a heap."""
     at, child = place, 2 * place + 1
     while child < size:
         k, other = start + child, start + wp.min(child + 1, size - 1)
@@ -39,7 +39,7 @@ def _sink(
 def _heap(
     keys: wp.array(dtype=wp.float64), values: wp.array(dtype=wp.int32), start: wp.int32, size: wp.int32
 ):
-    """Make pairs a heap."""
+    """Arrange pairs as a max-heap."""
     for k in range(size // 2):
         place = size // 2 - 1 - k
         _sink(keys, values, start, size, place, keys[start + place], values[start + place])
@@ -47,26 +47,28 @@ def _heap(
 
 @wp.kernel(enable_backward=False)
 def search(
-    begins: wp.array(dtype=wp.int32),  # of the points of each column, and the end
+    begins: wp.array(dtype=wp.int32),  # first point of each column, and the end
     depths: wp.array(dtype=wp.int32),  # cell of each point along its column, ascending
     order: wp.array(dtype=wp.int32),  # index of each point
     points: wp.array(dtype=wp.vec3d),  # column after column
-    across: wp.int32,  # columns along y
+    across: wp.int32,  # number of columns along y
     centres: wp.array(dtype=wp.vec3d),
     whitening: wp.array(dtype=wp.mat33d),
-    first: wp.array(dtype=wp.vec3i),  # cells that the box of each ellipsoid meets
+    first: wp.array(dtype=wp.vec3i),  # first and last cell in the bounding box of each ellipsoid
     last: wp.array(dtype=wp.vec3i),
     threshold: wp.float64,
-    most: wp.int32,
-    counts: wp.array(dtype=wp.int32),  # out: points in each ellipsoid, up to `most`; None: rows are known
-    starts: wp.array(dtype=wp.int32),  # of the rows of what is found, and the end
-    distances: wp.array(dtype=wp.float64),  # scratch, like `found`
-    found: wp.array(dtype=wp.int32),  # out: the nearest points, by index, as many as the row has room for
+    limit: wp.int32,
+    counts: wp.array(dtype=wp.int32),  # out: points in each ellipsoid, up to `limit`; None: rows are known
+    starts: wp.array(dtype=wp.int32),  # start of each row of `nearest`, and the end
+    distances: wp.array(dtype=wp.float64),  # scratch, shaped like `nearest`
+    nearest: wp.array(
+        dtype=wp.int32
+    ),  # out: the nearest points, sorted by index, as many as fit into the row
 ):
-    """The points in each ellipsoid: how many they are, or which."""
+    """Number of the points in each ellipsoid, or their indices."""
     g = wp.tid()
     centre, to_ball, low, high = centres[g], whitening[g], first[g], last[g]
-    start, room = wp.int32(0), wp.int32(most)
+    start, room = wp.int32(0), wp.int32(limit)
     if starts:
         start = wp.int32(starts[g])
         room = starts[g + 1] - start
@@ -75,7 +77,7 @@ def search(
         for y in range(low[1], high[1] + 1):
             place, end = wp.int32(begins[x * across + y]), wp.int32(begins[x * across + y + 1])
             past = wp.int32(end)
-            while place < past:  # the first point that is as deep as the box
+            while place < past:  # binary search for the first point in the box
                 middle = (place + past) // 2
                 if depths[middle] < low[2]:
                     place = middle + 1
@@ -86,7 +88,7 @@ def search(
                     break
                 offset = points[place] - centre
                 distance = wp.float64(0.0)
-                for axis in range(3):  # the thinnest one first: discs leave most points out
+                for axis in range(3):  # the shortest axis first, which excludes most points of a disc
                     if distance <= bound:
                         along = wp.dot(to_ball[axis], offset)
                         distance += along * along
@@ -94,23 +96,23 @@ def search(
                     if not counts:
                         if count < room:
                             distances[start + count] = distance
-                            found[start + count] = order[place]
-                        elif distance < bound or order[place] < found[start]:
-                            _sink(distances, found, start, room, 0, distance, order[place])
+                            nearest[start + count] = order[place]
+                        elif distance < bound or order[place] < nearest[start]:
+                            _sink(distances, nearest, start, room, 0, distance, order[place])
                         if count >= room - 1:
                             if count == room - 1:
-                                _heap(distances, found, start, room)
+                                _heap(distances, nearest, start, room)
                             bound = distances[start]
                     count += 1
                 place += 1
     if counts:
         counts[g] = count
-    else:  # sorted by index alone: the last one is taken out of the heap again and again
+    else:  # heap sort by index
         for k in range(room):
             distances[start + k] = wp.float64(0.0)
-        _heap(distances, found, start, room)
+        _heap(distances, nearest, start, room)
         for k in range(room - 1):
             size = room - 1 - k
-            value = found[start + size]
-            found[start + size] = found[start]
-            _sink(distances, found, start, size, 0, wp.float64(0.0), value)
+            value = nearest[start + size]
+            nearest[start + size] = nearest[start]
+            _sink(distances, nearest, start, size, 0, wp.float64(0.0), value)

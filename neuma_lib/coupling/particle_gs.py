@@ -1,4 +1,4 @@
-"""Particle-GS (paper Sec. 3.3): Gaussians carried by simulated particles and splatted into images."""
+"""Particle-GS (paper Sec. 3.3): Gaussians moved by simulated particles and rendered to images."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.rasterizer import rasterize, rasterized_error
 
 _CACHE_BYTES = 16e6
-"""Memory of the buffers of one batch of frames on a CPU, so that they stay in its cache."""
+"""Size of the buffers of one batch of frames on a CPU, so that they stay in its cache."""
 _GPU_SHARE, _GPU_BYTES = 1 / 16, 4e9
-"""The same on a GPU: part of its memory, and the most. Every batch costs the host about a millisecond."""
+"""The same on a GPU: fraction of its memory, and maximum. A batch has an overhead of about one millisecond."""
 
 
 def _batch_bytes(device: torch.device) -> float:
@@ -34,9 +34,9 @@ class ParticleGS:
         x0: particle positions at t = 0 [m], shape (N, 3).
         cameras: V views.
         background: colour behind the Gaussians.
-        covariance_gradient: whether gradients reach the particles through the covariances as well as the means.
-        affine: whether Gaussians beside their particles follow the affine motion of these (`deform` with arms).
-        eps2d: variance that a pixel adds to a splat [px^2]; Gaussians of `fit_gaussians` hold it already.
+        covariance_gradient: propagate gradients to the particles through covariances too, not only means.
+        affine: Gaussians follow the affine motion of their particles (`deform` with arms).
+        eps2d: variance added to a splat by a pixel [px^2]; Gaussians of `fit_gaussians` already include it.
     """
 
     def __init__(
@@ -72,11 +72,11 @@ class ParticleGS:
         return self._rasterized(means, covars)[0]
 
     def coverage(self, x: Tensor, F: Tensor) -> Tensor:
-        """How far the body covers each pixel, (T, V, H, W, 1) in [0, 1], for states as they are rendered."""
+        """Coverage of each pixel by the body, (T, V, H, W, 1) in [0, 1]."""
         return self._rasterized(*self.deformed(x, F))[1][..., None]
 
     def layer(self, x: Tensor, F: Tensor) -> Tensor:
-        """Colours over the background and coverage together, (T, V, H, W, 4), for states as they are rendered."""
+        """Colours over the background, and coverage, (T, V, H, W, 4)."""
         colours, alpha = self._rasterized(*self.deformed(x, F))
         return torch.cat([colours, alpha[..., None]], dim=-1)
 
@@ -85,7 +85,7 @@ class ParticleGS:
         return self.splatted_error(*self.deformed(x, F), observed)
 
     def splatted_error(self, means: Tensor, covars: Tensor, observed: Tensor) -> Tensor:
-        """The same of deformed Gaussians, as `splatted` takes them."""
+        """`error` of deformed Gaussians, with the arguments of `splatted`."""
         return rasterized_error(*self._arguments(means, covars), observed, **self._look)
 
     def _rasterized(self, means: Tensor, covars: Tensor) -> tuple[Tensor, Tensor]:
@@ -97,12 +97,12 @@ class ParticleGS:
 
     @property
     def frames_per_batch(self) -> int:
-        """Frames to render together, forward and backward: estimated by the bytes of images and projected Gaussians."""
+        """Number of frames to render together, estimated from the size of images and projected Gaussians."""
         return self._frames(14)
 
     @property
     def frames_per_error(self) -> int:
-        """The same where only the `error` of images is wanted, which a GPU does not keep."""
+        """Number of frames to compute the `error` of together; a GPU does not store their images."""
         return self._frames(14 if self.x0.device.type == "cpu" else 5)
 
     def _frames(self, numbers: int) -> int:
@@ -113,7 +113,7 @@ class ParticleGS:
     def batches(self, x: Tensor, F: Tensor, size: int | None = None) -> Iterator[tuple[slice, Tensor]]:
         """Render ``size`` frames at a time (None: `frames_per_batch`): yields (slice of frames, images).
 
-        States may be on another device than the Gaussians, so that memory there stays bounded too.
+        States may be on another device than the Gaussians, to save memory.
         """
         size = size or self.frames_per_batch
         for start in range(0, len(x), size):

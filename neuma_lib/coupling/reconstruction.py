@@ -1,4 +1,4 @@
-"""What the optimisation loops may know: the reconstructed body, and the frames that the cameras saw."""
+"""A reconstructed body: particles, Gaussians and their binding."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Reconstruction:
         mass: particle masses [kg], shape (N,).
         gaussians: static Gaussians, G of them.
         binding: (G, N) binding matrix.
-        affine: whether Gaussians follow the affine motion of their particles, not only the mean shift (`deform`).
+        affine: Gaussians follow the affine motion of their particles, not only the mean displacement (`deform`).
     """
 
     x0: Tensor
@@ -40,16 +40,16 @@ class Reconstruction:
 
     @classmethod
     def of_gaussians(cls, gaussians: Gaussians, volume: float, density: Density) -> Reconstruction:
-        """The Gaussians as particles (the paper's w/o Bind), one each, with equal shares of the volume [m^3]."""
+        """One particle per Gaussian (the paper's w/o Bind), with equal shares of the volume [m^3]."""
         count = len(gaussians.means)
         vol0 = torch.full_like(gaussians.means[:, 0], volume / count)
         mass = vol0 * density_at(gaussians.means, density)
         return cls(gaussians.means, vol0, mass, gaussians, Binding.identity(count, gaussians.means))
 
-    def refilled(
+    def resampled(
         self, x: Tensor, volume: float, density: Density, settings: BindingConfig | None = None
     ) -> Reconstruction:
-        """The same Gaussians on other particles x (N', 3) [m], which share a volume [m^3] evenly."""
+        """The same Gaussians with other particles x (N', 3) [m], which have equal shares of a volume [m^3]."""
         gaussians = self.gaussians
         binding, x0, _, vol0 = bind_two_pass(gaussians.means, gaussians.covars(), x, volume, settings)
         x0, vol0 = x0.to(self.x0), vol0.to(self.x0)
@@ -62,11 +62,11 @@ class Reconstruction:
         spin: Sequence[float] | Tensor = (0.0, 0.0, 0.0),
         centre: Sequence[float] | Tensor | None = None,
     ) -> State:
-        """The particles at t = 0 with the velocity v0 [m/s] and the spin [rad/s] of `State.thrown`."""
+        """The particles at t = 0 with velocity v0 [m/s] and angular velocity ``spin`` [rad/s] (`State.thrown`)."""
         return State.thrown(self.x0, self.mass, self.vol0, v0, spin, centre)
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Reconstruction:
-        """The same body in another precision or on another device."""
+        """The same body with another dtype or on another device."""
         kind = dict(dtype=dtype, device=device)
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return Reconstruction(**{

@@ -1,9 +1,9 @@
 """Ground truth of a synthetic benchmark: known shapes of known materials, simulated by the same MPM.
 
-Only evaluation and the particle-supervised ablation may read what this module makes. It differs from the
-reconstruction in its particles (more, of another seed) and its law (analytic). Integrator and walls are the same and
-so are, by default, grid and time step: as in the paper, a law is judged in the discretisation that it was learned in.
-`dataset.grid`, `dataset.dt` and `scenes.<name>.truth` make a truth that is finer.
+Only evaluation and the particle-supervised ablation may read it. It differs from the reconstruction in its particles
+(more, with another seed) and its law (analytic). Integrator and walls are the same. Grid and time step are the same by
+default, because the paper evaluates a law in the discretisation of its training. `dataset.grid`, `dataset.dt` and
+`scenes.<name>.truth` refine the truth.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from neuma_lib.sim.state import State, Trajectory
 
 @dataclass(frozen=True)
 class TrueBody:
-    """A solid where it starts.
+    """A solid at its initial position.
 
     Attributes:
-        mesh: its surface, watertight [m].
+        mesh: surface, watertight [m].
         law: analytic material.
         velocity: initial velocity [m/s].
         density: mass density [kg/m^3], see `neuma_lib.mechanics.density`.
@@ -44,13 +44,13 @@ class TrueBody:
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """Simulated bodies, the particles of one after those of another.
+    """Simulated bodies, with concatenated particles.
 
     Attributes:
         frames: simulation steps of the frames, length T.
         path: particle states at the frames (x [m], v [m/s], F), N particles.
         tracers: passive tracers from a jittered grid in the true shapes [m], shape (T, M, 3).
-        tracers_again: tracers from another jittered grid, shape (T, M', 3): their distance to ``tracers`` is the
+        tracers_again: tracers from another jittered grid, shape (T, M', 3). Their distance to ``tracers`` is the
             sampling floor of the Chamfer distance.
         vol0: particle volumes [m^3], shape (N,).
         mass: particle masses [kg], shape (N,).
@@ -74,20 +74,20 @@ def simulate_ground_truth(
     seed: int,
     device: torch.device | str = "cpu",
 ) -> GroundTruth:
-    """Fill placed watertight meshes with particles and simulate them on one grid.
+    """Fill bodies with particles and simulate them on one grid.
 
     Args:
         model: simulator constants.
-        bodies: what moves.
-        frames: steps to keep, 0 is the start.
-        particles: wanted count in each body.
-        tracers: wanted count in all bodies together, equally dense in each.
+        bodies: simulated bodies.
+        frames: steps to store, 0 is the start.
+        particles: requested number in each body.
+        tracers: requested number in all bodies together, with uniform density.
         seed: of particle and tracer positions.
-        device: where to simulate; the result is on the CPU.
+        device: of the simulation; the result is on the CPU.
 
     Raises:
-        InputError: a mesh is not watertight or lies outside the domain, bodies overlap, or the time step is too
-            large for a law.
+        InputError: a mesh is not watertight or outside the domain, bodies overlap, or the time step is too large for a
+            law.
     """
     check_apart([body.mesh for body in bodies])
     solids = []

@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 
 from neuma_lib.config.figures import FiguresConfig
 from neuma_lib.errors import InputError
-from neuma_lib.evaluation.figures.material_response import VISITED
 from neuma_lib.evaluation.material_point import Visited
 from neuma_lib.evaluation.plotting import style
 from neuma_lib.evaluation.response import tests_within
+from neuma_lib.evaluation.stress_curves import VISITED
 from neuma_lib.io.files import one_line
 from neuma_lib.mechanics.law import Law
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -18,7 +19,7 @@ from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.evaluation.metrics import mechanical_energy, tracer_errors
 from neuma_lib.geometry.chamfer import chamfer_sequence
 from neuma_lib.mechanics.law import Law
-from neuma_lib.sim.model import Body, MPMModel, as_bodies
+from neuma_lib.sim.model import Body, MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
@@ -133,9 +134,19 @@ def energy_gain_after(gravity: Sequence[float], start: State, path: Trajectory) 
     return path.frames[first - 1] if first else 0
 
 
+class Predictor(Protocol):
+    """What predicts a motion: a model of `neuma_lib.methods.model`."""
+
+    def predict(
+        self, mpm: MPMModel, state: State, frames: Sequence[int], tracers: Tensor | None, total: bool
+    ) -> tuple[Trajectory, Failure | None]: ...
+
+    def courant(self, mpm: MPMModel, state: State) -> float | None: ...
+
+
 def evaluate(
-    model: MPMModel,
-    law: Law | Sequence[Body],
+    mpm: MPMModel,
+    motion: Predictor,
     start: State,
     frames: Sequence[int],
     truth: Tensor,
@@ -147,59 +158,28 @@ def evaluate(
     """Tracer error from identical starts, Chamfer distance over the sequence, and its sampling floor.
 
     Args:
-        model: simulator constants.
-        law: material to judge, or several with their ranges of particles.
+        mpm: simulator constants.
+        motion: model to evaluate.
         start: reconstructed particles with the estimated initial motion.
         frames: simulation steps, T of them.
         truth: tracers of the ground truth [m], shape (T, M, 3).
-        truth_again: tracers of the ground truth from another sampling of the shape, shape (T, M'', 3).
+        truth_again: tracers of the ground truth from another sampling of the shape [m], shape (T, M'', 3).
         tracers: start positions inside the reconstructed shape [m], shape (M', 3).
         total: also carry the total deformation.
-        floor: Chamfer distances of the truth's two samplings, the same for all laws, shape (T,); None: measured here.
+        floor: Chamfer distances between the truth's two samplings, shape (T,). None: computed here.
 
     Raises:
-        InputError: other counts than a sampling's tolerance allows, with which the floor is not that of the distance.
-    """
-
-    def predicted(starts: Tensor) -> tuple[Trajectory, Failure | None]:
-        return predict(model, law, start, frames, starts, total)
-
-    def courant() -> float:
-        return max(
-            model.courant(part.law, float(start.density[part.start : part.stop].min()))
-            for part in as_bodies(law, len(start.x))
-        )
-
-    return judge(predicted, courant, start, model.gravity, frames, truth, truth_again, tracers, floor)
-
-
-def judge(
-    predicted: Callable[[Tensor], tuple[Trajectory, Failure | None]],
-    courant: Callable[[], float | None],
-    start: State,
-    gravity: Sequence[float],
-    frames: Sequence[int],
-    truth: Tensor,
-    truth_again: Tensor,
-    tracers: Tensor,
-    floor: Tensor | None = None,
-) -> Evaluation:
-    """The measures of `evaluate`, of whatever moves particles and tracers.
-
-    Args:
-        predicted: called with the starts of all tracers; gives the path with them, and how it failed.
-        courant: gives the Courant number of the simulation, None where it has none.
-        start: what it starts from.
-        gravity: acceleration [m/s^2].
-        frames, truth, truth_again, tracers, floor: as there.
+        InputError: counts of tracers that differ by more than `COUNT_TOLERANCE`. The floor holds for equal counts.
     """
     counts = [truth.shape[1], truth_again.shape[1], len(tracers)]
     if max(counts) > (1 + COUNT_TOLERANCE) * min(counts):
         raise InputError(
-            f"the truth has {counts[0]} and {counts[1]} tracers, the prediction {counts[2]}: the sampling floor is "
-            "that of equal counts. Set evaluation.tracers to the dataset.tracers that the truth was made with"
+            "evaluation.tracers",
+            f"the truth has {counts[0]} and {counts[1]} tracers, the prediction has {counts[2]}, and the sampling "
+            "floor holds for equal counts",
+            "Set it to the dataset.tracers of the truth",
         )
-    path, failure = predicted(torch.cat([tracers, truth[0].to(tracers)]))
+    path, failure = motion.predict(mpm, start, frames, torch.cat([tracers, truth[0].to(tracers)]), total)
     ours, same_start = path.tracers[:, : len(tracers)], path.tracers[:, len(tracers) :]
     chamfer = chamfer_sequence(ours, truth)
     floor = chamfer_sequence(truth_again, truth) if floor is None else floor
@@ -212,8 +192,8 @@ def judge(
         "frames": list(frames),
         "chamfer_per_frame": [float(c) for c in chamfer],
         "chamfer_floor_per_frame": [float(c) for c in floor],
-        "courant": courant(),
-        "energy_gain_after_step": energy_gain_after(gravity, start, path),
+        "courant": motion.courant(mpm, start),
+        "energy_gain_after_step": energy_gain_after(mpm.gravity, start, path),
         "diverged_at_step": failure and failure.step,
         "diverged": failure and asdict(failure),
     }

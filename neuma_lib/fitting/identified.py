@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.coupling.initial_motion import Throw
 from neuma_lib.fitting.families import Family
-from neuma_lib.fitting.throw import Throw
 from neuma_lib.mechanics.combinations import Values, named_combinations, physical
 
 

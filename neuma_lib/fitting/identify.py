@@ -32,6 +32,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.coupling.initial_motion import Throw
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.families import Family
@@ -43,7 +44,6 @@ from neuma_lib.fitting.least_squares import (
     jackknife,
     levenberg_marquardt,
 )
-from neuma_lib.fitting.throw import Throw
 from neuma_lib.fitting.thrown_video import MOTION, NUISANCES, ThrownVideo, Try, averaged
 from neuma_lib.mechanics.combinations import Values
 from neuma_lib.sim.model import MPMModel

@@ -271,16 +271,7 @@ def train_material(
         model.check_courant(law, min(float(start.density.min()) for start, _ in videos))
     law.set_adjoint_precision(settings.adjoint_precision)
     loop = _Loop(model, law, videos, settings, log, stretch)
-    if checkpoint is not None and (state := checkpoint.load()) is not None:
-        loop.load_state_dict(state)
-        log(f"resumed at iteration {loop.iteration} of {settings.iterations}")
-    while loop.iteration < settings.iterations and not loop.ended:
-        loop.advance()
-        if progress:
-            progress(loop.iteration, settings.iterations, loop.history.loss[-1])
-        if checkpoint is not None and loop.iteration % settings.checkpoint_every == 0:
-            checkpoint.save(loop.state_dict())
-    loop.judge_last_step()
+    loop.run(checkpoint, progress)
     law.load_state_dict(loop.best["law"])
     return TrainedMaterial(
         law,
@@ -326,7 +317,6 @@ class _Loop(TrainingLoop):
                 self.deviation = Deviation.of_videos(law, paths, model.dt)
 
     def advance(self) -> None:
-        """One accepted optimiser step, or a return to the best state."""
         started = time.perf_counter()
         try:
             frame_losses = self._frame_losses()
@@ -354,17 +344,8 @@ class _Loop(TrainingLoop):
         self.lr_scale = min(1.0, self.lr_scale * self.settings.recovery_growth)
         self.iteration += 1
 
-    def judge_last_step(self) -> None:
-        """Whether the state after the last optimiser step is the best one."""
-        if self.ended:
-            return
-        try:
-            with torch.no_grad():
-                value = _mean(self._frame_losses())
-        except NonFiniteError:
-            return
-        if math.isfinite(value):
-            self.best = self._better_state(value)
+    def _mean_loss(self) -> float:
+        return _mean(self._frame_losses())
 
     def _frame_losses(self) -> list[Tensor]:
         """Losses of the frames of every video, shape (T,) each; the penalty, times the first loss, is added to all."""

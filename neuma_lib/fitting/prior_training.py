@@ -104,5 +104,5 @@ def remark(report: Mapping[str, Any]) -> str:
         return text
     return (
         f"{text}. WARNING: this prior follows its law only roughly (below {CLOSE:g}e-4 m^2 is close); what is learned "
-        "from it starts there, not at the law (docs/guide.md, How close is a prior)"
+        "from it starts there, not at the law (docs/materials.md, Priors)"
     )

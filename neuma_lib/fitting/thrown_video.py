@@ -18,10 +18,10 @@ from torch import Tensor
 
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.coupling.filmed import Filmed
+from neuma_lib.coupling.initial_motion import Throw
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.frame_batches import first_contact, frame_batches, held_out_frames, spread_frames
-from neuma_lib.fitting.throw import Throw
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.batch import rollout_batch
 from neuma_lib.sim.model import MPMModel

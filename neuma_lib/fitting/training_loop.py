@@ -8,10 +8,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar
 
+import torch
 from torch.optim import Optimizer
 
 from neuma_lib.config.material import MaterialConfig
 from neuma_lib.errors import NonFiniteError
+from neuma_lib.io.checkpoint import Checkpoint
 
 
 class TrainingLoop(ABC):
@@ -40,6 +42,45 @@ class TrainingLoop(ABC):
         self.iteration, self.lr_scale, self.ended = 0, 1.0, False
         self.history, self.first_loss = history, first_loss
         self.best = {"loss": math.inf, "iteration": 0, **self._snapshot()}
+
+    def run(
+        self, checkpoint: Checkpoint | None = None, progress: Callable[[int, int, float], None] | None = None
+    ) -> None:
+        """Advance to the last iteration.
+
+        Args:
+            checkpoint: where to keep the state, so that a killed run goes on; None keeps none.
+            progress: called with (iteration, iterations, loss).
+        """
+        settings = self.settings
+        if checkpoint is not None and (state := checkpoint.load()) is not None:
+            self.load_state_dict(state)
+            self.log(f"resumed at iteration {self.iteration} of {settings.iterations}")
+        while self.iteration < settings.iterations and not self.ended:
+            self.advance()
+            if progress:
+                progress(self.iteration, settings.iterations, self.history.loss[-1])
+            if checkpoint is not None and self.iteration % settings.checkpoint_every == 0:
+                checkpoint.save(self.state_dict())
+        self._judge_last_step()
+
+    @abstractmethod
+    def advance(self) -> None:
+        """One accepted optimiser step, or a return to the best state."""
+
+    @abstractmethod
+    def _mean_loss(self) -> float:
+        """The loss of the present state."""
+
+    def _judge_last_step(self) -> None:
+        """Whether the state after the last optimiser step is the best one."""
+        if self.ended:
+            return
+        try:
+            with torch.no_grad():
+                self.best = self._better_state(self._mean_loss())
+        except NonFiniteError:
+            return
 
     @abstractmethod
     def _snapshot(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Chamfer distance of two point sets, as a measure (paper Sec. 4.1) and as a loss."""
+"""Chamfer distance of two point sets, as a metric (paper Sec. 4.1) and as a loss."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.geometry.nearest import nearest
 
 CHAMFER_SCALE = 1e4
-"""The paper reports squared metres times this."""
+"""Factor of squared metres in the paper's unit."""
 
 
 def _points(points: Tensor | np.ndarray, name: str) -> np.ndarray:
     array = points.detach().cpu().numpy() if isinstance(points, Tensor) else np.asarray(points)
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0:
-        raise InputError(f"chamfer: {name} has shape {array.shape}; expected a non-empty (n, 3)")
+        raise InputError(f"chamfer: {name}", f"has shape {array.shape}, expected a non-empty (n, 3)")
     if not np.isfinite(array).all():
-        raise InputError(f"chamfer: {name} holds values that are not finite")
+        raise InputError(f"chamfer: {name}", "has values that are not finite")
     return array
 
 
@@ -30,7 +30,7 @@ def chamfer(a: Tensor | np.ndarray, b: Tensor | np.ndarray) -> float:
     Raises:
         InputError: an empty set, a wrong shape, or values that are not finite.
     """
-    a, b = _points(a, "the first set"), _points(b, "the second set")
+    a, b = _points(a, "a"), _points(b, "b")
     return float(chamfer_sequence(torch.from_numpy(a)[None], torch.from_numpy(b)[None]))
 
 
@@ -38,51 +38,53 @@ def chamfer_sequence(a: Tensor, b: Tensor) -> Tensor:
     """Chamfer distance of each frame: a (T, n, 3) and b (T, m, 3) [m] -> (T,) in 1e-4 m^2, float64, on the CPU.
 
     Raises:
-        InputError: another number of frames, or values that are not finite.
+        InputError: different numbers of frames, or values that are not finite.
     """
     if len(a) != len(b):
-        raise InputError(f"chamfer: {len(a)} frames against {len(b)}")
-    for points, name in ((a, "the first set"), (b, "the second set")):
+        raise InputError("chamfer", f"a has {len(a)} frames, b has {len(b)}")
+    for points, name in ((a, "a"), (b, "b")):
         if not bool(points.isfinite().all()):
-            raise InputError(f"chamfer: {name} holds values that are not finite")
+            raise InputError(f"chamfer: {name}", "has values that are not finite")
     with torch.no_grad():
-        there, back = _squares(a.double(), b.double())
-    means = [x.mean() + y.mean() for x, y in zip(there, back, strict=True)]
+        forward, backward = _squared_distances(a.double(), b.double())
+    means = [x.mean() + y.mean() for x, y in zip(forward, backward, strict=True)]
     return CHAMFER_SCALE * torch.stack(means).cpu()
 
 
 def chamfer_loss(x: Tensor, targets: Tensor | Sequence[Tensor]) -> Tensor:
     """Chamfer distance [m^2] of each frame, differentiable in x.
 
-    The nearest neighbours are found for all frames at once, on the device of x, and held fixed in the gradient, which
-    is exact where no point is equally near to two others.
+    Nearest neighbours are computed for all frames at once on the device of x, and are constant in the gradient, which
+    is exact unless a point is equally near to two others.
 
     Args:
         x: simulated particles [m], shape (T, N, 3).
-        targets: points to match [m], T sets of shape (M, 3), where M may differ from set to set.
+        targets: points to match [m], T sets of shape (M, 3), where M may differ between sets.
 
     Returns:
         Losses, shape (T,).
 
     Raises:
-        InputError: another number of frames than targets.
-        NonFiniteError: a particle that is not finite.
+        InputError: different numbers of frames and targets.
+        NonFiniteError: a particle is not finite.
     """
     if len(x) != len(targets):
-        raise InputError(f"chamfer_loss: {len(x)} frames against {len(targets)}")
+        raise InputError("chamfer_loss", f"x has {len(x)} frames, targets has {len(targets)}")
     finite = x.detach().isfinite().all(dim=2)
     if not bool(finite.all()):
         frame, particle = (~finite).nonzero()[0].tolist()
         raise NonFiniteError("chamfer_loss", f"particle {particle} of frame {frame} is not finite")
-    means = [a.mean() + b.mean() for a, b in zip(*_squares(x, targets), strict=True)]
+    means = [a.mean() + b.mean() for a, b in zip(*_squared_distances(x, targets), strict=True)]
     return torch.stack(means)
 
 
-def _squares(x: Tensor, targets: Tensor | Sequence[Tensor]) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
-    """Squared distances of each set of x to the nearest of its targets, and of these to the nearest of x [m^2]."""
-    own, there = [x.shape[1]] * len(x), [len(target) for target in targets]
+def _squared_distances(
+    x: Tensor, targets: Tensor | Sequence[Tensor]
+) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+    """Squared distances [m^2] of each set of x to the nearest of its targets, and of the targets to the nearest x."""
+    counts, target_counts = [x.shape[1]] * len(x), [len(target) for target in targets]
     points, goals = x.reshape(-1, 3), torch.cat([target.to(x) for target in targets])
     fixed = points.detach()
-    forward = (points - goals[nearest(goals, there, fixed, own)]).square().sum(-1)
-    backward = (points[nearest(fixed, own, goals, there)] - goals).square().sum(-1)
-    return forward.split(own), backward.split(there)
+    forward = (points - goals[nearest(goals, target_counts, fixed, counts)]).square().sum(-1)
+    backward = (points[nearest(fixed, counts, goals, target_counts)] - goals).square().sum(-1)
+    return forward.split(counts), backward.split(target_counts)

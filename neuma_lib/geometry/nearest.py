@@ -1,7 +1,7 @@
-"""Nearest neighbours between many pairs of point sets at once, on the device where they lie: cells and rings.
+"""Nearest neighbours between many pairs of point sets at once, on their device.
 
-The points of a set are sorted into the cubic cells of a grid about them. A search begins in the cell of the query and
-goes on in rings of cells until no point outside can be nearer, so it is exact however far the query is.
+The points of a set are sorted into the cubic cells of a grid. A search begins in the cell of the query and proceeds in
+rings of cells until no point outside can be nearer, so the result is exact at any distance.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -20,18 +20,18 @@ start_warp()
 
 @functools.cache
 def _kernels(dtype: torch.dtype) -> SimpleNamespace:
-    """Kernel `search`, over the queries, for a precision."""
+    """Kernel `search`, over the queries, for a dtype."""
     real = {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
     vec3 = wp.types.vector(length=3, dtype=real)
     module = wp.get_module(f"{__name__}.{str(dtype).removeprefix('torch.')}")
 
     @wp.func
     def beyond(q: vec3, c: wp.vec3i, shape: wp.vec3i, width: real, ring: wp.int32):
-        """Lower bound of the squared distance from q to what lies outside the rings 0 .. ring about its cell c.
+        """Lower bound of the squared distance from q to the points outside the rings 0 .. ring about its cell c.
 
-        Infinite if nothing does. Positions are relative to the corner of the grid, where all points are.
+        Infinite if the rings cover the grid. Positions are relative to the corner of the grid.
         """
-        out = vec3()  # from q to the grid along each axis
+        out = vec3()  # distance from q to the grid along each axis
         for a in range(3):
             out[a] = wp.max(wp.max(-q[a], q[a] - width * real(shape[a])), real(0.0))
         bound = real(wp.inf)
@@ -48,16 +48,16 @@ def _kernels(dtype: torch.dtype) -> SimpleNamespace:
     @wp.kernel(enable_backward=False, module=module)
     def search(
         points: wp.array(dtype=vec3),  # sorted by cell
-        starts: wp.array(dtype=wp.int32),  # of each cell, and the end
+        starts: wp.array(dtype=wp.int32),  # first point of each cell, and the end
         corner: wp.array(dtype=vec3),  # of the grid of each set
         width: wp.array(dtype=real),
         shape: wp.array(dtype=wp.vec3i),
-        first: wp.array(dtype=wp.int32),  # cell of each set
+        first: wp.array(dtype=wp.int32),  # first cell of each set
         queries: wp.array(dtype=vec3),
-        of: wp.array(dtype=wp.int32),  # set that each query searches
+        of: wp.array(dtype=wp.int32),  # set of each query
         out: wp.array(dtype=wp.int32),
     ):
-        """Position of the point nearest to each query."""
+        """Index of the point nearest to each query."""
         k = wp.tid()
         s = of[k]
         w, n = width[s], shape[s]
@@ -65,7 +65,7 @@ def _kernels(dtype: torch.dtype) -> SimpleNamespace:
         c = wp.vec3i()
         for a in range(3):
             c[a] = wp.clamp(wp.int32(wp.floor(wp.clamp(q[a] / w, real(-1.0), real(n[a])))), 0, n[a] - 1)
-        best, found = real(wp.inf), wp.int32(-1)
+        best, closest = real(wp.inf), wp.int32(-1)
         for ring in range(wp.max(n[0], wp.max(n[1], n[2]))):
             for i in range(wp.max(c[0] - ring, 0), wp.min(c[0] + ring + 1, n[0])):
                 for j in range(wp.max(c[1] - ring, 0), wp.min(c[1] + ring + 1, n[1])):
@@ -75,24 +75,24 @@ def _kernels(dtype: torch.dtype) -> SimpleNamespace:
                         if m >= 0 and m < n[2]:
                             cell = first[s] + (i * n[1] + j) * n[2] + m
                             for p in range(starts[cell], starts[cell + 1]):
-                                apart = points[p] - queries[k]
-                                distance = wp.dot(apart, apart)
+                                offset = points[p] - queries[k]
+                                distance = wp.dot(offset, offset)
                                 if distance < best:
-                                    best, found = distance, p
+                                    best, closest = distance, p
             if best <= beyond(q, c, n, w, ring):
                 break
-        out[k] = found
+        out[k] = closest
 
     return SimpleNamespace(search=search)
 
 
 def nearest(points: Tensor, points_of: Sequence[int], queries: Tensor, queries_of: Sequence[int]) -> Tensor:
-    """For each query the nearest point of its set.
+    """Nearest point of its set for each query.
 
     Args:
         points: finite positions [m], shape (P, 3), set after set.
-        points_of: number of points in each set, none of them zero.
-        queries: finite positions [m], shape (Q, 3), ordered alike.
+        points_of: number of points in each set, at least one.
+        queries: finite positions [m], shape (Q, 3), in the order of the sets.
         queries_of: number of queries of each set.
 
     Returns:
@@ -108,7 +108,7 @@ def nearest(points: Tensor, points_of: Sequence[int], queries: Tensor, queries_o
         )
         for kind in ("amin", "amax")
     )
-    # As many cells along the longest side as make no more cells than points.
+    # as many cells along the longest side as possible without more cells than points
     extent = (high - low).amax(dim=1)
     along = sizes.to(points).pow(1 / 3).floor().clamp(min=1)
     width = (extent / along).clamp(min=torch.finfo(points.dtype).tiny ** 0.25)
@@ -116,9 +116,9 @@ def nearest(points: Tensor, points_of: Sequence[int], queries: Tensor, queries_o
     shape = torch.minimum(shape, along[:, None].long())
     cells = shape.prod(dim=1)
     first = cells.cumsum(0) - cells
-    place = ((points - low[of]) / width[of, None]).floor().long().clamp(min=0)
-    place = torch.minimum(place, shape[of] - 1)
-    cell = first[of] + (place[:, 0] * shape[of, 1] + place[:, 1]) * shape[of, 2] + place[:, 2]
+    index = ((points - low[of]) / width[of, None]).floor().long().clamp(min=0)
+    index = torch.minimum(index, shape[of] - 1)
+    cell = first[of] + (index[:, 0] * shape[of, 1] + index[:, 1]) * shape[of, 2] + index[:, 2]
     order = cell.argsort(stable=True)
     counts = torch.bincount(cell, minlength=int(cells.sum()))
     starts = torch.cat([counts.new_zeros(1), counts.cumsum(0)])

@@ -1,4 +1,4 @@
-"""Repair of surfaces with MeshLab (Cignoni et al. 2008, through pymeshlab): one closed body of even triangles."""
+"""Repair and isotropic remeshing of surfaces with MeshLab (Cignoni et al. 2008, by pymeshlab)."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from neuma_lib.errors import InputError
 from neuma_lib.extras import require
 from neuma_lib.geometry.volume import check_mesh
 
-MOST_HOLE_EDGES = 1000
-"""Longest border of a hole that is closed, in edges."""
+MAX_HOLE_EDGES = 1000
+"""Maximum number of edges of a hole that is closed."""
 _ROUNDS = 4
-"""Times that what crosses is cut out and closed again."""
+"""Attempts to remove self-intersections and close the holes."""
 _REMESHINGS = 6
 """Iterations of the remeshing."""
 _WRAP = (4.0, 0.05)
-"""Size of the openings that a wrapping does not enter, and its distance from the surface, in edge lengths."""
+"""Alpha and offset of the alpha wrapping, in edge lengths."""
 
-_LEAST_THICKNESS = 0.15
-"""Volume over surface of what was wrapped that makes it a body, in edge lengths; a wrapped sheet has 0.05."""
+_MIN_THICKNESS = 0.15
+"""Minimum volume over area of a wrapped body, in edge lengths; a wrapped sheet has 0.05."""
 
 
 def repaired(mesh: trimesh.Trimesh, edge: float, name: str = "mesh") -> trimesh.Trimesh:
     """A closed surface of one body without self-intersections, of nearly equilateral triangles (isotropic remeshing).
 
-    Double and flat faces, faces that cross others and all bodies but the largest are removed, holes are closed, and
-    faces turned outwards. What this does not mend is wrapped: the surface is then the border of the space that balls
-    of four edges' radius cannot reach from outside (alpha wrapping, Portaneri et al. 2022). The volume is kept.
+    Removes duplicate, degenerate and self-intersecting faces and all bodies but the largest, closes holes, and orients
+    faces outwards. If this fails, the surface is replaced by its alpha wrapping (Portaneri et al. 2022), the border of
+    the space that balls with a radius of four edges cannot reach from outside. The volume is preserved.
 
     Args:
-        mesh: triangles [m], with holes, several bodies, any orientation.
-        edge: wanted length of an edge [m].
+        mesh: triangles [m]; may have holes, several bodies and any orientation.
+        edge: target length of an edge [m].
         name: for messages.
 
     Raises:
@@ -43,17 +43,18 @@ def repaired(mesh: trimesh.Trimesh, edge: float, name: str = "mesh") -> trimesh.
     meshlab()
     if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
         check_mesh(mesh, name)
-    for mend in (_mended, _wrapped):
-        closed = mend(mesh, edge)
+    for repair in (_mended, _wrapped):
+        closed = repair(mesh, edge)
         even = None if closed is None else _mended(_remeshed(closed, edge), edge)
         if even is not None:
-            # remeshing cuts corners; an offset along the normals restores the volume to second order
+            # remeshing shrinks the body; an offset along the normals restores the volume to second order
             whole = even.copy()
             whole.vertices = even.vertices + (closed.volume - even.volume) / even.area * even.vertex_normals
             return whole if _is_sound(whole) else even
     raise InputError(
-        f"{name}: cannot be closed to a body with edges of {1000 * edge:.1f} mm: look at the mattes, take more"
-        " photographs from all sides, or choose shorter edges (photographs.edge, of a splat splat.edge)"
+        name,
+        f"cannot be closed to a body with edges of {1000 * edge:.1f} mm",
+        "Check the mattes, take more photographs from all sides, or reduce photographs.edge (splat.edge for a splat)",
     )
 
 
@@ -68,24 +69,24 @@ def meshlab() -> ModuleType:
 
 
 def crossing_faces(mesh: trimesh.Trimesh) -> int:
-    """How many faces of a mesh cross others that they share no vertex or edge with."""
+    """Number of faces of a mesh that intersect faces without a common vertex or edge."""
     meshes = _opened(mesh)
     meshes.compute_selection_by_self_intersections_per_face()
     return meshes.current_mesh().selected_face_number()
 
 
 def _mended(mesh: trimesh.Trimesh, edge: float) -> trimesh.Trimesh | None:
-    """Its largest body with what crosses and what is flat cut out, holes closed; None where that leaves none."""
+    """The largest body without intersecting or degenerate faces and with closed holes; None if this fails."""
     for attempt in range(_ROUNDS):
         meshes = _opened(mesh)
         meshes.meshing_remove_duplicate_vertices()
         meshes.meshing_remove_duplicate_faces()
         meshes.meshing_remove_null_faces()
         meshes.compute_selection_by_self_intersections_per_face()
-        for _ in range(attempt):  # what was closed and crosses again is cut out more widely
+        for _ in range(attempt):  # each attempt removes a wider neighbourhood
             meshes.apply_selection_dilatation()
         meshes.meshing_remove_selected_faces()
-        if attempt:  # a hole whose border was not to be closed gets another border
+        if attempt:  # change the border of holes that could not be closed
             meshes.meshing_repair_non_manifold_edges(method="Remove Faces")
             meshes.compute_selection_from_mesh_border()
             meshes.meshing_remove_selected_faces()
@@ -97,13 +98,13 @@ def _mended(mesh: trimesh.Trimesh, edge: float) -> trimesh.Trimesh | None:
 
 
 def _closed_up(meshes) -> trimesh.Trimesh:
-    """With edges and vertices of two faces and one fan, and without holes as far as MeshLab can."""
+    """The mesh as a manifold, with holes closed as far as MeshLab can."""
     try:
         meshes.meshing_repair_non_manifold_edges(method="Remove Faces")
         meshes.meshing_repair_non_manifold_vertices()
-        meshes.meshing_close_holes(maxholesize=MOST_HOLE_EDGES)
+        meshes.meshing_close_holes(maxholesize=MAX_HOLE_EDGES)
         meshes.meshing_re_orient_faces_coherently()
-    except meshlab().PyMeshLabException:  # not to be closed like this
+    except meshlab().PyMeshLabException:  # the caller checks the result
         pass
     return _taken(meshes)
 
@@ -113,8 +114,8 @@ def _wrapped(mesh: trimesh.Trimesh, edge: float) -> trimesh.Trimesh | None:
     alpha, offset = (meshlab().PureValue(part * edge) for part in _WRAP)
     meshes.generate_alpha_wrap(alpha=alpha, offset=offset)
     body = _mended(_taken(meshes), edge)
-    # a sheet without an inside is wrapped from both sides
-    return None if body is None or body.volume < _LEAST_THICKNESS * edge * body.area else body
+    # a sheet is wrapped from both sides to a thin body
+    return None if body is None or body.volume < _MIN_THICKNESS * edge * body.area else body
 
 
 def _remeshed(mesh: trimesh.Trimesh, edge: float) -> trimesh.Trimesh:
@@ -126,7 +127,7 @@ def _remeshed(mesh: trimesh.Trimesh, edge: float) -> trimesh.Trimesh:
 
 
 def _largest(mesh: trimesh.Trimesh) -> trimesh.Trimesh | None:
-    """The body with the most surface, turned outwards where it has an inside; None where there is no face."""
+    """The body with the largest area, oriented outwards if closed; None if there are no faces."""
     bodies = mesh.split(only_watertight=False)
     if len(bodies) == 0:
         return None
@@ -137,13 +138,13 @@ def _largest(mesh: trimesh.Trimesh) -> trimesh.Trimesh | None:
 
 
 def _is_sound(mesh: trimesh.Trimesh) -> bool:
-    """Whether it is one closed body, oriented outwards, and no face crosses another."""
+    """Whether a mesh is one closed body, oriented outwards, without self-intersections."""
     closed = mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0 and mesh.body_count == 1
     return bool(closed and crossing_faces(mesh) == 0)
 
 
 def _opened(mesh: trimesh.Trimesh):
-    """A mesh in MeshLab."""
+    """A MeshLab document with the mesh."""
     pymeshlab = meshlab()
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(pymeshlab.Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)))
@@ -152,5 +153,5 @@ def _opened(mesh: trimesh.Trimesh):
 
 def _taken(meshes) -> trimesh.Trimesh:
     """MeshLab's current mesh."""
-    found = meshes.current_mesh()
-    return trimesh.Trimesh(found.vertex_matrix(), found.face_matrix(), process=False)
+    mesh = meshes.current_mesh()
+    return trimesh.Trimesh(mesh.vertex_matrix(), mesh.face_matrix(), process=False)

@@ -1,12 +1,11 @@
 """Procedural solids of the benchmarks: a ball, a duck, a pawn, a cat, a bottle, a fish, and letters.
 
-Every solid is a signed distance function (negative inside) put together from a few rounded primitives by a smooth
-minimum, and is meshed by marching cubes. Each primitive belongs to a named part (body, beak, eyes ...), so that a
-scene can colour parts; a part may also be only painted on the surface (eyes, a label), without changing the solid.
+Every solid is a signed distance function (negative inside), a smooth union of rounded primitives, and is meshed by
+marching cubes. Primitives belong to named parts (body, beak, eyes ...), which a scene can colour. A part may also be
+painted on the surface (eyes, a label) without changing the solid.
 
-Frame: right-handed, y up; what one recognises best faces +z, where the frontal camera stands. The nominal sizes in
-this file are metres at the benchmarks' scale; thin parts (necks, ears, tails) are kept near 6 cm so that a grid of
-24 cells a metre resolves them.
+Frame: right-handed, y up, front towards +z and the frontal camera. Nominal sizes are metres at the benchmarks' scale.
+Thin parts (necks, ears, tails) have about 6 cm, so that a grid of 24 cells per metre resolves them.
 """
 
 from __future__ import annotations
@@ -38,8 +37,8 @@ class Shape:
     Attributes:
         parts: part name -> signed distance (n,3) -> (n,) in nominal metres; the solid is their smooth union.
         blend: width of the smooth union [m].
-        paint: part name -> signed distance of a region whose surface takes that part's colour.
-        lower, upper: nominal box that holds the solid [m].
+        paint: part name -> signed distance of a region whose surface has that part's colour.
+        lower, upper: nominal bounding box [m].
     """
 
     parts: dict[str, Distance]
@@ -50,7 +49,7 @@ class Shape:
 
     @property
     def part_names(self) -> tuple[str, ...]:
-        """Names that an appearance can colour; the order is the one of :meth:`part_weights`."""
+        """Names of the parts that can be coloured, in the order of :meth:`part_weights`."""
         return tuple(self.parts) + tuple(name for name in self.paint if name not in self.parts)
 
     def distance(self, points: Array) -> Array:
@@ -58,9 +57,9 @@ class Shape:
         return union(self.blend, *self.parts.values())(points)
 
     def part_weights(self, points: Array, softness: float) -> Array:
-        """How far points (n,3) belong to each of :attr:`part_names`: weights (n, parts) that sum to 1.
+        """Weights (n, parts), which sum to 1, of :attr:`part_names` at points (n,3).
 
-        Borders between parts are ``softness`` [nominal m] wide, so that an image of them is not jagged.
+        Borders between parts are ``softness`` [nominal m] wide, for antialiasing.
         """
         distances = np.stack([part(points) for part in self.parts.values()], axis=1)
         weights = np.zeros((len(points), len(self.part_names)))
@@ -77,7 +76,7 @@ class Shape:
 
 
 def union(width: float, *parts: Distance) -> Distance:
-    """Union of parts, its seams rounded over ``width`` [m] by a polynomial smooth minimum."""
+    """Union of parts, with seams rounded over ``width`` [m] by a polynomial smooth minimum."""
 
     def distance(p: Array) -> Array:
         result = parts[0](p)
@@ -95,13 +94,13 @@ def _vector(*values: float) -> Array:
 
 
 def sphere(centre: Vector, radius: float) -> Distance:
-    """Ball of one radius [m]."""
+    """Ball with a radius in [m]."""
     c = _vector(*centre)
     return lambda p: np.linalg.norm(p - c, axis=1) - radius
 
 
 def ellipsoid(centre: Vector, radii: Vector, tilt: float = 0.0) -> Distance:
-    """Ellipsoid, turned by ``tilt`` [degrees] about z; first-order distance, good near the surface."""
+    """Ellipsoid, rotated by ``tilt`` [degrees] about z; the distance is accurate to first order near the surface."""
     c, r = _vector(*centre), _vector(*radii)
     cos, sin = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
 
@@ -116,7 +115,7 @@ def ellipsoid(centre: Vector, radii: Vector, tilt: float = 0.0) -> Distance:
 
 
 def tapered_capsule(start: Vector, stop: Vector, r_start: float, r_stop: float) -> Distance:
-    """Segment with a radius that changes linearly from one end to the other [m]."""
+    """Capsule with a radius that changes linearly from one end to the other [m]."""
     a, b = _vector(*start), _vector(*stop)
     axis = b - a
 
@@ -133,7 +132,7 @@ def revolved(profile: Distance) -> Distance:
 
 
 def polygon(corners: list[tuple[float, float]], rounding: float = 0.0) -> Distance:
-    """Exact signed distance to a closed polygon in 2-D, its corners rounded outwards by ``rounding`` [m]."""
+    """Exact signed distance to a closed 2-D polygon, with corners rounded outwards by ``rounding`` [m]."""
     a = np.asarray(corners, dtype=np.float64)
     b = np.roll(a, -1, axis=0)
 
@@ -165,17 +164,17 @@ def extruded(profile: Distance, half_depth: float, rounding: float) -> Distance:
 
 
 def mirrored_x(part: Distance) -> Distance:
-    """The part and its mirror image in the plane x = 0: the part is given for x >= 0."""
+    """The part, given for x >= 0, and its mirror image in the plane x = 0."""
     return lambda p: part(np.abs(p, where=[True, False, False], out=p.copy()))
 
 
 def mirrored_z(part: Distance) -> Distance:
-    """The part and its mirror image in the plane z = 0: the part is given for z >= 0."""
+    """The part, given for z >= 0, and its mirror image in the plane z = 0."""
     return lambda p: part(np.abs(p, where=[False, False, True], out=p.copy()))
 
 
 def turned(part: Distance, degrees: float) -> Distance:
-    """The part turned about the vertical axis, counter-clockwise seen from above."""
+    """The part rotated about the vertical axis, counter-clockwise seen from above."""
     cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return lambda p: part(
         np.stack([cos * p[:, 0] - sin * p[:, 2], p[:, 1], sin * p[:, 0] + cos * p[:, 2]], axis=1)
@@ -202,7 +201,7 @@ def _ball() -> Shape:
         return distance
 
     def caps(p: Array) -> Array:
-        # Divided by the slope of the difference at its zero, to be metres.
+        # division by the slope of the difference at its zero gives metres
         return (0.93 * np.linalg.norm(p, axis=1) - np.abs(p @ axis)) / np.sqrt(1.0 - 0.93**2)
 
     return Shape(
@@ -219,7 +218,7 @@ def _ball() -> Shape:
 
 
 def _duck() -> Shape:
-    """A bath duck that looks to the right, turned a little towards the camera."""
+    """A bath duck that looks to the right, rotated slightly towards the camera."""
     turn = 28.0
     body = union(
         0.05,
@@ -395,7 +394,7 @@ def _letter(character: str) -> Shape:
     xs = np.arange(box.x0 - margin, box.x1 + margin, cell)
     ys = np.arange(box.y0 - margin, box.y1 + margin, cell)
     grid = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2)
-    # Even-odd over the outline's loops: each letter's holes are loops inside it.
+    # even-odd rule, because holes are loops inside the outline
     filled = np.zeros(len(grid), dtype=bool)
     for loop in outline.to_polygons():
         filled ^= measure.points_in_poly(grid, loop)
@@ -420,25 +419,24 @@ def _letter(character: str) -> Shape:
 
 _MAKERS = {"ball": _ball, "duck": _duck, "pawn": _pawn, "cat": _cat, "bottle": _bottle, "fish": _fish}
 NAMES = tuple(_MAKERS)
-"""Solids with a name of their own; ``letter_A`` ... ``letter_Z`` exist besides."""
+"""Named solids, in addition to ``letter_A`` ... ``letter_Z``."""
 
 
 @cache
 def shape(name: str) -> Shape:
-    """The solid of that name.
+    """The solid with a name.
 
     Raises:
-        InputError: no such solid; the message names those that exist.
+        InputError: unknown name; the message lists the known ones.
     """
     if name in _MAKERS:
         return _MAKERS[name]()
     if re.fullmatch(r"letter_[A-Z]", name):
         return _letter(name[-1])
     near = difflib.get_close_matches(name, [*NAMES, *(f"letter_{c}" for c in string.ascii_uppercase)], n=1)
-    hint = f" Did you mean {near[0]!r}?" if near else ""
-    raise InputError(
-        f"shape: {name!r} is not known.{hint} Choose one of {', '.join(NAMES)} or letter_A ... letter_Z."
-    )
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    remedy = f"Choose one of {', '.join(NAMES)} or letter_A ... letter_Z"
+    raise InputError("shape", f"{name!r} is unknown{hint}", remedy)
 
 
 def build(name: str, size: float | None = None, resolution: int = 96) -> trimesh.Trimesh:
@@ -450,23 +448,23 @@ def build(name: str, size: float | None = None, resolution: int = 96) -> trimesh
         resolution: cells along the longest side.
 
     Returns:
-        A watertight mesh [m], faces outward, its bounding box centred at the origin, with what :func:`to_nominal`
-        needs.
+        A watertight mesh [m], faces outward, its bounding box centred at the origin, with metadata for
+        :func:`to_nominal`.
 
     Raises:
         InputError: unknown name, or a size or resolution that is not positive.
     """
     solid = shape(name)
     if resolution < 8:
-        raise InputError(f"resolution: {resolution} is too coarse for shape {name!r}; give at least 8.")
+        raise InputError("resolution", f"must be at least 8 for shape {name!r}, not {resolution}")
     if size is not None and not size > 0.0:
-        raise InputError(f"size: {size} of shape {name!r} must be a positive length in metres.")
+        raise InputError("size", f"must be a positive length in metres for shape {name!r}, not {size}")
     lower, upper = _vector(*solid.lower), _vector(*solid.upper)
     cell = (upper - lower).max() / resolution
     axes = [np.arange(lo - 1.5 * cell, hi + 1.5 * cell, cell) for lo, hi in zip(lower, upper, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     values = solid.distance(grid.reshape(-1, 3)).reshape(grid.shape[:3])
-    # A lattice value of exactly zero would give degenerate triangles.
+    # a value of exactly zero would give degenerate triangles
     values[np.abs(values) < 1e-7] = 1e-7
     vertices, faces, _, _ = measure.marching_cubes(
         values, 0.0, spacing=(cell,) * 3, gradient_direction="descent", allow_degenerate=False
@@ -485,10 +483,10 @@ def build(name: str, size: float | None = None, resolution: int = 96) -> trimesh
 def place(
     name: str, size: float | None, height: float, center: Sequence[float], resolution: int = 96
 ) -> trimesh.Trimesh:
-    """The solid where a scene starts it.
+    """The solid at its initial position in a scene.
 
     Args:
-        name, size, resolution: as of :func:`build`.
+        name, size, resolution: see :func:`build`.
         height: y of the bounding box's centre [m].
         center: x and z of the bounding box's centre [m].
     """
@@ -498,17 +496,15 @@ def place(
 
 
 def to_nominal(mesh: trimesh.Trimesh, points: Array) -> tuple[Shape, Array]:
-    """The solid of a mesh from :func:`build`, and points (n,3) [m] beside it in that solid's nominal frame.
+    """The solid of a mesh from :func:`build`, and points (n,3) [m] transformed to its nominal frame.
 
-    The mesh may have been moved since (not turned or scaled); points are in its present frame.
+    The mesh may have been translated since, but not rotated or scaled. Points are in its current frame.
 
     Raises:
-        InputError: the mesh does not come from :func:`build`.
+        InputError: the mesh was not created by :func:`build`.
     """
     if "shape" not in mesh.metadata:
-        raise InputError(
-            "this mesh was not made by geometry.shapes.build, so its solid and parts are not known"
-        )
+        raise InputError("mesh", "was not created by geometry.shapes.build, so its parts are unknown")
     local = np.asarray(points, dtype=np.float64) - mesh.bounds.mean(axis=0)
     return shape(mesh.metadata["shape"]), local / mesh.metadata["scale"] + np.asarray(mesh.metadata["centre"])
 

@@ -1,8 +1,8 @@
 """Move the vertices of a mesh with the particles inside it.
 
-Moving least squares from positions only: every vertex is a fixed linear combination of the particles around it at
-rest, with coefficients that reproduce affine motions exactly. The elastic deformation gradient is not used, because
-it says nothing about the plastic part of the motion.
+Moving least squares on positions: every vertex is a fixed linear combination of the particles around it at rest, with
+coefficients that reproduce affine motions exactly. The elastic deformation gradient is not used, because it excludes
+the plastic part of the motion.
 """
 
 from __future__ import annotations
@@ -15,31 +15,31 @@ from neuma_lib.errors import InputError
 
 
 def skinning_matrix(vertices: np.ndarray, particles: np.ndarray, neighbours: int = 32) -> csr_matrix:
-    """Coefficients that carry vertices along with particles.
+    """Coefficients that move vertices with particles.
 
     Args:
         vertices: rest positions [m], shape (n, 3).
         particles: rest positions of the particles that fill the body [m], shape (N, 3).
-        neighbours: particles that a vertex listens to; the weight of the farthest falls to zero, so that the
-            coefficients are continuous along the surface.
+        neighbours: number of particles per vertex; the weight of the farthest is zero, so that the coefficients are
+            continuous along the surface.
 
     Returns:
-        Matrix (n, N) with rows that sum to 1; ``matrix @ x_t`` are the vertices at time t. It returns the rest
-        vertices for the rest particles, and A p + b for particles moved by A p + b.
+        Matrix (n, N) with rows that sum to 1; ``matrix @ x_t`` are the vertices at time t. It maps rest particles to
+        rest vertices, and reproduces affine motions A p + b of the particles.
 
     Raises:
         InputError: fewer particles than needed for an affine fit.
     """
     vertices, particles = np.asarray(vertices, dtype=np.float64), np.asarray(particles, dtype=np.float64)
     if len(particles) < 8:
-        raise InputError(f"skinning: {len(particles)} particles cannot carry a mesh; use at least 8")
+        raise InputError("skinning: particles", f"{len(particles)} are too few, at least 8 are needed")
     k = min(neighbours, len(particles) - 1)
     distance, index = cKDTree(particles).query(vertices, k=k + 1)
     radius = distance[:, -1:]
     ratio = distance[:, :k] / radius
     weight = (1.0 - ratio) ** 4 * (4.0 * ratio + 1.0)
     index = index[:, :k]
-    # Shape functions phi_j = w_j (1, 0, 0, 0) M^-1 p_j with p_j = (1, (X_j - v) / radius), M = sum_j w_j p_j p_j^T.
+    # shape functions phi_j = w_j (1, 0, 0, 0) M^-1 p_j with p_j = (1, (X_j - v) / radius), M = sum_j w_j p_j p_j^T
     basis = np.concatenate(
         [np.ones((len(vertices), k, 1)), (particles[index] - vertices[:, None]) / radius[..., None]], axis=2
     )

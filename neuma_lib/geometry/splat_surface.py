@@ -1,4 +1,4 @@
-"""A watertight surface of Gaussians alone, from opacity and depth in renders from all around."""
+"""A watertight surface of Gaussians, from the opacity and depth of renders from all directions."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from neuma_lib.splatting.spherical_harmonics import SH_C0
 from neuma_lib.splatting.viewpoints import static_views
 
 PIXEL_BLUR = 0.3
-"""Variance that a pixel adds to a splat [px^2], as in the 3DGS release, for which such Gaussians were fitted."""
+"""Variance added to a splat by a pixel [px^2], as in the 3DGS release, whose renderer such Gaussians are fitted for."""
 
 
 def views_around(gaussians: Gaussians, count: int, pixels: int) -> Cameras:
-    """Cameras evenly all around Gaussians, each of ``pixels`` x ``pixels``, that see all of them."""
+    """Cameras evenly distributed around Gaussians, ``pixels`` x ``pixels`` each, that see all of them."""
     around = outermost(gaussians.means.detach(), gaussians.covars().detach(), gaussians.opacities.detach())
     views = static_views(around.cpu().numpy(), count, pixels, pixels)
     Ks = torch.from_numpy(np.repeat(views.K[None], count, axis=0))
@@ -32,20 +32,20 @@ def views_around(gaussians: Gaussians, count: int, pixels: int) -> Cameras:
 def splat_surface(
     gaussians: Gaussians, cameras: Cameras, settings: SurfaceConfig, *, dents: bool = True
 ) -> trimesh.Trimesh:
-    """The surface that opacity and depth of Gaussians show in all views (`reconstruct`); without ``dents``, opacity."""
+    """Surface (`reconstruct`) from the opacity and, with ``dents``, the depth of Gaussians in all views."""
     images, depths = opacity_and_depth(gaussians, cameras, settings.matte_level)
     return reconstruct(gaussians, cameras, images, settings, depths=list(depths) if dents else None)
 
 
 def opacity_and_depth(gaussians: Gaussians, cameras: Cameras, level: float) -> tuple[Tensor, Tensor]:
-    """RGBA images (V, H, W, 4), of which alpha counts, and depths along the optical axes (V, H, W) of Gaussians.
+    """RGBA images (V, H, W, 4), of which only alpha is meaningful, and depths along the optical axes (V, H, W).
 
-    The depth of a pixel is that of the mean of the centres on its ray, with the weights that blend their colours: one
-    rendering gives both, with the centres as colours, and one of their squares how far apart they lie. A pixel that
-    blends what is farther apart than `REACH` looks partly through a gap, and its mean is no surface.
+    The depth of a pixel is that of the mean of the Gaussian centres on its ray, with the weights of their colours. It
+    is computed by rendering the centres as colours. The squares of the centres give the standard deviation. A pixel
+    with a deviation above `REACH` (of the body's longest side) looks partly through a gap and has no depth.
 
     Returns:
-        images; depths [m], nan where alpha is below ``level`` or the pixel looks partly through a gap.
+        images; depths [m], nan where alpha is below ``level`` or the deviation is too large.
     """
     low, high = gaussians.means.amin(dim=0), gaussians.means.amax(dim=0)
     span = float((high - low).max()) or 1.0

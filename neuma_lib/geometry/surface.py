@@ -1,8 +1,7 @@
 """A watertight surface of a static object from its silhouettes: the zero level of the visual hull's signed distance.
 
-The surface lies more finely than pixels or voxels (see `neuma_lib.geometry.visual_hull`). What no silhouette shows, a
-dent seen only by its shading, stays filled, unless depth maps tell it. The Gaussians fitted to the same views say where
-to look.
+The surface is more accurate than a pixel or voxel (see `neuma_lib.geometry.visual_hull`). Dents that no silhouette
+shows stay filled unless depth maps are given. Gaussians fitted to the same views bound the search.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from neuma_lib.config.geometry import SurfaceConfig
 from neuma_lib.errors import InputError
 from neuma_lib.geometry.depth_fusion import REACH, fused_distance
 from neuma_lib.geometry.repair import repaired
-from neuma_lib.geometry.visual_hull import NO_COMMON_SPACE, contour_distances, distance_inside
+from neuma_lib.geometry.visual_hull import contour_distances, distance_inside, no_common_space
 from neuma_lib.geometry.volume import check_mesh
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians
@@ -32,12 +31,12 @@ Array = NDArray[np.float64]
 BOX_SIDE = 1.0
 """Side of the simulator's box [m]."""
 _COARSE_RESOLUTION = 32
-"""Voxels along the longest side of the first look, which finds the body's box and the band around its surface."""
+"""Voxels along the longest side of the coarse grid that locates the body and the band around its surface."""
 
 
 @dataclass(frozen=True)
 class _Grid:
-    """Points of a regular lattice: origin (3,) [m], spacing [m], points along each axis."""
+    """Regular grid of points: origin (3,) [m], spacing [m], points along each axis."""
 
     origin: Array
     spacing: float
@@ -60,29 +59,29 @@ def reconstruct(
     floor: float | None = None,
     depths: Sequence[Tensor] | None = None,
 ) -> trimesh.Trimesh:
-    """Surface of the body that the views show (paper, section 3.2, where a multi-view method makes it).
+    """Surface of the body in the views (paper, section 3.2, which uses a multi-view method).
 
     Args:
-        gaussians: static reconstruction; its extent bounds the search, and is widened if the body is larger.
-        cameras: V views, or V sets of one where sizes differ.
+        gaussians: static reconstruction; its extent initialises the search region.
+        cameras: V views, or V sets of one if sizes differ.
         images: RGBA with straight alpha in [0, 1] of V views, shape (H, W, 4) each.
         settings: resolution and smoothing.
-        floor: height y [m] below which nothing is, where no camera sees the underside; None: there is no floor.
-        depths: of the surface along the optical axes [m] in V views, shape (H, W) each, not finite where a pixel shows
-            none; they tell dents. None: outlines alone.
+        floor: height y [m] of a floor that hides the underside from the cameras; None: no floor.
+        depths: depth of the surface along the optical axes [m] in V views, shape (H, W) each, not finite where a pixel
+            shows none. None: silhouettes alone.
 
     Returns:
         Watertight mesh in the world frame [m], one body without inner cavities, oriented outwards.
 
     Raises:
-        InputError: images that do not fit the cameras, an empty matte, mattes that share no point of space.
+        InputError: images do not match the cameras, a matte is empty, or the mattes have no common point of space.
     """
     for view, (image, camera) in enumerate(zip(images, cameras)):
         if tuple(image.shape) != (camera.height, camera.width, 4):
-            raise InputError(
-                f"surface: images {tuple(image.shape)} (view {view}) do not fit {len(cameras)} cameras of"
-                f" {camera.width} x {camera.height} pixels; expected RGBA (height, width, 4)"
+            problem = (
+                f"the image has shape {tuple(image.shape)}, expected ({camera.height}, {camera.width}, 4)"
             )
+            raise InputError(f"surface: view {view}", problem)
     cameras = [camera.to("cpu", torch.float64) for camera in cameras]
     contours = contour_distances([image[..., 3] for image in images], settings.matte_level)
 
@@ -92,7 +91,7 @@ def reconstruct(
     lower = coarse.origin + (near.min(axis=0) - 1) * coarse.spacing
     upper = coarse.origin + (near.max(axis=0) + 1) * coarse.spacing
     grid = _Grid.around(lower, upper, settings.resolution)
-    # Away from the surface the coarse distance is enough: it is only read for its sign there.
+    # away from the surface only the sign matters, so the coarse distance is sufficient
     at = [(axis - coarse.origin[k]) / coarse.spacing for k, axis in enumerate(grid.axes())]
     field = ndimage.map_coordinates(
         distance, np.stack(np.meshgrid(*at, indexing="ij")), order=1, mode="nearest"
@@ -110,22 +109,22 @@ def reconstruct(
     mesh = _polygonise(_one_solid_body(field), grid)
     if settings.smoothing:
         _smooth(mesh, settings.smoothing)
-    if floor is not None:  # smoothing may bend an edge on the floor down
+    if floor is not None:  # smoothing may move vertices below the floor
         mesh.vertices[:, 1] = np.maximum(mesh.vertices[:, 1], floor)
     check_mesh(mesh, "surface")
     return mesh
 
 
 def photographed(mesh: trimesh.Trimesh, edge: float, floor: float | None) -> trimesh.Trimesh:
-    """The surface of a photographed body, repaired, remeshed, and above its floor.
+    """The surface of a photographed body, repaired, remeshed, and moved above the floor.
 
     Args:
         mesh: result of `reconstruct`, in the simulator's box [m].
         edge: length of an edge, as a fraction of the longest side.
-        floor: height of the floor [m]; None: there is none.
+        floor: height of the floor [m]; None: no floor.
 
     Raises:
-        InputError: pymeshlab is missing, no closed body is left, or it is not in the simulator's box.
+        InputError: pymeshlab is missing, no closed body is left, or it is outside the simulator's box.
     """
     body = repaired(mesh, edge * float(mesh.extents.max()), "surface")
     if floor is not None:
@@ -133,10 +132,11 @@ def photographed(mesh: trimesh.Trimesh, edge: float, floor: float | None) -> tri
     check_mesh(body, "surface")
     lower, upper = body.bounds
     if (lower < 0).any() or (upper > BOX_SIDE).any():
-        place = ", ".join(f"{axis} from {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", lower, upper))
+        extent = ", ".join(f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", lower, upper))
         raise InputError(
-            f"surface: the body reaches {place} m and leaves the simulator's box, 0 to {BOX_SIDE:g} m each way: set"
-            " `center` to the place where it lies, or a smaller `scale`, in capture.yaml"
+            "surface",
+            f"the body ({extent} m) exceeds the simulator's box, 0 to {BOX_SIDE:g} m along each axis",
+            "Correct `center`, or reduce `scale`, in capture.yaml",
         )
     return body
 
@@ -144,16 +144,16 @@ def photographed(mesh: trimesh.Trimesh, edge: float, floor: float | None) -> tri
 def _locate(
     gaussians: Gaussians, contours: Sequence[Tensor], cameras: Sequence[Cameras], floor: float | None
 ) -> tuple[_Grid, Array]:
-    """Coarse lattice that holds the whole body, and the distances on it.
+    """Coarse grid around the whole body, and the distances on it.
 
-    Starts at the box of the Gaussians, and is doubled while the body reaches its walls.
+    It starts from the bounding box of the Gaussians, which is doubled while the body reaches its border.
     """
     if len(gaussians) == 0:
-        raise InputError("surface: there are no Gaussians; rerun the gaussians stage")
+        raise InputError("surface: gaussians", "there are no Gaussians", "Run the rule gaussians again")
     means = gaussians.means.detach().to("cpu", torch.float64).numpy()
     reach = 2.0 * gaussians.covars().detach().diagonal(dim1=1, dim2=2).sqrt().to("cpu", torch.float64).numpy()
     if not (np.isfinite(means).all() and np.isfinite(reach).all()):
-        raise InputError("surface: a Gaussian is not finite; rerun the gaussians stage")
+        raise InputError("surface: gaussians", "a Gaussian is not finite", "Run the rule gaussians again")
     lower, upper = (means - reach).min(axis=0), (means + reach).max(axis=0)
     for _ in range(6):
         margin = 0.05 * float((upper - lower).max())
@@ -167,21 +167,17 @@ def _locate(
         middle, half = (lower + upper) / 2, (upper - lower).max() / 2
         lower, upper = middle - 2 * half, middle + 2 * half
     if (distance > -grid.spacing).any():
-        raise InputError(
-            "masks: they do not bound a body; more views from other directions, or masks that the "
-            "frame does not cut, are needed"
-        )
-    raise InputError(f"masks: {NO_COMMON_SPACE}")
+        remedy = "Add views from other directions, or use masks that the frame does not crop"
+        raise InputError("masks", "they do not bound a body", remedy)
+    raise no_common_space()
 
 
 def _one_solid_body(field: Array) -> Array:
-    """The field with its largest body alone, without cavities, and closed at the lattice's walls."""
+    """The field of the largest body alone, without cavities, and closed at the border of the grid."""
     field = np.pad(field, 1, constant_values=min(float(field.min()), -1e-6))
     bodies, count = ndimage.label(field > 0)
     if count == 0:
-        raise InputError(
-            f"masks: {NO_COMMON_SPACE} (a body thinner than a voxel needs a higher geometry.surface.resolution)"
-        )
+        raise no_common_space("Increase geometry.surface.resolution if the body is thinner than a voxel")
     largest = 1 + int(np.argmax(np.bincount(bodies.ravel())[1:]))
     filled = ndimage.binary_fill_holes(bodies == largest)
     return np.where(filled, np.maximum(field, -field), np.minimum(field, -field))
@@ -189,15 +185,15 @@ def _one_solid_body(field: Array) -> Array:
 
 def _polygonise(field: Array, grid: _Grid) -> trimesh.Trimesh:
     """Zero level of a field padded by one."""
-    # A value next to nothing would make faces without area.
-    least = 1e-3 * grid.spacing
-    field = np.where(field > 0, np.maximum(field, least), np.minimum(field, -least))
+    # values near zero give degenerate faces
+    minimum = 1e-3 * grid.spacing
+    field = np.where(field > 0, np.maximum(field, minimum), np.minimum(field, -minimum))
     vertices, faces, _, _ = marching_cubes(field, 0.0, gradient_direction="ascent")
     return trimesh.Trimesh(grid.origin + (vertices - 1.0) * grid.spacing, faces)
 
 
 def _smooth(mesh: trimesh.Trimesh, rounds: int) -> None:
-    """Taubin's smoothing, in place; a last offset along the normals restores the volume to second order."""
+    """Taubin smoothing, in place; an offset along the normals restores the volume to second order."""
     before = mesh.volume
     trimesh.smoothing.filter_taubin(mesh, lamb=0.5, nu=0.53, iterations=2 * rounds)
     mesh.vertices = mesh.vertices + (before - mesh.volume) / mesh.area * mesh.vertex_normals

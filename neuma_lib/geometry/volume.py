@@ -1,6 +1,6 @@
-"""The inside of a closed surface: membership, evenly spread points, overlap of two bodies.
+"""The inside of a closed surface: membership, sampling, overlap of two bodies.
 
-Meshes are `trimesh.Trimesh` in metres, watertight and oriented outwards; points are float64 arrays.
+Meshes are `trimesh.Trimesh` in metres, watertight and oriented outwards. Points are float64 arrays.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -22,39 +22,37 @@ start_warp()
 Array = NDArray[np.float64]
 
 _ATTEMPTS = 12
-"""Samplings tried for a count near the wanted one."""
+"""Maximum number of samplings to reach the requested count."""
 _COUNT_TOLERANCE = 0.01
-"""Relative error of the count at which no further sampling is tried; the promise is 5 %."""
-_CELLS_A_POINT = 4
-"""Cells of the grid that spares points their winding numbers."""
+"""Relative error of the count at which the attempts stop; the guaranteed error is 5 %."""
+_CELLS_PER_POINT = 4
+"""Cells per point of the grid that reduces the number of evaluated winding numbers."""
 
 
 def check_mesh(mesh: trimesh.Trimesh, name: str = "mesh") -> None:
-    """Make sure that a mesh has an inside.
+    """Check that a mesh is closed and oriented outwards.
 
     Raises:
         InputError: no faces, vertices that are not finite, holes, or faces that point inwards.
     """
     if len(mesh.faces) == 0:
-        raise InputError(f"{name}: has no faces")
+        raise InputError(name, "has no faces")
     finite = np.isfinite(mesh.vertices).all(axis=1)
     if not finite.all():
-        raise InputError(f"{name}: vertex {int(np.argmin(finite))} is not finite; export the mesh again")
+        raise InputError(name, f"vertex {int(np.argmin(finite))} is not finite", "Export the mesh again")
     if not mesh.is_watertight:
-        raise InputError(
-            f"{name}: is not watertight, so it has no volume to fill; close its holes (for example with "
-            "trimesh.repair.fill_holes or a voxel remesh)"
-        )
+        remedy = "Close its holes, for example with trimesh.repair.fill_holes or a voxel remesh"
+        raise InputError(name, "is not watertight", remedy)
     if mesh.volume <= 0:
-        raise InputError(f"{name}: encloses no positive volume; its faces point inwards, flip them")
+        raise InputError(name, "has no positive volume because its faces point inwards", "Flip them")
 
 
 def inside(mesh: trimesh.Trimesh, points: Array) -> NDArray[np.bool_]:
     """Which points lie inside a closed mesh.
 
-    Decided by Warp's winding numbers in single precision, on the CPU so that every machine fills a body alike. Parts
-    that overlap count as one body; a point within about 1e-7 of the mesh's size of its surface may go either way.
-    Between two points in a region of cells that no face comes near there is no surface: one of them decides for all.
+    Uses Warp's winding numbers in single precision, on the CPU for the same result on every machine. Overlapping parts
+    are one body. Points within about 1e-7 of the mesh's size from its surface may be on either side. Points in a
+    connected region of cells without faces are on the same side, so one of them is evaluated for all.
 
     Args:
         mesh: watertight, oriented outwards [m].
@@ -63,27 +61,27 @@ def inside(mesh: trimesh.Trimesh, points: Array) -> NDArray[np.bool_]:
     Returns:
         True inside, shape (P,).
     """
-    found = ((points >= mesh.bounds[0]) & (points <= mesh.bounds[1])).all(axis=1)
-    near = np.flatnonzero(found)
+    result = ((points >= mesh.bounds[0]) & (points <= mesh.bounds[1])).all(axis=1)
+    near = np.flatnonzero(result)
     if len(near) == 0:
-        return found
-    alone, alike = np.unique(_regions(mesh, points[near]), return_index=True, return_inverse=True)[1:]
-    found[near] = _winding_inside(mesh, points[near[alone]])[alike]
-    return found
+        return result
+    first, region = np.unique(_regions(mesh, points[near]), return_index=True, return_inverse=True)[1:]
+    result[near] = _winding_inside(mesh, points[near[first]])[region]
+    return result
 
 
 def _regions(mesh: trimesh.Trimesh, points: Array) -> NDArray[np.int64]:
-    """Numbers (P,), the same only of points (P, 3) within the mesh's bounds that no face of it separates."""
+    """Labels (P,) of points (P, 3) within the mesh's bounds; points with the same label are not separated by a face."""
     diagonal = float(np.linalg.norm(mesh.extents))
-    wide = np.maximum(mesh.extents, 1e-3 * diagonal)  # a leaf's cells are no thinner
-    cell = float((np.prod(wide) / (_CELLS_A_POINT * len(points))) ** (1 / 3))
-    slack = 1e-5 * diagonal  # for what single precision moves
+    extents = np.maximum(mesh.extents, 1e-3 * diagonal)  # minimum cell size for flat meshes
+    cell = float((np.prod(extents) / (_CELLS_PER_POINT * len(points))) ** (1 / 3))
+    slack = 1e-5 * diagonal  # for round-off in single precision
     origin = mesh.bounds[0] - slack
     shape = tuple(((mesh.extents + 2 * slack) / cell).astype(int) + 1)
     corners = mesh.triangles
     first = np.maximum(((corners.min(axis=1) - slack - origin) / cell).astype(int), 0)
     last = np.minimum(((corners.max(axis=1) + slack - origin) / cell).astype(int), np.array(shape) - 1) + 1
-    # How many boxes of faces cover a cell: +1 and -1 at the boxes' corners, summed along each axis.
+    # number of bounding boxes of faces that cover a cell: +1 and -1 at the corners of the boxes, summed along each axis
     picks, grid = list(product((0, 1), repeat=3)), tuple(np.add(shape, 1))
     at = np.concatenate([np.ravel_multi_index(np.where(pick, last, first).T, grid) for pick in picks])
     signs = np.repeat([(-1.0) ** sum(pick) for pick in picks], len(first))
@@ -98,7 +96,7 @@ def _regions(mesh: trimesh.Trimesh, points: Array) -> NDArray[np.int64]:
 
 
 def _winding_inside(mesh: trimesh.Trimesh, points: Array) -> NDArray[np.bool_]:
-    """`inside` of points (P, 3) within the mesh's bounds, by the winding number of each."""
+    """`inside` for points (P, 3) within the mesh's bounds, by the winding number of each."""
     centre, diagonal = mesh.bounds.mean(axis=0), float(np.linalg.norm(mesh.extents))
     body = wp.Mesh(
         wp.array(mesh.vertices - centre, dtype=wp.vec3, device="cpu"),
@@ -123,39 +121,39 @@ def _winding_signs(
 
 
 def check_apart(meshes: Sequence[trimesh.Trimesh]) -> None:
-    """Make sure that no two solids share space.
+    """Check that no two solids overlap.
 
     Raises:
         InputError: a vertex of one lies inside another.
     """
     for (i, a), (j, b) in combinations(enumerate(meshes), 2):
         if inside(a, b.vertices).any() or inside(b, a.vertices).any():
-            raise InputError(f"bodies {i} and {j} overlap at the start: move one of them (height, center)")
+            raise InputError(f"bodies {i} and {j}", "overlap at the start", "Change height or center")
 
 
 def sample_volume(
     mesh: trimesh.Trimesh, count: int, seed: int = 0, method: Literal["jittered", "uniform"] = "jittered"
 ) -> Array:
-    """Points spread evenly over the inside of a mesh (paper, section 3.2: uniform samples of the volume).
+    """Uniform samples of the volume of a mesh (paper, section 3.2).
 
     Args:
         mesh: watertight, oriented outwards [m].
-        count: wanted number of points.
+        count: requested number of points.
         seed: of the random generator.
-        method: ``jittered`` puts one point at random into each cell of a grid (of a random origin), and keeps
-            those inside; ``uniform`` draws all points independently.
+        method: ``jittered`` draws one point in each cell of a grid with a random origin and keeps those inside;
+            ``uniform`` draws all points independently.
 
     Returns:
         Points [m], shape (n, 3), with n equal to ``count`` (uniform) or within 5 % of it (jittered).
 
     Raises:
-        InputError: a mesh without an inside, or a count that cannot be reached.
+        InputError: see `check_mesh`; a count that cannot be reached.
     """
     check_mesh(mesh)
     if count < 1:
-        raise InputError(f"volume sampling: {count} points were asked for; ask for at least 1")
+        raise InputError("sample_volume: count", f"must be at least 1, not {count}")
     if method not in ("jittered", "uniform"):
-        raise InputError(f"volume sampling: unknown method {method!r}; choose jittered or uniform")
+        raise InputError("sample_volume: method", f"must be jittered or uniform, not {method!r}")
     rng = np.random.default_rng(seed)
     if method == "uniform":
         return _uniform(mesh, count, rng)
@@ -169,15 +167,15 @@ def sample_volume(
         if abs(len(best) - count) <= _COUNT_TOLERANCE * count:
             break
     if abs(len(best) - count) > 0.05 * count:
-        raise InputError(
-            f"volume sampling: {len(best)} points at best where {count} were asked for; a jittered grid "
-            "cannot hit so small a count in this body, use the uniform method or more points"
+        problem = (
+            f"a jittered grid of about {count} points is impossible in this body, the nearest has {len(best)}"
         )
+        raise InputError("sample_volume: count", problem, "Use the uniform method or more points")
     return best
 
 
 def sample_tracers(mesh: trimesh.Trimesh, count: int = 100_000, seed: int = 0) -> Array:
-    """Dense passive points that fill a body, one in each cell of a jittered grid: `sample_volume`."""
+    """Dense passive points that fill a body, on a jittered grid (`sample_volume`)."""
     return sample_volume(mesh, count, seed, method="jittered")
 
 
@@ -192,22 +190,22 @@ def _jittered_grid(bounds: Array, spacing: float, rng: np.random.Generator) -> A
 def _uniform(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator) -> Array:
     """Independent points by rejection from the bounding box."""
     filled = float(mesh.volume / np.prod(mesh.extents))
-    found: list[Array] = []
-    while sum(map(len, found)) < count:
-        tries = int((count - sum(map(len, found))) / filled * 1.05) + 16
+    accepted: list[Array] = []
+    while sum(map(len, accepted)) < count:
+        tries = int((count - sum(map(len, accepted))) / filled * 1.05) + 16
         points = mesh.bounds[0] + rng.random((tries, 3)) * mesh.extents
-        found.append(points[inside(mesh, points)])
-    return np.concatenate(found)[:count]
+        accepted.append(points[inside(mesh, points)])
+    return np.concatenate(accepted)[:count]
 
 
 def volume_iou(a: trimesh.Trimesh, b: trimesh.Trimesh, resolution: int = 96) -> float:
     """Volume of the intersection over that of the union.
 
-    Measured on a jittered grid with ``resolution`` cells along the longest side of the common bounding box,
-    which is accurate to about 1e-3 at the default.
+    Computed on a jittered grid with ``resolution`` cells along the longest side of the common bounding box, with an
+    error of about 1e-3 at the default.
 
     Raises:
-        InputError: a mesh without an inside.
+        InputError: see `check_mesh`.
     """
     check_mesh(a, "first mesh")
     check_mesh(b, "second mesh")

@@ -1,7 +1,7 @@
-"""State of a long computation on disk, so that a killed run goes on where it was.
+"""State of a long computation on disk, from which an interrupted run resumes.
 
-A checkpoint stands outside a stage's declared outputs, is stamped with a fingerprint of settings, inputs and code,
-and is removed when the stage has written its result. One that belongs to something else is refused.
+A checkpoint is not a declared output of its stage. It holds a fingerprint of settings, inputs and code, is rejected
+if the fingerprint differs, and is removed when the stage has written its result.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ class Checkpoint:
     """One state on disk.
 
     Args:
-        path: file to keep it in.
-        fingerprint: short texts or numbers that must be equal for a resumed run to mean the same thing, by name
-            (see `workflow.provenance.fingerprint`).
+        path: file of the state.
+        fingerprint: name -> short text or number; a run resumes only if all are equal (see
+            `workflow.provenance.fingerprint`).
     """
 
     def __init__(self, path: str | Path, fingerprint: Mapping[str, Any]):
@@ -31,10 +31,9 @@ class Checkpoint:
         self.fingerprint = {k: str(v) for k, v in fingerprint.items()}
 
     def save(self, state: Mapping[str, Any]) -> None:
-        """Replace the state: weights, optimiser, scheduler, iteration; the generators' states are added."""
-        generators: dict[str, Any] = {
-            "torch": torch.get_rng_state()
-        }  # the library uses no global one of numpy
+        """Replace the state (weights, optimiser, scheduler, iteration); states of the random generators are added."""
+        # the library does not use numpy's global generator
+        generators: dict[str, Any] = {"torch": torch.get_rng_state()}
         if torch.cuda.is_available():
             generators["cuda"] = torch.cuda.get_rng_state_all()
         content = {"fingerprint": self.fingerprint, "generators": generators, "state": dict(state)}
@@ -42,25 +41,28 @@ class Checkpoint:
             torch.save(content, partial)
 
     def load(self) -> dict[str, Any] | None:
-        """The saved state, with the random generators put back; None where there is none.
+        """The saved state, or None if there is none. Restores the random generators.
 
         Raises:
             InputError: the file is damaged, or belongs to other settings, inputs or code.
         """
         if not self.path.exists():
             return None
-        remedy = f"remove it to start again:  rm '{self.path}'"
+        delete = f"rm '{self.path}'"
         try:
             content = dict(read_torch(self.path))
-            found, generators, state = (content[key] for key in ("fingerprint", "generators", "state"))
-            names = sorted({*found.keys(), *self.fingerprint})
+            saved, generators, state = (content[key] for key in ("fingerprint", "generators", "state"))
+            names = sorted({*saved.keys(), *self.fingerprint})
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise InputError(f"checkpoint {self.path} cannot be read ({one_line(error)}); {remedy}") from None
-        pairs = {k: (found.get(k, "absent"), self.fingerprint.get(k, "absent")) for k in names}
+            reason = error.problem if isinstance(error, InputError) else error
+            problem = f"is not a valid checkpoint: {one_line(reason)}"
+            raise InputError(self.path, problem, f"Start again with: {delete}") from None
+        pairs = {k: (saved.get(k, "absent"), self.fingerprint.get(k, "absent")) for k in names}
         if changed := [f"{k} (was {was}, is {now})" for k, (was, now) in pairs.items() if was != now]:
             raise InputError(
-                f"checkpoint {self.path} belongs to another run: {one_line(', '.join(changed), 500)} changed since;"
-                f" go back to the former settings to resume it, or {remedy}"
+                self.path,
+                f"is the checkpoint of another run: {one_line(', '.join(changed), 500)} changed",
+                f"Restore the former settings to resume, or start again with: {delete}",
             )
         torch.set_rng_state(generators["torch"])
         if "cuda" in generators and torch.cuda.is_available():
@@ -68,5 +70,5 @@ class Checkpoint:
         return state
 
     def remove(self) -> None:
-        """Forget the state: the result is written."""
+        """Delete the state after the result is written."""
         self.path.unlink(missing_ok=True)

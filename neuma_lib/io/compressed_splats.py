@@ -1,9 +1,9 @@
-"""Gaussians as compressed PLY, PlayCanvas' layout (SuperSplat reads and writes it): 16 bytes each, more with harmonics.
+"""Gaussians as compressed PLY in the layout of PlayCanvas (SuperSplat): 16 bytes each, plus higher harmonics.
 
-Element ``chunk``, one for 256 Gaussians, has the ranges of their positions, logarithms of scales and colours; element
-``vertex`` four words of 32 bits, in parts of these ranges: position and scale of 11, 10, 11 bits, rotation of 2 bits
-that name the largest component and 3 x 10 bits for the others, colour and opacity of 8 bits each. Element ``sh`` has
-a byte for each coefficient of the higher harmonics, by channel.
+Element ``chunk`` has, for every 256 Gaussians, the ranges of their positions, log scales and colours. Element
+``vertex`` has four 32-bit words quantised in these ranges: position and log scale (11, 10, 11 bits), rotation (2 bits
+name the largest component, 3 x 10 bits hold the others), colour and opacity (8 bits each). Element ``sh`` has one byte
+for each coefficient of the higher harmonics, by channel.
 """
 
 from __future__ import annotations
@@ -21,45 +21,45 @@ from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.spherical_harmonics import SH_C0
 
 CHUNK = 256
-"""Gaussians that share their ranges."""
+"""Gaussians with common ranges."""
 _RANGES = [f"{end}_{of}{axis}" for of in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
 _COLOURS = [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
 _WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _SH_RANGE = 8.0
-"""Width of the range of a coefficient of the higher harmonics, about zero."""
+"""Width of the range of a higher coefficient, centred at zero."""
 _SQRT2 = np.sqrt(2.0)
 
 
 def is_compressed(elements: Mapping[str, np.ndarray]) -> bool:
-    """Whether the elements of a PLY file are those of this layout."""
+    """Whether the elements of a PLY file have this layout."""
     return "chunk" in elements and set(_WORDS) <= set(elements["vertex"].dtype.names)
 
 
 def unpacked(elements: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Arrays of `Gaussians` by name, of float32, from the elements of a PLY file of this layout.
+    """Arrays of `Gaussians` by name, float32, from the elements of a PLY file of this layout.
 
     Raises:
-        ValueError: elements that do not fit each other.
+        ValueError: inconsistent elements.
     """
     chunks, rows = elements["chunk"], elements["vertex"]
     if missing := [name for name in _RANGES if name not in chunks.dtype.names]:
-        raise ValueError(f"its chunks miss {', '.join(missing)}")
+        raise ValueError(f"the element chunk has no {', '.join(missing)}")
     if not (len(chunks) - 1) * CHUNK < len(rows) <= len(chunks) * CHUNK:
-        raise ValueError(f"{len(chunks)} chunks of {CHUNK} are not those of {len(rows)} Gaussians")
+        raise ValueError(f"{len(chunks)} chunks of {CHUNK} do not match {len(rows)} Gaussians")
     chunks = chunks[np.arange(len(rows)) // CHUNK]
     position, rotation, scale, colour = (rows[name].astype(np.uint32) for name in _WORDS)
     means = _between(chunks, _RANGES[:6], _bits(position, (11, 10, 11)))
     scales = np.exp(_between(chunks, _RANGES[6:], _bits(scale, (11, 10, 11))))
     rgba = _bits(colour, (8, 8, 8, 8))
     rgb = rgba[:, :3]
-    if set(_COLOURS) <= set(chunks.dtype.names):  # older files have none
+    if set(_COLOURS) <= set(chunks.dtype.names):  # older files have no ranges of colours
         rgb = _between(chunks, _COLOURS, rgb)
     rest = np.zeros((len(rows), 0))
     if "sh" in elements:
         columns = elements["sh"].dtype.names
         if len(columns) not in REST_COUNTS or len(elements["sh"]) != len(rows):
             raise ValueError(
-                f"{len(columns)} coefficients for {len(elements['sh'])} of {len(rows)} Gaussians"
+                f"{len(columns)} coefficients of {len(elements['sh'])} Gaussians, not {len(rows)}"
             )
         rest = np.stack([elements["sh"][f"f_rest_{i}"] for i in range(len(columns))], axis=1)
         rest = rest * (_SH_RANGE / 255) - _SH_RANGE / 2
@@ -77,12 +77,12 @@ def unpacked(elements: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 def save_compressed(path: str | Path, gaussians: Gaussians, order: np.ndarray | None = None) -> None:
     """Write Gaussians as compressed PLY.
 
-    Positions keep their chunk's extent over 2047 (y: 1023), logarithms of scales likewise, rotations about 1e-3,
-    colours and opacities 1/255 and harmonics 1/32. What is not in an opacity of 8 bits or within [-4, 4] is clipped.
+    The resolution is the chunk's extent over 2047 (y: 1023) for positions and log scales, about 1e-3 for rotations,
+    1/255 for colours and opacities and 1/32 for harmonics, which are clipped to [-4, 4].
 
     Args:
         gaussians: at least one.
-        order: (G,) order in which they are written; None: that of `morton_order`, which makes chunks small.
+        order: (G,) order in which they are written; None: `morton_order`, which keeps the chunks compact.
     """
     g = gaussians.to("cpu", torch.float64)
     arrays = [
@@ -116,7 +116,7 @@ def save_compressed(path: str | Path, gaussians: Gaussians, order: np.ndarray | 
 
 
 def _bits(words: np.ndarray, widths: tuple[int, ...]) -> np.ndarray:
-    """Fields (G, n) in [0, 1] of words of 32 bits, the first in the highest bits."""
+    """Fields (G, n) in [0, 1] of 32-bit words, the first in the highest bits."""
     shifts = 32 - np.cumsum(widths)
     return np.stack(
         [((words >> np.uint32(s)) & (2**w - 1)) / (2**w - 1) for s, w in zip(shifts, widths, strict=True)],
@@ -125,7 +125,7 @@ def _bits(words: np.ndarray, widths: tuple[int, ...]) -> np.ndarray:
 
 
 def _words(fields: np.ndarray, widths: tuple[int, ...]) -> np.ndarray:
-    """The inverse of `_bits`."""
+    """Inverse of `_bits`."""
     words = np.zeros(len(fields), np.uint32)
     for column, width, shift in zip(fields.T, widths, 32 - np.cumsum(widths), strict=True):
         words |= (np.clip(column, 0, 1) * (2**width - 1)).round().astype(np.uint32) << np.uint32(shift)
@@ -133,13 +133,13 @@ def _words(fields: np.ndarray, widths: tuple[int, ...]) -> np.ndarray:
 
 
 def _between(chunks: np.ndarray, names: list[str], part: np.ndarray) -> np.ndarray:
-    """Values (G, 3) from parts of the ranges of their chunks: names of three minima, then of three maxima."""
+    """Values (G, 3) from fractions of the ranges of their chunks; names of three minima, then three maxima."""
     low, high = (np.stack([chunks[name] for name in ends], axis=1) for ends in (names[:3], names[3:]))
     return low * (1 - part) + high * part
 
 
 def _unpacked_rotations(words: np.ndarray) -> np.ndarray:
-    """Unit quaternions (G, 4), w first: the largest component is what the others leave."""
+    """Unit quaternions (G, 4), w first; the largest component follows from the norm."""
     others = (_bits(words << np.uint32(2), (10, 10, 10, 2))[:, :3] - 0.5) * _SQRT2
     largest = (words >> np.uint32(30)).astype(np.int64)
     quats = np.empty((len(words), 4))
@@ -159,5 +159,5 @@ def _packed_rotations(quats: np.ndarray) -> np.ndarray:
 
 
 def _other_components(largest: np.ndarray) -> np.ndarray:
-    """Indices (G, 3) of a quaternion's components but the largest one."""
+    """Indices (G, 3) of all components of a quaternion but the largest."""
     return np.array([[j for j in range(4) if j != k] for k in range(4)])[largest]

@@ -1,9 +1,8 @@
-"""Text and JSON, checksums, and writing safely.
+"""Text and JSON, checksums and atomic writing.
 
-Writers of this package are atomic (a temporary name in the same folder, then a rename) and deterministic: the same
-arrays give the same bytes, without dates, host names or paths. Readers check what they read before they allocate
-memory for it; a damaged or foreign file is an `InputError` of one line that names the file, what is wrong with it and
-what to do.
+Writers of this package are atomic (a temporary name in the same folder, then a rename) and deterministic: equal arrays
+give equal bytes, without dates, host names or paths. Readers check sizes before they allocate memory, and raise an
+`InputError` of one line for a damaged or foreign file.
 
 Lengths are metres, times seconds, masses kilograms; arrays are numpy.
 """
@@ -14,7 +13,7 @@ import hashlib
 import json
 import os
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
@@ -24,9 +23,9 @@ from neuma_lib.errors import InputError
 
 @contextmanager
 def atomic(path: str | Path) -> Iterator[Path]:
-    """A temporary path in the folder of ``path``; it takes the final name when the block ends without an error.
+    """A temporary path in the folder of ``path``, renamed to ``path`` when the block ends without an error.
 
-    A killed process leaves at most one file named ``.partial-<name>``, which the next run overwrites.
+    A killed process leaves at most one file ``.partial-<name>``, which the next run overwrites.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -50,26 +49,25 @@ def write_json(path: str | Path, data: Any) -> None:
 
 
 def read_json(path: str | Path) -> Any:
-    """Read JSON. Raises InputError when the file is missing or is not JSON (NaN and Infinity are not)."""
+    """Read JSON. Raises InputError if the file is missing or is not JSON (NaN and Infinity are not)."""
     return parse_json(existing(path).read_bytes(), path)
 
 
 def parse_json(content: str | bytes, where: str | Path) -> Any:
-    """Value of a JSON text. Raises InputError, which names ``where``, when it is not JSON or nested too deep."""
+    """Value of a JSON text. Raises InputError, which names ``where``, if it is not JSON or nested too deeply."""
     with reading(where, "JSON"):
         return json.loads(content, parse_constant=_refuse_constant)
 
 
 def _refuse_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is not a number of JSON")
+    raise ValueError(f"{name} is not valid JSON")
 
 
 @contextmanager
 def reading(where: str | Path, kind: str) -> Iterator[None]:
-    """Whatever the block raises becomes an `InputError` that says that ``where`` cannot be read as ``kind``.
+    """Turn any exception of the block into an `InputError`: ``where`` cannot be read as ``kind``.
 
-    What reads a damaged or foreign file raises errors of many kinds. The block must only read: a full disk is no fault
-    of the file.
+    The block must only read, because an error of writing is not the fault of the file.
     """
     try:
         yield
@@ -77,39 +75,45 @@ def reading(where: str | Path, kind: str) -> Iterator[None]:
         raise
     except Exception as error:
         reason = one_line(error) or type(error).__name__
-        raise InputError(
-            f"{where} cannot be read as {kind} ({reason}): replace it, or make it again"
-        ) from None
+        raise InputError(where, f"cannot be read as {kind}: {reason}", "Replace or regenerate it") from None
 
 
-def existing(path: str | Path, remedy: str = "run the stage that makes it, or correct the path") -> Path:
-    """The path of a file. Raises InputError where there is none."""
+def located(error: InputError, path: str | Path) -> InputError:
+    """The error of a part of a file, with the file added to its place."""
+    return InputError(f"{path}: {one_line(error.where)}", one_line(error.problem, 600), error.remedy)
+
+
+def existing(path: str | Path, remedy: str = "Run the stage that writes it, or correct the path") -> Path:
+    """The path of a file. Raises InputError if it does not exist."""
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path} does not exist: {remedy}")
+        raise InputError(path, "does not exist", remedy)
     return path
 
 
 def zip_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, limit: int) -> bytes:
-    """Bytes of a member of an archive, at most ``limit``; neither its header nor its content can ask for more memory.
+    """Bytes of a member of an archive. Neither its header nor its content can make it use more than ``limit`` bytes.
 
-    Raises ValueError or what zipfile raises for a larger or damaged one.
+    Raises ValueError, or an error of zipfile, for a larger or damaged member.
     """
-    # the other methods of ZIP have no bound on what a block of them unpacks to
+    # other compression methods have no bound on the size of an unpacked block
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.file_size > limit:
-        raise ValueError(f"{info.filename} is larger than {limit} bytes or oddly compressed")
+        raise ValueError(f"{info.filename} is larger than {limit} bytes or has an unsupported compression")
     with archive.open(info) as file:
-        return file.read(
-            info.file_size + 1
-        )  # read() would unpack all that is there, whatever the header claims
+        return file.read(info.file_size + 1)  # read() would unpack everything, whatever the header claims
 
 
 def sha256_file(path: str | Path) -> str:
-    """Hex digest of a file's bytes."""
+    """SHA-256 of a file, in hexadecimal."""
     return hashlib.sha256(existing(path).read_bytes()).hexdigest()
 
 
 def one_line(error: object, limit: int = 200) -> str:
-    """Text of an error or a value of a file, on one line and not longer than ``limit``, to quote in a message."""
+    """Text of an error or of a value in a file, on one line of at most ``limit`` characters, for messages."""
     text = " ".join("".join(c if c.isprintable() else " " for c in str(error)).split())
     return text if len(text) <= limit else f"{text[:limit]}..."
+
+
+def listed(files: str | Iterable[str] | None) -> list[str]:
+    """Paths as a list. One path, which a workflow gives as text, is a list of one; None is empty."""
+    return [files] if isinstance(files, str) else list(files or ())

@@ -1,4 +1,4 @@
-"""Gaussians as PLY, in the layout of the 3DGS release."""
+"""Gaussians as PLY in the layout of the 3DGS release."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.spherical_harmonics import MAX_DEGREE, coefficient_count
 
 REST_COUNTS = [3 * (coefficient_count(degree) - 1) for degree in range(MAX_DEGREE + 1)]
-"""Numbers of f_rest_* properties that a file may have: three channels of the degrees above 0."""
+"""Valid numbers of f_rest_* properties: three channels of the degrees above 0."""
 
 
 def save_gaussians(path: str | Path, gaussians: Gaussians) -> None:
-    """Write Gaussians as every splat viewer opens them: scales as logarithms, opacities as logits, SH by channel."""
+    """Write Gaussians as splat viewers read them: log scales, logits of opacities, SH by channel."""
     arrays = {f.name: getattr(gaussians, f.name).detach().cpu().numpy() for f in fields(gaussians)}
     means, quats, scales, opacities, sh0, shN = arrays.values()
     G, rest = len(means), shN.shape[1] * 3
@@ -38,11 +38,11 @@ def save_gaussians(path: str | Path, gaussians: Gaussians) -> None:
     write_ply(path, rows)
 
 
-def load_gaussians(path: str | Path, remedy: str = "fit the Gaussians again") -> Gaussians:
-    """Read Gaussians in the 3DGS layout, in float32, with unit quaternions; ``remedy`` ends messages on bad values.
+def load_gaussians(path: str | Path, remedy: str = "Fit the Gaussians again") -> Gaussians:
+    """Read Gaussians in the 3DGS layout, in float32, with unit quaternions.
 
     Raises:
-        InputError: missing properties (they are listed), or values that are not finite.
+        InputError: missing properties, or values that are not finite, with the given ``remedy``.
     """
     rows, _ = read_ply(path)
     names = set(rows.dtype.names)
@@ -56,25 +56,22 @@ def load_gaussians(path: str | Path, remedy: str = "fit the Gaussians again") ->
         "shN": [f"f_rest_{i}" for i in range(rest)],
     }
     if missing := [name for group in groups.values() for name in group if name not in names]:
-        raise InputError(
-            f"{path} misses the properties {', '.join(missing)}: it is no 3D Gaussian splatting file"
-        )
+        problem = f"is not a 3D Gaussian splatting file: it has no property {', '.join(missing)}"
+        raise InputError(path, problem)
     if rest not in REST_COUNTS:
-        raise InputError(
-            f"{path}: {rest} f_rest_* properties are not those of whole SH degrees {REST_COUNTS}"
-        )
+        raise InputError(path, f"has {rest} f_rest_* properties, expected one of {REST_COUNTS}")
     raw = {}
     for key, columns in groups.items():
         raw[key] = np.zeros((len(rows), len(columns)), np.float32)
         for i, column in enumerate(columns):
             raw[key][:, i] = rows[column]
-        # converters from layouts with opacities of 8 bits write those of 0 and 1 as infinite logits
+        # converters from layouts with 8-bit opacities write 0 and 1 as infinite logits
         usable = ~np.isnan(raw[key]) if key == "opacities" else np.isfinite(raw[key])
         if (bad := ~usable.all(axis=1)).any():
-            raise InputError(f"{path}: {key} of Gaussian {np.argmax(bad)} is not finite: {remedy}")
+            raise InputError(path, f"{key} of Gaussian {np.argmax(bad)} is not finite", remedy)
     norm = np.linalg.norm(raw["quats"], axis=1, keepdims=True)
     if (norm == 0).any():
-        raise InputError(f"{path}: the rotation of Gaussian {np.argmin(norm)} is zero: {remedy}")
+        raise InputError(path, f"the rotation of Gaussian {np.argmin(norm)} is zero", remedy)
     arrays = {
         "means": raw["means"],
         "quats": raw["quats"] / norm,

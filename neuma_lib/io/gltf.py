@@ -1,4 +1,4 @@
-"""A moving surface as binary glTF 2.0: one mesh with a morph target a frame, and an animation of their weights."""
+"""A moving surface as binary glTF 2.0: a mesh with one morph target per frame, and an animation of their weights."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from neuma_lib.io.files import atomic
 
 _FLOAT, _UINT = 5126, 5125
 _VERTICES, _FACES = 34962, 34963
-"""Targets of the buffer views of a mesh."""
+"""Buffer targets of a mesh."""
 
 
 def write_glb(
     path: str | Path, vertices: np.ndarray, faces: np.ndarray, times: np.ndarray, colors: np.ndarray
 ) -> None:
-    """Write a moving surface, y up and in metres as glTF has it.
+    """Write a moving surface, y up and in metres as glTF requires.
 
     Args:
         vertices: (T, V, 3) [m].
         faces: (M, 3).
-        times: (T,) ascending [s]; between two frames vertices move evenly.
+        times: (T,) ascending [s]; vertices are interpolated linearly in between.
         colors: (V, 3) sRGB in [0, 1].
     """
     vertices = np.asarray(vertices, "<f4")
@@ -69,22 +69,18 @@ def write_glb(
         "bufferViews": views,
         "buffers": [{"byteLength": len(body)}],
     }
-    if frames == 1:  # nothing moves, and glTF has no empty lists
+    if frames == 1:  # glTF does not allow empty lists
         del content["animations"], primitive["targets"], content["meshes"][0]["weights"]
     text = json.dumps(content, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)  # all arrays are of 4 bytes
+    text += b" " * (-len(text) % 4)
     with atomic(path) as partial:
-        parts = (
-            struct.pack("<II", len(text), 0x4E4F534A),
-            text,
-            struct.pack("<II", len(body), 0x004E4942),
-            body,
-        )
+        headers = [struct.pack("<II", len(text), 0x4E4F534A), struct.pack("<II", len(body), 0x004E4942)]
+        parts = (headers[0], text, headers[1], body)
         size = 12 + sum(map(len, parts))
         partial.write_bytes(struct.pack("<4sII", b"glTF", 2, size) + b"".join(map(bytes, parts)))
 
 
 def linear(srgb: np.ndarray) -> np.ndarray:
-    """Linear colours of sRGB ones (IEC 61966-2-1), both in [0, 1]."""
+    """Linear colours from sRGB (IEC 61966-2-1), both in [0, 1]."""
     c = np.clip(np.asarray(srgb, np.float64), 0, 1)
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)

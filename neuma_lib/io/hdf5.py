@@ -1,4 +1,4 @@
-"""Named quantities with units in HDF5: every trajectory, set of particles and sparse matrix."""
+"""Named quantities with units in HDF5: trajectories, sets of particles and sparse matrices."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ QUANTITIES = {
 }
 
 MAX_RATIO = 1032
-"""Most bytes that one byte of a deflate stream can stand for (zlib's own bound)."""
+"""Maximum compression ratio of a deflate stream (bound given by zlib)."""
 
 
 def write_arrays(
@@ -45,7 +45,7 @@ def write_arrays(
     """Write named quantities (see `QUANTITIES`) to HDF5, each with its unit, and file attributes.
 
     Args:
-        arrays: quantity name -> array; None entries are left out.
+        arrays: quantity name -> array; None entries are skipped.
         attributes: numbers and texts; anything else is stored as JSON text.
     """
     with atomic(path) as partial, h5py.File(partial, "w", track_order=True) as file:
@@ -64,29 +64,29 @@ def read_arrays(
     """Read quantities and attributes of an HDF5 artifact.
 
     Args:
-        required: names that must be there.
-        only: names to read (others stay on disk); None reads all of `QUANTITIES` that the file has.
+        required: names that must exist.
+        only: names to read; None reads all of `QUANTITIES` in the file.
 
     Raises:
-        InputError: missing or damaged file, missing quantity, something else under its name (a group, a link, texts),
-            a value that is not finite, or more claimed than stored.
+        InputError: missing or damaged file, missing quantity, a group, link or text under its name, a value that is not
+            finite, or a claimed size larger than the stored one.
     """
     path = existing(path)
     with reading(path, "HDF5"), h5py.File(path, "r") as file:
         if missing := [name for name in required if name not in file.keys()]:
-            found = one_line(", ".join(file.keys()))
-            raise InputError(f"{path} has no dataset {', '.join(missing)} (it has {found})")
-        # keys in the file's order; a lookup would follow links
+            present = one_line(", ".join(file.keys()))
+            raise InputError(path, f"has no dataset {', '.join(missing)} (it has {present})")
+        # lookup by name would follow links
         names = [name for name in file.keys() if name in (QUANTITIES if only is None else only)]
         arrays = {name: _checked(file, name, path.stat().st_size)[()] for name in names}
         for name, array in arrays.items():
             if array.dtype.kind == "f" and not np.isfinite(array).all():
-                raise ValueError(f"{name} holds values that are not finite")
+                raise ValueError(f"{name} has values that are not finite")
         return arrays, {key: _attribute(file, key) for key in file.attrs}
 
 
 def _checked(file: h5py.File, name: str, size: int) -> h5py.Dataset:
-    """A dataset that is safe to read: numbers that are stored in this file of ``size`` bytes, as many as it claims."""
+    """A dataset that is safe to read: numbers, all of them stored in this file of ``size`` bytes."""
     link = file.get(name, getlink=True)
     if not isinstance(link, h5py.HardLink):
         raise ValueError(f"{name} is a {type(link).__name__}, not a dataset of this file")
@@ -104,13 +104,13 @@ def _checked(file: h5py.File, name: str, size: int) -> h5py.Dataset:
         held = data.nbytes <= stored
     if not held or stored > size:
         raise ValueError(
-            f"{name} claims {data.nbytes} bytes (shape {data.shape}) and stores {stored} of {size} in the file"
+            f"{name} claims {data.nbytes} bytes (shape {data.shape}) but stores {stored} in a file of {size}"
         )
     return data
 
 
 def _attribute(file: h5py.File, key: str) -> Any:
-    """A number or a text."""
+    """A number or a text attribute."""
     value = file.attrs[key] if file.attrs.get_id(key).shape == () else None
     value = value.item() if isinstance(value, np.generic) else value
     if not isinstance(value, str | int | float):

@@ -1,4 +1,4 @@
-"""Calibrated images: transforms.json and the files that it lists."""
+"""Calibrated images: transforms.json and the images that it lists."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ import torch
 from PIL import Image
 
 from neuma_lib.errors import InputError
+from neuma_lib.io.datasets.released import image_name, matrix_of_numbers, released_frames
 from neuma_lib.io.files import one_line, read_json, reading, sha256_file, write_json
-from neuma_lib.io.released import image_name, matrix_of_numbers, released_frames
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.observation import Observation, exposed_steps
 
 
 @dataclass(frozen=True)
 class ImageSet:
-    """Calibrated images: one entry a file, in the order of transforms.json.
+    """Calibrated images, in the order of transforms.json.
 
     Attributes:
         images: straight-alpha RGBA, uint8, shape (K, H, W, 4).
@@ -53,41 +53,41 @@ class ImageSet:
         """Frames of some views: steps, indices into the images of shape (T, V), and camera indices of shape (V,).
 
         Raises:
-            InputError: a view is missing, or the views were not filmed at the same steps.
+            InputError: a view is missing, or the views have frames at different steps.
         """
         columns = []
         for view in views:
             chosen = np.flatnonzero(self.views == view)
             if len(chosen) == 0:
                 filmed = sorted(set(self.views.tolist()))
-                raise InputError(f"view {view} is not among the filmed views {filmed}")
+                raise InputError("views", f"{view} is not one of the filmed views {filmed}")
             columns.append(chosen[np.argsort(self.steps[chosen], kind="stable")])
         steps = [tuple(self.steps[c].tolist()) for c in columns]
         if any(s != steps[0] for s in steps):
-            raise InputError(f"views {list(views)} were not filmed at the same steps")
+            raise InputError("views", f"{list(views)} have frames at different steps")
         index = np.stack(columns, axis=1)
         return steps[0], index, index[0]
 
 
 FORMATS = ("PNG", "JPEG", "WEBP")
-"""Image formats that are read, by Pillow's names; others have decoders that are less tried."""
+"""Supported image formats, by Pillow's names. Decoders of other formats are less well tested."""
 MAX_PIXELS = 2**26
-"""Most pixels of an image that is read: 8192 x 8192, 256 MiB of RGBA."""
-SUB_FRAMES = 5
-"""Most renders that are averaged to a frame, where settings say nothing else."""
+"""Maximum size of an image: 8192 x 8192 pixels, 256 MiB of RGBA."""
+EXPOSURE_SAMPLES = 5
+"""Default maximum number of renders that are averaged to a frame."""
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def write_transforms(
     path: str | Path, intrinsics: Mapping[str, float], frames: Sequence[Mapping[str, Any]], **extra: Any
 ) -> None:
-    """Write transforms.json beside images that exist already; the sha256 of each image is added.
+    """Write transforms.json for existing images, with the sha256 of each.
 
     Args:
         path: .../transforms.json.
         intrinsics: fl_x, fl_y, cx, cy [px], w, h.
         frames: dicts with ``file_path`` relative to the folder, ``transform_matrix`` (camera to world, OpenGL
-            axes, 4 x 4) and what else is known of a frame (``view``, ``step``, ``time``).
+            axes, 4 x 4) and optional entries (``view``, ``step``, ``time``).
         extra: further top-level entries.
     """
     folder = Path(path).parent
@@ -98,15 +98,15 @@ def write_transforms(
 def list_images(
     source: str | Path, path: str | Path, scale: float = 1.0, offset: Sequence[float] | None = None
 ) -> ImageSet:
-    """Write a transforms.json for images that stay where another list names them; returns what it lists.
+    """Write a transforms.json that refers to the images of another list, and return these images.
 
     Args:
         source: a transforms.json, or a list in the layout of the authors' release.
         path: the new transforms.json.
-        scale, offset: as of `place`; None: no offset.
+        scale, offset: see `transform_world`; None: no offset.
 
     Raises:
-        InputError: as of `read_image_set`.
+        InputError: see `read_image_set`.
     """
     images = read_image_set(source)
     data = read_transforms(source)
@@ -114,21 +114,23 @@ def list_images(
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     names = [relative_to(path, file) for file in files]
     frames = [{**f, "file_path": name} for f, name in zip(data.pop("frames"), names, strict=True)]
-    world = place(frames, scale, (0.0, 0.0, 0.0) if offset is None else offset)
+    world = transform_world(frames, scale, (0.0, 0.0, 0.0) if offset is None else offset)
     write_transforms(path, data, frames, **world)
     return read_image_set(path) if world else images
 
 
 def relative_to(path: str | Path, file: Path) -> str:
-    """The name of a file in a list at ``path``."""
+    """Path of a file relative to the folder of the list ``path``."""
     return os.path.relpath(file.resolve(), Path(path).parent.resolve())
 
 
-def place(frames: Sequence[dict[str, Any]], scale: float, offset: Sequence[float]) -> dict[str, Any]:
-    """Move cameras in place, positions x to ``scale x + offset`` [m].
+def transform_world(
+    frames: Sequence[dict[str, Any]], scale: float, offset: Sequence[float]
+) -> dict[str, Any]:
+    """Transform camera positions x to ``scale x + offset`` [m], in place.
 
     Returns:
-        What a transforms.json says of it: ``world`` with ``scale`` and ``offset``; nothing if nothing moved.
+        Entry ``world`` of transforms.json, with ``scale`` and ``offset``; empty for the identity.
     """
     if scale == 1.0 and not any(offset):
         return {}
@@ -140,68 +142,65 @@ def place(frames: Sequence[dict[str, Any]], scale: float, offset: Sequence[float
 
 
 def read_transforms(path: str | Path) -> dict[str, Any]:
-    """Read and check transforms.json: for every frame a file, a pose, and intrinsics (its own or the file's).
+    """Read and check transforms.json: a file, a pose and intrinsics (its own or common ones) for every frame.
 
-    A list in the layout of the authors' release is read as well (`neuma_lib.io.released`).
+    A list in the layout of the authors' release is converted (`neuma_lib.io.datasets.released`).
 
     Raises:
-        InputError: names the file, the frame and the missing or wrong entry.
+        InputError: a missing or wrong entry; names the file, the frame and the entry.
     """
     return checked_transforms(read_json(path), path)
 
 
 def checked_transforms(data: Any, path: str | Path) -> dict[str, Any]:
-    """What a transforms.json holds, if it is one (see `read_transforms`); ``path`` is for messages."""
+    """The content of a transforms.json, checked (see `read_transforms`); ``path`` is for messages."""
     if isinstance(data, list):
         data = {"frames": released_frames(data, path)}
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
-        raise InputError(f"{path}: the list 'frames' is missing or empty")
+        raise InputError(f"{path}: frames", "the list is missing or empty")
     for i, frame in enumerate(frames):
         where = f"{path}: frame {i} ({image_name(frame, f'{path}: frame {i}')})"
         _check_intrinsics({**data, **frame}, where)
         for key in ("view", "step"):
             if type(frame.get(key, 0)) is not int:
-                raise InputError(f"{where}: {key} must be a whole number, not {one_line(repr(frame[key]))}")
+                raise InputError(f"{where}: {key}", f"must be an integer, not {one_line(repr(frame[key]))}")
         exposure = frame.get("exposure", 0)
         if type(exposure) not in (int, float) or not (0 <= exposure < math.inf):
-            raise InputError(
-                f"{where}: exposure must be a duration in seconds, not {one_line(repr(exposure))}"
-            )
+            problem = f"must be a duration in seconds, not {one_line(repr(exposure))}"
+            raise InputError(f"{where}: exposure", problem)
         if not isinstance(frame.get("sha256"), str | None):
-            raise InputError(f"{where}: sha256 must be a text")
+            raise InputError(f"{where}: sha256", "must be a text")
         pose = matrix_of_numbers(frame.get("transform_matrix"))
         if pose.shape != (4, 4):
-            raise InputError(f"{where} needs a 4x4 transform_matrix of numbers (camera to world)")
+            raise InputError(f"{where}: transform_matrix", "must be a 4x4 matrix (camera to world)")
         rotation = pose[:3, :3]
         if not np.isfinite(pose).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
-            raise InputError(f"{where}: the transform_matrix is not a rigid motion")
+            raise InputError(f"{where}: transform_matrix", "is not a rigid motion")
     _check_photographs(data, path)
     return data
 
 
 def _check_photographs(data: Mapping[str, Any], path: str | Path) -> None:
-    """Make sure that the entry `photographs` of a transforms.json, where there is one, can be understood."""
+    """Check the optional entry `photographs` of a transforms.json."""
     entry = data.get("photographs", {"floor": None})
     floor = entry.get("floor", "missing") if isinstance(entry, dict) and len(entry) == 1 else "missing"
     if floor is not None and (type(floor) not in (int, float) or not math.isfinite(floor)):
-        raise InputError(
-            f'{path}: photographs must be {{"floor": height of the floor in metres, or null}}, not'
-            f" {one_line(repr(entry))}"
-        )
+        expected = '{"floor": height of the floor in metres, or null}'
+        raise InputError(f"{path}: photographs", f"must be {expected}, not {one_line(repr(entry))}")
 
 
 def _check_intrinsics(values: Mapping[str, Any], where: str) -> None:
     if "fl_x" not in values and "camera_angle_x" not in values:
-        raise InputError(
-            f"{where} has no intrinsics: give fl_x, fl_y, cx, cy in pixels, or camera_angle_x in radians"
-        )
+        remedy = "Add fl_x, fl_y, cx, cy in pixels, or camera_angle_x in radians"
+        raise InputError(where, "has no intrinsics", remedy)
     for key in ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x"):
         value = values.get(key, 1)
         if type(value) not in (int, float) or not (0 < value < math.inf):
-            raise InputError(f"{where}: {key} must be a positive number, not {one_line(repr(value))}")
+            raise InputError(f"{where}: {key}", f"must be a positive number, not {one_line(repr(value))}")
     if values.get("w", 1) * values.get("h", 1) > MAX_PIXELS:
-        raise InputError(f"{where}: {values['w']} x {values['h']} are more than {MAX_PIXELS} pixels (w, h)")
+        problem = f"{values['w']} x {values['h']} pixels exceed the maximum of {MAX_PIXELS}"
+        raise InputError(f"{where}: w, h", problem)
 
 
 def intrinsic_matrix(values: Mapping[str, Any], width: int, height: int) -> np.ndarray:
@@ -212,29 +211,29 @@ def intrinsic_matrix(values: Mapping[str, Any], width: int, height: int) -> np.n
 
 
 def read_image_set(path: str | Path, views: Sequence[int] | None = None) -> ImageSet:
-    """Read the images that a transforms.json lists, verifying their checksums where it holds them.
+    """Read the images of a transforms.json and verify the checksums in it.
 
     Args:
         path: .../transforms.json.
-        views: read the images of these views only; None reads all.
+        views: views to read; None reads all.
 
     Raises:
-        InputError: missing image, truncated or changed image, image of another size, no intrinsics, empty mask.
+        InputError: missing, truncated or changed image, image of another size, no intrinsics, empty mask.
     """
     frames = [frame for frame in _all_frames(path) if views is None or frame["view"] in views]
     if not frames:
-        raise InputError(f"{path}: no frame belongs to the views {list(views or ())}")
+        raise InputError(path, f"no frame belongs to the views {list(views or ())}")
     return _read_frames(frames, path)
 
 
 def _all_frames(path: str | Path) -> list[dict[str, Any]]:
-    """The frames of a transforms.json, each with what the file says of all."""
+    """The frames of a transforms.json, each with the entries common to all."""
     data = read_transforms(path)
     return [{**data, "view": i, "step": 0, **frame} for i, frame in enumerate(data["frames"])]
 
 
 def _read_frames(frames: Sequence[Mapping[str, Any]], path: str | Path) -> ImageSet:
-    """Images of one size, of some frames of a list."""
+    """Images of some frames of a list, which have one size."""
     folder = Path(path).parent
     files = [image_file(folder, frame["file_path"], path) for frame in frames]
     images = _read_all(files, frames, path)
@@ -250,28 +249,27 @@ def _read_frames(frames: Sequence[Mapping[str, Any]], path: str | Path) -> Image
 
 
 def image_file(folder: Path, name: str, listed_in: str | Path) -> Path:
-    """The file of an entry. Raises InputError where there is none."""
+    """The file of an entry. Raises InputError if it does not exist."""
     for candidate in (folder / name, folder / f"{name}.png"):
         if candidate.is_file():
             return candidate
     raise InputError(
-        f"{folder / name} is missing although {listed_in} lists it: remove it from the list, or render it again with"
-        f" `snakemake --cores 2 --forcerun render_static render_dynamic`"
+        folder / name,
+        f"does not exist but is listed in {listed_in}",
+        "Remove it from the list, or render it with `snakemake --cores 2 --forcerun render_static render_dynamic`",
     )
 
 
 def _read_all(files: Sequence[Path], frames: Sequence[Mapping[str, Any]], path: str | Path) -> np.ndarray:
-    """Images of one size (K, H, W, 4), on all cores: decoding and checksums run outside Python's lock."""
+    """Images of one size (K, H, W, 4), on all cores: decoding and checksums release Python's global lock."""
     with open_image(files[0].read_bytes(), files[0]) as image:
         width, height = image.size
     for frame in frames:
         w, h = frame.get("w", width), frame.get("h", height)
         if (w, h) != (width, height):
             name = frame["file_path"]
-            raise InputError(
-                f"{path}: w, h of {name} are {w}x{h}, the image is {width}x{height}: correct them"
-            )
-    # the first is decoded before memory is taken for all
+            raise InputError(f"{path}: w, h of {name}", f"are {w}x{h}, but the image is {width}x{height}")
+    # the first image is decoded before memory is allocated for all
     first = read_rgba(files[0], frames[0].get("sha256"), (width, height))
     images = np.empty((len(files), *first.shape), dtype=np.uint8)
     images[0] = first
@@ -285,79 +283,79 @@ def _read_all(files: Sequence[Path], frames: Sequence[Mapping[str, Any]], path: 
 
 
 def open_image(content: bytes, where: str | Path, sha256: str | None = None) -> Image.Image:
-    """An image with its header read, not its pixels: of one of `FORMATS`, not too large, of this checksum if given."""
+    """An image of which only the header is read. Checks the format, the size, and the checksum if given."""
     if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
-        raise InputError(
-            f"{where} is damaged or was changed: its sha256 differs from the one in transforms.json; make it again"
-        )
+        problem = "is damaged or was changed: its sha256 differs from the one in transforms.json"
+        raise InputError(where, problem, "Regenerate it")
     with reading(where, "an image"):
         image = Image.open(BytesIO(content), formats=FORMATS)
         if image.width * image.height > MAX_PIXELS:
-            raise ValueError(f"{image.width}x{image.height} pixels are more than {MAX_PIXELS}")
+            raise ValueError(f"{image.width}x{image.height} pixels exceed the maximum of {MAX_PIXELS}")
         return image
 
 
 def read_rgba(path: Path, sha256: str | None, size: tuple[int, int] | None) -> np.ndarray:
-    """Pixels (H, W, 4), uint8, of a matte, of this checksum and this width and height if they are given.
+    """Pixels (H, W, 4), uint8, of a matte, with checksum and (width, height) verified if given.
 
     Raises:
-        InputError: damaged, of another size, without alpha, with 16 bits a channel, or with an empty mask.
+        InputError: damaged, of another size, without alpha, with 16 bits per channel, or with an empty mask.
     """
     with open_image(path.read_bytes(), path, sha256) as image:
         if size is not None and image.size != size:
-            raise InputError("{} is {}x{}, others {}x{}".format(path, *image.size, *size))
+            raise InputError(path, "is {}x{}, but expected {}x{}".format(*image.size, *size))
         if image.mode in ("I;16", "I"):
-            raise InputError(f"{path} has 16 bits a channel: convert it to 8-bit RGBA")
+            raise InputError(path, "has 16 bits per channel", "Convert it to 8-bit RGBA")
         with reading(path, "an image"):
             image.load()
             has_alpha = "A" in image.mode or "transparency" in image.info
             pixels = np.asarray(image.convert("RGBA"))
     if not has_alpha:
-        raise InputError(f"{path} has no alpha channel: the object's mask must be stored as alpha (RGBA)")
+        raise InputError(path, "has no alpha channel", "Store the mask of the object as alpha (RGBA)")
     if not (pixels[..., 3] > 127).any():
-        raise InputError(f"{path}: the mask (alpha) is empty, nothing is in the picture: remove this frame")
+        raise InputError(path, "the mask (alpha) is empty", "Remove this frame")
     return pixels
 
 
 def load_views(transforms: str | Path, views: Sequence[int] | None = None) -> tuple[torch.Tensor, Cameras]:
-    """Straight-alpha RGBA images (V, H, W, 4) in [0, 1] and their cameras, of an image set at one time."""
+    """Straight-alpha RGBA images (V, H, W, 4) in [0, 1] of a static image set, and their cameras."""
     images = read_image_set(transforms, views)
     pixels = torch.from_numpy(images.images).float() / 255
     return pixels, _cameras(images, np.arange(len(pixels)))
 
 
 def load_videos(
-    transforms: str | Path, views: Sequence[int], dt: float | None = None, sub_frames: int = SUB_FRAMES
+    transforms: str | Path, views: Sequence[int], dt: float | None = None, sub_frames: int = EXPOSURE_SAMPLES
 ) -> tuple[Observation, ...]:
-    """The videos of some views, with their pixels as they are stored: 1 GB for 400 frames of 800 x 800.
+    """The videos of some views, as uint8: 1 GB for 400 frames of 800 x 800 pixels.
 
-    Views that share steps, size and exposure are one observation; so all views of a scene that was rendered are. Frames
-    whose exposure began before step 0 are left out, as nothing is simulated there.
+    Views with the same steps, size and exposure form one observation, as all views of a rendered scene do. Frames whose
+    exposure begins before step 0, the start of the simulation, are skipped.
 
     Args:
-        transforms: .../transforms.json. A frame's ``exposure`` [s] has its middle at the frame's step.
+        transforms: .../transforms.json. The ``exposure`` [s] of a frame is centred at its step.
         views: numbers of the views.
-        dt: duration of a step [s], which turns exposures into steps; None: as if all were instants.
-        sub_frames: most renders that are averaged to a frame, see `exposed_steps`.
+        dt: duration of a step [s], which converts exposures to steps; None: instantaneous exposures.
+        sub_frames: maximum number of renders that are averaged to a frame, see `exposed_steps`.
 
     Raises:
         InputError: see `read_image_set` and `Observation`; a view that was not filmed, or only before step 0.
     """
-    found = []
+    observations = []
     for (_, _, exposure), frames in _shots(transforms, views, dt, sub_frames).items():
         images = _read_frames(frames, transforms)
         order = list(dict.fromkeys(frame["view"] for frame in frames))
         steps, index, columns = images.video(order)
         pixels, cameras = torch.from_numpy(images.images[index]), _cameras(images, columns)
         offsets, shares = exposure
-        found.append(Observation(steps, pixels, cameras, offsets, shares if len(offsets) > 1 else None))
-    return tuple(found)
+        shares = shares if len(offsets) > 1 else None
+        observations.append(Observation(steps, pixels, cameras, offsets, shares))
+    return tuple(observations)
 
 
 def filmed_steps(
-    transforms: str | Path, views: Sequence[int], dt: float | None = None, sub_frames: int = SUB_FRAMES
+    transforms: str | Path, views: Sequence[int], dt: float | None = None, sub_frames: int = EXPOSURE_SAMPLES
 ) -> tuple[int, ...]:
-    """Steps whose states a comparison with `load_videos` of the same arguments needs, ascending, without its images."""
+    """Steps needed to compare with `load_videos` of the same arguments, ascending. Reads no images."""
     shots = _shots(transforms, views, dt, sub_frames)
     return tuple(sorted({
         step + offset for steps, _, (offsets, _) in shots for step in steps for offset in (*offsets, 0)
@@ -367,16 +365,17 @@ def filmed_steps(
 def _shots(
     transforms: str | Path, views: Sequence[int], dt: float | None, sub_frames: int
 ) -> dict[tuple, list[dict[str, Any]]]:
-    """Frames of each observation, view by view, under (steps, size, (offsets, shares) of the exposure).
+    """(steps, size, (offsets, shares) of the exposure) of each observation -> its frames, view by view.
 
-    A view whose camera or exposure changes along the video is one of several observations.
+    A view whose camera or exposure changes during the video belongs to several observations.
     """
     frames = _all_frames(transforms)
     filmed = sorted({frame["view"] for frame in frames})
     if missing := [view for view in views if view not in filmed]:
         raise InputError(
-            f"{transforms}: view {missing[0]} is not among the filmed views {filmed}: film more"
-            " (dataset.dynamic.views), or let the method use fewer (methods.<name>.material.views, identify.views)"
+            f"{transforms}: view {missing[0]}",
+            f"is not one of the filmed views {filmed}",
+            "Film more views (dataset.dynamic.views), or use fewer (methods.<name>.material.views, identify.views)",
         )
     shots: dict[tuple, list[dict[str, Any]]] = {}
     for view in dict.fromkeys(views):
@@ -386,9 +385,8 @@ def _shots(
             if frame["step"] + exposure[0][0] >= 0:
                 columns.setdefault((exposure, _camera_key(frame)), []).append(frame)
         if not columns:
-            raise InputError(
-                f"{transforms}: every exposure of view {view} begins before step 0, which is the start: check the steps"
-            )
+            problem = "every exposure begins before step 0, the start of the simulation"
+            raise InputError(f"{transforms}: view {view}", problem, "Correct the steps")
         for (exposure, _), column in columns.items():
             steps = tuple(frame["step"] for frame in column)
             shots.setdefault((steps, (column[0].get("w"), column[0].get("h")), exposure), []).extend(column)
@@ -396,25 +394,23 @@ def _shots(
 
 
 def _camera_key(frame: Mapping[str, Any]) -> tuple:
-    """What tells cameras apart; poses that agree to a micrometre are one."""
+    """Key that identifies a camera; poses are compared to 1e-6."""
     intrinsics = (frame.get(key) for key in ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x"))
     pose = np.asarray(frame["transform_matrix"], dtype=np.float64)
     return (*intrinsics, *(pose.round(6) + 0.0).ravel().tolist())
 
 
 def load_observation(transforms: str | Path, views: Sequence[int]) -> Observation:
-    """The video of views that were filmed at the same steps by cameras of one size that stand still, without blur.
+    """The video of views with the same steps, taken by static cameras of one image size, without motion blur.
 
     Raises:
-        InputError: see `load_videos`; views that differ in these.
+        InputError: see `load_videos`; views that differ in steps or size, or whose camera moves.
     """
-    found = load_videos(transforms, views)
-    if len(found) > 1:
-        raise InputError(
-            f"{transforms}: views {list(views)} were not filmed at the same steps by cameras of one size that stand"
-            " still: choose one of them"
-        )
-    return found[0]
+    observations = load_videos(transforms, views)
+    if len(observations) > 1:
+        problem = f"views {list(views)} differ in steps or image size, or a camera moves"
+        raise InputError(transforms, problem, "Choose one view")
+    return observations[0]
 
 
 def _cameras(images: ImageSet, index: np.ndarray) -> Cameras:

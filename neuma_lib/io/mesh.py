@@ -1,4 +1,4 @@
-"""Surfaces as PLY."""
+"""Triangle meshes as PLY."""
 
 from __future__ import annotations
 
@@ -11,16 +11,11 @@ from neuma_lib.errors import InputError
 from neuma_lib.io.ply import read_ply, write_ply
 
 
-def write_mesh(
-    path: str | Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray | None = None
-) -> None:
-    """Write a triangle mesh: vertices (N, 3) [m], faces (M, 3), optional colours (N, 3) in [0, 255]."""
-    columns = [(axis, "<f4", vertices[:, i]) for i, axis in enumerate("xyz")]
-    if colors is not None:
-        columns += [(channel, "u1", colors[:, i]) for i, channel in enumerate(("red", "green", "blue"))]
-    rows = np.empty(len(vertices), dtype=[(name, kind) for name, kind, _ in columns])
-    for name, _, column in columns:
-        rows[name] = column
+def write_mesh(path: str | Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Write a triangle mesh: vertices (N, 3) [m], faces (M, 3)."""
+    rows = np.empty(len(vertices), dtype=[(axis, "<f4") for axis in "xyz"])
+    for i, axis in enumerate("xyz"):
+        rows[axis] = vertices[:, i]
     write_ply(path, rows, faces)
 
 
@@ -28,22 +23,20 @@ def read_mesh(path: str | Path, watertight: bool = True) -> trimesh.Trimesh:
     """Read a triangle mesh in metres.
 
     Raises:
-        InputError: missing properties, values that are not finite, or holes where ``watertight`` is asked for.
+        InputError: missing properties, values that are not finite, or holes if ``watertight`` is required.
     """
     rows, faces = read_ply(path)
     missing = [axis for axis in "xyz" if axis not in rows.dtype.names]
     if missing or faces is None or len(faces) == 0:
-        raise InputError(f"{path} is not a triangle mesh: it has no {', '.join(missing) or 'faces'}")
+        raise InputError(path, f"is not a triangle mesh: it has no {', '.join(missing) or 'faces'}")
     vertices = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
     if (bad := ~np.isfinite(vertices).all(axis=1)).any():
-        raise InputError(f"{path}: vertex {np.argmax(bad)} of {len(bad)} is not finite: rebuild the mesh")
+        raise InputError(path, f"vertex {np.argmax(bad)} of {len(bad)} is not finite", "Rebuild the mesh")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(f"{path}: a face names a vertex that does not exist: rebuild the mesh")
+        raise InputError(path, "a face refers to a vertex that does not exist", "Rebuild the mesh")
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     if watertight and not mesh.is_watertight:
-        raise InputError(
-            f"{path} is not watertight, so it has no inside: close its holes (a mesh repair tool)"
-        )
+        raise InputError(path, "is not watertight", "Close its holes with a mesh repair tool")
     if watertight and mesh.volume <= 0:
-        raise InputError(f"{path} has a volume of {mesh.volume:.3g} m^3: its faces point inwards, flip them")
+        raise InputError(path, f"has a volume of {mesh.volume:.3g} m^3: its faces point inwards", "Flip them")
     return mesh

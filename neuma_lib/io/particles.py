@@ -1,4 +1,4 @@
-"""Reconstructed bodies: particles, the Gaussians bound to them, their start and their motion."""
+"""Reconstructed bodies: particles, the Gaussians bound to them, initial motion and trajectory."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from neuma_lib.mechanics.density import Density, density_at
 from neuma_lib.sim.state import State
 
 Carrier = Literal["binding", "gaussians"]
-"""What moves a body's Gaussians: bound volume particles, or themselves."""
+"""Simulated particles: the volume particles of the binding, or the Gaussians themselves."""
 GaussianMotion = Literal["mean", "affine"]
-"""How they follow these: by the mean displacement, or by the affine motion."""
+"""How Gaussians follow their particles: by the mean displacement, or by the affine motion."""
 
 
 def save_particles(
@@ -50,20 +50,21 @@ def load_body(
     carrier: Carrier = "binding",
     gaussian_motion: GaussianMotion = "mean",
 ) -> Reconstruction:
-    """The reconstructed body of a scene or experiment: particles with their volumes, and the Gaussians they carry.
+    """The reconstructed body of a scene or experiment: particles with their volumes, and the Gaussians bound to them.
 
     With ``carrier="gaussians"`` the Gaussians are the particles, with equal shares of the same volume. With
-    ``gaussian_motion="affine"`` renders let Gaussians follow the affine motion of their particles.
-    Raises InputError where the binding was made for other Gaussians or particles.
+    ``gaussian_motion="affine"`` Gaussians follow the affine motion of their particles in renders.
+
+    Raises:
+        InputError: the binding belongs to other Gaussians or particles.
     """
     splats = load_gaussians(gaussians)
     x0, vol0, _ = load_particles(particles)
     arrays, attributes = read_arrays(binding, required=("indptr", "indices", "values"))
     for kind, file, count in (("gaussians", gaussians, len(splats)), ("particles", particles, len(x0))):
         if attributes.get(kind) != count:
-            raise InputError(
-                f"{binding} is of {attributes.get(kind)} {kind}, {file} has {count}: run the rule binding again"
-            )
+            problem = f"has {attributes.get(kind)} {kind}, but {file} has {count}"
+            raise InputError(binding, problem, "Run the rule binding again")
     if carrier == "gaussians":
         return Reconstruction.of_gaussians(splats, float(vol0.sum()), density)
     return Reconstruction(
@@ -79,22 +80,22 @@ def load_body(
 
 
 INITIAL_MOTION = ("v0", "angular_velocity", "centre")
-"""Keys of a motion in velocity.json: velocity of the centre [m/s], angular velocity about it [rad/s], centre [m]."""
+"""Keys of velocity.json: velocity of the centre [m/s], angular velocity about it [rad/s], centre [m]."""
 
 
 def _initial_motion(file: str | Path) -> dict[str, Any]:
-    """Content of velocity.json, or the start in identified.json, which has the same keys."""
-    found = read_json(file)
-    return found.get("start", found)
+    """Content of velocity.json, or the entry ``start`` of identified.json, which has the same keys."""
+    content = read_json(file)
+    return content.get("start", content)
 
 
-def thrown(body: Reconstruction, velocity: str | Path) -> State:
-    """A reconstructed body with the initial motion that was estimated for it: velocity.json or identified.json."""
-    found = _initial_motion(velocity)
-    return body.state(*(found[key] for key in INITIAL_MOTION))
+def with_motion(body: Reconstruction, velocity: str | Path) -> State:
+    """State of a reconstructed body with its estimated initial motion, from velocity.json or identified.json."""
+    motion = _initial_motion(velocity)
+    return body.state(*(motion[key] for key in INITIAL_MOTION))
 
 
-def load_start(
+def load_initial_state(
     particles: str | Path,
     binding: str | Path,
     gaussians: str | Path,
@@ -102,28 +103,26 @@ def load_start(
     densities: Sequence[Density],
     carrier: Carrier = "binding",
 ) -> tuple[State, list[int]]:
-    """What a prediction starts from: the reconstructed bodies of a scene (one) or of an experiment.
+    """Initial state of a prediction: the reconstructed bodies of a scene (one) or of an experiment.
 
     Returns:
-        All bodies in motion, one after the other, and the particle count of each.
+        State of all bodies, one after the other, and the particle count of each.
 
     Raises:
-        InputError: files of different bodies, or several whose Gaussians are to be the particles.
+        InputError: files of different bodies, or several bodies with Gaussians as particles.
     """
     together = load_body(particles, binding, gaussians, 1.0, carrier)
     x0, vol0 = together.x0, together.vol0
-    found = _initial_motion(velocity)
-    parts = found.get("bodies", [{**found, "particles": len(x0)}])
+    motion = _initial_motion(velocity)
+    parts = motion.get("bodies", [{**motion, "particles": len(x0)}])
     if carrier == "gaussians":
         if len(parts) > 1:
-            raise InputError(
-                f"{velocity} is of {len(parts)} bodies: the Gaussians can be the particles of one body only; choose a "
-                "method that is judged on particles"
-            )
+            problem = f"has {len(parts)} bodies, but the Gaussians can be the particles of one body only"
+            raise InputError(velocity, problem, "Choose a method that is evaluated on particles")
         parts = [{**parts[0], "particles": len(x0)}]
     counts = [part["particles"] for part in parts]
     if sum(counts) != len(x0) or len(densities) != len(counts):
-        raise InputError(f"{velocity} is of other bodies than {particles}: make both again")
+        raise InputError(velocity, f"does not have the bodies of {particles}", "Regenerate both")
     return State.joined([
         State.thrown(x, vol * density_at(x, density), vol, *(part[key] for key in INITIAL_MOTION))
         for x, vol, density, part in zip(x0.split(counts), vol0.split(counts), densities, parts, strict=True)
@@ -131,9 +130,9 @@ def load_start(
 
 
 def load_motion(rollout: str | Path) -> tuple[torch.Tensor, torch.Tensor]:
-    """What renders need of a rollout: positions (T, N, 3) [m], and deformations (T, N, 3, 3) that stretch Gaussians.
+    """Positions (T, N, 3) [m] and deformation gradients (T, N, 3, 3) of a rollout, for renders.
 
-    These are elastic, or the total ones where the method says so and the file has them.
+    The deformation gradients are the total ones if the file has them, else the elastic ones.
     """
     arrays, _ = read_arrays(rollout, required=("x", "F"), only=("x", "F", "F_total"))
     return torch.from_numpy(arrays["x"]), torch.from_numpy(arrays.get("F_total", arrays["F"]))

@@ -1,4 +1,4 @@
-"""Mattes of photographs, of any sizes: each cut out around its mask, and reduced where it is larger than needed."""
+"""Mattes of photographs of any size, each cropped to its mask and downsampled if larger than needed."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from neuma_lib.io.images import (
 )
 from neuma_lib.splatting.cameras import Cameras
 
-LEAST_PHOTOGRAPHS = 4
-"""Fewer show no body."""
-MOST_LEFT_OUT = 0.3
-"""Share of the photographs that may be left out."""
-_LEAST_MARGIN = 8
-"""What is kept around a mask at least [px]: more than the window of SSIM reaches."""
+MIN_PHOTOGRAPHS = 4
+"""Minimum number of photographs of a body."""
+MAX_LEFT_OUT = 0.3
+"""Maximum fraction of rejected photographs."""
+_MIN_MARGIN = 8
+"""Minimum margin around a mask [px], larger than the radius of the window of SSIM."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,11 +36,11 @@ class StaticViews:
     """Views of an object at rest.
 
     Attributes:
-        images: V of RGBA with straight alpha in [0, 1], (H, W, 4) each; a tensor where all have one size.
-        cameras: V cameras; V sets of one where sizes may differ.
-        photographs: their settings; None for rendered images, which are exact and of one exposure.
-        floor: height y of the floor that the object lies on [m]; None: there is none, or cameras see the underside.
-        left_out: files of photographs whose masks lack a part of the body.
+        images: V of RGBA with straight alpha in [0, 1], (H, W, 4) each; a tensor if all have one size.
+        cameras: V cameras; V sets of one if sizes may differ.
+        photographs: settings of photographs; None for rendered images, which are exact and have one exposure.
+        floor: height y of the floor under the object [m]; None: no floor, or cameras see the underside.
+        left_out: files of rejected photographs, whose masks lack a part of the body.
     """
 
     images: torch.Tensor | list[torch.Tensor]
@@ -50,7 +50,7 @@ class StaticViews:
     left_out: tuple[str, ...] = ()
 
     def to(self, device: torch.device) -> StaticViews:
-        """On a device."""
+        """The same views on another device."""
         images, cameras = self.images, self.cameras
         if isinstance(images, torch.Tensor):
             return replace(self, images=images.to(device), cameras=cameras.to(device=device))
@@ -60,21 +60,19 @@ class StaticViews:
 
 
 def load_static(transforms: str | Path, settings: PhotographsConfig) -> StaticViews:
-    """Views at rest: cut out of photographs where the list has the entry `photographs`, as they are where it has not.
+    """Views of an object at rest, cropped and checked if the list has the entry `photographs`.
 
     Raises:
-        InputError: as `neuma_lib.io.images.read_image_set`; fewer than `LEAST_PHOTOGRAPHS` photographs, or more
-            than `MOST_LEFT_OUT` of them with masks that lack a part of the body.
+        InputError: see `neuma_lib.io.images.read_image_set`; fewer than `MIN_PHOTOGRAPHS` photographs, or more than
+            `MAX_LEFT_OUT` of them with masks that lack a part of the body.
     """
     data = read_transforms(transforms)
     if "photographs" not in data:
         return StaticViews(*load_views(transforms))
     names = [frame["file_path"] for frame in data["frames"]]
-    if len(names) < LEAST_PHOTOGRAPHS:
-        raise InputError(
-            f"{transforms}: {len(names)} mattes of photographs show no body, at least {LEAST_PHOTOGRAPHS} are needed:"
-            " take more photographs from all sides, 30 to 60 are good"
-        )
+    if len(names) < MIN_PHOTOGRAPHS:
+        problem = f"has {len(names)} mattes of photographs, at least {MIN_PHOTOGRAPHS} are needed"
+        raise InputError(transforms, problem, "Take 30 to 60 photographs from all sides")
     views = [_cut_out(Path(transforms), {**data, **frame}, settings) for frame in data["frames"]]
     floor = data["photographs"]["floor"]
     kept = list(range(len(names)))
@@ -84,11 +82,13 @@ def load_static(transforms: str | Path, settings: PhotographsConfig) -> StaticVi
         )
         kept = (shares <= settings.lacking).nonzero()[:, 0].tolist()
     left_out = tuple(name for i, name in enumerate(names) if i not in kept)
-    if len(left_out) > MOST_LEFT_OUT * len(names):
+    if len(left_out) > MAX_LEFT_OUT * len(names):
         raise InputError(
-            f"{transforms}: {len(left_out)} of {len(names)} masks lack more than {100 * settings.lacking:.0f} % of the"
-            f" body that the others show ({', '.join(left_out[:5])}): give masks of your own for them, photograph the"
-            " whole object before another colour, or set photographs.lacking"
+            transforms,
+            f"{len(left_out)} of {len(names)} masks lack more than {100 * settings.lacking:.0f} % of the body that the"
+            f" others show: {', '.join(left_out[:5])}",
+            "Provide your own masks for them, photograph the whole object in front of another colour, or set"
+            " photographs.lacking",
         )
     images, cameras = map(list, zip(*(views[i] for i in kept)))
     return StaticViews(images, cameras, settings, floor, left_out)
@@ -97,14 +97,14 @@ def load_static(transforms: str | Path, settings: PhotographsConfig) -> StaticVi
 def _cut_out(
     listed_in: Path, frame: Mapping[str, Any], settings: PhotographsConfig
 ) -> tuple[torch.Tensor, Cameras]:
-    """A matte (h, w, 4) around its mask, inside the picture, and its camera."""
+    """A matte (h, w, 4) cropped to its mask and a margin, and its camera."""
     file = image_file(listed_in.parent, frame["file_path"], listed_in)
     size = (frame["w"], frame["h"]) if "w" in frame and "h" in frame else None
     pixels = read_rgba(file, frame.get("sha256"), size)
     height, width = pixels.shape[:2]
     K = intrinsic_matrix(frame, width, height)
     rows, columns = (np.flatnonzero((pixels[..., 3] > 127).any(axis=axis)) for axis in (1, 0))
-    margin = max(_LEAST_MARGIN, round(settings.margin * max(np.ptp(rows), np.ptp(columns))))
+    margin = max(_MIN_MARGIN, round(settings.margin * max(np.ptp(rows), np.ptp(columns))))
     left, top = max(0, columns[0] - margin), max(0, rows[0] - margin)
     right, bottom = min(width, columns[-1] + 1 + margin), min(height, rows[-1] + 1 + margin)
     window = pixels[top:bottom, left:right].astype(np.float32) / 255
@@ -119,10 +119,10 @@ def _cut_out(
 
 
 def _reduced(rgba: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray]:
-    """A matte reduced, each pixel the mean of the area that it covers, and by how much in x and y."""
+    """A matte downsampled by area means, and the scale factors in x and y."""
     height, width = rgba.shape[:2]
     rows, columns = max(1, round(factor * height)), max(1, round(factor * width))
-    # colours count by their alpha: those of transparent pixels mean nothing
+    # colours are weighted by alpha, because those of transparent pixels are arbitrary
     weighted = np.concatenate([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], axis=-1)
     small = _area_means(_area_means(weighted, rows).swapaxes(0, 1), columns).swapaxes(0, 1)
     small[..., :3] /= np.maximum(small[..., 3:], 1e-6)
@@ -130,7 +130,7 @@ def _reduced(rgba: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _area_means(pixels: np.ndarray, count: int) -> np.ndarray:
-    """Means over equal stretches of the first axis, whose ends may lie inside of a pixel."""
+    """Means over equal intervals of the first axis, whose ends may lie inside a pixel."""
     total = np.concatenate([np.zeros((1, *pixels.shape[1:])), np.cumsum(pixels, axis=0, dtype=np.float64)])
     ends = np.linspace(0, len(pixels), count + 1)
     before = np.minimum(ends.astype(int), len(pixels) - 1)

@@ -1,4 +1,4 @@
-"""PLY files: vertices with any scalar properties, and triangles; `mesh` and `gaussians` say what they mean."""
+"""PLY files: vertices with any scalar properties, and triangles. `mesh` and `gaussians` interpret them."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from plyfile import PlyData, PlyElement, PlyListProperty
 from neuma_lib.io.files import atomic, existing, reading
 
 MAX_HEADER = 2**16
-"""Longest header that is read [bytes]; one of 3D Gaussian splatting takes 1.5 kB."""
+"""Maximum length of a header [bytes]; that of 3D Gaussian splatting has 1.5 kB."""
 TRIANGLES = ("vertex_indices", "vertex_index")
-"""Names that programs give to the list of a face's corners."""
+"""Common names of the list of a face's corners."""
 
 
 def write_ply(path: str | Path, vertices: np.ndarray, faces: np.ndarray | None = None) -> None:
@@ -37,30 +37,30 @@ def read_ply(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Structured vertices and (M, 3) faces (None without a face element) of an ASCII or binary PLY file.
 
     Raises:
-        InputError: no such file, no PLY file, a header that claims more than the file holds, or faces that are not
-            triangles.
+        InputError: missing file, not a PLY file, a header that claims more than the file contains, or faces that are
+            not triangles.
     """
     elements = read_elements(path)
     return elements["vertex"], elements.get("face")
 
 
 def read_elements(path: str | Path) -> dict[str, np.ndarray]:
-    """The elements of an ASCII or binary PLY file by name, structured arrays; of faces the (M, 3) corners alone.
+    """Elements of an ASCII or binary PLY file by name, as structured arrays; only the (M, 3) corners of faces.
 
     Raises:
-        InputError: as of `read_ply`.
+        InputError: see `read_ply`.
     """
     path = existing(path)
     with reading(path, "PLY of triangles"), path.open("rb") as file:
         corners = _checked_header(file.read(MAX_HEADER), path.stat().st_size)
         file.seek(0)
-        # a fixed length lets binary faces be read at once, not one by one
+        # with a known length, plyfile reads all binary faces at once
         data = PlyData.read(file, known_list_len={"face": dict.fromkeys(corners, 3)})
         elements = {element.name: np.array(element.data) for element in data}
         if "face" not in elements:
             return elements
         faces = elements["face"][corners[0]]
-        if data.text:  # each face is an array of its own
+        if data.text:  # each face is a separate array
             if wrong := [i for i, face in enumerate(faces) if len(face) != 3]:
                 raise ValueError(f"face {wrong[0]} is not a triangle")
             faces = np.array(list(faces)).reshape(-1, 3)
@@ -68,15 +68,13 @@ def read_elements(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def _checked_header(head: bytes, size: int) -> list[str]:
-    """The list properties of faces, of a header that claims no more than a file of ``size`` bytes can hold."""
+    """List properties of the faces. Checks that the header claims no more than a file of ``size`` bytes contains."""
     header, end, rest = head.partition(b"end_header")
     if not head.startswith(b"ply") or not end:
         raise ValueError(f"no header in its first {MAX_HEADER} bytes")
     if rest[:1] not in (b"\n", b"\r"):
         raise ValueError("no new line after end_header")
-    data = PlyData._parse_header(
-        BytesIO(head)
-    )  # plyfile, which is pinned, has no public way to read only this
+    data = PlyData._parse_header(BytesIO(head))  # plyfile has no public function for this
     if "vertex" not in data:
         raise ValueError("no vertices")
     claimed, corners = 0, []
@@ -89,7 +87,7 @@ def _checked_header(head: bytes, size: int) -> list[str]:
         if element.name == "face":
             corners = [p.name for p in lists]
             if len(corners) != 1 or corners[0] not in TRIANGLES:
-                raise ValueError(f"its faces have the lists {corners}, not {TRIANGLES[0]}")
+                raise ValueError(f"the faces have the lists {corners}, not {TRIANGLES[0]}")
         elif lists:
             raise ValueError(f"element {element.name} has the list {lists[0].name}")
         for p in element.properties:
@@ -102,6 +100,6 @@ def _checked_header(head: bytes, size: int) -> list[str]:
             else:
                 claimed += np.dtype(p.val_dtype).itemsize * element.count
     held = size - len(header) - len(end) - 1
-    if claimed > held + 1:  # the last number of a text needs no separator
-        raise ValueError(f"its header claims {claimed} bytes, {held} follow")
+    if claimed > held + 1:  # the last number of an ASCII file needs no separator
+        raise ValueError(f"the header claims {claimed} bytes, but {held} follow")
     return corners

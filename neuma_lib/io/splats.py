@@ -1,11 +1,11 @@
-"""Gaussian splats that were made elsewhere, in the layouts in which they are passed on.
+"""Gaussian splats of other programs, in common exchange formats.
 
 - PLY of the 3DGS release (`neuma_lib.io.gaussians`), which image-to-3D models write, or compressed
   (`neuma_lib.io.compressed_splats`).
 - ``.splat`` (github.com/antimatter15/splat): 32 bytes each, no higher harmonics.
-- ``.spz`` (github.com/nianticlabs/spz), versions 1 to 3: 19 bytes each and the higher harmonics, under gzip.
+- ``.spz`` (github.com/nianticlabs/spz), versions 1 to 3: 19 bytes each plus higher harmonics, compressed by gzip.
 
-Coordinates are those of the file; which way is up, no layout says.
+Coordinates are those of the file. No format defines the up direction.
 """
 
 from __future__ import annotations
@@ -27,62 +27,62 @@ from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.spherical_harmonics import MAX_DEGREE, SH_C0, coefficient_count
 
 KINDS = (".ply", ".splat", ".spz")
-"""Endings of the files that are read."""
-_REMEDY = "remove it in a splat editor, or export the file again"
+"""Supported file suffixes."""
+_REMEDY = "Remove it in a splat editor, or export the file again"
 _SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 _SPZ_HEADER = struct.Struct("<IIIBBBB")
-"""Magic number, version, count, degree of harmonics, fractional bits of positions, flags, nothing."""
+"""Magic number, version, count, degree of harmonics, fractional bits of positions, flags, reserved."""
 _SPZ_MAGIC = 0x5053474E
 _SPZ_VERSIONS = (1, 2, 3)
 _SPZ_EXTENSIONS = 2
-"""Flag of extensions, among them other ranges of the harmonics."""
+"""Flag of extensions, which include other ranges of the harmonics."""
 _SPZ_COLOUR = 0.15
-"""Part of [0, 1] that an sh0 of 1 takes."""
-_MOST_INFLATION = 1040
-"""Bytes that a byte under gzip can hold at most (DEFLATE: 1032), with room for short files."""
+"""Stored colour per unit of sh0."""
+_MAX_INFLATION = 1040
+"""Maximum compression ratio of gzip (DEFLATE: 1032), with a margin for short files."""
 
 
 def load_splat(path: str | Path) -> Gaussians:
-    """Read Gaussians in any of the layouts of this module, in float32, with unit quaternions.
+    """Read Gaussians in any format of this module, in float32, with unit quaternions.
 
     Raises:
-        InputError: a file of another kind, a damaged one, no Gaussians in it, or values that are not finite.
+        InputError: a damaged file or one of another format, no Gaussians, or values that are not finite.
     """
-    path = existing(path, "correct the path of the splat")
+    path = existing(path, "Correct the path of the splat")
     kind = path.suffix.lower()
     if kind not in KINDS:
-        raise InputError(f"{path}: a splat's file ends in {', '.join(KINDS)}: convert it in a splat editor")
+        raise InputError(path, f"must end in one of {', '.join(KINDS)}", "Convert it in a splat editor")
     if kind == ".ply":
         with reading(path, "a splat"):
             elements = read_elements(path)
             if not is_compressed(elements):
-                found = load_gaussians(path, _REMEDY)
-                return _checked(
-                    {field.name: getattr(found, field.name).numpy() for field in fields(found)}, path
-                )
+                loaded = load_gaussians(path, _REMEDY)
+                arrays = {field.name: getattr(loaded, field.name).numpy() for field in fields(loaded)}
+                return _checked(arrays, path)
             return _checked(unpacked(elements), path)
     with reading(path, f"a {kind} file"):
         return _checked((_read_splat if kind == ".splat" else _read_spz)(path), path)
 
 
 def _checked(arrays: dict[str, np.ndarray], path: Path) -> Gaussians:
-    """Gaussians of arrays by name, with unit quaternions."""
+    """Gaussians from arrays by name, with normalised quaternions."""
     if len(arrays["means"]) == 0:
-        raise InputError(f"{path} has no Gaussians: name another file")
+        raise InputError(path, "has no Gaussians")
     for name, array in arrays.items():
         if (bad := ~np.isfinite(array.reshape(len(array), -1)).all(axis=1)).any():
-            raise InputError(f"{path}: {name} of Gaussian {np.argmax(bad)} is not finite: {_REMEDY}")
+            raise InputError(path, f"{name} of Gaussian {np.argmax(bad)} is not finite", _REMEDY)
     norm = np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
     if (norm == 0).any():
-        raise InputError(f"{path}: the rotation of Gaussian {np.argmin(norm)} is zero: {_REMEDY}")
+        raise InputError(path, f"the rotation of Gaussian {np.argmin(norm)} is zero", _REMEDY)
     arrays = {**arrays, "quats": arrays["quats"] / norm}
-    made = {name: torch.from_numpy(np.ascontiguousarray(a, dtype=np.float32)) for name, a in arrays.items()}
-    return Gaussians(**made)
+    return Gaussians(**{
+        name: torch.from_numpy(np.ascontiguousarray(array, np.float32)) for name, array in arrays.items()
+    })  # fmt: skip
 
 
 def _read_splat(path: Path) -> dict[str, np.ndarray]:
     if path.stat().st_size % _SPLAT.itemsize:
-        raise ValueError(f"{path.stat().st_size} bytes are not {_SPLAT.itemsize} a Gaussian")
+        raise ValueError(f"{path.stat().st_size} bytes are not a multiple of {_SPLAT.itemsize}")
     rows = np.fromfile(path, _SPLAT)
     rgba = rows["rgba"] / 255
     return {
@@ -98,27 +98,24 @@ def _read_splat(path: Path) -> dict[str, np.ndarray]:
 def _read_spz(path: Path) -> dict[str, np.ndarray]:
     packed = path.read_bytes()
     if packed[:4] == struct.pack("<I", _SPZ_MAGIC):
-        raise InputError(
-            f"{path} is of version 4 or later, which is not read: export it as version 3, or as PLY"
-        )
+        raise InputError(path, "version 4 or later is not supported", "Export it as version 3 or PLY")
     stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
     head = stream.decompress(packed, _SPZ_HEADER.size)
     magic, version, count, degree, fractional, flags, _ = _SPZ_HEADER.unpack(head)
     if magic != _SPZ_MAGIC:
         raise ValueError("it does not begin with NGSP")
     if version not in _SPZ_VERSIONS or degree > MAX_DEGREE or (degree and flags & _SPZ_EXTENSIONS):
-        raise InputError(
-            f"{path}: version {version} with harmonics of degree {degree} and flags {flags} is not read (versions "
-            f"{_SPZ_VERSIONS[0]} to {_SPZ_VERSIONS[-1]}, degrees to {MAX_DEGREE}, no extensions): export it as PLY"
-        )
+        supported = f"{_SPZ_VERSIONS[0]} to {_SPZ_VERSIONS[-1]}, degree up to {MAX_DEGREE}, no extensions"
+        problem = f"version {version} with degree {degree} and flags {flags} is not supported (versions {supported})"
+        raise InputError(path, problem, "Export it as PLY")
     rest = coefficient_count(degree) - 1
     widths = {
         "means": 6 if version == 1 else 9, "opacities": 1, "sh0": 3, "scales": 3,
         "quats": 4 if version == 3 else 3, "shN": 3 * rest,
     }  # fmt: skip
     size = count * sum(widths.values())
-    if size > _MOST_INFLATION * len(packed):
-        raise ValueError(f"its header claims {count} Gaussians, more than it can hold")
+    if size > _MAX_INFLATION * len(packed):
+        raise ValueError(f"the header claims {count} Gaussians, more than the file can contain")
     body = stream.decompress(stream.unconsumed_tail, size) if size else b""
     if len(body) < size:
         raise ValueError(f"it ends after {len(body)} of {size} bytes")
@@ -140,20 +137,20 @@ def _read_spz(path: Path) -> dict[str, np.ndarray]:
 
 
 def _fixed_point(bytes_: np.ndarray) -> np.ndarray:
-    """Signed whole numbers (G, 3) of 24 bits, the low byte first, from (G, 9)."""
+    """Signed little-endian 24-bit integers (G, 3) from bytes (G, 9)."""
     low, middle, high = bytes_.reshape(-1, 3, 3).astype(np.int64).transpose(2, 0, 1)
     value = low | (middle << 8) | (high << 16)
     return value - ((value & 0x800000) << 1)
 
 
 def _first_three(bytes_: np.ndarray) -> np.ndarray:
-    """Quaternions (G, 4), w first, of x, y, z as bytes (G, 3); w is what they leave, and positive."""
+    """Quaternions (G, 4), w first, from x, y, z as bytes (G, 3); w >= 0 follows from the norm."""
     xyz = bytes_ / 127.5 - 1
     return np.column_stack([np.sqrt(np.maximum(0.0, 1 - np.square(xyz).sum(axis=1))), xyz])
 
 
 def _smallest_three(bytes_: np.ndarray) -> np.ndarray:
-    """Quaternions (G, 4), w first: 2 bits name the largest of x, y, z, w, 3 x 10 are sign and size of the others."""
+    """Quaternions (G, 4), w first: 2 bits name the largest of x, y, z, w; 3 x 10 bits are sign and size of the rest."""
     words = np.ascontiguousarray(bytes_).view("<u4")[:, 0].astype(np.int64)
     largest, rows = words >> 30, np.arange(len(words))
     xyzw = np.zeros((len(words), 4))

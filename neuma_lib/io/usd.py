@@ -1,4 +1,4 @@
-"""A moving surface as USD (Universal Scene Description): a mesh whose points have time samples."""
+"""A moving surface as USD (Universal Scene Description): a mesh with time samples of its points."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from neuma_lib.io.files import atomic
 from neuma_lib.io.gltf import linear
 
 CODES_A_SECOND = 24.0
-"""Time codes of USD to a second; frames lie between them where their times do."""
+"""USD time codes per second; frames may have fractional codes."""
 
 
 def write_usd(
     path: str | Path, vertices: np.ndarray, faces: np.ndarray, times: np.ndarray, colors: np.ndarray
 ) -> None:
-    """Write a moving surface, y up, in metres; arguments as of `write_glb`. The ending says the format: usda, usdc.
+    """Write a moving surface, y up, in metres; arguments as for `write_glb`. The suffix sets the format: usda, usdc.
 
     Raises:
         InputError: usd-core is missing.

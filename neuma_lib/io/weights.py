@@ -1,4 +1,4 @@
-"""Tensors on disk: safetensors, with metadata, and files of torch.save, read without running what they hold."""
+"""Tensors on disk: safetensors with metadata, and files of torch.save, which are read without executing code."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from neuma_lib.io.files import atomic, existing, parse_json, reading, zip_member
 
 
 def write_weights(path: str | Path, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
-    """Write tensors to safetensors, with metadata as one JSON text (their own header has no fixed order)."""
+    """Write tensors to safetensors, with metadata as one JSON text (the order of the header is not fixed)."""
     kept = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     content = save(kept, metadata={"neuma": json.dumps(metadata, sort_keys=True)})
     with atomic(path) as partial:
-        partial.write_bytes(content)  # save_file would let nobody else read it
+        partial.write_bytes(content)  # save_file sets permissions that exclude other users
 
 
 def read_weights(path: str | Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     """Read tensors and metadata from safetensors.
 
     Raises:
-        InputError: missing, truncated or foreign file, or weights that are not finite.
+        InputError: missing, truncated or foreign file, or values that are not finite.
     """
     path = existing(path)
     with reading(path, "safetensors"), safe_open(path, framework="pt", device="cpu") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        metadata = parse_json((file.metadata() or {}).get("neuma", "{}"), f"{path}: its metadata")
+        metadata = parse_json((file.metadata() or {}).get("neuma", "{}"), f"{path}: metadata")
         if not isinstance(metadata, dict):
-            raise ValueError("its metadata is no JSON object")
+            raise ValueError("the metadata are not a JSON object")
         for name, tensor in tensors.items():
             if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
                 raise ValueError(f"{name} is not finite")
@@ -42,10 +42,10 @@ def read_weights(path: str | Path) -> tuple[dict[str, torch.Tensor], dict[str, A
 
 
 def read_torch(path: str | Path) -> Any:
-    """What torch.save wrote: tensors, numbers and texts in plain containers; nothing else is unpickled.
+    """Content of a file of torch.save: tensors, numbers and texts in plain containers; nothing else is unpickled.
 
     Raises:
-        InputError: missing, damaged or foreign file, or one that would need more memory than it has bytes.
+        InputError: missing, damaged or foreign file, or one that would need more memory than its size.
     """
     path = existing(path)
     with reading(path, "a torch file of plain tensors"):
@@ -55,7 +55,7 @@ def read_torch(path: str | Path) -> Any:
             if sum(member.file_size for member in members) > size:
                 raise ValueError("it claims more data than it has bytes")
             pickles = [zip_member(archive, info, size) for info in members if info.filename.endswith(".pkl")]
-        # the one type that torch lets a file make at a size of its choice
+        # the only type that torch allocates at a size given in the file
         if any(b"bytearray" in content for content in pickles):
-            raise ValueError("it holds a bytearray, not only plain tensors")
+            raise ValueError("it contains a bytearray, not only plain tensors")
         return torch.load(path, map_location="cpu", weights_only=True)

@@ -1,4 +1,4 @@
-"""Low-rank adaptor (the paper's Delta M, Sec. 3.2): the trained correction of a frozen prior; laws that take one."""
+"""Low-rank adaptor (the paper's Delta M, Sec. 3.2): the trained correction of a frozen prior law."""
 
 from __future__ import annotations
 
@@ -11,31 +11,32 @@ from neuma_lib.errors import InputError
 from neuma_lib.mechanics.law import Constitutive, Law, Weights
 
 LAYER_KEYS = ("layers.0.fc.weight", "layers.1.fc.weight", "final_layer.fc.weight")
-"""Names of the three matrices of a network in files, those of NCLaw's checkpoints."""
+"""Names of the three matrices of a network in files, as in NCLaw's checkpoints."""
 
 
 class Adaptor(nn.Module):
     """Correction W_l = W0_l + w * s_l * Delta_l of every layer of one network.
 
-    ``Delta_l = (alpha / rank) B_l A_l`` (LoRA), or a full matrix ``D_l`` if ``rank`` is None (training the
-    base weights, the paper's "w/o LoRA"). ``s_l`` is the root mean square of W0_l over that of a
-    Xavier-uniform matrix of its shape, so that one learning rate serves priors whose weights differ in size; a
-    layer of zeros (the identity as a network) counts as Xavier-sized. Delta is zero at the start.
+    ``Delta_l = (alpha / rank) B_l A_l`` (LoRA), or a full matrix ``D_l`` if ``rank`` is None (the paper's "w/o
+    LoRA"). ``s_l`` is the root mean square of W0_l divided by that of a Xavier-uniform matrix of the same shape (1
+    for a zero matrix), so that one learning rate suits priors of different weight magnitudes. Delta is initially zero.
 
     Args:
-        base: the frozen weights W0_l, (out, in) each.
+        base: frozen weights W0_l, (out, in) each.
         rank: LoRA rank r, or None.
         alpha: LoRA scaling numerator.
-        seed: of the Kaiming-uniform(sqrt 5) start of A.
+        seed: seed of the Kaiming-uniform(sqrt 5) initialisation of A.
     """
 
     def __init__(self, base: Sequence[Tensor], rank: int | None = 16, alpha: float = 16.0, seed: int = 0):
         super().__init__()
         if rank is not None and (not isinstance(rank, int) or rank < 1):
-            raise InputError(f"adaptor rank must be a positive integer or null (full matrices), not {rank!r}")
+            raise InputError(
+                "adaptor.rank", f"{rank!r} must be a positive integer, or null for full matrices"
+            )
         self.rank, self.alpha = rank, float(alpha)
         self.weight = 1.0
-        """The multiplier w of the correction: 1 as trained, 0 the prior, between them an interpolation."""
+        """Multiplier w of the correction: 1 is the trained law, 0 the prior."""
         generator = torch.Generator().manual_seed(seed)
         self.A, self.B, self.D = nn.ParameterList(), nn.ParameterList(), nn.ParameterList()
         self.scales: list[float] = []
@@ -64,15 +65,15 @@ class Adaptor(nn.Module):
 
 
 class AdaptableConstitutive(Constitutive):
-    """A network of a few matrices with frozen base weights and, if one is attached, an adaptor."""
+    """A network with frozen base weights and an optional adaptor."""
 
     isotropic = False
-    """Whether the axes of the stretch do not matter, for any weights."""
+    """Whether the response is isotropic for any weights."""
     base: nn.ParameterList
     adaptor: Adaptor | None
 
     def freeze(self, weights: Weights) -> None:
-        """Make copies of ``weights`` the base, without an adaptor."""
+        """Set copies of ``weights`` as the base and remove the adaptor."""
         self.base = nn.ParameterList(nn.Parameter(w.detach().clone(), requires_grad=False) for w in weights)
         self.adaptor = None
 
@@ -81,24 +82,24 @@ class AdaptableConstitutive(Constitutive):
 
 
 class AdaptableLaw(Law):
-    """A law with networks; the adaptor, once attached, holds the only trainable parameters."""
+    """A law with networks. Only the parameters of an attached adaptor are trainable."""
 
     @property
     def parts(self) -> dict[str, AdaptableConstitutive]:
-        """The networks by name; a part without one (a plasticity that is the identity) is left out."""
+        """The networks by name, without parts that have none (the identity as plasticity)."""
         both = {"elasticity": self.elasticity, "plasticity": self.plasticity}
         return {name: part for name, part in both.items() if isinstance(part, AdaptableConstitutive)}
 
     def attach_adaptor(self, rank: int | None = 16, alpha: float = 16.0, seed: int = 0) -> None:
-        """Give the networks a fresh adaptor, zero at the start."""
+        """Attach a new adaptor, initially zero, to each network."""
         for offset, part in enumerate(self.parts.values()):
             part.adaptor = Adaptor(tuple(part.base), rank, alpha, seed=2 * seed + offset)
 
     def set_adaptor_weight(self, weight: float) -> None:
-        """Interpolate between the prior (0) and the adapted law (1); also beyond."""
+        """Interpolate between the prior (0) and the adapted law (1), or extrapolate."""
         for part in self.parts.values():
             if part.adaptor is None:
-                raise InputError("the law has no adaptor whose weight could be set")
+                raise InputError("adaptor.weight", f"law {self.name!r} has no adaptor")
             part.adaptor.weight = float(weight)
 
     def adaptor_state(self) -> dict[str, Tensor]:
@@ -113,21 +114,18 @@ class AdaptableLaw(Law):
     def load_adaptor_state(
         self, state: dict[str, Tensor], rank: int | None = 16, alpha: float = 16.0
     ) -> None:
-        """Attach an adaptor with the given tensors.
-
-        Raises:
-            InputError: the tensors do not fit an adaptor of this rank.
-        """
+        """Attach an adaptor with the given tensors. Raises InputError if they do not match the rank."""
         self.attach_adaptor(rank, alpha)
         for name, part in self.parts.items():
             own = {key[len(name) + 1 :]: value for key, value in state.items() if key.startswith(name + ".")}
             try:
                 part.adaptor.load_state_dict(own)
             except RuntimeError as error:
-                raise InputError(f"adaptor of the {name} does not fit rank {rank}: {error}") from None
+                reason = " ".join(str(error).split())
+                raise InputError(f"adaptor.{name}", f"tensors do not match rank {rank}: {reason}") from None
 
     def prior_state(self) -> dict[str, Tensor]:
-        """Merged weights under the names of :data:`LAYER_KEYS`, prefixed by the part."""
+        """Merged weights by the names of :data:`LAYER_KEYS`, prefixed by the part."""
         return {
             f"{name}.{key}": weight.detach().clone().contiguous()
             for name, part in self.parts.items()

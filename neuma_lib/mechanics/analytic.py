@@ -1,4 +1,4 @@
-"""Analytic laws from a specification, as written in the tables of scenes and priors."""
+"""Analytic laws from a specification, as used in the settings of scenes and priors."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ NAMES = {kind: name for name, kind in (ELASTICITIES | PLASTICITIES).items()}
 
 
 def analytic_law(spec: Mapping[str, Any], dt: float | None = None, name: str | None = None) -> Law:
-    """Law of a specification such as
+    """Build a law from a specification such as
 
     ``{"elasticity": {"name": "hencky", "E": 3e5, "nu": 0.25}, "plasticity": {"name": "von_mises",
     "yield_stress": 5e3}}``
 
     Args:
-        spec: the two parts, each with its ``name`` and constants. A plasticity takes E and nu from the elasticity
-            unless it has its own; a missing plasticity is the identity.
-        dt: time step [s], needed by rate-dependent plasticity (one with the constant ``dt``).
-        name: for messages; made of the parts' names if not given.
+        spec: the two parts, each with its ``name`` and constants. A plasticity inherits E and nu from the elasticity
+            by default. A missing plasticity is the identity.
+        dt: time step [s], required by rate-dependent plasticity (with the constant ``dt``).
+        name: name used in messages, by default composed of the names of the parts.
 
     Raises:
-        InputError: unknown part, name or constant, a missing one, or one outside its interval.
+        InputError: a part, name or constant is unknown or missing, or a constant is outside its interval.
     """
     parts = complete(spec, dt)
     names = [part.pop("name") for part in parts.values()]
@@ -35,7 +35,7 @@ def analytic_law(spec: Mapping[str, Any], dt: float | None = None, name: str | N
 
 
 def specification(elasticity: AnalyticElasticity, plasticity: Plasticity) -> dict[str, Any]:
-    """The specification of two analytic parts, complete: with E, nu and dt where a plasticity has them."""
+    """Complete specification of two analytic parts, including inherited constants of the plasticity (E, nu, dt)."""
     parts = {"elasticity": elasticity, "plasticity": plasticity}
     return {
         name: {"name": NAMES[type(part)], **{key: float(value) for key, value in part.values.items()}}

@@ -1,12 +1,12 @@
-// Text of the kernels of `analytic_fused`, around the load and the SVD of `singular_values_kernels.h`: a pack of matrices
-// of one law. The module puts the names of its laws before it. `constants` holds the number of the law and what
-// `analytic_fused` makes of its constants, c[1] ... c[3].
+// Kernels of `analytic_fused` for a pack of matrices of one law, combined with the load and SVD parts of
+// `singular_values_kernels.h`. The module prepends an enum of laws. `constants` holds the index of the law and its
+// coefficients c[1] ... c[3].
 
-// Comparisons are written so that a value that is not finite stays so.
+// Comparisons propagate values that are not finite.
 //// constants
     const Real* const c = (const Real*)constants.data;
-    const int law = (int)c[0];  // Warp makes another function of int(...)
-    const Real LEAST = Real(STRETCH_MIN);
+    const int law = (int)c[0];  // Warp redefines int(...)
+    const Real STRETCH_LOW = Real(STRETCH_MIN);
 
 //// unchanged
     auto copy_all = [&]() {
@@ -41,17 +41,17 @@
         for (int k = 0; k < 3; ++k) y[k] = s[k] * s[k] * (c[1] * e[k] + c[2] * (e[0] + e[1] + e[2]));
     } else if (law == Hencky) {
         Pack e[3];
-        for (int k = 0; k < 3; ++k) e[k] = log_of(at_least(s[k], LEAST));
+        for (int k = 0; k < 3; ++k) e[k] = log_of(at_least(s[k], STRETCH_LOW));
         for (int k = 0; k < 3; ++k) y[k] = c[1] * e[k] + c[2] * (e[0] + e[1] + e[2]);
     } else if (law == NeoHookean) {
-        const Pack bulk = c[2] * log_of(at_least(s[0] * s[1] * s[2], LEAST * LEAST * LEAST));
+        const Pack bulk = c[2] * log_of(at_least(s[0] * s[1] * s[2], STRETCH_LOW * STRETCH_LOW * STRETCH_LOW));
         for (int k = 0; k < 3; ++k) y[k] = c[1] * (s[k] - one) * (s[k] + one) + bulk;
     } else if (law == Fluid) {
         const Pack J = s[0] * s[1] * s[2];
         for (int k = 0; k < 3; ++k) y[k] = c[1] * J * (J - one);
-    } else {  // of the isochoric logarithmic strain: Ogden, MooneyRivlin
+    } else {  // functions of the isochoric logarithmic strain: Ogden, MooneyRivlin
         Pack e[3];
-        for (int k = 0; k < 3; ++k) e[k] = log_of(at_least(s[k], LEAST));
+        for (int k = 0; k < 3; ++k) e[k] = log_of(at_least(s[k], STRETCH_LOW));
         const Pack log_J = e[0] + e[1] + e[2];
         for (int k = 0; k < 3; ++k) {
             const Pack strain = e[k] - log_J / Real(3);
@@ -73,15 +73,15 @@
         }
     }
 
-// Principal stretches y after the return, then U diag(y) V^T, or F where they are the same.
+// Principal stretches y after the return, then U diag(y) V^T, or F where they are unchanged.
 //// plasticity
     auto yields = (s[0] == s[0]) | (s[0] != s[0]);
     if (law == FluidProjection) {
-        const Pack J = at_least(s[0] * s[1] * s[2], LEAST * LEAST * LEAST);
+        const Pack J = at_least(s[0] * s[1] * s[2], STRETCH_LOW * STRETCH_LOW * STRETCH_LOW);
         y[0] = y[1] = y[2] = exp_of(log_of(J) / Real(3));
     } else {
         Pack e[3];
-        for (int k = 0; k < 3; ++k) e[k] = log_of(at_least(s[k], LEAST));
+        for (int k = 0; k < 3; ++k) e[k] = log_of(at_least(s[k], STRETCH_LOW));
         const Pack mean = (e[0] + e[1] + e[2]) / Real(3);
         for (int k = 0; k < 3; ++k) e[k] = e[k] - mean;
         const Real NORMAL = sizeof(Real) == 4 ? Real(1.17549435e-38) : Real(2.2250738585072014e-308);
@@ -89,13 +89,13 @@
         auto beyond = [&](const Pack& limit) { return (norm > limit) | (norm != norm); };
         Pack kept, apex = zero;
         if (law == DruckerPrager) {  // c: slope of the cone, strain at the apex per axis
-            const Pack pressed = Real(3) * (mean - c[2]);
-            kept = -c[1] * pressed;
+            const Pack shifted = Real(3) * (mean - c[2]);
+            kept = -c[1] * shifted;
             yields = beyond(kept);
-            const auto pulled = pressed > Real(0);
-            apex = pulled ? zero + c[2] : mean;
-            kept = pulled ? zero : kept;
-        } else {  // ViscousFlow, and VonMises with a relaxation of zero; c: limit, what is left beyond it in a step
+            const auto tensile = shifted > Real(0);
+            apex = tensile ? zero + c[2] : mean;
+            kept = tensile ? zero : kept;
+        } else {  // ViscousFlow, and VonMises as c[2] = 0; c: limit, remaining share of the excess after a step
             kept = c[1] + (norm - c[1]) * c[2];
             yields = beyond(zero + c[1]);
             apex = mean;
@@ -106,16 +106,16 @@
             copy_all();
             return;
         }
-        const Pack shrunk = kept / norm;
-        for (int k = 0; k < 3; ++k) y[k] = exp_of(apex + e[k] * shrunk);
+        const Pack share = kept / norm;
+        for (int k = 0; k < 3; ++k) y[k] = exp_of(apex + e[k] * share);
     }
     yields = yields & ((y[0] != s[0]) | (y[1] != s[1]) | (y[2] != s[2]));
     for (int i = 0; i < 3; ++i) {
         for (int j = 0; j < 3; ++j) {
-            const Pack turned = u0[i] * y[0] * v0[j] + u1[i] * y[1] * v1[j] + u2[i] * y[2] * v2[j];
+            const Pack returned = u0[i] * y[0] * v0[j] + u1[i] * y[1] * v1[j] + u2[i] * y[2] * v2[j];
             for (int l = 0; l < used; ++l) {
                 const int k = 9 * (first + l) + 3 * i + j;
-                ((Real*)out.data)[k] = LANE(yields, l) ? LANE(turned, l) : ((const Real*)F.data)[k];
+                ((Real*)out.data)[k] = LANE(yields, l) ? LANE(returned, l) : ((const Real*)F.data)[k];
             }
         }
     }

@@ -1,12 +1,11 @@
-"""Analytic laws of several copies of a body, evaluated in one launch: for rollouts that differ in their constants.
+"""Fused evaluation of analytic laws for several copies of a body, used by rollouts that differ in their constants.
 
-`SideBySide` puts the elasticities (or the plasticities) of laws together: what they act on lies one copy after the
-other in memory. Values only: the adjoint, and whatever has no kernel, goes through the laws' own torch code, which is
-also the twin that tests compare with. On a CPU one law alone gains as well: torch takes ten launches and two singular
-value decompositions for what is one pass here.
+`SideBySide` combines the elasticities (or plasticities) of several laws whose particles follow each other in memory.
+Only values are computed here. Adjoints, and laws without a kernel, use the torch code of the laws, which is also the
+reference in tests. A single law is faster too: torch needs ten launches and two singular value decompositions.
 
-The number of a law and up to three coefficients, made of its constants once and in double precision, are its weights:
-a recorded CUDA graph serves any constants.
+The weights of a copy are the index of its law and up to three coefficients in double precision, so that a recorded
+CUDA graph applies to any constants.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -26,8 +25,8 @@ from neuma_lib.mechanics.singular_values_kernels import LOAD, SVD, pack_count, s
 start_warp()
 
 _TEXT = native_source(__file__, ".h")
-_WIDTH = 4  # number of the law and coefficients
-_BLOCK = 64  # threads of a block on a GPU
+_WIDTH = 4  # index of the law and coefficients
+_BLOCK = 64  # threads per block on a GPU
 
 Values = dict[str, float]
 
@@ -74,17 +73,17 @@ _COEFFICIENTS: dict[type[Constitutive], Callable[[Values], tuple[float, ...]]] =
     plasticity.FluidProjection: lambda values: (),
     plasticity.ViscousFlow: _viscous_flow,
 }
-"""What the kernels need of a law's constants."""
+"""Coefficients of the kernels from the constants of a law."""
 
-_NUMBERS = {part: number for number, part in enumerate(_COEFFICIENTS)}
+_INDEX = {part: index for index, part in enumerate(_COEFFICIENTS)}
 
 
 class SideBySide(Constitutive):
-    """The elasticities, or the plasticities, of several laws on equal numbers of particles, one after the other.
+    """Elasticities, or plasticities, of several laws that act on consecutive ranges of equally many particles.
 
     Args:
-        parts: one a copy, all of types that `fusible` knows; their constants are fixed.
-        device: where they are evaluated.
+        parts: one per copy, with fixed constants and types that `fusible` accepts.
+        device: device of the evaluation.
     """
 
     capturable = True
@@ -95,8 +94,11 @@ class SideBySide(Constitutive):
         self._kind = "elasticity" if isinstance(parts[0], Elasticity) else "plasticity"
         rows = torch.zeros(len(parts), _WIDTH, dtype=torch.float64)
         for row, part in zip(rows, parts, strict=True):
-            made = _COEFFICIENTS[type(part)]({key: float(value) for key, value in part.values.items()})
-            row[: 1 + len(made)] = torch.tensor([_NUMBERS[type(part)], *made], dtype=torch.float64)
+            coefficients = _COEFFICIENTS[type(part)](
+                {key: float(value) for key, value in part.values.items()}
+            )
+            numbers = [_INDEX[type(part)], *coefficients]
+            row[: len(numbers)] = torch.tensor(numbers, dtype=torch.float64)
         self._rows = rows.to(device)
 
     def graph_key(self) -> Hashable:
@@ -114,7 +116,7 @@ class SideBySide(Constitutive):
         F = F.detach().contiguous()
         result = torch.empty_like(F) if out is None else out
         copies, N = len(self.parts), len(F) // len(self.parts)
-        # contiguous memory of another shape is a view; a buffer that is not would not be written to
+        # `view` fails on a result that is not contiguous, instead of writing to a copy
         inputs = F.view(copies, N, 3, 3), weights[0], result.view(copies, N, 3, 3)
         kernel = _kernel(self._kind, F.dtype)
         launch(kernel, (copies, pack_count(N, F.device)), *inputs, N, block_dim=_BLOCK)
@@ -122,12 +124,12 @@ class SideBySide(Constitutive):
 
 
 def fusible(law: Law) -> bool:
-    """Whether there are kernels for both parts of a law."""
+    """Whether both parts of a law have kernels."""
     return type(law.elasticity) in _COEFFICIENTS and type(law.plasticity) in _COEFFICIENTS
 
 
 def side_by_side(laws: Sequence[Law], device: torch.device | str = "cpu") -> Law:
-    """One law for the particles of several copies, one after the other, each with its own of the given laws."""
+    """One law for consecutive copies, each of which follows its own law."""
     elastic = SideBySide([law.elasticity for law in laws], device)
     plastic = SideBySide([law.plasticity for law in laws], device)
     return Law(elastic, plastic, laws[0].name if len(laws) == 1 else f"{len(laws)} laws side by side")
@@ -135,7 +137,7 @@ def side_by_side(laws: Sequence[Law], device: torch.device | str = "cpu") -> Law
 
 @cache
 def _kernel(kind: str, dtype: torch.dtype):
-    """Kernel (F, rows, out, particles of a copy), launched over copies and packs of a copy."""
+    """Kernel (F, rows, out, particles per copy), launched over copies and packs per copy."""
     real, _, mat33 = warp_types(dtype)
     names = f"enum {{ {', '.join(part.__name__ for part in _COEFFICIENTS)} }};\n"
     before = _TEXT["constants"] + (_TEXT["unchanged"] if kind == "plasticity" else "")

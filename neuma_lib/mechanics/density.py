@@ -1,4 +1,4 @@
-"""Mass density of a body at rest: one number, or two on either side of a plane."""
+"""Mass density of a body at rest: constant, or two values separated by a plane."""
 
 from __future__ import annotations
 

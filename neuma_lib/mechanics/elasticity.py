@@ -3,8 +3,8 @@
 Each isotropic law is given by its principal Kirchhoff stresses as a function of the principal stretches sigma, with
 Lamé parameters mu, lam and J = sigma_1 sigma_2 sigma_3. All are symmetric, objective and stress-free at F = R.
 
-`Ogden`, `MooneyRivlin` and `FibreReinforced` serve as truths that no simpler law contains: with the same E and nu they
-agree with `Hencky` at small strains (the last one in its matrix), and part from it at those of an impact.
+`Ogden`, `MooneyRivlin` and `FibreReinforced` serve as ground truth outside the candidate families. With equal E and nu
+they agree with `Hencky` at small strains (`FibreReinforced` in its matrix) and deviate at the strains of an impact.
 """
 
 from __future__ import annotations
@@ -19,11 +19,10 @@ from neuma_lib.mechanics.isotropic import Constants, isotropic_stress, lame
 from neuma_lib.mechanics.law import Elasticity, Weights
 
 STRETCH_MIN = 0.05
-"""Logarithms are of max(sigma, STRETCH_MIN), as in NCLaw, so that a crushed element keeps a finite stress."""
+"""Logarithms are of max(sigma, STRETCH_MIN), as in NCLaw, which bounds the stress of a crushed element."""
 
 FIBRE_EXPONENT_MAX = 8.0
-"""Bound on the exponent of the fibre term, so that a torn element keeps a finite stress; the term is e^8 = 3,000 times
-as stiff there as at rest."""
+"""Bound on the exponent of the fibre term, which limits its stiffness to e^8 = 3,000 times that at rest."""
 
 
 class AnalyticElasticity(Constants, Elasticity):
@@ -34,8 +33,8 @@ class AnalyticElasticity(Constants, Elasticity):
     def principal(
         self, sigma: Tensor, mu: float | Tensor, lam: float | Tensor, **others: float | Tensor
     ) -> Tensor:
-        """Principal Kirchhoff stresses (N, 3) [Pa] of the principal stretches (N, 3); ``others``: constants beside E
-        and nu."""
+        """Principal Kirchhoff stresses (N, 3) [Pa] of the principal stretches (N, 3), with constants other than E and
+        nu in ``others``."""
         raise NotImplementedError
 
     def response(self, F: Tensor, weights: Weights) -> Tensor:
@@ -100,12 +99,12 @@ class Fluid(AnalyticElasticity):
 
 
 class Tait(AnalyticElasticity):
-    """tau = (K / 7) (J - J^-6) I + 2 mu dev eps, K = lam + 2 mu / 3: a liquid by the equation of state of Tait and Cole
-    with the exponent 7, and `Hencky` in shear.
+    """tau = (K / 7) (J - J^-6) I + 2 mu dev eps, K = lam + 2 mu / 3: the Tait-Cole equation of state of a liquid with
+    exponent 7, and `Hencky` in shear.
 
-    With the return `fluid_projection` only J counts, as in PAC-NeRF's weakly compressible fluid (Li et al. 2023), whose
-    kappa is K / 7. With `viscous_flow` it is a Newtonian fluid: in steady flow tau is 2 viscosity dev D beside the
-    pressure, so that PAC-NeRF's mu is twice the viscosity.
+    With `fluid_projection` the stress depends on J only, as in PAC-NeRF's weakly compressible fluid (Li et al. 2023),
+    whose kappa is K / 7. With `viscous_flow` it is a Newtonian fluid: dev tau = 2 viscosity dev D in steady flow, so
+    that PAC-NeRF's mu is twice the viscosity.
     """
 
     def principal(self, sigma, mu, lam):
@@ -117,8 +116,8 @@ class Tait(AnalyticElasticity):
 class Ogden(AnalyticElasticity):
     """One-term Ogden solid: tau_i = (2 mu / alpha) dev(s_i^alpha) + (lam + 2 mu / 3) log J, s_i = sigma_i J^(-1/3).
 
-    From the energy (2 mu / alpha^2) (sum_i s_i^alpha - 3) + (lam + 2 mu / 3) log(J)^2 / 2 (Ogden 1972). It stiffens
-    with strain: at alpha = 12, three times in pure shear to a stretch of 1.16. alpha -> 0 is `Hencky`.
+    Energy (2 mu / alpha^2) (sum_i s_i^alpha - 3) + (lam + 2 mu / 3) log(J)^2 / 2 (Ogden 1972). The solid stiffens with
+    strain, for alpha = 12 by a factor of three in pure shear to a stretch of 1.16. alpha -> 0 is `Hencky`.
     """
 
     constants = ELASTICITY["ogden"]
@@ -131,9 +130,9 @@ class Ogden(AnalyticElasticity):
 class MooneyRivlin(AnalyticElasticity):
     """tau = mu (1 - q) dev b - mu q dev b^-1 + (lam + 2 mu / 3) log J I with the isochoric b = J^(-2/3) F F^T.
 
-    From the energy C1 (I1 - 3) + C2 (I2 - 3) + (lam + 2 mu / 3) log(J)^2 / 2 of the isochoric invariants, where
-    C1 + C2 = mu / 2 and ``q`` = C2 / (C1 + C2): 0 is an isochoric neo-Hookean solid, 1 has the second invariant alone,
-    harder to press than to pull. Nearly incompressible with nu near 0.5.
+    Energy C1 (I1 - 3) + C2 (I2 - 3) + (lam + 2 mu / 3) log(J)^2 / 2 of the isochoric invariants, with C1 + C2 = mu / 2
+    and ``q`` = C2 / (C1 + C2). q = 0 is an isochoric neo-Hookean solid. q = 1 has the second invariant only and is
+    stiffer in compression than in tension. Nearly incompressible with nu near 0.5.
     """
 
     constants = ELASTICITY["mooney_rivlin"]
@@ -145,14 +144,14 @@ class MooneyRivlin(AnalyticElasticity):
 
 
 class FibreReinforced(Hencky):
-    """A `Hencky` matrix with one family of fibres along a (transversely isotropic), and a_F = F a, I4 = |a_F|^2:
+    """A `Hencky` matrix with one family of fibres along a (transversely isotropic), with a_F = F a and I4 = |a_F|^2:
 
     tau = tau_matrix + (H / 2) (I4 - 1) exp(b (I4 - 1)^2) a_F (x) a_F
 
-    from the energy H / (8 b) (exp(b (I4 - 1)^2) - 1) (Holzapfel, Gasser and Ogden 2000; but fibres bear pressure too,
-    so that stress is smooth at rest). H = ``fibre_modulus`` [Pa] is what they add to Young's modulus along a at small
-    strains, b = ``fibre_exponent`` how they stiffen. a at F = I lies ``elevation`` degrees above the x-z plane, over
-    the direction ``azimuth`` degrees from x towards z.
+    Energy H / (8 b) (exp(b (I4 - 1)^2) - 1) (Holzapfel, Gasser and Ogden 2000, but with fibres that bear compression,
+    so that the stress is smooth at rest). H = ``fibre_modulus`` [Pa] adds to Young's modulus along a at small strains,
+    b = ``fibre_exponent`` controls stiffening. At F = I, a has ``elevation`` degrees above the x-z plane and
+    ``azimuth`` degrees from x towards z.
     """
 
     constants = ELASTICITY["fibre_reinforced"]
@@ -160,17 +159,17 @@ class FibreReinforced(Hencky):
     def response(self, F: Tensor, weights: Weights) -> Tensor:
         constants = self.with_weights(weights)
         mu, lam = lame(constants["E"], constants["nu"])
-        turn, rise = (
+        azimuth, elevation = (
             torch.as_tensor(constants[key], dtype=F.dtype, device=F.device) * (math.pi / 180)
             for key in ("azimuth", "elevation")
         )
-        a = torch.stack([rise.cos() * turn.cos(), rise.sin(), rise.cos() * turn.sin()])
-        carried = F @ a
-        strain = (carried**2).sum(1) - 1
+        a = torch.stack([elevation.cos() * azimuth.cos(), elevation.sin(), elevation.cos() * azimuth.sin()])
+        a_F = F @ a
+        strain = (a_F**2).sum(1) - 1
         exponent = (constants["fibre_exponent"] * strain**2).clamp(max=FIBRE_EXPONENT_MAX)
         tension = constants["fibre_modulus"] / 2 * strain * exponent.exp()
         matrix = isotropic_stress(F, lambda sigma: self.principal(sigma, mu, lam))
-        return matrix + tension[:, None, None] * carried[:, :, None] * carried[:, None]
+        return matrix + tension[:, None, None] * a_F[:, :, None] * a_F[:, None]
 
 
 ELASTICITIES: dict[str, type[AnalyticElasticity]] = {

@@ -1,10 +1,10 @@
 """Isotropic tensor functions through singular values, and the constants of analytic laws.
 
-Every analytic law here is isotropic: with F = U diag(sigma) V^T it is given by three principal values y(sigma), as a
-stress U diag(y) U^T or as a deformation U diag(y) V^T. Their adjoints need divided differences of y, which are finite
-at equal singular values; :func:`_apart` evaluates them without a branch by keeping the two values at least eps^(1/3)
-apart (error eps^(2/3), because the quotient is an even function of the distance). A law that has them in closed form,
-to round-off, calls :func:`coaxial_stress` and :func:`coaxial_deformation` instead.
+With F = U diag(sigma) V^T, an isotropic law is given by three principal values y(sigma), as a stress U diag(y) U^T or
+as a deformation U diag(y) V^T. The adjoints need divided differences of y, which are finite at equal singular values.
+:func:`_separate` evaluates them without a branch by keeping both values at least eps^(1/3) apart (error eps^(2/3),
+because the quotient is an even function of the distance). Laws with closed-form divided differences use
+:func:`coaxial_stress` and :func:`coaxial_deformation`.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ y_i + y_j and sigma_i + sigma_j, (N, 3 pairs) each."""
 PAIRS = ((0, 1), (0, 2), (1, 2))
 
 
-def _apart(sigma: Tensor, function: PrincipalFunction) -> tuple[Tensor, Tensor]:
-    """For each pair (i, j) of :data:`PAIRS`: sigma_i, sigma_j moved apart about their mean, and y_i, y_j there; both
-    (N, 3 pairs, 2)."""
+def _separate(sigma: Tensor, function: PrincipalFunction) -> tuple[Tensor, Tensor]:
+    """For each pair (i, j) of :data:`PAIRS`: sigma_i and sigma_j, separated about their mean, and y_i, y_j there;
+    both (N, 3 pairs, 2)."""
     least = torch.finfo(sigma.dtype).eps ** (1 / 3)
     moved = sigma[:, None].repeat(1, 3, 1)
     for pair, (i, j) in enumerate(PAIRS):
@@ -49,18 +49,18 @@ def _symmetric(pairs: Tensor) -> Tensor:
     return torch.stack([zero, a, b, a, zero, c, b, c, zero], dim=1).reshape(-1, 3, 3)
 
 
-def _moving_apart(function: PrincipalFunction) -> Quotients:
-    """The quotients of a function of which only values are known."""
+def _numeric_quotients(function: PrincipalFunction) -> Quotients:
+    """Divided differences of a function from its values."""
 
     def quotients(sigma):
-        s, y = _apart(sigma, function)
+        s, y = _separate(sigma, function)
         return (y[..., 0] - y[..., 1]) / (s[..., 0] - s[..., 1]), y.sum(-1), s.sum(-1)
 
     return quotients
 
 
-def _decomposed(ctx, F: Tensor, quotients: Quotients) -> tuple[Tensor, Tensor, Tensor]:
-    """U, sigma, Vh of F, kept for backward together with the quotients."""
+def _decompose(ctx, F: Tensor, quotients: Quotients) -> tuple[Tensor, Tensor, Tensor]:
+    """U, sigma, Vh of F, saved for backward together with the quotients."""
     parts = svd3(F)
     ctx.quotients = quotients
     ctx.save_for_backward(*parts)
@@ -77,11 +77,11 @@ def _deformation(F: Tensor, U: Tensor, sigma: Tensor, Vh: Tensor, y: Tensor) -> 
 
 
 class _Stress(torch.autograd.Function):
-    """(F, y) -> U diag(y) U^T; the gradient to F is that of U at fixed y."""
+    """(F, y) -> U diag(y) U^T. The gradient with respect to F is that of U at fixed y."""
 
     @staticmethod
     def forward(ctx, F, y, quotients):
-        U, _, _ = _decomposed(ctx, F, quotients)
+        U, _, _ = _decompose(ctx, F, quotients)
         return _stress(U, y)
 
     @staticmethod
@@ -96,11 +96,12 @@ class _Stress(torch.autograd.Function):
 
 
 class _Deformation(torch.autograd.Function):
-    """(F, y) -> U diag(y) V^T, and F itself where y equals sigma; the gradient to F is that of U, V at fixed y."""
+    """(F, y) -> U diag(y) V^T, exactly F where y equals sigma. The gradient with respect to F is that of U and V at
+    fixed y."""
 
     @staticmethod
     def forward(ctx, F, y, quotients):
-        return _deformation(F, *_decomposed(ctx, F, quotients), y)
+        return _deformation(F, *_decompose(ctx, F, quotients), y)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -109,8 +110,8 @@ class _Deformation(torch.autograd.Function):
         G = U.mT @ grad @ Vh.mT
         quotient, y_total, total = ctx.quotients(sigma)
         stretch = _symmetric(quotient)
-        turn = _symmetric(y_total / away_from_zero(total, torch.finfo(sigma.dtype).eps))
-        K = 0.5 * stretch * (G + G.mT) + 0.5 * turn * (G - G.mT)
+        rotation = _symmetric(y_total / away_from_zero(total, torch.finfo(sigma.dtype).eps))
+        K = 0.5 * stretch * (G + G.mT) + 0.5 * rotation * (G - G.mT)
         return U @ K @ Vh, G.diagonal(dim1=1, dim2=2), None
 
 
@@ -120,33 +121,33 @@ def coaxial_stress(F: Tensor, y: Tensor, quotients: Quotients) -> Tensor:
 
 
 def coaxial_deformation(F: Tensor, y: Tensor, quotients: Quotients) -> Tensor:
-    """U diag(y) V^T, (N, 3, 3), differentiable likewise; exactly F where y equals the singular values."""
+    """U diag(y) V^T, (N, 3, 3), differentiable in F and y; exactly F where y equals the singular values."""
     return _Deformation.apply(F, y, quotients)
 
 
 def isotropic_stress(F: Tensor, function: PrincipalFunction) -> Tensor:
-    """U diag(y(sigma)) U^T, (N, 3, 3), differentiable in F and in what ``function`` closes over."""
+    """U diag(y(sigma)) U^T, (N, 3, 3), differentiable in F and in the tensors that ``function`` closes over."""
     if not torch.is_grad_enabled():  # one decomposition instead of two
         U, sigma, _ = svd3(F)
         return _stress(U, function(sigma))
     _, sigma = rotation_and_singular_values(F) if F.requires_grad else (None, svd3(F)[1])
-    return coaxial_stress(F, function(sigma), _moving_apart(function))
+    return coaxial_stress(F, function(sigma), _numeric_quotients(function))
 
 
 def isotropic_deformation(F: Tensor, function: PrincipalFunction) -> Tensor:
-    """U diag(y(sigma)) V^T, (N, 3, 3), differentiable likewise; exactly F where y(sigma) equals sigma."""
+    """U diag(y(sigma)) V^T, (N, 3, 3), differentiable like `isotropic_stress`; exactly F where y(sigma) = sigma."""
     if not torch.is_grad_enabled():
         parts = svd3(F)
         return _deformation(F, *parts, function(parts[1]))
     _, sigma = rotation_and_singular_values(F) if F.requires_grad else (None, svd3(F)[1])
-    return coaxial_deformation(F, function(sigma), _moving_apart(function))
+    return coaxial_deformation(F, function(sigma), _numeric_quotients(function))
 
 
 class Constants(nn.Module):
-    """Mix-in that checks and holds a law's constants.
+    """Mix-in that checks and holds the constants of a law.
 
-    A constant given as a number is fixed. A tensor that requires a gradient becomes one of the law's ``weights()``, in
-    the order of ``constants``: so an analytic law can be fitted like a neural one.
+    A number is fixed. A tensor that requires a gradient becomes one of the law's ``weights()``, in the order of
+    ``constants``, so that an analytic law can be fitted like a neural one.
     """
 
     constants: dict[str, Constant] = {}

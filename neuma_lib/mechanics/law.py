@@ -1,11 +1,11 @@
-"""The two interfaces that analytic and neural constitutive laws share.
+"""Interfaces of constitutive laws, analytic and neural.
 
-A material model of the paper (Sec. 3.2) is a pair: an *elasticity*, from the deformation gradient to a stress, and a
-*plasticity*, which projects the trial deformation gradient back to the admissible elastic region. Both have an adjoint
-that is called by hand, so that a rollout is differentiated by one explicit reverse loop without an autograd graph.
+A material model (paper, Sec. 3.2) is a pair of an *elasticity*, which maps the deformation gradient to a stress, and a
+*plasticity*, which projects the trial deformation gradient to the admissible elastic region. Both have an explicit
+adjoint, so that a rollout is differentiated by one reverse loop without an autograd graph.
 
-The weights are an argument: the rollout asks for them once (``law.weights()``, where LoRA is merged), uses the same
-tensors at every step and returns their gradients to autograd once.
+The weights are an argument. A rollout calls ``law.weights()`` once (which merges LoRA), uses the same tensors at every
+step and returns their gradients to autograd once.
 """
 
 from __future__ import annotations
@@ -25,33 +25,34 @@ AdjointPrecision = Literal["single", "half"]
 class Constitutive(nn.Module):
     """A pointwise map of deformation gradients, (N, 3, 3) -> (N, 3, 3), differentiable in F and its weights.
 
-    A subclass writes :meth:`response` in differentiable torch, and may override the rest with faster code.
+    A subclass implements :meth:`response` in differentiable torch and may override the rest with faster code.
     """
 
     capturable = False
-    """Whether `evaluate` and `vjp` can be recorded in a CUDA graph: no read from the device, all scratch reused."""
+    """Whether `evaluate` and `vjp` can be recorded in a CUDA graph: they read nothing from the device and reuse all
+    scratch memory."""
     adjoint_precision: AdjointPrecision = "single"
-    """Of the matrix products in `vjp`: "half" takes factors of 11 bits where a law has such kernels, and sums them in
-    float32; elsewhere it changes nothing."""
+    """Precision of the matrix products in `vjp`. "half" uses factors of 11 bits and sums them in float32, for laws
+    with such kernels."""
 
     def graph_key(self) -> Hashable:
-        """Equal for laws that do the same with the same weights, so that they can share recorded graphs."""
+        """Key that is equal for laws that can share recorded graphs because they differ only in weights."""
         return self
 
     def weights(self) -> Weights:
-        """Tensors that a rollout differentiates, as a differentiable function of the parameters; () if all is fixed."""
+        """Tensors that a rollout differentiates, as a differentiable function of the parameters."""
         return ()
 
     def response(self, F: Tensor, weights: Weights) -> Tensor:
-        """The law itself, in differentiable torch. F (N, 3, 3) -> (N, 3, 3)."""
+        """Differentiable evaluation in torch, F (N, 3, 3) -> (N, 3, 3)."""
         raise NotImplementedError
 
     def forward(self, F: Tensor) -> Tensor:
-        """Differentiable evaluation with the module's own weights (regression, tests)."""
+        """Differentiable evaluation with the module's own weights."""
         return self.response(F, self.weights())
 
     def evaluate(self, F: Tensor, weights: Weights, out: Tensor | None = None) -> Tensor:
-        """The law without gradient; ``out`` (N, 3, 3), not an alias of F, receives the result if given."""
+        """Evaluation without gradient. ``out`` (N, 3, 3), not an alias of F, receives the result if given."""
         with torch.no_grad():
             value = self.response(F, weights)
         return value if out is None else out.copy_(value)
@@ -59,10 +60,10 @@ class Constitutive(nn.Module):
     def evaluate_with_cache(
         self, F: Tensor, weights: Weights, out: Tensor | None = None, cache: Any = None
     ) -> tuple[Tensor, Any]:
-        """As `evaluate`, and an opaque cache that spares `vjp` the recomputation; None where a law keeps nothing.
+        """As `evaluate`, and an opaque cache of intermediate values for `vjp`, or None for laws without one.
 
-        The cache owns its memory, so that several can be kept. One that is no longer needed can be given back as
-        `cache`, for as many rows, to be filled again.
+        A cache owns its memory. One that is no longer needed can be passed as ``cache``, for the same number of rows,
+        to be overwritten.
         """
         return self.evaluate(F, weights, out), None
 
@@ -78,15 +79,15 @@ class Constitutive(nn.Module):
         """Vector-Jacobian product at F.
 
         Args:
-            F, weights: as given to :meth:`evaluate`.
+            F, weights: arguments of :meth:`evaluate`.
             grad_out: (N, 3, 3) gradient of a scalar with respect to the result.
-            cache: from :meth:`evaluate_with_cache` at the same F and weights; None recomputes.
+            cache: result of :meth:`evaluate_with_cache` at the same F and weights; None recomputes.
             grad_F: (N, 3, 3) buffer that receives the first result if given.
-            grad_weights: accumulators shaped as the weights, or what :meth:`accumulators` made of them; if given, the
+            grad_weights: accumulators shaped like the weights, or the result of :meth:`accumulators`. If given, the
                 gradients are added to them.
 
         Returns:
-            the gradient with respect to F, and one gradient a weight (the accumulators if they were given).
+            Gradient with respect to F, and one gradient per weight (``grad_weights`` if given).
         """
         with torch.enable_grad():
             leaves = [F.detach().requires_grad_(), *(w.detach().requires_grad_() for w in weights)]
@@ -104,13 +105,14 @@ class Constitutive(nn.Module):
         return result, grad_weights
 
     def accumulators(self, F: Tensor, grad_weights: Weights) -> Weights:
-        """What many calls of `vjp`, each for as many rows as F (N, 3, 3), add to at the least cost, zero at the start;
-        `add_up` has the last word. By default the accumulators ``grad_weights`` themselves.
+        """Zero buffers to which many calls of `vjp` for F (N, 3, 3) add most cheaply, to be reduced by `add_up`.
+
+        By default ``grad_weights`` itself.
         """
         return grad_weights
 
     def add_up(self, accumulators: Weights, grad_weights: Weights) -> None:
-        """Add to ``grad_weights`` what ``accumulators``, of :meth:`accumulators`, have received."""
+        """Add the contents of the buffers of :meth:`accumulators` to ``grad_weights``."""
 
 
 class Elasticity(Constitutive):
@@ -135,15 +137,15 @@ class Law(nn.Module):
         return self.elasticity.weights(), self.plasticity.weights()
 
     def set_adjoint_precision(self, precision: AdjointPrecision) -> None:
-        """Compute gradients in :attr:`Constitutive.adjoint_precision` from now on, in both parts."""
+        """Set :attr:`Constitutive.adjoint_precision` of both parts."""
         for part in (self.elasticity, self.plasticity):
             part.adjoint_precision = precision
 
     def longitudinal_modulus(self) -> float:
         """Largest eigenvalue of the acoustic tensor Q_ik = n_j (d tau_ij / d F_kl) n_l at F = I over n [Pa].
 
-        For an isotropic law this is the P-wave modulus, lam + 2 mu. Measured by one-sided differences in float64 along
-        26 directions n (a neural law need not be isotropic, and sorted singular values have a kink at F = I).
+        For an isotropic law this is the P-wave modulus lam + 2 mu. Computed by one-sided differences in float64 along
+        26 directions n, because a neural law may be anisotropic and sorted singular values have a kink at F = I.
         """
         step = 1e-5
         ticks = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)
@@ -151,7 +153,7 @@ class Law(nn.Module):
         n = n[n.norm(dim=1) > 0]
         n = n / n.norm(dim=1, keepdim=True)
         eye = torch.eye(3, dtype=torch.float64)
-        H = torch.einsum("ka,dl->dakl", eye, n)  # displacement gradient e_a (x) n of direction d
+        H = torch.einsum("ka,dl->dakl", eye, n)  # displacement gradient e_a (x) n
         F = torch.cat([eye + step * H.reshape(-1, 3, 3), eye[None]])
         weights = self.elasticity.weights()
         device = weights[0].device if weights else torch.device("cpu")
@@ -163,5 +165,5 @@ class Law(nn.Module):
         return float(torch.linalg.eigvalsh(0.5 * (Q + Q.mT)).max())
 
     def wave_speed(self, rho: float) -> float:
-        """Speed of the fastest small elastic wave about F = I [m/s], for density rho [kg/m^3]."""
+        """Largest speed of small elastic waves at F = I [m/s], for density rho [kg/m^3]."""
         return max(self.longitudinal_modulus(), 0.0) ** 0.5 / rho**0.5

@@ -1,15 +1,15 @@
 """Neural constitutive laws (NCLaw, Ma et al. 2023): the paper's M_0, optionally with an adaptor Delta M.
 
-One network of three layers without bias, 13 -> 64 -> 64 -> 9 with GELU between, reads the rotation-invariant
-features (sigma - 1, F^T F - I, det F - 1); its symmetrised output X gives
+A network of three layers without bias, 13 -> 64 -> 64 -> 9 with GELU activations, maps the rotation-invariant features
+(sigma - 1, F^T F - I, det F - 1) to an output whose symmetric part X gives
 
 - elasticity: P = R X, tau = P F^T;
 - plasticity: F = F_trial + 1e-3 R X.
 
-Without bias, zero features give zero output: any rotation is free of stress; and R makes both maps objective.
+Zero features give zero output because there is no bias, so rotations are stress-free. R makes both maps objective.
 
-In float32 on a recent GPU the kernels of :mod:`neural_fused` do the work; this module serves everything else, and is
-their slow twin.
+:mod:`neural_fused` has faster kernels for float32 on recent GPUs. This module covers all other cases and is the
+reference implementation of those kernels.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ WIDTH = 64
 SHAPES = ((WIDTH, FEATURES), (WIDTH, WIDTH), (9, WIDTH))
 PLASTIC_SCALE = 1e-3
 CPU_ROWS = 2048
-"""Rows per matrix product on the CPU: larger ones leave the cache."""
+"""Rows per matrix product on the CPU, so that operands fit into the cache."""
 PADDED = 16
-"""Columns of the gradient of the features: BLAS is four times faster with 16 than with 13."""
+"""Columns of the gradient of the features. BLAS is four times faster with 16 than with 13."""
 
 aten = torch.ops.aten
 
@@ -49,7 +49,7 @@ def features(F: Tensor, sigma: Tensor) -> Tensor:
 
 
 class _Forward:
-    """What the adjoint needs of a forward pass over the rows F (n, 3, 3)."""
+    """Intermediate values of a forward pass over the rows F (n, 3, 3), for the adjoint."""
 
     def __init__(self, F: Tensor):
         n = len(F)
@@ -59,7 +59,7 @@ class _Forward:
 
 
 class _Backward:
-    """Scratch of the adjoint over the rows F; grad_z has columns of padding."""
+    """Scratch memory of the adjoint over the rows F. grad_z has padding columns."""
 
     def __init__(self, F: Tensor):
         n = len(F)
@@ -69,7 +69,7 @@ class _Backward:
 
 
 class _Scratch(threading.local):
-    """Reused buffers by (kind, rows, dtype, device), one set a thread."""
+    """Reused buffers by (kind, rows, dtype, device), one set per thread."""
 
     def __init__(self):
         self.buffers: dict[tuple, _Forward | _Backward] = {}
@@ -77,7 +77,7 @@ class _Scratch(threading.local):
     def get(self, kind: type, F: Tensor):
         key = (kind, len(F), F.dtype, F.device)
         if key not in self.buffers:
-            if len(self.buffers) > 32:  # those of a GPU stay: recorded graphs hold their addresses
+            if len(self.buffers) > 32:  # recorded graphs hold the addresses of buffers on a GPU
                 self.buffers = {k: buffer for k, buffer in self.buffers.items() if k[-1].type != "cpu"}
             self.buffers[key] = kind(F)
         return self.buffers[key]
@@ -87,19 +87,19 @@ _scratch = _Scratch()
 
 
 class NeuralConstitutive(AdaptableConstitutive):
-    """A network with frozen base weights and, if one is attached, an adaptor."""
+    """A network with frozen base weights and an optional adaptor."""
 
     kind: str
     scale: float
     capturable = True
     fused: bool | None = None
-    """Whether evaluate and vjp use :mod:`neural_fused`: None where it runs, False never, True always."""
+    """Whether evaluate and vjp use :mod:`neural_fused`: False never, True always, None where it is supported."""
 
     def graph_key(self) -> Hashable:
         return type(self), self.fused, self.adjoint_precision
 
     def __init__(self, weights: Weights | None = None, seed: int = 0):
-        """Args: weights: three matrices of :data:`SHAPES`; Xavier-uniform from ``seed`` if not given."""
+        """Args: weights: three matrices of :data:`SHAPES`, by default Xavier-uniform from ``seed``."""
         super().__init__()
         if weights is None:
             generator = torch.Generator().manual_seed(seed)
@@ -109,7 +109,7 @@ class NeuralConstitutive(AdaptableConstitutive):
             )
         shapes = tuple(tuple(w.shape) for w in weights)
         if shapes != SHAPES:
-            raise InputError(f"a neural law has weights of shapes {SHAPES}, not {shapes}")
+            raise InputError(f"{self.kind} weights", f"shapes {shapes} must be {SHAPES}")
         self.freeze(weights)
 
     def response(self, F: Tensor, weights: Weights) -> Tensor:
@@ -120,7 +120,7 @@ class NeuralConstitutive(AdaptableConstitutive):
         return R @ X @ F.mT if self.kind == "elasticity" else F + self.scale * (R @ X)
 
     def uses_fused(self, F: Tensor) -> bool:
-        """Whether F, by its device and dtype and by :attr:`fused`, goes to the fused kernels."""
+        """Whether the fused kernels evaluate F, depending on its device, its dtype and :attr:`fused`."""
         return neural_fused.supported(F.device, F.dtype) if self.fused is None else self.fused
 
     def evaluate(self, F: Tensor, weights: Weights, out: Tensor | None = None) -> Tensor:
@@ -190,7 +190,7 @@ class NeuralConstitutive(AdaptableConstitutive):
             grad_weights[1].addmm_(back.grad_a.mT, state.h0)
             torch.mm(back.grad_a, W1, out=back.grad_h)
             aten.gelu_backward.grad_input(back.grad_h, state.a0, grad_input=back.grad_a)
-            grad_weights[0].add_((state.z.mT @ back.grad_a).mT)  # this order of the product is the fast one
+            grad_weights[0].add_((state.z.mT @ back.grad_a).mT)  # faster than the other order of factors
             torch.mm(back.grad_a, padded_W0, out=back.grad_z)
             launch(
                 input_adjoint, len(part), part, state.R, state.Vh, state.z, state.Y, g,
@@ -219,14 +219,14 @@ class NeuralPlasticity(NeuralConstitutive, Plasticity):
 
 
 class NeuralLaw(AdaptableLaw):
-    """A pair of networks; the adaptor, once attached, holds the only trainable parameters."""
+    """Elasticity and plasticity as networks. Only the parameters of an attached adaptor are trainable."""
 
     elasticity: NeuralElasticity
     plasticity: NeuralPlasticity
 
 
 def neural_law(state: dict[str, Tensor] | None = None, name: str = "neural", seed: int = 0) -> NeuralLaw:
-    """Neural law from the tensors of :meth:`NeuralLaw.prior_state`, or random (Xavier-uniform) from ``seed``.
+    """Neural law from the tensors of :meth:`NeuralLaw.prior_state`, or Xavier-uniform from ``seed``.
 
     Raises:
         InputError: a tensor is missing or has another shape.
@@ -239,7 +239,7 @@ def neural_law(state: dict[str, Tensor] | None = None, name: str = "neural", see
         missing = [key for key in keys if key not in state]
         if missing:
             raise InputError(
-                f"prior {name}: weights {', '.join(missing)} are missing; an NCLaw checkpoint has them"
+                f"prior {name}", f"weights {', '.join(missing)} of an NCLaw checkpoint are missing"
             )
         parts.append(kind(tuple(state[key].float() for key in keys)))
     return NeuralLaw(*parts, name)

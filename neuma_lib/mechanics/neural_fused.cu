@@ -1,6 +1,6 @@
-// Text of the kernels of neural_fused.py: bodies of functions, in parts, with the constants that module defines.
+// Kernels of neural_fused.py: bodies of functions in parts, with constants defined by that module.
 
-// What the rest needs of the machine. The tests replace this part by an emulation.
+// Hardware instructions. The tests replace this part by an emulation.
 //// machine
     const int thread = threadIdx.x, lane = thread & 31, warp = thread >> 5;
     char* pool = (char*)&shared.data.ptr[0];
@@ -44,25 +44,24 @@
     auto warp_max = [](unsigned x) { return __reduce_max_sync(0xffffffffu, x); };
 
 // Fragments of mma.m16n8k16, with g = lane / 4 and t = lane % 4: the accumulator c has rows g (0, 1) and g + 8 (2, 3)
-// and columns 2t, 2t + 1; the left operand has the same rows and columns in a[0], a[1] and those plus 8 in a[2], a[3],
-// so two accumulators side by side are one left operand.
+// and columns 2t, 2t + 1. The left operand has these rows and columns in a[0], a[1] and columns + 8 in a[2], a[3], so
+// that two adjacent accumulators form one left operand.
 //// tools
     typedef float Pack;
     typedef float Real;
     const int WIDTH = 1;
     #define LANE(x, l) (x)
-    // two units in the last place will do where products have 11 bits
+    // two units in the last place suffice for products of 11 bits
     #define SQRT(x) (HALF ? root(x) : sqrtf(x))
     #define DIVIDE(x, y) (HALF ? __fdividef(x, y) : (x) / (y))
     const int g = lane >> 2, t = lane & 3;
-    // This thread's row among those of the warp and of the block. Where a warp has 16 rows, both of its halves do the work
-    // of a row, and write the same.
+    // Row of this thread in the warp and in the block. If a warp has 16 rows, both of its halves compute the same rows.
     const int warp_rows = 16 * TILES, warp_row = lane & (warp_rows - 1), block_row = warp_rows * warp + warp_row;
-    // Place [bytes] of a chunk of eight halves in a matrix with 64 or 16 columns; the order of chunks depends on the row
+    // Byte offset of a chunk of eight halves in a matrix with 64 or 16 columns
     auto at64 = [](int row, int chunk) { return row * ROW64 + ((chunk ^ (row & 7)) << 4); };
     auto at16 = [](int row, int chunk) { return row * ROW16 + ((chunk ^ ((row >> 2) & 1)) << 4); };
 
-    // Where HALF there are no low parts: they are neither computed nor stored, loaded or multiplied.
+    // With HALF there are no low parts.
     auto split = [&](float x0, float x1, unsigned& high, unsigned& low) {
         float y0, y1;
         high = pack(x0, x1);
@@ -70,7 +69,7 @@
         unpack(high, y0, y1);
         low = pack(x0 - y0, x1 - y1);
     };
-    // Powers of two that bring numbers of this exponent to [2^14, 2^15), and back.
+    // Powers of two that scale numbers with this exponent to [2^14, 2^15), and back.
     auto scales = [](unsigned largest, float& up, float& down) {
         unsigned exponent = largest >> 23;
         exponent = exponent < 15u ? 15u : exponent;
@@ -81,7 +80,7 @@
         #pragma unroll
         for (int i = 0; i < (int)(sizeof(c) / sizeof(float)); ++i) ((float*)c)[i] = 0.0f;
     };
-    // c[m][n + q] += a[m] b[q], the small terms first
+    // c[m][n + q] += a[m] b[q], small terms first
     auto multiply = [&](auto& c, int n, const auto& high, const auto& low, const auto& b) {
         const int M = sizeof(c) / sizeof(c[0]), Q = sizeof(b) / sizeof(b[0]);
         if (!HALF) {
@@ -109,7 +108,7 @@
                 split(c[0] * up, c[1] * up, high[m][k], low[m][k]);
             }
     };
-    // Rows of this warp of a matrix with 16 columns, as left operand
+    // Rows of this warp in a matrix with 16 columns, as left operand
     auto load16 = [&](int matrix, auto& high, auto& low) {
         #pragma unroll
         for (int m = 0; m < TILES; ++m) {
@@ -132,7 +131,7 @@
             if (!HALF) *(uint4*)(place + LOW16) = make_uint4(low[0], low[1], low[2], low[3]);
         }
     };
-    // Columns 16 j to 16 j + 15 of this warp's rows of a matrix with 64 columns
+    // Columns 16 j to 16 j + 15 of the rows of this warp in a matrix with 64 columns
     auto stage = [&](int matrix, int j, const auto& high, const auto& low) {
         #pragma unroll
         for (int m = 0; m < TILES; ++m)
@@ -144,8 +143,8 @@
                 if (!HALF) *(unsigned*)(place + LOW64) = low[m][k];
             }
     };
-    // Right operands, an even number of tiles: place(q, part) is where this lane's chunk of the high (part 0) or low part
-    // of tile q lies. One load brings both parts of a tile, or the high parts of two.
+    // Right operands of an even number of tiles: place(q, part) is the offset of this lane's chunk in the high (part 0)
+    // or low part of tile q. One load reads both parts of a tile, or the high parts of two tiles.
     auto right = [&](auto load, auto& b, auto place) {
         const int Q = sizeof(b) / sizeof(b[0]);
         if (HALF)
@@ -160,7 +159,7 @@
             #pragma unroll
             for (int q = 0; q < Q; ++q) load(b[q], place(q, lane >> 4));
     };
-    // Tiles of 8 columns from tile n, rows 16 k to 16 k + 15; of W^T and of W
+    // Tiles of 8 columns from tile n, rows 16 k to 16 k + 15, of W^T and of W
     auto weights_T = [&](int matrix, int low, int k, int n, auto& b) {
         right(matrices, b, [&](int q, int part) {
             return matrix + part * low + at64(8 * (n + q) + (lane & 7), 2 * k + ((lane >> 3) & 1));
@@ -176,7 +175,7 @@
         });
         multiply(c, to, high, low, b);
     };
-    // Standard normal distribution function: 2^q(|x|) is its tail, to 5e-8
+    // Standard normal distribution function with tail 2^q(|x|), error 5e-8
     auto normal_cdf = [&](float x) {
         const float u = fabsf(x);
         float q = -2.3349487037194194e-06f;
@@ -198,7 +197,7 @@
     auto warp_scales = [&](float magnitude, float& up, float& down) {
         scales(warp_max(__float_as_uint(magnitude)), up, down);
     };
-    // X = sym(Y), Y (9) in the lane's row of what the warp put down
+    // X = sym(Y), with y (9) the stored output of the lane's row
     auto output_of_row = [&](const float* y, float* X) {
         #pragma unroll
         for (int i = 0; i < 3; ++i)
@@ -216,7 +215,7 @@
                     if (column < columns) rows[ROW_STRIDE * (16 * m + g + 8 * (k >> 1)) + column] = c[m][n][k] * factor;
                 }
     };
-    // c = a b, with either transposed
+    // c = a b, with strides that allow to transpose either factor
     auto matmul = [](const float* a, const float* b, float* c, int a_row, int a_column, int b_row, int b_column) {
         #pragma unroll
         for (int i = 0; i < 3; ++i)
@@ -233,12 +232,12 @@
     #define TN 1, 3, 3, 1
     float down0 = 0.0f, down1 = 0.0f, down2 = 0.0f;
 
-// Opens the loop over tiles of ROWS rows, up to the features and, the first time, the weights in shared memory.
+// Opens the loop over tiles of ROWS rows and stores the features and, in the first iteration, the weights.
 //// features
     for (int tile = blockIdx.x; tile * ROWS < n; tile += gridDim.x) {
         __syncthreads();
         const bool first = tile == (int)blockIdx.x;
-        // rows past the end repeat the last one, and have no gradient and no result
+        // rows past the end repeat the last row, without gradient and result
         const bool used = tile * ROWS + block_row < n;
         const int row = used ? tile * ROWS + block_row : n - 1;
         float f[9], R[9], V[9], z[16], sums[3];
@@ -350,7 +349,7 @@
         }
         __syncwarp();
 
-// Both kernels: the first two products, with h0 in x and what the second layer is before its gelu, unscaled, in y.
+// Both kernels: the first two products, with h0 in x and the unscaled input of the second gelu in y.
 //// layers
         unsigned high[TILES][4], low[TILES][4];
         float x[TILES][8][4], y[TILES][8][4], up_h0, down_h0, down;
@@ -409,11 +408,11 @@
             for (int k = 0; k < 9; ++k) ((float*)out)[9 * (size_t)row + k] = result[k];
     }
 
-// Backward only: what the end needs again is put down, and registers are free for the layers.
+// Backward only: stores values that are needed again at the end, which frees registers for the layers.
 //// put_down
         float* state = (float*)(pool + STATE_AT) + block_row;
         float* downs = (float*)(pool + DOWNS_AT);
-        // downs: what turns the scaled activations of each warp back
+        // downs: inverse scales of the activations of each warp
         enum { OF_Z, OF_H0, OF_H1, OF_GY, OF_G1, OF_G0 };
         auto publish = [&](int which, float value) {
             if (lane == 0) downs[WARPS * which + warp] = value;
@@ -427,12 +426,12 @@
         for (int k = 0; k < 3; ++k) state[ROWS * (STATE_TURN + k)] = sums[k];
         publish(OF_Z, down_z);
 
-// With g the gradient of the result, B = R^T grad_P and grad_Y = sym(B). The rotation returns to F by
-// R skew(V kappa), kappa_i = m_i / (sigma_j + sigma_k), m = Vh axial(B X); see `input_adjoint` of the twin, whose
-// M - M^T is skew(m).
+// With g the gradient of the result, B = R^T grad_P and grad_Y = sym(B). The rotation contributes R skew(V kappa) to
+// grad_F, kappa_i = m_i / (sigma_j + sigma_k), m = Vh axial(B X). In `input_adjoint` of neural_kernels.py, M - M^T is
+// skew(m).
 //// vjp
         publish(OF_H0, down_h0);
-        // y turns from the second layer into gelu' there, x into h1
+        // y becomes gelu' of the second layer, x becomes h1
         size = 0.0f;
         float factor_a = down_h0 * down1;
         #pragma unroll
@@ -512,10 +511,10 @@
         }
         __syncthreads();
 
-        // total[n] += sum over the block's rows of G^T H; gradient and input give places of (row, chunk)
+        // total[n] += sum over the rows of the block of G^T H; gradient and input give offsets of (row, chunk)
         auto outer = [&](auto gradient, int low_g, auto input, auto& total, int which_g, int which_h) {
             const int N = sizeof(total) / sizeof(total[0]), Q = N < 4 ? N : 4;
-            // as many products on their way at a time as registers allow
+            // as many concurrent products as registers allow
             const int UNROLL = TILES > 1 ? 1 : N > 2 ? 2 : 4;
             clear(total);
             #pragma unroll UNROLL
@@ -549,7 +548,7 @@
         auto part16 = [&](int matrix) {
             return [=](int r, int chunk, int part) { return matrix + LOW16 * part + at16(r, chunk); };
         };
-        // four warps share the 64 columns of a gradient, or, of a product with 16 columns, those of the other factor
+        // four warps share the 64 columns of a gradient or, for a product with 16 columns, those of the other factor
         const int slice = warp & 3;
         auto slice64 = [&](int matrix) {
             return [=](int r, int chunk) { return matrix + at64(r, 2 * slice + chunk); };
@@ -557,8 +556,8 @@
         float* partial = (float*)partials + (size_t)blockIdx.x * WEIGHTS;
         const bool alone = first && fresh;
         auto add = [&](int i, float value) { partial[i] = alone ? value : partial[i] + value; };
-        // Pairs (2k, 2k + 1) of total[n] are added at place(n, k), if that is not negative. What stands there is loaded
-        // before the product that fills the total.
+        // Adds pairs (2k, 2k + 1) of total[n] at place(n, k) unless that is negative. Old values are loaded before the
+        // product that fills the total.
         auto add_pairs = [&](auto& total, auto place, auto product) {
             const int N = sizeof(total) / sizeof(total[0]);
             float2 before[N][2];
@@ -592,7 +591,7 @@
                       OF_GY, OF_H1);
             });
         }
-        // y turns into g1, the gradient before the second gelu
+        // y becomes g1, the gradient before the second gelu
         load16(GY_AT, high, low);
         size = 0.0f;
         factor_a = down_gy * down2;
@@ -627,7 +626,7 @@
                 multiply(x, n8, high, low, b);
             }
         }
-        // the first layer once more, four tiles at a time; x turns into g0
+        // recomputes the first layer, four tiles at a time; x becomes g0
         {
             const float factor_g = down * down1;
             unsigned z_high[TILES][4], z_low[TILES][4];
@@ -742,7 +741,7 @@
     #undef NT
     #undef TN
 
-// A kernel of its own: one block sums 32 columns of (blocks, WEIGHTS).
+// Separate kernel: one block sums 32 columns of (blocks, WEIGHTS).
 //// add
     __shared__ float sums[32][33];
     const int lane = threadIdx.x & 31, group = threadIdx.x >> 5;

@@ -1,23 +1,22 @@
-"""The neural constitutive law as one CUDA kernel forward and one backward: features, network, stress.
+"""Neural constitutive law as one CUDA kernel forward and one backward: features, network, stress.
 
-The twin in :mod:`neuma_lib.mechanics.neural` writes every activation to memory and launches a dozen kernels; here
-only F is read and only the result written, and the backward pass computes the activations again. The text of the
-kernels is ``neural_fused.cu``.
+The reference in :mod:`neuma_lib.mechanics.neural` writes every activation to memory and launches a dozen kernels.
+These kernels (``neural_fused.cu``) read only F, write only the result, and recompute activations in the backward pass.
 
-A warp owns one or two tiles of 16 rows. Each lane computes the features of one row; the matrix products run on the
-tensor cores, a tile at a time; each lane ends with the output of its row. The accumulators of a layer hold a row in the
-order in which the next layer wants its operand, so activations stay in registers between layers.
+A warp owns one or two tiles of 16 rows. Each lane computes the features and the final output of one row, and the tensor
+cores compute the matrix products of a tile. The accumulators of a layer have the operand layout of the next layer, so
+activations stay in registers.
 
-**Precision.** Each factor is scaled by a power of two (one a weight matrix, one an activation of a warp) and split
-into two halves of 11 bits, x = hi + lo; lo hi + hi lo + hi hi, accumulated in float32, keeps 22 bits. That costs half
-of the same split in TF32, and the scale replaces the exponent bits that float16 lacks. The backward pass can do with
-hi hi alone (precision "half"): a third of the products, and gradients to 11 bits. What it computes of the forward pass
-again, the network at F, is rounded likewise. Sums, singular values and rotations stay in float32, with roots and
-quotients to two units in the last place.
+**Precision.** Each factor is scaled by a power of two (per weight matrix, and per activation of a warp) and split into
+two halves of 11 bits, x = hi + lo. The sum lo hi + hi lo + hi hi, accumulated in float32, has 22 bits. This costs half
+as much as the same split in TF32, and the scale compensates for the small exponent range of float16. With precision
+"half", the backward pass uses only hi hi, a third of the products, for gradients and the recomputed network, which then
+have 11 bits. Sums, singular values and rotations stay in float32, with square roots and quotients to two units in the
+last place.
 
-**Weight gradients** are products over rows, G^T H. The warps of a block put G and H, already split, in shared memory
-and each takes a slice of the result; blocks write their sums apart, and a second kernel adds them in a fixed order:
-after each call, or after many of them, which let their blocks go on adding to :func:`partial_sums`.
+**Weight gradients** are products over rows, G^T H. The warps of a block store G and H, already split, in shared memory
+and compute one slice of the result each. Blocks write separate partial sums, and a second kernel adds them in a fixed
+order, after each call or after many calls that accumulate in :func:`partial_sums`.
 """
 
 from __future__ import annotations
@@ -34,51 +33,50 @@ from neuma_lib.mechanics.neural_kernels import FEATURES, GRAM
 from neuma_lib.mechanics.singular_values_kernels import SVD, SWEEPS
 
 ROWS = 128
-"""Rows of a block."""
+"""Rows per block."""
 EVALUATE_TILES, VJP_TILES = 2, 1
-"""Tiles of 16 rows that a warp owns, forward and backward. With one there are twice as many warps, of half the
-registers, which hides more of the latency where rows are few for the GPU; but two lanes do the same for each row, its
-features and stress."""
+"""Tiles of 16 rows per warp, forward and backward. One tile gives twice as many warps with half the registers, which
+hides more latency for few rows, but two lanes then compute the features and stress of each row redundantly."""
 BLOCKS_PER_PROCESSOR = 2
 HIDDEN, OUTPUTS = 64, 9
 WEIGHTS = HIDDEN * (FEATURES + HIDDEN + OUTPUTS)
 ALIGNMENT = 128
-"""Bytes of shared memory lost at most to an aligned start."""
+"""Largest number of bytes of shared memory lost to alignment."""
 
-# Shared memory in bytes. A matrix of halves is its high parts and then its low parts. The 128-byte rows of a matrix
-# with 64 columns, and the 32-byte rows of one with 16, hold chunks of eight halves in an order that depends on the
-# row, so that ldmatrix, which reads one chunk of eight rows at once, meets every bank once.
+# Byte offsets in shared memory. A matrix of halves consists of its high parts followed by its low parts. The order of
+# the chunks of eight halves in a row (128 bytes for 64 columns, 32 bytes for 16) depends on the row, so that ldmatrix,
+# which reads one chunk of eight rows at once, has no bank conflicts.
 LAYOUT = {
     "W0_AT": 0,  # (64, 16)
     "W1_AT": 4096,  # (64, 64)
     "W2_AT": 20480,  # (16, 64)
-    "PEAKS_AT": 24576,  # largest weights, three numbers a warp, before the next
+    "PEAKS_AT": 24576,  # largest weights, three numbers per warp
     "DOWNS_AT": 24640,  # scales of the activations, six numbers for each of eight warps
     "Z_AT": 24832,  # features (128, 16)
-    "ROW_AT": 33024,  # forward only: output of the network, by row
-    "S0_AT": 33024,  # backward only: h0 (128, 64); before it, the output of the network and its gradient
-    "GY_AT": 49408,  # (128, 16), in the second half of the former
+    "ROW_AT": 33024,  # forward only: output of the network by row
+    "S0_AT": 33024,  # backward only: output of the network and its gradient, then h0 (128, 64)
+    "GY_AT": 49408,  # (128, 16), in the second half of S0
     "S1_AT": 65792,  # h1, then g1, then g0 (128, 64)
-    "STATE_AT": 98560,  # 27 floats a row
+    "STATE_AT": 98560,  # 27 floats per row
 }
 CONSTANTS = {
     **LAYOUT,
-    # bytes of a row of halves
+    # bytes per row of halves
     "ROW16": 2 * 16,
     "ROW64": 2 * 64,
-    # bytes from the high parts of a matrix to the low ones: of the weights, and of ROWS rows of 16 or 64 columns
+    # byte offset of the low parts of a matrix: weights, and ROWS rows of 16 or 64 columns
     "W0_LOW": 2 * 64 * 16,
     "W1_LOW": 2 * 64 * 64,
     "W2_LOW": 2 * 16 * 64,
     "LOW16": 2 * ROWS * 16,
     "LOW64": 2 * ROWS * 64,
-    # floats between rows of the network's output, and of its gradient with respect to the features
+    # floats between rows of the output of the network, and of its gradient with respect to the features
     "ROW_STRIDE": FEATURES,
-    # numbers of a row that the backward pass puts down: R, V, and sums of singular values, then the turned gradient
+    # numbers per row stored by the backward pass: R, V, and sums of singular values, then part of the gradient
     "STATE_R": 0,
     "STATE_V": 9,
     "STATE_TURN": 18,
-    # the three weight matrices in one array
+    # offsets of the weight matrices in one array
     "W1_START": HIDDEN * FEATURES,
     "W2_START": HIDDEN * (FEATURES + HIDDEN),
     "WEIGHTS": WEIGHTS,
@@ -93,12 +91,12 @@ VJP_BYTES = LAYOUT["STATE_AT"] + 4 * 27 * ROWS + ALIGNMENT
 
 
 def threads(tiles: int) -> int:
-    """Of a block whose warps own that many tiles of 16 rows."""
+    """Threads per block for warps with ``tiles`` tiles of 16 rows."""
     return 32 * ROWS // (16 * tiles)
 
 
 def _loads(threads: int) -> dict[str, int]:
-    """Loads of a thread: of single weights of the first matrix, of pairs of the others (the last padded to 16 rows)."""
+    """Loads per thread: single weights of the first matrix, pairs of the others (the last padded to 16 rows)."""
     counts = {"W0": HIDDEN * FEATURES, "W1": HIDDEN * HIDDEN // 2, "W2": 16 * HIDDEN // 2}
     return {f"{name}_LOADS": -(-count // threads) for name, count in counts.items()}
 
@@ -108,9 +106,9 @@ def _constants(values: dict[str, int]) -> str:
 
 
 def source(kind: str, backward: bool, machine: str | None = None, precision: str = "single") -> str:
-    """C++ text of the body of a kernel for ``kind`` "elasticity" or "plasticity".
+    """C++ source of the body of a kernel for ``kind`` "elasticity" or "plasticity".
 
-    ``machine``: see the ``.cu`` file; ``precision``: of the products, "single" or "half".
+    ``machine`` replaces the part of the ``.cu`` file of that name. ``precision`` of the products is "single" or "half".
     """
     tiles = VJP_TILES if backward else EVALUATE_TILES
     size = threads(tiles)
@@ -129,7 +127,7 @@ def source(kind: str, backward: bool, machine: str | None = None, precision: str
     return constants + (machine or parts["machine"]) + parts["tools"] + features + body
 
 
-# Arrays are handed over as addresses: Warp's array objects would cost more time than the launch.
+# Arrays are passed as addresses because Warp's array objects take more time than the launch.
 @cache
 def evaluate_kernel(kind: str):
     """Kernel (F, W0, W1, W2, factor, n, out) over blocks of :data:`ROWS` rows."""
@@ -157,9 +155,9 @@ def evaluate_kernel(kind: str):
 
 @cache
 def vjp_kernel(kind: str, precision: str = "single"):
-    """Kernel (F, W0, W1, W2, grad_out, factor, n, grad_F, fresh, partials (blocks, WEIGHTS)) over blocks as above.
+    """Kernel (F, W0, W1, W2, grad_out, factor, n, grad_F, fresh, partials (blocks, WEIGHTS)) over blocks of rows.
 
-    ``fresh``: whether it sets ``partials``; otherwise it adds to them.
+    It overwrites ``partials`` if ``fresh``, and adds to them otherwise.
     """
 
     @wp.func_native(source(kind, backward=True, precision=precision))
@@ -186,7 +184,7 @@ def vjp_kernel(kind: str, precision: str = "single"):
 
 @cache
 def add_kernel():
-    """Kernel (partials (blocks, WEIGHTS), blocks, three accumulators) that adds sums over the blocks."""
+    """Kernel (partials (blocks, WEIGHTS), blocks, three accumulators) that adds the sums over blocks."""
 
     @wp.func_native(_constants(CONSTANTS) + native_source(__file__)["add"])
     def add_columns(
@@ -207,11 +205,11 @@ def _device(device: torch.device) -> wp.Device:
 
 @cache
 def supported(device: torch.device, dtype: torch.dtype) -> bool:
-    """Whether these kernels run there: float32 on a GPU with float16 tensor cores and enough shared memory."""
+    """Whether these kernels run: float32 on a GPU with float16 tensor cores and enough shared memory."""
     if device.type != "cuda" or dtype != torch.float32:
         return False
-    there = _device(device)
-    return there.arch >= 80 and there.max_shared_memory_per_block >= VJP_BYTES + 4 * threads(VJP_TILES)
+    gpu = _device(device)
+    return gpu.arch >= 80 and gpu.max_shared_memory_per_block >= VJP_BYTES + 4 * threads(VJP_TILES)
 
 
 def _launch(kernel, blocks: int, threads: int, device: torch.device, *inputs) -> None:
@@ -231,14 +229,14 @@ def _blocks(rows: int, device: torch.device) -> int:
 
 
 def _packed(weights: Weights) -> list[Tensor]:
-    """Weights as the kernels read them: no gaps, and pairs of numbers at multiples of 8 bytes."""
+    """Weights as the kernels read them: contiguous, with pairs of numbers at multiples of 8 bytes."""
     weights = [w.detach().contiguous() for w in weights]
     return [w.clone() if w.data_ptr() % 8 else w for w in weights]
 
 
 @torch.no_grad()
 def evaluate(F: Tensor, weights: Weights, kind: str, factor: float, out: Tensor | None = None) -> Tensor:
-    """The law of ``kind`` at F (n, 3, 3); plasticity is F + factor R X. See :class:`Constitutive`."""
+    """Evaluate the law of ``kind`` at F (n, 3, 3), plasticity as F + factor R X. See :class:`Constitutive`."""
     F = F.detach().contiguous()
     result = out if out is not None and out.is_contiguous() else torch.empty_like(F)
     if len(F):
@@ -262,8 +260,7 @@ def vjp(
 ) -> tuple[Tensor, Weights]:
     """Gradients of F and, added to ``grad_weights``, of the weights. See :class:`Constitutive`.
 
-    ``grad_weights`` may be :func:`partial_sums`; ``precision`` is that of the products, see
-    :attr:`Constitutive.adjoint_precision`.
+    ``grad_weights`` may be :func:`partial_sums`. ``precision`` is :attr:`Constitutive.adjoint_precision`.
     """
     F, grad_out = F.detach().contiguous(), grad_out.contiguous()
     result = grad_F if grad_F is not None and grad_F.is_contiguous() else torch.empty_like(F)
@@ -280,7 +277,7 @@ def vjp(
 
 
 def partial_sums(F: Tensor) -> Tensor:
-    """Zero gradients of the weights for each block that `vjp` at F (n, 3, 3) has, (blocks, WEIGHTS)."""
+    """Zero gradients of the weights for each block of `vjp` at F (n, 3, 3), shape (blocks, WEIGHTS)."""
     return F.new_zeros(_blocks(len(F), F.device), WEIGHTS)
 
 

@@ -1,6 +1,6 @@
-// Text of the kernel of the networks' features, between parts of singular_values_kernels.h.
+// Features of the networks, combined with parts of singular_values_kernels.h.
 
-// Features are sigma - 1 (3), F^T F - I (9, row-major) and det F - 1 (1). The SVD scales a[] in place, so F is read before.
+// Features are sigma - 1 (3), F^T F - I (9, row-major) and det F - 1 (1). The SVD scales a[], so this part precedes it.
 //// gram
     Pack gram[9], det;
     for (int i = 0; i < 3; ++i)

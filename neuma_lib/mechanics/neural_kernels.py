@@ -1,6 +1,6 @@
-"""Kernels around the networks of :mod:`neuma_lib.mechanics.neural`: features before, stress or return map after.
+"""Kernels of :mod:`neuma_lib.mechanics.neural` for the features and for the stress or return map.
 
-The networks themselves are three matrix products, which torch does best. X = sym(Y) is the symmetrised output.
+The matrix products of the network stay in torch. X = sym(Y) is the symmetrised output.
 """
 
 from functools import cache
@@ -19,7 +19,7 @@ _STORE = _PARTS["store"].replace("FEATURES", str(FEATURES))
 
 @cache
 def feature_kernel(dtype: torch.dtype):
-    """Kernel (F, z (n, 13), R, Vh, n) over packs: features and rotation; U = R V is not kept."""
+    """Kernel (F, z (n, 13), R, Vh, n) over packs: features and rotation. U = R V is not stored."""
     real, _, mat33 = warp_types(dtype)
 
     @wp.func_native(snippet(LOAD, GRAM, SVD, _STORE, dtype=dtype))
@@ -42,11 +42,11 @@ def feature_kernel(dtype: torch.dtype):
 def output_kernels(dtype: torch.dtype, kind: str):
     """Kernels (result, output adjoint, input adjoint) of one dtype, for ``kind`` "elasticity" or "plasticity".
 
-    elasticity: tau = P F^T, P = R X; plasticity: F + scale R X. With g the gradient of the result,
+    Elasticity is tau = P F^T with P = R X, plasticity F + scale R X. With g the gradient of the result,
 
-    - elasticity: grad_P = g F, and g^T P goes to F directly; plasticity: grad_P = scale g, and g goes to F;
+    - elasticity: grad_P = g F, and grad_F has the direct term g^T P; plasticity: grad_P = scale g, direct term g;
     - grad_R = grad_P X, grad_X = R^T grad_P, grad_Y = sym(grad_X);
-    - the rotation and the features return to F by V K V^T-like terms, see ``input_adjoint``.
+    - ``input_adjoint`` adds the terms of grad_F from the rotation and the features.
     """
     real, vec3, mat33 = warp_types(dtype)
     half, one = real(0.5), real(1.0)

@@ -1,11 +1,11 @@
 """Analytic plasticities (return maps): trial deformation gradient F_trial -> elastic deformation gradient F.
 
-Each is given by its principal stretches; the directions U, V of F_trial are kept. A state inside the yield
-surface is returned unchanged, bit for bit.
+Each is given by its principal stretches and keeps the directions U, V of F_trial. A state inside the yield surface is
+returned bit-identically.
 
-`CrushableFoam`, `HerschelBulkley` and `CohesiveDruckerPrager` serve as truths that no simpler return map contains.
-Stresses in their formulas are those of `Hencky` elasticity with the same E and nu: tau = 2 mu dev eps + K tr(eps) I
-with the logarithmic strain eps and K = lam + 2 mu / 3, p = -tr(tau) / 3, q = sqrt(3/2) |dev tau|.
+`CrushableFoam`, `HerschelBulkley` and `CohesiveDruckerPrager` serve as ground truth outside the candidate families.
+Their formulas use the stresses of `Hencky` elasticity with the same E and nu: tau = 2 mu dev eps + K tr(eps) I with
+the logarithmic strain eps and K = lam + 2 mu / 3, p = -tr(tau) / 3, q = sqrt(3/2) |dev tau|.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class AnalyticPlasticity(Constants, Plasticity):
     """An isotropic return map."""
 
     def principal(self, sigma: Tensor, **constants: float | Tensor) -> Tensor:
-        """Principal stretches (N, 3) after the return; equal to ``sigma`` to the bit where nothing yields."""
+        """Principal stretches (N, 3) after the return, bit-identical to ``sigma`` where nothing yields."""
         raise NotImplementedError
 
     def response(self, F: Tensor, weights: Weights) -> Tensor:
@@ -54,7 +54,7 @@ class Identity(Constants, Plasticity):
 
 
 class VonMises(AnalyticPlasticity):
-    """Yield where |dev eps| > yield_stress / (2 mu), eps the logarithmic strain; return along dev eps to the surface.
+    """Yield at |dev eps| > yield_stress / (2 mu), eps the logarithmic strain, with return along dev eps to the surface.
 
     With Hencky elasticity this bounds the norm of the deviatoric Kirchhoff stress by ``yield_stress`` [Pa].
     """
@@ -70,16 +70,16 @@ class VonMises(AnalyticPlasticity):
 
 
 class DruckerPrager(AnalyticPlasticity):
-    """Granular flow (Klar et al. 2016): shear is bounded by friction times pressure; no tension.
+    """Granular flow (Klar et al. 2016): shear is bounded by friction times pressure, without tension.
 
-    ``friction_angle`` in degrees; ``cohesion`` is the volumetric log strain per axis that is borne in tension.
+    ``friction_angle`` in degrees; ``cohesion`` is the largest tensile logarithmic strain per axis.
     """
 
     constants = PLASTICITY["drucker_prager"]
 
     @staticmethod
     def slope(E, nu, friction_angle, **_) -> float | Tensor:
-        """Slope of the cone in Hencky strain: norm of the deviator at yield over the negative trace."""
+        """Slope of the cone in Hencky strain: norm of the deviator at yield divided by the negative trace."""
         mu, lam = lame(E, nu)
         if isinstance(friction_angle, Tensor):
             sine = torch.sin(friction_angle * (math.pi / 180))
@@ -90,18 +90,18 @@ class DruckerPrager(AnalyticPlasticity):
 
     def principal(self, sigma, E, nu, friction_angle, cohesion):
         trace, deviator, norm = hencky_strain(sigma)
-        pressed = trace - 3 * cohesion
-        excess = norm + self.slope(E, nu, friction_angle) * pressed
+        shifted = trace - 3 * cohesion  # trace relative to the apex
+        excess = norm + self.slope(E, nu, friction_angle) * shifted
         sheared = (trace / 3 + deviator * (1 - excess / norm)).exp()
         apex = torch.full_like(sigma, 1.0) * (
             cohesion.exp() if isinstance(cohesion, Tensor) else math.exp(cohesion)
         )
-        returned = torch.where(pressed > 0, apex, sheared)
-        return torch.where((pressed > 0) | (excess > 0), returned, sigma)
+        returned = torch.where(shifted > 0, apex, sheared)
+        return torch.where((shifted > 0) | (excess > 0), returned, sigma)
 
 
 class FluidProjection(AnalyticPlasticity):
-    """A fluid forgets shear: F = J^(1/3) R. Same stress as the customary J^(1/3) I, but objective."""
+    """Removes all shear of a fluid: F = J^(1/3) R. Same stress as the usual J^(1/3) I, but objective."""
 
     def principal(self, sigma):
         J = (sigma[:, 0] * sigma[:, 1] * sigma[:, 2])[:, None]
@@ -111,8 +111,8 @@ class FluidProjection(AnalyticPlasticity):
 class ViscousFlow(AnalyticPlasticity):
     """Viscous relaxation of the deviatoric logarithmic strain, by one implicit step of length ``dt`` [s].
 
-    The strain beyond the yield stress decays at the rate mu / viscosity; with Hencky elasticity the shear stress of a
-    steady flow is then exactly viscosity times shear rate (a Bingham fluid if ``yield_stress`` > 0).
+    The strain beyond the yield stress decays at the rate mu / viscosity. With Hencky elasticity the shear stress of a
+    steady flow is exactly viscosity times shear rate (a Bingham fluid if ``yield_stress`` > 0).
     """
 
     constants = PLASTICITY["viscous_flow"]
@@ -127,17 +127,16 @@ class ViscousFlow(AnalyticPlasticity):
 
 
 class CrushableFoam(AnalyticPlasticity):
-    """Compactable foam: yield outside an ellipse in (p, q), from -``tension`` to ``crush`` [Pa] along p, whose
-    half axis in q is ``slope`` times that in p; radial return.
+    """Compactable foam: yield outside an ellipse in (p, q) that extends from -``tension`` to ``crush`` [Pa] along p
+    and has a half axis in q of ``slope`` times that in p, with radial return.
 
-    The elastic strain shrinks towards zero along itself, eps = r eps_trial: pressure compacts the foam for good, with a
-    plastic Poisson's ratio equal to the elastic one (not associated; Deshpande and Fleck 2000 have an associated
-    ellipse). Every return dissipates.
+    The elastic strain is scaled, eps = r eps_trial, so that pressure compacts the foam permanently with a plastic
+    Poisson's ratio equal to the elastic one (non-associated; the ellipse of Deshpande and Fleck 2000 is associated).
+    Every return dissipates.
 
-    Hardening is by rate: the strain outside decays to the ellipse in ``relaxation`` [s] (Duvaut and Lions), as where
-    gas has to leave the cells, by one implicit step of length ``dt``. Compacted at the rate d the pressure rises to
-    crush + K d relaxation. Hardening by compaction itself is not possible here: the state is the elastic F alone,
-    whose volume says the pressure and nothing of the volume that was lost.
+    Hardening is viscous: the strain outside decays to the ellipse with the time constant ``relaxation`` [s] (Duvaut
+    and Lions), in one implicit step of length ``dt``. At the compaction rate d the pressure rises to crush + K d
+    relaxation. Hardening by compaction is not possible because the elastic F contains no plastic volume.
     """
 
     constants = PLASTICITY["crushable_foam"]
@@ -159,11 +158,11 @@ class CrushableFoam(AnalyticPlasticity):
 
 
 class HerschelBulkley(AnalyticPlasticity):
-    """A paste that flows beyond its yield stress, thinner (``exponent`` m < 1) or thicker (m > 1) the faster it is.
+    """A yield-stress fluid that is shear-thinning (``exponent`` m < 1) or shear-thickening (m > 1).
 
-    |dev tau| = yield_stress + sqrt(2) k g^m with the shear rate g = sqrt(2) |D|: a steady simple shear of rate g has
-    the shear stress yield_stress / sqrt(2) + k g^m, k = ``consistency``. m = 1 is `ViscousFlow`. One implicit step of
-    length ``dt`` [s]; its equation is solved by Newton's method, and differentiated as an implicit function.
+    |dev tau| = yield_stress + sqrt(2) k g^m with the shear rate g = sqrt(2) |D| and k = ``consistency``. A steady
+    simple shear of rate g has the shear stress yield_stress / sqrt(2) + k g^m. m = 1 is `ViscousFlow`. One implicit
+    step of length ``dt`` [s] is solved by Newton's method and differentiated as an implicit function.
     """
 
     constants = PLASTICITY["herschel_bulkley"]
@@ -182,19 +181,19 @@ class HerschelBulkley(AnalyticPlasticity):
 
 
 NEWTON_STEPS = 8
-"""Of `_positive_root`: enough for float64 at any power that `HerschelBulkley` admits, as a test shows."""
+"""Iterations of `_positive_root`, sufficient in float64 for every exponent that `HerschelBulkley` admits."""
 
 
 def _positive_root(rate: float | Tensor, power: float | Tensor, total: Tensor) -> Tensor:
     """y > 0 of y + rate y^power = total > 0, shape of ``total``; differentiable in all three.
 
-    In u = log y the logarithm of the left side is convex and increasing, so that Newton's method falls to the root from
-    a start above it. Only its last step is differentiated: the derivative of the implicit function.
+    In u = log y the logarithm of the left side is convex and increasing, so that Newton's method decreases to the root
+    from a start above it. Differentiating only the last step gives the derivative of the implicit function.
     """
     log_rate, log_total = torch.as_tensor(rate, dtype=total.dtype, device=total.device).log(), total.log()
 
     def newton_step(u: Tensor) -> Tensor:
-        share = torch.sigmoid(log_rate + (power - 1) * u)  # of the second term in the sum
+        share = torch.sigmoid(log_rate + (power - 1) * u)  # share of the second term
         slope = 1 + (power - 1) * share
         return u - (torch.logaddexp(u, log_rate + power * u) - log_total) / slope.detach()
 
@@ -206,12 +205,12 @@ def _positive_root(rate: float | Tensor, power: float | Tensor, total: Tensor) -
 
 
 class CohesiveDruckerPrager(AnalyticPlasticity):
-    """Damp, dense grains: friction, ``cohesion`` c [Pa], and dilatancy (a volume that grows in shear).
+    """Damp, dense granular material with friction, ``cohesion`` c [Pa] and dilatancy.
 
-    q <= 6 (c cos phi + p sin phi) / (3 - sin phi), the compressive cone of Mohr and Coulomb for the angle phi =
-    ``friction_angle``; plastic strain along dev tau / |dev tau| + alpha(psi) I with ``dilation_angle`` psi <= phi, to
-    the apex where that would turn the deviator round. Both angles in degrees, alpha(x) = sqrt(2/3) 2 sin x / (3 - sin
-    x). Every return dissipates. `DruckerPrager` is c = psi = 0 but for its apex, which takes all states of tension.
+    q <= 6 (c cos phi + p sin phi) / (3 - sin phi), the compressive Mohr-Coulomb cone for phi = ``friction_angle``.
+    Plastic strain is along dev tau / |dev tau| + alpha(psi) I with ``dilation_angle`` psi <= phi, or to the apex where
+    that would reverse the deviator. Both angles in degrees, alpha(x) = sqrt(2/3) 2 sin x / (3 - sin x). Every return
+    dissipates. `DruckerPrager` is c = psi = 0, except that it returns all tensile states to its apex.
     """
 
     constants = PLASTICITY["cohesive_drucker_prager"]
@@ -232,8 +231,8 @@ class CohesiveDruckerPrager(AnalyticPlasticity):
         trace, deviator, norm = hencky_strain(sigma)
         excess = 2 * mu * norm + 3 * bulk * alpha * trace - strength
         flow = excess / (2 * mu + 9 * bulk * alpha * beta)
-        kept = flow.clamp(min=0).minimum(norm)  # what the branches not taken need to stay finite
-        sheared = (trace / 3 - beta * kept + deviator * (1 - kept / norm)).exp()
+        bounded = flow.clamp(min=0).minimum(norm)  # keeps the branches that are not selected finite
+        sheared = (trace / 3 - beta * bounded + deviator * (1 - bounded / norm)).exp()
         apex = (strength / (9 * bulk * alpha)).exp() * torch.ones_like(sigma)
         return torch.where(excess > 0, torch.where(flow < norm, sheared, apex), sigma)
 

@@ -1,11 +1,11 @@
-"""Batched singular value decomposition and rotation of 3x3 matrices, with an adjoint that is safe at F = I.
+"""Batched singular value decomposition and rotation of 3x3 matrices, with an adjoint that is accurate at F = I.
 
-F = U diag(sigma) Vh with det U = det V = +1, |sigma| descending, and the sign of det F in the last singular
-value. The rotation R = U Vh and symmetric functions of sigma are smooth where U and V themselves are not
-(equal singular values, as in every undeformed body), so gradients are only ever taken through R and sigma.
+F = U diag(sigma) Vh with det U = det V = +1, |sigma| descending, and the sign of det F in the last singular value. At
+equal singular values, as in any undeformed body, U and V are not smooth, but R = U Vh and symmetric functions of sigma
+are. Gradients are therefore taken only through R and sigma.
 
-Warp's ``svd3`` would not do: on a CPU it takes three times as long for 2,000 matrices, and its adjoint errs by 26 % at
-F = I, ours by round-off (``benchmarks/singular_values.py``, figures in ``docs/results/speed.md``).
+Warp's ``svd3`` is not used because it takes three times as long on a CPU for 2,000 matrices, and its adjoint has an
+error of 26 % at F = I (``benchmarks/singular_values.py``, results in ``docs/results/speed.md``).
 """
 
 from __future__ import annotations
@@ -18,14 +18,8 @@ from neuma_lib.mechanics.singular_values_kernels import pack_count, svd_kernel
 
 
 def svd3(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Singular value decomposition, to round-off in float32 and float64; no gradient.
-
-    Args:
-        F: (N, 3, 3).
-
-    Returns:
-        U (N, 3, 3), sigma (N, 3), Vh (N, 3, 3), in the convention of this module.
-    """
+    """U (N, 3, 3), sigma (N, 3) and Vh (N, 3, 3) of F (N, 3, 3) to round-off, without gradient, in the convention of
+    this module."""
     F = F.detach().contiguous()
     U, sigma, Vh = torch.empty_like(F), F.new_empty(F.shape[:-1]), torch.empty_like(F)
     if len(F):
@@ -41,9 +35,9 @@ def away_from_zero(x: Tensor, floor: Tensor | float) -> Tensor:
 class _RotationAndSingularValues(torch.autograd.Function):
     """F -> (R, sigma).
 
-    With dF' = U^T dF V the singular values move by diag dF' and R by U K' Vh, where K'_ij = (dF'_ij - dF'_ji) /
-    (sigma_i + sigma_j); no difference of singular values occurs. R itself is singular where sigma_i + sigma_j = 0 (an
-    element turned inside out along two axes): there the quotient is bounded instead of infinite.
+    With dF' = U^T dF V, d sigma = diag dF' and dR = U K' Vh with K'_ij = (dF'_ij - dF'_ji) / (sigma_i + sigma_j),
+    without differences of singular values. The quotient is bounded where sigma_i + sigma_j = 0 (an element inverted
+    along two axes), where R is singular.
     """
 
     @staticmethod
@@ -66,6 +60,6 @@ class _RotationAndSingularValues(torch.autograd.Function):
 def rotation_and_singular_values(F: Tensor) -> tuple[Tensor, Tensor]:
     """Rotation R (N, 3, 3) and singular values (N, 3) of F (N, 3, 3), differentiable once.
 
-    The gradient of symmetric functions of sigma is exact everywhere, that of a single sigma where it is distinct.
+    The gradient of symmetric functions of sigma is exact everywhere, that of a single sigma only where it is distinct.
     """
     return _RotationAndSingularValues.apply(F)

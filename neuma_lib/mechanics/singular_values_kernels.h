@@ -1,7 +1,7 @@
-// Text of the kernels that begin with the SVD of 3x3 matrices: a pack of matrices, one a SIMD lane on the CPU and one a
-// thread on a GPU. The module replaces REAL, CPU_WIDTH and SWEEPS.
+// Kernels that start with the SVD of a pack of 3x3 matrices, one per SIMD lane on the CPU and one per thread on a GPU.
+// The module replaces REAL, CPU_WIDTH and SWEEPS.
 
-// The type `Pack`, its size `WIDTH`, and the macros LANE, SQRT and DIVIDE.
+// Type `Pack`, its size `WIDTH`, and macros LANE, SQRT and DIVIDE.
 //// types
     typedef REAL Real;
 #if defined(__CUDA_ARCH__)
@@ -29,9 +29,9 @@
         for (int k = 0; k < 9; ++k) LANE(a[k], l) = p[k];
     }
 
-// Turns `Pack a[9]` (row-major, scaled in place) into the columns u0, u1, u2 and v0, v1, v2 and into s[3]. Cyclic Jacobi
-// on A^T A gives V; one one-sided Jacobi sweep on A V restores the relative accuracy that squaring A has cost; then sort,
-// and orthonormalise A V. Rotations only, and u2 = u0 x u1: det U = det V = +1.
+// Decomposes `Pack a[9]` (row-major, scaled in place) into columns u0, u1, u2 and v0, v1, v2 and s[3]. Cyclic Jacobi on
+// A^T A gives V, one one-sided Jacobi sweep on A V restores the relative accuracy lost by squaring A, then A V is sorted
+// and orthonormalised. Only rotations are used and u2 = u0 x u1, so det U = det V = +1.
 //// svd
     const Real TINY = sizeof(Real) == 4 ? Real(1e-36) : Real(1e-300);
     Pack zero = a[0];
@@ -46,7 +46,7 @@
     for (int k = 0; k < 9; ++k) a[k] = DIVIDE(a[k], scale);
 
     auto dot = [](const Pack* x, const Pack* y) { return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]; };
-    // cosine and sine of the rotation that diagonalises [[app, apq], [apq, aqq]], of angle at most 45 degrees
+    // cosine and sine of the rotation by at most 45 degrees that diagonalises [[app, apq], [apq, aqq]]
     auto angle = [&](const Pack& app, const Pack& aqq, const Pack& apq, Pack& c, Pack& sn) {
         const Pack d = aqq - app;
         const Pack p2 = apq + apq;
@@ -133,7 +133,7 @@
     const Pack overlap = dot(u0, u1);
     for (int k = 0; k < 3; ++k) u1[k] = u1[k] - overlap * u0[k];
     s[1] = SQRT(dot(u1, u1));
-    const auto flat = s[1] <= s[0] * TINY;  // rank one: any direction orthogonal to u0 serves
+    const auto flat = s[1] <= s[0] * TINY;  // rank one: any direction orthogonal to u0
     const auto steep = u0[0] * u0[0] > Real(0.5);
     Pack e[3] = {steep ? zero : one, steep ? one : zero, zero};
     const Pack along = dot(u0, e);

@@ -1,10 +1,9 @@
-"""Kernels of `singular_values`: the SVD of 3x3 matrices, written once for CPU lanes and CUDA threads.
+"""Kernels of `singular_values`: the SVD of 3x3 matrices for CPU lanes and CUDA threads.
 
-An SVD is a long chain of dependent square roots and divisions, so on a CPU one matrix at a time leaves the
-vector units idle. The text in ``singular_values_kernels.h`` works on a *pack*: 8 matrices, one per SIMD lane, on the
-CPU (6 times faster than the same code for one matrix), and one matrix per thread on a GPU. It is C++ because Warp's
-Python functions know no lanes. A kernel is the parts "types" and "pack", then :data:`LOAD`, :data:`SVD` and what
-follows from it, and the part "end" (:func:`snippet`).
+An SVD is a long chain of dependent square roots and divisions, which leaves the vector units of a CPU idle if it
+processes one matrix at a time. ``singular_values_kernels.h`` processes a *pack*: 8 matrices, one per SIMD lane, on a
+CPU (6 times faster), and one matrix per thread on a GPU. It is C++ because Warp's Python functions have no lanes.
+:func:`snippet` composes a kernel of these parts.
 """
 
 from functools import cache
@@ -19,18 +18,18 @@ start_warp()
 CPU_WIDTH = 8
 
 SWEEPS = {torch.float32: 3, torch.float64: 4}
-"""Cyclic Jacobi sweeps until the off-diagonal of A^T A is round-off; convergence is quadratic from the second on."""
+"""Cyclic Jacobi sweeps that reduce the off-diagonal of A^T A to round-off (quadratic convergence from the second)."""
 _PARTS = native_source(__file__, ".h")
 TYPES, LOAD, SVD, STORE, END = (_PARTS[name] for name in ("types", "load", "svd", "store", "end"))
 
 
 def snippet(*parts: str, dtype: torch.dtype) -> str:
-    """A kernel over packs of parts of C++, see `filled`."""
+    """C++ source of a kernel over packs from its parts, usually `LOAD`, `SVD` and code that uses the result."""
     return filled("".join((TYPES, _PARTS["pack"], *parts, END)), dtype)
 
 
 def filled(text: str, dtype: torch.dtype) -> str:
-    """C++ with the scalar type, the size of a pack and the number of Jacobi sweeps filled in."""
+    """C++ source with the scalar type, the size of a pack and the number of Jacobi sweeps substituted."""
     text = text.replace("CPU_WIDTH", str(CPU_WIDTH)).replace("SWEEPS", str(SWEEPS[dtype]))
     return text.replace("REAL", {torch.float32: "float", torch.float64: "double"}[dtype])
 
@@ -45,7 +44,7 @@ def warp_types(dtype: torch.dtype):
 
 
 def pack_count(n: int, device: torch.device) -> int:
-    """Launch size for n matrices: packs on the CPU, matrices on a GPU."""
+    """Launch size for n matrices: packs on a CPU, matrices on a GPU."""
     return -(-n // CPU_WIDTH) if device.type == "cpu" else n
 
 

@@ -1,50 +1,47 @@
-"""Laws with the structure of a material: a learned correction of an analytic law that stays isotropic and bounded.
+"""Structured laws: a learned correction of an analytic law that stays isotropic and bounded.
 
-With F = U diag(sigma) V^T, a stress is U diag(y) U^T and a return map U diag(y) V^T, so both are frame-indifferent,
-isotropic and coaxial, and the stress is symmetric, for any weights. With e = log sigma, t = tr e and s = |dev e|^2 a
-network of two hidden layers of 16 reads the `invariants` of e and gives a few numbers n, bounded by
-:data:`LIMIT`; they change the base, an analytic law with constants, as follows.
+With F = U diag(sigma) V^T, a stress is U diag(y) U^T and a return map U diag(y) V^T. For any weights both are
+frame-indifferent, isotropic and coaxial, and the stress is symmetric. With e = log sigma, t = tr e and s = |dev e|^2, a
+network with two hidden layers of width 16 maps the `invariants` of e to a few outputs n, bounded by :data:`LIMIT`, that
+modify an analytic base law as follows.
 
-**Elasticity, form "stretch".** The base's mean stress p and the shear function f of one stretch, of which the base's
-deviator is 2 mu dev f(sigma_i), become
+**Elasticity, form "stretch".** Let p be the mean stress of the base and 2 mu dev f(sigma_i) its deviator. Then
 
     tau_i = exp(n0) p + 2 mu exp(n1) (dev f_k)_i,    f_k(x) = integral of f'(z) z^k dz from 1 to x,
 
-with k(n2) in (-1, 3). f_k rises where f does, so larger stretches have larger stresses wherever the base says so
-(Baker-Ericksen inequality: everywhere for ``hencky`` and ``neo_hookean``, among stretches above 1/2 for
-``fixed_corotated``, whose own f falls below that). For ``hencky``, f = log, dev tau = 2 G dev (sigma^k - 1) / k. There
-is no energy: a closed cycle does the work of the correction tau - tau_base alone, so at most its largest norm times the
-length of the cycle in e.
+with k(n2) in (-1, 3). f_k increases where f does, so the correction preserves the Baker-Ericksen inequality of the base
+(everywhere for ``hencky`` and ``neo_hookean``, for stretches above 1/2 for ``fixed_corotated``). For ``hencky``,
+f = log and dev tau = 2 G dev (sigma^k - 1) / k. This form has no energy. The work in a closed cycle is that of
+tau - tau_base, so at most its largest norm times the length of the cycle in e.
 
-**Elasticity, form "energy".** tau_i = d psi / d e_i of psi = exp(n0) psi_volume + exp(n1) psi_shear, two non-negative
-parts of the base's energy: no cycle gains or loses energy, but stresses need not be ordered.
+**Elasticity, form "energy".** tau_i = d psi / d e_i with psi = exp(n0) psi_volume + exp(n1) psi_shear, two non-negative
+parts of the energy of the base. Cycles conserve energy, but stresses need not be ordered like the stretches.
 
-**Plasticity.** A share v of t relaxes, then q = |dev e| slips by D along dev e, which may compact (k) or dilate (d):
+**Plasticity.** A share v of t relaxes, then q = |dev e| slips by D along dev e, with compaction k or dilatancy d:
 
     t1 = (1 - a v) t,    q' = q - D,    t' = (1 - k D / q) t1 - d D,    D = a ramp(q - q_y) / (1 + m d),
     q_y = q0(n0) + m(n1) ramp(-t1),    a = 1 / (1 + r(n2)),
     v = g(n3) / LIMIT,    k = g(-n4) / LIMIT,    d = 2 mu m / K g(n4) / LIMIT.
 
-Von Mises is m = r = 0, viscous flow r = viscosity / (mu dt), a Bingham fluid the same with q0 > 0. A granular base
-(``drucker_prager``) has a cohesion c(n0) instead of q0: q_y = m (3 c - t1), and beyond t1 = 3 c + d q it is torn to the
-tip of its cone, e' = c. A constant x > 0 of the base becomes x exp(n); one that is 0 becomes unit g(n), so that a base
-without friction, rate or cohesion can learn some. g(n), `from_zero`, rises from 0 for n <= 0 to LIMIT as an exponential
-does, since such constants lie orders of magnitude apart: v = 0.01 a step lets go all pressure within some hundred
-steps, and a fluid with a yield strain of 0.001 hardly flows. A first step of training must not take it there.
+Von Mises is m = r = 0, viscous flow r = viscosity / (mu dt), and a Bingham fluid has q0 > 0 as well. A granular base
+(``drucker_prager``) has a cohesion c(n0) in place of q0: q_y = m (3 c - t1), and states beyond t1 = 3 c + d q return to
+the apex of the cone, e' = c. A constant x > 0 of the base becomes x exp(n), and a zero constant becomes unit g(n), so
+that friction, rate or cohesion can be learned from zero. g(n) (`from_zero`) is 0 for n <= 0 and grows exponentially up
+to LIMIT, because such constants span orders of magnitude: v = 0.01 per step removes all pressure within some hundred
+steps, and a fluid with a yield strain of 0.001 hardly flows. The first step of training must not reach such values.
 
-The bases keep the volume (v = k = d = 0). A v that begins at some pressure is a crush cap, one that begins in tension
-a tensile strength, and k near 1 returns towards e = 0, as `CrushableFoam` does. t is the elastic part, so that a body
-which grows in shear is pressed: slip at a = 1 ends on the cone at its new pressure, where m = 3 K alpha(phi) / (2 mu)
-and d = 3 alpha(psi) give `CohesiveDruckerPrager`.
+The bases preserve volume (v = k = d = 0). A v that starts at some pressure is a crush cap, a v in tension is a tensile
+strength, and k near 1 returns towards e = 0, as `CrushableFoam` does. t is the elastic part, so dilatancy raises the
+pressure: slip at a = 1 ends on the cone at the new pressure, where m = 3 K alpha(phi) / (2 mu) and d = 3 alpha(psi)
+give `CohesiveDruckerPrager`.
 
-For any weights 0 <= q' <= q, t' lies between 0 and t unless n4 > 0, and d is at most that of flow normal to the cone.
-So mu q^2 + K t^2 / 2, the Hencky energy of the base's mu and K, never grows. With other elastic stresses tau, of a
-corrected elasticity too, no return adds energy where tau . dev e >= 0, as with stresses ordered as the stretches, and
-tr tau has the sign of t; but dilatancy under a pressure p may add up to p d D.
+For any weights 0 <= q' <= q, t' lies between 0 and t unless n4 > 0, and d is at most that of flow normal to the cone,
+so the Hencky energy mu q^2 + K t^2 / 2 of the base never grows. With other elastic stresses tau, no return adds energy
+if tau . dev e >= 0, as for stresses ordered like the stretches, and if tr tau has the sign of t, except that dilatancy
+under a pressure p may add up to p d D.
 
-A last layer of zeros, where training starts and which an adaptor weight of 0 restores, leaves the base exactly
-(to round-off). Bases are those named above with any of ``identity`` (stays elastic, has no network), ``von_mises``,
-``drucker_prager`` and ``viscous_flow``.
+A last layer of zeros, the start of training and an adaptor weight of 0, reproduces the base to round-off. The plastic
+bases are ``identity`` (elastic, no network), ``von_mises``, ``drucker_prager`` and ``viscous_flow``.
 """
 
 from __future__ import annotations
@@ -90,9 +87,9 @@ from neuma_lib.mechanics.structured_kernels import (
 )
 
 FORMS = {"stretch": 3, "energy": 2}
-"""Numbers that the network of each form of elasticity gives."""
+"""Number of network outputs for each form of elasticity."""
 PLASTIC_OUTPUTS = 5
-# Shear function f = sum of c (x^p - 1) / p over (c, p), with log x for p = 0: the base's deviator is 2 mu dev f.
+# Shear function f = sum of c (x^p - 1) / p over (c, p), log x for p = 0. The deviator of the base is 2 mu dev f.
 SHEAR_TERMS: dict[type[AnalyticElasticity], tuple[tuple[float, float], ...]] = {
     Hencky: ((1.0, 0.0),),
     NeoHookean: ((1.0, 2.0),),
@@ -108,7 +105,7 @@ def shapes(outputs: int) -> tuple[tuple[int, int], ...]:
 
 
 def initial_weights(outputs: int, seed: int) -> Weights:
-    """Two Xavier-uniform layers and a last one of zeros."""
+    """Two Xavier-uniform layers and a last layer of zeros."""
     generator = torch.Generator().manual_seed(seed)
     *hidden, last = shapes(outputs)
     weights = [(2 * torch.rand(s, generator=generator) - 1) * (6 / sum(s)) ** 0.5 for s in hidden]
@@ -118,24 +115,24 @@ def initial_weights(outputs: int, seed: int) -> Weights:
 def invariants(strain: Tensor) -> Tensor:
     """(N, 3) smooth symmetric functions of the logarithmic strains e (N, 3).
 
-    t; the size sqrt(s + SMOOTH^2) - SMOOTH of the deviator; its Lode part LODE det dev e / (s + SMOOTH^2), which lies
-    between -sqrt(s) and sqrt(s).
+    t; the size sqrt(s + SMOOTH^2) - SMOOTH of the deviator; its Lode part LODE det dev e / (s + SMOOTH^2) in
+    [-sqrt(s), sqrt(s)].
     """
     trace = strain.sum(1)
     deviator = strain - trace[:, None] / 3
     s = (deviator**2).sum(1)
     rounded = s + SMOOTH**2
-    size = s / (rounded.sqrt() + SMOOTH)  # no difference of nearly equal numbers
+    size = s / (rounded.sqrt() + SMOOTH)  # avoids cancellation
     return torch.stack([trace, size, LODE * deviator.prod(1) / rounded], dim=1)
 
 
 def from_zero(n: Tensor) -> Tensor:
-    """g(n) = LIMIT expm1(GROWTH ramp(n)) / expm1(GROWTH LIMIT); its slope at n = 0 counts as that of n > 0."""
+    """g(n) = LIMIT expm1(GROWTH ramp(n)) / expm1(GROWTH LIMIT), with the right derivative at n = 0."""
     return LIMIT / math.expm1(GROWTH * LIMIT) * (GROWTH * n.clamp(min=0)).expm1()
 
 
 def _bend(x: Tensor) -> Tensor:
-    """The activation x / sqrt(1 + x^2): bounded, and needs no exponential."""
+    """The activation x / sqrt(1 + x^2), bounded and without an exponential."""
     return x * torch.rsqrt(1 + x * x)
 
 
@@ -144,7 +141,7 @@ def _slope(x: Tensor) -> Tensor:
 
 
 def _layers(z: Tensor, weights: Weights) -> list[Tensor]:
-    """Arguments of the three activations, the last in units of LIMIT."""
+    """Arguments of the three activations, the last divided by LIMIT."""
     W0, W1, W2 = weights
     a0 = pad(z / STRAIN, (0, 1), value=1.0) @ W0.mT
     a1 = pad(_bend(a0), (0, 1), value=1.0) @ W1.mT
@@ -152,7 +149,7 @@ def _layers(z: Tensor, weights: Weights) -> list[Tensor]:
 
 
 def network(z: Tensor, weights: Weights) -> Tensor:
-    """Outputs n (N, k), between -LIMIT and LIMIT, for invariants z (N, 3)."""
+    """Outputs n (N, k) in (-LIMIT, LIMIT) for invariants z (N, 3)."""
     return LIMIT * _bend(_layers(z, weights)[-1])
 
 
@@ -170,39 +167,38 @@ def _sinhc(x: Tensor) -> Tensor:
     small = x.abs() < 0.5
     square = torch.where(small, x, 0.0) ** 2
     series = torch.ones_like(x)
-    for n in range(8, 0, -1):  # the next term is 0.5^18 / 19!, less than round-off
+    for n in range(8, 0, -1):  # the next term is 0.5^18 / 19!, below round-off
         series = 1 + square / ((2 * n) * (2 * n + 1)) * series
-    away = torch.where(small, 1.0, x)
-    return torch.where(small, series, away.sinh() / away)
+    large = torch.where(small, 1.0, x)
+    return torch.where(small, series, large.sinh() / large)
 
 
 class _Pairs:
     """Divided differences over the pairs (i, j) of `PAIRS` of singular values sigma (N, 3), (N, 3 pairs) each.
 
-    ``clamped`` are those of max(sigma, STRETCH_MIN), ``log`` those of its logarithm, ``gap`` and ``mean`` the
-    difference and the mean of the two logarithms. No differences of nearly equal numbers but of singular values.
+    ``clamped`` are those of max(sigma, STRETCH_MIN) and ``log`` those of its logarithm, ``gap`` and ``mean`` the
+    difference and the mean of the two logarithms. The only cancellation is in differences of singular values.
     """
 
     def __init__(self, sigma: Tensor):
         self.si, self.sj = sigma[:, FIRST], sigma[:, SECOND]
         self.ci, self.cj = self.si.clamp(min=STRETCH_MIN), self.sj.clamp(min=STRETCH_MIN)
-        apart, clamped_apart = self.si - self.sj, self.ci - self.cj
-        same = apart == 0
+        difference, clamped_difference = self.si - self.sj, self.ci - self.cj
+        same = difference == 0
         inside = (self.sj > STRETCH_MIN).to(sigma)
-        self.clamped = torch.where(same, inside, clamped_apart / torch.where(same, 1.0, apart))
-        ratio = clamped_apart / self.cj
+        self.clamped = torch.where(same, inside, clamped_difference / torch.where(same, 1.0, difference))
+        ratio = clamped_difference / self.cj
         self.gap, self.mean = ratio.log1p(), 0.5 * (self.ci * self.cj).log()
         equal = ratio == 0
         self.log = self.clamped / self.cj * torch.where(equal, 1.0, self.gap / torch.where(equal, 1.0, ratio))
 
 
 class StructuredConstitutive(AdaptableConstitutive):
-    """A network around an analytic law. The kernels of :mod:`structured_kernels` do the work; `response` is their slow
-    twin."""
+    """A network that corrects an analytic law. :mod:`structured_kernels` evaluates it, with `response` as reference."""
 
     capturable = True
     kernel: tuple[str, kernels.Constants]
-    """Which kernel, and what it knows beside the weights."""
+    """Kind of the kernel, and the constants of the law."""
 
     def graph_key(self) -> Hashable:
         return type(self), self.kernel
@@ -222,12 +218,12 @@ class StructuredElasticity(StructuredConstitutive, Elasticity):
     """A corrected isotropic elasticity, see the module.
 
     Args:
-        base: its analytic law, with numbers as constants.
+        base: analytic law with numbers as constants.
         form: "stretch" or "energy".
-        weights: three matrices of `shapes`; `initial_weights` of ``seed`` if not given.
+        weights: three matrices of `shapes`, by default `initial_weights` of ``seed``.
 
     Raises:
-        InputError: no such form, a base that has none, weights of other shapes.
+        InputError: the form or the base is not supported, or the weights have other shapes.
     """
 
     isotropic = True
@@ -237,24 +233,20 @@ class StructuredElasticity(StructuredConstitutive, Elasticity):
     ):
         super().__init__()
         if form not in FORMS:
-            raise InputError(
-                f"a structured elasticity has the form {' or '.join(map(repr, FORMS))}, not {form!r}"
-            )
+            raise InputError("form", f"{form!r} must be {' or '.join(map(repr, FORMS))}")
         if type(base) not in SHEAR_TERMS:
-            raise InputError(_no_base("elasticity", "hencky, neo_hookean, fixed_corotated"))
+            raise _unsupported("elasticity", base, "hencky, neo_hookean, fixed_corotated")
         self.analytic, self.form = base, form
         self.mu, self.lam = (float(x) for x in lame(base.values["E"], base.values["nu"]))
         self.terms = SHEAR_TERMS[type(base)]
         if form == "energy" and self.lam < 0 and type(base) is not Hencky:
-            raise InputError(
-                f"the energy form needs nu >= 0, not {base.values['nu']:g}: its volume part is else negative"
-            )
-        base_number = kernels.BASES.index(NAMES[type(base)])
-        self.kernel = form, kernels.Constants(base_number, (self.mu, self.lam, 0.0, 0.0))
-        self.freeze(_checked(weights, FORMS[form], seed))
+            raise InputError("elasticity.nu", f"{base.values['nu']:g} must be >= 0 for the form 'energy'")
+        base_index = kernels.BASES.index(NAMES[type(base)])
+        self.kernel = form, kernels.Constants(base_index, (self.mu, self.lam, 0.0, 0.0))
+        self.freeze(_checked("elasticity", weights, FORMS[form], seed))
 
     def outputs(self, z: Tensor, weights: Weights) -> Tensor:
-        """What the network gives (N, k) for invariants z (N, 3)."""
+        """Outputs of the network (N, k) for invariants z (N, 3)."""
         return network(z, weights)
 
     def response(self, F: Tensor, weights: Weights) -> Tensor:
@@ -262,7 +254,7 @@ class StructuredElasticity(StructuredConstitutive, Elasticity):
         return coaxial_stress(F, *self.principal(sigma, weights))
 
     def principal(self, sigma: Tensor, weights: Weights) -> tuple[Tensor, Quotients]:
-        """Principal Kirchhoff stresses (N, 3) [Pa] at principal stretches (N, 3), and their divided differences."""
+        """Principal Kirchhoff stresses (N, 3) [Pa] of principal stretches (N, 3), and their divided differences."""
         return (self._stretch_form if self.form == "stretch" else self._energy_form)(sigma, weights)
 
     def _stretch_form(self, sigma, weights):
@@ -281,7 +273,7 @@ class StructuredElasticity(StructuredConstitutive, Elasticity):
         return y, quotients
 
     def _shear(self, sigma: Tensor, strain: Tensor, shift: Tensor | float) -> Tensor:
-        """f_k(sigma) (N, 3); below STRETCH_MIN it goes on as the base, with the slope that this has."""
+        """f_k(sigma) (N, 3), continued below STRETCH_MIN with the slope of the base."""
         total, clamped = 0.0, sigma.clamp(min=STRETCH_MIN)
         for c, p in self.terms:
             half = 0.5 * (p + shift) * strain
@@ -329,7 +321,7 @@ class StructuredElasticity(StructuredConstitutive, Elasticity):
         return y, quotients
 
     def _energy_parts(self, sigma: Tensor, deviator: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Energies (N,) of volume and shear [Pa], and the principal stresses of each."""
+        """Energies (N,) of volume and shear [Pa], and their principal stresses."""
         mu, lam = self.mu, self.lam
         if isinstance(self.analytic, Hencky):
             bulk, t = lam + 2 * mu / 3, sigma.clamp(min=STRETCH_MIN).log().sum(1)
@@ -348,11 +340,11 @@ class StructuredPlasticity(StructuredConstitutive, Plasticity):
     """A corrected return map, see the module.
 
     Args:
-        base: its analytic law, with numbers as constants: von Mises, Drucker-Prager or viscous flow.
-        weights, seed: as of `StructuredElasticity`.
+        base: von Mises, Drucker-Prager or viscous flow, with numbers as constants.
+        weights, seed: see `StructuredElasticity`.
 
     Raises:
-        InputError: a base that has none, weights of other shapes.
+        InputError: the base is not supported, or the weights have other shapes.
     """
 
     isotropic = True
@@ -360,22 +352,21 @@ class StructuredPlasticity(StructuredConstitutive, Plasticity):
     def __init__(self, base: Plasticity, weights: Weights | None = None, seed: int = 0):
         super().__init__()
         if type(base) not in (VonMises, DruckerPrager, ViscousFlow):
-            raise InputError(_no_base("plasticity", "identity, von_mises, drucker_prager, viscous_flow"))
+            raise _unsupported("plasticity", base, "identity, von_mises, drucker_prager, viscous_flow")
         self.analytic = base
         self.granular = isinstance(base, DruckerPrager)
         mu, lam = lame(base.values["E"], base.values["nu"])
-        # d / m of flow normal to the cone
-        self.associated = 2 * mu / (lam + 2 * mu / 3)
+        self.associated = 2 * mu / (lam + 2 * mu / 3)  # d / m of flow normal to the cone
         self.friction = base.slope(**base.values) if self.granular else 0.0
         self.threshold = base.values["cohesion"] if self.granular else base.values["yield_stress"] / (2 * mu)
         viscous = isinstance(base, ViscousFlow)
         self.rate = base.values["viscosity"] / (mu * base.values["dt"]) if viscous else 0.0
         constants = self.threshold, self.friction, self.rate, self.associated
         self.kernel = "return", kernels.Constants(int(self.granular), tuple(map(float, constants)))
-        self.freeze(_checked(weights, PLASTIC_OUTPUTS, seed))
+        self.freeze(_checked("plasticity", weights, PLASTIC_OUTPUTS, seed))
 
     def outputs(self, z: Tensor, weights: Weights) -> Tensor:
-        """What the network gives (N, k) for invariants z (N, 3)."""
+        """Outputs of the network (N, k) for invariants z (N, 3)."""
         return network(z, weights)
 
     def response(self, F: Tensor, weights: Weights) -> Tensor:
@@ -383,7 +374,8 @@ class StructuredPlasticity(StructuredConstitutive, Plasticity):
         return coaxial_deformation(F, *self.principal(sigma, weights))
 
     def principal(self, sigma: Tensor, weights: Weights) -> tuple[Tensor, Quotients]:
-        """Principal stretches (N, 3) after the return, sigma itself where nothing yields; their divided differences."""
+        """Principal stretches (N, 3) after the return, sigma itself where nothing yields, and their divided
+        differences."""
         trace, deviator, norm = hencky_strain(sigma)
         n = self.outputs(invariants(trace / 3 + deviator), weights)
         threshold = _corrected(self.threshold, n[:, :1], COHESION_UNIT)
@@ -391,22 +383,22 @@ class StructuredPlasticity(StructuredConstitutive, Plasticity):
         fluidity = 1 / (1 + _corrected(self.rate, n[:, 2:3], 1.0))
         crush, dilation, compaction = (from_zero(x) / LIMIT for x in (n[:, 3:4], n[:, 4:], -n[:, 4:]))
         dilatancy = dilation * self.associated * friction
-        eased = trace * (1 - fluidity * crush)
+        relaxed = trace * (1 - fluidity * crush)  # t1
         if self.granular:
-            pressed = eased - 3 * threshold
-            limit = -friction * pressed
-            torn = pressed > dilatancy * norm
+            shifted = relaxed - 3 * threshold
+            limit = -friction * shifted
+            torn = shifted > dilatancy * norm
         else:
-            limit = threshold + friction * (-eased).clamp(min=0)
+            limit = threshold + friction * (-relaxed).clamp(min=0)
             torn = torch.zeros_like(trace, dtype=torch.bool)
         slips = ~torn & (norm > limit)
         share = fluidity / (1 + friction * dilatancy) * (1 - limit / torch.where(slips, norm, 1.0))
         share = torch.where(slips, share, 0.0)  # D / q
-        after = eased * (1 - compaction * share) - dilatancy * share * norm
+        after = relaxed * (1 - compaction * share) - dilatancy * share * norm  # t'
         returned = (after / 3 + deviator * (1 - share)).exp()
-        tip = threshold.exp().expand_as(sigma) if self.granular else returned
+        apex = threshold.exp().expand_as(sigma) if self.granular else returned
         changed = torn | slips | (crush > 0)
-        y = torch.where(changed, torch.where(torn, tip, returned), sigma)
+        y = torch.where(changed, torch.where(torn, apex, returned), sigma)
         scale = torch.where(torn, 0.0, 1 - share).detach()
 
         def quotients(sigma):
@@ -419,7 +411,7 @@ class StructuredPlasticity(StructuredConstitutive, Plasticity):
 
 
 def _corrected(constant: float, n: Tensor, unit: float) -> Tensor:
-    """constant exp(n), or unit g(n) for a constant that is zero."""
+    """constant exp(n), or unit g(n) if the constant is zero."""
     return constant * n.exp() if constant > 0 else unit * from_zero(n)
 
 
@@ -427,20 +419,21 @@ def _sums(y: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
     return y[:, FIRST] + y[:, SECOND], sigma[:, FIRST] + sigma[:, SECOND]
 
 
-def _no_base(part: str, choices: str) -> str:
-    return f"a structured {part} corrects an analytic one with numbers as constants: {choices}"
+def _unsupported(part: str, base: AnalyticElasticity | Plasticity, choices: str) -> InputError:
+    name = NAMES.get(type(base), type(base).__name__)
+    return InputError(f"{part}.name", f"{name} is no base of a structured law, which are {choices}")
 
 
-def _checked(weights: Weights | None, outputs: int, seed: int) -> Weights:
+def _checked(part: str, weights: Weights | None, outputs: int, seed: int) -> Weights:
     weights = initial_weights(outputs, seed) if weights is None else weights
-    found = tuple(tuple(w.shape) for w in weights)
-    if found != shapes(outputs):
-        raise InputError(f"this structured law has weights of shapes {shapes(outputs)}, not {found}")
+    given = tuple(tuple(w.shape) for w in weights)
+    if given != shapes(outputs):
+        raise InputError(f"{part} weights", f"shapes {given} must be {shapes(outputs)}")
     return weights
 
 
 class StructuredLaw(AdaptableLaw):
-    """A corrected elasticity and plasticity; the identity as plasticity has no network."""
+    """A corrected elasticity and plasticity. The identity as plasticity has no network."""
 
     elasticity: StructuredElasticity
     plasticity: StructuredPlasticity | Identity
@@ -458,18 +451,17 @@ def structured_law(
     name: str | None = None,
     seed: int = 0,
 ) -> StructuredLaw:
-    """Law around the analytic law of a specification, exactly that law until something is trained.
+    """Structured law whose base is the analytic law of a specification, equal to the base until it is trained.
 
     Args:
-        spec: as for `analytic_law`, with numbers as constants; its key ``form`` ("stretch" if missing) is that of the
-            elasticity.
-        dt: time step [s], needed by ``viscous_flow``.
-        state: tensors of `StructuredLaw.prior_state`; if not given the last layers are zero.
-        name: for messages; made of the base's name if not given.
-        seed: of the first layers, if ``state`` is not given.
+        spec: as in `analytic_law`, with numbers as constants, and the ``form`` of the elasticity (default "stretch").
+        dt: time step [s], required by ``viscous_flow``.
+        state: tensors of `StructuredLaw.prior_state`. By default the last layers are zero.
+        name: name used in messages, by default derived from that of the base.
+        seed: seed of the first layers if ``state`` is not given.
 
     Raises:
-        InputError: what `analytic_law` refuses, a base or a form that there is none of, tensors that do not fit.
+        InputError: as in `analytic_law`, or an unsupported base or form, or tensors that do not match.
     """
     spec = dict(spec)
     form = spec.pop("form", "stretch")
@@ -480,7 +472,7 @@ def structured_law(
         if state is not None and (part == "elasticity" or not isinstance(base.plasticity, Identity)):
             missing = [key for key in keys if key not in state]
             if missing:
-                raise InputError(f"structured law: weights {', '.join(missing)} are missing")
+                raise InputError("structured law", f"weights {', '.join(missing)} are missing")
             weights[part] = tuple(state[key].float() for key in keys)
     elasticity = StructuredElasticity(base.elasticity, form, weights.get("elasticity"), 2 * seed)
     plasticity = base.plasticity

@@ -1,26 +1,26 @@
-// Text of the kernels of structured_kernels.py: a pack of rows at a time, as in singular_values_kernels.h, whose parts
-// "types" and "svd" stand in between. Letters are those of structured.py.
+// Kernels of structured_kernels.py for packs of rows, combined with the parts "types" and "svd" of
+// singular_values_kernels.h. Letters are those of structured.py.
 
-// A CPU is to multiply and add in one instruction, as a GPU does; Warp's default there is not to.
+// Enables fused multiply-add on a CPU, as on a GPU, which is not Warp's default.
 //// begin
 #if defined(__clang__)
     #pragma clang fp contract(fast)
 #endif
 
-// The SVD stays that of singular_values.py to the last bit.
+// Keeps the SVD bit-identical to that of singular_values.py.
 //// round_all
 #if defined(__clang__)
     #pragma clang fp contract(off)
 #endif
 
-// Functions of a pack. On a CPU exp and log are series, good to one or two units in the last place.
+// Functions of a pack. On a CPU exp and log are series with an error of one or two units in the last place.
 //// functions
     Pack zero;
     for (int l = 0; l < WIDTH; ++l) LANE(zero, l) = Real(0);
     const Pack one = zero + Real(1);
 #if defined(__CUDA_ARCH__)
     #define UNROLL _Pragma("unroll")
-    // Weights are read again: else all of them are kept in registers, from layer to layer and from tile to tile.
+    // Forces the weights to be read again, instead of keeping all of them in registers across layers and tiles.
     #define READ_AGAIN asm volatile("" : : : "memory");
     auto exponential = [](const Pack& x) { return Real(exp(x)); };
     auto logarithm = [](const Pack& x) { return Real(log(x)); };
@@ -30,9 +30,9 @@
     #define READ_AGAIN
     typedef INTEGER Bits __attribute__((vector_size(CPU_WIDTH * sizeof(Real))));
     const int MANTISSA = sizeof(Real) == 4 ? 23 : 52, BIAS = sizeof(Real) == 4 ? 127 : 1023;
-    // 1.5 2^MANTISSA: adding it rounds to an integer, which the last bits of the sum then hold
+    // Adding 1.5 2^MANTISSA rounds to an integer, which is then in the last bits of the sum
     const Real ROUND = sizeof(Real) == 4 ? Real(12582912.0) : Real(6755399441055744.0);
-    // log 2 in two parts, the first exact in products with an exponent
+    // log 2 in two parts; products of the first with an exponent are exact
     const Real LOG2_HIGH = sizeof(Real) == 4 ? Real(0.693359375) : Real(0.693147180369123816490);
     const Real LOG2_LOW = sizeof(Real) == 4 ? Real(-2.12194440054690583e-4) : Real(1.90821492927058770002e-10);
     const Real EXP_MIN = sizeof(Real) == 4 ? Real(-87) : Real(-708), EXP_MAX = sizeof(Real) == 4 ? Real(89) : Real(709.9);
@@ -46,7 +46,7 @@
         for (int i = EXP_TERMS; i > 0; --i) series = series * r * (Real(1) / Real(i)) + Real(1);
         return series * (Pack)(((Bits)shifted + BIAS) << MANTISSA);
     };
-    // of normal numbers
+    // for normal numbers
     auto logarithm = [&](const Pack& x) {
         const Pack root = zero + Real(0.70710678118654752);
         const Bits k = ((Bits)x - (Bits)root) >> MANTISSA;
@@ -59,12 +59,12 @@
         return exponent * LOG2_HIGH + (Real(2) * w * series + exponent * LOG2_LOW);
     };
     auto any = [](const auto& mask) {
-        INTEGER found = 0;
-        for (int l = 0; l < WIDTH; ++l) found |= mask[l];
-        return found != 0;
+        INTEGER bits = 0;
+        for (int l = 0; l < WIDTH; ++l) bits |= mask[l];
+        return bits != 0;
     };
 #endif
-    // sinh(x) / x and its derivative, with X = exp(x)
+    // sinh(x) / x and its derivative, for X = exp(x)
     auto sinhc = [&](const Pack& x, const Pack& X, Pack& value, Pack& slope) {
         const Pack q = x * x;
         Real c[SINH_TERMS + 1];  // 1 / (2 i + 1)!
@@ -83,7 +83,7 @@
         slope = far ? (Real(0.5) * (X + inverse) - away) / safe : slope;
         value = far ? away : value;
     };
-    // activation x / sqrt(1 + x^2), with r = 1 / sqrt(1 + x^2): its slope is r^3
+    // activation x / sqrt(1 + x^2), with r = 1 / sqrt(1 + x^2) and slope r^3
     auto bend = [](auto& x, auto& r) {
         UNROLL for (int k = 0; k < (int)(sizeof(x) / sizeof(x[0])); ++k) {
             r[k] = Real(1) / SQRT(x[k] * x[k] + Real(1));
@@ -117,8 +117,8 @@
     auto dot = [](const Pack* x, const Pack* y) { return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]; };
     const int FIRST[3] = {0, 0, 1}, SECOND[3] = {1, 2, 2}, THIRD[3] = {2, 1, 0};
 
-// The loop over rows: packs on a CPU; on a GPU tiles of a row a thread, where rows past the end repeat the last one
-// and have no gradient and no result.
+// Loop over rows: packs on a CPU, tiles of one row per thread on a GPU, where rows past the end repeat the last row
+// without gradient and result.
 //// rows
 #if defined(__CUDA_ARCH__)
     const int thread = threadIdx.x;
@@ -142,7 +142,7 @@
         const int used = n - first < WIDTH ? n - first : WIDTH;
 #endif
 
-// u[k], v[k] and s[k], from the cache if it holds them.
+// u[k], v[k] and s[k], from the cache if it has them.
 //// decompose
         Pack u[3][3], v[3][3], s[3];
         Pack* const kept = (Pack*)cache + CACHED * (first / WIDTH);
@@ -182,7 +182,7 @@
                 kept[18 + k] = s[k];
             }
 
-// Logarithmic strains e of c = max(s, STRETCH_MIN), rate = d e / d s, the invariants z and the network.
+// Logarithmic strains e of c = max(s, STRETCH_MIN), rate = d e / d s, invariants z and network.
 //// network
         Pack c[3], e[3], rate[3], dev[3];
         for (int k = 0; k < 3; ++k) {
@@ -216,7 +216,7 @@
             across[k] = LODE * inverse * (cofactor[k] - Real(2) * det * inverse * dev[k]);
         }
 
-// Divided differences over the pairs: of max(s, STRETCH_MIN), and of its logarithm.
+// Divided differences of max(s, STRETCH_MIN) and of its logarithm over the pairs.
 //// pairs
         Pack clamped[3], log_quotient[3];
         for (int pair = 0; pair < 3; ++pair) {
@@ -237,7 +237,7 @@
             }
         }
 
-// Principal stresses y of the form "stretch"; slope = d shear / d s, twist = d shear / d shift.
+// Principal stresses y of the form "stretch", with slope = d shear / d s and twist = d shear / d shift.
 //// stretch
         Pack mean, mean_slope[3];
         if (kind == HENCKY) {
@@ -310,7 +310,7 @@
             quotient[k] = modulus * quotient[k];
         }
 
-// Of the gradient gy of y: g_change of the outputs, g_s of the stretches but through the network.
+// From the gradient gy of y: g_change of the outputs, and g_s of the stretches without the path through the network.
 //// stretch_vjp
         Pack g_change[OUTPUTS], g_s[3];
         {
@@ -326,8 +326,8 @@
             g_change[2] = g_shift * Real(12) * growth * inverse_growth * inverse_growth;
         }
 
-// Form "energy": parts of the energy, psi[0] of volume and psi[1] of shear, and their principal stresses; each with its
-// derivative by s, that of the stresses in the direction gy (zero forward).
+// Form "energy": psi[0] of volume and psi[1] of shear and their principal stresses, with derivatives by s, those of the
+// stresses in the direction gy (zero in the forward kernel).
 //// energy_parts
         Pack psi[2], stress[2][3], psi_slope[2][3], stress_slope[2][3];
         const Pack gy_total = gy[0] + gy[1] + gy[2];
@@ -379,8 +379,8 @@
             }
         }
 
-// Principal stresses y: those of the parts and, through the network, d psi / d z. d0, d1, d2 are the derivatives of psi
-// by what the activations get, b0 and b1 those by the activations.
+// Principal stresses y: those of the parts and d psi / d z through the network. d0, d1, d2 are the derivatives of psi
+// by the arguments of the activations, b0 and b1 by their values.
 //// energy
         Pack d0[HIDDEN], d1[HIDDEN], d2[OUTPUTS], b0[HIDDEN], b1[HIDDEN], dx[3], factor[OUTPUTS];
         for (int k = 0; k < OUTPUTS; ++k) {
@@ -405,9 +405,9 @@
             quotient[k] = Real(2) * mu * factor[1] * plain + through * log_quotient[k];
         }
 
-// gy . y is the derivative of psi in the direction gy of e, with the factors of the parts' stresses beside: a tangent
-// through the network (dots), and back through both. The part "network_vjp" adds b0 and b1, which are then what the slopes of the activations
-// change.
+// gy . y is the derivative of psi in the direction gy of e plus the scaled stresses of the parts: a tangent through the
+// network (dots), followed by the adjoint of both. The part "network_vjp" adds b0 and b1, which then hold the
+// contributions of the slopes of the activations.
 //// energy_vjp
         Pack g_s[3], g_change[OUTPUTS];
         {
@@ -420,7 +420,7 @@
             for (int k = 0; k < HIDDEN; ++k) h1_dot[k] = a1_dot[k] * r1[k] * r1[k] * r1[k];
             layer(w2, h1_dot, a2_dot, Real(0));
             add_weights(d0, d1, d2, x_dot, h0_dot, h1_dot, Real(0));
-            // the slope r^3 of an activation falls by 3 h r^4
+            // the derivative of the slope r^3 of an activation is -3 h r^4
             for (int k = 0; k < HIDDEN; ++k) {
                 b0[k] = Real(-3) * h0[k] * a0_dot[k] * b0[k] * r0[k] * r0[k] * r0[k] * r0[k];
                 b1[k] = Real(-3) * h1[k] * a1_dot[k] * b1[k] * r1[k] * r1[k] * r1[k] * r1[k];
@@ -431,7 +431,7 @@
                 g_change[k] = factor[k] * (dot(gy, stress[k]) + psi[k] * dots[k])
                     - Real(3) / (LIMIT * LIMIT) * change[k] * r2[k] * a2_dot[k] * factor[k] * psi[k];
             }
-            // Lode part: along gy it grows by LODE (A / R - 2 det B / R^2), R = rounded
+            // derivative of the Lode part along gy: LODE (A / R - 2 det B / R^2), R = rounded
             const Pack mean = gy_total * THIRD_PART;
             const Pack even[3] = {gy[0] - mean, gy[1] - mean, gy[2] - mean};
             const Pack B = dot(dev, even), A = dot(cofactor, even);
@@ -449,7 +449,7 @@
             }
         }
 
-// Back through the network: the gradients of its weights are added, that of the stretches goes to g_s.
+// Adjoint of the network: adds the gradients of its weights and of the stretches (g_s).
 //// network_vjp
         Pack g0[HIDDEN], g1[HIDDEN], g2[OUTPUTS], gx[3];
         for (int k = 0; k < OUTPUTS; ++k) g2[k] = g_change[k] * r2[k] * r2[k] * r2[k];
@@ -463,7 +463,7 @@
             g_s[k] = g_s[k] + rate[k] * (Real(1) / STRAIN) * (gx[0] + gx[1] * along[k] + gx[2] * across[k]);
 
 // Before the rows: sums over rows of products of a gradient g with an input, per weight. On a GPU the rows of a block
-// are put in shared memory, a column a number, and a thread sums the products of a few weights.
+// are stored in shared memory, one column per number, and a thread sums the products of a few weights.
 //// sums
 #if defined(__CUDA_ARCH__)
     const int COLUMN = THREADS + 1, SHARE = (WEIGHTS + THREADS - 1) / THREADS;
@@ -516,7 +516,7 @@
     };
 #endif
 
-// After the rows: the sums are added to the totals of the weights' gradients; on a GPU a block puts them down.
+// After the rows: adds the sums to the gradients of the weights on a CPU, stores them per block on a GPU.
 //// put_sums
 #if defined(__CUDA_ARCH__)
     UNROLL for (int k = 0; k < SHARE; ++k) {
@@ -533,11 +533,11 @@
     }
 #endif
 
-// Principal stretches y after the return, where `changed`; growing, slopes of threshold, friction and rate by change;
-// share = D / q. Letters of structured.py: crush v, compaction k, dilatancy d, eased t1, after t', from_zero g.
+// Principal stretches y after the return, where `changed`. growing: slopes of threshold, friction and rate by change.
+// share = D / q. Letters of structured.py: crush v, compaction k, dilatancy d, relaxed t1, after t', from_zero g.
 //// plastic
         auto from_zero = [&](const Pack& x, Pack& risen, Pack& slope) {
-            // expm1(2 h) = 2 exp(h) sinh(h): no difference of nearly equal numbers
+            // expm1(2 h) = 2 exp(h) sinh(h) avoids cancellation
             const Pack h = Real(0.5) * GROWTH * (x > Real(0) ? x : zero), X = exponential(h);
             Pack value, derivative;
             sinhc(h, X, value, derivative);
@@ -564,16 +564,16 @@
         crush = crush * (Real(1) / LIMIT);
         dilation = dilation * (Real(1) / LIMIT);
         compaction = compaction * (Real(1) / LIMIT);
-        const Pack tiny = zero + LEAST;
-        const Pack norm = SQRT(square > LEAST ? square : tiny), inverse_norm = one / norm;
+        const Pack tiny = zero + NORMAL_MIN;
+        const Pack norm = SQRT(square > NORMAL_MIN ? square : tiny), inverse_norm = one / norm;
         const Pack fluid = one / (one + value[2]), dilatancy = dilation * associated * value[1];
-        const Pack eased = trace * (one - fluid * crush);
-        const Pack pressed = kind == GRANULAR ? eased - Real(3) * value[0] : eased;
-        const Pack pressure = kind == GRANULAR ? -pressed : pressed < Real(0) ? -pressed : zero;
+        const Pack relaxed = trace * (one - fluid * crush);
+        const Pack shifted = kind == GRANULAR ? relaxed - Real(3) * value[0] : relaxed;
+        const Pack pressure = kind == GRANULAR ? -shifted : shifted < Real(0) ? -shifted : zero;
         const Pack limit = (kind == GRANULAR ? zero : value[0]) + value[1] * pressure;
-        const Pack beyond_tip = kind == GRANULAR ? pressed - dilatancy * norm : zero;
-        const auto torn = beyond_tip > Real(0);
-        const auto slips = (norm > limit) & (beyond_tip <= Real(0));
+        const Pack beyond_apex = kind == GRANULAR ? shifted - dilatancy * norm : zero;
+        const auto torn = beyond_apex > Real(0);
+        const auto slips = (norm > limit) & (beyond_apex <= Real(0));
         const auto changed = torn | slips | (crush > Real(0));
         const bool moves = any(changed);
         const Pack held = one / (one + value[1] * dilatancy), slip = one - limit * inverse_norm;
@@ -581,11 +581,11 @@
         Pack y[3];
         for (int k = 0; k < 3; ++k) y[k] = s[k];
         if (moves) {
-            const Pack tip = kind == GRANULAR ? exponential(value[0]) : one;
-            const Pack after = eased * (one - compaction * share) - dilatancy * share * norm;
+            const Pack apex = kind == GRANULAR ? exponential(value[0]) : one;
+            const Pack after = relaxed * (one - compaction * share) - dilatancy * share * norm;
             for (int k = 0; k < 3; ++k) {
                 const Pack returned = exponential(after * THIRD_PART + dev[k] * (one - share));
-                y[k] = torn ? tip : changed ? returned : s[k];
+                y[k] = torn ? apex : changed ? returned : s[k];
             }
         }
 
@@ -603,7 +603,7 @@
             }
         }
 
-// Nothing to do where no row of the pack yields; else K of grad_F = U K V^T, with G = U^T g V.
+// K of grad_F = U K V^T with G = U^T g V, unless no row of the pack yields.
 //// plastic_vjp
         Pack K[3][3], g_s[3], g_change[OUTPUTS];
         {
@@ -618,24 +618,24 @@
             for (int k = 0; k < 3; ++k) ga[k] = changed ? G[k][k] * y[k] : zero;
             const Pack total = ga[0] + ga[1] + ga[2];
             const Pack g_after = torn ? zero : total * THIRD_PART;
-            const Pack g_share = slips ? -(dot(ga, dev) + g_after * (eased * compaction + dilatancy * norm)) : zero;
+            const Pack g_share = slips ? -(dot(ga, dev) + g_after * (relaxed * compaction + dilatancy * norm)) : zero;
             const Pack g_slip = g_share * fluid * held;
             const Pack g_limit = -(g_slip * inverse_norm);
-            // d limit / d pressed
-            const Pack pulled = kind == GRANULAR ? -value[1] : pressed < Real(0) ? -value[1] : zero;
-            const Pack g_pressed = g_limit * pulled;
-            const Pack g_eased = g_after * (one - compaction * share) + g_pressed;
-            const Pack g_held = -(g_share * share * held);  // of the product of friction and dilatancy
+            // d limit / d shifted
+            const Pack pulled = kind == GRANULAR ? -value[1] : shifted < Real(0) ? -value[1] : zero;
+            const Pack g_shifted = g_limit * pulled;
+            const Pack g_relaxed = g_after * (one - compaction * share) + g_shifted;
+            const Pack g_held = -(g_share * share * held);  // gradient of friction times dilatancy
             const Pack g_dilatancy = g_held * value[1] - g_after * share * norm;
-            const Pack g_fluid = g_share * held * slip - g_eased * trace * crush;
-            const Pack g_trace = g_eased * (one - fluid * crush);
+            const Pack g_fluid = g_share * held * slip - g_relaxed * trace * crush;
+            const Pack g_trace = g_relaxed * (one - fluid * crush);
             const Pack g_norm = g_slip * limit * inverse_norm * inverse_norm - g_after * dilatancy * share;
-            g_change[0] = (kind == GRANULAR ? (torn ? total : Real(-3) * g_pressed) : g_limit) * growing[0];
+            g_change[0] = (kind == GRANULAR ? (torn ? total : Real(-3) * g_shifted) : g_limit) * growing[0];
             g_change[1] = (g_limit * pressure + g_held * dilatancy + g_dilatancy * dilation * associated) * growing[1];
             g_change[2] = -(g_fluid * fluid * fluid * growing[2]);
-            g_change[3] = g_eased * trace * fluid * crush_slope * (Real(-1) / LIMIT);
+            g_change[3] = g_relaxed * trace * fluid * crush_slope * (Real(-1) / LIMIT);
             g_change[4] = (g_dilatancy * associated * value[1] * dilation_slope
-                           + g_after * eased * share * compaction_slope) * (Real(1) / LIMIT);
+                           + g_after * relaxed * share * compaction_slope) * (Real(1) / LIMIT);
             for (int k = 0; k < 3; ++k) {
                 const Pack straight = torn ? zero : scale * (ga[k] - total * THIRD_PART);
                 g_s[k] = rate[k] * (g_trace + straight + g_norm * inverse_norm * dev[k]);
@@ -674,7 +674,7 @@
             for (int k = 0; k < 9; ++k) LANE(g[k], l) = l < used ? p[k] : Real(0);
         }
 
-// gy, and off = G + G^T of G = U^T g U by pairs
+// gy, and off = G + G^T by pairs for G = U^T g U
 //// stress_gradient
         Pack gy[3], off[3];
         {
@@ -740,7 +740,7 @@
     #undef UNROLL
     #undef READ_AGAIN
 
-// A kernel of its own, on a GPU: a block of LANES times GROUPS threads adds a column a lane of partials (summands, WEIGHTS).
+// Separate kernel on a GPU: a block of LANES times GROUPS threads adds one column per lane of partials (summands, WEIGHTS).
 //// add
     __shared__ Real sums[GROUPS][LANES];
     const int lane = threadIdx.x % LANES, group = threadIdx.x / LANES, i = LANES * blockIdx.x + lane;

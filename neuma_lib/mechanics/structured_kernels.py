@@ -1,10 +1,9 @@
-"""The laws of `structured` as one kernel forward and one backward, on a CPU and on CUDA: SVD, invariants, network,
-principal values and back.
+"""Kernels of `structured`, one forward and one backward for CPU and CUDA: SVD, invariants, network, principal values.
 
-The text in ``structured_kernels.h`` works on packs: 8 rows, one a SIMD lane, on a CPU, and a row a thread on a GPU. A
-row stays in registers from F to the result. Backward computes it again, but for the SVD, which the CPU caches, and
-takes the adjoint in closed form; the sums of the weights' gradients are kept by pack on the CPU and by block on a GPU,
-where a second kernel adds them, always in the same order.
+``structured_kernels.h`` processes packs: 8 rows, one per SIMD lane, on a CPU, and one row per thread on a GPU. A row
+stays in registers from F to the result. The backward kernel recomputes everything except the SVD, which a CPU caches,
+and uses closed-form adjoints. Gradients of the weights are summed per pack on a CPU and per block on a GPU, where a
+second kernel adds them in a fixed order.
 """
 
 import math
@@ -23,33 +22,33 @@ from neuma_lib.mechanics.singular_values_kernels import CPU_WIDTH, END, SVD, TYP
 WIDTH = 16
 INVARIANTS = 3
 LIMIT = 3.0
-"""Bound of the network's outputs: it changes a constant by a factor of at most exp(3) = 20."""
+"""Bound of the outputs of the network, which scale a constant by at most exp(3) = 20."""
 GROWTH = 2.0
-"""Rate at which what a base lacks grows with an output: at 0.05, as a first optimiser step leaves it, a share of
-the trace relaxes within some 4000 steps, and a cohesion or yield strain of zero becomes 2e-5."""
+"""Growth rate of constants that are zero in the base. After a first optimiser step the output is about 0.05: a share of
+the trace then relaxes within some 4000 steps, and a cohesion or yield strain becomes 2e-5."""
 STRAIN = 0.1
-"""Strain that counts as one for the network."""
+"""Unit of strain for the network."""
 SMOOTH = 0.05
-"""Strain below which the size of the deviator, which has a kink at zero, is rounded off."""
+"""Strain below which the norm of the deviator, not differentiable at zero, is smoothed."""
 LODE = 3 * math.sqrt(6)
 """|det dev e| is at most |dev e|^3 / LODE."""
 COHESION_UNIT = 0.02
-"""Strain that g = 1 adds to a cohesion or yield strain of zero; g is at most LIMIT."""
+"""Cohesion or yield strain at g = 1 if it is zero in the base; g is at most LIMIT."""
 KINDS = {"stretch": 3, "energy": 2, "return": 5}
-"""Kernels there are, with the outputs of their networks: the two forms of elasticity, and plasticity."""
+"""Number of network outputs by kind of kernel: the two forms of elasticity, and plasticity."""
 BASES = ("hencky", "neo_hookean", "fixed_corotated")
-"""Bases of elasticity, in the order of their numbers in the kernels."""
+"""Bases of elasticity in the order of their indices in the kernels."""
 CACHED = 21
-"""Numbers that the CPU caches of a row: U, V and the singular values."""
+"""Numbers per row that a CPU caches: U, V and the singular values."""
 THREADS = {torch.float32: 128, torch.float64: 64}
-"""Rows, and threads, of a block: what they put in shared memory is at most 40 KB of the 48 KB that every GPU has."""
+"""Rows, and threads, per block. They use at most 40 KB of the 48 KB of shared memory that every GPU has."""
 BLOCKS_PER_PROCESSOR = 2
-LANES, GROUPS = 32, 8  # of the kernel that adds the blocks' sums
+LANES, GROUPS = 32, 8  # of the kernel that adds the sums of blocks
 
 
 @dataclass(frozen=True)
 class Constants:
-    """What a kernel knows of its law beside the weights: a number for its kind, and four constants."""
+    """Index of the kind of law within its kernel, and its four constants."""
 
     kind: int
     values: tuple[float, float, float, float]
@@ -75,8 +74,8 @@ def _constants(kind: str, dtype: torch.dtype) -> str:
         "GRANULAR": 1,
         "LANES": LANES,
         "GROUPS": GROUPS,
-        # terms after which series are good to round-off: exp to log(2) / 2, atanh(x) / x where x^2 is at most
-        # ATANH_SQUARE, sinh(x) / x to 1/2
+        # terms for round-off accuracy of exp up to log(2) / 2, atanh(x) / x up to x^2 = ATANH_SQUARE, and sinh(x) / x
+        # up to 1/2
         "EXP_TERMS": 8 if single else 14,
         "ATANH_TERMS": 5 if single else 11,
         "SINH_TERMS": 4 if single else 8,
@@ -93,14 +92,14 @@ def _constants(kind: str, dtype: torch.dtype) -> str:
         "THIRD_PART": 1 / 3,
         "ATANH_SQUARE": 0.03,
         "EPS": torch.finfo(dtype).eps,
-        "LEAST": torch.finfo(dtype).tiny,
+        "NORMAL_MIN": torch.finfo(dtype).tiny,
     }
     text = "".join(f"    const int {name} = {value};\n" for name, value in integers.items())
     return text + "".join(f"    const Real {name} = Real({value!r});\n" for name, value in reals.items())
 
 
 def source(kind: str, backward: bool, dtype: torch.dtype) -> str:
-    """C++ text of the body of a kernel, one of :data:`KINDS`."""
+    """C++ source of the body of a kernel, one of :data:`KINDS`."""
     parts = native_source(__file__, ".h")
     if kind == "return":
         names = "const Real threshold_base = p0, friction_base = p1, rate_base = p2, associated = p3;"
@@ -132,16 +131,16 @@ def source(kind: str, backward: bool, dtype: torch.dtype) -> str:
 
 
 def add_source(kind: str, dtype: torch.dtype) -> str:
-    """C++ text of the body of the kernel that adds the sums of blocks."""
+    """C++ source of the body of the kernel that adds the sums of blocks."""
     return filled(TYPES + _constants(kind, dtype) + native_source(__file__, ".h")["add"] + END, dtype)
 
 
-# Arrays are handed over as addresses: Warp's array objects would cost more time than the kernel.
+# Arrays are passed as addresses because Warp's array objects take more time than the kernel.
 @cache
 def evaluate_kernel(kind: str, dtype: torch.dtype):
-    """Kernel (F, W0, W1, W2, number, four constants, n, cached, cache, out), launched by `_launch`.
+    """Kernel (F, W0, W1, W2, index of the base, four constants, n, cached, cache, out), launched by `_launch`.
 
-    ``cached``: 0 keeps nothing of the SVD, 1 writes it to the cache (n / CPU_WIDTH packs, CACHED, CPU_WIDTH).
+    If ``cached`` is 1, it writes the SVD to the cache (n / CPU_WIDTH packs, CACHED, CPU_WIDTH).
     """
     real, _, _ = warp_types(dtype)
 
@@ -163,10 +162,10 @@ def evaluate_kernel(kind: str, dtype: torch.dtype):
 
 @cache
 def vjp_kernel(kind: str, dtype: torch.dtype):
-    """Kernel (F, W0, W1, W2, number, four constants, n, cached, cache, grad_out, grad_F, ...), likewise.
+    """Kernel (F, W0, W1, W2, index of the base, four constants, n, cached, cache, grad_out, grad_F, ...).
 
-    ``cached``: 0 computes the SVD, 2 reads it from the cache. The sums go to the last arguments: on a CPU they are
-    added to three totals, on a GPU they are put into partials (blocks, weights).
+    If ``cached`` is 2, it reads the SVD from the cache. It adds the gradients of the weights to three totals on a CPU,
+    and writes them to partials (blocks, weights) on a GPU.
     """
     real, _, _ = warp_types(dtype)
 
@@ -192,7 +191,7 @@ def vjp_kernel(kind: str, dtype: torch.dtype):
 
 @cache
 def add_kernel(kind: str, dtype: torch.dtype):
-    """CUDA kernel (partials (blocks, weights), their number, three totals) that adds the sums of the blocks."""
+    """CUDA kernel (partials (blocks, weights), their number, three totals) that adds the sums of blocks."""
 
     @wp.func_native(add_source(kind, dtype))
     def add_columns(
@@ -214,7 +213,7 @@ def _device(device: torch.device) -> wp.Device:
 
 
 def _blocks(F: Tensor) -> int:
-    """Blocks of threads for the rows of F; one on a CPU, which goes through all rows by itself."""
+    """Thread blocks for the rows of F. On a CPU one thread processes all rows."""
     if F.device.type == "cpu":
         return 1
     return min(-(-len(F) // THREADS[F.dtype]), BLOCKS_PER_PROCESSOR * _device(F.device).sm_count)
@@ -222,8 +221,8 @@ def _blocks(F: Tensor) -> int:
 
 def _launch(kernel, blocks: int, threads: int, device: torch.device, *inputs) -> None:
     tensors = [x for x in inputs if isinstance(x, Tensor)]
-    if any(x.dtype != tensors[0].dtype or x.device != device for x in tensors):  # addresses do not know
-        raise TypeError("F, weights and buffers of a structured law must be of one dtype and on one device")
+    if any(x.dtype != tensors[0].dtype or x.device != device for x in tensors):  # addresses have no type
+        raise TypeError("F, weights and buffers of a structured law must have one dtype and one device")
     inputs = [x.data_ptr() if isinstance(x, Tensor) else 0 if x is None else x for x in inputs]
     threads = 1 if device.type == "cpu" else threads
     wp.launch(
@@ -237,7 +236,7 @@ def _launch(kernel, blocks: int, threads: int, device: torch.device, *inputs) ->
 
 
 def new_cache(F: Tensor) -> Tensor | None:
-    """Memory for the SVD of F (n, 3, 3) on a CPU: (packs, CACHED, CPU_WIDTH); None on a GPU."""
+    """Memory (packs, CACHED, CPU_WIDTH) for the SVD of F (n, 3, 3) on a CPU, None on a GPU."""
     return F.new_empty(-(-len(F) // CPU_WIDTH), CACHED, CPU_WIDTH) if F.device.type == "cpu" else None
 
 
@@ -250,7 +249,7 @@ def evaluate(
     out: Tensor | None = None,
     cache: Tensor | None = None,
 ) -> Tensor:
-    """The law of ``kind`` at F (n, 3, 3); the SVD goes to ``cache`` (`new_cache`) if given. See `Constitutive`."""
+    """Evaluate the law of ``kind`` at F (n, 3, 3) and store the SVD in ``cache`` if given. See `Constitutive`."""
     F = F.detach().contiguous()
     result = out if out is not None and out.is_contiguous() else torch.empty_like(F)
     if len(F):
@@ -280,16 +279,8 @@ def vjp(
         blocks, threads = _blocks(F), THREADS[F.dtype]
         partials = F.new_empty(blocks, weight_count(kind)) if on_gpu else None
         sums = [total if total.is_contiguous() else total.contiguous() for total in totals]
-        inputs = (
-            *W,
-            constants.kind,
-            *constants.values,
-            len(F),
-            0 if cache is None else 2,
-            cache,
-            grad_out,
-            result,
-        )
+        cached = 0 if cache is None else 2
+        inputs = *W, constants.kind, *constants.values, len(F), cached, cache, grad_out, result
         _launch(vjp_kernel(kind, F.dtype), blocks, threads, F.device, F, *inputs, *sums, partials)
         if on_gpu:
             columns = -(-weight_count(kind) // LANES)

@@ -1,4 +1,4 @@
-"""What a law's time step has to do with what it says."""
+"""Dependence of a law on the time step of the simulation."""
 
 from __future__ import annotations
 
@@ -12,15 +12,12 @@ StepDependence = Literal["none", "follows", "fixed"]
 
 
 def step_dependence(law: Law) -> StepDependence:
-    """How a law depends on the time step of the simulation.
+    """How the return map of a law depends on the time step. An elasticity does not depend on it.
 
-    An elasticity does not. A return map is taken once a step:
-
-    - "none": it projects on a yield surface, and so often as one likes (identity, von Mises, Drucker-Prager).
-    - "follows": it has the step among its constants, and flows by the rate that it has (viscous flow).
-    - "fixed": a network decides it, which was trained on trial states of one step and on what returned of them. With
-      another step it meets other trial states, as far beyond the surface as the step is long, and what it lets go in
-      each comes more or less often. A network with a last layer of zeros decides nothing, and its base counts.
+    - "none": the map is an idempotent projection on a yield surface (identity, von Mises, Drucker-Prager).
+    - "follows": the step is one of its constants (viscous flow).
+    - "fixed": the map is a network trained with one step. Another step changes the distribution of its trial states
+      and the number of returns per second. For a network whose last layer is zero, the base law decides.
     """
     plasticity = law.plasticity
     if isinstance(plasticity, AdaptableConstitutive):

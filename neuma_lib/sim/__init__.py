@@ -1,4 +1,4 @@
-"""Differentiable material point method: one rollout for data, fitting and evaluation."""
+"""Differentiable material point method."""
 
 from neuma_lib.sim.model import Body, MPMModel, consecutive, contact_clearance
 from neuma_lib.sim.rollout import rollout

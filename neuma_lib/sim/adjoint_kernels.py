@@ -1,8 +1,8 @@
-"""Adjoints of the transfers in `kernels`, written by hand and run in the opposite order.
+"""Hand-written adjoints of the transfers in `kernels`, run in reverse order.
 
-``grad_y`` is the derivative of the loss with respect to ``y``. The adjoint of a gather is a scatter over the
-same stencil and the other way round, so `g2p_adjoint` reads like P2G and `p2g_adjoint` like G2P. When the
-particle moves, a weight changes by dw_i/dx = N'_i / dx and an offset d_i = x_i - x by -I.
+``grad_y`` is the derivative of the loss with respect to ``y``. The adjoint of a gather is a scatter over the same
+stencil and vice versa, so `g2p_adjoint` reads like P2G and `p2g_adjoint` like G2P. The derivative of a weight by the
+position is dw_i/dx = N'_i / dx, that of an offset d_i = x_i - x is -I.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -19,18 +19,19 @@ from neuma_lib.sim.scatter import scatter_functions
 
 @functools.cache
 def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamespace:
-    """Kernels `g2p_adjoint`, `grid_adjoint`, `p2g_adjoint` and `total_adjoint` for one precision and one way to
-    scatter.
-    """
+    """Kernels `g2p_adjoint`, `grid_adjoint`, `p2g_adjoint` and `total_adjoint` for a precision and a scatter method."""
     t, functions = warp_types(dtype), grid_functions(dtype)
     ordered = scatter != "atomic"
     run_of, deposit = vars(scatter_functions(dtype, scatter, 3)).values()
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
-    base_node, copy_of, from_base = functions.base_node, functions.copy_of, functions.from_base
-    weights, slopes = functions.weights, functions.slopes
+    copy_of, stencil, slopes, moments = (
+        functions.copy_of,
+        functions.stencil,
+        functions.slopes,
+        functions.moments,
+    )
+    column, wall_mask, moved_mask = functions.column, functions.wall_mask, functions.moved_mask
     gather, three_nodes = vars(gather_functions(dtype)).values()
-    column, offsets, wall_mask = functions.column, functions.offsets, functions.wall_mask
-    moved_mask = functions.moved_mask
     module = f"neuma_lib.sim.adjoint_{str(dtype).removeprefix('torch.')}_{scatter}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
 
@@ -55,26 +56,24 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         grad_F: wp.array(dtype=mat33),
         grad_grid_rows: wp.array2d(dtype=mat34),
     ):
-        """Gradients of x, v, C after the step and of F_trial to those of grid_v (added), x and F (set)."""
+        """From gradients of x, v, C after the step and of F_trial to those of grid_v (added), x and F (set)."""
         p = wp.tid()
         alive = p < grad_x.shape[0]
         if wp.static(ordered):
             p = order[sort, wp.min(p, grad_x.shape[0] - 1)]
         xp = x[now, p]
-        bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
+        bi, bj, bk, f, wi, wj, wk = stencil(c, xp)
         plane = copy_of(c, p) * c.n + bi
         run = run_of(wp.where(alive, (plane * c.n + bj) * c.n + bk, -1))
-        f = from_base(c, xp, bi, bj, bk)
-        wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
         si, sj, sk = slopes(f[0]), slopes(f[1]), slopes(f[2])
-        # F_trial = (I + dt C) F and x = x + dt v pass their gradients on to C, F and v.
+        # gradients of C, F and v from F_trial = (I + dt C) F and x = x + dt v
         g_trial = grad_F_trial[p]
         if alive:
             grad_F[p] = g_trial + c.dt * (wp.transpose(C[after, p]) * g_trial)
         g_C = grad_C[p] + c.dt * (g_trial * wp.transpose(F[now, p]))
         g_x = wp.cw_mul(moved_mask(c, x[after, p]), grad_x[p])
         g_v = grad_v[p] + c.dt * g_x
-        # Node i gets w_i u_i with u_i = g_v + D d_i / dx, which grows by a column of D from node to node.
+        # Node i receives w_i u_i with u_i = g_v + D d_i / dx. u grows by a column of D from node to node.
         D = (real(4.0) * c.inv_dx) * g_C
         u0 = g_v - D * f
         u_i = vec4(u0[0], u0[1], u0[2], real(0.0))
@@ -103,9 +102,9 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         grid: wp.array2d(dtype=vec4),
         grad_grid: wp.array2d(dtype=vec4),
     ):
-        """In place: gradient of a node's velocity to the gradients of its momentum and mass.
+        """In place: from the gradient of a node's velocity to those of its momentum and mass.
 
-        The other side of `grad_grid` is cleared for the step before this one.
+        Clears the other side of `grad_grid` for the previous step.
         """
         node = wp.tid()
         mv = grid[cached, node]
@@ -134,18 +133,14 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         grad_C: wp.array(dtype=mat33),
         grad_tau: wp.array(dtype=mat33),
     ):
-        """Gradients of the nodes' momentum and mass to those of x (added), v, C and tau (set)."""
+        """From gradients of momentum and mass of the nodes to those of x (added), v, C and tau (set)."""
         p = wp.tid()
         xp = x[now, p]
-        bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
+        bi, bj, bk, f, wi, wj, wk = stencil(c, xp)
         plane = copy_of(c, p) * c.n + bi
-        f = from_base(c, xp, bi, bj, bk)
-        wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
         si, sj, sk = slopes(f[0]), slopes(f[1]), slopes(f[2])
-        wd_i = wp.cw_mul(wi, offsets(f[0]))
-        wd_j = wp.cw_mul(wj, offsets(f[1]))
-        wd_k = wp.cw_mul(wk, offsets(f[2]))
-        # The scattered q_i = (m v + A d_i, m), as in p2g.
+        wd_i, wd_j, wd_k = moments(wi, f[0]), moments(wj, f[1]), moments(wk, f[2])
+        # q_i = (m v + A d_i, m) as in p2g
         m = mass[p]
         stress = real(4.0) * c.dt * c.inv_dx * c.inv_dx * vol0[p]
         A = c.dx * (m * C[now, p] - stress * tau[cached, p])
@@ -181,7 +176,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         grad_C: wp.array(dtype=mat33),
         grad_F_total: wp.array(dtype=mat33),
     ):
-        """In place: gradient of F_total after the step to those of C after it (added) and of F_total before it."""
+        """In place: from the gradient of F_total after the step to those of C (added) and of F_total before it."""
         p = wp.tid()
         g = grad_F_total[p]
         grad_C[p] = grad_C[p] + c.dt * (g * wp.transpose(F_total[now, p]))

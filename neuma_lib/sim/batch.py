@@ -1,4 +1,4 @@
-"""Several simulations of a body in the same launches: other laws, other starts, for fits that compare many of them."""
+"""Several simulations of a body with different laws or initial states in the same launches."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from neuma_lib.sim.rollout import check_inside, checked_frames, fly_and_simulate
 from neuma_lib.sim.state import State, Trajectory
 
 TOGETHER = {"cpu": 8, "cuda": 64}
-"""Copies that share launches: a core saves what it takes to launch, a GPU is not full before."""
+"""Copies that share launches: on a CPU this saves launch overhead, a GPU needs that many to be fully used."""
 
 
 @torch.no_grad()
@@ -30,43 +30,44 @@ def rollout_batch(
     scatter: str | None = None,
     together: int | None = None,
 ) -> list[Trajectory | None]:
-    """As `rollout` for each of several laws, to round-off, without gradient and in fewer launches.
+    """`rollout` for each of several laws, equal to round-off, without gradients and in fewer launches.
 
-    Analytic laws that have kernels (`analytic_fused`) are evaluated in one launch, whatever their kinds and constants;
-    of other laws only the transfers are shared.
+    Analytic laws with kernels (`analytic_fused`) are evaluated in one launch for any kinds and constants. Other laws
+    share only the transfers.
 
     Args:
         model: as in `rollout`.
-        laws: B materials, each of all particles.
-        start: N particles at the start, for all laws or one for each.
+        laws: B laws, each for all particles.
+        start: N particles, one initial state for all laws or one per law.
         steps, frames, total, scatter: as in `rollout`.
         skip_free_flight: as in `rollout`, up to the first contact of any copy in the same launches.
-        together: copies that share launches; None: `TOGETHER` of the device.
+        together: number of copies that share launches, by default `TOGETHER` of the device.
 
     Returns:
-        The trajectory of each law, or None where it diverged, which leaves the others as they are.
+        The trajectory of each law, or None where it diverged.
 
     Raises:
-        InputError: as `rollout`, or starts that are not as many as the laws or differ in their number of particles.
+        InputError: as `rollout`, or the numbers of laws, initial states or their particles do not match.
     """
     frames = checked_frames(frames, steps)
     starts = [start] * len(laws) if isinstance(start, State) else list(start)
     if not laws or len(starts) != len(laws) or len({len(state.x) for state in starts}) > 1:
         raise InputError(
-            f"{len(laws)} laws and starts of {[len(state.x) for state in starts]} particles: give at least one law, "
-            "and one start for all or one for each, with as many particles"
+            "laws",
+            f"{len(laws)} laws do not match initial states of {[len(state.x) for state in starts]} particles",
+            "Give one state for all laws or one per law, with equal numbers of particles",
         )
     for state in {id(state): state for state in starts}.values():
         check_inside(model, state.x)
-    found: list[Trajectory | None] = [None] * len(laws)
+    result: list[Trajectory | None] = [None] * len(laws)
     order = sorted(range(len(laws)), key=lambda copy: not fusible(laws[copy]))
     together = together or TOGETHER[starts[0].x.device.type]
     for copies in (order[i : i + together] for i in range(0, len(laws), together)):
         own = [laws[copy] for copy in copies], [starts[copy] for copy in copies]
         paths = _side_by_side(model, *own, frames, total, skip_free_flight, scatter)
         for copy, path in zip(copies, paths, strict=True):
-            found[copy] = path
-    return found
+            result[copy] = path
+    return result
 
 
 def _side_by_side(
@@ -78,7 +79,7 @@ def _side_by_side(
     skip_free_flight: bool,
     scatter: str | None,
 ) -> list[Trajectory | None]:
-    """Laws in the same launches, those with kernels in front."""
+    """Simulate laws in the same launches, those with fused kernels first."""
     N, copies = len(starts[0].x), len(laws)
     fused = sum(map(fusible, laws))
     bodies = [Body(law, copy * N, (copy + 1) * N) for copy, law in enumerate(laws) if copy >= fused]

@@ -1,7 +1,4 @@
-"""Steps before the first contact in closed form.
-
-An undeformed body that moves with one velocity and touches nothing only falls, so its steps need no grid.
-"""
+"""Closed-form steps before the first contact, for an undeformed body with uniform velocity."""
 
 from __future__ import annotations
 
@@ -13,15 +10,15 @@ from torch import Tensor
 from neuma_lib.sim.model import Body, MPMModel, contact_clearance, law_weights
 from neuma_lib.sim.state import State, Trajectory
 
-_MARGIN = 1e-3  # distance from the zone of contact at which free flight ends [dx]
+_MARGIN = 1e-3  # distance from the contact zone at which free flight ends [dx]
 
 
 def free_flight_steps(
     model: MPMModel, bodies: Sequence[Body], state: State, last: int, copies: int = 1
 ) -> int:
-    """Number of leading steps, at most `last`, in which nothing but gravity acts and nothing can deform.
+    """Number of leading steps, at most `last`, in which only gravity acts and no particle deforms.
 
-    Of several copies (see `kernels`), each may have a velocity of its own; the first to touch ends it for all.
+    Copies (see `kernels`) may have different velocities. The first contact of any copy ends free flight for all.
     """
     x, v, F, C = state.x, state.v, state.F, state.C
     if torch.is_grad_enabled() and (v.ndim == 2 and v.requires_grad or F.requires_grad or C.requires_grad):
@@ -39,7 +36,7 @@ def free_flight_steps(
 
 
 def _clear_of_walls(model: MPMModel, x0: Tensor, v0: Tensor, last: int) -> int:
-    """Number of leading ballistic steps that start with all particles x0 (copies, N, 3) out of reach of the walls."""
+    """Number of leading ballistic steps in which no particle of x0 (copies, N, 3) is in reach of a wall."""
     box = torch.stack([x0.amin(dim=1), x0.amax(dim=1)], dim=1).double().cpu()
     n = torch.arange(last, dtype=torch.float64)[:, None, None, None]
     gravity = torch.tensor(model.gravity, dtype=torch.float64)
@@ -49,9 +46,9 @@ def _clear_of_walls(model: MPMModel, x0: Tensor, v0: Tensor, last: int) -> int:
 
 
 def _at_rest(model: MPMModel, body: Body, state: State, copy: int) -> bool:
-    """Whether the law leaves F = I as it is and without a stress that could be felt in a step.
+    """Whether the law preserves F = I, with a stress that has no effect in a step beyond round-off.
 
-    A body of several copies, of ``copy`` particles each, has a law that may differ from copy to copy.
+    The law of a body that spans several copies, of ``copy`` particles each, may differ from copy to copy.
     """
     x0, firsts = state.x, slice(body.start, body.stop, copy)
     mass, vol0 = state.mass[firsts], state.vol0[firsts]
@@ -67,7 +64,7 @@ def _at_rest(model: MPMModel, body: Body, state: State, copy: int) -> bool:
 def ballistic(
     model: MPMModel, start: tuple[Tensor, ...], tracers: Tensor | None, frames: Sequence[int]
 ) -> Trajectory:
-    """Free flight in closed form: x_n = x0 + n dt v0 + g dt^2 n (n + 1) / 2, v_n = v0 + n dt g."""
+    """Free flight: x_n = x0 + n dt v0 + g dt^2 n (n + 1) / 2, v_n = v0 + n dt g."""
     x0, v0, *constant = start
     T = len(frames)
     n = torch.tensor(frames, dtype=torch.float64)[:, None, None]

@@ -1,7 +1,7 @@
-// Text of the functions of gather.py. REAL is the scalar type, VECTOR whether a node of it is one load on a GPU.
+// Functions of gather.py. REAL is the scalar type, VECTOR whether a GPU loads a node in one instruction.
 //// node
     typedef REAL Real;
-    // A node is one vector register on a CPU, where the compiler would otherwise take its numbers one by one.
+    // A node is one vector register on a CPU. Otherwise the compiler loads its numbers one by one.
 #if defined(__CUDA_ARCH__)
     struct alignas(16) Node { Real c[4]; };
     #define EACH for (int a = 0; a < 4; ++a)
@@ -11,8 +11,8 @@
     #define EACH
     #define OF(x) (x)
 #endif
-    // Where the fourth number is not used, the compiler would take the others one by one on a GPU too. It may move the
-    // load: a kernel that reads these nodes writes none of them.
+    // On a GPU the compiler loads single numbers if the fourth is not used. The load is not volatile, because kernels
+    // that read these nodes do not write them.
     auto load = [](const Node* place) {
 #if VECTOR && defined(__CUDA_ARCH__)
         Node node;

@@ -1,4 +1,4 @@
-"""How particles read the nodes of the grid: the sums over their stencils that g2p and the adjoint of p2g begin with."""
+"""Gather from grid nodes: the sums over the stencil of a particle in g2p and in the adjoint of p2g."""
 
 # No `from __future__ import annotations` here: Warp reads the annotations of functions as objects.
 import functools
@@ -14,14 +14,14 @@ start_warp()
 
 @functools.cache
 def gather_functions(dtype: torch.dtype) -> SimpleNamespace:
-    """Functions `gather` and `three_nodes` for kernels whose threads each hold one particle.
+    """Functions `gather` and `three_nodes` for kernels with one particle per thread.
 
-    ``gather(rows, index, row, n, wi, wj, wk, wd_i, wd_j, wd_k)`` returns, as the rows of a 4 x 4 matrix, the sum of w q
-    over the 27 nodes and those of w q d_i, w q d_j and w q d_k. Here q are the four numbers of a node, w = wi wj wk is
-    its weight and d its offset from the particle; ``wd_i`` holds the products of weights and offsets along an axis.
-    ``row`` is the first of the particle's nodes in a index of the grid, which has ``n`` nodes along an edge.
+    ``gather(rows, index, row, n, wi, wj, wk, wd_i, wd_j, wd_k)`` returns a 4 x 4 matrix whose rows are the sums of w q,
+    w q d_i, w q d_j and w q d_k over the 27 nodes. q are the four numbers of a node, w = wi wj wk is its weight and d
+    its offset from the particle. ``wd_i`` holds the products of weights and offsets along an axis. ``row`` is the first
+    node of the particle in the grid ``index``, which has ``n`` nodes along an edge.
 
-    ``three_nodes(rows, index, row)`` is ``rows[index, row]``, the nodes from ``row`` on, in loads of a whole node.
+    ``three_nodes(rows, index, row)`` is ``rows[index, row]``, loaded by whole nodes.
     """
     real = {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
     vec3 = wp.types.vector(length=3, dtype=real)

@@ -1,20 +1,20 @@
-"""The transfers of the material point method as Warp kernels: particles to grid, grid, grid to particles.
+"""Transfers of the material point method as Warp kernels: particles to grid, grid update, grid to particles.
 
-MLS-MPM (Hu et al. 2018) with quadratic B-splines and the affine velocity C of APIC (Jiang et al. 2015), in
-the order and letters of the paper's Algorithm 2 (appendix "Introduction to the Material Point Method"). Their
-adjoints are in `adjoint_kernels`.
+MLS-MPM (Hu et al. 2018) with quadratic B-splines and the affine velocity C of APIC (Jiang et al. 2015), in the order
+and letters of the paper's Algorithm 2 (appendix "Introduction to the Material Point Method"). Adjoints are in
+`adjoint_kernels`.
 
-Memory: the first axis of an array counts steps; ``now`` and ``after`` are the indices of the states before and after
-the step in hand, ``cached`` that of its stress and grid (`Workspace`). A grid node is a 4-vector, momentum and mass
-(``grid``) or velocity and 1 where there is mass (``grid_v``). A particle sees 3 x 3 rows of three nodes that
-lie side by side in memory, so kernels read and write ``rows``: a view of the grid whose element b is the
-matrix (3 x 4) of nodes b, b + 1 and b + 2. Sums over the last axis of the stencil are products with a row.
+Memory: the first axis of an array is the step. ``now`` and ``after`` are the indices of the states before and after
+the current step, ``cached`` that of its stress and grid (`Workspace`). A grid node is a 4-vector: momentum and mass
+(``grid``), or velocity and 1 where there is mass (``grid_v``). The stencil of a particle has 3 x 3 rows of three
+consecutive nodes, so kernels use ``rows``: a view of the grid whose element b is the matrix (3 x 4) of nodes b, b + 1
+and b + 2. Sums over the last axis of the stencil are products with a row.
 
-Order: where a scatter to the grid wants neighbours side by side (`scatter`), thread i takes particle
-``order[sort, i]``, the particles sorted by cell a few steps ago. A gather is faster in the order of memory.
+Order: for scatter methods that profit from neighbouring particles in a warp (`scatter`), thread i processes particle
+``order[sort, i]``, from a sort by cell a few steps ago. Gathers are faster in the order of memory.
 
-Copies: several simulations of as many particles each, which do not see each other, lie one after the other in the
-arrays of particles and in those of nodes.
+Copies: several independent simulations with equal numbers of particles are stored one after the other in the arrays
+of particles and of nodes.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -34,7 +34,7 @@ NO_SLIP, SLIP, STICKY = 0, 1, 2
 """Codes of the boundary conditions in ``GridConstants.walls``."""
 
 NO_FAULT = 2**62
-"""Value of a fault flag as long as nothing has gone wrong."""
+"""Value of a fault flag without a fault."""
 
 
 @functools.cache
@@ -53,17 +53,17 @@ def warp_types(dtype: torch.dtype) -> SimpleNamespace:
     @wp.struct
     class GridConstants:
         n: wp.int32  # nodes along an edge
-        particles: wp.int32  # of a copy
-        wall_nodes: wp.int32  # nodes of a wall, from either end of the grid
+        particles: wp.int32  # per copy
+        wall_nodes: wp.int32  # thickness of a wall
         walls: types.walls  # condition on x_min, x_max, y_min, y_max, z_min, z_max
         first: real  # coordinate of node 0 [dx]
         dx: real  # node spacing [m]
         inv_dx: real
         dt: real  # [s]
         gravity: types.vec3  # [m/s^2]
-        clamp_low: real  # particles are moved to at least and at most these coordinates [m]
+        clamp_low: real  # bounds to which coordinates of particles are clamped [m]
         clamp_high: real
-        leave_low: real  # a particle beyond these coordinates has left the grid [m]
+        leave_low: real  # bounds beyond which a particle has left the grid [m]
         leave_high: real
 
     types.GridConstants = GridConstants
@@ -72,31 +72,26 @@ def warp_types(dtype: torch.dtype) -> SimpleNamespace:
 
 @functools.cache
 def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
-    """Functions that the transfers and their adjoints share: stencil, wall condition, motion."""
+    """Functions shared by the transfers and their adjoints: stencil, boundary condition, motion."""
     t = warp_types(dtype)
     real, vec3, vec4, mat33, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.GridConstants
 
     @wp.func
     def base_node(c: GridConstants, x: real):
-        """First of the three nodes that see coordinate x; clamped, so that no fault indexes outside."""
+        """First of the three nodes around coordinate x, clamped to valid indices."""
         return wp.clamp(wp.int32(x * c.inv_dx - (c.first + real(0.5))), 0, c.n - 3)
 
     @wp.func
     def copy_of(c: GridConstants, p: wp.int32):
-        """The copy that particle p belongs to."""
+        """Copy of particle p."""
         copy = wp.int32(0)
-        if p >= c.particles:  # spares a single simulation the division
+        if p >= c.particles:  # avoids the division for a single copy
             copy = p / c.particles
         return copy
 
     @wp.func
-    def from_base(c: GridConstants, x: vec3, i: wp.int32, j: wp.int32, k: wp.int32):
-        """Distance of x from the node (i, j, k) [dx]."""
-        return x * c.inv_dx - vec3(real(i) + c.first, real(j) + c.first, real(k) + c.first)
-
-    @wp.func
     def weights(f: real):
-        """Quadratic B-spline N at the three nodes of an axis; f: distance to the first of them [dx]."""
+        """Quadratic B-spline N at the three nodes of an axis, at the distance f from the first [dx]."""
         return vec3(
             real(0.5) * (real(1.5) - f) * (real(1.5) - f),
             real(0.75) - (f - real(1.0)) * (f - real(1.0)),
@@ -105,22 +100,29 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
 
     @wp.func
     def slopes(f: real):
-        """Derivative of the weights with respect to f."""
+        """Derivatives of the weights with respect to f."""
         return vec3(f - real(1.5), real(2.0) - real(2.0) * f, f - real(0.5))
 
     @wp.func
-    def offsets(f: real):
-        """Offsets d of the three nodes of an axis from the particle [dx]."""
-        return vec3(-f, real(1.0) - f, real(2.0) - f)
+    def stencil(c: GridConstants, x: vec3):
+        """First of the 27 nodes (i, j, k) around x, distance of x from it [dx], and weights along each axis."""
+        i, j, k = base_node(c, x[0]), base_node(c, x[1]), base_node(c, x[2])
+        f = x * c.inv_dx - vec3(real(i) + c.first, real(j) + c.first, real(k) + c.first)
+        return i, j, k, f, weights(f[0]), weights(f[1]), weights(f[2])
+
+    @wp.func
+    def moments(w: vec3, f: real):
+        """Products of the weights of an axis and the offsets of its nodes from the particle [dx]."""
+        return wp.cw_mul(w, vec3(-f, real(1.0) - f, real(2.0) - f))
 
     @wp.func
     def column(A: mat33, a: wp.int32):
-        """Column a of A, with a zero in the place of the mass."""
+        """Column a of A, with 0 for the mass."""
         return vec4(A[0, a], A[1, a], A[2, a], real(0.0))
 
     @wp.func
     def wall_mask(c: GridConstants, node: wp.int32, v: vec3):
-        """1 for each component of the node's velocity v that the walls let pass, 0 for the others."""
+        """1 for each component of a node's velocity v that the walls admit, else 0."""
         mask = vec3(real(1.0), real(1.0), real(1.0))
         place = node
         for axis in range(3):
@@ -143,12 +145,12 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
 
     @wp.func
     def moved(c: GridConstants, x: vec3, v: vec3):
-        """Position after a step, kept where the stencil exists if the walls are the released simulator's."""
+        """Position after a step, clamped for the walls of the released code."""
         return wp.max(wp.min(x + c.dt * v, vec3(c.clamp_high)), vec3(c.clamp_low))
 
     @wp.func
     def moved_mask(c: GridConstants, x_new: vec3):
-        """Derivative of `moved` with respect to its unclamped argument: 0 for each component at a bound."""
+        """Derivative of `moved` with respect to the unclamped position: 0 for components at a bound."""
         mask = vec3()
         for a in range(3):
             if x_new[a] > c.clamp_low and x_new[a] < c.clamp_high:
@@ -158,10 +160,9 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
     return SimpleNamespace(
         base_node=base_node,
         copy_of=copy_of,
-        from_base=from_base,
-        weights=weights,
+        stencil=stencil,
         slopes=slopes,
-        offsets=offsets,
+        moments=moments,
         column=column,
         wall_mask=wall_mask,
         moved=moved,
@@ -171,22 +172,21 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
 
 @functools.cache
 def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamespace:
-    """Kernels `cells`, `p2g`, `grid_update`, `g2p`, `trial_deformation` and `advect_tracers` for one precision
-    and one way to scatter.
-    """
+    """Kernels `cells`, `p2g`, `grid_update`, `g2p`, `trial_deformation` and `advect_tracers` for a precision and a
+    scatter method."""
     t, functions = warp_types(dtype), grid_functions(dtype)
     ordered = scatter != "atomic"
     run_of, deposit = vars(scatter_functions(dtype, scatter, 4)).values()
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
-    base_node, copy_of, from_base = functions.base_node, functions.copy_of, functions.from_base
-    weights, offsets, gather = functions.weights, functions.offsets, gather_functions(dtype).gather
+    base_node, copy_of, gather = functions.base_node, functions.copy_of, gather_functions(dtype).gather
+    stencil, moments = functions.stencil, functions.moments
     column, wall_mask, moved = functions.column, functions.wall_mask, functions.moved
     module = f"neuma_lib.sim.forward_{str(dtype).removeprefix('torch.')}_{scatter}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
 
     @kernel
     def cells(c: GridConstants, now: wp.int32, x: wp.array2d(dtype=vec3), cell: wp.array(dtype=wp.int32)):
-        """Index of the first node that a particle sees, to sort by."""
+        """Index of the first node of a particle's stencil, as a sort key."""
         p = wp.tid()
         xp = x[now, p]
         bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
@@ -213,14 +213,12 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         if wp.static(ordered):
             p = order[sort, wp.min(p, mass.shape[0] - 1)]
         xp = x[now, p]
-        bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
+        bi, bj, bk, f, wi, wj, wk = stencil(c, xp)
         plane = copy_of(c, p) * c.n + bi
         run = run_of(wp.where(alive, (plane * c.n + bj) * c.n + bk, -1))
-        f = from_base(c, xp, bi, bj, bk)
-        wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
         m = mass[p]
         A = c.dx * (m * C[now, p] - (real(4.0) * c.dt * c.inv_dx * c.inv_dx * vol0[p]) * tau[cached, p])
-        # q = (m v + A d, m) grows by a column of A from node to node.
+        # q = (m v + A d, m) grows by a column of A from node to node
         q0 = m * v[now, p] - A * f
         q_i = vec4(q0[0], q0[1], q0[2], m)
         slope_k = wp.outer(wp.cw_mul(wk, vec3(real(0.0), real(1.0), real(2.0))), column(A, 2))
@@ -236,7 +234,7 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
     def grid_update(
         c: GridConstants, cached: wp.int32, grid: wp.array2d(dtype=vec4), grid_v: wp.array2d(dtype=vec4)
     ):
-        """v_i = (m v)_i / m_i + dt g where there is mass, then the walls; nothing is added to the mass."""
+        """v_i = (m v)_i / m_i + dt g where there is mass, then the boundary conditions."""
         node = wp.tid()
         mv = grid[cached, node]
         result = vec4()
@@ -264,14 +262,10 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         """v = sum w_i v_i,  C = (4/dx^2) sum w_i v_i d_i^T,  x += dt v (clamped),  F_trial = (I + dt C) F."""
         p = wp.tid()
         xp = x[now, p]
-        bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
+        bi, bj, bk, f, wi, wj, wk = stencil(c, xp)
         copy = copy_of(c, p)
         plane = copy * c.n + bi
-        f = from_base(c, xp, bi, bj, bk)
-        wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
-        wd_i = wp.cw_mul(wi, offsets(f[0]))
-        wd_j = wp.cw_mul(wj, offsets(f[1]))
-        wd_k = wp.cw_mul(wk, offsets(f[2]))
+        wd_i, wd_j, wd_k = moments(wi, f[0]), moments(wj, f[1]), moments(wk, f[2])
         # rows: sum w v, then the columns of B = sum w v d^T / dx
         S = gather(grid_v_rows, cached, (plane * c.n + bj) * c.n + bk, c.n, wi, wj, wk, wd_i, wd_j, wd_k)
         v_new = vec3(S[0, 0], S[0, 1], S[0, 2])
@@ -283,7 +277,7 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         v[after, p] = v_new
         C[after, p] = C_new
         F_trial[cached, p] = F[now, p] + c.dt * (C_new * F[now, p])
-        # Faults keep the first (step, particle). A clamped position would hide both of them.
+        # Faults keep the first (step, particle). Velocities are checked because clamping hides errors of positions.
         here = wp.int64(step) * wp.int64(2147483648) + wp.int64(p)
         if not (wp.isfinite(v_new) and wp.isfinite(C_new)):
             wp.atomic_min(faults, copy, 0, here)
@@ -302,9 +296,9 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         F: wp.array2d(dtype=mat33),
         F_trial: wp.array2d(dtype=mat33),
     ):
-        """F_trial = (I + dt C) F, exactly as in g2p, for a reverse loop that kept only the states.
+        """F_trial = (I + dt C) F, bit-identical to g2p, for a reverse loop that kept only the states.
 
-        With the total deformation for both, and `after` for `cached`, it takes this one a step further.
+        With the total deformation for F and F_trial, and `after` for `cached`, it advances the total deformation.
         """
         p = wp.tid()
         F_trial[cached, p] = F[now, p] + c.dt * (C[after, p] * F[now, p])
@@ -313,15 +307,10 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
     def advect_tracers(
         c: GridConstants, cached: wp.int32, grid_v_rows: wp.array2d(dtype=mat34), x: wp.array(dtype=vec3)
     ):
-        """x += dt v, v interpolated over the nodes that carry mass; a tracer that sees none of them stays.
-
-        All tracers follow the first copy.
-        """
+        """x += dt v, interpolated over nodes with mass of the first copy. A tracer without such nodes stays."""
         p = wp.tid()
         xp = x[p]
-        bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
-        f = from_base(c, xp, bi, bj, bk)
-        wi, wj, wk = weights(f[0]), weights(f[1]), weights(f[2])
+        bi, bj, bk, f, wi, wj, wk = stencil(c, xp)
         total = vec4()
         for i in range(3):
             for j in range(3):

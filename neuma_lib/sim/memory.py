@@ -1,4 +1,4 @@
-"""What a rollout keeps for its gradient and what it computes again: gradient checkpointing with a cache."""
+"""Memory plan of a differentiable rollout: gradient checkpointing with a cache."""
 
 from __future__ import annotations
 
@@ -8,24 +8,23 @@ from dataclasses import dataclass
 from neuma_lib.errors import InputError
 
 DEFAULT_CACHE_BYTES = {"cpu": 1 << 29, "cuda": 1 << 32}
-"""Memory for intermediate values of the steps, beyond their states, if the caller names none."""
+"""Default memory for intermediate values of the steps, in addition to their states."""
 
 _STATE_FLOATS = 24  # x, v, C, F of a particle
-_TOTAL_FLOATS = 9  # its total F, where that is carried
+_TOTAL_FLOATS = 9  # F_total of a particle
 _STEP_FLOATS = 18  # tau, F_trial of a particle
 _NODE_FLOATS = 8  # grid, grid_v of a node
 
 
 @dataclass(frozen=True)
 class MemoryPlan:
-    """What the reverse loop finds in memory.
+    """Values that the reverse loop has in memory.
 
     Attributes:
-        segment: steps whose states are in memory together. If these are not all steps, the state before every
-            segment is kept as a checkpoint, and the reverse loop computes a segment again before going back
-            through it.
-        caches_steps: whether stresses and grids of these steps are kept as well, not only their states.
-        law_cache_bytes: memory left for what the laws keep of their evaluations.
+        segment: number of consecutive steps whose states are in memory. If there are several segments, the state
+            before each is kept as a checkpoint, and the reverse loop recomputes a segment from it.
+        caches_steps: whether stresses and grids of these steps are kept in addition to their states.
+        law_cache_bytes: memory left for the caches of the laws.
     """
 
     segment: int
@@ -42,17 +41,17 @@ def plan_memory(
     memory: float | None = None,
     total: bool = False,
 ) -> MemoryPlan:
-    """The fastest plan that fits.
+    """The fastest plan that fits into memory.
 
     Args:
         steps, particles, nodes: size of the rollout.
-        itemsize: bytes of a number.
-        cache_bytes: most bytes for intermediate values if all states fit; 0: these are always computed again.
-        memory: most bytes for states and intermediate values together; None: no limit for the states.
-        total: whether states hold the total deformation too.
+        itemsize: bytes per number.
+        cache_bytes: maximum bytes for intermediate values if all states fit; 0 always recomputes them.
+        memory: maximum bytes for states and intermediate values together; None does not limit the states.
+        total: whether states include the total deformation.
 
     Raises:
-        InputError: not even one step at a time fits into `memory`.
+        InputError: segments of a single step do not fit into `memory`.
     """
     state = itemsize * (_STATE_FLOATS + total * _TOTAL_FLOATS) * particles
     step = itemsize * (_STEP_FLOATS * particles + _NODE_FLOATS * nodes)
@@ -63,8 +62,8 @@ def plan_memory(
         caches_steps = steps > 0 and step * steps <= cache_bytes
         return MemoryPlan(max(steps, 1), caches_steps, cache_bytes - step * steps if caches_steps else 0)
 
-    # A longer segment costs no more time than a shorter one, so take the longest that fits.
-    least = whole
+    # The time does not depend on the length of the segments, so choose the longest that fits.
+    needed = whole
     for caches_steps in (True, False) if cache_bytes else (False,):
         for segment in range(steps, 0, -1):
             size = state * (segment + 1 + math.ceil(steps / segment)) + step * (
@@ -72,8 +71,10 @@ def plan_memory(
             )
             if size <= memory:
                 return MemoryPlan(segment, caches_steps, 0)
-            least = min(least, size)
+            needed = min(needed, size)
     raise InputError(
-        f"memory = {memory / 2**30:.3g} GiB is too little for {steps} steps of {particles} particles: their gradient "
-        f"needs at least {least / 2**30:.3g} GiB; allow that much, or use fewer particles or steps"
+        "memory",
+        f"{memory / 2**30:.3g} GiB must be at least {needed / 2**30:.3g} GiB to differentiate {steps} steps of "
+        f"{particles} particles",
+        "Raise the limit, or use fewer particles or steps",
     )

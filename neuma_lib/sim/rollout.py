@@ -1,8 +1,7 @@
-"""The one entry to the simulator, for ground truth, velocity estimation, training and evaluation alike.
+"""Entry point of the simulator.
 
-Callers differ in law, start and set of frames only. The gradient is one reverse loop over the stored states,
-not a graph of steps: autograd sees one function from (x, v, F, C, weights of the laws) to the frames. Where the total
-deformation is asked for, it is a fifth part of the state.
+For autograd a rollout is one function from (x, v, F, C, weights of the laws) to the states at the frames, whose
+gradient is one reverse loop over the stored states. The total deformation is an optional fifth part of the state.
 """
 
 from __future__ import annotations
@@ -38,42 +37,44 @@ def rollout(
 ) -> Trajectory:
     """Simulate particles and return their states at the frames.
 
-    Differentiable with respect to the weights of the laws and to x, v, F and C of the state; masses, volumes and
-    tracers carry no gradient.
+    Differentiable with respect to the weights of the laws and to x, v, F and C of the state. Masses, volumes and
+    tracers have no gradient.
 
     Args:
         model: grid, time step, gravity and walls.
-        law: material of all particles, or bodies that each have a law and a range of particles on one grid.
-        state: N particles at the start.
-        steps: number of time steps; the simulation ends at the last frame, which must not lie beyond.
-        frames: steps whose states are returned, strictly increasing, 0 is the start.
-        tracers: positions of passive points that follow the grid's velocity [m], shape (M, 3).
-        total: also carry the total deformation: F_total = (I + dt C) F_total in every step, the product without the
-            plastic return, from F of the start on. Differentiable as F is.
-        skip_free_flight: take the steps before the first contact in closed form while the state is undeformed
-            and moves with one velocity: equal to simulating them, to round-off, in value and gradient. Not
-            used where a gradient could deform the state (v of shape (N, 3), F or C that require it).
-        memory: most bytes that the gradient may keep; where that is too little for the states of all steps, these
-            are computed a second time, segment by segment. None: no limit. Same gradient, slower.
-        cache_bytes: bytes that the gradient may spend to keep stresses, grids and what the laws computed, beyond
-            the states of the steps; 0 computes these again. None: `memory.DEFAULT_CACHE_BYTES`. Same gradient.
-        scatter: how particles are added to nodes, see `scatter.SCATTERS`; None takes the fastest way.
+        law: law of all particles, or bodies that each have a law and a range of particles on one grid.
+        state: initial state of N particles.
+        steps: number of time steps, not less than the last frame, at which the simulation ends.
+        frames: steps whose states are returned, strictly increasing, 0 is the initial state.
+        tracers: positions of passive points that follow the velocity of the grid [m], shape (M, 3).
+        total: also compute the total deformation, F_total = (I + dt C) F_total without plastic return, initially F.
+            Differentiable like F.
+        skip_free_flight: compute the steps before the first contact in closed form if the state is undeformed and
+            has a uniform velocity, equal to simulated steps to round-off in value and gradient. Not used if a gradient
+            is required of v of shape (N, 3), F or C.
+        memory: maximum bytes kept for the gradient, None for no limit. If it is less than the states of all steps
+            need, these are recomputed segment by segment, with the same gradient.
+        cache_bytes: maximum bytes for stresses, grids and caches of the laws, None for
+            `memory.DEFAULT_CACHE_BYTES`. Other values are recomputed, with the same gradient.
+        scatter: scatter method, see `scatter`. None chooses the fastest.
 
     Raises:
-        InputError: frames, tracers, a particle that starts outside the grid, bodies that misfit.
-        NonFiniteError: a particle became non-finite, crossed a cell in a step or left the grid; has
+        InputError: invalid frames, tracers or bodies, or a particle starts outside the grid.
+        NonFiniteError: a particle became non-finite, moved by more than a cell in a step or left the grid; has
             `step` and `particle`.
     """
     frames = checked_frames(frames, steps)
     bodies = as_bodies(law, len(state.x))
     check_inside(model, state.x)
     if tracers is not None and (tracers.ndim != 2 or tracers.shape[1] != 3 or tracers.dtype != state.x.dtype):
-        raise InputError(f"tracers: give positions of shape (M, 3) as {state.x.dtype}")
+        given = f"shape {tuple(tracers.shape)} as {tracers.dtype}"
+        raise InputError("tracers", f"{given} must be (M, 3) as {state.x.dtype}")
 
     plan = dict(memory=memory, cache_bytes=cache_bytes)
-    return fly_and_simulate(model, bodies, state, frames, tracers, total, skip_free_flight, scatter, **plan)[
-        0
-    ]
+    path, _ = fly_and_simulate(
+        model, bodies, state, frames, tracers, total, skip_free_flight, scatter, **plan
+    )
+    return path
 
 
 def fly_and_simulate(
@@ -89,10 +90,10 @@ def fly_and_simulate(
     memory: float | None = None,
     cache_bytes: float | None = None,
 ) -> tuple[Trajectory, list[NonFiniteError | None]]:
-    """The body of `rollout`, with its arguments checked.
+    """`rollout` with checked arguments, for a state of several ``copies`` with equal numbers of particles.
 
-    The state may hold several ``copies``, simulations of as many particles each. What is returned of one that
-    diverges, to which the second result has an error, means nothing; that all do is raised.
+    Returns one error per copy, or None. The states of a copy with an error are undefined. If all copies have one, the
+    first is raised.
     """
     first = free_flight_steps(model, bodies, state, frames[-1], copies) if skip_free_flight else 0
     start = (*state.motion, state.F) if total else state.motion
@@ -126,7 +127,7 @@ def _simulate(
     memory: float | None,
     cache_bytes: float | None,
 ) -> tuple[Trajectory, list[NonFiniteError | None]]:
-    """Step from (x, v, F, C), with F_total behind them or without, at step `first` to the last frame."""
+    """Simulate from (x, v, F, C) and optionally F_total at step `first` to the last frame."""
     x, steps, total = state.x, frames[-1] - first, len(start) == 5
     weights, slices = gather_weights(bodies, x.dtype)
     inputs = (*start, *weights)
@@ -141,7 +142,7 @@ def _simulate(
 
 
 class RolloutFunction(torch.autograd.Function):
-    """All steps as one function of the start and the weights."""
+    """All steps as one function of the initial state and the weights."""
 
     @staticmethod
     def forward(ctx, simulation, frames, tracers, *inputs):
@@ -158,29 +159,30 @@ class RolloutFunction(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, *grads):
-        *grads, _ = grads  # tracers carry none
+        *grads, _ = grads  # tracers have no gradient
         start, weights = ctx.simulation.run_adjoint(ctx.saved_tensors, ctx.frames, grads)
         return None, None, None, *start, *weights
 
 
 def checked_frames(frames: Sequence[int], steps: int) -> tuple[int, ...]:
-    """The steps of the frames, strictly increasing from 0 on and not beyond the last."""
+    """The frames as a tuple of steps, strictly increasing from 0 to at most ``steps``."""
     frames = tuple(int(n) for n in frames)
     if not frames or frames[0] < 0 or any(b <= a for a, b in zip(frames, frames[1:], strict=False)):
-        raise InputError(f"frames = {list(frames)}: give at least one step, from 0 on, strictly increasing")
+        raise InputError("frames", f"{list(frames)} must be strictly increasing steps >= 0, at least one")
     if frames[-1] > steps:
-        raise InputError(f"frames end at step {frames[-1]}, but the rollout has {steps} steps")
+        raise InputError("frames", f"the last frame, {frames[-1]}, must not exceed the {steps} steps")
     return frames
 
 
 def check_inside(model: MPMModel, x0: Tensor) -> None:
-    """Every particle must see three nodes along each axis."""
+    """Raise InputError unless the stencil of every particle exists."""
     low, high = model.stencil_range
     outside = ~((x0 >= low) & (x0 <= high)).all(dim=1)
     if outside.any():
         p = int(outside.nonzero()[0])
         place = ", ".join(f"{value:.4g}" for value in x0[p].tolist())
         raise InputError(
-            f"{int(outside.sum())} of {len(x0)} particles start outside the grid (first: {p}, at {place} m): place "
-            f"the object within [{low:.4g}, {high:.4g}] m on every axis"
+            "state.x",
+            f"{int(outside.sum())} of {len(x0)} particles start outside the grid (first: {p}, at {place} m)",
+            f"Place the object within [{low:.4g}, {high:.4g}] m on every axis",
         )

@@ -1,6 +1,6 @@
-// Text of the functions of scatter.py that the threads of a warp call together, each for the particle that it holds.
-// Bits of a run, as a thread sees it: 0-7 the lane after its last member, 8-15 how many halving steps its warp's
-// longest run needs, 16 whether this thread is the first member, which adds the sum.
+// Functions of scatter.py that all threads of a warp call together, one particle per thread.
+// Bits of a run in a thread: 0-7 the lane after its last member, 8-15 the number of halving steps for the longest run of
+// the warp, 16 whether this thread is the first member, which adds the sum.
 //// run
     const unsigned all = 0xffffffffu;
     const int lane = threadIdx.x & 31;
@@ -15,7 +15,7 @@
     return stop | (steps << 8) | ((first && cell >= 0) ? 1 << 16 : 0);
 
 //// deposit
-    // COMPONENTS of the four numbers of a node are added, 16 bytes at a time if VECTOR.
+    // Adds COMPONENTS of the four numbers of a node, 16 bytes at a time if VECTOR.
     const unsigned all = 0xffffffffu;
     const int lane = threadIdx.x & 31;
     const int stop = run & 0xff;

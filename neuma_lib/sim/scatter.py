@@ -1,13 +1,12 @@
-"""How particles add to the nodes of the grid: the part of the transfers that decides their speed on a GPU.
+"""Scatter from particles to grid nodes, which dominates the time of the transfers on a GPU.
 
-A particle's 27 contributions meet those of its neighbours, so they are added atomically. Two ways:
+The 27 contributions of a particle overlap with those of its neighbours and are added atomically. There are two methods:
 
-- "atomic": every particle adds each of its numbers. Right everywhere, in both precisions, on CPU and GPU.
-- "runs" (CUDA, float32): threads take particles sorted by cell, so that neighbours in a warp mostly share
-  their 27 nodes. The warp first sums the contributions of each run of equal cells with shuffles, and the first
-  thread of the run adds the sum, a whole node (16 bytes) at a time where the hardware can (compute capability
-  9.0), else number by number. "runs_scalar" is the latter everywhere, for tests. The result does not depend on
-  how well the particles are sorted, only the speed does.
+- "atomic": every particle adds each of its numbers, for both precisions, on CPU and GPU.
+- "runs" (CUDA, float32): threads process particles sorted by cell, so that neighbours in a warp mostly share their 27
+  nodes. The warp sums the contributions of each run of equal cells with shuffles, and the first thread of the run adds
+  the sum, by whole nodes (16 bytes) on compute capability 9.0 or by single numbers. "runs_scalar" always adds single
+  numbers, for tests. Sorting affects only the speed.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of functions as objects.
@@ -21,27 +20,25 @@ from neuma_lib.device import native_source, start_warp
 
 start_warp()
 
-SCATTERS = ("atomic", "runs", "runs_scalar")
-
 
 def scatter_for(device: torch.device, dtype: torch.dtype) -> str:
-    """The fastest way to scatter in a precision on a device."""
+    """The fastest scatter method for a device and precision."""
     return "runs" if device.type == "cuda" and dtype == torch.float32 else "atomic"
 
 
 @functools.cache
 def scatter_functions(dtype: torch.dtype, scatter: str, components: int) -> SimpleNamespace:
-    """Functions for kernels whose threads each hold one particle.
+    """Functions for kernels with one particle per thread.
 
     Args:
         dtype: precision.
-        scatter: one of `SCATTERS`.
-        components: 4 where nodes carry momentum and mass, 3 where the last of their four numbers stays zero.
+        scatter: "atomic", "runs" or "runs_scalar".
+        components: 4 if nodes carry momentum and mass, 3 if the last of their four numbers stays zero.
 
     Returns:
-        ``run_of(cell)``, called once by all threads of a warp with the particle's cell (-1: no particle), and
-        ``deposit(rows, index, row, value, run)``, which adds the matrix ``value`` (3 x 4) to three nodes from
-        ``row`` on in a index of the grid, likewise called by all threads of a warp.
+        ``run_of(cell)`` takes the cell of the particle (-1: none), and ``deposit(rows, index, row, value, run)`` adds
+        the matrix ``value`` (3 x 4) to the three nodes from ``row`` on of grid ``index``. All threads of a warp must
+        call both.
     """
     real = {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
     mat34 = wp.types.matrix(shape=(3, 4), dtype=real)

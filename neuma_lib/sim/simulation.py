@@ -1,10 +1,10 @@
-"""The loop over the steps and its adjoint: the only place where time advances.
+"""The loop over time steps and its adjoint.
 
-A step turns the state (x, v, C, F) at t into that at t + dt (paper Sec. 3.2 and Algorithm 2):
+A step maps the state (x, v, C, F) at t to that at t + dt (paper Sec. 3.2 and Algorithm 2):
 
     tau = elasticity(F);   P2G, grid, G2P;   F = plasticity((I + dt C) F)
 
-The state may also carry the total deformation, with all that has flowed: F_total = (I + dt C) F_total.
+The state may include the total deformation, elastic and plastic: F_total = (I + dt C) F_total.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ PARTS = ("elasticity", "plasticity")
 def gather_weights(
     bodies: Sequence[Body], dtype: torch.dtype
 ) -> tuple[list[Tensor], dict[tuple[int, str], slice]]:
-    """Weights of all laws in one list, and where those of each part stand in it, by (id(law), part)."""
+    """Weights of all laws in one list, and the slice of each part by (id(law), part)."""
     weights, slices = [], {}
     for law in {id(body.law): body.law for body in bodies}.values():
         for part, own in zip(PARTS, law_weights(law, dtype), strict=True):
@@ -41,26 +41,24 @@ def gather_weights(
 
 
 class Simulation:
-    """The loop over the steps, forward and in reverse, in buffers that belong to it while it lives.
+    """The loop over the steps, forward and in reverse, with buffers that it owns during its lifetime.
 
-    The steps are taken in segments. All states of a segment are in memory together if the rollout is to be
-    differentiated; otherwise only the last one, and segments end at the frames. On a GPU a segment, there and
-    back, is a CUDA graph, replayed from the third time on (`GraphCache`).
+    Steps are grouped in segments. For a differentiable rollout all states of a segment are in memory. Otherwise only
+    the last one is, and segments end at the frames. On a GPU a segment in one direction is a CUDA graph (`GraphCache`).
 
     Args:
         model, bodies: as in `rollout`.
-        weight_slices: second result of `gather_weights`; the weights themselves come with each call.
-        state: gives the number of particles, their masses and volumes, precision and device.
+        weight_slices: second result of `gather_weights`; the weights are an argument of each call.
+        state: number of particles, masses and volumes, precision and device.
         steps: number of steps.
         first: number of the first step, for messages.
-        plan: what to keep for `run_adjoint`; None if that will not be called.
-        scatter: how particles are added to nodes, one of `scatter.SCATTERS`; None takes the fastest.
-        total: whether the state carries the total deformation.
-        copies: simulations of as many particles each that the state holds one after the other; they share the
-            launches and do not see each other.
+        plan: memory plan for `run_adjoint`, or None if that is not called.
+        scatter: scatter method, see `scatter`. None chooses the fastest.
+        total: whether the state includes the total deformation.
+        copies: number of independent simulations in the state that share launches, see `kernels`.
 
     Attributes:
-        errors: after `run`, what went wrong in each copy, or None.
+        errors: after `run`, the error of each copy, or None.
     """
 
     def __init__(
@@ -91,7 +89,7 @@ class Simulation:
         self.workspace.mass.copy_(state.mass.detach())
         self.workspace.vol0.copy_(state.vol0.detach())
         self._law_cache_bytes = plan.law_cache_bytes if plan else 0
-        self._cached: set[tuple] = set()  # evaluations of laws whose caches are filled
+        self._cached: set[tuple] = set()  # evaluations of laws with valid caches
         self._segment_in_memory = 0
         self._weight_slices = weight_slices
         laws = [getattr(body.law, part) for body in bodies for part in PARTS]
@@ -106,10 +104,10 @@ class Simulation:
         frames: Sequence[int],
         tracers: Tensor | None = None,
     ) -> tuple[Tensor | None, ...]:
-        """From the start (x, v, F, C and maybe F_total) through all steps; the same and tracers at the frames.
+        """Run all steps from ``start`` (x, v, F, C and optionally F_total) and return these and tracers at the frames.
 
         Raises:
-            NonFiniteError: every copy diverges. Where only some do, they are in `errors`, and the others are right.
+            NonFiniteError: every copy diverged. If only some did, `errors` has their errors.
         """
         ws = self.workspace
         states = ws.states
@@ -122,7 +120,7 @@ class Simulation:
         passive = None if tracers is None else _Tracers(ws, tracers, frames)
         faults = ws.faults.clone()
         self._copy_frames(0, [0], frames, result)
-        last = 0  # where the last state of the segment before is
+        last = 0  # index of the last state of the previous segment
         for index, (first, steps) in enumerate(self._segments(frames)):
             for state in states if last else ():
                 state[0].copy_(state[last])
@@ -135,10 +133,10 @@ class Simulation:
                 self._advance(steps, weights, lambda n, first=first: passive.move(n, first))
             last, self._segment_in_memory = ws.at(steps), index
             self._copy_frames(first, range(1, steps + 1) if self.plan else [steps], frames, result)
-            found = torch.where(ws.faults < NO_FAULT, ws.faults + (first << 31), ws.faults)
-            torch.minimum(faults, found, out=faults)
+            shifted = torch.where(ws.faults < NO_FAULT, ws.faults + (first << 31), ws.faults)
+            torch.minimum(faults, shifted, out=faults)
             ws.faults.fill_(NO_FAULT)
-            # A GPU would have to wait for the answer.
+            # This check would synchronise a GPU.
             if ws.size.device.type == "cpu" and (faults < NO_FAULT).any(dim=1).all():
                 break
         self._find_errors(faults, result[2][-1])
@@ -157,7 +155,7 @@ class Simulation:
     def run_adjoint(
         self, weights: Sequence[Tensor], frames: Sequence[int], grads: Sequence[Tensor | None]
     ) -> tuple[tuple[Tensor, ...], list[Tensor]]:
-        """Gradients of the states at the frames to those of the start and of the weights."""
+        """From gradients of the states at the frames to those of the initial state and of the weights."""
         ws = self.workspace
         if self._uses_graphs:
             weights, grad_weights = ws.weights, ws.grad_weights
@@ -181,7 +179,7 @@ class Simulation:
                 added = ws.load_frame_grads(name, added)
             self._launch(
                 name,
-                lambda steps=steps, at=at, added=added: self._go_back(
+                lambda steps=steps, at=at, added=added: self._reverse(
                     steps, at, added, weights, grad_weights
                 ),
             )
@@ -192,9 +190,8 @@ class Simulation:
         return tuple(total.clone() for total in totals), [grad.clone() for grad in grad_weights]
 
     def step_adjoint(self, n: int, weights: Sequence[Tensor], sums: Mapping[str, Sequence[Weights]]) -> None:
-        """Gradients of state n + 1, in the workspace, to those of state n. Those of the weights are added to `sums`: of
-        each part of the laws, the `Constitutive.accumulators` of all bodies.
-        """
+        """From gradients of state n + 1, in the workspace, to those of state n. Gradients of the weights are added to
+        `sums`, the `Constitutive.accumulators` of all bodies by part of the law."""
         ws = self.workspace
         cached = ws.cached_at(n)
         F, F_trial = ws.F[ws.at(n)], ws.F_trial[cached]
@@ -216,7 +213,7 @@ class Simulation:
         return [(a, b - a) for a, b in zip(borders, borders[1:], strict=False)]
 
     def _launch(self, name: Hashable, launches: Callable[[], None]) -> None:
-        """Launch, by a graph where these are used."""
+        """Run launches, as a graph if graphs are used."""
         if self._uses_graphs:
             self.workspace.graphs.run((name, self._graph_key), launches)
         else:
@@ -225,14 +222,14 @@ class Simulation:
     def _advance(
         self, steps: int, weights: Sequence[Tensor], after_step: Callable[[int], None] | None = None
     ) -> None:
-        """All steps of a segment."""
+        """Run all steps of a segment."""
         with self.workspace.stream():
             for n in range(steps):
                 self.step(n, weights)
                 if after_step:
                     after_step(n)
 
-    def _go_back(
+    def _reverse(
         self,
         steps: int,
         at: Sequence[int],
@@ -240,7 +237,7 @@ class Simulation:
         weights: Sequence[Tensor],
         grad_weights: Sequence[Tensor],
     ) -> None:
-        """All steps of a segment in reverse, adding the gradients of the states after the steps `at` on the way."""
+        """Run the adjoint of all steps of a segment and add the gradients of the states after the steps `at`."""
         ws = self.workspace
         totals = ws.grad_states
         frame_of = {n: index for index, n in enumerate(at)}
@@ -266,20 +263,20 @@ class Simulation:
     def _copy_frames(
         self, first: int, steps: Sequence[int], frames: Sequence[int], result: Sequence[Tensor]
     ) -> None:
-        """States after some steps of the segment that starts at step `first`, where they are frames."""
+        """Copy states after ``steps`` of the segment that starts at step `first` to ``result`` if they are frames."""
         ws = self.workspace
         frame_of = {n: index for index, n in enumerate(frames)}
         here = [(frame_of[first + n], ws.at(n)) for n in steps if first + n in frame_of]
         if here:
             part = slice(here[0][0], here[-1][0] + 1)
-            places = torch.tensor([place for _, place in here], device=ws.size.device)
+            indices = torch.tensor([index for _, index in here], device=ws.size.device)
             for values, state in zip(result, ws.states, strict=True):
-                torch.index_select(state, 0, places, out=values[part])
+                torch.index_select(state, 0, indices, out=values[part])
 
     def _evaluate(
         self, part: str, n: int, F: Tensor, weights: Sequence[Tensor], out: Tensor, fill_cache: bool = False
     ) -> None:
-        """Elasticity or plasticity of every body; what `_vjp` needs is cached if asked for or if it fits."""
+        """Evaluate elasticity or plasticity of every body, with a cache for `_vjp` if requested or if it fits."""
         for law, here, own, key in self._laws(part, n):
             if fill_cache or self._law_cache_bytes > 0:
                 caches = self.workspace.law_caches
@@ -301,7 +298,7 @@ class Simulation:
         grad_F: Tensor,
         sums: Mapping[str, Sequence[Weights]],
     ) -> None:
-        """Adjoint of `_evaluate`; sets grad_F and adds to the sums."""
+        """Adjoint of `_evaluate`. Sets grad_F and adds to the sums."""
         for (law, here, own, key), received in zip(self._laws(part, n), sums[part], strict=True):
             law.vjp(
                 F[here],
@@ -313,20 +310,19 @@ class Simulation:
             )
 
     def _laws(self, part: str, n: int) -> list[tuple[Constitutive, slice, slice, tuple]]:
-        """Of every body: its law, its particles, its place among the weights, and the name of its cache in step n.
+        """For every body: law, slice of particles, slice of weights, and key of the cache in step n.
 
-        Any law of the same type and with the same particles can use a cache again.
+        Laws of the same type with the same particles can reuse a cache.
         """
-        found = []
+        laws = []
         for body in self.bodies:
             law = getattr(body.law, part)
             key = (type(law), body.start, body.stop, self.workspace.cached_at(n))
-            found.append((law, slice(body.start, body.stop), self._weight_slices[id(body.law), part], key))
-        return found
+            laws.append((law, slice(body.start, body.stop), self._weight_slices[id(body.law), part], key))
+        return laws
 
     def _find_errors(self, faults: Tensor, F: Tensor) -> None:
-        """Note the copies where a velocity on the way or the last F (N, 3, 3) is not what a stable simulation gives,
-        and raise if these are all."""
+        """Set `errors` from the fault flags and the last F (N, 3, 3), and raise the first if all copies failed."""
         self.errors = []
         for copy, (flags, own) in enumerate(zip(faults.tolist(), F.chunk(len(faults)), strict=True)):
             if min(flags) == NO_FAULT and not torch.isfinite(own).all():
@@ -337,7 +333,7 @@ class Simulation:
             raise self.errors[0]
 
     def _error(self, not_finite: int, too_fast: int, left: int) -> NonFiniteError | None:
-        """What the flags of a copy say."""
+        """The error described by the flags of a copy."""
         fault = min(not_finite, too_fast, left)
         if fault == NO_FAULT:
             return None
@@ -349,12 +345,12 @@ class Simulation:
             left: "left the grid",
         }[fault]
         size = self.workspace.size
-        particle %= size.particles // size.copies  # counted in its copy
+        particle %= size.particles // size.copies  # index within the copy
         return NonFiniteError(
             "rollout",
             f"particle {particle} (law {law.name!r}) {happened} at step {step}, t = "
-            f"{step * self.model.dt:.4g} s: the simulation is unstable. Use a smaller dt (see "
-            "MPMModel.check_courant), a slower start, or the last good weights with a lower rate",
+            f"{step * self.model.dt:.4g} s. The simulation is unstable. Use a smaller dt (see "
+            "MPMModel.check_courant), a lower initial velocity, or earlier weights with a lower learning rate",
             step=step,
             particle=particle,
             happened=happened,
@@ -362,21 +358,21 @@ class Simulation:
 
 
 class _Tracers:
-    """Passive points (M, 3) that move with the grid, and where they were at the frames, `seen` (T, M, 3)."""
+    """Passive points (M, 3) that move with the grid, and their positions at the frames, `seen` (T, M, 3)."""
 
     def __init__(self, ws: Workspace, tracers: Tensor, frames: Sequence[int]):
         self._ws, self._frame_of = ws, {n: index for index, n in enumerate(frames)}
         self._x = tracers.detach().clone(memory_format=torch.contiguous_format)
         self._launch = ws.tracer_launch(self._x)
         self.seen = self._x.new_empty(len(frames), *self._x.shape)
-        self._note(0)
+        self._store(0)
 
     def move(self, n: int, first: int) -> None:
         """Move with the nodes of step n of the segment that starts at step `first`."""
         self._ws.move_tracers(self._launch, n)
-        self._note(first + n + 1)
+        self._store(first + n + 1)
 
-    def _note(self, step: int) -> None:
+    def _store(self, step: int) -> None:
         if step in self._frame_of:
             self.seen[self._frame_of[step]].copy_(self._x)
 

@@ -1,10 +1,11 @@
-"""The particles that a rollout starts from, and their states at the frames that it returns."""
+"""Initial state of the particles of a rollout, and their states at its frames."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,19 +14,19 @@ from neuma_lib.errors import InputError
 
 @dataclass(frozen=True)
 class State:
-    """N particles at one time. Their device and precision (float32 or float64) are those of x.
+    """N particles at one time. Device and precision (float32 or float64) are those of x.
 
     Attributes:
         x: positions [m], shape (N, 3).
-        v: velocities [m/s], shape (N, 3), or (3,): one velocity that all particles share.
+        v: velocities [m/s], shape (N, 3), or (3,) for a uniform velocity.
         mass: particle masses [kg], shape (N,).
         vol0: particle volumes in the undeformed body [m^3], shape (N,).
-        F: elastic deformation gradients, shape (N, 3, 3); None makes it the identity.
-        C: APIC affine velocities [1/s], shape (N, 3, 3); None makes it zero.
+        F: elastic deformation gradients, shape (N, 3, 3), by default the identity.
+        C: APIC affine velocities [1/s], shape (N, 3, 3), by default zero.
 
     Raises:
-        InputError: shapes, precisions or devices that do not fit, a value that is not finite, a mass or a volume
-            that is not positive.
+        InputError: shapes, precisions or devices do not match, or a value is not finite or a mass or volume not
+            positive.
     """
 
     x: Tensor
@@ -38,9 +39,9 @@ class State:
     def __post_init__(self):
         x = self.x
         if x.ndim != 2 or x.shape[1] != 3 or len(x) == 0:
-            raise InputError(f"x has shape {tuple(x.shape)}: give positions of at least one particle, (N, 3)")
+            raise InputError("state.x", f"shape {tuple(x.shape)} must be (N, 3) with N >= 1")
         if x.dtype not in (torch.float32, torch.float64):
-            raise InputError(f"x is {x.dtype}: use float32 or float64")
+            raise InputError("state.x", f"{x.dtype} must be float32 or float64")
         N = len(x)
         eye = torch.eye(3, dtype=x.dtype, device=x.device).expand(N, 3, 3)
         if self.F is None:
@@ -52,15 +53,16 @@ class State:
             value = getattr(self, name)
             if tuple(value.shape) not in allowed:
                 expected = " or ".join(map(str, allowed))
-                raise InputError(f"{name} has shape {tuple(value.shape)}: expected {expected}")
+                raise InputError(f"state.{name}", f"shape {tuple(value.shape)} must be {expected}")
             if value.dtype != x.dtype or value.device != x.device:
                 raise InputError(
-                    f"{name} is {value.dtype} on {value.device}, x is {x.dtype} on {x.device}: give both alike"
+                    f"state.{name}",
+                    f"{value.dtype} on {value.device} must be {x.dtype} on {x.device}, like x",
                 )
             if not torch.isfinite(value).all():
-                raise InputError(f"{name} has a value that is not finite")
+                raise InputError(f"state.{name}", "a value is not finite")
             if name in ("mass", "vol0") and not (value > 0).all():
-                raise InputError(f"{name} must be positive for every particle")
+                raise InputError(f"state.{name}", f"{float(value.min()):g} must be positive")
 
     @classmethod
     def thrown(
@@ -72,16 +74,16 @@ class State:
         spin: Sequence[float] | Tensor = (0.0, 0.0, 0.0),
         centre: Sequence[float] | Tensor | None = None,
     ) -> State:
-        """Particles that start as one rigid body, v = velocity + spin x (x - centre).
+        """Particles in rigid motion, v = velocity + spin x (x - centre).
 
-        C is the gradient of that field, [spin]_x, which the grid needs to keep the angular momentum. A body without
-        spin has one velocity for all particles: it can fly in closed form.
+        C is the gradient of that field, [spin]_x, which conserves angular momentum on the grid. Without spin the
+        velocity is uniform, so that free flight has a closed form.
 
         Args:
             x, mass, vol0: see `State`.
-            velocity: of the centre [m/s], shape (3,).
+            velocity: velocity of the centre [m/s], shape (3,).
             spin: angular velocity [rad/s], shape (3,).
-            centre: point that moves with `velocity` [m], shape (3,); None: the centre of mass.
+            centre: point that moves with `velocity` [m], shape (3,), by default the centre of mass.
         """
         velocity, spin = (torch.as_tensor(vector).to(x) for vector in (velocity, spin))
         if not spin.any():
@@ -94,13 +96,13 @@ class State:
 
     @classmethod
     def joined(cls, bodies: Sequence[State]) -> State:
-        """The particles of several bodies, one after the other."""
+        """Concatenate the particles of several bodies."""
         x, v, F, C = (torch.cat(parts) for parts in zip(*(body.motion for body in bodies), strict=True))
         mass, vol0 = (torch.cat([getattr(body, name) for body in bodies]) for name in ("mass", "vol0"))
         return cls(x, v, mass, vol0, F, C)
 
     def to(self, device: torch.device | str) -> State:
-        """The same on another device."""
+        """Copy to another device."""
         return State(*(getattr(self, name).to(device) for name in ("x", "v", "mass", "vol0", "F", "C")))
 
     @property
@@ -110,12 +112,12 @@ class State:
 
     @property
     def motion(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """What changes in time: x, v (N, 3), F and C."""
+        """The variables of the simulation: x, v (N, 3), F and C."""
         return self.x, self.v.expand_as(self.x), self.F, self.C
 
 
 def cross_matrix(a: Tensor) -> Tensor:
-    """[a]_x, the matrix (3, 3) that multiplies a vector b to a x b; a of shape (3,)."""
+    """[a]_x, the matrix (3, 3) with [a]_x b = a x b, for a of shape (3,)."""
     return torch.linalg.cross(a.expand(3, 3), torch.eye(3, dtype=a.dtype, device=a.device)).mT
 
 
@@ -124,13 +126,13 @@ class Trajectory:
     """States of N particles (and positions of M tracers) at T frames.
 
     Attributes:
-        frames: steps of the frames, increasing, 0 is the start.
+        frames: steps of the frames, increasing, 0 is the initial state.
         x: positions [m], shape (T, N, 3).
         v: velocities [m/s], shape (T, N, 3).
         F: elastic deformation gradients, shape (T, N, 3, 3).
         C: APIC affine velocities [1/s], shape (T, N, 3, 3).
         tracers: positions of passive tracers [m], shape (T, M, 3), or None.
-        F_total: total deformation gradients, what has flowed included, shape (T, N, 3, 3); None if not asked for.
+        F_total: total deformation gradients, elastic and plastic, shape (T, N, 3, 3), or None.
     """
 
     frames: tuple[int, ...]
@@ -142,39 +144,44 @@ class Trajectory:
     F_total: Tensor | None = None
 
     def at(self, frames: Sequence[int]) -> Trajectory:
-        """The states at some of the frames. Those after the last one here repeat the one before them.
+        """The states at some of the frames. Frames after the last one repeat it.
 
         Raises:
-            InputError: a frame is missing, or all lie after the last one here.
+            InputError: a frame is missing, or all are after the last one.
         """
         index = {n: i for i, n in reversed(list(enumerate(self.frames)))}
         reached = tuple(n for n in frames if n <= self.frames[-1])
         if not reached or not index.keys() >= set(reached):
-            raise InputError(f"the trajectory has not all of the frames {list(frames)}")
-        found = replace(self._each(lambda value: value[[index[n] for n in reached]]), frames=reached)
-        return found.hold_last(len(frames) - len(reached)) if len(reached) < len(frames) else found
+            raise InputError("frames", f"{list(frames)} must be frames of the trajectory")
+        path = replace(self._each(lambda value: value[[index[n] for n in reached]]), frames=reached)
+        return path.hold_last(len(frames) - len(reached)) if len(reached) < len(frames) else path
 
     @property
     def stretch(self) -> Tensor:
-        """What stretches Gaussians, shape (T, N, 3, 3): the total deformation where it was asked for, else F."""
+        """Deformation of Gaussians, shape (T, N, 3, 3): the total deformation if available, else F."""
         return self.F if self.F_total is None else self.F_total
 
     def hold_last(self, count: int) -> Trajectory:
-        """The same with the last frame repeated `count` times, for a rollout that stopped early."""
+        """Repeat the last frame `count` times, for a rollout that stopped early."""
         held = self._each(lambda value: torch.cat([value, value[-1:].expand(count, *value.shape[1:])]))
         return replace(held, frames=self.frames + (self.frames[-1],) * count)
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What files of rollouts keep: positions and deformation gradients of the particles."""
+        values = {"x": self.x, "F": self.F, "F_total": self.F_total}
+        return {name: value.cpu().numpy() for name, value in values.items() if value is not None}
+
     def cpu(self) -> Trajectory:
-        """The same in main memory."""
+        """Copy to main memory."""
         return self._each(torch.Tensor.cpu)
 
     def followed_by(self, second: Trajectory) -> Trajectory:
-        """This trajectory and a later one with the same parts as one."""
+        """Concatenate this trajectory and a later one with the same parts."""
         joined = {name: torch.cat([value, getattr(second, name)]) for name, value in self._parts().items()}
         return Trajectory(self.frames + second.frames, **joined)
 
     def split(self, count: int) -> list[Trajectory]:
-        """The trajectories of several simulations whose particles stand one after the other."""
+        """The trajectories of ``count`` copies, see `kernels`."""
         if count == 1:
             return [self]
         return [
@@ -186,6 +193,6 @@ class Trajectory:
         return replace(self, **{name: function(value) for name, value in self._parts().items()})
 
     def _parts(self) -> dict[str, Tensor]:
-        """The arrays that are there, by name."""
-        found = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: value for name, value in found.items() if isinstance(value, Tensor)}
+        """The arrays by name, without those that are None."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if isinstance(value, Tensor)}

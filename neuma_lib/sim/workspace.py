@@ -1,6 +1,6 @@
-"""Buffers of a rollout and the launches that work on them, made once for a size and used again.
+"""Reusable buffers of a rollout of a given size, and the launches that use them.
 
-Nothing here is allocated per step: launches are recorded on fixed memory and only the indices in them change.
+Nothing is allocated per step. Launches are recorded with fixed memory and only their indices change.
 """
 
 from __future__ import annotations
@@ -18,61 +18,61 @@ from torch import Tensor
 
 from neuma_lib.sim import kernels
 from neuma_lib.sim.adjoint_kernels import adjoint_kernels
-from neuma_lib.sim.graphs import MOST_GRAPHS, GraphCache
+from neuma_lib.sim.graphs import MAX_GRAPHS, GraphCache
 from neuma_lib.sim.kernels import NO_FAULT, forward_kernels, warp_types
 from neuma_lib.sim.model import MPMModel
 
 SORT_EVERY = 16
-"""Steps after which particles are sorted by cell again, where the scatter profits from it."""
+"""Steps between sorts of the particles by cell, for scatter methods that need it."""
 
 BLOCK = 64
-"""Threads of a block on a GPU: 30,000 particles are few, so small blocks spread better over the processors."""
+"""Threads per block on a GPU. Small blocks distribute better, since 30,000 particles are few for a GPU."""
 
 LEAVING = 1e-3
-"""How far a particle may be beyond the last stencil by round-off [dx]: there the weights still sum to 1."""
+"""Tolerance for round-off beyond the last position with a stencil [dx], where the weights still sum to 1."""
 
 _CONDITION_CODES = {"no_slip": kernels.NO_SLIP, "slip": kernels.SLIP, "sticky": kernels.STICKY}
 
 
 class WorkspaceSize(NamedTuple):
-    """All that decides the size and the launches of a workspace."""
+    """Parameters of the size and the launches of a workspace."""
 
     model: MPMModel
     particles: int
     dtype: torch.dtype
     device: torch.device
-    n_states: int = 2  # states held: before and after a step, or to differentiate all of a segment
-    n_cached_steps: int = 1  # steps whose stress and grids are held
-    n_checkpoints: int = 0  # segments, if there are several
+    n_states: int = 2  # stored states: before and after a step, or all states of a segment to differentiate
+    n_cached_steps: int = 1  # steps whose stress and grids are stored
+    n_checkpoints: int = 0  # number of segments if there are several
     differentiable: bool = False
-    total: bool = False  # whether the total deformation is carried
-    copies: int = 1  # simulations side by side, which share the particles equally
-    scatter: str = "atomic"  # one of `scatter.SCATTERS`
+    total: bool = False  # whether the state includes the total deformation
+    copies: int = 1  # independent simulations with equal numbers of particles
+    scatter: str = "atomic"  # scatter method
 
 
 class Workspace:
-    """States, grids and gradients of N particles, those of all copies.
+    """States, grids and gradients of the N particles of all copies.
 
-    The states of steps n and n + `n_states` share a place, and so do the cached values of steps n and
+    The states of steps n and n + `n_states` share memory, and so do the cached values of steps n and
     n + `n_cached_steps`.
 
     Attributes:
         x, v: positions [m] and velocities [m/s], shape (n_states, N, 3).
         C, F: affine velocities [1/s] and elastic deformation gradients, shape (n_states, N, 3, 3).
-        F_total: total deformation gradients, shape (n_states, N, 3, 3), where they are carried.
-        states: x, v, F, C and, where it is carried, F_total; grad_states: their gradients.
+        F_total: total deformation gradients, shape (n_states, N, 3, 3), if the state includes them.
+        states: x, v, F, C and optionally F_total; grad_states: their gradients.
         tau, F_trial: Kirchhoff stresses [Pa] and trial deformation gradients, shape (n_cached_steps, N, 3, 3).
         grid: momentum [kg m/s] and mass [kg] of the nodes, shape (n_cached_steps, copies * nodes^3, 4).
         grid_v: velocity [m/s] of the nodes and 1 where there is mass, shape (n_cached_steps, copies * nodes^3, 4).
         mass, vol0: particle masses [kg] and initial volumes [m^3], shape (N,).
-        faults: first step and particle of a non-finite value, of one that crossed a cell in a step and of one
-            that left the grid, shape (copies, 3).
-        order: particles sorted by cell, every `SORT_EVERY` steps, shape (n_sorts, N).
-        checkpoints: the states at the start of each segment, shape (n_checkpoints, ...).
+        faults: first step and particle with a non-finite value, with a move of more than a cell in a step, and
+            outside the grid, shape (copies, 3).
+        order: particles sorted by cell every `SORT_EVERY` steps, shape (n_sorts, N).
+        checkpoints: states at the start of each segment, shape (n_checkpoints, ...).
         grad_*: gradients of the above for one step, without the first axis. grad_grid has two sides that steps
-            use in turn.
-        law_caches: what the laws keep of their evaluations, held here so that the next rollout can overwrite it.
-        weights, grad_weights: weights of the laws and their gradients at a fixed place, for the graphs.
+            use alternately.
+        law_caches: caches of the laws, kept here so that the next rollout can overwrite them.
+        weights, grad_weights: weights of the laws and their gradients at fixed addresses, for the graphs.
         graphs: recorded loops over these buffers.
     """
 
@@ -84,7 +84,7 @@ class Workspace:
         self.weights: list[Tensor] = []
         self.grad_weights: list[Tensor] = []
         self._frame_grads: dict[Hashable, list[Tensor | None]] = {}
-        N, nodes = size.particles, self._nodes_of_all
+        N, nodes = size.particles, self._node_count
         states, cached = size.n_states, size.n_cached_steps
         self.x, self.v = self._vectors(states, N), self._vectors(states, N)
         self.C, self.F = self._matrices(states, N), self._matrices(states, N)
@@ -126,29 +126,29 @@ class Workspace:
         return step % self.size.n_cached_steps
 
     def sorted_at(self, step: int) -> int:
-        """Index of the order of the particles in a step."""
+        """Index of the particle order in a step."""
         return step // SORT_EVERY % len(self.order)
 
     def sort(self, step: int) -> None:
-        """Order the particles by cell if the kernels profit from it and it is time to."""
+        """Sort the particles by cell if the scatter method needs it, every `SORT_EVERY` steps."""
         if self.sorts and step % SORT_EVERY == 0:
             _run(self._cells, self.at(step))
             self.order[self.sorted_at(step)].copy_(torch.sort(self.cells, stable=True).indices)
 
     def load_weights(self, weights: Sequence[Tensor]) -> None:
-        """Copy weights to their fixed place."""
+        """Copy weights to their fixed addresses."""
         if [w.shape for w in weights] != [w.shape for w in self.weights]:
-            self._forget_graphs()
+            self._clear_graphs()
             self.weights = [torch.empty_like(w, memory_format=torch.contiguous_format) for w in weights]
             self.grad_weights = [torch.zeros_like(w) for w in self.weights]
         for own, weight in zip(self.weights, weights, strict=True):
             own.copy_(weight)
 
     def load_frame_grads(self, name: Hashable, grads: Sequence[Tensor | None]) -> list[Tensor | None]:
-        """Copy gradients of the frames to a fixed place of that name."""
+        """Copy gradients of the frames to the fixed buffers of that name."""
         if name not in self._frame_grads:
-            if len(self._frame_grads) == MOST_GRAPHS:
-                self._forget_graphs()
+            if len(self._frame_grads) == MAX_GRAPHS:
+                self._clear_graphs()
             self._frame_grads[name] = [
                 None if grad is None else torch.empty_like(grad, memory_format=torch.contiguous_format)
                 for grad in grads
@@ -158,26 +158,26 @@ class Workspace:
                 own.copy_(grad)
         return self._frame_grads[name]
 
-    def _forget_graphs(self) -> None:
-        """No graph may outlive what it reads."""
+    def _clear_graphs(self) -> None:
+        """Drop graphs together with the buffers that they read."""
         self._frame_grads, self.graphs = {}, GraphCache()
 
     def transfer_to_grid(self, step: int) -> None:
-        """tau and the state of a step to the velocities of the nodes."""
+        """From tau and the state of a step to the velocities of the nodes."""
         cached = self.cached_at(step)
         self.grid[cached].zero_()
         _run(self._p2g, self.at(step), cached, self.sorted_at(step))
         _run(self._grid_update, cached)
 
     def transfer_to_particles(self, step: int) -> None:
-        """Velocities of the nodes to x, v, C and the total deformation after the step, and to F_trial."""
+        """From velocities of the nodes to x, v, C and the total deformation after the step, and to F_trial."""
         now, after = self.at(step), self.at(step + 1)
         _run(self._g2p, now, after, self.cached_at(step), step)
         if self.size.total:
             _run(self._total, now, after, after)
 
     def trial_deformation(self, step: int) -> None:
-        """F_trial of a step again, from the F before and the C after it."""
+        """Recompute F_trial of a step from the F before and the C after it."""
         _run(self._trial, self.at(step), self.at(step + 1), self.cached_at(step))
 
     def tracer_launch(self, tracers: Tensor) -> wp.Launch:
@@ -191,10 +191,10 @@ class Workspace:
         _run(launch, self.cached_at(step))
 
     def transfer_adjoint(self, step: int) -> None:
-        """Gradients of the state after a step and of F_trial to those of the state before it and of tau.
+        """From gradients of the state after a step and of F_trial to those of the state before it and of tau.
 
-        grad_x, grad_v, grad_C and grad_F_total hold the former on entry and the latter on return; grad_F is set to
-        the part that comes through F_trial. Steps run downwards after `grad_grid` was cleared once.
+        grad_x, grad_v, grad_C and grad_F_total are updated in place, and grad_F is set to the contribution of F_trial.
+        Call it for decreasing steps after clearing `grad_grid` once.
         """
         now, after, cached = self.at(step), self.at(step + 1), self.cached_at(step)
         side = step % 2
@@ -206,7 +206,7 @@ class Workspace:
 
     @contextmanager
     def stream(self) -> Iterator[None]:
-        """Launch on torch's current stream, so that torch and Warp see each other's results in order."""
+        """Launch on torch's current stream, so that launches of torch and Warp are ordered."""
         if self.size.device.type != "cuda":
             yield
             return
@@ -215,7 +215,7 @@ class Workspace:
             yield
 
     def _buffer(self, shape: tuple[int, ...], warp_type, dtype: torch.dtype | None = None) -> Tensor:
-        """Zeros, and Warp's view of them for the launches."""
+        """Zeros, with a Warp view for the launches."""
         tensor = torch.zeros(shape, dtype=dtype or self.size.dtype, device=self.size.device)
         self._views[id(tensor)] = wp.from_torch(tensor, dtype=warp_type)
         return tensor
@@ -251,19 +251,19 @@ class Workspace:
         )
 
     @property
-    def _nodes_of_all(self) -> int:
-        """Nodes of all copies."""
+    def _node_count(self) -> int:
+        """Number of nodes of all copies."""
         return self.size.copies * self.size.model.nodes**3
 
     @property
     def _scattering_threads(self) -> int:
-        """Threads of a kernel that scatters: whole warps where these work together."""
+        """Threads of a scattering kernel, a multiple of `BLOCK` if the threads of a warp cooperate."""
         N = self.size.particles
         return -(-N // BLOCK) * BLOCK if self.sorts else N
 
     def _record_forward(self) -> None:
         k = forward_kernels(self.size.dtype, self.size.scatter)
-        N, nodes = self.size.particles, self._nodes_of_all
+        N, nodes = self.size.particles, self._node_count
         rows, rows_v = self._rows(self.grid), self._rows(self.grid_v)
         if self.sorts:
             self._cells = self._record(k.cells, N, 0, self.x, self.cells)
@@ -283,7 +283,7 @@ class Workspace:
 
     def _record_adjoint(self) -> None:
         k = adjoint_kernels(self.size.dtype, self.size.scatter)
-        N, nodes = self.size.particles, self._nodes_of_all
+        N, nodes = self.size.particles, self._node_count
         rows_v, grad_rows = self._rows(self.grid_v), self._rows(self.grad_grid)
         self._g2p_adjoint = self._record(
             k.g2p_adjoint, self._scattering_threads, 0, 0, 0, 0, 0, self.order,
@@ -302,25 +302,25 @@ class Workspace:
             )
 
 
-_POOL_SIZE = 2  # one in use by the graph of the last iteration, one for the next
-_pool: list[Workspace] = []  # workspaces that nobody uses, the last used at the end
-_pool_lock = threading.RLock()  # a user may be freed in any thread, also while another takes a workspace
+_POOL_SIZE = 2  # one for the autograd graph of the last iteration, one for the next
+_pool: list[Workspace] = []  # unused workspaces, the last used at the end
+_pool_lock = threading.RLock()  # a user can be freed in any thread
 
 
 def pooled_workspace(size: WorkspaceSize, user: object) -> Workspace:
-    """A workspace of that size, from the pool if it has one; it goes back to the pool when `user` is freed."""
+    """A workspace of that size, from the pool if possible. It returns to the pool when `user` is freed."""
     with _pool_lock:
-        fitting = [workspace for workspace in _pool if workspace.size == size]
-        if fitting:
-            _pool.remove(fitting[-1])
-    workspace = fitting[-1] if fitting else Workspace(size)
+        matching = [workspace for workspace in _pool if workspace.size == size]
+        if matching:
+            _pool.remove(matching[-1])
+    workspace = matching[-1] if matching else Workspace(size)
     workspace.faults.fill_(NO_FAULT)
     weakref.finalize(user, _give_back, workspace).atexit = False
     return workspace
 
 
 def free_pool() -> None:
-    """Give the memory of unused workspaces back."""
+    """Release the memory of unused workspaces."""
     with _pool_lock:
         _pool.clear()
 
@@ -332,7 +332,7 @@ def _give_back(workspace: Workspace) -> None:
 
 
 def _run(launch: wp.Launch, *indices: int) -> None:
-    """Launch with these values of the integer parameters that follow the constants."""
+    """Launch with the given values of the integer parameters that follow the constants."""
     for i, index in enumerate(indices):
         launch.set_param_at_index_from_ctype(i + 1, index)
     launch.launch()

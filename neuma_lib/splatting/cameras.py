@@ -1,7 +1,4 @@
-"""Pinhole cameras: OpenCV extrinsics and intrinsics.
-
-A camera looks along its +z axis with +x right and +y down (OpenCV). Pixel centres are at half integers.
-"""
+"""Pinhole cameras with OpenCV axes: +z forward, +x right, +y down. Pixel centres are at half integers."""
 
 from __future__ import annotations
 
@@ -31,29 +28,27 @@ class Cameras:
     def __post_init__(self):
         count = self.viewmats.shape[0]
         if tuple(self.viewmats.shape) != (count, 4, 4) or tuple(self.Ks.shape) != (count, 3, 3):
-            raise InputError(
-                f"cameras: viewmats {tuple(self.viewmats.shape)} and Ks {tuple(self.Ks.shape)} "
-                "must be (V, 4, 4) and (V, 3, 3)"
-            )
+            shapes = f"{tuple(self.viewmats.shape)} and {tuple(self.Ks.shape)}"
+            raise InputError("cameras: viewmats, Ks", f"have {shapes}, expected (V, 4, 4) and (V, 3, 3)")
         if self.width <= 0 or self.height <= 0:
-            raise InputError(f"cameras: image size {self.width} x {self.height} must be positive")
+            raise InputError("cameras: width, height", f"must be positive, not {self.width} x {self.height}")
         self.width, self.height = int(self.width), int(self.height)
 
     def __len__(self) -> int:
         return self.viewmats.shape[0]
 
     def __getitem__(self, index) -> Cameras:
-        """Some of the cameras: an int, slice or sequence of ints."""
+        """Select cameras by an int, slice or sequence of ints."""
         index = [index] if isinstance(index, int) else index
         return Cameras(self.viewmats[index], self.Ks[index], self.width, self.height)
 
     def __iter__(self) -> Iterator[Cameras]:
-        """The cameras one by one, as sets of one."""
+        """Iterate over the cameras as sets of one."""
         return (self[view] for view in range(len(self)))
 
     @classmethod
     def joined(cls, cameras: Cameras | Sequence[Cameras]) -> Cameras:
-        """Sets of cameras as one, as large as the largest picture: says where cameras stand, not what they see."""
+        """Concatenate sets of cameras, with the largest image size. Poses and intrinsics are valid, sizes are not."""
         if isinstance(cameras, Cameras):
             return cameras
         viewmats, Ks = (torch.cat([getattr(c, name) for c in cameras]) for name in ("viewmats", "Ks"))
@@ -64,14 +59,14 @@ class Cameras:
 
     @property
     def positions(self) -> torch.Tensor:
-        """(V, 3) camera centres, world frame [m]."""
+        """(V, 3) camera centres in the world frame [m]."""
         return -torch.einsum("vji,vj->vi", self.viewmats[:, :3, :3], self.viewmats[:, :3, 3])
 
     def project(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Image coordinates and depth of world points.
 
         Args:
-            points: (P, 3) world frame [m].
+            points: (P, 3) in the world frame [m].
 
         Returns:
             pixels (V, P, 2) and depths (V, P) [m]; points with depth <= 0 are behind the camera.
@@ -82,9 +77,9 @@ class Cameras:
 
 
 def look_at(eyes: torch.Tensor, target: torch.Tensor, up: torch.Tensor) -> torch.Tensor:
-    """World-to-camera matrices (V, 4, 4), OpenCV axes, of cameras at ``eyes`` (V, 3) facing ``target`` (3,).
+    """World-to-camera matrices (V, 4, 4), OpenCV axes, of cameras at ``eyes`` (V, 3) that face ``target`` (3,).
 
-    ``up`` (3,) is the world direction that points up in the images; not parallel to a line of sight.
+    ``up`` (3,) is the up direction of the images in the world, not parallel to a line of sight.
     """
     forward = torch.nn.functional.normalize(target - eyes, dim=-1)
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up.expand_as(forward)), dim=-1)

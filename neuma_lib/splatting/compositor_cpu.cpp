@@ -1,5 +1,4 @@
-// Text of the kernels of compositor_cpu.py, for Clang; that module replaces SPLAT_SIZE, LANES and REAL, and puts the parts
-// together.
+// Parts of the kernels of compositor_cpu.py, for Clang. That module replaces SPLAT_SIZE, LANES and REAL.
 
 //// types
     typedef REAL Real;
@@ -38,8 +37,8 @@
         return e;
     };
 
-// Loops over the rows and columns where alpha can reach alpha_min (a hair more; the lanes test alpha itself). BODY sees
-// the splat, the offset `at` into the planes, dx, dy, alpha and `drawn`.
+// Loops over the rows and columns where alpha can reach alpha_min (with a tolerance; the lanes test alpha itself). BODY
+// uses the splat, the offset `at` into the planes, dx, dy, alpha and `drawn`.
 //// splat
         const Real* s = record + (long long)index[i] * SPLAT_SIZE;
         const Real mx = s[0], my = s[1], A = s[2], B = s[3], C = s[4], opacity = s[5];

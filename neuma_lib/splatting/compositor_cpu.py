@@ -1,12 +1,12 @@
-"""Splat-major compositing on a CPU: splats in depth order, each over the exact rows and columns it touches.
+"""Splat-major compositing on a CPU: splats in depth order, each over the exact rows and columns that it covers.
 
-On one core it is cheaper to loop over splats and then their pixels than the other way round, as a GPU does: no tile
-lists, and every load is contiguous. Pixels keep colour, transmittance T and the rank at which they became opaque; the
-reverse pass goes through the splats backwards and recovers the earlier transmittance by dividing by 1 - alpha.
+On one core, a loop over splats and their pixels is faster than the pixel-major order of a GPU, because it needs no tile
+lists and all loads are contiguous. Pixels store colour, transmittance T and the rank at which they became opaque. The
+reverse pass visits the splats backwards and recovers the previous transmittance by dividing by 1 - alpha.
 
-Rows are processed eight pixels at a time with the vector types of Clang, which Warp embeds on every platform, so
-these kernels are native snippets. Planes have padded rows (``padded_width``): lanes right of the image compute values
-that nobody reads, and their image gradient is zero.
+Rows are processed eight pixels at a time with the vector types of Clang, which Warp embeds on every platform, so these
+kernels are native snippets. Planes have padded rows (``padded_width``). Values of lanes right of the image are unused,
+and their image gradient is zero.
 """
 
 import functools
@@ -54,7 +54,7 @@ def composite_adjoint(
 
 
 def padded_width(width: int) -> int:
-    """Row length of the planes: a splat may start at the last column and still fill all lanes."""
+    """Row length of the planes, such that a splat that starts at the last column fills all lanes."""
     return width + LANES
 
 
@@ -72,7 +72,7 @@ def source(name: str, dtype: torch.dtype) -> str:
 
 @functools.cache
 def kernels(dtype: torch.dtype):
-    """``(composite, composite_adjoint)`` Warp kernels of a dtype; one thread an image, CPU only."""
+    """``(composite, composite_adjoint)`` Warp kernels of a dtype; one thread per image, CPU only."""
     real = wp.dtype_from_torch(dtype)
     module = wp.get_module(f"{__name__}.{str(dtype).removeprefix('torch.')}")
 
@@ -100,7 +100,7 @@ def kernels(dtype: torch.dtype):
     def composite(
         splats: wp.array3d(dtype=real),  # (I, G, SPLAT_SIZE)
         order: wp.array2d(dtype=wp.int64),  # (I, G) indices by depth
-        seen: wp.array(dtype=wp.int64),  # (I,) how many of them are not culled
+        seen: wp.array(dtype=wp.int64),  # (I,) number of splats that are not culled
         alpha_min: real,
         alpha_max: real,
         transmittance_min: real,

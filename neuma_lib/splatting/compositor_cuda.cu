@@ -1,10 +1,10 @@
-// Text of the compositing kernels of compositor_cuda.py, which replaces TILE, LANE_PIXELS, PATCH_WIDTH, PATCH_HEIGHT,
-// WARPS, SPLAT_SIZE, COMPARES and OPACITIES. COMPARES 0: the first pass writes images, the second reads their gradients.
-// COMPARES 1: the first subtracts what was observed and sums the squares, the second takes the differences for
-// gradients. OPACITIES 0: nobody wants the gradients of opacities, and the second pass leaves out the sum that is theirs.
+// Parts of the kernels of compositor_cuda.py, which replaces TILE, LANE_PIXELS, PATCH_WIDTH, PATCH_HEIGHT, WARPS,
+// SPLAT_SIZE, COMPARES and OPACITIES. COMPARES 0: the first pass writes images, the second reads their gradients.
+// COMPARES 1: the first pass subtracts the observation and sums the squares, the second uses the differences as
+// gradients. OPACITIES 0: the second pass omits the sum for gradients of opacities.
 
-// Opens both passes. A thread knows its tile, its patch and its pixels: column x, rows y + 4 p. `fetch` puts the splat of
-// an entry on the warp's board, for powers of two: weights of dx^2, dx dy, dy^2 and log2 of the opacity.
+// Common start of both passes. The pixels of a thread are in column x and rows y + 4 p. `fetch` loads the splat of an
+// entry into the warp's shared memory, for powers of two: weights of dx^2, dx dy, dy^2 and log2 of the opacity.
 //// common
     constexpr unsigned ALL = 0xffffffffu;
     const float LOG2_E = 1.44269504f;
@@ -23,7 +23,7 @@
     const long long corner = ((long long)image * height + y) * width + x;  // the lane's first pixel
 #if COMPARES
     float4* differences = (float4*)states.data;  // of colours, and transmittance
-    // where pixel p has its state: tile by tile, so that lanes of a warp are neighbours
+    // index of the state of pixel p, tile by tile, so that lanes of a warp are neighbours
     auto place_of = [&](int p) { return ((long long)tile * LANE_PIXELS + p) * (32 * WARPS) + thread; };
 #endif
 
@@ -36,8 +36,8 @@
         return exp2f(v);
 #endif
     };
-    // does the ellipse come near one of the patch's pixel centres? The minimum of the quadratic form over their
-    // rectangle lies on one of the two sides that face the mean, or is the mean.
+    // Whether the ellipse reaches one of the patch's pixel centres. The minimum of the quadratic form over their
+    // rectangle is on one of the two sides that face the mean, or at the mean.
     auto touches = [&](float mx, float my, float A, float B, float C, float reach) {
         const float x0 = patch_x + 0.5f - mx, x1 = x0 + (PATCH_WIDTH - 1);
         const float y0 = patch_y + 0.5f - my, y1 = y0 + (PATCH_HEIGHT - 1);
@@ -62,7 +62,7 @@
 //// forward
 #if !COMPARES
     if (begin == end) {
-        // no splats: the warp writes its rows of the tile one after another, so that stores are contiguous
+        // no splats: the warp writes its rows of the tile one by one, for contiguous stores
         const int left = tile_column * TILE, columns = min(TILE, width - left);
         for (int row = tile_row * TILE + warp; row < min(height, (tile_row + 1) * TILE); row += WARPS) {
             const long long at = ((long long)image * height + row) * width + left;
@@ -73,10 +73,10 @@
     }
 #endif
     float T[LANE_PIXELS], red[LANE_PIXELS], green[LANE_PIXELS], blue[LANE_PIXELS];
-    int stop[LANE_PIXELS];  // list position after the last splat that was drawn
+    int stop[LANE_PIXELS];  // list position after the last drawn splat
     bool open[LANE_PIXELS];
 #if COMPARES
-    unsigned seen[LANE_PIXELS];  // R, G, B, A from the lowest byte up; asked for early, used late
+    unsigned seen[LANE_PIXELS];  // R, G, B, A from the lowest byte up; loaded early to hide latency
 #endif
 #pragma unroll
     for (int p = 0; p < LANE_PIXELS; ++p) {
@@ -93,7 +93,7 @@
 #pragma unroll
         for (int p = 0; p < LANE_PIXELS; ++p) any_open |= open[p];
         if (!__any_sync(ALL, any_open)) break;
-        __syncwarp();  // the board of the round before has been read
+        __syncwarp();  // all lanes have read the previous entries
         const bool hit = base + lane < end && fetch(base + lane);
         unsigned todo = __ballot_sync(ALL, hit);
         __syncwarp();
@@ -161,13 +161,13 @@
 
 //// backward
     if (begin == end) return;
-    float T[LANE_PIXELS], red[LANE_PIXELS], green[LANE_PIXELS], blue[LANE_PIXELS];  // colours: of the image's gradient
+    float T[LANE_PIXELS], red[LANE_PIXELS], green[LANE_PIXELS], blue[LANE_PIXELS];  // gradient of the image
     float behind[LANE_PIXELS];  // gradient-weighted light that reaches the pixel from behind the current splat
     int stop[LANE_PIXELS], last = 0;
 #pragma unroll
     for (int p = 0; p < LANE_PIXELS; ++p) {
 #if COMPARES
-        const float4 state = differences[place_of(p)];  // beyond the image: 0, and no splat drawn
+        const float4 state = differences[place_of(p)];  // 0 outside the image
         const float scale = scales.data[image];
         stop[p] = stops.data[place_of(p)];
         T[p] = state.w;
@@ -268,7 +268,7 @@
             w_blue += __shfl_xor_sync(ALL, w_blue, 16);
             w_blue += __shfl_xor_sync(ALL, w_blue, 8);
             w_blue += __shfl_xor_sync(ALL, w_blue, 4);
-            // the ninth sum joins: lanes with bit 1 carry it on, the others sum number lane / 4
+            // lanes with bit 1 continue with the ninth sum, the others with sum number lane / 4
             const float given = upper2 ? sums[0] : w_blue;
             float sum = (upper2 ? w_blue : sums[0]) + __shfl_xor_sync(ALL, given, 2);
 #else

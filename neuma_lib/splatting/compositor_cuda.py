@@ -1,32 +1,32 @@
-"""Compositing for CUDA in float32: every image in tiles, every tile with the list of its splats in depth order.
+"""Compositing for CUDA in float32: tiles of every image, with a list of splats in depth order for every tile.
 
-Lists. A splat enters a tile where the ellipse with alpha >= alpha_min comes nearer than a hair to one of the tile's
-pixel centres: in every row of tiles an ellipse covers one interval of columns, which has a closed form, so the lists
-hold no tiles that only a bounding box would touch. All splats of all images are sorted by depth once, written to
-the lists in that order, and sorted stably by tile: by as many bits as tiles have. The number of entries is read by the
-host, once a call.
+Lists. A splat is listed in a tile if the ellipse with alpha >= alpha_min reaches one of the tile's pixel centres (plus
+a small tolerance). In every row of tiles an ellipse covers one interval of columns, which has a closed form, so the
+lists are tighter than with bounding boxes. All splats of all images are sorted by depth once, written to the lists in
+that order, and sorted stably by tile, with as many bits as tiles need. The host reads the number of entries once per
+call.
 
-Compositing. A warp owns a patch of 8 x (4 LANE_PIXELS) pixels, ``LANE_PIXELS`` a lane, and walks the list of its tile
-without waiting for other warps: 32 entries at a time, each lane fetches one splat and tests it against the patch
-exactly (the quadratic form's minimum over the rectangle of pixel centres); the warp then composites the entries that
-passed. So lists stay short, as for large tiles, and pixels see few splats in vain, as for small ones. A warp ends when
-its pixels are opaque.
+Compositing. A warp owns a patch of 8 x (4 LANE_PIXELS) pixels, ``LANE_PIXELS`` per lane, and processes the list of its
+tile independently of other warps, 32 entries at a time. Each lane loads one splat and tests it exactly against the
+patch (minimum of the quadratic form over the rectangle of pixel centres). The warp then composites the entries that
+passed. This combines the short lists of large tiles with the few rejected splats per pixel of small tiles. A warp ends
+when its pixels are opaque.
 
-Adjoint. The same walk backwards. A splat's nine sums over a patch are first taken over the pixels of a lane and then
-over lanes by halving: at each of five exchanges between lanes both sides keep the half of the sums that is theirs, so
-that nine sums take 12 exchanges instead of 45, and end in nine lanes that add them to memory by one instruction. (The
-other good order, a lane a splat and pixels passed from lane to lane, needs the state of the pixels stored for every
-32 splats and does as much arithmetic at this patch size.) Sums end in memory in any order: last bits vary between runs.
+Adjoint. The same list backwards. Nine sums per splat and patch are taken over the pixels of a lane and then over lanes
+by recursive halving: in each of five exchanges between lanes, both sides keep half of the sums. This takes 12 exchanges
+instead of 45, and ends with nine lanes that add the sums to memory by one instruction. (The alternative, one splat per
+lane with pixels passed between lanes, stores the state of the pixels for every 32 splats and needs as much arithmetic
+at this patch size.) Atomic additions occur in any order, so the last bits vary between runs.
 
-Comparison. The first pass has a pixel's colour in registers: where a squared error is all that is wanted, it subtracts
-the observed pixel there, sums the squares of a patch in a fixed order and keeps the difference, of which the adjoint
-makes the pixel's gradient. No image is written or read, and where no splat is nothing but the observation is read. An
-adjoint for fixed opacities does without the sum that is theirs: eight are summed by 9 exchanges.
+Comparison. If only a squared error is needed, the first pass subtracts the observed pixel from the colour in registers,
+sums the squares of a patch in a fixed order and stores the difference, from which the adjoint computes the pixel's
+gradient. No image is written or read, and tiles without splats only read the observation. For fixed opacities the
+adjoint omits their sum and needs 9 exchanges for eight sums.
 
-Memory at the peak of a call, bytes: 24 a pixel (images, alphas, what the adjoint needs), 16 a pixel more for the
-gradients that come in, 130 a splat (of every image), 16 an entry of the lists, of which 8 stay for the adjoint. A
-splat of 3 px deviation has 4 to 5 entries: 40 images of 800 x 800 with 20,000 splats each take 1.2 GB. A comparison
-takes 20 a pixel in all, of which it touches those of tiles that have splats.
+Peak memory of a call in bytes: 24 per pixel (images, alphas, data for the adjoint), 16 more per pixel for incoming
+gradients, 130 per splat and image, 16 per list entry, of which 8 remain for the adjoint. A splat with a deviation of
+3 px has 4 to 5 entries, so 40 images of 800 x 800 with 20,000 splats each take 1.2 GB. A comparison takes 20 per pixel
+in total, and accesses only those of tiles with splats.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ from neuma_lib.splatting.records import SPLAT_SIZE, functions
 
 start_warp()
 
-TILE = 16  # pixels a side of a tile; a multiple of the patch's sides
-LANE_PIXELS = 2  # pixels of a lane, below one another: a patch has 8 columns and 4 rows a pixel
+TILE = 16  # side of a tile [px], a multiple of the sides of a patch
+LANE_PIXELS = 2  # vertically adjacent pixels per lane; a patch has 8 columns and 4 LANE_PIXELS rows
 PATCH_WIDTH = 8
-SLACK = 0.01  # [px] added to intervals of pixels, for rounding
+SLACK = 0.01  # tolerance of intervals of pixels for round-off [px]
 
 
 def composite(splats, depths, background, settings: Settings, empty):
@@ -95,9 +95,7 @@ def compare(splats, depths, background, settings: Settings, observed, empty):
     return sums.view(len(observed), -1), kept
 
 
-def compare_adjoint(
-    splats, kept, background, settings: Settings, scales, opacities: bool, grad_splats, empty
-):
+def compare_adjoint(splats, kept, background, settings: Settings, scales, opacities: bool, grad_splats):
     """See ``compositing``."""
     _, starts, *_ = kept
     grad_splats.zero_()
@@ -113,7 +111,7 @@ def compare_adjoint(
 def lists(
     splats: torch.Tensor, depths: torch.Tensor, width: int, height: int, tile: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Splats of every tile from near to far. Works on CPU and CUDA; reads one number from the GPU.
+    """Splats of every tile from near to far. Runs on CPU and CUDA; synchronises once with the GPU.
 
     Args:
         splats: (I, G, SPLAT_SIZE) and depths (I, G) of ``projection``, float32.
@@ -125,7 +123,7 @@ def lists(
         ``starts[t + 1]`` belong to tile t, tiles counted along rows, then images.
 
     Raises:
-        InputError: more pixels, splats or entries than int32 counts.
+        InputError: more pixels, splats or entries than the range of int32.
     """
     images, count = depths.shape
     tiles = images * -(-width // tile) * -(-height // tile)
@@ -138,8 +136,9 @@ def lists(
     total = int(ends[-1]) if len(ends) else 0
     if max(total, len(order), tiles * tile**2) >= 2**31:
         raise InputError(
-            f"rasterize: {images} images of {width} x {height} px and {count} Gaussians, {total} entries in tiles, "
-            "are more than 2^31; render fewer frames a call"
+            "rasterize",
+            f"{images} images of {width} x {height} px with {count} Gaussians ({total} entries in tiles) exceed 2^31",
+            "Render fewer frames per call",
         )
     if total == 0:
         return sizes.new_empty(0), sizes.new_zeros(tiles + 1)
@@ -162,9 +161,9 @@ def by_depth(depths: torch.Tensor) -> torch.Tensor:
 
 @functools.cache
 def list_kernels():
-    """``(count_tiles, list_tiles, finish)`` Warp kernels; ``finish`` turns sums into gradients."""
+    """``(count_tiles, list_tiles, finish)`` Warp kernels; ``finish`` converts sums to gradients."""
     module = wp.get_module(f"{__name__}.lists")
-    # Counting and listing must agree to the last bit: no contraction, which may differ between two kernels.
+    # Counting and listing must agree to the last bit, so fused multiply-add is disabled.
     wp.set_module_options({"fuse_fp": False}, module)
     culled = wp.float32(CULLED)
     slack = wp.float32(SLACK)
@@ -172,11 +171,11 @@ def list_kernels():
 
     @wp.func(module=module)
     def pixels(low: float, high: float, extent: int):
-        # first and last pixel whose centre is between low and high; none: first > last
+        # first and last pixel with a centre between low and high; first > last if there is none
         last = float(extent)
         first_pixel = int(wp.ceil(wp.clamp(low - 0.5 - slack, -1.0, last)))
         last_pixel = int(wp.floor(wp.clamp(high - 0.5 + slack, -1.0, last)))
-        # the integers are limited once more in case low or high is not a number
+        # the integers are clamped again in case low or high is NaN
         return wp.clamp(first_pixel, 0, extent), wp.clamp(last_pixel, -1, extent - 1)
 
     @wp.func(module=module)
@@ -186,12 +185,12 @@ def list_kernels():
 
     @wp.func(module=module)
     def columns(place: wp.vec4, C: float, ellipse: wp.vec4, low: float, high: float, width: int):
-        # first and last pixel column of the ellipse between the heights low and high above its centre
+        # first and last pixel column of the ellipse between the heights low and high, relative to its centre
         mean, A, B = place[0], place[2], place[3]
         reach, half_height = ellipse[1], ellipse[3]
         bottom = wp.clamp(low, -half_height, half_height)
         top = wp.clamp(high, -half_height, half_height)
-        tilt = B / C * ellipse[2]  # height of the leftmost point, and minus that of the rightmost
+        tilt = B / C * ellipse[2]  # height of the leftmost point; minus that of the rightmost
         left = wp.clamp(tilt, bottom, top)
         right = wp.clamp(-tilt, bottom, top)
         slope = -B / A
@@ -216,7 +215,7 @@ def list_kernels():
         splat = order[rank]
         image = splat // splats.shape[1]
         g = splat - image * splats.shape[1]
-        size = int(0)  # noqa: UP018, a constant would not be counted up in a loop by Warp
+        size = int(0)  # noqa: UP018, Warp cannot modify a constant in a loop
         if depths[image, g] < culled:
             place, ellipse = load(splats, image, g, 0), load(splats, image, g, 2)
             C = splats[image, g, 4]
@@ -270,7 +269,7 @@ def list_kernels():
     @wp.kernel(module=module, enable_backward=False)
     def finish(
         splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
-        grad_splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE), sums of the adjoint in, gradients out
+        grad_splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE), in: sums of the adjoint, out: gradients
     ):
         image, g = wp.tid()
         near, far = load(grad_splats, image, g, 0), load(grad_splats, image, g, 1)
@@ -284,9 +283,9 @@ def list_kernels():
 
 
 def source(name: str, tile: int, lane_pixels: int, compares: bool = False, opacities: bool = True) -> str:
-    """CUDA code of a pass, "forward" or "backward", with its constants; of images, or of what compares them.
+    """CUDA code of a pass, "forward" or "backward", with its constants, for images or for their comparison.
 
-    ``opacities``: whether the sum that their gradients need is taken.
+    ``opacities``: compute the sum for gradients of opacities.
     """
     parts = native_source(__file__)
     text = parts["common"] + parts[name]
@@ -308,9 +307,9 @@ def source(name: str, tile: int, lane_pixels: int, compares: bool = False, opaci
 
 @functools.cache
 def kernels(tile: int, lane_pixels: int):
-    """``(composite, composite_adjoint, threads)``: Warp kernels, launched with a block of ``threads`` a tile.
+    """``(composite, composite_adjoint, threads)``: Warp kernels, launched with a block of ``threads`` per tile.
 
-    CUDA only. All threads of a block must enter, so that warps are whole.
+    CUDA only. All threads of a block must enter, so that warps are complete.
     """
     module = wp.get_module(f"{__name__}.tile{tile}x{lane_pixels}")
     threads = tile * tile // lane_pixels
@@ -345,8 +344,8 @@ def kernels(tile: int, lane_pixels: int):
         background: wp.array(dtype=float),  # (3,)
         pictures: wp.array4d(dtype=float),  # (I, H, W, 3), out
         alphas: wp.array3d(dtype=float),  # (I, H, W), out
-        transmittances: wp.array3d(dtype=float),  # (I, H, W), out; tiles without splats are left out
-        stops: wp.array3d(dtype=int),  # (I, H, W), out, likewise
+        transmittances: wp.array3d(dtype=float),  # (I, H, W), out; undefined in tiles without splats
+        stops: wp.array3d(dtype=int),  # (I, H, W), out; undefined in tiles without splats
     ):
         i = wp.tid()
         composite_patch(
@@ -366,7 +365,7 @@ def kernels(tile: int, lane_pixels: int):
         background: wp.array(dtype=float),  # (3,)
         grad_pictures: wp.array4d(dtype=float),  # (I, H, W, 3)
         grad_alphas: wp.array3d(dtype=float),  # (I, H, W)
-        grad_splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE), sums that `finish` reads, added to
+        grad_splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE), out: sums for `finish`, added
     ):
         i = wp.tid()
         composite_patch_adjoint(
@@ -379,7 +378,7 @@ def kernels(tile: int, lane_pixels: int):
 
 @functools.cache
 def comparing_kernel(tile: int, lane_pixels: int):
-    """``(compare, threads)``: as `kernels`, with the observed pixels in place of pictures."""
+    """``(compare, threads)``: as `kernels`, for the comparison with observed pixels."""
     module = wp.get_module(f"{__name__}.tile{tile}x{lane_pixels}.compare")
     threads = tile * tile // lane_pixels
 
@@ -403,8 +402,8 @@ def comparing_kernel(tile: int, lane_pixels: int):
         background: wp.array(dtype=float),  # (3,)
         observed: wp.array3d(dtype=int),  # (I, H, W)
         sums: wp.array2d(dtype=wp.float64),  # (tiles, warps), out
-        states: wp.array3d(dtype=float),  # (tiles, pixels, 4), out; tiles without splats are left out
-        stops: wp.array2d(dtype=int),  # (tiles, pixels), out, likewise
+        states: wp.array3d(dtype=float),  # (tiles, pixels, 4), out; undefined in tiles without splats
+        stops: wp.array2d(dtype=int),  # (tiles, pixels), out; undefined in tiles without splats
     ):
         i = wp.tid()
         compare_patch(
@@ -417,7 +416,7 @@ def comparing_kernel(tile: int, lane_pixels: int):
 
 @functools.cache
 def comparing_adjoint(tile: int, lane_pixels: int, opacities: bool):
-    """``(compare_adjoint, threads)``, with or without the sum that gradients of opacities need."""
+    """``(compare_adjoint, threads)``, with or without the sum for gradients of opacities."""
     module = wp.get_module(f"{__name__}.tile{tile}x{lane_pixels}.compare_adjoint{int(opacities)}")
     threads = tile * tile // lane_pixels
 
@@ -443,7 +442,7 @@ def comparing_adjoint(tile: int, lane_pixels: int, opacities: bool):
         width: int,
         height: int,
         scales: wp.array(dtype=float),  # (I,)
-        grad_splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE), sums that `finish` reads, added to
+        grad_splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE), out: sums for `finish`, added
     ):
         i = wp.tid()
         compare_patch_adjoint(

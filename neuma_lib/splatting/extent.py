@@ -1,4 +1,4 @@
-"""How far out Gaussians are seen, which is farther than their centres."""
+"""Visible extent of Gaussians, which is larger than that of their centres."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from torch import Tensor
 from neuma_lib.splatting.viewpoints import sphere_directions
 
 SEEN = 0.05
-"""Where less than this share of the light behind it is taken away, a Gaussian is over."""
+"""Alpha at the border of a Gaussian."""
 DIRECTIONS = 100
-"""Of planes that touch them, beside the axes: nothing of an ellipsoid is farther beyond their hull than some percent of
-its largest half-axis."""
+"""Number of tangent planes in addition to those normal to the axes. Ellipsoids exceed the convex hull by a few percent
+of their largest half-axis."""
 
 
 def outermost(means: Tensor, covars: Tensor, opacities: Tensor) -> Tensor:
-    """Points (K, 3) [m] whose hull holds what is seen of Gaussians, almost.
+    """Points (K, 3) [m] whose convex hull contains nearly all of the visible part of Gaussians.
 
-    A Gaussian of opacity o is seen up to the ellipsoid on which o exp(-r^2 / 2) = `SEEN`. Each point is where a plane,
-    one of `DIRECTIONS` normals all around and the six axes, touches the outermost ellipsoid.
+    A Gaussian of opacity o is visible up to the ellipsoid with o exp(-r^2 / 2) = `SEEN`. The points are those where
+    planes, with `DIRECTIONS` normals on the sphere and the six axes, touch the outermost ellipsoids.
 
     Args:
         means: (G, 3) [m].
         covars: (G, 3, 3) [m^2].
-        opacities: (G,) in [0, 1]; fainter ones than `SEEN` are left out, and there may be none.
+        opacities: (G,) in [0, 1]; those below `SEEN` are ignored. The result is empty if all are.
     """
     shown = opacities > SEEN
     means, covars = means[shown].double(), covars[shown].double()
@@ -32,7 +32,7 @@ def outermost(means: Tensor, covars: Tensor, opacities: Tensor) -> Tensor:
         return means
     reach = (2 * (opacities[shown].double() / SEEN).log()).sqrt()
     axes = torch.from_numpy(np.concatenate([np.eye(3), -np.eye(3), sphere_directions(DIRECTIONS)])).to(means)
-    # first those alone whose surrounding ball is not inside of what the centres span
+    # exclude Gaussians whose bounding ball is inside the extent of the centres
     balls = reach * covars.diagonal(dim1=1, dim2=2).sum(dim=1).sqrt()
     near = torch.zeros_like(balls, dtype=torch.bool)
     for normal in axes:

@@ -37,16 +37,16 @@ class Gaussians:
         for name, shape in expected.items():
             if tuple(getattr(self, name).shape) != (count, *shape):
                 actual = tuple(getattr(self, name).shape)
-                raise InputError(f"gaussians: {name} has shape {actual}, expected {(count, *shape)}")
+                raise InputError(f"gaussians: {name}", f"has shape {actual}, expected {(count, *shape)}")
         allowed = [coefficient_count(degree) - 1 for degree in range(MAX_DEGREE + 1)]
         if self.shN.dim() != 3 or self.shN.shape[0] != count or self.shN.shape[1] not in allowed:
-            raise InputError(f"gaussians: shN has shape {tuple(self.shN.shape)}, expected (G, K - 1, 3)")
+            raise InputError("gaussians: shN", f"has shape {tuple(self.shN.shape)}, expected (G, K - 1, 3)")
 
     def __len__(self) -> int:
         return self.means.shape[0]
 
     def __getitem__(self, index) -> Gaussians:
-        """Some of the Gaussians: a boolean mask, an index tensor or a slice."""
+        """Select Gaussians by a boolean mask, an index tensor or a slice."""
         return Gaussians(*(getattr(self, field.name)[index] for field in dataclasses.fields(self)))
 
     def to(self, device=None, dtype: torch.dtype | None = None) -> Gaussians:
@@ -61,12 +61,12 @@ class Gaussians:
         return covariances(self.quats, self.scales)
 
     def absorbing_blur(self, cameras: Cameras, eps2d: float) -> Gaussians:
-        """The Gaussians with the blur of the cameras' pixels as a part of their own size.
+        """The Gaussians enlarged by the pixel blur of the cameras.
 
-        Splatting widens every projected Gaussian by a pixel's variance ``eps2d`` [px^2], so Gaussians that were fitted
-        through some cameras would look larger through cameras with larger pixels. Here each grows by ``eps2d`` in
-        metres at the mean camera; rendered with ``eps2d=0`` they look the same through those cameras, and keep their
-        size through all others (the idea of Mip-Splatting's 3D smoothing filter, Yu et al. 2024).
+        Splatting adds the variance ``eps2d`` [px^2] to every projected Gaussian, so Gaussians fitted with some cameras
+        look larger in cameras with larger pixels. This method adds ``eps2d``, converted to metres at the mean camera,
+        to the Gaussians. Rendered with ``eps2d=0`` they look the same in those cameras and have the same size in others
+        (as with the 3D smoothing filter of Mip-Splatting, Yu et al. 2024).
         """
         _, depth = cameras.project(self.means)
         focal = cameras.Ks[:, 0, 0].to(depth)
@@ -74,12 +74,12 @@ class Gaussians:
         return dataclasses.replace(self, scales=(self.scales.square() + blur[:, None]).sqrt())
 
     def cull(self, min_opacity: float) -> Gaussians:
-        """Those with opacity above ``min_opacity`` (the paper uses 0.02)."""
+        """The Gaussians with opacity above ``min_opacity`` (0.02 in the paper)."""
         return self[self.opacities > min_opacity]
 
 
 def rotations(quats: torch.Tensor) -> torch.Tensor:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4), w first, normalised here."""
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4), w first, which are normalised first."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -96,7 +96,7 @@ def covariances(quats: torch.Tensor, scales: torch.Tensor) -> torch.Tensor:
 
 
 def quaternions(rotations: torch.Tensor) -> torch.Tensor:
-    """Unit quaternions (..., 4), w first and not negative, of rotation matrices (..., 3, 3)."""
+    """Unit quaternions (..., 4), w first and w >= 0, of rotation matrices (..., 3, 3)."""
     m00, m01, m02, m10, m11, m12, m20, m21, m22 = rotations.flatten(-2).unbind(-1)
     # 4 q q^T: the row with the largest diagonal element, normalised, has no cancellation
     rows = [

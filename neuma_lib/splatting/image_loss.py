@@ -1,8 +1,8 @@
 """Mean squared colour difference between rendered images and decoded files, without copies of either.
 
-The observed pixels stay as they were decoded, four bytes each; the kernels composite them over white on the way. One
-pass reads both images for the loss, one reads them again and writes the gradient. (``rasterizer.rasterized_error``
-does without rendered images where the compositor can.)
+The observed pixels stay as decoded, four bytes each. The kernels composite them over white. One pass reads both images
+for the loss, another reads them again and writes the gradient. (``rasterizer.rasterized_error`` needs no rendered
+images if the compositor supports it.)
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
@@ -18,22 +18,22 @@ from neuma_lib.errors import InputError
 start_warp()
 
 _GPU_LANES = 4096
-"""Partial sums of a frame on a GPU: neighbouring threads read neighbouring pixels, and few frames fill the device."""
+"""Partial sums of a frame on a GPU, for coalesced reads and enough threads for few frames."""
 
 
 def mean_squared_error(images: Tensor, observed: Tensor) -> Tensor:
     """Mean squared difference of each frame over all its views, pixels and channels (paper Eq. 2), shape (T,).
 
-    Differentiable with respect to ``images``. Sums are taken in double precision and in a fixed order, so equal inputs
-    give equal bits.
+    Differentiable with respect to ``images``. Sums are computed in double precision in a fixed order, so the result is
+    deterministic.
 
     Args:
         images: rendered colours over white, float32 or float64, shape (T, V, H, W, 3).
-        observed: straight-alpha RGBA as uint8, shape (T, V, H, W, 4), or floating colours over white like ``images``;
-            so can be other channels, then of both.
+        observed: straight-alpha RGBA as uint8, shape (T, V, H, W, 4), or floating-point values shaped like ``images``:
+            colours over white, or any other channels.
 
     Raises:
-        InputError: shapes that do not fit, or another device.
+        InputError: inconsistent shapes or devices.
     """
     check_fits(images.shape, images.device, observed)
     if observed.dtype != torch.uint8:
@@ -44,17 +44,14 @@ def mean_squared_error(images: Tensor, observed: Tensor) -> Tensor:
 def check_fits(shape: tuple[int, ...], device: torch.device, observed: Tensor) -> None:
     """Raise InputError unless images rendered on a device, (T, V, H, W, C), can be compared with observed ones."""
     if observed.device != device:
-        raise InputError(
-            f"image loss: images are rendered on {device}, observed ones are on {observed.device}"
-        )
+        raise InputError("image loss: observed", f"is on {observed.device}, but renders are on {device}")
     if observed.shape != ((*shape[:-1], 4) if observed.dtype == torch.uint8 else shape):
-        raise InputError(
-            f"image loss: rendered images {tuple(shape)} do not fit observed ones {tuple(observed.shape)}"
-        )
+        problem = f"has shape {tuple(observed.shape)}, but rendered images have {tuple(shape)}"
+        raise InputError("image loss: observed", problem)
 
 
 def as_integers(observed: Tensor) -> Tensor:
-    """Straight-alpha bytes (..., 4) as an int32 a pixel (...), R its lowest byte."""
+    """Straight-alpha bytes (..., 4) as one int32 per pixel (...), R in the lowest byte."""
     return observed.contiguous().view(torch.int32)[..., 0]
 
 
@@ -84,13 +81,13 @@ class _SquaredError(torch.autograd.Function):
 
 
 def _pair(images: Tensor, observed: Tensor) -> tuple[Tensor, Tensor]:
-    """Colours (T, P, 3), and pixels (T, P) as one integer each."""
+    """Colours (T, P, 3), and pixels (T, P) as integers."""
     return images.view(len(images), -1, 3), as_integers(observed).view(len(observed), -1)
 
 
 @functools.cache
 def kernels(dtype: torch.dtype):
-    """``(squared_error, squared_error_adjoint)`` of a dtype, over (T, lanes): a lane takes every lanes-th pixel."""
+    """``(squared_error, squared_error_adjoint)`` of a dtype, over (T, lanes); a lane processes every lanes-th pixel."""
     real = wp.dtype_from_torch(dtype)
     vec3 = wp.types.vector(3, real)
     module = wp.get_module(f"{__name__}.{str(dtype).removeprefix('torch.')}")
@@ -98,7 +95,7 @@ def kernels(dtype: torch.dtype):
 
     @wp.func(module=module)
     def over_white(pixel: wp.int32):
-        """Colour of a straight-alpha pixel, whose bytes are R, G, B, A from the lowest up, over white."""
+        """Colour over white of a straight-alpha pixel, with bytes R, G, B, A from the lowest up."""
         rgba, unit, byte = wp.uint32(pixel), real(1.0) / real(255.0), wp.uint32(255)
         alpha = unit * real(rgba >> wp.uint32(24))
         red = unit * real(rgba & byte)

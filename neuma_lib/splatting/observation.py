@@ -1,10 +1,9 @@
-"""A video from calibrated views: what the cameras saw, at which steps of a simulation, and for how long each time.
+"""A video from calibrated views: images, simulation steps and exposures.
 
-**Motion blur.** A frame shows the mean of what was there while its shutter was open. A render shows one instant, so
-the renders of several steps are averaged: `exposed_steps` divides the exposure among them. The mean is taken of colours
-as they are stored, over white. A camera averages light, and stores its mean by a gamma: in the middle of a blurred edge
-between black and white it has 0.73 where the mean of renders has 0.5, so dark bodies look narrower by a part of the
-blur. That is neglected; masks have no gamma.
+**Motion blur.** A frame shows the mean over its exposure, a render shows one instant. Renders of several steps are
+therefore averaged, with weights from `exposed_steps`. The mean is taken of stored colours over white. A camera averages
+light and applies a gamma: in the middle of a blurred edge between black and white it has 0.73, the mean of renders 0.5,
+so dark bodies look narrower by a fraction of the blur. This is neglected. Masks have no gamma.
 """
 
 from __future__ import annotations
@@ -19,25 +18,24 @@ from torch import Tensor
 from neuma_lib.errors import InputError
 from neuma_lib.splatting.cameras import Cameras
 
-_LEAST_SHARE = 0.01
-"""Part of a step's time that an exposure must reach into for the step to be rendered."""
+_MIN_SHARE = 0.01
+"""Minimum fraction of a step's time covered by an exposure for the step to be rendered."""
 _DEVICE_SHARE = 0.3
-"""Largest part of a GPU's free memory that a video may take; the rollout and the renders need the rest."""
+"""Maximum fraction of a GPU's free memory for a video; the rollout and the renders need the rest."""
 
 
 @dataclass(frozen=True)
 class Observation:
-    """A video from V calibrated views that took their pictures at the same times.
+    """A video from V calibrated views with simultaneous frames.
 
     Attributes:
-        frames: simulation step of each frame (0 is the start), length T, ascending: that of the middle of its exposure.
-        images: straight-alpha RGBA as uint8, shape (T, V, H, W, 4), as decoded from files: a quarter of the memory of
-            floats. Or, for renders of our own, floating colours over white in [0, 1], shape (T, V, H, W, 3).
-            `colours` gives either as the latter.
-        cameras: the V views; their precision is that of the colours.
-        exposure: steps whose renders are averaged to one that shows what a frame does, relative to the frame's step,
-            ascending; (0,): the picture of an instant.
-        shares: weights of those renders, which sum to 1; None: equal ones.
+        frames: simulation step of each frame (0 is the start) at the middle of its exposure, length T, ascending.
+        images: straight-alpha RGBA as uint8, shape (T, V, H, W, 4), as decoded from files, which takes a quarter of the
+            memory of floats. Or, for renders, floating-point colours over white in [0, 1], shape (T, V, H, W, 3).
+            `colours` returns both as the latter.
+        cameras: the V views; colours have their dtype.
+        exposure: steps whose renders are averaged to a frame, relative to its step, ascending; (0,): no motion blur.
+        shares: weights of those renders, which sum to 1; None: equal weights.
     """
 
     frames: tuple[int, ...]
@@ -48,37 +46,35 @@ class Observation:
 
     def __post_init__(self):
         if len(self.frames) != len(self.images):
-            raise InputError(
-                f"{len(self.images)} images for {len(self.frames)} frames: every frame needs an image"
-            )
+            problem = f"there are {len(self.images)} images for {len(self.frames)} frames"
+            raise InputError("observation: images", problem)
         channels = 4 if self.images.dtype == torch.uint8 else 3
         views, height, width = len(self.cameras), self.cameras.height, self.cameras.width
         if tuple(self.images.shape[1:]) != (views, height, width, channels):
             raise InputError(
-                f"images of shape {tuple(self.images.shape)} and {self.images.dtype} do not fit {views} cameras of"
-                f" {width}x{height} pixels: give RGBA as uint8 or RGB as floats, (T, V, H, W, channels)"
+                "observation: images",
+                f"have shape {tuple(self.images.shape)} and {self.images.dtype}, which do not match {views} cameras of"
+                f" {width}x{height} pixels",
+                "Use RGBA as uint8 or RGB as floats, shape (T, V, H, W, channels)",
             )
         if list(self.frames) != sorted(set(self.frames)):
-            raise InputError(f"frames must ascend without repeats, got {self.frames}")
+            raise InputError("observation: frames", f"must be strictly ascending, not {self.frames}")
         exposure = self.exposure
         if not exposure or list(exposure) != sorted(set(exposure)):
-            raise InputError(f"exposure must be steps that ascend without repeats, got {exposure}")
+            raise InputError("observation: exposure", f"must be strictly ascending steps, not {exposure}")
         if self.shares is not None and not (
             len(self.shares) == len(exposure)
             and min(self.shares) > 0
             and math.isclose(sum(self.shares), 1, rel_tol=1e-6)
         ):
-            raise InputError(
-                f"shares of {len(exposure)} steps must be positive and sum to 1, got {self.shares}"
-            )
+            problem = f"of {len(exposure)} steps must be positive and sum to 1, not {self.shares}"
+            raise InputError("observation: shares", problem)
         if self.frames and self.frames[0] + exposure[0] < 0:
-            raise InputError(
-                f"the exposure {exposure} of the frame at step {self.frames[0]} begins before the start: leave the"
-                " frame out, or start earlier"
-            )
+            problem = f"{exposure} of the frame at step {self.frames[0]} begins before step 0"
+            raise InputError("observation: exposure", problem, "Omit the frame, or start earlier")
 
     def colours(self, part: slice | Sequence[int] = slice(None)) -> Tensor:
-        """Colours over a white background in [0, 1] of some frames, all by default, shape (T', V, H, W, 3)."""
+        """Colours over white in [0, 1] of some frames, all by default, shape (T', V, H, W, 3)."""
         images = self.stored(part)
         if images.dtype != torch.uint8:
             return images
@@ -88,15 +84,15 @@ class Observation:
         """Masks in [0, 1] of some frames, all by default, shape (T', V, H, W, 1).
 
         Raises:
-            InputError: the images are renders, which have none.
+            InputError: the images are renders without alpha.
         """
         images = self.stored(part)
         if images.dtype != torch.uint8:
-            raise InputError("masks can be compared with images that have an alpha channel alone")
+            raise InputError("observation: images", "comparing masks needs an alpha channel")
         return images[..., 3:].to(self.cameras.viewmats.dtype) / 255
 
     def stored(self, part: slice | Sequence[int] = slice(None)) -> Tensor:
-        """Images of some frames as they are stored, on the cameras' device."""
+        """Images of some frames in their stored format, on the cameras' device."""
         return self.images[part].to(self.cameras.viewmats.device, non_blocking=True)
 
     def select(self, keep: Sequence[int]) -> Observation:
@@ -105,10 +101,9 @@ class Observation:
         return replace(self, frames=tuple(self.frames[i] for i in keep), images=self.images[keep])
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Observation:
-        """The same frames on another device, with cameras and colours in another precision.
+        """The same frames on another device, with another dtype of cameras and colours.
 
-        Images go along if they take at most `_DEVICE_SHARE` of a GPU's free memory. Otherwise they stay, and go there
-        a part at a time (`stored`).
+        Images are moved if they take at most `_DEVICE_SHARE` of a GPU's free memory. Otherwise `stored` moves parts.
         """
         images = self.images if self.images.dtype == torch.uint8 else self.images.to(dtype)
         if device is not None:
@@ -117,15 +112,15 @@ class Observation:
 
 
 def several(videos: Observation | Sequence[Observation]) -> tuple[Observation, ...]:
-    """One video or several of one motion, as several.
+    """One or several videos of one motion as a tuple.
 
     Raises:
-        InputError: there is none, or one without frames.
+        InputError: no video, or one without frames.
     """
-    found = (videos,) if isinstance(videos, Observation) else tuple(videos)
-    if not found or not all(video.frames for video in found):
-        raise InputError("no frames to compare with: give at least one video, and each a frame")
-    return found
+    result = (videos,) if isinstance(videos, Observation) else tuple(videos)
+    if not result or not all(video.frames for video in result):
+        raise InputError("videos", "there must be at least one video, and each must have a frame")
+    return result
 
 
 def joint_frames(videos: Sequence[Observation]) -> tuple[int, ...]:
@@ -134,41 +129,41 @@ def joint_frames(videos: Sequence[Observation]) -> tuple[int, ...]:
 
 
 def rendered_steps(videos: Sequence[Observation]) -> tuple[int, ...]:
-    """Steps whose states the comparison with several videos of one motion needs, ascending: frames and exposures."""
+    """Steps whose states are needed to compare with several videos of one motion (frames and exposures), ascending."""
     exposed = {frame + step for video in videos for frame in video.frames for step in video.exposure}
     return tuple(sorted(exposed.union(joint_frames(videos))))
 
 
 def select_frames(videos: Sequence[Observation], steps: Sequence[int]) -> tuple[Observation, ...]:
-    """What several videos show at some of their steps; those that show nothing are left out."""
+    """The frames of several videos at some steps, without videos that have none there."""
     wanted = set(steps)
     kept = ((video, [i for i, n in enumerate(video.frames) if n in wanted]) for video in videos)
     return tuple(video.select(indices) for video, indices in kept if indices)
 
 
-def exposed_steps(length: float, most: int) -> tuple[tuple[int, ...], tuple[float, ...]]:
-    """Steps to render, relative to the middle of an exposure, and the part of the exposure that each stands for.
+def exposed_steps(length: float, limit: int) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    """Steps to render, relative to the middle of an exposure, and their weights.
 
-    An odd number of steps in equal distances, as near as ``most`` allows, each for the time until half-way to the next;
-    those at both ends for as much of it as the exposure reaches into.
+    An odd number of equidistant steps, as dense as ``limit`` allows. A step represents the time until half-way to its
+    neighbours, the first and last one as much of it as the exposure covers.
 
     Args:
         length: duration of the exposure in steps.
-        most: largest number of steps; 1: the middle one, so no blur.
+        limit: maximum number of steps; 1: the middle one, without motion blur.
     """
-    count = most - (most + 1) % 2
-    apart = max(1, math.ceil(length / count - _LEAST_SHARE))
-    reach = min(count // 2, max(0, math.ceil((length / apart - 1) / 2 - _LEAST_SHARE)))
+    count = limit - (limit + 1) % 2
+    stride = max(1, math.ceil(length / count - _MIN_SHARE))
+    reach = min(count // 2, max(0, math.ceil((length / stride - 1) / 2 - _MIN_SHARE)))
     shares = [
-        max(0.0, min(1.0, length / apart / 2 - abs(k) + 0.5)) if reach else 1.0
+        max(0.0, min(1.0, length / stride / 2 - abs(k) + 0.5)) if reach else 1.0
         for k in range(-reach, reach + 1)
     ]
     total = sum(shares)
-    return tuple(apart * k for k in range(-reach, reach + 1)), tuple(share / total for share in shares)
+    return tuple(stride * k for k in range(-reach, reach + 1)), tuple(share / total for share in shares)
 
 
 def _fits(images: Tensor, device: torch.device) -> bool:
-    """Whether images should be kept on a device."""
+    """Whether images fit into the memory of a device."""
     if device.type != "cuda":
         return True
     free, _ = torch.cuda.mem_get_info(device)

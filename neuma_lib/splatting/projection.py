@@ -1,13 +1,13 @@
 """EWA projection of 3D Gaussians to splats (Warp kernels with hand-written adjoint).
 
-Conventions are those of gsplat: camera z forward, pixel centres at half integers, a blur of ``eps2d`` pixel^2
-added to the projected covariance, the tangents x/z and y/z of the Jacobian limited to 30 % beyond the image,
-colour max(0, 1/2 + SH) along the direction from the camera to the mean, depth = camera z.
+Conventions are those of gsplat: camera z forward, pixel centres at half integers, a blur of ``eps2d`` pixel^2 added to
+the projected covariance, the tangents x/z and y/z of the Jacobian limited to 30 % beyond the image, colour
+max(0, 1/2 + SH) along the direction from the camera to the mean, depth = camera z.
 
-A splat is a record of ``SPLAT_SIZE`` numbers, three groups of four so that a GPU can load it in three aligned
-pieces: mean (2) [px], conic A, B, C [1/px^2] (the exponent is -(A dx^2 + C dy^2)/2 - B dx dy), opacity, RGB, and
-the ellipse A dx^2 + 2 B dx dy + C dy^2 <= reach in which alpha can be alpha_min or more: reach, and half the width
-and height of the ellipse's bounding box [px]. Gradients leave the last three out.
+A splat is a record of ``SPLAT_SIZE`` numbers, in three aligned groups of four: mean (2) [px], conic A, B, C [1/px^2]
+(the exponent is -(A dx^2 + C dy^2)/2 - B dx dy), opacity, RGB, and the ellipse A dx^2 + 2 B dx dy + C dy^2 <= reach
+where alpha can reach alpha_min: reach, and half the width and height of its bounding box [px]. The last three have no
+gradients.
 """
 
 import functools
@@ -24,24 +24,23 @@ start_warp()
 NEAR_PLANE = 0.01
 """Depth [m] below which a Gaussian is culled."""
 REACH_SLACK = 0.02
-"""Added to the reach so that rounding never cuts a pixel off: the compositors test alpha itself."""
+"""Added to the reach so that round-off excludes no pixel; the compositors test alpha itself."""
 UNLIMITED = 1.0e20
-"""Reach where alpha_min = 0."""
+"""Reach for alpha_min = 0."""
 CULLED = 1.0e30
-"""Depth written for Gaussians that no pixel can see."""
+"""Depth of Gaussians that are invisible in an image."""
 
 
 def for_device(sh: torch.Tensor) -> torch.Tensor:
-    """The same harmonics (G, K, 3); on CUDA stored coefficient by coefficient, so that neighbouring threads, which
-    work on neighbouring Gaussians, read neighbouring numbers."""
+    """The same harmonics (G, K, 3), on CUDA with coefficients as the slowest index in memory, for coalesced reads."""
     return sh.transpose(0, 1).contiguous().transpose(0, 1) if sh.is_cuda else sh.contiguous()
 
 
 def project(means, covars, opacities, sh, viewmats, Ks, settings, empty) -> tuple[torch.Tensor, torch.Tensor]:
-    """Splats (T V, G, SPLAT_SIZE) and depths (T V, G) of T frames seen by V cameras, image t V + v.
+    """Splats (T V, G, SPLAT_SIZE) and depths (T V, G) of T frames in V cameras; image t V + v.
 
-    Arguments as of ``rasterizer.rasterize``, ``settings`` and ``empty`` as in ``compositing``. The record of a culled
-    Gaussian (depth ``CULLED``) is not written.
+    Arguments as for ``rasterizer.rasterize``, ``settings`` and ``empty`` as in ``compositing``. The record of a culled
+    Gaussian (depth ``CULLED``) is undefined.
     """
     shape = (len(means) * len(viewmats), means.shape[1])
     splats, depths = empty("splats", (*shape, SPLAT_SIZE), means), empty("depths", shape, means)
@@ -78,9 +77,9 @@ def appearance_adjoint(means, sh, viewmats, splats, depths, grad_splats) -> tupl
 def kernels(dtype: torch.dtype):
     """``(project, geometry_adjoint, appearance_adjoint)`` Warp kernels for float32 or float64.
 
-    The adjoint is in two parts because training a material needs the first only, with a thread for every Gaussian of
-    a frame; in the second a thread sums over all images of a Gaussian, so without atomics. Loops over harmonics have a
-    constant length and a test inside, so that they unroll and the coefficients stay in registers.
+    The adjoint has two parts, because training a material needs the first one only. It has a thread per Gaussian and
+    frame. In the second, a thread sums over all images of a Gaussian, without atomics. Loops over harmonics have a
+    constant length, so that they are unrolled and coefficients stay in registers.
     """
     real = wp.dtype_from_torch(dtype)
     vec3 = wp.types.vector(3, real)
@@ -129,7 +128,7 @@ def kernels(dtype: torch.dtype):
 
     @wp.func(module=module)
     def sh_gradients(d: vec3, count: int):
-        # row i: derivative of every harmonic's polynomial with respect to component i of the direction
+        # row i: derivative of the harmonics with respect to component i of the direction
         x, y, z = d[0], d[1], d[2]
         g = mat316()
         if count > 1:
@@ -195,7 +194,7 @@ def kernels(dtype: torch.dtype):
     def colour_gradient(
         splats: wp.array3d(dtype=real), grad_splats: wp.array3d(dtype=real), image: int, g: int
     ):
-        # none where the colour was limited to zero
+        # zero where the colour is clamped to zero
         grad = vec3()
         for i in range(3):
             if splats[image, g, 6 + i] > zero:
@@ -242,7 +241,7 @@ def kernels(dtype: torch.dtype):
         b = half * (cov[0, 1] + cov[1, 0])
         c = cov[1, 1] + eps2d
         det = a * c - b * b
-        if not (det > zero):  # also where it is not a number
+        if not (det > zero):  # or NaN
             return
         mean_x = fx * p[0] * rz + cx
         mean_y = fy * p[1] * rz + cy
@@ -332,7 +331,7 @@ def kernels(dtype: torch.dtype):
                 g_y = grad_splats[image, g, 1] * fy * rz
                 g_z = -(g_x * tan_x + g_y * tan_y)
                 g_z -= rz * rz * (fx * g_jacobian[0, 0] + fy * g_jacobian[1, 1])
-                # third column of the Jacobian: -f (x/z) / z, x/z held fixed where it is limited
+                # third column of the Jacobian: -f (x/z) / z, with constant x/z where it is clamped
                 g_u = -fx * rz * g_jacobian[0, 2]
                 g_w = -fy * rz * g_jacobian[1, 2]
                 g_z -= rz * (u * g_u + w * g_w)

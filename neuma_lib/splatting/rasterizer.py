@@ -1,9 +1,9 @@
 """Differentiable Gaussian splatting of a batch of frames (paper Sec. 3.3 and the supplement's 3DGS).
 
-One autograd function holds the whole render: projection and compositing, Warp kernels with hand-written adjoints.
-A CPU composites splat by splat (``compositor_cpu``), a GPU tile by tile (``compositor_cuda``). ``gsplat_backend``
-renders by the gsplat package instead, where that is installed. Where only the squared error of the render is wanted, a
-compositor may compare it with the observation as it draws (``rasterized_error``).
+One autograd function contains projection and compositing, Warp kernels with hand-written adjoints. CPUs composite splat
+by splat (``compositor_cpu``), GPUs tile by tile (``compositor_cuda``). ``gsplat_backend`` uses the gsplat package
+instead. If only the squared error is needed, a compositor may compare with the observation directly
+(``rasterized_error``).
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from typing import Literal
 import torch
 
 from neuma_lib.errors import InputError
-from neuma_lib.splatting import compositor_cpu, compositor_cuda, gsplat_backend, projection
+from neuma_lib.splatting import compositor_cpu, compositor_cuda, projection
 from neuma_lib.splatting.arrays import check_tensors
 from neuma_lib.splatting.compositing import Settings
 from neuma_lib.splatting.image_loss import as_integers, check_fits, mean_squared_error
 
-Compositor = Literal["rows", "tiles", "gsplat"]
+Compositor = Literal["rows", "tiles"]
 COMPOSITORS = {"rows": compositor_cpu, "tiles": compositor_cuda}
 
 
 @dataclasses.dataclass
 class Statistics:
-    """What the last backward pass saw of every Gaussian, for densification and pruning.
+    """Statistics of the last backward pass for densification and pruning.
 
     Attributes:
         screen_gradients: (G,) norm of the loss gradient with respect to the projected mean, in units of half
             the image (as in 3D Gaussian splatting), summed over the images.
-        views: (G,) number of images in which the Gaussian took part.
+        views: (G,) number of images in which the Gaussian is visible.
     """
 
     screen_gradients: torch.Tensor | None = None
@@ -41,9 +41,9 @@ class Statistics:
 
 
 class RenderBuffers:
-    """Memory kept between calls of the same shape, so that a loop allocates little and can be captured.
+    """Memory reused between calls of the same shape, to save allocations and to allow CUDA graphs.
 
-    A call overwrites what the call before it left: run backward before the next forward.
+    A call overwrites the results of the previous one, so run backward before the next forward.
     """
 
     def __init__(self):
@@ -58,7 +58,7 @@ class RenderBuffers:
 
 
 def _fresh(name: str, shape: Sequence[int], like: torch.Tensor, dtype=None) -> torch.Tensor:
-    """Allocates every time: results of several calls may be alive together."""
+    """Allocate for each call, so that results of several calls may coexist."""
     return torch.empty(shape, dtype=dtype or like.dtype, device=like.device)
 
 
@@ -115,13 +115,13 @@ class _RasterizedError(torch.autograd.Function):
         grad_splats = options.empty("grad_splats", splats.shape, splats)
         wanted = ctx.needs_input_grad[2]
         options.compositor.compare_adjoint(
-            splats, kept, background, options.settings, scales, wanted, grad_splats, options.empty
+            splats, kept, background, options.settings, scales, wanted, grad_splats
         )
         return *_scene_gradients(ctx, grad_splats), None, None, None, None, None
 
 
 def _project(means, covars, opacities, sh, viewmats, Ks, options: _Options):
-    """``(means, covars, sh, viewmats, Ks)`` as the kernels take them, and ``(splats, depths)``."""
+    """``(means, covars, sh, viewmats, Ks)`` in the memory layout of the kernels, and ``(splats, depths)``."""
     sh = projection.for_device(sh.detach())
     means, covars, opacities, viewmats, Ks = (
         x.detach().contiguous() for x in (means, covars, opacities, viewmats, Ks)
@@ -132,7 +132,7 @@ def _project(means, covars, opacities, sh, viewmats, Ks, options: _Options):
 
 
 def _scene_gradients(ctx, grad_splats):
-    """Those of means, covars, opacities and sh that are wanted, of tensors saved as `_project` returns them."""
+    """The required gradients of means, covars, opacities and sh, from tensors saved by `_project`."""
     means, covars, sh, viewmats, Ks, splats, depths = ctx.saved_tensors[:7]
     settings, statistics = ctx.options.settings, ctx.options.statistics
     if statistics is not None:
@@ -166,7 +166,7 @@ def _colour(background: Sequence[float] | torch.Tensor, like: torch.Tensor) -> t
 
 @functools.lru_cache(maxsize=32)
 def _constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
-    """Kept, because a copy to the GPU makes the host wait."""
+    """Cached, because a copy to the GPU blocks the host."""
     return torch.tensor(values, dtype=dtype, device=device)
 
 
@@ -183,9 +183,9 @@ def check_shapes(means, covars, opacities, sh, viewmats, Ks) -> None:
     }
     check_tensors("rasterize", expected)
     if means.dtype not in (torch.float32, torch.float64):
-        raise InputError(f"rasterize: dtype {means.dtype} is not supported, use float32 or float64")
+        raise InputError("rasterize: means", f"must be float32 or float64, not {means.dtype}")
     if sh.shape[1] not in (1, 4, 9, 16):
-        raise InputError(f"rasterize: sh has {sh.shape[1]} coefficients a channel, expected 1, 4, 9 or 16")
+        raise InputError("rasterize: sh", f"must have 1, 4, 9 or 16 coefficients, not {sh.shape[1]}")
 
 
 def rasterize(
@@ -209,11 +209,10 @@ def rasterize(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Render T frames from V cameras.
 
-    Differentiable with respect to ``means``, ``covars``, ``opacities`` and ``sh``. A contribution counts
-    where its alpha is at least ``alpha_min``; alpha is limited to ``alpha_max`` (no gradient where it is); a
-    pixel ends before the Gaussian that would bring its transmittance below ``transmittance_min``. With
-    alpha_min = 0, alpha_max > 1 and transmittance_min = 0 the image is a smooth function of its inputs, apart
-    from the order in depth.
+    Differentiable with respect to ``means``, ``covars``, ``opacities`` and ``sh``. Contributions with alpha below
+    ``alpha_min`` are ignored. Alpha is limited to ``alpha_max`` (without gradient). A pixel ends before the Gaussian
+    that would reduce its transmittance below ``transmittance_min``. With alpha_min = 0, alpha_max > 1 and
+    transmittance_min = 0 the image is a smooth function of its inputs, except for changes of the depth order.
 
     Args:
         means: Gaussian centres of every frame, world frame.
@@ -226,18 +225,18 @@ def rasterize(
         background: colour behind the Gaussians, no gradient.
         alpha_min, alpha_max, transmittance_min: thresholds, see above.
         eps2d: blur added to the projected covariance [px^2].
-        statistics: filled by the backward pass when given.
-        buffers: memory kept between calls; the images returned then live in it.
-        compositor: "rows" (CPU), "tiles" (CUDA, float32) or "gsplat" (CUDA, float32; other limit of alpha, see
-            ``gsplat_backend``). Default: rows on CPU, tiles on CUDA. Tiles and gsplat read one number from the GPU a
-            call, so a CUDA graph cannot hold them. In float64 a CUDA device leaves the work to the CPU: that serves
-            comparisons only.
+        statistics: filled by the backward pass if given.
+        buffers: memory reused between calls, which then contains the returned images.
+        compositor: "rows" (CPU) or "tiles" (CUDA, float32).
+            Default: rows on CPU, tiles on CUDA. Tiles synchronise once per call with
+            the GPU, so they cannot be captured in a CUDA graph. In float64 on CUDA, the computation runs on the CPU,
+            for comparisons only.
 
     Returns:
         images (T, V, H, W, 3) over ``background`` and alphas (T, V, H, W).
 
     Raises:
-        InputError: shapes, dtypes or devices disagree, or the compositor cannot work with them.
+        InputError: inconsistent shapes, dtypes or devices, or ones that the compositor does not support.
     """
     check_shapes(means, covars, opacities, sh, viewmats, Ks)
     if means.is_cuda and means.dtype == torch.float64 and compositor is None:
@@ -251,18 +250,15 @@ def rasterize(
     background = _colour(background, means)
     on_cpu, single = means.device.type == "cpu", means.dtype == torch.float32
     compositor = compositor or _own_compositor(means)
-    works = {"rows": on_cpu, "tiles": not on_cpu and single, "gsplat": not on_cpu and single}
+    works = {"rows": on_cpu, "tiles": not on_cpu and single}
     if not works.get(compositor, False):
         raise InputError(
-            f"rasterize: compositor {compositor!r} does not work with {means.dtype} on {means.device}; "
-            f"choose {' or '.join(name for name, can in works.items() if can)}, or leave it out"
+            "rasterize: compositor",
+            f"{compositor!r} does not support {means.dtype} on {means.device}",
+            f"Choose {' or '.join(name for name, can in works.items() if can)}, or omit it",
         )
     thresholds = map(float, (alpha_min, alpha_max, transmittance_min, eps2d))
     settings = Settings(int(width), int(height), *thresholds)
-    if compositor == "gsplat":
-        if statistics is not None:
-            raise InputError("rasterize: compositor 'gsplat' fills no statistics, leave one of the two out")
-        return gsplat_backend.rasterize(means, covars, opacities, sh, viewmats, Ks, background, settings)
     empty = _fresh if buffers is None else buffers.empty
     options = _Options(settings, COMPOSITORS[compositor], statistics, empty)
     return _Rasterize.apply(means, covars, opacities, sh, viewmats, Ks, background, options)
@@ -285,22 +281,21 @@ def rasterized_error(
     transmittance_min: float = 1e-4,
     eps2d: float = 0.3,
 ) -> torch.Tensor:
-    """Mean squared difference of each frame, as `rasterize` renders it, from what was observed (paper Eq. 2).
+    """Mean squared difference of each rendered frame from the observation (paper Eq. 2).
 
-    The value of ``mean_squared_error(rasterize(...)[0], observed)``, and differentiable like it. Where the observation
-    is bytes and the device's compositor can (CUDA in float32), it compares them as it draws and no image is made: sums
-    are then taken in another order.
+    Equals ``mean_squared_error(rasterize(...)[0], observed)`` and has the same gradients. For observations as uint8 on
+    CUDA in float32, the compositor computes it without storing images, with sums in another order.
 
     Args:
-        observed: as of `mean_squared_error`.
+        observed: see `mean_squared_error`.
 
     The others are those of `rasterize`.
 
     Returns:
-        Of each frame the mean over all its views, pixels and channels, shape (T,).
+        Mean over all views, pixels and channels of each frame, shape (T,).
 
     Raises:
-        InputError: shapes, dtypes or devices disagree.
+        InputError: inconsistent shapes, dtypes or devices.
     """
     scene = (means, covars, opacities, sh, viewmats, Ks)
     thresholds = dict(

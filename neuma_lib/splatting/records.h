@@ -1,5 +1,5 @@
-// Text of the functions of records.py, which replaces REAL and SPLAT_SIZE. Four numbers are one access of 16 bytes on a
-// GPU in single precision, where they would otherwise be taken one by one.
+// Functions of records.py, which replaces REAL and SPLAT_SIZE. Four numbers are one access of 16 bytes on a GPU in
+// single precision.
 //// piece
     struct alignas(16) Piece { REAL c[4]; };
     Piece* pieces = (Piece*)(records.data + ((long long)image * records.shape[1] + g) * SPLAT_SIZE);

@@ -1,7 +1,6 @@
-"""Splats' records of ``SPLAT_SIZE`` numbers, and their gradients', in pieces of four.
+"""Access to records of splats and their gradients, ``SPLAT_SIZE`` numbers each, in groups of four.
 
-Neighbouring threads work on neighbouring records, or on any at all: number by number each would touch memory of its
-own, twelve times over.
+Vector loads of 16 bytes avoid twelve uncoalesced accesses per record.
 """
 
 # No `from __future__ import annotations` here: Warp reads the annotations of functions as objects.

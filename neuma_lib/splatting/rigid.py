@@ -1,4 +1,4 @@
-"""Gaussians that have been moved as one body."""
+"""Similarity transformations of Gaussians."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from neuma_lib.splatting.spherical_harmonics import basis
 def moved(
     gaussians: Gaussians, rotation: torch.Tensor, translation: torch.Tensor, scale: float = 1.0
 ) -> Gaussians:
-    """Gaussians after a similarity, x to s R x + t, R (3, 3) and t (3,) [m]; their colours turn along."""
+    """Gaussians transformed by x -> s R x + t, with R (3, 3) and t (3,) [m], including their harmonics."""
     R, t = rotation.to(gaussians.means), translation.to(gaussians.means)
     quats = _product(_quaternion(R), torch.nn.functional.normalize(gaussians.quats, dim=-1))
     sh = rotated(gaussians.sh(), rotation)
@@ -25,35 +25,35 @@ def moved(
 
 
 def rotated(sh: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
-    """Harmonics (G, K, 3) of Gaussians that were turned by a rotation (3, 3): seen along R d as they were along d.
+    """Harmonics (G, K, 3) after a rotation R (3, 3): the new values along R d are the old ones along d.
 
-    A rotation mixes the harmonics of one degree among themselves. How, is solved for from their values in directions
-    that lie evenly on the sphere.
+    A rotation mixes harmonics of the same degree. The mixing matrix is the least-squares solution for values in evenly
+    distributed directions.
     """
     count = sh.shape[-2]
     k = torch.arange(64, dtype=torch.float64) + 0.5
     up, around = 1 - k / 32, math.pi * (1 + math.sqrt(5)) * k
     level = (1 - up * up).sqrt()
     directions = torch.stack([level * around.cos(), level * around.sin(), up], dim=-1)
-    turned = basis(directions @ rotation.double().cpu(), count)  # along R^T d, as rows
+    turned = basis(directions @ rotation.double().cpu(), count)  # along R^T d
     mixed = torch.linalg.lstsq(basis(directions, count), turned).solution
     return mixed.to(sh) @ sh
 
 
 def _quaternion(R: torch.Tensor) -> torch.Tensor:
-    """Unit quaternion (4,), w first, of a rotation (3, 3), at any angle: an eigenvector (Bar-Itzhack 2000)."""
+    """Unit quaternion (4,), w first, of a rotation (3, 3) with any angle, as an eigenvector (Bar-Itzhack 2000)."""
     m = R.double().cpu()
     xx, yy, zz = m.diagonal()
-    K = torch.zeros(4, 4, dtype=torch.float64)  # of (x, y, z, w)
+    K = torch.zeros(4, 4, dtype=torch.float64)  # order (x, y, z, w)
     K[0, 0], K[1, 1], K[2, 2], K[3, 3] = xx - yy - zz, yy - xx - zz, zz - xx - yy, xx + yy + zz
     K[0, 1], K[0, 2], K[1, 2] = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
     K[0, 3], K[1, 3], K[2, 3] = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
-    found = torch.linalg.eigh(K, UPLO="U")[1][:, -1]
-    return found.roll(1).to(R)
+    xyzw = torch.linalg.eigh(K, UPLO="U")[1][:, -1]
+    return xyzw.roll(1).to(R)
 
 
 def _product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Products (..., 4) of quaternions, w first: the turn b, then the turn a."""
+    """Products (..., 4) of quaternions, w first: the rotation b, then the rotation a."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
     values = [

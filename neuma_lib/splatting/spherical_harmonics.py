@@ -1,6 +1,6 @@
 """Real spherical harmonics up to degree 3, in the order and sign of 3D Gaussian splatting files.
 
-The Warp kernels of ``projection.py`` are written from the polynomials of ``basis``, with the same coefficients.
+The Warp kernels of ``projection.py`` use the polynomials and coefficients of ``basis``.
 """
 
 import math
@@ -25,7 +25,7 @@ MAX_DEGREE = 3
 
 
 def coefficient_count(degree: int) -> int:
-    """Number K of coefficients of a colour channel for an SH degree: 1, 4, 9, 16."""
+    """Number K of coefficients per colour channel for an SH degree: 1, 4, 9, 16."""
     return (degree + 1) ** 2
 
 
@@ -79,15 +79,15 @@ def rgb_to_sh0(rgb: torch.Tensor) -> torch.Tensor:
 
 
 def sh0_to_rgb(sh0: torch.Tensor) -> torch.Tensor:
-    """View-independent part of the colour held by a degree-0 coefficient."""
+    """View-independent colour of a degree-0 coefficient."""
     return sh0 * SH_C0 + 0.5
 
 
 def rotated(sh: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:
-    """Coefficients of colours that have been turned: seen along R d they are what the old ones are along d.
+    """Coefficients after a rotation R: the new colours along R d are the old ones along d.
 
-    Harmonics of a degree turn among themselves, so that the coefficients follow exactly from the values in as many
-    directions as there are harmonics: Y sh' = Y(R^T .) sh, solved with the pseudo-inverse of Y.
+    A rotation mixes harmonics of the same degree, so the coefficients follow exactly from the values in enough
+    directions: Y sh' = Y(R^T .) sh, solved with the pseudo-inverse of Y.
 
     Args:
         sh: (G, K, 3) coefficients.
@@ -100,7 +100,7 @@ def rotated(sh: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:
     if count == 1:
         return sh
     index = torch.arange(4 * count, dtype=sh.dtype, device=sh.device) + 0.5
-    angle, z = math.pi * (1 + math.sqrt(5)) * index, 1 - index / (2 * count)  # evenly over the sphere
+    angle, z = math.pi * (1 + math.sqrt(5)) * index, 1 - index / (2 * count)  # Fibonacci lattice
     radius = (1 - z * z).sqrt()
     directions = torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=-1)
     solve = torch.linalg.pinv(basis(directions, count))

@@ -1,4 +1,4 @@
-"""The rasterizer written plainly in torch: slow, differentiated by autograd, judge of the fast kernels."""
+"""Reference rasterizer in plain torch with autograd, slow, to test the kernels."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def rasterize(
     transmittance_min: float = 1e-4,
     eps2d: float = 0.3,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Same arguments and results as ``rasterizer.rasterize``; memory grows as G H W for one image."""
+    """Same arguments and results as ``rasterizer.rasterize``; memory is proportional to G H W per image."""
     check_shapes(means, covars, opacities, sh, viewmats, Ks)
     background = torch.as_tensor(background, dtype=means.dtype, device=means.device)
     x = torch.arange(width, dtype=means.dtype, device=means.device) + 0.5

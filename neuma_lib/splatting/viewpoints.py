@@ -1,7 +1,7 @@
-"""Where the benchmark's cameras stand: a sphere of still views, and a ring of video views. Needs no Blender.
+"""Cameras of the benchmark: static views on a sphere, and video views on a ring. Independent of Blender.
 
 World frame: y up [m]. A pose is a camera-to-world matrix with OpenGL axes (x right, y up, looking along -z), as in
-``transforms.json`` and in Blender; pixel (0, 0) has its centre at (0.5, 0.5), y of the image points down.
+``transforms.json`` and in Blender. The centre of pixel (0, 0) is at (0.5, 0.5), y of the image points down.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 FIELD_OF_VIEW = 30.0
-"""Full horizontal field of view of every camera [degrees]: narrow, so that the perspective stays mild."""
+"""Full horizontal field of view of every camera [degrees], narrow for weak perspective."""
 
 
 @dataclass(frozen=True)
 class Views:
-    """Pinhole cameras with common intrinsics and square pixels, the principal point at the image's middle.
+    """Pinhole cameras with common intrinsics, square pixels, and the principal point at the image centre.
 
     Attributes:
         c2w: camera-to-world matrices, OpenGL axes, shape (V, 4, 4) [m].
@@ -52,7 +52,7 @@ class Views:
 
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Pose (4, 4) of an upright camera at ``eye`` that looks at ``target`` [m]; not for views straight up or down."""
+    """Pose (4, 4) of an upright camera at ``eye`` that looks at ``target`` [m], not straight up or down."""
     back = np.asarray(eye, dtype=np.float64) - target
     back /= np.linalg.norm(back)
     right = np.cross([0.0, 1.0, 0.0], back)
@@ -64,7 +64,7 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def sphere_directions(count: int) -> np.ndarray:
-    """``count`` unit vectors (count, 3) spread evenly over the sphere (Fibonacci lattice about y, no pole)."""
+    """Evenly distributed unit vectors (count, 3) on the sphere (Fibonacci lattice about y, without poles)."""
     index = np.arange(count) + 0.5
     y = 1.0 - 2.0 * index / count
     angle = np.pi * (1.0 + 5.0**0.5) * index
@@ -75,8 +75,8 @@ def sphere_directions(count: int) -> np.ndarray:
 def ring_directions(count: int) -> np.ndarray:
     """Unit vectors (count, 3) towards the video cameras, ``count`` at most 10.
 
-    The first is +z: that camera is horizontal and its image plane is (x, y). The others follow at steps of 108
-    degrees, which visits ten places around the object and spreads any first few of them, a little above it.
+    The first is +z, so the frontal camera is horizontal with (x, y) as image plane. The others are slightly above the
+    object, at azimuths in steps of 108 degrees, which gives ten positions and distributes any first few of them.
     """
     if not 1 <= count <= 10:
         raise ValueError(f"a ring has 1 to 10 views, not {count}")
@@ -92,11 +92,11 @@ def ring_directions(count: int) -> np.ndarray:
 def framing(
     directions: np.ndarray, points: np.ndarray, width: int, height: int, *, fill: float = 0.92
 ) -> Views:
-    """Cameras in the given directions, at one distance, as near as they may be with every point in the frame.
+    """Cameras in the given directions, at the smallest common distance with every point in the frame.
 
     Args:
-        directions: unit vectors from the middle of the points' box to the cameras, shape (V, 3).
-        points: everything that has to be seen [m], shape (n, 3), over all frames of a video.
+        directions: unit vectors from the centre of the points' bounding box to the cameras, shape (V, 3).
+        points: points that must be visible [m], shape (n, 3), over all frames of a video.
         width, height: image size [px].
         fill: fraction of the half frame that the outermost point may reach.
     """
@@ -107,7 +107,7 @@ def framing(
     for direction in directions:
         axes = look_at(centre + direction, centre)[:3, :3]
         local = (points - centre) @ axes
-        # |x| <= tangent * depth, where depth = distance - local z.
+        # |x| <= tangent * depth with depth = distance - local z
         distance = max(distance, (np.abs(local[:, :2]) / tangent + local[:, 2:]).max())
     poses = [look_at(centre + distance * direction, centre) for direction in directions]
     focal = width / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
@@ -115,10 +115,10 @@ def framing(
 
 
 def static_views(points: np.ndarray, count: int, width: int, height: int) -> Views:
-    """Cameras spread evenly on a sphere around points (n, 3) [m], which fill the frame of the tightest view."""
+    """Evenly distributed cameras on a sphere around points (n, 3) [m], which fill the frame of the tightest view."""
     return framing(sphere_directions(count), points, width, height)
 
 
 def video_views(points: np.ndarray, count: int, width: int, height: int) -> Views:
-    """Static cameras on a ring that see points (n, 3) [m] of all frames; view 0 is frontal."""
+    """Static cameras on a ring that see points (n, 3) [m] of all frames; view 0 is the frontal one."""
     return framing(ring_directions(count), points, width, height)

@@ -1,8 +1,8 @@
-"""A simulation that runs while one watches and acts on it: in a thread of its own, which nothing blocks for long.
+"""Interactive simulation in a background thread.
 
-Everything from outside is a command in a queue; the thread carries it out between two frames. What it shows is the last
-`Snapshot`. Lengths are metres in the simulated box; the floor is tilted by turning gravity the other way, and whoever
-draws the box turns it (`LiveSimulation.floor`).
+Other threads put commands into a queue, which are executed between two frames, and read the last `Snapshot`. Lengths
+are metres in the simulated box. A tilt of the floor rotates gravity in the opposite direction; the display rotates the
+box (`LiveSimulation.floor`).
 """
 
 from __future__ import annotations
@@ -28,39 +28,39 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
 FRAME = 1 / 30
-"""Time between two pictures [s], to a whole number of steps, where that much can be computed in it."""
+"""Target time between two frames [s], rounded to steps."""
 BUSY = 0.06
-"""Seconds of computing that a frame may take: more than ten frames a second, with time left to draw."""
+"""Maximum computing time of a frame [s]: more than ten frames per second, with time to draw."""
 PIVOT = np.array([0.5, 0.0, 0.5])
-"""Point of the floor that the box turns about [m]."""
+"""Centre of the box's rotation, on the floor [m]."""
 IDLE = 0.2
-"""Seconds between looks at nothing happening."""
+"""Time between updates of a paused simulation [s]."""
 EARTH = 9.8
-FASTEST = 10.0
-"""Largest speed that a throw or a hand gives [m/s]."""
+MAX_SPEED = 10.0
+"""Maximum speed of a launched or held body [m/s]."""
 _HAND = 0.08
-"""Time in which a held body reaches the hand [s]."""
+"""Time in which a held body reaches the pointer [s]."""
 _NEW = 0.2
-"""Share of the last frame in running means."""
+"""Weight of the last frame in running means."""
 _GAP = 1.5
-"""Between bodies, and to the walls, when one is put into the box [cells]."""
+"""Distance of an added body from others and from the walls [cells]."""
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What there is at one time.
+    """State of a live simulation.
 
     Attributes:
-        number: of the frame, from 0; grows with every one.
-        time: simulated since the last reset [s].
+        number: of the frame, from 0, increasing.
+        time: simulated time since the last reset [s].
         x, v, F, total: positions [m], velocities [m/s], elastic and total deformation gradients of all particles, on
             the CPU.
-        counts: particles of each body.
+        counts: number of particles of each body.
         dt: time step [s].
         pace: simulated over real time.
-        rate: frames a second.
-        trouble: what went wrong, or None; the simulation then waits for a reset.
-        notice: why the last command was not carried out, or None.
+        rate: frames per second.
+        trouble: error that stopped the simulation until a reset, or None.
+        notice: reason why the last command was rejected, or None.
     """
 
     number: int
@@ -83,23 +83,24 @@ def _undeformed(x: Tensor) -> Tensor:
 
 
 def _check_steps(laws: Sequence[Law], dts: Sequence[float]) -> None:
-    """Whether bodies can share the smallest of the steps that their laws were learned at.
+    """Check that bodies can share the smallest time step of their laws' trainings.
 
     Raises:
-        InputError: one that was learned at a longer step is another material at that one (`step_dependence`).
+        InputError: a law trained at a longer step depends on it (`step_dependence`).
     """
-    least = min(dts)
+    smallest = min(dts)
     for law, dt in zip(laws, dts, strict=True):
-        if dt - least > SAME_STEP * least and step_dependence(law) != "none":
+        if dt - smallest > SAME_STEP * smallest and step_dependence(law) != "none":
             raise InputError(
-                f"bodies of one simulation share a time step, here {1e3 * least:g} ms, and the law {law.name} is "
-                f"another material there than at the {1e3 * dt:g} ms that it was learned at: reset, which leaves one "
-                "body, or take a law of the same step"
+                f"law {law.name}",
+                f"was trained at a time step of {1e3 * dt:g} ms and is another material at {1e3 * smallest:g} ms, the "
+                "time step of all bodies",
+                "Use reset, which leaves one body, or a law of the same time step",
             )
 
 
 def tilted(about_x: float, about_z: float) -> np.ndarray:
-    """Rotation (3, 3) of the box when its floor is tilted about the axes x and z [degrees]."""
+    """Rotation (3, 3) of a box with its floor tilted about the axes x and z [degrees]."""
     a, b = np.radians([about_x, about_z])
     x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
     z = np.array([[np.cos(b), -np.sin(b), 0], [np.sin(b), np.cos(b), 0], [0, 0, 1]])
@@ -110,10 +111,10 @@ class LiveSimulation:
     """Bodies in the box, simulated by a thread.
 
     Args:
-        constants: of `MPMModel`, without dt and gravity.
-        start: the first body with its motion; a reset goes back to it. It is simulated on the device that it is on.
-        law: of the first body, on that device, too.
-        dt: time step that the law was learned at [s].
+        constants: arguments of `MPMModel`; dt and gravity are ignored.
+        start: initial state of the first body, restored by a reset. The simulation runs on its device.
+        law: of the first body, on the same device.
+        dt: time step of the law's training [s].
 
     Attributes:
         floor: rotation (3, 3) of the box.
@@ -127,7 +128,7 @@ class LiveSimulation:
         self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._news, self._closing = threading.Condition(), False
         self._running, self._hand, self._trouble, self._notice = True, None, None, None
-        self._number, self._steps_a_frame, self._span, self._moved = 0, 1, FRAME, 0.0
+        self._number, self._steps_per_frame, self._span, self._moved = 0, 1, FRAME, 0.0
         self._measured = time.perf_counter()
         self._restart()
         self._thread = threading.Thread(target=self._loop, name="live simulation", daemon=True)
@@ -140,24 +141,24 @@ class LiveSimulation:
         return self
 
     def close(self) -> None:
-        """End the thread, after the frame that it is at."""
+        """End the thread after the current frame."""
         self._closing = True
         self._commands.put(lambda: None)
         self._thread.join(timeout=10)
 
     @property
     def snapshot(self) -> Snapshot:
-        """The last one."""
+        """The last snapshot."""
         return self._snapshot
 
     def wait(self, number: int, timeout: float = 10.0) -> Snapshot:
-        """The first snapshot seen whose number is at least ``number``, or the last one when the time is up [s]."""
+        """Wait for a snapshot with at least this number, or return the last one after a timeout [s]."""
         with self._news:
             self._news.wait_for(lambda: self._snapshot.number >= number, timeout)
             return self._snapshot
 
     def do(self, timeout: float = 10.0) -> Snapshot:
-        """Wait until all commands given so far are carried out; the snapshot after them."""
+        """Wait until all previous commands are executed, and return the next snapshot."""
         reached: queue.SimpleQueue[int] = queue.SimpleQueue()
         self._commands.put(lambda: reached.put(self._number))
         try:
@@ -166,68 +167,68 @@ class LiveSimulation:
             return self._snapshot
 
     def reset(self) -> None:
-        """Back to the start: the first body alone, with gravity, floor, law and weight as they are set."""
-        self._tell(self._restart)
+        """Restore the initial state of the first body alone. Gravity, floor, law and weight stay as set."""
+        self._enqueue(self._restart)
 
     def run(self, running: bool) -> None:
-        """Go on or pause."""
-        self._tell(lambda: setattr(self, "_running", running))
+        """Continue or pause."""
+        self._enqueue(lambda: setattr(self, "_running", running))
 
     def set_gravity(self, strength: float) -> None:
-        """Gravity downward in the room [m/s^2]."""
-        self._tell(lambda: setattr(self, "_strength", float(strength)))
+        """Set the gravity, downwards in the room [m/s^2]."""
+        self._enqueue(lambda: setattr(self, "_strength", float(strength)))
 
     def set_floor(self, about_x: float, about_z: float) -> None:
         """Tilt the box about two axes [degrees]."""
-        self._tell(lambda: setattr(self, "floor", tilted(about_x, about_z)))
+        self._enqueue(lambda: setattr(self, "floor", tilted(about_x, about_z)))
 
     def set_weight(self, weight: float) -> None:
-        """Weight of the adaptors: 0 is the prior, 1 as trained. Laws without one stay as they are."""
-        self._tell(lambda: self._weigh(weight))
+        """Set the weight of the adaptors: 0 is the prior, 1 as trained. Has no effect on laws without one."""
+        self._enqueue(lambda: self._set_weight(weight))
 
     def set_law(self, law: Law, dt: float) -> None:
-        """Another material for the first body, with the time step that it was learned at [s].
+        """Change the law of the first body; ``dt`` is the time step of its training [s].
 
-        Where other bodies cannot take that step (`_check_steps`) the snapshot says so, and nothing changes.
+        Rejected with a notice if other bodies cannot use that step (`_check_steps`).
         """
-        self._tell(lambda: self._swap(law, dt))
+        self._enqueue(lambda: self._set_law(law, dt))
 
-    def throw(self, velocity: Sequence[float]) -> None:
-        """Give the first body one velocity [m/s], in the room's axes."""
-        self._tell(lambda: self._throw(velocity))
+    def launch(self, velocity: Sequence[float]) -> None:
+        """Set a uniform velocity of the first body [m/s], in the room's axes."""
+        self._enqueue(lambda: self._launch(velocity))
 
     def drop(self, height: float) -> None:
-        """Take the first body, undeformed, to a height above the floor [m] and let it go."""
-        self._tell(lambda: self._lift(height))
+        """Move the first body, undeformed and at rest, to a height above the floor [m]."""
+        self._enqueue(lambda: self._lift(height))
 
     def hold(self, place: Sequence[float] | None) -> None:
-        """Draw the centre of the first body to a place [m], in the room's axes; None lets go."""
-        self._tell(lambda: setattr(self, "_hand", None if place is None else np.array(place, float)))
+        """Pull the centre of the first body to a point [m], in the room's axes; None releases it."""
+        self._enqueue(lambda: setattr(self, "_hand", None if place is None else np.array(place, float)))
 
     def add(self, body: State, law: Law, dt: float) -> None:
-        """Put another body at rest above all others; where there is no room or no common step the snapshot says so."""
-        self._tell(lambda: self._add(body, law, dt))
+        """Add a body at rest above all others. Rejected with a notice if there is no space or no common time step."""
+        self._enqueue(lambda: self._add(body, law, dt))
 
     def to_box(self, vector: Sequence[float]) -> np.ndarray:
         """A direction of the room in the axes of the box."""
         return self.floor.T @ np.asarray(vector, float)
 
     def place_in_box(self, place: Sequence[float]) -> np.ndarray:
-        """A point of the room in the coordinates of the box, which turns about `PIVOT`."""
+        """A point of the room in the coordinates of the box, which is rotated about `PIVOT`."""
         return self.to_box(np.asarray(place, float) - PIVOT) + PIVOT
 
-    def _tell(self, command: Callable[[], None]) -> None:
-        def obeyed() -> None:
+    def _enqueue(self, command: Callable[[], None]) -> None:
+        def run() -> None:
             self._notice = None
             command()
 
-        self._commands.put(obeyed)
+        self._commands.put(run)
 
     # ---- in the thread -----------------------------------------------------------------------------------------------
 
     @property
     def model(self) -> MPMModel:
-        """Constants of the next steps; the time step is the smallest that a law was learned at."""
+        """Model of the next steps, with the smallest time step of the laws' trainings."""
         gravity = self.to_box((0.0, -self._strength, 0.0))
         return MPMModel(**self._constants, dt=min(self._dts), gravity=tuple(gravity.tolist()))
 
@@ -236,44 +237,43 @@ class LiveSimulation:
         while not self._closing:
             due = min(due, time.perf_counter())
             while not self._commands.empty():
-                self._obey(self._commands.get())
+                self._execute(self._commands.get())
             moving, before = self._running and not self._trouble, self._time
             if moving:
                 try:
                     self._advance()
                 except (InputError, NonFiniteError) as error:
                     self._trouble = str(error)
-                except Exception as error:  # whatever a law from elsewhere does, a reset has to work
+                except Exception as error:  # a reset must work whatever error a law raises
                     self._trouble = f"{type(error).__name__}: {error}"
             self._measure()
             self._publish()
-            # a frame lasts as long as what it simulates; of the time by which one is late, the next make up one frame
+            # a frame takes as long as its simulated time; later frames compensate a delay of at most one frame
             now = time.perf_counter()
             due = max(due + self._time - before, now - FRAME) if moving else now + IDLE
             self._rest(due, moving)
 
-    def _obey(self, command: Callable[[], None]) -> None:
-        """Carry out a command; one that cannot be leaves everything as it is."""
+    def _execute(self, command: Callable[[], None]) -> None:
+        """Execute a command; a rejected one has no effect."""
         try:
             command()
         except InputError as error:
             self._notice = str(error)
 
     def _rest(self, until: float, moving: bool) -> None:
-        """Carry out commands until a time of the clock, or the first of them alone where nothing moves."""
+        """Execute commands until a time of the clock, or only one command if nothing moves."""
         while (left := until - time.perf_counter()) > 0:
             try:
-                self._obey(self._commands.get(timeout=left))
+                self._execute(self._commands.get(timeout=left))
             except queue.Empty:
                 return
             if not moving:
                 return
 
     def _advance(self) -> None:
-        """The steps of one frame: as many as real time asks for, or as can be computed in time."""
+        """Simulate one frame: as many steps as in real time, or fewer if they take too long."""
         model, began = self.model, time.perf_counter()
-        wanted = max(1, round(FRAME / model.dt))
-        steps = min(self._steps_a_frame, wanted)
+        steps = min(self._steps_per_frame, max(1, round(FRAME / model.dt)))
         if self._hand is not None:
             self._follow_hand(steps * model.dt)
         with torch.no_grad():
@@ -282,20 +282,20 @@ class LiveSimulation:
         self._take(path)
         self._time += steps * model.dt
         each = (time.perf_counter() - began) / steps
-        self._steps_a_frame = max(1, min(int(BUSY / each), 2 * self._steps_a_frame))
+        self._steps_per_frame = max(1, min(int(BUSY / each), 2 * self._steps_per_frame))
 
     def _take(self, path: Trajectory) -> None:
         x, v, F, C, total = (value[-1] for value in (path.x, path.v, path.F, path.C, path.F_total))
         for name, value in (("position", x), ("velocity", v), ("deformation", F)):
             if not value.isfinite().all():
                 raise NonFiniteError("live", f"a {name} is not finite: the law diverges here")
-        # the rollout counts the total deformation from the F that it began with
+        # the total deformation of the rollout starts from the initial F
         self._total = total @ torch.linalg.solve(self._state.F, self._total)
         self._state = replace(self._state, x=x, v=v, F=F, C=C)
 
     def _measure(self) -> None:
-        """Running means of the time between frames and of what is simulated in it: frames a second and pace are their
-        ratios, which means of ratios would exceed where frames are uneven."""
+        """Update running means of real and simulated time per frame. Frame rate and pace are ratios of these means,
+        which mean ratios would overestimate for uneven frames."""
         now = time.perf_counter()
         span, moved = now - self._measured, max(self._time - self._measured_time, 0.0)
         self._measured, self._measured_time = now, self._time
@@ -323,33 +323,33 @@ class LiveSimulation:
         self._hand = self._trouble = None
         self._publish()
 
-    def _weigh(self, weight: float) -> None:
+    def _set_weight(self, weight: float) -> None:
         self._weight = float(weight)
         for law in self._laws:
             adapted = isinstance(law, AdaptableLaw) and all(part.adaptor for part in law.parts.values())
             if adapted and law.parts:
                 law.set_adaptor_weight(self._weight)
 
-    def _swap(self, law: Law, dt: float) -> None:
+    def _set_law(self, law: Law, dt: float) -> None:
         _check_steps([law, *self._laws[1:]], [dt, *self._dts[1:]])
         self._first_law, self._first_dt = law, dt
         self._laws[0], self._dts[0] = law, dt
-        self._weigh(self._weight)
+        self._set_weight(self._weight)
 
     def _first(self) -> slice:
         return slice(0, self._counts[0])
 
     def _set_velocity(self, velocity: np.ndarray) -> None:
-        """One velocity for the first body, in the axes of the box, at most `FASTEST`."""
+        """Set a uniform velocity of the first body, in the axes of the box, limited to `MAX_SPEED`."""
         if not np.isfinite(velocity).all():
-            raise InputError("throw: a velocity is not finite")
-        velocity = velocity * min(1.0, FASTEST / max(float(np.linalg.norm(velocity)), 1e-9))
+            raise InputError("velocity", "is not finite")
+        velocity = velocity * min(1.0, MAX_SPEED / max(float(np.linalg.norm(velocity)), 1e-9))
         state, own = self._state, self._first()
         v, C = state.v.expand_as(state.x).clone(), state.C.clone()
         v[own], C[own] = torch.from_numpy(velocity).to(v), 0.0
         self._state = replace(state, v=v, C=C)
 
-    def _throw(self, velocity: Sequence[float]) -> None:
+    def _launch(self, velocity: Sequence[float]) -> None:
         self._hand = None
         self._set_velocity(self.to_box(velocity))
 
@@ -363,7 +363,7 @@ class LiveSimulation:
     def _lift(self, height: float) -> None:
         start, own = self._start, self._first()
         if not np.isfinite(height):
-            raise InputError("drop: the height is not a number")
+            raise InputError("height", "is not a number")
         low, high = (float(end) for end in torch.aminmax(start.x[:, 1]))
         highest = 1 - _GAP * self.model.dx - (high - low)
         lifted = start.x.clone()
@@ -376,7 +376,7 @@ class LiveSimulation:
         total[own] = rest
         self._state, self._total, self._hand = replace(self._state, v=v, **values), total, None
         if len(self._counts) == 1:
-            self._trouble = None  # nothing is left of what diverged
+            self._trouble = None  # the diverged state is gone
 
     def _add(self, body: State, law: Law, dt: float) -> None:
         _check_steps([*self._laws, law], [*self._dts, dt])
@@ -384,7 +384,7 @@ class LiveSimulation:
         low, high = body.x.amin(dim=0), body.x.amax(dim=0)
         floor = float(self._state.x[:, 1].max()) + gap
         if floor + float(high[1] - low[1]) > 1 - gap:
-            raise InputError("no room above what is there: reset, or wait until it lies lower")
+            raise InputError("add", "there is no room above the other bodies", "Reset, or wait")
         shift = 0.5 - 0.5 * (low + high)
         shift[1] = floor - low[1]
         added = replace(body, x=body.x + shift, v=torch.zeros_like(body.x), F=None, C=None)
@@ -395,4 +395,4 @@ class LiveSimulation:
             [*self._laws, law],
             [*self._dts, dt],
         )
-        self._weigh(self._weight)
+        self._set_weight(self._weight)

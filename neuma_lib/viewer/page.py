@@ -1,7 +1,7 @@
-"""A scene in one HTML file that needs no server and loads nothing: quantised frames, and a renderer of our own.
+"""A scene as one standalone HTML file with quantised frames and a WebGL renderer.
 
-The frames are whole numbers of 16 or 8 bits between the ends of each component, written as differences from the frame
-before, low bytes first, and deflated. ``page.js`` undoes it and draws the Gaussians with WebGL 2.
+Frames are integers of 16 or 8 bits in the range of each component, stored as differences from the previous frame, low
+bytes first, and deflated. ``page.js`` decodes them and renders the Gaussians with WebGL 2.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ from neuma_lib.viewer.scalars import QUANTITIES
 from neuma_lib.viewer.scene import Motion, Scene, View, frame_at
 
 COLOURS = {None: "viridis", 1.0: "coolwarm"}
-"""Colour map by the middle of a quantity."""
+"""Centre of a quantity's range -> colour map."""
 _WEBP = {"format": "WEBP", "quality": 80, "method": 4}
 _HERE = Path(__file__)
 
 
 class Blob:
-    """Arrays one after the other in one stream, and what is needed to find and decode them."""
+    """Stream of concatenated arrays, and metadata to decode them."""
 
     def __init__(self):
         self.parts: list[bytes] = []
         self._size = 0
 
     def add(self, content: bytes) -> int:
-        """Append bytes; where they begin."""
+        """Append bytes and return their offset."""
         start = self._size
         self.parts.append(content)
         self._size += len(content)
         return start
 
     def frames(self, values: np.ndarray, bits: int = 16, ends: tuple[float, float] | None = None) -> dict:
-        """Append values (T, C, M), each component between its own ends, or all between the given ones."""
+        """Append values (T, C, M), quantised in the range of each component or in the given one; returns metadata."""
         T, C, M = values.shape
         if ends is None:
             low, high = values.min(axis=(0, 2)), values.max(axis=(0, 2))
@@ -59,7 +59,7 @@ class Blob:
 
 
 def quantised(values: np.ndarray, low: np.ndarray, high: np.ndarray, bits: int) -> np.ndarray:
-    """Whole numbers (T, C, M), 0 at ``low`` and 2^bits - 1 at ``high``, (C,) each; what lies outside is clipped."""
+    """Integers (T, C, M), 0 at ``low`` and 2^bits - 1 at ``high``, (C,) each; values outside are clipped."""
     span = np.maximum(high - low, 1e-30)
     share = (values - low[:, None]) / span[:, None]
     top = 2**bits - 1
@@ -67,7 +67,7 @@ def quantised(values: np.ndarray, low: np.ndarray, high: np.ndarray, bits: int) 
 
 
 def as_differences(whole: np.ndarray, bits: int) -> bytes:
-    """Frames (T, ...) as differences from the one before, small numbers for small ones of either sign."""
+    """Frames (T, ...) as differences from the previous one, zigzag-encoded, low bytes first."""
     kind = np.dtype(f"int{bits}")
     steps = whole.copy()
     steps[1:] -= whole[:-1]
@@ -80,7 +80,7 @@ def as_differences(whole: np.ndarray, bits: int) -> bytes:
 def roots(covars: Tensor) -> np.ndarray:
     """Symmetric square roots of covariances (T, G, 3, 3), their six upper entries as (T, 6, G).
 
-    In the size of a Gaussian, not its square: quantising them costs large and flat ones the same fraction.
+    They are linear in the size of a Gaussian, which reduces the relative error of quantisation.
     """
     values, vectors = torch.linalg.eigh(covars.double())
     half = (vectors * values.clamp_min(0).sqrt()[..., None, :]) @ vectors.mT
@@ -89,14 +89,14 @@ def roots(covars: Tensor) -> np.ndarray:
 
 
 def page(scene: Scene, particles: int = 8000, megabytes: float = 25) -> str:
-    """The text of the file.
+    """The content of the file.
 
     Args:
-        particles: most of each motion that are shown; some are left out evenly where there are more.
-        megabytes: largest size of the file [MB]; where it is too small, every second frame is left out, and again.
+        particles: maximum number of particles per motion; more are subsampled evenly.
+        megabytes: maximum size of the file [MB]; every second frame is dropped repeatedly until it fits.
 
     Raises:
-        InputError: not even first and last frame fit.
+        InputError: first and last frame do not fit.
     """
     steps = scene.steps
     stride = 1
@@ -106,15 +106,16 @@ def page(scene: Scene, particles: int = 8000, megabytes: float = 25) -> str:
         if len(text) <= megabytes * 1e6:
             return text
         if len(kept) <= 2:
-            raise InputError(
-                f"{scene.name}: two frames take {len(text) / 1e6:.1f} MB; raise viewer.megabytes ({megabytes:g}), or "
-                "lower viewer.particles or the number of viewer.methods"
+            problem = (
+                f"{megabytes:g} MB are too small for two frames of {scene.name}, {len(text) / 1e6:.1f} MB"
             )
+            remedy = "Increase it, or reduce viewer.particles or the number of viewer.methods"
+            raise InputError("viewer.megabytes", problem, remedy)
         stride *= 2
 
 
 def write_page(path: str | Path, scene: Scene, particles: int = 8000, megabytes: float = 25) -> int:
-    """Write `page`; its size in bytes."""
+    """Write `page` and return its size in bytes."""
     text = page(scene, particles, megabytes)
     write_text(path, text)
     return len(text)
@@ -159,7 +160,7 @@ def _filled(scene: Scene, steps: tuple[int, ...], particles: int) -> str:
 
 
 def colour_map(name: str) -> list[int]:
-    """256 colours of matplotlib's map of that name, 768 numbers from 0 to 255."""
+    """256 colours of a matplotlib colour map, 768 integers from 0 to 255."""
     colours = require("matplotlib", "viewer").colormaps[name](np.arange(256))[:, :3]
     return (colours * 255).round().astype(int).ravel().tolist()
 
@@ -169,7 +170,7 @@ def _motion(scene: Scene, motion: Motion, steps: tuple[int, ...], particles: int
     stride = -(-motion.x.shape[1] // particles)
     x = motion.x[at, ::stride]
     radius = (scene.volume / x.shape[1] * 3 / (4 * np.pi)) ** (1 / 3)
-    found: dict[str, Any] = {
+    content: dict[str, Any] = {
         "name": motion.name,
         "title": motion.title,
         "radius": radius,
@@ -180,9 +181,9 @@ def _motion(scene: Scene, motion: Motion, steps: tuple[int, ...], particles: int
         },
     }
     if motion.means is not None:
-        found["means"] = blob.frames(motion.means[at].transpose(1, 2).numpy())
-        found["roots"] = blob.frames(roots(motion.covars[at]))
-    return found
+        content["means"] = blob.frames(motion.means[at].transpose(1, 2).numpy())
+        content["roots"] = blob.frames(roots(motion.covars[at]))
+    return content
 
 
 def _view(view: View, steps: tuple[int, ...], blob: Blob) -> dict:

@@ -1,4 +1,4 @@
-"""A reconstructed body to play with: the live simulation, its laws, and the Gaussians that its particles carry."""
+"""Interactive simulation of a reconstructed body: the live simulation, its laws, and the bound Gaussians."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.volume import sample_volume
-from neuma_lib.io.particles import load_body, thrown
+from neuma_lib.io.particles import load_body, with_motion
 from neuma_lib.mechanics.law import Law
+from neuma_lib.methods.base import ModelSource
+from neuma_lib.project.files import SceneFiles, inside
 from neuma_lib.sim.model import MPMModel
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.viewer import scalars
-from neuma_lib.viewer.files import LawFiles, SceneFiles, inside
 from neuma_lib.viewer.live import LiveSimulation, Snapshot
-from neuma_lib.viewer.scene import law_of
 
 ADDED_SIZE = 0.22
-"""Longest side of a solid that is dropped onto the others [m]."""
+"""Longest side of an added solid [m]."""
 ADDED_PARTICLES = 500
 _COLOURS = ((0.23, 0.49, 0.77), (0.84, 0.27, 0.24), (0.94, 0.75, 0.25), (0.35, 0.65, 0.38))
 
 
 @dataclass(frozen=True)
 class Picture:
-    """Gaussians of a snapshot: means (G, 3) [m], covariances (G, 3, 3) [m^2], and themselves at rest."""
+    """Gaussians of a snapshot: means (G, 3) [m], covariances (G, 3, 3) [m^2], and the Gaussians at rest."""
 
     snapshot: Snapshot
     means: Tensor
@@ -48,18 +48,18 @@ class Playground:
 
     Args:
         files: of the scene.
-        laws: what may be chosen, by name.
-        chosen: the law at the start.
-        device: of the simulation; pictures are made on the CPU.
+        laws: available laws by name.
+        chosen: initial law.
+        device: of the simulation; Gaussians are deformed on the CPU.
 
     Raises:
-        InputError: files of the body or of the law that cannot be read, or that must not be (`files.inside`).
+        InputError: files of the body or of the law are damaged or outside the permitted folders (`files.inside`).
     """
 
     def __init__(
         self,
         files: SceneFiles,
-        laws: Mapping[str, LawFiles],
+        laws: Mapping[str, ModelSource],
         chosen: str,
         device: torch.device | str = "cpu",
     ):
@@ -67,7 +67,9 @@ class Playground:
         paths = [files.checked(path) for path in (files.particles, files.binding, files.gaussians)]
         first = load_body(*paths, files.density, gaussian_motion="affine").to(torch.float32)
         start = (
-            thrown(first, files.checked(files.velocity)) if files.velocity else first.state((0.0, 0.0, 0.0))
+            with_motion(first, files.checked(files.velocity))
+            if files.velocity
+            else first.state((0.0, 0.0, 0.0))
         )
         self._density = (
             files.density if isinstance(files.density, int | float) else float(start.density.mean())
@@ -83,27 +85,27 @@ class Playground:
         )
 
     def law(self, name: str) -> Law:
-        """A law by its name, read when it is first wanted."""
+        """A law by name, loaded on first use."""
         if name not in self.laws:
-            raise InputError(f"no law '{name}': choose one of {', '.join(self.laws)}")
+            raise InputError("law", f"'{name}' is unknown", f"Choose one of {', '.join(self.laws)}")
         if name not in self._loaded:
-            law = law_of(self.laws[name], self._checked).requires_grad_(False).to(self.device)
+            law = self.laws[name].load(self._checked).law.requires_grad_(False).to(self.device)
             self._try(law, self.laws[name].dt)
             self._loaded[name] = law
         return self._loaded[name]
 
     def _try(self, law: Law, dt: float) -> None:
-        """Take one step, which loads kernels: Warp must not load them first in two threads at once, and the thread
-        that simulates and the one that draws both use them."""
+        """Take one step to load kernels, because Warp must not load them in the simulating and the drawing thread at
+        the same time."""
         model = MPMModel(**{**self._constants, "dt": dt})
-        with torch.no_grad(), suppress(NonFiniteError):  # the simulation says so
+        with torch.no_grad(), suppress(NonFiniteError):  # the simulation reports it
             rollout(model, law, self._start, steps=1, frames=[1], total=True, skip_free_flight=False)
 
     def _checked(self, path: str | Path) -> Path:
         return inside(path, self.roots)
 
     def choose(self, name: str) -> str | None:
-        """Give the first body another law, from its state as it is on; why it was not possible, or None."""
+        """Change the law of the first body without changing its state. Returns the reason if it is impossible."""
         law = self.law(name)
         with self._changing:
             self.simulation.set_law(law, self.laws[name].dt)
@@ -113,14 +115,14 @@ class Playground:
         return notice
 
     def reset(self) -> None:
-        """The first body alone, at its start."""
+        """Restore the first body at its initial state, and remove all others."""
         with self._changing:
             self.simulation.reset()
             self.simulation.do()
             del self._bodies[1:], self._whole[1:]
 
     def add(self, shape: str) -> str | None:
-        """Drop a solid of the chosen law onto what is there; why it was not possible, or None."""
+        """Drop a solid with the current law onto the others. Returns the reason if it is impossible."""
         mesh = place(shape, ADDED_SIZE, 0.5, (0.5, 0.5), resolution=48)
         x0 = torch.from_numpy(sample_volume(mesh, ADDED_PARTICLES)).float()
         with self._changing:
@@ -136,11 +138,11 @@ class Playground:
         return notice
 
     def picture(self, snapshot: Snapshot, flow: bool = False) -> Picture:
-        """The Gaussians of a snapshot; with ``flow`` plastic deformation stretches them, too."""
+        """The Gaussians of a snapshot; with ``flow`` stretched by the total, not the elastic deformation."""
         index = len(snapshot.counts) - 1
         whole: Reconstruction = self._whole[min(index, len(self._whole) - 1)]
         x, F = snapshot.x, snapshot.total if flow else snapshot.F
-        if len(whole.x0) < len(x):  # a body has just been taken away
+        if len(whole.x0) < len(x):  # a body has just been removed
             x, F = x[: len(whole.x0)], F[: len(whole.x0)]
         g = whole.gaussians
         if id(whole) not in self._arms:
@@ -150,7 +152,7 @@ class Playground:
         return Picture(snapshot, means[0], covars[0], g)
 
     def values(self, snapshot: Snapshot, name: str) -> Tensor:
-        """A quantity of `scalars.QUANTITIES` of all particles, stresses by the first body's law."""
+        """A quantity of `scalars.QUANTITIES` for all particles; stresses by the law of the first body."""
         if name == "speed":
             return snapshot.v.norm(dim=-1)
         if name == "plastic_strain":
@@ -160,17 +162,19 @@ class Playground:
         return scalars.von_mises(self.law(self.chosen), snapshot.F.to(self.device)).cpu()
 
 
-def first_law(files: SceneFiles, laws: Mapping[str, LawFiles], preferred: Sequence[str] = ("neuma",)) -> str:
-    """The law that a scene's playground begins with: that of its own method, or else the first.
+def first_law(
+    files: SceneFiles, laws: Mapping[str, ModelSource], preferred: Sequence[str] = ("neuma",)
+) -> str:
+    """Initial law of a scene's playground: that of one of its methods, or else the first.
 
     Raises:
         InputError: there is none.
     """
     own = {run.name: run.law for run in files.runs if run.law is not None}
     for law in (*(own.get(name) for name in preferred), *own.values()):
-        found = [name for name, each in laws.items() if each == law]
-        if found:
-            return found[0]
+        names = [name for name, each in laws.items() if each == law]
+        if names:
+            return names[0]
     if not laws:
-        raise InputError(f"{files.name}: no law has been trained yet; make one, for example the method neuma")
+        raise InputError(files.name, "has no trained law", "Train one, for example with the method neuma")
     return next(iter(laws))

@@ -1,4 +1,4 @@
-"""What colours particles: speed, stress, plastic strain, volume, with ranges for a legend in SI units."""
+"""Scalars that colour particles: speed, stress, plastic strain, volume ratio, with ranges for a legend in SI units."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from torch import Tensor
 
 from neuma_lib.mechanics.law import Law
 
-_HIGHEST = 99.5
-"""Percentile that ends a legend: single particles that are torn off would take all colours."""
+_PERCENTILE = 99.5
+"""Upper end of a legend, robust to single detached particles."""
 _NEIGHBOURS = 16
-"""Nearest particles whose motion is that of a particle's surroundings."""
+"""Number of nearest particles in the fit of a deformation gradient."""
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A coloured quantity: label and unit for the legend, the value in its middle if it has one, its least range."""
+    """A quantity: label and unit for the legend, value at the centre of its range (or None), minimum range."""
 
     label: str
     unit: str
     middle: float | None
-    least: float
+    min_range: float
 
 
 QUANTITIES = {
@@ -37,7 +37,7 @@ QUANTITIES = {
 
 
 def speed(x: Tensor, times: Tensor, v: Tensor | None = None) -> Tensor:
-    """Speeds (T, N) [m/s] of positions (T, N, 3) at times (T,): from v (T, N, 3), or by differences without it."""
+    """Speeds (T, N) [m/s] from velocities v (T, N, 3), or by differences of positions (T, N, 3) at times (T,)."""
     if v is None:
         if len(times) == 1:
             return x.new_zeros(x.shape[:2])
@@ -48,7 +48,7 @@ def speed(x: Tensor, times: Tensor, v: Tensor | None = None) -> Tensor:
 def von_mises(law: Law, F: Tensor) -> Tensor:
     """Von Mises stress sqrt(3/2 s : s) [Pa] of elastic F (..., 3, 3), s the deviator of the Cauchy stress tau / det F.
 
-    The stress of a network need not be symmetric; its symmetric part counts.
+    The symmetric part is used, because the stress of a network need not be symmetric.
     """
     flat = F.reshape(-1, 3, 3)
     with torch.no_grad():
@@ -77,10 +77,10 @@ def plastic_strain(F: Tensor, total: Tensor) -> Tensor:
 
 
 def total_deformation(x: Tensor) -> Tensor:
-    """Total deformation gradients (T, N, 3, 3) of positions (T, N, 3), where a file has none.
+    """Total deformation gradients (T, N, 3, 3) estimated from positions (T, N, 3).
 
-    The affine map that moves a particle's nearest neighbours of the first frame best, by least squares: exact for
-    affine motions, else an average over about two distances between particles.
+    Least-squares fit of an affine map to the motion of a particle's nearest neighbours in the first frame: exact for
+    affine motions, else an average over about two particle spacings.
     """
     x0 = x[0].double()
     count = min(_NEIGHBOURS + 1, len(x0))
@@ -88,33 +88,33 @@ def total_deformation(x: Tensor) -> Tensor:
     near = torch.from_numpy(near)
     rest = x0[near] - x0[near].mean(dim=1, keepdim=True)
     inverse = torch.linalg.pinv(rest.mT @ rest)
-    found = []
+    gradients = []
     for now in x.double():
         moved = now[near] - now[near].mean(dim=1, keepdim=True)
-        found.append((moved.mT @ rest @ inverse).to(x.dtype))
-    return torch.stack(found)
+        gradients.append((moved.mT @ rest @ inverse).to(x.dtype))
+    return torch.stack(gradients)
 
 
 def ranges(motions: Iterable[Mapping[str, Tensor]]) -> dict[str, tuple[float, float]]:
-    """Ends of the legend of every quantity, the same for all motions, round numbers.
+    """Common legend range of all motions for every quantity, in round numbers.
 
-    They suit the motion in the middle: one that goes astray would take all colours from the others.
+    The range is the median over the motions, which is robust to a diverged one.
     """
     motions = list(motions)
-    found = {}
+    result = {}
     for name, quantity in QUANTITIES.items():
         values = [own[name].reshape(-1) for own in motions if name in own]
         if not values:
             continue
         middle = quantity.middle or 0.0
-        ends = [float(np.percentile((v - middle).abs().numpy(), _HIGHEST)) for v in values]
-        reach = rounded_up(max(sorted(ends)[len(ends) // 2], quantity.least))
-        found[name] = (middle - reach if quantity.middle is not None else 0.0, middle + reach)
-    return found
+        ends = [float(np.percentile((v - middle).abs().numpy(), _PERCENTILE)) for v in values]
+        reach = rounded_up(max(sorted(ends)[len(ends) // 2], quantity.min_range))
+        result[name] = (middle - reach if quantity.middle is not None else 0.0, middle + reach)
+    return result
 
 
 def rounded_up(value: float) -> float:
-    """The next of 1, 1.5, 2, 3, 4, 5, 6, 8, 10 times a power of ten that is not less than a positive value."""
+    """Round a positive value up to 1, 1.5, 2, 3, 4, 5, 6, 8 or 10 times a power of ten."""
     power = 10.0 ** np.floor(np.log10(value))
     steps = (1, 1.5, 2, 3, 4, 5, 6, 8, 10)
     return float(next(step for step in steps if step * power >= value * (1 - 1e-9)) * power)

@@ -1,4 +1,4 @@
-"""What a viewer shows: Gaussians and particles of several motions of one body, cameras and what they saw."""
+"""Data of a viewer: Gaussians and particles of several motions of one body, cameras and their images."""
 
 from __future__ import annotations
 
@@ -19,33 +19,31 @@ from neuma_lib.errors import InputError
 from neuma_lib.io.files import one_line, parse_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import read_image_set, read_transforms
-from neuma_lib.io.laws import load_laws
 from neuma_lib.io.particles import load_body
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Law
+from neuma_lib.project.files import RunFiles, SceneFiles
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.viewer import scalars
-from neuma_lib.viewer.files import LawFiles, RunFiles, SceneFiles
 
 TRUTH = "truth"
-_CARRYING = 8
-"""True particles that carry a Gaussian of the reconstruction."""
+_BOUND = 8
+"""Number of true particles bound to a Gaussian of the reconstruction."""
 
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Motion:
-    """How one body moves.
+    """Motion of a body.
 
     Attributes:
-        name: `TRUTH`, or of a method.
-        title: for the screen.
+        name: `TRUTH`, or that of a method.
+        title: display name.
         steps: simulation step of each frame, length T.
         x: particles [m], shape (T, N, 3).
-        scalars: values of particles by the names of `scalars.QUANTITIES`, shape (T, N); what cannot be known is left
-            out.
-        means, covars: Gaussians [m], [m^2], shapes (T, G, 3) and (T, G, 3, 3); None where the particles carry none.
+        scalars: name in `scalars.QUANTITIES` -> values of particles, shape (T, N); without unknown ones.
+        means, covars: Gaussians [m], [m^2], shapes (T, G, 3) and (T, G, 3, 3); None if none are bound to the particles.
     """
 
     name: str
@@ -61,7 +59,7 @@ class Motion:
 class View:
     """A camera: world to camera (4, 4) (OpenCV axes), intrinsics (3, 3) and size [px].
 
-    ``images`` by step are straight-alpha RGBA, uint8, smaller than the camera's but of its proportions.
+    ``images`` by step are straight-alpha RGBA, uint8, downsampled.
     """
 
     number: int
@@ -81,10 +79,10 @@ class Scene:
         dt: time step [s].
         gaussians: at rest; colours and opacities are the same in all motions.
         volume: of the body [m^3].
-        motions: the true one first if it is known.
+        motions: the true one first, if known.
         views: cameras.
-        ranges: ends of the legends by name, see `scalars.ranges`.
-        notes: what could not be shown, and why.
+        ranges: legend ranges by name, see `scalars.ranges`.
+        notes: messages on missing content.
     """
 
     name: str
@@ -98,35 +96,36 @@ class Scene:
 
     @property
     def steps(self) -> tuple[int, ...]:
-        """Steps of the frames on the slider: those of the motion with most."""
+        """Steps of the frames on the slider: those of the motion with most frames."""
         return max((motion.steps for motion in self.motions), key=len)
 
     def motion(self, name: str) -> Motion:
-        """The motion of that name. Raises InputError where there is none."""
+        """The motion with a name. Raises InputError if there is none."""
         for motion in self.motions:
             if motion.name == name:
                 return motion
         known = ", ".join(motion.name for motion in self.motions)
-        raise InputError(f"no motion '{name}' in {self.name}: there are {known}")
+        raise InputError(self.name, f"has no motion '{name}', only {known}")
 
 
 def frame_at(steps: tuple[int, ...], step: int) -> int:
-    """Index of the last frame at or before a step; the first one where there is none."""
+    """Index of the last frame at or before a step, or of the first frame."""
     return max(int(np.searchsorted(steps, step, side="right")) - 1, 0)
 
 
 def load_scene(
     files: SceneFiles, say: Say = lambda text: None, side: int = 160, skip_damaged: bool = False
 ) -> Scene:
-    """Read a scene and move its Gaussians with every motion.
+    """Read a scene and deform its Gaussians with every motion.
 
     Args:
-        say: receives a line on what is being read.
+        say: callback for progress messages.
         side: see `load_views`.
-        skip_damaged: a predicted motion that cannot be read becomes a note.
+        skip_damaged: replace a damaged predicted motion by a note.
 
     Raises:
-        InputError: a damaged file of the body or of a motion, or one that must not be read (`SceneFiles.checked`).
+        InputError: a damaged file of the body or of a motion, or one outside the permitted folders
+            (`SceneFiles.checked`).
     """
     paths = [files.checked(path) for path in (files.particles, files.binding, files.gaussians)]
     body = load_body(*paths, files.density)
@@ -142,10 +141,8 @@ def load_scene(
                 raise
             notes.append(f"{run.title} is left out: {one_line(error)}")
     if not motions:
-        raise InputError(
-            f"{files.name}: nothing moves here yet; make a motion with `snakemake --cores 2 results/{files.name}/"
-            "<method>/rollout.h5`"
-        )
+        command = f"snakemake --cores 2 results/{files.name}/<method>/rollout.h5"
+        raise InputError(files.name, "has no motion", f"Compute one with `{command}`")
     views = ()
     if files.transforms:
         try:
@@ -159,19 +156,10 @@ def load_scene(
     )
 
 
-def law_of(files: LawFiles, checked: Callable[[str], Path]) -> Law:
-    """The law that files describe. Raises InputError as `load_laws` and ``checked`` do."""
-    prior, adaptor, identified = (
-        [checked(file)] if file else [] for file in (files.prior, files.adaptor, files.identified)
-    )
-    return load_laws(files.dt, [files.spec] if files.spec else [], identified, prior, adaptor)[0]
-
-
 def true_motion(path: Path, body: Reconstruction, dt: float) -> Motion:
-    """The ground truth; its particles carry the Gaussians of the reconstruction.
+    """The ground truth, with the fitted Gaussians of the reconstruction.
 
-    Each follows the affine motion of the `_CARRYING` particles that are nearest to it at the start: the motion is
-    true, the Gaussians are those that were fitted.
+    Each Gaussian follows the affine motion of the `_BOUND` true particles that are nearest to it at the start.
     """
     names = ("x", "F", "v", "frames")
     arrays, attributes = read_arrays(path, required=("x", "F"), only=names)
@@ -192,8 +180,8 @@ def true_motion(path: Path, body: Reconstruction, dt: float) -> Motion:
 
 
 def nearest_binding(means: Tensor, x: Tensor) -> Binding:
-    """Every Gaussian (G, 3) bound to its nearest particles of x (N, 3), in proportion to one over their distance."""
-    count = min(_CARRYING, len(x))
+    """Bind every Gaussian (G, 3) to its nearest particles of x (N, 3), with weights inverse to the distance."""
+    count = min(_BOUND, len(x))
     distance, near = cKDTree(x.numpy()).query(means.numpy(), k=np.arange(1, count + 1))
     weights = 1 / np.maximum(distance, 1e-9)
     order = np.argsort(near, axis=1)
@@ -215,14 +203,14 @@ def _predicted(files: SceneFiles, run: RunFiles, body: Reconstruction, notes: li
     x, F = (torch.from_numpy(arrays[name]) for name in ("x", "F"))
     total = torch.from_numpy(arrays["F_total"]) if "F_total" in arrays else None
     if not (x.isfinite().all() and F.isfinite().all()):
-        raise InputError(f"{path} holds values that are not finite: make it again")
+        raise InputError(path, "has values that are not finite", "Regenerate it")
     steps, dt = _steps(arrays, len(x)), float(attributes.get("dt", files.simulation["dt"]))
     law = None
     if run.law is None:
         notes.append(f"{run.title}: springs have no stress")
     else:
         try:
-            law = law_of(run.law, files.checked)
+            law = run.law.load(files.checked).law
         except InputError as error:
             notes.append(f"{run.title}: no stress, as its law cannot be read ({one_line(error)})")
     means = covars = None
@@ -235,7 +223,7 @@ def _predicted(files: SceneFiles, run: RunFiles, body: Reconstruction, notes: li
         means, covars = deform(*at_rest, Binding.identity(len(g), g.means), g.means, x, stretch)
     else:
         notes.append(f"{run.title}: particles of its own, which carry no Gaussians")
-    # A law that was learned at another time step has steps of its own; the slider's are those of the scene.
+    # a law with another time step has other steps; the slider shows those of the scene
     shown = tuple(round(step * dt / files.simulation["dt"]) for step in steps)
     return Motion(run.name, run.title, shown, x, _values(x, F, total, None, steps, dt, law), means, covars)
 
@@ -243,15 +231,15 @@ def _predicted(files: SceneFiles, run: RunFiles, body: Reconstruction, notes: li
 def _values(
     x: Tensor, F: Tensor, total: Tensor | None, v: Tensor | None, steps: tuple[int, ...], dt: float, law: Law | None
 ) -> dict[str, Tensor]:  # fmt: skip
-    """All scalars of a motion that can be known."""
-    found = {
+    """All known scalars of a motion."""
+    values = {
         "speed": scalars.speed(x, dt * torch.tensor(steps), v),
         "plastic_strain": scalars.plastic_strain(F, scalars.total_deformation(x) if total is None else total),
         "volume_ratio": scalars.volume_ratio(F),
     }
     if law is not None:
-        found["von_mises"] = torch.stack([scalars.von_mises(law, frame) for frame in F])
-    return found
+        values["von_mises"] = torch.stack([scalars.von_mises(law, frame) for frame in F])
+    return values
 
 
 def _steps(arrays: dict[str, np.ndarray], count: int) -> tuple[int, ...]:
@@ -259,13 +247,13 @@ def _steps(arrays: dict[str, np.ndarray], count: int) -> tuple[int, ...]:
 
 
 def load_views(files: SceneFiles, side: int = 160) -> tuple[View, ...]:
-    """Cameras of a video, each with its images, made smaller.
+    """Cameras of a video with downsampled images.
 
     Args:
         side: longer side of the images [px].
 
     Raises:
-        InputError: no such list, or an image that is damaged, missing or must not be read.
+        InputError: no such list, or an image that is damaged, missing or outside the permitted folders.
     """
     path = files.checked(files.transforms)
     listed = read_transforms(path)["frames"]
@@ -275,10 +263,10 @@ def load_views(files: SceneFiles, side: int = 160) -> tuple[View, ...]:
                 files.checked(path.parent / name)
     views = []
     for number in sorted({frame.get("view", i) for i, frame in enumerate(listed)}):
-        found = read_image_set(path, [number])
-        scale = min(1.0, side / max(found.width, found.height))
-        size = max(1, round(found.width * scale)), max(1, round(found.height * scale))
-        pictures = [Image.fromarray(image).resize(size, Image.Resampling.BOX) for image in found.images]
-        images = {int(step): np.asarray(image) for step, image in zip(found.steps, pictures, strict=True)}
-        views.append(View(number, found.viewmats[0], found.Ks[0], found.width, found.height, images))
+        full = read_image_set(path, [number])
+        scale = min(1.0, side / max(full.width, full.height))
+        size = max(1, round(full.width * scale)), max(1, round(full.height * scale))
+        small = [Image.fromarray(image).resize(size, Image.Resampling.BOX) for image in full.images]
+        images = {int(step): np.asarray(image) for step, image in zip(full.steps, small, strict=True)}
+        views.append(View(number, full.viewmats[0], full.Ks[0], full.width, full.height, images))
     return tuple(views)

@@ -1,4 +1,4 @@
-"""The viewer's server: the motions of a scene, and its body to play with, in a browser; drawn by viser."""
+"""The viewer's server: the motions of a scene and an interactive simulation in a browser, rendered by viser."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ from neuma_lib.viewer.scene import Motion, Scene, frame_at
 
 RECORDED, LIVE = "recorded", "live"
 NOTHING, SEEN, DISTANCE = "nothing", "Gaussians", "Gaussians by distance of both"
-BESIDE = 1.15
-"""From one box to the one beside it [m]."""
+OFFSET = 1.15
+"""Offset of the second box from the first [m]."""
 PACES = {"1/32": 1 / 32, "1/16": 1 / 16, "1/8": 1 / 8, "1/4": 1 / 4, "real time": 1.0}
-PICTURES = 15
-"""Most pictures a second that are sent."""
-_STILL = 0.05
-"""Seconds between looks at whether there is something new."""
-_READABLE = 0.5
-"""Seconds that a line of numbers stands: what changes with every picture cannot be read, and moves what is below it."""
+MAX_RATE = 15
+"""Maximum number of frames sent per second."""
+_POLL = 0.05
+"""Time to wait for a new snapshot [s]."""
+_TEXT_TIME = 0.5
+"""Minimum time between updates of the status text [s], for legibility."""
 _FRUSTUM = 0.12
 _HANDLE = 0.55
-"""Radius of what a hand grabs, in the longest side of the body."""
+"""Radius of the handle for dragging, in longest sides of the body."""
 
 
 def viser() -> ModuleType:
-    """The module viser. Raises InputError where it is not installed."""
+    """The module viser. Raises InputError if it is not installed."""
     return require("viser", "viewer")
 
 
@@ -50,9 +50,9 @@ class ViewerServer:
 
     Args:
         scene: recorded motions.
-        playground: to play with, or None.
-        host: address to listen at; 127.0.0.1 is this machine alone.
-        port: the next free one is taken where it is not free.
+        playground: interactive simulation, or None.
+        host: address to listen on; 127.0.0.1 is this machine only.
+        port: to listen on; the next free one is used if it is occupied.
     """
 
     def __init__(
@@ -74,16 +74,16 @@ class ViewerServer:
 
     @property
     def port(self) -> int:
-        """The port that it listens at."""
+        """The port of the server."""
         return self.server.get_port()
 
     @property
     def host(self) -> str:
-        """The address that it listens at."""
+        """The address of the server."""
         return self.server.get_host()
 
     def close(self) -> None:
-        """End drawing, simulation and server."""
+        """Stop drawing, simulation and server."""
         self._closing.set()
         self._drawer.join(timeout=10)
         if self.playground:
@@ -95,7 +95,7 @@ class ViewerServer:
     def _room(self) -> None:
         scene = self.server.scene
         scene.set_up_direction("+y")
-        for name, shift in (("left", 0.0), ("right", BESIDE)):
+        for name, shift in (("left", 0.0), ("right", OFFSET)):
             scene.add_frame(f"/{name}", show_axes=False, position=(shift, 0.0, 0.0))
             self._nodes[name, "box"] = scene.add_frame(f"/{name}/box", show_axes=False)
             scene.add_grid(
@@ -182,19 +182,19 @@ class ViewerServer:
         presses = {
             "reset": play.reset,
             "drop": lambda: simulation.drop(value("height")),
-            "throw": lambda: simulation.throw(value("velocity")),
+            "throw": lambda: simulation.launch(value("velocity")),
             "add": lambda: play.add(value("shape")),
         }
         for name, act in reactions.items():
             add[name].on_update(lambda event, act=act: self._act(act))
-        # not where it is put back after a refusal, which stays on the screen
+        # resetting the list after a rejected choice must not clear the message
         add["law"].on_update(lambda event: value("law") != play.chosen and self._act(self._choose))
         for name, act in presses.items():
             add[name].on_click(lambda event, act=act: self._act(act))
         x = simulation.snapshot.x
         radius = _HANDLE * float((x.amax(dim=0) - x.amin(dim=0)).max())
         self._handle = self.server.scene.add_mesh_trimesh(
-            "/left/box/handle", unseen_ball(radius), cast_shadow=False, receive_shadow=False, visible=False
+            "/left/box/handle", invisible_ball(radius), cast_shadow=False, receive_shadow=False, visible=False
         )
 
         @self._handle.on_drag
@@ -208,16 +208,16 @@ class ViewerServer:
             raise InputError(notice)
 
     def _act(self, act) -> None:
-        """Do what somebody asked for; an input that cannot be used is told, and changes nothing."""
+        """Execute an action of the user, and display the message of an invalid one."""
         try:
             act()
-            self._told = None
+            self._message = None
         except InputError as error:
-            self._told = str(error)
+            self._message = str(error)
         self._dirty = True
 
-    _told: str | None = None
-    _said, _trouble = 0.0, (None, None, None)
+    _message: str | None = None
+    _text_time, _trouble = 0.0, (None, None, None)
 
     def _play(self, playing: bool) -> None:
         self._playing = playing
@@ -228,7 +228,7 @@ class ViewerServer:
         self._clock = self.scene.dt * self.scene.steps[self.gui["frame"].value]
 
     def _slid(self, event) -> None:
-        if event.client_id is not None and self._playing:  # by somebody, not by playing
+        if event.client_id is not None and self._playing:  # moved by a user, not by playback
             self._play(False)
 
     def _changed(self) -> None:
@@ -256,9 +256,9 @@ class ViewerServer:
                     if self._dirty:
                         self._dirty = False
                         self._draw_recorded()
-            except Exception as error:  # the next picture may be all right
-                self._say(f"**cannot be drawn:** {type(error).__name__}: {error}")
-            rest = 1 / PICTURES - (time.perf_counter() - now)
+            except Exception as error:  # the next frame may be valid
+                self._set_status(f"**cannot be drawn:** {type(error).__name__}: {error}")
+            rest = 1 / MAX_RATE - (time.perf_counter() - now)
             self._closing.wait(max(rest, 0.002))
 
     def _advance(self, passed: float) -> None:
@@ -276,16 +276,16 @@ class ViewerServer:
     def _draw_recorded(self) -> None:
         step = self.scene.steps[self.gui["frame"].value]
         left = self._titled(self.gui["left"].value)
-        beside = None if self.gui["right"].value == NOTHING else self._titled(self.gui["right"].value)
+        right = None if self.gui["right"].value == NOTHING else self._titled(self.gui["right"].value)
         shown = self.gui["show"].value
         text = [f"**{1e3 * self.scene.dt * step:.0f} ms**"]
         self._turn(np.eye(3))
         with self.server.atomic():
             pair = shown == DISTANCE
-            self._draw_motion("left", left, step, shown, beside, text)
-            if beside and not pair:
-                self._draw_motion("right", beside, step, shown, left, text)
-            self._nodes["right", "frame"].visible = bool(beside and not pair)
+            self._draw_motion("left", left, step, shown, right, text)
+            if right and not pair:
+                self._draw_motion("right", right, step, shown, left, text)
+            self._nodes["right", "frame"].visible = bool(right and not pair)
             for view in self.scene.views:
                 at = frame_at(tuple(sorted(view.images)), step)
                 image = view.images[sorted(view.images)[at]]
@@ -293,7 +293,7 @@ class ViewerServer:
                 if node.visible and self._nodes.get(("image", view.number)) is not image:
                     node.image = image
                     self._nodes["image", view.number] = image
-        self._say("  \n".join([*text, *self.scene.notes]))
+        self._set_status("  \n".join([*text, *self.scene.notes]))
 
     def _draw_motion(
         self, side: str, motion: Motion, step: int, shown: str, other: Motion | None, text: list[str]
@@ -325,7 +325,7 @@ class ViewerServer:
 
     def _draw_live(self) -> None:
         play = self.playground
-        snapshot = play.simulation.wait(self._number + 1, _STILL)
+        snapshot = play.simulation.wait(self._number + 1, _POLL)
         if snapshot.number == self._number and not self._dirty:
             return
         self._number, self._dirty = snapshot.number, False
@@ -342,10 +342,10 @@ class ViewerServer:
             else:
                 self._points("left", snapshot.x, play.values(snapshot, name), name, self.scene.volume)
             self._handle.position = snapshot.x[: snapshot.counts[0]].mean(dim=0).numpy()
-        now, trouble = time.perf_counter(), (snapshot.trouble, snapshot.notice, self._told)
-        if now - self._said > _READABLE or trouble != self._trouble:
-            self._said, self._trouble = now, trouble
-            self._say(self._live_text(snapshot))
+        now, trouble = time.perf_counter(), (snapshot.trouble, snapshot.notice, self._message)
+        if now - self._text_time > _TEXT_TIME or trouble != self._trouble:
+            self._text_time, self._trouble = now, trouble
+            self._set_status(self._live_text(snapshot))
 
     def _live_text(self, snapshot: Snapshot) -> str:
         lines = [
@@ -354,15 +354,15 @@ class ViewerServer:
         ]
         if snapshot.trouble:
             lines.append(f"**Stopped: the simulation diverged.** {snapshot.trouble} — press *Reset*")
-        if told := self._told or snapshot.notice:
-            lines.append(f"*{told}*")
+        if message := self._message or snapshot.notice:
+            lines.append(f"*{message}*")
         return "  \n".join(lines)
 
     def _titled(self, title: str) -> Motion:
         return next(motion for motion in self.scene.motions if motion.title == title)
 
     def _largest_gap(self, a: Motion, b: Motion) -> float:
-        """Distance that 99 of 100 Gaussians of all frames do not exceed, rounded up [m]."""
+        """99th percentile of the distances between Gaussians in all frames, rounded up [m]."""
         if (a.name, b.name) not in self._reach:
             at = [frame_at(b.steps, step) for step in a.steps]
             gaps = (a.means - b.means[at]).norm(dim=-1)
@@ -387,7 +387,7 @@ class ViewerServer:
 
     def _points(self, side: str, x: torch.Tensor, values, name: str, volume: float) -> None:
         quantity = QUANTITIES[name]
-        low, high = self.scene.ranges.get(name, (0.0, quantity.least))
+        low, high = self.scene.ranges.get(name, (0.0, quantity.min_range))
         rgb = np.full((len(x), 3), 0.7)
         if values is not None:
             rgb = colours(COLOURS[quantity.middle], ((values - low) / (high - low)).numpy())
@@ -427,36 +427,36 @@ class ViewerServer:
         if self._nodes.pop("legend", None):
             self._bar.visible = self._legend.visible = False
 
-    def _say(self, text: str) -> None:
+    def _set_status(self, text: str) -> None:
         if self._status.content != text:
             self._status.content = text
 
 
-def unseen_ball(radius: float) -> trimesh.Trimesh:
-    """A ball to grab that hides nothing: viewers of glTF write no depth for what blends."""
+def invisible_ball(radius: float) -> trimesh.Trimesh:
+    """A transparent ball for dragging; with alpha blending, glTF viewers write no depth for it."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=radius)
-    unseen = PBRMaterial(baseColorFactor=(255, 255, 255, 0), alphaMode="BLEND")
-    ball.visual = TextureVisuals(material=unseen)
+    transparent = PBRMaterial(baseColorFactor=(255, 255, 255, 0), alphaMode="BLEND")
+    ball.visual = TextureVisuals(material=transparent)
     return ball
 
 
 def quantity_named(shown: str) -> str | None:
-    """The quantity of an entry of the list of what can be shown; None for Gaussians."""
+    """Name of the quantity of an entry of the list "show"; None for Gaussians."""
     return next((name for name, q in QUANTITIES.items() if shown == f"particles by {q.label}"), None)
 
 
 def colours(name: str, share: np.ndarray) -> np.ndarray:
-    """RGB (N, 3) in [0, 1] of values (N,) between 0 and 1 on matplotlib's map of that name."""
+    """RGB (N, 3) in [0, 1] of values (N,) in [0, 1] in a matplotlib colour map."""
     return require("matplotlib", "viewer").colormaps[name](np.clip(share, 0, 1))[:, :3]
 
 
 def colour_bar(name: str) -> np.ndarray:
-    """A picture of a colour map, from low to high."""
+    """Image of a colour map, from low to high."""
     return np.broadcast_to((255 * colours(name, np.linspace(0, 1, 256))).astype(np.uint8), (14, 256, 3))
 
 
 def in_units(value: float, unit: str) -> str:
-    """A value with its unit, pascals with a prefix."""
+    """A value with its unit, with a prefix for pascals."""
     for factor, prefix in ((1e6, "M"), (1e3, "k")):
         if unit == "Pa" and abs(value) >= factor:
             return f"{value / factor:.4g} {prefix}Pa"

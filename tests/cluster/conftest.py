@@ -4,8 +4,9 @@ import importlib.util
 import sys
 
 import pytest
-from project import TABLE, Project, copied
-from slurm import cluster, missing
+
+from tests.support.project import TABLE, Project, copied
+from tests.support.slurm import cluster, missing
 
 PLUGIN = "snakemake_executor_plugin_slurm"
 # The plugin's first look at its jobs comes after 40 seconds by default.

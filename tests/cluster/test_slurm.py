@@ -14,17 +14,17 @@ from pathlib import Path
 
 import pytest
 import torch
-from project import SCENE, TABLE, Project, copied, wait_for
 
 from neuma_lib.io.weights import read_torch
-from neuma_lib.timings import core_seconds
+from neuma_lib.project.timings import core_seconds
+from tests.support.project import SCENE, TABLE, Project, copied, wait_for
 
 # Table 1 with a training that is long enough to be cancelled in the middle; all before it is there.
 LONGER = ("--config", "material={iterations: 400}", "--", TABLE)
 CHECKPOINT = f"{SCENE}/neuma/checkpoint.pt"
 SCENE_RULES = (
     *("ground_truth", "render_static", "render_dynamic", "gaussians", "mesh", "sampled_particles"),
-    *("binding", "velocity", "tracers", "material", "evaluation"),
+    *("binding", "velocity", "tracers", "fit_neuma", "evaluate"),
 )
 
 
@@ -118,7 +118,7 @@ def test_jobs_ask_for_what_their_rules_say_and_use_no_more(finished, slurm):
     asked = {job["Comment"]: job for number, job in jobs(slurm).items() if number in ran}
     used = measured(finished)
     assert set(planned) == set(asked) == set(used)
-    assert planned[f"rule_material_wildcards_{Path(SCENE).name}_neuma"]["mem_mb"] == 6000
+    assert planned[f"rule_fit_neuma_wildcards_{Path(SCENE).name}_neuma"]["mem_mb"] == 6000
     for name, job in asked.items():
         said = planned[name]
         assert f"cpu=1,mem={said['mem_mb']}M,node=1," in job["TRES"], name
@@ -158,7 +158,7 @@ def started_training(project: Project, slurm) -> tuple[subprocess.Popen, dict[st
     """Start the run, and wait until its training has gone some way. Returns Snakemake and SLURM's job."""
     snakemake = project.start(*LONGER)
     wait_for(lambda: reached(project) >= 20, 600)
-    job = job_of(slurm, "material")
+    job = job_of(slurm, "fit_neuma")
     assert job["JobState"] == "RUNNING"
     return snakemake, job
 
@@ -170,9 +170,9 @@ def goes_on(project: Project, slurm, uninterrupted: dict[str, str]) -> None:
     output = project.run(*LONGER)
     told = jobs(slurm)
     names = {told[number]["Comment"].split("_wildcards_")[0] for number in submitted(output)}
-    assert names == {"rule_material", "rule_evaluation", "rule_chamfer_table"}
+    assert names == {"rule_fit_neuma", "rule_evaluate", "rule_chamfer_table"}
     assert len(submitted(output)) == 3
-    (log,) = (project.root / "tiny/results/logs").rglob("neuma/material.log")
+    (log,) = (project.root / "tiny/results/logs").rglob("neuma/fit_neuma.log")
     assert f"resumed at iteration {iteration} of 400" in log.read_text()
     assert project.artifacts() == uninterrupted
     remade = {name for name, time in made(project).items() if finished.get(name) != time}
@@ -208,13 +208,13 @@ def test_an_interrupted_snakemake_takes_its_jobs_along(interruptible, clone, slu
 
 def test_a_job_that_needs_more_memory_than_it_asks_for_is_ended_and_says_so(clone, slurm):
     target = f"{SCENE}/neuma+rank=3/adaptor.safetensors"
-    clone.run("--set-resources", "material:mem_mb=300", "--", target, succeeds=False)
-    job = job_of(slurm, "material")
+    clone.run("--set-resources", "fit_neuma:mem_mb=300", "--", target, succeeds=False)
+    job = job_of(slurm, "fit_neuma")
     assert "mem=300M" in job["TRES"] and job["JobState"] == "FAILED"
     assert "Exceeded job memory limit" in slurm_log(job)
     assert not (clone.root / target).exists()
     clone.run(target)
-    assert "mem=6000M" in job_of(slurm, "material")["TRES"]
+    assert "mem=6000M" in job_of(slurm, "fit_neuma")["TRES"]
 
 
 # ---- several of ours as one of SLURM's

@@ -1,8 +1,8 @@
 """Compare the results of two runs, file by file: ``python -m tests.support.same_results A B``.
 
 A and B are folders of results or data. Logs, benchmarks and checkpoints are left out. Files are equal if their bytes
-are equal. With ``--values``, HDF5, NPZ, safetensors and PNG files are equal if their arrays are, and JSON files if their
-contents are: metadata, which repeat settings and commits, may then differ.
+are equal. With ``--values``, HDF5, NPZ, safetensors and PNG files are equal if their arrays are, and JSON files if
+their contents are: metadata, which repeat settings and commits, may then differ.
 
 The exit status is 0 if no file differs and both folders have the same files.
 """

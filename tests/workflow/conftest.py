@@ -1,7 +1,8 @@
 """What the tests of the workflow share: one finished run."""
 
 import pytest
-from project import SCENE, TABLE, copied
+
+from tests.support.project import SCENE, TABLE, copied
 
 
 @pytest.fixture(scope="session")

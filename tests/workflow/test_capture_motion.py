@@ -6,10 +6,11 @@ import subprocess
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from board_pictures import BOARD, LENS, around, looking_at, picture
 from PIL import Image
-from project import copied
 from scipy.spatial.transform import Rotation
+
+from tests.support.board_pictures import BOARD, LENS, around, looking_at, picture
+from tests.support.project import copied
 
 PAGE = "tiny/results/mug/motion.md"
 SETTINGS = "board: {square: 0.03}\nposes: board\nlens: lenses.json\nlongest: 400\n"
@@ -157,7 +158,7 @@ def test_bad_videos_and_masks_end_with_one_line(project):
     empty = np.asarray(Image.open(mug / "stills/left.png"))
     write_video(mug / "videos/left.mp4", [empty[:400]] * 8)
     said = project.run(left, succeeds=False)
-    assert "left.mp4 is 800x400, the picture of the empty scene" in said and "Traceback" not in said
+    assert "left.mp4: the video is 800x400" in said and "Traceback" not in said
     (mug / "videos/left.mp4").write_bytes(video)
     (mug / "masks/first/left").mkdir(parents=True)
     Image.new("L", (800, 600), 255).save(mug / "masks/first/left/900.png")

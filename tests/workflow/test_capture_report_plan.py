@@ -4,8 +4,9 @@ import re
 from collections import Counter
 
 import pytest
-from project import copied
-from test_graph import jobs
+
+from tests.support.job_graph import jobs
+from tests.support.project import copied
 
 SETTINGS = "board: {square: 0.03}\nheld_out: [two]\n"
 REPORT = "tiny/results/mug/{method}/report.html"
@@ -38,10 +39,12 @@ def test_the_report_plans_every_stage_once(graph):
     planned = Counter(rule for rule, _, _ in graph)
     expected = {f"capture_{name}": 1 for name in once} | {f"capture_{name}": 3 for name in throws}
     expected |= {"capture_frames": 6, "capture_video_masks": 6}
-    expected |= {"capture_prediction": 9, "capture_view": 18}  # the prior, the constants, and the law
-    expected |= dict.fromkeys(("gaussians", "mesh", "sampled_particles", "binding", "prior", "material"), 1)
+    expected |= {"predict": 9, "capture_view": 18}  # the prior, the constants, and the law
+    expected |= dict.fromkeys(
+        ("gaussians", "mesh", "sampled_particles", "binding", "prior", "fit_structured"), 1
+    )
     assert expected.items() <= planned.items(), planned
-    assert not planned.keys() & {"ground_truth", "evaluation", "velocity", "tracers", "image_metrics"}
+    assert not planned.keys() & {"ground_truth", "evaluate", "velocity", "tracers", "image_metrics"}
     # Constants begin where identification found: in each video that the law is learned from, and in none held out.
     assert planned["identify_views"] == 2
 
@@ -63,7 +66,11 @@ def test_a_held_out_throw_has_the_law_of_the_others_and_the_start_of_its_flight(
 
 def test_reports_of_the_prior_and_the_constants_train_nothing(project):
     planned = project.plan(*(REPORT.format(method=method) for method in ("nclaw", "constants")))
-    assert "material" not in planned and planned["capture_report"] == 2 and planned["capture_prediction"] == 6
+    assert (
+        not any(rule.startswith("fit_") for rule in planned)
+        and planned["capture_report"] == 2
+        and planned["predict"] == 6
+    )
 
 
 def test_what_cannot_be_reported_is_said(project):

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 import yaml
-from project import copied
-from test_layouts import WRITERS, centre_of, ours
-from test_released import write_release
 
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import read_image_set
+from tests.support.image_layouts import WRITERS, centre_of, ours
+from tests.support.project import copied
+from tests.support.released_images import write_release
 
 
 def test_workflow_takes_supplied_images_in_place_of_blenders(tmp_path):
@@ -50,7 +50,7 @@ def test_a_scene_is_made_of_another_systems_folder(tmp_path, layout):
     own.write_text(yaml.safe_dump(settings))
     plan = project.plan("tiny/results/Theirs/neuma/metrics.json")
     assert (
-        plan["supplied_static"] == plan["supplied_dynamic"] == plan["material"] == plan["ground_truth"] == 1
+        plan["supplied_static"] == plan["supplied_dynamic"] == plan["fit_neuma"] == plan["ground_truth"] == 1
     )
     assert not any(rule.startswith("render") for rule in plan)
     output = project.run(*(f"tiny/data/Theirs/{kind}/transforms.json" for kind in images if kind != "stride"))

@@ -67,4 +67,4 @@ def test_a_missing_python_is_named(tmp_path):
 
 def test_a_missing_system_library_is_named_with_its_package():
     text = "ImportError: libXi.so.6: cannot open shared object file: No such file or directory"
-    assert "libxi6" in explain_import_error(text) and "apt-get install" in explain_import_error(text)
+    assert "apt-get install libxi6" in explain_import_error(text).remedy

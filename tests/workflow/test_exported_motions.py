@@ -9,13 +9,13 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 import trimesh
-from blends import read_blend
 from PIL import Image
 from plyfile import PlyData
-from project import SCENE
 
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.splats import load_splat
+from tests.support.blends import read_blend
+from tests.support.project import SCENE
 
 EXPERIMENTS = "tiny/results/experiments"
 SPRINGS = "spring_gaus+iterations=2"

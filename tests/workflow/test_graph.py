@@ -3,28 +3,20 @@
 import re
 
 import pytest
-from project import SCENE, TABLE, copied
 
-from neuma_lib.config.places import law_files
-from neuma_lib.project import settings_around
+from neuma_lib.project import cases
+from neuma_lib.project.project import settings_around
+from tests.support.job_graph import jobs
+from tests.support.project import SCENE, TABLE, copied
 
 EXPERIMENT = f"{SCENE.rpartition('/')[0]}/experiments/letter_N_bouncy"
 SUPERVISED = "neuma_particle_supervision"  # the one method that trains on the truth
 # Blender films the truth, evaluation measures against it; figures and viewer show it.
 MAY_READ_THE_TRUTH = {
-    *("render_static", "render_dynamic", "initial_state", "evaluation", "viewer", "experiment"),
+    *("render_static", "render_dynamic", "initial_state", "evaluate", "viewer", "evaluate_experiment"),
     *("tracers", "experiment_tracers"),
     *("particles_app", "lora_alphav", "ext_time"),
 }
-
-
-def jobs(plan: str) -> list[tuple[str, list[str], list[str]]]:
-    """Rule, inputs and outputs of every job of a dry run."""
-    found = []
-    for rule, said in re.findall(r"^(?:local)?rule (\w+):\n((?:    .*\n)*)", plan, re.MULTILINE):
-        listed = dict(re.findall(r"^    (input|output): (.*)$", said, re.MULTILINE))
-        found.append((rule, *(listed.get(key, "").split(", ") for key in ("input", "output"))))
-    return found
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +37,8 @@ def test_only_evaluation_and_figures_of_it_and_one_ablation_read_the_truth(proje
     }
     assert len(truths) > 5
     readers = {(rule, made[0]) for rule, read, made in graph if truths & set(read)}
-    assert {rule for rule, _ in readers} == MAY_READ_THE_TRUTH | {"material"}
-    trained = {made for rule, made in readers if rule == "material"}
+    assert {rule for rule, _ in readers} == MAY_READ_THE_TRUTH | {"fit_neuma"}
+    trained = {made for rule, made in readers if rule == "fit_neuma"}
     assert trained and all(f"/{SUPERVISED}" in made for made in trained)
     (supervised,) = [
         read for rule, read, made in graph if made[0] == f"{SCENE}/{SUPERVISED}/adaptor.safetensors"
@@ -75,10 +67,10 @@ def test_identified_constants_need_the_video_and_no_training(project):
     graph = jobs(project.run("--dry-run", target, f"{SCENE}/identified.png"))
     made = {rule: (read, outputs) for rule, read, outputs in graph}
     read, outputs = made["identify"]
-    assert outputs == [f"{SCENE}/identified.json"] and "identified_page" in made and "material" not in made
+    assert outputs == [f"{SCENE}/identified.json"] and "identified_page" in made and "fit_neuma" not in made
     assert any(file.endswith("transforms.json") for file in read)
     assert not any("particles.h5" in file and "/data/" in file for file in read), "the truth"
-    assert f"{SCENE}/identified.json" in made["evaluation"][0]
+    assert f"{SCENE}/identified.json" in made["evaluate"][0]
     chained = project.run("--dry-run", target.replace("/constants", "+seed=1/constants"))
     assert f"{SCENE}+seed=1/identified.json" in chained
 
@@ -86,15 +78,15 @@ def test_identified_constants_need_the_video_and_no_training(project):
 def test_springs_are_fitted_to_the_video_alone(project):
     graph = jobs(project.run("--dry-run", f"{SCENE}/spring_gaus+anchors=50/metrics.json"))
     made = {rule: (read, outputs) for rule, read, outputs in graph}
-    read, outputs = made["springs"]
-    assert outputs[0] == f"{SCENE}/spring_gaus+anchors=50/springs.safetensors" and "material" not in made
+    read, outputs = made["fit_spring_gaus"]
+    assert outputs[0] == f"{SCENE}/spring_gaus+anchors=50/springs.safetensors" and "fit_neuma" not in made
     assert "tiny/data/BouncyBall/dynamic/transforms.json" in read and f"{SCENE}/velocity.json" in read
     assert not any("/priors/" in file or "/data/BouncyBall/particles.h5" in file for file in read)
-    assert outputs[0] in made["springs_evaluation"][0] and "evaluation" not in made
+    assert outputs[0] in made["evaluate"][0]
     target = "tiny/results/experiments/{}/spring_gaus/metrics.json"
     graph = jobs(project.run("--dry-run", target.format("letter_N_bouncy")))
     made = {rule: (read, outputs) for rule, read, outputs in graph}
-    assert f"{SCENE}/spring_gaus/springs.safetensors" in made["springs_experiment"][0]
+    assert f"{SCENE}/spring_gaus/springs.safetensors" in made["evaluate_experiment"][0]
     for impossible in (target.format("letter_and_ball"), f"{SCENE}/spring_gaus/stress.json"):
         refused = project.run("--dry-run", impossible, succeeds=False)
         assert "only springs in one body: it has no stress, and no experiment" in refused
@@ -103,14 +95,18 @@ def test_springs_are_fitted_to_the_video_alone(project):
 def test_springs_and_laws_of_a_table_are_put_to_use_elsewhere_as_their_scenes_taught_them(project):
     """Fits are those of the scenes: the table repeats none, and none sees more than the video."""
     graph = jobs(project.run("--dry-run", "tiny/results/table2_systems.csv"))
-    fitted = [outputs[0] for rule, _, outputs in graph if rule in ("springs", "pac_nerf")]
+    fitted = [outputs[0] for rule, _, outputs in graph if rule in ("fit_spring_gaus", "fit_pac_nerf")]
     scenes, files = (
         ("BouncyBall", "JellyDuck", "RubberPawn"),
         {"spring_gaus/springs.safetensors", "pac_nerf/constants.json"},
     )
     assert sorted(fitted) == sorted(f"tiny/results/{scene}/{file}" for scene in scenes for file in files)
-    used = {outputs[0].split("/")[3]: read for rule, read, outputs in graph if rule == "springs_experiment"}
-    assert len(used) == 5 and sum(rule == "experiment" for rule, *_ in graph) == 5 * 5
+    used = {
+        outputs[0].split("/")[3]: read
+        for rule, read, outputs in graph
+        if rule == "evaluate_experiment" and "/spring_gaus/" in outputs[0]
+    }
+    assert len(used) == 5 and sum(rule == "evaluate_experiment" for rule, *_ in graph) == 6 * 5
     for experiment, scene in (
         ("letter_N_jelly", "JellyDuck"),
         ("longer_jelly", "JellyDuck"),
@@ -129,12 +125,14 @@ def test_pac_nerf_needs_images_its_field_and_contact_alone(project):
     run = f"{SCENE}+seed=1/pac_nerf+guesses=prior"
     graph = jobs(project.run("--dry-run", f"{run}/metrics.json"))
     made = {rule: (read, outputs) for rule, read, outputs in graph}
-    read, outputs = made["pac_nerf"]
-    assert outputs[0] == f"{run}/constants.json" and not {"material", "identify"} & set(made)
+    read, outputs = made["fit_pac_nerf"]
+    assert outputs[0] == f"{run}/constants.json" and not {"fit_neuma", "fit_structured", "identify"} & set(
+        made
+    )
     assert made["radiance_field"][1][0] == f"{SCENE}+seed=1/pac_nerf/field.safetensors" in read
     assert "tiny/data/BouncyBall/dynamic/transforms.json" in read and f"{SCENE}+seed=1/velocity.json" in read
     assert not any("/priors/" in file or "/data/BouncyBall/particles.h5" in file for file in read)
-    judged = made["evaluation"][0]
+    judged = made["evaluate"][0]
     assert f"{run}/constants.json" in judged and not any("velocity.json" in file for file in judged)
 
 
@@ -142,12 +140,12 @@ def test_pac_nerfs_own_particles_are_judged_with_its_field_and_fit_nothing_again
     own, base = (f"{SCENE}+seed=1/{name}+guesses=prior" for name in ("pac_nerf_own", "pac_nerf"))
     graph = jobs(project.run("--dry-run", *(f"{own}/{name}" for name in ("image_metrics.json", "video.mp4"))))
     made = {rule: (read, outputs) for rule, read, outputs in graph}
-    assert made["pac_nerf"][1][0] == f"{base}/constants.json" and "radiance_field" in made
-    for rule in ("evaluation", "image_metrics", "video"):
+    assert made["fit_pac_nerf"][1][0] == f"{base}/constants.json" and "radiance_field" in made
+    for rule in ("evaluate", "image_metrics", "video"):
         read, (first, *_) = made[rule]
         assert first.startswith(f"{own}/") and f"{SCENE}+seed=1/pac_nerf/field.safetensors" in read
         assert any(file.endswith("radiance.ready") for file in read)
-    assert f"{base}/constants.json" in made["evaluation"][0]
+    assert f"{base}/constants.json" in made["evaluate"][0]
     for name, said in {
         "constants.json": "MissingRule",
         "history.json": "trains nothing: its law is that of",
@@ -179,9 +177,9 @@ def test_a_structured_law_corrects_what_the_video_shows(project):
     """Around the constants of its scene, in its chain, and without networks to start from."""
     graph = jobs(project.run("--dry-run", f"{SCENE}+seed=1/neuma_structured/metrics.json"))
     made = {rule: (read, outputs) for rule, read, outputs in graph}
-    assert f"{SCENE}+seed=1/identified.json" in made["material"][0]
-    assert not any("/priors/" in file for rule in ("material", "evaluation") for file in made[rule][0])
-    assert f"{SCENE}+seed=1/neuma_structured/adaptor.safetensors" in made["evaluation"][0]
+    assert f"{SCENE}+seed=1/identified.json" in made["fit_structured"][0]
+    assert not any("/priors/" in file for rule in ("fit_structured", "evaluate") for file in made[rule][0])
+    assert f"{SCENE}+seed=1/neuma_structured/adaptor.safetensors" in made["evaluate"][0]
     graph = jobs(
         project.run("--dry-run", f"{SCENE}/neuma_structured+prior=jelly+start=estimated/metrics.json")
     )
@@ -212,11 +210,10 @@ def test_the_command_line_exports_the_law_that_the_rule_exports(project):
         if rule == "export_law"
     }
     for target, (scene, method) in targets.items():
-        files = law_files(settings, scene, method)
-        named = {files.identified, files.prior, files.adaptor} - {None}
+        named = set(cases.case(settings, scene, method).source().paths)
         own = {f"tiny/results/{scene}/{method}/{file}" for file in ("metrics.json", "rollout.h5")}
         assert read[target] - own == {"tiny/data/kernels/laws.ready", *named} and bool(named) == (
-            files.spec is None
+            method != "true_law"
         )
         assert own <= read[target] or "law_from" in method
 
@@ -229,7 +226,7 @@ def test_more_views_have_constants_of_their_own(project):
     (found,) = [outputs for rule, _, outputs in graph if rule.startswith("identify")]
     assert found == [f"{SCENE}+seed=1/identified+views=0,1.json"]
     readers = [rule for rule, read, _ in graph if found[0] in read]
-    assert sorted(readers) == ["evaluation", "evaluation", "material"]  # of both methods: law and throw
+    assert sorted(readers) == ["evaluate", "evaluate", "fit_structured"]  # of both methods: law and throw
 
 
 def test_stresses_are_compared_in_the_states_of_their_chain_and_drawn_over_those_of_the_first(project):
@@ -248,14 +245,14 @@ def test_networks_can_start_from_what_the_video_shows(project):
     read, outputs = made["identified_prior"]
     assert f"{SCENE}+seed=1/identified.json" in read
     assert outputs[0] == f"{SCENE}+seed=1/priors/identified.safetensors"
-    assert all(outputs[0] in made[rule][0] for rule in ("material", "evaluation"))
+    assert all(outputs[0] in made[rule][0] for rule in ("fit_neuma", "evaluate"))
     assert "tiny/results/priors/jelly+seed=1.safetensors" in made["velocity"][0]
 
 
 def test_a_method_can_start_as_identification_found(project):
     graph = jobs(project.run("--dry-run", f"{SCENE}+seed=1/neuma+start=identified/metrics.json"))
     made = {rule: (read, outputs) for rule, read, outputs in graph}
-    for rule in ("material", "evaluation"):
+    for rule in ("fit_neuma", "evaluate"):
         assert f"{SCENE}+seed=1/identified.json" in made[rule][0]
         assert not any(file.endswith("velocity.json") for file in made[rule][0])
 
@@ -268,6 +265,24 @@ def test_finer_bodies_must_be_finer(project):
         )
         told = "identify.particles: 200 are not more than the 200 of the reconstruction"
         assert (told in output) != accepted
+
+
+def test_rules_with_a_script_get_what_they_leave_out(project):
+    """Fails where a Snakemake no longer reads what `workflow.defaults.complete` writes."""
+    target = f"{SCENE}+seed=1/neuma/video.mp4"
+    plan = project.run("--dry-run", "--set-resources", "mesh:runtime=7", "--", target)
+    blocks = dict(re.findall(r"^rule (\w+):\n((?:    .*\n)*)", plan, re.MULTILINE))
+    for rule, expected in {
+        "video": (
+            "log: tiny/results/logs/BouncyBall+seed=1/neuma/video.log",
+            "benchmark: tiny/results/benchmarks/BouncyBall+seed=1/neuma/video.tsv",
+            *("mem_mb=4000,", "runtime=60,", "gpu="),
+        ),
+        "fit_neuma": ("mem_mb=6000,", "runtime=240,"),
+        "mesh": ("mem_mb=4000,", "runtime=7,"),
+        "kernels": ("log: tiny/data/kernels/logs/",),
+    }.items():
+        assert all(text in blocks[rule] for text in expected), blocks[rule]
 
 
 def test_images_are_rendered_where_the_settings_say(project):
@@ -292,7 +307,7 @@ DATA_RULES = ("kernels", "ground_truth", "render_static", "render_dynamic")
 def test_three_chains_share_their_data_and_nothing_else(project):
     one, three = project.plan(TABLE), project.plan(*CHAINS, TABLE)
     shared = {*DATA_RULES, "chamfer_table", "total"}
-    assert {"prior", "gaussians", "sampled_particles", "velocity", "material", "evaluation"} <= set(one)
+    assert {"prior", "gaussians", "sampled_particles", "velocity", "fit_neuma", "evaluate"} <= set(one)
     assert three == {rule: count if rule in shared else 3 * count for rule, count in one.items()}
     graph = jobs(project.run("--dry-run", *CHAINS, TABLE))
     made = [file for *_, outputs in graph for file in outputs]
@@ -308,13 +323,13 @@ def test_three_chains_share_their_data_and_nothing_else(project):
 @pytest.mark.parametrize(
     ("drawn", "anew"),
     [
-        ("adaptor", {"material": 2}),
-        ("prior", {"prior": 2, "velocity": 2, "material": 2}),
-        ("particles", {"sampled_particles": 2, "binding": 2, "velocity": 2, "material": 2}),
+        ("adaptor", {"fit_neuma": 2}),
+        ("prior", {"prior": 2, "velocity": 2, "fit_neuma": 2}),
+        ("particles", {"sampled_particles": 2, "binding": 2, "velocity": 2, "fit_neuma": 2}),
         (
             "gaussians",
             dict.fromkeys(
-                ["gaussians", "mesh", "tracers", "sampled_particles", "binding", "velocity", "material"], 2
+                ["gaussians", "mesh", "tracers", "sampled_particles", "binding", "velocity", "fit_neuma"], 2
             ),
         ),
     ],
@@ -324,7 +339,7 @@ def test_what_varies_alone_repeats_what_depends_on_it(project, drawn, anew):
     three = project.plan("--config", f"tables={{table1: {{seeds: 3, vary: [{drawn}]}}}}", "--", TABLE)
     evaluations = 2 if drawn == "adaptor" else 4  # the prior's motion has no adaptor
     total = {"total": sum(anew.values()) + evaluations}
-    more = {**anew, **total, "evaluation": evaluations}
+    more = {**anew, **total, "evaluate": evaluations}
     assert three == {rule: count + more.get(rule, 0) for rule, count in one.items()}
 
 
@@ -333,9 +348,9 @@ def test_an_experiment_follows_the_chains_of_its_scenes(project):
         project.run("--dry-run", "tiny/results/experiments/letter_and_ball+seed=1/neuma/metrics.json")
     )
     read = {rule: files for rule, files, _ in graph}
-    assert f"{SCENE}+seed=1/neuma/adaptor.safetensors" in read["experiment"]
-    assert "tiny/results/priors/jelly+seed=1.safetensors" in read["experiment"]
-    assert "tiny/data/experiments/letter_and_ball/particles.h5" in read["experiment"]
+    assert f"{SCENE}+seed=1/neuma/adaptor.safetensors" in read["evaluate_experiment"]
+    assert "tiny/results/priors/jelly+seed=1.safetensors" in read["evaluate_experiment"]
+    assert "tiny/data/experiments/letter_and_ball/particles.h5" in read["evaluate_experiment"]
     assert f"{SCENE}+seed=1/velocity.json" in read["experiment_start"]
 
 
@@ -347,8 +362,8 @@ def test_several_videos_train_one_law_which_is_judged_on_all(project):
     held_out = "neuma+law_from=BouncyBall"
     targets = (f"{SCENE}+seed=1/neuma/metrics.json", f"{THROW}+seed=1/{held_out}/metrics.json")
     graph = jobs(project.run("--dry-run", *TWO_VIDEOS, *targets, f"{SCENE}+seed=1/identified.json"))
-    ((_, (adaptor, _)),) = [(read, made) for rule, read, made in graph if rule == "material"]
-    for read in (read for rule, read, _ in graph if rule in ("material", "identify")):
+    ((_, (adaptor, _)),) = [(read, made) for rule, read, made in graph if rule == "fit_neuma"]
+    for read in (read for rule, read, _ in graph if rule in ("fit_neuma", "identify")):
         for folder in (f"{SCENE}+seed=1", f"{THROW}+seed=1"):
             for file in ("particles.h5", "binding.h5", "gaussians.ply", "velocity.json"):
                 assert f"{folder}/{file}" in read
@@ -356,7 +371,7 @@ def test_several_videos_train_one_law_which_is_judged_on_all(project):
             "tiny/data/BouncyBall/dynamic/transforms.json",
             "tiny/data/BouncyBall_throw2/dynamic/transforms.json",
         }
-    judged = {made[0]: read for rule, read, made in graph if rule == "evaluation"}
+    judged = {made[0]: read for rule, read, made in graph if rule == "evaluate"}
     assert len(judged) == 2 and all(adaptor in read for read in judged.values())
     refused = f"{THROW}/{held_out}/adaptor.safetensors"
     said = project.run("--dry-run", *TWO_VIDEOS, refused, succeeds=False)

@@ -5,18 +5,18 @@ import json
 import numpy as np
 import pytest
 import torch
-from flight_scene import GAINS, PLACE, VELOCITY, filmed, thing, true_motion
 from PIL import Image
-from project import copied
 from scipy.spatial.transform import Rotation
 
 from neuma_lib.coupling.binding import Binding
-from neuma_lib.fitting.throw import Throw
+from neuma_lib.coupling.initial_motion import Throw
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.gaussians import load_gaussians, save_gaussians
 from neuma_lib.io.images import OPENGL_TO_OPENCV, load_views, write_transforms
 from neuma_lib.io.mesh import read_mesh, write_mesh
 from neuma_lib.io.particles import load_body, load_particles, save_binding, save_particles
+from tests.support.flight_scene import GAINS, PLACE, VELOCITY, filmed, thing, true_motion
+from tests.support.project import copied
 
 OFFSET, SIZE, FRAMES = 0.0035, (80, 60), 10
 RULES = ("--allowed-rules", "capture_registration", "capture_video", "kernels")

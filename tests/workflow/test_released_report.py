@@ -4,8 +4,9 @@ import json
 
 import pytest
 import yaml
-from project import copied
-from released_layouts import write_spring_gaus
+
+from tests.support.project import copied
+from tests.support.released_layouts import write_spring_gaus
 
 PAGE, FIGURE = "tiny/results/bun/neuma/report.html", "tiny/results/figures/realworld.png"
 
@@ -23,7 +24,7 @@ def test_a_released_capture_goes_to_its_report_and_into_the_figure(tmp_path):
     tiny.write_text(yaml.safe_dump(settings))
     made.run(PAGE, FIGURE)
     page = (made.root / PAGE).read_text()
-    assert "10 photographs, 1 throw, 3 cameras" in page and "What to distrust" in page
+    assert "10 photographs, 1 take, 3 cameras" in page and "Warnings" in page
     assert (made.root / FIGURE).stat().st_size > 10_000
     results = made.root / "tiny/results"
     placed = json.loads((results / "bun_first/registration.json").read_text())

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from project import ROOT, copied
+
+from tests.support.project import ROOT, copied
 
 pytestmark = pytest.mark.slow
 
@@ -44,7 +45,7 @@ def project(tmp_path_factory):
 
 
 def test_an_edit_of_a_figure_makes_this_figure_again(project):
-    module = project.root / "neuma_lib/evaluation/figures/main_res.py"
+    module = project.root / "neuma_lib/paper/figures/main_res.py"
     original = module.read_text()
     module.write_text(original.replace('"""', '"""Another caption. ', 1))
     assert project.plan(*TARGETS) == {}
@@ -91,6 +92,6 @@ def test_report_shows_a_figure_with_its_caption(report):
     assert (content < 200).any(-1).mean() > 0.005  # the figure is there, not an empty page
     page = browse(report, '[["Figures", null], ["main_res", 1]]', "--dump-dom")
     shown = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
-    module = ast.parse((ROOT / "neuma_lib/evaluation/figures/main_res.py").read_text())
+    module = ast.parse((ROOT / "neuma_lib/paper/figures/main_res.py").read_text())
     caption = ast.get_docstring(module).split(":")[0]
     assert caption in " ".join(shown.split())

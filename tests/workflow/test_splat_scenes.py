@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 from PIL import Image
 from plyfile import PlyData
-from project import copied
-from splat_files import ball, write_spz
 
 from neuma_lib.io.exported import about_law
 from neuma_lib.io.gaussians import load_gaussians
@@ -17,6 +15,8 @@ from neuma_lib.io.laws import save_law
 from neuma_lib.io.splats import load_splat
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.splatting.culling import morton_order
+from tests.support.project import copied
+from tests.support.splat_files import ball, write_spz
 
 RESULTS = "tiny/results"
 FIGURE = f"{RESULTS}/figures/i23d.png"
@@ -107,8 +107,8 @@ def test_a_law_from_elsewhere_moves_a_splat_and_the_motion_can_be_taken_away(pro
 def test_what_is_done_is_not_done_again_and_the_placement_repeats_what_it_moves(project):
     assert project.plan(FIGURE, *settings()) == {}
     again = project.plan(FIGURE, *settings(turn=30.0))
-    assert again["splat_gaussians"] == again["splat_mesh"] == again["splat_motion"] == 1
-    assert not again.keys() & {"material", "prior", "ground_truth", "gaussians", "evaluation"}
+    assert again["splat_gaussians"] == again["splat_mesh"] == again["predict_splat"] == 1
+    assert not again.keys() & {"fit_neuma", "prior", "ground_truth", "gaussians", "evaluate"}
 
 
 @pytest.mark.parametrize(
@@ -127,7 +127,7 @@ def test_what_a_splat_cannot_have_is_said(project, target, says):
 def test_a_damaged_file_is_one_line(project):
     (project.root / "made/bad.spz").write_bytes(b"nothing")
     said = project.run(f"{RESULTS}/Splat/gaussians.ply", *settings(file="made/bad.spz"), succeeds=False)
-    assert re.search(r"splat_gaussians Splat: ERROR: made/bad.spz cannot be read", said)
+    assert re.search(r"splat_gaussians Splat: ERROR: made/bad.spz: cannot be read", said)
     assert not (project.root / f"{RESULTS}/Splat/gaussians.ply").exists()
 
 

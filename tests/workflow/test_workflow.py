@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from project import ROOT, SCENE, TABLE, Project, copied, wait_for
 
 from neuma_lib.evaluation.lpips import expected_shapes
-from neuma_lib.evaluation.plotting.image_grid import load_image_grid
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.weights import write_weights
+from neuma_lib.paper.image_grid import load_image_grid
+from tests.support.project import ROOT, SCENE, TABLE, Project, copied, wait_for
 
 # ---- from nothing to a table
 
@@ -39,7 +39,7 @@ def test_table_from_nothing(finished):
 
 
 @pytest.mark.parametrize(
-    "stage", ["ground_truth", "render_static", "gaussians", "mesh", "binding", "velocity", "material"]
+    "stage", ["ground_truth", "render_static", "gaussians", "mesh", "binding", "velocity", "fit_neuma"]
 )
 def test_every_stage_says_what_it_made_and_logs_it(finished, stage):
     said = re.findall(rf"^{stage} .*?: .*\d.*$", finished.output, re.MULTILINE)
@@ -88,7 +88,7 @@ def test_compiled_kernels_rerun_nothing(finished, tmp_path):
     variant = f"{SCENE}/neuma+rank=3/metrics.json"
     for cache in (), ("--config", f"kernel_cache={tmp_path}", "--"):
         assert finished.plan(*cache, TABLE) == {}
-        assert finished.plan(*cache, variant) == {"material": 1, "evaluation": 1}
+        assert finished.plan(*cache, variant) == {"fit_neuma": 1, "evaluate": 1}
 
 
 def test_touching_reruns_nothing(clone):
@@ -100,7 +100,7 @@ def test_touching_reruns_nothing(clone):
 
 
 def test_comments_and_docstrings_rerun_nothing(clone):
-    for name in ("neuma_lib/splatting/rasterizer.py", "workflow/scripts/material.py"):
+    for name in ("neuma_lib/splatting/rasterizer.py", "workflow/scripts/fit.py"):
         file = clone.root / name
         file.write_text(re.sub(r'^"""', '"""Reworded. ', file.read_text(), count=1) + "\n# a remark\n")
     assert clone.plan(TABLE) == {}
@@ -109,7 +109,7 @@ def test_comments_and_docstrings_rerun_nothing(clone):
 def test_a_training_parameter_reruns_training_and_evaluation_only(clone):
     change = ("--config", "material={iterations: 9}", "--")
     before = clone.artifacts()
-    assert clone.plan(*change, TABLE) == {"material": 1, "evaluation": 1, "chamfer_table": 1}
+    assert clone.plan(*change, TABLE) == {"fit_neuma": 1, "evaluate": 1, "chamfer_table": 1}
     clone.run(*change, TABLE)
     after = clone.artifacts()
     changed = {name for name in before if before[name] != after[name]}
@@ -131,8 +131,8 @@ def test_editing_the_rasterizer_reruns_what_renders(clone):
         "mesh",
         "binding",
         "velocity",
-        "material",
-        "evaluation",
+        "fit_neuma",
+        "evaluate",
         "chamfer_table",
     } <= set(plan)
     assert not {"ground_truth", "render_static", "render_dynamic", "prior"} & set(plan)
@@ -149,13 +149,13 @@ def test_editing_the_rasterizer_reruns_what_renders(clone):
     [
         (
             "neuma_lib/evaluation/motion.py",
-            {"evaluation", "chamfer_table"},
-            {"material", "velocity", "ground_truth"},
+            {"evaluate", "chamfer_table"},
+            {"fit_neuma", "velocity", "ground_truth"},
         ),
-        ("neuma_lib/evaluation/tables.py", {"chamfer_table"}, {"evaluation"}),
+        ("neuma_lib/paper/tables.py", {"chamfer_table"}, {"evaluate"}),
         (
             "neuma_lib/coupling/particle_binding.py",
-            {"binding", "velocity", "material", "evaluation"},
+            {"binding", "velocity", "fit_neuma", "evaluate"},
             {"gaussians", "mesh", "prior"},
         ),
         (
@@ -163,10 +163,10 @@ def test_editing_the_rasterizer_reruns_what_renders(clone):
             {"render_static", "render_dynamic", "gaussians"},
             {"ground_truth", "prior"},
         ),
-        ("neuma_lib/sim/rollout.py", {"ground_truth", "prior", "material"}, set()),
+        ("neuma_lib/sim/rollout.py", {"ground_truth", "prior", "fit_neuma"}, set()),
         (
             "workflow/scripts/binding.py",
-            {"binding", "velocity", "evaluation"},
+            {"binding", "velocity", "evaluate"},
             {"sampled_particles", "gaussians"},
         ),
     ],
@@ -180,7 +180,7 @@ def test_edits_rerun_what_depends_on_them(clone, file, runs, spared):
 
 def test_a_variant_has_a_folder_of_its_own(finished):
     plan = finished.plan(f"{SCENE}/neuma+rank=2+seed=3/metrics.json")
-    assert plan == {"material": 1, "evaluation": 1}
+    assert plan == {"fit_neuma": 1, "evaluate": 1}
 
 
 # ---- learned laws elsewhere, and measures of images
@@ -269,7 +269,7 @@ def test_a_chain_of_another_seed_draws_everything_anew(clone):
 
 def test_the_true_law_is_evaluated_without_training_or_prior(clone):
     target = f"{SCENE}/true_law/metrics.json"
-    assert clone.plan(target) == {"evaluation": 1}
+    assert clone.plan(target) == {"evaluate": 1}
     assert "priors/" not in clone.run("--dry-run", target)
     clone.run(target)
     true, prior = (
@@ -301,22 +301,22 @@ def test_the_demo_leaves_something_to_look_at_and_a_law_that_a_scene_can_start_f
     refused = clone.run(
         "--config", "scenes={BouncyBall: {prior: law.safetensors, dt: 1.0e-3}}", "--", variant, succeeds=False
     )
-    assert "law.safetensors: it was learned at a time step of 0.002 s" in refused
+    assert "law.safetensors: dt: the law was trained at a time step of 0.002 s" in refused
 
 
 def test_assumed_densities_are_runs_of_their_own(finished):
     plan = finished.plan(f"{SCENE}/neuma+assumed_density=900/metrics.json")
-    assert plan == {"material": 1, "evaluation": 1}
+    assert plan == {"fit_neuma": 1, "evaluate": 1}
 
 
 def test_all_tables_can_be_planned(finished):
     plan = finished.plan("tables")
-    assert {"experiment_truth", "experiment_start", "experiment", "benchmark_table"} <= set(plan)
+    assert {"experiment_truth", "experiment_start", "evaluate_experiment", "benchmark_table"} <= set(plan)
     assert plan["chamfer_table"] >= 4 and plan["prior"] == 7
 
 
 def test_all_figures_can_be_planned(finished):
-    modules = (ROOT / "neuma_lib/evaluation/figures").glob("[!_]*.py")
+    modules = (ROOT / "neuma_lib/paper/figures").glob("[!_]*.py")
     planned = finished.plan("--forceall", "figures", "random", "tiny/results/figures/realworld.png")
     # i23d needs a splat: test_splat_scenes.py makes it.
     assert {module.stem for module in modules} - {"i23d"} <= set(planned)
@@ -327,9 +327,9 @@ def test_without_the_gpu_that_is_asked_for_nothing_is_begun(kernels, tmp_path):
     project = copied(tmp_path, kernels)
     adaptor = f"{SCENE}/neuma/adaptor.safetensors"
     cuda = ("--config", "device=cuda", "--")
-    assert project.plan(*cuda, adaptor)["material"] == 1
+    assert project.plan(*cuda, adaptor)["fit_neuma"] == 1
     output = project.run(*cuda, adaptor, succeeds=False)
-    assert "torch sees no CUDA device" in output and "gaussians, material, velocity" in output
+    assert "torch sees no CUDA device" in output and "fit_neuma, gaussians, velocity" in output
     assert "Traceback (most recent call last)" not in output
     assert not (tmp_path / "tiny").exists()
     output = project.run(*cuda, "tiny/data/BouncyBall/particles.h5")
@@ -344,7 +344,7 @@ def test_what_a_failed_job_was_to_replace_counts_as_out_of_date(clone):
     assert "cannot be read" in clone.run(*longer, succeeds=False)
     assert not (clone.root / SCENE / "neuma" / "adaptor.safetensors").exists()
     damaged.unlink()
-    assert clone.plan(*longer) == {"material": 1, "evaluation": 1, "chamfer_table": 1}
+    assert clone.plan(*longer) == {"fit_neuma": 1, "evaluate": 1, "chamfer_table": 1}
     assert clone.plan(TABLE) == {}, "with the former settings the table is what it was"
     clone.run(*longer)
     assert clone.plan(*longer) == {}
@@ -370,7 +370,7 @@ def started_training(project: Project) -> tuple[subprocess.Popen, int]:
     checkpoint = project.root / SCENE / LONG / "checkpoint.pt"
     first = wait_for(lambda: checkpoint.exists() and checkpoint.stat().st_mtime_ns)
     wait_for(lambda: checkpoint.stat().st_mtime_ns > first)
-    (training,) = project.processes("material")
+    (training,) = project.processes("fit")
     return snakemake, training
 
 
@@ -398,7 +398,7 @@ def test_killed_snakemake_resumes_with_the_same_result(clone, uninterrupted):
     os.kill(snakemake.pid, signal.SIGKILL)
     snakemake.wait(60)
     # Its scripts do not go on alone.
-    wait_for(lambda: not clone.processes("material"), 20)
+    wait_for(lambda: not clone.processes("fit"), 20)
     assert "unlock" in clone.run(f"{SCENE}/{LONG}/adaptor.safetensors", succeeds=False)
     wait_for(lambda: subprocess.run(make, cwd=clone.root, capture_output=True).returncode == 0, 20)
     assert resumed(clone) == uninterrupted
@@ -455,6 +455,6 @@ def test_checkpoint_of_other_settings(clone):
         {"iteration": 1, "weights": torch.zeros(3)}
     )
     output = clone.run(f"{SCENE}/neuma+seed=7/adaptor.safetensors", succeeds=False)
-    assert f"checkpoint {path} belongs to another run" in output and f"rm '{path}'" in output
+    assert f"{path}: is the checkpoint of another run" in output and f"rm '{path}'" in output
     assert "Traceback (most recent call last)" not in output
     assert [f.name for f in (clone.root / path).parent.iterdir()] == ["checkpoint.pt"]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from neuma_lib.radiance.field import RadianceField
-from neuma_lib.radiance.lattice import Lattice
-from neuma_lib.radiance.rendering import Opacity
+from neuma_lib.methods.pac_nerf.field import RadianceField
+from neuma_lib.methods.pac_nerf.lattice import Lattice
+from neuma_lib.methods.pac_nerf.rendering import Opacity
 
 
 def compile_kernels(device: torch.device) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from neuma_lib.springs.network import SpringNetwork, Springs
-from neuma_lib.springs.rollout import SpringModel, spring_rollout
+from neuma_lib.methods.spring_gaus.network import SpringNetwork, Springs
+from neuma_lib.methods.spring_gaus.rollout import SpringModel, spring_rollout
 
 
 def compile_kernels(device: torch.device) -> None:

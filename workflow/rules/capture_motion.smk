@@ -1,4 +1,4 @@
-"""Masks of photographs and videos of a capture, the time between its cameras, and free flight. Needs captures.smk."""
+"""Masks of photographs and videos, time offsets between cameras, and free flight of a capture. Needs captures.smk."""
 
 MATTES = f"{DATA}/{{capture}}/videos/{{throw}}/{{camera}}/transforms.json"
 VIDEO_MASKS = f"{RESULTS}/{{capture}}/masks/{{throw}}/{{camera}}"
@@ -98,6 +98,6 @@ rule capture_motion_page:
     params:
         title="{capture}: masks and free flight",
         videos=of_capture(filmed_by),
-        throws=of_capture(lambda capture: list(capture.throws)),
+        throws=of_capture(lambda capture: list(capture.takes)),
     script:
         "../scripts/capture_motion_page.py"

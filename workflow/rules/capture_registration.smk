@@ -1,4 +1,4 @@
-"""The photographed object placed into the video of a throw, with its motion. Needs capture_motion.smk."""
+"""Registration of the photographed object in the video of a take, with its motion. Needs capture_motion.smk."""
 
 
 rule capture_registration:

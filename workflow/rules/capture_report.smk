@@ -1,4 +1,4 @@
-"""Predictions of filmed throws beside their videos, and the report of a capture. Needs capture_motion.smk."""
+"""Comparison of predictions with the videos of takes, and the report of a capture. Needs capture_motion.smk."""
 
 SHOWN = f"{DATA}/{{scene}}/shown/transforms.json"
 
@@ -53,36 +53,6 @@ rule released_shown:
         "../scripts/released_shown.py"
 
 
-rule capture_prediction:
-    input:
-        **body_files(),
-        kernels=kernels("laws"),
-        transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
-        velocity=capture_start,
-        prior=material_prior,
-        adaptor=trained_adaptor,
-        identified=identified_law,
-    output:
-        rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
-        report=f"{RESULTS}/{{scene}}/{{method}}/prediction.json",
-    wildcard_constraints:
-        scene=THROW_SCENE,
-        method=LAW_METHOD,
-    resources:
-        gpu=GPU,
-    params:
-        simulation=simulation_settings,
-        density=method_density,
-        carrier=judged_carrier,
-        total=carries_total,
-        cameras=scene_cameras,
-        scale=scene_scale,
-        filming=filming,
-        device=SETTINGS.device,
-    script:
-        "../scripts/capture_prediction.py"
-
-
 rule capture_view:
     input:
         **body_files(),
@@ -102,7 +72,7 @@ rule capture_view:
         view=scene_view,
         title=lambda wildcards: method_names(wildcards)[wildcards.method].partition(",")[0],
         density=scene_setting("density"),
-        carrier=judged_carrier,
+        carrier=of_bodies(shared_carrier),
         gaussian_motion=gaussian_motion,
         prior_motion=lambda wildcards: (
             gaussian_motion(SimpleNamespace(scene=wildcards.scene, method=PRIOR)) if PRIOR else None
@@ -122,8 +92,6 @@ rule capture_images:
     output:
         csv=f"{RESULTS}/{{capture}}/{{method}}/images.csv",
         json=f"{RESULTS}/{{capture}}/{{method}}/images.json",
-    wildcard_constraints:
-        method=LAW_METHOD,
     params:
         cells=of_report(report_cells),
     script:
@@ -136,19 +104,19 @@ rule capture_curves:
         rollout=of_report(lambda name, method: f"{RESULTS}/{training_scene(name)}/{method}/rollout.h5"),
         laws=of_report(
             lambda name, method: [
-                file for each in reported_methods(method) for file in law_files(name, each).values()
+                file
+                for each in reported_methods(method)
+                for file in report_law(name, each)["files"].values()
             ]
         ),
     output:
         curves=f"{RESULTS}/{{capture}}/{{method}}/stress_curves.json",
         picture=f"{RESULTS}/{{capture}}/{{method}}/stress_curves.png",
-    wildcard_constraints:
-        method=LAW_METHOD,
     params:
         method="{method}",
         titles=method_names,
         laws=of_report(
-            lambda name, method: {each: list(law_files(name, each)) for each in reported_methods(method)}
+            lambda name, method: {each: report_law(name, each) for each in reported_methods(method)}
         ),
         dt=of_capture(lambda capture: capture.settings.dt),
         scale=of_capture(lambda capture: capture.settings.scale),
@@ -157,6 +125,7 @@ rule capture_curves:
         model_std=SETTINGS.identify.model_std,
         spread=SETTINGS.identify.spread,
         seed=SETTINGS.seed,
+        code=code_of_methods("capture_curves.py"),
     script:
         "../scripts/capture_curves.py"
 
@@ -188,7 +157,6 @@ rule capture_report:
         page=f"{RESULTS}/{{capture}}/{{method}}/report.html",
     wildcard_constraints:
         capture=OWN_CAPTURE,
-        method=LAW_METHOD,
     params:
         capture="{capture}",
         method="{method}",
@@ -201,7 +169,7 @@ rule capture_report:
         "../scripts/capture_report.py"
 
 
-# Poses and masks came with the files: nothing of them was found here.
+# Poses and masks come with the files and are not part of the report.
 use rule capture_report as released_report with:
     input:
         timelines=of_videos("json"),
@@ -223,4 +191,3 @@ use rule capture_report as released_report with:
         identified=of_report(report_identified),
     wildcard_constraints:
         capture=RELEASED_CAPTURE,
-        method=LAW_METHOD,

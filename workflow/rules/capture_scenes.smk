@@ -1,4 +1,4 @@
-"""What a law is learned from: the video of a throw on the simulator's clock. Needs capture_motion.smk."""
+"""Training videos of captures: a take in simulation time. Needs capture_motion.smk."""
 
 
 rule capture_video:

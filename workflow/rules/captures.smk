@@ -1,9 +1,9 @@
-"""Files and settings of captures, own photographs and videos (docs/capture.md). Needs scenes.smk."""
+"""Files and settings of captures (docs/capture.md). Needs scenes.smk."""
 
 from functools import cache
 from types import SimpleNamespace
 
-from neuma_lib.capture.folder import NAME, inside, read_capture
+from neuma_lib.project.capture_folder import NAME, inside, read_capture
 
 CAPTURES = SETTINGS.captures.root.rstrip("/")
 CAPTURE_ENVIRONMENT = "../../envs/conda-capture.yaml"
@@ -19,10 +19,10 @@ OF_VIDEOS = (
     "frames",
     "width",
 )
-POSES_THREADS = 8  # for matches; all that there are where these are fewer
+POSES_THREADS = 8  # for matching, or all available ones if fewer
 
 
-# Results of others lie in folders of these names.
+# Names of folders with other results.
 OTHERS = f"{TRUE_SCENE}|{SPLAT_SCENE}|figures|logs|benchmarks|experiments|priors"
 RELEASED_CAPTURE = names_of(SETTINGS.captures.released, chains=False)
 OWN_CAPTURE = f"(?!({OTHERS}|{RELEASED_CAPTURE})/){NAME.pattern}"
@@ -41,14 +41,14 @@ wildcard_constraints:
 @cache
 def capture_named(name):
     if name in SETTINGS.captures.released:
-        from neuma_lib.capture.released import released_captures  # as in neuma_lib.capture.scenes
+        from neuma_lib.capture.released import released_captures  # slow to import
 
         return released_captures({name: SETTINGS.captures.released[name]})[name]
     return PLANNED.get(name) or read_capture(f"{CAPTURES}/{name}")
 
 
 def of_capture(choose):
-    """A function of wildcards: something of their capture."""
+    """A function of wildcards: a value of their capture."""
     return checked(lambda wildcards: choose(capture_named(wildcards.capture)))
 
 
@@ -61,7 +61,7 @@ def capture_stills(capture):
 
 
 def capture_file(capture, name):
-    """A file that the settings name, inside the capture's folder."""
+    """A file in the capture's folder that the settings name."""
     return [str(inside(capture.folder, name))] if name else []
 
 
@@ -71,18 +71,18 @@ def given_poses(capture):
 
 
 def filmed_by(capture):
-    """Throw and camera of all videos."""
-    return [(throw, camera) for throw, cameras in capture.throws.items() for camera in cameras]
+    """Take and camera of all videos."""
+    return [(take, camera) for take, cameras in capture.takes.items() for camera in cameras]
 
 
 def of_videos(ending, stage="frames"):
-    """A function of wildcards: a file of each video of their capture."""
+    """A function of wildcards: a file for each video of their capture."""
 
     @checked
     def choose(wildcards):
         name = wildcards.capture
         videos = filmed_by(capture_named(name))
-        return [f"{RESULTS}/{name}/{stage}/{throw}/{camera}.{ending}" for throw, camera in videos]
+        return [f"{RESULTS}/{name}/{stage}/{take}/{camera}.{ending}" for take, camera in videos]
 
     return choose
 
@@ -94,7 +94,7 @@ def filmed_rate(wildcards):
 
 
 def room_settings(capture):
-    """Settings of a capture that its room depends on."""
+    """Settings that the room depends on."""
     return capture.settings.model_dump(mode="json", exclude={*OF_VIDEOS, "photographs", "masks"})
 
 
@@ -104,7 +104,7 @@ def photograph_masks(capture):
 
 @checked
 def saliency_network(wildcards):
-    """The network, where a photograph has no mask of its own."""
+    """The network, if a photograph has no mask of the user."""
     capture = capture_named(wildcards.capture)
     own = capture.own_masks("photographs")
     return [] if all(p.stem in own for p in capture.photographs) else [f"{DATA}/weights/u2netp.onnx"]
@@ -118,12 +118,12 @@ def video_masks(wildcards):
 
 @checked
 def filmed_cameras(wildcards):
-    """Cameras of a throw, the first of which keeps the time."""
+    """Cameras of a take. The first one is the time reference."""
     return capture_named(wildcards.capture).cameras_of(wildcards.throw)
 
 
 def of_throw(pattern):
-    """A function of wildcards: a file for each camera of their throw."""
+    """A function of wildcards: a file for each camera of their take."""
 
     @checked
     def choose(wildcards):
@@ -137,12 +137,12 @@ def of_throw(pattern):
 
 
 def of_throws(pattern):
-    """A function of wildcards: a file for each throw of their capture."""
+    """A function of wildcards: a file for each take of their capture."""
 
     @checked
     def choose(wildcards):
         name = wildcards.capture
-        return [pattern.format(capture=name, throw=throw) for throw in capture_named(name).throws]
+        return [pattern.format(capture=name, throw=take) for take in capture_named(name).takes]
 
     return choose
 
@@ -155,7 +155,7 @@ def throw_videos(wildcards):
 
 @checked
 def camera_timing(wildcards):
-    """Stated offset and row time of each camera of a throw."""
+    """Offset and row time in the settings, for each camera of a take."""
     capture = capture_named(wildcards.capture)
     settings = [capture.settings.cameras.get(camera) for camera in capture.cameras_of(wildcards.throw)]
     return {
@@ -166,14 +166,14 @@ def camera_timing(wildcards):
 
 @checked
 def camera_exposures(wildcards):
-    """Stated exposure of each camera of a throw."""
+    """Exposure in the settings, for each camera of a take."""
     capture = capture_named(wildcards.capture)
     settings = [capture.settings.cameras.get(camera) for camera in capture.cameras_of(wildcards.throw)]
     return [camera.exposure if camera else 0.0 for camera in settings]
 
 
 def of_thrown(function):
-    """A function of the wildcards capture and throw, as one of a scene that is a throw."""
+    """Convert a function of the wildcards capture and throw to a function of the scene of a take."""
 
     def choose(wildcards):
         captured = SETTINGS.scene(wildcards.scene).captured
@@ -183,12 +183,12 @@ def of_thrown(function):
 
 
 def of_filmed(pattern):
-    """A function of a scene that is a throw: a file for each of its cameras."""
+    """A function of the scene of a take: a file for each of its cameras."""
     return of_thrown(of_throw(pattern))
 
 
 def of_thrown_capture(choose):
-    """A function of a scene that is a throw: something of its capture."""
+    """A function of the scene of a take: a value of its capture."""
     return of_thrown(of_capture(choose))
 
 
@@ -204,11 +204,11 @@ def released_folders(wildcards):
 
 @checked
 def one_clock(wildcards):
-    """The timing of cameras that share a clock."""
-    still = [0.0] * len(filmed_cameras(wildcards))
-    return {"offsets": still, "row_times": still}
+    """Timing of cameras that share a clock."""
+    zeros = [0.0] * len(filmed_cameras(wildcards))
+    return {"offsets": zeros, "row_times": zeros}
 
 
 def of_the_object(file):
-    """A function of a scene that is a throw: a file of its object as photographed."""
+    """A function of the scene of a take: a file of its photographed object."""
     return of_thrown(lambda wildcards: f"{RESULTS}/{wildcards.capture}/{file}")

@@ -1,4 +1,4 @@
-"""The board to print; frames, cameras and the room of a capture. Needs captures.smk."""
+"""The printed board, and frames, cameras and the room of a capture. Needs captures.smk."""
 
 
 rule capture_board:

@@ -36,59 +36,87 @@ rule tracers:
         "../scripts/tracers.py"
 
 
-rule evaluation:
+rule evaluate:
     input:
+        unpack(of_bodies(model_files)),
         **body_files(),
-        kernels=kernels_and_field("laws"),
+        kernels=of_bodies(model_kernels),
         truth=of_scene("particles.h5"),
         tracers=of_chain("tracers.h5"),
-        field=own_field,
-        velocity=start_file,
-        prior=material_prior,
-        adaptor=trained_adaptor,
-        identified=identified_law,
+        velocity=of_case(lambda case: case.method.start_file(case)),
     output:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
         metrics=f"{RESULTS}/{{scene}}/{{method}}/metrics.json",
     wildcard_constraints:
         scene=TRUE_SCENE,
-        method=LAW_METHOD,
     resources:
         gpu=GPU,
     params:
+        method=of_bodies(model_parameter),
         simulation=simulation_settings,
-        densities=lambda wildcards: [method_density(wildcards)],
-        laws=lambda wildcards: [law for law in [true_law(wildcards)] if law],
-        total=carries_total,
-        carrier=judged_carrier,
-        own=own_carrying,
+        densities=of_case(lambda case: [case.density(case.moved)]),
+        total=of_bodies(carries_total),
+        carrier=of_bodies(carrier),
         frames=frame_steps,
         device=SETTINGS.device,
+        code=code_of("evaluate.py"),
     script:
-        "../scripts/evaluation.py"
+        "../scripts/evaluate.py"
+
+
+# Where nobody knows the truth: a filmed throw. Splats have a rule like it.
+rule predict:
+    input:
+        unpack(of_bodies(model_files)),
+        **body_files(),
+        kernels=of_bodies(model_kernels),
+        transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
+        velocity=capture_start,
+    output:
+        rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
+        report=f"{RESULTS}/{{scene}}/{{method}}/prediction.json",
+    wildcard_constraints:
+        scene=THROW_SCENE,
+    resources:
+        gpu=GPU,
+    params:
+        method=of_bodies(model_parameter),
+        simulation=simulation_settings,
+        densities=of_case(lambda case: [case.density(case.moved)]),
+        total=of_bodies(carries_total),
+        carrier=of_bodies(shared_carrier),
+        frames=None,
+        cameras=scene_cameras,
+        scale=scene_scale,
+        filming=filming,
+        device=SETTINGS.device,
+        code=code_of("predict.py"),
+    script:
+        "../scripts/predict.py"
 
 
 rule video:
     input:
+        unpack(of_case(lambda case: case.method.body_inputs(case))),
         **body_files(),
-        kernels=kernels_and_field("rendering"),
+        kernels=of_case(body_kernels),
         transforms=of_scene("dynamic/transforms.json"),
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
-        field=own_field,
     output:
         video=f"{RESULTS}/{{scene}}/{{method}}/video.mp4",
     resources:
         gpu=GPU,
     params:
         density=scene_setting("density"),
-        carrier=judged_carrier,
-        own=own_carrying,
+        method=of_case(body_parameter),
+        carrier=of_bodies(carrier),
         gaussian_motion=gaussian_motion,
         view=SETTINGS.evaluation.video_view,
         frame_rate=SETTINGS.evaluation.frame_rate,
         magnify=SETTINGS.evaluation.video_magnify,
         filming=filming,
         device=SETTINGS.device,
+        code=code_of("video.py"),
     script:
         "../scripts/video.py"
 
@@ -102,5 +130,6 @@ rule viewer:
     params:
         files=lambda wildcards: viewer_files(wildcards).plain(),
         viewer=SETTINGS.viewer.plain(),
+        code=code_of_methods("viewer.py"),
     script:
         "../scripts/viewer.py"

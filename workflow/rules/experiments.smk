@@ -53,31 +53,23 @@ use rule tracers as experiment_tracers with:
         tracers=f"{RESULTS}/experiments/{{experiment}}/tracers.h5",
 
 
-rule experiment:
+use rule evaluate as evaluate_experiment with:
     input:
+        unpack(of_bodies(model_files)),
         **body_files(),
-        kernels=kernels("laws"),
+        kernels=of_bodies(model_kernels),
         truth=of_scene("particles.h5"),
         tracers=of_chain("tracers.h5"),
         velocity=of_chain("velocity.json"),
-        prior=of_each_body(material_prior),
-        adaptor=of_each_body(trained_adaptor),
-        identified=of_each_body(identified_law),
     output:
         rollout=f"{RESULTS}/experiments/{{experiment}}/{{method}}/rollout.h5",
         metrics=f"{RESULTS}/experiments/{{experiment}}/{{method}}/metrics.json",
-    wildcard_constraints:
-        method=LAW_METHOD,
-    resources:
-        gpu=GPU,
     params:
+        method=of_bodies(model_parameter),
         simulation=experiment_simulation,
-        densities=of_each_body(method_density),
-        laws=of_each_body(true_law),
-        total=carries_total,
-        carrier=experiment_carrier,
-        own=None,
+        densities=of_bodies(lambda bodies: [case.density(case.moved) for case in bodies]),
+        total=of_bodies(carries_total),
+        carrier=of_bodies(shared_carrier),
         frames=experiment_frames,
         device=SETTINGS.device,
-    script:
-        "../scripts/evaluation.py"
+        code=code_of("evaluate.py"),

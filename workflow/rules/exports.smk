@@ -17,7 +17,7 @@ rule export_gaussians:
     wildcard_constraints:
         layout="gaussians|compressed",
     params:
-        carrier=experiment_carrier,
+        carrier=of_bodies(shared_carrier),
         gaussian_motion=exported_motion,
         rotate_harmonics=SETTINGS.exports.rotate_harmonics,
         compressed=lambda wildcards: wildcards.layout == "compressed",
@@ -34,7 +34,7 @@ rule export_particles:
         together=f"{EXPORT}/particles.h5",
     params:
         densities=moved_densities,
-        carrier=experiment_carrier,
+        carrier=of_bodies(shared_carrier),
     script:
         "../scripts/export_particles.py"
 
@@ -48,7 +48,7 @@ rule export_surface:
     wildcard_constraints:
         kind="glb|usda|usdc",
     params:
-        carrier=experiment_carrier,
+        carrier=of_bodies(shared_carrier),
     script:
         "../scripts/export_surface.py"
 
@@ -61,7 +61,7 @@ rule export_blend:
         blend=f"{EXPORT}/motion.blend",
         picture=f"{EXPORT}/motion.png",
     params:
-        carrier=experiment_carrier,
+        carrier=of_bodies(shared_carrier),
     script:
         "../scripts/export_blend.py"
 
@@ -74,7 +74,7 @@ rule export_film:
         film=f"{EXPORT}/motion.mp4",
         gif=f"{EXPORT}/motion.gif",
     params:
-        carrier=experiment_carrier,
+        carrier=of_bodies(shared_carrier),
         gaussian_motion=exported_motion,
         size=SETTINGS.exports.size,
         frame_rate=SETTINGS.evaluation.frame_rate,

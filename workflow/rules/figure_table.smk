@@ -5,17 +5,15 @@ import ast
 DRAWN = SETTINGS.figures
 COMPARED = SETTINGS.tables["table1"] if "table1" in SETTINGS.tables else None
 # A law that is judged twice is shown once, on the particles that all methods share, unless figures.beside names it.
-SHARED = [m for m in (COMPARED or SETTINGS).methods if SETTINGS.method_training(m) == m]
+SHARED = [m for m in (COMPARED or SETTINGS).methods if cases.fit_name(SETTINGS, m) == m]
 METHODS = SHARED + [m for m in DRAWN.beside if m not in SHARED]
 NAMES = table_titles("table1") if COMPARED else {}
-# Methods whose pictures are of PAC-NeRF's field, which their own particles carry.
-OWN = [m for m in METHODS if SETTINGS.carries_field(m)]
-TITLES = {method: NAMES.get(method) or SETTINGS.method_title(method) for method in METHODS}
+TITLES = {method: NAMES.get(method) or cases.title(SETTINGS, method) for method in METHODS}
 PREDICTED = ["nclaw", *DRAWN.methods]
 # Laws of tests of material points: those whose stresses are compared, in all their chains.
 RESPONDING = SETTINGS.tables.get("stress")
 RESPONSES = [
-    (scene, method, SETTINGS.runs("stress", method, scene))
+    (scene, method, cases.runs(SETTINGS, "stress", method, scene))
     for scene in (DRAWN.material_response if RESPONDING else ())
     for method in RESPONDING.methods
 ]
@@ -52,9 +50,21 @@ def truths_of(scenes):
     return [f"{DATA}/{scene}/particles.h5" for scene in scenes]
 
 
+def own_bodies(scenes):
+    """Methods that are rendered on particles of their fit: what their bodies are loaded from, by method and scene."""
+    found = {}
+    for method in METHODS:
+        for scene in scenes:
+            case = case_on(scene, method)
+            if files := case.method.body_inputs(case):
+                source = body_parameter(case) | {"files": files, "carrier": case.method.carrier(case)}
+                found.setdefault(method, {})[scene] = source
+    return found
+
+
 def priors_of(scenes):
     """The priors that NeuMA starts from."""
-    return [prior_file(scene, "neuma") for scene in scenes]
+    return [case_on(scene, "neuma").prior_file() for scene in scenes]
 
 
 def filmed(scenes):
@@ -67,11 +77,12 @@ def filmed(scenes):
 
 
 def learned(scenes, method="neuma"):
-    """The laws of scenes before and after training; that of a structured one is its own prior."""
+    """The laws of scenes: priors, where the method has one, and adaptors."""
+    laws = [case.method.model_inputs(case) for case in (case_on(scene, method) for scene in scenes)]
     return {
         "kernels": kernels("laws"),
-        "prior": [] if SETTINGS.is_structured(method) else priors_of(scenes),
-        "adaptor": of_methods(scenes, [method], "adaptor.safetensors"),
+        "prior": [law["prior"] for law in laws if "prior" in law],
+        "adaptor": [law["adaptor"] for law in laws],
     }
 
 
@@ -105,7 +116,7 @@ def caption(figure):
 
 
 def figure_module(figure):
-    return ROOT / "neuma_lib" / "evaluation" / "figures" / f"{figure}.py"
+    return ROOT / "neuma_lib" / "paper" / "figures" / f"{figure}.py"
 
 
 # ---- the figures: kind of the data file, inputs and parameters of `data`, resources other than the default, the module
@@ -116,6 +127,7 @@ IN_VIEW = {"view": DRAWN.view, "magnify": DRAWN.magnify}
 
 def interpolation(method):
     """What lora_alphav is made of for a method."""
+    shown = [case_on(scene, method) for scene in DRAWN.lora_alphav]
     return {
         "kind": "h5",
         "input": {
@@ -123,11 +135,11 @@ def interpolation(method):
             **learned(DRAWN.lora_alphav, method),
             "kernels": kernels("laws", "rendering"),
             "truth": truths_of(DRAWN.lora_alphav),
-            "start": [home(scene, start_of(scene, method)) for scene in DRAWN.lora_alphav],
+            "start": [case.method.start_file(case) for case in shown],
         },
         "params": {
             "scenes": scene_constants(DRAWN.lora_alphav),
-            "total": {scene: stretches_by_total(scene, method) for scene in DRAWN.lora_alphav},
+            "total": {case.scene: carries_total([case]) for case in shown},
             "weights": list(DRAWN.weights),
             "shown": DRAWN.shown - 1,
             "device": SETTINGS.device,
@@ -239,14 +251,21 @@ FIGURES = {
         "kind": "h5",
         "input": {
             **filmed(DRAWN.main_res),
-            "kernels": kernels("rendering", *(["radiance"] if OWN else [])),
+            "kernels": sorted(
+                {file for s in DRAWN.main_res for m in METHODS for file in body_kernels(case_on(s, m))}
+            ),
             "rollouts": of_methods(DRAWN.main_res, METHODS, "rollout.h5"),
-            "fields": [home(scene, FIELD) for scene in DRAWN.main_res if OWN],
+            "own": [
+                file
+                for bodies in own_bodies(DRAWN.main_res).values()
+                for body in bodies.values()
+                for file in body["files"].values()
+            ],
         },
         "params": {
             "titles": TITLES,
             "scenes": scene_constants(DRAWN.main_res),
-            "own": {method: carrying(method) for method in OWN},
+            "own": own_bodies(DRAWN.main_res),
             "shown": DRAWN.shown,
             **IN_VIEW,
         },
@@ -276,7 +295,7 @@ FIGURES = {
             "rollouts": [f"{RESULTS}/experiments/{DRAWN.ext_time}/{m}/rollout.h5" for m in PREDICTED],
         },
         "params": {
-            "titles": {method: SETTINGS.method_title(method) for method in PREDICTED},
+            "titles": {method: cases.title(SETTINGS, method) for method in PREDICTED},
             "density": lambda wildcards: SETTINGS.experiment_bodies(DRAWN.ext_time)[0]["density"],
             "observed": lambda wildcards: video_length(SETTINGS.experiment(DRAWN.ext_time).bodies[0].scene),
             "shown": DRAWN.shown + 4,
@@ -311,7 +330,7 @@ FIGURES = {
             **{name: of_captures(lambda scenes, name=name: each_of(scenes)[name]) for name in BODY},
         },
         "params": {
-            "titles": {method: SETTINGS.method_title(method) for method in DRAWN.realworld_methods},
+            "titles": {method: cases.title(SETTINGS, method) for method in DRAWN.realworld_methods},
             "scenes": of_captures(filmed_constants),
             "view": 0,
             "frames": DRAWN.shown + 2,
@@ -361,7 +380,7 @@ FIGURES = {
         "input": {"responses": [f"{RESULTS}/{run}/response.json" for *_, runs in RESPONSES for run in runs]},
         "params": {
             "cells": [[scene, method, len(runs)] for scene, method, runs in RESPONSES],
-            "titles": {method: SETTINGS.method_title(method) for _, method, _ in RESPONSES},
+            "titles": {method: cases.title(SETTINGS, method) for _, method, _ in RESPONSES},
         },
     },
     "ablation_gradients": {
@@ -380,7 +399,7 @@ FIGURES = {
         "kind": "json",
         "input": {"metrics": random_files(SETTINGS.random.methods[:2], "metrics.json")},
         "params": {
-            "titles": {method: SETTINGS.method_title(method) for method in SETTINGS.random.methods[:2]},
+            "titles": {method: cases.title(SETTINGS, method) for method in SETTINGS.random.methods[:2]},
             "scenes": random_scenes(),
         },
         "on_request": True,

@@ -1,4 +1,4 @@
-"""Figures: one entry of FIGURES (figure_table.smk) and one module of neuma_lib/evaluation/figures make one."""
+"""Figures: one entry of FIGURES (figure_table.smk) and one module of neuma_lib/paper/figures make one."""
 
 import re
 

@@ -1,171 +1,157 @@
-"""What methods start from, read and are told. Needs scenes.smk."""
+"""Methods of jobs: their cases on scenes, files and parameters; the rules that fit them. Needs scenes.smk."""
 
 from dataclasses import replace
+from functools import cache
 
-from neuma_lib.config import places
-from neuma_lib.config.methods import IDENTIFIED
+from neuma_lib.project.cases import LAW_FROM
+from neuma_lib.project.paths import IDENTIFIED
 from neuma_lib.config.variants import parse_chain
-from neuma_lib.viewer.find import scene_files
+from neuma_lib.project.find import scene_files
 
 
-def prior_file(scene, method=None):
-    """The prior of a scene, or of a method there, in its chain: made here, or the user's own if it is a path."""
-    return places.prior_file(SETTINGS, scene, method)
+@cache
+def case_on(scene, method):
+    return cases.case(SETTINGS, scene, method)
+
+
+def of_case(choose):
+    """A function of wildcards: something of their case, a method on a scene."""
+    return checked(lambda wildcards: choose(case_on(wildcards.scene, wildcards.method)))
+
+
+def of_bodies(choose):
+    """A function of wildcards: something of the method's cases for the bodies of a scene or experiment."""
+    return checked(lambda wildcards: choose(cases.body_cases(SETTINGS, subject(wildcards), wildcards.method)))
+
+
+def presets_of(method):
+    """Pattern of the presets of a method that are fitted, and of their variants."""
+    return names_of(cases.of_kind(SETTINGS, method.name))
+
+
+# ---- fits
+
+
+def fit_files(case):
+    """Everything that a fit may read."""
+    if case.scene != case.moved:
+        raise InputError(f"{case.moved}/{case.name}", "it takes the law of another scene; ask for that one")
+    return case.method.fit_inputs(case)
+
+
+def fit_parameter(case):
+    return {
+        "module": type(case.method).__module__,
+        "files": sorted(case.method.fit_inputs(case)),
+        "options": case.method.fit_options(case),
+    }
+
+
+for fitted in (method for method in all_methods().values() if method.product):
+
+    rule:
+        name:
+            f"fit_{fitted.name}"
+        input:
+            unpack(of_case(fit_files)),
+            kernels=kernels(*fitted.fit_kernels),
+        output:
+            product=f"{RESULTS}/{{scene}}/{{method}}/{fitted.product}",
+            history=f"{RESULTS}/{{scene}}/{{method}}/history.json",
+        wildcard_constraints:
+            method=presets_of(fitted),
+        resources:
+            gpu=GPU,
+            mem_mb=6000,
+            runtime=240,
+        params:
+            method=of_case(fit_parameter),
+            simulation=simulation_settings,
+            densities=of_case(lambda case: case.densities),
+            filming=filming,
+            seed=SETTINGS.seed,
+            checkpoint=f"{RESULTS}/{{scene}}/{{method}}/checkpoint.pt",
+            device=SETTINGS.device,
+            code=code_of("fit.py"),
+        script:
+            "../scripts/fit.py"
+
+
+# ---- predictions
+
+
+def model_files(bodies):
+    """Files of the models of all bodies, by name: a list with one path a body."""
+    found = [{**case.method.model_inputs(case), **case.method.body_inputs(case)} for case in bodies]
+    return {name: [files[name] for files in found] for name in found[0]}
+
+
+def model_parameter(bodies):
+    """What `workflow.motion.Prediction` takes."""
+    return {
+        "module": type(bodies[0].method).__module__,
+        "files": sorted(model_files(bodies)),
+        "options": [case.method.model_options(case) for case in bodies],
+    }
+
+
+def body_parameter(case):
+    """The same of a job that renders a motion, and loads no model."""
+    return model_parameter([case]) | {"files": sorted(case.method.body_inputs(case))}
+
+
+def law_files(bodies):
+    """Files of the law of one body."""
+    (case,) = bodies
+    if not case.method.has_law:
+        raise InputError(
+            f"{case.moved}/{case.name}", "its motion follows from no material law", "Choose another method"
+        )
+    return model_files(bodies)
+
+
+def uncertainty_files(bodies):
+    """Files of the law of one body, and of what is known of its uncertainty."""
+    return law_files(bodies) | bodies[0].method.uncertainty_inputs(bodies[0])
+
+
+def model_kernels(bodies):
+    return kernels(*bodies[0].method.kernels)
+
+
+def body_kernels(case):
+    return kernels("rendering", *(case.method.kernels if case.method.body_inputs(case) else ()))
+
+
+def carries_total(bodies):
+    """Whether a prediction carries the total deformation: the options ask for it for one of the bodies at least."""
+    return any(case.options.covariance_from == "total" for case in bodies)
+
+
+def carrier(bodies):
+    return bodies[0].method.carrier(bodies[0])
+
+
+def shared_carrier(bodies):
+    """The same where there are no particles of a fit: experiments, splats and captures."""
+    case = bodies[0]
+    if case.method.body_inputs(case):
+        raise InputError(
+            f"{case.moved}/{case.name}",
+            "it is evaluated on particles of its own fit, which only scenes with rendered videos have",
+            "Choose the preset with the same fit on the particles that all methods share",
+        )
+    return carrier(bodies)
+
+
+@checked
+def gaussian_motion(wildcards):
+    return cases.gaussian_motion(SETTINGS, wildcards.scene, wildcards.method)
 
 
 def prior_chain(wildcards):
     """Name of a prior, and the seeds of its chain."""
     return parse_chain(wildcards.prior, SETTINGS.priors.laws, "prior")
-
-
-@checked
-def material_settings(wildcards):
-    return SETTINGS.method_material(wildcards.scene, wildcards.method).plain()
-
-
-def stretches_by_total(scene, method):
-    """Whether the total deformation stretches the Gaussians in a method on a scene."""
-    return SETTINGS.method_material(scene, method).covariance_from == "total"
-
-
-@checked
-def carries_total(wildcards):
-    """Whether a prediction carries the total deformation: the method asks for it, for one of the bodies at least."""
-    scenes = SETTINGS.body_scenes(subject(wildcards))
-    return any(stretches_by_total(scene, wildcards.method) for scene in scenes)
-
-
-@checked
-def training_settings(wildcards):
-    """The same of a method that trains a law of its own."""
-    scene, method = wildcards.scene, wildcards.method
-    trained = SETTINGS.law_scene(scene, method), SETTINGS.method_training(method)
-    if trained != (scene, method):
-        raise InputError(
-            f"{scene}/{method} trains nothing: its law is that of {'/'.join(trained)}, ask for that one"
-        )
-    return material_settings(wildcards)
-
-
-def without_law(method):
-    """The error of a method with springs where a law is asked for."""
-    return InputError(
-        f"{method} has no law of a material, only springs in one body: it has no stress, and no experiment with several "
-        "bodies"
-    )
-
-
-@checked
-def material_prior(wildcards):
-    """The networks that a method starts from; none where its law is analytic, or corrects an analytic one."""
-    if SETTINGS.is_springs(wildcards.method):
-        raise without_law(wildcards.method)
-    kinds = (SETTINGS.is_identified, SETTINGS.is_structured, SETTINGS.is_pac_nerf)
-    analytic = any(is_kind(wildcards.method) for is_kind in kinds)
-    if analytic or SETTINGS.true_law(wildcards.scene, wildcards.method):
-        return []
-    return prior_file(SETTINGS.law_scene(wildcards.scene, wildcards.method), wildcards.method)
-
-
-@checked
-def stock_base(wildcards):
-    """The analytic law that a structured method corrects, where it is that of a prior."""
-    if not SETTINGS.is_structured(wildcards.method):
-        return None
-    return SETTINGS.method_base(wildcards.scene, wildcards.method)
-
-
-def identified_name(scene, method):
-    """The file of what was identified for a method: in the views of its training, if these are its own."""
-    return places.identified_name(SETTINGS, scene, method)
-
-
-def identified_file(wildcards):
-    """The same of the scene that a method's law is from, in its chain."""
-    scene, method = wildcards.scene, wildcards.method
-    return home(SETTINGS.law_scene(scene, method), identified_name(scene, method))
-
-
-@checked
-def identify_settings(wildcards):
-    """Settings of an identification, in the views that its file names, if any."""
-    finer, own = SETTINGS.identify.particles, SETTINGS.simulation.particles
-    if 0 < finer <= own:
-        raise InputError(
-            f"identify.particles: {finer} are not more than the {own} of the reconstruction (simulation.particles), whose "
-            f"coarseness they are to tell; give {4 * own}, or 0 to ignore it"
-        )
-    views = getattr(wildcards, "views", None)
-    return SETTINGS.identify.plain() | ({"views": [int(view) for view in views.split(",")]} if views else {})
-
-
-def pac_nerf_file(scene, method):
-    """The law, and the throw, that PAC-NeRF found in a scene's video."""
-    return places.pac_nerf_file(SETTINGS, scene, method)
-
-
-@checked
-def identified_base(wildcards):
-    """The law that was identified in a scene's video, where this is what a structured method corrects."""
-    if not SETTINGS.is_structured(wildcards.method) or stock_base(wildcards):
-        return []
-    return identified_file(wildcards)
-
-
-@checked
-def structured_settings(wildcards):
-    """Settings of a method's structured law; none where it has another."""
-    section = SETTINGS.method_structured(wildcards.method)
-    return section.plain() if section else None
-
-
-@checked
-def springs_settings(wildcards):
-    """Settings of a method with springs in place of a law."""
-    return SETTINGS.method_springs(wildcards.method).plain()
-
-
-def scene_views(wildcards):
-    """Numbers of the cameras of a filmed throw."""
-    return list(range(len(SETTINGS.scene(wildcards.scene).captured.cameras)))
-
-
-@checked
-def fitted_springs(wildcards):
-    """The springs of a scene, or of the scene of an experiment's one body."""
-    scenes = SETTINGS.body_scenes(subject(wildcards))
-    if len(scenes) > 1:
-        raise without_law(wildcards.method)
-    return f"{RESULTS}/{SETTINGS.run_folder(scenes[0], wildcards.method)}/springs.safetensors"
-
-
-@checked
-def pac_nerf_settings(wildcards):
-    """Settings of a method with PAC-NeRF's law."""
-    return SETTINGS.method_pac_nerf(wildcards.method).plain()
-
-
-@checked
-def pac_nerf_prior(wildcards):
-    """The analytic law of the prior that decides the family of a method with PAC-NeRF's law; none if it is a file."""
-    law = SETTINGS.priors.laws.get(SETTINGS.method_prior(wildcards.scene, wildcards.method))
-    return law.plain() if law else None
-
-
-@checked
-def true_law(wildcards):
-    """The scene's own law, where this is what a method evaluates."""
-    return SETTINGS.true_law(wildcards.scene, wildcards.method) or []
-
-
-@checked
-def identified_law(wildcards):
-    """The law that was identified in a scene's video, by us or by PAC-NeRF, where this is what a method evaluates."""
-    if SETTINGS.is_pac_nerf(wildcards.method):
-        return pac_nerf_file(SETTINGS.law_scene(wildcards.scene, wildcards.method), wildcards.method)
-    if not SETTINGS.is_identified(wildcards.method):
-        return []
-    return identified_file(wildcards)
 
 
 @checked
@@ -175,133 +161,40 @@ def stock_law(wildcards):
     return law.plain() if law else None
 
 
-def supervised_by(kind, file):
-    """A function of wildcards: a file of each video's data, where the method is supervised by what is in it."""
-
-    @checked
-    def choose(wildcards):
-        material = SETTINGS.method_material(wildcards.scene, wildcards.method)
-        return of_each_video(of_scene(file))(wildcards) if material.supervision == kind else []
-
-    return choose
-
-
-training_video = supervised_by("pixels", "dynamic/transforms.json")
-training_particles = supervised_by("particles", "particles.h5")  # ground truth, in one ablation
-
-
 @checked
-def trained_adaptor(wildcards):
-    """The adaptor, where there is one: of the method on the scene itself, or of those whose law it takes."""
-    if not SETTINGS.method_material(wildcards.scene, wildcards.method).train:
-        return []
-    scene = SETTINGS.law_scene(wildcards.scene, wildcards.method)
-    run = SETTINGS.run_folder(scene, SETTINGS.method_training(wildcards.method))
-    return f"{RESULTS}/{run}/adaptor.safetensors"
-
-
-@checked
-def judged_carrier(wildcards):
-    return SETTINGS.judged_carrier(wildcards.scene, wildcards.method)
-
-
-@checked
-def experiment_carrier(wildcards):
-    """The same in an experiment, or of a splat: no radiance field is fitted to their bodies."""
-    if SETTINGS.carries_field(wildcards.method):
-        kind = "experiments" if hasattr(wildcards, "experiment") else "splats"
+def identify_settings(wildcards):
+    """Settings of an identification, in the views that its file names, if any."""
+    finer, own = SETTINGS.identify.particles, SETTINGS.simulation.particles
+    if 0 < finer <= own:
         raise InputError(
-            f"{wildcards.method}: its own particles are those of a field, and {kind} have none; take "
-            f"{SETTINGS.method_training(wildcards.method)}, the same law on the particles that all methods share"
+            f"identify.particles = {finer}",
+            f"it must exceed simulation.particles = {own}",
+            f"Set it to {4 * own}, or to 0 to disable the discretisation correction",
         )
-    return SETTINGS.judged_carrier(SETTINGS.body_scenes(subject(wildcards))[0], wildcards.method)
-
-
-def carrying(method):
-    """How PAC-NeRF's field is carried by a method's particles, to `CarriedField.load`."""
-    field = {name: SETTINGS.radiance.plain()[name] for name in ("spacing", "least_opacity")}
-    return {**field, "settings": SETTINGS.method_pac_nerf(method).plain()}
-
-
-@checked
-def own_carrying(wildcards):
-    """The same of a method that is judged on PAC-NeRF's own particles; None of others."""
-    return carrying(wildcards.method) if SETTINGS.carries_field(wildcards.method) else None
-
-
-@checked
-def own_field(wildcards):
-    """The field that a method's own particles carry; none where it is judged on others."""
-    return home(wildcards.scene, FIELD) if SETTINGS.carries_field(wildcards.method) else []
-
-
-def kernels_and_field(*groups):
-    """A function of wildcards: groups of kernels, and those of the radiance field where a method's particles carry it."""
-    return lambda wildcards: kernels(*groups, *(["radiance"] if own_field(wildcards) else []))
-
-
-def start_of(scene, method):
-    """The file of a scene's chain that tells a method how bodies are thrown."""
-    identified = SETTINGS.method_material(scene, method).start == "identified"
-    return identified_name(scene, method) if identified else "velocity.json"
-
-
-@checked
-def start_name(wildcards):
-    return start_of(wildcards.scene, wildcards.method)
-
-
-def start_file(wildcards):
-    if SETTINGS.is_pac_nerf(wildcards.method):
-        return pac_nerf_file(wildcards.scene, wildcards.method)
-    return of_chain(start_name(wildcards))(wildcards)
-
-
-def start_files(wildcards):
-    """The same of each video."""
-    return of_each_video(of_chain(start_name(wildcards)))(wildcards)
-
-
-@checked
-def gaussian_motion(wildcards):
-    return SETTINGS.gaussian_motion(wildcards.scene, wildcards.method)
+    views = getattr(wildcards, "views", None)
+    return SETTINGS.identify.plain() | ({"views": [int(view) for view in views.split(",")]} if views else {})
 
 
 @checked
 def film_titles(wildcards):
     """Names of the methods of a film."""
     demo = SETTINGS.demo
-    return [demo.titles.get(method) or SETTINGS.method_title(method) for method in demo.methods]
+    return [demo.titles.get(method) or cases.title(SETTINGS, method) for method in demo.methods]
 
 
 @checked
 def film_motions(wildcards):
-    """The same of each method of a film."""
-    of_methods = (SETTINGS.method_material(wildcards.scene, method) for method in SETTINGS.demo.methods)
-    return [material.gaussian_motion for material in of_methods]
+    """How Gaussians follow their particles in each method of a film."""
+    return [cases.gaussian_motion(SETTINGS, wildcards.scene, method) for method in SETTINGS.demo.methods]
 
 
-@checked
-def method_density(wildcards):
-    return SETTINGS.method_density(wildcards.scene, wildcards.method)
-
-
-@checked
-def training_densities(wildcards):
-    """The same as a method takes them to be."""
-    own = video_densities(wildcards)
-    assumed = SETTINGS.method_material(wildcards.scene, wildcards.method).assumed_density
-    return own if assumed is None else [assumed] * len(own)
-
-
-@checked
-def evaluation_views(wildcards):
+def evaluation_views(case):
     """Views that image metrics are taken in: those that are asked for, or those that training does not see.
 
     Where training sees all views, those that other methods are measured in, or all: image metrics and figures then say
     so.
     """
-    seen = SETTINGS.method_material(wildcards.scene, wildcards.method).views
+    seen = case.options.views
     views = range(SETTINGS.dataset.dynamic.views)
     unseen, others = (
         [view for view in views if view not in used] for used in (seen, SETTINGS.material.views)
@@ -312,17 +205,16 @@ def evaluation_views(wildcards):
 def own_result(file):
     """A function of wildcards: a file of the same run; none where it would be another scene's, or there is no truth."""
 
-    @checked
     def choose(wildcards):
-        scene = SETTINGS.law_scene(wildcards.scene, wildcards.method)
-        without = scene != wildcards.scene or SETTINGS.scene(scene).captured
+        case = case_on(wildcards.scene, wildcards.method)
+        without = case.scene != case.moved or SETTINGS.scene(case.scene).captured
         return [] if without else f"{RESULTS}/{wildcards.scene}/{wildcards.method}/{file}"
 
-    return choose
+    return checked(choose)
 
 
 @checked
 def viewer_files(wildcards):
     """What the viewer in a file shows of a scene."""
-    methods = SETTINGS.moved_methods(wildcards.scene, SETTINGS.viewer.methods)
+    methods = cases.moving_methods(SETTINGS, wildcards.scene, SETTINGS.viewer.methods)
     return replace(scene_files(SETTINGS, wildcards.scene, methods), velocity=None)

@@ -10,25 +10,26 @@ rule lpips_weights:
 
 rule image_metrics:
     input:
+        unpack(of_case(lambda case: case.method.body_inputs(case))),
         **body_files(),
-        kernels=kernels_and_field("rendering"),
+        kernels=of_case(body_kernels),
         weights=f"{DATA}/weights/lpips.safetensors",
         transforms=of_scene("dynamic/transforms.json"),
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
-        field=own_field,
     output:
         metrics=f"{RESULTS}/{{scene}}/{{method}}/image_metrics.json",
     resources:
         gpu=GPU,
     params:
         density=scene_setting("density"),
-        carrier=judged_carrier,
-        own=own_carrying,
+        method=of_case(body_parameter),
+        carrier=of_bodies(carrier),
         gaussian_motion=gaussian_motion,
-        views=evaluation_views,
-        training_views=lambda wildcards: material_settings(wildcards)["views"],
+        views=of_case(evaluation_views),
+        training_views=of_case(lambda case: list(case.options.views)),
         margin=SETTINGS.evaluation.margin,
         filming=filming,
         device=SETTINGS.device,
+        code=code_of("image_metrics.py"),
     script:
         "../scripts/image_metrics.py"

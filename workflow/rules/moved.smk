@@ -10,30 +10,31 @@ def splat_setting(choose):
 def splat_start(wildcards):
     """The start of a splat; its law comes from elsewhere, as it has no video to learn one from."""
     scene, method = wildcards.scene, wildcards.method
-    if SETTINGS.learns_there(scene, method):
+    if case_on(scene, method).learns_there:
         raise InputError(
-            f"{scene}/{method}: a splat has no video to learn a law from; take that of another scene, "
-            f"{method}+law_from=<scene>, or the prior alone, nclaw"
+            f"{scene}/{method}",
+            "a splat has no video to learn a law from",
+            f"Use the law of another scene, {method}+{LAW_FROM}=<scene>, or the prior alone, nclaw",
         )
     return of_chain("velocity.json")(wildcards)
 
 
 @checked
 def splat_simulation(wildcards):
-    dt, _ = SETTINGS.motion_clock(wildcards.scene, wildcards.method)
+    dt, _ = cases.motion_clock(SETTINGS, wildcards.scene, wildcards.method)
     return simulator(dt)
 
 
 @checked
 def splat_frames(wildcards):
-    _, frames = SETTINGS.motion_clock(wildcards.scene, wildcards.method)
+    _, frames = cases.motion_clock(SETTINGS, wildcards.scene, wildcards.method)
     return list(frames)
 
 
 @checked
 def exported_motion(wildcards):
     """How Gaussians follow their particles in a scene, or as in the first one of an experiment."""
-    return SETTINGS.gaussian_motion(SETTINGS.body_scenes(subject(wildcards))[0], wildcards.method)
+    return cases.gaussian_motion(SETTINGS, SETTINGS.body_scenes(subject(wildcards))[0], wildcards.method)
 
 
 @checked

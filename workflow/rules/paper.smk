@@ -1,6 +1,6 @@
 """Tables of the paper, and the targets that name many results at once."""
 
-from neuma_lib.evaluation.paper import PAPER
+from neuma_lib.paper.published import PAPER
 
 SCENES = list(SETTINGS.tables["table1"].scenes) if "table1" in SETTINGS.tables else SETTINGS.plain_scenes
 BENCHMARK_SCENES = list(SETTINGS.tables["table4"].scenes) if "table4" in SETTINGS.tables else SCENES
@@ -57,7 +57,7 @@ rule random_table:
         markdown=f"{RESULTS}/random.md",
     params:
         scenes=random_scenes(),
-        titles={method: SETTINGS.method_title(method) for method in SETTINGS.random.methods},
+        titles={method: cases.title(SETTINGS, method) for method in SETTINGS.random.methods},
         seed=SETTINGS.random.seed,
     script:
         "../scripts/random_table.py"

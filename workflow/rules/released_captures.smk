@@ -1,4 +1,4 @@
-"""Captures of Spring-Gaus and of NeuMA's authors, whose cameras and masks lie beside them. Needs capture_motion.smk."""
+"""Released captures of Spring-Gaus and of NeuMA's authors, with cameras and masks. Needs capture_motion.smk."""
 
 
 rule released_photographs:
@@ -39,7 +39,7 @@ rule released_video:
         "../scripts/released_video.py"
 
 
-# One clock for all cameras. The world is not metric, so gravity is no check, and is only told.
+# All cameras share a clock. The world is not metric, so gravity is reported but not checked.
 use rule capture_flight as released_flight with:
     input:
         transforms=of_throw(MATTES),

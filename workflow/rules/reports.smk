@@ -1,18 +1,10 @@
 """What the report of a capture is made of: its laws, their runs on all throws, and files of these. Needs captures.smk."""
 
-from neuma_lib.capture.scenes import scene_name, training_throws
-from neuma_lib.config.methods import LAW_FROM
+from neuma_lib.project.capture_scenes import scene_name, training_takes
 
-# Methods that stand beside the learned one: the prior as it is, and the constants that the video shows.
-PRIOR = next(
-    (
-        name
-        for name, method in SETTINGS.methods.items()
-        if method.law == "learned" and not method.material.get("train", True)
-    ),
-    None,
-)
-CONSTANTS = next(filter(SETTINGS.is_identified, SETTINGS.methods), None)
+# Methods that the learned one is compared with: the prior as it is, and the constants identified in the video.
+PRIOR = next(iter(cases.of_kind(SETTINGS, "prior")), None)
+CONSTANTS = next(iter(cases.of_kind(SETTINGS, "constants")), None)
 
 
 def reported_methods(method):
@@ -24,7 +16,7 @@ def reported_methods(method):
 def training_scene(name):
     """The scene that the law of a capture is learned in, with its further videos."""
     capture = capture_named(name)
-    trained = training_throws(capture)
+    trained = training_takes(capture)
     if not trained:
         raise InputError(
             f"{capture.folder} has no videos: a report needs at least one throw, see docs/capture.md"
@@ -38,19 +30,14 @@ def thrown_method(name, throw, method):
     return f"{scene}/{method}" if scene == training else f"{scene}/{method}+{LAW_FROM}={training}"
 
 
-def without_own_field(wildcards):
-    if SETTINGS.carries_field(wildcards.method):
-        raise InputError(f"{wildcards.method}: pictures of captures are not made from PAC-NeRF's field")
-
-
 @checked
 def capture_start(wildcards):
     """How a filmed throw begins: as the method has it, or as its free flight tells where the throw is held out."""
-    without_own_field(wildcards)
     captured = SETTINGS.scene(wildcards.scene).captured
     if captured.throw in capture_named(captured.capture).settings.held_out:
         return of_chain("velocity.json")(wildcards)
-    return start_file(wildcards)
+    case = case_on(wildcards.scene, wildcards.method)
+    return case.method.start_file(case)
 
 
 @checked
@@ -85,21 +72,16 @@ def method_names(wildcards):
     """Titles of the laws of a report."""
     named = {PRIOR: "prior", CONSTANTS: "identified constants"}
     titles = {
-        name: named.get(name, SETTINGS.method_title(name)) for name in reported_methods(wildcards.method)
+        name: named.get(name, cases.title(SETTINGS, name)) for name in reported_methods(wildcards.method)
     }
     return titles
 
 
-def law_files(name, method):
-    """Files of the law of a capture, by kind."""
-    run = SimpleNamespace(scene=training_scene(name), method=method)
-    kinds = {
-        "identified": identified_law(run),
-        "prior": material_prior(run),
-        "adaptor": trained_adaptor(run),
-        "base": identified_base(run),
-    }
-    return {kind: file for kind, file in kinds.items() if file}
+def report_law(name, method):
+    """What the law of a capture is loaded from, with its uncertainty: as `workflow.motion.law_of` takes it."""
+    case = case_on(training_scene(name), method)
+    files = {kind: paths[0] for kind, paths in law_files([case]).items()}
+    return model_parameter([case]) | {"files": files | case.method.uncertainty_inputs(case)}
 
 
 def of_report(function):
@@ -136,7 +118,7 @@ def own_files(file, cameras=False):
 
     def choose(name, method):
         capture = capture_named(name)
-        places = filmed_by(capture) if cameras else [(throw, "") for throw in capture.throws]
+        places = filmed_by(capture) if cameras else [(throw, "") for throw in capture.takes]
         return [
             f"{RESULTS}/{thrown_method(name, throw, method)}/{file.format(camera=camera)}"
             for throw, camera in places
@@ -149,7 +131,7 @@ def thrown_files(file):
     """A function of wildcards: a file of the scene of each throw."""
     return of_report(
         lambda name, method: [
-            f"{RESULTS}/{scene_name(name, throw)}/{file}" for throw in capture_named(name).throws
+            f"{RESULTS}/{scene_name(name, throw)}/{file}" for throw in capture_named(name).takes
         ]
     )
 
@@ -157,7 +139,8 @@ def thrown_files(file):
 def report_identified(name, method):
     if CONSTANTS is None:
         return []
-    return identified_file(SimpleNamespace(scene=training_scene(name), method=CONSTANTS))
+    case = case_on(training_scene(name), CONSTANTS)
+    return case.result(case.identified())
 
 
 def report_facts(name, method):
@@ -175,6 +158,6 @@ def report_facts(name, method):
         "held_out": list(settings.held_out),
         "throws": {
             throw: {camera: exposures.get(camera, 0.0) for camera in cameras}
-            for throw, cameras in capture.throws.items()
+            for throw, cameras in capture.takes.items()
         },
     }

@@ -2,15 +2,19 @@
 
 from types import SimpleNamespace
 
-from neuma_lib.config import places
-from neuma_lib.config.places import FIELD
-from neuma_lib.config.settings import NO_TRUTH
+from neuma_lib.project import paths as places
+from neuma_lib.project.settings import NO_TRUTH
 from workflow.inputs import image_list
 
 
 def home(name, file):
     """The one path of a file of a scene or experiment in a chain."""
     return places.home(SETTINGS, name, file)
+
+
+def scene_prior(scene):
+    """The file of the prior of a scene in its chain."""
+    return places.prior_file(SETTINGS, scene, SETTINGS.scene(scene).prior)
 
 
 def of_chain(file):
@@ -128,7 +132,7 @@ def truth_memory(wildcards):
 def render_minutes(images, frames):
     """Minutes that the renders of all frames may take: an hour, and a minute a megapixel at 16 samples.
 
-    At the paper's scale a core took 0.2 minutes a megapixel, and 0.8 for a liquid (docs/guide.md).
+    At the paper's scale a core took 0.2 minutes a megapixel, and 0.8 for a liquid (docs/scale.md).
     """
     samples = frames * images.views * images.width * images.height * images.samples
     return 60 + round(samples / 16e6)

@@ -5,23 +5,25 @@ import shutil
 import sys
 from pathlib import Path
 
-ROOT = Path(workflow.basedir).resolve()
+ROOT = Path(workflow.current_basedir.get_path_or_uri(secret_free=True)).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from neuma_lib.capture.planned import planned_captures
-from neuma_lib.capture.scenes import captured_scenes
-from neuma_lib.checks import law_problems
+from neuma_lib.project.capture_scenes import captured_scenes
+from neuma_lib.project.checks import law_problems
+from neuma_lib.project import cases
 from neuma_lib.config.capture import CapturesConfig
-from neuma_lib.config.loading import load
+from neuma_lib.project.loading import load
 from neuma_lib.config.validation import validate
 from neuma_lib.errors import InputError
+from neuma_lib.methods.registry import methods as all_methods
 from workflow.defaults import complete, digest_of
 from workflow.provenance import code_digest
 from workflow.records import keep_records_of_failed_jobs
 
 try:
     captures = validate(CapturesConfig, config.get("captures") or {}, "captures")
-    PLANNED = planned_captures(captures.demo, captures.root)
+    # A workflow that includes this one may plan captures before their files exist.
+    PLANNED = plan_captures(config, captures.root) if "plan_captures" in globals() else {}
     SETTINGS = load(config, captured=captured_scenes(captures.root, captures.released, PLANNED))
 except InputError as error:
     raise WorkflowError(str(error)) from None
@@ -84,11 +86,6 @@ PICTURED_SCENE = scenes_that(lambda scene: not scene.splat and not (scene.captur
 THROW_SCENE = scenes_that(lambda scene: scene.captured and scene.captured.throw, chains=False)
 
 
-def is_captured(name):
-    """Whether a scene, or a chain of it, is of a capture."""
-    return SETTINGS.scenes[name.split("+")[0]].captured is not None
-
-
 wildcard_constraints:
     scene=f"({'|'.join(SETTINGS.scenes) or 'none'})([+][^/]*)?",
     prior=f"({'|'.join(SETTINGS.priors.laws) or 'none'})([+]seed=[1-9][0-9]*)?",
@@ -96,13 +93,6 @@ wildcard_constraints:
     experiment=f"({'|'.join(SETTINGS.experiments) or 'none'})([+][^/]*)?",
     group="binding|geometry|simulation|laws|rendering|radiance|springs",
     views="[0-9]+(,[0-9]+)*",
-
-
-# Methods without a law of a material have rules of their own beside those of evaluation.
-SPRING_METHOD = (
-    f"({'|'.join(name for name in SETTINGS.methods if SETTINGS.is_springs(name)) or 'none'})([+][^/]*)?"
-)
-LAW_METHOD = f"(?!{SPRING_METHOD}/)({'|'.join(SETTINGS.methods) or 'none'})([+][^/]*)?"
 
 
 def kernels(*groups):
@@ -120,3 +110,19 @@ def checked(function):
             raise WorkflowError(str(error)) from None
 
     return call
+
+
+def code_of(script):
+    """A function of wildcards: digest of a script and of the method that it loads."""
+
+    def digest(wildcards):
+        loaded = type(cases.kind_of(SETTINGS, wildcards.method)).__module__
+        return code_digest(ROOT / "workflow" / "scripts" / script, loaded)
+
+    return digest
+
+
+def code_of_methods(script):
+    """A function of wildcards: digest of a script that may load every method."""
+    modules = sorted(type(method).__module__ for method in all_methods().values())
+    return lambda wildcards: code_digest(ROOT / "workflow" / "scripts" / script, *modules)

@@ -62,29 +62,24 @@ rule splat_velocity:
         "../scripts/splat_velocity.py"
 
 
-rule splat_motion:
+use rule predict as predict_splat with:
     input:
+        unpack(of_bodies(model_files)),
         **body_files(),
-        kernels=kernels("laws"),
+        kernels=of_bodies(model_kernels),
         velocity=splat_start,
-        prior=material_prior,
-        adaptor=trained_adaptor,
-        identified=identified_law,
     output:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
         report=f"{RESULTS}/{{scene}}/{{method}}/motion.json",
     wildcard_constraints:
         scene=SPLAT_SCENE,
-        method=LAW_METHOD,
-    resources:
-        gpu=GPU,
     params:
+        method=of_bodies(model_parameter),
         simulation=splat_simulation,
-        density=scene_setting("density"),
-        laws=lambda wildcards: [law for law in [true_law(wildcards)] if law],
-        total=carries_total,
-        carrier=experiment_carrier,
+        densities=of_case(lambda case: [SETTINGS.scene(case.moved).plain()["density"]]),
+        total=of_bodies(carries_total),
+        carrier=of_bodies(shared_carrier),
         frames=splat_frames,
+        cameras=None,
         device=SETTINGS.device,
-    script:
-        "../scripts/splat_motion.py"
+        code=code_of("predict.py"),

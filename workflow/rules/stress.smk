@@ -25,46 +25,39 @@ rule visited:
 
 rule stress:
     input:
+        unpack(of_bodies(law_files)),
         kernels=kernels("laws"),
         visited=of_chain("visited.h5"),
-        prior=material_prior,
-        adaptor=trained_adaptor,
-        identified=identified_law,
     output:
         stress=f"{RESULTS}/{{scene}}/{{method}}/stress.json",
     params:
         dt=scene_setting("dt"),
         truth=scene_setting("law"),
-        laws=lambda wildcards: [law for law in [true_law(wildcards)] if law],
+        method=of_bodies(model_parameter),
+        code=code_of("stress.py"),
     script:
         "../scripts/stress.py"
 
 
 rule response:
     input:
+        unpack(of_bodies(uncertainty_files)),
         kernels=kernels("laws"),
         # that of the first chain: the tests of all chains have one axis
         visited=checked(lambda wildcards: home(SETTINGS.chain(wildcards.scene)[0], "visited.h5")),
-        prior=material_prior,
-        adaptor=trained_adaptor,
-        identified=identified_law,
-        base=identified_base,
-        rollout=lambda wildcards: (
-            f"{RESULTS}/{wildcards.scene}/{wildcards.method}/rollout.h5"
-            if identified_base(wildcards)
-            else []
-        ),
     output:
         response=f"{RESULTS}/{{scene}}/{{method}}/response.json",
     params:
         dt=scene_setting("dt"),
         truth=scene_setting("law"),
-        laws=lambda wildcards: [law for law in [true_law(wildcards)] if law],
+        method=of_bodies(model_parameter),
+        uncertainty=of_case(lambda case: sorted(case.method.uncertainty_inputs(case))),
         rate=SETTINGS.figures.shear_rate,
         total_shear=SETTINGS.figures.total_shear,
         model_std=SETTINGS.identify.model_std,
         spread=SETTINGS.identify.spread,
         seed=SETTINGS.seed,
+        code=code_of("response.py"),
     script:
         "../scripts/response.py"
 

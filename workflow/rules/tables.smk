@@ -25,13 +25,12 @@ def random_files(methods, name):
 
 def identified_scenes():
     """Every identification that a table judges: the scenes of table1 in all its chains, and the random scenes."""
-    table, methods = SETTINGS.tables.get("table1"), SETTINGS.methods
-    constants = [name for name in methods if SETTINGS.is_identified(name)][:1]
+    table, constants = SETTINGS.tables.get("table1"), cases.of_kind(SETTINGS, "constants")[:1]
     runs = [
         run
         for s in (table.scenes if table else ())
         for m in constants
-        for run in SETTINGS.runs("table1", m, s)
+        for run in cases.runs(SETTINGS, "table1", m, s)
     ]
     named = dict.fromkeys((Path(run).parent.name for run in runs), "scenes of Table 1")
     return with_truths(
@@ -41,8 +40,8 @@ def identified_scenes():
 
 def identified_behind(table):
     """The same of every scene whose identified constants have a row in a table."""
-    runs = [run for run in table_runs(table) if run["scene"] and SETTINGS.is_identified(run["method"])]
-    scenes = [SETTINGS.law_scene(run["scene"], run["method"]) for run in runs]
+    rows = [case_on(run["scene"], run["method"]) for run in table_runs(table) if run["scene"]]
+    scenes = [case.scene for case in rows if "identified" in case.method.model_inputs(case)]
     return with_truths({Path(home(scene, "identified.json")).parent.name: table for scene in scenes})
 
 
@@ -65,7 +64,7 @@ def method_runs(table, method):
             "folder": f"{RESULTS}/{run}" if column in chosen.scenes else f"{RESULTS}/experiments/{run}",
         }
         for column in (*chosen.scenes, *chosen.experiments)
-        for run in SETTINGS.runs(table, method, column)
+        for run in cases.runs(SETTINGS, table, method, column)
     ]
 
 
@@ -87,12 +86,12 @@ def table_cells(table):
 def table_titles(table):
     """Row names of a table by method."""
     chosen = SETTINGS.tables[table]
-    return {m: chosen.titles.get(m) or SETTINGS.method_title(m) for m in chosen.methods}
+    return {m: chosen.titles.get(m) or cases.title(SETTINGS, m) for m in chosen.methods}
 
 
 def table_notes(table):
     """What readers must know of the rows of a table, by method."""
-    notes = {method: SETTINGS.method_note(method) for method in SETTINGS.tables[table].methods}
+    notes = {m: cases.preset(SETTINGS, m)[0].note for m in SETTINGS.tables[table].methods}
     return {method: note for method, note in notes.items() if note}
 
 

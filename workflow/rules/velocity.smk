@@ -6,7 +6,7 @@ rule velocity:
         **body_files(),
         kernels=kernels("laws", "rendering"),
         transforms=of_scene("dynamic/transforms.json"),
-        prior=lambda wildcards: prior_file(wildcards.scene),
+        prior=lambda wildcards: scene_prior(wildcards.scene),
     output:
         velocity=f"{RESULTS}/{{scene}}/velocity.json",
     wildcard_constraints:

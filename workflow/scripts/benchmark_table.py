@@ -1,7 +1,7 @@
 """Table 4 of the paper from the settings of the scenes."""
 
-from neuma_lib.evaluation.reports import benchmark_table
 from neuma_lib.io.files import write_text
+from neuma_lib.paper.reports import benchmark_table
 from workflow.stage import run_script
 
 

@@ -1,6 +1,6 @@
-"""Print the board that is laid on the floor, at its true size."""
+"""Print the board for the floor at its true size."""
 
-from neuma_lib.capture.board import print_board
+from neuma_lib.capture.calibration.board import print_board
 from neuma_lib.config.capture import BoardConfig
 from workflow.stage import run_script
 
@@ -10,8 +10,8 @@ def main(inputs, output, params, run) -> None:
     print_board(output.board, board, params.paper)
     columns, rows = board.squares
     run.say(
-        f"{columns} x {rows} squares of {1000 * board.square:.1f} mm on {params.paper}: print it at 100 %, measure it,"
-        " and give a square's side as board.square in capture.yaml"
+        f"{columns} x {rows} squares of {1000 * board.square:.1f} mm on {params.paper}: print it at 100 %, measure the"
+        " side of a square, and set it as board.square in capture.yaml"
     )
 
 

@@ -1,34 +1,27 @@
-"""Stress curves of the prior, the identified constants and the learned law of a capture, in the units of its room."""
+"""Stress curves of the prior, the identified constants and the learned law of a capture, in units of its room."""
 
 import torch
 
-from neuma_lib.evaluation.bands import DRAWS, constants_draws, corrected_draws
+from neuma_lib.evaluation.bands import DRAWS
 from neuma_lib.evaluation.plotting.style import save
 from neuma_lib.evaluation.stress_curves import draw, stress_curves
-from neuma_lib.io.files import read_json, write_json
+from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import read_arrays
-from neuma_lib.io.laws import load_laws
+from neuma_lib.methods.base import method_of
 from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
     motion, _ = read_arrays(inputs.rollout, required=("F",), only=("F",))
-    F, files = torch.from_numpy(motion["F"]), iter(inputs.laws)
+    F = torch.from_numpy(motion["F"])
+    uncertainty = {"model_std": params.model_std, "spread": params.spread}
     drawn = {"dt": params.dt, "count": DRAWS, "seed": params.seed}
     laws, draws = {}, {}
-    for method, kinds in params.laws.items():
-        # files of a law lie one after the other
-        parts = {kind: next(files) for kind in kinds}
-        given = [[parts[kind]] if kind in parts else [] for kind in ("identified", "prior", "adaptor")]
-        (laws[method],) = load_laws(params.dt, (), *given)
-        found = read_json(parts["identified"]) if "identified" in parts else {}
-        if "best" in found:  # constants that come with their covariance
-            draws[method] = constants_draws(found, params.model_std, **drawn)
-        elif "base" in parts and laws[method].elasticity.form == "stretch":
-            before = {"model_std": params.model_std, "spread": params.spread}
-            draws[method] = corrected_draws(
-                laws[method], read_json(parts["base"])["best"], F, **before, **drawn
-            )
+    for name, source in params.laws.items():
+        method, files = method_of(source["module"]), source["files"]
+        laws[name] = method.load(files, source["options"][0], params.dt).law
+        if drawn_laws := method.draws(files, laws[name], F, uncertainty, **drawn):
+            draws[name] = drawn_laws
     curves = stress_curves(
         laws, params.method, F, params.rate, params.total_shear, params.dt, draws, params.scale
     )

@@ -1,16 +1,15 @@
-"""Fit the free flight of a throw to what all cameras saw, and check gravity."""
+"""Fit the free flight of a take in all cameras, and check gravity."""
 
 from pathlib import Path
 
 import numpy as np
 
-from neuma_lib.capture.agreement import check_one_object
-from neuma_lib.capture.flight import Filmed, draw_flight, find_flight, report
-from neuma_lib.capture.mattes import metric_camera
-from neuma_lib.capture.timing import read_sound
-from neuma_lib.io.files import read_json, write_json
+from neuma_lib.capture.masks.agreement import check_one_object
+from neuma_lib.capture.masks.mattes import metric_camera
+from neuma_lib.capture.motion.flight import Filmed, draw_flight, find_flight, report
+from neuma_lib.capture.motion.timing import read_sound
+from neuma_lib.io.files import listed, read_json, write_json
 from neuma_lib.io.images import read_image_set, read_transforms
-from workflow.inputs import listed
 from workflow.stage import run_script
 
 
@@ -55,7 +54,7 @@ def filmed(camera, video, transforms, masks, timeline, offset, row_time) -> Film
         K,
         timeline["height"],
         row_time,
-        # Sound is not slowed with the picture.
+        # The sound of slow motion is not slowed.
         read_sound(Path(video)) if video and timeline["stretch"] == 1 else None,
         offset,
     )

@@ -1,10 +1,9 @@
-"""One page of a capture's masks and free flights: checks and pictures."""
+"""Page of a capture's masks and free flights: checks and pictures."""
 
 from pathlib import Path
 
-from neuma_lib.capture.page import markdown, motion_checks
-from neuma_lib.io.files import read_json, write_text
-from workflow.inputs import listed
+from neuma_lib.capture.report.page import markdown, motion_checks
+from neuma_lib.io.files import listed, read_json, write_text
 from workflow.stage import run_script
 
 
@@ -25,7 +24,7 @@ def main(inputs, output, params, run) -> None:
     missing = None if names else "There are no videos yet."
     write_text(output.page, markdown(params.title, checks, pictures, missing))
     for check in checks:
-        run.say(f"{check.what}: {check.found}" + ("" if check.good else f" (wanted: {check.wanted})"))
+        run.say(f"{check.what}: {check.value}" + ("" if check.good else f" (wanted: {check.wanted})"))
 
 
 run_script(main, snakemake)

@@ -1,28 +1,26 @@
-"""One page of a capture: checks and pictures."""
+"""Page of a capture: checks and pictures."""
 
 from pathlib import Path
 
-from neuma_lib.capture.page import checks, markdown
-from neuma_lib.io.files import read_json, write_text
-from workflow.inputs import listed
+from neuma_lib.capture.report.page import checks, markdown
+from neuma_lib.io.files import listed, read_json, write_text
 from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
     home = Path(output.page).parent
     names = [f"{throw}, {camera}" for throw, camera in params.videos]
-    found = checks(read_json(inputs.room), dict(zip(names, map(read_json, listed(inputs.timelines)))))
+    results = checks(read_json(inputs.room), dict(zip(names, map(read_json, listed(inputs.timelines)))))
     files = {
         "Cameras and points": inputs.cameras,
         "Floor and box": inputs.floor,
         **{f"Frames: {name}": sheet for name, sheet in zip(names, listed(inputs.sheets))},
     }
     pictures = {caption: str(Path(file).relative_to(home)) for caption, file in files.items()}
-    write_text(
-        output.page, markdown(params.title, found, pictures, None if names else "There are no videos yet.")
-    )
-    for check in found:
-        run.say(f"{check.what}: {check.found}" + ("" if check.good else f" (wanted: {check.wanted})"))
+    missing = None if names else "There are no videos yet."
+    write_text(output.page, markdown(params.title, results, pictures, missing))
+    for check in results:
+        run.say(f"{check.what}: {check.value}" + ("" if check.good else f" (wanted: {check.wanted})"))
 
 
 run_script(main, snakemake)

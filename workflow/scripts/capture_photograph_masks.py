@@ -4,24 +4,30 @@ from pathlib import Path
 
 import numpy as np
 
-from neuma_lib.capture.agreement import LEAST_AGREEMENT, agreement
-from neuma_lib.capture.board import board_outline
-from neuma_lib.capture.folder import PHOTOGRAPHS
+from neuma_lib.capture.calibration.board import board_outline
+from neuma_lib.capture.calibration.lens import read_lens
 from neuma_lib.capture.frames import Frame
-from neuma_lib.capture.lens import read_lens
-from neuma_lib.capture.masks import overlay
-from neuma_lib.capture.mattes import metric_camera, own_mask, read_pixels, room_frames, world_of, write_mattes
-from neuma_lib.capture.photograph_masks import photograph_mask
+from neuma_lib.capture.masks.agreement import MIN_AGREEMENT, agreement
+from neuma_lib.capture.masks.mask_refinement import redrawn_masks
+from neuma_lib.capture.masks.mattes import (
+    metric_camera,
+    own_mask,
+    read_pixels,
+    room_frames,
+    world_of,
+    write_mattes,
+)
+from neuma_lib.capture.masks.photograph_masks import photograph_mask
+from neuma_lib.capture.masks.regions import overlay
+from neuma_lib.capture.masks.saliency import Saliency
 from neuma_lib.capture.pictures import picture_sheet
-from neuma_lib.capture.redrawn_masks import redrawn_masks
-from neuma_lib.capture.saliency import Saliency
 from neuma_lib.config.board import BoardConfig
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import read_json, write_json
-from workflow.inputs import listed
+from neuma_lib.io.files import listed, read_json, write_json
+from neuma_lib.project.capture_folder import PHOTOGRAPHS
 from workflow.stage import run_script
 
-_STEPS = 4  # of which the network's masks are one
+_STEPS = 4  # of progress, one for the network's masks
 
 
 def main(inputs, output, params, run) -> None:
@@ -29,10 +35,8 @@ def main(inputs, output, params, run) -> None:
     lens = read_lens(read_json(inputs.report)["lenses"][PHOTOGRAPHS], inputs.report)
     own = {Path(file).stem: file for file in listed(inputs.own)}
     network = Saliency(listed(inputs.network)[0]) if listed(inputs.network) else None
-    board, world = (
-        BoardConfig(**params.board) if params.board else None,
-        world_of(inputs.room).get("world", {}),
-    )
+    board = BoardConfig(**params.board) if params.board else None
+    world = world_of(inputs.room).get("world", {})
     names, pictures, masks = [], [], []
     for number, frame in enumerate(frames):
         file = Path(inputs.room).parent / frame["file_path"]
@@ -47,52 +51,55 @@ def main(inputs, output, params, run) -> None:
         masks.append(mask)
         run.progress(number + 1, _STEPS * len(frames))
     cameras, Ks = map(np.stack, zip(*(metric_camera(frame, {}) for frame in frames)))
-    # Own masks are taken as they are.
-    is_own = [name in own for name in names]
-    agreed = np.ones(1)
+    is_own = [name in own for name in names]  # masks of the user are not refined
+    ious = np.ones(1)
     if len(masks) > 1:
         _check(agreement(masks, cameras, Ks), names, is_own, params.name)
 
-        def drawn(done: int, total: int) -> None:
+        def progress(done: int, total: int) -> None:
             run.progress(total + (_STEPS - 1) * done, _STEPS * total)
 
-        masks = redrawn_masks(pictures, masks, cameras, Ks, is_own, drawn)
-        agreed = agreement(masks, cameras, Ks)
-    doubtful = _check(agreed, names, is_own, params.name)
+        masks = redrawn_masks(pictures, masks, cameras, Ks, is_own, progress)
+        ious = agreement(masks, cameras, Ks)
+    doubtful = _check(ious, names, is_own, params.name)
     kept = [name not in doubtful for name in names]
-    shown = [
+    sheet = [
         (f"{name}: {value:.2f}{'' if good else ', left out'}", overlay(Frame(0, 0.0, pixels), mask).pixels)
-        for name, value, good, pixels, mask in zip(names, agreed, kept, pictures, masks)
+        for name, value, good, pixels, mask in zip(names, ious, kept, pictures, masks)
     ]
-    said = f"{sum(kept)} of {len(names)} masks agree, IoU {np.mean(agreed[kept]):.2f} with the body that they leave"
-    picture_sheet(output.sheet, shown, f"{params.name}: {said}", 6)
+    summary = (
+        f"{sum(kept)} of {len(names)} masks agree, mean IoU {np.mean(ious[kept]):.2f} with their visual hull"
+    )
+    picture_sheet(output.sheet, sheet, f"{params.name}: {summary}", 6)
     mattes = [
         ({**frame, "file_path": f"{name}.png"}, pixels, mask)
         for frame, name, pixels, mask, good in zip(frames, names, pictures, masks, kept)
         if good
     ]
-    # the object lies on the floor of the room (neuma_lib.config.photographs)
+    # The object lies on the floor of the room (neuma_lib.config.photographs).
     write_mattes(output.transforms, mattes, {**world_of(inputs.room), "photographs": {"floor": 0.0}})
     write_json(
         output.report,
         {
             "photographs": len(names),
-            "agreement": dict(zip(names, agreed.tolist())),
+            "agreement": dict(zip(names, ious.tolist())),
             "left_out": doubtful,
             "own": sorted(own),
         },
     )
-    run.say(said + (f"; left out: {', '.join(doubtful)}" if doubtful else ""))
+    run.say(summary + (f", left out: {', '.join(doubtful)}" if doubtful else ""))
 
 
-def _check(agreed, names, is_own, name) -> list[str]:
+def _check(ious, names, is_own, name) -> list[str]:
     """Photographs whose masks do not agree with the others."""
-    doubtful = [n for n, value, own in zip(names, agreed, is_own) if value < LEAST_AGREEMENT and not own]
+    doubtful = [n for n, value, own in zip(names, ious, is_own) if value < MIN_AGREEMENT and not own]
     if len(doubtful) > 0.5 * len(names):
         raise InputError(
-            f"{name}: {len(doubtful)} of {len(names)} masks of photographs do not belong to the body that the"
-            f" others show ({', '.join(doubtful[:5])}): photograph the object alone, whole, and before another"
-            f" colour; or put masks of your own into the folder masks/{PHOTOGRAPHS}"
+            name,
+            f"{len(doubtful)} of {len(names)} masks of photographs disagree with the others"
+            f" ({', '.join(doubtful[:5])}), at most half may",
+            "Photograph the whole object alone in front of a background of another colour, or put masks into the folder"
+            f" masks/{PHOTOGRAPHS}",
         )
     return doubtful
 

@@ -1,13 +1,13 @@
-"""Find the cameras of photographs and stills, and the points that they see."""
+"""Estimate the cameras of photographs and stills, and points of the scene."""
 
 import tempfile
 from pathlib import Path
 
-from neuma_lib.capture.drawing import draw_poses
-from neuma_lib.capture.folder import PHOTOGRAPHS
-from neuma_lib.capture.poses import find_poses, save_poses
+from neuma_lib.capture.calibration.drawing import draw_poses
+from neuma_lib.capture.calibration.poses import find_poses, save_poses
 from neuma_lib.config.capture import BoardConfig
-from workflow.inputs import listed
+from neuma_lib.io.files import listed
+from neuma_lib.project.capture_folder import PHOTOGRAPHS
 from workflow.stage import run_script
 
 
@@ -28,8 +28,8 @@ def main(inputs, output, params, run) -> None:
     draw_poses(output.picture, poses)
     save_poses(output.poses, output.points, poses)
     run.say(
-        f"{len(poses.names)} of {len(poses.names) + len(poses.lost)} pictures have their place, {len(poses.points)}"
-        f" points, reprojection error {poses.error:.2f} px"
+        f"{len(poses.names)} of {len(poses.names) + len(poses.lost)} pictures registered, {len(poses.points)} points,"
+        f" reprojection error {poses.error:.2f} px"
     )
 
 

@@ -1,27 +1,26 @@
-"""Place the photographed object into the video of a throw, and find how it moves there."""
+"""Register the photographed object in the video of a take, and estimate its motion."""
 
 import shutil
 
 import numpy as np
 import torch
 
-from neuma_lib.capture.clock import frame_times
-from neuma_lib.capture.gravity import GRAVITY, Gravity
+from neuma_lib.capture.motion.gravity import GRAVITY, Gravity
+from neuma_lib.capture.motion.synchronisation import frame_times
 from neuma_lib.capture.pictures import picture_sheet
+from neuma_lib.capture.registration.registration import Parabola, register
+from neuma_lib.capture.registration.rigid_views import Sight
 from neuma_lib.errors import InputError
-from neuma_lib.fitting.registration import Parabola, register
-from neuma_lib.fitting.rigid_views import Sight
-from neuma_lib.io.files import atomic, read_json, write_json
+from neuma_lib.io.files import atomic, listed, read_json, write_json
 from neuma_lib.io.gaussians import load_gaussians, save_gaussians
 from neuma_lib.io.images import read_image_set, read_transforms
 from neuma_lib.io.particles import load_particles, save_particles
 from neuma_lib.io.ply import read_ply, write_ply
 from neuma_lib.splatting.rigid import moved
-from workflow.inputs import listed
 from workflow.stage import run_script
 
 KNOWN_SPIN = 3.0
-"""Deviation of a measured spin above which the search begins without it [rad/s]."""
+"""Standard deviation of a measured spin above which the search starts without it [rad/s]."""
 
 
 def main(inputs, output, params, run) -> None:
@@ -38,7 +37,7 @@ def main(inputs, output, params, run) -> None:
     world = read_transforms(listed(inputs.transforms)[0]).get("world", {})
     scale = world.get("scale", 1.0)
     scale_known = read_transforms(inputs.photographs).get("scale_known", True)
-    found = register(
+    registered = register(
         gaussians,
         x.double().numpy(),
         vol0.double().numpy(),  # of one density
@@ -50,55 +49,57 @@ def main(inputs, output, params, run) -> None:
         floor=float(world.get("offset", [0.0, 0.0, 0.0])[1]),
     )
     gravity = Gravity(
-        found.gravity / scale,
-        found.gravity_covariance / scale**2,
-        f"the placed object in {found.pictures[0]} pictures",
+        registered.gravity / scale,
+        registered.gravity_covariance / scale**2,
+        f"the placed object in {registered.pictures[0]} pictures",
         len(sights) > 1,
     )
-    line = gravity.checked(params.name) if scale_known else gravity.told(params.name)
-    placed = found.place(x.double().numpy())
+    line = gravity.check(params.name) if scale_known else gravity.describe(params.name)
+    placed = registered.place(x.double().numpy())
     if placed.min() < 0 or placed.max() > 1:
         raise InputError(
-            f"{params.name}: the flight begins outside the simulator's box, which is shown in floor.png: move it by"
-            " `center` in capture.yaml, or make it larger with `scale`"
+            params.name,
+            f"the object starts at {placed.min():.2f} to {placed.max():.2f}, outside the simulation box [0, 1] shown in"
+            " floor.png",
+            "Set `center` or a smaller `scale` in capture.yaml",
         )
-    R, t = torch.from_numpy(found.rotation), torch.from_numpy(found.translation)
-    save_gaussians(output.gaussians, moved(gaussians, R, t, found.scale))
+    R, t = torch.from_numpy(registered.rotation), torch.from_numpy(registered.translation)
+    save_gaussians(output.gaussians, moved(gaussians, R, t, registered.scale))
     vertices, faces = read_ply(inputs.mesh)
     corners = np.stack([vertices[axis] for axis in "xyz"], axis=1)
-    for axis, values in zip("xyz", found.place(corners).T):
+    for axis, values in zip("xyz", registered.place(corners).T):
         vertices[axis] = values
     write_ply(output.mesh, vertices, faces)
     for source, target in ((inputs.sampled, output.sampled), (inputs.particles, output.particles)):
         x, vol0, attributes = load_particles(source)
-        placed = torch.from_numpy(found.place(x.double().numpy()))
-        save_particles(target, placed.to(x), found.scale**3 * vol0, attributes)
+        placed = torch.from_numpy(registered.place(x.double().numpy()))
+        save_particles(target, placed.to(x), registered.scale**3 * vol0, attributes)
     with atomic(output.binding) as partial:
         shutil.copyfile(inputs.binding, partial)
     pictures = []
-    for shown in found.shown:
+    for shown in registered.shown:
         triple = [shown.seen, shown.rendered, (1 + shown.rendered - shown.seen) / 2]
         pixels = np.rint(255 * np.concatenate(triple, axis=1)).astype(np.uint8)
         pictures.append(
-            (f"{found.names[shown.camera]}, {shown.time:.4f} s: seen, rendered, difference", pixels)
+            (f"{registered.names[shown.camera]}, {shown.time:.4f} s: seen, rendered, difference", pixels)
         )
-    picture_sheet(output.picture, pictures, f"{params.name}: {found.summary()}", columns=3)
-    write_json(output.velocity, found.velocity())
-    write_json(output.registration, {**found.report(), **gravity.report(), "gravity": line})
-    run.say(found.summary())
+    picture_sheet(output.picture, pictures, f"{params.name}: {registered.summary()}", columns=3)
+    write_json(output.velocity, registered.velocity())
+    write_json(output.registration, {**registered.report(), **gravity.report(), "gravity": line})
+    run.say(registered.summary())
     run.say(line)
-    if found.ambiguous:
-        run.say(f"not told: {found.ambiguous}")
+    if registered.ambiguous:
+        run.say(f"undetermined: {registered.ambiguous}")
 
 
 def sight(camera, transforms, timeline, row_time, flight, name) -> Sight:
-    """What a camera saw of the free flight."""
+    """Frames of one camera during free flight."""
     data, images = read_transforms(transforms), read_image_set(transforms)
     first, last = flight["frames"][camera]
     flying = [k for k, step in enumerate(images.steps) if first <= step <= last]
     if not flying:
         raise InputError(
-            f"{name}, {camera}: {transforms} has none of the frames {first} to {last} of the flight"
+            f"{name}, {camera}", f"{transforms} has none of the frames {first} to {last} of the flight"
         )
     frames, pixels = [data["frames"][k] for k in flying], images.images[flying]
     rows = np.array([np.flatnonzero(image[..., 3].any(axis=1)).mean() + 0.5 for image in pixels])
@@ -108,9 +109,9 @@ def sight(camera, transforms, timeline, row_time, flight, name) -> Sight:
 
 
 def parabola(flight, scale, offset, metric) -> Parabola:
-    """The flight of the masks' centre, from the room's metres to those of the simulator.
+    """The flight of the masks' centre, converted from metres of the room to simulated metres.
 
-    Gravity is known, but measured where lengths are not metres.
+    Gravity is 9.81 m/s^2, or the measured value if lengths are not metres.
     """
     gravity = [0.0, -GRAVITY, 0.0] if metric else flight["gravity_m_s2"]
     spin, sure = flight["spin_rad_s"], flight["spin_deviation_rad_s"]

@@ -1,103 +1,94 @@
-"""One page of a capture: prediction beside every video, measures, the law, what to distrust, checks, and input."""
+"""Report of a capture: comparison with every video, measures, the law, warnings, checks and input."""
 
 from pathlib import Path
 
-from neuma_lib.capture.page import checks, motion_checks, object_checks, registration_checks
-from neuma_lib.evaluation.capture_doubts import (
-    of_checks,
-    of_constants,
-    of_curves,
-    of_filming,
-    of_predictions,
+from neuma_lib.capture.report.page import checks, motion_checks, object_checks, registration_checks
+from neuma_lib.capture.report.report import Film, Report, page
+from neuma_lib.capture.report.warnings import (
+    check_warnings,
+    constants_warnings,
+    curve_warnings,
+    filming_warnings,
+    prediction_warnings,
 )
-from neuma_lib.evaluation.capture_report import Film, Report, page
-from neuma_lib.io.files import read_json, write_text
-from workflow.inputs import listed
+from neuma_lib.io.files import listed, read_json, write_text
 from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
     facts, method = params.facts, params.method
-    of_others = "room" not in inputs.keys()  # poses and masks came with a released capture
+    released = "room" not in inputs.keys()  # released captures come with poses and masks
     videos = [tuple(video) for video in params.videos]
-    names, throws = [f"{throw}, {camera}" for throw, camera in videos], list(facts["throws"])
+    names, takes = [f"{take}, {camera}" for take, camera in videos], list(facts["throws"])
 
-    def by_throw(files):
-        return dict(zip(throws, map(read_json, listed(files)), strict=True))
+    def by_take(files):
+        return dict(zip(takes, map(read_json, listed(files)), strict=True))
 
     def by_video(files):
         return dict(zip(names, map(read_json, listed(files)), strict=True))
 
-    flights, registrations = by_throw(inputs.flights), by_throw(inputs.registrations)
-    predictions, rows = by_throw(inputs.predictions), read_json(inputs.images)
+    flights, registrations = by_take(inputs.flights), by_take(inputs.registrations)
+    predictions, rows = by_take(inputs.predictions), read_json(inputs.images)
     curves = read_json(inputs.curves)
     identified = read_json(inputs.identified) if inputs.identified else None
-    groups = (
-        {}
-        if of_others
-        else {"Frames, cameras, room": checks(read_json(inputs.room), by_video(inputs.timelines))}
-    )
     photographs = read_json(inputs.photographs)
+    groups, pictures = {}, {}
+    if not released:
+        groups["Frames, cameras, room"] = checks(read_json(inputs.room), by_video(inputs.timelines))
+        pictures["Cameras and room"] = {"Cameras and points": inputs.cameras, "Floor and box": inputs.floor}
+        pictures["Videos"] = {f"Frames: {n}": file for n, file in zip(names, listed(inputs.frame_sheets))}
     groups |= {
         "Masks and free flight": motion_checks(photographs, by_video(inputs.masks), flights),
-        "The object as photographed": object_checks(read_json(inputs.object)),
-        "Its place in the videos": registration_checks(registrations),
+        "Gaussians of the object": object_checks(read_json(inputs.object)),
+        "Registration": registration_checks(registrations),
     }
     filmed = {
-        throw: {
+        take: {
             "cameras": cameras,
-            "flight": flights[throw],
-            "registration": registrations[throw],
-            "prediction": predictions[throw],
+            "flight": flights[take],
+            "registration": registrations[take],
+            "prediction": predictions[take],
         }
-        for throw, cameras in facts["throws"].items()
+        for take, cameras in facts["throws"].items()
     }
-    said = [
-        *of_checks(groups),
-        *of_predictions(rows, method, params.prior, params.constants, predictions),
-        *of_constants(identified),
-        *of_curves(curves, params.titles, params.prior, params.constants),
-        *of_filming(facts, filmed),
+    warnings = [
+        *check_warnings(groups),
+        *prediction_warnings(rows, method, params.prior, params.constants, predictions),
+        *constants_warnings(identified),
+        *curve_warnings(curves, params.titles, params.prior, params.constants),
+        *filming_warnings(facts, filmed),
     ]
-    pictures = (
-        {}
-        if of_others
-        else {
-            "Cameras and room": {"Cameras and points": inputs.cameras, "Floor and box": inputs.floor},
-            "Videos": {f"Frames: {n}": file for n, file in zip(names, listed(inputs.frame_sheets))},
-        }
-    )
     pictures |= {
         "Photographs": {"Masks of the photographs": inputs.photograph_sheet},
         "Masks of the videos": {f"Masks: {n}": file for n, file in zip(names, listed(inputs.mask_sheets))},
-        "Free flight": {f"Free flight: {t}": file for t, file in zip(throws, listed(inputs.flight_pictures))},
-        "Place of the object in the videos": {
-            f"Registration: {t}": file for t, file in zip(throws, listed(inputs.registration_pictures))
+        "Free flight": {f"Free flight: {t}": file for t, file in zip(takes, listed(inputs.flight_pictures))},
+        "Registration": {
+            f"Registration: {t}": file for t, file in zip(takes, listed(inputs.registration_pictures))
         },
     }
     means = {(row["throw"], row["camera"]): row for row in rows if row["method"] == method}
     films = [
         Film(
-            throw,
+            take,
             camera,
-            throw not in facts["held_out"],
+            take not in facts["held_out"],
             Path(file),
-            "PSNR {psnr:.1f} dB, LPIPS {lpips_vgg:.3f} on the object".format(**means[throw, camera]),
+            "PSNR {psnr:.1f} dB, LPIPS {lpips_vgg:.3f} on the object".format(**means[take, camera]),
         )
-        for (throw, camera), file in zip(videos, listed(inputs.films), strict=True)
+        for (take, camera), file in zip(videos, listed(inputs.films), strict=True)
     ]
     cameras = {camera for filming in facts["throws"].values() for camera in filming}
     held = f", {', '.join(facts['held_out'])} held out" if facts["held_out"] else ""
     summary = [
-        f"{_counted(photographs['photographs'], 'photograph')}, {_counted(len(throws), 'throw')}{held}, "
+        f"{_counted(photographs['photographs'], 'photograph')}, {_counted(len(takes), 'take')}{held}, "
         f"{_counted(len(cameras), 'camera')}. Prior: {facts['prior']}, density {facts['density']:g} kg/m³, "
-        f"steps of {1e3 * facts['dt']:g} ms, learned from pictures of {facts['width']} pixels."
+        f"time step {1e3 * facts['dt']:g} ms, training pictures of {facts['width']} pixels."
     ]
     report = Report(
         params.capture,
         params.titles[method],
         summary,
-        said,
+        warnings,
         groups,
         pictures,
         films,
@@ -108,12 +99,12 @@ def main(inputs, output, params, run) -> None:
         facts["scale"],
     )
     write_text(output.page, page(report))
-    off = sum(not check.good for found in groups.values() for check in found)
-    run.say(f"{len(films)} videos, {off} checks are off, {len(said)} things to distrust: {output.page}")
+    failed = sum(not check.good for group in groups.values() for check in group)
+    run.say(f"{len(films)} videos, {failed} failed checks, {len(warnings)} warnings: {output.page}")
 
 
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 run_script(main, snakemake)

@@ -1,15 +1,14 @@
-"""Make poses metric and upright, place them in the simulator's box, and undistort the pictures."""
+"""Make poses metric and upright, place them in the simulation box, and undistort the pictures."""
 
 from pathlib import Path
 
-from neuma_lib.capture.drawing import draw_floor, draw_room
-from neuma_lib.capture.folder import PHOTOGRAPHS
+from neuma_lib.capture.calibration.drawing import draw_floor, draw_room
+from neuma_lib.capture.calibration.poses import load_poses
+from neuma_lib.capture.calibration.room import find_room, write_room
 from neuma_lib.capture.pictures import name_pictures
-from neuma_lib.capture.poses import load_poses
-from neuma_lib.capture.room import find_room, write_room
 from neuma_lib.config.capture import CaptureConfig
-from neuma_lib.io.files import write_json
-from workflow.inputs import listed
+from neuma_lib.io.files import listed, write_json
+from neuma_lib.project.capture_folder import PHOTOGRAPHS
 from workflow.stage import run_script
 
 
@@ -24,7 +23,7 @@ def main(inputs, output, params, run) -> None:
     write_json(output.report, report)
     if room.board:
         run.say(
-            f"{len(room.board.corners)} corners of the board, {1000 * room.board.residual:.2f} mm off the print"
+            f"{len(room.board.corners)} corners of the board, residual {1000 * room.board.residual:.2f} mm"
         )
     elif room.floor is not None:
         run.say(f"{100 * room.floor:.0f} % of the points lie on the floor")

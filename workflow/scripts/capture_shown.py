@@ -1,15 +1,14 @@
-"""Write a throw's video as it was filmed, at the size of the report."""
+"""Write the original frames of a take at the size of the report."""
 
 from pathlib import Path
 
+from neuma_lib.capture.calibration.lens import read_lens
 from neuma_lib.capture.frames import read_frames, read_timeline
-from neuma_lib.capture.lens import read_lens
-from neuma_lib.capture.mattes import read_pixels, room_frames
+from neuma_lib.capture.masks.mattes import read_pixels, room_frames
 from neuma_lib.capture.pictures import undistorted
-from neuma_lib.capture.shown import numbers_of, shown_frames
-from neuma_lib.io.files import read_json
+from neuma_lib.capture.report.display_video import numbers_of, shown_frames
+from neuma_lib.io.files import listed, read_json
 from neuma_lib.io.images import read_transforms, write_transforms
-from workflow.inputs import listed
 from workflow.stage import run_script
 
 
@@ -18,19 +17,19 @@ def main(inputs, output, params, run) -> None:
     lenses = read_json(inputs.report)["lenses"]
     video = read_transforms(inputs.dynamic)["frames"]
     folder, entries = Path(output.transforms).parent, []
-    Path(output.transforms).unlink(missing_ok=True)  # a folder without it is an unfinished one
+    Path(output.transforms).unlink(missing_ok=True)  # a folder without it is incomplete
     files = zip(params.cameras, listed(inputs.videos), listed(inputs.mattes), params.rates, strict=True)
     for camera, file, mattes, rate in files:
         lens = read_lens(lenses[camera], inputs.report)
         (still,) = room_frames(inputs.room, camera)
-        plate = read_pixels(Path(inputs.room).parent / still["file_path"])
+        background = read_pixels(Path(inputs.room).parent / still["file_path"])
         frames = (
             (frame.number, undistorted(frame.pixels, lens, params.longest))
             for frame in read_frames(file, read_timeline(file, rate), numbers_of(video, camera))
         )
-        found = shown_frames(folder, camera, video, mattes, frames, plate, params.width, gains[camera])
-        entries += found
-        run.say(f"{camera}: {len(found)} frames")
+        new = shown_frames(folder, camera, video, mattes, frames, background, params.width, gains[camera])
+        entries += new
+        run.say(f"{camera}: {len(new)} frames")
     write_transforms(output.transforms, {}, entries)
 
 

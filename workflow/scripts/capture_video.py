@@ -1,14 +1,19 @@
-"""Write the video of a throw on the simulator's clock, in the colours of the photographs, at the size of training."""
+"""Write the video of a take in simulation time, with the colours of the photographs, at the size of training."""
 
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-from neuma_lib.capture.clock import chosen_frames, frame_times, reduced, reduced_intrinsics, without_gain
-from neuma_lib.io.files import atomic, read_json
+from neuma_lib.capture.motion.synchronisation import (
+    chosen_frames,
+    frame_times,
+    reduced,
+    reduced_intrinsics,
+    without_gain,
+)
+from neuma_lib.io.files import atomic, listed, read_json
 from neuma_lib.io.images import read_image_set, read_transforms, write_transforms
-from workflow.inputs import listed
 from workflow.stage import run_script
 
 
@@ -16,7 +21,7 @@ def main(inputs, output, params, run) -> None:
     registration = read_json(inputs.registration)
     folder, entries = Path(output.transforms).parent, []
     folder.mkdir(parents=True, exist_ok=True)
-    Path(output.transforms).unlink(missing_ok=True)  # a folder without it is an unfinished one
+    Path(output.transforms).unlink(missing_ok=True)  # a folder without it is incomplete
     files = zip(
         params.cameras,
         listed(inputs.transforms),
@@ -48,9 +53,7 @@ def main(inputs, output, params, run) -> None:
                 "time": float(times[k]),
             }
             entries.append(entry | ({"exposure": exposure} if exposure else {}))
-        run.say(
-            f"{camera}: {len(chosen)} of {len(frames)} frames, {times[chosen[-1]]:.3f} s from the start on"
-        )
+        run.say(f"{camera}: {len(chosen)} of {len(frames)} frames in the first {times[chosen[-1]]:.3f} s")
     entries = [entry for entry in entries if entry["step"] >= 0]
     write_transforms(output.transforms, {}, entries, **{k: data[k] for k in ("world", "room") if k in data})
 

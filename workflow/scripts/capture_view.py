@@ -1,4 +1,4 @@
-"""Compare a prediction with what a camera filmed: measures of every frame, and a video of both."""
+"""Compare a prediction with the video of a camera: measures of frames, and a video of both."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,17 +7,17 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from neuma_lib.coupling.filmed import Filmed
-from neuma_lib.device import choose_device
-from neuma_lib.errors import InputError
-from neuma_lib.evaluation.captured_images import (
+from neuma_lib.capture.report.images import (
     as_planes,
     averaged,
     captured_metrics,
+    composited,
     error_picture,
     exposed,
-    laid_over,
 )
+from neuma_lib.coupling.filmed import Filmed
+from neuma_lib.device import choose_device
+from neuma_lib.errors import InputError
 from neuma_lib.evaluation.lpips import LPIPS
 from neuma_lib.evaluation.video import side_by_side, write_mp4
 from neuma_lib.fitting.frame_batches import frame_batches, spread_frames
@@ -35,7 +35,7 @@ def read_rgb(path: Path) -> np.ndarray:
 
 
 class Layers(NamedTuple):
-    """A renderer, as `Filmed` takes them, of colours with their opacity."""
+    """A renderer of colours with opacity for `Filmed`."""
 
     render: Callable
     frames_per_batch: int
@@ -52,11 +52,13 @@ class Prediction:
         arrays, _ = read_arrays(rollout, required=("frames",), only=("frames",))
         self.steps = arrays["frames"].tolist()
         if not set(needed) <= set(self.steps):
-            raise InputError(f"{rollout} has other steps than the video: run capture_prediction again")
+            raise InputError(
+                rollout, "its steps are not those of the video", "Run the rule capture_prediction again"
+            )
         self.x, self.F = (state.to(body.x0) for state in load_motion(rollout))
 
     def frames(self, video):
-        """Layer (H, W, 4) of each frame of a video of one camera: colours over black, and opacity."""
+        """Layer (H, W, 4) of each frame of a video of one camera: premultiplied colours and opacity."""
         renderer = self.body.particle_gs(video.cameras, background=(0.0, 0.0, 0.0))
         layers = Filmed(Layers(renderer.layer, renderer.frames_per_batch), video, self.steps)
         x, F = layers.states(self.x), layers.states(self.F)
@@ -78,7 +80,7 @@ def main(inputs, output, params, run) -> None:
             predictions.append(Prediction(body, rollout, needed))
     folder = Path(inputs.shown).parent
     entries = {f["step"]: f for f in read_transforms(inputs.shown)["frames"] if f["view"] == params.view}
-    plate = read_rgb(folder / next(iter(entries.values()))["plate"])
+    background = read_rgb(folder / next(iter(entries.values()))["plate"])
     steps = sorted(entries)
     measured = {steps[k] for k in spread_frames(len(steps), params.measured)}
     measures, panels = [], []
@@ -86,20 +88,20 @@ def main(inputs, output, params, run) -> None:
         video = video.to(torch.float32, device)
         with torch.no_grad():
             renders = zip(*(prediction.frames(video) for prediction in predictions), strict=True)
-            for k, (step, shown) in enumerate(zip(video.frames, renders, strict=True)):
+            for k, (step, rendered) in enumerate(zip(video.frames, renders, strict=True)):
                 entry = entries[step]
                 filmed = as_planes(read_rgb(folder / entry["picture"])).to(device)
-                empty = exposed(plate, entry["plate_gain"], entry["plate_offset"])
+                empty = exposed(background, entry["plate_gain"], entry["plate_offset"])
                 empty = torch.from_numpy(empty).float().to(device)
                 gain = torch.tensor(entry["gain"], dtype=torch.float32, device=device)
-                layers = [(gain * layer[..., :3], layer[..., 3]) for layer in shown]
-                pictures = [laid_over(*layer, empty) for layer in layers]
+                layers = [(gain * layer[..., :3], layer[..., 3]) for layer in rendered]
+                pictures = [composited(*layer, empty) for layer in layers]
                 if step in measured:
                     matte = as_planes(video.images[k, 0].cpu().numpy()).to(device)
                     values = captured_metrics(*layers[0], matte, filmed, empty, networks, params.margin)
                     measures.append({"step": step} | values)
-                shown_now = [picture.clamp(0, 1).cpu().numpy() for picture in (filmed, *pictures)]
-                panels.append((step, [*shown_now[:2], error_picture(*shown_now[:2]), *shown_now[2:]]))
+                panel = [picture.clamp(0, 1).cpu().numpy() for picture in (filmed, *pictures)]
+                panels.append((step, [*panel[:2], error_picture(*panel[:2]), *panel[2:]]))
                 run.progress(len(panels), len(entries))
     panels.sort(key=lambda frame: frame[0])
     columns = [np.stack(panel) for panel in zip(*(frame for _, frame in panels), strict=True)]
@@ -108,12 +110,12 @@ def main(inputs, output, params, run) -> None:
     film = np.concatenate([side_by_side(columns[row], labels[row]) for row in rows], axis=1)
     with atomic(output.video) as partial:
         write_mp4(partial, film, params.frame_rate, quality=24)
-    found = {"frames": sorted(measures, key=lambda frame: frame["step"])}
     mean = averaged([{k: v for k, v in frame.items() if k != "step"} for frame in measures])
-    write_json(output.measures, {**found, "mean": mean})
+    measures.sort(key=lambda frame: frame["step"])
+    write_json(output.measures, {"frames": measures, "mean": mean})
     run.say(
-        f"{len(panels)} frames, {len(measures)} measured, object: PSNR {mean['psnr']:.1f} dB, SSIM {mean['ssim']:.3f},"
-        f" LPIPS {mean['lpips_vgg']:.3f}, IoU {mean['iou']:.2f}; whole picture: PSNR {mean['scene_psnr']:.1f} dB"
+        f"{len(panels)} frames, {len(measures)} measured. Object: PSNR {mean['psnr']:.1f} dB, SSIM {mean['ssim']:.3f},"
+        f" LPIPS {mean['lpips_vgg']:.3f}, IoU {mean['iou']:.2f}. Whole picture: PSNR {mean['scene_psnr']:.1f} dB"
     )
 
 

@@ -1,8 +1,8 @@
 """A table of tracer errors and Chamfer distances from the metrics behind it."""
 
-from neuma_lib.evaluation.paper import PAPER
-from neuma_lib.evaluation.tables import chamfer_table
 from neuma_lib.io.files import read_json, write_text
+from neuma_lib.paper.published import PAPER
+from neuma_lib.paper.tables import chamfer_table
 from workflow.stage import run_script
 
 

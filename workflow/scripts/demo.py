@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from neuma_lib.io.files import read_json, write_text
-from workflow.inputs import listed
+from neuma_lib.io.files import listed, read_json, write_text
 from workflow.stage import run_script
 
 PAGE = """\

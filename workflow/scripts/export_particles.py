@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
-from neuma_lib.io.particles import load_start
+from neuma_lib.io.particles import load_initial_state
 from neuma_lib.io.ply import write_ply
 from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
     files = (inputs.particles, inputs.binding, inputs.gaussians, inputs.velocity)
-    start, _ = load_start(*files, params.densities, params.carrier)
+    start, _ = load_initial_state(*files, params.densities, params.carrier)
     names = ("x", "F", "frames")
     path, attributes = read_arrays(inputs.rollout, required=names, only=names)
     for k, (x, F) in enumerate(zip(path["x"], path["F"], strict=True)):

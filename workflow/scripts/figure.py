@@ -2,14 +2,14 @@
 
 from importlib import import_module
 
-from neuma_lib.evaluation.plotting.image_grid import ImageGrid, load_image_grid, save_image_grid
 from neuma_lib.evaluation.plotting.style import save
 from neuma_lib.io.files import read_json, write_json
+from neuma_lib.paper.image_grid import ImageGrid, load_image_grid, save_image_grid
 from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
-    module = import_module(f"neuma_lib.evaluation.figures.{params.figure}")
+    module = import_module(f"neuma_lib.paper.figures.{params.figure}")
     data = module.data(inputs, params, run.say)
     in_pictures = isinstance(data, ImageGrid)
     (save_image_grid if in_pictures else write_json)(output.data, data)

@@ -1,8 +1,8 @@
 """Draw what was identified in a scene: families by held-out loss, constants with their uncertainty."""
 
-from neuma_lib.evaluation.identified_page import identified_page
 from neuma_lib.evaluation.plotting.style import save
 from neuma_lib.io.files import read_json
+from neuma_lib.paper.identified_page import identified_page
 from workflow.stage import run_script
 
 

@@ -1,7 +1,7 @@
 """Identified materials beside the true ones, as a table."""
 
-from neuma_lib.evaluation.identified_table import IdentifiedScene, identified_table
 from neuma_lib.io.files import read_json, write_text
+from neuma_lib.paper.identified_table import IdentifiedScene, identified_table
 from workflow.stage import run_script
 
 

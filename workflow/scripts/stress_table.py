@@ -1,8 +1,8 @@
 """A table of stress errors."""
 
-from neuma_lib.evaluation.paper import PAPER
-from neuma_lib.evaluation.stress_table import stress_table
 from neuma_lib.io.files import read_json, write_text
+from neuma_lib.paper.published import PAPER
+from neuma_lib.paper.stress_table import stress_table
 from workflow.stage import run_script
 
 

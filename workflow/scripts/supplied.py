@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from neuma_lib.io.datasets.layouts import OFFSETS, take_video
 from neuma_lib.io.images import list_images
-from neuma_lib.io.layouts import OFFSETS, take_video
 from workflow.stage import run_script
 
 

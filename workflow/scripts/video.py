@@ -8,24 +8,20 @@ from neuma_lib.device import choose_device
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.image_metrics import psnr
 from neuma_lib.evaluation.video import side_by_side, write_mp4
-from neuma_lib.fitting.carried_field import CarriedField
 from neuma_lib.fitting.frame_batches import frame_batches
 from neuma_lib.io.files import atomic
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_videos
-from neuma_lib.io.particles import load_body, load_motion
+from neuma_lib.io.particles import load_motion
 from neuma_lib.splatting.observation import rendered_steps
+from workflow.motion import Prediction
 from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
-    if params.own:
-        body = CarriedField.load(inputs.field, params.own, params.density, device)
-    else:
-        files = (inputs.particles, inputs.binding, inputs.gaussians)
-        body = load_body(*files, params.density, params.carrier, params.gaussian_motion)
-        body = body.to(torch.float32, device)
+    prediction = Prediction(inputs, params.method)
+    body = prediction.body(params.density, params.carrier, params.gaussian_motion, device)
     x, F = load_motion(inputs.rollout)
     steps = read_arrays(inputs.rollout, required=("frames",), only=("frames",))[0]["frames"].tolist()
     panels, quality = {}, []

@@ -1,6 +1,6 @@
 """Put the motions of a scene into one file that opens in a browser, without a server."""
 
-from neuma_lib.viewer.files import SceneFiles
+from neuma_lib.project.files import SceneFiles
 from neuma_lib.viewer.page import write_page
 from neuma_lib.viewer.scene import load_scene
 from workflow.stage import run_script

@@ -3,7 +3,7 @@
 from neuma_lib.device import choose_device
 from neuma_lib.evaluation.stress import visit
 from neuma_lib.io.hdf5 import write_arrays
-from neuma_lib.io.particles import load_start
+from neuma_lib.io.particles import load_initial_state
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.model import MPMModel
 from workflow.stage import run_script
@@ -12,7 +12,7 @@ from workflow.stage import run_script
 def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
     files = [inputs[name] for name in ("particles", "binding", "gaussians", "velocity")]
-    start, _ = load_start(*files, [params.density])
+    start, _ = load_initial_state(*files, [params.density])
     dt = params.simulation["dt"]
     law = analytic_law(params.law, dt).to(device)
     draws = {"states": params.states, "paths": params.paths, "seed": params.seed}

@@ -1,6 +1,6 @@
-"""Colour of a solid as a function of the rest position: part colours with soft noise, so that motion can be seen.
+"""Colour of a solid as a function of the rest position: part colours with smooth noise, which makes motion visible.
 
-The same function colours mesh vertices, sand grains and the surface of a liquid (through the particles beneath it).
+The same function colours mesh vertices, sand grains and the surface of a liquid (through the particles below it).
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ def parse_color(text: str) -> np.ndarray:
             raise ValueError
         return np.array([int(digits[i : i + 2], 16) for i in (0, 2, 4)]) / 255.0
     except ValueError:
-        raise InputError(f"colour {text!r}: write it as '#rrggbb', for example '#f2c83d'") from None
+        raise InputError("colors", f"{text!r} is not of the form '#rrggbb', for example '#f2c83d'") from None
 
 
 def smooth_noise(points: np.ndarray, scale: float, seed: int) -> np.ndarray:
-    """Value noise in [0, 1] of two octaves at points (n, 3) [m] -> (n,); ``scale`` [m] is the lattice spacing."""
+    """Value noise in [0, 1] with two octaves at points (n, 3) [m] -> (n,); ``scale`` [m] is the lattice spacing."""
     total = np.zeros(len(points))
     for octave, amplitude in enumerate((0.7, 0.3)):
         rng = np.random.default_rng([seed, octave])
@@ -53,29 +53,28 @@ def colors_at(mesh: trimesh.Trimesh, points: np.ndarray, appearance: AppearanceC
     """sRGB colours (n, 3) in [0, 1] at rest positions (n, 3) [m] in the frame of a mesh from ``shapes.build``.
 
     Raises:
-        InputError: a colour for a part that the shape does not have, or none for ``body``.
+        InputError: a colour of a part that the shape does not have, or no colour of ``body``.
     """
     solid, nominal = shapes.to_nominal(mesh, points)
     names = solid.part_names
     unknown = set(appearance.colors) - set(names)
     if unknown:
-        raise InputError(
-            f"colors: shape {mesh.metadata['shape']!r} has no part {sorted(unknown)}; its parts are {', '.join(names)}"
-        )
+        problem = f"shape {mesh.metadata['shape']!r} has no part {sorted(unknown)}; its parts are {', '.join(names)}"
+        raise InputError("colors", problem)
     if "body" not in appearance.colors:
-        raise InputError("colors: give at least the colour of 'body'")
+        raise InputError("colors", "must have a colour of 'body'")
     plain = np.stack([parse_color(appearance.colors.get(name, appearance.colors["body"])) for name in names])
     patched = 0.6 * plain
     if appearance.accent:
         patched[names.index("body")] = parse_color(appearance.accent)
     weights = solid.part_weights(nominal, BORDER / mesh.metadata["scale"])
     noise = smooth_noise(np.asarray(points, dtype=np.float64), appearance.scale, appearance.seed)
-    # A smooth step keeps the patches' edges about a centimetre wide: sharp ones need more Gaussians.
+    # a smooth step with edges of about a centimetre, because sharp edges need more Gaussians
     patch = np.clip((noise - 0.35) / 0.3, 0.0, 1.0)
     patch = (appearance.contrast * patch * patch * (3.0 - 2.0 * patch))[:, None]
     return (1.0 - patch) * (weights @ plain) + patch * (weights @ patched)
 
 
 def to_linear(srgb: np.ndarray) -> np.ndarray:
-    """sRGB values in [0, 1] as linear light."""
+    """Linear values of sRGB values in [0, 1]."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)

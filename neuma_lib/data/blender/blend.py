@@ -1,4 +1,4 @@
-"""A moving surface as a .blend file, written by a Blender process of its own."""
+"""A moving surface as a .blend file, written by a separate Blender process."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from neuma_lib.data.blender.libraries import explain_import_error
-from neuma_lib.errors import InputError
 from neuma_lib.io.files import atomic
 from neuma_lib.io.gltf import linear
 from neuma_lib.splatting.viewpoints import video_views
 
 _WORKER = "neuma_lib.data.blender.cycles_animation"
 _SIZE, _SAMPLES = (256, 256), 16
-"""Of the picture that shows that the file renders [px], samples a pixel."""
+"""Size of the preview [px], and samples per pixel."""
 
 
 def write_blend(
@@ -29,13 +28,13 @@ def write_blend(
     times: np.ndarray,
     colors: np.ndarray,
 ) -> None:
-    """Write a moving surface, and a render of its last frame from the front; other arguments as of `write_glb`.
+    """Write a moving surface, and a render of its last frame from the front; other arguments as for `write_glb`.
 
-    In the file z is up, as in Blender: the object is turned, its vertices are the simulator's.
+    In the file z is up, as in Blender. The object is rotated; its vertices have the coordinates of the simulator.
 
     Raises:
         InputError: Blender cannot be imported.
-        RuntimeError: Blender failed; the message ends with its last words.
+        RuntimeError: Blender failed; the message ends with its last output.
     """
     views = video_views(np.asarray(vertices).reshape(-1, 3), 1, *_SIZE)
     with tempfile.TemporaryDirectory(prefix="neuma-blend-") as folder:
@@ -56,10 +55,10 @@ def write_blend(
             errors="replace",
         )
         if done.returncode:
-            if hint := explain_import_error(done.stdout):
-                raise InputError(hint)
+            if error := explain_import_error(done.stdout):
+                raise error
             tail = "\n".join(done.stdout.strip().splitlines()[-12:])
             raise RuntimeError(f"Blender ended with status {done.returncode}:\n{tail}")
-        for made, target in ((job.with_name("motion.blend"), path), (job.with_name("proof.png"), picture)):
+        for source, target in ((job.with_name("motion.blend"), path), (job.with_name("proof.png"), picture)):
             with atomic(target) as partial:
-                partial.write_bytes(made.read_bytes())
+                partial.write_bytes(source.read_bytes())

@@ -1,4 +1,4 @@
-"""The Blender scene itself. The only module that imports bpy: use it through `neuma_lib.data.blender.scene`."""
+"""The Blender scene. Imports bpy and is used through `neuma_lib.data.blender.scene`."""
 
 from __future__ import annotations
 
@@ -10,24 +10,23 @@ from mathutils import Matrix, Vector
 
 from neuma_lib.errors import InputError
 
-SENSOR = 36.0  # width of the camera's sensor [mm]; only its ratio to the lens matters
+SENSOR = 36.0  # width of the camera's sensor [mm]; only its ratio to the focal length matters
 SEED = 0
-"""Seed of the sampler; the same seed gives the same bytes."""
+"""Seed of the sampler, for deterministic images."""
 AMBIENT = 0.82
-"""Radiance of the uniform surroundings; it colours the surface the same wherever it turns."""
+"""Radiance of the uniform surroundings, independent of the surface's orientation."""
 KEY = 0.35
-"""Strength of one wide soft light from above the frontal camera, which gives the form its shade."""
+"""Strength of a wide soft light above the frontal camera, for shading."""
 
 
 def start(width: int, height: int, samples: int, threads: int, device: str = "cpu") -> None:
     """An empty scene with the renderer's settings and the light.
 
     Args:
-        device: what renders and denoises: "cpu"; "cuda", the first CUDA device that is visible; or "auto", CUDA where
-            there is a device.
+        device: of rendering and denoising: "cpu"; "cuda", the first visible CUDA device; or "auto", CUDA if available.
 
     Raises:
-        InputError: CUDA is asked for and Blender sees no device.
+        InputError: CUDA is requested and Blender has no device.
     """
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
@@ -66,16 +65,14 @@ def start(width: int, height: int, samples: int, threads: int, device: str = "cp
     lamp.rotation_quaternion = towards.to_track_quat("Z", "Y")
     scene.collection.objects.link(lamp)
     if device != "cpu" and not _use_cuda() and device == "cuda":
-        raise InputError(
-            "dataset.blender.device: cuda is asked for, but Blender sees no CUDA device; set cpu or auto, or mend the "
-            "driver"
-        )
+        remedy = "Use cpu or auto, or check the driver"
+        raise InputError("dataset.blender.device", "is cuda, but Blender has no CUDA device", remedy)
 
 
 def _use_cuda() -> bool:
-    """Render and denoise on the first CUDA device; False, and nothing changes, where there is none.
+    """Render and denoise on the first CUDA device; returns False without changes if there is none.
 
-    Several devices would share every picture: pictures of this size gain more from one process a device.
+    Small images are rendered faster by one process per device than by several devices together.
     """
     preferences = bpy.context.preferences.addons["cycles"].preferences
     devices = [each for each in preferences.get_devices_for_type("CUDA") if each.type == "CUDA"]
@@ -104,7 +101,7 @@ def add_camera(focal: float, width: int) -> bpy.types.Object:
 
 
 def place(camera: bpy.types.Object, c2w: np.ndarray) -> None:
-    """Put the camera at a camera-to-world pose (4, 4); Blender's camera axes are OpenGL's."""
+    """Set the pose of a camera (camera to world, (4, 4)); Blender's camera axes are those of OpenGL."""
     camera.matrix_world = Matrix(c2w.tolist())
 
 
@@ -115,7 +112,7 @@ def render(path: Path) -> None:
 
 
 def _material() -> bpy.types.Material:
-    """Matt, coloured by the attribute ``rest_color``."""
+    """Diffuse material with the colours of the attribute ``rest_color``."""
     material = bpy.data.materials.new("body")
     material.use_nodes = True
     nodes, links = material.node_tree.nodes, material.node_tree.links
@@ -146,7 +143,7 @@ def _grain_nodes(radius: float, material: bpy.types.Material) -> bpy.types.NodeT
 
 
 class Body:
-    """The object of a job, shown one frame at a time."""
+    """The object of a job, with the geometry of one frame."""
 
     def __init__(self, job: dict[str, np.ndarray]):
         self.job = job
@@ -155,7 +152,7 @@ class Body:
         self.object: bpy.types.Object | None = None
 
     def show(self, frame: int) -> None:
-        """Bring the geometry of one frame into the scene."""
+        """Set the geometry of a frame."""
         start, stop = (int(i) for i in self.job["vertex_start"][frame : frame + 2])
         vertices = self.job["vertices"][start:stop]
         if self.object is not None and self.same_faces:

@@ -1,6 +1,6 @@
-"""A .blend file with a moving surface, written and rendered by ``python -m`` of this module with a job.npz.
+"""Write and render a .blend file with a moving surface: ``python -m neuma_lib.data.blender.cycles_animation job.npz``.
 
-The surface has a shape key a frame, and an animated evaluation time that goes through them: all is in the one file.
+The surface has one shape key per frame and an animated evaluation time.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from mathutils import Matrix
 from neuma_lib.data.blender import cycles
 
 RATE = 24
-"""Blender's frames to a second."""
+"""Blender's frames per second."""
 
 
 def main(path: str) -> None:
@@ -48,14 +48,14 @@ def main(path: str) -> None:
     scene.frame_start, scene.frame_end = 0, max(1, int(np.ceil(times[-1] * RATE)))
     camera = cycles.add_camera(float(job["focal"]), width)
     cycles.place(camera, job["pose"])
-    stand = Matrix.Rotation(np.pi / 2, 4, "X")  # y up becomes z up, Blender's
+    stand = Matrix.Rotation(np.pi / 2, 4, "X")  # from y up to z up
     bpy.context.view_layer.update()
     for each in scene.objects:
         each.matrix_world = stand @ each.matrix_world
     scene.frame_set(int(job["shown"] * RATE), subframe=float(job["shown"] * RATE % 1))
     cycles.render(folder / "proof.png")
     scene.frame_set(0)
-    # a date and the folder of the render would be in the file
+    # keep the folder of the render out of the file
     scene.render.filepath = ""
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "motion.blend"), compress=True)
 

@@ -1,8 +1,8 @@
-"""Render an object from many cameras over many frames, in a Blender process of its own.
+"""Render an object from many cameras over many frames, in a separate Blender process.
 
-The parent (this module) never imports bpy: it writes one job file, starts ``neuma_lib.data.blender.worker`` and
-collects the images, which appear in the target folder only when all of them are there. What is rendered is a
-`Surface` (the mesh of a solid, or grains of sand, moved) or a `Liquid` (a new surface a frame).
+This module never imports bpy. It writes a job file, starts ``neuma_lib.data.blender.worker`` and moves the images to
+the target folder when all are rendered. The object is a `Surface` (moving mesh of a solid, or grains of sand) or a
+`Liquid` (a separate surface per frame).
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from neuma_lib.splatting.viewpoints import Views
 
 Progress = Callable[[int, int], None]
 OTHER_PYTHON = "NEUMA_BLENDER_PYTHON"
-"""Environment variable with the interpreter that has bpy, where it is not this one."""
+"""Environment variable with another interpreter that has bpy."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A mesh whose vertices move, or balls of one size that do.
+    """A mesh with moving vertices, or moving balls of one size.
 
     Attributes:
-        vertices: positions [m], shape (T, n, 3); the balls' centres.
-        faces: vertex indices, shape (m, 3); none of balls.
+        vertices: positions [m], shape (T, n, 3); centres for balls.
+        faces: vertex indices, shape (m, 3); empty for balls.
         colors: sRGB colours of the vertices in [0, 1], shape (n, 3).
         radius: of the balls [m]; 0 for a mesh.
     """
@@ -52,11 +52,11 @@ class Surface:
 
     @property
     def points(self) -> np.ndarray:
-        """What has to be in the frame (k, 3) [m]; the radius of balls is left to the frame's margin."""
+        """Points that must be in the frame (k, 3) [m]; the frame's margin covers the radius of balls."""
         return self.vertices.reshape(-1, 3)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """What the Blender process reads: vertices of all frames in a row, and where each frame starts."""
+        """Arrays for the Blender process: concatenated vertices of all frames, and the offset of each frame."""
         frames, count = self.vertices.shape[:2]
         return {
             "vertices": self.points.astype(np.float32),
@@ -70,7 +70,7 @@ class Surface:
 
 @dataclass(frozen=True)
 class Liquid:
-    """A surface of its own for every frame: tuples of vertices (n, 3) [m], faces (m, 3), sRGB colours (n, 3)."""
+    """A separate surface per frame: tuples of vertices (n, 3) [m], faces (m, 3), sRGB colours (n, 3)."""
 
     surfaces: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]
 
@@ -79,11 +79,11 @@ class Liquid:
 
     @property
     def points(self) -> np.ndarray:
-        """What has to be in the frame (k, 3) [m]."""
+        """Points that must be in the frame (k, 3) [m]."""
         return np.concatenate([vertices for vertices, _, _ in self.surfaces])
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """As of `Surface`, with faces and colours of every frame."""
+        """Arrays as for `Surface`, with faces and colours of every frame."""
         _, faces, colors = (np.concatenate(parts) for parts in zip(*self.surfaces, strict=True))
         return {
             "vertices": self.points.astype(np.float32),
@@ -111,22 +111,22 @@ def render_images(
     Args:
         geometry: the object, frames 0 ... len - 1.
         views: cameras.
-        shots: (frame, camera) of each image; shots of one frame should stand together.
-        out_dir: folder of the images, created; images of the same names are replaced.
+        shots: (frame, camera) of each image; shots of one frame should be consecutive.
+        out_dir: folder of the images, created if missing; existing images are replaced.
         names: file name of each shot.
-        samples: samples a pixel, denoised (the alpha channel is not: 8 are usable, 16 clean).
-        threads: CPU cores that Blender may use.
-        progress: called with the number of finished images and of all.
-        device: what renders: "cpu", "cuda", or "auto", CUDA where Blender sees a device.
+        samples: samples per pixel, denoised (except alpha: 8 are usable, 16 clean).
+        threads: CPU cores for Blender.
+        progress: called with the numbers of finished and of all images.
+        device: "cpu", "cuda", or "auto", CUDA if Blender has a device.
 
     Raises:
-        InputError: Blender cannot be imported, and the message names the Debian package or pip package to install; or
-            it sees no CUDA device where one is asked for.
-        RuntimeError: Blender failed; the message ends with its last words.
+        InputError: Blender cannot be imported (the message names the package to install), or it has no CUDA device but
+            one is requested.
+        RuntimeError: Blender failed; the message ends with its last output.
     """
     out_dir = Path(out_dir)
     out_dir.mkdir(parents=True, exist_ok=True)
-    for abandoned in out_dir.glob(".render-*"):  # of a process that was killed
+    for abandoned in out_dir.glob(".render-*"):  # from a killed process
         shutil.rmtree(abandoned)
     with tempfile.TemporaryDirectory(prefix=".render-", dir=out_dir) as folder:
         job = Path(folder) / "job.npz"
@@ -149,7 +149,7 @@ def render_images(
 
 
 def _pixels_only(png: bytes) -> bytes:
-    """A PNG file without its texts: Cycles leaves render times there, and equal images shall be equal bytes."""
+    """A PNG file without text chunks, in which Cycles stores render times, so that equal images have equal bytes."""
     kept, position = [png[:8]], 8
     while position < len(png):
         length = int.from_bytes(png[position : position + 4], "big")
@@ -161,7 +161,7 @@ def _pixels_only(png: bytes) -> bytes:
 
 
 def run_worker(module: str, job: Path, total: int, progress: Progress | None) -> None:
-    """Start a Blender process, a module of this package, on a job file and follow it.
+    """Run a module of this package in a Blender process on a job file.
 
     Raises:
         InputError, RuntimeError: see `render_images`.
@@ -169,18 +169,14 @@ def run_worker(module: str, job: Path, total: int, progress: Progress | None) ->
     root = str(Path(__file__).resolve().parents[3])
     python, packages = sys.executable, [root, os.environ.get("PYTHONPATH", "")]
     if other := os.environ.get(OTHER_PYTHON):
-        python, packages = shutil.which(other), [root]  # what is for this interpreter is not for another
+        python, packages = shutil.which(other), [root]  # PYTHONPATH is that of this interpreter
         if python is None:
-            raise InputError(f"{OTHER_PYTHON}={other}: no such program; name a Python 3.11 that has bpy")
+            raise InputError(f"{OTHER_PYTHON}={other}", "no such program", "Use a Python 3.11 with bpy")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(packages)}
     log = job.with_suffix(".log")
     with open(log, "wb") as sink:
         process = subprocess.Popen(
-            [python, "-m", module, str(job)],
-            stdout=subprocess.PIPE,
-            stderr=sink,
-            env=environment,
-            text=True,
+            [python, "-m", module, str(job)], stdout=subprocess.PIPE, stderr=sink, env=environment, text=True
         )
         try:
             for line in process.stdout:
@@ -192,14 +188,13 @@ def run_worker(module: str, job: Path, total: int, progress: Progress | None) ->
             process.wait()
             raise
     if process.returncode:
-        words = log.read_text(errors="replace")
-        if hint := explain_import_error(words):
-            raise InputError(hint)
-        if refused := re.search(
-            rf"^{re.escape(InputError.__module__)}\.InputError: (.+)", words, re.MULTILINE
-        ):
-            raise InputError(refused[1])
-        tail = "\n".join(words.strip().splitlines()[-12:])
+        output = log.read_text(errors="replace")
+        if error := explain_import_error(output):
+            raise error
+        pattern = rf"^{re.escape(InputError.__module__)}\.InputError: (.+?): (.+)"
+        if raised := re.search(pattern, output, re.MULTILINE):
+            raise InputError(*raised.groups())
+        tail = "\n".join(output.strip().splitlines()[-12:])
         raise RuntimeError(f"Blender ended with status {process.returncode}:\n{tail}")
 
 
@@ -212,7 +207,7 @@ def render_static(
     progress: Progress | None = None,
     device: str = "cpu",
 ) -> None:
-    """Render frame 0 from every camera, and write transforms.json: files ``s_<view>.png``."""
+    """Render frame 0 from every camera to ``s_<view>.png``, and write transforms.json."""
     shots = [(0, view) for view in range(len(views))]
     names = [f"s_{view:03d}.png" for _, view in shots]
     _render_set(geometry, views, shots, names, [0], [0.0], out_dir, samples, threads, progress, device)
@@ -229,14 +224,14 @@ def render_dynamic(
     progress: Progress | None = None,
     device: str = "cpu",
 ) -> None:
-    """Render every frame from every camera, and write transforms.json: files ``d_<view>_<step>.png``.
+    """Render every frame from every camera to ``d_<view>_<step>.png``, and write transforms.json.
 
     Args:
         steps: simulation step of each frame of ``geometry``.
         dt: time step [s].
     """
     if len(steps) != len(geometry):
-        raise InputError(f"steps: {len(steps)} steps are given for {len(geometry)} frames of geometry")
+        raise InputError("steps", f"there are {len(steps)} steps for {len(geometry)} frames of geometry")
     shots = [(frame, view) for frame in range(len(geometry)) for view in range(len(views))]
     names = [f"d_{view}_{steps[frame]:04d}.png" for frame, view in shots]
     times = [float(step) * dt for step in steps]
@@ -245,7 +240,7 @@ def render_dynamic(
 
 def _render_set(geometry, views, shots, names, steps, times, out_dir, *options) -> None:
     transforms = Path(out_dir, "transforms.json")
-    transforms.unlink(missing_ok=True)  # a folder without it is an unfinished one
+    transforms.unlink(missing_ok=True)  # marks the folder as unfinished
     render_images(geometry, views, shots, out_dir, names, *options)
     frames = [
         {

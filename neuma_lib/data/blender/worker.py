@@ -1,6 +1,6 @@
 """The Blender process: ``python -m neuma_lib.data.blender.worker job.npz`` renders a job of `scene`.
 
-Prints the number of finished images, a line each, on standard output; Blender's own chatter goes to standard error.
+Prints the number of finished images on standard output, one line per image. Output of Blender goes to standard error.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 
 def quiet_stdout():
-    """A stream to the real standard output; file descriptor 1 becomes standard error, because Blender prints in C."""
+    """Stream to the original standard output. File descriptor 1 is redirected to standard error for prints in C."""
     sys.stdout.flush()
     real = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
@@ -23,9 +23,9 @@ def quiet_stdout():
 
 
 def claim_cores(count: int) -> list:
-    """Pin this process to ``count`` cores that no other Blender of ours holds, as far as there are any.
+    """Pin this process to up to ``count`` cores that no other of our Blender processes uses.
 
-    Cycles' own thread limit leaves its helpers on every core. Returns open lock files: keep them while rendering.
+    The thread limit of Cycles does not apply to its helper threads. Returns lock files to keep open while rendering.
     """
     if not hasattr(os, "sched_setaffinity"):
         return []

@@ -1,0 +1,1 @@
+"""Cameras, lenses, the board and the room."""

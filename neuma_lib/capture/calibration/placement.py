@@ -1,0 +1,184 @@
+"""Triangulation, and the similarity that makes a reconstruction metric and upright."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from neuma_lib.errors import InputError
+
+RANSAC_DRAWS = 2000
+"""RANSAC samples: 99 % probability of sampling the floor if it has 14 % of the points."""
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """x -> scale rotation x + translation, with scale > 0, a proper rotation (3, 3) and translation (3,)."""
+
+    scale: float
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Transform points (N, 3)."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def after(self, first: Similarity) -> Similarity:
+        """The composition: first ``first``, then this one."""
+        return Similarity(
+            self.scale * first.scale, self.rotation @ first.rotation, self.apply(first.translation[None])[0]
+        )
+
+    def inverse(self) -> Similarity:
+        rotation = self.rotation.T
+        return Similarity(1 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
+
+    def move_cameras(self, viewmats: np.ndarray) -> np.ndarray:
+        """World to camera (N, 4, 4) after transforming the world. Projections of points do not change."""
+        moved = viewmats.copy()
+        moved[:, :3, :3] = viewmats[:, :3, :3] @ self.rotation.T
+        moved[:, :3, 3] = self.scale * viewmats[:, :3, 3] - moved[:, :3, :3] @ self.translation
+        return moved
+
+    def plain(self) -> dict:
+        return {
+            "scale": self.scale,
+            "rotation": self.rotation.tolist(),
+            "translation": self.translation.tolist(),
+        }
+
+
+def identity() -> Similarity:
+    return Similarity(1.0, np.eye(3), np.zeros(3))
+
+
+def fit_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
+    """Least-squares similarity between points (N, 3) (Umeyama 1991). Raises InputError for points on a line."""
+    middle, aim = source.mean(axis=0), target.mean(axis=0)
+    spread = np.linalg.svd(source - middle, compute_uv=False) if len(source) > 2 else np.zeros(3)
+    if spread[1] <= 1e-6 * spread[0] or spread[0] == 0:
+        raise InputError("source", "at least three points that are not on a line are required")
+    U, values, Vt = np.linalg.svd((target - aim).T @ (source - middle))
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    rotation = U @ np.diag(signs) @ Vt
+    scale = float((values * signs).sum() / ((source - middle) ** 2).sum())
+    return Similarity(scale, rotation, aim - scale * rotation @ middle)
+
+
+def camera_centres(viewmats: np.ndarray) -> np.ndarray:
+    """Centres (N, 3) of cameras (N, 4, 4), world to camera."""
+    return -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
+
+
+def triangulate(
+    viewmats: np.ndarray, directions: np.ndarray, iterations: int = 10
+) -> tuple[np.ndarray, float]:
+    """Triangulate a point: nearest point to all rays, then Gauss-Newton on x/z and y/z.
+
+    Args:
+        viewmats: world to camera, (N, 4, 4), N >= 2.
+        directions: x/z and y/z of the point in each camera, (N, 2).
+        iterations: of Gauss-Newton.
+
+    Returns:
+        The point (3,), NaN if it is behind a camera or the rays are parallel, and the largest angle between two rays
+        [rad].
+    """
+    R, t = viewmats[:, :3, :3], viewmats[:, :3, 3]
+    rays = np.concatenate([directions, np.ones((len(directions), 1))], axis=1)
+    rays = np.einsum("nji,nj->ni", R, rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    angle = float(np.arccos(np.clip((rays @ rays.T).min(), -1, 1)))
+    away = np.eye(3) - np.einsum("ni,nj->nij", rays, rays)
+    normal = away.sum(axis=0)
+    if np.linalg.cond(normal) > 1e12:
+        return np.full(3, np.nan), angle
+    point = np.linalg.solve(normal, np.einsum("nij,nj->i", away, camera_centres(viewmats)))
+    for _ in range(iterations):
+        seen = R @ point + t
+        if (seen[:, 2] <= 0).any():
+            return np.full(3, np.nan), angle
+        residual = seen[:, :2] / seen[:, 2:] - directions
+        J = (R[:, :2] - (seen[:, :2] / seen[:, 2:])[:, :, None] * R[:, 2:]) / seen[:, 2:, None]
+        point = point - np.linalg.lstsq(J.reshape(-1, 3), residual.reshape(-1), rcond=None)[0]
+    return point, angle
+
+
+def fit_floor(
+    points: np.ndarray, cameras: np.ndarray, tolerance: float, seed: int
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """RANSAC fit of the plane with the most points near it that has all cameras on one side.
+
+    Args:
+        points: of the reconstruction, (N, 3).
+        cameras: centres of the cameras, (M, 3).
+        tolerance: distance from the plane of near points.
+        seed: of the random samples.
+
+    Returns:
+        A point of the plane (3,), its unit normal (3,) towards the cameras, and the share of near points.
+
+    Raises:
+        InputError: no plane with at least a tenth of the points.
+    """
+    rng = np.random.default_rng(seed)
+    best, near = 0, None
+    for _ in range(RANSAC_DRAWS if len(points) >= 3 else 0):
+        a, b, c = points[rng.choice(len(points), 3, replace=False)]
+        normal = np.cross(b - a, c - a)
+        size = np.linalg.norm(normal)
+        if size < 1e-12:
+            continue
+        normal /= size
+        sides = (cameras - a) @ normal
+        inliers = np.abs((points - a) @ normal) < tolerance
+        if (np.sign(sides) == np.sign(sides[0])).all() and inliers.sum() > best:
+            best, near = int(inliers.sum()), inliers
+    if near is None or best < max(10, 0.1 * len(points)):
+        raise InputError(
+            "photographs",
+            f"no floor detected: the best plane has {best} of {len(points)} points, a tenth and at least 10 are"
+            " required",
+            "Lay down the printed board, or photograph a floor with texture",
+        )
+    for _ in range(3):  # least squares and selection of near points in turn
+        middle = points[near].mean(axis=0)
+        normal = np.linalg.svd(points[near] - middle, full_matrices=False)[2][2]
+        near = np.abs((points - middle) @ normal) < tolerance
+    normal = normal * np.sign((cameras - middle).mean(axis=0) @ normal)
+    return middle, normal, float(near.mean())
+
+
+def upright(normal: np.ndarray, origin: np.ndarray) -> Similarity:
+    """The rigid motion that maps a floor to y = 0, its unit normal (3,) to +y and its point ``origin`` (3,) to 0."""
+    least = np.eye(3)[np.abs(normal).argmin()]
+    x = np.cross(normal, least)
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, normal, np.cross(x, normal)])
+    return Similarity(1.0, rotation, -(rotation @ origin))
+
+
+def scale_from_length(
+    viewmats: Sequence[np.ndarray], directions: Sequence[np.ndarray], metres: float
+) -> float:
+    """Metres per unit of a reconstruction, from the two ends of a known length in several views.
+
+    Args:
+        viewmats: world to camera of the views, (N, 4, 4).
+        directions: x/z and y/z of the ends in each view, (N, 2, 2).
+        metres: the length.
+
+    Raises:
+        InputError: the ends cannot be triangulated.
+    """
+    views, seen = np.asarray(viewmats), np.asarray(directions)
+    ends = [triangulate(views, seen[:, end])[0] for end in (0, 1)]
+    distance = float(np.linalg.norm(ends[1] - ends[0]))
+    if not distance > 0:
+        raise InputError(
+            "length.ends",
+            "the marked points cannot be triangulated",
+            "Mark the same two points, in the same order, in photographs from different sides",
+        )
+    return metres / distance

@@ -1,0 +1,162 @@
+"""The room: poses in metres, y up, the floor at y = 0, from the board, a known length, or given poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from neuma_lib.capture.calibration.board import BoardFit, Detection, fit_board, room_from_board
+from neuma_lib.capture.calibration.placement import (
+    Similarity,
+    camera_centres,
+    fit_floor,
+    identity,
+    scale_from_length,
+    upright,
+)
+from neuma_lib.capture.calibration.poses import Poses, find_boards
+from neuma_lib.capture.pictures import group_of, read_picture, undistorted
+from neuma_lib.config.capture import CaptureConfig, LengthConfig
+from neuma_lib.errors import InputError
+from neuma_lib.io.files import atomic
+from neuma_lib.io.images import OPENGL_TO_OPENCV, transform_world, write_transforms
+from neuma_lib.project.capture_folder import PHOTOGRAPHS
+
+FLOOR_TOLERANCE = 0.005
+"""Distance of near points from the floor, relative to the distance from the cameras to the points."""
+BOX_MIDDLE = (0.5, 0.0, 0.5)
+"""Position of the room's origin, on the floor, in the simulation box [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """Poses in metres, y up, the floor at y = 0.
+
+    Attributes:
+        poses: in the room.
+        room_from_world: from the world of the estimated poses.
+        board: fit of the board. None without one.
+        floor: share of the points near the fitted floor. None with a board.
+    """
+
+    poses: Poses
+    room_from_world: Similarity
+    board: BoardFit | None = None
+    floor: float | None = None
+
+
+def find_room(poses: Poses, pictures: Mapping[str, Path], settings: CaptureConfig) -> Room:
+    """The room of poses by the method in the settings, from pictures by name. Raises InputError as `room_of`."""
+    if settings.poses == "photographs":
+        placed = {name: pictures[name] for name in poses.names}
+        return room_of(poses, find_boards(placed, settings.board) if settings.board else {}, settings)
+    room = room_from_board(settings.board, settings.center) if settings.poses == "board" else identity()
+    return Room(poses.moved(room), room)
+
+
+def room_of(poses: Poses, detections: Mapping[str, Detection], settings: CaptureConfig) -> Room:
+    """Make poses metric and upright, by the board, else by a known length and a fitted floor.
+
+    Args:
+        poses: of structure from motion.
+        detections: corners of the board by picture, unused without a board.
+
+    Raises:
+        InputError: see `fit_board`, `scale_from_length`, `fit_floor`.
+    """
+    if settings.board is not None:
+        corners = [detections[name] for name in poses.names]
+        fit = fit_board(corners, poses.lenses, poses.viewmats, settings.board)
+        room = room_from_board(settings.board, settings.center).after(fit.board_from_world)
+        return Room(poses.moved(room), room, board=fit)
+    centres = camera_centres(poses.viewmats)
+    away = (
+        np.median(np.linalg.norm(poses.points - centres.mean(axis=0), axis=1)) if len(poses.points) else 0.0
+    )
+    point, normal, share = fit_floor(poses.points, centres, FLOOR_TOLERANCE * away, settings.seed)
+    middle = np.median(poses.points, axis=0)
+    level = upright(normal, middle - ((middle - point) @ normal) * normal)
+    scale = _metres_per_unit(poses, settings.length)
+    room = Similarity(scale, np.eye(3), np.zeros(3)).after(level)
+    return Room(poses.moved(room), room, floor=share)
+
+
+def _metres_per_unit(poses: Poses, length: LengthConfig) -> float:
+    views, directions = [], []
+    for file, ends in length.ends.items():
+        name = f"{PHOTOGRAPHS}/{file}"
+        if name in poses.names:
+            i = poses.names.index(name)
+            views.append(poses.viewmats[i])
+            directions.append(poses.lenses[i].directions(np.array(ends)))
+    if len(views) < 2:
+        raise InputError(
+            "length.ends",
+            f"{len(views)} of the marked photographs were registered, at least two are required",
+            "Mark the points in other photographs",
+        )
+    return scale_from_length(views, directions, length.metres)
+
+
+def write_room(
+    path: str | Path, room: Room, pictures: Mapping[str, Path], settings: CaptureConfig
+) -> dict[str, Any]:
+    """Write undistorted pictures and the transforms.json at ``path``, with the room in the simulation box.
+
+    ``world`` of the file is the transform from the room to the box, ``room`` that from the reconstruction to the room.
+    Returns the `report`.
+    """
+    folder = Path(path).parent
+    folder.mkdir(parents=True, exist_ok=True)
+    Path(path).unlink(missing_ok=True)  # a folder without it is incomplete
+    frames = []
+    views = {
+        group: i for i, group in enumerate(sorted({group_of(n) for n in room.poses.names} - {PHOTOGRAPHS}))
+    }
+    photographs = 0
+    for name, lens, viewmat in zip(room.poses.names, room.poses.lenses, room.poses.viewmats):
+        smaller = lens.pinhole().resized(settings.longest)
+        pixels = undistorted(read_picture(pictures[name]), lens, settings.longest)
+        file = folder / Path(name).with_suffix(".png")
+        with atomic(file) as partial:
+            Image.fromarray(pixels).save(partial, "PNG")
+        group = group_of(name)
+        view = photographs if group == PHOTOGRAPHS else views[group]
+        photographs += group == PHOTOGRAPHS
+        frames.append(
+            {
+                "file_path": str(file.relative_to(folder)),
+                "transform_matrix": (np.linalg.inv(viewmat) @ OPENGL_TO_OPENCV).tolist(),
+                **smaller.intrinsics(),
+                "group": group,
+                "view": view,
+                "step": 0,
+            }
+        )
+    offset = tuple(np.array(BOX_MIDDLE, np.float64).tolist())
+    world = transform_world(frames, settings.scale, offset)
+    write_transforms(path, {}, frames, room=room.room_from_world.plain(), **world)
+    return report(room)
+
+
+def report(room: Room) -> dict[str, Any]:
+    """JSON report of the poses."""
+    poses = room.poses
+    lenses = {group_of(name): lens.plain() for name, lens in zip(poses.names, poses.lenses)}
+    return {
+        "registered": len(poses.names),
+        "pictures": len(poses.names) + len(poses.lost),
+        "lost": list(poses.lost),
+        "points": len(poses.points),
+        "reprojection_error_px": poses.error if np.isfinite(poses.error) else None,
+        "lenses": lenses,
+        "unsure": {name: list(values) for name, values in poses.unsure.items()},
+        "board": room.board.plain() if room.board else None,
+        "share_of_points_on_floor": room.floor,
+        "centres_m": dict(zip(poses.names, camera_centres(poses.viewmats).tolist())),
+    }

@@ -1,0 +1,1 @@
+"""Masks of the object in photographs and videos."""

@@ -1,0 +1,85 @@
+"""Read and write mattes: pictures with masks, listed in a transforms.json."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from neuma_lib.capture.calibration.lens import Lens
+from neuma_lib.capture.masks.regions import matted, read_mask
+from neuma_lib.capture.pictures import undistorted
+from neuma_lib.errors import InputError
+from neuma_lib.io.files import atomic
+from neuma_lib.io.images import OPENGL_TO_OPENCV, open_image, read_transforms, write_transforms
+
+
+def room_frames(path: str | Path, group: str) -> list[dict[str, Any]]:
+    """Entries of the room's transforms.json of `photographs` or a camera. Raises InputError if there are none."""
+    frames = [frame for frame in read_transforms(path)["frames"] if frame.get("group") == group]
+    if not frames:
+        raise InputError(
+            path, f"no pose was estimated for the pictures of '{group}'", "See the report of the poses"
+        )
+    return frames
+
+
+def read_pixels(path: str | Path) -> np.ndarray:
+    """RGB (H, W, 3), uint8, of a picture of the room."""
+    with open_image(Path(path).read_bytes(), path) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def own_mask(path: str | Path, lens: Lens, longest: int) -> np.ndarray:
+    """A mask of the user, undistorted like its picture, (H, W). Raises InputError as `read_mask`."""
+    mask = read_mask(path, (lens.width, lens.height))
+    return undistorted(255 * mask.astype(np.uint8), lens, longest) > 127
+
+
+def metric_camera(frame: Mapping[str, Any], world: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Camera of an entry in the room's metres, before placement into the simulation box.
+
+    Args:
+        world: ``world`` of the file, with scale and offset.
+
+    Returns:
+        World to camera, OpenCV axes (4, 4), and intrinsics (3, 3) [px].
+    """
+    pose = np.array(frame["transform_matrix"], np.float64)
+    pose[:3, 3] = (pose[:3, 3] - world.get("offset", 0.0)) / world.get("scale", 1.0)
+    K = np.array([[frame["fl_x"], 0, frame["cx"]], [0, frame["fl_y"], frame["cy"]], [0, 0, 1]], np.float64)
+    return np.linalg.inv(pose @ OPENGL_TO_OPENCV), K
+
+
+def world_of(room: str | Path) -> dict[str, Any]:
+    """Entries of the room's transforms.json that describe its world, shared by all files derived from it."""
+    data = read_transforms(room)
+    return {key: data[key] for key in ("world", "room") if key in data}
+
+
+def write_mattes(
+    path: str | Path,
+    mattes: Iterable[tuple[dict[str, Any], np.ndarray, np.ndarray]],
+    world: Mapping[str, Any],
+) -> None:
+    """Write a transforms.json and the RGBA pictures that it lists.
+
+    Args:
+        path: .../transforms.json.
+        mattes: entry with the ``file_path`` to write to, pixels (H, W, 3), uint8, and mask (H, W) of each picture.
+        world: entries of the file that describe the world of its cameras, see `world_of`.
+    """
+    folder = Path(path).parent
+    folder.mkdir(parents=True, exist_ok=True)
+    Path(path).unlink(missing_ok=True)  # a folder without it is incomplete
+    frames = []
+    for frame, pixels, mask in mattes:
+        rgba = matted(pixels, mask)
+        rgba[rgba[..., 3] == 0] = 0  # compresses better
+        with atomic(folder / frame["file_path"]) as partial:
+            Image.fromarray(rgba).save(partial, "PNG")
+        frames.append({key: value for key, value in frame.items() if key != "sha256"})
+    write_transforms(path, {}, frames, **world)

@@ -1,0 +1,1 @@
+"""Timing of the cameras and free flight of the object."""

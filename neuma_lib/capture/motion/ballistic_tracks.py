@@ -1,0 +1,149 @@
+"""Detect ballistic tracks ("arcs") among the moving regions of one camera.
+
+A hand that launches an object is often larger than the object and moves too. In free flight the position in the picture
+is nearly a quadratic function of time. Hands, noise and shadows follow a parabola only briefly. An arc starts from
+three candidates at equal spacings and grows in both directions while candidates lie on it.
+
+Positions are (x, y) [px], pixel centres at +0.5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+MIN_FRAMES = 5
+"""Frames of an arc: a parabola passes through any three."""
+MIN_TRAVEL = 1.0
+"""Path length of an arc, in diameters: resting objects fit a parabola, too."""
+MAX_CANDIDATES = 5
+"""Candidates per picture, the largest ones."""
+_TOLERANCE = 0.35  # distance from the arc, in radii
+_MIN_TOLERANCE = 2.0  # [px]
+_MAX_AREA_RATIO = 2.5  # within an arc; motion blur changes areas
+_SPACINGS = (1, 2, 4, 8, 16)  # frames between the three candidates that start an arc
+_MAX_GAP = 2  # frames in which the object may be missed
+
+
+@dataclass(frozen=True, eq=False)
+class Arc:
+    """A segment of free flight.
+
+    Attributes:
+        frames: numbers of its first and last frame.
+        candidates: frame -> number of the candidate on the arc; frames in which it was missed are left out.
+        start: time origin of the coefficients [s].
+        coefficients: position = c0 + c1 t + c2 t^2, (3, 2) [px].
+        area: median area of the candidates [px].
+    """
+
+    frames: tuple[int, int]
+    candidates: dict[int, int]
+    start: float
+    coefficients: np.ndarray
+    area: float
+
+    def place(self, time: float | np.ndarray) -> np.ndarray:
+        """Position (..., 2) [px] at a time [s]."""
+        t = np.asarray(time, float)[..., None] - self.start
+        return self.coefficients[0] + self.coefficients[1] * t + self.coefficients[2] * t**2
+
+    @property
+    def reach(self) -> float:
+        """Tolerated distance from the arc [px]."""
+        return max(_MIN_TOLERANCE, _TOLERANCE * float(np.sqrt(self.area / np.pi)))
+
+
+def find_arcs(
+    candidates: Sequence[np.ndarray], times: np.ndarray, down: np.ndarray | None = None
+) -> list[Arc]:
+    """Arcs in order of time, without shared frames. The longest arcs are selected first.
+
+    Args:
+        candidates: x, y and area of moving regions that do not touch the picture's border, (N, 3) for each of T frames.
+        times: [s], ascending, (T,).
+        down: direction of gravity in the picture, (2,). It rejects the upward parabola of a bounce. None if unknown.
+    """
+    times = np.asarray(times, float)
+    table = np.full((len(times), MAX_CANDIDATES, 3), np.nan)
+    order = []
+    for row, regions in zip(table, candidates):
+        largest = np.argsort(-regions[:, 2], kind="stable")[:MAX_CANDIDATES]
+        order.append(largest)
+        row[: len(largest)] = regions[largest]
+    arcs: list[Arc] = []
+    while (best := _longest(table, times, down)) is not None:
+        first, last = best.frames
+        table[first : last + 1] = np.nan
+        arcs.append(replace(best, candidates={i: int(order[i][c]) for i, c in best.candidates.items()}))
+    return sorted(arcs, key=lambda arc: arc.frames)
+
+
+def _longest(table: np.ndarray, times: np.ndarray, down: np.ndarray | None) -> Arc | None:
+    best: Arc | None = None
+    for spacing in _SPACINGS:
+        for middle in range(spacing, len(times) - spacing):
+            three = [middle - spacing, middle, middle + spacing]
+            for chosen in np.ndindex(*(int(np.isfinite(table[i, :, 0]).sum()) for i in three)):
+                if best is not None and all(best.candidates.get(i) == c for i, c in zip(three, chosen)):
+                    continue  # would grow into the same arc
+                arc = _grown(table, times, three, chosen)
+                if arc is not None and down is not None and arc.coefficients[2] @ down <= 0:
+                    continue
+                if arc is not None and (best is None or len(arc.candidates) > len(best.candidates)):
+                    best = arc
+    return best
+
+
+def _grown(table: np.ndarray, times: np.ndarray, three: list[int], chosen: tuple[int, ...]) -> Arc | None:
+    """The arc through three candidates, refitted to the candidates on it until these no longer change."""
+    areas = table[three, chosen, 2]
+    if areas.max() > _MAX_AREA_RATIO * areas.min():
+        return None
+    members = dict(zip(three, chosen))
+    for _ in range(5):
+        start = times[three[1]]
+        area = float(np.median([table[i, c, 2] for i, c in members.items()]))
+        fitted = Arc((0, 0), members, start, _fit(table, times, members, start), area)
+        updated = _candidates_on(table, times, fitted, three[1])
+        if len(updated) < 3 or updated == members:
+            break
+        members = updated
+    if len(members) < MIN_FRAMES:
+        return None
+    first, last = min(members), max(members)
+    places = fitted.place(times[first : last + 1])
+    travel = np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
+    if travel < MIN_TRAVEL * 2 * np.sqrt(area / np.pi):
+        return None
+    return Arc((first, last), members, start, fitted.coefficients, area)
+
+
+def _fit(table: np.ndarray, times: np.ndarray, members: dict[int, int], start: float) -> np.ndarray:
+    frames = list(members)
+    t = times[frames] - start
+    return np.linalg.lstsq(
+        np.stack([np.ones_like(t), t, t * t], axis=1), table[frames, list(members.values()), :2], rcond=None
+    )[0]
+
+
+def _candidates_on(table: np.ndarray, times: np.ndarray, arc: Arc, middle: int) -> dict[int, int]:
+    """Candidates on an arc around a frame, without a gap longer than `_MAX_GAP` frames."""
+    distance = np.linalg.norm(table[..., :2] - arc.place(times)[:, None], axis=2)
+    with np.errstate(invalid="ignore"):
+        similar = np.abs(np.log(table[..., 2] / arc.area)) < np.log(_MAX_AREA_RATIO)
+    distance = np.where(similar & np.isfinite(distance), distance, np.inf)
+    nearest = distance.argmin(axis=1)
+    on = distance[np.arange(len(distance)), nearest] <= arc.reach
+    members: dict[int, int] = {}
+    for frames in (range(middle, len(on)), range(middle - 1, -1, -1)):
+        missed = 0
+        for i in frames:
+            missed = 0 if on[i] else missed + 1
+            if missed > _MAX_GAP:
+                break
+            if on[i]:
+                members[i] = int(nearest[i])
+    return dict(sorted(members.items()))

@@ -1,0 +1,242 @@
+"""Free flight of one take, from the masks of all its cameras: time offsets, gravity, velocity and spin."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuma_lib.capture.masks.agreement import agreement
+from neuma_lib.capture.motion.contact import contact_time, lowest_points
+from neuma_lib.capture.motion.free_fall import FreeFall, Track, fit_flight
+from neuma_lib.capture.motion.gravity import gravity_checks
+from neuma_lib.capture.motion.spin import Spin, fit_spin, follow
+from neuma_lib.capture.motion.timing import (
+    Offset,
+    choose_offset,
+    offset_from_motion,
+    offset_from_sound,
+    row_times,
+)
+from neuma_lib.errors import InputError
+from neuma_lib.extras import require
+from neuma_lib.io.files import atomic
+
+TOLERATED_DEVIATIONS = 2.0
+"""Standard deviations by which gravity from masks must exceed its limit to be refused.
+
+The centroid of a mask is not the centre of mass. Registration measures gravity again, for the placed object, without
+this tolerance."""
+
+
+@dataclass(frozen=True, eq=False)
+class Filmed:
+    """Undistorted frames of a take by one camera, those with a mask.
+
+    Attributes:
+        camera: its name.
+        numbers: of the frames, (T,).
+        times: on its clock [s], (T,).
+        pixels: (T, H, W, 3), uint8.
+        masks: (T, H, W).
+        arc: numbers of the first and last frame of its first free flight. None without free flight.
+        viewmat, K: in the room, (4, 4) and (3, 3).
+        sensor_rows: rows of the recorded frames.
+        row_time: of a rolling shutter [s].
+        sound: mono, (N,). None if missing or not on the clock of the picture.
+        offset: set by the user [s]. None if it is to be estimated.
+    """
+
+    camera: str
+    numbers: np.ndarray
+    times: np.ndarray
+    pixels: np.ndarray
+    masks: np.ndarray
+    arc: tuple[int, int] | None
+    viewmat: np.ndarray
+    K: np.ndarray
+    sensor_rows: int
+    row_time: float = 0.0
+    sound: np.ndarray | None = None
+    offset: float | None = None
+
+    @property
+    def centroids(self) -> np.ndarray:
+        """(T, 2) [px]."""
+        return np.array([np.argwhere(mask).mean(axis=0)[::-1] + 0.5 for mask in self.masks])
+
+    @property
+    def row_times(self) -> np.ndarray:
+        """Read-out times of the row of the object's centre, (T,) [s]."""
+        rows = self.centroids[:, 1]
+        return row_times(self.times, rows, self.row_time, self.masks.shape[1], self.sensor_rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """Free flight of a take.
+
+    Attributes:
+        fall: in the room.
+        spin: None if the object has too little texture.
+        frames: numbers of the first and last frame of the fit, for each camera.
+        tracks: of the cameras, all frames.
+        offsets_from: source of the time offset of each camera but the first, as text.
+        agreement: IoU of each camera's mask at rest with the common body. None with one camera.
+        gravity: result of the gravity check, as text.
+    """
+
+    fall: FreeFall
+    spin: Spin | None
+    frames: list[tuple[int, int]]
+    tracks: list[Track]
+    offsets_from: list[str]
+    agreement: np.ndarray | None
+    gravity: str
+
+
+def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flight:
+    """Fit the free flight of a take.
+
+    A single camera requires a plane: the vertical one through the middle of the room that faces the camera.
+
+    Args:
+        views: of the cameras. The first one is the time reference.
+        name: of the take for messages.
+        metric: whether the room's lengths are metres, so that gravity is checked.
+
+    Raises:
+        InputError: a camera shows no free flight, the time between two cameras is undetermined, no flight fits, or
+            gravity is significantly off by more than 10 %.
+    """
+    tracks, inside = [], []
+    for view in views:
+        if view.arc is None:
+            raise InputError(
+                f"{name}, {view.camera}",
+                "no free flight detected: 5 frames or more in which the object moves along a parabola by its size",
+                "Film the whole fall from 0.3 m at 60 frames per second or more, and check the masks' contact sheet",
+            )
+        flying = (view.numbers >= view.arc[0]) & (view.numbers <= view.arc[1])
+        inside.append(np.flatnonzero(flying))
+        times, places = view.row_times[flying], view.centroids[flying]
+        radius = float(np.sqrt(np.median(view.masks[flying].sum(axis=(1, 2))) / np.pi))
+        tracks.append(Track(times, places, view.viewmat, view.K, f"{name}, {view.camera}", radius))
+    offsets, lines = [0.0], []
+    for view in views[1:]:
+        offset, line = _offset(views[0], view, f"{name}, {view.camera}")
+        offsets.append(offset)
+        lines.append(line)
+    fixed = [view.offset is not None for view in views]
+    plane = _plane(views[0]) if len(views) == 1 else None
+    fall, kept = fit_flight(tracks, plane, offsets, fixed)
+    contact = _contact(views, inside, fall)
+    if np.isfinite(contact):
+        fall, kept = fit_flight(tracks, plane, fall.offsets, fixed, contact)
+    gravity = (
+        fall.gravity.check(name, tolerated=TOLERATED_DEVIATIONS) if metric else fall.gravity.describe(name)
+    )
+    frames, paths = [], []
+    for number, (view, flying, part) in enumerate(zip(views, inside, kept)):
+        used = flying[part]
+        frames.append((int(view.numbers[used[0]]), int(view.numbers[used[-1]])))
+        paths += follow(list(view.pixels[used]), view.masks[used], view.row_times[used], number)
+    spin = fit_spin(paths, tracks, fall)
+    return Flight(fall, spin, frames, tracks, lines, _at_rest(views, fall.offsets), gravity)
+
+
+def _contact(views: Sequence[Filmed], inside: Sequence[np.ndarray], fall: FreeFall) -> float:
+    """Contact time on the first camera's clock [s]. Infinite if there is no contact in the given frames."""
+    times = [view.row_times[flying] + offset for view, flying, offset in zip(views, inside, fall.offsets)]
+    heights = [
+        lowest_points(view.masks[flying], fall.place(clock), view.viewmat, view.K)
+        for view, flying, clock in zip(views, inside, times)
+    ]
+    return contact_time(times, heights)
+
+
+def _offset(first: Filmed, second: Filmed, name: str) -> tuple[float, str]:
+    if second.offset is not None:
+        return second.offset, f"{name}: time between the cameras from the settings"
+    by_sound: Offset | None = None
+    if first.sound is not None and second.sound is not None:
+        by_sound = offset_from_sound(first.sound, second.sound)
+    speeds = [np.linalg.norm(np.gradient(v.centroids, v.times, axis=0), axis=1) for v in (first, second)]
+    by_motion = offset_from_motion((first.times, second.times), (speeds[0], speeds[1]))
+    best, line = choose_offset(by_sound, by_motion, name)
+    return best.seconds, line
+
+
+def _plane(view: Filmed) -> tuple[np.ndarray, np.ndarray]:
+    """The vertical plane through the middle of the room that faces the camera: point and normal."""
+    eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
+    return np.zeros(3), np.array([eye[0], 0.0, eye[2]])
+
+
+def _at_rest(views: Sequence[Filmed], offsets: np.ndarray) -> np.ndarray | None:
+    if len(views) == 1:
+        return None
+    end = min(float(view.times[-1] + offset) for view, offset in zip(views, offsets))
+    masks = [view.masks[int(np.abs(view.times + o - end).argmin())] for view, o in zip(views, offsets)]
+    return agreement(masks, np.stack([v.viewmat for v in views]), np.stack([v.K for v in views]))
+
+
+def report(flight: Flight, views: Sequence[Filmed]) -> dict[str, Any]:
+    """JSON report of a flight. Metres of the room, y up."""
+    fall, spin = flight.fall, flight.spin
+    deviations = np.sqrt(np.diag(fall.covariance))
+    names = [view.camera for view in views]
+    return {
+        "start_s": fall.start,
+        "x0_m": fall.x0.tolist(),
+        "v0_m_s": fall.v0.tolist(),
+        "v0_deviation_m_s": deviations[3:6].tolist(),
+        **fall.gravity.report(),
+        "offsets_s": dict(zip(names, fall.offsets.tolist())),
+        "offsets_deviation_s": dict(zip(names, [0.0, *deviations[9:].tolist()])),
+        "offsets_from": flight.offsets_from,
+        "spin_rad_s": spin.velocity.tolist() if spin else None,
+        "spin_deviation_rad_s": np.sqrt(np.diag(spin.covariance)).tolist() if spin else None,
+        "spin_points": spin.points if spin else 0,
+        "rms_px": fall.rms,
+        "views": fall.views,
+        "frames": dict(zip(names, flight.frames)),
+        "agreement": dict(zip(names, flight.agreement.tolist())) if flight.agreement is not None else None,
+        "gravity": flight.gravity,
+    }
+
+
+def draw_flight(path: str | Path, flight: Flight, views: Sequence[Filmed], title: str) -> None:
+    """Plot observed and fitted positions of the object's centre in each camera, and their distances."""
+    size = (5 * (len(views) + 1), 5)
+    figure = require("matplotlib.figure", "capture").Figure(figsize=size, layout="constrained")
+    *cameras, last = figure.subplots(1, len(views) + 1)
+    for number, (axes, view, track) in enumerate(zip(cameras, views, flight.tracks)):
+        fitted = flight.fall.seen(track, number)
+        axes.imshow(view.pixels[0] // 2 + 127)
+        axes.plot(*track.places.T, ".", label="seen")
+        axes.plot(*fitted.T, "-", label="free flight")
+        axes.set(title=view.camera, xlabel="x [px]", ylabel="y [px]")
+        axes.legend()
+        clock = track.times + flight.fall.offsets[number] - flight.fall.start
+        last.plot(1000 * clock, np.linalg.norm(fitted - track.places, axis=1), ".-", label=view.camera)
+    last.set(title="off the fit", xlabel="time [ms]", ylabel="[px]", yscale="log")
+    last.legend()
+    figure.suptitle(title)
+    with atomic(path) as partial:
+        canvas = require("matplotlib.backends.backend_agg", "capture").FigureCanvasAgg(figure)
+        canvas.print_png(partial, metadata={"Software": None})
+
+
+def flight_checks(name: str, flight: Mapping[str, Any]) -> list[tuple[str, str, str, bool]]:
+    """Checks of a flight's `report`, with the fields of `neuma_lib.capture.report.page.Check`."""
+    checks = [
+        *gravity_checks(f"outlines of {name}", flight),
+        (f"flight in {name}", f"{flight['rms_px']:.2f} px off the fit", "< 1 px", flight["rms_px"] < 1),
+    ]
+    for camera, value in (flight["agreement"] or {}).items():
+        checks.append((f"mask of {camera} at rest, {name}", f"IoU {value:.2f}", "> 0.7", value > 0.7))
+    return checks

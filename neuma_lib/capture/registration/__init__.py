@@ -1,0 +1,1 @@
+"""Pose, size and rigid motion of the reconstruction in the videos."""

@@ -1,0 +1,186 @@
+"""The least squares problem of registration: pictures of a rigid flight as a function of its pose, motion and times."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from neuma_lib.capture.registration.rigid_motion import RigidMotion, turned
+from neuma_lib.capture.registration.rigid_views import LOCAL, Pictures
+from neuma_lib.fitting.least_squares import Linearisation
+
+LIKELY_SPIN = 10.0
+"""Standard deviation of the spin of a dropped object [rad/s], before it is seen."""
+LIKELY_SIZE, ANY_SIZE = 0.01, 0.3
+"""Standard deviations of the relative size of its Gaussians, before: in metres, and in a world of unknown scale."""
+
+TURN, PLACE, VELOCITY, SPIN, SIZE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), 12
+GRAVITY, OFFSETS = slice(13, 16), 16
+"""Places of the unknowns; those of the offsets begin at the last."""
+_ANY_TURN = np.pi / np.sqrt(3)  # deviation of an angle that is not known at all [rad]
+_UNITS = np.array([_ANY_TURN] * 3 + [0.1] * 3 + [1.0] * 3 + [LIKELY_SPIN] * 3)
+_NO_DIRECTIONS = np.zeros((0, 3))
+_GRAVITY_UNIT, _OFFSET_UNIT = 3.0, 0.01  # [m/s^2], [s]
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A pose with what was fitted along.
+
+    Attributes:
+        motion: of the body.
+        offsets: added to each camera's times [s], (cameras,).
+        enlargement: of the rendered body.
+        gains: of the cameras, (cameras, 3).
+        cost: sum of squares of the round that it comes from.
+    """
+
+    motion: RigidMotion
+    offsets: np.ndarray
+    enlargement: float
+    gains: np.ndarray
+    cost: float = np.inf
+
+
+class Problem:
+    """Residuals of pictures as a function of unknowns, in units of their own (`_UNITS`): a turn of the pose, changes of
+    place and velocity, the spin, the enlargement, and changes of gravity and of the cameras' offsets but the first.
+
+    Attributes:
+        size: number of unknowns.
+        all: places of those that are fitted.
+        start: unknowns of what it begins with.
+        falling: directions along which gravity is fitted, rows (K, 3); none: it is known.
+    """
+
+    def __init__(
+        self,
+        pictures: Pictures,
+        begin: Found,
+        time: float,
+        fitted: Sequence[int],
+        size: float = LIKELY_SIZE,
+        falling: np.ndarray = _NO_DIRECTIONS,
+    ):
+        self.pictures, self.begin, self.time, self.falling = pictures, begin, time, falling
+        cameras = len(begin.offsets)
+        self.size = OFFSETS + cameras - 1
+        self.units = np.concatenate([_UNITS, [size], [_GRAVITY_UNIT] * 3, np.full(cameras - 1, _OFFSET_UNIT)])
+        self.all = [*range(GRAVITY.start + len(falling)), *(OFFSETS + k - 1 for k in fitted)]
+        self.start = np.zeros(self.size)
+        self.start[SPIN], self.start[SIZE] = begin.motion.spin, begin.enlargement
+        self.start /= self.units
+        pictures.gains = begin.gains.copy()
+
+    def found(self, unknowns: np.ndarray) -> Found:
+        """What unknowns stand for."""
+        u, begin = self.units * unknowns, self.begin
+        motion = replace(
+            begin.motion,
+            rotation=Rotation.from_rotvec(u[TURN]).as_matrix() @ begin.motion.rotation,
+            centre=begin.motion.centre + u[PLACE],
+            velocity=begin.motion.velocity + u[VELOCITY],
+            spin=u[SPIN],
+            gravity=begin.motion.gravity + u[GRAVITY][: len(self.falling)] @ self.falling,
+        )
+        offsets = begin.offsets + np.append(0.0, u[OFFSETS:])
+        return replace(begin, motion=motion, offsets=offsets, enlargement=float(u[SIZE]))
+
+    def cost(self, unknowns: np.ndarray) -> float:
+        """Sum of squares."""
+        return float(costs(self.pictures, self.found(unknowns), self.time).sum())
+
+    def linearise(self, unknowns: np.ndarray, free: Sequence[int], central: bool = False) -> Linearisation:
+        """The problem around unknowns; columns that are not free are 0."""
+        pictures, found = self.pictures, self.found(unknowns)
+        times = picture_times(pictures, found, self.time)
+        motion = found.motion
+        centres, speeds = motion.place(times)
+        rotations, spins = motion.turn(times)
+        # How the pose in each picture, and the enlargement, depend on the unknowns: (pictures, 7, unknowns).
+        G = np.zeros((len(times), LOCAL, self.size))
+        G[:, :3, TURN], G[:, :3, SPIN] = self._turns(motion, times)
+        G[:, 3:6, PLACE], G[:, 3:6, VELOCITY] = np.eye(3), times[:, None, None] * np.eye(3)
+        G[:, 3:6, GRAVITY][..., : len(self.falling)] = times[:, None, None] ** 2 / 2 * self.falling.T
+        G[:, 6, SIZE] = 1.0
+        for camera in range(1, pictures.cameras):
+            of = pictures.camera == camera
+            G[of, :3, OFFSETS + camera - 1], G[of, 3:6, OFFSETS + camera - 1] = spins[of], speeds[of]
+        held = np.setdiff1d(np.arange(self.size), free)
+        G[..., held] = 0.0
+        G *= self.units
+        H, g, cost = pictures.normal_equations(rotations, centres, found.enlargement, central)
+        curvatures = np.einsum("nia,nbij,njc->nbac", G, H, G)
+        scores = np.einsum("nia,nbi->nba", G, g)
+        # Blocks are those of a camera, over all its pictures.
+        of = np.eye(pictures.cameras)[pictures.camera]
+        curvatures, scores = (np.einsum("nc,nb...->cb...", of, each) for each in (curvatures, scores))
+        total = float(cost.sum())
+        rms = float(np.sqrt(total / pictures.covered))
+        return Linearisation(
+            curvatures.reshape(-1, self.size, self.size), scores.reshape(-1, self.size), total, rms
+        )
+
+    def penalty(self, fit: Linearisation) -> np.ndarray:
+        """Curvature that holds turn, spin and enlargement at 0 +- 1: what nobody sees, stays likely."""
+        held = np.zeros(self.size)
+        held[[*range(3), *range(9, 12), SIZE]] = fit.block_cost
+        return np.diag(held)
+
+    def _turns(self, motion: RigidMotion, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives (T, 3, 3) of the rotations at times by a turn and by the spin at the time 0, by differences."""
+        step = 1e-4
+        small = Rotation.from_rotvec(step * np.concatenate([np.eye(3), -np.eye(3)])).as_matrix()
+        stay = np.repeat(motion.rotation[None], 6, axis=0)
+        spins = np.repeat(motion.spin[None], 6, axis=0)
+        moved = spins + step * np.concatenate([np.eye(3), -np.eye(3)])
+        turned_at, _ = turned(
+            np.concatenate([small @ motion.rotation, stay]),
+            np.concatenate([spins, moved]),
+            motion.inertia,
+            times,
+        )
+        change = turned_at.reshape(2, 2, 3, *turned_at.shape[1:])  # (turn or spin, side, axis, T, 3, 3)
+        rotvecs = Rotation.from_matrix(
+            (change[:, 0] @ np.swapaxes(change[:, 1], -1, -2)).reshape(-1, 3, 3)
+        ).as_rotvec()
+        by = rotvecs.reshape(2, 3, len(times), 3).transpose(0, 2, 3, 1) / (2 * step)
+        return by[0], by[1]
+
+
+class Central:
+    """A problem with central differences."""
+
+    def __init__(self, problem: Problem):
+        self.cost, self._problem = problem.cost, problem
+
+    def linearise(self, unknowns: np.ndarray, free: Sequence[int]) -> Linearisation:
+        return self._problem.linearise(unknowns, free, central=True)
+
+
+def picture_times(pictures: Pictures, found: Found, start: float) -> np.ndarray:
+    return pictures.times + found.offsets[pictures.camera] - start
+
+
+def render(pictures: Pictures, found: Found, start: float) -> torch.Tensor:
+    times = picture_times(pictures, found, start)
+    poses = found.motion.turn(times)[0], found.motion.place(times)[0]
+    return pictures.render(*poses, enlargement=found.enlargement)
+
+
+def costs(pictures: Pictures, found: Found, start: float) -> np.ndarray:
+    """Cost of each picture, (N,)."""
+    return pictures.residuals(render(pictures, found, start))[1].numpy()
+
+
+def difference(a: Found, b: Found) -> np.ndarray:
+    """From one pose to another, in the unknowns."""
+    p, q = a.motion, b.motion
+    turn = Rotation.from_matrix(q.rotation @ p.rotation.T).as_rotvec()
+    rest = [q.centre - p.centre, q.velocity - p.velocity, q.spin - p.spin, [b.enlargement - a.enlargement]]
+    rest.append(q.gravity - p.gravity)
+    return np.concatenate([turn, *rest, (b.offsets - a.offsets)[1:]])

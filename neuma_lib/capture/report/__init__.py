@@ -1,0 +1,1 @@
+"""Pages, measures and films of a capture."""

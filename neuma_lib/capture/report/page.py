@@ -1,0 +1,127 @@
+"""Checks of a capture with their expected values, and pages that list them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from neuma_lib.capture.masks.agreement import MIN_AGREEMENT
+from neuma_lib.capture.motion.flight import flight_checks
+from neuma_lib.capture.motion.gravity import gravity_checks
+
+MAX_ERROR = 1.0
+"""Mean reprojection error of good photographs [px]."""
+MAX_RESIDUAL = 0.5
+"""Distance of the board's corners from the print for a flat board with the correct square size [mm]."""
+MAX_UNSURE = 0.3
+"""Standard deviation of a fixed camera's direction [degrees]."""
+MIN_FLOOR = 0.2
+"""Share of the points on a floor with texture."""
+MAX_LEFT_OUT = 0.1
+"""Share of the photographs whose masks disagree with the others."""
+MAX_JUMP = 0.1
+"""Relative change of a good mask's area from frame to frame of free flight."""
+MIN_OVERLAP = 0.9
+"""IoU of masks from videos with those of the placed object, in free flight."""
+MAX_TURN = 5.0
+"""Standard deviation of the object's orientation about its worst axis, for good videos [degrees]."""
+MIN_PSNR = 20.0
+"""PSNR inside the object of Gaussians in held-out photographs, for good photographs [dB]."""
+
+
+class Check(NamedTuple):
+    """A check: name, measured value, expected value, and whether they agree."""
+
+    what: str
+    value: str
+    wanted: str
+    good: bool
+
+
+def checks(room: Mapping[str, Any], videos: Mapping[str, Mapping[str, Any]]) -> list[Check]:
+    """Checks of a capture, from the report of its room and `Timeline.plain` by name of the video."""
+    registered, pictures = room["registered"], room["pictures"]
+    lost = f" (not {', '.join(room['lost'])})" if room["lost"] else ""
+    result = [
+        Check("pictures with a place", f"{registered} of {pictures}{lost}", "all", registered == pictures)
+    ]
+    if (error := room["reprojection_error_px"]) is not None:
+        result.append(
+            Check("reprojection error", f"{error:.2f} px", f"< {MAX_ERROR:g} px", error < MAX_ERROR)
+        )
+    for name, (x, y, turn) in room.get("unsure", {}).items():
+        text = f"+-{turn:.2f} degrees, the lens's centre +-{x:.1f} and +-{y:.1f} px"
+        wanted = f"< {MAX_UNSURE:g} degrees"
+        result.append(Check(f"direction of {name.split('/')[0]}", text, wanted, turn < MAX_UNSURE))
+    if board := room["board"]:
+        residual = board["residual_mm"]
+        text = f"{residual:.2f} mm ({board['corners']} corners, {board['pictures']} pictures)"
+        wanted = f"< {MAX_RESIDUAL:g} mm"
+        result.append(Check("board's corners off the print", text, wanted, residual < MAX_RESIDUAL))
+    if (share := room["share_of_points_on_floor"]) is not None:
+        text, wanted = f"{100 * share:.0f} % of the points", f"> {100 * MIN_FLOOR:.0f} %"
+        result.append(Check("floor", text, wanted, share > MIN_FLOOR))
+    for name, video in videos.items():
+        slow = f", slowed {video['stretch']:g} times in the file" if video["stretch"] != 1 else ""
+        text = f"{video['frames']} at {video['rate']:.2f} a second{slow}"
+        missing = len(video["lost_before"])
+        text += (
+            f", missing at {missing} places" if missing else "" if video["steady"] else ", at a varying rate"
+        )
+        result.append(Check(f"frames of {name}", text, "none missing", not missing))
+    return result
+
+
+def motion_checks(
+    photographs: Mapping[str, Any],
+    videos: Mapping[str, Mapping[str, Any]],
+    flights: Mapping[str, Mapping[str, Any]],
+) -> list[Check]:
+    """Checks of masks and free flight, from reports of photographs, of videos by name, and of flights by take."""
+    count, out = photographs["photographs"], photographs["left_out"]
+    text = f"{count - len(out)} of {count}" + (f" (not {', '.join(out)})" if out else "")
+    what = f"masks of photographs that agree (IoU > {MIN_AGREEMENT})"
+    result = [Check(what, text, "nearly all", len(out) <= MAX_LEFT_OUT * count)]
+    for name, report in videos.items():
+        jump = report["largest_jump"]
+        text = "no free flight" if jump is None else f"{100 * jump:.1f} %"
+        good = jump is not None and jump < MAX_JUMP
+        result.append(Check(f"area of {name}, frame to frame", text, f"< {100 * MAX_JUMP:.0f} %", good))
+    for take, flight in flights.items():
+        result += [Check(*values) for values in flight_checks(take, flight)]
+    return result
+
+
+def object_checks(fit: Mapping[str, Any]) -> list[Check]:
+    """Checks of the Gaussians fitted to the photographs, from the report of the fit."""
+    psnr = fit["psnr_object"]
+    text = f"{psnr:.1f} dB inside the object ({len(fit['held_out'])} photographs, {fit['count']} Gaussians)"
+    return [Check("PSNR of photographs kept from the fit", text, f"> {MIN_PSNR:g} dB", psnr > MIN_PSNR)]
+
+
+def registration_checks(placed: Mapping[str, Mapping[str, Any]]) -> list[Check]:
+    """Checks of the object's pose in the videos, from the registration report of each take."""
+    result = []
+    for take, report in placed.items():
+        turn = max(report["rotation_std_deg_principal"])
+        text, wanted = f"+-{turn:.1f} degrees", f"< {MAX_TURN:g} degrees"
+        result.append(Check(f"pose of the object in {take}", text, wanted, turn < MAX_TURN))
+        result += [Check(*values) for values in gravity_checks(take, report)]
+        for camera, after in report["after"].items():
+            text, wanted = f"IoU {after['iou']:.3f}", f"> {MIN_OVERLAP:g}"
+            what = f"placed object in {take}, {camera}"
+            result.append(Check(what, text, wanted, after["iou"] > MIN_OVERLAP))
+    return result
+
+
+def markdown(title: str, checks: list[Check], pictures: Mapping[str, str], missing: str | None = None) -> str:
+    """A page with a table of checks, a note on what is missing, and pictures: caption -> path relative to the page."""
+    lines = [f"# {title}", "", "| check | found | wanted | |", "|---|---|---|---|"]
+    for check in checks:
+        lines.append(
+            f"| {check.what} | {check.value} | {check.wanted} | {'ok' if check.good else '**look**'} |"
+        )
+    lines += ["", missing] if missing else []
+    for caption, file in pictures.items():
+        lines += ["", f"## {caption}", "", f"![{caption}]({file})"]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,206 @@
+"""Warnings about a law learned from a capture: failed checks, and what the videos do not determine."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from neuma_lib.capture.report.page import Check
+from neuma_lib.evaluation.stress_curves import share_inside
+
+FEW_FRAMES = 10
+"""Frames of a camera after the first contact below which a warning is given."""
+WORSE = 1.5
+"""Ratio of the mean squared errors of held-out and training takes above which a warning is given."""
+MIN_IOU = 0.8
+"""Mean IoU of predicted masks with those of the video below which a warning is given."""
+MAX_OUTSIDE = 0.25
+"""Share of the visited range outside a 95 % band above which a warning is given."""
+BLUR = 1e-3
+"""Exposure assumed for the size of motion blur, if none is set [s]."""
+STRESS_TESTS = {"uniaxial": "stretch", "shear": "shear", "yield": "yielding"}
+
+
+def check_warnings(groups: Mapping[str, Sequence[Check]]) -> list[str]:
+    """Warnings of all failed checks."""
+    return [
+        f"{group}: {check.what} is {check.value}, good captures have {check.wanted}."
+        for group, checks in groups.items()
+        for check in checks
+        if not check.good
+    ]
+
+
+def filming_warnings(capture: Mapping[str, Any], takes: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Warnings about the set-up of the capture.
+
+    Args:
+        capture: ``density`` [kg/m^3], ``density_stated``, ``scale``, and ``held_out``, names of takes.
+        takes: for each take ``cameras``, with the exposure of each [s], and the content of its files ``flight``,
+            ``registration`` and ``prediction`` (of the learned law).
+    """
+    warnings = []
+    for name, take in takes.items():
+        cameras, flight, motion = take["cameras"], take["flight"], take["prediction"]
+        if len(cameras) == 1:
+            warnings.append(
+                f"{name}: there is only one camera. It hardly shows motion towards it, and the object is assumed to "
+                "fall above the middle of the box, in a plane that faces the camera."
+            )
+        if flight.get("spin_rad_s") is None:
+            warnings.append(
+                f"{name}: no spin was measured in free flight, the object's surface has too little texture."
+            )
+        if reason := (take.get("registration") or {}).get("ambiguous"):
+            warnings.append(f"{name}: the flight does not determine the pose of the object: {reason}.")
+        unknown = [camera for camera, exposure in cameras.items() if not exposure]
+        if unknown and motion.get("fastest_m_s"):
+            smear = 1e3 * BLUR * motion["fastest_m_s"]
+            warnings.append(
+                f"{name}: no exposure is set for {', '.join(unknown)}, so motion blur is neglected. At the maximum "
+                f"speed of {motion['fastest_m_s']:.1f} m/s, an exposure of 1/1000 s blurs the object over {smear:.1f} "
+                "mm."
+            )
+        for camera, count in (motion.get("frames_after_contact") or {}).items():
+            if count < FEW_FRAMES:
+                warnings.append(
+                    f"{name}, {camera}: only {count} frames show the object after its first contact. Earlier "
+                    "motion contains no information on the material."
+                )
+        if motion.get("touched"):
+            walls = ", ".join(motion["touched"])
+            warnings.append(
+                f"{name}: the predicted object touches the box ({walls}), where the room has no wall. Set "
+                "scale or center in capture.yaml."
+            )
+    if not capture["density_stated"]:
+        warnings.append(
+            f"The density is the default, {capture['density']:g} kg/m³. Motion only determines the ratio of stress "
+            "to density: if the object has twice the density, all stresses double. Weigh it, and set density in "
+            "capture.yaml."
+        )
+    if not capture["held_out"]:
+        warnings.append(
+            "No take is held out: all measures are of videos that the law was learned from. Film another "
+            "take, and list it under held_out in capture.yaml."
+        )
+    return warnings
+
+
+def prediction_warnings(
+    rows: Sequence[Mapping[str, Any]],
+    method: str,
+    prior: str,
+    constants: str,
+    predictions: Mapping[str, Mapping[str, Any]],
+) -> list[str]:
+    """Warnings from image measures of the learned law.
+
+    Args:
+        rows: of `neuma_lib.capture.report.images.image_rows`.
+        method: the learned one.
+        prior, constants: methods that evaluate the unchanged prior and the identified constants.
+        predictions: content of prediction.json of the learned law, by take.
+    """
+    warnings = []
+    for take, motion in predictions.items():
+        if failure := motion.get("diverged"):
+            warnings.append(
+                f"{take}: the predicted motion diverged at step {failure['step']} (a particle "
+                f"{failure['happened']}). Later frames show the last valid state."
+            )
+    if any(motion.get("stable") is False for motion in predictions.values()):
+        warnings.append("The training diverged, and its best state is shown.")
+    own = {(row["throw"], row["camera"], row["learned"]): row for row in rows if row["method"] == method}
+    before = {(row["throw"], row["camera"], row["learned"]): row for row in rows if row["method"] == prior}
+    for (take, camera, learned), row in own.items():
+        if take == "all":
+            continue
+        where, first = f"{take}, {camera}", before.get((take, camera, learned))
+        if method != prior and first and row["psnr"] < first["psnr"]:
+            warnings.append(
+                f"{where}: the prior, without any learning, is closer to the video ({first['psnr']:.1f} dB "
+                f"against {row['psnr']:.1f} dB on the object)."
+            )
+        if row["iou"] < MIN_IOU:
+            warnings.append(
+                f"{where}: the mean IoU of predicted masks with those of the video is {row['iou']:.2f}: the "
+                "predicted position or shape of the object is wrong."
+            )
+    for row in rows:
+        mine = own.get((row["throw"], row["camera"], row["learned"]))
+        if row["method"] == constants != method and row["throw"] == "all" and mine["psnr"] < row["psnr"]:
+            kind = "training" if row["learned"] else "held-out"
+            warnings.append(
+                f"In {kind} frames, the identified constants alone fit better ({row['psnr']:.1f} dB against "
+                f"{mine['psnr']:.1f} dB on the object). Use them, or the structured law that starts from "
+                "them."
+            )
+    trained, held_out = (own.get(("all", "all", learned)) for learned in (True, False))
+    if trained and held_out and 10 ** ((trained["psnr"] - held_out["psnr"]) / 10) > WORSE:
+        warnings.append(
+            f"Held-out takes are predicted worse than training takes, {held_out['psnr']:.1f} dB against "
+            f"{trained['psnr']:.1f} dB on the object: the law overfits its training videos."
+        )
+    return warnings
+
+
+def constants_warnings(identified: Mapping[str, Any] | None) -> list[str]:
+    """Warnings about identified constants that the videos do not determine."""
+    if not identified:
+        return []
+    warnings = []
+    if identified.get("ties"):
+        warnings.append(
+            f"The families {', '.join([identified['family'], *identified['ties']])} explain the video equally "
+            "well, so the family of the material is undetermined."
+        )
+    best = identified["best"]
+    unknown = [name for name, entry in best["quantities"].items() if not entry["determined"]]
+    if unknown:
+        known = [name for name, entry in best["quantities"].items() if entry["determined"]]
+        rest = f" It determines {', '.join(known)}." if known else ""
+        warnings.append(
+            f"The video does not determine {', '.join(unknown)} of the identified law, whose values are close to "
+            f"those at the start of the search.{rest}"
+        )
+    if best.get("diverged"):
+        warnings.append("The motion of the identified law diverged during the search of its constants.")
+    return warnings
+
+
+def curve_warnings(
+    curves: Mapping[str, Any] | None, titles: Mapping[str, str], prior: str, constants: str
+) -> list[str]:
+    """Warnings about stress curves: undetermined ranges, and contradictions between laws.
+
+    Args:
+        curves: of `neuma_lib.evaluation.stress_curves.stress_curves`.
+        titles: of the methods.
+        prior, constants: methods that evaluate the prior and the identified constants.
+    """
+    if not curves:
+        return []
+    method, tests = curves["learned"], curves["tests"]
+    warnings = [
+        "Outside the blue ranges, stress curves are extrapolated by the form of the law, since no part of the "
+        "object was deformed that far."
+    ]
+    if all(test["laws"][method]["band"] is None for test in tests.values()):
+        warnings.append(
+            f"{titles[method]} has no error bars, since its networks have no estimate of uncertainty. The bands of "
+            "the identified constants are the best substitute."
+        )
+    verdicts = {
+        prior: "the video contradicts the prior there",
+        method: "either the family is wrong, or the correction fits errors other than those of stress",
+    }
+    for name, test in tests.items():
+        for law, verdict in verdicts.items():
+            share = share_inside(test, law, constants) if law in test["laws"] and law != constants else None
+            if share is not None and 1 - share > MAX_OUTSIDE:
+                warnings.append(
+                    f"{STRESS_TESTS[name].capitalize()}: over {100 * (1 - share):.0f} % of the visited range, "
+                    f"{titles[law]} is outside the 95 % band of the identified constants: {verdict}."
+                )
+    return warnings

@@ -1,0 +1,1 @@
+"""Data sets of others: how they lay out images and cameras."""

@@ -1,0 +1,81 @@
+"""Image sets in the layout of the authors' released data.
+
+``<scene>/data_dynamic.json`` and ``eval_dynamic.json`` are lists of {``file_path``, ``c2w``, ``intrinsic``} over RGBA
+images named ``<letter>_<view>_<step>.png``. This module converts them to our transforms.json; `neuma_lib.io.images`
+reads both.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuma_lib.errors import InputError
+
+_NAME = re.compile(r"[a-z]+_(\d{1,9})_(\d{1,9})$", re.IGNORECASE)
+
+
+def released_frames(entries: Sequence[Mapping[str, Any]], path: str | Path) -> list[dict[str, Any]]:
+    """Frames in the format of transforms.json.
+
+    Args:
+        entries: the list: ``c2w`` camera to world, OpenGL axes, 4 x 4 (or its first three rows); ``intrinsic``, 3 x 3
+            [px]. A file whose name contains no view and step is a separate view at step 0.
+        path: the list's file, for messages.
+
+    Raises:
+        InputError: names the file and the wrong entry.
+    """
+    frames = []
+    for i, entry in enumerate(entries):
+        name = image_name(entry, f"{path}: entry {i}")
+        where = f"{path}: entry {i} ({name})"
+        named = _NAME.fullmatch(Path(name).stem)
+        view, step = map(int, named.groups()) if named else (i, 0)
+        frames.append({"file_path": name, **camera(entry, where), "view": view, "step": step})
+    return frames
+
+
+def camera(entry: Mapping[str, Any], where: str, intrinsic: str = "intrinsic") -> dict[str, Any]:
+    """Pose and intrinsics of an entry in the format of transforms.json.
+
+    Args:
+        entry: ``c2w`` and intrinsics, see `released_frames`.
+        where: the entry, for messages.
+        intrinsic: key of the intrinsics.
+
+    Raises:
+        InputError: names the entry and the key.
+    """
+    pose, K = matrix_of_numbers(entry.get("c2w")), matrix_of_numbers(entry.get(intrinsic))
+    if pose.shape not in [(4, 4), (3, 4)]:
+        raise InputError(f"{where}: c2w", "must be a 4x4 matrix of numbers")
+    if K.shape != (3, 3):
+        raise InputError(f"{where}: {intrinsic}", "must be a 3x3 matrix of numbers")
+    if not np.abs(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1]).max() <= 1e-9:
+        raise InputError(f"{where}: {intrinsic}", "must be that of a pinhole camera without skew")
+    return {
+        "transform_matrix": [*pose[:3].tolist(), [0.0, 0.0, 0.0, 1.0]],
+        **{"fl_x": K[0, 0].item(), "fl_y": K[1, 1].item(), "cx": K[0, 2].item(), "cy": K[1, 2].item()},
+    }
+
+
+def image_name(entry: Any, where: str) -> str:
+    """The ``file_path`` of an entry of a list of images. Raises InputError if it has none."""
+    name = entry.get("file_path") if isinstance(entry, Mapping) else None
+    if not isinstance(name, str) or not name or not name.isprintable():
+        raise InputError(where, "has no file_path that is a text", "Check that this is a list of images")
+    return name
+
+
+def matrix_of_numbers(value: Any) -> np.ndarray:
+    """Nested lists of numbers as float64; an empty array for anything else."""
+    try:
+        matrix = np.asarray(value)
+        return matrix.astype(np.float64) if matrix.dtype.kind in "fiu" else np.empty(0)
+    except (TypeError, ValueError, OverflowError, RecursionError):
+        return np.empty(0)

@@ -1,0 +1,348 @@
+"""Interface of methods: how a model of motion is obtained from a scene.
+
+A method is one subclass of `Method` in one file. `neuma_lib.methods.registry` lists the built-in ones. Importing this
+module, or the module of a method, loads no torch, so that settings are read and jobs are planned without it.
+"""
+
+from __future__ import annotations
+
+import importlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from neuma_lib.config.base import Section
+from neuma_lib.config.motion import MotionOptions
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+    from neuma_lib.io.checkpoint import Checkpoint
+    from neuma_lib.mechanics.law import Law
+    from neuma_lib.methods.model import MotionModel
+    from neuma_lib.sim.state import State
+
+Files = dict[str, Any]
+"""Paths by name: one path, or a list of several."""
+EvaluatedOn = Literal["particles", "training_particles"]
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A named set of options of a method. Its name is the name of a folder of results.
+
+    Attributes:
+        title: name in tables.
+        options: values that differ from the defaults of `Method.Options`.
+        note: what readers must know of its numbers. It is printed below tables.
+        same_fit_as: preset whose fit it takes, with its kind and options. None: its own fit.
+        evaluate_on: what is simulated when it is evaluated: the particles of the body's volume, which all methods
+            share, or the particles that it was fitted with.
+    """
+
+    title: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    note: str | None = None
+    same_fit_as: str | None = None
+    evaluate_on: EvaluatedOn = "particles"
+
+
+class Case(ABC):
+    """A preset or variant on a scene: its options, and where files are. `neuma_lib.project.project.cases` builds it.
+
+    Attributes:
+        scene: folder of the scene that the model is obtained from, with the seeds of its replicate.
+        moved: folder of the scene whose motion is predicted. It differs from `scene` only with ``+law_from=``.
+        name: preset or variant whose fit is used, for example ``neuma+rank=4``.
+        options: validated options.
+        evaluate_on: of the preset.
+    """
+
+    scene: str
+    moved: str
+    name: str
+    options: MotionOptions
+    evaluate_on: EvaluatedOn
+
+    @abstractmethod
+    def on_moved(self) -> Case:
+        """The same method and options, obtained from the scene whose motion is predicted."""
+
+    @property
+    @abstractmethod
+    def prior(self) -> str:
+        """Name of the prior, or path of the user's own."""
+
+    @property
+    @abstractmethod
+    def prior_law(self) -> dict[str, Any] | None:
+        """Specification of the analytic law behind the prior. None if there is none, or the prior is the user's."""
+
+    @property
+    @abstractmethod
+    def true_law(self) -> dict[str, Any]:
+        """Specification of the scene's true law. Raises InputError if nobody knows it."""
+
+    @abstractmethod
+    def section(self, name: str) -> dict[str, Any]:
+        """A section of the settings as plain values."""
+
+    @abstractmethod
+    def result(self, file: str) -> str:
+        """Path of a file of the scene in its replicate, for example ``velocity.json``."""
+
+    @abstractmethod
+    def data(self, file: str) -> str:
+        """Path of a file of the scene's data, for example ``dynamic/transforms.json``."""
+
+    @abstractmethod
+    def rollout(self) -> str:
+        """Path of the predicted motion."""
+
+    @abstractmethod
+    def product(self) -> str:
+        """Path of what `Method.fit` writes."""
+
+    @abstractmethod
+    def prior_file(self) -> str:
+        """Path of the prior."""
+
+    @abstractmethod
+    def identified(self) -> str:
+        """Name of the file of the law identified in the views of `options`."""
+
+    @abstractmethod
+    def each_video(self, choose: Callable[[Case], str]) -> str | list[str]:
+        """A path of the scene of each video: one path, or a list if a scene has several videos."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is known of a scene before a fit.
+
+    Attributes:
+        simulation: constants of the simulator, as `MPMModel` takes them.
+        densities: density of the body of each video, as `density_at` takes it.
+        filming: what turns exposures into renders, see `load_videos`.
+        seed: of the project.
+    """
+
+    simulation: Mapping[str, Any]
+    densities: Sequence[Any]
+    filming: Mapping[str, Any]
+    seed: int = 0
+
+
+class FitRun(ABC):
+    """What a fit has of the process that it runs in.
+
+    Attributes:
+        device: where to compute.
+        product, history: files to write.
+    """
+
+    device: torch.device
+    product: Path
+    history: Path
+
+    @abstractmethod
+    def checkpoint(self, settings: Mapping[str, Any], inputs: Mapping[str, Any]) -> Checkpoint:
+        """The saved state of a fit with these settings and input files, which an earlier process may have left."""
+
+    @abstractmethod
+    def progress(self, done: int, total: int, loss: float | None = None) -> None:
+        """Report the number of finished iterations."""
+
+    @abstractmethod
+    def log(self, text: str) -> None:
+        """Report a result in one line."""
+
+
+@dataclass(frozen=True)
+class ModelSource:
+    """What a model of motion is loaded from, in plain values: a parameter of jobs and of the viewer.
+
+    Attributes:
+        module: module of the method.
+        options: what `Method.model_options` gives.
+        files: what `Method.model_inputs` gives.
+        dt: time step that the model was obtained with [s].
+    """
+
+    module: str
+    options: dict[str, Any]
+    files: Files
+    dt: float
+
+    @property
+    def paths(self) -> list[str]:
+        """All files."""
+        return [
+            path for value in self.files.values() for path in ([value] if isinstance(value, str) else value)
+        ]
+
+    def plain(self) -> dict[str, Any]:
+        return asdict(self)
+
+    def load(self, checked: Callable[[str], str | Path] = str) -> MotionModel:
+        """The model. `checked` is applied to every path."""
+        files = {name: checked(path) for name, path in self.files.items()}
+        return method_of(self.module).load(files, self.options, self.dt)
+
+
+class Method(ABC):
+    """How a model of motion is obtained from a scene. One subclass a file.
+
+    Class attributes:
+        name: the value of ``kind`` in the settings of presets.
+        Options: settings that presets and names of variants (``neuma+rank=4``) may set.
+        sections: sections of the settings with the defaults of these options.
+        presets: built-in presets by name.
+        product: file that `fit` writes. None: nothing is fitted.
+        fit_kernels, kernels: groups of Warp kernels that `fit` and predictions use.
+        has_law: whether the motion follows from a material law (`MotionModel.law`). Only laws move several bodies.
+        moves_other_bodies: whether the model moves the bodies of other scenes (``+law_from=``).
+    """
+
+    name: ClassVar[str]
+    Options: ClassVar[type[Section]] = MotionOptions
+    sections: ClassVar[tuple[str, ...]] = ("material",)
+    presets: ClassVar[Mapping[str, Preset]] = {}
+    product: ClassVar[str | None] = None
+    fit_kernels: ClassVar[tuple[str, ...]] = ("laws", "rendering")
+    kernels: ClassVar[tuple[str, ...]] = ("laws",)
+    has_law: ClassVar[bool] = True
+    moves_other_bodies: ClassVar[bool] = True
+
+    # ---- planning, without torch
+
+    def fit_inputs(self, case: Case) -> Files:
+        """Everything that `fit` may read."""
+        return {}
+
+    @abstractmethod
+    def model_inputs(self, case: Case) -> Files:
+        """Files of the model, for `load`: one path a name."""
+
+    def body_inputs(self, case: Case) -> Files:
+        """Further files of `load_initial_state` and `load_body`: one path a name."""
+        return {}
+
+    def uncertainty_inputs(self, case: Case) -> Files:
+        """Files of `draws`: one path a name."""
+        return {}
+
+    def fit_options(self, case: Case) -> dict[str, Any]:
+        """Options of `fit` as plain values."""
+        return case.options.plain()
+
+    def model_options(self, case: Case) -> dict[str, Any]:
+        """Options of `load`, `load_initial_state` and `load_body` as plain values."""
+        return {}
+
+    def start_file(self, case: Case) -> str:
+        """The file with the initial motion: the estimated one, or the one that a fit found."""
+        own = case.on_moved()
+        return own.result(own.identified() if own.options.start == "identified" else "velocity.json")
+
+    def seeds(self, case: Case) -> tuple[str, ...]:
+        """Seeds of a replicate that change its results. They name the folder of its runs."""
+        return ("prior", "gaussians", "particles")
+
+    def carrier(self, case: Case) -> str:
+        """What is simulated in an evaluation: "binding" (particles of the volume), or what it was fitted with."""
+        return case.options.carrier if case.evaluate_on == "training_particles" else "binding"
+
+    def learns_from_video(self, case: Case) -> bool:
+        """Whether the model comes from the scene itself. If not, it is the same for all scenes with one prior."""
+        return True
+
+    # ---- work, with torch
+
+    def fit(self, inputs: Files, options: Mapping[str, Any], problem: Problem, run: FitRun) -> None:
+        """Obtain the model from `inputs` and write it to ``run.product``.
+
+        Args:
+            inputs: the files of `fit_inputs`.
+            options: what `fit_options` gives.
+        """
+        raise NotImplementedError(f"{self.name} has nothing to fit")
+
+    @abstractmethod
+    def load(self, inputs: Files, options: Mapping[str, Any], dt: float) -> MotionModel:
+        """The model, from the files of `model_inputs`.
+
+        Args:
+            options: what `model_options` gives.
+            dt: time step of the prediction [s].
+        """
+
+    def load_initial_state(
+        self, inputs: Files, options: Mapping[str, Any], densities: Sequence[Any], carrier: str
+    ) -> tuple[State, list[int]]:
+        """What a prediction starts from: particles in motion, and how many belong to each body.
+
+        Args:
+            inputs: ``particles``, ``binding``, ``gaussians``, ``velocity`` and the files of `body_inputs`.
+            densities: of each body.
+        """
+        from neuma_lib.io.particles import load_initial_state
+
+        files = (inputs[name] for name in ("particles", "binding", "gaussians", "velocity"))
+        return load_initial_state(*files, densities, carrier)
+
+    def load_body(
+        self,
+        inputs: Files,
+        options: Mapping[str, Any],
+        density: Any,
+        carrier: str,
+        gaussian_motion: str,
+        device: torch.device | str = "cpu",
+    ) -> Any:
+        """The body that renders a predicted motion, with ``particle_gs(cameras)``."""
+        import torch
+
+        from neuma_lib.io.particles import load_body
+
+        files = (inputs[name] for name in ("particles", "binding", "gaussians"))
+        return load_body(*files, density, carrier, gaussian_motion).to(torch.float32, device)
+
+    def draws(
+        self, inputs: Files, law: Law, F: Tensor | None, uncertainty: Mapping[str, Any], **drawn: Any
+    ) -> list[Law]:
+        """Laws drawn from what the video leaves open. Empty if the uncertainty is unknown.
+
+        Args:
+            inputs: the files of `uncertainty_inputs`.
+            law: from `load`.
+            F: deformation gradients that the body goes through, shape (T, N, 3, 3); None: read from `inputs`.
+            uncertainty: ``model_std`` and ``spread`` of the settings of `identify`.
+            drawn: ``dt`` [s], ``count`` and ``seed``.
+        """
+        return []
+
+
+def body_of_each_video(case: Case) -> Files:
+    """The reconstructed body of each video of a scene: particles, binding and Gaussians."""
+    names = {"particles": "particles.h5", "binding": "binding.h5", "gaussians": "gaussians.ply"}
+    return {name: case.each_video(lambda each, file=file: each.result(file)) for name, file in names.items()}
+
+
+def method_of(module: str) -> Method:
+    """The method that a module defines.
+
+    Raises:
+        LookupError: it does not define exactly one.
+    """
+    found = [
+        value
+        for value in vars(importlib.import_module(module)).values()
+        if isinstance(value, type) and issubclass(value, Method) and value.__module__ == module
+    ]
+    if len(found) != 1:
+        raise LookupError(f"{module} defines {len(found)} methods, expected one")
+    return found[0]()

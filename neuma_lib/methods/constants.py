@@ -1,0 +1,36 @@
+"""The analytic law whose family and constants the stage `identify` fits to the video."""
+
+from __future__ import annotations
+
+from neuma_lib.methods.base import Case, Files, Method, Preset
+
+
+class Constants(Method):
+    name = "constants"
+    presets = {
+        "constants": Preset(
+            "Constants",
+            {"covariance_from": "total", "gaussian_motion": "affine", "start": "identified"},
+            note="The analytic law whose family and few constants fit the training video best, thrown as the same fit "
+            "found; nothing else is learned.",
+        )
+    }
+
+    def model_inputs(self, case: Case) -> Files:
+        return {"identified": case.result(case.identified())}
+
+    def load(self, inputs, options, dt):
+        from neuma_lib.io.files import read_json
+        from neuma_lib.mechanics.analytic import analytic_law
+        from neuma_lib.methods.model import LawOnGrid
+
+        return LawOnGrid(analytic_law(read_json(inputs["identified"])["law"], dt=dt))
+
+    def uncertainty_inputs(self, case: Case) -> Files:
+        return self.model_inputs(case)
+
+    def draws(self, inputs, law, F, uncertainty, **drawn):
+        from neuma_lib.evaluation.bands import constants_draws
+        from neuma_lib.io.files import read_json
+
+        return constants_draws(read_json(inputs["identified"]), uncertainty["model_std"], **drawn)

@@ -1,0 +1,82 @@
+"""Models of motion: what `Method.load` gives, and what predicts the states of bodies."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from neuma_lib.evaluation.motion import Failure, predict
+from neuma_lib.mechanics.law import Law
+from neuma_lib.sim.model import MPMModel, as_bodies, consecutive
+from neuma_lib.sim.state import State, Trajectory
+
+
+class MotionModel(ABC):
+    """Predicts the motion of a body.
+
+    Attributes:
+        law: the material law that the motion follows from, None if there is none.
+        stable: whether the fit ended without divergence.
+    """
+
+    law: Law | None = None
+    stable: bool = True
+
+    @abstractmethod
+    def predict(
+        self,
+        mpm: MPMModel,
+        state: State,
+        frames: Sequence[int],
+        tracers: Tensor | None = None,
+        total: bool = False,
+    ) -> tuple[Trajectory, Failure | None]:
+        """States at the frames. After a failure the last sound state is repeated.
+
+        Args:
+            state: particles and their initial motion.
+            frames: simulation steps, increasing.
+            tracers: start positions of passive tracers [m], shape (M, 3).
+            total: also carry the total deformation.
+        """
+
+    def courant(self, mpm: MPMModel, state: State) -> float | None:
+        """Courant number of the simulation, None if it has none."""
+        return None
+
+
+class LawOnGrid(MotionModel):
+    """Material laws in the material point method.
+
+    Args:
+        laws: one law a body.
+        counts: number of particles of each body. None: one body.
+        stable: whether all fits ended without divergence.
+    """
+
+    def __init__(self, *laws: Law, counts: Sequence[int] | None = None, stable: bool = True):
+        self.law = laws[0]
+        self.stable = stable
+        self._laws, self._counts = laws, counts
+
+    @classmethod
+    def together(cls, models: Sequence[MotionModel], counts: Sequence[int]) -> MotionModel:
+        """One model of several bodies, whose particles follow each other. One model is returned as it is."""
+        if len(models) == 1:
+            return models[0]
+        return cls(
+            *(model.law for model in models), counts=counts, stable=all(model.stable for model in models)
+        )
+
+    def predict(self, mpm, state, frames, tracers=None, total=False):
+        return predict(mpm, self._bodies(state), state, frames, tracers, total)
+
+    def courant(self, mpm: MPMModel, state: State) -> float:
+        bodies = as_bodies(self._bodies(state), len(state.x))
+        return max(mpm.courant(b.law, float(state.density[b.start : b.stop].min())) for b in bodies)
+
+    def _bodies(self, state: State):
+        laws = [law.to(state.x.device) for law in self._laws]
+        return consecutive(laws, self._counts or [len(state.x)])

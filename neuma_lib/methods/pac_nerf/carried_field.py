@@ -1,0 +1,134 @@
+"""A radiance field that particles carry through a simulation, and its pictures (PAC-NeRF, Li et al. 2023, Sec. 3.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuma_lib.coupling.interpolation import Interpolation
+from neuma_lib.errors import InputError
+from neuma_lib.mechanics.density import Density, density_at
+from neuma_lib.methods.pac_nerf.field import WHITE, RadianceField
+from neuma_lib.methods.pac_nerf.io import load_field
+from neuma_lib.methods.pac_nerf.options import PacNerfConfig
+from neuma_lib.sim.state import State
+from neuma_lib.splatting.cameras import Cameras
+
+
+class CarriedField:
+    """A field as its particles carry it: fewer of them are simulated, the others follow.
+
+    Args:
+        field: of the first stage.
+        spacing, least_opacity: of the particles that are seen, see `RadianceField.particles`.
+        settings: how many move.
+        density: of the body [kg/m^3].
+    """
+
+    def __init__(
+        self,
+        field: RadianceField,
+        spacing: float,
+        least_opacity: float,
+        settings: PacNerfConfig,
+        density: Density,
+    ):
+        self.field = field.requires_grad_(False)
+        self.shown = field.particles(spacing, least_opacity)
+        if not len(self.shown.x):
+            raise InputError("pac_nerf: the field has no particles: run the rule radiance_field again")
+        coarser = max(1.0, (len(self.shown.x) / settings.particles) ** (1 / 3))
+        self.moving = field.particles(coarser * spacing, max(least_opacity, settings.least_opacity))
+        self.mass = self.moving.masses(density_at(self.moving.x, density))
+        self._follow = Interpolation(self.shown.x, self.moving.x, settings.followed)
+
+    @classmethod
+    def load(
+        cls,
+        path: str | Path,
+        own: Mapping[str, Any],
+        density: Density,
+        device: torch.device | str = "cpu",
+    ) -> CarriedField:
+        """The field of a file as a method's particles carry it.
+
+        Args:
+            own: ``spacing``, ``least_opacity`` and ``settings`` (a `PacNerfConfig` as plain values), with which the
+                method's constants were found.
+        """
+        field, _ = load_field(path)
+        return cls(
+            field.to(device),
+            own["spacing"],
+            own["least_opacity"],
+            PacNerfConfig(**own["settings"]),
+            density,
+        )
+
+    def state(
+        self,
+        v0: Sequence[float] | Tensor,
+        spin: Sequence[float] | Tensor = (0.0, 0.0, 0.0),
+        centre: Sequence[float] | Tensor | None = None,
+    ) -> State:
+        """What moves, with the velocity v0 [m/s] and the spin [rad/s] of `State.thrown`."""
+        return State.thrown(self.moving.x, self.mass, self.moving.volumes(), v0, spin, centre)
+
+    def positions(self, x: Tensor) -> Tensor:
+        """Of what is seen, (T, N, 3) [m], for those of what moves, (T, A, 3)."""
+        return self._follow(x)[0]
+
+    def particle_gs(self, cameras: Cameras, background: Sequence[float] = WHITE) -> FieldRenderer:
+        """The renderer of this body for the given cameras, as `Reconstruction` has one of its Gaussians."""
+        return FieldRenderer(self, cameras, background)
+
+
+class FieldRenderer:
+    """Renders the states of a carried field as `ParticleGS` does those of bound Gaussians.
+
+    Args:
+        body: what is seen.
+        cameras: V views.
+        background: colour behind it.
+    """
+
+    frames_per_batch = 1
+    """Every frame has a lattice of its own."""
+
+    def __init__(self, body: CarriedField, cameras: Cameras, background: Sequence[float] = WHITE):
+        self.body, self.background = body, background
+        self.cameras = cameras.to(body.shown.x.device, body.shown.x.dtype)
+
+    def __call__(self, x: Tensor, F: Tensor | None = None) -> Tensor:
+        """Images (T, V, H, W, 3) in [0, 1] of what moves at x (T, A, 3) [m]; its deformations F are not needed.
+
+        Raises:
+            InputError: other particles than those that this field moves by.
+        """
+        moving = self.body.moving.x
+        if x.shape[1:] != moving.shape:
+            raise InputError(
+                f"a rollout of {x.shape[1]} particles is not that of a field that {len(moving)} particles carry: run "
+                "evaluation again"
+            )
+        field, shown = self.body.field, self.body.shown
+        places = self.body.positions(x.to(moving))
+        views = range(len(self.cameras))
+        images = [
+            field.draw(self.cameras, view, replace(shown, x=place), self.background)
+            for place in places
+            for view in views
+        ]
+        return torch.stack(images).unflatten(0, (len(places), len(views)))
+
+    def batches(self, x: Tensor, F: Tensor, size: int | None = None) -> Iterator[tuple[slice, Tensor]]:
+        """Render ``size`` frames at a time: yields (slice of frames, images)."""
+        size = size or self.frames_per_batch
+        for start in range(0, len(x), size):
+            part = slice(start, min(start + size, len(x)))
+            yield part, self(x[part])

@@ -1,0 +1,245 @@
+"""Voxel radiance field from posed RGBA images: the first stage of PAC-NeRF (Li et al. 2023, Sec. 3.1).
+
+The field is rendered as the later stages will: its densities and features go to particles and back to the nodes before
+rays are drawn through them. This trains it to survive that round trip. Coarse to fine: at given iterations the voxel is
+halved, the lattice shrinks to what is occupied, and Adam begins anew.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.geometry.visual_hull import Hull, check_masks, visual_hull
+from neuma_lib.io.checkpoint import Checkpoint
+from neuma_lib.methods.pac_nerf.field import FieldParticles, RadianceField
+from neuma_lib.methods.pac_nerf.field_options import RadianceConfig
+from neuma_lib.methods.pac_nerf.lattice import Lattice
+from neuma_lib.methods.pac_nerf.rendering import Opacity, camera_rays
+from neuma_lib.splatting.cameras import Cameras
+from neuma_lib.splatting.observation import over_white
+
+VOLUME_RANGE = (1e-4, 1e-1)
+"""Opacities between which a particle counts in the volume term (PAC-NeRF)."""
+CERTAIN = 1e-5
+"""Transmittances are kept this far from 0 and 1 in their entropy (PAC-NeRF)."""
+
+
+@dataclass
+class RadianceReport:
+    """How a fit went.
+
+    Attributes:
+        losses: training loss of every iteration.
+        voxel: of the last lattice [m].
+        nodes: of the last lattice, along each axis.
+        particles: in the field at the end.
+        held_out: indices of the views kept for measurement.
+        psnr, psnr_object: mean PSNR [dB] of the held-out views, full frame over white and inside the object (pixels
+            with alpha above 1/2), through particles and back.
+        direct_psnr, direct_psnr_object: the same of the field itself, without particles.
+    """
+
+    losses: list[float]
+    voxel: float
+    nodes: tuple[int, int, int]
+    particles: int
+    held_out: list[int]
+    psnr: float
+    psnr_object: float
+    direct_psnr: float
+    direct_psnr_object: float
+
+
+def fit_radiance_field(
+    images: Tensor,
+    cameras: Cameras,
+    settings: RadianceConfig,
+    seed: int = 0,
+    checkpoint: Checkpoint | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> tuple[RadianceField, RadianceReport]:
+    """Fit a field to images of an object. It begins in the box of the object's visual hull.
+
+    Args:
+        images: (V, H, W, 4) RGBA with straight alpha in [0, 1].
+        cameras: their V cameras, more than half of `settings.held_out`.
+        settings: hyper-parameters.
+        seed: of everything random; the same seed gives the same field on a CPU.
+        checkpoint: where the state is kept, so that a killed fit goes on.
+        progress: called with (iteration, loss) after each iteration.
+
+    Raises:
+        InputError: shapes disagree, a mask is empty or covers the frame, or masks and poses contradict each other.
+        NonFiniteError: the loss is not finite.
+    """
+    _check(images, cameras, settings.held_out)
+    images = images.to(cameras.viewmats.dtype)
+    held_out = list(range(settings.held_out // 2, len(cameras), settings.held_out))
+    fitted = [view for view in range(len(cameras)) if view not in held_out]
+    fit = _Fit(images[fitted], cameras[fitted], settings, seed)
+    start = fit.resume(checkpoint.load()) if checkpoint else 0
+    for iteration in range(start, settings.iterations):
+        loss = fit.step(iteration)
+        if not math.isfinite(loss):
+            raise NonFiniteError(
+                "radiance field", f"loss is {loss} in iteration {iteration}; lower radiance.rate_density"
+            )
+        if progress is not None:
+            progress(iteration, loss)
+        if checkpoint and (iteration + 1) % settings.checkpoint_every == 0:
+            checkpoint.save(fit.state(iteration + 1))
+    field = fit.field.requires_grad_(False)
+    particles = field.particles(settings.spacing, settings.least_opacity)
+    scores = [evaluate(field, images, cameras, held_out, part) for part in (particles, None)]
+    report = RadianceReport(
+        fit.losses, field.lattice.voxel, field.lattice.nodes, len(particles.x), held_out,
+        *(value for pair in scores for value in pair),
+    )  # fmt: skip
+    return field, report
+
+
+def evaluate(
+    field: RadianceField,
+    images: Tensor,
+    cameras: Cameras,
+    views: list[int],
+    particles: FieldParticles | None = None,
+) -> tuple[float, float]:
+    """Mean PSNR [dB] over views against RGBA images over white: full frame; where alpha > 1/2."""
+    full, inside = [], []
+    for view in views:
+        error = (field.draw(cameras, view, particles).clamp(0, 1) - over_white(images[view])) ** 2
+        full.append(-10 * math.log10(float(error.mean())))
+        inside.append(-10 * math.log10(float(error[images[view, ..., 3] > 0.5].mean())))
+    return sum(full) / len(full), sum(inside) / len(inside)
+
+
+class _Fit:
+    """The field, its optimiser, and what is random."""
+
+    def __init__(self, images: Tensor, cameras: Cameras, settings: RadianceConfig, seed: int):
+        self.settings, self.generator = settings, torch.Generator().manual_seed(seed)
+        self.targets = over_white(images).flatten(1, 2)
+        self.rays = [camera_rays(cameras, view) for view in range(len(cameras))]
+        self.halvings = [round(part * settings.iterations) for part in settings.halvings]
+        self.order: list[int] = []
+        self.losses: list[float] = []
+        lattice = _around(visual_hull(images[..., 3], cameras, settings.hull_resolution), settings)
+        with torch.random.fork_rng(devices=[]):  # of the network
+            torch.manual_seed(seed)
+            field = RadianceField(lattice, Opacity(settings.initial_opacity, lattice.voxel))
+        self._begin(field.to(images))
+
+    def _begin(self, field: RadianceField) -> None:
+        """Go on with a field, with a new optimiser; only rays that meet its lattice are drawn."""
+        self.field, settings = field, self.settings
+        self.optimizer = torch.optim.Adam(
+            [
+                {"params": list(parameters), "first_lr": rate}
+                for parameters, rate in (
+                    ([field.density], settings.rate_density * field.opacity.base_voxel / field.lattice.voxel),
+                    ([field.features], settings.rate_features),
+                    (field.network.parameters(), settings.rate_network),
+                )
+            ]
+        )
+        self.meeting = [_meeting(field.lattice, *rays) for rays in self.rays]
+
+    def step(self, iteration: int) -> float:
+        """One Adam step."""
+        settings = self.settings
+        if iteration in self.halvings:
+            self._begin(self.field.halved())
+        if not self.order:
+            self.order = torch.randperm(len(self.rays), generator=self.generator).tolist()
+        view = self.order.pop()
+        drawn = torch.randint(len(self.meeting[view]), (settings.rays,), generator=self.generator)
+        chosen = self.meeting[view][drawn.to(self.targets.device)]
+        particles = self.field.particles(settings.spacing, settings.least_opacity, self.generator)
+        rays = (part[chosen] for part in self.rays[view])
+        colours, passed = self.field.render(*particles.seen(), *rays)
+        loss = ((colours - self.targets[view, chosen]) ** 2).mean()
+        doublings = math.floor(iteration / settings.iterations * settings.entropy_doublings)
+        weight = min(settings.entropy_weight * 2**doublings, settings.entropy_most)
+        passed = passed.clamp(CERTAIN, 1 - CERTAIN)
+        entropy = -(passed * passed.log() + (1 - passed) * (1 - passed).log()).mean()
+        fuzzy = particles.opacities.clamp(*VOLUME_RANGE).sum() * particles.volume / particles.voxel
+        loss = loss + weight * entropy + settings.volume_weight * fuzzy
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["first_lr"] * settings.rate_decay ** self._done(iteration)
+        self.optimizer.step()
+        self.losses.append(float(loss.detach()))
+        return self.losses[-1]
+
+    def _done(self, iteration: int) -> float:
+        """How much of what follows the last halving is behind us, from 0 to 1."""
+        first = self.halvings[-1] if self.halvings else 0
+        return max(0.0, (iteration - first) / (self.settings.iterations - first))
+
+    def state(self, iteration: int) -> dict:
+        """All that a checkpoint must hold."""
+        lattice = self.field.lattice
+        return {
+            "iteration": iteration,
+            "lattice": [list(lattice.origin), lattice.voxel, list(lattice.nodes)],
+            "field": self.field.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "generator": self.generator.get_state(),
+            "order": self.order,
+            "losses": self.losses,
+        }
+
+    def resume(self, state: dict | None) -> int:
+        """Go back to a state, if there is one; the iteration to go on with."""
+        if state is None:
+            return 0
+        origin, voxel, nodes = state["lattice"]
+        field = RadianceField(
+            Lattice(tuple(origin), voxel, tuple(nodes)), self.field.opacity, self.field.network
+        )
+        field = field.to(self.field.density)
+        field.load_state_dict(state["field"])
+        self._begin(field)
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.generator.set_state(state["generator"])
+        self.order, self.losses = list(state["order"]), list(state["losses"])
+        return state["iteration"]
+
+
+def _around(hull: Hull, settings: RadianceConfig) -> Lattice:
+    """The coarsest lattice, with the box of a visual hull in the middle of it."""
+    volume = float(hull.occupied.sum()) * hull.voxel**3
+    last = (volume / settings.particles) ** (1 / 3) / settings.spacing
+    voxel = settings.voxel or 2 ** len(settings.halvings) * last
+    found = hull.occupied.nonzero()
+    low, high = (hull.origin + hull.voxel * corner for corner in (found.amin(0), found.amax(0) + 1))
+    cells = ((high - low) / voxel).ceil().clamp(min=1)
+    origin = (low + high - voxel * cells) / 2
+    return Lattice(tuple(origin.tolist()), voxel, tuple(int(n) + 1 for n in cells.tolist()))
+
+
+def _meeting(lattice: Lattice, origins: Tensor, directions: Tensor) -> Tensor:
+    """Indices of the rays that meet a lattice's box."""
+    low, high = (torch.tensor(corner).to(origins) for corner in (lattice.origin, lattice.far))
+    one, other = (low - origins) / directions, (high - origins) / directions
+    first, last = torch.minimum(one, other).amax(1), torch.maximum(one, other).amin(1)
+    return (last > first.clamp(min=0)).nonzero()[:, 0]
+
+
+def _check(images: Tensor, cameras: Cameras, held_out: int) -> None:
+    expected = (len(cameras), cameras.height, cameras.width, 4)
+    if tuple(images.shape) != expected:
+        raise InputError(f"images of shape {tuple(images.shape)} do not fit the cameras: expected {expected}")
+    if len(cameras) <= max(1, held_out // 2):
+        raise InputError(
+            f"radiance field: {len(cameras)} views leave none to measure with; lower radiance.held_out ({held_out})"
+        )
+    check_masks(images[..., 3])

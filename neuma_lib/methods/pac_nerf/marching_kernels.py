@@ -1,0 +1,141 @@
+"""Kernels of :mod:`neuma_lib.methods.pac_nerf.rendering`: selection of the points of a ray, and compositing."""
+
+# No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
+import functools
+from types import SimpleNamespace
+
+import torch
+import warp as wp
+
+from neuma_lib.device import start_warp
+from neuma_lib.methods.pac_nerf.lattice_kernels import lattice_functions, lattice_types
+
+start_warp()
+
+
+@functools.cache
+def kernels(dtype: torch.dtype) -> SimpleNamespace:
+    """Kernels `march`, `composite` and `composite_adjoint` over rays."""
+    t, functions = lattice_types(dtype), lattice_functions(dtype)
+    real, vec3, Place = t.real, t.vec3, t.Place
+    cell, within, share, row = functions.cell, functions.within, functions.share, functions.row
+    module = wp.get_module(f"{__name__}.{str(dtype).removeprefix('torch.')}")
+    kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
+
+    @wp.func(module=module)
+    def density_at(place: Place, density: wp.array(dtype=real), x: vec3):
+        c = cell(place, x)
+        f = within(place, x, c)
+        total = real(0.0)
+        for i in range(2):
+            for j in range(2):
+                n, w = row(place, c, i, j), share(f[0], i) * share(f[1], j)
+                total += w * ((real(1.0) - f[2]) * density[n] + f[2] * density[n + 1])
+        return total
+
+    @wp.func(module=module)
+    def opacity(density: real, interval: real, shift: real):
+        """1 - (1 + exp(d + shift))^-interval, without overflow."""
+        s = density + shift
+        softplus = wp.max(s, real(0.0)) + wp.log(real(1.0) + wp.exp(-wp.abs(s)))
+        return real(1.0) - wp.exp(-interval * softplus)
+
+    @kernel
+    def march(
+        place: Place,
+        near: real,
+        step: real,
+        interval: real,
+        shift: real,
+        least: real,
+        end: real,
+        fill: wp.int32,
+        density: wp.array(dtype=real),
+        origins: wp.array(dtype=vec3),
+        directions: wp.array(dtype=vec3),
+        starts: wp.array(dtype=wp.int32),
+        points: wp.array(dtype=vec3),
+        rays: wp.array(dtype=wp.int64),
+        counts: wp.array(dtype=wp.int32),
+    ):
+        """Select points of a ray with a weight T alpha above `least`, until the transmittance T is below `end`.
+
+        Counts the points, or writes them from `starts` on if `fill` is 1. Both passes select the same points.
+        """
+        r = wp.tid()
+        o, d = origins[r], directions[r]
+        first, last = near, real(1.0e30)
+        for a in range(3):
+            low, high = place.origin[a], place.origin[a] + real(place.nodes[a] - 1) / place.inv_voxel
+            if wp.abs(d[a]) > real(1.0e-12):
+                one, other = (low - o[a]) / d[a], (high - o[a]) / d[a]
+                first, last = wp.max(first, wp.min(one, other)), wp.min(last, wp.max(one, other))
+            elif o[a] < low or o[a] > high:
+                last = real(-1.0)
+        transmitted = real(1.0)
+        count, i = wp.int32(0), wp.int32(0)
+        s = first
+        while s <= last and transmitted >= end:
+            x = o + s * d
+            alpha = opacity(density_at(place, density, x), interval, shift)
+            if transmitted * alpha > least:
+                if fill == 1:
+                    points[starts[r] + count] = x
+                    rays[starts[r] + count] = wp.int64(r)
+                count += 1
+                transmitted *= real(1.0) - alpha
+            i += 1
+            s = first + real(i) * step
+        if fill == 0:
+            counts[r] = count
+
+    @kernel
+    def composite(
+        background: vec3,
+        starts: wp.array(dtype=wp.int32),
+        alphas: wp.array(dtype=real),
+        colours: wp.array(dtype=vec3),
+        reaching: wp.array(dtype=real),
+        pictures: wp.array(dtype=vec3),
+        passed: wp.array(dtype=real),
+    ):
+        """C = sum_i T_i alpha_i c_i + T background with T_i = prod_{j < i} (1 - alpha_j), stored in `reaching`."""
+        r = wp.tid()
+        transmitted = real(1.0)
+        light = vec3()
+        for i in range(starts[r], starts[r + 1]):
+            reaching[i] = transmitted
+            light += (transmitted * alphas[i]) * colours[i]
+            transmitted *= real(1.0) - alphas[i]
+        pictures[r] = light + transmitted * background
+        passed[r] = transmitted
+
+    @kernel
+    def composite_adjoint(
+        background: vec3,
+        starts: wp.array(dtype=wp.int32),
+        alphas: wp.array(dtype=real),
+        colours: wp.array(dtype=vec3),
+        reaching: wp.array(dtype=real),
+        grad_pictures: wp.array(dtype=vec3),
+        grad_passed: wp.array(dtype=real),
+        grad_alphas: wp.array(dtype=real),
+        grad_colours: wp.array(dtype=vec3),
+    ):
+        """Back to front, with the colour B and the transmittance P behind point i, which avoids division by 1 - alpha.
+
+        dC/dalpha_i = T_i (c_i - B),  dT/dalpha_i = -T_i P,  dC/dc_i = T_i alpha_i.
+        """
+        r = wp.tid()
+        g, g_passed = grad_pictures[r], grad_passed[r]
+        behind, passing = background, real(1.0)
+        count = starts[r + 1] - starts[r]
+        for k in range(count):
+            i = starts[r + 1] - 1 - k
+            a, c = alphas[i], colours[i]
+            grad_alphas[i] = reaching[i] * (wp.dot(g, c - behind) - g_passed * passing)
+            grad_colours[i] = (reaching[i] * a) * g
+            behind = a * c + (real(1.0) - a) * behind
+            passing *= real(1.0) - a
+
+    return SimpleNamespace(march=march, composite=composite, composite_adjoint=composite_adjoint)

@@ -1,0 +1,33 @@
+"""The prior as it is (NCLaw): nothing is learned from the video."""
+
+from __future__ import annotations
+
+from neuma_lib.config.motion import MotionOptions, WithPrior
+from neuma_lib.methods.base import Case, Files, Method, ModelSource, Preset
+
+
+class PriorOptions(MotionOptions, WithPrior):
+    """Options of the prior."""
+
+
+class Prior(Method):
+    name = "prior"
+    Options = PriorOptions
+    presets = {"nclaw": Preset("NCLaw")}
+
+    def model_inputs(self, case: Case) -> Files:
+        return {"prior": case.prior_file()}
+
+    def learns_from_video(self, case: Case) -> bool:
+        return False
+
+    def load(self, inputs, options, dt):
+        from neuma_lib.io.laws import load_law
+        from neuma_lib.methods.model import LawOnGrid
+
+        return LawOnGrid(load_law(inputs["prior"], dt=dt))
+
+
+def prior_source(path: str, dt: float) -> ModelSource:
+    """A law that is complete in one file: a prior, or a law to pass on."""
+    return ModelSource(Prior.__module__, {}, {"prior": path}, dt)

@@ -1,0 +1,230 @@
+"""Fitting a network of springs to a video (Spring-Gaus, Zhong et al. 2024: the stage "dynamic").
+
+Start, images and loss are those of all methods here. As published, an optimiser step is made at each frame with the
+gradient of the substeps since the frame before it, and the state is taken as given from there on (`truncated`). Beside
+it stands one step for the whole video, by the gradient through all substeps.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from statistics import median
+
+import torch
+from torch import Tensor
+
+from neuma_lib.config.material import MaterialConfig
+from neuma_lib.errors import NonFiniteError
+from neuma_lib.fitting.material import PixelLoss, frame_weights
+from neuma_lib.fitting.training_loop import TrainingLoop
+from neuma_lib.io.checkpoint import Checkpoint
+from neuma_lib.methods.spring_gaus.body import SpringBody
+from neuma_lib.methods.spring_gaus.network import Springs
+from neuma_lib.methods.spring_gaus.options import SpringsConfig
+from neuma_lib.methods.spring_gaus.rollout import SpringModel, spring_rollout
+from neuma_lib.sim.state import State
+
+
+@dataclass
+class SpringHistory:
+    """Curves of a fit, one entry an iteration: state before its optimiser steps.
+
+    Attributes:
+        loss: mean squared error over all frames.
+        modulus: Young's modulus of the network [Pa].
+        softness: the parameter of the soft vector.
+        friction, resistance, gap: as `Springs.values` gives them.
+        substeps: parts of a time step.
+        lr_scale: factor on the learning rate after recoveries.
+        recoveries: returns to the best state.
+        seconds: wall time [s].
+    """
+
+    loss: list[float] = field(default_factory=list)
+    modulus: list[float] = field(default_factory=list)
+    softness: list[float] = field(default_factory=list)
+    friction: list[float] = field(default_factory=list)
+    resistance: list[float] = field(default_factory=list)
+    gap: list[float] = field(default_factory=list)
+    substeps: list[int] = field(default_factory=list)
+    lr_scale: list[float] = field(default_factory=list)
+    recoveries: list[dict] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+
+
+@dataclass
+class FittedSprings:
+    """Result of `fit_springs`: the springs at their lowest loss, and how they got there."""
+
+    springs: Springs
+    substeps: int
+    history: SpringHistory
+    best_loss: float
+    best_iteration: int
+    stable: bool
+
+    def summary(self, density: float) -> str:
+        """One line for people; density [kg/m^3]."""
+        if not self.history.loss:
+            return f"nothing fitted, loss {self.best_loss:.3e}"
+        note = "" if self.stable else "; UNSTABLE: best state kept"
+        _, friction, gap = self.springs.shared()
+        return (
+            f"loss {self.history.loss[0]:.3e} -> {self.best_loss:.3e} at iteration {self.best_iteration}, E "
+            f"{self.history.modulus[0]:.3g} -> {self.springs.modulus(density):.3g} Pa, friction {friction:.2f}, "
+            f"gap {1e3 * gap:.1f} mm, {self.substeps} substeps, {median(self.history.seconds):.3g} s an iteration{note}"
+        )
+
+
+def fit_springs(
+    model: SpringModel,
+    body: SpringBody,
+    springs: Springs,
+    start: State,
+    loss: PixelLoss,
+    settings: MaterialConfig,
+    how: SpringsConfig,
+    *,
+    checkpoint: Checkpoint | None = None,
+    progress: Callable[[int, int, float], None] | None = None,
+    log: Callable[[str], None] = print,
+) -> FittedSprings:
+    """Optimise the parameters of the springs so that the particles that follow them match the video.
+
+    Args:
+        model: time step, gravity and box.
+        body: particles and network.
+        springs: the network with its parameters, which are optimised in place.
+        start: the particles with their initial motion.
+        loss: of the particles' states at the frames.
+        settings: iterations, rate schedule, clipping, frame weights, recoveries.
+        how: mode, learning rate, and what is learned.
+        checkpoint: where to keep the state of the loop, so that a killed run goes on; None keeps none.
+        progress: called with (iteration, iterations, loss).
+        log: receives a line for every halving of the step and every recovery.
+
+    Raises:
+        NonFiniteError: already the first rollout runs away.
+    """
+    loop = _Loop(model, body, springs, start, loss, settings, how, log)
+    loop.run(checkpoint, progress)
+    best = loop.best
+    springs.load_state_dict(best["springs"])
+    return FittedSprings(
+        springs, best["substeps"], loop.history, best["loss"], best["iteration"], stable=not loop.ended
+    )
+
+
+class _Loop(TrainingLoop):
+    """The state of the fit, and one pass over the video."""
+
+    RETURN = "back to iteration"
+
+    def __init__(self, model, body, springs, start, loss, settings, how, log):
+        self.model, self.body, self.springs, self.loss = model, body, springs, loss
+        self.settings, self.how, self.log = settings, how, log
+        self.start = body.start(start)
+        self.density = float(start.mass.sum() / start.vol0.sum())
+        later = [k for k, n in enumerate(loss.frames) if n > 0]
+        self.single = [loss.select([k]) for k in later] if how.truncated else []
+        springs.log_damping.requires_grad_(how.learn_resistance)
+        springs.gap.requires_grad_(how.learn_gap)
+        rates = {"log_damping": 0.1 * how.lr_springs, "gap": 0.03 * how.lr_springs}
+        groups = [
+            {"params": p, "lr": rate, "base_lr": rate}
+            for name, p in springs.named_parameters()
+            if p.requires_grad and (rate := rates.get(name, how.lr_springs))
+        ]
+        self.optimizer = torch.optim.Adam(groups, betas=settings.betas)
+        self._begin(SpringHistory())
+
+    def advance(self) -> None:
+        """Judge the springs, then one pass of optimiser steps; or a return to the best state."""
+        started = time.perf_counter()
+        try:
+            with torch.set_grad_enabled(not self.how.truncated):
+                losses = self._frame_losses()
+            value = float(losses.detach().mean())
+            self.best = self._better_state(value)
+            self._note(value)
+            self.first_loss = self.first_loss or max(value, 1e-30)
+            self._set_rates()
+            if self.how.truncated:
+                self._frame_by_frame()
+            else:
+                weights = frame_weights(self.iteration, len(losses), self.settings).to(losses)
+                self._step((weights * losses).sum() / weights.sum())
+        except NonFiniteError as error:
+            self._recover(error)
+        else:
+            self.history.seconds.append(time.perf_counter() - started)
+            self.iteration += 1
+
+    def _mean_loss(self) -> float:
+        return float(self._frame_losses().mean())
+
+    def _frame_losses(self) -> Tensor:
+        """Losses of all frames, shape (T,)."""
+        x, v, self.model = spring_rollout(
+            self.model, self.springs, *self.start, self.loss.steps, log=self.log
+        )
+        return self.loss(self.body.path(self.loss.steps, x, v))
+
+    def _frame_by_frame(self) -> None:
+        """An optimiser step for every frame, by the gradient of the substeps since the frame before it.
+
+        Where exposures overlap, those since the last state before the frame's own.
+        """
+        known = [(0, *self.start)]
+        for loss in self.single:
+            reached, x, v = next(state for state in reversed(known) if state[0] <= loss.steps[0])
+            xs, vs, self.model = spring_rollout(
+                self.model, self.springs, x, v, loss.steps, reached, log=self.log
+            )
+            self._step(loss(self.body.path(loss.steps, xs, vs)).sum())
+            known += zip(loss.steps, xs.detach(), vs.detach(), strict=True)
+
+    def _step(self, loss: Tensor) -> None:
+        """One optimiser step down the gradient of a loss, which is divided by the first one before it is clipped."""
+        self.optimizer.zero_grad(set_to_none=True)
+        (loss / self.first_loss).backward()
+        parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
+        norm = torch.nn.utils.clip_grad_norm_(parameters, self.settings.gradient_clip)
+        if not math.isfinite(norm):
+            raise NonFiniteError("springs", f"the gradient is not finite at iteration {self.iteration}")
+        self.optimizer.step()
+
+    def _set_rates(self) -> None:
+        s = self.settings
+        cosine = (1 + math.cos(math.pi * self.iteration / max(1, s.iterations))) / 2
+        schedule = s.lr_floor + (1 - s.lr_floor) * cosine
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["base_lr"] * self.lr_scale * schedule
+
+    def _note(self, value: float) -> None:
+        history = self.history
+        history.loss.append(value)
+        history.modulus.append(self.springs.modulus(self.density))
+        history.softness.append(float(self.springs.softness.detach()))
+        for curve, now in zip(
+            (history.resistance, history.friction, history.gap), self.springs.shared(), strict=True
+        ):
+            curve.append(now)
+        history.substeps.append(self.model.substeps)
+        history.lr_scale.append(self.lr_scale)
+
+    def _snapshot(self) -> dict:
+        return {
+            "springs": copy.deepcopy(self.springs.state_dict()),
+            "optimizer": copy.deepcopy(self.optimizer.state_dict()),
+            "substeps": self.model.substeps,
+        }
+
+    def _restore(self, state: dict) -> None:
+        self.springs.load_state_dict(state["springs"])
+        self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
+        self.model = replace(self.model, substeps=state["substeps"])

@@ -1,0 +1,122 @@
+"""An analytic law and a correction by small networks that keep the structure of a material."""
+
+from __future__ import annotations
+
+from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.motion import WithPrior
+from neuma_lib.config.structured import StructuredConfig
+from neuma_lib.errors import InputError
+from neuma_lib.methods.base import Case, Files, Method, Preset
+from neuma_lib.methods.neuma import training_inputs
+
+IDENTIFIED = "identified"
+
+
+class StructuredOptions(MaterialConfig, StructuredConfig, WithPrior):
+    """Options of the training, of the correction, and the prior whose analytic law is corrected."""
+
+
+class Structured(Method):
+    name = "structured"
+    Options = StructuredOptions
+    sections = ("material", "structured")
+    product = "adaptor.safetensors"
+    presets = {
+        "neuma_structured": Preset(
+            "NeuMA, structured",
+            {
+                "prior": IDENTIFIED,
+                "rank": None,
+                "covariance_from": "total",
+                "gaussian_motion": "affine",
+                "start": "identified",
+                "iterations": 16,
+                "lr_elastic": 0.02,
+                "lr_plastic": 0.04,
+            },
+            note="The law and the throw of the row Constants, corrected by small networks that keep it isotropic, its "
+            "stress symmetric and zero at rest; a part of it that gains nothing on held-out frames stays as it is.",
+        )
+    }
+
+    def fit_inputs(self, case: Case) -> Files:
+        base = {"identified": case.result(case.identified())} if case.prior == IDENTIFIED else {}
+        return training_inputs(case) | base
+
+    def fit_options(self, case: Case) -> dict:
+        return {"base": self._base(case), **super().fit_options(case)}
+
+    def model_inputs(self, case: Case) -> Files:
+        return {"adaptor": case.product()}
+
+    def seeds(self, case: Case) -> tuple[str, ...]:
+        return (*super().seeds(case), "adaptor")  # of the first layers
+
+    def fit(self, inputs, options, problem, run):
+        from neuma_lib.fitting.structured_fit import rival_bases, train_structured
+        from neuma_lib.io.files import read_json
+        from neuma_lib.io.laws import save_adaptor
+        from neuma_lib.mechanics.structured import structured_law
+        from neuma_lib.methods.training import Training
+
+        options = dict(options)
+        base = options.pop("base")
+        settings = StructuredOptions(**options)
+        bases = [base]
+        if not base:
+            identified = read_json(inputs["identified"])
+            bases = [identified["law"], *rival_bases(identified, settings.rivals)]
+        laws = [
+            structured_law({**each, "form": settings.form}, problem.simulation["dt"], seed=settings.seed)
+            for each in bases
+        ]
+        laws = [law.to(run.device) for law in laws]
+        for law in laws:
+            law.attach_adaptor(settings.rank, settings.alpha, settings.seed)
+        training = Training(inputs, options, settings, problem, run, {"base": base})
+        trained, chosen = train_structured(
+            *training.problem(laws[0]), settings, rivals=laws[1:], **training.options()
+        )
+        run.log(chosen.summary())
+        training.write_history(trained, chosen.as_dict())
+        about = {"settings": options, **training.report(trained)}
+        save_adaptor(run.product, trained.law, settings.rank, settings.alpha, about)
+        training.finish(trained)
+
+    def load(self, inputs, options, dt):
+        from neuma_lib.io.laws import load_law
+        from neuma_lib.io.weights import read_weights
+        from neuma_lib.methods.model import LawOnGrid
+
+        stable = read_weights(inputs["adaptor"])[1]["stable"]
+        return LawOnGrid(load_law(None, inputs["adaptor"], dt), stable=stable)
+
+    def uncertainty_inputs(self, case: Case) -> Files:
+        if case.prior != IDENTIFIED:
+            return {}
+        return {"identified": case.result(case.identified()), "rollout": case.rollout()}
+
+    def draws(self, inputs, law, F, uncertainty, **drawn):
+        import torch
+
+        from neuma_lib.evaluation.bands import corrected_draws
+        from neuma_lib.io.files import read_json
+        from neuma_lib.io.hdf5 import read_arrays
+
+        if not inputs or law.elasticity.form != "stretch":
+            return []
+        if F is None:
+            F = torch.from_numpy(read_arrays(inputs["rollout"], required=("F",), only=("F",))[0]["F"])
+        return corrected_draws(law, read_json(inputs["identified"])["best"], F, **uncertainty, **drawn)
+
+    def _base(self, case: Case) -> dict | None:
+        """The analytic law of the prior, or None for the law identified in the video."""
+        if case.prior == IDENTIFIED:
+            return None
+        if case.prior_law is None:
+            raise InputError(
+                f"{case.name} on {case.scene}",
+                f"the prior {case.prior} is a file, and only an analytic law can be corrected",
+                f"Use +prior={IDENTIFIED} or one of priors.laws, or the method neuma",
+            )
+        return case.prior_law

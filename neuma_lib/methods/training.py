@@ -1,0 +1,110 @@
+"""What the trainings of `neuma` and `structured` share: bodies, starts and losses of all videos, and their report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+import torch
+
+from neuma_lib.config.material import MaterialConfig
+from neuma_lib.coupling.reconstruction import Reconstruction
+from neuma_lib.fitting.material import ParticleLoss, PixelLoss
+from neuma_lib.io.files import listed, write_json
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.images import load_videos
+from neuma_lib.io.particles import load_body, with_motion
+from neuma_lib.mechanics.adaptor import AdaptableLaw
+from neuma_lib.methods.base import Files, FitRun, Problem
+from neuma_lib.sim.model import MPMModel
+
+
+class Training:
+    """A training on all videos of a scene.
+
+    Args:
+        inputs: files of `neuma.training_inputs`, and those of the method.
+        options: as the method got them.
+        settings: the same, validated.
+        stamp: further settings that a checkpoint must agree with.
+    """
+
+    def __init__(
+        self,
+        inputs: Files,
+        options: Mapping[str, Any],
+        settings: MaterialConfig,
+        problem: Problem,
+        run: FitRun,
+        stamp: Mapping[str, Any] | None = None,
+    ):
+        self.settings, self.run, self._problem = settings, run, problem
+        parts = zip(*(listed(inputs[name]) for name in ("particles", "binding", "gaussians")), strict=True)
+        bodies = [
+            load_body(*files, density, settings.carrier, settings.gaussian_motion).to(
+                torch.float32, run.device
+            )
+            for files, density in zip(parts, problem.densities, strict=True)
+        ]
+        self.starts = [
+            with_motion(body, f) for body, f in zip(bodies, listed(inputs["velocity"]), strict=True)
+        ]
+        if settings.supervision == "particles":
+            self.losses = [particle_loss(file, run.device) for file in listed(inputs["truth"])]
+        else:
+            videos = zip(bodies, listed(inputs["transforms"]), strict=True)
+            self.losses = [pixel_loss(body, file, settings, problem.filming) for body, file in videos]
+        files = {
+            f"{name} {k}": file for name, found in inputs.items() for k, file in enumerate(listed(found))
+        }
+        known = {
+            "simulation": problem.simulation,
+            "filming": problem.filming,
+            "densities": problem.densities,
+            **options,
+        }
+        self._checkpoint = run.checkpoint(known | dict(stamp or {}), files)
+
+    def problem(self, law: AdaptableLaw) -> tuple:
+        """Positional arguments of `train_material`."""
+        return MPMModel(**self._problem.simulation), law, self.starts[0], self.losses[0], self.settings
+
+    def options(self) -> dict[str, Any]:
+        """Keyword arguments of `train_material`."""
+        others = list(zip(self.starts[1:], self.losses[1:], strict=True))
+        return {
+            "checkpoint": self._checkpoint,
+            "progress": self.run.progress,
+            "log": self.run.log,
+            "further": others,
+        }
+
+    def report(self, trained) -> dict[str, Any]:
+        return {name: getattr(trained, name) for name in ("best_loss", "best_iteration", "stable")}
+
+    def write_history(self, trained, extra: Mapping[str, Any] | None = None) -> None:
+        """Write the learning curves. Times are left out: equal settings give equal files."""
+        curves = asdict(trained.history)
+        del curves["seconds"]
+        write_json(self.run.history, {**self.report(trained), **(extra or {}), **curves})
+
+    def finish(self, trained) -> None:
+        self._checkpoint.remove()
+        self.run.log(trained.summary())
+
+
+def particle_loss(truth: str, device: torch.device) -> ParticleLoss:
+    """The loss of a ground truth."""
+    arrays, _ = read_arrays(truth, required=("x", "frames"), only=("x", "frames"))
+    return ParticleLoss(tuple(arrays["frames"].tolist()), torch.from_numpy(arrays["x"]).to(device))
+
+
+def pixel_loss(
+    body: Reconstruction, transforms: str, settings: MaterialConfig, filming: Mapping[str, Any]
+) -> PixelLoss:
+    """The loss of a video."""
+    videos = load_videos(transforms, settings.views, **filming)
+    videos = [video.to(body.x0.dtype, body.x0.device) for video in videos]
+    total = settings.covariance_from == "total"
+    return PixelLoss(body, videos, settings.covariance_gradient, total=total, compare=settings.compare)

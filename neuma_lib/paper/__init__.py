@@ -1,0 +1,1 @@
+"""Tables, claims and figures of the paper. Other rooms but the viewer do not need them."""

@@ -1,0 +1,65 @@
+"""Splats that were made elsewhere, by an image-to-3D model or from photographs, under laws that were learned from
+videos of other objects: particles fill the surface that renders of the splat show, and carry its Gaussians. Left: the
+splat where it starts. Paper: fig:i23d.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from neuma_lib.evaluation.plotting import rendering, style
+from neuma_lib.io.files import read_json
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.particles import load_body, load_motion
+from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images
+
+LEFT, TOP = 1.05, 0.2
+DENSITY = 1000.0
+"""Of all bodies [kg/m^3]: it does not show in pictures."""
+TALLEST, WIDEST = 1.5, 0.6
+"""Limits of a picture's height relative to its width."""
+
+
+def data(inputs, params, say) -> ImageGrid:
+    """Rows are splats, each under all laws one after the other; columns are times.
+
+    Numbers: ``laws``, the count of rows of a splat; ``diverged``, rows whose prediction broke off.
+    """
+    laws, splats = len(params.laws), list(params.splats)
+    files = zip(inputs.particles, inputs.binding, inputs.gaussians, strict=True)
+    bodies = [load_body(*of_body, DENSITY, gaussian_motion="affine") for of_body in files]
+    paths = [read_arrays(file, required=("frames",), only=("frames",)) for file in inputs.rollouts]
+    motions = []
+    for file, (arrays, _) in zip(inputs.rollouts, paths, strict=True):
+        shown = rendering.evenly(params.shown, len(arrays["frames"]))
+        motions.append([torch.as_tensor(state[shown]) for state in load_motion(file)])
+    around = [rendering.seen_around(bodies[k // laws], *motion) for k, motion in enumerate(motions)]
+    clouds = [np.concatenate(around[k : k + laws]) for k in range(0, len(around), laws)]
+    wide, high = np.max([np.ptp(cloud, axis=0)[:2] for cloud in clouds], axis=0)
+    width, height = params.size, round(params.size * float(np.clip(high / wide, WIDEST, TALLEST)))
+    pictures, times = [], []
+    for k, (arrays, attributes) in enumerate(paths):
+        body, cameras = bodies[k // laws], rendering.frontal(clouds[k // laws], width, height)
+        shown = rendering.evenly(params.shown, len(arrays["frames"]))
+        pictures.append(rendering.renders(body, cameras, *motions[k]))
+        times = times or rendering.milliseconds(arrays["frames"][shown], attributes["dt"])
+    diverged = [k for k, file in enumerate(inputs.reports) if read_json(file)["diverged"]]
+    say(f"{len(splats)} splats under {laws} laws" + (f"; {len(diverged)} broke off" if diverged else ""))
+    titles = [f"{splat}, {law}" for splat in splats for law in params.laws]
+    groups = [np.stack(pictures[k : k + laws]) for k in range(0, len(pictures), laws)]
+    numbers = {"laws": laws, "diverged": diverged}
+    return ImageGrid(np.concatenate(rendering.cropped(groups)), tuple(titles), tuple(times), numbers)
+
+
+@style.styled
+def draw(grid: ImageGrid) -> Figure:
+    """A row a splat and law; predictions that broke off are marked."""
+    width = style.PAGE - LEFT - 0.02
+    titles = [
+        title + (", broke off" if k in grid.numbers["diverged"] else "") for k, title in enumerate(grid.rows)
+    ]
+    figure = style.new_canvas(style.PAGE, TOP + len(titles) * (grid.height(width) + GAP) + 0.03)
+    draw_images(figure, grid.images, LEFT, TOP, width, titles, grid.columns)
+    return figure

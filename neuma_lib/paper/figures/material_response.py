@@ -1,0 +1,134 @@
+"""Tests of single material points: what the laws themselves say, without grid or body. Top: axial Kirchhoff stress of
+the elastic law over the axial stretch, the sides free of traction. Middle: shear stress of the elastic law over simple
+shear, compressed to the 5th percentile of the observed volume ratios J. Bottom: the same shear at a constant rate of 20
+per second with elastic law and return map step by step, as in the simulation: where the curve bends, the material
+yields or flows. Blue ground: the range of elastic stretches, shears and shear stresses that the true law goes through
+on the reconstruction (99 % of them). Ranges are marginal: not every combination inside them was visited. Coloured
+bands: 95 % of the laws that the video leaves possible, by the constants' covariance and, around a correction, a process
+that is as free as the correction where the video is silent; of laws without such an account, the range of their chains,
+if there are several. The video determines motion, that is elastic law and return map together; where the two can trade
+places, each alone may differ from the truth. Laws far off are cut where they leave the panel. Not in the paper.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from neuma_lib.evaluation.bands import envelope
+from neuma_lib.evaluation.plotting import style
+from neuma_lib.evaluation.response import inside
+from neuma_lib.evaluation.stress_curves import VISITED
+from neuma_lib.io.files import read_json
+
+TESTS = {
+    "uniaxial": ("axial stretch", "axial stress"),
+    "shear": ("elastic shear", "shear stress"),
+    "yield": ("total shear", "shear stress"),
+}
+HEADROOM = 0.6
+"""How far the curves of compared laws may go beyond those of the truth, relative to the truth's; then they are cut."""
+
+
+def data(inputs, params, say) -> dict:
+    """Titles of the laws; of every scene the tests of `TESTS`: ``x``, ``visited`` (low, high), ``by_stress``, ``true``
+    [Pa] and ``laws``: of each its ``stress`` [Pa], ``title``, and ``band``, if there is one, with ``x``, ``low``,
+    ``high``, and ``inside``, the part of its visited points at which the truth lies in it.
+    """
+    files = iter(inputs.responses)
+    runs = [(*cell, [read_json(next(files)) for _ in range(chains)]) for *cell, chains in params.cells]
+    found: dict = {}
+    for scene, method, chains in runs:
+        for test in TESTS:
+            of_test = [chain[test] for chain in chains]
+            first = of_test[0]
+            shared = {key: first[key] for key in ("x", "visited", "by_stress", "true")}
+            entry = found.setdefault(scene, {}).setdefault(test, {**shared, "laws": {}})
+            entry["laws"][method] = {"stress": first["stress"], "band": _band(of_test)}
+    gathered = {"titles": params.titles, "scenes": found}
+    for method, parts in covered(gathered).items():
+        whole = sum(part == 1 for values in parts.values() for part in values)
+        total = sum(map(len, parts.values()))
+        say(f"{params.titles[method]}: the truth is inside {whole} of {total} bands everywhere")
+    return gathered
+
+
+def covered(data: Mapping) -> dict[str, dict[str, list[float]]]:
+    """Of each law with bands and each scene, the parts of visited points of its tests at which the truth is inside."""
+    found: dict[str, dict[str, list[float]]] = {}
+    for scene, tests in data["scenes"].items():
+        for test in tests.values():
+            for method, law in test["laws"].items():
+                if law["band"] and law["band"]["inside"] is not None:
+                    found.setdefault(method, {}).setdefault(scene, []).append(law["band"]["inside"])
+    return found
+
+
+def _band(chains: Sequence[Mapping]) -> dict | None:
+    """The band of all chains of a law in a test; that of their curves where they have none."""
+    if all("band" in chain for chain in chains):
+        x, ends = chains[0]["band"]["x"], [(chain["band"]["low"], chain["band"]["high"]) for chain in chains]
+    elif len(chains) > 1:
+        x, ends = chains[0]["x"], [(chain["stress"], chain["stress"]) for chain in chains]
+    else:
+        return None
+    low, high = envelope(ends)
+    found = {"x": x, "low": low.tolist(), "high": high.tolist()}
+    return {**found, "inside": inside({**chains[0], "band": found})}
+
+
+@style.styled
+def draw(data: Mapping) -> Figure:
+    """A column a scene and a row a test."""
+    scenes = data["scenes"]
+    figure = style.new_figure(style.PAGE if len(scenes) > 2 else style.COLUMN, 0.35 + 1.25 * len(TESTS))
+    panels = figure.subplots(len(TESTS), len(scenes), squeeze=False)
+    for column, (scene, tests) in zip(panels.T, scenes.items()):
+        column[0].set_title(scene)
+        for axes, test in zip(column, TESTS):
+            _curves(axes, test, tests[test], data["titles"])
+    for row, (xlabel, ylabel) in zip(panels, TESTS.values()):
+        for axes in row:
+            axes.set_xlabel(xlabel)
+        row[0].set_ylabel(f"{ylabel} [kPa]")
+    figure.align_ylabels(panels[:, 0])
+    style.legend_above(figure, panels[0, 0], 6 if len(scenes) > 2 else 2)
+    return figure
+
+
+def _curves(axes, test: str, values: Mapping, titles: Mapping[str, str]) -> None:
+    x, true = np.asarray(values["x"]), 1e-3 * np.asarray(values["true"])
+    low, high = values["visited"]
+    span = axes.axhspan if values["by_stress"] else axes.axvspan
+    scale = 1e-3 if values["by_stress"] else 1.0
+    span(scale * low, scale * high, color=VISITED, linewidth=0, label="visited in the video")
+    axes.plot(x, true, color=style.GREY, linewidth=2.4, label="true law")
+    shown = [true]
+    for law, entry in values["laws"].items():
+        line = style.look(law).line
+        if entry["band"]:
+            ends = [1e-3 * np.asarray(entry["band"][key]) for key in ("low", "high")]
+            axes.fill_between(entry["band"]["x"], *ends, color=line["color"], alpha=0.18, linewidth=0)
+        shown.append(1e-3 * np.asarray(entry["stress"]))
+        axes.plot(x, shown[-1], **line, label=titles[law])
+    room = HEADROOM * (np.ptp(true) or 1.0)
+    ends = max(np.min(shown), true.min() - room), min(np.max(shown), true.max() + room)
+    margin = 0.08 * (ends[1] - ends[0] or 1.0)
+    axes.set(xlim=(x.min(), x.max()), ylim=(ends[0] - margin, ends[1] + margin))
+    axes.axhline(0, color=style.GREY, linewidth=0.4, zorder=0.5)
+    axes.set_xticks(_ticks(test, x))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_major_locator(MaxNLocator(4))
+
+
+def _ticks(test: str, x: np.ndarray) -> list[float]:
+    """Few and round: panels are narrow."""
+    if test == "uniaxial":
+        return [float(f"{1 + 0.6 * (x.min() - 1):.2g}"), 1.0]
+    if test == "shear":
+        end = float(f"{0.6 * x.max():.1g}")
+        return [-end, 0.0, end] if len(f"{end:g}") <= 4 else [-end, end]
+    return [0.0, float(f"{0.5 * x.max():.2g}"), float(f"{x.max():.2g}")]

@@ -1,0 +1,45 @@
+"""Simulated particles of one scene under all methods, against the particles of the ground truth. Times run to the
+right; colours are those of the methods in all figures. Paper: fig:particles_app.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from neuma_lib.evaluation.plotting import rendering, style
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images
+
+LEFT, TOP = 0.92, 0.18
+
+
+def data(inputs, params, say) -> ImageGrid:
+    """A row for the truth and each method, a column a time."""
+    truth, _ = read_arrays(inputs.truth, required=("x", "vol0"), only=("x", "vol0", "frames"))
+    simulated, _ = read_arrays(inputs.particles, required=("vol0",), only=("vol0",))
+    shown = rendering.evenly(params.shown, len(truth["x"]))
+    paths = {"truth": truth["x"][shown]}
+    for method, file in zip(params.titles, inputs.rollouts, strict=True):
+        paths[method] = read_arrays(file, required=("x",), only=("x",))[0]["x"][shown]
+    cameras = rendering.frontal(
+        np.concatenate([x.reshape(-1, 3) for x in paths.values()]), params.size, params.size
+    )
+    rows = []
+    for method, x in paths.items():
+        color = style.TRUE_PARTICLES if method == "truth" else style.look(method).color
+        vol0 = truth["vol0"] if method == "truth" else simulated["vol0"]
+        rows.append(rendering.particle_pictures(x, color, rendering.sphere_radius(vol0), cameras))
+    (images,) = rendering.cropped([np.stack(rows)])
+    say(f"{images.shape[0]} x {images.shape[1]} pictures")
+    columns = tuple(rendering.milliseconds(truth["frames"][shown], params.dt))
+    return ImageGrid(images, ("Truth", *params.titles.values()), columns)
+
+
+@style.styled
+def draw(grid: ImageGrid) -> Figure:
+    """A row a method and a column a time."""
+    width = style.PAGE - LEFT - 0.02
+    figure = style.new_canvas(style.PAGE, TOP + len(grid.rows) * (grid.height(width) + GAP) + 0.03)
+    draw_images(figure, grid.images, LEFT, TOP, width, grid.rows, grid.columns)
+    return figure

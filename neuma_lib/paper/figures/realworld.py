@@ -1,0 +1,87 @@
+"""Filmed objects, cut from their videos, beside what Spring-Gaus and NeuMA predict from the first frame on, from the
+same camera. At the right: PSNR and LPIPS (VGG) of the object, means over all cameras and measured frames. Paper:
+fig:realworld.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from neuma_lib.coupling.filmed import Filmed
+from neuma_lib.evaluation.plotting import rendering, style
+from neuma_lib.io.files import read_json
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.images import load_videos
+from neuma_lib.io.particles import load_body, load_motion
+from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images, note
+
+LEFT, TOP, UNDER = 0.92, 0.3, 0.12
+DENSITY = 1000.0
+"""Of all bodies [kg/m^3]: it does not show in pictures."""
+
+
+def data(inputs, params, say) -> ImageGrid:
+    """Blocks of rows are throws: the video, then each method; columns are times.
+
+    Numbers: ``scenes``; ``measures``, for each scene and method PSNR [dB] and LPIPS.
+    """
+    blocks, times, measures = [], [], []
+    rollouts, found = iter(inputs.rollouts), iter(inputs.measures)
+    for k, setting in enumerate(params.scenes.values()):
+        (video,) = load_videos(inputs.shown[k], [params.view], **setting["filming"])
+        files = (inputs.particles[k], inputs.binding[k], inputs.gaussians[k])
+        shown = rendering.evenly(params.frames, len(video.frames))
+        seen = video.select(shown)
+        rows = [rendering.as_bytes(seen.colours()[:, 0])]
+        measures.append([])
+        for method in params.titles:
+            body = load_body(*files, DENSITY, gaussian_motion=setting["motion"][method])
+            rollout = next(rollouts)
+            steps = read_arrays(rollout, required=("frames",), only=("frames",))[0]["frames"].tolist()
+            renders = Filmed(body.particle_gs(video.cameras), seen, steps)
+            x, F = (renders.states(state.to(body.x0)) for state in load_motion(rollout))
+            with torch.no_grad():
+                rows.append(rendering.as_bytes(renders(x, F)[:, 0]))
+            means = [read_json(next(found))["mean"] for _ in range(setting["cameras"])]
+            measures[-1].append([float(np.mean([m[key] for m in means])) for key in ("psnr", "lpips_vgg")])
+        blocks.append(np.stack(rows))
+        times.append(rendering.milliseconds(seen.frames, setting["dt"]))
+    images = _one_size(rendering.cropped([block[None] for block in blocks]))
+    count = images.shape[1]
+    say(f"{len(blocks)} throws, {images.shape[0]} x {count} pictures")
+    titles = [title for _ in blocks for title in ("video", *params.titles.values())]
+    numbers = {"scenes": list(params.scenes), "measures": measures, "times": [t[:count] for t in times]}
+    return ImageGrid(images, tuple(titles), tuple(str(k) for k in range(count)), numbers)
+
+
+def _one_size(blocks: list[np.ndarray]) -> np.ndarray:
+    """Blocks (1, R, C, H, W, 3) as one, padded with white at the right and below, with as many columns as all have."""
+    columns = min(block.shape[2] for block in blocks)
+    height, width = (max(block.shape[axis] for block in blocks) for axis in (3, 4))
+    found = []
+    for block in blocks:
+        padded = np.full((*block.shape[1:2], columns, height, width, 3), 255, np.uint8)
+        padded[:, :, : block.shape[3], : block.shape[4]] = block[0, :, :columns]
+        found.append(padded)
+    return np.concatenate(found)
+
+
+@style.styled
+def draw(grid: ImageGrid) -> Figure:
+    """A block a throw, with its times above and the measures beside its rows."""
+    numbers, right = grid.numbers, 0.95
+    width = style.PAGE - LEFT - right
+    height = grid.height(width)
+    rows = len(grid.rows) // len(numbers["scenes"])
+    block = TOP + rows * (height + GAP) + UNDER
+    figure = style.new_canvas(style.PAGE, block * len(numbers["scenes"]) + 0.03)
+    for k, scene in enumerate(numbers["scenes"]):
+        part, top = slice(k * rows, (k + 1) * rows), k * block + TOP
+        note(figure, LEFT + width / 2, top - TOP + 0.09, scene, ha="center", fontweight="bold")
+        draw_images(figure, grid.images[part], LEFT, top, width, grid.rows[part], tuple(numbers["times"][k]))
+        for row, (psnr, lpips) in enumerate(numbers["measures"][k], 1):
+            at = top + (row + 0.5) * (height + GAP)
+            note(figure, LEFT + width + 0.06, at, f"{psnr:.1f} dB / {lpips:.3f}", ha="left")
+    return figure

@@ -1,0 +1,74 @@
+"""Plain tables of numbers as CSV and Markdown: reports of stages, the benchmarks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from neuma_lib.evaluation.text_tables import as_csv, as_markdown
+from neuma_lib.paper.published import BENCHMARKS, BENCHMARKS_LABEL
+
+
+def benchmark_table(scenes: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:
+    """Properties of the benchmarks (the paper's table of them), with the materials that it does not publish.
+
+    Args:
+        scenes: scene -> its complete plain settings, with ``steps`` as simulated.
+
+    Returns:
+        CSV, and Markdown with the paper's numbers beside ours where they differ, and a line that says so.
+    """
+    header = {
+        "benchmark": "Benchmark",
+        "shape": "Initial shape",
+        "dynamics": "Dynamics",
+        "dt": "Step size [s]",
+        "velocity": "Initial velocity [m/s]",
+        "height": "Initial height [m]",
+        "steps": "Steps",
+        "size": "Size [m]",
+        "density": "Density [kg/m³]",
+        "elasticity": "Elasticity",
+        "plasticity": "Plasticity",
+        "prior": "Prior",
+    }
+    table, shown, same, other = [], [], [], []
+    for name, scene in scenes.items():
+        printed = BENCHMARKS.get(name, {})
+        row = {
+            "benchmark": name,
+            "dynamics": printed.get("dynamics", ""),
+            **{key: _constant(value) for key, value in (scene | scene["law"]).items() if key in header},
+        }
+        table.append([row[key] for key in header])
+        if printed:
+            apart = {k: _constant(printed[k]) for k in ("dt", "velocity", "height") if printed[k] != scene[k]}
+            row |= {key: f"{row[key]} (*paper: {value}*)" for key, value in apart.items()}
+            (other if apart else same).append(name)
+        shown.append([row[key] for key in header])
+    verdict = []
+    if same:
+        agree = f"Step size, velocity and height are the paper's ({BENCHMARKS_LABEL}) for {', '.join(same)}."
+        verdict.append(agree)
+    if other:
+        verdict.append(f"They differ from it for {', '.join(other)}; the paper's numbers stand in brackets.")
+    text = [
+        "# Table 4: the benchmarks",
+        "",
+        *as_markdown(list(header.values()), shown),
+        "",
+        " ".join(verdict),
+    ]
+    text += ["", "The paper does not publish materials, sizes and densities: those are ours.", ""]
+    return as_csv([header, *table]), "\n".join(text)
+
+
+def _constant(value: Any) -> str:
+    """A setting in a cell: numbers short, mappings as name and constants, lists in brackets."""
+    if isinstance(value, Mapping):
+        name = str(value.get("name", "")).replace("_", " ")
+        constants = ", ".join(f"{key} {_constant(v)}" for key, v in value.items() if key != "name")
+        return f"{name}: {constants}" if name and constants else name or constants
+    if isinstance(value, list | tuple):
+        return f"({', '.join(map(_constant, value))})"
+    return f"{value:g}" if isinstance(value, int | float) else str(value)

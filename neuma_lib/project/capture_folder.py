@@ -1,0 +1,202 @@
+"""The folder of a capture: settings, photographs, stills and videos."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from neuma_lib.config.capture import CaptureConfig
+from neuma_lib.config.validation import hint, validate
+from neuma_lib.errors import InputError
+from neuma_lib.io.files import existing, one_line, reading
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+"""Valid names of captures, takes and cameras. Results are named after them."""
+PHOTOGRAPHS = "photographs"
+"""Group of the photographs. Other groups are named after cameras."""
+PICTURES = (".jpg", ".jpeg", ".png", ".webp")
+VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
+OTHER_PICTURES = (".heic", ".heif", ".dng", ".cr2", ".nef", ".arw")
+"""Formats of cameras that are not supported. They cause an error, so that no photograph is silently ignored."""
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Files of a capture.
+
+    Attributes:
+        folder: root of the capture.
+        settings: its capture.yaml.
+        photographs: pictures of the object, sorted by name, possibly none yet.
+        stills: camera -> its picture of the empty scene.
+        takes: take -> camera -> video, cameras sorted by name, possibly none yet.
+    """
+
+    folder: Path
+    settings: CaptureConfig
+    photographs: tuple[Path, ...]
+    stills: dict[str, Path]
+    takes: dict[str, dict[str, Path]]
+
+    def pictures(self) -> dict[str, tuple[Path, ...]]:
+        """Photographs and stills, by group. Raises InputError if photographs, or the still of a camera, are missing."""
+        if not self.photographs:
+            raise InputError(
+                self.folder / self.settings.photographs,
+                f"no photographs ({', '.join(PICTURES)})",
+                "Put them there",
+            )
+        filmed = {camera for videos in self.takes.values() for camera in videos}
+        for camera in sorted(filmed - self.stills.keys()):
+            raise InputError(
+                self.folder / self.settings.stills,
+                f"no picture of the empty scene for the camera '{camera}'",
+                f"Film the scene for a second without the object, and save a frame as {camera}.png",
+            )
+        return {PHOTOGRAPHS: self.photographs, **{camera: (file,) for camera, file in self.stills.items()}}
+
+    def video(self, take: str, camera: str) -> Path:
+        """The video of a take by a camera. Raises InputError if there is none."""
+        if camera not in self.cameras_of(take):
+            raise InputError(
+                self.folder, f"no video of '{take}' by '{camera}'{hint(camera, self.takes[take])}"
+            )
+        return self.takes[take][camera]
+
+    def cameras_of(self, take: str) -> tuple[str, ...]:
+        """Cameras of a take, by name. Raises InputError if there is no such take."""
+        if not self.takes:
+            raise _no_videos(self.folder / "videos")
+        if take not in self.takes:
+            raise InputError(self.folder, f"no take '{take}'{hint(take, self.takes)}")
+        return tuple(self.takes[take])
+
+    def own_masks(self, name: str) -> dict[str, Path]:
+        """Masks of the user in a subfolder, by file stem. Raises InputError for two masks of one picture."""
+        return _by_camera(self.folder, f"{self.settings.masks}/{name}", PICTURES)
+
+
+def _no_videos(folder: Path) -> InputError:
+    return InputError(
+        folder, f"no videos ({', '.join(VIDEOS)})", "Put one there for each camera, <camera>.mp4"
+    )
+
+
+def read_settings(path: str | Path) -> CaptureConfig:
+    """Settings of a capture.yaml. Raises InputError: names the file and each invalid, missing or unknown key."""
+    content = existing(path, "Create it as in the example of docs/capture.md").read_bytes()
+    with reading(path, "YAML"):
+        raw = yaml.safe_load(content)
+    try:
+        return validate(CaptureConfig, {} if raw is None else raw)
+    except InputError as error:
+        raise InputError(path, str(error).removeprefix("settings: ")) from None
+
+
+def inside(folder: str | Path, name: str | Path) -> Path:
+    """A path below a capture's folder. Raises InputError: it is outside the folder, possibly through a link."""
+    root = Path(folder).resolve()
+    path = (root / name).resolve()
+    if path != root and root not in path.parents:
+        raise InputError(
+            Path(folder) / name, f"it is outside the capture's folder {folder}", "Copy the file there"
+        )
+    return Path(folder) / name
+
+
+def read_capture(folder: str | Path) -> Capture:
+    """Settings and files of a capture, of which some may still be missing.
+
+    Raises:
+        InputError: see `read_settings` and `inside`; a take without videos; settings of an unknown camera; two files
+            for one camera; invalid names.
+    """
+    folder = Path(folder)
+    source = folder / "capture.yaml"
+    settings = read_settings(source)
+    photographs = _pictures(folder, settings.photographs)
+    if settings.throws:
+        takes = {name: _by_camera(folder, take.folder, VIDEOS) for name, take in settings.throws.items()}
+    else:
+        takes = _default_takes(folder)
+    for name, videos in takes.items():
+        if not videos:
+            take = settings.throws.get(name)
+            raise _no_videos(folder / (take.folder if take else f"videos/{name}"))
+    stills = _by_camera(folder, settings.stills, PICTURES)
+    filmed = {camera for videos in takes.values() for camera in videos}
+    cameras = sorted(filmed | stills.keys())
+    for camera in settings.cameras:
+        if camera not in cameras:
+            raise InputError(
+                f"{source}: cameras.{camera}", f"no video or still has this name{hint(camera, cameras)}"
+            )
+    for name in (*cameras, *takes):
+        if not NAME.fullmatch(name):
+            raise InputError(
+                folder,
+                f"'{one_line(name)}' cannot name folders and results",
+                "Rename it, with letters, digits, - and _",
+            )
+    if PHOTOGRAPHS in cameras:
+        raise InputError(folder, f"a video camera cannot be named '{PHOTOGRAPHS}'", "Rename its files")
+    if settings.length:
+        names = [file.name for file in photographs]
+        for name in settings.length.ends:
+            if name not in names:
+                raise InputError(f"{source}: length.ends.{name}", f"no such photograph{hint(name, names)}")
+    return Capture(folder, settings, photographs, stills, takes)
+
+
+def _default_takes(folder: Path) -> dict[str, dict[str, Path]]:
+    """The videos in `videos`, or one take for each of its folders."""
+    direct = _by_camera(folder, "videos", VIDEOS)
+    below = sorted(p for p in _listed(folder, "videos") if p.is_dir())
+    if direct and below:
+        raise InputError(
+            folder / "videos",
+            "it contains both videos and folders",
+            "Put the videos of each take into a folder, or list the takes under `throws` in capture.yaml",
+        )
+    if below:
+        return {p.name: _by_camera(folder, f"videos/{p.name}", VIDEOS) for p in below}
+    return {"first": direct} if direct else {}
+
+
+def _listed(folder: Path, name: str) -> list[Path]:
+    """Sorted content of a folder without hidden files. Empty if the folder does not exist."""
+    path = inside(folder, name)
+    files = sorted(p for p in path.iterdir() if not p.name.startswith(".")) if path.is_dir() else []
+    return [inside(folder, p.relative_to(folder)) for p in files]
+
+
+def _pictures(folder: Path, name: str) -> tuple[Path, ...]:
+    files = _listed(folder, name)
+    for file in files:
+        if file.suffix.lower() in OTHER_PICTURES:
+            raise InputError(
+                file, "this picture format is not supported", "Convert it to JPEG, and remove it"
+            )
+    pictures = [file for file in files if file.suffix.lower() in PICTURES]
+    for i, file in enumerate(pictures):
+        if file.stem in [other.stem for other in pictures[:i]]:
+            raise InputError(
+                file, "another picture has the same name with another suffix", "Rename one of them"
+            )
+    return tuple(pictures)
+
+
+def _by_camera(folder: Path, name: str, suffixes: Iterable[str]) -> dict[str, Path]:
+    files: dict[str, Path] = {}
+    for file in _listed(folder, name):
+        if file.is_file() and file.suffix.lower() in suffixes:
+            if file.stem in files:
+                raise InputError(
+                    file, f"{files[file.stem].name} is of the same camera", "Remove one of the two"
+                )
+            files[file.stem] = file
+    return files

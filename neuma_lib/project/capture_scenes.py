@@ -1,0 +1,84 @@
+"""Scenes of captures: the object at rest from its photographs, and each take."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from neuma_lib.config.capture import ReleasedConfig
+from neuma_lib.config.validation import hint
+from neuma_lib.errors import InputError
+from neuma_lib.project.capture_folder import NAME, Capture, read_capture
+
+
+def captured_scenes(
+    root: str | Path,
+    released: Mapping[str, ReleasedConfig] | None = None,
+    planned: Mapping[str, Capture] | None = None,
+) -> dict[str, dict[str, Any]]:
+    """Settings of the scenes of all captures in a folder, of released and of planned captures, by name.
+
+    A capture ``mug`` has a scene ``mug`` for its photographs and a scene ``mug_<take>`` for each take. The law is
+    learned in the first of the `training_takes`. The others are its ``videos``. Captures that cannot be read are
+    skipped, since their own rules report the error.
+    """
+    scenes: dict[str, dict[str, Any]] = {}
+    for capture in (planned or {}).values():
+        scenes |= scenes_of(capture)
+    if released:
+        # Imported here, because it is too slow for every start of the workflow.
+        from neuma_lib.capture.released import released_captures
+
+        for capture in released_captures(released).values():
+            scenes |= scenes_of(capture)
+    folders = sorted(p for p in Path(root).iterdir() if p.is_dir()) if Path(root).is_dir() else []
+    for folder in folders:
+        if not NAME.fullmatch(folder.name) or folder.name in (planned or {}):
+            continue
+        try:
+            capture = read_capture(folder)
+            training_takes(capture)
+        except InputError:
+            continue
+        scenes |= scenes_of(capture)
+    return scenes
+
+
+def scenes_of(capture: Capture) -> dict[str, dict[str, Any]]:
+    """Settings of the scenes of one capture, by name."""
+    name, settings = capture.folder.name, capture.settings
+    common = {"prior": settings.prior, "density": settings.density, "dt": settings.dt}
+    world = {"capture": name, "scale": settings.scale, "grid": settings.grid}
+    scenes = {name: {**common, "captured": world}}
+    trained = training_takes(capture)
+    for take, cameras in capture.takes.items():
+        scenes[scene_name(name, take)] = {
+            **common,
+            "captured": {**world, "throw": take, "cameras": list(cameras)},
+            "material": {"views": list(range(len(cameras)))},
+            "videos": [scene_name(name, other) for other in trained[1:]] if take in trained[:1] else [],
+        }
+    return scenes
+
+
+def scene_name(capture: str, take: str) -> str:
+    """Name of the scene of a take."""
+    return f"{capture}_{take}"
+
+
+def training_takes(capture: Capture) -> list[str]:
+    """Takes that the law is learned from, by name. Raises InputError if ``held_out`` of the capture is invalid."""
+    where = f"{capture.folder / 'capture.yaml'}: held_out"
+    for take in capture.settings.held_out:
+        if take not in capture.takes:
+            raise InputError(where, f"no take '{take}'{hint(take, capture.takes)}")
+    trained = sorted(set(capture.takes) - set(capture.settings.held_out))
+    if capture.takes and not trained:
+        raise InputError(where, "all takes are held out", "Keep at least one for training")
+    for take in trained[1:]:
+        if list(capture.takes[take]) != list(capture.takes[trained[0]]):
+            raise InputError(
+                where, f"'{take}' and '{trained[0]}' have different cameras", "Hold one of them out"
+            )
+    return trained

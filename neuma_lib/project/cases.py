@@ -1,0 +1,323 @@
+"""Methods on scenes: options, runs and files of a preset or variant, as the settings have them.
+
+Names only: no file is read, and none has to exist.
+"""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import yaml
+
+from neuma_lib.config.base import Section
+from neuma_lib.config.validation import hint, validate
+from neuma_lib.config.variants import DRAWN, folder, split_variant
+from neuma_lib.errors import InputError
+from neuma_lib.methods.base import Case, Method, ModelSource
+from neuma_lib.methods.registry import methods
+from neuma_lib.project import paths as places
+from neuma_lib.project.methods import PresetConfig
+from neuma_lib.project.paths import IDENTIFIED
+from neuma_lib.project.settings import NO_TRUTH, Config
+
+LAW_FROM = "law_from"
+"""Key of a variant: the scene whose model moves all bodies, in place of each scene's own."""
+
+
+@dataclass(frozen=True)
+class ProjectCase(Case):
+    """A case whose paths and options come from the settings of a project."""
+
+    settings: Config
+    scene: str
+    moved: str
+    name: str
+    folder: str
+    options: Any
+    evaluate_on: str
+    method: Method
+
+    def on_moved(self) -> ProjectCase:
+        return replace(self, scene=self.moved)
+
+    @property
+    def prior(self) -> str:
+        named = getattr(self.options, "prior", None)
+        return self.settings.scene(self.scene).prior if named is None else named
+
+    @property
+    def prior_law(self) -> dict[str, Any] | None:
+        law = self.settings.priors.laws.get(self.prior)
+        return law.plain() if law else None
+
+    @property
+    def true_law(self) -> dict[str, Any]:
+        law = self.settings.scene(self.scene).law
+        if law is None:
+            raise InputError(f"{self.scene}/{self.name}", NO_TRUTH)
+        return law.plain()
+
+    def section(self, name: str) -> dict[str, Any]:
+        return getattr(self.settings, name).plain()
+
+    def result(self, file: str) -> str:
+        return places.home(self.settings, self.scene, file)
+
+    def data(self, file: str) -> str:
+        base, _ = self.settings.chain(self.scene)
+        return f"{self.settings.data_root.rstrip('/')}/{base}/{file}"
+
+    def rollout(self) -> str:
+        return f"{places.results_root(self.settings)}/{self.moved}/{self.folder}/rollout.h5"
+
+    def product(self) -> str:
+        run = f"{self._folder(self.scene)}/{self.name}"
+        return f"{places.results_root(self.settings)}/{run}/{self.method.product}"
+
+    def prior_file(self) -> str:
+        return places.prior_file(self.settings, self.scene, self.prior)
+
+    def identified(self) -> str:
+        views = self.options.views
+        if views in (self.settings.material.views, self.settings.identify.views):
+            return "identified.json"
+        return f"identified+views={','.join(map(str, views))}.json"
+
+    def each_video(self, choose: Callable[[Case], str]) -> str | list[str]:
+        found = [choose(replace(self, scene=scene)) for scene in self.settings.video_scenes(self.scene)]
+        return found if len(found) > 1 else found[0]
+
+    def seeds(self) -> tuple[str, ...]:
+        """Seeds of a replicate that change the results."""
+        return tuple(name for name in DRAWN if name in self.method.seeds(self))
+
+    def _folder(self, scene: str) -> str:
+        base, seeds = self.settings.chain(scene)
+        return folder(base, seeds, self.seeds())
+
+    def density(self, scene: str) -> float | dict[str, Any]:
+        """Density that the method assumes for the body of a scene [kg/m^3]."""
+        assumed = self.options.assumed_density
+        return self.settings.scene(scene).plain()["density"] if assumed is None else assumed
+
+    @property
+    def densities(self) -> list[float | dict[str, Any]]:
+        """The same for the bodies of all videos of a fit."""
+        return [self.density(scene) for scene in self.settings.video_scenes(self.scene)]
+
+    @property
+    def learns_there(self) -> bool:
+        """Whether the model is obtained from the moved scene itself."""
+        return self.scene == self.moved and self.method.learns_from_video(self)
+
+    def source(self) -> ModelSource:
+        """What the model is loaded from."""
+        dt = self.settings.scene(self.scene).dt
+        module = type(self.method).__module__
+        return ModelSource(module, self.method.model_options(self), self.method.model_inputs(self), dt)
+
+
+def preset(settings: Config, method: str) -> tuple[PresetConfig, dict[str, Any]]:
+    """Preset of a preset or variant, and the options in its name.
+
+    Args:
+        method: name of a folder of results, for example ``neuma+rank=4+law_from=ClayCat``. Values are YAML scalars, and
+            commas make lists.
+
+    Raises:
+        InputError: unknown preset or option, an option that is given twice, a piece without '='.
+    """
+    base = method.partition("+")[0]
+    keys = [LAW_FROM, *(kind_of(settings, base).Options.model_fields if base in settings.methods else ())]
+    base, texts = split_variant(method, settings.methods, keys, "method")
+    options = kind_of(settings, base).Options.model_fields
+    given: dict[str, Any] = {}
+    for key, value in texts.items():
+        is_list = key in options and typing.get_origin(options[key].annotation) is tuple
+        given[key] = [yaml.safe_load(v) for v in value.split(",")] if is_list else yaml.safe_load(value)
+    return settings.methods[base], given
+
+
+def kind_of(settings: Config, method: str) -> Method:
+    """The method of a preset or variant."""
+    name = method.partition("+")[0]
+    chosen = settings.methods[settings.methods[name].same_fit_as or name]
+    return methods()[chosen.kind]
+
+
+def of_kind(settings: Config, name: str) -> list[str]:
+    """Presets of a method that have a fit of their own, in the order of the settings."""
+    own = (key for key, chosen in settings.methods.items() if chosen.same_fit_as is None)
+    return [key for key in own if settings.methods[key].kind == name]
+
+
+def title(settings: Config, method: str) -> str:
+    """Name of a preset or variant for tables, for example "NeuMA, rank 4"."""
+    chosen, given = preset(settings, method)
+    texts = {key: ",".join(map(str, v)) if isinstance(v, list) else v for key, v in given.items()}
+    return ", ".join([chosen.title, *(f"{key} {text}" for key, text in texts.items())])
+
+
+def fit_name(settings: Config, method: str) -> str:
+    """The preset or variant whose fit gives a method's model, in the scene that the model is from."""
+    base, *pieces = method.split("+")
+    others = [piece for piece in pieces if not piece.startswith(f"{LAW_FROM}=")]
+    return "+".join([settings.methods[base].same_fit_as or base, *others])
+
+
+def source_scene(settings: Config, scene: str, method: str) -> str:
+    """Folder of the scene that a method's model is obtained from, in the replicate of a scene."""
+    source = law_from(settings, method)
+    return scene if source is None else folder(source, settings.chain(scene)[1])
+
+
+def law_from(settings: Config, method: str) -> str | None:
+    """The scene that a variant's model is obtained from. None: the scene whose motion is predicted.
+
+    Raises:
+        InputError: unknown names, or a model that moves the body of its own scene only.
+    """
+    source = preset(settings, method)[1].get(LAW_FROM)
+    if source is not None and source not in settings.scenes:
+        raise InputError(method, f"no scene '{source}'{hint(source, settings.scenes)}")
+    if source is not None and not kind_of(settings, method).moves_other_bodies:
+        raise InputError(method, "its model moves the body of its own scene only", f"Leave out {LAW_FROM}")
+    return source
+
+
+def case(settings: Config, scene: str, method: str) -> ProjectCase:
+    """A preset or variant on a scene.
+
+    Args:
+        scene: folder of the scene, with the seeds of its replicate.
+
+    Raises:
+        InputError: unknown names, options that do not fit.
+    """
+    chosen, _ = preset(settings, method)
+    kind, source = kind_of(settings, method), source_scene(settings, scene, method)
+    name, options = fit_name(settings, method), _options(settings, source, method)
+    found = ProjectCase(settings, source, scene, name, method, options, chosen.evaluate_on, kind)
+    known = [*settings.priors.laws, IDENTIFIED]
+    if getattr(options, "prior", None) not in (None, *known):
+        raise InputError(
+            method,
+            f"no prior '{options.prior}' in priors.laws{hint(options.prior, known)}",
+            "A law in a file is the prior of a scene",
+        )
+    return found
+
+
+def _options(settings: Config, scene: str, method: str) -> Section:
+    """Effective options: sections of the settings, changed by the scene, the preset and the variant, in this order.
+
+    The seed of the scene's replicate is added to the option ``seed``.
+    """
+    fitted = fit_name(settings, method)
+    chosen, given = preset(settings, fitted)
+    kind = kind_of(settings, fitted)
+    base, seeds = settings.chain(scene)
+    known = kind.Options.model_fields
+    values: dict[str, Any] = {}
+    for section in (
+        *(getattr(settings, name).plain() for name in kind.sections),
+        settings.scene(base).material,
+    ):
+        values |= {key: value for key, value in section.items() if key in known}
+    validate(kind.Options, values, f"scenes.{base}.material")
+    values |= chosen.options
+    validate(kind.Options, values, f"methods.{fitted.partition('+')[0]}.options")
+    options = validate(kind.Options, values | given, fitted)
+    if "seed" in known:
+        options = options.model_copy(update={"seed": options.seed + seeds["adaptor"]})
+    return options
+
+
+# ---- runs
+
+
+def body_cases(settings: Config, column: str, method: str) -> list[ProjectCase]:
+    """A method on the scene of each body of a scene or experiment, in its replicate.
+
+    Raises:
+        InputError: several bodies, and a model without a material law.
+    """
+    cases = [case(settings, scene, method) for scene in settings.body_scenes(column)]
+    if len(cases) > 1 and not cases[0].method.has_law:
+        raise InputError(
+            f"{column}/{method}", "it has no material law, so that it cannot move several bodies together"
+        )
+    return cases
+
+
+def run_folder(settings: Config, column: str, method: str) -> str:
+    """Folder of a method's run, below the one of the results or of the experiments.
+
+    Args:
+        column: folder of a scene or experiment, with the seeds of its replicate. Seeds that change nothing in the run
+            are left out, so that it is computed once.
+    """
+    base, seeds = settings.chain(column)
+    used = {name for each in body_cases(settings, column, method) for name in each.seeds()}
+    return f"{folder(base, seeds, [name for name in DRAWN if name in used])}/{method}"
+
+
+def runs(settings: Config, table: str, method: str, column: str) -> list[str]:
+    """Folders of the runs behind a cell of a table, in the order of its replicates, each once."""
+    chosen = settings.tables[table]
+    replicates = (folder(column, dict.fromkeys(chosen.vary, k)) for k in range(chosen.seeds))
+    return list(dict.fromkeys(run_folder(settings, each, method) for each in replicates))
+
+
+def gaussian_motion(settings: Config, scene: str, method: str) -> str:
+    """How Gaussians follow their particles. Those of a splat, many of which lie outside the body, move affinely."""
+    return "affine" if settings.scene(scene).splat else case(settings, scene, method).options.gaussian_motion
+
+
+def moving_methods(settings: Config, scene: str, asked: Sequence[str]) -> list[str]:
+    """Methods that predict the motion of a scene: those asked for.
+
+    A splat has no video. Where a method would learn from it, the models of the scenes ``figures.i23d`` replace it.
+
+    Raises:
+        InputError: a splat, and a method whose model cannot come from another scene.
+    """
+    if not settings.scene(scene).splat:
+        return list(asked)
+    found = []
+    for method in asked:
+        if not kind_of(settings, method).moves_other_bodies:
+            raise InputError(
+                f"{scene}/{method}", "a splat has no video to fit this method to; leave the method out"
+            )
+        elsewhere = case(settings, scene, method).learns_there
+        sources = settings.figures.i23d if elsewhere else (None,)
+        found += [f"{method}+{LAW_FROM}={source}" if source else method for source in sources]
+    return list(dict.fromkeys(found))
+
+
+def motion_clock(settings: Config, scene: str, method: str) -> tuple[float, tuple[int, ...]]:
+    """Time step of the prediction of a splat [s], and the steps of its frames.
+
+    A law holds at the time step that it was learned at, so this is the step of the scene that the model is from.
+    """
+    dt, law_dt = settings.scene(scene).dt, settings.scene(source_scene(settings, scene, method)).dt
+    return law_dt, tuple(round(step * dt / law_dt) for step in settings.frame_steps(scene))
+
+
+def law_origin(settings: Config, scene: str, method: str) -> dict[str, Any]:
+    """What the settings know of the origin of a method's law, with the keys of `neuma_lib.io.exported`."""
+    found = case(settings, scene, method)
+    chosen = settings.scene(found.scene)
+    return {
+        "dt": chosen.dt,
+        **settings.scene_world(found.scene),
+        "density": found.density(found.scene),
+        "scale": chosen.captured.scale if chosen.captured else chosen.images.scale,
+        "scene": found.scene,
+        "method": method,
+        "prior": found.prior if "prior" in found.method.model_inputs(found) else None,
+    }

@@ -1,0 +1,208 @@
+"""Checks of a project's settings that run nothing and load no torch: laws, shapes, starts, time steps, the GPU."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.metadata
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuma_lib.config.validation import hint
+from neuma_lib.errors import InputError
+from neuma_lib.mechanics.catalogue import COURANT_LIMIT, check_law, longitudinal_modulus
+from neuma_lib.project.capture_folder import NAME, read_capture
+from neuma_lib.project.capture_scenes import training_takes
+from neuma_lib.project.random_scenes import SHAPES, DrawnPart, Outline
+from neuma_lib.project.settings import Config
+
+OWN_SIZES = {"ball": 0.26, "duck": 0.41, "pawn": 0.417, "cat": 0.376, "bottle": 0.438, "fish": 0.402}
+"""Longest side of the shapes whose size is not given [m]."""
+LETTER, LETTER_SIZE = Outline((0.25, 0.7, 0.2), (0, 0, 0), ("body",)), 0.3
+"""Sides that every letter has at least, relative to its longest side, and that side where it is not given [m]."""
+ROUND_OFF = 1e-6
+
+
+def problems(settings: Config) -> list[str]:
+    """All problems of valid settings, one line each."""
+    return [
+        *law_problems(settings),
+        *_scene_problems(settings),
+        *_experiment_problems(settings),
+        *_device_problems(settings.device),
+    ]
+
+
+def capture_problems(root: str | Path) -> list[str]:
+    """Captures below a folder whose capture.yaml or files cannot be used, one line each."""
+    folders = sorted(p for p in Path(root).iterdir() if p.is_dir()) if Path(root).is_dir() else []
+    found = []
+    for folder in folders:
+        try:
+            if not NAME.fullmatch(folder.name):
+                raise InputError(folder, "the name is invalid", "Use letters, digits, - and _")
+            training_takes(read_capture(folder))
+        except InputError as error:
+            found += lines(error)
+    return found
+
+
+def law_problems(settings: Config) -> list[str]:
+    """Laws with an unknown name, an unknown or missing constant, or one outside its bounds; one line each."""
+    found = []
+    for where, spec in _laws(settings):
+        _, problem = _checked(where, spec)
+        found += problem
+    return found
+
+
+def lines(error: InputError) -> list[str]:
+    """The problems in an error of the settings, one line each."""
+    return [line.strip() for line in str(error).removeprefix("settings: ").splitlines()]
+
+
+def _laws(settings: Config) -> Iterator[tuple[str, dict[str, Any]]]:
+    """All laws in the settings with their keys; of ranges the two ends."""
+    drawn = set(settings.random_scenes)
+    for name, scene in settings.scenes.items():
+        if scene.law is not None and name not in drawn:
+            yield f"scenes.{name}.law", scene.law.plain()
+    for name, law in settings.priors.laws.items():
+        yield f"priors.laws.{name}", law.plain()
+    for name, law in settings.identify.families.items():
+        yield f"identify.families.{name}", law.plain()
+    for name, family in settings.pac_nerf.families.items():
+        yield f"pac_nerf.families.{name}", family.plain()
+    for group in ("families", "outside"):
+        for name, family in getattr(settings.random, group).items():
+            for end in (0, 1):
+                parts = {"elasticity": family.elasticity, "plasticity": family.plasticity}
+                yield f"random.{group}.{name}", {key: _end(part, end) for key, part in parts.items()}
+
+
+def _end(part: DrawnPart, end: int) -> dict[str, Any]:
+    return {"name": part.name, **{key: bounds[end] for key, bounds in part.ranges.items()}}
+
+
+def _checked(where: str, spec: Mapping[str, Any]) -> tuple[dict[str, Any] | None, list[str]]:
+    """A complete law, or None and its problem."""
+    plain = {key: value for key, value in spec.items() if key in ("elasticity", "plasticity")}
+    try:
+        return check_law(plain, dt=1.0), []
+    except InputError as error:
+        return None, [str(InputError(f"{where}.{error.where}", error.problem, error.remedy))]
+
+
+def _scene_problems(settings: Config) -> list[str]:
+    found, priors = [], settings.priors.laws
+    for name, scene in settings.scenes.items():
+        where, world, plain = f"scenes.{name}", settings.scene_world(name), scene.plain()
+        if scene.has_truth:
+            truth = settings.scene_truth(name)
+            found += _start_problems(where, plain, scene.dt, world["grid"])
+            found += _courant_problem(f"{where}.law", plain["law"], plain["density"], truth.grid, truth.dt)
+        if scene.prior in priors:
+            spec, label = priors[scene.prior].plain(), f"{where}.prior = {scene.prior}"
+            found += _courant_problem(label, spec, plain["density"], world["grid"], scene.dt)
+    return found
+
+
+def _experiment_problems(settings: Config) -> list[str]:
+    found = []
+    for name, experiment in settings.experiments.items():
+        truth = settings.experiment_truth(name)
+        for k, (body, plain) in enumerate(zip(experiment.bodies, settings.experiment_bodies(name))):
+            where = f"experiments.{name}.bodies.{k}"
+            if body.shape is not None:
+                found += _start_problems(where, plain, truth.dt, truth.grid)
+            if experiment.dt is not None and plain["law"] is not None:
+                found += _courant_problem(where, plain["law"], plain["density"], truth.grid, truth.dt)
+    return found
+
+
+def _start_problems(where: str, body: Mapping[str, Any], dt: float, grid: int) -> list[str]:
+    """Problems of the shape, the place and the motion that a body starts with."""
+    shape = body["shape"]
+    if not (shape in SHAPES or re.fullmatch(r"letter_[A-Z]", shape)):
+        return [f"{where}.shape: {shape!r} is unknown{hint(shape, [*SHAPES, 'letter_A'])}"]
+    outline, own = (SHAPES[shape], OWN_SIZES[shape]) if shape in SHAPES else (LETTER, LETTER_SIZE)
+    size = body["size"] or own
+    half = size * np.array(outline.sides) / 2
+    middle = np.array([body["center"][0], body["height"], body["center"][1]])
+    found = []
+    for axis, key, low, high in zip("xyz", ("center", "height", "center"), middle - half, middle + half):
+        if low < -ROUND_OFF or high > 1 + ROUND_OFF:
+            wall = "below the floor at y = 0" if axis == "y" and low < 0 else "outside the box from 0 to 1 m"
+            found.append(
+                f"{where}.{key}: the body extends from {axis} = {low:.3g} to {high:.3g} m, {wall}. Move it, or change "
+                f"size = {size:g} m"
+            )
+    reach = float(np.linalg.norm(half + size * np.abs(outline.mass_centre)))
+    speed = math.hypot(*body["velocity"]) + math.hypot(*body["spin"]) * reach
+    if speed * dt * grid >= 1:
+        found.append(
+            f"{where}.velocity: at up to {speed:.3g} m/s a particle crosses a grid cell of {1 / grid:.3g} m in a time "
+            f"step of {dt:g} s. Reduce velocity, spin or dt"
+        )
+    return found
+
+
+def _courant_problem(where: str, spec: Mapping[str, Any], density: Any, grid: int, dt: float) -> list[str]:
+    """The problem of a time step that is unstable for a law; none for a law that `law_problems` reports."""
+    law, _ = _checked(where, spec)
+    if law is None:
+        return []
+    rho = min(density["below"], density["above"]) if isinstance(density, Mapping) else density
+    number = math.sqrt(longitudinal_modulus(law["elasticity"]) / rho) * dt * grid
+    if number <= COURANT_LIMIT:
+        return []
+    return [
+        f"{where}: the Courant number {number:.3g} exceeds {COURANT_LIMIT} with dt = {dt:g} s and {grid} grid cells. "
+        f"The largest stable step is {dt * COURANT_LIMIT / number:.3g} s"
+    ]
+
+
+def _device_problems(device: str) -> list[str]:
+    if device != "cuda":
+        return []
+    found = []
+    if gpus() == 0:
+        found.append(
+            "device: cuda is set, but the machine has no CUDA GPU or driver. Set device: cpu or auto"
+        )
+    if torch_version().endswith("+cpu"):
+        found.append(
+            f"device: cuda is set, but torch {torch_version()} is a CPU build. Install one with CUDA support"
+        )
+    return found
+
+
+def gpus() -> int:
+    """How many GPUs the CUDA driver reports, 0 without a driver."""
+    for library in ("libcuda.so.1", "nvcuda.dll"):
+        try:
+            driver, count = ctypes.CDLL(library), ctypes.c_int(0)
+        except OSError:
+            continue
+        if driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0:
+            return count.value
+    return 0
+
+
+def torch_version() -> str:
+    """Version of the installed torch, for example ``2.13.0+cpu``; empty without one."""
+    try:
+        return importlib.metadata.version("torch")
+    except importlib.metadata.PackageNotFoundError:
+        return ""
+
+
+def summary(settings: Config, files: Sequence[str | Path]) -> str:
+    """What was checked, in one line."""
+    laws = len({where for where, _ in _laws(settings)})
+    counts = f"{len(settings.scenes)} scenes, {laws} laws, {len(settings.experiments)} experiments"
+    return f"{', '.join(map(str, files))}: no problems ({counts}, device {settings.device})"

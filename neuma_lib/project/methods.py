@@ -1,0 +1,36 @@
+"""Presets of methods: named sets of options over the same code."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field, model_validator
+
+from neuma_lib.config.base import Section
+
+
+class PresetConfig(Section):
+    """A named set of options of a method. Presets of the built-in methods stand beside their code."""
+
+    kind: str | None = Field(
+        None,
+        description="method, for example `neuma` or `constants`; null: that of the preset in `same_fit_as`",
+    )
+    title: str = Field(description="name in tables")
+    note: str | None = Field(None, description="remark on its numbers, printed below tables")
+    same_fit_as: str | None = Field(
+        None, description="preset whose fit it takes, with its options; null: its own fit"
+    )
+    evaluate_on: Literal["particles", "training_particles"] = Field(
+        "particles",
+        description="what an evaluation simulates: particles of the body's volume, or the particles of the fit",
+    )
+    options: dict[str, Any] = Field({}, description="options of the method that differ from their defaults")
+
+    @model_validator(mode="after")
+    def _complete(self) -> PresetConfig:
+        if self.kind is None and self.same_fit_as is None:
+            raise ValueError("kind: this key is missing")
+        if self.same_fit_as and self.options:
+            raise ValueError(f"options: those of '{self.same_fit_as}' apply; leave them out")
+        return self

@@ -1,0 +1,76 @@
+"""Wall time, core seconds and memory of the stages of a results folder, from benchmark files and logs."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from neuma_lib.errors import InputError
+from neuma_lib.evaluation.text_tables import as_markdown
+
+COLUMNS = {
+    "runs": "runs",
+    "seconds": "all together [s]",
+    "longest": "longest [s]",
+    "core_seconds": "core seconds",
+    "start": "of these to start",
+    "memory": "most memory [MB]",
+}
+MAXIMA = ("longest", "memory")
+"""Columns that hold the maximum over the runs; the others hold the sum."""
+
+_CORE_SECONDS = re.compile(r"core seconds: ([\d.]+) to start, ([\d.]+) of work")
+
+
+def timings_table(results: Path) -> str:
+    """Markdown table with a row for each stage, the most expensive first, and their total.
+
+    Core seconds come from the logs: Snakemake samples those of a job only now and then and misses up to 30 s of each.
+
+    Args:
+        results: folder with the subfolders ``benchmarks`` and ``logs``.
+
+    Raises:
+        InputError: the folder has no benchmark file.
+    """
+    rows: dict[str, dict[str, float]] = {}
+    for file in sorted((results / "benchmarks").rglob("*.tsv")):
+        log = results / "logs" / file.relative_to(results / "benchmarks").with_suffix(".log")
+        run = _measured(file, log)
+        row = rows.setdefault(file.stem, dict.fromkeys(COLUMNS, 0))
+        rows[file.stem] = {key: _aggregate(key)((row[key], run[key])) for key in COLUMNS}
+    if not rows:
+        raise InputError(results, "has no benchmarks", "Name the results folder of a finished run.")
+    rows = dict(sorted(rows.items(), key=lambda item: (-item[1]["core_seconds"], item[0])))
+    rows["total"] = {key: _aggregate(key)(row[key] for row in rows.values()) for key in COLUMNS}
+    cells = [
+        [stage, *(v if isinstance(v, int) else f"{v:.4g}" for v in row.values())]
+        for stage, row in rows.items()
+    ]
+    return "\n".join(as_markdown(["stage", *COLUMNS.values()], cells, numbers=True)) + "\n"
+
+
+def core_seconds(log: Path) -> tuple[float, float] | None:
+    """Core seconds that a script took to start and to work, from its log; None if it did not finish."""
+    found = _CORE_SECONDS.findall(log.read_text()) if log.exists() else []
+    return tuple(map(float, found[-1])) if found else None
+
+
+def _aggregate(column: str):
+    return max if column in MAXIMA else sum
+
+
+def _measured(benchmark: Path, log: Path) -> dict[str, float]:
+    """The columns of one run."""
+    header, values = (line.split("\t") for line in benchmark.read_text().splitlines()[:2])
+    measured = dict(zip(header, values, strict=True))
+    seconds, memory = float(measured["s"]), measured["max_rss"]
+    start, work = core_seconds(log) or (0.0, 0.0)
+    return {
+        "runs": 1,
+        "seconds": seconds,
+        "longest": seconds,
+        "core_seconds": start + work,
+        "start": start,
+        "memory": 0.0 if memory in ("-", "NA") else float(memory),
+    }

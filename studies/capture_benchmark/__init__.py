@@ -1,0 +1,1 @@
+"""Captures that Blender films, with a known truth."""

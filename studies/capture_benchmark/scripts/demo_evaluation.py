@@ -1,0 +1,101 @@
+"""Compare results of the demo captures with the ground truth and with goals."""
+
+import csv
+import io
+from pathlib import Path
+
+from neuma_lib.capture.calibration.lens import read_lens
+from neuma_lib.io.files import read_json, write_text
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.images import read_image_set, read_transforms
+from studies.capture_benchmark.evaluation import (
+    Truth,
+    compare_cameras,
+    compare_flight,
+    compare_masks,
+    compare_motion,
+    compare_registration,
+    mask_agreement,
+    table,
+    tracer_error,
+)
+from studies.capture_benchmark.sets import body_at_rest, body_of_drop
+from studies.capture_benchmark.settings import DemoCapturesConfig
+from workflow.stage import run_script
+
+EVERY = 4
+"""Stride of the video frames that are compared with true silhouettes."""
+
+
+def main(inputs, output, params, run) -> None:
+    demo, files = DemoCapturesConfig(**params.demo), params.files
+    rows = []
+    for number, name in enumerate(demo.objects):
+        capture, known = params.captures[name], read_json(files[name]["truth"])
+        lenses = {
+            group: read_lens(lens, "room.json")
+            for group, lens in read_json(files[name]["report"])["lenses"].items()
+        }
+        room = read_transforms(files[name]["room"])
+        photographs = {Path(file).stem: camera for file, camera in known["photographs"].items()}
+        cameras = compare_cameras(room["frames"], photographs, known["cameras"])
+        rest = body_at_rest(demo, name)
+        agreements = {"photographs": []}
+        for frame, alpha in mattes(files[name]["static"]):
+            true = photographs[Path(frame["file_path"]).stem]
+            agreements["photographs"].append(
+                mask_agreement(
+                    alpha, rest.vertices[0], rest.faces, true, lenses["photographs"], params.longest[name]
+                )
+            )
+        rows += [(capture, "", row) for row in cameras + compare_masks(agreements)]
+        for drop in demo.objects[name].drops:
+            of_drop = compare_drop(demo, name, drop, known, lenses, files[name], params)
+            rows += [(capture, drop, row) for row in of_drop]
+        run.progress(number + 1, len(demo.objects))
+    markdown, cells = table(rows)
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(cells)
+    write_text(output.csv, text.getvalue())
+    write_text(output.page, "# The demo captures compared with the ground truth\n\n" + markdown)
+    missed = [row.what for _, _, row in rows if row.reached is False]
+    run.say(f"{sum(row.reached is True for _, _, row in rows)} goals reached, {len(missed)} missed")
+
+
+def mattes(path):
+    """Entries of a set of mattes, each with its opacity (H, W), uint8."""
+    return list(zip(read_transforms(path)["frames"], read_image_set(path).images[..., 3]))
+
+
+def compare_drop(demo, name, drop, known, lenses, files, params):
+    of_drop = files["drops"][drop]
+    arrays, _ = read_arrays(of_drop["particles"], ("time", "x", "mass", "tracers"))
+    truth = Truth(*(arrays[key] for key in ("time", "x", "mass", "tracers")))
+    body, numbers = body_of_drop(demo, name, drop, of_drop["particles"])
+    agreements = {}
+    for camera, path in of_drop["mattes"].items():
+        agreements[camera] = [
+            mask_agreement(
+                alpha,
+                body.vertices[numbers[camera][frame["step"]]],
+                body.faces,
+                known["cameras"][camera],
+                lenses[camera],
+                params.longest[name],
+            )
+            for frame, alpha in mattes(path)[::EVERY]
+        ]
+    rows = compare_masks(agreements) + compare_flight(read_json(of_drop["flight"]), known, truth, drop)
+    if of_drop["registration"]:
+        registration = read_json(of_drop["registration"])
+        rows += compare_registration(registration, read_json(of_drop["velocity"]), known, truth, drop)
+        start = known["cameras"][min(registration["offsets_s"])]["offset_s"] + registration["t0_s"]
+        errors = {}
+        for method, path in of_drop["rollouts"].items():
+            motion, attributes = read_arrays(path, ("x", "frames"), ("x", "frames"))
+            errors[method] = tracer_error(motion["x"], motion["frames"] * attributes["dt"], truth, start)
+        rows += compare_motion(errors, params.prior, drop in known["held_out"])
+    return rows
+
+
+run_script(main, snakemake)

@@ -1,0 +1,291 @@
+"""The report of a capture: what it says, and that it holds all it shows."""
+
+import math
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from neuma_lib.capture.report import warnings as module
+from neuma_lib.capture.report.images import COLUMNS
+from neuma_lib.capture.report.page import Check
+from neuma_lib.capture.report.report import Film, Report, number, page, picture_uri, prefixed, room_value
+from tests.support.errors import refused
+
+NASTY = "<script>alert(\"x\")</script> & 'mug'"
+VOID = ("meta", "img", "br")
+
+
+class Reader(HTMLParser):
+    """Checks that elements are closed in order, and keeps what the page refers to."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.links, self.tags, self.said = [], [], [], ""
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        self.links += [
+            value for key, value in attributes if key in ("src", "href", "poster", "srcset", "data")
+        ]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.said += data
+
+
+def row(method="neuma", throw="one", camera="left", learned=True, **values):
+    named = {"method": method, "title": method, "throw": throw, "camera": camera, "learned": learned}
+    return {**named, "frames": 5, **dict.fromkeys(COLUMNS, 0.9), "psnr": 20.0, **values}
+
+
+def identified(**changes):
+    quantities = {
+        "E": {"value": 4e5, "log_std": 0.5, "determined": False},
+        "yield_stress": {"value": 1000.0, "log_std": 0.05, "determined": True},
+        "friction_angle": {"value": 30.0, "log_std": 900.0, "determined": False},
+    }
+    families = {
+        "von_mises": {"held_out_loss": 1e-3, "score": -6.0},
+        "hencky": {"held_out_loss": 2e-3, "score": -5.0},
+        "sand": {},
+    }
+    best = {"quantities": quantities, "diverged": False}
+    return {"family": "von_mises", "ties": [], "families": families, "best": best, **changes}
+
+
+@pytest.fixture
+def whole(tmp_path):
+    """A report with everything in it."""
+    Image.new("RGB", (1600, 20), "red").save(tmp_path / "sheet.png")
+    (tmp_path / "left.mp4").write_bytes(b"frames")
+    return {
+        "title": "mug",
+        "method": "NeuMA",
+        "summary": ["40 photographs."],
+        "warnings": ["One camera alone."],
+        "checks": {
+            "Room": [Check("floor", "12 %", "> 20 %", False), Check("board", "0.2 mm", "< 0.5", True)]
+        },
+        "pictures": {"Videos": {"Frames: one, left": tmp_path / "sheet.png"}},
+        "films": [Film("one", "left", True, tmp_path / "left.mp4", "PSNR 20.0 dB")],
+        "rows": [row("nclaw", psnr=15.0), row(), row(throw="all", camera="all")],
+        "own": "neuma",
+        "curves": tmp_path / "sheet.png",
+        "identified": identified(),
+    }
+
+
+def test_the_page_holds_all_that_it_shows_and_asks_for_nothing_else(whole):
+    read = Reader(page(Report(**whole)))
+    assert {"video", "img", "table", "details"} <= set(read.tags) and "script" not in read.tags
+    assert all(link.startswith(("data:", "#")) for link in read.links) and len(read.links) > 5
+    anchors = [link[1:] for link in read.links if link.startswith("#")]
+    assert set(anchors) == set(re.findall(r'<h2 id="([^"]+)"', page(Report(**whole))))
+    style = page(Report(**whole)).partition("<style>")[2].partition("</style>")[0]
+    assert "url(" not in style and "@import" not in style
+    for text in (
+        "40 photographs.",
+        "One camera alone.",
+        "One check failed.",
+        "✗ failed",
+        "✓ passed",
+        "PSNR 20.0 dB",
+    ):
+        assert text in read.said
+    assert read.said.count("not determined") == 2 and "(training)" in read.said
+
+
+def test_names_and_texts_are_escaped(whole, tmp_path):
+    nasty = {
+        "title": NASTY,
+        "method": NASTY,
+        "summary": [NASTY],
+        "warnings": [NASTY],
+        "checks": {NASTY: [Check(NASTY, NASTY, NASTY, True)]},
+        "pictures": {NASTY: {NASTY: tmp_path / "sheet.png", NASTY + " ": tmp_path / "none.png"}},
+        "films": [
+            Film(NASTY, NASTY, True, tmp_path / "left.mp4", NASTY),
+            Film(NASTY, NASTY, True, None),
+        ],
+        "rows": [row(throw=NASTY, camera=NASTY, title=NASTY)],
+        "identified": identified(family=NASTY, ties=[NASTY]),
+    }
+    read = Reader(page(Report(**{**whole, **nasty})))
+    assert "script" not in read.tags
+    assert read.said.count(NASTY) >= 15
+    assert all(link.startswith(("data:", "#")) for link in read.links)
+
+
+def test_what_is_missing_is_said():
+    said = Reader(page(Report("mug", "NeuMA"))).said
+    for text in (
+        "There are no videos.",
+        "No pictures were measured.",
+        "There are no stress curves.",
+        "No family of laws was identified.",
+        "There are no checks.",
+        "There are no pictures.",
+    ):
+        assert text in said
+
+
+def test_files_that_are_not_there_are_said_to_be_missing(whole, tmp_path):
+    gone = tmp_path / "gone"
+    films = [Film("one", "left", True, gone)]
+    read = Reader(
+        page(Report(**{**whole, "films": films, "pictures": {"Videos": {"Sheet": gone}}, "curves": gone}))
+    )
+    assert "The video of left is missing." in read.said and "Sheet: the picture is missing." in read.said
+    assert "There are no stress curves." in read.said and "video" not in read.tags
+
+
+def test_a_file_that_is_no_picture_is_named(tmp_path):
+    (tmp_path / "sheet.png").write_text("no picture")
+    with refused("sheet.png"):
+        picture_uri(tmp_path / "sheet.png")
+
+
+def test_pictures_are_made_small(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 255, (300, 3000, 3), np.uint8)
+    Image.fromarray(noise).save(tmp_path / "large.png")
+    assert len(picture_uri(tmp_path / "large.png")) < (tmp_path / "large.png").stat().st_size / 10
+
+
+def test_stresses_are_those_of_the_room():
+    # A room of half the box's size: the same body is as stiff relative to rho v^2 where E is a quarter.
+    assert room_value("E", 4e5, 2.0) == (1e5, "Pa")
+    assert room_value("viscosity", 40.0, 2.0) == (10.0, "Pa s")
+    assert room_value("friction_angle", 30.0, 2.0) == (30.0, "°")
+    assert room_value("yield_strain", 0.1, 2.0) == (0.1, "")
+    shown = Reader(page(Report("mug", "NeuMA", identified=identified(), scale=2.0))).said
+    assert "100 kPa" in shown and "250 Pa" in shown and "lengths are 2 times" in shown
+    # Two standard deviations of the logarithm, and one that says nothing.
+    assert f"{number(250 / math.exp(0.1))} to {number(250 * math.exp(0.1))}" in shown
+    assert "unknown" in shown
+
+
+@pytest.mark.parametrize(
+    "value, text",
+    [
+        (0, "0"),
+        (0.25, "0.25"),
+        (9996.0, "10000"),
+        (1000.0, "1000"),
+        (123456.0, "1.23 × 10⁵"),
+        (-2e-5, "-2.00 × 10⁻⁵"),
+    ],
+)
+def test_numbers_are_short(value, text):
+    assert number(value) == text
+
+
+def test_stresses_have_prefixes():
+    assert prefixed(2.5e5, "Pa") == (1e-3, "kPa") and prefixed(3e6, "Pa s") == (1e-6, "MPa s")
+    assert prefixed(250.0, "Pa") == (1.0, "Pa") and prefixed(2.5e5, "°") == (1.0, "°")
+
+
+CAPTURE = {"density": 900.0, "density_stated": True, "held_out": ["two"]}
+GOOD_FLIGHT = {"spin_rad_s": [0, 1, 0]}
+GOOD_MOTION = {
+    "fastest_m_s": 2.0,
+    "frames_after_contact": {"left": 30, "right": 30},
+    "touched": [],
+    "diverged": None,
+}
+
+
+def take(**changes):
+    cameras = {"left": 1e-3, "right": 1e-3}
+    return {"one": {"cameras": cameras, "flight": GOOD_FLIGHT, "prediction": GOOD_MOTION, **changes}}
+
+
+def test_a_capture_without_faults_has_no_warnings():
+    assert module.filming_warnings(CAPTURE, take()) == []
+    assert module.check_warnings({"Room": [Check("floor", "50 %", "> 20 %", True)]}) == []
+    rows = [row("nclaw", psnr=15.0), row(), row(throw="all", camera="all")]
+    assert module.prediction_warnings(rows, "neuma", "nclaw", "constants", {"one": GOOD_MOTION}) == []
+    assert (
+        module.constants_warnings(None) == [] and module.curve_warnings(None, {}, "nclaw", "constants") == []
+    )
+
+
+@pytest.mark.parametrize(
+    "changes, said",
+    [
+        ({"cameras": {"left": 1e-3}}, "only one camera"),
+        ({"flight": {"spin_rad_s": None}}, "no spin was measured"),
+        ({"cameras": {"left": 1e-3, "right": 0.0}}, "no exposure is set for right.*2.0 mm"),
+        (
+            {"prediction": {**GOOD_MOTION, "frames_after_contact": {"left": 3}}},
+            "one, left: only 3 frames",
+        ),
+        ({"prediction": {**GOOD_MOTION, "touched": ["x_min"]}}, "touches the box .x_min."),
+        ({"registration": {"ambiguous": "it looks alike"}}, "does not determine the pose .*: it looks alike"),
+    ],
+)
+def test_each_fault_of_filming_is_said(changes, said):
+    (found,) = module.filming_warnings(CAPTURE, take(**changes))
+    assert re.search(said, found)
+
+
+def test_what_nobody_stated_or_held_out_is_said():
+    (density,) = module.filming_warnings({**CAPTURE, "density_stated": False}, take())
+    assert "900 kg/m³" in density
+    (held,) = module.filming_warnings({**CAPTURE, "held_out": []}, take())
+    assert "No take is held out" in held
+
+
+def test_predictions_that_are_worse_than_nothing_are_said():
+    rows = [row("nclaw", psnr=21.0), row(iou=0.5)]
+    rows += [row(throw="all", camera="all"), row(throw="all", camera="all", learned=False, psnr=18.0)]
+    rows += [row("constants", throw="all", camera="all", psnr=22.0)]
+    broken = {**GOOD_MOTION, "stable": False, "diverged": {"step": 30, "happened": "became non-finite"}}
+    found = module.prediction_warnings(rows, "neuma", "nclaw", "constants", {"one": broken})
+    for text in (
+        "diverged at step 30",
+        "training diverged",
+        "prior, without any learning",
+        "is 0.50",
+        "Held-out",
+        "In training frames, the identified constants alone fit better",
+    ):
+        assert sum(text in line for line in found) == 1, text
+    assert len(found) == 6
+
+
+def test_undetermined_constants_and_ties_are_said():
+    tie, open_ = module.constants_warnings(identified(ties=["hencky"]))
+    assert (
+        "von_mises, hencky" in tie
+        and "does not determine E, friction_angle" in open_
+        and "yield_stress" in open_
+    )
+
+
+def curve(stress, band=None):
+    x = [0.0, 1.0, 2.0, 3.0]
+    ends = {"x": x, "low": [v - band for v in x], "high": [v + band for v in x]} if band else None
+    return {"stress": stress, "band": ends}
+
+
+def test_laws_outside_the_band_are_said():
+    laws = {
+        "nclaw": curve([5.0, 6.0, 7.0, 8.0]),
+        "constants": curve([0.0, 1.0, 2.0, 3.0], band=0.5),
+        "neuma": curve([0.0, 1.2, 2.2, 3.1]),
+    }
+    test = {"x": [0.0, 1.0, 2.0, 3.0], "visited": [0.0, 3.0], "by_stress": False, "laws": laws}
+    curves = {"learned": "neuma", "rate": 20, "tests": {"shear": test}}
+    titles = {"nclaw": "prior", "constants": "identified constants", "neuma": "NeuMA"}
+    found = module.curve_warnings(curves, titles, "nclaw", "constants")
+    assert len(found) == 3 and "no error bars" in found[1]
+    assert found[2].startswith("Shear: over 100 % of the visited range, prior is outside")

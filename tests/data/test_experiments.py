@@ -1,0 +1,220 @@
+"""Several bodies on one grid, coloured solids, and densities that differ inside a body."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from neuma_lib.coupling.bodies import coloured_solid, join
+from neuma_lib.coupling.particle_binding import bind_two_pass
+from neuma_lib.coupling.reconstruction import Reconstruction
+from neuma_lib.data.ground_truth import TrueBody, simulate_ground_truth
+from neuma_lib.errors import InputError
+from neuma_lib.geometry.shapes import place
+from neuma_lib.geometry.volume import check_apart, sample_volume
+from neuma_lib.io.files import write_json
+from neuma_lib.io.gaussians import save_gaussians
+from neuma_lib.io.particles import load_initial_state, save_binding, save_particles
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.density import density_at
+from neuma_lib.project import cases
+from neuma_lib.project.loading import load, merged
+from neuma_lib.sim.model import MPMModel, consecutive
+from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State
+from neuma_lib.splatting.cameras import Cameras
+from tests.support.errors import refused
+from tests.support.render_scenes import dense
+
+ROOT = Path(__file__).resolve().parents[2]
+JELLY = {"elasticity": {"name": "fixed_corotated", "E": 1e5, "nu": 0.2}}
+SPLIT = {"axis": "x", "at": 0.5, "below": 500.0, "above": 1500.0}
+FLOATING = MPMModel(grid=16, dt=1e-3, gravity=(0.0, 0.0, 0.0))
+
+
+def solid(x: float, shape: str = "ball", count: int = 150) -> tuple:
+    mesh = place(shape, 0.22, 0.5, (x, 0.5))
+    points = torch.as_tensor(sample_volume(mesh, count, seed=3), dtype=torch.float32)
+    return mesh, points, coloured_solid(mesh, points, 1000.0, torch.full((len(points), 3), 0.5))
+
+
+def settings(**changes):
+    raw = yaml.safe_load((ROOT / "config" / "config.yaml").read_text())
+    return load(merged(raw, changes), ROOT)
+
+
+def test_bodies_of_an_experiment_are_complete():
+    found = settings(
+        experiments={
+            "x": {
+                "title": "X",
+                "bodies": [
+                    {"scene": "BouncyBall", "shape": "letter_N", "height": 0.5},
+                    {"scene": "ClayCat"},
+                ],
+                "steps": 100,
+            }
+        }
+    )
+    letter, cat = found.experiment_bodies("x")
+    ball = found.scene("BouncyBall").plain()
+    assert (letter["shape"], letter["height"], letter["size"]) == ("letter_N", 0.5, None)
+    assert letter["velocity"] == ball["velocity"] and letter["law"] == ball["law"]
+    assert not letter["reconstructed"] and cat["reconstructed"]
+    scene = found.scene("ClayCat").plain()
+    assert {key: cat[key] for key in ("shape", "size", "height", "velocity")} == {
+        key: scene[key] for key in ("shape", "size", "height", "velocity")
+    }
+    assert found.experiment_dt("x") == scene["dt"] < ball["dt"]
+
+
+def test_mistakes_in_experiments_and_tables_are_named():
+    body = {"title": "X", "steps": 10}
+    with pytest.raises(InputError, match="experiments.x.bodies.0.scene: no scene 'ClayCats'; did you mean"):
+        settings(experiments={"x": {**body, "bodies": [{"scene": "ClayCats"}]}})
+    with pytest.raises(InputError, match="height: a reconstructed object starts as in its scene"):
+        settings(experiments={"x": {**body, "bodies": [{"scene": "ClayCat", "height": 0.4}]}})
+    with pytest.raises(InputError, match="tables.table2.experiments: no experiment 'letter_M_bouncy'"):
+        settings(tables={"table2": {"experiments": ["letter_M_bouncy"]}})
+    with pytest.raises(InputError, match="at least one scene or experiment"):
+        settings(tables={"table2": {"experiments": []}})
+    with pytest.raises(InputError, match="scenes.ClayCat.density"):
+        settings(scenes={"ClayCat": {"density": {"below": 1.0}}})
+
+
+def test_what_a_method_believes_of_the_density():
+    found = settings()
+    own = found.scene("UnevenCat").plain()["density"]
+    assert cases.case(found, "UnevenCat", "neuma").density("UnevenCat") == own
+    assert cases.case(found, "UnevenCat", "neuma+assumed_density=900").density("UnevenCat") == 900
+
+
+def test_densities_on_both_sides_of_a_plane():
+    x = torch.tensor([[0.4, 0, 0], [0.6, 0, 0], [0.5, 0, 0]])
+    assert density_at(x, SPLIT).tolist() == [500, 1500, 1500]
+    assert density_at(x, 700.0).tolist() == [700, 700, 700]
+    assert density_at(x.double(), {**SPLIT, "axis": "z"}).tolist() == [500] * 3
+
+
+def test_a_joined_body_renders_and_binds_as_its_parts():
+    _, _, left = solid(0.3)
+    _, points, plain = solid(0.7)
+    matrix, x0, _, vol0 = bind_two_pass(
+        plain.gaussians.means[:90], 3 * plain.gaussians.covars()[:90], points, plain.vol0
+    )
+    kernels = plain.gaussians[torch.arange(len(points)) < 90]
+    kernels.shN = torch.randn(90, 3, 3, generator=torch.Generator().manual_seed(0))
+    right = Reconstruction(x0, vol0, 1500 * vol0, kernels, matrix)
+    both = join([left, right])
+    split = len(left.x0)
+    torch.testing.assert_close(
+        dense(both.binding), torch.block_diag(dense(left.binding), dense(right.binding))
+    )
+    assert torch.equal(both.mass, torch.cat([left.mass, right.mass]))
+    assert torch.equal(both.gaussians.sh()[split:], right.gaussians.sh())
+    assert not both.gaussians.shN[:split].any()
+    with refused("bodies 0 and 1"):
+        check_apart([solid(0.5)[0], solid(0.6)[0]])
+    check_apart([solid(0.3)[0], solid(0.7)[0]])
+
+
+def test_a_coloured_solid_covers_its_outline_in_its_colour():
+    mesh = place("letter_N", None, 0.5, (0.5, 0.5))
+    points = torch.as_tensor(sample_volume(mesh, 800, seed=0), dtype=torch.float32)
+    body = coloured_solid(mesh, points, 1000.0, torch.tensor([0.2, 0.6, 0.4]).expand(len(points), 3))
+    assert float(body.vol0.sum()) == pytest.approx(mesh.volume, rel=1e-5)
+    view = torch.eye(4)
+    view[:3, :3] = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+    view[:3, 3] = torch.tensor([-0.5, 0.5, 1.5])
+    cameras = Cameras(view[None], torch.tensor([[[90.0, 0, 32], [0, 90.0, 32], [0, 0, 1]]]), 64, 64)
+    eye = torch.eye(3).expand(1, len(points), 3, 3)
+    image = body.particle_gs(cameras)(points[None], eye)[0, 0]
+    # The front faces the camera: the centre of a stroke is opaque, the notch above the diagonal is empty.
+    stroke, _ = cameras.project(torch.tensor([[0.39, 0.5, 0.55], [0.54, 0.62, 0.55], [0.2, 0.5, 0.5]]))
+    left, notch, outside = (image[int(v), int(u)] for u, v in stroke[0].tolist())
+    assert left.max() < 0.75 and left[1] > left[2] > left[0]
+    assert outside.min() > 0.99 and notch.min() > 0.8
+
+
+def test_bodies_far_apart_move_as_they_do_alone():
+    model = MPMModel(grid=20, dt=1e-3)
+    bodies = [solid(0.25)[2], solid(0.75)[2]]
+    laws = [analytic_law(JELLY), analytic_law({"elasticity": {"name": "hencky", "E": 3e5, "nu": 0.25}})]
+    velocities = [[0.0, -3.0, 0.0], [0.0, -2.0, 0.0]]
+    frames, both = (0, 60, 120), join(bodies)
+    counts = [len(body.x0) for body in bodies]
+    start = State.joined([body.state(v0) for body, v0 in zip(bodies, velocities, strict=True)])
+    assert torch.equal(start.x, both.x0) and torch.equal(start.mass, both.mass)
+    together = rollout(model, consecutive(laws, counts), start, steps=120, frames=frames)
+    start = 0
+    for body, law, velocity in zip(bodies, laws, velocities, strict=True):
+        alone = rollout(model, law, body.state(velocity), steps=120, frames=frames)
+        part = together.x[:, start : start + len(body.x0)]
+        torch.testing.assert_close(part, alone.x, atol=2e-6, rtol=0)
+        start += len(body.x0)
+
+
+def test_colliding_bodies_of_different_mass_exchange_momentum():
+    """Free of gravity and walls, total momentum stays, and both bodies feel the collision."""
+    meshes = [solid(0.34)[0], solid(0.66)[0]]
+    bodies = [
+        TrueBody(meshes[0], analytic_law(JELLY), (1.0, 0.0, 0.0), 1000.0),
+        TrueBody(meshes[1], analytic_law(JELLY), (-1.0, 0.0, 0.0), SPLIT | {"at": 0.66}),
+    ]
+    truth = simulate_ground_truth(FLOATING, bodies, (0, 40, 80), particles=300, tracers=600, seed=1)
+    count = len(sample_volume(meshes[0], 300, seed=1))
+    assert set(np.unique((truth.mass / truth.vol0)[count:].round())) == {500.0, 1500.0}
+    momentum = (truth.mass[:, None] * truth.path.v).sum(1)
+    torch.testing.assert_close(momentum[-1], momentum[0], atol=2e-4 * float(truth.mass.sum()), rtol=0)
+    for part in (slice(0, count), slice(count, None)):
+        speed = (truth.mass[part, None] * truth.path.v[:, part]).sum(1)[:, 0] / truth.mass[part].sum()
+        assert abs(float(speed[-1] - speed[0])) > 0.2
+    # Tracers fill both bodies, equally densely.
+    left = float((truth.tracers[0, :, 0] < 0.5).float().mean())
+    assert left == pytest.approx(0.5, abs=0.04)
+
+
+def test_a_start_has_the_densities_and_motions_of_its_bodies(tmp_path):
+    both = join([solid(0.3)[2], solid(0.7)[2]])
+    half = len(both.x0) // 2
+    save_gaussians(tmp_path / "g.ply", both.gaussians)
+    save_binding(tmp_path / "b.h5", both.binding)
+    save_particles(tmp_path / "p.h5", both.x0, both.vol0, {})
+    still, pivot = {"angular_velocity": [0, 0, 0], "centre": None}, [0.6, 0.5, 0.5]
+    starts = [
+        {"v0": [1.0, 0, 0], **still, "particles": half},
+        {
+            "v0": [0, 0, 2.0],
+            "angular_velocity": [0, 3.0, 0],
+            "centre": pivot,
+            "particles": len(both.x0) - half,
+        },
+    ]
+    files = [tmp_path / name for name in ("p.h5", "b.h5", "g.ply", "v.json")]
+    write_json(files[-1], {"bodies": starts})
+    start, counts = load_initial_state(*files, [1000.0, {**SPLIT, "axis": "y"}])
+    assert counts == [half, len(both.x0) - half]
+    assert start.v[:half].unique(dim=0).tolist() == [[1, 0, 0]] and not start.C[:half].any()
+    arm = start.x[half:] - torch.tensor(pivot)
+    turning = torch.stack([3 * arm[:, 2], torch.zeros(len(arm)), 2 - 3 * arm[:, 0]], dim=1)
+    torch.testing.assert_close(start.v[half:], turning)
+    torch.testing.assert_close(
+        (start.C[half:] @ arm[:, :, None])[..., 0], turning - torch.tensor([0, 0, 2.0])
+    )
+    density = start.density.round()
+    assert set(density[:half].tolist()) == {1000.0} and set(density[half:].tolist()) == {500.0, 1500.0}
+    with refused(files[-1]):
+        load_initial_state(*files, [1000.0])
+    with refused(files[-1]):
+        load_initial_state(*files, [1000.0, 1000.0], "gaussians")
+    write_json(files[-1], {"v0": [0, 1.0, 0], **still})
+    start, counts = load_initial_state(*files, [1000.0])
+    assert counts == [len(both.x0)] and start.v.unique(dim=0).tolist() == [[0, 1, 0]]
+    splats, counts = load_initial_state(*files, [500.0], "gaussians")
+    assert counts == [len(both.gaussians)]
+    torch.testing.assert_close(splats.x, both.gaussians.means)
+    torch.testing.assert_close(splats.mass.sum(), 500.0 * both.vol0.sum())

@@ -1,0 +1,180 @@
+"""Predicting a motion and comparing it with the truth: what is known of the error must come out."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from neuma_lib.errors import NonFiniteError
+from neuma_lib.evaluation.motion import evaluate, predict
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.law import Elasticity, Law
+from neuma_lib.methods.model import LawOnGrid
+from neuma_lib.sim.rollout import rollout
+from tests.support.errors import refused
+from tests.support.grounding_scene import MODEL, PRIOR, RADIUS, TRUTH, ball
+
+pytestmark = pytest.mark.core
+
+V0 = torch.tensor([0.3, -1.5, 0.1], dtype=torch.float64)
+LAW = analytic_law(TRUTH, MODEL.dt)
+IN_FLIGHT = [0, 5, 10, 20]
+"""Frames before the ball of `ball()` touches the floor."""
+
+
+def in_ball(count: int, seed: int, height: float = 0.3) -> torch.Tensor:
+    """Uniform points in the ball of `ball()`."""
+    g = torch.Generator().manual_seed(seed)
+    direction = torch.randn(count, 3, generator=g, dtype=torch.float64)
+    radius = RADIUS * torch.rand(count, 1, generator=g, dtype=torch.float64) ** (1 / 3)
+    centre = torch.tensor([0.5, height, 0.5], dtype=torch.float64)
+    return centre + radius * direction / direction.norm(dim=1, keepdim=True)
+
+
+def true_tracers(body, frames, *starts, law=LAW) -> list[torch.Tensor]:
+    """Paths of tracers in the motion of a body under the true law, one (T, M, 3) for each set of starts."""
+    with torch.no_grad():
+        path = rollout(MODEL, law, body.state(V0), steps=frames[-1], frames=frames, tracers=torch.cat(starts))
+    return path.tracers.split([len(points) for points in starts], dim=1)
+
+
+def test_the_true_law_from_another_sampling_is_as_good_as_the_sampling_allows():
+    particles, tracers, frames = 1500, 500, [0, 20, 50, 75, 100]
+    truth, again = true_tracers(
+        ball(count=particles, seed=0), frames, in_ball(tracers, 10), in_ball(tracers, 11)
+    )
+    body, starts = ball(count=particles, seed=1), in_ball(tracers, 12)
+    found, wrong = (
+        evaluate(MODEL, LawOnGrid(law), body.state(V0), frames, truth, again, starts).metrics
+        for law in (LAW, analytic_law(PRIOR, MODEL.dt))
+    )
+    # A coordinate of uniform points in the ball has the variance R^2 / 5, so the centres of mass of two samplings
+    # are sqrt(2 * 3 * R^2 / (5 N)) apart; the floor meets each with its own. Three standard deviations.
+    limit = 3e3 * math.sqrt(6 / (5 * particles)) * RADIUS
+    assert found["tracer_rmse_mm"] < limit < wrong["tracer_rmse_mm"] / 3
+    assert max(found["tracer_rmse_mm_per_frame"][:2]) < 1e-9  # before contact no sampling matters
+    # Squared distances r^2 to the nearest of M points (r^3 is exponential) deviate by 0.68 of their mean. Two sets of
+    # M against the truth, two directions each, whose neighbours share points (a factor of sqrt(2) at most): three
+    # standard deviations of the difference.
+    floor = found["chamfer_floor"]
+    sampling = 3 * 0.68 * floor / math.sqrt(tracers) * math.sqrt(2)
+    # Tracers that are e away from where they should be change mean r^2 by at most 2 e r + e^2, in both directions.
+    e = 1e-3 * found["tracer_rmse_mm"]
+    displaced = 2e4 * (2 * e * math.sqrt(0.5e-4 * floor) + e**2)
+    assert abs(found["chamfer_excess"]) < sampling + displaced < wrong["chamfer_excess"]
+    in_flight = [a - b for a, b in zip(found["chamfer_per_frame"], found["chamfer_floor_per_frame"])][:2]
+    assert max(map(abs, in_flight)) < sampling
+    assert found["diverged_at_step"] is found["diverged"] is found["energy_gain_after_step"] is None
+
+
+def test_a_known_shift_of_the_truth_is_the_error():
+    """Tracers on a lattice wider than twice the shift: every one has its own twin for a neighbour."""
+    shift = torch.tensor([3e-3, 0.0, 4e-3], dtype=torch.float64)  # 5 mm
+    axis = 0.03 * torch.arange(-2, 3, dtype=torch.float64)
+    lattice = torch.cartesian_prod(axis, axis, axis) + torch.tensor([0.5, 0.3, 0.5], dtype=torch.float64)
+    (path,) = true_tracers(ball(), IN_FLIGHT, lattice)
+    truth = path + shift
+    truth[0] = lattice
+    evaluation = evaluate(MODEL, LawOnGrid(LAW), ball(seed=1).state(V0), IN_FLIGHT, truth, path, lattice)
+    found = evaluation.metrics
+    assert found["tracer_rmse_mm_per_frame"] == pytest.approx([0, 5, 5, 5], abs=1e-9)
+    assert found["tracer_rmse_mm"] == pytest.approx(5 * math.sqrt(3 / 4), rel=1e-9)
+    assert (
+        found["tracer_error_p95_mm"]
+        == pytest.approx(found["tracer_rmse_last_mm"])
+        == pytest.approx(5, rel=1e-9)
+    )
+    # 25 mm^2 in both directions, in units of 1e-4 m^2: for the prediction, and for the floor that is shifted too.
+    assert found["chamfer_per_frame"] == pytest.approx([0, 0.5, 0.5, 0.5], rel=1e-9, abs=1e-12)
+    assert found["chamfer_floor_per_frame"] == found["chamfer_per_frame"]
+    assert found["chamfer"] == pytest.approx(0.375) and found["chamfer_excess"] == 0
+    torch.testing.assert_close(evaluation.tracers, path)
+    # The prediction is wrong by the fall that a slower start lacks.
+    slower = evaluate(
+        MODEL, LawOnGrid(LAW), ball(seed=1).state(V0 + shift), IN_FLIGHT, path, path, lattice
+    ).metrics
+    late = [1e3 * 5e-3 * MODEL.dt * step for step in IN_FLIGHT]
+    assert slower["tracer_rmse_mm_per_frame"] == pytest.approx(late, abs=1e-9)
+
+
+class FailsOnce(Elasticity):
+    """The true elasticity, not a number at one evaluation of its life; a simulation evaluates it once a step."""
+
+    def __init__(self, step: int):
+        super().__init__()
+        self.step, self.count = step, 0
+
+    def response(self, F, weights):
+        self.count += 1
+        return LAW.elasticity.response(F, weights) * (math.nan if self.count == self.step else 1)
+
+
+ON_THE_FLOOR = RADIUS + MODEL.free_range[0] - MODEL.dx / 2
+"""Height at which particles of the ball feel the floor from the first step on."""
+
+
+def test_a_motion_that_diverges_is_held_and_marked():
+    frames, body = [0, 4, 8, 12], ball(height=ON_THE_FLOOR)
+    tracers = in_ball(50, 0, ON_THE_FLOOR)
+    (truth,) = true_tracers(body, frames, tracers)
+    evaluation = evaluate(
+        MODEL, LawOnGrid(Law(FailsOnce(6), LAW.plasticity)), body.state(V0), frames, truth, truth, tracers
+    )
+    path, found = evaluation.path, evaluation.metrics
+    assert found["diverged_at_step"] == 6
+    assert found["diverged"] == {"happened": "became non-finite", "step": 6, "particle": 0}
+    assert evaluation.summary().endswith("DIVERGED: a particle became non-finite at step 6")
+    assert path.frames == (0, 4, 4, 4) and len(found["chamfer_per_frame"]) == 4
+    sound, _ = predict(MODEL, LAW, body.state(V0), [0, 4])
+    for name in ("x", "F", "tracers"):
+        values = getattr(path, name)
+        assert torch.isfinite(values).all()
+        assert torch.equal(values[2], values[1]) and torch.equal(values[3], values[1])
+    assert torch.equal(path.x[:2], sound.x) and torch.equal(path.F[:2], sound.F)
+    errors = found["tracer_rmse_mm_per_frame"]
+    assert errors[:2] == [0, 0]
+    expected = 1e3 * (truth[1] - truth[3]).square().sum(-1).mean().sqrt()  # the truth goes on
+    assert errors[3] == pytest.approx(float(expected)) and errors[3] > errors[2] > 1
+
+
+class Repelling(Elasticity):
+    """The true elasticity with its sign turned: what is deformed is driven further."""
+
+    def response(self, F, weights):
+        return -LAW.elasticity.response(F, weights)
+
+
+def test_a_motion_that_explodes_had_too_much_energy_before():
+    """Which fault it was is told from a number that is no more; the energy, a frame or more before it."""
+    frames, body = list(range(0, 61, 2)), ball(height=ON_THE_FLOOR)
+    tracers = in_ball(50, 0, ON_THE_FLOOR)
+    (truth,) = true_tracers(body, frames, tracers)
+    found = evaluate(
+        MODEL, LawOnGrid(Law(Repelling(), LAW.plasticity)), body.state(V0), frames, truth, truth, tracers
+    ).metrics
+    failure = found["diverged"]
+    assert failure["happened"] != "became non-finite" and failure["step"] == found["diverged_at_step"]
+    assert 0 <= found["energy_gain_after_step"] < failure["step"] - 2
+    sound = evaluate(MODEL, LawOnGrid(LAW), body.state(V0), frames, truth, truth, tracers).metrics
+    assert sound["diverged"] is sound["energy_gain_after_step"] is None
+
+
+def test_a_floor_of_other_counts_is_refused():
+    (truth, again) = true_tracers(ball(), IN_FLIGHT, in_ball(40, 0), in_ball(40, 1))
+    with refused("evaluation.tracers"):
+        evaluate(MODEL, LawOnGrid(LAW), ball().state(V0), IN_FLIGHT, truth, again, in_ball(50, 2))
+
+
+def test_a_motion_without_a_finite_frame_is_an_error():
+    with pytest.raises(NonFiniteError, match="step 2"):
+        predict(MODEL, Law(FailsOnce(2), LAW.plasticity), ball(height=ON_THE_FLOOR).state(V0), [4, 8])
+
+
+def test_a_motion_that_stays_finite_is_the_rollout():
+    frames, body = [0, 10, 40], ball()
+    path, failure = predict(MODEL, LAW, body.state(V0), frames)
+    with torch.no_grad():
+        expected = rollout(MODEL, LAW, body.state(V0), steps=40, frames=frames)
+    assert failure is None and torch.equal(path.x, expected.x) and torch.equal(path.F, expected.F)

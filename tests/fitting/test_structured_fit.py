@@ -1,0 +1,346 @@
+"""Which parts of a structured law are corrected, and that the others stay as they are."""
+
+import copy
+from itertools import pairwise
+
+import pytest
+import torch
+
+from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.structured import StructuredConfig
+from neuma_lib.errors import InputError
+from neuma_lib.fitting.frame_batches import first_contact, held_out_frames
+from neuma_lib.fitting.material import ParticleLoss, PixelLoss, Stretch, train_material
+from neuma_lib.fitting.structured_fit import (
+    AS_WELL,
+    Trial,
+    _chosen,
+    from_frame,
+    largest_as_good,
+    rival_bases,
+    subsets,
+    told_from,
+    train_structured,
+)
+from neuma_lib.mechanics.structured import structured_law
+from neuma_lib.sim.rollout import rollout
+from tests.support.errors import refused
+from tests.support.grounding_scene import MODEL, TRUTH, ball, observe
+
+pytestmark = pytest.mark.core
+
+FRAMES = (0, 50, 60, 70, 80, 90, 100, 110)  # it touches the ground at about 50
+V0 = torch.tensor([0.0, -1.5, 0.0], dtype=torch.float64)
+SETTINGS = MaterialConfig(
+    iterations=3, rank=None, lr_elastic=0.02, lr_plastic=0.02, warm_up=0, checkpoint_every=1
+)
+STRUCTURED = StructuredConfig(trial_iterations=2, blocks=2)
+FLOWS = {
+    "elasticity": {**TRUTH["elasticity"], "E": 6e4},
+    "plasticity": {"name": "von_mises", "yield_stress": 1e6},  # beyond what the fall reaches
+}
+
+
+@pytest.fixture(scope="module")
+def problem():
+    body = ball()
+    return body, PixelLoss(body, observe(body, V0, FRAMES))
+
+
+def fit(problem, *specs, settings=SETTINGS, structured=STRUCTURED, **options):
+    body, loss = problem
+    laws = [structured_law(spec, MODEL.dt).double() for spec in specs]
+    for law in laws:
+        law.attach_adaptor(rank=settings.rank)
+    options["rivals"] = laws[1:]
+    return train_structured(MODEL, laws[0], body.state(V0), loss, settings, structured, **options)
+
+
+def deltas(law, part):
+    return [p.detach() for p in law.parts[part].adaptor.parameters()]
+
+
+@pytest.fixture(scope="module")
+def too_stiff(problem):
+    said, shown = [], []
+    trained, choice = fit(problem, FLOWS, log=said.append, progress=lambda *state: shown.append(state))
+    return trained, choice, said, shown
+
+
+def test_the_part_that_gains_is_corrected_and_the_other_stays_exactly(too_stiff):
+    trained, choice, said, shown = too_stiff
+    assert choice.parts == ("elastic",)
+    assert set(choice.trials) == {"nothing", "elastic", "plastic", "elastic + plastic"}
+    before, after = choice.trials["nothing"], choice.trials["elastic"]
+    assert after.held_out_loss < 0.95 * before.held_out_loss
+    assert choice.trials["plastic"] == before, "no state yields"
+    assert any(bool(p.any()) for p in deltas(trained.law, "elasticity"))
+    assert not any(bool(p.any()) for p in deltas(trained.law, "plasticity"))
+    assert trained.best_loss < trained.history.loss[0] and len(said) == 3
+    done = [state[0] for state in shown]
+    assert done == sorted(done) and done[-1] == 5 and {state[1] for state in shown} == {5}
+    assert choice.held_out_frames == ((80, 110),) and choice.as_dict()["held_out_frames"] == [[80, 110]]
+
+
+def test_the_last_training_goes_on_from_the_law_that_was_judged(problem, too_stiff):
+    """Its first loss is that of the trial, over all frames from the contact on."""
+    trained, choice, *_ = too_stiff
+    body, _ = problem
+    path = rollout(
+        MODEL, structured_law(FLOWS, MODEL.dt).double(), body.state(V0), steps=FRAMES[-1], frames=FRAMES
+    )
+    contact = first_contact(MODEL, path.x)
+    trial, out = choice.trials["elastic"], len(choice.held_out_frames[0])
+    told = len(FRAMES) - contact
+    assert contact > 0
+    mean = (trial.loss * (told - out) + trial.held_out_loss * out) / told
+    assert trained.history.loss[0] == pytest.approx(mean, rel=1e-9)
+
+
+def test_a_training_in_two_stretches_is_the_whole(problem):
+    body, loss = problem
+    slow = SETTINGS.model_copy(update={"lr_elastic": 1e-3, "warm_up": 2})  # every step lowers the loss
+
+    def train(law, iterations, stretch=None):
+        how = slow.model_copy(update={"iterations": iterations})
+        return train_material(MODEL, law, body.state(V0), loss, how, stretch=stretch)
+
+    laws = [structured_law({"elasticity": FLOWS["elasticity"]}, MODEL.dt).double() for _ in range(2)]
+    for law in laws:
+        law.attach_adaptor(rank=None)
+    whole = train(laws[0], 5)
+    first = train(laws[1], 2, Stretch(after=3))
+    assert first.best_iteration == 2, "the law is that of the last step"
+    second = train(laws[1], 3, Stretch(before=2, memory=first.memory))
+    curve = first.history.weighted_loss + second.history.weighted_loss
+    assert curve == pytest.approx(whole.history.weighted_loss, rel=1e-9)
+    for once, again in zip(*(deltas(law, "elasticity") for law in laws), strict=True):
+        assert torch.allclose(once, again, rtol=1e-9, atol=1e-15)
+
+
+def test_a_correction_may_stiffen_beyond_the_limit_where_training_may_begin(problem):
+    """Constants found at the edge of what the time step bears are corrected upwards, too."""
+    body, loss = problem
+    density, spec = float(body.state(V0).density.min()), {"elasticity": FLOWS["elasticity"]}
+    number = MODEL.courant(structured_law(spec, MODEL.dt).double(), density)
+    stiff = {"elasticity": {**FLOWS["elasticity"], "E": FLOWS["elasticity"]["E"] * (0.799 / number) ** 2}}
+    law = structured_law(stiff, MODEL.dt).double()
+    law.attach_adaptor(rank=None)
+    with torch.no_grad():
+        *_, last = law.elasticity.adaptor.parameters()
+        last[:2, -1] = 0.1  # both moduli by 10 %
+    assert MODEL.courant(law, density) > 0.8
+    how = SETTINGS.model_copy(update={"iterations": 1})
+    with refused("dt"):
+        train_material(MODEL, law, body.state(V0), loss, how)
+    assert train_material(MODEL, law, body.state(V0), loss, how, stretch=Stretch(before=2)).stable
+
+
+@pytest.mark.parametrize("viscosity", [20.0, 60.0])
+def test_the_first_step_on_a_fluid_that_is_too_viscous_lowers_the_loss(viscosity):
+    """It also gives the fluid a yield stress and lets its volume go, which must not undo what it gains."""
+    body, elasticity = ball(), {"name": "hencky", "E": 5e4, "nu": 0.3}
+
+    def spec(factor):
+        flow = {"name": "viscous_flow", "viscosity": factor * viscosity}
+        return {"elasticity": elasticity, "plasticity": flow}
+
+    law = structured_law(spec(1.08), MODEL.dt).double()
+    law.attach_adaptor(rank=None)
+    how = MaterialConfig(iterations=2, rank=None, lr_elastic=0.02, lr_plastic=0.04)
+    loss = PixelLoss(body, observe(body, V0, FRAMES, spec(1.0)))
+    trained = train_material(MODEL, law, body.state(V0), loss, how, stretch=Stretch(after=24))
+    first, second = trained.history.loss
+    assert second < first and not trained.history.recoveries
+
+
+def test_a_law_that_nothing_improves_stays_exactly_as_it_is(problem):
+    """The video is that of the law itself."""
+    trained, choice = fit(problem, TRUTH, log=lambda _: None)
+    assert choice.parts == () and set(choice.trials) == {"nothing", "elastic"}
+    assert not any(bool(p.any()) for p in deltas(trained.law, "elasticity"))
+    assert trained.stable and len(trained.history.loss) == 1 and trained.summary()
+
+
+class KilledAfter:
+    """A checkpoint in memory whose run is killed as it has saved so many states."""
+
+    def __init__(self, saves):
+        self.states, self.left = [], saves
+
+    def load(self):
+        return copy.deepcopy(self.states[-1]) if self.states else None
+
+    def save(self, state):
+        self.states.append(copy.deepcopy(state))
+        self.left -= 1
+        if self.left == 0:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("saves", [1, 2, 4])
+def test_a_killed_run_goes_on_to_the_same_bits(problem, too_stiff, saves):
+    """In the trial, at its end, in the last training."""
+    keep = KilledAfter(saves)
+    with pytest.raises(KeyboardInterrupt):
+        fit(problem, FLOWS, log=lambda _: None, checkpoint=keep)
+    before = len(keep.states)
+    trained, choice = fit(problem, FLOWS, log=lambda _: None, checkpoint=keep)
+    assert choice == too_stiff[1] and len(keep.states) == 5 and before == saves
+    for part in ("elasticity", "plasticity"):
+        for again, once in zip(deltas(trained.law, part), deltas(too_stiff[0].law, part), strict=True):
+            assert torch.equal(again, once)
+
+
+def test_each_part_has_to_gain_the_margin():
+    def chosen(elastic, plastic, both, margin=0.1):
+        losses = {"nothing": 1.0, "elastic": elastic, "plastic": plastic, "elastic + plastic": both}
+        trials = {name: Trial(0.0, loss) for name, loss in losses.items()}
+        base, parts = _chosen([(0, parts) for parts in subsets(("elastic", "plastic"))], trials, margin)
+        assert base == 0
+        return parts
+
+    assert chosen(0.91, 0.95, 0.82) == ()
+    assert chosen(0.89, 0.95, 0.82) == ("elastic",)
+    assert chosen(0.89, 0.85, 0.77) == ("plastic",)
+    assert chosen(0.89, 0.85, 0.76) == ("elastic", "plastic")
+    assert chosen(0.89, 0.85, float("inf")) == ("plastic",)
+    assert chosen(1.0, 1.0, 1.0, margin=0.0) == ()
+
+
+CLOSER = {**FLOWS, "elasticity": {**TRUTH["elasticity"], "E": 3.5e4}}
+
+
+def test_a_rival_whose_correction_does_better_takes_the_place_of_the_law(problem):
+    """Both may flow and do not; one is nearer to the stiffness of the video."""
+    done = []
+    trained, choice = fit(
+        problem, FLOWS, CLOSER, log=lambda _: None, progress=lambda *state: done.append(state[:2])
+    )
+    assert choice.base == 1 == choice.as_dict()["base"] and choice.parts == ("elastic",)
+    assert "rival 1: elastic" in choice.summary() and "rival 1: elastic + plastic" in choice.trials
+    assert trained.law.specification()["elasticity"]["E"] == 3.5e4
+    assert done[-1] == (7, 7) and done == sorted(done)
+    # as if it had been the law from the beginning
+    alone, of_it = fit(problem, CLOSER, log=lambda _: None)
+    assert choice.trials["rival 1: elastic"] == of_it.trials["elastic"]
+    assert all(map(torch.equal, deltas(trained.law, "elasticity"), deltas(alone.law, "elasticity")))
+
+
+def test_a_rival_that_does_worse_changes_nothing(problem):
+    trained, choice = fit(problem, CLOSER, FLOWS, log=lambda _: None)
+    alone, _ = fit(problem, CLOSER, log=lambda _: None)
+    assert choice.base == 0 and trained.best_loss == alone.best_loss
+    assert all(map(torch.equal, deltas(trained.law, "elasticity"), deltas(alone.law, "elasticity")))
+
+
+@pytest.mark.parametrize("saves", [2, 3, 5, 6])
+def test_a_killed_run_with_a_rival_goes_on(problem, saves):
+    never, keep = KilledAfter(100), KilledAfter(saves)
+    whole, choice = fit(problem, FLOWS, CLOSER, log=lambda _: None, checkpoint=never)
+    with pytest.raises(KeyboardInterrupt):
+        fit(problem, FLOWS, CLOSER, log=lambda _: None, checkpoint=keep)
+    trained, again = fit(problem, FLOWS, CLOSER, log=lambda _: None, checkpoint=keep)
+    assert again == choice and len(keep.states) == len(never.states) > saves
+    assert all(map(torch.equal, deltas(trained.law, "elasticity"), deltas(whole.law, "elasticity")))
+
+
+def test_a_rival_has_to_gain_the_margin_too():
+    trials = {"nothing": Trial(0.0, 1.0), "elastic": Trial(0.0, 0.8), "rival 1: elastic": Trial(0.0, 0.73)}
+    candidates = [(0, ("elastic",)), (1, ("elastic",))]
+    assert _chosen(candidates, trials, 0.1) == (0, ("elastic",))
+    trials["rival 1: elastic"] = Trial(0.0, 0.71)
+    assert _chosen(candidates, trials, 0.1) == (1, ("elastic",))
+
+
+def test_rivals_are_ties_that_flow_otherwise_the_best_first():
+    def law(flow):
+        return {"elasticity": {"name": "hencky"}, "plasticity": {"name": flow}}
+
+    flows = {"sand": "drucker_prager", "clay": "von_mises", "hencky": "identity", "bingham": "viscous_flow"}
+    scores = {"sand": -7.2, "clay": -7.0, "hencky": -7.1, "bingham": -7.3, "fluid": -7.4}
+    families = {name: {"law": law(flow), "score": scores[name]} for name, flow in flows.items()}
+    families["fluid"] = {"law": law("viscous_flow"), "score": scores["fluid"]}
+    found = {"law": law("von_mises"), "families": families, "ties": ["clay", "hencky", "bingham", "fluid"]}
+    assert rival_bases(found, 3) == [law("viscous_flow"), law("identity")]
+    assert rival_bases(found, 1) == [law("viscous_flow")]
+    assert rival_bases(found, 0) == [] == rival_bases({**found, "ties": []}, 1)
+
+
+def test_the_largest_penalty_that_held_out_frames_bear_is_taken(problem):
+    """A crushing weight leaves the law at its base, which these frames do not bear."""
+    said = []
+    structured = STRUCTURED.model_copy(update={"penalties": (1e-9, 1e9)})
+    spec = {"elasticity": FLOWS["elasticity"]}
+    trained, choice = fit(problem, spec, structured=structured, log=said.append)
+    assert set(choice.trials) == {"nothing", "elastic", "elastic, penalty 1e-09", "elastic, penalty 1e+09"}
+    assert choice.penalty == 1e-9 == choice.as_dict()["penalty"] and any("1e-09" in line for line in said)
+    free, held = (choice.trials[f"elastic{w}"].held_out_loss for w in ("", ", penalty 1e+09"))
+    assert held > (1 + AS_WELL) * free and trained.best_loss < trained.history.loss[0]
+    assert largest_as_good({0.0: 1.0, 0.1: 1 + AS_WELL / 2, 1.0: 1 + 2 * AS_WELL}) == 0.1
+    assert largest_as_good({0.0: 1.0, 0.1: 0.9, 1.0: float("inf")}) == 0.1
+
+
+def test_some_frames_of_a_loss_are_those_of_the_loss(problem):
+    body, loss = problem
+    law, keep = structured_law(FLOWS, MODEL.dt).double(), [0, 1, 4, 6]
+    path = rollout(MODEL, law, body.state(V0), steps=FRAMES[-1], frames=FRAMES)
+    targets = ParticleLoss(FRAMES, path.x.flip(0))
+    for whole in (loss, targets):
+        part = whole.select(keep)
+        assert part.frames == tuple(FRAMES[k] for k in keep) and part.total == whole.total
+        assert torch.equal(part(path.at(part.frames)), whole(path)[keep])
+
+
+@pytest.mark.parametrize("contact", [0, 3])
+@pytest.mark.parametrize("blocks", [1, 2, 4, 50])
+@pytest.mark.parametrize("count", [4, 7, 33, 400])
+@pytest.mark.parametrize("share", [0.01, 0.25, 0.9])
+def test_frames_that_judge_end_every_part_of_what_follows_the_contact(blocks, count, share, contact):
+    """They are about the share of all, the last frame is among them, the first is not, and every part keeps some."""
+    found = held_out_frames(count, share, blocks, contact)
+    first = contact if contact < count - 1 else 0
+    parts = min(blocks, (count - first) // 2)
+    assert found == sorted(set(found)) and found[-1] == count - 1 and found[0] > first
+    assert abs(len(found) - share * (count - first)) <= parts
+    edges = [first + round(k * (count - first) / parts) for k in range(parts + 1)]
+    for start, end in pairwise(edges):
+        assert end - 1 in found and start not in found
+
+
+@pytest.mark.parametrize("first", [0, 1, 3])
+def test_a_video_from_a_frame_on_is_the_rest_of_the_whole(problem, first):
+    body, whole = problem
+    law = structured_law(FLOWS, MODEL.dt).double()
+    path = rollout(MODEL, law, body.state(V0), steps=FRAMES[-1], frames=FRAMES, total=True)
+    start, rest = from_frame(body.state(V0), whole, path, first)
+    before = FRAMES[first - 1] if first else 0
+    assert rest.frames == tuple(step - before for step in FRAMES[first:])
+    again = rollout(MODEL, law, start, steps=rest.frames[-1], frames=rest.frames)
+    assert torch.allclose(again.x, path.x[first:], rtol=0, atol=1e-12)
+    assert torch.allclose(rest(again), whole(path)[first:], rtol=1e-9)
+    targets = ParticleLoss(FRAMES, path.x.flip(0))
+    _, rest = from_frame(body.state(V0), targets, path, first)
+    assert torch.allclose(rest(again), targets(path)[first:], rtol=1e-9)
+
+
+def test_frames_from_the_contact_on_tell_of_the_law_unless_too_few_follow():
+    assert [told_from(10, contact) for contact in (0, 1, 6, 7, 10)] == [0, 1, 6, 0, 0]
+
+
+def test_choices_of_parts():
+    assert subsets(("elastic",)) == [("elastic",)]
+    assert subsets(("elastic", "plastic")) == [("elastic",), ("plastic",), ("elastic", "plastic")]
+
+
+def test_the_first_contact_is_that_of_any_particle():
+    x = torch.full((5, 2, 3), 0.5)
+    assert first_contact(MODEL, x) == 5
+    x[3:, 1, 1] = 0.01
+    assert first_contact(MODEL, x) == 3
+
+
+def test_too_few_frames(problem):
+    body, loss = problem
+    with pytest.raises(InputError, match="at least 4 frames"):
+        fit((body, loss.select([0, 1, 2])), TRUTH)

@@ -1,0 +1,415 @@
+"""Bad files end in one line that names the file; nothing is written, and no memory is taken on a header's word."""
+
+import json
+import pickle
+import struct
+import tracemalloc
+import zipfile
+import zlib
+from collections import OrderedDict
+from io import BytesIO
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from safetensors.torch import save, save_file
+
+from neuma_lib.errors import InputError
+from neuma_lib.io.checkpoint import Checkpoint
+from neuma_lib.io.gaussians import load_gaussians
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.io.images import list_images, read_image_set
+from neuma_lib.io.laws import load_law, load_prior
+from neuma_lib.io.mesh import read_mesh
+from neuma_lib.io.weights import read_weights
+
+pytestmark = pytest.mark.core
+
+HUGE = 2**26
+"""Zeros that archives below hide [bytes]."""
+MEMORY = HUGE / 2
+"""Most that a refusal may take [bytes]; what the headers below claim is 64 MiB to 22 TiB."""
+
+
+def refused(read, path, message=None):
+    """The call raises InputError of one line that names the file, takes little memory and writes nothing."""
+    before = {p: p.read_bytes() for p in path.parent.rglob("*") if p.is_file()}
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=message) as caught:
+            read(path)
+        assert tracemalloc.get_traced_memory()[1] < MEMORY
+    finally:
+        tracemalloc.stop()
+    text = str(caught.value)
+    assert path.name in text and len(text.splitlines()) == 1 and len(text) < 1000
+    assert {p: p.read_bytes() for p in path.parent.rglob("*") if p.is_file()} == before
+
+
+# ---- PLY
+
+XYZ = "property float x\nproperty float y\nproperty float z\n"
+CORNERS = "property list uchar int vertex_indices\n"
+
+
+def ply(body, form="binary_little_endian", end="end_header\n", data=b"\0" * 36):
+    return f"ply\nformat {form} 1.0\n{body}{end}".encode() + data
+
+
+PLY = {
+    "empty": b"",
+    "no header": b"solid nothing",
+    "no end of the header": b"ply\nformat ascii 1.0\n" + b"comment\n" * 20000,
+    "negative count": ply(f"element vertex -3\n{XYZ}"),
+    "negative count in text": ply(f"element vertex -3\n{XYZ}", "ascii"),
+    "count in words": ply(f"element vertex three\n{XYZ}"),
+    "count with a fraction": ply(f"element vertex 3.5\n{XYZ}"),
+    "no count": ply(f"element vertex\n{XYZ}"),
+    "count of 10^4300": ply(f"element vertex 1{'0' * 5000}\n{XYZ}"),
+    "property before its element": ply(f"{XYZ}element vertex 3\n"),
+    "nothing after end_header": ply(f"element vertex 0\n{XYZ}", end="end_header", data=b""),
+    "no new line after end_header": ply(f"element vertex 3\n{XYZ}", end="end_header"),
+    "claims a terabyte": ply(f"element vertex {2**37}\n{XYZ}"),
+    "claims a terabyte of text": ply(f"element vertex {2**37}\n{XYZ}", "ascii"),
+    "claims a terabyte of faces": ply(f"element vertex 3\n{XYZ}element face {2**37}\n{CORNERS}"),
+    "rows without properties": ply(f"element vertex {2**60}\n"),
+    "truncated": ply(f"element vertex 4\n{XYZ}"),
+    "truncated text": ply(f"element vertex 4\n{XYZ}", "ascii", data=b"0 0 0\n" * 3 + b" " * 99),
+    "text that is no number": ply(f"element vertex 1\n{XYZ}", "ascii", data=b"0 zero 0\n"),
+    "bytes that are no text": ply(f"element vertex 1\n{XYZ}", "ascii", data=b"\xff\xff\xff\xff\xff\xff\n"),
+    "unknown format": ply(f"element vertex 3\n{XYZ}", "binary_middle_endian"),
+    "unknown type": ply("element vertex 3\nproperty quaternion x\n"),
+    "two properties of one name": ply("element vertex 3\nproperty float x\nproperty float x\n"),
+    "two elements of one name": ply(f"element vertex 1\n{XYZ}element vertex 1\n{XYZ}"),
+    "vertices with a list": ply("element vertex 3\nproperty list uchar int vertex_indices\n"),
+    "a list elsewhere": ply(
+        f"element vertex 1\n{XYZ}element strip 1\nproperty list int int vertex_indices\n"
+    ),
+    "faces without corners": ply(f"element vertex 1\n{XYZ}element face 1\nproperty float x\n"),
+    "faces of 4 corners": ply(
+        f"element vertex 0\n{XYZ}element face 1\n{CORNERS}", data=struct.pack("<B4i", 4, 0, 1, 2, 3)
+    ),
+    "faces of 4 corners in text": ply(
+        f"element vertex 0\n{XYZ}element face 1\n{CORNERS}", "ascii", data=b"4 0 1 2 3\n"
+    ),
+    "no vertices": ply("", data=b""),
+}
+
+
+@pytest.mark.parametrize("content", PLY.values(), ids=PLY)
+@pytest.mark.parametrize("read", [read_mesh, load_gaussians])
+def test_ply(tmp_path, read, content):
+    path = tmp_path / "bad.ply"
+    path.write_bytes(content)
+    refused(read, path)
+
+
+# ---- HDF5
+
+
+def soft_link(file, folder):
+    file["x"] = h5py.SoftLink("/other")
+    file["other"] = np.zeros((2, 3))
+
+
+def external_storage(file, folder):
+    (folder / "secret").write_bytes(b"\1" * 48)
+    file.create_dataset("x", (2, 3), "f8", external=[(folder / "secret", 0, 48)])
+
+
+def external_link(file, folder):
+    with h5py.File(folder / "secret.h5", "w") as other:
+        other["x"] = np.zeros((2, 3))
+    file["x"] = h5py.ExternalLink(str(folder / "secret.h5"), "x")
+
+
+def virtual(file, folder):
+    layout = h5py.VirtualLayout((2, 3), "f8")
+    layout[:] = h5py.VirtualSource(str(folder / "secret.h5"), "x", (2, 3))
+    file.create_virtual_dataset("x", layout)
+
+
+def incomplete(file, folder):
+    data = file.create_dataset("x", (2**20, 3), "f4", chunks=(1024, 3), compression="gzip")
+    data[:1024] = np.random.default_rng(0).random((1024, 3))
+
+
+def attribute(value):
+    def change(file, folder):
+        file["x"] = np.zeros((2, 3))
+        file.attrs["dt"] = value
+
+    return change
+
+
+HDF5 = {
+    "external link": external_link,
+    "soft link": soft_link,
+    "dangling link": lambda file, folder: file.update(x=h5py.SoftLink("/absent")),
+    "link to itself": lambda file, folder: file.update(x=h5py.SoftLink("/x")),
+    "external storage": external_storage,
+    "virtual dataset": virtual,
+    "a group": lambda file, folder: file.create_group("x"),
+    "a type": lambda file, folder: file.update(x=np.dtype("f8")),
+    "a text": lambda file, folder: file.update(x="text"),
+    "bytes": lambda file, folder: file.update(x=np.bytes_(b"text")),
+    "records": lambda file, folder: file.update(x=np.zeros(2, [("a", "f4")])),
+    "texts of any length": lambda file, folder: file.create_dataset("x", (2,), h5py.string_dtype()),
+    "references": lambda file, folder: file.create_dataset("x", (2,), h5py.ref_dtype),
+    "complex numbers": lambda file, folder: file.update(x=np.zeros(2, complex)),
+    "nothing": lambda file, folder: file.update(x=h5py.Empty("f4")),
+    "claims 22 TiB": lambda file, folder: file.create_dataset("x", (22 * 2**40,), "u1"),
+    "claims 22 TiB in chunks": lambda file, folder: file.create_dataset(
+        "x", (22 * 2**40,), "u1", chunks=(2**30,), compression="gzip"
+    ),
+    "chunks that were never written": incomplete,
+    "an infinite number": lambda file, folder: file.update(x=np.array([1, np.inf])),
+    "an attribute that is an array": attribute(np.zeros(9)),
+    "an attribute that is empty": attribute(h5py.Empty("f4")),
+}
+
+
+@pytest.mark.parametrize("change", HDF5.values(), ids=HDF5)
+def test_hdf5(tmp_path, change):
+    path = tmp_path / "bad.h5"
+    with h5py.File(path, "w") as file:
+        change(file, tmp_path)
+    refused(lambda p: read_arrays(p, required=("x",)), path)
+
+
+def test_what_is_not_asked_for_is_not_read(tmp_path):
+    path = tmp_path / "more.h5"
+    with h5py.File(path, "w") as file:
+        external_link(file, tmp_path)
+        file["vol0"], file["foreign"] = np.ones(3), h5py.SoftLink("/absent")
+    assert set(read_arrays(path, only=("vol0",))[0]) == {"vol0"}
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89HDF\r\n\x1a\n", b"\x89HDF\r\n\x1a\n" + bytes(300)])
+def test_what_is_not_hdf5(tmp_path, content):
+    path = tmp_path / "bad.h5"
+    path.write_bytes(content)
+    refused(read_arrays, path)
+
+
+# ---- lists of images and images
+
+
+def picture(kind="PNG", size=(16, 12), **options):
+    file = BytesIO()
+    Image.new("RGBA" if kind != "JPEG" else "RGB", size, (1, 2, 3, 255)[: 3 + (kind != "JPEG")]).save(
+        file, kind, **options
+    )
+    return file.getvalue()
+
+
+def image_list():
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "view": 0, "step": 0}
+    return {"fl_x": 20.0, "cx": 8.0, "w": 16, "h": 12, "frames": [frame]}
+
+
+def with_frame(**changes):
+    data = image_list()
+    data["frames"][0].update(changes)
+    return json.dumps(data)
+
+
+def with_top(**changes):
+    return json.dumps({**image_list(), **changes})
+
+
+LISTS = {
+    **{f"file_path {value!r}": with_frame(file_path=value) for value in (5, None, ["a.png"], {}, "", "a\nb", "\0")},
+    **{f"view {value!r}": with_frame(view=value) for value in ("5", None, 5.5, [5], True, {})},
+    **{f"step {value!r}": with_frame(step=value) for value in ("5", None, 5.5, [5])},
+    **{f"frames {value!r}": with_top(frames=value) for value in (5, "text", None, [5], [None], ["a"], {}, [[]])},
+    **{f"w {value!r}": with_top(w=value) for value in ("16", 10**6, 0, -1, True, [16], 10**400)},
+    "fl_x of text": with_top(fl_x="20"),
+    "a million by a million": with_top(w=10**6, h=10**6),
+    "sha256 5": with_frame(sha256=5),
+    "matrix of text": with_frame(transform_matrix=[["a"] * 4] * 4),
+    "matrix of numbers in text": with_frame(transform_matrix=[["1"] * 4] * 4),
+    "ragged matrix": with_frame(transform_matrix=[[1, 0, 0, 0], [0, 1]]),
+    "matrix of huge numbers": with_frame(transform_matrix=[[10**400] * 4] * 4),
+    "matrix of null": with_frame(transform_matrix=[[None] * 4] * 4),
+    "nested matrix": with_frame(transform_matrix="NESTED").replace('"NESTED"', "[" * 500 + "]" * 500),
+    "deep nesting": "[" * 100_000,
+    "deep nesting that ends": '{"frames": ' * 50_000 + "1" + "}" * 50_000,
+    "NaN": with_frame(transform_matrix=[[float("nan")] * 4] * 4),
+    "Infinity": with_top(fl_x=float("inf")),
+    "overflow": with_top(fl_x=1).replace('"fl_x": 1,', '"fl_x": 1e999,'),
+    "number of 5000 digits": "[" + "1" * 5000 + "]",
+    "not UTF-8": b"\xff\xfe\x00",
+    "a number": "5",
+    "null": "null",
+    "released: entry 5": "[5]",
+    "released: file_path null": '[{"file_path": null, "c2w": [], "intrinsic": []}]',
+    "released: c2w of text": '[{"file_path": "a.png", "c2w": [["a"]], "intrinsic": [[1]]}]',
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("content", LISTS.values(), ids=LISTS)
+def test_lists_of_images(tmp_path, content):
+    (tmp_path / "a.png").write_bytes(picture())
+    path = tmp_path / "bad.json"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    refused(read_image_set, path)
+    refused(lambda p: list_images(p, p.parent / "new" / "transforms.json"), path)
+
+
+def chunk(kind, data):
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def png(width, height, rows):
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+
+
+IMAGES = {
+    "empty": b"",
+    "text": b"no image",
+    "a GIF": picture("GIF"),
+    "a TIFF": picture("TIFF"),
+    "a BMP": picture("BMP"),
+    "an EPS": b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 16 12\n%%EndComments\n",
+    "a JPEG, which has no alpha": picture("JPEG"),
+    "a bomb": png(7000, 7000, bytes(10)),
+    "claims 10^6 x 10^6": png(10**6, 10**6, bytes(10)),
+    "claims 2^31": png(2**31 - 1, 2**31 - 1, bytes(10)),
+    "of another size": picture(size=(17, 12)),
+    "truncated": picture()[:-20],
+    "truncated WebP": picture("WEBP", lossless=True)[:-9],
+    "rows that are missing": png(16, 12, bytes(10)),
+    "a text chunk that unpacks to 64 MiB": picture()[:33]
+    + chunk(b"zTXt", b"a\0\0" + zlib.compress(bytes(HUGE), 1))
+    + picture()[33:],
+}
+
+
+@pytest.mark.parametrize("content", IMAGES.values(), ids=IMAGES)
+def test_images(tmp_path, content):
+    path = tmp_path / "a.png"
+    path.write_bytes(content)
+    (tmp_path / "transforms.json").write_text(json.dumps(image_list()))
+    refused(lambda p: read_image_set(p.parent / "transforms.json"), path)
+
+
+# ---- weights
+
+
+class Command:
+    """Runs a command when it is unpickled."""
+
+    def __reduce__(self):
+        return print, ("unpickled",)
+
+
+class Zeros:
+    """Takes memory when it is unpickled, which torch permits."""
+
+    def __reduce__(self):
+        return bytearray, (HUGE,)
+
+
+def torch_file(content):
+    file = BytesIO()
+    torch.save(content, file)
+    return file.getvalue()
+
+
+def denied(archive):
+    """The same archive with headers that claim 9 bytes where there are 64 MiB."""
+    return archive.replace(struct.pack("<L", HUGE), struct.pack("<L", 9))
+
+
+def deflated(content, part="/data/"):
+    """The same archive, but with 64 MiB in a few bytes."""
+    file = BytesIO()
+    with zipfile.ZipFile(BytesIO(torch_file(content))) as old, zipfile.ZipFile(file, "w") as new:
+        for info in old.infolist():
+            data = bytes(HUGE) if part in info.filename else old.read(info)
+            new.writestr(info.filename, data, zipfile.ZIP_DEFLATED)
+    return file.getvalue()
+
+
+def law_parts(weight):
+    names = ("layers.0.fc.weight", "layers.1.fc.weight", "final_layer.fc.weight")
+    return {part: dict.fromkeys(names, weight) for part in ("elasticity", "plasticity")}
+
+
+TORCH = {
+    "empty": b"",
+    "text": b"no weights",
+    "a pickle": pickle.dumps({"elasticity": Command()}),
+    "a command": torch_file({"elasticity": Command(), "plasticity": Command()}),
+    "zeros on request": torch_file({"elasticity": Zeros()}),
+    "a list": torch_file([1, 2]),
+    "a tensor": torch_file(torch.zeros(3)),
+    "parts that are numbers": torch_file({"elasticity": 5, "plasticity": 5}),
+    "weights that are numbers": torch_file(law_parts(5)),
+    "weights that are text": torch_file(law_parts("text")),
+    "weights of other shapes": torch_file(law_parts(torch.zeros(3))),
+    "weights without memory": torch_file(law_parts(torch.zeros(1, dtype=torch.float64).expand(2**20, 2**20))),
+    "truncated": torch_file(law_parts(torch.zeros(64, 64)))[:-200],
+    "64 MiB deflated": deflated(law_parts(torch.zeros(2))),
+    "64 MiB deflated, which its header denies": denied(deflated(law_parts(torch.zeros(2)), "data.pkl")),
+    "an ordered list": torch_file(OrderedDict(a=1)),
+}
+
+
+@pytest.mark.parametrize("content", TORCH.values(), ids=TORCH)
+def test_torch_files(tmp_path, content, capsys):
+    path = tmp_path / "bad.pt"
+    path.write_bytes(content)
+    refused(load_prior, path)
+    refused(lambda p: Checkpoint(p, {"a": 1}).load(), path, "rm ")
+    assert "unpickled" not in capsys.readouterr().out
+
+
+def safetensors_header(**entries):
+    text = json.dumps(entries).encode()
+    return struct.pack("<Q", len(text)) + text
+
+
+SAFETENSORS = {
+    "empty": b"",
+    "a header of 2^60 bytes": struct.pack("<Q", 2**60) + b"{}",
+    "claims 22 TiB": safetensors_header(x={"dtype": "U8", "shape": [22 * 2**40], "data_offsets": [0, 22 * 2**40]}),
+    "offsets beyond the end": safetensors_header(x={"dtype": "U8", "shape": [9], "data_offsets": [0, 9]}),
+    "a shape of text": safetensors_header(x={"dtype": "U8", "shape": "9", "data_offsets": [0, 9]}),
+    "metadata that is no JSON": save({"x": torch.zeros(2)}, {"neuma": "{"}),
+    "metadata that is a list": save({"x": torch.zeros(2)}, {"neuma": "[]"}),
+    "metadata nested deep": save({"x": torch.zeros(2)}, {"neuma": "[" * 100_000}),
+    "infinite": save({"x": torch.full((2,), torch.inf)}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("content", SAFETENSORS.values(), ids=SAFETENSORS)
+def test_safetensors(tmp_path, content):
+    path = tmp_path / "bad.safetensors"
+    path.write_bytes(content)
+    refused(read_weights, path)
+
+
+LAWS = {
+    "no rank": {},
+    "rank of text": {"rank": "4", "alpha": 4.0},
+    "rank below one": {"rank": -4, "alpha": 4.0},
+    "rank of a million": {"rank": 10**6, "alpha": 4.0},
+    "alpha of text": {"rank": 4, "alpha": "4"},
+    "alpha that is missing": {"rank": 4, "alpha": None},
+    "other tensors": {"rank": 4, "alpha": 4.0},
+}
+
+
+@pytest.mark.parametrize("metadata", LAWS.values(), ids=LAWS)
+def test_adaptors(tmp_path, metadata):
+    from neuma_lib.mechanics.neural import neural_law
+
+    save_file(neural_law(seed=0).prior_state(), tmp_path / "prior.safetensors")
+    path = tmp_path / "bad.safetensors"
+    save_file({"x": torch.zeros(2)}, path, {"neuma": json.dumps(metadata)})
+    refused(lambda p: load_law(tmp_path / "prior.safetensors", p), path)

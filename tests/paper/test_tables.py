@@ -1,0 +1,290 @@
+"""Tables of errors: their numbers, what stands beside them, and what they say of the paper's claims."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from neuma_lib.errors import InputError
+from neuma_lib.paper.published import PAPER, Claim, PaperTable
+from neuma_lib.paper.tables import QUANTITIES, chamfer_table, shown
+from neuma_lib.project.loading import load
+from tests.support.table_results import run
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+BROKEN = {
+    "diverged": {"happened": "moved by more than a cell in a step", "step": 80, "particle": 7},
+    "energy_gain_after_step": 60,
+}
+TITLES = {"nclaw": "NCLaw", "neuma": "NeuMA"}
+SCENES = {scene: scene for scene in PAPER["table1"].columns}
+AB = {"a": "a", "b": "b"}
+
+
+def rows_of(table) -> dict:
+    return {(row["quantity"], row["method"]): row for row in csv.DictReader(io.StringIO(table.csv()))}
+
+
+def test_table_has_the_papers_rows_and_columns():
+    metrics = {
+        method: {scene: [run(k + i)] for i, scene in enumerate(SCENES)}
+        for k, method in ((100, "nclaw"), (10, "neuma"))
+    }
+    table = chamfer_table(metrics, TITLES, SCENES, PAPER["table1"])
+    rows = rows_of(table)
+    assert list(rows) == [(q, method) for q in QUANTITIES for method in TITLES] + [("chamfer_floor", "floor")]
+    first = rows["tracer_rmse_mm", "nclaw"]
+    assert list(first)[3:] == [*SCENES, "Average", "Median", "wins", "diverged"]
+    assert float(first["Average"]) == float(first["Median"]) == 102.5 and first["wins"] == "0"
+    assert rows["tracer_rmse_mm", "neuma"]["wins"] == "6" and rows["chamfer", "neuma"]["wins"] == ""
+    assert table.row("tracer_rmse_mm", "nclaw").mean[list(SCENES).index("SandFish")] == 104
+    text = table.markdown()
+    assert "| NeuMA | 10.0 | 11.0 | 12.0 | 13.0 | 14.0 | 15.0 | 12.5 | 12.5 | 25.0 | 37.5 | 6 of 6 |" in text
+    assert "| *paper* | *56.13* |" in text and "| *12.18* |" in text and "| Sampling floor | 0.50 |" in text
+    assert text.index("| NeuMA | 1.50 |") < text.index("| *paper* | *1.19* |") < text.index("**What holds**")
+    assert (
+        text.index("Tracer RMSE") < text.index("Chamfer")
+        and "1.19 for NeuMA on its ball is essentially its floor" in text
+    )
+    assert "†" not in text and "‡" not in text and "±" not in text.partition("**What holds**")[0]
+
+
+def test_table_is_open_for_more_methods():
+    metrics = {"pac_nerf": {scene: [run(30.0)] for scene in SCENES}}
+    text = chamfer_table(metrics, {"pac_nerf": "PAC-NeRF"}, SCENES, PAPER["table1"]).markdown()
+    assert "| PAC-NeRF | 3.50 |" in text and "| *paper* | *516.30* |" in text and "| *114.80* |" in text
+
+
+def test_a_note_stands_below_the_table_and_its_sign_behind_the_row():
+    metrics = {method: {scene: [run(3.0)] for scene in SCENES} for method in TITLES}
+    text = chamfer_table(metrics, TITLES, SCENES, notes={"neuma": "Mind this."}).markdown()
+    assert text.count("| NeuMA (1) |") == 2 and "| NCLaw |" in text and "\n(1) Mind this.\n" in text
+
+
+def test_what_a_law_gains_over_the_true_one_is_told():
+    values = {"nclaw": (9.0, 9.0, 1.0), "neuma": (2.0, 3.0, 9.0), "true_law": (4.0, 6.0, 5.0)}
+    metrics = {
+        method: {column: [run(value)] for column, value in zip("abc", row)} for method, row in values.items()
+    }
+    metrics["nclaw"]["c"] = [run(1.0, **BROKEN)]
+    columns = {column: column for column in "abc"}
+    table = chamfer_table(metrics, {**TITLES, "true_law": "True law"}, columns)
+    assert "than it: NeuMA in 2 of 3 columns (there by 2.5 of 5.0 mm on average). What" in table.markdown()
+    del metrics["neuma"]
+    table = chamfer_table(metrics, {"nclaw": "NCLaw", "true_law": "True law"}, columns)
+    assert "None is closer than it." in table.absorbed()
+    assert chamfer_table(metrics, {"nclaw": "NCLaw"}, columns).absorbed() is None
+
+
+def test_a_method_that_knows_the_truth_wins_nothing():
+    metrics = {m: {"a": [run(value)]} for m, value in (("neuma", 2.0), ("true_law", 1.0), ("nclaw", 3.0))}
+    table = chamfer_table(metrics, {**TITLES, "true_law": "True law"}, {"a": "a"})
+    assert table.wins() == {"nclaw": 0, "neuma": 1}
+    assert "| True law | 1.0 | 1.0 | 2.0 | 3.0 |  |" in table.markdown()
+
+
+def test_what_would_be_zero_is_less_than_the_last_digit():
+    assert [shown(x, 2) for x in (0.0, 0.004, 0.0051, -0.001, 1.0)] == [
+        "< 0.01",
+        "< 0.01",
+        "0.01",
+        "< 0.01",
+        "1.00",
+    ]
+    assert shown(0.04, 1) == "< 0.1"
+
+
+def test_paper_averages_are_those_printed_there():
+    printed = {
+        "table1": {"pac_nerf": 114.80, "nclaw": 12.18, "neuma": 1.31, "neuma_particle_supervision": 1.51,
+                   "neuma_without_binding_own": 6.60, "neuma_without_adaptor": 1.79},
+        "table5": {"neuma+rank=4": 1.18, "neuma+rank=8": 1.10, "neuma": 1.04, "neuma+rank=24": 1.05},
+    }  # fmt: skip
+    for table, averages in printed.items():
+        assert set(averages) == set(PAPER[table].rows)
+        for method, average in averages.items():
+            assert np.mean(PAPER[table].rows[method]) == pytest.approx(average, abs=7e-3), method
+
+
+def test_tables_of_the_paper_are_whole():
+    settings = load(yaml.safe_load((ROOT / "config" / "config.yaml").read_text()), ROOT)
+    for name, paper in PAPER.items():
+        table = settings.tables[name]
+        assert tuple(paper.columns) == (*table.scenes, *table.experiments)
+        assert set(paper.rows) - {"pac_nerf"} <= set(table.methods)
+        for claim in paper.claims:
+            assert {*claim.better, *claim.worse} <= set(table.methods)
+            assert set(claim.columns) <= set(paper.columns)
+        assert all(len(row) == len(paper.columns) for row in paper.rows.values())
+
+
+def test_diverged_runs_and_averages_with_them_are_marked_and_explained():
+    metrics = {
+        "nclaw": {"BouncyBall": [run(5.0)], "Other": [run(4.0, **BROKEN)]},
+        "neuma": {"BouncyBall": [run(1.0, stable=False)], "Other": [run(2.0)]},
+    }
+    table = chamfer_table(metrics, TITLES, {"BouncyBall": "Ball", "Other": "Other"}, PAPER["table1"])
+    text = table.markdown()
+    assert "| Method | Ball | Other | Average | Median | 95 % | Last frame | Best in |" in text
+    assert "| NCLaw | 5.0 | 4.0‡ | 4.5‡ | 4.5‡ | 9.0‡ | 13.5‡ | 0 of 2 |" in text
+    assert "| NeuMA | 1.0† | 2.0 | 1.5† |" in text and "| NCLaw | 1.00 | 0.90‡ | 0.95‡ |" in text
+    assert "† The training diverged" in text and "‡ A predicted motion broke off" in text
+    assert (
+        "- NCLaw on Other: particle 7 moved by more than a cell in a step at step 80 of 90; it had more energy than at"
+        " the start after step 60.\n" in text
+    )
+    assert "*paper*" not in text, "the paper has no such column"
+    rows = rows_of(table)
+    assert rows["chamfer", "nclaw"]["diverged"] == "Other"
+    assert rows["chamfer", "neuma"]["diverged"] == "BouncyBall"
+
+
+@pytest.mark.parametrize(
+    ("failing", "word"), [({}, "holds"), ({"letter_N_jelly_fast": BROKEN}, "does not hold")]
+)
+def test_that_no_letter_breaks_off_is_judged_by_all_of_them(failing, word):
+    columns = dict.fromkeys(PAPER["letters"].columns, "")
+    metrics = {"neuma_structured": {c: [run(2.0), run(2.1), run(2.2, **failing.get(c, {}))] for c in columns}}
+    table = chamfer_table(metrics, {"neuma_structured": "ours"}, columns, PAPER["letters"])
+    near, sound = table.verdicts()
+    assert near.word == "holds", "a letter at 3 m/s is no matter of those at 1 m/s"
+    assert sound.word == word and f"kept in {12 - len(failing)} of 12" in sound.here
+    assert "broke_off" not in table.csv()
+
+
+def test_a_missing_or_broken_cell_is_named():
+    column = {"BouncyBall": "BouncyBall"}
+    with pytest.raises(InputError, match="no metrics.json of neuma on BouncyBall"):
+        chamfer_table({"nclaw": {"BouncyBall": [run(1.0)]}}, TITLES, column)
+    broken = {"nclaw": {"BouncyBall": [run(float("nan"))]}}
+    with pytest.raises(InputError, match="nclaw on BouncyBall is nan"):
+        chamfer_table(broken, {"nclaw": "NCLaw"}, column)
+
+
+def test_several_chains_give_mean_and_standard_deviation():
+    metrics = {
+        "nclaw": {"a": [run(5.0), run(5.0), run(5.0)], "b": [run(7.0), run(8.0), run(9.0, **BROKEN)]},
+        "neuma": {"a": [run(1.0), run(2.0), run(3.0)], "b": [run(2.0), run(2.0), run(5.0)]},
+    }
+    table = chamfer_table(metrics, TITLES, AB)
+    text = table.markdown()
+    # Errors of the chains average 1.5, 2 and 4; of the six, 2 is the median.
+    assert "| NeuMA | 2.0 ± 1.0 | 3.0 ± 1.7 | 2.5 ± 1.3 | 2.0 |" in text
+    assert "| NCLaw | 5.0 ± < 0.1 | 8.0 ± 1.0‡ | 6.5 ± 0.5‡ | 6.0‡ |" in text
+    assert (
+        "± is the standard deviation over 3 chains" in text
+        and "- NCLaw on b, chain 3 of 3: particle 7" in text
+    )
+    rows = rows_of(table)
+    assert float(rows["tracer_rmse_mm_std", "neuma"]["Average"]) == pytest.approx(1.3229, abs=1e-4)
+    assert ("chamfer_floor_std", "floor") not in rows
+
+
+def test_a_chain_above_twice_the_mean_of_its_cell_is_named():
+    metrics = {
+        "nclaw": {"a": [run(5.0)] * 3, "b": [run(1.0), run(1.0), run(3.0)]},
+        "neuma": {"a": [run(1.0), run(9.0), run(1.0)], "b": [run(2.0)] * 3},
+    }
+    table = chamfer_table(metrics, TITLES, {"a": "A", "b": "b"})
+    assert table.outliers() == ["NeuMA on A, chain 2 of 3: 9.0 mm, more than twice the mean of its chains."]
+    assert f"\n- {table.outliers()[0]}\n" in table.markdown()
+
+
+# ---- verdicts
+
+METHODS = {**TITLES, "other": "Other"}
+
+
+def judged(claim: Claim, errors: dict, paper: dict | None = None, columns=AB, **broken):
+    """Verdict on a claim; `errors`: method -> one list of chains a column, broken: method -> what its runs add."""
+    printed = PaperTable("tab:x", "X", "x", tuple(columns), paper or {}, (claim,))
+    metrics = {
+        method: {
+            column: [run(value, **broken.get(method, {})) for value in chains]
+            for column, chains in zip(columns, values, strict=True)
+        }
+        for method, values in errors.items()
+    }
+    titles = {method: METHODS[method] for method in errors}
+    (verdict,) = chamfer_table(metrics, titles, columns, printed).verdicts()
+    return verdict
+
+
+CLOSER = Claim("NeuMA is closer", ("neuma",), ("nclaw",))
+
+
+def test_a_claim_holds_on_average_in_most_columns_and_beyond_the_spread():
+    far = {"nclaw": [[5, 6, 7], [5, 6, 7]], "neuma": [[1, 2, 3], [1, 2, 3]]}
+    verdict = judged(CLOSER, far, {"neuma": (1.0, 2.0), "nclaw": (3.0, 3.0)})
+    assert verdict.word == "holds" and verdict.paper == "1.50 against 3.00"
+    assert verdict.here == "2.0 ± 1.0 (NeuMA) against 6.0 ± 1.0 (NCLaw), lower in 2 of 2"
+    assert str(verdict) == f"Holds: NeuMA is closer. {verdict.here}."
+    # The intervals 2 to 4 and 4 to 6 touch.
+    near = judged(CLOSER, far | {"nclaw": [[4, 5, 6], [2, 3, 4]]})
+    assert near.word == "mixed" and near.here.endswith("lower in 2 of 2; the ± overlap") and near.paper == ""
+
+
+def test_a_claim_with_too_few_runs_is_mixed_at_most():
+    for chains in (1, 2):
+        verdict = judged(CLOSER, {"nclaw": [[9] * chains] * 2, "neuma": [[1] * chains] * 2})
+        assert verdict.word == "mixed" and f"; {chains} run" in verdict.here
+    assert judged(CLOSER, {"nclaw": [[1], [1]], "neuma": [[9], [9]]}).word == "does not hold"
+
+
+def test_a_claim_needs_average_and_majority():
+    outlier = {"nclaw": [[9, 9, 9], [1, 1, 1]], "neuma": [[2, 2, 2], [2, 2, 2]]}
+    verdict = judged(CLOSER, outlier)
+    assert verdict.word == "mixed" and verdict.here.endswith("lower in 1 of 2; not in most columns")
+    columns = {**AB, "c": "c"}
+    verdict = judged(CLOSER, {"nclaw": [[2] * 3] * 3, "neuma": [[1] * 3, [1] * 3, [9] * 3]}, columns=columns)
+    assert verdict.word == "mixed" and verdict.here.endswith("lower in 2 of 3; not on average")
+    verdict = judged(CLOSER, {"nclaw": [[1] * 3] * 2, "neuma": [[1] * 3] * 2})
+    assert verdict.word == "does not hold", "equal is not lower"
+
+
+def test_a_claim_about_groups_is_one_about_all_their_pairs():
+    """The worst of the first against the best of the others, in every column and with every spread."""
+    claim = Claim("they are closest", ("neuma", "other"), ("nclaw",), ("b",), by_paper=False)
+    errors = {"neuma": [[1] * 3, [1] * 3], "other": [[9] * 3, [2, 3, 4]], "nclaw": [[1] * 3, [6] * 3]}
+    verdict = judged(claim, errors)
+    assert verdict.word == "holds" and verdict.here.startswith(
+        "3.0 ± 1.0 (Other) against 6.0 ± < 0.1 (NCLaw)"
+    )
+    assert verdict.here.endswith("lower in 1 of 1") and verdict.paper == "not compared there"
+    # The lower average has the wider spread.
+    assert judged(claim, errors | {"neuma": [[1] * 3, [-8, 1, 10]]}).word == "mixed"
+
+
+def test_a_held_motion_proves_nothing_for_its_method():
+    errors = {"nclaw": [[9, 9, 9]] * 2, "neuma": [[1, 1, 1]] * 2}
+    verdict = judged(CLOSER, errors, neuma=BROKEN)
+    assert verdict.word == "mixed" and verdict.here.endswith("; a prediction broke off")
+    assert judged(CLOSER, errors, nclaw=BROKEN).word == "holds", "its error is even larger"
+
+
+def test_verdicts_stand_in_the_table_if_its_rows_do():
+    claims = (CLOSER, Claim("nobody runs this", ("neuma",), ("pac_nerf",)))
+    paper = PaperTable("tab:x", "X", "x", claims=claims)
+    metrics = {method: {c: [run(value)] for c in AB} for method, value in (("nclaw", 1.0), ("neuma", 2.0))}
+    text = chamfer_table(metrics, TITLES, AB, paper).markdown()
+    assert (
+        "| NeuMA is closer | **does not hold** | 2.0 (NeuMA) against 1.0 (NCLaw), lower in 0 of 2 |  |"
+        in text
+    )
+    assert "nobody runs this" not in text
+
+
+def test_a_note_stands_below_its_table_and_other_systems_beside_the_papers_row():
+    metrics = {"pac_nerf": {scene: [run(30.0)] for scene in SCENES}}
+    paper = PAPER["table1_systems"]
+    text = chamfer_table(metrics, {"pac_nerf": "PAC-NeRF"}, SCENES, paper, note="See elsewhere.").markdown()
+    assert text.rstrip().endswith("\n\nSee elsewhere.") and "| *paper* | *516.30* |" in text
+    plain = chamfer_table(metrics, {"pac_nerf": "PAC-NeRF"}, SCENES, paper)
+    assert plain.markdown() == text.replace("\nSee elsewhere.\n", "")

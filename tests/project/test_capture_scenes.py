@@ -1,0 +1,128 @@
+"""Captures as scenes, and their videos on the simulator's clock."""
+
+import numpy as np
+import pytest
+
+from neuma_lib.capture.motion.synchronisation import (
+    chosen_frames,
+    frame_times,
+    reduced,
+    reduced_intrinsics,
+    without_gain,
+)
+from neuma_lib.errors import InputError
+from neuma_lib.project import cases
+from neuma_lib.project.capture_scenes import captured_scenes
+from neuma_lib.project.loading import load, read_yaml
+from neuma_lib.project.settings import NO_TRUTH
+
+
+@pytest.fixture
+def captures(tmp_path):
+    """A capture `mug` with two throws of two cameras."""
+    for throw in ("one", "two"):
+        (tmp_path / f"mug/videos/{throw}").mkdir(parents=True)
+        for camera in ("left", "right"):
+            (tmp_path / f"mug/videos/{throw}/{camera}.mp4").touch()
+    settings(tmp_path)
+    return tmp_path
+
+
+def settings(root, more=""):
+    (root / "mug/capture.yaml").write_text("board: {square: 0.03}\n" + more)
+
+
+def loaded(root):
+    return load(read_yaml("config/config.yaml"), captured=captured_scenes(root))
+
+
+def test_a_capture_is_a_scene_and_each_throw_of_it_another(captures):
+    settings(captures, "density: 900\nscale: 2\n")
+    found = loaded(captures).scenes
+    assert found["mug"].captured.throw is None and found["mug_one"].captured.throw == "one"
+    assert found["mug_one"].videos == ("mug_two",) and found["mug_two"].videos == ()
+    assert found["mug_one"].material["views"] == [0, 1]
+    assert found["mug_two"].density == 900 and found["mug_two"].captured.scale == 2
+    assert "mug_one" not in loaded(captures).plain_scenes
+
+
+def test_a_capture_falls_in_its_room_on_its_own_grid(captures):
+    settings(captures, "scale: 2\n")
+    found = loaded(captures)
+    assert found.scene_world("mug_two") == {"grid": found.captures.grid, "gravity": [0.0, -19.62, 0.0]}
+    settings(captures, "grid: 30\n")
+    assert loaded(captures).scene_world("mug_two") == {"grid": 30, "gravity": [0.0, -9.81, 0.0]}
+    own = found.simulation
+    assert found.scene_world("BouncyBall") == {"grid": own.grid, "gravity": list(own.gravity)}
+
+
+def test_what_is_held_out_trains_nothing(captures):
+    settings(captures, "held_out: [one]\n")
+    found = loaded(captures).scenes
+    assert found["mug_two"].videos == () and found["mug_one"].videos == ()
+    settings(captures, "held_out: [one, two]\n")
+    assert captured_scenes(captures) == {}  # its own rules say why
+
+
+def test_nobody_knows_the_truth_of_a_capture(captures):
+    found = loaded(captures)
+    for ask in (
+        lambda: found.frame_steps("mug_one"),
+        lambda: cases.case(found, "mug_one", "true_law").source(),
+    ):
+        with pytest.raises(InputError, match=NO_TRUTH):
+            ask()
+
+
+def test_two_scenes_of_one_name(captures):
+    with pytest.raises(InputError, match="BouncyBall.*rename"):
+        load({}, captured={"BouncyBall": captured_scenes(captures)["mug"]})
+
+
+def test_other_scenes_need_a_truth():
+    with pytest.raises(InputError, match="law: null stands in scenes of captures only"):
+        load({"scenes": {"BouncyBall": {"law": None}}})
+
+
+def test_rows_are_read_one_after_the_other():
+    frames = [{"time": 0.1 * k, "h": 50} for k in range(3)]
+    times = frame_times(frames, np.array([0.0, 25.0, 50.0]), 1e-5, 1000)
+    np.testing.assert_allclose(times, [0.0, 0.105, 0.21])
+
+
+def test_frames_are_spread_over_the_time_after_the_start():
+    times = np.arange(-10, 90) / 100
+    chosen = chosen_frames(times, 0.5, 11, "one, left")
+    np.testing.assert_allclose(times[chosen], np.arange(11) / 20)
+    assert len(chosen_frames(times, 0.5, 999, "one, left")) == 51
+    with pytest.raises(InputError, match="one, left: 6 frames"):
+        chosen_frames(times, 0.05, 60, "one, left")
+
+
+def test_reduced_pictures_keep_coverage_and_colour_and_nothing_of_the_background():
+    rgba = np.zeros((40, 80, 4), np.uint8)
+    rgba[..., :3] = (10, 250, 90)  # under the background
+    rgba[8:24, 13:51] = (200, 100, 50, 255)
+    small = reduced(rgba, 20)
+    assert small.shape == (10, 20, 4)
+    assert small[..., 3].sum() / 255 * 16 == pytest.approx(16 * 38, rel=0.01)
+    np.testing.assert_array_equal(
+        small[small[..., 3] > 0][:, :3], [(200, 100, 50)] * int((small[..., 3] > 0).sum())
+    )
+    assert not small[small[..., 3] == 0].any()
+    assert reduced(rgba, 100) is rgba
+
+
+def test_a_point_stays_on_its_part_of_a_reduced_picture():
+    frame = {"fl_x": 70.0, "fl_y": 72.0, "cx": 41.0, "cy": 19.0, "w": 80, "h": 40}
+    small = reduced_intrinsics(frame, (20, 10))
+    for axis, focal, centre, size in (("x", "fl_x", "cx", 80), ("y", "fl_y", "cy", 40)):
+        seen, seen_small = (f[focal] * 0.3 + f[centre] for f in (frame, small))
+        assert seen_small / (size / 4) == pytest.approx(seen / size), axis
+
+
+def test_the_gain_of_a_camera_is_taken_out():
+    rgba = np.array([[[100, 80, 250, 255], [0, 0, 0, 0]]], np.uint8)
+    found = without_gain(rgba, (0.5, 1.0, 0.8))
+    np.testing.assert_array_equal(found[0, 0], [200, 80, 255, 255])
+    np.testing.assert_array_equal(rgba[0, 0], [100, 80, 250, 255])

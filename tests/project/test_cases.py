@@ -1,0 +1,216 @@
+"""Presets and variants on scenes: options, runs, priors and sources of models."""
+
+from pathlib import Path
+
+import pytest
+
+from neuma_lib.methods.registry import built_in_presets, methods
+from neuma_lib.project import cases, loading
+from tests.support.errors import refused
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def changed(raw, **changes):
+    return loading.load(loading.merged(raw, changes), ROOT)
+
+
+def test_a_name_holds_a_preset_and_options(loaded):
+    assert cases.preset(loaded, "neuma")[1] == {}
+    chosen, given = cases.preset(loaded, "neuma+rank=4+lr_elastic=0.1+views=0,2+prior=sand")
+    assert chosen == loaded.methods["neuma"]
+    assert given == {"rank": 4, "lr_elastic": 0.1, "views": [0, 2], "prior": "sand"}
+    assert cases.title(loaded, "neuma+rank=4+views=0,2") == "NeuMA, rank 4, views 0,2"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("neumo", "no method 'neumo'; did you mean neuma"),
+        ("neuma+rank", "write variants as +key=value"),
+        ("neuma+rank=", "write variants as +key=value"),
+        ("neuma+rank=4+rank=8", "'rank' is given twice"),
+        ("neuma+ranks=4", "no setting 'ranks'; did you mean rank"),
+        ("neuma+anchors=50", "no setting 'anchors'"),
+        ("neuma+form=energy", "no setting 'form'"),
+        ("spring_gaus+margin=0", "no setting 'margin'"),
+        ("neuma+guesses=prior", "no setting 'guesses'"),
+        ("constants+prior=sand", "no setting 'prior'"),
+    ],
+)
+def test_names_with_mistakes_are_refused(loaded, name, message):
+    with refused() as caught:
+        cases.preset(loaded, name)
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["neuma+rank=x", "neuma_structured+form=secant"])
+def test_a_wrong_value_names_the_variant(loaded, name):
+    with refused() as caught:
+        cases.case(loaded, "BouncyBall", name)
+    assert name in str(caught.value)
+
+
+def test_options_are_layers_of_section_scene_preset_and_variant(raw):
+    loaded = changed(
+        raw,
+        material={"lr_elastic": 1.0, "lr_plastic": 1.0, "alpha": 1.0, "iterations": 1},
+        scenes={"BouncyBall": {"material": {"lr_plastic": 2.0, "alpha": 2.0, "iterations": 2}}},
+        methods={"neuma": {"options": {"alpha": 3.0, "iterations": 3}}},
+    )
+    options = cases.case(loaded, "BouncyBall", "neuma+iterations=4").options
+    assert (options.lr_elastic, options.lr_plastic, options.alpha, options.iterations) == (1.0, 2.0, 3.0, 4)
+
+
+def test_built_in_presets_can_be_changed_and_added_to(raw):
+    loaded = changed(
+        raw,
+        methods={"neuma": {"title": "Mine"}, "low": {"kind": "neuma", "title": "L", "options": {"rank": 2}}},
+    )
+    assert cases.title(loaded, "neuma") == "Mine"
+    assert cases.case(loaded, "BouncyBall", "low").options.rank == 2
+    assert [*loaded.methods] == [*built_in_presets(), "low"]
+
+
+def test_a_preset_may_take_the_fit_of_another(loaded):
+    own, base = "neuma_without_binding_own", "neuma_without_binding"
+    found = {name: cases.case(loaded, "BouncyBall", f"{name}+lr_scale=1") for name in (own, base)}
+    assert found[own].name == found[base].name == f"{base}+lr_scale=1"
+    assert found[own].options == found[base].options
+    assert found[own].product() == found[base].product()
+    carriers = {name: case.method.carrier(case) for name, case in found.items()}
+    assert carriers == {own: "gaussians", base: "binding"}
+
+
+@pytest.mark.parametrize(
+    ("preset", "where"),
+    [
+        ({"kind": "neumo"}, "methods.new.kind"),
+        ({}, "methods.new"),
+        ({"same_fit_as": "neumo"}, "methods.new.same_fit_as"),
+        ({"same_fit_as": "neuma_without_binding_own"}, "methods.new.same_fit_as"),
+        ({"same_fit_as": "neuma", "options": {"rank": 4}}, "methods.new"),
+        ({"same_fit_as": "neuma", "kind": "structured"}, "methods.new.kind"),
+        ({"kind": "neuma", "options": {"margin": 0.1}}, "methods.new.options.margin"),
+        ({"kind": "structured", "options": {"margins": 0.1}}, "methods.new.options.margins"),
+        ({"kind": "neuma", "options": {"prior": "snad"}}, "methods.new.options.prior"),
+        ({"kind": "constants", "options": {"prior": "sand"}}, "methods.new.options.prior"),
+    ],
+)
+def test_presets_with_mistakes_name_the_key(raw, preset, where):
+    with refused() as caught:
+        changed(raw, methods={"new": {"title": "new", **preset}})
+    assert where in str(caught.value)
+
+
+def test_methods_that_tables_name_exist(raw):
+    table = {"scenes": ["BouncyBall"], "methods": ["neuma+law_from=ClayCatt"]}
+    with refused("tables.new"):
+        changed(raw, tables={"new": table})
+    with refused("figures.beside"):
+        changed(raw, figures={"beside": ["spring_gaus+law_from=ClayCat"]})
+
+
+class TestPriors:
+    def test_of_the_scene_or_the_preset(self, loaded):
+        priors = {
+            name: cases.case(loaded, "BouncyBall", name).prior for name in ("neuma", "neuma+prior=sand")
+        }
+        assert priors == {"neuma": "jelly", "neuma+prior=sand": "sand"}
+        with refused("neuma+prior=snad"):
+            cases.case(loaded, "BouncyBall", "neuma+prior=snad")
+
+    def test_the_identified_law_is_a_prior_of_any_method(self, raw, loaded):
+        for name in ("neuma+prior=identified", "neuma_structured"):
+            assert cases.case(loaded, "BouncyBall", name).prior == "identified"
+        law = raw["priors"]["laws"]["jelly"]
+        for changes in (
+            {"priors": {"laws": {"identified": law}}},
+            {"scenes": {"ClayCat": {"prior": "identified"}}},
+        ):
+            with refused():
+                changed(raw, **changes)
+
+    def test_a_structured_method_corrects_an_analytic_law(self, raw, loaded):
+        found = cases.case(loaded, "BouncyBall", "neuma_structured")
+        assert found.method.fit_options(found)["base"] is None
+        assert found.method.fit_inputs(found)["identified"] == "results/BouncyBall/identified.json"
+        stock = cases.case(loaded, "BouncyBall", "neuma_structured+prior=jelly")
+        assert stock.method.fit_options(stock)["base"] == loaded.priors.laws["jelly"].plain()
+        assert "identified" not in stock.method.fit_inputs(stock)
+        own = changed(
+            raw,
+            scenes={"BouncyBall": {"prior": "my/law.pt"}},
+            methods={"new": {"title": "new", "kind": "structured"}},
+        )
+        mine = cases.case(own, "BouncyBall", "new")
+        with refused("new on BouncyBall"):
+            mine.method.fit_options(mine)
+
+    def test_it_is_identified_in_the_views_of_the_training(self, raw, loaded):
+        def name(settings, scene, method):
+            return cases.case(settings, scene, method).identified()
+
+        assert name(loaded, "BouncyBall", "neuma_structured") == "identified.json"
+        assert name(loaded, "BouncyBall", "neuma_structured+views=0,2") == "identified+views=0,2.json"
+        assert name(loaded, "BouncyBall", "constants+views=1") == "identified+views=1.json"
+        own = changed(raw, identify={"views": [0, 1]}, scenes={"ClayCat": {"material": {"views": [1, 2]}}})
+        assert name(own, "BouncyBall", "neuma_structured+views=0,1") == "identified.json"
+        assert name(own, "ClayCat", "constants") == "identified+views=1,2.json"
+
+
+class TestLawFrom:
+    """A model that is obtained in one scene moves another."""
+
+    def test_everything_about_the_law_is_of_its_scene(self, raw):
+        scenes = {"ClayCat": {"material": {"iterations": 7, "covariance_from": "total"}}}
+        loaded = changed(raw, scenes=scenes)
+        found = cases.case(loaded, "BouncyBall+seed=2", "neuma+law_from=ClayCat+rank=4")
+        assert (found.scene, found.moved, found.name) == (
+            "ClayCat+seed=2",
+            "BouncyBall+seed=2",
+            "neuma+rank=4",
+        )
+        assert found.prior == "plasticine" and not found.learns_there
+        assert found.options == cases.case(loaded, "ClayCat+seed=2", "neuma+rank=4").options
+        assert found.product() == "results/ClayCat+seed=2/neuma+rank=4/adaptor.safetensors"
+        true = cases.case(loaded, "BouncyBall", "true_law+law_from=ClayCat")
+        assert true.method.model_options(true)["law"] == loaded.scene("ClayCat").law.plain()
+
+    def test_the_body_stays_that_of_the_scene(self, loaded):
+        found = cases.case(loaded, "ClayCat", "neuma+law_from=UnevenCat")
+        assert found.density(found.moved) == loaded.scene("ClayCat").density
+        assert found.method.start_file(found) == "results/ClayCat/velocity.json"
+
+    def test_mistakes(self, loaded):
+        with refused("neuma+law_from=ClayCatt"):
+            cases.case(loaded, "BouncyBall", "neuma+law_from=ClayCatt")
+        with refused("spring_gaus+law_from=ClayCat"):
+            cases.case(loaded, "BouncyBall", "spring_gaus+law_from=ClayCat")
+
+
+def test_pac_nerf_has_its_own_start_and_particles(loaded):
+    for own, base in (("pac_nerf_own", "pac_nerf"), ("pac_nerf_own+guesses=prior", "pac_nerf+guesses=prior")):
+        mine, shared = (cases.case(loaded, "BouncyBall", name) for name in (own, base))
+        assert mine.options == shared.options and mine.product() == shared.product()
+        assert mine.method.start_file(mine) == shared.product()
+        assert (mine.method.carrier(mine), shared.method.carrier(shared)) == ("field", "binding")
+        assert mine.method.body_inputs(mine) and not shared.method.body_inputs(shared)
+        assert {own, base} <= set(loaded.tables["table1_systems"].methods)
+    assert cases.run_folder(loaded, "BouncyBall+adaptor_seed=2", "pac_nerf") == "BouncyBall/pac_nerf"
+
+
+def test_what_a_method_draws_names_its_run(loaded):
+    folder = "ClayCat+adaptor_seed=1"
+    runs = {name: cases.run_folder(loaded, folder, name).partition("/")[0] for name in loaded.methods}
+    drawn = {name for name, run in runs.items() if run == folder}
+    assert drawn == {"neuma", "neuma_particle_supervision", "neuma_without_binding", "neuma_without_binding_own",
+                     "neuma_structured"}  # fmt: skip
+
+
+def test_every_method_states_its_files_without_torch(loaded):
+    for name in loaded.methods:
+        found = cases.case(loaded, "ClayCat", name)
+        assert all(isinstance(path, str) for path in found.source().paths)
+        assert bool(found.method.product) == bool(found.method.fit_inputs(found))
+        assert found.method is methods()[found.method.name]

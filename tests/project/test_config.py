@@ -1,0 +1,440 @@
+"""Settings: mistakes are found by path, variants mean what they say, the documentation follows the types."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from neuma_lib.config.base import Section
+from neuma_lib.config.variants import DRAWN, folder, parse_chain
+from neuma_lib.errors import InputError
+from neuma_lib.project import cases, loading
+from neuma_lib.project.page import settings_markdown
+from neuma_lib.project.settings import Config
+
+pytestmark = pytest.mark.core
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_default_settings_are_valid(loaded):
+    assert loaded.tables["table1"].scenes[0] == "BouncyBall"
+    assert loaded.dataset.particles >= 4 * loaded.simulation.particles
+    assert loaded.dataset.seed != loaded.seed
+
+
+@pytest.mark.parametrize(
+    "files", [(), ("three_chains.yaml",), ("paper.yaml",), ("paper.yaml", "paper_light.yaml")]
+)
+def test_images_are_measured_in_at_least_two_views_that_training_does_not_see(raw, files):
+    for file in files:
+        raw = loading.merged(raw, loading.read_yaml(ROOT / "config" / file))
+    chosen = loading.load(raw, ROOT)
+    assert chosen.dataset.dynamic.views - len(chosen.material.views) >= 2
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"matreial": {}}, r"matreial: unknown key; did you mean material\?"),
+        ({"material": {"lr_elastc": 1}}, r"material\.lr_elastc: unknown key; did you mean lr_elastic"),
+        ({"material": {"iterations": "many"}}, r"material\.iterations: .*integer.*'many'"),
+        ({"material": {"rank": 0}}, r"material\.rank: .*greater than or equal to 1"),
+        ({"binding": {"confidence": 95}}, r"binding\.confidence: .*less than 1 \(given: 95\)"),
+        ({"dataset": {"static": {"veiws": 3}}}, r"dataset\.static\.veiws: unknown key; did you mean views"),
+        (
+            {"scenes": {"BouncyBall": {"hieght": 1}}},
+            r"scenes\.BouncyBall\.hieght: unknown key; did you mean height",
+        ),
+        (
+            {"scenes": {"BouncyBall": {"prior": "jely"}}},
+            r"no prior 'jely' in priors\.laws; did you mean jelly",
+        ),
+        (
+            {"scenes": {"BouncyBall": {"material": {"lr": 1}}}},
+            r"scenes\.BouncyBall\.material\.lr: unknown key",
+        ),
+        ({"methods": {"neuma": {"options": {"rnk": 4}}}}, r"methods\.neuma\.options\.rnk: unknown key"),
+        ({"tables": {"table1": {"scenes": ["BouncyBal"]}}}, r"no scene 'BouncyBal'; did you mean BouncyBall"),
+        ({"tables": {"table1": {"methods": ["neuma+rnk=4"]}}}, r"no setting 'rnk'; did you mean rank"),
+        ({"tables": {"table1": {"vary": ["particle"]}}}, r"tables\.table1\.vary\.0: .*'particles'"),
+        ({"tables": {"table1": {"scenes": ["BouncyBall+seed=1"]}}}, r"no scene 'BouncyBall\+seed=1'"),
+        (
+            {"methods": {"neuma+x": {"title": "x", "kind": "neuma"}}},
+            r"methods\.neuma\+x: .*leave out \+ and /",
+        ),
+        (
+            {"experiments": {"ClayCat": {"title": "x", "bodies": [{"scene": "ClayCat"}], "steps": 9}}},
+            r"experiments\.ClayCat: a scene has this name",
+        ),
+        ({"scenes": {"New": {"shape": "ball"}}}, r"scenes\.New\.height: this key is missing"),
+        ({"dataset": {"stride": 4}}, r"dataset: give either frames or stride"),
+        (
+            {"evaluation": {"tracers": 5}},
+            r"evaluation\.tracers: 5 in the prediction and dataset\.tracers: 100000 in the truth",
+        ),
+        ({"seed": 1000}, r"dataset\.seed: 1000 draws the particles of the truth with the seed 1000"),
+        ({"dataset": {"seed": -1}}, r"dataset\.seed: -1 draws the tracers of the truth with the seed 0"),
+        (
+            {"dataset": {"seed": 1}, "tables": {"table2": {"seeds": 4}}},
+            r"dataset\.seed: 1 draws .* of the truth with the seed [123]",
+        ),
+        ({"dataset": {"frames": None}}, r"dataset: give either frames or stride"),
+        ({"scenes": {"BouncyBall": {"images": {"video": "x"}}}}, r"BouncyBall\.images\.video: unknown key"),
+        (
+            {"gaussians": {"densification": {"evry": 3}}},
+            r"gaussians\.densification\.evry: unknown key; did you mean every",
+        ),
+        (
+            {"priors": {"regression": {"iteration": 3}}},
+            r"priors\.regression\.iteration: .*did you mean iterations",
+        ),
+        (
+            {"priors": {"laws": {"jelly": {"elasticity": {"E": "stiff"}}}}},
+            r"priors\.laws\.jelly\.elasticity\.E: .*number.*'stiff'",
+        ),
+        ({"priors": {"laws": {"mud": {}}}}, r"priors\.laws\.mud\.elasticity: this key is missing"),
+        (
+            {"priors": {"laws": {"mud": {"elasticity": {"E": 1e5}}}}},
+            r"laws\.mud\.elasticity\.name: this key is missing",
+        ),
+        (
+            {"scenes": {"BouncyBall": {"appearance": {"kind": "foam"}}}},
+            r"BouncyBall\.appearance\.kind: .*'solid', 'grains' or 'liquid'.*'foam'",
+        ),
+        ({"scenes": 3}, r"scenes: .*dictionary.*3"),
+        (
+            {"experiments": {"longer_bouncy": {"bodies": [{"scene": "BouncyBall", "shap": "ball"}]}}},
+            r"experiments\.longer_bouncy\.bodies\.0\.shap: unknown key; did you mean shape",
+        ),
+        ({"figures": {"main_res": ["BouncyBal"]}}, r"figures\.main_res: no scene 'BouncyBal'; did you mean"),
+        (
+            {"figures": {"ext_time": "longer"}},
+            r"figures\.ext_time: no experiment 'longer'; did you mean longer_",
+        ),
+        ({"scenes_file": "nowhere.yaml"}, r"nowhere\.yaml does not exist"),
+    ],
+)
+def test_mistakes_are_named(raw, change, message):
+    with pytest.raises(InputError, match=message):
+        loading.load(loading.merged(raw, change), ROOT)
+
+
+def test_every_mistake_is_reported_at_once(raw):
+    with pytest.raises(InputError) as error:
+        loading.load(loading.merged(raw, {"material": {"a": 1, "b": 2}}), ROOT)
+    assert "material.a" in str(error.value) and "material.b" in str(error.value)
+
+
+def test_invalid_yaml_names_the_file(tmp_path):
+    (tmp_path / "broken.yaml").write_text("a: [1,\n")
+    with pytest.raises(InputError, match=r"broken\.yaml is not valid YAML"):
+        loading.read_yaml(tmp_path / "broken.yaml")
+
+
+def test_numbers_without_a_point_are_numbers(raw):
+    """YAML 1.1 reads 1e5 as text."""
+    elasticity = {"name": "fixed_corotated", "E": "1e5", "nu": 0.2}
+    change = {"priors": {"laws": {"jelly": {"elasticity": elasticity}}}}
+    jelly = loading.load(loading.merged(raw, change), ROOT).priors.laws["jelly"]
+    assert jelly.plain()["elasticity"] == {**elasticity, "E": 1e5}
+
+
+class TestChains:
+    def runs(self, raw, method, column="ClayCat", **table):
+        change = {"tables": {"table1": {"seeds": 3, **table}}}
+        return cases.runs(loading.load(loading.merged(raw, change), ROOT), "table1", method, column)
+
+    @pytest.mark.parametrize("seeds", [(0, 0, 0, 0), (1, 1, 1, 1), (0, 0, 0, 2), (1, 2, 3, 0), (0, 11, 0, 0)])
+    def test_names_say_the_seeds(self, seeds):
+        chosen = dict(zip(DRAWN, seeds))
+        assert parse_chain(folder("A", chosen), ["A"], "scene") == ("A", chosen)
+
+    def test_what_depends_on_equal_seeds_has_one_name(self):
+        assert folder("A", {}) == "A" and folder("A", dict.fromkeys(DRAWN, 2)) == "A+seed=2"
+        assert folder("A", {"gaussians": 1}) == "A+gaussians_seed=1"
+        assert folder("A", {"gaussians": 1, "adaptor": 5}, ["gaussians"]) == "A+seed=1"
+        assert folder("A", {"adaptor": 5}, ["prior", "gaussians"]) == "A"
+
+    def test_one_seed_may_differ_from_the_common_one(self):
+        _, seeds = parse_chain("A+seed=2+prior_seed=0", ["A"], "scene")
+        assert seeds == {"prior": 0, "gaussians": 2, "particles": 2, "adaptor": 2}
+
+    @pytest.mark.parametrize(
+        ("name", "message"),
+        [
+            ("B+seed=1", "no scene 'B'"),
+            ("A+sed=1", "no setting 'sed'; did you mean seed"),
+            ("A+seed=-1", "seed must be a whole number from 0, not '-1'"),
+            ("A+seed=1+seed=1", "'seed' is given twice"),
+            ("A+seed", r"write variants as \+key=value"),
+        ],
+    )
+    def test_mistakes(self, name, message):
+        with pytest.raises(InputError, match=message):
+            parse_chain(name, ["A"], "scene")
+
+    def test_every_row_of_a_table_has_all_chains(self, raw, loaded):
+        for method in loaded.tables["table1"].methods:
+            expected = [f"ClayCat{chain}/{method}" for chain in ("", "+seed=1", "+seed=2")]
+            assert self.runs(raw, method) == expected
+
+    def test_what_does_not_vary_has_one_run(self, raw):
+        assert self.runs(raw, "nclaw", vary=["adaptor"]) == ["ClayCat/nclaw"]
+        # The base weights are no draw of the adaptor's.
+        assert self.runs(raw, "neuma_without_adaptor", vary=["adaptor"]) == ["ClayCat/neuma_without_adaptor"]
+        expected = [f"ClayCat{chain}/neuma" for chain in ("", "+adaptor_seed=1", "+adaptor_seed=2")]
+        assert self.runs(raw, "neuma", vary=["adaptor"]) == expected
+        # Without an adaptor all that is drawn has seed 1: one home with the whole chain.
+        assert self.runs(raw, "nclaw", vary=DRAWN[:3])[1] == "ClayCat+seed=1/nclaw"
+
+    def test_bodies_of_an_experiment_are_of_its_chain(self, raw, loaded):
+        assert loaded.body_scenes("fish_into_duck+seed=1") == ["SandFish+seed=1", "JellyDuck+seed=1"]
+        assert self.runs(raw, "nclaw", "letter_N_sand")[2] == "letter_N_sand+seed=2/nclaw"
+        assert loaded.experiment("letter_N_sand+seed=1") == loaded.experiment("letter_N_sand")
+
+    def test_a_chain_changes_seeds_alone(self, raw):
+        loaded = loading.load(loading.merged(raw, {"material": {"seed": 10}}), ROOT)
+        plain = cases.case(loaded, "ClayCat", "neuma").options
+        other = cases.case(loaded, "ClayCat+seed=2", "neuma").options
+        assert (plain.seed, other.seed) == (10, 12)
+        assert other.model_copy(update={"seed": 10}) == plain
+        assert cases.case(loaded, "ClayCat+seed=2", "neuma+seed=5").options.seed == 7
+        assert cases.case(loaded, "ClayCat+prior_seed=2", "neuma").options == plain
+        assert loaded.scene("ClayCat+seed=2") == loaded.scene("ClayCat")
+
+
+class TestFrames:
+    def frames(self, raw, scene=None, **dataset):
+        changes = {"dataset": dataset, "scenes": {"BouncyBall": {"steps": 100, **(scene or {})}}}
+        return loading.load(loading.merged(raw, changes), ROOT).frame_steps("BouncyBall")
+
+    def test_a_number_of_frames_is_even_and_ends_with_the_video(self, raw):
+        assert self.frames(raw, frames=5) == (0, 25, 50, 75, 100)
+        assert self.frames(raw, frames=1000) == tuple(range(101))
+
+    def test_a_stride_starts_with_the_video(self, raw):
+        assert self.frames(raw, frames=None, stride=25) == (0, 25, 50, 75, 100)
+        assert self.frames(raw, frames=None, stride=30) == (0, 30, 60, 90)
+
+    def test_steps_of_every_video(self, raw):
+        assert self.frames(raw, frames=None, stride=10, steps=40) == (0, 10, 20, 30, 40)
+
+    def test_a_scene_may_list_its_own(self, raw):
+        own = {"frames": [0, 7, 9]}
+        assert self.frames(raw, own, frames=None, stride=10, steps=40) == (0, 7, 9)
+
+
+class TestLike:
+    def test_a_scene_like_another_has_its_settings_and_its_own(self, raw):
+        change = {"Soft": {"like": "UnevenCat", "law": {"elasticity": {"E": 1e5}}}, "ClayCat": {"size": 0.3}}
+        loaded = loading.load(loading.merged(raw, {"scenes": change}), ROOT)
+        soft, cat = loaded.scene("Soft"), loaded.scene("ClayCat")
+        assert (soft.size, soft.law.plasticity, soft.dt) == (0.3, cat.law.plasticity, cat.dt)
+        assert soft.density == loaded.scene("UnevenCat").density
+        assert soft.law.elasticity.plain() == {**cat.law.elasticity.plain(), "E": 1e5}
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"New": {"like": "ClayCatt"}}, r"scenes\.New\.like: no scene 'ClayCatt'; did you mean ClayCat"),
+            ({"A": {"like": "B"}, "B": {"like": "A"}}, r"scenes\.B\.like: A is in turn like B"),
+            ({"A": {"like": "A"}}, r"scenes\.A\.like: A is in turn like A"),
+        ],
+    )
+    def test_mistakes(self, raw, change, message):
+        with pytest.raises(InputError, match=message):
+            loading.load(loading.merged(raw, {"scenes": change}), ROOT)
+
+
+class TestVideos:
+    def loaded(self, raw, **scenes):
+        return loading.load(loading.merged(raw, {"scenes": scenes}), ROOT)
+
+    def test_another_throw_of_the_same_object_is_one_line(self, raw):
+        again = {"velocity": [0.5, -1.0, 0.0], "steps": 300}
+        loaded = self.loaded(
+            raw, ClayCat={"videos": [again, "OtherCat"]}, OtherCat={"like": "ClayCat", "shape": "duck"}
+        )
+        throw, cat = loaded.scene("ClayCat_throw2"), loaded.scene("ClayCat")
+        assert cat.videos == ("ClayCat_throw2", "OtherCat")
+        assert (throw.velocity, throw.steps) == ((0.5, -1.0, 0.0), 300)
+        own = {"velocity", "steps", "videos", "like"}
+        plain = [scene.model_dump(exclude=own) for scene in (throw, cat)]
+        assert plain[0] == plain[1]
+
+    def test_videos_are_not_handed_on(self, raw):
+        loaded = self.loaded(raw, ClayCat={"videos": [{"height": 0.4}]}, Near={"like": "ClayCat"})
+        assert not loaded.scene("Near").videos and not loaded.scene("UnevenCat").videos
+        assert not loaded.scene("ClayCat_throw2").videos
+
+    def test_pairs_of_throws_that_are_shown(self, raw):
+        pairs = loading.read_yaml(ROOT / "config" / "two_throws.yaml")
+        loaded = loading.load(loading.merged(raw, pairs), ROOT)
+        for material in ("Paste", "Gel"):
+            slow, both = loaded.scene(f"{material}Slow"), loaded.scene(f"{material}Both")
+            assert both.videos == (f"{material}Fast",) and not slow.videos
+            own = {"videos", "images", "like"}
+            assert slow.model_dump(exclude=own) == both.model_dump(exclude=own)
+            assert loaded.tables[f"two_throws_{material.lower()}"].on_request
+
+    def test_all_videos_are_of_the_chain(self, raw):
+        loaded = self.loaded(raw, ClayCat={"videos": [{"height": 0.4}]})
+        assert loaded.video_scenes("ClayCat+seed=2") == ["ClayCat+seed=2", "ClayCat_throw2+seed=2"]
+        assert loaded.video_scenes("BouncyBall") == ["BouncyBall"]
+
+    @pytest.mark.parametrize(
+        ("scenes", "message"),
+        [
+            (
+                {"ClayCat": {"videos": ["ClayCatt"]}},
+                r"scenes\.ClayCat\.videos: no scene 'ClayCatt'; did you mean",
+            ),
+            ({"ClayCat": {"videos": ["ClayCat"]}}, r"scenes\.ClayCat\.videos: 'ClayCat' is there twice"),
+            ({"ClayCat": {"videos": ["UnevenCat", "UnevenCat"]}}, "'UnevenCat' is there twice"),
+            ({"ClayCat": {"videos": ["BouncyBall"]}}, "'BouncyBall' has another law"),
+            ({"ClayCat": {"videos": [{"prior": "sand"}]}}, "'ClayCat_throw2' has another prior"),
+            ({"ClayCat": {"videos": [{"dt": 2.5e-4}]}}, "'ClayCat_throw2' has another dt"),
+            (
+                {"ClayCat": {"videos": ["UnevenCat"]}, "UnevenCat": {"videos": ["ClayCat"]}},
+                "'UnevenCat' has further videos itself",
+            ),
+            (
+                {"ClayCat": {"videos": [{}]}, "ClayCat_throw2": {"like": "ClayCat"}},
+                "ClayCat_throw2, which is another",
+            ),
+            (
+                {"ClayCat": {"videos": [{"height": 0.4}], "images": {"dynamic": "mine.json"}}},
+                r"'ClayCat_throw2' has the same video, mine\.json",
+            ),
+            ({"ClayCat": {"videos": [{"heigth": 0.4}]}}, r"scenes\.ClayCat_throw2\.heigth: unknown key"),
+        ],
+    )
+    def test_mistakes(self, raw, scenes, message):
+        with pytest.raises(InputError, match=message):
+            self.loaded(raw, **scenes)
+
+
+class TestFinerTruth:
+    def loaded(self, raw, **changes):
+        return loading.load(loading.merged(raw, changes), ROOT)
+
+    def values(self, truth):
+        return truth.grid, truth.dt, truth.particles
+
+    def test_it_is_as_fine_as_simulation_and_scene_by_default(self, loaded):
+        assert self.values(loaded.scene_truth("BouncyBall")) == (24, 1e-3, 8000)
+        assert self.values(loaded.experiment_truth("letter_N_sand")) == (24, 5e-4, 8000)
+
+    def test_settings_of_all_truths_and_of_one(self, raw):
+        finer = {"grid": 40, "dt": 2.5e-4, "particles": 9000}
+        loaded = self.loaded(raw, dataset=finer, scenes={"ClayCat": {"truth": {"grid": 50}}})
+        assert self.values(loaded.scene_truth("BouncyBall+seed=2")) == (40, 2.5e-4, 9000)
+        assert self.values(loaded.scene_truth("ClayCat")) == (50, 2.5e-4, 9000)
+        assert self.values(loaded.experiment_truth("letter_N_clay")) == (40, 2.5e-4, 9000)
+        assert loaded.frame_steps("BouncyBall") == self.loaded(raw).frame_steps("BouncyBall")
+
+    def test_recorded_ones_are_twice_as_fine_and_asked_for_by_name(self, loaded):
+        table = loaded.tables["finer_truth"]
+        assert table.on_request and set(loaded.tables["table1"].methods) < set(table.methods)
+        for name, scene in zip(table.scenes, loaded.tables["table1"].scenes, strict=True):
+            finer, plain = loaded.scene_truth(name), loaded.scene_truth(scene)
+            assert finer.grid == 2 * plain.grid and finer.particles == 8 * plain.particles
+            assert plain.dt == 2 * finer.dt
+            assert loaded.scene(name).law == loaded.scene(scene).law
+        assert not {*table.scenes, *loaded.random_scenes} & set(loaded.plain_scenes)
+
+    def test_truths_outside_every_family_are_asked_for_by_name(self, loaded):
+        """No prior has their laws, no random scene of the default draw, and no other target makes them."""
+        table = loaded.tables["outside"]
+        assert table.on_request and not {*table.scenes} & set(loaded.plain_scenes)
+        assert not any(
+            {*table.scenes} & {*t.scenes} for name, t in loaded.tables.items() if name != "outside"
+        )
+        known = [*loaded.priors.laws.values()]
+        known += [loaded.scene(name).law for name in (*loaded.plain_scenes, *loaded.random_scenes)]
+        pairs = {(law.elasticity.name, law.plasticity.name) for law in known}
+        outside = [loaded.scene(name).law for name in table.scenes]
+        chosen = {(law.elasticity.name, law.plasticity.name) for law in outside}
+        assert len(chosen) == len(table.scenes) and not chosen & pairs
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            (
+                {"dataset": {"dt": 3e-4}},
+                r"dataset\.dt: .* 0\.0003 s must go evenly into .* 0\.001 s in scenes\.B",
+            ),
+            ({"dataset": {"dt": 2e-3}}, r"dataset\.dt: .* 0\.002 s must go evenly"),
+            (
+                {"scenes": {"ClayCat": {"truth": {"dt": 1e-3}}}},
+                r"scenes\.ClayCat\.truth\.dt: .* must go evenly",
+            ),
+            ({"scenes": {"ClayCat": {"truth": {"gird": 9}}}}, r"truth\.gird: unknown key; did you mean grid"),
+        ],
+    )
+    def test_mistakes(self, raw, change, message):
+        with pytest.raises(InputError, match=message):
+            self.loaded(raw, **change)
+
+
+class TestScaleOfThePaper:
+    def overlay(self, raw, *names):
+        for name in names:
+            raw = loading.merged(raw, loading.read_yaml(ROOT / "config" / f"{name}.yaml"))
+        return loading.load(raw, ROOT)
+
+    def test_paper(self, raw):
+        paper = self.overlay(raw, "paper")
+        assert (paper.simulation.particles, paper.simulation.grid, paper.material.iterations) == (
+            30000,
+            32,
+            1000,
+        )
+        assert (paper.dataset.dynamic.width, paper.dataset.static.height) == (800, 800)
+        assert paper.gaussians.densification.max_count == 20000 and paper.device == "cuda"
+        for scene in paper.scenes:
+            assert paper.frame_steps(scene) == tuple(range(401))
+
+    def test_light_differs_in_images_alone(self, raw, loaded):
+        paper, light = self.overlay(raw, "paper"), self.overlay(raw, "paper", "paper_light")
+        assert light.frame_steps("BouncyBall") == tuple(range(0, 401, 4))
+        same = ("device", "simulation", "gaussians", "material", "scenes", "kernel_cache")
+        assert all(getattr(light, name) == getattr(paper, name) for name in same)
+        roots = [getattr(c, root) for c in (loaded, paper, light) for root in ("data_root", "results_root")]
+        assert len(set(roots)) == 6
+
+
+def test_plain_values_build_the_section_again(loaded):
+    """What a rule hands to its script, as text in between, gives the same settings."""
+    assert Config(**json.loads(json.dumps(loaded.plain()))) == loaded
+
+
+def test_a_stage_depends_on_its_own_settings_alone_and_settings_on_no_torch():
+    """So an edit of the figures' settings does not fit the Gaussians anew, and a plan is made in no time."""
+    grimp = pytest.importorskip("grimp")
+    graph = grimp.build_graph("neuma_lib", include_external_packages=True)
+    reached = graph.find_upstream_modules("neuma_lib.fitting.gaussians")
+    assert {m for m in reached if m.startswith("neuma_lib.config")} == {
+        "neuma_lib.config.base",
+        "neuma_lib.config.gaussians",
+    }
+    command = (
+        "import sys, neuma_lib.project.loading; print([m for m in ('torch', 'warp') if m in sys.modules])"
+    )
+    loaded = subprocess.run(
+        [sys.executable, "-c", command], cwd=ROOT, text=True, capture_output=True, check=True
+    )
+    assert loaded.stdout.strip() == "[]"
+
+
+def test_every_section_and_key_is_explained():
+    for kind in Section.__subclasses__():
+        assert kind.__doc__ and all(entry.description for entry in kind.model_fields.values()), kind.__name__
+
+
+def test_settings_page_is_up_to_date():
+    page = ROOT / "docs" / "settings.md"
+    assert page.read_text() == settings_markdown(), "run: python -m neuma_lib.project.page > docs/settings.md"

@@ -1,0 +1,203 @@
+"""Several rollouts in the same launches: each as alone, one that diverges among others, laws without kernels."""
+
+import pytest
+import torch
+
+from neuma_lib.errors import NonFiniteError
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.analytic_fused import fusible, side_by_side
+from neuma_lib.sim.batch import rollout_batch
+from neuma_lib.sim.memory import MemoryPlan
+from neuma_lib.sim.model import Body, MPMModel
+from neuma_lib.sim.rollout import RolloutFunction, rollout
+from neuma_lib.sim.simulation import Simulation, gather_weights
+from neuma_lib.sim.state import State
+from tests.support.errors import refused
+from tests.support.sim_scenes import DT, SPECS, cube, make_law, strained
+
+pytestmark = pytest.mark.core
+
+MODEL = MPMModel(16, DT)
+FRAMES = (0, 10, 25, 40)
+RUN = dict(steps=FRAMES[-1], frames=FRAMES)
+PARTS = ("x", "v", "F", "C")
+FURTHER = {
+    "ogden": {"elasticity": {"name": "ogden", "E": 5e4, "nu": 0.3, "alpha": 6.0}},
+    "mooney_rivlin": {"elasticity": {"name": "mooney_rivlin", "E": 5e4, "nu": 0.3, "q": 0.4}},
+    "bingham": {
+        "elasticity": {"name": "hencky", "E": 5e4, "nu": 0.3},
+        "plasticity": {"name": "viscous_flow", "viscosity": 10.0, "yield_stress": 5e2},
+    },
+    "cohesive": {
+        "elasticity": {"name": "hencky", "E": 5e4, "nu": 0.2},
+        "plasticity": {"name": "drucker_prager", "friction_angle": 30.0, "cohesion": 0.01},
+    },
+}
+FUSED = {**SPECS, **FURTHER}
+UNSTABLE = {"elasticity": {"name": "hencky", "E": 5e8, "nu": 0.3}}
+
+
+def law(name, stiffness=1.0):
+    spec = {part: dict(values) for part, values in FUSED[name].items()}
+    spec["elasticity"]["E"] *= stiffness
+    return analytic_law(spec, DT, name)
+
+
+def falling(dtype=torch.float64, velocity=(0.3, -2.0, 0.1), count=300):
+    """A cube just above the floor."""
+    x, mass, vol0 = cube(count, centre=(0.5, 0.21, 0.5), dtype=dtype)
+    return State(x, torch.tensor(velocity, dtype=dtype), mass, vol0)
+
+
+def assert_same(a, b, tolerance=0.0):
+    assert a.frames == b.frames
+    for name in PARTS:
+        one, other = getattr(a, name), getattr(b, name)
+        if tolerance:
+            assert (one - other).abs().max() <= tolerance * (1 + other.abs().max()), name
+        else:
+            assert torch.equal(one, other), name
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", FUSED)
+def test_kernels_agree_with_the_laws_themselves(name, dtype):
+    """To round-off of the largest value; also where nothing yields, inside out, crushed and at rest."""
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(37, 3, 3, generator=generator, dtype=torch.float64)
+    eye = torch.eye(3, dtype=torch.float64).expand(37, 3, 3)
+    flipped = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
+    strained = eye + 0.1 * noise
+    for F in (eye, eye + 1e-6 * noise, strained, strained @ flipped, 0.03 * eye, 1.2 * eye):
+        F = torch.cat([F, 1.01 * F]).to(dtype)
+        both = side_by_side([law(name), law(name, 1.7)])
+        for part in (both.elasticity, both.plasticity):
+            weights = tuple(w.to(dtype) for w in part.weights())
+            expected = part.response(F, weights)
+            found = part.evaluate(F, weights, out=torch.full_like(F, torch.nan))
+            # Three rotations, an exponential and up to a dozen products; the stress of a strain e has the round-off
+            # of F times the stiffness.
+            stiffness = 0.0 if part is both.plasticity else 2e5 * F.abs().max() ** 2
+            scale = stiffness + expected.abs().max()
+            assert (found - expected).abs().max() <= 32 * torch.finfo(dtype).eps * scale
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_copies_equal_rollouts_of_their_own(dtype):
+    """All kinds of laws in one launch; a rollout alone differs by the kernels' round-off, which 40 steps carry on."""
+    laws = [law(name, stiffness) for name in FUSED for stiffness in (1.0, 1.3)]
+    found = rollout_batch(MODEL, laws, falling(dtype), **RUN, total=True, together=len(laws))
+    for own, path in zip(laws, found, strict=True):
+        alone = rollout(MODEL, own, falling(dtype), **RUN, total=True)
+        assert_same(path, alone, 1e4 * torch.finfo(dtype).eps)
+        assert (path.F_total - alone.F_total).abs().max() < 1e4 * torch.finfo(dtype).eps
+        assert (path.F[-1] - torch.eye(3, dtype=dtype)).abs().max() > 1e-2
+
+
+def test_how_many_go_together_changes_no_bit():
+    laws = [law("von_mises", 1 + 0.1 * copy) for copy in range(5)]
+    groups = [rollout_batch(MODEL, laws, falling(), **RUN, together=together) for together in (1, 2, 5)]
+    for paths in zip(*groups, strict=True):
+        assert_same(paths[1], paths[0])
+        assert_same(paths[2], paths[0])
+
+
+def test_one_that_diverges_leaves_the_others_alone():
+    laws = [law("hencky"), analytic_law(UNSTABLE), law("von_mises")]
+    with pytest.raises(NonFiniteError):
+        rollout(MODEL, laws[1], falling(), **RUN)
+    first, lost, last = rollout_batch(MODEL, laws, falling(), **RUN)
+    assert lost is None
+    for path, own in ((first, laws[0]), (last, laws[2])):
+        assert_same(path, rollout_batch(MODEL, [own], falling(), **RUN)[0])
+    assert rollout_batch(MODEL, [laws[1]] * 2, falling(), **RUN) == [None, None]
+
+
+def test_one_that_flies_away_leaves_the_others_alone():
+    slow, fast = falling(), falling(velocity=(0.0, 100.0, 0.0))
+    lost, kept = rollout_batch(MODEL, [law("fluid")] * 2, [fast, slow], **RUN, skip_free_flight=False)
+    assert lost is None
+    assert_same(kept, rollout_batch(MODEL, [law("fluid")], slow, **RUN, skip_free_flight=False)[0])
+
+
+def test_every_copy_has_its_own_start():
+    """Other velocities, a spin, a strained body; free flight ends for all with the first contact."""
+    plain, spin = falling(), State.thrown(*cube(300), velocity=(0.0, -1.0, 0.0), spin=(3.0, 5.0, -2.0))
+    sideways = falling(velocity=(2.0, -1.0, -1.0))
+    v, F, C = strained(plain.x)
+    bent = State(plain.x, v, plain.mass, plain.vol0, F, C)
+    for starts in ((plain, sideways), (plain, sideways, spin, bent)):
+        laws = [law("von_mises")] * len(starts)
+        for start, path in zip(starts, rollout_batch(MODEL, laws, starts, **RUN), strict=True):
+            assert_same(path, rollout(MODEL, laws[0], start, **RUN), 1e-9)
+
+
+def test_a_batch_in_free_flight_needs_no_grid():
+    high = State(
+        falling().x + torch.tensor([0, 0.3, 0]), *(getattr(falling(), n) for n in ("v", "mass", "vol0"))
+    )
+    for path in rollout_batch(MODEL, [law("hencky"), law("fluid")], high, **RUN):
+        assert_same(path, rollout(MODEL, law("hencky"), high, **RUN))
+        assert torch.equal(path.F[-1], torch.eye(3, dtype=torch.float64).expand(300, 3, 3))
+
+
+def test_laws_without_kernels_share_the_transfers():
+    paste = {
+        "elasticity": {"name": "hencky", "E": 5e4, "nu": 0.3},
+        "plasticity": {"name": "herschel_bulkley", "consistency": 20.0, "exponent": 0.7, "yield_stress": 2e2},
+    }
+    laws = [make_law("neural"), law("hencky"), analytic_law(paste, DT), law("fluid")]
+    assert [fusible(own) for own in laws] == [False, True, False, True]
+    for own, path in zip(laws, rollout_batch(MODEL, laws, falling(), **RUN), strict=True):
+        assert_same(path, rollout(MODEL, own, falling(), **RUN), 1e-9)
+
+
+def test_wrong_starts_are_named():
+    two = [law("hencky")] * 2
+    for laws, start in (([], falling()), (two, [falling()]), (two, [falling(), falling(count=9)])):
+        with refused("laws"):
+            rollout_batch(MODEL, laws, start, **RUN)
+
+
+def test_gradients_of_copies_are_those_of_each():
+    """The adjoint keeps copies apart as well: same gradients of x and v as of each simulation alone."""
+    starts = [falling(), falling(velocity=(1.0, -2.5, 0.5))]
+    own = make_law("hencky")
+
+    def gradients(state, copies):
+        bodies = (Body(own, 0, len(state.x)),)
+        weights, slices = gather_weights(bodies, state.x.dtype)
+        plan = MemoryPlan(FRAMES[-1], True, 0)
+        simulation = Simulation(MODEL, bodies, slices, state, FRAMES[-1], plan=plan, copies=copies)
+        start = [value.clone().requires_grad_() for value in state.motion]
+        x, *_ = RolloutFunction.apply(simulation, FRAMES, None, *start, *weights)
+        return torch.autograd.grad(x[-1].square().sum(), start[:2])
+
+    together = gradients(State.joined(starts), 2)
+    alone = [gradients(state, 1) for state in starts]
+    for found, expected in zip(together, zip(*alone, strict=True), strict=True):
+        assert torch.equal(found, torch.cat(expected))
+
+
+def test_constants_are_weights_so_that_graphs_serve_all():
+    one, other = side_by_side([law("von_mises")]), side_by_side([law("fluid", 1.3)])
+    assert one.plasticity.graph_key() == other.plasticity.graph_key() != one.elasticity.graph_key()
+    assert one.elasticity.graph_key() != side_by_side([law("fluid")] * 2).elasticity.graph_key()
+    assert one.elasticity.capturable and one.elasticity.weights()[0].shape == (1, 4)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_gpu_agrees_also_when_it_replays(dtype):
+    """Three times, with other constants each time: as it is, recorded, replayed; one copy diverges in the second."""
+    for stiffness in (1.0, 1.2, 0.8):
+        laws = [law(name, stiffness) for name in FUSED]
+        if stiffness == 1.2:
+            laws[2] = analytic_law(UNSTABLE)
+        start = falling(dtype)
+        on_gpu = rollout_batch(MODEL, laws, start.to("cuda"), **RUN, total=True)
+        on_cpu = rollout_batch(MODEL, laws, start, **RUN, total=True)
+        for found, expected in zip(on_gpu, on_cpu, strict=True):
+            assert (found is None) == (expected is None)
+            if found:
+                assert_same(found.cpu(), expected, 1e4 * torch.finfo(dtype).eps)

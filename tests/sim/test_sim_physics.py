@@ -1,0 +1,412 @@
+"""The simulator against conservation laws and closed forms, at its walls, and on input it must refuse."""
+
+import pytest
+import torch
+
+from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.law import Law, Plasticity
+from neuma_lib.sim.free_flight import free_flight_steps
+from neuma_lib.sim.model import WALLS, Body, MPMModel, as_bodies, contact_clearance
+from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State, cross_matrix
+from neuma_lib.sim.workspace import Workspace, WorkspaceSize
+from tests.support.errors import refused
+from tests.support.sim_scenes import (
+    DENSITY,
+    DT,
+    EVERY_LAW,
+    angular_momentum,
+    axial,
+    cube,
+    linear_momentum,
+    make_law,
+    spinning,
+    strained,
+)
+
+pytestmark = pytest.mark.core
+
+WEIGHTLESS = MPMModel(16, DT, gravity=(0.0, 0.0, 0.0))
+EPS = {torch.float32: 1.2e-7, torch.float64: 2.2e-16}
+
+
+@pytest.mark.parametrize("skip", [True, False], ids=["skipped", "simulated"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+@pytest.mark.parametrize("name", EVERY_LAW)
+def test_free_fall(name, dtype, skip):
+    """x_n = x0 + v0 n dt + g dt^2 n (n + 1) / 2 and F = I, to round-off, in every frame."""
+    model = MPMModel(16, DT, gravity=(1.0, -9.8, 0.5))
+    x0, mass, vol0 = cube(dtype=dtype)
+    v0 = torch.tensor([0.3, 0.8, -0.2], dtype=dtype)
+    frames = (0, 1, 17, 60)
+    path = rollout(
+        model,
+        make_law(name, dtype),
+        State(x0, v0, mass, vol0),
+        steps=60,
+        frames=frames,
+        skip_free_flight=skip,
+    )
+    n = torch.tensor(frames, dtype=torch.float64)[:, None, None]
+    gravity = torch.tensor(model.gravity, dtype=torch.float64)
+    fallen = x0.double() + v0.double() * n * DT + gravity * DT**2 * n * (n + 1) / 2
+    assert contact_clearance(model, fallen).min() > 0
+    # n steps add at most n roundings of numbers below 1; F sees velocities over a cell, dt / dx.
+    assert (path.x.double() - fallen).abs().max() < 60 * EPS[dtype]
+    assert (path.v.double() - v0.double() - gravity * DT * n).abs().max() < 60 * 4 * EPS[dtype]
+    assert (path.F.double() - torch.eye(3)).abs().max() < 60 * 16 * EPS[dtype]
+
+
+def test_p2g_conserves_mass_and_momentum():
+    """Whatever C and tau are: the weights sum to 1 and the weighted offsets to 0."""
+    x, mass, vol0 = cube(side=0.5)
+    v, _, C = strained(x)
+    ws = Workspace(WorkspaceSize(WEIGHTLESS, len(x), x.dtype, x.device))
+    for buffer, value in ((ws.x, x), (ws.v, v), (ws.C, C), (ws.tau, 1e4 * C)):
+        buffer[0].copy_(value)
+    ws.mass.copy_(mass)
+    ws.vol0.copy_(vol0)
+    ws.transfer_to_grid(0)
+    total = ws.grid[0].sum(dim=0)
+    torch.testing.assert_close(total[3], mass.sum(), rtol=1e-13, atol=0)
+    torch.testing.assert_close(total[:3], linear_momentum(mass, v), rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", EVERY_LAW)
+def test_momenta_of_a_spinning_cube(name):
+    """Linear momentum stays; the angular one changes by -dt sum vol0 axial(tau) a step. Both hold to round-off.
+
+    P2G adds -dt vol0 (4/dx^2) w_i tau d_i to node i, and sum_i w_i d_i d_i^T = dx^2/4 I. The stress of an analytic
+    law is symmetric, that of a network, R X F^T, is not quite.
+    """
+    steps, law = 100, make_law(name)
+    x0, mass, vol0 = cube(side=0.25)
+    v0, C0 = spinning(x0, omega=(8.0, -5.0, 10.0), velocity=(0.2, -0.1, 0.3))
+    F0 = torch.linalg.matrix_exp(0.03 * torch.tensor([[1.0, 0.5, 0], [0.5, -1.5, 0], [0, 0, 0.5]]).double())
+    state = State(x0, v0, mass, vol0, F0.expand(len(x0), 3, 3), C0)
+    path = rollout(WEIGHTLESS, law, state, steps=steps, frames=range(steps + 1))
+    assert contact_clearance(WEIGHTLESS, path.x).min() > 0
+    assert (path.F[-1] - path.F[0]).abs().max() > 1e-3  # it does deform
+    linear = [linear_momentum(mass, path.v[n]) for n in (0, -1)]
+    torch.testing.assert_close(linear[1], linear[0], rtol=1e-11, atol=0)
+    spin = [
+        angular_momentum(WEIGHTLESS, mass, path.x[n] - x0.mean(dim=0), path.v[n], path.C[n]) for n in (0, -1)
+    ]
+    torque = -sum((vol0[:, None] * axial(law.elasticity(F))).sum(dim=0) for F in path.F[:-1])
+    torch.testing.assert_close(spin[1] - spin[0], DT * torque, rtol=0, atol=1e-11 * float(spin[0].norm()))
+    if name == "neural":
+        assert DT * torque.norm() > 1e-6 * spin[0].norm()  # there is something to see
+
+
+def test_a_thrown_body_has_the_momenta_of_its_velocity_and_spin():
+    """Linear momentum m v, angular momentum I w about the centre of mass, for unequal masses."""
+    x, _, vol0 = cube(side=0.25)
+    mass = 1e3 * vol0 * (1 + 3 * (x[:, 0] > x[:, 0].mean()))
+    velocity, spin = torch.tensor([[0.3, -1.0, 0.2], [2.0, -3.0, 4.0]], dtype=x.dtype)
+    state = State.thrown(x, mass, vol0, velocity, spin)
+    torch.testing.assert_close(linear_momentum(mass, state.v), mass.sum() * velocity)
+    arm = x - mass @ x / mass.sum()
+    inertia = (mass * arm.square().sum(1)).sum() * torch.eye(3).double() - (mass[:, None] * arm).mT @ arm
+    found = (mass[:, None] * torch.linalg.cross(arm, state.v)).sum(0)
+    torch.testing.assert_close(found, inertia @ spin)
+    # C is the gradient of v: it takes v from one particle to another.
+    torch.testing.assert_close(state.v[7] + state.C[7] @ (x[3] - x[7]), state.v[3])
+    about_a_corner = State.thrown(x, mass, vol0, velocity, spin, centre=x[0])
+    torch.testing.assert_close(about_a_corner.v[0], velocity)
+
+
+def test_free_rotation_of_a_stiff_cube():
+    """x(t) = c(t) + R(w t) (x0 - c): a lattice keeps its axis, because its moments of inertia are equal.
+
+    It stretches by rho w^2 r^2 / E or less (r: half the diagonal) and rings about that, and steps of dt follow the
+    circle with an error of w dt / 2 at most; both relative to r.
+    """
+    dt, E, steps = 2e-4, 1e6, 500
+    law = analytic_law({"elasticity": {"name": "fixed_corotated", "E": E, "nu": 0.3}}, dt)
+    c, ticks = torch.tensor([0.5, 0.6, 0.5]).double(), 0.2 * ((torch.arange(7) + 0.5) / 7 - 0.5).double()
+    x0 = c + torch.cartesian_prod(ticks, ticks, ticks)
+    vol0 = torch.full((len(x0),), 0.2**3 / len(x0), dtype=x0.dtype)
+    velocity, spin = torch.tensor([[0.2, 0.4, -0.1], [1.5, -2.0, 2.5]], dtype=x0.dtype)
+    model, state = MPMModel(16, dt), State.thrown(x0, DENSITY * vol0, vol0, velocity, spin)
+    assert not free_flight_steps(model, as_bodies(law, len(x0)), state, steps)
+    path = rollout(model, law, state, steps=steps, frames=(steps,))
+    assert contact_clearance(model, path.x) > 0
+    t, gravity = steps * dt, torch.tensor(model.gravity)
+    fallen = c + t * velocity + gravity * dt**2 * steps * (steps + 1) / 2
+    R = torch.linalg.matrix_exp(t * cross_matrix(spin))
+    r, w = float((x0 - c).norm(dim=1).max()), float(spin.norm())
+    stretch = DENSITY * w**2 * r**2 / E
+    apart = (path.x[0] - fallen - (x0 - c) @ R.mT).norm(dim=1).max()
+    assert apart < r * (2 * stretch + w * dt / 2)
+    assert (path.F[0] - R).norm(dim=(1, 2)).max() < 3 * (2 * stretch + w * dt / 2)
+    assert w * t * r > 100 * apart  # it did turn
+
+
+@pytest.mark.parametrize("condition", ["no_slip", "slip", "sticky"])
+@pytest.mark.parametrize("wall", WALLS)
+def test_thrown_at_a_wall(wall, condition):
+    """The body stays inside and turns; its motion along the wall lasts if the wall is slippery.
+
+    It arrives after 0.018 s and is thrown back when a wave has crossed it twice, 2 side / c = 0.049 s later. A wall
+    that does not hold only takes momentum that points into it, and no wall gives energy.
+    """
+    axis, side = WALLS.index(wall) // 2, 1 if wall.endswith("max") else -1
+    model = MPMModel(16, DT, gravity=(0.0, 0.0, 0.0), boundary=condition)
+    centre = [0.5, 0.5, 0.5]
+    centre[axis] = 0.69 if side > 0 else 0.25
+    x0, mass, vol0 = cube(centre=centre, side=0.2)
+    v0 = torch.full((3,), 0.2, dtype=x0.dtype)
+    v0[axis] = 3.0 * side
+    path = rollout(
+        model, make_law("fixed_corotated"), State(x0, v0, mass, vol0), steps=120, frames=range(121)
+    )
+    low, high = model.stencil_range
+    assert path.x.min() >= low and path.x.max() <= high
+    assert contact_clearance(model, path.x).min() < 0  # it did arrive
+    toward = side * path.v[..., axis].mean(dim=1)
+    assert -v0.norm() <= toward[-1] < 0
+    assert path.v[-1].square().mean() <= v0.square().mean()
+    if condition != "sticky":
+        assert (toward.diff() < 1e-12).all()
+    mean = path.v[-1].mean(dim=0)
+    along = [a for a in range(3) if a != axis]
+    if condition == "slip":
+        torch.testing.assert_close(mean[along], v0[along], rtol=1e-10, atol=0)
+    else:
+        assert (mean[along].abs() < v0[along]).all()
+
+
+def test_walls_have_their_own_conditions():
+    model = MPMModel(16, DT, boundary={"y_min": "slip", "x_max": "sticky"})
+    assert model.boundary == ("no_slip", "sticky", "slip", "no_slip", "no_slip", "no_slip")
+    assert hash(model) == hash(MPMModel(16, DT, boundary=model.boundary))
+
+
+def test_free_flight_ends_where_contact_begins():
+    """The simulated body leaves its parabola in the step that starts inside the contact zone, not before."""
+    model = MPMModel(16, 2e-3)
+    x0, mass, vol0 = cube(centre=(0.5, 0.4, 0.5))
+    v0 = torch.tensor([0.0, -2.0, 0.0], dtype=x0.dtype)
+    steps = 60
+    path = rollout(
+        model,
+        make_law("hencky"),
+        State(x0, v0, mass, vol0),
+        steps=steps,
+        frames=range(steps + 1),
+        skip_free_flight=False,
+    )
+    first = int((contact_clearance(model, path.x) <= 0).int().argmax())
+    assert 0 < first < steps
+    strain = (path.F - torch.eye(3)).abs().amax(dim=(1, 2, 3))
+    assert strain[: first + 1].max() < 1e-12 < strain[first + 1]
+
+
+@pytest.mark.parametrize("name", ["fixed_corotated", "drucker_prager", "neural"])
+def test_skipping_the_flight_changes_nothing(name):
+    model = MPMModel(16, 2e-3)
+    x0, mass, vol0 = cube(centre=(0.5, 0.35, 0.5))
+    v0 = torch.tensor([0.3, -2.0, 0.1], dtype=x0.dtype)
+    tracers, _, _ = cube(50, side=0.2, centre=(0.5, 0.35, 0.5), seed=1)
+    both = [
+        rollout(
+            model,
+            make_law(name),
+            State(x0, v0, mass, vol0),
+            steps=60,
+            frames=(0, 10, 40, 60),
+            tracers=tracers,
+            skip_free_flight=skip,
+        )
+        for skip in (True, False)
+    ]
+    assert contact_clearance(model, both[0].x[-1]) < 0
+    for field in ("x", "v", "F", "C", "tracers"):
+        a, b = (getattr(path, field) for path in both)
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-9)
+
+
+def test_tracers_follow_the_body():
+    """A tracer on a particle stays on it, one in empty space stays where it is, and none is felt."""
+    model = MPMModel(16, 2e-3)
+    x0, mass, vol0 = cube(centre=(0.5, 0.3, 0.5))
+    v0 = torch.tensor([0.3, -2.0, 0.1], dtype=x0.dtype)
+    away = torch.tensor([[0.9, 0.9, 0.9]], dtype=x0.dtype)
+    args = (model, make_law("hencky"), State(x0, v0, mass, vol0))
+    plain = rollout(*args, steps=60, frames=(0, 30, 60), skip_free_flight=False)
+    path = rollout(
+        *args, steps=60, frames=(0, 30, 60), tracers=torch.cat([x0[::7], away]), skip_free_flight=False
+    )
+    assert torch.equal(path.x, plain.x)
+    torch.testing.assert_close(path.tracers[:, :-1], path.x[:, ::7], rtol=0, atol=1e-12)
+    assert torch.equal(path.tracers[:, -1], away.expand(3, 3))
+
+
+def test_bodies_apart_do_not_feel_each_other():
+    """Two bodies with two laws on one grid move as each would alone."""
+    model = MPMModel(20, DT)
+    starts = [
+        cube(200, side=0.2, centre=centre, seed=i)
+        for i, centre in enumerate([(0.3, 0.2, 0.3), (0.7, 0.2, 0.7)])
+    ]
+    laws = [make_law("fixed_corotated"), make_law("drucker_prager")]
+    v0 = torch.tensor([0.0, -2.0, 0.0], dtype=torch.float64)
+    frames = (20, 60)
+    alone = [
+        rollout(model, law, State(x0, v0, mass, vol0), steps=60, frames=frames)
+        for law, (x0, mass, vol0) in zip(laws, starts, strict=True)
+    ]
+    x0, mass, vol0 = (torch.cat(parts) for parts in zip(*starts, strict=True))
+    bodies = [Body(laws[0], 0, 200), Body(laws[1], 200, 400)]
+    both = rollout(model, bodies, State(x0, v0, mass, vol0), steps=60, frames=frames)
+    for field in ("x", "v", "F", "C"):
+        separate = torch.cat([getattr(path, field) for path in alone], dim=1)
+        torch.testing.assert_close(getattr(both, field), separate, rtol=0, atol=1e-12)
+
+
+def test_bodies_collide():
+    """Momentum passes from one body to the other, and none is lost.
+
+    Both have mass m, and 80 steps are longer than a wave takes to cross one twice, 2 side / c = 0.049 s. When they part
+    again the body that was hit is faster than their common centre, 1 m/s, and not faster than the other was, 2 m/s.
+    """
+    left, mass, vol0 = cube(200, side=0.2, centre=(0.36, 0.5, 0.5))
+    right = left + torch.tensor([0.28, 0.0, 0.0], dtype=left.dtype)
+    v0 = torch.zeros(400, 3, dtype=left.dtype)
+    v0[:200, 0] = 2.0
+    bodies = [Body(make_law("hencky"), 0, 200), Body(make_law("neo_hookean"), 200, 400)]
+    masses = mass.repeat(2)
+    state = State(torch.cat([left, right]), v0, masses, vol0.repeat(2))
+    path = rollout(WEIGHTLESS, bodies, state, steps=80, frames=(0, 80))
+    assert 1.0 < path.v[-1, 200:, 0].mean() < 2.0
+    torch.testing.assert_close(
+        linear_momentum(masses, path.v[-1]), linear_momentum(masses, v0), rtol=0, atol=1e-12
+    )
+
+
+def test_same_start_same_bytes():
+    """Also when other sizes and models used the buffers in between."""
+    x0, mass, vol0 = cube(centre=(0.5, 0.25, 0.5), dtype=torch.float32)
+    v0 = torch.tensor([0.3, -2.0, 0.1])
+    law = make_law("neural", torch.float32)
+
+    def run(count, **options):
+        x = x0[:count].clone().requires_grad_()
+        state = State(x, v0, mass[:count], vol0[:count])
+        path = rollout(MPMModel(16, DT), law, state, steps=50, frames=(5, 50), **options)
+        (path.x**2).sum().backward()
+        return path.x.detach(), path.F.detach(), x.grad
+
+    first = run(300)
+    run(200)
+    run(300, cache_bytes=0)
+    for a, b in zip(first, run(300), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_courant_number_names_the_largest_step():
+    model = MPMModel(24, 5e-3)
+    law = make_law("hencky")
+    with refused("dt") as error:
+        model.check_courant(law, DENSITY)
+    stable = float(error.value.remedy.split("dt <= ")[-1].split()[0])
+    assert MPMModel(24, 0.99 * stable).check_courant(law, DENSITY) == pytest.approx(0.792, rel=0.01)
+    with pytest.raises(InputError):
+        MPMModel(24, 1.01 * stable).check_courant(law, DENSITY)
+
+
+@pytest.mark.parametrize(
+    "settings, where",
+    [
+        (dict(boundary="glue"), "boundary"),
+        (dict(boundary={"floor": "slip"}), "boundary"),
+        (dict(boundary=("slip", "slip")), "boundary"),
+        (dict(grid=4), "grid"),
+        (dict(dt=-1.0), "dt"),
+        (dict(dt=float("nan")), "dt"),
+        (dict(gravity=(0.0, -9.8)), "gravity"),
+        (dict(walls="padded"), "walls"),
+        (dict(walls="released", wall_cells=0), "wall_cells"),
+        (dict(wall_cells=2), "wall_cells"),
+    ],
+)
+def test_wrong_model_is_named(settings, where):
+    with refused(where):
+        MPMModel(**{"grid": 16, "dt": DT, **settings})
+
+
+@pytest.mark.parametrize(
+    "change, where",
+    [
+        (dict(x=lambda x: x + 0.5), "state.x"),
+        (dict(x=lambda x: x * float("nan")), "state.x"),
+        (dict(x=lambda x: x[:, :2]), "state.x"),
+        (dict(v=lambda x: x[:5]), "state.v"),
+        (dict(v=lambda x: x.float()), "state.v"),
+        (dict(v=lambda x: x / 0), "state.v"),
+        (dict(F=lambda x: x), "state.F"),
+        (dict(mass=lambda x: -x[:, 0]), "state.mass"),
+        (dict(vol0=lambda x: x), "state.vol0"),
+        (dict(frames=lambda x: (3, 2)), "frames"),
+        (dict(frames=lambda x: (0, 21)), "frames"),
+        (dict(tracers=lambda x: x[:, :2]), "tracers"),
+        (dict(law=lambda x: [Body(make_law("hencky"), 0, 299)]), "bodies"),
+        (dict(law=lambda x: [Body(make_law("hencky"), 0, 200), Body(make_law("hencky"), 199, 300)]), "body"),
+    ],
+)
+def test_wrong_start_is_named(change, where):
+    x0, mass, vol0 = cube()
+    state = dict(x=x0, v=torch.zeros_like(x0), mass=mass, vol0=vol0)
+    rest = dict(law=make_law("hencky"), steps=20, frames=(20,))
+    for key, make in change.items():
+        (state if key in (*state, "F") else rest)[key] = make(x0)
+    with refused(where):
+        rollout(MPMModel(16, DT), state=State(**state), **rest)
+
+
+class BreaksAt(Plasticity):
+    """Gives NaN for one particle from one step on."""
+
+    def __init__(self, step, particle):
+        super().__init__()
+        self.calls, self.step, self.particle = 0, step, particle
+
+    def response(self, F, weights):
+        F = F.clone()
+        self.calls += 1
+        if self.calls >= self.step:
+            F[self.particle] = torch.nan
+        return F
+
+
+@pytest.mark.parametrize("last", [20, 7], ids=["on the way", "in the last step"])
+def test_nan_names_step_and_particle(last):
+    x0, mass, vol0 = cube()
+    law = Law(make_law("hencky").elasticity, BreaksAt(7, 123), "brittle")
+    with pytest.raises(NonFiniteError, match="brittle") as error:
+        state = State(x0, x0 * 0, mass, vol0)
+        rollout(MPMModel(16, DT), law, state, steps=20, frames=(last,), skip_free_flight=False)
+    # F becomes NaN in step 7; its stress reaches the velocities, of neighbours too, one step later.
+    assert error.value.step == (7 if last == 7 else 8)
+    assert "dt" in str(error.value)
+    near = (x0[error.value.particle] - x0[123]).abs().max()
+    assert near < 3 / 16 and (last > 7 or error.value.particle == 123)
+
+
+def test_instability_is_an_error():
+    """Far above the Courant limit the simulation stops loudly; positions never index outside the grid."""
+    x0, mass, vol0 = cube(centre=(0.5, 0.25, 0.5))
+    v0 = torch.tensor([0.0, -3.0, 0.0], dtype=x0.dtype)
+    with pytest.raises(NonFiniteError, match="smaller dt"):
+        state = State(x0, v0, mass, vol0)
+        rollout(MPMModel(16, 4e-2), make_law("neo_hookean"), state, steps=200, frames=(200,))
+
+
+def test_hold_last_repeats_the_last_frame():
+    x0, mass, vol0 = cube()
+    state = State(x0, x0[0] * 0, mass, vol0)
+    path = rollout(MPMModel(16, DT), make_law("hencky"), state, steps=5, frames=(0, 5))
+    held = path.hold_last(3)
+    assert held.frames == (0, 5, 5, 5, 5) and held.tracers is None
+    assert torch.equal(held.x[1:], path.x[1:].expand(4, -1, -1))

@@ -1,0 +1,167 @@
+"""Balls against the walls: that nothing leaves the grid, that they come back in shape, and where they come to rest."""
+
+import math
+
+import pytest
+import torch
+
+from neuma_lib.errors import NonFiniteError
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.sim.model import CONDITIONS, WALLS, MPMModel
+from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State
+from tests.support.sim_scenes import DENSITY
+
+pytestmark = pytest.mark.core
+
+RADIUS = 0.13
+SOFT = {"elasticity": {"name": "fixed_corotated", "E": 3e4, "nu": 0.45}}  # the softest body of the benchmarks
+DT = 5e-4
+WEIGHTLESS = (0.0, 0.0, 0.0)
+
+
+def ball(grid: int, centre: tuple[float, float, float]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Eight particles a cell on a jittered lattice: positions [m], masses [kg], volumes [m^3]."""
+    spacing = 0.5 / grid
+    reach = math.ceil(RADIUS / spacing)
+    ticks = spacing * (torch.arange(-reach, reach) + 0.5)
+    x = torch.cartesian_prod(ticks, ticks, ticks)
+    x = x + 0.5 * spacing * (torch.rand(x.shape, generator=torch.Generator().manual_seed(0)) - 0.5)
+    x = x[x.norm(dim=1) < RADIUS - 0.25 * spacing]
+    vol0 = torch.full((len(x),), 4 / 3 * math.pi * RADIUS**3 / len(x))
+    return x + torch.tensor(centre), DENSITY * vol0, vol0
+
+
+def before(wall: str, gap: float) -> tuple[list[float], torch.Tensor]:
+    """Centre of a ball whose surface is at this distance from a wall of the cube [m], and the way there (3,)."""
+    axis, upper = divmod(WALLS.index(wall), 2)
+    centre, towards = [0.5, 0.5, 0.5], torch.zeros(3)
+    centre[axis] = 1 - RADIUS - gap if upper else RADIUS + gap
+    towards[axis] = 1.0 if upper else -1.0
+    return centre, towards
+
+
+def largest_error(x: torch.Tensor, start: torch.Tensor) -> float:
+    """Largest distance [m] of a particle from its place at the start, after the best rigid motion."""
+    a, b = (points.double() - points.double().mean(dim=0) for points in (x, start))
+    U, _, Vh = torch.linalg.svd(a.mT @ b)
+    mirrored = torch.ones(3, dtype=a.dtype)
+    mirrored[2] = torch.linalg.det(U @ Vh)
+    return float((a @ U @ torch.diag(mirrored) @ Vh - b).norm(dim=1).max())
+
+
+@pytest.mark.parametrize(
+    "wall, condition, form",
+    [*((wall, "no_slip", "outside") for wall in WALLS), ("y_min", "slip", "outside")]
+    + [("y_min", "no_slip", "released")],
+)
+def test_a_ball_comes_back_in_shape(wall, condition, form):
+    """At rest again, no particle of a soft ball that was thrown at a wall is off by more than 1 % of the radius.
+
+    Squeezed to half its height it comes back vibrating; so it is stopped after the bounce and may ring down. What is
+    left is what the wall did to it for good: a tenth of the radius with released walls.
+    """
+    model = MPMModel(24, DT, gravity=WEIGHTLESS, boundary=condition, walls=form)
+    centre, towards = before(wall, 0.08)
+    x0, mass, vol0 = ball(model.grid, centre)
+    law = analytic_law(SOFT, dt=DT)
+    path = rollout(model, law, State(x0, 2.5 * towards, mass, vol0), steps=500, frames=(200, 500))
+    assert ((path.x[0] - x0) @ towards).min() > 0.05  # it was in contact
+    x, F = path.x[1], path.F[1]
+    assert (x.mean(dim=0) - path.x[0].mean(dim=0)) @ towards < 0
+    aside = x - x.mean(dim=0) + 0.5
+    still = State(aside, torch.zeros(3), mass, vol0, F, torch.zeros_like(F))
+    rested = rollout(model, law, still, steps=1000, frames=(1000,), skip_free_flight=False)
+    error = largest_error(rested.x[0], x0)
+    assert error < 0.01 * RADIUS if form == "outside" else error > 0.05 * RADIUS
+
+
+@pytest.mark.parametrize("condition", CONDITIONS)
+@pytest.mark.parametrize("wall", WALLS)
+def test_a_hard_throw_leaves_no_particle_outside(wall, condition):
+    """Thrown at 8 m/s, over four times the speed of its shear waves, obliquely into a corner of walls.
+
+    Half a cell beyond the first wall node the velocity is zero, whatever the body does: there a particle sees wall
+    nodes only. Its distance d from there, in cells, shrinks in a step by d^2 / 2 times the cells that the nearest free
+    node moves, so it stays positive.
+    """
+    model = MPMModel(16, DT, gravity=WEIGHTLESS, boundary=condition)
+    centre, towards = before(wall, 0.05)
+    x0, mass, vol0 = ball(model.grid, centre)
+    aside = (1 - towards.abs()) * torch.tensor([3.0, 2.0, -2.0])
+    law = analytic_law({"elasticity": {"name": "hencky", "E": 1e4, "nu": 0.3}}, dt=DT)
+    path = rollout(model, law, State(x0, 8 * towards + aside, mass, vol0), steps=400, frames=range(0, 401, 4))
+    low, high = model.stencil_range
+    assert (low, high) == (-1.5 * model.dx, 1 + 1.5 * model.dx)
+    assert low < path.x.min() and path.x.max() < high
+    assert not ((path.x == low) | (path.x == high)).any()
+    if condition != "sticky":
+        ahead = (path.x[-1] - 0.5) @ towards
+        assert ahead.max() < 0.5
+
+
+def test_a_particle_that_leaves_the_grid_stops_the_run():
+    """One whose affine velocity throws a node further than its own velocity tells: the message names it."""
+    model = MPMModel(16, DT, gravity=WEIGHTLESS, boundary="sticky")
+    x = torch.tensor([[0.5, 0.5, 0.5], [0.5, -model.dx, 0.5]])
+    C = torch.zeros(2, 3, 3)
+    C[1, 1, 1] = (
+        -5 / DT
+    )  # the free node above moves down by five cells, and the particle with an eighth of it
+    one = torch.full((2,), 1e-3)
+    law = analytic_law(SOFT, dt=DT)
+    with pytest.raises(NonFiniteError, match="particle 1 .* left the grid at step 1") as error:
+        rollout(model, law, State(x, torch.zeros(3), one, one, C=C), steps=2, frames=(2,))
+    assert (error.value.step, error.value.particle) == (1, 1)
+
+
+@pytest.mark.parametrize("wall", ["y_min", "x_max"])
+@pytest.mark.parametrize("E, fraction", [(3e4, 0.4), (1e6, 0.2)])
+def test_bodies_rest_at_the_wall_of_the_cube(wall, E, fraction):
+    """The particle next to the wall settles there: a soft ball sinks a third of a cell deep."""
+    towards = before(wall, 0.0)[1]
+    for grid in (16, 24):
+        dt = 0.3 / (grid * math.sqrt(2.5 * E / DENSITY))
+        model = MPMModel(grid, dt, gravity=tuple(9.8 * towards.tolist()[a] for a in range(3)))
+        x0, mass, vol0 = ball(grid, before(wall, model.free_range[0])[0])
+        law = analytic_law({"elasticity": {"name": "fixed_corotated", "E": E, "nu": 0.4}}, dt=dt)
+        steps = round(0.6 / dt)
+        path = rollout(
+            model, law, State(x0, torch.zeros(3), mass, vol0), steps=steps, frames=range(steps // 2, steps)
+        )
+        depth = ((path.x - 0.5) @ towards).amax(dim=1) - 0.5
+        assert abs(float(depth.mean())) < fraction * model.dx
+
+
+def bounce(grid: int, E: float = 3e4) -> tuple[float, float]:
+    """Lowest place [cells] of a particle of a ball thrown down, and height [m] that its centre comes back to."""
+    model = MPMModel(grid, DT)
+    x0, mass, vol0 = ball(grid, (0.5, RADIUS + 0.15, 0.5))
+    state = State(x0, torch.tensor([0.0, -1.92, 0.0]), mass, vol0)
+    law = analytic_law({"elasticity": {"name": "fixed_corotated", "E": E, "nu": 0.45}}, dt=DT)
+    path = rollout(model, law, state, steps=900, frames=range(0, 901, 4))
+    y, v = path.x[..., 1], path.v[..., 1].mean(dim=1)
+    up = int((v > 0).int().argmax())
+    top = up + int((v[up:] < 0).int().argmax())
+    return float(y[:top].min()) * grid, float(y[top].mean())
+
+
+def test_coarse_grids_meet_the_same_floor():
+    """How deep a body goes below y = 0 is a fraction of a cell, the same at both sizes; the finer one loses less."""
+    (low, height), (lower, higher) = bounce(16), bounce(24)
+    assert -0.75 < low < 0 and abs(low - lower) < 0.05
+    assert height < higher
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("E, rate", [(3e4, 1.0), (1e5, 0.5)])
+def test_the_rebound_converges_to_the_same_floor(E, rate):
+    """Twice as fine a grid changes the height less than the doubling before it did, and half as much (first order) for
+    a ball that is not squeezed to half its height. Lowest places are one fraction of a cell, so they go to y = 0.
+    """
+    grids = (16, 24, 32, 48, 64)
+    lows, heights = zip(*(bounce(grid, E) for grid in grids), strict=True)
+    assert max(lows) - min(lows) < 0.06 and -0.75 < min(lows)
+    assert all(a < b for a, b in zip(heights, heights[1:], strict=False))
+    assert heights[4] - heights[2] < rate * (heights[2] - heights[0])
+    assert heights[4] - heights[3] < heights[3] - heights[2]

@@ -1,0 +1,20 @@
+"""What several tests share of random scenes."""
+
+from neuma_lib.paper.random_scenes import RandomScene
+
+
+def result(name, prior, judged, true=3.0, failed=None, depth=0.1, plane=1.0):
+    start = {
+        "velocity_error_in_plane_percent": plane,
+        "velocity_error_depth": depth,
+        "velocity_std_depth": 0.1,
+        "angular_velocity_error_camera": [0.2, -0.6, 0.01],
+        "angular_velocity_std_camera": [0.1, 0.2, 0.1],
+        "angular_velocity_error_viewing_percent": 0.5,
+        "angular_velocity_error_percent": 8.0,
+    }
+    rmse = {"nclaw": prior, "neuma": judged, "true_law": true}
+    return RandomScene(name, "ball", "hencky", "jelly", rmse, failed or {}, start)
+
+
+METHODS = {"nclaw": "NCLaw", "neuma": "NeuMA", "true_law": "True law"}

@@ -1,0 +1,152 @@
+"""The command `neuma`: new settings that are valid, and checks that name every problem."""
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from neuma_lib.cli import main
+from neuma_lib.geometry.shapes import build
+from neuma_lib.project import checks
+
+ROOT = Path(__file__).resolve().parents[1]
+core = pytest.mark.core
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch):
+    """A folder with the project's settings, as the current one."""
+    shutil.copytree(ROOT / "config", tmp_path / "config")
+    shutil.copy(ROOT / "Snakefile", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def overlay(folder: Path, **settings) -> str:
+    file = folder / "overlay.yaml"
+    file.write_text(yaml.safe_dump(settings))
+    return str(file)
+
+
+@core
+def test_the_shipped_settings_have_no_problems(project, capsys):
+    for file in sorted((ROOT / "config").glob("*.yaml")):
+        if file.name not in (
+            "config.yaml",
+            "scenes.yaml",
+            "paper.yaml",
+            "paper_light.yaml",
+            "paper_stride4.yaml",
+        ):
+            assert main(["check", f"config/{file.name}"]) == 0, capsys.readouterr().out
+    capsys.readouterr()
+    assert main(["check", "config/paper.yaml", "config/paper_stride4.yaml"]) in (0, 1)
+    assert all(
+        "device: cuda" in line or "no problems" in line for line in capsys.readouterr().out.splitlines()
+    )
+
+
+@core
+def test_a_new_scene_is_valid_and_named_in_the_next_commands(project, capsys):
+    assert main(["new", "scene", "Mine"]) == 0
+    assert "config/Mine.yaml -- results/Mine/film.mp4" in capsys.readouterr().out
+    assert main(["check", "config/Mine.yaml"]) == 0
+    assert main(["new", "scene", "Mine"]) == 1 and main(["new", "scene", "BouncyBall"]) == 1
+    assert main(["new", "scene", "../up"]) == 1
+
+
+@core
+def test_a_new_capture_is_valid_and_becomes_a_scene(project, capsys):
+    assert main(["new", "capture", "mug"]) == 0
+    assert {p.name for p in (project / "captures/mug").iterdir()} == {
+        "capture.yaml",
+        "photos",
+        "stills",
+        "videos",
+    }
+    assert main(["check"]) == 0 and main(["check", "captures/mug/capture.yaml"]) == 0
+    assert main(["new", "capture", "mug"]) == 1
+    (project / "captures/mug/capture.yaml").write_text("board: {square: -1}\n")
+    capsys.readouterr()
+    assert main(["check"]) == 1
+    assert "board.square" in capsys.readouterr().out
+
+
+@core
+@pytest.mark.parametrize(
+    ("scene", "where"),
+    [
+        ({"hieght": 1}, "scenes.JellyDuck.hieght"),
+        ({"shape": "duk"}, "scenes.JellyDuck.shape"),
+        ({"height": 0.1}, "scenes.JellyDuck.height"),
+        ({"center": [0.9, 0.5]}, "scenes.JellyDuck.center"),
+        ({"velocity": [0, -60, 0]}, "scenes.JellyDuck.velocity"),
+        ({"spin": [0, 300, 0]}, "scenes.JellyDuck.velocity"),
+        ({"law": {"elasticity": {"E": -1}}}, "scenes.JellyDuck.law.elasticity.E"),
+        ({"law": {"elasticity": {"name": "jelly"}}}, "scenes.JellyDuck.law.elasticity.name"),
+        ({"law": {"plasticity": {"name": "von_mises"}}}, "scenes.JellyDuck.law.plasticity.yield_stress"),
+        ({"law": {"elasticity": {"E": 3e7}}}, "scenes.JellyDuck.law"),
+        ({"density": 1.0}, "scenes.JellyDuck.prior = jelly"),
+    ],
+)
+def test_check_names_each_problem(project, capsys, scene, where):
+    assert main(["check", overlay(project, scenes={"JellyDuck": scene})]) == 1
+    out = capsys.readouterr().out.splitlines()
+    assert any(line.startswith(f"{where}:") for line in out), out
+
+
+@core
+def test_check_names_all_problems_at_once(project, capsys):
+    scenes = {"JellyDuck": {"height": 0.1, "velocity": [0, -60, 0]}, "BouncyBall": {"shape": "bal"}}
+    priors = {"laws": {"sand": {"plasticity": {"friction_angle": 95}}}}
+    assert main(["check", overlay(project, scenes=scenes, priors=priors)]) == 1
+    out = capsys.readouterr().out
+    for where in (
+        "JellyDuck.height",
+        "JellyDuck.velocity",
+        "BouncyBall.shape",
+        "sand.plasticity.friction_angle",
+    ):
+        assert where in out
+
+
+@core
+def test_check_reports_a_missing_gpu(project, capsys, monkeypatch):
+    monkeypatch.setattr(checks, "gpus", lambda: 0)
+    assert main(["check", overlay(project, device="cuda")]) == 1
+    assert "no CUDA GPU" in capsys.readouterr().out
+    monkeypatch.setattr(checks, "gpus", lambda: 1)
+    monkeypatch.setattr(checks, "torch_version", lambda: "2.13.0+cu130")
+    assert main(["check", overlay(project, device="cuda")]) == 0
+
+
+@core
+def test_outside_of_a_project_the_commands_say_so(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for words in (["check"], ["demo"], ["new", "scene", "Mine"]):
+        assert main(words) == 1
+        assert "not in a project" in capsys.readouterr().err
+
+
+@core
+def test_check_loads_no_torch(project):
+    import subprocess
+
+    code = "import sys; from neuma_lib.cli import main; main(['check']); sys.exit('torch' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, env={"PYTHONPATH": str(ROOT), "PATH": ""})
+
+
+@core
+@pytest.mark.parametrize("name", checks.OWN_SIZES)
+def test_sizes_of_shapes_are_their_own(name):
+    assert build(name).extents.max() == pytest.approx(checks.OWN_SIZES[name], rel=0.01)
+
+
+def test_letters_have_at_least_the_sides_that_are_checked():
+    pytest.importorskip("matplotlib")
+    for letter in "IMWN":
+        sides = build(f"letter_{letter}").extents
+        assert (sides / sides.max() >= checks.LETTER.sides).all()
+        assert sides.max() >= checks.LETTER_SIZE * 0.99

@@ -1,0 +1,86 @@
+"""The package: what an import loads, what a missing extra is answered with, what an archive holds."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import neuma_lib
+from neuma_lib.extras import require
+from tests.support.errors import refused
+
+pytestmark = pytest.mark.core
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def run(code: str) -> str:
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT).stdout
+
+
+def test_importing_the_library_loads_neither_torch_nor_numpy():
+    code = "import sys, neuma_lib; print({'torch', 'warp', 'numpy', 'pydantic'} & set(sys.modules))"
+    assert run(code).strip() == "set()"
+
+
+def test_every_public_name_is_there():
+    assert all(hasattr(neuma_lib, name) for name in neuma_lib.__all__)
+    assert set(neuma_lib.__all__) <= set(dir(neuma_lib))
+    with pytest.raises(AttributeError):
+        neuma_lib.simulation_of_everything  # noqa: B018
+
+
+BLOCKED = """
+import importlib, importlib.abc, pkgutil, sys
+EXTRAS = {"matplotlib", "imageio", "imageio_ffmpeg", "bpy", "mathutils", "cv2", "tqdm", "grimp", "snakemake", "psutil",
+          "pycolmap", "pymeshlab", "viser", "pxr", "pysplashsurf", "pandas", "jinja2"}
+class Blocked(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name.partition(".")[0] in EXTRAS:
+            raise ModuleNotFoundError(name)
+sys.meta_path.insert(0, Blocked())
+import neuma_lib
+for module in pkgutil.walk_packages(neuma_lib.__path__, "neuma_lib."):
+    try:
+        importlib.import_module(module.name)
+    except ModuleNotFoundError:
+        print(module.name)
+"""
+PLOTS = ("neuma_lib.evaluation.", "neuma_lib.data.blender.cycles")
+"""Modules that may need an extra at import: those that draw and those that run inside Blender."""
+
+
+def test_without_the_extras_everything_but_plots_and_blender_imports():
+    missing = run(BLOCKED).split()
+    assert [name for name in missing if not name.startswith(PLOTS)] == []
+
+
+def test_a_missing_extra_is_named_with_its_command():
+    with refused("no_such_package") as caught:
+        require("no_such_package.part", "capture")
+    assert 'pip install "neuma[capture]"' in str(caught.value)
+
+
+def test_the_archives_hold_every_file_that_the_library_reads(tmp_path):
+    pytest.importorskip("build")
+    if not (ROOT / "pyproject.toml").is_file():
+        pytest.skip("not a checkout")
+    import tarfile
+    import zipfile
+
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(tmp_path), str(ROOT)]
+    subprocess.run(command, check=True, capture_output=True)
+    with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
+        in_wheel = set(wheel.namelist())
+    with tarfile.open(next(tmp_path.glob("*.tar.gz"))) as sdist:
+        in_sdist = {name.partition("/")[2] for name in sdist.getnames()}
+    files = {
+        str(file.relative_to(ROOT))
+        for file in (ROOT / "neuma_lib").rglob("*")
+        if file.is_file() and "__pycache__" not in file.parts
+    }
+    assert any(file.endswith(".cu") for file in files) and "neuma_lib/viewer/page.html" in files
+    assert files <= in_wheel and files <= in_sdist
+    assert not [name for name in in_wheel if name.startswith(("workflow", "tests", "benchmarks"))]

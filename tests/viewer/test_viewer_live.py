@@ -1,0 +1,269 @@
+"""The live simulation: its thread obeys, resets after anything, and simulates what `rollout` does."""
+
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.law import Elasticity, Law
+from neuma_lib.mechanics.neural import neural_law
+from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State
+from neuma_lib.viewer.live import EARTH, FRAME, MAX_SPEED, PIVOT, LiveSimulation, tilted
+from tests.support.sim_scenes import DENSITY, SPECS, cube, make_law
+
+CONSTANTS = {"grid": 16, "boundary": "no_slip", "walls": "outside"}
+DT = 1e-3
+
+
+def start(height=0.3, count=200, velocity=(0.0, 0.0, 0.0)):
+    x, mass, vol0 = cube(count, 0.25, (0.5, height, 0.5), dtype=torch.float32)
+    return State.thrown(x, mass, vol0, velocity)
+
+
+@pytest.fixture
+def live():
+    opened = []
+
+    def make(law=None, paused=False, **options):
+        live = LiveSimulation(CONSTANTS, start(**options), law or make_law("hencky", torch.float32), DT)
+        live.run(not paused)
+        opened.append(live.open())
+        return live
+
+    yield make
+    for each in opened:
+        each.close()
+
+
+class Exploding(Elasticity):
+    """A stress that tears everything apart once it is deformed at all."""
+
+    def response(self, F, weights):
+        return 1e12 * (F + 0.1)
+
+
+def exploding():
+    return Law(Exploding(), make_law("hencky", torch.float32).plasticity, name="exploding")
+
+
+def reached(live, condition, timeout=20.0):
+    """The first snapshot that fulfils a condition."""
+    until = time.monotonic() + timeout
+    while not condition(live.snapshot):
+        assert time.monotonic() < until, "not reached in time"
+        live.wait(live.snapshot.number + 1, 1.0)
+    return live.snapshot
+
+
+def test_it_simulates_what_a_rollout_does(live):
+    found = reached(live(), lambda s: s.time > 0.25)
+    live_x, steps = found.x, round(found.time / DT)
+    assert steps == pytest.approx(found.time / DT, abs=1e-6)
+    model = MPMModel(**CONSTANTS, dt=DT, gravity=(0.0, -EARTH, 0.0))
+    wanted = rollout(
+        model, make_law("hencky", torch.float32), start(), steps=steps, frames=[steps], total=True
+    )
+    # float32, rounded where the frames part
+    assert torch.allclose(live_x, wanted.x[0], atol=2e-4)
+    assert torch.allclose(found.total, wanted.F_total[0], atol=5e-3)
+    assert (found.F - torch.eye(3)).abs().max() > 1e-3, "it has touched the floor"
+
+
+def test_a_tilted_floor_is_turned_gravity(live):
+    simulation = live(height=0.5)
+    simulation.set_floor(20.0, -10.0)
+    simulation.reset()
+    simulation.do()
+    found = reached(simulation, lambda s: s.time > 0.1)
+    steps = round(found.time / DT)
+    gravity = tilted(20.0, -10.0).T @ [0.0, -EARTH, 0.0]
+    model = MPMModel(**CONSTANTS, dt=DT, gravity=tuple(gravity.tolist()))
+    law = make_law("hencky", torch.float32)
+    wanted = rollout(model, law, start(height=0.5), steps=steps, frames=[steps])
+    assert np.linalg.norm(gravity) == pytest.approx(EARTH) and abs(gravity[0]) > 1
+    assert torch.allclose(found.x, wanted.x[0], atol=2e-4)
+    down = simulation.floor @ np.asarray(gravity)
+    assert np.allclose(down, [0, -EARTH, 0]), "seen in the room it points down"
+    place = np.array([0.7, 0.2, 0.4])
+    back = simulation.floor @ (simulation.place_in_box(place) - PIVOT) + PIVOT
+    assert np.allclose(back, place)
+
+
+def test_a_law_that_diverges_says_so_and_a_reset_helps(live):
+    simulation = live(height=0.14)
+    simulation.set_law(exploding(), DT)
+    found = reached(simulation, lambda s: s.trouble)
+    assert "unstable" in found.trouble or "not finite" in found.trouble
+    assert found.x.isfinite().all() and found.F.isfinite().all(), "the last good state stays on the screen"
+    before = simulation.do()
+    assert simulation.wait(before.number + 2).time == before.time, "it waits"
+    simulation.set_law(make_law("hencky", torch.float32), DT)
+    simulation.reset()
+    assert simulation.do().trouble is None
+    assert reached(simulation, lambda s: s.time > 0.05).trouble is None
+
+
+def test_an_error_in_foreign_code_ends_nothing(live):
+    class Broken(Elasticity):
+        def response(self, F, weights):
+            raise RuntimeError("no such thing")
+
+    law = make_law("hencky", torch.float32)
+    simulation = live(height=0.14)
+    simulation.set_law(Law(Broken(), law.plasticity), DT)
+    assert "RuntimeError: no such thing" in reached(simulation, lambda s: s.trouble).trouble
+    simulation.set_law(law, DT)
+    simulation.reset()
+    assert reached(simulation, lambda s: s.time > 0.02).trouble is None
+
+
+def test_reset_brings_the_start_back_bit_by_bit(live):
+    simulation = live()
+    reached(simulation, lambda s: s.time > 0.1)
+    simulation.add(start(), make_law("von_mises", torch.float32), DT)
+    simulation.launch((1.0, 0.0, 0.0))
+    assert simulation.do().counts == (200, 200)
+    simulation.run(False)
+    simulation.reset()
+    found = simulation.do()
+    assert torch.equal(found.x, start().x) and found.time == 0 and found.counts == (200,)
+    assert torch.equal(found.F, torch.eye(3).expand(200, 3, 3))
+
+
+def test_uneven_frames_do_not_make_the_numbers_on_the_screen_larger(monkeypatch):
+    simulation = LiveSimulation(CONSTANTS, start(), make_law("hencky", torch.float32), DT)  # no thread
+    clock = simulation._measured
+    monkeypatch.setattr(time, "perf_counter", lambda: clock)
+    for k in range(100):
+        clock += 0.002 if k % 2 else 0.098  # 20 frames a second
+        simulation._time += 0.02
+        simulation._measure()
+    simulation._publish()
+    assert simulation.snapshot.rate == pytest.approx(20, rel=0.2)
+    assert simulation.snapshot.pace == pytest.approx(0.4, rel=0.2)
+
+
+def test_it_runs_in_real_time_whatever_is_asked_meanwhile(live):
+    simulation, steps = live(paused=True), []
+
+    def quick():  # as on a machine that is never late
+        steps.append(simulation._time)
+        simulation._time += 0.011
+
+    simulation._advance = quick
+    simulation.do()
+    began = time.perf_counter()
+    simulation.run(True)
+    while time.perf_counter() - began < 0.5:
+        simulation.set_gravity(EARTH)  # a drag sends some sixty commands a second
+        time.sleep(0.002)
+    simulation.run(False)
+    moved, passed = simulation.do().time, time.perf_counter() - began
+    assert moved == pytest.approx(0.011 * len(steps))
+    assert 0.3 * passed < moved < passed + FRAME + 0.022
+
+
+def test_launch_drop_and_gravity(live):
+    simulation = live(paused=True)
+    simulation.launch((1.0, 2.0, 0.0))
+    assert torch.allclose(simulation.do().v, torch.tensor([1.0, 2.0, 0.0]))
+    simulation.launch((0.0, 1000.0, 0.0))
+    assert torch.allclose(simulation.do().v, torch.tensor([0.0, MAX_SPEED, 0.0]))
+    simulation.launch((float("nan"), 0.0, 0.0))
+    found = simulation.do()
+    assert "not finite" in found.notice and found.v.isfinite().all() and found.trouble is None
+    simulation.drop(0.4)
+    found = simulation.do()
+    assert found.x[:, 1].min() == pytest.approx(0.4, abs=1e-6) and found.v.abs().max() == 0
+    simulation.drop(50.0)
+    assert simulation.do().x[:, 1].max() < 1
+    simulation.drop(0.4)
+    simulation.set_gravity(0.0)
+    simulation.run(True)
+    begun = simulation.do().time
+    found = reached(simulation, lambda s: s.time > begun + 0.05)
+    assert found.x[:, 1].min() == pytest.approx(0.4, abs=1e-5), "it hovers"
+
+
+def test_a_held_body_comes_to_the_hand_and_flies_on(live):
+    simulation = live(height=0.4)
+    simulation.set_gravity(0.0)
+    simulation.hold((0.7, 0.6, 0.5))
+    centre = lambda s: s.x.mean(dim=0)  # noqa: E731
+    wanted = torch.tensor([0.7, 0.6, 0.5])
+    reached(simulation, lambda s: (centre(s) - wanted).norm() < 0.02)
+    simulation.hold((0.3, 0.6, 0.5))
+    reached(simulation, lambda s: centre(s)[0] < 0.6)
+    simulation.hold(None)
+    found = simulation.do()
+    assert found.v[:, 0].mean() < -0.5, "it keeps the velocity of the hand"
+    simulation.hold((9.0, -9.0, 0.5))
+    assert reached(simulation, lambda s: s.time > found.time + 0.4).trouble is None, "never through a wall"
+
+
+def test_the_weight_of_the_adaptor_goes_from_the_prior_on(live):
+    law = neural_law(seed=1)
+    law.attach_adaptor(rank=4, seed=1)
+    simulation = live(law, paused=True)
+    simulation.set_weight(0.25)
+    simulation.do()
+    assert {part.adaptor.weight for part in law.parts.values()} == {0.25}
+    simulation.set_law(make_law("hencky", torch.float32), DT)  # has none
+    simulation.set_weight(1.25)
+    assert simulation.do().notice is None
+    simulation.set_law(law, DT)
+    simulation.do()
+    assert {part.adaptor.weight for part in law.parts.values()} == {1.25}
+
+
+def test_bodies_are_put_above_each_other_until_there_is_no_room(live):
+    simulation = live(height=0.2, paused=True)
+    law = make_law("hencky", torch.float32)
+    simulation.add(start(), law, 5e-4)
+    found = simulation.do()
+    first, second = found.x.split(list(found.counts))
+    assert second[:, 1].min() - first[:, 1].max() > 1 / 16 and found.dt == 5e-4, "the smaller step counts"
+    simulation.add(start(), law, DT)
+    found = simulation.do()
+    assert "no room" in found.notice and found.counts == (200, 200) and found.trouble is None
+    simulation.run(True)
+    found = reached(simulation, lambda s: s.time > 0.05)
+    assert found.trouble is None
+
+
+def test_a_network_is_not_simulated_at_another_step_than_its_own(live):
+    simulation, network = live(height=0.2, paused=True), neural_law(seed=1)
+    simulation.set_law(network, DT)
+    assert simulation.do().notice is None
+    simulation.add(start(), make_law("hencky", torch.float32), DT / 2)
+    found = simulation.do()
+    assert "another material" in found.notice and found.counts == (200,) and found.dt == DT
+    simulation.add(start(), network, DT)
+    simulation.set_law(neural_law(seed=2), DT / 2)
+    found = simulation.do()
+    assert "reset" in found.notice and found.counts == (200, 200) and found.dt == DT
+    simulation.reset()
+    simulation.set_law(neural_law(seed=2), DT / 2)
+    found = simulation.do()
+    assert found.notice is None and found.dt == DT / 2
+
+
+def test_commands_are_not_held_up_by_a_slow_law(live):
+    """Whatever a frame takes, the next command comes right after it."""
+
+    class Slow(Elasticity):
+        def response(self, F, weights):
+            time.sleep(0.02)
+            return torch.zeros_like(F)
+
+    law = analytic_law(SPECS["hencky"], dt=DT)
+    simulation = live(Law(Slow(), law.plasticity), height=0.14, velocity=(0.0, -1.0, 0.0))
+    reached(simulation, lambda s: s.number > 5 and s.time > 0)
+    began = time.monotonic()
+    simulation.reset()
+    assert simulation.do().time < 0.2 and time.monotonic() - began < 3.0  # a frame takes 0.06 s
+    assert start().density[0] == pytest.approx(DENSITY)

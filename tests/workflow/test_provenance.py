@@ -1,0 +1,115 @@
+"""The code digest changes when, and only when, something that a script reaches changes."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from workflow.provenance import Sources, fingerprint
+
+ROOT = Path(__file__).resolve().parents[2]
+SCRIPTS = ROOT / "workflow" / "scripts"
+FILES = {
+    "sample/__init__.py": "",
+    "sample/render/__init__.py": "from sample.render.fast import draw\nfrom sample.render.cam import Cam\n",
+    "sample/render/fast.py": "from . import kernels\ndef draw(): return kernels.k()\n",
+    "sample/render/kernels.py": "def k(): return 1\n",
+    "sample/render/kernels.cu": "__global__ void k() {}\n",
+    "sample/render/cam.py": "class Cam: pass\n",
+    "sample/other.py": "from sample.render.cam import Cam\n",
+    "script.py": "from sample.render.fast import draw\nfrom sample.render import fast\n",
+}
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch):
+    """A small package in the place of the library, and a script."""
+
+    def write(name, text):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        os.utime(path, ns=(1, 1))  # times of files mean nothing
+
+    for name, text in FILES.items():
+        write(name, text)
+    monkeypatch.syspath_prepend(tmp_path)
+    write.script = tmp_path / "script.py"
+    return write
+
+
+def reached(project):
+    return Sources("sample").reached(project.script)
+
+
+def digest(project):
+    return Sources("sample").digest(project.script)
+
+
+def test_reaches_modules_through_packages_and_relative_imports(project):
+    assert reached(project) == ["sample.render.fast", "sample.render.kernels"]
+
+
+@pytest.mark.parametrize(
+    "line", ["import sample.render", "from sample.render import draw", "def main(): import sample.render"]
+)
+def test_what_a_package_imports_itself_counts_where_it_is_used(project, line):
+    project("script.py", line)
+    assert reached(project) == [f"sample.render{end}" for end in ("", ".cam", ".fast", ".kernels")]
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "changes"),
+    [
+        ("sample/render/kernels.py", "def k(): return 2\n", True),
+        ("sample/render/kernels.py", '"""Documented."""\n\ndef k():\n    """One."""\n    return 1  # one\n', False),
+        ("sample/render/kernels.cu", "__global__ void k() { return; }\n", True),
+        ("sample/render/cam.py", "class Cam: x = 1\n", False),
+        ("sample/render/__init__.py", "", False),
+        ("sample/other.py", "x = 2\n", False),
+        ("script.py", FILES["script.py"] + "# the end\n", False),
+        ("script.py", FILES["script.py"] + "print(1)\n", True),
+        ("script.py", FILES["script.py"] + "def main():\n    import sample.other\n", True),
+    ],
+)  # fmt: skip
+def test_changes_that_count(project, file, text, changes):
+    before = digest(project)
+    project(file, text)
+    assert (digest(project) != before) == changes
+
+
+class TestThisProject:
+    def reached(self, script, *modules):
+        return set(Sources().reached(SCRIPTS / f"{script}.py", modules))
+
+    @pytest.mark.parametrize("script", ["gaussians", "velocity", "video"])
+    def test_what_renders_depends_on_the_rasterizer(self, script):
+        assert "neuma_lib.splatting.rasterizer" in self.reached(script)
+
+    def test_a_fit_depends_on_its_own_method_alone(self):
+        springs = "neuma_lib.methods.spring_gaus.method"
+        assert springs not in self.reached("fit", "neuma_lib.methods.neuma")
+        assert "neuma_lib.fitting.material" in self.reached("fit", "neuma_lib.methods.neuma")
+        assert "neuma_lib.splatting.rasterizer" in self.reached("fit", springs)
+        assert "neuma_lib.fitting.material" not in self.reached("evaluate", "neuma_lib.methods.true_law")
+
+    @pytest.mark.parametrize(
+        "script",
+        ["ground_truth", "prior", "sampled_particles", "render_static", "render_dynamic", "chamfer_table"],
+    )
+    def test_what_does_not_render_is_free_of_it(self, script):
+        assert "neuma_lib.splatting.rasterizer" not in self.reached(script)
+
+    @pytest.mark.parametrize("script", ["gaussians", "mesh", "binding", "velocity", "fit"])
+    def test_no_stage_can_reach_the_truth(self, script):
+        reached = self.reached(script, *(["neuma_lib.methods.structured"] if script == "fit" else []))
+        assert "neuma_lib.data.ground_truth" not in reached and "neuma_lib.geometry.shapes" not in reached
+
+
+def test_fingerprint_names_what_changed(tmp_path):
+    (tmp_path / "input").write_text("a")
+    first = fingerprint({"lr": 0.1, "big": list(range(100))}, {"video": tmp_path / "input"}, "c0de")
+    (tmp_path / "input").write_text("b")
+    second = fingerprint({"lr": 0.2, "big": list(range(100))}, {"video": tmp_path / "input"}, "c0de")
+    assert {k for k in first if first[k] != second[k]} == {"setting lr", "input video"}
+    assert all(len(v) <= 40 for v in first.values())

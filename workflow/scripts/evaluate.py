@@ -1,0 +1,40 @@
+"""Predict a motion from the estimated start, and compare it with the ground truth."""
+
+import numpy as np
+import torch
+
+from neuma_lib.device import choose_device
+from neuma_lib.evaluation.motion import evaluate
+from neuma_lib.io.files import write_json
+from neuma_lib.io.hdf5 import read_arrays, write_arrays
+from neuma_lib.sim.model import MPMModel
+from workflow.motion import Prediction
+from workflow.stage import run_script
+
+
+def main(inputs, output, params, run) -> None:
+    device, dt = choose_device(params.device), params.simulation["dt"]
+    names = ("tracers", "tracers_again")
+    truth, _ = read_arrays(inputs.truth, only=names, required=names)
+    measure, _ = read_arrays(inputs.tracers, required=("starts", "floor"))
+    prediction = Prediction(inputs, params.method)
+    start, counts = prediction.start(params.densities, params.carrier)
+    model = prediction.model(dt, counts)
+    evaluation = evaluate(
+        MPMModel(**params.simulation),
+        model,
+        start.to(device),
+        params.frames,
+        torch.from_numpy(truth["tracers"]).to(device),
+        torch.from_numpy(truth["tracers_again"]).to(device),
+        torch.from_numpy(measure["starts"]).to(device),
+        total=params.total,
+        floor=torch.from_numpy(measure["floor"]),
+    )
+    arrays = evaluation.path.arrays()
+    write_arrays(output.rollout, {**arrays, "frames": np.asarray(params.frames)}, {"dt": dt})
+    write_json(output.metrics, {**evaluation.metrics, "stable": model.stable})
+    run.say(evaluation.summary())
+
+
+run_script(main, snakemake)
