@@ -33,7 +33,7 @@ echo
 # A copy without neuma_lib, so that the installed package is tested.
 work=$folder/work
 mkdir "$work"
-cp -r tests config benchmarks examples envs Snakefile pyproject.toml "$work"
+cp -r tests config benchmarks docs examples envs Snakefile pyproject.toml "$work"
 cd "$work"
 neuma=$(realpath ../bin/neuma) python=$(realpath -s ../bin/python)
 "$python" - <<'PYTHON'
@@ -51,4 +51,4 @@ assert torch.isfinite(v.grad).all() and "site-packages" in nm.__file__
 print("example:", tuple(path.x.shape), v.grad.tolist())
 PYTHON
 "$neuma" check
-"$python" -m pytest -q -m "core and not slow" -p no:cacheprovider tests/unit "$@"
+"$python" -m pytest -q -m "core and not slow" -p no:cacheprovider tests "$@"

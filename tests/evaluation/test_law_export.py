@@ -326,7 +326,7 @@ def test_nothing_is_written_where_something_is_wrong(tmp_path, capsys):
     for words, complaint in (
         ([law, "new.npz"], "written as .safetensors"),
         ([law, "new.safetensors", "--apart"], "no adaptor"),
-        ([law, "new.safetensors", "--weight", "0.5"], "--weight"),
+        ([law, "new.safetensors", "--weight", "0.5"], "no adaptor"),
         ([law, "new.safetensors", "--weight", "0.5", "--separate"], "--separate"),
         ([law, "new.safetensors", "--dt", "1e-3"], "trained at a time step"),
         ([law, "new.safetensors", "--dt=-1"], "--dt: -1"),
@@ -367,6 +367,7 @@ def project(tmp_path):
 
 
 def test_a_folder_of_results_is_exported(project, capsys):
+    pytest.importorskip("matplotlib")
     target, page = project / "out/law.safetensors", project / "out/law.png"
     words = ["law", "export", str(project / "results/ClayCat/neuma"), str(target), "--page", str(page)]
     assert main(words) == 0 and page.stat().st_size > 10_000
