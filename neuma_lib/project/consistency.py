@@ -107,10 +107,11 @@ def _preset_errors(settings: Config, name: str) -> Iterator[InputError]:
             problem = f"{preset.kind} differs from the kind of '{preset.same_fit_as}', {kind}"
             yield InputError(f"{where}.kind", problem, "Leave it out")
         return
-    if preset.kind not in methods():
-        yield InputError(f"{where}.kind", f"no method '{preset.kind}'{hint(preset.kind, methods())}")
+    known_methods = methods(settings.extensions)
+    if preset.kind not in known_methods:
+        yield InputError(f"{where}.kind", f"no method '{preset.kind}'{hint(preset.kind, known_methods)}")
         return
-    kind = methods()[preset.kind]
+    kind = known_methods[preset.kind]
     sections = (getattr(settings, section).plain() for section in kind.sections)
     known = kind.Options.model_fields
     values = {key: value for section in sections for key, value in section.items() if key in known}

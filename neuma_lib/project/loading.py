@@ -13,6 +13,7 @@ from neuma_lib.config.priors import PriorsConfig
 from neuma_lib.config.simulation import SimulationConfig
 from neuma_lib.config.validation import hint, validate, with_advanced
 from neuma_lib.errors import InputError
+from neuma_lib.extensions import load_laws
 from neuma_lib.io.files import one_line
 from neuma_lib.methods.registry import built_in_presets
 from neuma_lib.project.consistency import check_consistency
@@ -47,8 +48,9 @@ def load(
     scenes |= captured or {}
     if isinstance(changes, Mapping):
         changes = _complete(_with_takes(merged(scenes, changes)))
-    presets = merged(built_in_presets(), raw.get("methods") or {})
-    settings = validate(Config, {**raw, "scenes": changes, "methods": presets})
+    extensions = _extensions(raw, root)
+    presets = merged(built_in_presets(extensions), raw.get("methods") or {})
+    settings = validate(Config, {**raw, "extensions": extensions, "scenes": changes, "methods": presets})
     check_consistency(settings)
     return settings
 
@@ -56,6 +58,16 @@ def load(
 def load_captures(raw: Mapping[str, Any]) -> CapturesConfig:
     """The section ``captures`` of merged settings, which `load` needs for the scenes of captures."""
     return validate(CapturesConfig, with_advanced(Config, raw).get("captures") or {}, "captures")
+
+
+def _extensions(raw: Mapping[str, Any], root: str | Path) -> tuple[str, ...]:
+    """Paths of the extensions, which are loaded."""
+    files = raw.get("extensions") or ()
+    if not isinstance(files, list | tuple) or not all(isinstance(file, str) for file in files):
+        raise InputError("extensions", f"{files!r} is not a list of Python files", "Write [my_method.py]")
+    paths = tuple(str(Path(root) / file) for file in files)
+    load_laws(paths)
+    return paths
 
 
 def _random_scenes(raw: Mapping[str, Any]) -> dict[str, Any]:

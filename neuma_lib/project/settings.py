@@ -54,6 +54,9 @@ class Config(Section):
         "auto", description="where to compute; auto: CUDA if there is one"
     )
     seed: int = Field(0, description="seed of every stage that has none of its own")
+    extensions: tuple[str, ...] = Field(
+        (), description="Python files with own methods and laws, relative to the folder of the project"
+    )
     scenes: dict[str, SceneConfig] = Field({}, description="benchmarks by name")
     random: RandomConfig = Field(RandomConfig(), description="scenes drawn at random, beside those by name")
     dataset: DatasetConfig = Field(DatasetConfig(), description="ground truth and images")
