@@ -28,7 +28,7 @@ def test_default_settings_are_valid(loaded):
 
 
 @pytest.mark.parametrize(
-    "files", [(), ("three_chains.yaml",), ("paper.yaml",), ("paper.yaml", "paper_light.yaml")]
+    "files", [(), ("studies/three_chains.yaml",), ("paper.yaml",), ("paper.yaml", "studies/paper_light.yaml")]
 )
 def test_images_are_measured_in_at_least_two_views_that_training_does_not_see(raw, files):
     for file in files:
@@ -278,7 +278,7 @@ class TestVideos:
         assert not loaded.scene("ClayCat_throw2").videos
 
     def test_pairs_of_throws_that_are_shown(self, raw):
-        pairs = loading.read_yaml(ROOT / "config" / "two_throws.yaml")
+        pairs = loading.read_yaml(ROOT / "config" / "studies" / "two_throws.yaml")
         loaded = loading.load(loading.merged(raw, pairs), ROOT)
         for material in ("Paste", "Gel"):
             slow, both = loaded.scene(f"{material}Slow"), loaded.scene(f"{material}Both")
@@ -397,7 +397,7 @@ class TestScaleOfThePaper:
             assert paper.frame_steps(scene) == tuple(range(401))
 
     def test_light_differs_in_images_alone(self, raw, loaded):
-        paper, light = self.overlay(raw, "paper"), self.overlay(raw, "paper", "paper_light")
+        paper, light = self.overlay(raw, "paper"), self.overlay(raw, "paper", "studies/paper_light")
         assert light.frame_steps("BouncyBall") == tuple(range(0, 401, 4))
         same = ("device", "simulation", "gaussians", "training", "scenes", "kernel_cache")
         assert all(getattr(light, name) == getattr(paper, name) for name in same)
