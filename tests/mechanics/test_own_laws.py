@@ -60,7 +60,9 @@ def test_it_is_simulated(file):
     vol0 = torch.full((100,), 1e-5)
     start = State(x, torch.tensor([0.0, -3.0, 0.0]), 1000 * vol0, vol0)
     ends = [
-        rollout(MPMModel(grid=16, dt=1e-3), analytic_law({"elasticity": part}), start, 60, frames=(60,)).x[0]
+        rollout(
+            MPMModel(grid=16, dt=1e-3), analytic_law({"elasticity": part}), start, steps=60, frames=(60,)
+        ).x[0]
         for part in (CUBIC, {**CUBIC, "b": 1e-9}, SOFT)
     ]
     torch.testing.assert_close(ends[1], ends[2], atol=1e-5, rtol=0)
@@ -74,7 +76,7 @@ def test_settings_name_it(file, raw):
     settings = loaded({"elasticity": CUBIC})
     assert cases.case(settings, "BouncyBall", "true_law").scene_law["elasticity"] == CUBIC
     assert checks.law_problems(settings) == []
-    (problem,) = checks.law_problems(loaded({"elasticity": {**CUBIC, "b": -1}}))
+    problem, *_ = checks.law_problems(loaded({"elasticity": {**CUBIC, "b": -1}}))
     assert "scenes.BouncyBall.law.elasticity.b" in problem
 
 

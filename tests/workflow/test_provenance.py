@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from neuma_lib.mechanics.catalogue import DEFINED_IN
-from workflow.provenance import Sources, fingerprint
+from workflow.provenance import Sources, fingerprint, law_files
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = ROOT / "workflow" / "scripts"
@@ -120,13 +120,10 @@ def test_a_method_in_a_file_counts_with_what_it_imports(tmp_path):
     assert springs in Sources().reached(script, (str(file),))
 
 
-def test_laws_in_files_count_where_laws_are_built(tmp_path, monkeypatch):
-    file = tmp_path / "law.py"
-    before = {name: Sources().digest(SCRIPTS / f"{name}.py") for name in ("ground_truth", "render_static")}
-    file.write_text("x = 1\n")
-    monkeypatch.setitem(DEFINED_IN, ("elasticity", "mine"), str(file))
-    after = {name: Sources().digest(SCRIPTS / f"{name}.py") for name in before}
-    assert {name for name in before if before[name] != after[name]} == {"ground_truth"}
+def test_own_laws_are_noticed_in_parameters(monkeypatch):
+    monkeypatch.setitem(DEFINED_IN, ("elasticity", "mine"), "mine.py")
+    assert law_files([{"law": {"elasticity": {"name": "mine", "E": 1.0}}}, 3]) == {"mine.py"}
+    assert law_files({"laws": [{"elasticity": {"name": "hencky"}}], "title": "mine"}) == set()
 
 
 def test_fingerprint_names_what_changed(tmp_path):
