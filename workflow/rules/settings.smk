@@ -15,6 +15,7 @@ from neuma_lib.config.capture import CapturesConfig
 from neuma_lib.project.loading import load
 from neuma_lib.config.validation import validate
 from neuma_lib.errors import InputError
+from neuma_lib.mechanics.catalogue import DEFINED_IN
 from neuma_lib.methods.registry import methods
 from workflow.defaults import complete, digest_of
 from workflow.provenance import code_digest
@@ -114,11 +115,15 @@ def checked(function):
 
 
 def code_of(script):
-    """A function of wildcards: digest of a script and of the method that it loads."""
+    """A function of wildcards: digest of a script and of the method that it loads.
+
+    A method in a file may name any of the own laws.
+    """
 
     def digest(wildcards):
         loaded = type(cases.kind_of(SETTINGS, wildcards.method)).__module__
-        return code_digest(ROOT / "workflow" / "scripts" / script, loaded)
+        laws = {*DEFINED_IN.values()} - {loaded} if loaded in SETTINGS.extensions else ()
+        return code_digest(ROOT / "workflow" / "scripts" / script, loaded, *sorted(laws))
 
     return digest
 
