@@ -8,7 +8,7 @@ from functools import reduce
 from neuma_lib.config.scenes import SceneConfig
 from neuma_lib.project.loading import load, merged, read_yaml
 from neuma_lib.project.settings import Config
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 
 
 def scene_parser(description: str, nargs: str) -> argparse.ArgumentParser:
@@ -38,7 +38,7 @@ def chosen_scenes(args: argparse.Namespace) -> dict[str, Config]:
     }
 
 
-def simulator(settings: Config, scene: SceneConfig) -> MPMModel:
+def simulator(settings: Config, scene: SceneConfig) -> MPM:
     """Constants of the simulator for a scene's reconstruction."""
     known = settings.simulation.plain()
-    return MPMModel(dt=scene.dt, **{key: known[key] for key in ("grid", "gravity", "boundary", "walls")})
+    return MPM(dt=scene.dt, **{key: known[key] for key in ("grid", "gravity", "boundary", "walls")})

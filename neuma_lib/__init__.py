@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from neuma_lib.io.laws import load_law, save_law
     from neuma_lib.mechanics.analytic import analytic_law
     from neuma_lib.mechanics.law import Elasticity, Law, Plasticity
-    from neuma_lib.sim.model import MPMModel
+    from neuma_lib.sim.model import MPM
     from neuma_lib.sim.rollout import rollout
     from neuma_lib.sim.rollout import rollout as simulate
     from neuma_lib.sim.state import State, Trajectory
@@ -24,7 +24,7 @@ __all__ = [
     "Elasticity",
     "InputError",
     "Law",
-    "MPMModel",
+    "MPM",
     "NonFiniteError",
     "Plasticity",
     "State",
@@ -41,7 +41,7 @@ _HOMES = {
     "Elasticity": "mechanics.law",
     "InputError": "errors",
     "Law": "mechanics.law",
-    "MPMModel": "sim.model",
+    "MPM": "sim.model",
     "NonFiniteError": "errors",
     "Plasticity": "mechanics.law",
     "State": "sim.state",

@@ -62,8 +62,8 @@ class Reconstruction:
         spin: Sequence[float] | Tensor = (0.0, 0.0, 0.0),
         centre: Sequence[float] | Tensor | None = None,
     ) -> State:
-        """The particles at t = 0 with velocity v0 [m/s] and angular velocity ``spin`` [rad/s] (`State.thrown`)."""
-        return State.thrown(self.x0, self.mass, self.vol0, v0, spin, centre)
+        """The particles at t = 0 with velocity v0 [m/s] and angular velocity ``spin`` [rad/s] (`State.rigid`)."""
+        return State.rigid(self.x0, self.mass, self.vol0, v0, spin, centre)
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Reconstruction:
         """The same body with another dtype or on another device."""

@@ -12,7 +12,7 @@ from neuma_lib.errors import InputError
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.catalogue import ELASTICITY, PLASTICITY, POISSON, Constant
 from neuma_lib.mechanics.combinations import Values
-from neuma_lib.sim.model import COURANT_LIMIT, MPMModel
+from neuma_lib.sim.model import COURANT_LIMIT, MPM
 
 _PARTS = {"elasticity": ELASTICITY, "plasticity": PLASTICITY}
 _AT_THE_LIMIT = 0.999  # of the stiffness that the time step bears, since constants are rounded
@@ -56,7 +56,7 @@ class Family:
         """Logarithms, and logits of what has two bounds, shape (k,)."""
         return np.array([self._to(key, values[key]) for key in self.constants])
 
-    def values(self, unbounded: np.ndarray, model: MPMModel, density: float) -> Values:
+    def values(self, unbounded: np.ndarray, model: MPM, density: float) -> Values:
         """Constants of unbounded ones, with no more stiffness than the time step bears at the density [kg/m^3]."""
         values = self.bounded(unbounded)
         unit = analytic_law(self.law_spec({**values, "E": 1.0}), model.dt)

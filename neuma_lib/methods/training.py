@@ -17,7 +17,7 @@ from neuma_lib.io.images import load_videos
 from neuma_lib.io.particles import load_body, with_motion
 from neuma_lib.mechanics.adaptor import AdaptableLaw
 from neuma_lib.methods.base import Files, FitRun, Problem
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 
 
 class Training:
@@ -68,7 +68,7 @@ class Training:
 
     def problem(self, law: AdaptableLaw) -> tuple:
         """Positional arguments of `train_material`."""
-        return MPMModel(**self._problem.simulation), law, self.starts[0], self.losses[0], self.settings
+        return MPM(**self._problem.simulation), law, self.starts[0], self.losses[0], self.settings
 
     def options(self) -> dict[str, Any]:
         """Keyword arguments of `train_material`."""

@@ -16,13 +16,13 @@ from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.free_flight import ballistic, free_flight_steps
 from neuma_lib.sim.memory import DEFAULT_CACHE_BYTES, plan_memory
-from neuma_lib.sim.model import Body, MPMModel, as_bodies
+from neuma_lib.sim.model import MPM, Body, as_bodies
 from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import State, Trajectory
 
 
 def rollout(
-    model: MPMModel,
+    model: MPM,
     law: Law | Sequence[Body],
     state: State,
     *,
@@ -78,7 +78,7 @@ def rollout(
 
 
 def fly_and_simulate(
-    model: MPMModel,
+    model: MPM,
     bodies: tuple[Body, ...],
     state: State,
     frames: tuple[int, ...],
@@ -115,7 +115,7 @@ def fly_and_simulate(
 
 
 def _simulate(
-    model: MPMModel,
+    model: MPM,
     bodies: tuple[Body, ...],
     state: State,
     start: tuple[Tensor, ...],
@@ -174,7 +174,7 @@ def checked_frames(frames: Sequence[int], steps: int) -> tuple[int, ...]:
     return frames
 
 
-def check_inside(model: MPMModel, x0: Tensor) -> None:
+def check_inside(model: MPM, x0: Tensor) -> None:
     """Raise InputError unless the stencil of every particle exists."""
     low, high = model.stencil_range
     outside = ~((x0 >= low) & (x0 <= high)).all(dim=1)
