@@ -19,6 +19,31 @@ _AT_THE_LIMIT = 0.999  # of the stiffness that the time step bears, since consta
 _UNBOUNDED = 12.0  # logits beyond it are the bound, to six digits
 
 
+_GUESS = {"E": 2e5, "nu": 0.3}
+FAMILIES: dict[str, dict[str, dict[str, Any]]] = {
+    "hencky": {"elasticity": {"name": "hencky", **_GUESS}},
+    "fixed_corotated": {"elasticity": {"name": "fixed_corotated", **_GUESS}},
+    "neo_hookean": {"elasticity": {"name": "neo_hookean", **_GUESS}},
+    "von_mises": {
+        "elasticity": {"name": "hencky", **_GUESS},
+        "plasticity": {"name": "von_mises", "yield_stress": 5e3},
+    },
+    "drucker_prager": {
+        "elasticity": {"name": "hencky", **_GUESS},
+        "plasticity": {"name": "drucker_prager", "friction_angle": 30},
+    },
+    "viscous_flow": {
+        "elasticity": {"name": "hencky", **_GUESS},
+        "plasticity": {"name": "viscous_flow", "viscosity": 150},
+    },
+    "bingham": {
+        "elasticity": {"name": "hencky", **_GUESS},
+        "plasticity": {"name": "viscous_flow", "viscosity": 50, "yield_stress": 2e3},
+    },
+}
+"""Candidate families with initial guesses of their constants, as in ``identify.families`` of the shipped settings."""
+
+
 class Family:
     """A kind of material with constants to be found.
 

@@ -77,6 +77,45 @@ def rollout(
     return path
 
 
+def simulate(
+    mpm: MPM,
+    law: Law | Sequence[Body],
+    state: State,
+    frames: Sequence[int],
+    *,
+    tracers: Tensor | None = None,
+    total: bool = False,
+) -> Trajectory:
+    """Simulate particles up to the last frame and return their states at the frames.
+
+    Differentiable with respect to the weights of the law and to x, v, F and C of the state. `rollout` has further
+    options for speed and memory.
+
+    Args:
+        mpm: grid, time step, gravity and walls.
+        law: law of all particles, or one `Body` per range of particles.
+        state: initial state of N particles.
+        frames: time steps whose states are returned, strictly increasing, 0 is the initial state.
+        tracers: positions of passive points that follow the velocity of the grid [m], shape (M, 3).
+        total: also compute the total deformation gradients, elastic and plastic.
+
+    Returns:
+        States at the T frames: x (T, N, 3) [m], v [m/s], F and C.
+
+    Raises:
+        InputError: invalid frames or tracers, or a particle starts outside the grid.
+        NonFiniteError: the simulation is unstable, or a particle leaves the grid.
+
+    Example:
+        >>> path = simulate(MPM(grid=24, dt=1e-3), law, state, frames=range(0, 201, 10))
+        >>> path.x.shape  # 21 frames
+        torch.Size([21, 2000, 3])
+    """
+    frames = tuple(frames)
+    last = frames[-1] if frames else 0
+    return rollout(mpm, law, state, steps=last, frames=frames, tracers=tracers, total=total)
+
+
 def fly_and_simulate(
     model: MPM,
     bodies: tuple[Body, ...],
