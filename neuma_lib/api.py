@@ -1,4 +1,4 @@
-"""Scenes in memory, and what is fitted to them, rendered and evaluated. `neuma_lib` exports the names of this module."""
+"""Scenes in memory: what is fitted to them, rendered and evaluated. `neuma_lib` exports these names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reconstruction of a body from images of it at rest: Gaussians, surface, particles and binding (paper Sec. 3.1-3.2)."""
+"""Reconstruct a body from images of it at rest: Gaussians, surface, particles, binding (paper Sec. 3.1-3.4)."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def fit_parameter(case):
     }
 
 
-for fitted in (method for method in all_methods().values() if method.product):
+for fitted in (method for method in KINDS.values() if method.product):
 
     rule:
         name:
