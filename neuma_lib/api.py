@@ -298,13 +298,11 @@ def adapt(law: Law, scene: Scene, options: Mapping[str, Any] | None = None) -> A
         loss = ParticleLoss(scene.truth.frames, scene.truth.x)
     else:
         loss = pixel_loss(body, _of_body(_video(scene), body), settings)
-    if not correct:
+    if isinstance(law, AdaptableLaw):
         law = copy.deepcopy(law)
-    elif not isinstance(law, StructuredLaw):
+    else:
         spec = {**specification(law.elasticity, law.plasticity), "form": settings.form}
         law = structured_law(spec, scene.mpm.dt, seed=settings.seed)
-    else:
-        law = copy.deepcopy(law)
     law.attach_adaptor(settings.rank, settings.alpha, settings.seed)
     problem = (scene.mpm, law, start, loss, settings)
     if correct:
@@ -335,7 +333,7 @@ def render(path: Trajectory, reconstruction: Reconstruction, cameras: Cameras) -
     if path.x.shape[1] != len(reconstruction.x0):
         count = f"{path.x.shape[1]} particles must be the {len(reconstruction.x0)} of the reconstruction"
         raise InputError("path", count)
-    renderer = reconstruction.particle_gs(cameras.to(reconstruction.x0.dtype, reconstruction.x0.device))
+    renderer = reconstruction.particle_gs(cameras.to(reconstruction.x0.device, reconstruction.x0.dtype))
     size, F = renderer.frames_per_batch, path.stretch
     parts = [renderer.layer(path.x[k : k + size], F[k : k + size]) for k in range(0, len(path.x), size)]
     return torch.cat(parts)
