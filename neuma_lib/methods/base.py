@@ -204,6 +204,7 @@ class Method(ABC):
         presets: built-in presets by name.
         product: file that `fit` writes. None: nothing is fitted.
         fit_kernels, kernels: groups of Warp kernels that `fit` and predictions use.
+        body_kernels: groups that predictions and renderings with the files of `body_inputs` use in addition.
         has_law: whether the motion follows from a material law (`MotionModel.law`). Only laws move several bodies.
         moves_other_bodies: whether the model moves the bodies of other scenes (``+law_from=``).
     """
@@ -215,6 +216,7 @@ class Method(ABC):
     product: ClassVar[str | None] = None
     fit_kernels: ClassVar[tuple[str, ...]] = ("laws", "rendering")
     kernels: ClassVar[tuple[str, ...]] = ("laws",)
+    body_kernels: ClassVar[tuple[str, ...]] = ()
     has_law: ClassVar[bool] = True
     moves_other_bodies: ClassVar[bool] = True
 
