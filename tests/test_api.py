@@ -187,15 +187,6 @@ def test_a_body_is_reconstructed_from_images(tmp_path):
         nm.Reconstruction.from_images(tmp_path / "transforms.json", 1000.0, {"grid": 3})
 
 
-def test_a_class_keyword_names_a_law():
-    class Doubled(nm.Elasticity, name="doubled_identity"):
-        def response(self, F, weights):
-            return 2 * (F @ F.mT - torch.eye(3, dtype=F.dtype))
-
-    law = nm.Law.from_spec({"elasticity": {"name": "doubled_identity"}})
-    assert isinstance(law.elasticity, Doubled)
-
-
 def test_methods_are_listed_by_name():
     assert {"neuma", "constants", "structured"} <= set(nm.METHODS)
     assert all(isinstance(method, nm.Method) and method.name == name for name, method in nm.METHODS.items())
