@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from functools import reduce
+from typing import Any
 
 from neuma_lib.config.scenes import SceneConfig
 from neuma_lib.project.loading import load, merged, read_yaml
@@ -38,7 +39,12 @@ def chosen_scenes(args: argparse.Namespace) -> dict[str, Config]:
     }
 
 
-def simulator(settings: Config, scene: SceneConfig) -> MPMModel:
-    """Constants of the simulator for a scene's reconstruction."""
+def simulation(settings: Config, scene: SceneConfig) -> dict[str, Any]:
+    """Constants of the simulator for a scene's reconstruction, as `MPMModel` takes them."""
     known = settings.simulation.plain()
-    return MPMModel(dt=scene.dt, **{key: known[key] for key in ("grid", "gravity", "boundary", "walls")})
+    return {"dt": scene.dt, **{key: known[key] for key in ("grid", "gravity", "boundary", "walls")}}
+
+
+def simulator(settings: Config, scene: SceneConfig) -> MPMModel:
+    """The simulator for a scene's reconstruction."""
+    return MPMModel(**simulation(settings, scene))

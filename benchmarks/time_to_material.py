@@ -36,6 +36,7 @@ from neuma_lib.io.images import load_videos
 from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_body
 from neuma_lib.mechanics.structured import structured_law
+from neuma_lib.project import cases
 from neuma_lib.project.settings import Config
 
 METHOD = "neuma_structured"
@@ -128,22 +129,21 @@ def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
     with clock.parts(IDENTIFYING), clock.part("identifying, the rest"):
         found = identify(model, throw, body, videos, chosen, stock.plain() if stock else None, finer=[finer])
     plain = found.as_dict()
-    material, structured = settings.method_material(name, METHOD), settings.method_structured(METHOD)
+    options = cases.case(settings, name, METHOD).options
     with clock.part("preparing the correction"):
-        bases = [plain["law"], *rival_bases(plain, structured.rivals)]
+        bases = [plain["law"], *rival_bases(plain, options.rivals)]
         laws = [
-            structured_law({**base, "form": structured.form}, dt, seed=material.seed).to(device)
-            for base in bases
+            structured_law({**base, "form": options.form}, dt, seed=options.seed).to(device) for base in bases
         ]
         for law in laws:
-            law.attach_adaptor(material.rank, material.alpha, material.seed)
+            law.attach_adaptor(options.rank, options.alpha, options.seed)
         start = found.best.throws[0].of_body(body)
-        total = material.covariance_from == "total"
-        loss = PixelLoss(body, videos, material.covariance_gradient, total=total, compare=material.compare)
+        total = options.covariance_from == "total"
+        loss = PixelLoss(body, videos, options.covariance_gradient, total=total, compare=options.compare)
     quiet = {"log": lambda text: None}
     with clock.parts(CORRECTING), clock.part("correcting, the rest"):
         trained, choice = train_structured(
-            model, laws[0], start, loss, material, structured, rivals=laws[1:], **quiet
+            model, laws[0], start, loss, options, options, rivals=laws[1:], **quiet
         )
     parts = clock.plain()
     return {

@@ -11,12 +11,13 @@ step and returns their gradients to autograd once.
 from __future__ import annotations
 
 from collections.abc import Hashable
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
 from neuma_lib.errors import NonFiniteError
+from neuma_lib.mechanics.catalogue import register
 
 Weights = tuple[Tensor, ...]
 AdjointPrecision = Literal["single", "half"]
@@ -34,6 +35,21 @@ class Constitutive(nn.Module):
     adjoint_precision: AdjointPrecision = "single"
     """Precision of the matrix products in `vjp`. "half" uses factors of 11 bits and sums them in float32, for laws
     with such kernels."""
+
+    part: ClassVar[str]
+    named: ClassVar[dict[str, type[Constitutive]]]
+    """Subclasses by name."""
+
+    def __init_subclass__(cls, name: str | None = None, **options: Any):
+        """``class Mine(Elasticity, name="mine")`` gives a law a name for specifications.
+
+        Its ``constants``, units and bounds by name, are those of the specification. They are arguments of ``__init__``.
+        """
+        super().__init_subclass__(**options)
+        if name is not None:
+            if not cls.__module__.startswith("neuma_lib."):
+                register(cls.part, name, getattr(cls, "constants", {}), cls.__module__)
+            cls.named[name] = cls
 
     def graph_key(self) -> Hashable:
         """Key that is equal for laws that can share recorded graphs because they differ only in weights."""
@@ -118,9 +134,15 @@ class Constitutive(nn.Module):
 class Elasticity(Constitutive):
     """Deformation gradient F -> Kirchhoff stress tau = P F^T [Pa], both (N, 3, 3)."""
 
+    part = "elasticity"
+    named: ClassVar[dict[str, type[Elasticity]]] = {}
+
 
 class Plasticity(Constitutive):
     """Trial deformation gradient F_trial -> elastic deformation gradient F, both (N, 3, 3)."""
+
+    part = "plasticity"
+    named: ClassVar[dict[str, type[Plasticity]]] = {}
 
 
 class Law(nn.Module):

@@ -6,7 +6,6 @@ module, or the module of a method, loads no torch, so that settings are read and
 
 from __future__ import annotations
 
-import importlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -15,6 +14,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from neuma_lib.config.base import Section
 from neuma_lib.config.motion import MotionOptions
+from neuma_lib.errors import InputError
+from neuma_lib.extensions import load_module
 
 if TYPE_CHECKING:
     import torch
@@ -83,7 +84,7 @@ class Case(ABC):
 
     @property
     @abstractmethod
-    def true_law(self) -> dict[str, Any]:
+    def scene_law(self) -> dict[str, Any]:
         """Specification of the scene's true law. Raises InputError if nobody knows it."""
 
     @abstractmethod
@@ -166,7 +167,7 @@ class ModelSource:
     """What a model of motion is loaded from, in plain values: a parameter of jobs and of the viewer.
 
     Attributes:
-        module: module of the method.
+        module: module or Python file of the method.
         options: what `Method.model_options` gives.
         files: what `Method.model_inputs` gives.
         dt: time step that the model was obtained with [s].
@@ -203,6 +204,7 @@ class Method(ABC):
         presets: built-in presets by name.
         product: file that `fit` writes. None: nothing is fitted.
         fit_kernels, kernels: groups of Warp kernels that `fit` and predictions use.
+        body_kernels: groups that predictions and renderings with the files of `body_inputs` use in addition.
         has_law: whether the motion follows from a material law (`MotionModel.law`). Only laws move several bodies.
         moves_other_bodies: whether the model moves the bodies of other scenes (``+law_from=``).
     """
@@ -214,6 +216,7 @@ class Method(ABC):
     product: ClassVar[str | None] = None
     fit_kernels: ClassVar[tuple[str, ...]] = ("laws", "rendering")
     kernels: ClassVar[tuple[str, ...]] = ("laws",)
+    body_kernels: ClassVar[tuple[str, ...]] = ()
     has_law: ClassVar[bool] = True
     moves_other_bodies: ClassVar[bool] = True
 
@@ -332,17 +335,22 @@ def body_of_each_video(case: Case) -> Files:
     return {name: case.each_video(lambda each, file=file: each.result(file)) for name, file in names.items()}
 
 
-def method_of(module: str) -> Method:
-    """The method that a module defines.
-
-    Raises:
-        LookupError: it does not define exactly one.
-    """
-    found = [
-        value
-        for value in vars(importlib.import_module(module)).values()
+def methods_in(module: str) -> list[Method]:
+    """The methods that a module or a Python file defines."""
+    return [
+        value()
+        for value in vars(load_module(module)).values()
         if isinstance(value, type) and issubclass(value, Method) and value.__module__ == module
     ]
+
+
+def method_of(module: str) -> Method:
+    """The method that a module or a Python file defines.
+
+    Raises:
+        InputError: it does not define exactly one.
+    """
+    found = methods_in(module)
     if len(found) != 1:
-        raise LookupError(f"{module} defines {len(found)} methods, expected one")
-    return found[0]()
+        raise InputError(module, f"it defines {len(found)} methods", "Define one method in a file")
+    return found[0]

@@ -13,7 +13,7 @@ class TrueLaw(Method):
         return {}
 
     def model_options(self, case: Case) -> dict:
-        return {"law": case.true_law}
+        return {"law": case.scene_law}
 
     def load(self, inputs, options, dt):
         from neuma_lib.mechanics.analytic import analytic_law

@@ -54,7 +54,7 @@ class ProjectCase(Case):
         return law.plain() if law else None
 
     @property
-    def true_law(self) -> dict[str, Any]:
+    def scene_law(self) -> dict[str, Any]:
         law = self.settings.scene(self.scene).law
         if law is None:
             raise InputError(f"{self.scene}/{self.name}", NO_TRUTH)
@@ -109,7 +109,7 @@ class ProjectCase(Case):
         return [self.density(scene) for scene in self.settings.video_scenes(self.scene)]
 
     @property
-    def learns_there(self) -> bool:
+    def learned_from_moved_scene(self) -> bool:
         """Whether the model is obtained from the moved scene itself."""
         return self.scene == self.moved and self.method.learns_from_video(self)
 
@@ -145,7 +145,7 @@ def kind_of(settings: Config, method: str) -> Method:
     """The method of a preset or variant."""
     name = method.partition("+")[0]
     chosen = settings.methods[settings.methods[name].same_fit_as or name]
-    return methods()[chosen.kind]
+    return methods(settings.extensions)[chosen.kind]
 
 
 def of_kind(settings: Config, name: str) -> list[str]:
@@ -293,7 +293,7 @@ def moving_methods(settings: Config, scene: str, asked: Sequence[str]) -> list[s
             raise InputError(
                 f"{scene}/{method}", "a splat has no video to fit this method to; leave the method out"
             )
-        elsewhere = case(settings, scene, method).learns_there
+        elsewhere = case(settings, scene, method).learned_from_moved_scene
         sources = settings.figures.i23d if elsewhere else (None,)
         found += [f"{method}+{LAW_FROM}={source}" if source else method for source in sources]
     return list(dict.fromkeys(found))

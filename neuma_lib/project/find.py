@@ -127,7 +127,7 @@ def found_laws(settings: Config, scene: str | None = None) -> dict[str, ModelSou
                 law = law_source(settings, folder.name, method)
             except InputError:
                 continue  # unknown variant
-            learned = law and law.paths and cases.case(settings, folder.name, method).learns_there
+            learned = law and law.paths and cases.case(settings, folder.name, method).learned_from_moved_scene
             if learned and all(Path(file).is_file() for file in law.paths):
                 laws[f"{folder.name}: {cases.title(settings, method)}"] = law
     own = [settings.scene(scene)] if scene else []

@@ -15,10 +15,24 @@ from neuma_lib.config.priors import PriorsConfig
 from neuma_lib.config.simulation import SimulationConfig
 from neuma_lib.config.validation import hint, validate
 from neuma_lib.errors import InputError
+from neuma_lib.extensions import load_laws
 from neuma_lib.methods.registry import built_in_presets
 from neuma_lib.project.cases import law_from
 from neuma_lib.project.random_scenes import RandomConfig, draw_scenes
 from neuma_lib.project.settings import Config
+
+RENAMED = {
+    "law": "renamed to kind: neuma or prior (learned), constants (identified), structured, true_law (true), "
+    "spring_gaus (springs) or pac_nerf",
+    "material": "renamed to options",
+    "structured": "renamed to options, which has the options of all parts of the method",
+    "springs": "renamed to options, which has the options of all parts of the method",
+    "pac_nerf": "renamed to options, which has the options of all parts of the method",
+    "prior": "moved to options.prior",
+    "trained_as": "renamed to same_fit_as",
+    "judged_on": "renamed to evaluate_on",
+}
+"""Keys of `methods` in former versions."""
 
 
 def load(
@@ -45,8 +59,9 @@ def load(
     scenes |= captured or {}
     if isinstance(changes, Mapping):
         changes = _complete(_with_throws(merged(scenes, changes)))
-    presets = merged(built_in_presets(), raw.get("methods") or {})
-    settings = validate(Config, {**raw, "scenes": changes, "methods": presets})
+    extensions = _extensions(raw, root)
+    presets = merged(built_in_presets(extensions), _presets(raw))
+    settings = validate(Config, {**raw, "extensions": extensions, "scenes": changes, "methods": presets})
     check_methods(settings)
     return settings
 
@@ -65,6 +80,26 @@ def check_methods(settings: Config) -> None:
                 law_from(settings, method)
             except InputError as error:
                 raise InputError(where, str(error)) from None
+
+
+def _extensions(raw: Mapping[str, Any], root: str | Path) -> tuple[str, ...]:
+    """Paths of the extensions, which are loaded."""
+    files = raw.get("extensions") or ()
+    if not isinstance(files, list | tuple) or not all(isinstance(file, str) for file in files):
+        raise InputError("extensions", f"{files!r} is not a list of Python files", "Write [my_method.py]")
+    paths = tuple(str(Path(root) / file) for file in files)
+    load_laws(paths)
+    return paths
+
+
+def _presets(raw: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The user's presets. Raises InputError for keys of former versions."""
+    presets = raw.get("methods") or {}
+    for name, preset in presets.items() if isinstance(presets, Mapping) else ():
+        for key in preset if isinstance(preset, Mapping) else ():
+            if key in RENAMED:
+                raise InputError(f"methods.{name}.{key}", f"was {RENAMED[key]}")
+    return presets
 
 
 def _random_scenes(raw: Mapping[str, Any]) -> dict[str, Any]:

@@ -67,6 +67,9 @@ class Config(Section):
         "auto", description="where to compute; auto: CUDA if there is one"
     )
     seed: int = Field(0, description="seed of every stage that has none of its own")
+    extensions: tuple[str, ...] = Field(
+        (), description="Python files with own methods and laws, relative to the folder of the project"
+    )
     scenes: dict[str, SceneConfig] = Field({}, description="benchmarks by name")
     random: RandomConfig = Field(RandomConfig(), description="scenes drawn at random, beside those by name")
     dataset: DatasetConfig = Field(DatasetConfig(), description="ground truth and images")
@@ -148,10 +151,11 @@ class Config(Section):
                     f"{where}.kind: it must be {kind}, as of '{preset.same_fit_as}'; leave it out"
                 )
             return
-        if preset.kind not in methods():
-            raise ValueError(f"{where}.kind: no method '{preset.kind}'{hint(preset.kind, methods())}")
-        Options = methods()[preset.kind].Options
-        sections = (getattr(self, section).plain() for section in methods()[preset.kind].sections)
+        known = methods(self.extensions)
+        if preset.kind not in known:
+            raise ValueError(f"{where}.kind: no method '{preset.kind}'{hint(preset.kind, known)}")
+        Options = known[preset.kind].Options
+        sections = (getattr(self, section).plain() for section in known[preset.kind].sections)
         values = {
             key: value
             for section in sections

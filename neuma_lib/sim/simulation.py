@@ -349,8 +349,8 @@ class Simulation:
         return NonFiniteError(
             "rollout",
             f"particle {particle} (law {law.name!r}) {happened} at step {step}, t = "
-            f"{step * self.model.dt:.4g} s. The simulation is unstable. Use a smaller dt (see "
-            "MPMModel.check_courant), a lower initial velocity, or earlier weights with a lower learning rate",
+            f"{step * self.model.dt:.4g} s: the simulation is unstable. Use a smaller dt (see "
+            "MPMModel.check_courant), a slower start, or the last good weights with a lower rate",
             step=step,
             particle=particle,
             happened=happened,

@@ -367,6 +367,7 @@ def project(tmp_path):
 
 
 def test_a_folder_of_results_is_exported(project, capsys):
+    pytest.importorskip("matplotlib")
     target, page = project / "out/law.safetensors", project / "out/law.png"
     words = ["law", "export", str(project / "results/ClayCat/neuma"), str(target), "--page", str(page)]
     assert main(words) == 0 and page.stat().st_size > 10_000

@@ -27,8 +27,6 @@ from neuma_lib.sim.rollout import rollout
 from tests.support.errors import refused
 from tests.support.grounding_scene import MODEL, TRUTH, ball, observe
 
-pytestmark = pytest.mark.core
-
 FRAMES = (0, 50, 60, 70, 80, 90, 100, 110)  # it touches the ground at about 50
 V0 = torch.tensor([0.0, -1.5, 0.0], dtype=torch.float64)
 SETTINGS = MaterialConfig(

@@ -47,7 +47,7 @@ def fit_parameter(case):
     }
 
 
-for fitted in (method for method in all_methods().values() if method.product):
+for fitted in (method for method in KINDS.values() if method.product):
 
     rule:
         name:
@@ -116,11 +116,17 @@ def uncertainty_files(bodies):
 
 
 def model_kernels(bodies):
-    return kernels(*bodies[0].method.kernels)
+    """Kernels of a prediction."""
+    return kernels(*bodies[0].method.kernels, *own_kernels(bodies[0]))
 
 
 def body_kernels(case):
-    return kernels("rendering", *(case.method.kernels if case.method.body_inputs(case) else ()))
+    """Kernels of a rendering."""
+    return kernels("rendering", *own_kernels(case))
+
+
+def own_kernels(case):
+    return case.method.body_kernels if case.method.body_inputs(case) else ()
 
 
 def carries_total(bodies):

@@ -15,7 +15,7 @@ from neuma_lib.config.capture import CapturesConfig
 from neuma_lib.project.loading import load
 from neuma_lib.config.validation import validate
 from neuma_lib.errors import InputError
-from neuma_lib.methods.registry import methods as all_methods
+from neuma_lib.methods.registry import methods
 from workflow.defaults import complete, digest_of
 from workflow.provenance import code_digest
 from workflow.records import keep_records_of_failed_jobs
@@ -30,6 +30,7 @@ except InputError as error:
 if wrong_laws := law_problems(SETTINGS):
     raise WorkflowError("\n".join(wrong_laws))
 
+KINDS = methods(SETTINGS.extensions)
 DATA = SETTINGS.data_root.rstrip("/")
 RESULTS = SETTINGS.results_root.rstrip("/")
 KERNELS = f"{DATA}/kernels"  # what is known of them; they themselves are in SETTINGS.kernel_cache
@@ -124,5 +125,5 @@ def code_of(script):
 
 def code_of_methods(script):
     """A function of wildcards: digest of a script that may load every method."""
-    modules = sorted(type(method).__module__ for method in all_methods().values())
+    modules = sorted(type(method).__module__ for method in KINDS.values())
     return lambda wildcards: code_digest(ROOT / "workflow" / "scripts" / script, *modules)

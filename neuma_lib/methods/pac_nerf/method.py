@@ -20,6 +20,7 @@ class PacNerf(Method):
     sections = ("material", "pac_nerf")
     product = "constants.json"
     fit_kernels = ("laws", "radiance")
+    body_kernels = ("radiance",)
     presets = {
         "pac_nerf": Preset(
             "PAC-NeRF",
