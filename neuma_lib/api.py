@@ -134,7 +134,7 @@ class Scene:
         settings, files = found_scene(folder)
         mpm = MPM(**files.simulation)
         body = load_body(files.particles, files.binding, files.gaussians, files.density)
-        blur = {"dt": mpm.dt, "exposure_samples": settings.dataset.sub_frames}
+        blur = {"dt": mpm.dt, "exposure_samples": settings.dataset.exposure_samples}
         return cls(
             mpm,
             body.to(torch.float32),
