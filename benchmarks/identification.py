@@ -27,7 +27,7 @@ from scipy.optimize import minimize
 from benchmarks.project_scenes import chosen_scenes, scene_parser, simulator
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.scenes import SceneConfig
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.metrics import tracer_errors
@@ -195,14 +195,14 @@ def _listed(constants: Mapping[str, float]) -> str:
 
 def _read(
     name: str, settings: Config, changes: Mapping[str, Any]
-) -> tuple[SceneConfig, IdentifyConfig, Throw, Reconstruction, Observation]:
+) -> tuple[SceneConfig, IdentifyConfig, InitialMotion, Reconstruction, Observation]:
     scene = settings.scene(name)
     data, results = Path(settings.data_root) / name, Path(settings.results_root) / name
     chosen = IdentifyConfig(**merged(settings.identify.plain(), changes))
     files = (results / name for name in ("particles.h5", "binding.h5", "gaussians.ply"))
     body = load_body(*files, scene.density, gaussian_motion=chosen.gaussian_motion).to(torch.float32)
     video = load_observation(data / "dynamic/transforms.json", chosen.views).to(torch.float32)
-    return scene, chosen, Throw.of(read_json(results / "velocity.json")), body, video
+    return scene, chosen, InitialMotion.of(read_json(results / "velocity.json")), body, video
 
 
 def _core_seconds() -> float:

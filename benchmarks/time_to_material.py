@@ -22,7 +22,7 @@ import torch
 
 from benchmarks.project_scenes import chosen_scenes, scene_parser, simulator
 from benchmarks.timing import device_name, synchronize
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.device import choose_device
 from neuma_lib.fitting import identify as identification
 from neuma_lib.fitting import structured_fit
@@ -108,7 +108,7 @@ def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
         body = load_body(*files, scene.density, gaussian_motion=chosen.gaussian_motion).to(
             torch.float32, device
         )
-        throw = Throw.of(read_json(results / "velocity.json"))
+        throw = InitialMotion.of(read_json(results / "velocity.json"))
     with clock.part("reading images"):
         videos = [
             video.to(torch.float32, device)

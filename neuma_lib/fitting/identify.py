@@ -32,7 +32,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.config.identify import IdentifyConfig
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.families import Family
@@ -46,7 +46,7 @@ from neuma_lib.fitting.least_squares import (
 )
 from neuma_lib.fitting.thrown_video import MOTION, NUISANCES, ThrownVideo, Try, averaged
 from neuma_lib.mechanics.combinations import Values
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.splatting.observation import Observation, joint_frames, several
 
 _LAST_GAIN = 0.1  # of `min_gain`, in the last round
@@ -54,15 +54,15 @@ _LEAST_LOSS = 1e-12  # below it, held-out images agree exactly
 
 
 def identify(
-    model: MPMModel,
-    throw: Throw,
+    model: MPM,
+    throw: InitialMotion,
     body: Reconstruction,
     observation: Observation | Sequence[Observation],
     settings: IdentifyConfig,
     stock: Mapping[str, Mapping[str, Any]] | None = None,
     *,
     finer: Sequence[Sequence[Reconstruction]] = (),
-    further: Sequence[tuple[Throw, Reconstruction, Observation | Sequence[Observation]]] = (),
+    further: Sequence[tuple[InitialMotion, Reconstruction, Observation | Sequence[Observation]]] = (),
     progress: Callable[[int, int, float], None] | None = None,
     log: Callable[[str], None] = lambda text: None,
 ) -> Identified:
@@ -449,7 +449,7 @@ class _Run:
                     slope[i] += float((self._averaged(at, column) * seen).sum())
         return slope
 
-    def _thrown(self, v: int, stds: np.ndarray) -> Throw:
+    def _thrown(self, v: int, stds: np.ndarray) -> InitialMotion:
         """The fitted throw of a video; standard deviations of all unknowns are given."""
         motion, throw = self._own(v)[:MOTION], self.videos[v].throw
         return replace(throw.moved(self._u[motion]), std=throw.std * stds[motion])

@@ -36,7 +36,7 @@ from neuma_lib.fitting.training_loop import TrainingLoop
 from neuma_lib.geometry.chamfer import chamfer_loss
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.mechanics.law import Law
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 from neuma_lib.splatting.observation import (
@@ -234,7 +234,7 @@ def frame_weights(iteration: int, count: int, settings: TrainingConfig) -> Tenso
 
 
 def train_material(
-    model: MPMModel,
+    model: MPM,
     law: Law,
     start: State,
     loss: TrajectoryLoss,

@@ -33,7 +33,7 @@ from neuma_lib.fitting.frame_batches import first_contact, held_out_frames
 from neuma_lib.fitting.material import History, Stretch, TrainedMaterial, TrajectoryLoss, train_material
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.mechanics.structured import StructuredLaw
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
@@ -105,7 +105,7 @@ class Choice:
 
 
 def train_structured(
-    model: MPMModel,
+    model: MPM,
     law: StructuredLaw,
     start: State,
     loss: TrajectoryLoss,
@@ -324,7 +324,7 @@ def largest_as_good(losses: dict[float, float]) -> float:
 
 
 def _simulated(
-    model: MPMModel, law: StructuredLaw, start: State, loss: TrajectoryLoss
+    model: MPM, law: StructuredLaw, start: State, loss: TrajectoryLoss
 ) -> tuple[Trajectory, list[float]] | None:
     """The motion at all steps of a loss, and the losses of its frames; None if it breaks off."""
     with torch.no_grad():

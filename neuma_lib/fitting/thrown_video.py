@@ -18,13 +18,13 @@ from torch import Tensor
 
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.coupling.filmed import Filmed
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.frame_batches import first_contact, frame_batches, held_out_frames, spread_frames
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.batch import rollout_batch
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.state import Trajectory
 from neuma_lib.splatting.observation import Observation, joint_frames, rendered_steps, several
 
@@ -67,8 +67,8 @@ class ThrownVideo:
 
     def __init__(
         self,
-        model: MPMModel,
-        throw: Throw,
+        model: MPM,
+        throw: InitialMotion,
         body: Reconstruction,
         video: Observation | Sequence[Observation],
         settings: IdentifyConfig,

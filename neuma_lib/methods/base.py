@@ -125,7 +125,7 @@ class Problem:
     """What is known of a scene before a fit.
 
     Attributes:
-        simulation: constants of the simulator, as `MPMModel` takes them.
+        simulation: constants of the simulator, as `MPM` takes them.
         densities: density of the body of each video, as `density_at` takes it.
         exposure: what turns exposures into renders, see `load_videos`.
         seed: of the project.

@@ -277,7 +277,7 @@ def _flaw(settings: RandomConfig, scene: Mapping[str, Any], gravity: Vector) -> 
     box: the ground is touched no sooner than by the turning box, and not much later than by the ellipsoid.
 
     A wall is where it stands, at 0 and 1, so that a draw does not depend on the grid, although the simulator feels it
-    half a cell earlier (`MPMModel.walls`; 0.021 m on 24 cells). What remains is enough, and a test moves the meshes of
+    half a cell earlier (`MPM.walls`; 0.021 m on 24 cells). What remains is enough, and a test moves the meshes of
     many draws to see it: no body feels a wall at the start, or another one before the ground, and at least five frames
     come before the ground is felt.
     """

@@ -9,7 +9,7 @@ import torch
 
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.laws import LawConfig
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.frame_batches import first_contact
@@ -54,10 +54,10 @@ def pixel_noise(images: torch.Tensor) -> torch.Tensor:
     return 0.01 * torch.randn(images.shape, generator=torch.Generator().manual_seed(5), dtype=images.dtype)
 
 
-def known(body, std=(0.0,) * 6, v0=V0) -> Throw:
+def known(body, std=(0.0,) * 6, v0=V0) -> InitialMotion:
     """The true throw, up to standard deviations."""
     centre = (body.mass @ body.x0 / body.mass.sum()).numpy()
-    return Throw(np.array(v0), np.zeros(3), centre, np.eye(3), np.array(std))
+    return InitialMotion(np.array(v0), np.zeros(3), centre, np.eye(3), np.array(std))
 
 
 def found_in(spec: dict, families: dict, noise=pixel_noise, throw=None, **options):
@@ -187,13 +187,15 @@ def test_a_throw_is_read_moved_and_written():
     """Deviations along the camera's axes are those of the world turned; what is known does not move."""
     axes = [[0, 0, 1], [0, -1, 0], [1, 0, 0]]
     content = {"v0": [1, 2, 3], "angular_velocity": [0, 1, 0], "centre": [0.5, 0.5, 0.5], "camera_axes": axes}
-    throw = Throw.of(content | {"std_camera": [0.1, 0.2, 0.3], "angular_velocity_std_camera": [1, 0, 0]})
+    throw = InitialMotion.of(
+        content | {"std_camera": [0.1, 0.2, 0.3], "angular_velocity_std_camera": [1, 0, 0]}
+    )
     moved = throw.moved(np.array([1.0, 2.0, 0.0, 1.0, 5.0, 5.0]))
     np.testing.assert_allclose(moved.velocity, [1, 1.6, 3.1])
     np.testing.assert_allclose(moved.spin, [0, 1, 1])
-    again = Throw.of(moved.as_dict())
+    again = InitialMotion.of(moved.as_dict())
     assert all(np.array_equal(getattr(again, field), getattr(moved, field)) for field in vars(moved))
-    assert not Throw.of(content).std.any()
+    assert not InitialMotion.of(content).std.any()
     body = ball()
     around = np.cross(moved.spin, body.x0.numpy() - moved.centre)
     np.testing.assert_allclose(moved.of_body(body).v, moved.velocity + around)

@@ -15,7 +15,7 @@ from neuma_lib.config.training import TrainingConfig
 from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.coupling import particle_gs
 from neuma_lib.coupling.filmed import Filmed
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.errors import InputError
 from neuma_lib.fitting.identify import identify
 from neuma_lib.fitting.material import PixelLoss
@@ -291,9 +291,9 @@ def test_what_lies_under_a_transparent_pixel_does_not_count_and_masks_have_no_co
 # ---- identification and velocity
 
 
-def known(body, v0) -> Throw:
+def known(body, v0) -> InitialMotion:
     centre = (body.mass @ body.x0 / body.mass.sum()).numpy()
-    return Throw(np.array(v0), np.zeros(3), centre, np.eye(3), np.zeros(6))
+    return InitialMotion(np.array(v0), np.zeros(3), centre, np.eye(3), np.zeros(6))
 
 
 def law(E=3e4, nu=0.3) -> dict:

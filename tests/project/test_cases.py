@@ -105,6 +105,25 @@ def test_presets_with_mistakes_name_the_key(raw, preset, where):
     assert where in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "new"),
+    [
+        ("law", "identified", "kind"),
+        ("material", {"rank": 4}, "options"),
+        ("structured", {"margin": 0.1}, "options"),
+        ("springs", {"anchors": 9}, "options"),
+        ("pac_nerf", {"guesses": "prior"}, "options"),
+        ("prior", "sand", "options.prior"),
+        ("trained_as", "neuma", "same_fit_as"),
+        ("judged_on", "carrier", "evaluate_on"),
+    ],
+)
+def test_keys_of_former_versions_name_the_new_one(raw, key, value, new):
+    with refused(f"methods.mine.{key}") as caught:
+        changed(raw, methods={"mine": {"title": "Mine", key: value}})
+    assert f" to {new}" in caught.value.problem
+
+
 def test_methods_that_tables_name_exist(raw):
     table = {"scenes": ["BouncyBall"], "methods": ["neuma+law_from=ClayCatt"]}
     with refused("tables.new"):

@@ -164,6 +164,9 @@ def test_editing_the_rasterizer_reruns_what_renders(clone):
             {"ground_truth", "prior"},
         ),
         ("neuma_lib/sim/rollout.py", {"ground_truth", "prior", "fit_neuma"}, set()),
+        ("neuma_lib/methods/neuma.py", {"fit_neuma", "evaluate"}, {"velocity", "ground_truth"}),
+        ("neuma_lib/methods/spring_gaus/method.py", set(), {"fit_neuma", "evaluate"}),
+        ("neuma_lib/methods/spring_gaus/fit.py", set(), {"fit_neuma", "evaluate"}),
         (
             "workflow/scripts/binding.py",
             {"binding", "velocity", "evaluate"},

@@ -13,6 +13,7 @@ from neuma_lib.project.checks import law_problems
 from neuma_lib.project import cases
 from neuma_lib.project.loading import load, load_captures
 from neuma_lib.errors import InputError
+from neuma_lib.mechanics.catalogue import DEFINED_IN
 from neuma_lib.methods.registry import methods
 from workflow.defaults import complete, digest_of
 from workflow.provenance import code_digest
@@ -112,11 +113,15 @@ def checked(function):
 
 
 def code_of(script):
-    """A function of wildcards: digest of a script and of the method that it loads."""
+    """A function of wildcards: digest of a script and of the method that it loads.
+
+    A method in a file may name any of the own laws.
+    """
 
     def digest(wildcards):
         loaded = type(cases.kind_of(SETTINGS, wildcards.method)).__module__
-        return code_digest(ROOT / "workflow" / "scripts" / script, loaded)
+        laws = {*DEFINED_IN.values()} - {loaded} if loaded in SETTINGS.extensions else ()
+        return code_digest(ROOT / "workflow" / "scripts" / script, loaded, *sorted(laws))
 
     return digest
 

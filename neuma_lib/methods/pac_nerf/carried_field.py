@@ -76,8 +76,8 @@ class CarriedField:
         spin: Sequence[float] | Tensor = (0.0, 0.0, 0.0),
         centre: Sequence[float] | Tensor | None = None,
     ) -> State:
-        """What moves, with the velocity v0 [m/s] and the spin [rad/s] of `State.thrown`."""
-        return State.thrown(self.moving.x, self.mass, self.moving.volumes(), v0, spin, centre)
+        """What moves, with the velocity v0 [m/s] and the spin [rad/s] of `State.rigid`."""
+        return State.rigid(self.moving.x, self.mass, self.moving.volumes(), v0, spin, centre)
 
     def positions(self, x: Tensor) -> Tensor:
         """Of what is seen, (T, N, 3) [m], for those of what moves, (T, A, 3)."""

@@ -78,7 +78,7 @@ class PacNerf(Method):
         from neuma_lib.methods.pac_nerf.families import choose_family
         from neuma_lib.methods.pac_nerf.fit import fit_pac_nerf
         from neuma_lib.methods.pac_nerf.io import load_field
-        from neuma_lib.sim.model import MPMModel
+        from neuma_lib.sim.model import MPM
 
         options = dict(options)
         prior, radiance = options.pop("prior"), options.pop("radiance")
@@ -104,7 +104,7 @@ class PacNerf(Method):
                 "Choose one view by +views=0, and ignore motion blur by dataset.exposure_samples: 1",
             )
         fit = fit_pac_nerf(
-            MPMModel(**problem.simulation),
+            MPM(**problem.simulation),
             body,
             video.to(torch.float32, run.device),
             estimated["frames"][-1],

@@ -61,7 +61,7 @@ class SpringGaus(Method):
         from neuma_lib.methods.spring_gaus.io import save_springs
         from neuma_lib.methods.spring_gaus.network import Springs
         from neuma_lib.methods.spring_gaus.rollout import SpringModel
-        from neuma_lib.sim.model import MPMModel
+        from neuma_lib.sim.model import MPM
 
         settings = SpringGausOptions(**options)
         files = (inputs[name] for name in ("particles", "binding", "gaussians"))
@@ -81,7 +81,7 @@ class SpringGaus(Method):
         }
         checkpoint = run.checkpoint({**known, **options}, inputs)
         fitted = fit_springs(
-            SpringModel.of(MPMModel(**problem.simulation), settings.substeps),
+            SpringModel.of(MPM(**problem.simulation), settings.substeps),
             anchored,
             springs,
             start,
