@@ -249,9 +249,9 @@ def identify(
     """
     values = {"particles": 0, **(options or {}), "families": dict(FAMILIES if families is None else families)}
     settings = validate(IdentifyConfig, values, "options")
-    if settings.particles:
+    if settings.refined_particles:
         raise InputError(
-            "options.particles", f"{settings.particles} must be 0", "Use the workflow to correct it"
+            "options.refined_particles", f"{settings.refined_particles} must be 0", "Use the workflow to correct it"
         )
     body = replace(scene.reconstruction, affine=settings.gaussian_motion == "affine")
     video = _video(scene)
