@@ -247,7 +247,7 @@ def identify(
         >>> found.family, found.constants
         ('hencky', {'E': 61000.0, 'nu': 0.31})
     """
-    values = {"particles": 0, **(options or {}), "families": dict(FAMILIES if families is None else families)}
+    values = {"refined_particles": 0, **(options or {}), "families": dict(FAMILIES if families is None else families)}
     settings = validate(IdentifyConfig, values, "options")
     if settings.refined_particles:
         raise InputError(
