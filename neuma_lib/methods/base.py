@@ -125,15 +125,15 @@ class Problem:
     """Known quantities of a scene before a fit.
 
     Attributes:
-        simulation: constants of the simulator, as `MPMModel` takes them.
+        simulation: constants of the simulator, as `MPM` takes them.
         densities: density of the body of each video, as `density_at` takes it.
-        filming: what turns exposures into renders, see `load_videos`.
+        exposure: how frames with an exposure are rendered, see `load_videos`.
         seed: of the project.
     """
 
     simulation: Mapping[str, Any]
     densities: Sequence[Any]
-    filming: Mapping[str, Any]
+    exposure: Mapping[str, Any]
     seed: int = 0
 
 
@@ -212,7 +212,7 @@ class Method(ABC):
 
     name: ClassVar[str]
     Options: ClassVar[type[Section]] = MotionOptions
-    sections: ClassVar[tuple[str, ...]] = ("material",)
+    sections: ClassVar[tuple[str, ...]] = ("training",)
     presets: ClassVar[Mapping[str, Preset]] = {}
     product: ClassVar[str | None] = None
     fit_kernels: ClassVar[tuple[str, ...]] = ("laws", "rendering")
@@ -258,7 +258,7 @@ class Method(ABC):
 
     def carrier(self, case: Case) -> str:
         """What an evaluation simulates: "binding" (particles of the volume), or the particles of the fit."""
-        return case.options.carrier if case.evaluate_on == "training_particles" else "binding"
+        return case.options.particle_source if case.evaluate_on == "training_particles" else "binding"
 
     def learns_from_video(self, case: Case) -> bool:
         """Whether the model comes from the scene itself. If not, it is the same for all scenes with one prior."""

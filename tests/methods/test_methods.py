@@ -20,7 +20,7 @@ from neuma_lib.methods import registry
 from neuma_lib.methods.base import ModelSource, method_of
 from neuma_lib.methods.model import LawOnGrid
 from neuma_lib.methods.prior import prior_source
-from neuma_lib.sim.model import MPMModel, consecutive
+from neuma_lib.sim.model import MPM, consecutive
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
@@ -134,7 +134,7 @@ def test_paths_are_checked_before_they_are_read(tmp_path):
 
 def test_models_together_move_as_consecutive_bodies():
     """Two cubes that meet: one model of both gives the motion of the simulator, bit for bit."""
-    mpm, below, above = MPMModel(grid=16, dt=DT), cube(height=0.2), cube(height=0.32)
+    mpm, below, above = MPM(grid=16, dt=DT), cube(height=0.2), cube(height=0.32)
     both = State(
         *(torch.cat([getattr(s, name) for s in (below, above)]) for name in ("x", "v", "mass", "vol0"))
     )

@@ -11,9 +11,7 @@ sys.path.insert(0, str(ROOT))
 from neuma_lib.project.capture_scenes import captured_scenes
 from neuma_lib.project.checks import law_problems
 from neuma_lib.project import cases
-from neuma_lib.config.capture import CapturesConfig
-from neuma_lib.project.loading import load
-from neuma_lib.config.validation import validate
+from neuma_lib.project.loading import load, load_captures
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import DEFINED_IN
 from neuma_lib.methods.registry import methods
@@ -22,7 +20,7 @@ from workflow.provenance import code_digest
 from workflow.records import keep_records_of_failed_jobs
 
 try:
-    captures = validate(CapturesConfig, config.get("captures") or {}, "captures")
+    captures = load_captures(config)
     # A workflow that includes this one may plan captures before their files exist.
     PLANNED = plan_captures(config, captures.root) if "plan_captures" in globals() else {}
     SETTINGS = load(config, captured=captured_scenes(captures.root, captures.released, PLANNED))
