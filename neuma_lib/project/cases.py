@@ -87,8 +87,8 @@ class ProjectCase(Case):
         return f"identified+views={','.join(map(str, views))}.json"
 
     def each_video(self, choose: Callable[[Case], str]) -> str | list[str]:
-        found = [choose(replace(self, scene=scene)) for scene in self.settings.video_scenes(self.scene)]
-        return found if len(found) > 1 else found[0]
+        paths = [choose(replace(self, scene=scene)) for scene in self.settings.video_scenes(self.scene)]
+        return paths if len(paths) > 1 else paths[0]
 
     def seeds(self) -> tuple[str, ...]:
         """Seeds of a replicate that change the results."""
@@ -200,7 +200,6 @@ def case(settings: Config, scene: str, method: str) -> ProjectCase:
     chosen, _ = preset(settings, method)
     kind, source = kind_of(settings, method), source_scene(settings, scene, method)
     name, options = fit_name(settings, method), _options(settings, source, method)
-    found = ProjectCase(settings, source, scene, name, method, options, chosen.evaluate_on, kind)
     known = [*settings.priors.laws, IDENTIFIED]
     if getattr(options, "prior", None) not in (None, *known):
         raise InputError(
@@ -208,7 +207,7 @@ def case(settings: Config, scene: str, method: str) -> ProjectCase:
             f"no prior '{options.prior}' in priors.laws{hint(options.prior, known)}",
             "A law in a file is the prior of a scene",
         )
-    return found
+    return ProjectCase(settings, source, scene, name, method, options, chosen.evaluate_on, kind)
 
 
 def _options(settings: Config, scene: str, method: str) -> Section:
@@ -277,8 +276,8 @@ def gaussian_motion(settings: Config, scene: str, method: str) -> str:
     return "affine" if settings.scene(scene).splat else case(settings, scene, method).options.gaussian_motion
 
 
-def moving_methods(settings: Config, scene: str, asked: Sequence[str]) -> list[str]:
-    """Methods that predict the motion of a scene: those asked for.
+def moving_methods(settings: Config, scene: str, wanted: Sequence[str]) -> list[str]:
+    """Methods that predict the motion of a scene.
 
     A splat has no video. Where a method would learn from it, the models of the scenes ``figures.i23d`` replace it.
 
@@ -286,17 +285,17 @@ def moving_methods(settings: Config, scene: str, asked: Sequence[str]) -> list[s
         InputError: a splat, and a method whose model cannot come from another scene.
     """
     if not settings.scene(scene).splat:
-        return list(asked)
-    found = []
-    for method in asked:
+        return list(wanted)
+    moving = []
+    for method in wanted:
         if not kind_of(settings, method).moves_other_bodies:
             raise InputError(
                 f"{scene}/{method}", "a splat has no video to fit this method to; leave the method out"
             )
         elsewhere = case(settings, scene, method).learned_from_moved_scene
         sources = settings.figures.i23d if elsewhere else (None,)
-        found += [f"{method}+{LAW_FROM}={source}" if source else method for source in sources]
-    return list(dict.fromkeys(found))
+        moving += [f"{method}+{LAW_FROM}={source}" if source else method for source in sources]
+    return list(dict.fromkeys(moving))
 
 
 def motion_clock(settings: Config, scene: str, method: str) -> tuple[float, tuple[int, ...]]:
@@ -309,15 +308,15 @@ def motion_clock(settings: Config, scene: str, method: str) -> tuple[float, tupl
 
 
 def law_origin(settings: Config, scene: str, method: str) -> dict[str, Any]:
-    """What the settings know of the origin of a method's law, with the keys of `neuma_lib.io.exported`."""
-    found = case(settings, scene, method)
-    chosen = settings.scene(found.scene)
+    """Origin of a method's law according to the settings, with the keys of `neuma_lib.io.exported`."""
+    of_law = case(settings, scene, method)
+    chosen = settings.scene(of_law.scene)
     return {
         "dt": chosen.dt,
-        **settings.scene_world(found.scene),
-        "density": found.density(found.scene),
+        **settings.scene_world(of_law.scene),
+        "density": of_law.density(of_law.scene),
         "scale": chosen.captured.scale if chosen.captured else chosen.images.scale,
-        "scene": found.scene,
+        "scene": of_law.scene,
         "method": method,
-        "prior": found.prior if "prior" in found.method.model_inputs(found) else None,
+        "prior": of_law.prior if "prior" in of_law.method.model_inputs(of_law) else None,
     }

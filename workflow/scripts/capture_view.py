@@ -53,7 +53,7 @@ class Prediction:
         self.steps = arrays["frames"].tolist()
         if not set(needed) <= set(self.steps):
             raise InputError(
-                rollout, "its steps are not those of the video", "Run the rule capture_prediction again"
+                rollout, "its steps are not those of the video", "Run the rule predict again"
             )
         self.x, self.F = (state.to(body.x0) for state in load_motion(rollout))
 
