@@ -247,11 +247,17 @@ def identify(
         >>> found.family, found.constants
         ('hencky', {'E': 61000.0, 'nu': 0.31})
     """
-    values = {"refined_particles": 0, **(options or {}), "families": dict(FAMILIES if families is None else families)}
+    values = {
+        "refined_particles": 0,
+        **(options or {}),
+        "families": dict(FAMILIES if families is None else families),
+    }
     settings = validate(IdentifyConfig, values, "options")
     if settings.refined_particles:
         raise InputError(
-            "options.refined_particles", f"{settings.refined_particles} must be 0", "Use the workflow to correct it"
+            "options.refined_particles",
+            f"{settings.refined_particles} must be 0",
+            "Use the workflow to correct it",
         )
     body = replace(scene.reconstruction, affine=settings.gaussian_motion == "affine")
     video = _video(scene)
