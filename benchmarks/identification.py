@@ -2,7 +2,7 @@
 
     python -m benchmarks.identification RubberPawn                          # reads data/, results/, config/config.yaml
     python -m benchmarks.identification random1_05 random2_03 --seeds 1 2 --count 12 --jobs 16 --out found.json
-    python -m benchmarks.identification random1_05 --set '{"give_up": 3}'   # other settings of `identify`
+    python -m benchmarks.identification random1_05 --set '{"prune_factor": 3}'   # other settings of `identify`
     python -m benchmarks.identification random1_02 --seeds 1 --count 8 --simplex   # only: two ways to find constants
 
 A scene may be named by the beginning of its name; without names, all random scenes that have results are taken.
@@ -69,7 +69,7 @@ def judge(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str, 
             scene.density,
             settings.binding,
         )
-        for seed in range(1, 1 + (chosen.samplings if chosen.particles else 0))
+        for seed in range(1, 1 + (chosen.resamplings if chosen.refined_particles else 0))
     ]
     model = simulator(settings, scene)
     stock = settings.priors.laws.get(scene.prior)
@@ -121,7 +121,7 @@ def compare(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str
     model = simulator(settings, scene)
     thrown = ThrownVideo(model, throw, body, video, chosen)
     thrown.hold_out(family, chosen.held_out)
-    rounds = range(len(chosen.squares))
+    rounds = range(len(chosen.pyramid))
     origin, known = family.unbounded(family.guess), np.zeros(NUISANCES)
     images: dict[bytes, torch.Tensor | None] = {}
     finest: list[float] = []  # squared residuals at the finest squares, of one rollout after the other
@@ -150,7 +150,7 @@ def compare(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str
     most, begun, u = SIMPLEX_ROLLOUTS * run.rollouts, _core_seconds(), np.zeros(len(origin))
     for level in rounds:
         first = u + np.vstack([np.zeros(len(u)), 0.5**level * SIMPLEX_EDGE * np.eye(len(u))])
-        tolerance = chosen.least_gain * (_LAST_GAIN if level == rounds[-1] else 1.0)
+        tolerance = chosen.min_gain * (_LAST_GAIN if level == rounds[-1] else 1.0)
         options = dict(initial_simplex=first, xatol=math.inf, fatol=tolerance, maxfev=most - len(finest))
         u = minimize(log_cost, u, (level,), "Nelder-Mead", options=options).x if most > len(finest) else u
     pixels = thrown.fitted_pixels

@@ -134,7 +134,7 @@ class Scene:
         settings, files = found_scene(folder)
         mpm = MPM(**files.simulation)
         body = load_body(files.particles, files.binding, files.gaussians, files.density)
-        blur = {"dt": mpm.dt, "exposure_samples": settings.dataset.sub_frames}
+        blur = {"dt": mpm.dt, "exposure_samples": settings.dataset.exposure_samples}
         return cls(
             mpm,
             body.to(torch.float32),
@@ -247,11 +247,11 @@ def identify(
         >>> found.family, found.constants
         ('hencky', {'E': 61000.0, 'nu': 0.31})
     """
-    values = {"particles": 0, **(options or {}), "families": dict(FAMILIES if families is None else families)}
+    values = {"refined_particles": 0, **(options or {}), "families": dict(FAMILIES if families is None else families)}
     settings = validate(IdentifyConfig, values, "options")
-    if settings.particles:
+    if settings.refined_particles:
         raise InputError(
-            "options.particles", f"{settings.particles} must be 0", "Use the workflow to correct it"
+            "options.refined_particles", f"{settings.refined_particles} must be 0", "Use the workflow to correct it"
         )
     body = replace(scene.reconstruction, affine=settings.gaussian_motion == "affine")
     video = _video(scene)

@@ -49,7 +49,7 @@ from neuma_lib.mechanics.combinations import Values
 from neuma_lib.sim.model import MPM
 from neuma_lib.splatting.observation import Observation, joint_frames, several
 
-_LAST_GAIN = 0.1  # of `least_gain`, in the last round
+_LAST_GAIN = 0.1  # of `min_gain`, in the last round
 _LEAST_LOSS = 1e-12  # below it, held-out images agree exactly
 
 
@@ -100,7 +100,7 @@ def identify(
         video.weight = (videos[0].fitted_pixels / video.fitted_pixels) ** 0.5
     stock_values = _constants(stock) if stock else {}
     running: list[_Run] = []
-    rounds = len(settings.squares)
+    rounds = len(settings.pyramid)
     for family in families:
         running.append(_begun(family, videos, running, stock_values, settings))
     for run, best in _better_later(running):
@@ -128,7 +128,7 @@ def identify(
     run.look_closer()
     final = _Run(run.family, videos, [len(video.frames) for video in videos], settings)
     starts, first = [run.values], rounds - 1
-    if chosen.held_out > settings.give_up * chosen.loss:  # the first frames misled: from the beginning
+    if chosen.held_out > settings.prune_factor * chosen.loss:  # the first frames misled: from the beginning
         starts, first = [run.values, *(run.family.with_guesses(values) for values in ({}, stock_values))], 0
     final.begin(starts, first, run.deviations)
     for level in range(first + 1, rounds if final.alive else 0):
@@ -196,7 +196,7 @@ def _leave_behind(running: Sequence[_Run], settings: IdentifyConfig) -> None:
     """
     alive = [run for run in running if run.alive]
     least = min((run.fit.cost for run in alive), default=0.0)
-    left = [run for run in alive if run.fit.cost > settings.give_up * least or _adds_nothing(run, alive)]
+    left = [run for run in alive if run.fit.cost > settings.prune_factor * least or _adds_nothing(run, alive)]
     for run in left:
         run.alive = False
 
@@ -317,14 +317,14 @@ class _Run:
 
     def refine(self, level: int) -> None:
         """Go on with a round's squares."""
-        self._level, last = level, level == len(self.settings.squares) - 1
+        self._level, last = level, level == len(self.settings.pyramid) - 1
         unsure = [k for v, video in enumerate(self.videos) if video.by_deviation for k in self._unsure(v)]
         self._u, self.fit, steps = levenberg_marquardt(
             self,
             self._u,
             [*range(self._constants), *unsure],
             self._held,
-            self.settings.least_gain * (_LAST_GAIN if last else 1.0),
+            self.settings.min_gain * (_LAST_GAIN if last else 1.0),
             self.settings.iterations,
             longest=self.settings.longest_step,
         )

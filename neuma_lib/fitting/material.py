@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.config.base import Compared
-from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.coupling.filmed import Filmed
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
@@ -225,7 +225,7 @@ class TrainedMaterial:
         )
 
 
-def frame_weights(iteration: int, count: int, settings: MaterialConfig) -> Tensor:
+def frame_weights(iteration: int, count: int, settings: TrainingConfig) -> Tensor:
     """Weights of the frames, shape (count,): d^k, k the part of the video; d rises to 1 over a third of training."""
     rise = min(1.0, iteration / max(1.0, settings.iterations / 3))
     d = settings.frame_weight_start + (1 - settings.frame_weight_start) * rise
@@ -238,7 +238,7 @@ def train_material(
     law: Law,
     start: State,
     loss: TrajectoryLoss,
-    settings: MaterialConfig,
+    settings: TrainingConfig,
     *,
     further: Sequence[tuple[State, TrajectoryLoss]] = (),
     stretch: Stretch | None = None,

@@ -26,8 +26,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.structured import StructuredConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.frame_batches import first_contact, held_out_frames
 from neuma_lib.fitting.material import History, Stretch, TrainedMaterial, TrajectoryLoss, train_material
@@ -109,7 +109,7 @@ def train_structured(
     law: StructuredLaw,
     start: State,
     loss: TrajectoryLoss,
-    settings: MaterialConfig,
+    settings: TrainingConfig,
     structured: StructuredConfig,
     *,
     rivals: Sequence[StructuredLaw] = (),
@@ -166,7 +166,7 @@ def train_structured(
         begin: LawState,
         parts: Sequence[str],
         videos: Sequence[Video],
-        how: MaterialConfig,
+        how: TrainingConfig,
         stretch: Stretch,
         before: int,
     ) -> TrainedMaterial:

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.fitting.material import ParticleLoss, PixelLoss
 from neuma_lib.io.files import listed, write_json
@@ -35,7 +35,7 @@ class Training:
         self,
         inputs: Files,
         options: Mapping[str, Any],
-        settings: MaterialConfig,
+        settings: TrainingConfig,
         problem: Problem,
         run: FitRun,
         stamp: Mapping[str, Any] | None = None,
@@ -63,14 +63,14 @@ class Training:
         }
         known = {
             "simulation": problem.simulation,
-            "filming": problem.filming,
+            "exposure": problem.exposure,
             "densities": problem.densities,
             **options,
         }
         self._checkpoint = run.checkpoint(known | dict(stamp or {}), files)
 
     def _videos(self, transforms: str) -> list[Observation]:
-        videos = load_videos(transforms, self.settings.views, **self._problem.filming)
+        videos = load_videos(transforms, self.settings.views, **self._problem.exposure)
         return [video.to(torch.float32, self.run.device) for video in videos]
 
     def problem(self, law: AdaptableLaw) -> tuple:
@@ -107,7 +107,7 @@ def particle_loss(truth: str, device: torch.device) -> ParticleLoss:
     return ParticleLoss(tuple(arrays["frames"].tolist()), torch.from_numpy(arrays["x"]).to(device))
 
 
-def pixel_loss(body: Reconstruction, videos: Sequence[Observation], settings: MaterialConfig) -> PixelLoss:
+def pixel_loss(body: Reconstruction, videos: Sequence[Observation], settings: TrainingConfig) -> PixelLoss:
     """The loss of a video."""
     total = settings.covariance_from == "total"
     return PixelLoss(body, videos, settings.covariance_gradient, total=total, compare=settings.compare)

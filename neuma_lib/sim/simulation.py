@@ -350,7 +350,7 @@ class Simulation:
             "rollout",
             f"particle {particle} (law {law.name!r}) {happened} at step {step}, t = "
             f"{step * self.model.dt:.4g} s: the simulation is unstable. Use a smaller dt (see "
-            "MPMModel.check_courant), a slower start, or the last good weights with a lower rate",
+            "MPM.check_courant), a slower start, or the last good weights with a lower rate",
             step=step,
             particle=particle,
             happened=happened,

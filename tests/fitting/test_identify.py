@@ -47,7 +47,7 @@ FLUID = law("hencky", "viscous_flow", viscosity=60)
 
 def settings(families: dict, **options) -> IdentifyConfig:
     families = {name: LawConfig(**spec) for name, spec in families.items()}
-    return IdentifyConfig(families=families, **{"squares": SQUARES, "misplaced": 0.0, **options})
+    return IdentifyConfig(families=families, **{"pyramid": SQUARES, "pose_tolerance": 0.0, **options})
 
 
 def pixel_noise(images: torch.Tensor) -> torch.Tensor:
@@ -99,7 +99,7 @@ def test_first_frames_that_mislead_are_not_where_the_last_fit_begins(monkeypatch
     monkeypatch.setattr(_Run, "begin", noted)
     truth = law("hencky", "von_mises", E=6e4, nu=0.3, yield_stress=2e3)
     for factor, expected in ((1e6, (1, len(SQUARES) - 1)), (1.2, (3, 0))):
-        assert found_in(truth, {"hencky": ELASTIC}, give_up=factor).best.refined
+        assert found_in(truth, {"hencky": ELASTIC}, prune_factor=factor).best.refined
         assert begun[-1] == expected
 
 
@@ -126,7 +126,7 @@ def test_two_videos_have_the_constants_in_common_and_a_throw_each():
     v0, off = (0.2, -2.5, 0.3), np.array([0.03, 0.05, 0.0])
     body, seen = video_of(truth, v0, FRAMES[:11])
     throw = known(body, (0.05, 0.05, 0.0, 0.0, 0.0, 0.0), np.array(v0) + off)
-    options = dict(squares=(8, 32))
+    options = dict(pyramid=(8, 32))
     alone = found_in(truth, families, **options)
     both = found_in(truth, families, further=[(throw, body, seen)], **options)
     assert both.best.values["E"] == pytest.approx(3e4, rel=0.02)
@@ -144,7 +144,7 @@ def test_two_videos_have_the_constants_in_common_and_a_throw_each():
 def test_videos_count_alike_however_long():
     """The same video again, in half as many frames: the loss is the mean of both, what is found the same."""
     families, truth = {"hencky": ELASTIC}, law("hencky", E=3e4, nu=0.4)
-    options = dict(squares=(8, 32), frames=33)
+    options = dict(pyramid=(8, 32), frames=33)
     body, half = video_of(truth, V0, FRAMES[::2])
     found = [
         found_in(truth, families, **options),
@@ -217,7 +217,7 @@ class Begun:
 def test_families_are_left_that_are_far_behind_or_show_what_one_within_them_shows():
     """What is merely no better in blurred images stays: with more constants, of another elasticity, or flowing where a
     body within it as soft as to lie flat does as well."""
-    options = settings({"hencky": ELASTIC}, give_up=3.0)
+    options = settings({"hencky": ELASTIC}, prune_factor=3.0)
     elastic, far = Begun(1.0, ELASTIC, "soft"), Begun(3.1, law("neo_hookean"), "far")
     never_yields, flat = Begun(0.99, PLASTIC, "soft"), Begun(1.2, FLUID, "flat")
     sibling = Begun(1.0, law("fixed_corotated"), "soft")

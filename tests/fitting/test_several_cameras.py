@@ -11,7 +11,7 @@ from PIL import Image
 
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.laws import LawConfig
-from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.coupling import particle_gs
 from neuma_lib.coupling.filmed import Filmed
@@ -302,7 +302,7 @@ def law(E=3e4, nu=0.3) -> dict:
 
 def identified(body, videos, v0=V0, squares=(8, 24), **options):
     chosen = IdentifyConfig(
-        families={"hencky": LawConfig(**law(6e4))}, squares=squares, misplaced=0.0,
+        families={"hencky": LawConfig(**law(6e4))}, pyramid=squares, pose_tolerance=0.0,
         covariance_from="elastic", gaussian_motion="mean", **options,
     )  # fmt: skip
     return identify(MODEL, known(body, v0), body, videos, chosen).best
@@ -400,6 +400,6 @@ def test_springs_are_fitted_to_staggered_cameras_whose_exposures_overlap(truncat
     loss = PixelLoss(body, videos)
     assert loss.steps == steps and float(loss(path).max()) < 1e-20
     how = SpringsConfig(truncated=truncated, lr_springs=0.05, learn_gap=False)
-    problem = (model, anchored, guess, start, loss, MaterialConfig(iterations=12), how)
+    problem = (model, anchored, guess, start, loss, TrainingConfig(iterations=12), how)
     fitted = fit_springs(*problem, log=lambda _: None)
     assert fitted.stable and fitted.best_loss < 0.1 * fitted.history.loss[0]

@@ -106,7 +106,7 @@ def test_default_settings_reach_25_decibels_inside_the_object():
 
 def test_particles_lie_in_the_body(fit):
     field, report = fit
-    particles = field.particles(SMALL.spacing, SMALL.least_opacity)
+    particles = field.particles(SMALL.spacing, SMALL.min_opacity)
     assert report.particles == len(particles.x)
     assert (raycast.distance(particles.x) < 1.5 * report.voxel).double().mean() > 0.95
     # nearly all of the body is filled

@@ -26,19 +26,24 @@ def main(inputs, output, params, run) -> None:
             load_body(*body, density, gaussian_motion=settings.gaussian_motion).to(torch.float32, device),
             [
                 video.to(torch.float32, device)
-                for video in load_videos(transforms, settings.views, **params.filming)
+                for video in load_videos(transforms, settings.views, **params.exposure)
             ],
         )
         for *body, velocity, transforms, density in zip(
             *(listed(inputs[name]) for name in names), params.densities, strict=True
         )
     ]
-    seeds = range(params.seed + 1, params.seed + 1 + (settings.samplings if settings.particles else 0))
+    seeds = range(
+        params.seed + 1, params.seed + 1 + (settings.resamplings if settings.refined_particles else 0)
+    )
     meshes = [read_mesh(file) for file in listed(inputs.mesh)]
     finer = [
         [
             body.resampled(
-                torch.from_numpy(sample_volume(mesh, settings.particles, seed)), mesh.volume, density, binding
+                torch.from_numpy(sample_volume(mesh, settings.refined_particles, seed)),
+                mesh.volume,
+                density,
+                binding,
             )
             for seed in seeds
         ]

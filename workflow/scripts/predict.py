@@ -22,7 +22,7 @@ def main(inputs, output, params, run) -> None:
     start, model, mpm = start.to(device), prediction.model(dt, counts), MPM(**params.simulation)
     frames = params.frames
     if params.cameras:
-        steps = filmed_steps(inputs.transforms, range(len(params.cameras)), **params.filming)
+        steps = filmed_steps(inputs.transforms, range(len(params.cameras)), **params.exposure)
         frames = sorted({0, *steps})
     path, failure = model.predict(mpm, start, frames, total=params.total)
     write_arrays(output.rollout, {**path.arrays(), "frames": np.asarray(frames)}, {"dt": dt})

@@ -22,7 +22,7 @@ def main(inputs, output, params, run) -> None:
     body = body.to(torch.float32, device)
     videos = [
         video.to(torch.float32, device)
-        for video in load_videos(inputs.transforms, settings.views, **params.filming)
+        for video in load_videos(inputs.transforms, settings.views, **params.exposure)
     ]
     estimate = estimate_velocity(model, law, body, videos, settings, run.progress)
     free = estimate

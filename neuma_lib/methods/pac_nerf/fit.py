@@ -211,7 +211,7 @@ class _Fit:
         warm = contact + round(settings.after_contact / model.dt)
         near = [k for k in after if observation.frames[k] <= warm] or after[:1]
         self.flying = spread(before, settings.velocity_frames)
-        self.stages = [spread(near, settings.most_frames), spread(after, settings.most_frames)]
+        self.stages = [spread(near, settings.max_frames), spread(after, settings.max_frames)]
         self.iterations = settings.iterations_contact + settings.iterations_all
         self.optimizer = torch.optim.Adam(constants.groups(settings), betas=settings.betas)
         self.iteration, self.history = 0, PacNerfHistory()
