@@ -84,8 +84,8 @@ class ProjectCase(Case):
         return f"identified+views={','.join(map(str, views))}.json"
 
     def each_video(self, choose: Callable[[Case], str]) -> str | list[str]:
-        found = [choose(replace(self, scene=scene)) for scene in self.settings.video_scenes(self.scene)]
-        return found if len(found) > 1 else found[0]
+        paths = [choose(replace(self, scene=scene)) for scene in self.settings.video_scenes(self.scene)]
+        return paths if len(paths) > 1 else paths[0]
 
     def seeds(self) -> tuple[str, ...]:
         """Seeds of a replicate that change the results."""
@@ -197,7 +197,6 @@ def case(settings: Config, scene: str, method: str) -> ProjectCase:
     chosen, _ = preset(settings, method)
     kind, source = kind_of(settings, method), source_scene(settings, scene, method)
     name, options = fit_name(settings, method), _options(settings, source, method)
-    found = ProjectCase(settings, source, scene, name, method, options, chosen.evaluate_on, kind)
     known = [*settings.priors.laws, IDENTIFIED]
     if getattr(options, "prior", None) not in (None, *known):
         raise InputError(
@@ -205,7 +204,7 @@ def case(settings: Config, scene: str, method: str) -> ProjectCase:
             f"no prior '{options.prior}' in priors.laws{hint(options.prior, known)}",
             "A law in a file is the prior of a scene",
         )
-    return found
+    return ProjectCase(settings, source, scene, name, method, options, chosen.evaluate_on, kind)
 
 
 def _options(settings: Config, scene: str, method: str) -> Section:
@@ -306,15 +305,15 @@ def motion_clock(settings: Config, scene: str, method: str) -> tuple[float, tupl
 
 
 def law_origin(settings: Config, scene: str, method: str) -> dict[str, Any]:
-    """Metadata of a method's law from the settings, with the keys of `neuma_lib.io.exported`."""
-    found = case(settings, scene, method)
-    chosen = settings.scene(found.scene)
+    """Origin of a method's law according to the settings, with the keys of `neuma_lib.io.exported`."""
+    of_law = case(settings, scene, method)
+    chosen = settings.scene(of_law.scene)
     return {
         "dt": chosen.dt,
-        **settings.scene_world(found.scene),
-        "density": found.density(found.scene),
+        **settings.scene_world(of_law.scene),
+        "density": of_law.density(of_law.scene),
         "scale": chosen.captured.scale if chosen.captured else chosen.images.scale,
-        "scene": found.scene,
+        "scene": of_law.scene,
         "method": method,
-        "prior": found.prior if "prior" in found.method.model_inputs(found) else None,
+        "prior": of_law.prior if "prior" in of_law.method.model_inputs(of_law) else None,
     }
