@@ -9,7 +9,7 @@ from typing import Any
 from neuma_lib.config.scenes import SceneConfig
 from neuma_lib.project.loading import load, merged, read_yaml
 from neuma_lib.project.settings import Config
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 
 
 def scene_parser(description: str, nargs: str) -> argparse.ArgumentParser:
@@ -40,11 +40,11 @@ def chosen_scenes(args: argparse.Namespace) -> dict[str, Config]:
 
 
 def simulation(settings: Config, scene: SceneConfig) -> dict[str, Any]:
-    """Constants of the simulator for a scene's reconstruction, as `MPMModel` takes them."""
+    """Constants of the simulator for a scene's reconstruction, as `MPM` takes them."""
     known = settings.simulation.plain()
     return {"dt": scene.dt, **{key: known[key] for key in ("grid", "gravity", "boundary", "walls")}}
 
 
-def simulator(settings: Config, scene: SceneConfig) -> MPMModel:
+def simulator(settings: Config, scene: SceneConfig) -> MPM:
     """The simulator for a scene's reconstruction."""
-    return MPMModel(**simulation(settings, scene))
+    return MPM(**simulation(settings, scene))

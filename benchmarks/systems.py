@@ -56,8 +56,8 @@ def measure(name: str, settings: Config, method: str, fields: Path) -> str:
     files = case.method.fit_inputs(case)
     if "field" in files:
         files["field"] = _field(case.result("pac_nerf/field.safetensors"), name, settings, fields)
-    filming = {"dt": scene.dt, "sub_frames": settings.dataset.sub_frames}
-    problem = Problem(simulation(settings, scene), case.densities, filming, settings.seed)
+    exposure = {"dt": scene.dt, "exposure_samples": settings.dataset.exposure_samples}
+    problem = Problem(simulation(settings, scene), case.densities, exposure, settings.seed)
     with TemporaryDirectory() as folder:
         run = Run(Path(folder), case.method.product)
         before = _core_seconds()

@@ -22,7 +22,7 @@ import torch
 
 from benchmarks.project_scenes import chosen_scenes, scene_parser, simulator
 from benchmarks.timing import device_name, synchronize
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.device import choose_device
 from neuma_lib.fitting import identify as identification
 from neuma_lib.fitting import structured_fit
@@ -102,17 +102,17 @@ def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
     clock, scene, chosen = Clock(device), settings.scene(name), settings.identify
     data, results = Path(settings.data_root) / name, Path(settings.results_root) / name
     model, dt = simulator(settings, scene), scene.dt
-    binding, filming = settings.binding, {"dt": dt, "sub_frames": settings.dataset.sub_frames}
+    binding, exposure = settings.binding, {"dt": dt, "exposure_samples": settings.dataset.exposure_samples}
     with clock.part("reading body"):
         files = (results / file for file in ("particles.h5", "binding.h5", "gaussians.ply"))
         body = load_body(*files, scene.density, gaussian_motion=chosen.gaussian_motion).to(
             torch.float32, device
         )
-        throw = Throw.of(read_json(results / "velocity.json"))
+        throw = InitialMotion.of(read_json(results / "velocity.json"))
     with clock.part("reading images"):
         videos = [
             video.to(torch.float32, device)
-            for video in load_videos(data / "dynamic/transforms.json", chosen.views, **filming)
+            for video in load_videos(data / "dynamic/transforms.json", chosen.views, **exposure)
         ]
     with clock.part("finer bodies"):
         mesh = read_mesh(results / "mesh.ply")
@@ -123,7 +123,7 @@ def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
                 scene.density,
                 binding,
             )
-            for seed in range(1, 1 + (chosen.samplings if chosen.particles else 0))
+            for seed in range(1, 1 + (chosen.resamplings if chosen.refined_particles else 0))
         ]
     stock = settings.priors.laws.get(scene.prior)
     with clock.parts(IDENTIFYING), clock.part("identifying, the rest"):

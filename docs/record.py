@@ -1,7 +1,7 @@
 """Copy the tables and figures of a run to docs/results, and update the numbers on the pages that show them.
 
 python -m docs.record            # after: snakemake --cores 2 tables figures random results/finer_truth.csv
-python -m docs.record --configfile config/three_chains.yaml     # after the same with this option
+python -m docs.record --configfile config/studies/three_chains.yaml     # after the same with this option
 
 The first line of a recorded table names date, commit and machine. Text between `<!-- name -->` and `<!-- /name -->` is
 generated: `table1` in README.md, `verdicts` in docs/results/claims.md, `figures` in docs/results/figures.md.

@@ -13,7 +13,7 @@ from types import ModuleType
 
 from neuma_lib.errors import InputError
 
-LAWS, METHODS = "neuma.laws", "neuma.methods"
+LAW_GROUP, METHOD_GROUP = "neuma.laws", "neuma.methods"
 """Groups of entry points."""
 
 
@@ -55,5 +55,5 @@ def load_laws(files: Iterable[str]) -> None:
 
 @cache
 def _load_installed_laws() -> None:
-    for point in entry_points(group=LAWS):
+    for point in entry_points(group=LAW_GROUP):
         importlib.import_module(point.module)

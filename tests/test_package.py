@@ -48,7 +48,12 @@ for module in pkgutil.walk_packages(neuma_lib.__path__, "neuma_lib."):
     except ModuleNotFoundError:
         print(module.name)
 """
-PLOTS = ("neuma_lib.paper.", "neuma_lib.evaluation.", "neuma_lib.capture.report.", "neuma_lib.data.blender.cycles")
+PLOTS = (
+    "neuma_lib.paper.",
+    "neuma_lib.evaluation.",
+    "neuma_lib.capture.report.",
+    "neuma_lib.data.blender.cycles",
+)
 """Modules that may need an extra at import: those that draw and those that run inside Blender."""
 
 

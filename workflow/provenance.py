@@ -12,7 +12,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
-from collections.abc import Mapping, Set
+from collections.abc import Iterable, Mapping, Set
 from functools import cache, cached_property
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,7 +24,6 @@ from neuma_lib.io.files import sha256_file
 from neuma_lib.mechanics.catalogue import DEFINED_IN
 
 PACKAGES = ("neuma_lib", "studies")
-LAWS = "neuma_lib.mechanics.analytic"
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 DIGITS = 16  # hexadecimal digits of a digest
 
@@ -54,12 +53,7 @@ class Sources:
         return sorted(direct.union(*through))
 
     def digest(self, script: Path, modules: tuple[str, ...] = ()) -> str:
-        """Digest of a script and of all modules that it reaches, and of further modules that it loads by name.
-
-        Files of laws that are not built in belong to everything that reaches analytic laws.
-        """
-        if LAWS in self.reached(script, modules):
-            modules = (*modules, *sorted(set(DEFINED_IN.values()) - set(modules)))
+        """Digest of a script and of all modules that it reaches, and of further modules that it loads by name."""
         parts = [
             _file_digest(script),
             *(
@@ -93,6 +87,19 @@ def code_digest(script: str | Path, *modules: str) -> str:
         modules: of the library, of other packages, or Python files, which the script loads by name.
     """
     return _library().digest(Path(script), modules)
+
+
+def digest_of_files(modules: Iterable[str]) -> str:
+    """Digest of Python files, and of modules that are not of the library."""
+    return _hash("\n".join(_file_digest(_file_of(module)) for module in sorted(modules)).encode())
+
+
+def law_files(value: Any) -> set[str]:
+    """Files of the laws in nested plain values that are not built in."""
+    if isinstance(value, Mapping):
+        named = {file for (_, name), file in DEFINED_IN.items() if value.get("name") == name}
+        return named.union(*map(law_files, value.values()))
+    return set().union(*map(law_files, value)) if isinstance(value, list | tuple) else set()
 
 
 def fingerprint(settings: Mapping[str, Any], inputs: Mapping[str, str | Path], code: str) -> dict[str, str]:

@@ -32,16 +32,16 @@ def split_variant(
     """
     base, *pieces = text.split("+")
     if base not in bases:
-        raise InputError(f"no {kind} '{base}'{hint(base, bases)}")
+        raise InputError(text, f"no {kind} '{base}'{hint(base, bases)}")
     variant: dict[str, str] = {}
     for piece in pieces:
         key, equals, value = piece.partition("=")
         if not equals or not key or not value:
-            raise InputError(f"{kind} '{text}': write variants as +key=value, not '+{piece}'")
+            raise InputError(text, f"a variant of a {kind} is written +key=value, not '+{piece}'")
         if key not in keys:
-            raise InputError(f"{kind} '{text}': no setting '{key}'{hint(key, keys)}")
+            raise InputError(text, f"no option '{key}'{hint(key, keys)}")
         if key in variant:
-            raise InputError(f"{kind} '{text}': '{key}' is given twice")
+            raise InputError(text, f"'{key}' is given twice")
         variant[key] = value
     return base, variant
 
@@ -62,7 +62,7 @@ def parse_chain(text: str, bases: Iterable[str], kind: str) -> tuple[str, dict[s
     base, variant = split_variant(text, bases, ["seed", *single], kind)
     for key, value in variant.items():
         if not (value.isascii() and value.isdigit()):
-            raise InputError(f"{kind} '{text}': {key} must be a whole number from 0, not '{value}'")
+            raise InputError(text, f"{key} must be an integer ≥ 0, not '{value}'")
     common = int(variant.get("seed", 0))
     return base, {drawn: int(variant.get(key, common)) for key, drawn in single.items()}
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuma_lib.sim.model import MPMModel, contact_clearance
+from neuma_lib.sim.model import MPM, contact_clearance
 
 
 def frame_batches(count: int, size: int) -> Iterator[slice]:
@@ -29,7 +29,7 @@ def spread_frames(count: int, most: int) -> list[int]:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
 
 
-def first_contact(model: MPMModel, x: Tensor) -> int:
+def first_contact(model: MPM, x: Tensor) -> int:
     """Index of the first frame in which a particle feels a wall, of positions x (T, N, 3) [m]; T if there is none."""
     touching = contact_clearance(model, x) <= 0
     return int(touching.int().argmax()) if bool(touching.any()) else len(x)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from neuma_lib.config.identify import IdentifyConfig
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.fitting.families import Family
 from neuma_lib.mechanics.combinations import Values, named_combinations, physical
 
@@ -38,7 +38,7 @@ class FamilyFit:
     held_out: float = math.inf
     score: float = math.inf
     covariance: np.ndarray | None = None
-    throws: tuple[Throw, ...] = ()
+    throws: tuple[InitialMotion, ...] = ()
     refined: bool = False
     rollouts: int = 0
     steps: int = 0

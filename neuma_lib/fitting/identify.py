@@ -32,7 +32,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.config.identify import IdentifyConfig
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.families import Family
@@ -46,23 +46,23 @@ from neuma_lib.fitting.least_squares import (
 )
 from neuma_lib.fitting.thrown_video import MOTION, NUISANCES, ThrownVideo, Try, averaged
 from neuma_lib.mechanics.combinations import Values
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.splatting.observation import Observation, joint_frames, several
 
-_LAST_GAIN = 0.1  # of `least_gain`, in the last round
+_LAST_GAIN = 0.1  # of `min_gain`, in the last round
 _LEAST_LOSS = 1e-12  # below it, held-out images agree exactly
 
 
 def identify(
-    model: MPMModel,
-    throw: Throw,
+    model: MPM,
+    throw: InitialMotion,
     body: Reconstruction,
     observation: Observation | Sequence[Observation],
     settings: IdentifyConfig,
     stock: Mapping[str, Mapping[str, Any]] | None = None,
     *,
     finer: Sequence[Sequence[Reconstruction]] = (),
-    further: Sequence[tuple[Throw, Reconstruction, Observation | Sequence[Observation]]] = (),
+    further: Sequence[tuple[InitialMotion, Reconstruction, Observation | Sequence[Observation]]] = (),
     progress: Callable[[int, int, float], None] | None = None,
     log: Callable[[str], None] = lambda text: None,
 ) -> Identified:
@@ -100,7 +100,7 @@ def identify(
         video.weight = (videos[0].fitted_pixels / video.fitted_pixels) ** 0.5
     stock_values = _constants(stock) if stock else {}
     running: list[_Run] = []
-    rounds = len(settings.squares)
+    rounds = len(settings.pyramid)
     for family in families:
         running.append(_begun(family, videos, running, stock_values, settings))
     for run, best in _better_later(running):
@@ -128,7 +128,7 @@ def identify(
     run.look_closer()
     final = _Run(run.family, videos, [len(video.frames) for video in videos], settings)
     starts, first = [run.values], rounds - 1
-    if chosen.held_out > settings.give_up * chosen.loss:  # the first frames misled: from the beginning
+    if chosen.held_out > settings.prune_factor * chosen.loss:  # the first frames misled: from the beginning
         starts, first = [run.values, *(run.family.with_guesses(values) for values in ({}, stock_values))], 0
     final.begin(starts, first, run.deviations)
     for level in range(first + 1, rounds if final.alive else 0):
@@ -196,7 +196,7 @@ def _leave_behind(running: Sequence[_Run], settings: IdentifyConfig) -> None:
     """
     alive = [run for run in running if run.alive]
     least = min((run.fit.cost for run in alive), default=0.0)
-    left = [run for run in alive if run.fit.cost > settings.give_up * least or _adds_nothing(run, alive)]
+    left = [run for run in alive if run.fit.cost > settings.prune_factor * least or _adds_nothing(run, alive)]
     for run in left:
         run.alive = False
 
@@ -317,14 +317,14 @@ class _Run:
 
     def refine(self, level: int) -> None:
         """Go on with a round's squares."""
-        self._level, last = level, level == len(self.settings.squares) - 1
+        self._level, last = level, level == len(self.settings.pyramid) - 1
         unsure = [k for v, video in enumerate(self.videos) if video.by_deviation for k in self._unsure(v)]
         self._u, self.fit, steps = levenberg_marquardt(
             self,
             self._u,
             [*range(self._constants), *unsure],
             self._held,
-            self.settings.least_gain * (_LAST_GAIN if last else 1.0),
+            self.settings.min_gain * (_LAST_GAIN if last else 1.0),
             self.settings.iterations,
             longest=self.settings.longest_step,
         )
@@ -449,7 +449,7 @@ class _Run:
                     slope[i] += float((self._averaged(at, column) * seen).sum())
         return slope
 
-    def _thrown(self, v: int, stds: np.ndarray) -> Throw:
+    def _thrown(self, v: int, stds: np.ndarray) -> InitialMotion:
         """The fitted throw of a video; standard deviations of all unknowns are given."""
         motion, throw = self._own(v)[:MOTION], self.videos[v].throw
         return replace(throw.moved(self._u[motion]), std=throw.std * stds[motion])

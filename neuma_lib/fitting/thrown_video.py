@@ -18,13 +18,13 @@ from torch import Tensor
 
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.coupling.filmed import Filmed
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.frame_batches import first_contact, frame_batches, held_out_frames, spread_frames
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.batch import rollout_batch
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.state import Trajectory
 from neuma_lib.splatting.observation import Observation, joint_frames, rendered_steps, several
 
@@ -41,7 +41,7 @@ class Try:
     Attributes:
         law: specification.
         deviations: of the throw from what is known of it, along velocity and spin, in standard deviations; then of the
-            rendered body to the right, down and in size, in the setting ``misplaced``; shape (9,).
+            rendered body to the right, down and in size, in the setting ``pose_tolerance``; shape (9,).
     """
 
     law: Mapping[str, Mapping[str, Any]]
@@ -67,8 +67,8 @@ class ThrownVideo:
 
     def __init__(
         self,
-        model: MPMModel,
-        throw: Throw,
+        model: MPM,
+        throw: InitialMotion,
         body: Reconstruction,
         video: Observation | Sequence[Observation],
         settings: IdentifyConfig,
@@ -78,12 +78,12 @@ class ThrownVideo:
         self.model, self.throw, self.frames, self.weight = model, throw, joint_frames(seen), 1.0
         self.fitted = len(self.frames)
         self.density = float((body.mass / body.vol0).min())
-        self.unsure = np.flatnonzero([*throw.std, *[settings.misplaced] * (NUISANCES - MOTION)]).tolist()
+        self.unsure = np.flatnonzero([*throw.std, *[settings.pose_tolerance] * (NUISANCES - MOTION)]).tolist()
         self.by_deviation: list[list[Tensor]] | None = None
         self.spread: list[Tensor] | None = None
         self.rollouts = 0
         self._added: list[Tensor] | None = None
-        self._misplaced = settings.misplaced
+        self._misplaced = settings.pose_tolerance
         self._total, self._axes = settings.covariance_from == "total", seen[0].cameras.viewmats[0, :3, :3]
         self._steps, self._own_frames = rendered_steps(seen), [each.frames for each in seen]
         self._last = [  # step at which the last exposure of the frames up to each ends
@@ -96,7 +96,7 @@ class ThrownVideo:
             ]
 
         self._body, *self._finer = [(each, films(each)) for each in (body, *finer)]
-        sizes = [[max(1, round(each.cameras.width / across)) for across in settings.squares] for each in seen]
+        sizes = [[max(1, round(each.cameras.width / across)) for across in settings.pyramid] for each in seen]
         self._finest = [each[-1] for each in sizes]
         self.sizes = [max(1, round(size / self._finest[0])) for size in sizes[0]]
         """Edge of each round's squares in squares of the finest ones."""

@@ -125,15 +125,15 @@ class Problem:
     """What is known of a scene before a fit.
 
     Attributes:
-        simulation: constants of the simulator, as `MPMModel` takes them.
+        simulation: constants of the simulator, as `MPM` takes them.
         densities: density of the body of each video, as `density_at` takes it.
-        filming: what turns exposures into renders, see `load_videos`.
+        exposure: what turns exposures into renders, see `load_videos`.
         seed: of the project.
     """
 
     simulation: Mapping[str, Any]
     densities: Sequence[Any]
-    filming: Mapping[str, Any]
+    exposure: Mapping[str, Any]
     seed: int = 0
 
 
@@ -211,7 +211,7 @@ class Method(ABC):
 
     name: ClassVar[str]
     Options: ClassVar[type[Section]] = MotionOptions
-    sections: ClassVar[tuple[str, ...]] = ("material",)
+    sections: ClassVar[tuple[str, ...]] = ("training",)
     presets: ClassVar[Mapping[str, Preset]] = {}
     product: ClassVar[str | None] = None
     fit_kernels: ClassVar[tuple[str, ...]] = ("laws", "rendering")
@@ -257,7 +257,7 @@ class Method(ABC):
 
     def carrier(self, case: Case) -> str:
         """What is simulated in an evaluation: "binding" (particles of the volume), or what it was fitted with."""
-        return case.options.carrier if case.evaluate_on == "training_particles" else "binding"
+        return case.options.particle_source if case.evaluate_on == "training_particles" else "binding"
 
     def learns_from_video(self, case: Case) -> bool:
         """Whether the model comes from the scene itself. If not, it is the same for all scenes with one prior."""

@@ -8,7 +8,7 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from neuma_lib.errors import InputError
-from neuma_lib.extensions import METHODS
+from neuma_lib.extensions import METHOD_GROUP
 from neuma_lib.methods.base import Method, method_of, methods_in
 
 BUILT_IN = (
@@ -33,7 +33,7 @@ def methods(extensions: tuple[str, ...] = ()) -> Mapping[str, Method]:
     Raises:
         InputError: two methods have one name, a file has several methods or cannot be imported.
     """
-    modules = [*BUILT_IN, *(point.module for point in entry_points(group=METHODS))]
+    modules = [*BUILT_IN, *(point.module for point in entry_points(group=METHOD_GROUP))]
     modules += [file for file in extensions if methods_in(file)]
     by_name: dict[str, Method] = {}
     for module in modules:
@@ -59,3 +59,7 @@ def built_in_presets(extensions: tuple[str, ...] = ()) -> dict[str, dict[str, An
                 "options": dict(preset.options),
             }
     return presets
+
+
+METHODS: Mapping[str, Method] = methods()
+"""Built-in methods and those of installed packages, by name."""

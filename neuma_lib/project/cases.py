@@ -82,7 +82,7 @@ class ProjectCase(Case):
 
     def identified(self) -> str:
         views = self.options.views
-        if views in (self.settings.material.views, self.settings.identify.views):
+        if views in (self.settings.training.views, self.settings.identify.views):
             return "identified.json"
         return f"identified+views={','.join(map(str, views))}.json"
 
@@ -224,10 +224,10 @@ def _options(settings: Config, scene: str, method: str) -> Section:
     values: dict[str, Any] = {}
     for section in (
         *(getattr(settings, name).plain() for name in kind.sections),
-        settings.scene(base).material,
+        settings.scene(base).training,
     ):
         values |= {key: value for key, value in section.items() if key in known}
-    validate(kind.Options, values, f"scenes.{base}.material")
+    validate(kind.Options, values, f"scenes.{base}.training")
     values |= chosen.options
     validate(kind.Options, values, f"methods.{fitted.partition('+')[0]}.options")
     options = validate(kind.Options, values | given, fitted)

@@ -62,7 +62,7 @@ def law_problems(settings: Config) -> list[str]:
 
 def lines(error: InputError) -> list[str]:
     """The problems in an error of the settings, one line each."""
-    return [line.strip() for line in str(error).removeprefix("settings: ").splitlines()]
+    return [line.strip() for line in str(error).splitlines()]
 
 
 def _laws(settings: Config) -> Iterator[tuple[str, dict[str, Any]]]:

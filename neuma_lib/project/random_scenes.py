@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field, PositiveFloat, model_validator
 
-from neuma_lib.config.base import Section, Vector
+from neuma_lib.config.base import Section, Vector, internal
 from neuma_lib.config.laws import LawConfig
 from neuma_lib.errors import InputError
 
@@ -96,12 +96,10 @@ class DrawnPart(Section):
 class FamilyConfig(Section):
     """A family of materials."""
 
-    prior: str = Field(
-        description="the prior that somebody who sees such a body would choose, see priors.laws"
-    )
-    look: Literal["solid", "grains", "liquid"] = Field("solid", description="how Blender shows it")
+    prior: str = Field(description="prior of its scenes, a name in priors.laws")
+    look: Literal["solid", "grains", "liquid"] = Field("solid", description="appearance in Blender")
     elasticity: DrawnPart = Field(
-        description="name, and lowest and highest value of each constant, for example E: [3e4, 3e5]"
+        description="elastic law, and minimum and maximum of each constant, for example E: [3e4, 3e5]"
     )
     plasticity: DrawnPart = Field(DrawnPart(name="identity"), description="the same of the return map")
 
@@ -116,48 +114,42 @@ class FamilyConfig(Section):
 class RandomConfig(Section):
     """Scenes drawn at random, named after their draw, for example random7_03_duck_von_mises."""
 
-    count: int = Field(0, ge=0, description="number of scenes; more of them leave the first ones as they are")
-    seed: int = Field(0, ge=0, description="seed of the draws")
+    count: int = Field(0, ge=0, description="number of scenes; a larger number keeps the first ones")
+    seed: int = Field(0, ge=0, description="seed of the scenes")
     methods: tuple[str, ...] = Field(
         ("nclaw", "neuma", "constants", "neuma_structured", "true_law"),
         min_length=2,
-        description="rows of results/random.csv: the prior, the method that is judged, and others to be shown",
+        description="rows of results/random.csv: the prior, the evaluated method, others",
     )
     families: dict[str, FamilyConfig] = Field(
-        {}, description="materials by name; of as many scenes in a row as there are, each gets another one"
+        {}, description="materials by name, which consecutive scenes take in turn"
     )
     outside: dict[str, FamilyConfig] = Field(
-        {}, description="materials by name that no law of `families` describes, see draw_from"
+        {}, description="materials by name outside `families`, see draw_from"
     )
     draw_from: Literal["families", "outside", "both"] = Field(
-        "families", description="what the materials of the scenes are drawn from"
+        "families", description="source of the materials"
     )
-    shapes: tuple[Literal[tuple(SHAPES)], ...] = Field(
-        tuple(SHAPES), min_length=1, description="shapes, dealt in the same way"
+    shapes: tuple[Literal[tuple(SHAPES)], ...] = internal(
+        tuple(SHAPES), "shapes, which consecutive scenes take in turn", min_length=1
     )
-    size: PositiveRange = Field((0.24, 0.4), description="longest side of the bounding box [m]")
-    height: Range = Field((0.2, 0.7), description="y of the bounding box's centre at the start [m]")
-    center: Range = Field((0.35, 0.65), description="x and z of the bounding box's centre [m]")
-    velocity: tuple[Range, Range, Range] = Field(
-        ((-0.8, 0.8), (-1.8, -0.4), (-0.8, 0.8)), description="initial velocity along x, y and z [m/s]"
+    size: PositiveRange = internal((0.24, 0.4), "longest side of the bounding box [m]")
+    height: Range = internal((0.2, 0.7), "initial y of the centre of the bounding box [m]")
+    center: Range = internal((0.35, 0.65), "x and z of that centre [m]")
+    velocity: tuple[Range, Range, Range] = internal(
+        ((-0.8, 0.8), (-1.8, -0.4), (-0.8, 0.8)), "initial velocity along x, y and z [m/s]"
     )
-    spin: Range = Field(
-        (1.0, 5.0), description="initial angular speed about an axis of any direction [rad/s]"
+    spin: Range = internal((1.0, 5.0), "initial angular speed about a random axis [rad/s]")
+    duration: PositiveRange = internal((0.26, 0.34), "duration of the video [s]")
+    contact: Range = internal((0.2, 0.5), "time of the first contact as a fraction of the video")
+    dt: tuple[PositiveFloat, ...] = internal(
+        (1e-3, 5e-4), "time steps, of which the largest stable one is used [s]", min_length=1
     )
-    duration: PositiveRange = Field((0.26, 0.34), description="length of the video [s]")
-    contact: Range = Field(
-        (0.2, 0.5),
-        description="first touch of the ground as a part of the video; six of 33 frames come before 0.2",
-    )
-    dt: tuple[PositiveFloat, ...] = Field(
-        (1e-3, 5e-4), min_length=1, description="time steps, of which the largest stable one is taken [s]"
-    )
-    courant: float = Field(
+    courant: float = internal(
         0.6,
+        "maximum Courant number of true law and prior; training may stiffen a law up to 0.8",
         gt=0,
         le=0.8,
-        description="largest Courant number of the true law and the prior on the reconstruction's grid; below the "
-        "limit of 0.8, as training may stiffen a law",
     )
 
     @property
@@ -195,7 +187,7 @@ def draw_scenes(
     families = settings.materials
     if settings.count and not families:
         where = "families" if settings.draw_from == "both" else settings.draw_from
-        raise InputError(f"settings: random.{where}: give at least one family of materials")
+        raise InputError(f"random.{where}", "no families", "Give at least one family of materials")
     found = {}
     for k in range(settings.count):
         family = _dealt(sorted(families), settings.seed, 0, k)
@@ -212,10 +204,8 @@ def draw_scenes(
             flaws[flaw] += 1
         else:
             counted = ", ".join(f"{number} {FLAWS[flaw]}" for flaw, number in flaws.most_common())
-            raise InputError(
-                f"settings: random: no draw of a {shape} of the family {family} can be used; of {ATTEMPTS}, "
-                f"{counted}: change the ranges"
-            )
+            problem = f"{ATTEMPTS} draws of a {shape} of the family {family} are unusable: {counted}"
+            raise InputError("random", problem, "Change the ranges")
         scene |= {"dt": dt, "steps": STEPS * max(1, round(scene.pop("duration") / dt / STEPS))}
         scene["appearance"] = _appearance(settings, k, shape, family)
         found[f"{settings.prefix}{k:02d}_{shape}_{family}"] = scene
@@ -287,7 +277,7 @@ def _flaw(settings: RandomConfig, scene: Mapping[str, Any], gravity: Vector) -> 
     box: the ground is touched no sooner than by the turning box, and not much later than by the ellipsoid.
 
     A wall is where it stands, at 0 and 1, so that a draw does not depend on the grid, although the simulator feels it
-    half a cell earlier (`MPMModel.walls`; 0.021 m on 24 cells). What remains is enough, and a test moves the meshes of
+    half a cell earlier (`MPM.walls`; 0.021 m on 24 cells). What remains is enough, and a test moves the meshes of
     many draws to see it: no body feels a wall at the start, or another one before the ground, and at least five frames
     come before the ground is felt.
     """

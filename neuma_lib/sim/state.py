@@ -65,7 +65,7 @@ class State:
                 raise InputError(f"state.{name}", f"{float(value.min()):g} must be positive")
 
     @classmethod
-    def thrown(
+    def rigid(
         cls,
         x: Tensor,
         mass: Tensor,

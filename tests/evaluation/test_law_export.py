@@ -24,7 +24,7 @@ from neuma_lib.mechanics.neural import NeuralElasticity, NeuralPlasticity, neura
 from neuma_lib.mechanics.plasticity import PLASTICITIES
 from neuma_lib.mechanics.structured import structured_law
 from neuma_lib.mechanics.time_step import step_dependence
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
@@ -474,7 +474,7 @@ def test_the_example_simulates_as_we_do(tmp_path, monkeypatch):
     v = 40.0 * (x - 0.5) * torch.tensor([1.0, -1.0, 0.5], dtype=torch.float64)
     volume = torch.full((len(x),), 0.125**3 / len(x), dtype=torch.float64)
     ours = rollout(
-        MPMModel(grid=grid, dt=dt), law, State(x, v, 1000 * volume, volume), steps=steps, frames=[steps]
+        MPM(grid=grid, dt=dt), law, State(x, v, 1000 * volume, volume), steps=steps, frames=[steps]
     )
     theirs = x.numpy(), v.numpy(), np.zeros((len(x), 3, 3)), np.tile(np.eye(3), (len(x), 1, 1))
     law_and_return = isotropic_in_numpy.load(path)[:2]

@@ -9,7 +9,7 @@ import torch
 
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.laws import LawConfig
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.frame_batches import first_contact
@@ -47,17 +47,17 @@ FLUID = law("hencky", "viscous_flow", viscosity=60)
 
 def settings(families: dict, **options) -> IdentifyConfig:
     families = {name: LawConfig(**spec) for name, spec in families.items()}
-    return IdentifyConfig(families=families, **{"squares": SQUARES, "misplaced": 0.0, **options})
+    return IdentifyConfig(families=families, **{"pyramid": SQUARES, "pose_tolerance": 0.0, **options})
 
 
 def pixel_noise(images: torch.Tensor) -> torch.Tensor:
     return 0.01 * torch.randn(images.shape, generator=torch.Generator().manual_seed(5), dtype=images.dtype)
 
 
-def known(body, std=(0.0,) * 6, v0=V0) -> Throw:
+def known(body, std=(0.0,) * 6, v0=V0) -> InitialMotion:
     """The true throw, up to standard deviations."""
     centre = (body.mass @ body.x0 / body.mass.sum()).numpy()
-    return Throw(np.array(v0), np.zeros(3), centre, np.eye(3), np.array(std))
+    return InitialMotion(np.array(v0), np.zeros(3), centre, np.eye(3), np.array(std))
 
 
 def found_in(spec: dict, families: dict, noise=pixel_noise, throw=None, **options):
@@ -99,7 +99,7 @@ def test_first_frames_that_mislead_are_not_where_the_last_fit_begins(monkeypatch
     monkeypatch.setattr(_Run, "begin", noted)
     truth = law("hencky", "von_mises", E=6e4, nu=0.3, yield_stress=2e3)
     for factor, expected in ((1e6, (1, len(SQUARES) - 1)), (1.2, (3, 0))):
-        assert found_in(truth, {"hencky": ELASTIC}, give_up=factor).best.refined
+        assert found_in(truth, {"hencky": ELASTIC}, prune_factor=factor).best.refined
         assert begun[-1] == expected
 
 
@@ -126,7 +126,7 @@ def test_two_videos_have_the_constants_in_common_and_a_throw_each():
     v0, off = (0.2, -2.5, 0.3), np.array([0.03, 0.05, 0.0])
     body, seen = video_of(truth, v0, FRAMES[:11])
     throw = known(body, (0.05, 0.05, 0.0, 0.0, 0.0, 0.0), np.array(v0) + off)
-    options = dict(squares=(8, 32))
+    options = dict(pyramid=(8, 32))
     alone = found_in(truth, families, **options)
     both = found_in(truth, families, further=[(throw, body, seen)], **options)
     assert both.best.values["E"] == pytest.approx(3e4, rel=0.02)
@@ -144,7 +144,7 @@ def test_two_videos_have_the_constants_in_common_and_a_throw_each():
 def test_videos_count_alike_however_long():
     """The same video again, in half as many frames: the loss is the mean of both, what is found the same."""
     families, truth = {"hencky": ELASTIC}, law("hencky", E=3e4, nu=0.4)
-    options = dict(squares=(8, 32), frames=33)
+    options = dict(pyramid=(8, 32), frames=33)
     body, half = video_of(truth, V0, FRAMES[::2])
     found = [
         found_in(truth, families, **options),
@@ -187,13 +187,15 @@ def test_a_throw_is_read_moved_and_written():
     """Deviations along the camera's axes are those of the world turned; what is known does not move."""
     axes = [[0, 0, 1], [0, -1, 0], [1, 0, 0]]
     content = {"v0": [1, 2, 3], "angular_velocity": [0, 1, 0], "centre": [0.5, 0.5, 0.5], "camera_axes": axes}
-    throw = Throw.of(content | {"std_camera": [0.1, 0.2, 0.3], "angular_velocity_std_camera": [1, 0, 0]})
+    throw = InitialMotion.of(
+        content | {"std_camera": [0.1, 0.2, 0.3], "angular_velocity_std_camera": [1, 0, 0]}
+    )
     moved = throw.moved(np.array([1.0, 2.0, 0.0, 1.0, 5.0, 5.0]))
     np.testing.assert_allclose(moved.velocity, [1, 1.6, 3.1])
     np.testing.assert_allclose(moved.spin, [0, 1, 1])
-    again = Throw.of(moved.as_dict())
+    again = InitialMotion.of(moved.as_dict())
     assert all(np.array_equal(getattr(again, field), getattr(moved, field)) for field in vars(moved))
-    assert not Throw.of(content).std.any()
+    assert not InitialMotion.of(content).std.any()
     body = ball()
     around = np.cross(moved.spin, body.x0.numpy() - moved.centre)
     np.testing.assert_allclose(moved.of_body(body).v, moved.velocity + around)
@@ -215,7 +217,7 @@ class Begun:
 def test_families_are_left_that_are_far_behind_or_show_what_one_within_them_shows():
     """What is merely no better in blurred images stays: with more constants, of another elasticity, or flowing where a
     body within it as soft as to lie flat does as well."""
-    options = settings({"hencky": ELASTIC}, give_up=3.0)
+    options = settings({"hencky": ELASTIC}, prune_factor=3.0)
     elastic, far = Begun(1.0, ELASTIC, "soft"), Begun(3.1, law("neo_hookean"), "far")
     never_yields, flat = Begun(0.99, PLASTIC, "soft"), Begun(1.2, FLUID, "flat")
     sibling = Begun(1.0, law("fixed_corotated"), "soft")

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation import motion
 from neuma_lib.fitting.material import PixelLoss, train_material
@@ -128,7 +128,7 @@ def learning_law():
 
 def trained(body, iterations=3, total=False, **options):
     loss = PixelLoss(body, observe(body, V0, FRAMES), total=total)
-    settings = MaterialConfig(iterations=iterations, **options)
+    settings = TrainingConfig(iterations=iterations, **options)
     return train_material(MODEL, learning_law(), body.state(V0), loss, settings, log=lambda _: None)
 
 

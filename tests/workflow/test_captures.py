@@ -12,7 +12,7 @@ from tests.support.films import film
 from tests.support.project import copied
 
 PAGE = "tiny/results/mug/capture.md"
-BOARD_ALONE = "board: {square: 0.03}\nposes: board\nlens: lenses.json\nlongest: 400\n"
+BOARD_ALONE = "board: {square: 0.03}\nposes: board\nlens: lenses.json\nadvanced: {longest: 400}\n"
 
 
 @pytest.fixture

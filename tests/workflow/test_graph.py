@@ -255,11 +255,11 @@ def test_a_method_can_start_as_identification_found(project):
 
 def test_finer_bodies_must_be_finer(project):
     for particles, accepted in {200: False, 201: True, 0: True}.items():
-        settings = f"identify={{particles: {particles}}}"
+        settings = f"identify={{refined_particles: {particles}}}"
         output = project.run(
             "--dry-run", "--config", settings, "--", f"{SCENE}/identified.json", succeeds=accepted
         )
-        assert ("identify.particles = 200" in output) != accepted
+        assert ("identify.refined_particles: 200" in output) != accepted
 
 
 def test_rules_with_a_script_get_what_they_leave_out(project):

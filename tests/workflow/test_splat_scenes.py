@@ -29,7 +29,7 @@ EXPORT = f"{RESULTS}/Splat/nclaw+law_from=BouncyBall/export"
 
 def settings(**splat):
     """Options of Snakemake for a splat that falls for 0.1 s, under a law that was passed on in a file."""
-    scene = {"splat": {"file": "made/ball.spz", "up": "z", "count": 300, "views": 12, "pixels": 48, **splat}}
+    scene = {"splat": {"file": "made/ball.spz", "up": "z", "count": 300, **splat}}
     scene |= {"height": 0.2, "size": 0.3, "velocity": [0.0, -2.0, 0.0], "dt": DT / 2, "steps": 100}
     scenes = {"Splat": scene, "BouncyBall": {"prior": "made/law.safetensors"}}
     return [
@@ -38,6 +38,7 @@ def settings(**splat):
             f"scenes={json.dumps(scenes)}",
             'figures={"i23d": ["BouncyBall"], "methods": ["nclaw"]}',
             'viewer={"methods": ["nclaw+law_from=BouncyBall"]}',
+            'advanced={"scenes.Splat.splat.views": 12, "scenes.Splat.splat.pixels": 48}',
         ),
         'dataset={"frames": 11}',
     ]

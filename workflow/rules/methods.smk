@@ -68,7 +68,7 @@ for fitted in (method for method in KINDS.values() if method.product):
             method=of_case(fit_parameter),
             simulation=simulation_settings,
             densities=of_case(lambda case: case.densities),
-            filming=filming,
+            exposure=exposure,
             seed=SETTINGS.seed,
             checkpoint=f"{RESULTS}/{{scene}}/{{method}}/checkpoint.pt",
             device=SETTINGS.device,
@@ -170,11 +170,11 @@ def stock_law(wildcards):
 @checked
 def identify_settings(wildcards):
     """Settings of an identification, in the views that its file names, if any."""
-    finer, own = SETTINGS.identify.particles, SETTINGS.simulation.particles
+    finer, own = SETTINGS.identify.refined_particles, SETTINGS.geometry.particles
     if 0 < finer <= own:
         raise InputError(
-            f"identify.particles = {finer}",
-            f"it must exceed simulation.particles = {own}",
+            "identify.refined_particles",
+            f"{finer} must exceed geometry.particles = {own}",
             f"Set it to {4 * own}, or to 0 to disable the discretisation correction",
         )
     views = getattr(wildcards, "views", None)
@@ -203,7 +203,7 @@ def evaluation_views(case):
     seen = case.options.views
     views = range(SETTINGS.dataset.dynamic.views)
     unseen, others = (
-        [view for view in views if view not in used] for used in (seen, SETTINGS.material.views)
+        [view for view in views if view not in used] for used in (seen, SETTINGS.training.views)
     )
     return list(SETTINGS.evaluation.views or unseen or others or seen)
 

@@ -76,7 +76,7 @@ def scene_setting(*names):
         section = SETTINGS.scene(wildcards.scene)
         scene = section.plain()
         if not section.has_truth and any(scene[name] is None for name in names):
-            raise InputError(f"{wildcards.scene}: {NO_TRUTH}")
+            raise InputError(f"scenes.{wildcards.scene}", NO_TRUTH)
         return scene[names[0]] if len(names) == 1 else {name: scene[name] for name in names}
 
     return choose
@@ -147,9 +147,9 @@ def simulation_settings(wildcards):
     return {**simulator(SETTINGS.scene(wildcards.scene).dt), **SETTINGS.scene_world(wildcards.scene)}
 
 
-def filming(wildcards):
+def exposure(wildcards):
     """What turns the exposures that a video states into renders."""
-    return {"dt": SETTINGS.scene(wildcards.scene).dt, "sub_frames": SETTINGS.dataset.sub_frames}
+    return {"dt": SETTINGS.scene(wildcards.scene).dt, "exposure_samples": SETTINGS.dataset.exposure_samples}
 
 
 def simulator(dt, grid=None):
