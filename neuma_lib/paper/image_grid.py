@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.textpath import TextPath
 
 from neuma_lib.errors import InputError
+from neuma_lib.evaluation.plotting import style
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 
 GAP = 0.02
@@ -106,6 +107,14 @@ def draw_images(
             if j == 0 and i < len(rows):
                 title = broken(rows[i], left - _TITLE_DISTANCE * each - GAP)
                 axes.text(-_TITLE_DISTANCE, 0.5, title, ha="right", va="center", **options)
+
+
+def rows_figure(grid: ImageGrid, left: float, top: float, rows: Sequence[str]) -> Figure:
+    """A figure of the page's width with the pictures and titles of a grid only."""
+    width = style.PAGE - left - 0.02
+    figure = style.new_canvas(style.PAGE, top + len(rows) * (grid.height(width) + GAP) + 0.03)
+    draw_images(figure, grid.images, left, top, width, rows, grid.columns)
+    return figure
 
 
 def broken(text: str, width: float) -> str:

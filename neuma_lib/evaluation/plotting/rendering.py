@@ -22,6 +22,8 @@ from neuma_lib.splatting.viewpoints import video_views
 
 _WHITE = 250
 """Minimum value of a background colour."""
+_FLATTEST, _TALLEST = 0.6, 1.5
+"""Limits of a picture's height relative to its width."""
 _BATCH = 4
 """Number of frames rendered at a time."""
 _UNIT_BALL_RADIUS = 0.62
@@ -41,6 +43,11 @@ def film(inputs, params, k: int, density: Density) -> tuple[Observation, Reconst
     video = load_observation(inputs.transforms[k], [params.view])
     body = load_body(inputs.particles[k], inputs.binding[k], inputs.gaussians[k], density)
     return video, body, magnified(video.cameras, params.magnify)
+
+
+def picture_size(wide: float, high: float, width: int) -> tuple[int, int]:
+    """Width and height [px] of a picture of a body that is ``wide`` and ``high``."""
+    return width, round(width * float(np.clip(high / wide, _FLATTEST, _TALLEST)))
 
 
 def frontal(points: np.ndarray, width: int, height: int) -> Cameras:

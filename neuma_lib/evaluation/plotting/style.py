@@ -132,6 +132,12 @@ def scene_labels(scenes: Iterable[str], seen: Collection[str]) -> list[str]:
     return [f"{scene}\n(training view)" if scene in seen else scene for scene in scenes]
 
 
+def separate(axes: Axes, count: int) -> None:
+    """Draw vertical lines between ``count`` categories at 0, 1, ..."""
+    for edge in range(count - 1):
+        axes.axvline(edge + 0.5, color=LIGHT, linewidth=0.5)
+
+
 def legend_above(figure: Figure, axes: Axes, columns: int) -> None:
     """One legend for all panels, above them."""
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=columns)

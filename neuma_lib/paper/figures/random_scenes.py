@@ -30,7 +30,7 @@ def data(inputs, params, say) -> dict:
 
 @style.styled
 def draw(data: Mapping) -> Figure:
-    """One square panel with logarithmic axes and the diagonal."""
+    """A square panel with logarithmic axes and the diagonal."""
     figure = style.new_figure(style.COLUMN, style.COLUMN + 0.6)
     axes = figure.subplots()
     values = [v for scenes in data["families"].values() for point, _ in scenes.values() for v in point]
