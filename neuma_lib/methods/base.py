@@ -38,7 +38,7 @@ class Preset:
     Attributes:
         title: name in tables.
         options: values that differ from the defaults of `Method.Options`.
-        note: what readers must know of its numbers. It is printed below tables.
+        note: remark on its numbers, printed below tables.
         same_fit_as: preset whose fit it takes, with its kind and options. None: its own fit.
         evaluate_on: what is simulated when it is evaluated: the particles of the body's volume, which all methods
             share, or the particles that it was fitted with.
@@ -85,7 +85,7 @@ class Case(ABC):
     @property
     @abstractmethod
     def scene_law(self) -> dict[str, Any]:
-        """Specification of the scene's true law. Raises InputError if nobody knows it."""
+        """Specification of the scene's true law. Raises InputError if the scene has none."""
 
     @abstractmethod
     def section(self, name: str) -> dict[str, Any]:
@@ -122,12 +122,12 @@ class Case(ABC):
 
 @dataclass(frozen=True)
 class Problem:
-    """What is known of a scene before a fit.
+    """Known quantities of a scene before a fit.
 
     Attributes:
         simulation: constants of the simulator, as `MPM` takes them.
         densities: density of the body of each video, as `density_at` takes it.
-        exposure: what turns exposures into renders, see `load_videos`.
+        exposure: how frames with an exposure are rendered, see `load_videos`.
         seed: of the project.
     """
 
@@ -138,11 +138,12 @@ class Problem:
 
 
 class FitRun(ABC):
-    """What a fit has of the process that it runs in.
+    """The process that a fit runs in.
 
     Attributes:
         device: where to compute.
-        product, history: files to write.
+        product: file of the model, to be written.
+        history: JSON file of learning curves, to be written. Equal settings must give equal files: no times.
     """
 
     device: torch.device
@@ -164,7 +165,7 @@ class FitRun(ABC):
 
 @dataclass(frozen=True)
 class ModelSource:
-    """What a model of motion is loaded from, in plain values: a parameter of jobs and of the viewer.
+    """Files and options of a model of motion as plain values, a parameter of jobs and of the viewer.
 
     Attributes:
         module: module or Python file of the method.
@@ -247,7 +248,7 @@ class Method(ABC):
         return {}
 
     def start_file(self, case: Case) -> str:
-        """The file with the initial motion: the estimated one, or the one that a fit found."""
+        """File of the initial motion: the estimated one, or the one that a fit contains."""
         own = case.on_moved()
         return own.result(own.identified() if own.options.start == "identified" else "velocity.json")
 
@@ -256,7 +257,7 @@ class Method(ABC):
         return ("prior", "gaussians", "particles")
 
     def carrier(self, case: Case) -> str:
-        """What is simulated in an evaluation: "binding" (particles of the volume), or what it was fitted with."""
+        """What an evaluation simulates: "binding" (particles of the volume), or the particles of the fit."""
         return case.options.particle_source if case.evaluate_on == "training_particles" else "binding"
 
     def learns_from_video(self, case: Case) -> bool:
@@ -286,7 +287,7 @@ class Method(ABC):
     def load_initial_state(
         self, inputs: Files, options: Mapping[str, Any], densities: Sequence[Any], carrier: str
     ) -> tuple[State, list[int]]:
-        """What a prediction starts from: particles in motion, and how many belong to each body.
+        """Initial state of a prediction, and the number of particles of each body.
 
         Args:
             inputs: ``particles``, ``binding``, ``gaussians``, ``velocity`` and the files of `body_inputs`.
@@ -317,12 +318,12 @@ class Method(ABC):
     def draws(
         self, inputs: Files, law: Law, F: Tensor | None, uncertainty: Mapping[str, Any], **drawn: Any
     ) -> list[Law]:
-        """Laws drawn from what the video leaves open. Empty if the uncertainty is unknown.
+        """Laws drawn from the uncertainty that remains after the video. Empty if it is unknown.
 
         Args:
             inputs: the files of `uncertainty_inputs`.
             law: from `load`.
-            F: deformation gradients that the body goes through, shape (T, N, 3, 3); None: read from `inputs`.
+            F: deformation gradients of the motion, shape (T, N, 3, 3); None: read from `inputs`.
             uncertainty: ``model_std`` and ``spread`` of the settings of `identify`.
             drawn: ``dt`` [s], ``count`` and ``seed``.
         """
@@ -350,7 +351,7 @@ def method_of(module: str) -> Method:
     Raises:
         InputError: it does not define exactly one.
     """
-    found = methods_in(module)
-    if len(found) != 1:
-        raise InputError(module, f"it defines {len(found)} methods", "Define one method in a file")
-    return found[0]
+    methods = methods_in(module)
+    if len(methods) != 1:
+        raise InputError(module, f"it defines {len(methods)} methods", "Define one method in a file")
+    return methods[0]

@@ -1,4 +1,4 @@
-"""Models of motion: what `Method.load` gives, and what predicts the states of bodies."""
+"""Models of motion, which `Method.load` returns and which predict the states of bodies."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class MotionModel(ABC):
         tracers: Tensor | None = None,
         total: bool = False,
     ) -> tuple[Trajectory, Failure | None]:
-        """States at the frames. After a failure the last sound state is repeated.
+        """States at the frames. After a failure the last valid state is repeated.
 
         Args:
             state: particles and their initial motion.

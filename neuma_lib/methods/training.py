@@ -1,4 +1,4 @@
-"""What the trainings of `neuma` and `structured` share: bodies, starts and losses of all videos, and their report."""
+"""Training of `neuma` and `structured`: bodies, initial states and losses of all videos, and the report."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Training:
                 for body, file in zip(bodies, listed(inputs["transforms"]), strict=True)
             ]
         files = {
-            f"{name} {k}": file for name, found in inputs.items() for k, file in enumerate(listed(found))
+            f"{name} {k}": file for name, value in inputs.items() for k, file in enumerate(listed(value))
         }
         known = {
             "simulation": problem.simulation,
@@ -84,7 +84,7 @@ class Training:
             "checkpoint": self._checkpoint,
             "progress": self.run.progress,
             "log": self.run.log,
-            "further": others,
+            "other_videos": others,
         }
 
     def report(self, trained) -> dict[str, Any]:

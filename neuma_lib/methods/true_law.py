@@ -1,4 +1,4 @@
-"""The true law of the scene on the reconstructed body: the error that remains when the law is right."""
+"""The true law of the scene on the reconstructed body. Its error is that of reconstruction and initial motion."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from neuma_lib.config.base import Section
 
 
 class PresetConfig(Section):
-    """A named set of options of a method. Presets of the built-in methods stand beside their code."""
+    """A named set of options of a method. Built-in presets are part of the code of their method."""
 
     kind: str | None = Field(
         None, description="method, for example `neuma` or `constants`; null: that of `same_fit_as`"

@@ -370,7 +370,7 @@ def test_several_videos_train_one_law_which_is_judged_on_all(project):
     assert len(judged) == 2 and all(adaptor in read for read in judged.values())
     refused = f"{THROW}/{held_out}/adaptor.safetensors"
     said = project.run("--dry-run", *TWO_VIDEOS, refused, succeeds=False)
-    assert "it takes the law of another scene" in said
+    assert "its law is that of another scene" in said
 
 
 def test_identifications_behind_a_table_are_those_of_the_laws_that_its_constants_have(project):

@@ -52,7 +52,7 @@ class Brightness(Method):
         from neuma_lib.io.files import write_json
         from neuma_lib.io.images import load_videos
 
-        video, *_ = load_videos(inputs["transforms"], options["views"], **problem.filming)
+        video, *_ = load_videos(inputs["transforms"], options["views"], **problem.exposure)
         modulus = options["scale"] * float(video.images.float().mean()) / 255
         write_json(run.product, {"E": modulus})
         write_json(run.history, {"scale": options["scale"]})

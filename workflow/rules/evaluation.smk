@@ -64,7 +64,7 @@ rule evaluate:
         "../scripts/evaluate.py"
 
 
-# Where nobody knows the truth: a filmed throw. Splats have a rule like it.
+# Scenes without a truth: takes of captures. `predict_splat` is the same for splats.
 rule predict:
     input:
         unpack(of_bodies(model_files)),

@@ -5,7 +5,7 @@ from functools import cache
 
 from neuma_lib.project.cases import LAW_FROM
 from neuma_lib.project.paths import IDENTIFIED
-from neuma_lib.config.variants import parse_chain
+from neuma_lib.config.variants import parse_replicate
 from neuma_lib.project.find import scene_files
 
 
@@ -35,7 +35,9 @@ def presets_of(method):
 def fit_files(case):
     """Everything that a fit may read."""
     if case.scene != case.moved:
-        raise InputError(f"{case.moved}/{case.name}", "it takes the law of another scene; ask for that one")
+        raise InputError(
+            f"{case.moved}/{case.name}", "its law is that of another scene", "Ask for the file of that scene"
+        )
     return case.method.fit_inputs(case)
 
 
@@ -82,12 +84,12 @@ for fitted in (method for method in KINDS.values() if method.product):
 
 def model_files(bodies):
     """Files of the models of all bodies, by name: a list with one path a body."""
-    found = [{**case.method.model_inputs(case), **case.method.body_inputs(case)} for case in bodies]
-    return {name: [files[name] for files in found] for name in found[0]}
+    each = [{**case.method.model_inputs(case), **case.method.body_inputs(case)} for case in bodies]
+    return {name: [files[name] for files in each] for name in each[0]}
 
 
 def model_parameter(bodies):
-    """What `workflow.motion.Prediction` takes."""
+    """Method, files and options of the models, as `workflow.motion.Prediction` takes them."""
     return {
         "module": type(bodies[0].method).__module__,
         "files": sorted(model_files(bodies)),
@@ -111,7 +113,7 @@ def law_files(bodies):
 
 
 def uncertainty_files(bodies):
-    """Files of the law of one body, and of what is known of its uncertainty."""
+    """Files of the law of one body, and of its uncertainty."""
     return law_files(bodies) | bodies[0].method.uncertainty_inputs(bodies[0])
 
 
@@ -130,7 +132,7 @@ def own_kernels(case):
 
 
 def carries_total(bodies):
-    """Whether a prediction carries the total deformation: the options ask for it for one of the bodies at least."""
+    """Whether the options of at least one body ask for the total deformation."""
     return any(case.options.covariance_from == "total" for case in bodies)
 
 
@@ -157,7 +159,7 @@ def gaussian_motion(wildcards):
 
 def prior_chain(wildcards):
     """Name of a prior, and the seeds of its chain."""
-    return parse_chain(wildcards.prior, SETTINGS.priors.laws, "prior")
+    return parse_replicate(wildcards.prior, SETTINGS.priors.laws, "prior")
 
 
 @checked

@@ -1,4 +1,4 @@
-"""Predict a motion where nobody knows the truth: a filmed throw at the steps of its frames, or a splat."""
+"""Predict a motion without a truth: a take at the steps of its frames, or a splat."""
 
 from dataclasses import asdict
 

@@ -1,4 +1,4 @@
-"""PAC-NeRF (Li et al., ICLR 2023): a radiance field, and the velocity and constants of a law whose family is named."""
+"""PAC-NeRF (Li et al., ICLR 2023): a radiance field, the initial velocity, and the constants of a given law."""
 
 from __future__ import annotations
 
@@ -154,6 +154,6 @@ class PacNerf(Method):
 
 
 def _seen(case: Case) -> dict:
-    """Which particles of the field are seen."""
+    """Options that select the visible particles of the field."""
     section = case.section("radiance")
     return {name: section[name] for name in ("spacing", "min_opacity")}

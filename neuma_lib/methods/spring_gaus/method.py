@@ -1,4 +1,4 @@
-"""Spring-Gaus (Zhong et al., ECCV 2024): a network of springs in the body, and no law of a material."""
+"""Spring-Gaus (Zhong et al., ECCV 2024): a network of springs in the body, without a material law."""
 
 from __future__ import annotations
 

@@ -20,9 +20,9 @@ from neuma_lib.sim.state import State, Trajectory
 
 
 class SpringMotion(MotionModel):
-    """Springs of a file, on the body that they were fitted to, or on another one of the same material.
+    """Springs of a file, on the body that they were fitted to or on another body of the same material.
 
-    Another body gets a network of its own, with one stiffness: the modulus of the fitted network.
+    Another body gets a new network with one stiffness, that of the fitted network's modulus.
 
     Args:
         path: file of the springs.
