@@ -64,7 +64,7 @@ def judge(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str, 
     mesh = read_mesh(results / "mesh.ply")
     finer = [
         body.resampled(
-            torch.from_numpy(sample_volume(mesh, chosen.particles, seed)),
+            torch.from_numpy(sample_volume(mesh, chosen.refined_particles, seed)),
             mesh.volume,
             scene.density,
             settings.binding,

@@ -118,7 +118,7 @@ def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
         mesh = read_mesh(results / "mesh.ply")
         finer = [
             body.resampled(
-                torch.from_numpy(sample_volume(mesh, chosen.particles, seed)),
+                torch.from_numpy(sample_volume(mesh, chosen.refined_particles, seed)),
                 mesh.volume,
                 scene.density,
                 binding,

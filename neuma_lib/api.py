@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.config.identify import IdentifyConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.config.validation import validate
 from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
@@ -21,7 +22,7 @@ from neuma_lib.errors import InputError
 from neuma_lib.evaluation.metrics import tracer_errors
 from neuma_lib.fitting import identify as identification
 from neuma_lib.fitting.families import FAMILIES
-from neuma_lib.fitting.material import ParticleLoss, train_material
+from neuma_lib.fitting.material import ParticleLoss, TrajectoryLoss, train_material
 from neuma_lib.fitting.structured_fit import train_structured
 from neuma_lib.fitting.velocity import estimate_velocity
 from neuma_lib.geometry.chamfer import chamfer_sequence
@@ -44,7 +45,7 @@ from neuma_lib.splatting.observation import Observation
 
 FLIGHT_COURANT = 0.3
 """Courant number of the elastic body that `estimate_motion` assumes by default."""
-_OF_THE_SCENE = {"carrier", "views", "start", "prior", "assumed_density"}
+_OF_THE_SCENE = {"particle_source", "views", "start", "prior", "assumed_density"}
 """Options of methods in the settings whose values are arguments of `adapt`."""
 
 
@@ -247,11 +248,17 @@ def identify(
         >>> found.family, found.constants
         ('hencky', {'E': 61000.0, 'nu': 0.31})
     """
-    values = {"refined_particles": 0, **(options or {}), "families": dict(FAMILIES if families is None else families)}
+    values = {
+        "refined_particles": 0,
+        **(options or {}),
+        "families": dict(FAMILIES if families is None else families),
+    }
     settings = validate(IdentifyConfig, values, "options")
     if settings.refined_particles:
         raise InputError(
-            "options.refined_particles", f"{settings.refined_particles} must be 0", "Use the workflow to correct it"
+            "options.refined_particles",
+            f"{settings.refined_particles} must be 0",
+            "Use the workflow to correct it",
         )
     body = replace(scene.reconstruction, affine=settings.gaussian_motion == "affine")
     video = _video(scene)
@@ -283,33 +290,27 @@ def adapt(law: Law, scene: Scene, options: Mapping[str, Any] | None = None) -> A
     Example:
         >>> adapt(Law.load("results/priors/jelly.safetensors"), scene, {"rank": 16}).law.save("jelly.safetensors", {})
     """
-    correct = not isinstance(law, AdaptableLaw) or isinstance(law, StructuredLaw)
-    preset = Structured.presets["neuma_structured"] if correct else Neuma.presets["neuma"]
-    Options = StructuredOptions if correct else NeumaOptions
     given = dict(options or {})
     if fixed := sorted(_OF_THE_SCENE & set(given)):
         raise InputError(f"options.{fixed[0]}", "is determined by the scene and the law", "Omit it")
-    settings = validate(Options, {**preset.options, **given}, "options")
-    body = replace(scene.reconstruction, affine=settings.gaussian_motion == "affine")
-    start = replace(scene, reconstruction=body).state()
-    if settings.supervision == "particles":
-        if scene.truth is None:
-            raise InputError("scene.truth", "is missing", "Use supervision: pixels")
-        loss = ParticleLoss(scene.truth.frames, scene.truth.x)
-    else:
-        loss = pixel_loss(body, _of_body(_video(scene), body), settings)
-    if isinstance(law, AdaptableLaw):
+    if isinstance(law, AdaptableLaw) and not isinstance(law, StructuredLaw):
+        settings = validate(NeumaOptions, {**Neuma.presets["neuma"].options, **given}, "options")
         law = copy.deepcopy(law)
+        law.attach_adaptor(settings.rank, settings.alpha, settings.seed)
+        trained = train_material(scene.mpm, law, *_start_and_loss(scene, settings), settings, log=_ignore)
+        return Adaptation(trained.law, trained.history.loss, trained.stable)
+    settings = validate(
+        StructuredOptions, {**Structured.presets["neuma_structured"].options, **given}, "options"
+    )
+    if isinstance(law, StructuredLaw):
+        corrected = copy.deepcopy(law)
     else:
         spec = {**specification(law.elasticity, law.plasticity), "form": settings.form}
-        law = structured_law(spec, scene.mpm.dt, seed=settings.seed)
-    law.attach_adaptor(settings.rank, settings.alpha, settings.seed)
-    problem = (scene.mpm, law, start, loss, settings)
-    if correct:
-        trained, chosen = train_structured(*problem, settings, log=_ignore)
-        return Adaptation(trained.law, trained.history.loss, trained.stable, chosen.parts)
-    trained = train_material(*problem, log=_ignore)
-    return Adaptation(trained.law, trained.history.loss, trained.stable)
+        corrected = structured_law(spec, scene.mpm.dt, seed=settings.seed)
+    corrected.attach_adaptor(settings.rank, settings.alpha, settings.seed)
+    problem = _start_and_loss(scene, settings)
+    trained, chosen = train_structured(scene.mpm, corrected, *problem, settings, settings, log=_ignore)
+    return Adaptation(trained.law, trained.history.loss, trained.stable, chosen.parts)
 
 
 def render(path: Trajectory, reconstruction: Reconstruction, cameras: Cameras) -> Tensor:
@@ -366,6 +367,17 @@ def evaluate(path: Trajectory, truth: Trajectory) -> dict[str, Any]:
     if ours.tracers is not None and theirs.tracers is not None:
         metrics |= tracer_errors(ours.tracers.detach(), theirs.tracers)
     return metrics
+
+
+def _start_and_loss(scene: Scene, settings: TrainingConfig) -> tuple[State, TrajectoryLoss]:
+    """Arguments of `train_material`."""
+    body = replace(scene.reconstruction, affine=settings.gaussian_motion == "affine")
+    start = replace(scene, reconstruction=body).state()
+    if settings.supervision == "pixels":
+        return start, pixel_loss(body, _of_body(_video(scene), body), settings)
+    if scene.truth is None:
+        raise InputError("scene.truth", "is missing", "Use supervision: pixels")
+    return start, ParticleLoss(scene.truth.frames, scene.truth.x)
 
 
 def _load_truth(file: str | Path) -> Trajectory:

@@ -43,9 +43,9 @@ import neuma_lib as nm
 x = 0.3 * torch.rand(2000, 3) + torch.tensor([0.35, 0.30, 0.35])
 vol0 = torch.full((2000,), 0.3**3 / 2000)
 v = torch.tensor([0.0, -1.0, 0.0], requires_grad=True)
-law = nm.analytic_law({"elasticity": {"name": "neo_hookean", "E": 1e5, "nu": 0.3}})
+law = nm.Law.from_spec({"elasticity": {"name": "neo_hookean", "E": 1e5, "nu": 0.3}})
 state = nm.State(x, v, mass=1000 * vol0, vol0=vol0)
-path = nm.simulate(nm.MPMModel(grid=24, dt=1e-3), law, state, steps=200, frames=range(0, 201, 10))
+path = nm.simulate(nm.MPM(grid=24, dt=1e-3), law, state, frames=range(0, 201, 10))
 path.x[-1, :, 1].mean().backward()
 assert torch.isfinite(v.grad).all() and "site-packages" in nm.__file__
 print("example:", tuple(path.x.shape), v.grad.tolist())

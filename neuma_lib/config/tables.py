@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from neuma_lib.config.base import Section
-from neuma_lib.config.variants import DRAWN
+from neuma_lib.config.variants import SEEDS
 
 
 class TableConfig(Section):
@@ -27,8 +27,8 @@ class TableConfig(Section):
         ge=1,
         description="number of replicates, `Scene`, `Scene+seed=1`, ...; several give mean and standard deviation",
     )
-    vary: tuple[Literal[DRAWN], ...] = Field(
-        DRAWN, min_length=1, description="what differs between replicates; the rest is shared"
+    vary: tuple[Literal[SEEDS], ...] = Field(
+        SEEDS, min_length=1, description="what differs between replicates; the rest is shared"
     )
 
     @model_validator(mode="after")

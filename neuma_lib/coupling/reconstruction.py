@@ -8,6 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -86,9 +87,9 @@ class Reconstruction:
 
     def state(
         self,
-        v0: Sequence[float] | Tensor,
-        spin: Sequence[float] | Tensor = (0.0, 0.0, 0.0),
-        centre: Sequence[float] | Tensor | None = None,
+        v0: Sequence[float] | np.ndarray | Tensor,
+        spin: Sequence[float] | np.ndarray | Tensor = (0.0, 0.0, 0.0),
+        centre: Sequence[float] | np.ndarray | Tensor | None = None,
     ) -> State:
         """The particles at t = 0 with velocity v0 [m/s] and angular velocity ``spin`` [rad/s] (`State.rigid`)."""
         return State.rigid(self.x0, self.mass, self.vol0, v0, spin, centre)

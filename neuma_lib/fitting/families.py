@@ -1,4 +1,4 @@
-"""Candidate materials: a law whose constants are unknown, and those constants as unbounded numbers."""
+"""Families of candidate laws, and their constants as unbounded unknowns."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from neuma_lib.mechanics.combinations import Values
 from neuma_lib.sim.model import COURANT_LIMIT, MPM
 
 _PARTS = {"elasticity": ELASTICITY, "plasticity": PLASTICITY}
-_AT_THE_LIMIT = 0.999  # of the stiffness that the time step bears, since constants are rounded
-_UNBOUNDED = 12.0  # logits beyond it are the bound, to six digits
+_LIMIT_SHARE = 0.999  # of the largest stable stiffness, since constants are rounded
+_MAX_LOGIT = 12.0  # logits beyond it equal the bound to six digits
 
 
 _GUESS = {"E": 2e5, "nu": 0.3}
@@ -45,63 +45,64 @@ FAMILIES: dict[str, dict[str, dict[str, Any]]] = {
 
 
 class Family:
-    """A kind of material with constants to be found.
+    """A kind of material with constants to estimate.
 
     Attributes:
-        name: for results.
-        spec: elasticity and plasticity by name, with guesses of all constants.
-        constants: the names of the constants, in order.
+        name: name in the results.
+        spec: elasticity and plasticity by name, with initial guesses of all constants.
+        constants: names of the constants in order.
         guess: their values in ``spec``.
     """
 
     def __init__(self, name: str, spec: Mapping[str, Mapping[str, Any]]):
         self.name, self.spec = name, spec
-        self._admitted: dict[str, tuple[str, Constant]] = {}
+        self._constants: dict[str, tuple[str, Constant]] = {}
         self.guess: Values = {}
-        analytic_law(spec, dt=1.0, name=name)  # names unknown parts and constants, and those out of range
+        analytic_law(spec, dt=1.0, name=name)  # checks names and ranges
         for part, known in _PARTS.items():
             given = spec.get(part) or {"name": "identity"}
             for key, value in given.items():
                 if key != "name":
-                    self._admitted[key] = (part, known[given["name"]][key])
+                    self._constants[key] = (part, known[given["name"]][key])
                     self.guess[key] = float(value)
         self.constants = tuple(self.guess)
         if own := {"E", "nu", "dt"} & set(spec.get("plasticity") or ()):
             raise InputError(
-                f"identify.families.{name}.plasticity: leave out {', '.join(sorted(own))}: elasticity and scene say it"
+                f"identify.families.{name}.plasticity",
+                f"{', '.join(sorted(own))} must not be set, since the elasticity and the scene define it",
             )
 
     def contains(self, other: Family) -> bool:
-        """Whether a limit of the constants makes this family the other one, which has fewer."""
+        """Whether the other family, with fewer constants, is a limit of this one."""
         flows = self.spec["plasticity"]["name"] in ("von_mises", "viscous_flow")
         same = self.spec["elasticity"]["name"] == other.spec["elasticity"]["name"]
         return flows and same and set(other.constants) < set(self.constants)
 
     def unbounded(self, values: Values) -> np.ndarray:
-        """Logarithms, and logits of what has two bounds, shape (k,)."""
-        return np.array([self._to(key, values[key]) for key in self.constants])
+        """Unbounded constants (k,): logarithms, or logits of constants with two bounds."""
+        return np.array([self._unbounded(key, values[key]) for key in self.constants])
 
     def values(self, unbounded: np.ndarray, model: MPM, density: float) -> Values:
-        """Constants of unbounded ones, with no more stiffness than the time step bears at the density [kg/m^3]."""
+        """Constants from unbounded ones, with E limited to what the time step admits at a density [kg/m^3]."""
         values = self.bounded(unbounded)
         unit = analytic_law(self.law_spec({**values, "E": 1.0}), model.dt)
-        stiffest = _AT_THE_LIMIT * (COURANT_LIMIT / model.courant(unit, density)) ** 2
+        stiffest = _LIMIT_SHARE * (COURANT_LIMIT / model.courant(unit, density)) ** 2
         return {**values, "E": min(values["E"], stiffest)}
 
     def bounded(self, unbounded: np.ndarray) -> Values:
-        """Constants of unbounded ones, however stiff."""
-        return {key: self._back(key, u) for key, u in zip(self.constants, unbounded, strict=True)}
+        """Constants from unbounded ones, without a limit on the stiffness."""
+        return {key: self._bounded(key, u) for key, u in zip(self.constants, unbounded, strict=True)}
 
     def law_spec(self, values: Values) -> dict[str, dict[str, Any]]:
-        """Specification of a law, as `analytic_law` takes it."""
+        """Specification of a law for `analytic_law`."""
         spec = {part: {"name": given["name"]} for part, given in self.spec.items()}
         for key, value in values.items():
-            spec[self._admitted[key][0]][key] = value
+            spec[self._constants[key][0]][key] = value
         return spec
 
     def unbounded_dict(self, values: Values, covariance: np.ndarray) -> dict[str, Any]:
-        """Unbounded constants with their covariance, for JSON: u = log(value - low) - log(high - value), the
-        second term where there is an upper bound (``high`` is null where there is none)."""
+        """Unbounded constants with their covariance, for JSON: u = log(value - low) - log(high - value), without the
+        second term if there is no upper bound (``high`` is null)."""
         bounds = [self._bounds(key) for key in self.constants]
         return {
             "constants": list(self.constants),
@@ -112,7 +113,7 @@ class Family:
         }
 
     def with_guesses(self, known: Values) -> Values:
-        """Known constants, where the family has them and they lie within its bounds, and guesses for the others."""
+        """Known constants of the family that lie within its bounds, and guesses for the others."""
         usable = {key: known[key] for key in self.constants if key in known and self._inside(key, known[key])}
         return {**self.guess, **usable}
 
@@ -122,29 +123,28 @@ class Family:
         return any(key not in ("E", "nu") for key in self.constants)
 
     def with_other_limits(self, values: Values, powers: Sequence[int]) -> list[Values]:
-        """The same with what limits plastic flow times 4 to some powers (in logarithms, logits); none if elastic."""
+        """Values with constants of plastic flow times 4 to each power (in logarithms or logits); none if elastic."""
         flow = np.array([key not in ("E", "nu") for key in self.constants])
         u = self.unbounded(values)
         return [self.bounded(u + math.log(4) * n * flow) for n in powers] if self.flows else []
 
     def _bounds(self, key: str) -> tuple[float, float]:
-        constant = self._admitted[key][1]
+        constant = self._constants[key][1]
         return (0.0, POISSON.high) if key == "nu" else (constant.low, constant.high)
 
     def _inside(self, key: str, value: float) -> bool:
         low, high = self._bounds(key)
         return low < value < high
 
-    def _to(self, key: str, value: float) -> float:
+    def _unbounded(self, key: str, value: float) -> float:
         low, high = self._bounds(key)
         if not low < value < high:
-            raise InputError(
-                f"identify.families.{self.name}: {key} = {value:g} must lie between {low:g} and {high:g}"
-            )
+            where = f"identify.families.{self.name}.{key}"
+            raise InputError(where, f"{value:g} must lie between {low:g} and {high:g}")
         return math.log(value - low) - (math.log(high - value) if math.isfinite(high) else 0.0)
 
-    def _back(self, key: str, u: float) -> float:
+    def _bounded(self, key: str, u: float) -> float:
         low, high = self._bounds(key)
         if math.isfinite(high):
-            return low + (high - low) / (1 + math.exp(-min(max(u, -_UNBOUNDED), _UNBOUNDED)))
+            return low + (high - low) / (1 + math.exp(-min(max(u, -_MAX_LOGIT), _MAX_LOGIT)))
         return low + math.exp(u)

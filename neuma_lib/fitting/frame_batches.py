@@ -1,8 +1,7 @@
-"""Frames of a video: which are compared, which judge, and functions of one frame each, a few frames at a time.
+"""Frames of a video: which are compared, which are held out, and evaluation of functions of frames in batches.
 
-Autograd would keep what every frame needs for its gradient until the backward pass: for renders of 400 frames, tens of
-gigabytes. Here gradients with respect to the states are taken while a part is still at hand. They are small, and the
-backward pass only weights them.
+For renders of 400 frames, autograd would keep tens of gigabytes until the backward pass. `evaluate_in_batches` computes
+the gradients with respect to the states batch by batch, and the backward pass only weights them.
 """
 
 from __future__ import annotations
@@ -18,49 +17,48 @@ from neuma_lib.sim.model import MPM, contact_clearance
 
 
 def frame_batches(count: int, size: int) -> Iterator[slice]:
-    """Consecutive ranges of at most ``size`` frames that cover ``count``, as equal in length as can be."""
+    """Consecutive ranges of at most ``size`` frames and nearly equal length that cover ``count`` frames."""
     pieces = max(1, -(-count // size))
     edges = [piece * count // pieces for piece in range(pieces + 1)]
     return (slice(first, last) for first, last in zip(edges, edges[1:], strict=False))
 
 
-def spread_frames(count: int, most: int) -> list[int]:
-    """At most ``most`` of ``count`` frames, evenly spread, first and last among them."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
+def spread_frames(count: int, limit: int) -> list[int]:
+    """At most ``limit`` of ``count`` frames, evenly spaced, including first and last."""
+    return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(int)).tolist()
 
 
 def first_contact(model: MPM, x: Tensor) -> int:
-    """Index of the first frame in which a particle feels a wall, of positions x (T, N, 3) [m]; T if there is none."""
+    """Index of the first frame of positions x (T, N, 3) [m] with a particle in contact with a wall, T if none."""
     touching = contact_clearance(model, x) <= 0
     return int(touching.int().argmax()) if bool(touching.any()) else len(x)
 
 
 def held_out_frames(count: int, share: float, blocks: int = 1, contact: int = 0) -> list[int]:
-    """Indices of the frames that judge: the last ones of each of some equal parts of the video, one at least each.
+    """Indices of the held-out frames: the last ones, at least one, of each of several equal blocks of the video.
 
     Args:
-        count: frames of the video.
-        share: part of what follows the contact.
-        blocks: number of the parts.
-        contact: index of the first frame that tells of the law; frames before it are left out, unless fewer than two
-            remain.
+        count: number of frames of the video.
+        share: share of the frames after the contact.
+        blocks: number of blocks.
+        contact: index of the first informative frame. Earlier frames are ignored unless fewer than two remain.
     """
     first = contact if count - contact >= 2 else 0
-    told = count - first
-    blocks = min(blocks, told // 2)
-    ends = [first + round(k * told / blocks) for k in range(blocks + 1)]
-    size = max(1, round(share * told / blocks))
+    informative = count - first
+    blocks = min(blocks, informative // 2)
+    ends = [first + round(k * informative / blocks) for k in range(blocks + 1)]
+    size = max(1, round(share * informative / blocks))
     return [frame for start, end in pairwise(ends) for frame in range(max(start + 1, end - size), end)]
 
 
 def evaluate_in_batches(function: Callable[..., Tensor], size: int, *states: Tensor) -> Tensor:
-    """``function`` of T frames, evaluated on ``size`` frames at a time; differentiable in the states, once.
+    """Evaluate ``function`` of T frames in batches of at most ``size`` frames; differentiable once in the states.
 
     Args:
-        function: called as ``function(part, *states_of_part)`` with a slice of the frames; returns one number a frame,
-            shape (t,), each of which depends on its own frame's states only. Gradients reach nothing but the states.
-        size: most frames of a part.
-        states: tensors whose first axis is the frames, T of them.
+        function: called as ``function(batch, *states_of_batch)`` with a slice of the frames; returns one number per
+            frame, shape (t,), that depends only on the states of that frame. Only the states have gradients.
+        size: maximum number of frames per batch.
+        states: tensors whose first axis is the frames.
 
     Returns:
         All values, shape (T,).
@@ -79,9 +77,9 @@ class _EvaluateInBatches(torch.autograd.Function):
         grads: list[Tensor | None] = [None] * len(states)
         values = []
         for part in frame_batches(len(states[0]), size):
-            value, found = _value_and_gradients(function, part, states, wanted)
+            value, batch_grads = _value_and_gradients(function, part, states, wanted)
             values.append(value)
-            for i, grad in zip(wanted, found, strict=True):
+            for i, grad in zip(wanted, batch_grads, strict=True):
                 if grad is None:
                     continue
                 if grads[i] is None:
@@ -100,7 +98,7 @@ class _EvaluateInBatches(torch.autograd.Function):
 def _value_and_gradients(
     function: Callable[..., Tensor], part: slice, states: Sequence[Tensor], wanted: Sequence[int]
 ) -> tuple[Tensor, tuple[Tensor | None, ...]]:
-    """Values of the frames of a part, and their gradients with respect to the wanted states; nothing else is kept."""
+    """Values of the frames of a batch, and their gradients with respect to the wanted states."""
     inputs = [state[part].detach() for state in states]
     leaves = [inputs[i].requires_grad_() for i in wanted]
     with torch.enable_grad():

@@ -38,7 +38,7 @@ from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.identified import FamilyFit, Identified
 from neuma_lib.fitting.least_squares import (
-    LEAST_COST,
+    MIN_COST,
     Linearisation,
     in_blocks,
     jackknife,
@@ -395,7 +395,7 @@ class _Run:
             step = 2 * whole[:, :k] @ axis / math.sqrt(variance)
             found = self._simulate([self._u + step, self._u - step])
             costs = [math.inf if residual is None else self._cost(residual) for residual in found]
-            promised, rise = step @ self.fit.curvature @ step, max(min(costs) - self.fit.cost, LEAST_COST)
+            promised, rise = step @ self.fit.curvature @ step, max(min(costs) - self.fit.cost, MIN_COST)
             wider = min(variance * max(promised / rise, 1.0), self.settings.spread**2)
             whole[:k, :k] += (wider - variance) * np.outer(axis, axis)
         return whole[:k, :k]

@@ -1,8 +1,7 @@
-"""Grounding the material law in the video (paper Sec. 3.2-3.4): low-rank corrections of both networks, from pixels.
+"""Grounding of the material law in the video (paper Sec. 3.2-3.4): low-rank corrections of both networks from pixels.
 
-Several videos of one material train one law: each counts by the mean over its own frames, and all videos alike.
-
-One loop serves the method and its ablations; they differ in the options that it is given:
+The loss of a video is the mean over its frames. Several videos of one material have equal weights. The method and its
+ablations use the same loop with different options:
 
 ==============================  =======================================================================
 NeuMA                           rank-16 adaptor, `PixelLoss`, reconstructed body
@@ -49,12 +48,12 @@ from neuma_lib.splatting.observation import (
 
 
 class TrajectoryLoss(Protocol):
-    """What training minimises: one number per frame from a simulated trajectory.
+    """Training loss: one number per frame from a simulated trajectory.
 
     Attributes:
         frames: steps of the frames.
-        steps: those whose states it reads, the frames among them; more where a frame shows a span of time.
-        total: whether it reads the total deformation of the trajectory.
+        steps: steps whose states it needs, including the frames and all steps of exposures.
+        total: whether it needs the total deformation of the trajectory.
     """
 
     frames: tuple[int, ...]
@@ -65,27 +64,27 @@ class TrajectoryLoss(Protocol):
         """Losses of the frames, shape (T,), of a trajectory at the steps."""
 
     def select(self, keep: Sequence[int]) -> TrajectoryLoss:
-        """The same of the frames with the given indices alone."""
+        """The loss restricted to the frames with the given indices."""
 
     def later(self, step: int) -> TrajectoryLoss:
-        """The same for a trajectory that starts at a step of this one."""
+        """The loss for a trajectory that starts at ``step`` of this one."""
 
 
 @dataclass
 class PixelLoss:
     """Mean squared colour difference of each frame over all training views (paper Eq. 2).
 
-    Cameras may have other times, sizes and exposures: then every step at which some camera has a picture is a frame,
-    and its loss is the mean over the pictures there, each the mean over its pixels.
+    If cameras differ in times, sizes or exposures, every step with an image of some camera is a frame, whose loss is
+    the mean over its images, each the mean over its pixels.
 
     Attributes:
-        body: what is rendered.
+        body: the reconstruction to render.
         observation: the video, or several of one motion.
         covariance_gradient: whether gradients reach the deformation gradients through the covariances.
-        frames_per_batch: frames rendered at a time, forward and backward; None: as many as a render of moderate memory
-            allows. The value does not depend on it.
-        total: whether the total deformation stretches the Gaussians, not its elastic part.
-        compare: colours, or masks alone.
+        frames_per_batch: frames rendered at a time, forward and backward, by default as many as moderate memory
+            permits. The value does not depend on it.
+        total: whether the total deformation deforms the Gaussians, instead of its elastic part.
+        compare: colours, or masks only.
     """
 
     body: Reconstruction
@@ -106,7 +105,9 @@ class PixelLoss:
 
     def __call__(self, path: Trajectory) -> Tensor:
         if len(path.x) != len(self.steps):
-            raise InputError(f"pixel loss: {len(path.x)} states for {len(self.steps)} rendered steps")
+            raise InputError(
+                "pixel loss", f"{len(path.x)} states must be those of {len(self.steps)} rendered steps"
+            )
         if len(self.videos) == 1:
             return self._of(0, path)
         total, count = path.x.new_zeros(2, len(self.frames))
@@ -118,11 +119,9 @@ class PixelLoss:
         return total / count
 
     def select(self, keep: Sequence[int]) -> PixelLoss:
-        """The same of the frames with the given indices alone."""
         return replace(self, observation=select_frames(self.videos, [self.frames[k] for k in keep]))
 
     def later(self, step: int) -> PixelLoss:
-        """The same for a trajectory that starts at a step of this one."""
         earlier = [
             replace(video, frames=tuple(frame - step for frame in video.frames)) for video in self.videos
         ]
@@ -133,8 +132,8 @@ class PixelLoss:
         video, filmed = self.videos[k], self._filmed[k]
 
         def losses(part: slice, x: Tensor, F: Tensor) -> Tensor:
-            seen = video.stored(part) if self.compare == "colour" else video.coverage(part)
-            return filmed.error(x, F, seen)
+            observed = video.stored(part) if self.compare == "colour" else video.coverage(part)
+            return filmed.error(x, F, observed)
 
         states = (filmed.states(path.x), filmed.states(path.stretch))
         return evaluate_in_batches(losses, self.frames_per_batch or filmed.error_batch, *states)
@@ -155,24 +154,21 @@ class ParticleLoss:
 
     @property
     def steps(self) -> tuple[int, ...]:
-        """Those of the frames."""
         return self.frames
 
     def __call__(self, path: Trajectory) -> Tensor:
         return chamfer_loss(path.x, self.targets)
 
     def select(self, keep: Sequence[int]) -> ParticleLoss:
-        """The same of the frames with the given indices alone."""
         return ParticleLoss(tuple(self.frames[k] for k in keep), self.targets[list(keep)])
 
     def later(self, step: int) -> ParticleLoss:
-        """The same for a trajectory that starts at a step of this one."""
         return ParticleLoss(tuple(frame - step for frame in self.frames), self.targets)
 
 
 @dataclass
 class History:
-    """Training curves, one entry an accepted iteration; ``seconds`` is the wall time that it took [s]."""
+    """Training curves with one entry per accepted iteration; ``seconds`` is its wall time [s]."""
 
     loss: list[float] = field(default_factory=list)
     weighted_loss: list[float] = field(default_factory=list)
@@ -185,11 +181,11 @@ class History:
 
 @dataclass
 class Stretch:
-    """A training that is a stretch of a longer one: its schedules are those of the whole.
+    """Position of a training within a longer one whose schedules it follows.
 
     Attributes:
-        before, after: iterations of the whole that come before it and after it.
-        memory: `TrainedMaterial.memory` of what came before; None: nothing did.
+        before, after: iterations of the whole training before and after this one.
+        memory: `TrainedMaterial.memory` of the preceding training, or None.
     """
 
     before: int = 0
@@ -199,10 +195,10 @@ class Stretch:
 
 @dataclass
 class TrainedMaterial:
-    """Result of `train_material`: the law at its best training loss, how it got there, and whether it stayed stable.
+    """Result of `train_material`: the law at its best training loss, the training curves, and whether it was stable.
 
-    ``memory`` is what a training that goes on from there needs beside the law: the optimiser's averages of each
-    parameter by its name, and the loss that losses are measured by.
+    ``memory`` holds values for a following training: the averages of the optimiser by name of the parameter, and the
+    first loss.
     """
 
     law: Law
@@ -213,20 +209,20 @@ class TrainedMaterial:
     memory: dict[str, Any] | None = None
 
     def summary(self) -> str:
-        """One line for people."""
+        """Summary line for the log."""
         if not self.history.seconds:
             return f"nothing trained, loss {self.best_loss:.3e}"
         first = self.history.loss[0]
-        note = "" if self.stable else "; UNSTABLE: best state kept"
-        moves = f", {len(self.history.recoveries)} recoveries" if self.history.recoveries else ""
+        note = "" if self.stable else "; UNSTABLE, best state kept"
+        recoveries = f", {len(self.history.recoveries)} recoveries" if self.history.recoveries else ""
         return (
             f"loss {first:.3e} -> {self.best_loss:.3e} (x{first / max(self.best_loss, 1e-30):.1f} lower) "
-            f"at iteration {self.best_iteration}{moves}, {median(self.history.seconds):.3g} s an iteration{note}"
+            f"at iteration {self.best_iteration}{recoveries}, {median(self.history.seconds):.3g} s per iteration{note}"
         )
 
 
 def frame_weights(iteration: int, count: int, settings: TrainingConfig) -> Tensor:
-    """Weights of the frames, shape (count,): d^k, k the part of the video; d rises to 1 over a third of training."""
+    """Weights (count,) of the frames: d^k for period k of the video; d rises to 1 in the first third of training."""
     rise = min(1.0, iteration / max(1.0, settings.iterations / 3))
     d = settings.frame_weight_start + (1 - settings.frame_weight_start) * rise
     part = torch.arange(count) * settings.frame_weight_periods // max(count, 1)
@@ -240,33 +236,33 @@ def train_material(
     loss: TrajectoryLoss,
     settings: TrainingConfig,
     *,
-    further: Sequence[tuple[State, TrajectoryLoss]] = (),
+    other_videos: Sequence[tuple[State, TrajectoryLoss]] = (),
     stretch: Stretch | None = None,
     checkpoint: Checkpoint | None = None,
     progress: Callable[[int, int, float], None] | None = None,
     log: Callable[[str], None] = print,
 ) -> TrainedMaterial:
-    """Optimise the law's trainable parameters so that the rollout matches the frames.
+    """Optimise the trainable parameters of a law so that rollouts match the frames of a video.
 
     Args:
         model: simulator constants.
-        law: prior with an adaptor; its parameters that require gradients are optimised, in place.
+        law: prior with an adaptor, whose parameters that require gradients are optimised in place.
         start: particles with their initial motion.
         loss: per-frame loss of a trajectory.
-        further: starts and losses of other videos of the same material, which train the same law.
-        settings: hyper-parameters, from ``iterations`` on and ``lr_scale``.
-        stretch: what comes before and after in a longer training; None: this is the whole.
-        checkpoint: where to keep the state of the loop, so that a killed run goes on; None keeps none.
+        other_videos: initial states and losses of other videos of the same material.
+        settings: hyper-parameters.
+        stretch: position within a longer training, or None.
+        checkpoint: file for the state of the loop, so that an interrupted run can resume; None for none.
         progress: called with (iteration, iterations, loss).
         log: receives a line for every recovery from a diverging step.
 
     Raises:
-        NonFiniteError: the very first rollout is not finite, so there is no good state to return to.
-        InputError: the law has nothing to train, or is too stiff for the time step when training begins.
+        NonFiniteError: the first rollout is not finite, so there is no state to return to.
+        InputError: the law has no trainable parameters, or is initially too stiff for the time step.
     """
-    videos = [(start, loss), *further]
+    videos = [(start, loss), *other_videos]
     stretch = stretch or Stretch()
-    # What was trained may pass the limit, which leaves a margin: a step too far is taken back.
+    # A trained law may exceed the limit, which has a margin, because diverging steps are reverted.
     if not stretch.before:
         model.check_courant(law, min(float(start.density.min()) for start, _ in videos))
     law.set_adjoint_precision(settings.adjoint_precision)
@@ -284,7 +280,7 @@ def train_material(
 
 
 class _Loop(TrainingLoop):
-    """The state of training, and one step of it."""
+    """State of the training, and a training step."""
 
     def __init__(self, model, law, videos, settings, log, stretch):
         self.model, self.law, self.videos, self.before = model, law, videos, stretch.before
@@ -296,7 +292,9 @@ class _Loop(TrainingLoop):
             "plastic": [p for p in law.plasticity.parameters() if p.requires_grad],
         }
         if not any(self.nets.values()):
-            raise InputError("the law has no trainable parameters: attach an adaptor before training")
+            raise InputError(
+                f"law {law.name!r}", "it has no trainable parameters", "Attach an adaptor before training"
+            )
         rates = {
             "elastic": settings.lr_scale * settings.lr_elastic,
             "plastic": settings.lr_scale * settings.lr_plastic,
@@ -312,7 +310,7 @@ class _Loop(TrainingLoop):
         self._begin(History(), memory["first_loss"])
         self.deviation = None
         if settings.penalty:
-            with torch.no_grad():  # before a checkpoint is loaded: the law that training begins with
+            with torch.no_grad():  # with the initial law, before a checkpoint is loaded
                 paths = [self._path(start, loss) for start, loss in self.videos]
                 self.deviation = Deviation.of_videos(law, paths, model.dt)
 
@@ -327,7 +325,7 @@ class _Loop(TrainingLoop):
                 raise NonFiniteError(
                     "material", f"loss {value:.3e} against a best of {self.best['loss']:.3e}"
                 )
-            # Taken before the backward pass, which changes the accumulated gradients, but kept only if it succeeds.
+            # Copied before the backward pass, which changes accumulated gradients, but kept only if that succeeds.
             best = self._better_state(value)
             norms, weighted = self._backward(frame_losses)
         except NonFiniteError as error:
@@ -348,7 +346,7 @@ class _Loop(TrainingLoop):
         return _mean(self._frame_losses())
 
     def _frame_losses(self) -> list[Tensor]:
-        """Losses of the frames of every video, shape (T,) each; the penalty, times the first loss, is added to all."""
+        """Losses of the frames of every video, shape (T,) each, plus the penalty in units of the first loss."""
         losses = [loss(self._path(start, loss)) for start, loss in self.videos]
         if self.deviation is None or self.first_loss is None:
             return losses
@@ -386,7 +384,7 @@ class _Loop(TrainingLoop):
         return norms, float(weighted.detach())
 
     def _weighted(self, losses: Tensor) -> Tensor:
-        """Weighted mean of the frames of a video."""
+        """Weighted mean over the frames of a video."""
         weights = frame_weights(self.before + self.iteration, len(losses), self.whole).to(losses)
         return (weights * losses).sum() / weights.sum()
 
@@ -399,7 +397,7 @@ class _Loop(TrainingLoop):
         self.optimizer.step()
 
     def memory(self) -> dict[str, Any]:
-        """What a training that goes on from here needs beside the law."""
+        """See `TrainedMaterial`."""
         state = self.optimizer.state
         averages = {name: copy.deepcopy(state[p]) for name, p in self.law.named_parameters() if p in state}
         return {"averages": averages, "first_loss": self.first_loss}
@@ -415,7 +413,7 @@ class _Loop(TrainingLoop):
         self.law.load_state_dict(state["law"])
         self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
         for parameter, gradient in zip(self._parameters(), state["gradients"], strict=True):
-            # Counts where gradients are not zeroed; a checkpoint may come from another device.
+            # Relevant if gradients are not zeroed. A checkpoint may be from another device.
             parameter.grad = None if gradient is None else gradient.to(parameter, copy=True)
 
     def _parameters(self) -> list[torch.nn.Parameter]:
@@ -423,5 +421,5 @@ class _Loop(TrainingLoop):
 
 
 def _mean(frame_losses: Sequence[Tensor]) -> float:
-    """Mean over the videos of the mean over the frames of each."""
+    """Mean over the videos of the mean over their frames."""
     return float(torch.stack([losses.detach().mean() for losses in frame_losses]).mean())

@@ -1,12 +1,12 @@
 """Priors by regression: networks fitted to the stress and the return map of a known law.
 
-The pairs (F -> tau) and (F_trial -> F) lie at deformation gradients that thrown cubes visit. From the second round on
-those that rollouts of the networks visit are added.
+The pairs (F -> tau) and (F_trial -> F) are at deformation gradients that simulated cubes visit. From the second round
+on, those visited by rollouts of the networks are added.
 
-Outside these pairs a network is left to chance. Where it takes volume from an element in every step, and answers with
-tension, the element collapses for good: seen in water, whose pressure falls again below J = 1/2. So the networks are
-tried on throws that are harder than those of the training, and if they crush an element that their law does not, a
-longer round follows with the states of these throws added. A prior that passes is not changed by the trial.
+A network is undetermined outside these pairs. If it removes volume from an element in every step and responds with
+tension, the element collapses permanently, as observed for water, whose pressure decreases below J = 1/2. The networks
+are therefore tested on faster motions than those of the training. If they crush an element that the law does not, a
+longer round with the states of these motions follows. The test does not change priors that pass.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from torch.nn.functional import gelu
 from neuma_lib.config.priors import RegressionConfig
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.fitting.prior_throws import (
+    Launch,
     Progress,
-    Throw,
+    random_launch,
     random_rotations,
-    random_throw,
     reference_law,
     visited_stretches,
 )
@@ -36,52 +36,53 @@ from neuma_lib.mechanics.neural import LAYER_KEYS, PLASTIC_SCALE, SHAPES, Neural
 from neuma_lib.mechanics.singular_values import svd3
 
 _AS_VISITED = 0.5
-"""Part of the training stretches that rollouts visited; the units of a network are measured on it."""
+"""Share of the training stretches that rollouts visited, from which the units of a network are computed."""
 _PURE_NOISE = 0.1
-"""Part of the training stretches that are random alone, so that nothing far from a rollout is left to chance."""
+"""Share of the training stretches that are purely random, which covers states far from any rollout."""
 _LOG_STRETCHES = (-2.0, 1.5)
-"""Range of the logarithms of the training stretches: 0.14 to 4.5."""
-_TRIAL_SEEDS = 30_000
-"""Added to a prior's seed: throws on which the networks are tried are not those of the training or of the judgement."""
-_TRIAL_SPEED = 1.25
-"""Speed of the trial throws over that of the others, so that an unseen throw does not go beyond the data."""
+"""Range of the logarithms of the training stretches, which are 0.14 to 4.5."""
+_TEST_SEEDS = 30_000
+"""Offset of the seed for tests, so that their motions differ from those of training and evaluation."""
+_TEST_SPEED = 1.25
+"""Speed factor of the motions in tests, so that unseen motions stay within the data."""
 _LONGER = 3
-"""Iterations of a further round over those of the others: its data are more various."""
+"""Factor of the iterations in a further round, whose data are more diverse."""
 _WARM_UP = 0.05
-"""Part of the iterations over which the learning rate rises."""
+"""Share of the iterations in which the learning rate rises."""
 _GRADIENT_CLIP = 1.0
 """Largest gradient norm of a network in normalised units."""
 _LAST_PART = 10
-"""The reported loss is the mean of the last 1 / this of the iterations."""
+"""The reported loss is the mean over the last 1 / `_LAST_PART` of the iterations."""
 _REPORT_EVERY = 50
-"""Iterations from one report of the progress to the next."""
+"""Iterations between progress reports."""
 
 
 def train_by_regression(
     spec: Mapping[str, Any], settings: RegressionConfig, seed: int, progress: Progress
 ) -> tuple[NeuralLaw, dict[str, Any]]:
+    """Fit a neural law to an analytic one, see :func:`neuma_lib.fitting.prior_training.train_prior`."""
     generator = torch.Generator().manual_seed(seed)
     reference = reference_law(spec, settings)
-    throws = [random_throw(reference, generator, settings) for _ in range(settings.throws)]
-    pools = [visited_stretches(throw, reference) for throw in throws]
+    launches = [random_launch(reference, generator, settings) for _ in range(settings.throws)]
+    pools = [visited_stretches(launch, reference) for launch in launches]
     elastic, plastic = (torch.cat(parts) for parts in zip(*pools, strict=True))
 
-    trials = torch.Generator().manual_seed(_TRIAL_SEEDS + seed)
+    tests = torch.Generator().manual_seed(_TEST_SEEDS + seed)
     total, done = 2 * settings.rounds * settings.iterations, 0
     networks: dict[str, Network] = {}
     losses: dict[str, list[float]] = {"elasticity": [], "plasticity": []}
-    how = settings
+    current = settings
     for index in range(settings.rounds + settings.further_rounds):
         if index:
             law = _law_of(networks)
             if index < settings.rounds:
-                more = [states for throw in throws if (states := _visited(throw, law))]
+                more = [states for launch in launches if (states := _visited(launch, law))]
             else:
-                more = missing_states(law, reference, trials, settings)
+                more = missing_states(law, reference, tests, settings)
                 if not more:
                     break
-                how = settings.model_copy(update={"iterations": _LONGER * settings.iterations})
-                total += 2 * how.iterations
+                current = settings.model_copy(update={"iterations": _LONGER * settings.iterations})
+                total += 2 * current.iterations
             elastic, plastic = (
                 torch.cat([pool, *parts]) for pool, *parts in zip((elastic, plastic), *more, strict=True)
             )
@@ -90,22 +91,22 @@ def train_by_regression(
             z, X = targets(reference, part, F)
             network = networks.get(part) or Network(z, X, generator)
 
-            def shown(iteration: int, loss: float, before: int = done, total: int = total) -> None:
+            def report_progress(iteration: int, loss: float, before: int = done, total: int = total) -> None:
                 progress(before + iteration, total, loss)
 
-            losses[part].append(network.fit(z, X, how, generator, shown))
+            losses[part].append(network.fit(z, X, current, generator, report_progress))
             networks[part] = network
-            done += how.iterations
+            done += current.iterations
     law = _law_of(networks)
     report = {"loss": losses, "pairs": settings.samples}
     report.update(plastic_errors(law, reference, plastic, generator))
     return law, report
 
 
-def _visited(throw: Throw, law: Law) -> tuple[Tensor, Tensor] | None:
-    """`visited_stretches`; None if the law is unstable, which is what the next round mends."""
+def _visited(launch: Launch, law: Law) -> tuple[Tensor, Tensor] | None:
+    """`visited_stretches`, or None if the law is unstable, which the next round corrects."""
     try:
-        return visited_stretches(throw, law)
+        return visited_stretches(launch, law)
     except NonFiniteError:
         return None
 
@@ -113,43 +114,42 @@ def _visited(throw: Throw, law: Law) -> tuple[Tensor, Tensor] | None:
 def missing_states(
     law: Law, reference: Law, generator: torch.Generator, settings: RegressionConfig
 ) -> list[tuple[Tensor, Tensor]]:
-    """States that the data of the networks ``law`` lack, if on faster throws these crush what their law does not.
+    """States to add to the data if the networks ``law`` crush elements in faster motions and their law does not.
 
     Returns:
-        none if every throw in which ``law`` crushes an element is one in which ``reference`` does, too. Else the
-        principal stretches of F and of F_trial, (M, 3) each, that either law visits in each throw; without the crushed
-        states of ``law``, where its reference does not go.
+        Principal stretches of F and of F_trial, (M, 3) each, that either law visits in each motion, without crushed
+        states of ``law``. Empty if ``reference`` crushes elements in every motion in which ``law`` does.
     """
-    throws = [random_throw(reference, generator, settings, _TRIAL_SPEED) for _ in range(settings.throws)]
-    tried = [_visited(throw, law) for throw in throws]
-    suspects = [index for index, states in enumerate(tried) if _crushes(states)]
+    launches = [random_launch(reference, generator, settings, _TEST_SPEED) for _ in range(settings.throws)]
+    tested = [_visited(launch, law) for launch in launches]
+    suspects = [index for index, states in enumerate(tested) if _crushes(states)]
     if not suspects:
         return []
-    true = [_visited(throw, reference) for throw in throws]
+    true = [_visited(launch, reference) for launch in launches]
     if all(_crushes(true[index]) for index in suspects):
         return []
-    kept = [tuple(part[~_crushed(part)] for part in states) for states in tried if states]
+    kept = [tuple(part[~_crushed(part)] for part in states) for states in tested if states]
     return [states for states in true if states] + kept
 
 
 def _crushes(states: tuple[Tensor, Tensor] | None) -> bool:
-    """Whether a rollout crushed an element, or broke off, from what `_visited` returned."""
+    """Whether a rollout diverged or crushed an element, from the result of `_visited`."""
     return states is None or bool(_crushed(states[0]).any())
 
 
 def _crushed(stretches: Tensor) -> Tensor:
-    """Which of the states (M, 3) are pressed together so far that laws know them no more, or turned inside out."""
+    """Mask of the states (M, 3) that are inverted or compressed below the range of the laws."""
     return stretches.amin(1) < STRETCH_MIN
 
 
 def plastic_errors(
     law: Law, reference: Law, pool: Tensor, generator: torch.Generator, count: int = 20000
 ) -> dict[str, float]:
-    """Errors of a step's plastic correction F - F_trial on visited stretches (M, 3).
+    """Errors of the plastic correction F - F_trial of a step on visited stretches (M, 3).
 
     Returns:
-        ``elastic_error``: mean norm of the correction where the law makes none; ``yield_error``: mean norm of the
-        error over the mean norm of the correction where it makes one. Zero where there are no such states.
+        ``elastic_error``: mean norm of the correction at elastic states; ``yield_error``: mean norm of the error
+        divided by the mean norm of the correction at yielding states. Zero if there are no such states.
     """
     sigma = pool[torch.randint(len(pool), (count,), generator=generator)]
     F = sigma[:, :, None] * random_rotations(count, generator)
@@ -167,8 +167,8 @@ def plastic_errors(
 def sample_deformations(pool: Tensor, settings: RegressionConfig, generator: torch.Generator) -> Tensor:
     """Deformation gradients diag(sigma) V^T around visited stretches, (samples, 3, 3).
 
-    The first `_AS_VISITED` of them are as visited, the others get random log strains added, the last `_PURE_NOISE` are
-    such strains alone. V is a random rotation; one from the left changes neither features nor targets.
+    The first `_AS_VISITED` of them are visited stretches, random log strains are added to the others, and the last
+    `_PURE_NOISE` are random only. V is a random rotation. Rotations from the left change neither features nor targets.
     """
     n = settings.samples
     picked = pool[torch.randint(len(pool), (n,), generator=generator)]
@@ -182,7 +182,7 @@ def sample_deformations(pool: Tensor, settings: RegressionConfig, generator: tor
 
 
 def targets(law: Law, part: str, F: Tensor) -> tuple[Tensor, Tensor]:
-    """Features (n, 13) of F, and the symmetric X (n, 9) that the network has to give for the law's answer."""
+    """Features (n, 13) of F, and the symmetric network output X (n, 9) that reproduces the law."""
     U, sigma, Vh = svd3(F.double())
     R = U @ Vh
     if part == "elasticity":
@@ -195,7 +195,7 @@ def targets(law: Law, part: str, F: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Network:
-    """A network in normalised units while it is fitted; :meth:`weights` folds the units back in."""
+    """A network in normalised units during the fit. :meth:`weights` includes the units."""
 
     def __init__(self, z: Tensor, X: Tensor, generator: torch.Generator):
         visited = slice(int(_AS_VISITED * len(z)))
@@ -216,10 +216,10 @@ class Network:
         generator: torch.Generator,
         progress: Callable[[int, float], None],
     ) -> float:
-        """Minimise the relative squared error; returns the mean loss of the last tenth of the iterations."""
+        """Minimise the relative squared error, and return the mean loss of the last tenth of the iterations."""
         if not bool(X.any()):
             with torch.no_grad():
-                self.layers[2].zero_()  # nothing to learn, and zero is exact
+                self.layers[2].zero_()  # exact
             progress(settings.iterations, 0.0)
             return 0.0
         z, X = z / self.unit_in, X / self.unit_out
@@ -244,7 +244,7 @@ class Network:
                 value = float(loss.detach())
                 if not math.isfinite(value):
                     raise NonFiniteError(
-                        "prior", f"regression diverged at iteration {iteration}; lower learning_rate"
+                        "prior", f"the regression diverged at iteration {iteration}. Lower learning_rate"
                     )
                 progress(iteration + 1, value)
                 tail += value * (iteration >= settings.iterations - last)

@@ -1,4 +1,4 @@
-"""Cubes thrown about a box: the motions that priors are trained and judged on."""
+"""Random motions of cubes in a box, on which priors are trained and evaluated."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 
 Progress = Callable[[int, int, float | None], None]
-"""Receives iterations done, iterations in all, and the loss."""
+"""Receives the number of finished iterations, the total number, and the loss."""
 DENSITY = 1000.0
 """Density of every training cube [kg/m^3]."""
 _COURANT = 0.5
-"""Cells that the law's waves pass in a step, at most."""
+"""Maximum Courant number."""
 _SIDES = (0.15, 0.35)
-"""Range of the sides of random cubes [m]; the box has a side of 1 m."""
+"""Range of the sides of random cubes [m], in a box with a side of 1 m."""
 _WALL_CLEARANCE = 0.1
-"""Distance of a cube's bounding sphere from the walls at the start [m]."""
+"""Initial distance of the bounding sphere of a cube from the walls [m]."""
 _LOWEST = 0.3
-"""Cubes start in this lowest part of the heights that the clearance leaves, to hit the floor soon."""
+"""Lowest share of the possible initial heights that is used, so that cubes hit the floor soon."""
 _VELOCITIES = ((-2.0, 2.0), (-4.0, -0.5), (-2.0, 2.0))
 """Ranges of the velocity along x, y and z [m/s]."""
 _SPIN = 6.0
@@ -37,8 +37,8 @@ _SPIN = 6.0
 
 
 @dataclass(frozen=True)
-class Throw:
-    """A cube of particles and its initial motion."""
+class Launch:
+    """A cube of particles with its initial motion."""
 
     model: MPM
     state: State
@@ -49,23 +49,23 @@ class Throw:
 
 
 def reference_law(spec: Mapping[str, Any], settings: RegressionConfig) -> Law:
-    """The analytic law, which knows the longest time step that suits it if it depends on the rate."""
+    """The analytic law, with the longest suitable time step if it depends on the rate."""
     law = analytic_law(spec, dt=settings.dt)
     return analytic_law(spec, dt=longest_step(law, settings))
 
 
 def longest_step(law: Law, settings: RegressionConfig) -> float:
-    """Time step [s] of the settings, shortened to the Courant number of throws."""
+    """Time step of the settings, reduced to the maximum Courant number [s]."""
     return min(settings.dt, _COURANT / (settings.grid * law.wave_speed(DENSITY)))
 
 
-def random_throw(
+def random_launch(
     law: Law, generator: torch.Generator, settings: RegressionConfig, speed: float = 1.0
-) -> Throw:
-    """A cube of random size, place, orientation, velocity and spin, all of its motion times ``speed``.
+) -> Launch:
+    """A cube of random size, position, orientation, velocity and spin, with its motion scaled by ``speed``.
 
-    Half of the throws take half the time step, so that the trial states of both are seen; not if the law
-    depends on the rate, because a network knows one step only.
+    Half of the launches use half the time step, to include its trial states, except for rate-dependent laws, because a
+    network is trained for one step.
     """
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
@@ -89,7 +89,7 @@ def random_throw(
         torch.full((count,), DENSITY * side**3 / count),
         torch.full((count,), side**3 / count),
     )
-    return Throw(MPM(grid=settings.grid, dt=dt), state, math.ceil(settings.duration / dt))
+    return Launch(MPM(grid=settings.grid, dt=dt), state, math.ceil(settings.duration / dt))
 
 
 def random_rotations(count: int, generator: torch.Generator) -> Tensor:
@@ -106,16 +106,16 @@ def random_rotations(count: int, generator: torch.Generator) -> Tensor:
     ).reshape(-1, 3, 3)
 
 
-def visited_stretches(throw: Throw, law: Law, every: int = 8) -> tuple[Tensor, Tensor]:
-    """Principal stretches of F and of F_trial that a rollout meets, (M, 3) each.
+def visited_stretches(launch: Launch, law: Law, every: int = 8) -> tuple[Tensor, Tensor]:
+    """Principal stretches of F and of F_trial in a rollout, (M, 3) each.
 
-    F_trial = (I + dt C) F of the step before, from pairs of consecutive frames.
+    F_trial = (I + dt C) F from pairs of consecutive frames.
     """
-    firsts = list(range(0, throw.steps - 1, every))
+    firsts = list(range(0, launch.steps - 1, every))
     frames = sorted({n for first in firsts for n in (first, first + 1)})
-    path = throw.run(law, frames)
+    path = launch.run(law, frames)
     before = [frames.index(n) for n in firsts]
     after = [frames.index(n + 1) for n in firsts]
     eye = torch.eye(3)
-    trial = (eye + throw.model.dt * path.C[after]) @ path.F[before]
+    trial = (eye + launch.model.dt * path.C[after]) @ path.F[before]
     return svd3(path.F.reshape(-1, 3, 3))[1], svd3(trial.reshape(-1, 3, 3))[1]

@@ -54,6 +54,8 @@ def from_images(
     if views.photographs:
         mesh = photographed(mesh, views.photographs.edge, views.floor)
     x = torch.from_numpy(sample_volume(mesh, chosen.particles, chosen.seed, chosen.sampling)).float()
-    binding, x, _, vol0 = bind_two_pass(gaussians.means, gaussians.covars(), x, mesh.volume, chosen.binding)
+    binding, x, _, vol0 = bind_two_pass(
+        gaussians.means, gaussians.covars(), x, float(mesh.volume), chosen.binding
+    )
     body = Reconstruction(x, vol0, vol0 * density_at(x, density), gaussians, binding)
     return body.to(torch.float32)

@@ -1,7 +1,6 @@
 """SOAP: Adam in the eigenbasis of Shampoo's preconditioner (Vyas et al. 2024), for small matrices.
 
-A network of three small layers that has to learn rotations and kinks is ill-conditioned for Adam: at equal
-time SOAP ends with a five to ten times lower loss in the regression of priors.
+The regression of priors is ill-conditioned for Adam. In equal time SOAP reaches a five to ten times lower loss.
 """
 
 from __future__ import annotations
@@ -17,9 +16,9 @@ class SOAP(torch.optim.Optimizer):
 
     Args:
         params: matrices (m, n).
-        lr: step size, as Adam's.
-        decay: of every running mean: of the gradient, its square, and the two second moments.
-        every: steps between updates of the eigenvectors (one orthogonal iteration each).
+        lr: step size, as in Adam.
+        decay: decay of the running means of the gradient, its square and the two second moments.
+        every: steps between updates of the eigenvectors by one orthogonal iteration.
     """
 
     def __init__(self, params: Iterable[Tensor], lr: float = 2e-2, decay: float = 0.95, every: int = 10):

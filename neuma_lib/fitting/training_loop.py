@@ -1,4 +1,4 @@
-"""What loops of optimiser steps have in common: a best state that they return to, and a state on disk."""
+"""Common base of training loops: recovery from divergence, and checkpoints."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from neuma_lib.io.checkpoint import Checkpoint
 
 
 class TrainingLoop(ABC):
-    """State of a loop: best so far, factor on the learning rates, curves.
+    """A training loop that returns to its best state if a step diverges.
 
     Attributes:
-        settings: how many recoveries are allowed, among others.
+        settings: maximum number of recoveries, among others.
         log: receives a line for every recovery.
-        optimizer: whose steps the loop makes.
-        iteration: accepted steps.
+        optimizer: the optimizer.
+        iteration: number of accepted steps.
         lr_scale: factor on the learning rates after recoveries.
-        ended: too many recoveries, the loop stops at its best state.
-        history: curves, a dataclass with a list ``recoveries``.
-        first_loss: what losses are measured by; None: no loss yet.
-        best: the state of lowest loss, with ``loss`` and ``iteration``.
+        ended: whether the loop stopped after too many recoveries.
+        history: training curves, a dataclass with a list ``recoveries``.
+        first_loss: unit of the loss, None before the first one.
+        best: state of the lowest loss, with ``loss`` and ``iteration``.
     """
 
     RETURN: ClassVar[str] = "back to the best state, that of iteration"
@@ -38,7 +38,7 @@ class TrainingLoop(ABC):
     optimizer: Optimizer
 
     def _begin(self, history: Any, first_loss: float | None = None) -> None:
-        """The end of a construction: the state that the loop starts from is its best one."""
+        """Initialise the loop at the end of construction, with the current state as the best one."""
         self.iteration, self.lr_scale, self.ended = 0, 1.0, False
         self.history, self.first_loss = history, first_loss
         self.best = {"loss": math.inf, "iteration": 0, **self._snapshot()}
@@ -49,7 +49,7 @@ class TrainingLoop(ABC):
         """Advance to the last iteration.
 
         Args:
-            checkpoint: where to keep the state, so that a killed run goes on; None keeps none.
+            checkpoint: file for the state, so that an interrupted run can resume; None for none.
             progress: called with (iteration, iterations, loss).
         """
         settings = self.settings
@@ -62,7 +62,7 @@ class TrainingLoop(ABC):
                 progress(self.iteration, settings.iterations, self.history.loss[-1])
             if checkpoint is not None and self.iteration % settings.checkpoint_every == 0:
                 checkpoint.save(self.state_dict())
-        self._judge_last_step()
+        self._update_best()
 
     @abstractmethod
     def advance(self) -> None:
@@ -70,10 +70,10 @@ class TrainingLoop(ABC):
 
     @abstractmethod
     def _mean_loss(self) -> float:
-        """The loss of the present state."""
+        """The loss of the current state."""
 
-    def _judge_last_step(self) -> None:
-        """Whether the state after the last optimiser step is the best one."""
+    def _update_best(self) -> None:
+        """Update the best state after the last optimiser step."""
         if self.ended:
             return
         try:
@@ -84,23 +84,23 @@ class TrainingLoop(ABC):
 
     @abstractmethod
     def _snapshot(self) -> dict[str, Any]:
-        """Copies of what an optimiser step changes or depends on."""
+        """Copies of all values that an optimiser step changes or depends on."""
 
     @abstractmethod
     def _restore(self, state: dict[str, Any]) -> None:
-        """Return to a `_snapshot`, which stays as it is."""
+        """Return to a `_snapshot` without changing it."""
 
     def _better_state(self, value: float) -> dict[str, Any]:
-        """The present state if its loss is the lowest so far, else the best one."""
+        """The current state if its loss is the lowest so far, else the best one."""
         if value < self.best["loss"]:
             return {"loss": value, "iteration": self.iteration, **self._snapshot()}
         return self.best
 
     def _recover(self, error: NonFiniteError) -> None:
-        """Return to the best state as a whole with half the learning rates; after too many returns the loop ends there.
+        """Return to the best state with half the learning rates, or end the loop after too many recoveries.
 
-        Not to the state before the diverging step: its loss may already be far above the best one. The schedule of
-        rates goes on, so the number of iterations stays bounded.
+        The state before the diverging step is not used because its loss may already be far above the best one. The
+        schedule of learning rates continues, so the number of iterations stays bounded.
         """
         if not math.isfinite(self.best["loss"]):
             raise error

@@ -40,7 +40,7 @@ class Constitutive(nn.Module):
     with such kernels."""
 
     part: ClassVar[str]
-    named: ClassVar[dict[str, type[Constitutive]]]
+    named: ClassVar[dict[str, type]]
     """Subclasses by name."""
 
     def __init_subclass__(cls, name: str | None = None, **options: Any):
@@ -138,14 +138,14 @@ class Elasticity(Constitutive):
     """Deformation gradient F -> Kirchhoff stress tau = P F^T [Pa], both (N, 3, 3)."""
 
     part = "elasticity"
-    named: ClassVar[dict[str, type[Elasticity]]] = {}
+    named: ClassVar[dict[str, type]] = {}
 
 
 class Plasticity(Constitutive):
     """Trial deformation gradient F_trial -> elastic deformation gradient F, both (N, 3, 3)."""
 
     part = "plasticity"
-    named: ClassVar[dict[str, type[Plasticity]]] = {}
+    named: ClassVar[dict[str, type]] = {}
 
 
 class Law(nn.Module):

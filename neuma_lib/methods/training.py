@@ -84,7 +84,7 @@ class Training:
             "checkpoint": self._checkpoint,
             "progress": self.run.progress,
             "log": self.run.log,
-            "further": others,
+            "other_videos": others,
         }
 
     def report(self, trained) -> dict[str, Any]:

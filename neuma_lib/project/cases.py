@@ -1,7 +1,4 @@
-"""Methods on scenes: options, runs and files of a preset or variant, as the settings have them.
-
-Names only: no file is read, and none has to exist.
-"""
+"""Methods on scenes: options, runs and paths of a preset or variant. No file is read or has to exist."""
 
 from __future__ import annotations
 
@@ -14,17 +11,17 @@ import yaml
 
 from neuma_lib.config.base import Section
 from neuma_lib.config.validation import hint, validate
-from neuma_lib.config.variants import DRAWN, folder, split_variant
+from neuma_lib.config.variants import SEEDS, replicate_folder, split_variant
 from neuma_lib.errors import InputError
 from neuma_lib.methods.base import Case, Method, ModelSource
 from neuma_lib.methods.registry import methods
-from neuma_lib.project import paths as places
+from neuma_lib.project import paths
 from neuma_lib.project.methods import PresetConfig
 from neuma_lib.project.paths import IDENTIFIED
 from neuma_lib.project.settings import NO_TRUTH, Config
 
 LAW_FROM = "law_from"
-"""Key of a variant: the scene whose model moves all bodies, in place of each scene's own."""
+"""Key of a variant: the scene whose model moves all bodies, instead of the model of each scene."""
 
 
 @dataclass(frozen=True)
@@ -64,21 +61,21 @@ class ProjectCase(Case):
         return getattr(self.settings, name).plain()
 
     def result(self, file: str) -> str:
-        return places.home(self.settings, self.scene, file)
+        return paths.result_path(self.settings, self.scene, file)
 
     def data(self, file: str) -> str:
-        base, _ = self.settings.chain(self.scene)
+        base, _ = self.settings.replicate(self.scene)
         return f"{self.settings.data_root.rstrip('/')}/{base}/{file}"
 
     def rollout(self) -> str:
-        return f"{places.results_root(self.settings)}/{self.moved}/{self.folder}/rollout.h5"
+        return f"{paths.results_root(self.settings)}/{self.moved}/{self.folder}/rollout.h5"
 
     def product(self) -> str:
         run = f"{self._folder(self.scene)}/{self.name}"
-        return f"{places.results_root(self.settings)}/{run}/{self.method.product}"
+        return f"{paths.results_root(self.settings)}/{run}/{self.method.product}"
 
     def prior_file(self) -> str:
-        return places.prior_file(self.settings, self.scene, self.prior)
+        return paths.prior_file(self.settings, self.scene, self.prior)
 
     def identified(self) -> str:
         views = self.options.views
@@ -92,11 +89,11 @@ class ProjectCase(Case):
 
     def seeds(self) -> tuple[str, ...]:
         """Seeds of a replicate that change the results."""
-        return tuple(name for name in DRAWN if name in self.method.seeds(self))
+        return tuple(name for name in SEEDS if name in self.method.seeds(self))
 
     def _folder(self, scene: str) -> str:
-        base, seeds = self.settings.chain(scene)
-        return folder(base, seeds, self.seeds())
+        base, seeds = self.settings.replicate(scene)
+        return replicate_folder(base, seeds, self.seeds())
 
     def density(self, scene: str) -> float | dict[str, Any]:
         """Density that the method assumes for the body of a scene [kg/m^3]."""
@@ -171,7 +168,7 @@ def fit_name(settings: Config, method: str) -> str:
 def source_scene(settings: Config, scene: str, method: str) -> str:
     """Folder of the scene that a method's model is obtained from, in the replicate of a scene."""
     source = law_from(settings, method)
-    return scene if source is None else folder(source, settings.chain(scene)[1])
+    return scene if source is None else replicate_folder(source, settings.replicate(scene)[1])
 
 
 def law_from(settings: Config, method: str) -> str | None:
@@ -218,7 +215,7 @@ def _options(settings: Config, scene: str, method: str) -> Section:
     fitted = fit_name(settings, method)
     chosen, given = preset(settings, fitted)
     kind = kind_of(settings, fitted)
-    base, seeds = settings.chain(scene)
+    base, seeds = settings.replicate(scene)
     known = kind.Options.model_fields
     values: dict[str, Any] = {}
     for section in (
@@ -259,38 +256,38 @@ def run_folder(settings: Config, column: str, method: str) -> str:
         column: folder of a scene or experiment, with the seeds of its replicate. Seeds that change nothing in the run
             are left out, so that it is computed once.
     """
-    base, seeds = settings.chain(column)
+    base, seeds = settings.replicate(column)
     used = {name for each in body_cases(settings, column, method) for name in each.seeds()}
-    return f"{folder(base, seeds, [name for name in DRAWN if name in used])}/{method}"
+    return f"{replicate_folder(base, seeds, [name for name in SEEDS if name in used])}/{method}"
 
 
 def runs(settings: Config, table: str, method: str, column: str) -> list[str]:
     """Folders of the runs behind a cell of a table, in the order of its replicates, each once."""
     chosen = settings.tables[table]
-    replicates = (folder(column, dict.fromkeys(chosen.vary, k)) for k in range(chosen.seeds))
+    replicates = (replicate_folder(column, dict.fromkeys(chosen.vary, k)) for k in range(chosen.seeds))
     return list(dict.fromkeys(run_folder(settings, each, method) for each in replicates))
 
 
 def gaussian_motion(settings: Config, scene: str, method: str) -> str:
-    """How Gaussians follow their particles. Those of a splat, many of which lie outside the body, move affinely."""
+    """Motion of the Gaussians, affine for splats, many of whose Gaussians are outside the body."""
     return "affine" if settings.scene(scene).splat else case(settings, scene, method).options.gaussian_motion
 
 
-def moving_methods(settings: Config, scene: str, wanted: Sequence[str]) -> list[str]:
-    """Methods that predict the motion of a scene.
+def moving_methods(settings: Config, scene: str, requested: Sequence[str]) -> list[str]:
+    """Requested methods that predict the motion of a scene.
 
-    A splat has no video. Where a method would learn from it, the models of the scenes ``figures.i23d`` replace it.
+    A splat has no video, so methods that learn use the models of the scenes ``figures.i23d``.
 
     Raises:
         InputError: a splat, and a method whose model cannot come from another scene.
     """
     if not settings.scene(scene).splat:
-        return list(wanted)
+        return list(requested)
     moving = []
-    for method in wanted:
+    for method in requested:
         if not kind_of(settings, method).moves_other_bodies:
             raise InputError(
-                f"{scene}/{method}", "a splat has no video to fit this method to; leave the method out"
+                f"{scene}/{method}", "a splat has no video to fit this method to", "Leave the method out"
             )
         elsewhere = case(settings, scene, method).learned_from_moved_scene
         sources = settings.figures.i23d if elsewhere else (None,)
@@ -301,7 +298,7 @@ def moving_methods(settings: Config, scene: str, wanted: Sequence[str]) -> list[
 def motion_clock(settings: Config, scene: str, method: str) -> tuple[float, tuple[int, ...]]:
     """Time step of the prediction of a splat [s], and the steps of its frames.
 
-    A law holds at the time step that it was learned at, so this is the step of the scene that the model is from.
+    A law is valid for the time step of its training, so this is the step of the scene of the model.
     """
     dt, law_dt = settings.scene(scene).dt, settings.scene(source_scene(settings, scene, method)).dt
     return law_dt, tuple(round(step * dt / law_dt) for step in settings.frame_steps(scene))

@@ -28,7 +28,7 @@ from neuma_lib.config.simulation import GRAVITY, SimulationConfig
 from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.config.tables import TableConfig
 from neuma_lib.config.training import TrainingConfig
-from neuma_lib.config.variants import folder, parse_chain
+from neuma_lib.config.variants import parse_replicate, replicate_folder
 from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.config.viewer import ViewerConfig
 from neuma_lib.errors import InputError
@@ -45,27 +45,25 @@ class Config(Section):
     """All settings."""
 
     data_root: str = Field("data", description="folder of generated or supplied inputs")
-    results_root: str = Field("results", description="folder of everything computed")
+    results_root: str = Field("results", description="folder of all computed files")
     kernel_cache: str = Field(".cache/warp", description="folder of compiled Warp kernels")
     scenes_file: str = Field(
-        "config/scenes.yaml", description="table of the scenes; 'scenes' overrides parts of it"
+        "config/scenes.yaml", description="table of the scenes, which `scenes` overrides"
     )
     device: Literal["auto", "cpu", "cuda"] = Field(
-        "auto", description="where to compute; auto: CUDA if there is one"
+        "auto", description="device of all computations; auto: CUDA if there is a GPU"
     )
-    seed: int = Field(0, description="seed of every stage that has none of its own")
+    seed: int = Field(0, description="seed of every stage without a seed of its own")
     extensions: tuple[str, ...] = Field(
         (), description="Python files with own methods and laws, relative to the folder of the project"
     )
-    scenes: dict[str, SceneConfig] = Field({}, description="benchmarks by name")
-    random: RandomConfig = Field(RandomConfig(), description="scenes drawn at random, beside those by name")
+    scenes: dict[str, SceneConfig] = Field({}, description="scenes by name")
+    random: RandomConfig = Field(RandomConfig(), description="random scenes")
     dataset: DatasetConfig = Field(DatasetConfig(), description="ground truth and images")
     simulation: SimulationConfig = Field(SimulationConfig(), description="material point method")
     priors: PriorsConfig = Field(PriorsConfig(), description="pre-trained laws")
     gaussians: GaussiansConfig = Field(GaussiansConfig(), description="static reconstruction")
-    photographs: PhotographsConfig = Field(
-        PhotographsConfig(), description="Gaussians and mesh of what was photographed"
-    )
+    photographs: PhotographsConfig = Field(PhotographsConfig(), description="reconstruction from photographs")
     radiance: RadianceConfig = Field(RadianceConfig(), description="voxel field of PAC-NeRF")
     geometry: GeometryConfig = Field(GeometryConfig(), description="mesh and particles")
     binding: BindingConfig = Field(BindingConfig(), description="Gaussians to particles")
@@ -82,22 +80,22 @@ class Config(Section):
     viewer: ViewerConfig = Field(ViewerConfig(), description="viewer in a file")
     exports: ExportsConfig = Field(ExportsConfig(), description="motions for other programs")
     figures: FiguresConfig = Field(FiguresConfig(), description="figures")
-    demo: DemoConfig = Field(DemoConfig(), description="the first minute: `make demo`")
+    demo: DemoConfig = Field(DemoConfig(), description="the demo, `make demo`")
     methods: dict[str, PresetConfig] = Field(
-        {}, description="presets of methods by name, besides the built-in"
+        {}, description="presets of methods by name, in addition to the built-in"
     )
     experiments: dict[str, ExperimentConfig] = Field({}, description="uses of learned laws by name")
     tables: dict[str, TableConfig] = Field({}, description="tables by name")
 
-    def chain(self, name: str) -> tuple[str, dict[str, int]]:
+    def replicate(self, name: str) -> tuple[str, dict[str, int]]:
         """Base and seeds of the folder of a scene or an experiment, for example ``BouncyBall+seed=1``."""
         if name.partition("+")[0] in self.experiments:
-            return parse_chain(name, self.experiments, "experiment")
-        return parse_chain(name, self.scenes, "scene")
+            return parse_replicate(name, self.experiments, "experiment")
+        return parse_replicate(name, self.scenes, "scene")
 
     def scene(self, name: str) -> SceneConfig:
-        """The scene of that name, or of a chain's folder."""
-        return self.scenes[parse_chain(name, self.scenes, "scene")[0]]
+        """The scene of a name or of the folder of a replicate."""
+        return self.scenes[parse_replicate(name, self.scenes, "scene")[0]]
 
     @property
     def random_scenes(self) -> list[str]:
@@ -107,9 +105,8 @@ class Config(Section):
 
     @property
     def plain_scenes(self) -> list[str]:
-        """Names of the scenes that have a truth, not one of their own fineness, and are neither drawn at random nor
-        belong to tables on request alone."""
-        asked, shown = (
+        """Names of the scenes with a truth of default resolution, but not random ones or those of tables on request."""
+        requested, shown = (
             {
                 scene
                 for table in self.tables.values()
@@ -120,28 +117,28 @@ class Config(Section):
         )
         others = {
             *self.random_scenes,
-            *(asked - shown),
+            *(requested - shown),
             *(name for name, s in self.scenes.items() if not s.has_truth),
         }
         return [name for name, s in self.scenes.items() if name not in others and s.truth == TruthConfig()]
 
     def experiment(self, name: str) -> ExperimentConfig:
-        """The experiment of that name, or of a chain's folder."""
-        return self.experiments[parse_chain(name, self.experiments, "experiment")[0]]
+        """The experiment of a name or of the folder of a replicate."""
+        return self.experiments[parse_replicate(name, self.experiments, "experiment")[0]]
 
     def experiment_bodies(self, name: str) -> list[dict[str, Any]]:
-        """Complete plain descriptions of an experiment's bodies: those of their scenes, placed where it says.
+        """Complete plain descriptions of the bodies of an experiment, with the settings of their scenes.
 
-        Each has ``scene``, and ``reconstructed`` for one that starts as the reconstruction of its scene's object.
+        Each has ``scene``, and ``reconstructed``: whether it is the reconstructed object of its scene.
         """
-        found = []
+        bodies = []
         for body in self.experiment(name).bodies:
             scene = self.scene(body.scene).plain()
             keys = ("shape", "size", "height", "center", "velocity", "spin", "density", "law", "appearance")
             own = {key: value for key, value in body.plain().items() if value is not None}
             own |= {"size": body.size} if body.shape is not None else {}
-            found.append({**{key: scene[key] for key in keys}, **own, "reconstructed": body.shape is None})
-        return found
+            bodies.append({**{key: scene[key] for key in keys}, **own, "reconstructed": body.shape is None})
+        return bodies
 
     def experiment_dt(self, name: str) -> float:
         """Time step of an experiment [s]."""
@@ -157,12 +154,12 @@ class Config(Section):
         return {"grid": captured.grid or self.captures.grid, "gravity": gravity}
 
     def scene_truth(self, name: str) -> TruthConfig:
-        """How finely the ground truth of a scene is simulated, with nothing left open."""
+        """Resolution of the ground truth of a scene, without null values."""
         scene = self.scene(name)
         return self._truth(scene.truth, scene.dt, f"scenes.{name}")
 
     def experiment_truth(self, name: str) -> TruthConfig:
-        """The same of an experiment, which has no settings of its own."""
+        """Resolution of the ground truth of an experiment."""
         return self._truth(TruthConfig(), self.experiment_dt(name), f"experiments.{name}")
 
     def _truth(self, own: TruthConfig, dt: float, origin: str) -> TruthConfig:
@@ -180,19 +177,19 @@ class Config(Section):
         )
 
     def video_scenes(self, name: str) -> list[str]:
-        """Folders of the scenes whose videos the law of a scene is found in, in its chain: itself, then the others."""
-        base, seeds = self.chain(name)
-        return [name, *(folder(video, seeds) for video in self.scenes[base].videos)]
+        """Folders of the scenes whose videos train the law of a scene, in its replicate: itself, then the others."""
+        base, seeds = self.replicate(name)
+        return [name, *(replicate_folder(video, seeds) for video in self.scenes[base].videos)]
 
     def body_scenes(self, column: str) -> list[str]:
-        """Folders of the scenes whose laws the bodies of a scene or experiment have, in its chain."""
-        base, seeds = self.chain(column)
+        """Folders of the scenes whose laws the bodies of a scene or experiment have, in its replicate."""
+        base, seeds = self.replicate(column)
         if base in self.scenes:
             return [column]
-        return [folder(body.scene, seeds) for body in self.experiments[base].bodies]
+        return [replicate_folder(body.scene, seeds) for body in self.experiments[base].bodies]
 
     def frame_steps(self, name: str) -> tuple[int, ...]:
-        """Steps of the frames of a scene's video. Raises InputError for a captured one, whose files tell them."""
+        """Steps of the frames of the video of a scene. Raises InputError for a capture, whose files define them."""
         scene, steps = self.scene(name), self.dataset.steps or self.scene(name).steps
         if scene.captured:
             raise InputError(f"scenes.{name}", NO_TRUTH)

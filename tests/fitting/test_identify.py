@@ -243,7 +243,7 @@ def test_fits_learn_of_better_ones_that_began_later():
 def test_a_flow_that_never_yields_shows_the_elastic_body():
     """And one that yields does not, whatever their squared residuals."""
     body, seen = video_of(ELASTIC, V0, FRAMES)
-    chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", particles=0)
+    chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", refined_particles=0)
     video = ThrownVideo(MODEL, known(body), body, seen, chosen)
     runs = [_Run(Family("x", spec), [video], [len(FRAMES)], chosen) for spec in (ELASTIC, PLASTIC, PLASTIC)]
     for run, limit in zip(runs, (1.0, 1e5, 1e3), strict=True):
@@ -258,7 +258,7 @@ def test_frames_after_the_contact_judge():
     """However late the contact is: a share of what follows it, and the others are fitted."""
     body, seen = video_of(ELASTIC, V0, FRAMES)
     for v0, share in ((V0, 0.25), ((0.5, -0.6, 0.0), 0.25), (V0, 0.5)):
-        chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", particles=0)
+        chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", refined_particles=0)
         video = ThrownVideo(MODEL, known(body, v0=v0), body, seen, chosen)
         video.hold_out(Family("hencky", ELASTIC), share)
         path = rollout(MODEL, analytic_law(ELASTIC), body.state(v0), steps=FRAMES[-1], frames=FRAMES)
@@ -382,7 +382,7 @@ def test_nesting_of_families():
 def test_stiffness_that_the_time_step_does_not_bear_has_a_difference_too():
     """At the stiffest that dt bears no small step changes the law: the difference is taken over a long one."""
     body, seen = video_of(ELASTIC, V0, FRAMES)
-    chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", particles=0)
+    chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", refined_particles=0)
     video, family = ThrownVideo(MODEL, known(body), body, seen, chosen), Family("hencky", ELASTIC)
     run = _Run(family, [video], [len(FRAMES)], chosen)
     run._origin = family.unbounded({"E": 1e9, "nu": 0.3})

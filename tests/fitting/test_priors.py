@@ -14,8 +14,8 @@ from neuma_lib.fitting.prior_regression import (
     targets,
     train_by_regression,
 )
-from neuma_lib.fitting.prior_throws import random_rotations, random_throw, reference_law, visited_stretches
-from neuma_lib.fitting.prior_training import judge, remark, train_prior
+from neuma_lib.fitting.prior_throws import random_launch, random_rotations, reference_law, visited_stretches
+from neuma_lib.fitting.prior_training import evaluate_prior, remark, train_prior
 from neuma_lib.fitting.soap import SOAP
 from neuma_lib.mechanics.elasticity import STRETCH_MIN
 from neuma_lib.mechanics.law import Law, Plasticity
@@ -87,11 +87,11 @@ def test_throws_stay_in_the_box_and_hit_its_floor():
     generator = torch.Generator().manual_seed(0)
     strains = []
     for _ in range(4):
-        throw = random_throw(law, generator, settings)
-        low, high = throw.model.free_range
-        assert bool(((throw.state.x > low) & (throw.state.x < high)).all())
-        assert throw.model.courant(law, 1000.0) <= 0.5 + 1e-3
-        elastic, trial = visited_stretches(throw, law)
+        launch = random_launch(law, generator, settings)
+        low, high = launch.model.free_range
+        assert bool(((launch.state.x > low) & (launch.state.x < high)).all())
+        assert launch.model.courant(law, 1000.0) <= 0.5 + 1e-3
+        elastic, trial = visited_stretches(launch, law)
         assert elastic.shape[1] == trial.shape[1] == 3
         strains.append(float(elastic.log().abs().max()))
     assert max(strains) > 0.05
@@ -124,7 +124,7 @@ def tiny_plasticine():
 def test_networks_beat_the_best_linear_map_of_their_features(tiny_plasticine):
     """The same relative error, minimised in closed form, is ten times that of the networks at least."""
     reference, generator = reference_law(PLASTICINE, TINY), torch.Generator().manual_seed(0)
-    visited = visited_stretches(random_throw(reference, generator, TINY), reference)
+    visited = visited_stretches(random_launch(reference, generator, TINY), reference)
     for part, pool in zip(("elasticity", "plasticity"), visited, strict=True):
         z, X = targets(reference, part, sample_deformations(pool, TINY, generator))
         X = X / Network(z, X, generator).unit_out
@@ -138,7 +138,10 @@ def test_trained_law_is_nearer_to_its_law_than_an_elastic_one(tiny_plasticine):
     """A hundredth of the Chamfer distance of the same law without its return map, and its speed of sound."""
     law, report = tiny_plasticine
     elastic = {**PLASTICINE, "plasticity": {"name": "identity"}}
-    assert report["chamfer"] < 0.01 * judge(reference_law(elastic, TINY), PLASTICINE, TINY, seed=3)["chamfer"]
+    assert (
+        report["chamfer"]
+        < 0.01 * evaluate_prior(reference_law(elastic, TINY), PLASTICINE, TINY, seed=3)["chamfer"]
+    )
     assert law.wave_speed(1000.0) == pytest.approx(
         reference_law(PLASTICINE, TINY).wave_speed(1000.0), rel=0.1
     )
@@ -162,7 +165,7 @@ def test_states_are_missing_where_networks_crush_what_their_law_does_not():
     assert missing(sink, sink) == []
     true, kept = missing(sink, law)[: TINY.throws], missing(sink, law)[TINY.throws :]
     assert len(true) == len(kept) == TINY.throws
-    usual = random_throw(law, torch.Generator().manual_seed(0), TINY)
+    usual = random_launch(law, torch.Generator().manual_seed(0), TINY)
     assert float(true[0][0].min()) < float(visited_stretches(usual, law)[0].min()), "trials are harder"
     for part in (part for states in kept for part in states):
         assert len(part) and float(part.min()) >= STRETCH_MIN
@@ -234,7 +237,7 @@ def test_a_rough_prior_is_rough_by_its_return_map_alone(name):
         "elasticity": Law(law.elasticity, reference.plasticity),
         "plasticity": Law(reference.elasticity, law.plasticity),
     }
-    apart = {part: judge(each, LAWS[name], settings)["chamfer"] for part, each in apart.items()}
+    apart = {part: evaluate_prior(each, LAWS[name], settings)["chamfer"] for part, each in apart.items()}
     assert apart["elasticity"] < 0.01 and apart["plasticity"] > 0.1
     assert 0.1 <= report["chamfer"] < 0.5
     assert f"Chamfer {report['chamfer']:.4f}e-4 m^2. WARNING" in remark(report)

@@ -8,18 +8,17 @@ import torch
 
 from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.config.training import TrainingConfig
-from neuma_lib.errors import InputError
 from neuma_lib.fitting.frame_batches import first_contact, held_out_frames
 from neuma_lib.fitting.material import ParticleLoss, PixelLoss, Stretch, train_material
 from neuma_lib.fitting.structured_fit import (
-    AS_WELL,
-    Trial,
-    _chosen,
+    TOLERANCE,
+    Score,
+    _select,
+    first_informative_frame,
     from_frame,
-    largest_as_good,
+    largest_similar,
     rival_bases,
     subsets,
-    told_from,
     train_structured,
 )
 from neuma_lib.mechanics.structured import structured_law
@@ -193,8 +192,8 @@ def test_a_killed_run_goes_on_to_the_same_bits(problem, too_stiff, saves):
 def test_each_part_has_to_gain_the_margin():
     def chosen(elastic, plastic, both, margin=0.1):
         losses = {"nothing": 1.0, "elastic": elastic, "plastic": plastic, "elastic + plastic": both}
-        trials = {name: Trial(0.0, loss) for name, loss in losses.items()}
-        base, parts = _chosen([(0, parts) for parts in subsets(("elastic", "plastic"))], trials, margin)
+        trials = {name: Score(0.0, loss) for name, loss in losses.items()}
+        base, parts = _select([(0, parts) for parts in subsets(("elastic", "plastic"))], trials, margin)
         assert base == 0
         return parts
 
@@ -244,11 +243,11 @@ def test_a_killed_run_with_a_rival_goes_on(problem, saves):
 
 
 def test_a_rival_has_to_gain_the_margin_too():
-    trials = {"nothing": Trial(0.0, 1.0), "elastic": Trial(0.0, 0.8), "rival 1: elastic": Trial(0.0, 0.73)}
+    trials = {"nothing": Score(0.0, 1.0), "elastic": Score(0.0, 0.8), "rival 1: elastic": Score(0.0, 0.73)}
     candidates = [(0, ("elastic",)), (1, ("elastic",))]
-    assert _chosen(candidates, trials, 0.1) == (0, ("elastic",))
-    trials["rival 1: elastic"] = Trial(0.0, 0.71)
-    assert _chosen(candidates, trials, 0.1) == (1, ("elastic",))
+    assert _select(candidates, trials, 0.1) == (0, ("elastic",))
+    trials["rival 1: elastic"] = Score(0.0, 0.71)
+    assert _select(candidates, trials, 0.1) == (1, ("elastic",))
 
 
 def test_rivals_are_ties_that_flow_otherwise_the_best_first():
@@ -274,9 +273,9 @@ def test_the_largest_penalty_that_held_out_frames_bear_is_taken(problem):
     assert set(choice.trials) == {"nothing", "elastic", "elastic, penalty 1e-09", "elastic, penalty 1e+09"}
     assert choice.penalty == 1e-9 == choice.as_dict()["penalty"] and any("1e-09" in line for line in said)
     free, held = (choice.trials[f"elastic{w}"].held_out_loss for w in ("", ", penalty 1e+09"))
-    assert held > (1 + AS_WELL) * free and trained.best_loss < trained.history.loss[0]
-    assert largest_as_good({0.0: 1.0, 0.1: 1 + AS_WELL / 2, 1.0: 1 + 2 * AS_WELL}) == 0.1
-    assert largest_as_good({0.0: 1.0, 0.1: 0.9, 1.0: float("inf")}) == 0.1
+    assert held > (1 + TOLERANCE) * free and trained.best_loss < trained.history.loss[0]
+    assert largest_similar({0.0: 1.0, 0.1: 1 + TOLERANCE / 2, 1.0: 1 + 2 * TOLERANCE}) == 0.1
+    assert largest_similar({0.0: 1.0, 0.1: 0.9, 1.0: float("inf")}) == 0.1
 
 
 def test_some_frames_of_a_loss_are_those_of_the_loss(problem):
@@ -323,7 +322,7 @@ def test_a_video_from_a_frame_on_is_the_rest_of_the_whole(problem, first):
 
 
 def test_frames_from_the_contact_on_tell_of_the_law_unless_too_few_follow():
-    assert [told_from(10, contact) for contact in (0, 1, 6, 7, 10)] == [0, 1, 6, 0, 0]
+    assert [first_informative_frame(10, contact) for contact in (0, 1, 6, 7, 10)] == [0, 1, 6, 0, 0]
 
 
 def test_choices_of_parts():
@@ -340,5 +339,5 @@ def test_the_first_contact_is_that_of_any_particle():
 
 def test_too_few_frames(problem):
     body, loss = problem
-    with pytest.raises(InputError, match="at least 4 frames"):
+    with refused("frames"):
         fit((body, loss.select([0, 1, 2])), TRUTH)

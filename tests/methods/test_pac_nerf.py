@@ -334,7 +334,7 @@ def test_bad_input_is_named(carried, loaded):
         fit_pac_nerf(MODEL, carried, video, 0, FamilyConstants(ELASTIC), SMALL)
     with pytest.raises(ValueError, match="fitted"):
         PacFamilyConfig(elasticity={"name": "hencky", "E": 1e5, "nu": 0.3}, fitted=("yield_stress",))
-    with pytest.raises(ValueError, match="not of both"):
+    with pytest.raises(ValueError, match="not both"):
         PacFamilyConfig(elasticity={"name": "hencky", "E": 1e5, "nu": 0.3}, fitted=("E", "mu"))
 
 

@@ -121,7 +121,7 @@ def test_presets_with_mistakes_name_the_key(raw, preset, where):
 def test_keys_of_former_versions_name_the_new_one(raw, key, value, new):
     with refused(f"methods.mine.{key}") as caught:
         changed(raw, methods={"mine": {"title": "Mine", key: value}})
-    assert caught.value.problem.endswith(f"methods.mine.{new}")
+    assert caught.value.problem.endswith(f" to methods.mine.{new}")
 
 
 def test_methods_that_tables_name_exist(raw):

@@ -1,4 +1,4 @@
-"""Settings: mistakes are found by path, variants mean what they say, the documentation follows the types."""
+"""Settings: errors name keys, variants and replicates name folders, the documentation follows the types."""
 
 import json
 import subprocess
@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from neuma_lib.config.base import Section
-from neuma_lib.config.variants import DRAWN, folder, parse_chain
+from neuma_lib.config.variants import SEEDS, parse_replicate, replicate_folder
 from neuma_lib.errors import InputError
 from neuma_lib.project import cases, loading
 from neuma_lib.project.page import PAGE, SCHEMA, settings_markdown, settings_schema
@@ -158,51 +158,53 @@ def test_numbers_without_a_point_are_numbers(raw):
     assert jelly.plain()["elasticity"] == {**elasticity, "E": 1e5}
 
 
-class TestChains:
+class TestReplicates:
     def runs(self, raw, method, column="ClayCat", **table):
         change = {"tables": {"table1": {"seeds": 3, **table}}}
         return cases.runs(loading.load(loading.merged(raw, change), ROOT), "table1", method, column)
 
     @pytest.mark.parametrize("seeds", [(0, 0, 0, 0), (1, 1, 1, 1), (0, 0, 0, 2), (1, 2, 3, 0), (0, 11, 0, 0)])
     def test_names_say_the_seeds(self, seeds):
-        chosen = dict(zip(DRAWN, seeds))
-        assert parse_chain(folder("A", chosen), ["A"], "scene") == ("A", chosen)
+        chosen = dict(zip(SEEDS, seeds))
+        assert parse_replicate(replicate_folder("A", chosen), ["A"], "scene") == ("A", chosen)
 
     def test_what_depends_on_equal_seeds_has_one_name(self):
-        assert folder("A", {}) == "A" and folder("A", dict.fromkeys(DRAWN, 2)) == "A+seed=2"
-        assert folder("A", {"gaussians": 1}) == "A+gaussians_seed=1"
-        assert folder("A", {"gaussians": 1, "adaptor": 5}, ["gaussians"]) == "A+seed=1"
-        assert folder("A", {"adaptor": 5}, ["prior", "gaussians"]) == "A"
+        assert (
+            replicate_folder("A", {}) == "A" and replicate_folder("A", dict.fromkeys(SEEDS, 2)) == "A+seed=2"
+        )
+        assert replicate_folder("A", {"gaussians": 1}) == "A+gaussians_seed=1"
+        assert replicate_folder("A", {"gaussians": 1, "adaptor": 5}, ["gaussians"]) == "A+seed=1"
+        assert replicate_folder("A", {"adaptor": 5}, ["prior", "gaussians"]) == "A"
 
     def test_one_seed_may_differ_from_the_common_one(self):
-        _, seeds = parse_chain("A+seed=2+prior_seed=0", ["A"], "scene")
+        _, seeds = parse_replicate("A+seed=2+prior_seed=0", ["A"], "scene")
         assert seeds == {"prior": 0, "gaussians": 2, "particles": 2, "adaptor": 2}
 
     @pytest.mark.parametrize("name", ["B+seed=1", "A+sed=1", "A+seed=-1", "A+seed=1+seed=1", "A+seed"])
     def test_mistakes(self, name):
         with refused(name):
-            parse_chain(name, ["A"], "scene")
+            parse_replicate(name, ["A"], "scene")
 
-    def test_every_row_of_a_table_has_all_chains(self, raw, loaded):
+    def test_every_row_of_a_table_has_all_replicates(self, raw, loaded):
         for method in loaded.tables["table1"].methods:
-            expected = [f"ClayCat{chain}/{method}" for chain in ("", "+seed=1", "+seed=2")]
+            expected = [f"ClayCat{seeds}/{method}" for seeds in ("", "+seed=1", "+seed=2")]
             assert self.runs(raw, method) == expected
 
     def test_what_does_not_vary_has_one_run(self, raw):
         assert self.runs(raw, "nclaw", vary=["adaptor"]) == ["ClayCat/nclaw"]
         # The base weights are no draw of the adaptor's.
         assert self.runs(raw, "neuma_without_adaptor", vary=["adaptor"]) == ["ClayCat/neuma_without_adaptor"]
-        expected = [f"ClayCat{chain}/neuma" for chain in ("", "+adaptor_seed=1", "+adaptor_seed=2")]
+        expected = [f"ClayCat{seeds}/neuma" for seeds in ("", "+adaptor_seed=1", "+adaptor_seed=2")]
         assert self.runs(raw, "neuma", vary=["adaptor"]) == expected
-        # Without an adaptor all that is drawn has seed 1: one home with the whole chain.
-        assert self.runs(raw, "nclaw", vary=DRAWN[:3])[1] == "ClayCat+seed=1/nclaw"
+        # Without an adaptor all seeds are 1: the folder of the replicate.
+        assert self.runs(raw, "nclaw", vary=SEEDS[:3])[1] == "ClayCat+seed=1/nclaw"
 
-    def test_bodies_of_an_experiment_are_of_its_chain(self, raw, loaded):
+    def test_bodies_of_an_experiment_are_of_its_replicate(self, raw, loaded):
         assert loaded.body_scenes("fish_into_duck+seed=1") == ["SandFish+seed=1", "JellyDuck+seed=1"]
         assert self.runs(raw, "nclaw", "letter_N_sand")[2] == "letter_N_sand+seed=2/nclaw"
         assert loaded.experiment("letter_N_sand+seed=1") == loaded.experiment("letter_N_sand")
 
-    def test_a_chain_changes_seeds_alone(self, raw):
+    def test_a_replicate_changes_seeds_only(self, raw):
         loaded = loading.load(loading.merged(raw, {"training": {"seed": 10}}), ROOT)
         plain = cases.case(loaded, "ClayCat", "neuma").options
         other = cases.case(loaded, "ClayCat+seed=2", "neuma").options
@@ -287,7 +289,7 @@ class TestVideos:
             assert slow.model_dump(exclude=own) == both.model_dump(exclude=own)
             assert not loaded.tables[f"two_throws_{material.lower()}"].default_target
 
-    def test_all_videos_are_of_the_chain(self, raw):
+    def test_all_videos_are_of_the_replicate(self, raw):
         loaded = self.loaded(raw, ClayCat={"videos": [{"height": 0.4}]})
         assert loaded.video_scenes("ClayCat+seed=2") == ["ClayCat+seed=2", "ClayCat_throw2+seed=2"]
         assert loaded.video_scenes("BouncyBall") == ["BouncyBall"]
@@ -351,7 +353,7 @@ class TestFinerTruth:
         assert not {*table.scenes, *loaded.random_scenes} & set(loaded.plain_scenes)
 
     def test_truths_outside_every_family_are_asked_for_by_name(self, loaded):
-        """No prior has their laws, no random scene of the default draw, and no other target makes them."""
+        """Their laws are of no prior and no default random scene, and no other table has them."""
         table = loaded.tables["outside"]
         assert not table.default_target and not {*table.scenes} & set(loaded.plain_scenes)
         assert not any(
@@ -406,12 +408,12 @@ class TestScaleOfThePaper:
 
 
 def test_plain_values_build_the_section_again(loaded):
-    """What a rule hands to its script, as text in between, gives the same settings."""
+    """Settings that pass through a job as text are unchanged."""
     assert Config(**json.loads(json.dumps(loaded.plain()))) == loaded
 
 
 def test_a_stage_depends_on_its_own_settings_alone_and_settings_on_no_torch():
-    """So an edit of the figures' settings does not fit the Gaussians anew, and a plan is made in no time."""
+    """An edit of the settings of figures does not repeat the fit of the Gaussians, and plans are fast."""
     grimp = pytest.importorskip("grimp")
     graph = grimp.build_graph("neuma_lib", include_external_packages=True)
     reached = graph.find_upstream_modules("neuma_lib.fitting.gaussians")

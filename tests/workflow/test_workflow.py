@@ -420,8 +420,8 @@ def test_mistyped_key(finished):
 @pytest.mark.parametrize(
     ("file", "message"),
     [
-        (f"{SCENE}/neuma+rnk=3/metrics.json", "no setting 'rnk'; did you mean rank"),
-        (f"{SCENE}+sed=3/gaussians.ply", "no setting 'sed'; did you mean seed"),
+        (f"{SCENE}/neuma+rnk=3/metrics.json", "no option 'rnk'; did you mean rank"),
+        (f"{SCENE}+sed=3/gaussians.ply", "no option 'sed'; did you mean seed"),
     ],
 )
 def test_mistyped_variant(finished, file, message):

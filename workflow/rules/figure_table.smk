@@ -174,7 +174,7 @@ def splats():
     """The scenes with a splat. Raises InputError where there are none."""
     found = [name for name, scene in SETTINGS.scenes.items() if scene.splat]
     if not found:
-        raise InputError("i23d: no scene has a splat; name one, scenes: {Guitar: {splat: guitar.ply}}")
+        raise InputError("scenes", "no scene has a splat", "Add one, for example Guitar: {splat: guitar.ply}")
     return found
 
 

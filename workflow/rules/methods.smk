@@ -5,7 +5,7 @@ from functools import cache
 
 from neuma_lib.project.cases import LAW_FROM
 from neuma_lib.project.paths import IDENTIFIED
-from neuma_lib.config.variants import parse_chain
+from neuma_lib.config.variants import parse_replicate
 from neuma_lib.project.find import scene_files
 
 
@@ -159,7 +159,7 @@ def gaussian_motion(wildcards):
 
 def prior_chain(wildcards):
     """Name of a prior, and the seeds of its chain."""
-    return parse_chain(wildcards.prior, SETTINGS.priors.laws, "prior")
+    return parse_replicate(wildcards.prior, SETTINGS.priors.laws, "prior")
 
 
 @checked

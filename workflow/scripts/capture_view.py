@@ -52,9 +52,7 @@ class Prediction:
         arrays, _ = read_arrays(rollout, required=("frames",), only=("frames",))
         self.steps = arrays["frames"].tolist()
         if not set(needed) <= set(self.steps):
-            raise InputError(
-                rollout, "its steps are not those of the video", "Run the rule predict again"
-            )
+            raise InputError(rollout, "its steps are not those of the video", "Run the rule predict again")
         self.x, self.F = (state.to(body.x0) for state in load_motion(rollout))
 
     def frames(self, video):

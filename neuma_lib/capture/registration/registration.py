@@ -44,7 +44,7 @@ from neuma_lib.capture.registration.rigid_motion import (
 from neuma_lib.capture.registration.rigid_views import Body, Pictures, Sight
 from neuma_lib.errors import InputError
 from neuma_lib.fitting.frame_batches import spread_frames
-from neuma_lib.fitting.least_squares import BLOCKS, LEAST_COST, jackknife, levenberg_marquardt
+from neuma_lib.fitting.least_squares import BLOCKS, MIN_COST, jackknife, levenberg_marquardt
 from neuma_lib.splatting.gaussians import Gaussians
 
 GRID = 600
@@ -212,7 +212,7 @@ def register(
         if 0 < number < len(STAGES) - 1:
             weights = _colour_weights(pictures, candidates[0], start)
         if stage.reach == np.inf:
-            best = max(candidates[0].cost, LEAST_COST)
+            best = max(candidates[0].cost, MIN_COST)
             going = [f for f in candidates if f.cost < _HOPELESS * best and stage is not STAGES[-1]]
             others += [(f.cost / best, f) for f in candidates[len(going) :] + dropped]
             candidates = going or candidates[:1]
