@@ -8,40 +8,24 @@ two samplings of one and the same body are apart, by less the denser they are. T
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.errors import InputError
 from neuma_lib.evaluation.metrics import mechanical_energy, tracer_errors
 from neuma_lib.geometry.chamfer import chamfer_sequence
-from neuma_lib.mechanics.law import Law
-from neuma_lib.sim.model import MPM, Body
-from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.model import MPM
+from neuma_lib.sim.prediction import Failure
 from neuma_lib.sim.state import State, Trajectory
 
 COUNT_TOLERANCE = 0.1
 """Two jittered samplings of the same wanted count differ by at most this fraction: each keeps to 5 % of it."""
 ENERGY_TOLERANCE = 0.01
 """Fraction of the energy at the start by which no passive body exceeds it (the integrator's own error is smaller)."""
-
-
-@dataclass(frozen=True)
-class Failure:
-    """Where a prediction ended before its last frame.
-
-    Attributes:
-        happened: what a particle did: "became non-finite", "moved by more than a cell in a step", "left the grid".
-        step: simulation step in which it did.
-        particle: the first particle that did.
-    """
-
-    happened: str
-    step: int | None
-    particle: int | None
 
 
 @dataclass(frozen=True)
@@ -68,55 +52,6 @@ class Evaluation:
         if failure := m["diverged"]:
             said += f"; DIVERGED: a particle {failure['happened']} at step {failure['step']}"
         return said
-
-
-def predict(
-    model: MPM,
-    law: Law | Sequence[Body],
-    start: State,
-    frames: Sequence[int],
-    tracers: Tensor | None = None,
-    total: bool = False,
-) -> tuple[Trajectory, Failure | None]:
-    """Rollout of a law; one that becomes unstable is held at its last sound frame.
-
-    Args:
-        start: particles and their initial motion.
-        frames: simulation steps of the frames, T of them.
-        tracers: start positions of passive tracers [m], shape (M, 3).
-        total: also carry the total deformation.
-
-    Returns:
-        The trajectory at the frames, and how it failed (None: it did not).
-    """
-    return sound_frames(
-        lambda kept: rollout(model, law, start, steps=kept[-1], frames=kept, tracers=tracers, total=total),
-        frames,
-    )
-
-
-def sound_frames(
-    simulate: Callable[[Sequence[int]], Trajectory], frames: Sequence[int]
-) -> tuple[Trajectory, Failure | None]:
-    """What a simulation gives up to its last sound frame, held from there on, and how it failed (None: it did not).
-
-    Args:
-        simulate: called with the frames that are wanted; raises NonFiniteError where one of them is not sound.
-        frames: simulation steps of all frames.
-    """
-    kept, failure = list(frames), None
-    while True:
-        try:
-            with torch.no_grad():
-                path = simulate(kept)
-            break
-        except NonFiniteError as error:
-            failure = failure or Failure(error.happened, error.step, error.particle)
-            kept = kept[:-1] if error.step is None else [n for n in kept if n < error.step]
-            if not kept:
-                raise
-    missing = len(frames) - len(kept)
-    return path.hold_last(missing) if missing else path, failure
 
 
 def energy_gain_after(gravity: Sequence[float], start: State, path: Trajectory) -> int | None:
