@@ -9,40 +9,24 @@ distance without the floor.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.errors import InputError
 from neuma_lib.evaluation.metrics import mechanical_energy, tracer_errors
 from neuma_lib.geometry.chamfer import chamfer_sequence
-from neuma_lib.mechanics.law import Law
-from neuma_lib.sim.model import MPM, Body
-from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.model import MPM
+from neuma_lib.sim.prediction import Failure
 from neuma_lib.sim.state import State, Trajectory
 
 COUNT_TOLERANCE = 0.1
 """Maximum relative difference of the counts of two jittered samplings, each within 5 % of the requested count."""
 ENERGY_TOLERANCE = 0.01
 """Maximum gain of a passive body relative to its initial energy. The error of the integrator is smaller."""
-
-
-@dataclass(frozen=True)
-class Failure:
-    """Failure of a prediction before its last frame.
-
-    Attributes:
-        happened: "became non-finite", "moved by more than a cell in a step" or "left the grid".
-        step: simulation step of the failure.
-        particle: the first particle that failed.
-    """
-
-    happened: str
-    step: int | None
-    particle: int | None
 
 
 @dataclass(frozen=True)
@@ -69,55 +53,6 @@ class Evaluation:
         if failure := m["diverged"]:
             text += f"; DIVERGED: a particle {failure['happened']} at step {failure['step']}"
         return text
-
-
-def predict(
-    model: MPM,
-    law: Law | Sequence[Body],
-    start: State,
-    frames: Sequence[int],
-    tracers: Tensor | None = None,
-    total: bool = False,
-) -> tuple[Trajectory, Failure | None]:
-    """Rollout of a law. An unstable motion is held at its last valid frame.
-
-    Args:
-        start: particles and their initial motion.
-        frames: simulation steps of the frames, T of them.
-        tracers: start positions of passive tracers [m], shape (M, 3).
-        total: also carry the total deformation.
-
-    Returns:
-        The trajectory at the frames, and its failure, if any.
-    """
-    return sound_frames(
-        lambda kept: rollout(model, law, start, steps=kept[-1], frames=kept, tracers=tracers, total=total),
-        frames,
-    )
-
-
-def sound_frames(
-    simulate: Callable[[Sequence[int]], Trajectory], frames: Sequence[int]
-) -> tuple[Trajectory, Failure | None]:
-    """A simulation up to its last valid frame, held from there on, and its failure, if any.
-
-    Args:
-        simulate: called with the requested frames. Raises NonFiniteError if it fails before one of them.
-        frames: simulation steps of all frames.
-    """
-    kept, failure = list(frames), None
-    while True:
-        try:
-            with torch.no_grad():
-                path = simulate(kept)
-            break
-        except NonFiniteError as error:
-            failure = failure or Failure(error.happened, error.step, error.particle)
-            kept = kept[:-1] if error.step is None else [n for n in kept if n < error.step]
-            if not kept:
-                raise
-    missing = len(frames) - len(kept)
-    return path.hold_last(missing) if missing else path, failure
 
 
 def energy_gain_after(gravity: Sequence[float], start: State, path: Trajectory) -> int | None:

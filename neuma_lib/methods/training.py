@@ -25,7 +25,7 @@ class Training:
     """A training on all videos of a scene.
 
     Args:
-        inputs: files of `neuma.training_inputs`, and those of the method.
+        inputs: files of `training_inputs`, and those of the method.
         options: as the method got them.
         settings: the same, validated.
         stamp: further settings that a checkpoint must agree with.

@@ -15,13 +15,13 @@ from matplotlib.figure import Figure
 
 from neuma_lib.device import choose_device
 from neuma_lib.evaluation.metrics import mean_height
-from neuma_lib.evaluation.motion import predict
 from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.laws import load_law
 from neuma_lib.io.particles import with_motion
 from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images, note, place
 from neuma_lib.sim.model import MPM
+from neuma_lib.sim.prediction import predict
 
 LEFT, LEGEND, TITLE, PICTURES, CURVES, BETWEEN = 0.5, 0.2, 0.34, 4.0, 1.85, 0.38
 APART = 0.002
