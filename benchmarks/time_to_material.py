@@ -29,7 +29,7 @@ from neuma_lib.fitting import structured_fit
 from neuma_lib.fitting.identify import identify
 from neuma_lib.fitting.material import PixelLoss
 from neuma_lib.fitting.structured_fit import rival_bases, train_structured
-from neuma_lib.fitting.thrown_video import ThrownVideo
+from neuma_lib.fitting.thrown_video import VideoResiduals
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.images import load_videos
@@ -40,8 +40,8 @@ from neuma_lib.project.settings import Config
 
 METHOD = "neuma_structured"
 IDENTIFYING = {
-    "simulating": (ThrownVideo, "_paths"),
-    "rendering": (ThrownVideo, "_residual"),
+    "simulating": (VideoResiduals, "_paths"),
+    "rendering": (VideoResiduals, "_residual"),
     "linearising": (identification._Run, "linearise"),
     "uncertainties": (identification._Run, "_covariance"),
 }
@@ -126,7 +126,9 @@ def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
         ]
     stock = settings.priors.laws.get(scene.prior)
     with clock.parts(IDENTIFYING), clock.part("identifying, the rest"):
-        found = identify(model, throw, body, videos, chosen, stock.plain() if stock else None, finer=[finer])
+        found = identify(
+            model, throw, body, videos, chosen, stock.plain() if stock else None, refined=[finer]
+        )
     plain = found.as_dict()
     material, structured = settings.method_material(name, METHOD), settings.method_structured(METHOD)
     with clock.part("preparing the correction"):
