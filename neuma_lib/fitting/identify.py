@@ -465,8 +465,8 @@ class _Run:
         return replace(throw.moved(self._u[motion]), std=throw.std * stds[motion])
 
     def _constant_columns(self, unknowns: np.ndarray, residual: Sequence[Tensor]) -> list[list[Tensor]]:
-        """Forward differences by the constants, or backward if the forward one diverges or exceeds the stiffness limit of
-        dt, which the last step may have reached."""
+        """Forward differences by the constants, or backward if the forward one diverges or exceeds the stiffness limit
+        of dt, which the last step may have reached."""
         values, h = self._values(unknowns), self.settings.difference
         columns = [[torch.zeros_like(r) for r in residual]] * self._constants
         missing = range(self._constants)
