@@ -216,8 +216,8 @@ def estimate_velocity(
 class _Flight:
     """Free flight of the body: the simulated motion of a spinning body, moved along a parabola.
 
-    In free flight the centre of mass follows a parabola independently of the rotation, which is simulated without gravity
-    in the middle of the cube, far from walls.
+    In free flight the centre of mass moves on a parabola independently of the rotation, simulated without gravity in the
+    middle of the cube, far from walls.
 
     Attributes:
         ends: step at which the exposure of each frame ends.
