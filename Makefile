@@ -41,6 +41,11 @@ test-all: env
 	$(BIN)/python -m pytest -n $(CORES) --ignore=tests/workflow
 	$(BIN)/python -m pytest tests/workflow
 
+# In a fresh environment; VERSIONS=lowest takes the lower bounds of pyproject.toml.
+VERSIONS ?= newest
+test-core:
+	PYTHON=$(PYTHON) tests/core_install.sh .core/$(VERSIONS) $(VERSIONS)
+
 lint: env
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .

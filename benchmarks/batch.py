@@ -21,7 +21,7 @@ from benchmarks.timing import synchronize
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.batch import rollout_batch
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 
 HENCKY = {"name": "hencky", "E": 1e5, "nu": 0.3}
@@ -73,7 +73,7 @@ def main() -> None:
 
     torch.set_num_threads(1)
     device = torch.device(args.device)
-    model, start = MPMModel(args.grid, args.dt), falling_cube(args.particles, device)
+    model, start = MPM(args.grid, args.dt), falling_cube(args.particles, device)
     run = dict(
         steps=args.steps,
         frames=range(0, args.steps + 1, FRAME_EVERY),

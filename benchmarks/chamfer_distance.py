@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from neuma_lib.evaluation.text_tables import as_markdown
 from neuma_lib.geometry.chamfer import chamfer
 from neuma_lib.geometry.volume import sample_volume
-from neuma_lib.paper.tables import shown
+from neuma_lib.paper.claims import shown
 
 
 def moved(x: np.ndarray, amount: float) -> np.ndarray:

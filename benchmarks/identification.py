@@ -2,7 +2,7 @@
 
     python -m benchmarks.identification RubberPawn                          # reads data/, results/, config/config.yaml
     python -m benchmarks.identification random1_05 random2_03 --seeds 1 2 --count 12 --jobs 16 --out found.json
-    python -m benchmarks.identification random1_05 --set '{"give_up": 3}'   # other settings of `identify`
+    python -m benchmarks.identification random1_05 --set '{"prune_factor": 3}'   # other settings of `identify`
     python -m benchmarks.identification random1_02 --seeds 1 --count 8 --simplex   # only: two ways to find constants
 
 A scene may be named by the beginning of its name; without names, all random scenes that have results are taken.
@@ -27,7 +27,7 @@ from scipy.optimize import minimize
 from benchmarks.project_scenes import chosen_scenes, scene_parser, simulator
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.scenes import SceneConfig
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.metrics import tracer_errors
@@ -64,12 +64,12 @@ def judge(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str, 
     mesh = read_mesh(results / "mesh.ply")
     finer = [
         body.resampled(
-            torch.from_numpy(sample_volume(mesh, chosen.particles, seed)),
+            torch.from_numpy(sample_volume(mesh, chosen.refined_particles, seed)),
             mesh.volume,
             scene.density,
             settings.binding,
         )
-        for seed in range(1, 1 + (chosen.samplings if chosen.particles else 0))
+        for seed in range(1, 1 + (chosen.resamplings if chosen.refined_particles else 0))
     ]
     model = simulator(settings, scene)
     stock = settings.priors.laws.get(scene.prior)
@@ -90,7 +90,7 @@ def judge(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str, 
     tracers = torch.from_numpy(arrays["tracers"])
     tracers = tracers[:, :: max(1, tracers.shape[1] // TRACERS)].to(body.x0)
     laws = {"identified": row["found"]["law"], "true_law": truth}
-    starts = {"velocity": throw, "fitted": found.best.throws[0]}
+    starts = {"velocity": throw, "fitted": found.best.motions[0]}
     for law, spec in laws.items():
         for start, thrown in starts.items():
             path, _ = predict(
@@ -121,7 +121,7 @@ def compare(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str
     model = simulator(settings, scene)
     thrown = VideoResiduals(model, throw, body, video, chosen)
     thrown.hold_out(family, chosen.held_out)
-    rounds = range(len(chosen.squares))
+    rounds = range(len(chosen.pyramid))
     origin, known = family.unbounded(family.guess), np.zeros(NUISANCES)
     images: dict[bytes, torch.Tensor | None] = {}
     finest: list[float] = []  # squared residuals at the finest squares, of one rollout after the other
@@ -150,7 +150,7 @@ def compare(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str
     most, begun, u = SIMPLEX_ROLLOUTS * run.rollouts, _core_seconds(), np.zeros(len(origin))
     for level in rounds:
         first = u + np.vstack([np.zeros(len(u)), 0.5**level * SIMPLEX_EDGE * np.eye(len(u))])
-        tolerance = chosen.least_gain * (_LAST_GAIN if level == rounds[-1] else 1.0)
+        tolerance = chosen.min_gain * (_LAST_GAIN if level == rounds[-1] else 1.0)
         options = dict(initial_simplex=first, xatol=math.inf, fatol=tolerance, maxfev=most - len(finest))
         u = minimize(log_cost, u, (level,), "Nelder-Mead", options=options).x if most > len(finest) else u
     pixels = thrown.fitted_pixels
@@ -195,14 +195,14 @@ def _listed(constants: Mapping[str, float]) -> str:
 
 def _read(
     name: str, settings: Config, changes: Mapping[str, Any]
-) -> tuple[SceneConfig, IdentifyConfig, Throw, Reconstruction, Observation]:
+) -> tuple[SceneConfig, IdentifyConfig, InitialMotion, Reconstruction, Observation]:
     scene = settings.scene(name)
     data, results = Path(settings.data_root) / name, Path(settings.results_root) / name
     chosen = IdentifyConfig(**merged(settings.identify.plain(), changes))
     files = (results / name for name in ("particles.h5", "binding.h5", "gaussians.ply"))
     body = load_body(*files, scene.density, gaussian_motion=chosen.gaussian_motion).to(torch.float32)
     video = load_observation(data / "dynamic/transforms.json", chosen.views).to(torch.float32)
-    return scene, chosen, Throw.of(read_json(results / "velocity.json")), body, video
+    return scene, chosen, InitialMotion.of(read_json(results / "velocity.json")), body, video
 
 
 def _core_seconds() -> float:

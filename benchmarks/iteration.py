@@ -25,7 +25,7 @@ import torch
 from benchmarks import torch_simulation
 from benchmarks.scene import SMALL, BenchmarkScene, Size, make_scene
 from benchmarks.timing import arithmetic, bandwidth, device_name, peak_memory, seconds, seconds_a_call
-from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.fitting.material import PixelLoss, train_material
 from neuma_lib.sim.memory import MemoryPlan
 from neuma_lib.sim.model import as_bodies
@@ -206,7 +206,7 @@ def iterations(scene: BenchmarkScene, count: int) -> list[float]:
     """Wall time of each of some training iterations [s], by the training loop itself."""
     loss = PixelLoss(scene.body, scene.observation)
     precision = scene.law.elasticity.adjoint_precision
-    settings = MaterialConfig(iterations=count, lr_elastic=1e-4, lr_plastic=1e-5, adjoint_precision=precision)
+    settings = TrainingConfig(iterations=count, lr_elastic=1e-4, lr_plastic=1e-5, adjoint_precision=precision)
     trained = train_material(
         scene.model, scene.law, scene.body.state(scene.v0), loss, settings, log=lambda _: None
     )

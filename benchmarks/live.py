@@ -31,7 +31,7 @@ from neuma_lib.device import choose_device
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.structured import structured_law
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from neuma_lib.viewer import scalars
@@ -56,7 +56,7 @@ def law_of(name: str, scene: BenchmarkScene) -> Law:
     return law
 
 
-def unpaced(model: MPMModel, law: Law, state: State) -> tuple[int, list[float]]:
+def unpaced(model: MPM, law: Law, state: State) -> tuple[int, list[float]]:
     """Steps of a frame in real time, and times of some such frames at full speed [s]."""
     steps, spans = max(1, round(FRAME / model.dt)), []
     for _ in range(FRAMES + 2):

@@ -30,13 +30,13 @@ from neuma_lib.methods.pac_nerf.lattice import Lattice
 from neuma_lib.methods.pac_nerf.options import PacFamilyConfig, PacNerfConfig
 from neuma_lib.methods.pac_nerf.rendering import Opacity, camera_rays
 from neuma_lib.project.loading import load, merged, read_yaml
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from neuma_lib.splatting.cameras import Cameras, look_at
 from neuma_lib.splatting.observation import Observation
 
-MODEL = MPMModel(grid=16, dt=1e-3)
+MODEL = MPM(grid=16, dt=1e-3)
 V0 = (0.3, -1.5, 0.2)
 DENSITY = 1000.0
 CENTRE, RADIUS, EDGE = (0.5, 0.25, 0.5), 0.08, 0.025

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 from functools import reduce
+from typing import Any
 
 from neuma_lib.config.scenes import SceneConfig
 from neuma_lib.project.loading import load, merged, read_yaml
 from neuma_lib.project.settings import Config
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 
 
 def scene_parser(description: str, nargs: str) -> argparse.ArgumentParser:
@@ -38,7 +39,12 @@ def chosen_scenes(args: argparse.Namespace) -> dict[str, Config]:
     }
 
 
-def simulator(settings: Config, scene: SceneConfig) -> MPMModel:
-    """Constants of the simulator for a scene's reconstruction."""
+def simulation(settings: Config, scene: SceneConfig) -> dict[str, Any]:
+    """Constants of the simulator for a scene's reconstruction, as `MPM` takes them."""
     known = settings.simulation.plain()
-    return MPMModel(dt=scene.dt, **{key: known[key] for key in ("grid", "gravity", "boundary", "walls")})
+    return {"dt": scene.dt, **{key: known[key] for key in ("grid", "gravity", "boundary", "walls")}}
+
+
+def simulator(settings: Config, scene: SceneConfig) -> MPM:
+    """The simulator for a scene's reconstruction."""
+    return MPM(**simulation(settings, scene))

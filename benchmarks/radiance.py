@@ -37,7 +37,7 @@ def main() -> None:
         before = resource.getrusage(resource.RUSAGE_SELF).ru_utime
         field, report = fit_radiance_field(*views, chosen, settings.seed)
         seconds = resource.getrusage(resource.RUSAGE_SELF).ru_utime - before
-        particles = field.particles(chosen.spacing, chosen.least_opacity)
+        particles = field.particles(chosen.spacing, chosen.min_opacity)
         numbers = (1e3 * float(particles.masses(1.0).sum()), report.psnr, report.psnr_object)
         numbers += (report.direct_psnr, report.direct_psnr_object)
         print(

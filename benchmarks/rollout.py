@@ -24,7 +24,7 @@ from neuma_lib.mechanics.adaptor import AdaptableLaw
 from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.mechanics.structured import FORMS, structured_law
 from neuma_lib.sim.memory import MemoryPlan
-from neuma_lib.sim.model import MPMModel, as_bodies
+from neuma_lib.sim.model import MPM, as_bodies
 from neuma_lib.sim.rollout import RolloutFunction, rollout
 from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import State
@@ -144,7 +144,7 @@ def main() -> None:
 
     torch.set_num_threads(args.threads)
     device = torch.device(args.device)
-    model = MPMModel(args.grid, 1e-3)
+    model = MPM(args.grid, 1e-3)
     law = soft_law(args.law, device)
     state = falling_cube(args.particles, device)
     frames = sorted({max(1, round(args.steps * (i + 1) / args.frames)) for i in range(args.frames)})

@@ -16,7 +16,7 @@ from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.neural import NeuralLaw, features, neural_law
 from neuma_lib.mechanics.singular_values import rotation_and_singular_values
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.observation import Observation
@@ -64,7 +64,7 @@ class BenchmarkScene:
     """
 
     size: Size
-    model: MPMModel
+    model: MPM
     law: NeuralLaw
     body: Reconstruction
     v0: torch.Tensor
@@ -74,7 +74,7 @@ class BenchmarkScene:
 def make_scene(size: Size, device: torch.device) -> BenchmarkScene:
     """The scene on a device, in float32."""
     generator = torch.Generator().manual_seed(0)
-    model = MPMModel(size.grid, size.dt)
+    model = MPM(size.grid, size.dt)
     centre = torch.tensor([0.5, model.free_range[0] + FREE_HEIGHT + RADIUS, 0.5])
     x0 = centre + RADIUS * _in_unit_ball(size.particles, generator)
     # as a jittered lattice would number them: along lines, so that neighbours in memory are neighbours in space

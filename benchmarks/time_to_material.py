@@ -22,7 +22,7 @@ import torch
 
 from benchmarks.project_scenes import chosen_scenes, scene_parser, simulator
 from benchmarks.timing import device_name, synchronize
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.device import choose_device
 from neuma_lib.fitting import identify as identification
 from neuma_lib.fitting import structured_fit
@@ -36,6 +36,7 @@ from neuma_lib.io.images import load_videos
 from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_body
 from neuma_lib.mechanics.structured import structured_law
+from neuma_lib.project import cases
 from neuma_lib.project.settings import Config
 
 METHOD = "neuma_structured"
@@ -101,28 +102,28 @@ def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
     clock, scene, chosen = Clock(device), settings.scene(name), settings.identify
     data, results = Path(settings.data_root) / name, Path(settings.results_root) / name
     model, dt = simulator(settings, scene), scene.dt
-    binding, filming = settings.binding, {"dt": dt, "sub_frames": settings.dataset.sub_frames}
+    binding, exposure = settings.binding, {"dt": dt, "exposure_samples": settings.dataset.exposure_samples}
     with clock.part("reading body"):
         files = (results / file for file in ("particles.h5", "binding.h5", "gaussians.ply"))
         body = load_body(*files, scene.density, gaussian_motion=chosen.gaussian_motion).to(
             torch.float32, device
         )
-        throw = Throw.of(read_json(results / "velocity.json"))
+        throw = InitialMotion.of(read_json(results / "velocity.json"))
     with clock.part("reading images"):
         videos = [
             video.to(torch.float32, device)
-            for video in load_videos(data / "dynamic/transforms.json", chosen.views, **filming)
+            for video in load_videos(data / "dynamic/transforms.json", chosen.views, **exposure)
         ]
     with clock.part("finer bodies"):
         mesh = read_mesh(results / "mesh.ply")
         finer = [
             body.resampled(
-                torch.from_numpy(sample_volume(mesh, chosen.particles, seed)),
+                torch.from_numpy(sample_volume(mesh, chosen.refined_particles, seed)),
                 mesh.volume,
                 scene.density,
                 binding,
             )
-            for seed in range(1, 1 + (chosen.samplings if chosen.particles else 0))
+            for seed in range(1, 1 + (chosen.resamplings if chosen.refined_particles else 0))
         ]
     stock = settings.priors.laws.get(scene.prior)
     with clock.parts(IDENTIFYING), clock.part("identifying, the rest"):
@@ -130,22 +131,21 @@ def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
             model, throw, body, videos, chosen, stock.plain() if stock else None, refined=[finer]
         )
     plain = found.as_dict()
-    material, structured = settings.method_material(name, METHOD), settings.method_structured(METHOD)
+    options = cases.case(settings, name, METHOD).options
     with clock.part("preparing the correction"):
-        bases = [plain["law"], *rival_bases(plain, structured.rivals)]
+        bases = [plain["law"], *rival_bases(plain, options.rivals)]
         laws = [
-            structured_law({**base, "form": structured.form}, dt, seed=material.seed).to(device)
-            for base in bases
+            structured_law({**base, "form": options.form}, dt, seed=options.seed).to(device) for base in bases
         ]
         for law in laws:
-            law.attach_adaptor(material.rank, material.alpha, material.seed)
-        start = found.best.throws[0].of_body(body)
-        total = material.covariance_from == "total"
-        loss = PixelLoss(body, videos, material.covariance_gradient, total=total, compare=material.compare)
+            law.attach_adaptor(options.rank, options.alpha, options.seed)
+        start = found.best.motions[0].of_body(body)
+        total = options.covariance_from == "total"
+        loss = PixelLoss(body, videos, options.covariance_gradient, total=total, compare=options.compare)
     quiet = {"log": lambda text: None}
     with clock.parts(CORRECTING), clock.part("correcting, the rest"):
         trained, choice = train_structured(
-            model, laws[0], start, loss, material, structured, rivals=laws[1:], **quiet
+            model, laws[0], start, loss, options, options, rivals=laws[1:], **quiet
         )
     parts = clock.plain()
     return {

@@ -1,7 +1,7 @@
 """Copy the tables and figures of a run to docs/results, and update the numbers on the pages that show them.
 
 python -m docs.record            # after: snakemake --cores 2 tables figures random results/finer_truth.csv
-python -m docs.record --configfile config/three_chains.yaml     # after the same with this option
+python -m docs.record --configfile config/studies/three_chains.yaml     # after the same with this option
 
 The first line of a recorded table names date, commit and machine. Text between `<!-- name -->` and `<!-- /name -->` is
 generated: `table1` in README.md, `verdicts` in docs/results/claims.md, `figures` in docs/results/figures.md.
@@ -24,10 +24,11 @@ from PIL import Image
 
 from neuma_lib.evaluation.text_tables import as_markdown
 from neuma_lib.io.files import read_json
+from neuma_lib.paper.claims import VERDICTS
 from neuma_lib.paper.figures import image_quality, lora_alphav, material_response
 from neuma_lib.paper.image_grid import load_image_grid
 from neuma_lib.paper.published import PAPER
-from neuma_lib.paper.tables import ABSORBED, VERDICTS
+from neuma_lib.paper.tables import ABSORBED
 
 MADE_BY = {
     "table1": "tables figures",
@@ -133,7 +134,7 @@ def verdicts(tables: dict[str, str]) -> str:
         "Recorded by an older version, without verdicts": [
             name
             for name, text in tables.items()
-            if name in PAPER and (PAPER[name].claims or PAPER[name].targets) and VERDICT_HEAD not in text
+            if name in PAPER and PAPER[name].claims and VERDICT_HEAD not in text
         ],
     }
     said = [line for what, names in lacking.items() if names for line in ("", f"{what}: {', '.join(names)}.")]

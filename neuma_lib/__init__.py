@@ -9,57 +9,91 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from neuma_lib.api import (
+        Adaptation,
+        Identification,
+        Scene,
+        Video,
+        adapt,
+        estimate_motion,
+        evaluate,
+        identify,
+        render,
+    )
+    from neuma_lib.coupling.initial_motion import InitialMotion
+    from neuma_lib.coupling.reconstruction import Reconstruction
     from neuma_lib.errors import InputError, NonFiniteError
-    from neuma_lib.io.laws import load_law, save_law
-    from neuma_lib.mechanics.analytic import analytic_law
     from neuma_lib.mechanics.law import Elasticity, Law, Plasticity
-    from neuma_lib.sim.model import MPMModel
-    from neuma_lib.sim.rollout import rollout
-    from neuma_lib.sim.rollout import rollout as simulate
+    from neuma_lib.methods.base import Method
+    from neuma_lib.methods.registry import METHODS
+    from neuma_lib.sim.model import MPM
+    from neuma_lib.sim.rollout import rollout, simulate
     from neuma_lib.sim.state import State, Trajectory
+    from neuma_lib.viewer.open import view
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "Adaptation",
     "Elasticity",
+    "Identification",
+    "InitialMotion",
     "InputError",
     "Law",
-    "MPMModel",
+    "METHODS",
+    "MPM",
+    "Method",
     "NonFiniteError",
     "Plasticity",
+    "Reconstruction",
+    "Scene",
     "State",
     "Trajectory",
+    "Video",
     "__version__",
-    "analytic_law",
-    "load_law",
+    "adapt",
+    "estimate_motion",
+    "evaluate",
+    "identify",
+    "render",
     "rollout",
-    "save_law",
     "simulate",
+    "view",
 ]
 
 _HOMES = {
+    "Adaptation": "api",
     "Elasticity": "mechanics.law",
+    "Identification": "api",
+    "InitialMotion": "coupling.initial_motion",
     "InputError": "errors",
     "Law": "mechanics.law",
-    "MPMModel": "sim.model",
+    "METHODS": "methods.registry",
+    "MPM": "sim.model",
+    "Method": "methods.base",
     "NonFiniteError": "errors",
     "Plasticity": "mechanics.law",
+    "Reconstruction": "coupling.reconstruction",
+    "Scene": "api",
     "State": "sim.state",
     "Trajectory": "sim.state",
-    "analytic_law": "mechanics.analytic",
-    "load_law": "io.laws",
+    "Video": "api",
+    "adapt": "api",
+    "estimate_motion": "api",
+    "evaluate": "api",
+    "identify": "api",
+    "render": "api",
     "rollout": "sim.rollout",
-    "save_law": "io.laws",
-    "simulate": "sim.rollout:rollout",
+    "simulate": "sim.rollout",
+    "view": "viewer.open",
 }
-"""Module of each public name below this package, and its name there if it differs."""
+"""Module of each public name below this package."""
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module, _, there = _HOMES[name].partition(":")
-    value = getattr(importlib.import_module(f"{__name__}.{module}"), there or name)
+    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
     globals()[name] = value
     return value
 

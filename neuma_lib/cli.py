@@ -6,9 +6,7 @@ import argparse
 import json
 import subprocess
 import sys
-import threading
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -329,9 +327,10 @@ def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
     settings, root = settings_around(place, options.configfile)
     settings = settings.model_copy(update={"results_root": str(place.parent.parent)})
     scene, method = place.parent.name, place.name
-    law = cases.case(settings, scene, method).source().load(lambda file: str(root / file)).law
-    if law is None:
+    case = cases.case(settings, scene, method)
+    if not case.method.has_law:
         raise InputError(options.source, "its motion follows from no material law", "Choose another method")
+    law = case.source().load(lambda file: str(root / file)).law
     origin = cases.law_origin(settings, scene, method)
     beside = {"metrics": place / "metrics.json", "rollout": place / "rollout.h5"}
     of_this = {name: file for name, file in beside.items() if file.is_file() and origin["scene"] == scene}
@@ -374,42 +373,17 @@ def _show(options: argparse.Namespace) -> None:
 
 
 def _view(options: argparse.Namespace) -> None:
-    import torch
+    from neuma_lib.viewer.open import view
 
-    from neuma_lib.device import choose_device
-    from neuma_lib.project.find import found_laws, found_scene
-    from neuma_lib.viewer.page import write_page
-    from neuma_lib.viewer.playground import Playground, first_law
-    from neuma_lib.viewer.scene import load_scene
-    from neuma_lib.viewer.server import ViewerServer, viser
-
-    if not options.file:
-        viser()  # fails before anything is read
-    settings, files = found_scene(options.scene, options.configfile)
-    if options.methods:
-        known = {run.name: run for run in files.runs}
-        if unknown := [name for name in options.methods if name not in known]:
-            raise InputError(f"--methods {unknown[0]}", f"{options.scene} has {', '.join(known) or 'none'}")
-        files = replace(files, runs=tuple(known[name] for name in options.methods))
-    viewer = settings.viewer
-    scene = load_scene(files, say=print, side=viewer.image_side, skip_damaged=True)
-    for note in scene.notes:
-        print(note, file=sys.stderr)
-    if options.file:
-        size = write_page(Path(options.file), scene, viewer.particles, viewer.megabytes)
-        print(f"{options.file}: {len(scene.motions)} motions, {size / 1e6:.1f} MB; open it in a browser")
-        return
-    device = choose_device(options.device)
-    torch.set_num_threads(1)  # two OpenMP threads next to the server's are slower than one
-    laws = found_laws(settings, files.name)
-    playground = Playground(files, laws, first_law(files, laws), device) if laws else None
-    server = ViewerServer(scene, playground, options.host, options.port)
-    counts = f"{len(scene.motions)} motions, {len(laws)} laws"
-    print(f"http://{server.host}:{server.port}  ({counts}; Ctrl-C ends it)")
-    try:
-        threading.Event().wait()
-    except KeyboardInterrupt:
-        server.close()
+    view(
+        options.scene,
+        methods=options.methods,
+        file=options.file,
+        configfiles=options.configfile,
+        host=options.host,
+        port=options.port,
+        device=options.device,
+    )
 
 
 if __name__ == "__main__":

@@ -26,6 +26,6 @@ def require(module: str, extra: str) -> ModuleType:
     except ImportError as error:
         raise InputError(
             module.partition(".")[0],
-            f"the package cannot be imported ({error})",
+            f"the package cannot be imported: {error}",
             f'Install it with `pip install "neuma[{extra}]"`, in the project\'s folder with `make {TARGETS[extra]}`',
         ) from None

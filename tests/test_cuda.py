@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from neuma_lib.config.binding import BindingConfig
-from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.coupling.particle_binding import bind_two_pass
 from neuma_lib.coupling.particle_gs import ParticleGS
@@ -307,7 +307,7 @@ def train(device, settings, checkpoint=None):
 
 @pytest.mark.parametrize("precision", ["single", "half"])
 def test_training_runs_on_the_gpu(precision):
-    result = train("cuda", MaterialConfig(iterations=5, adjoint_precision=precision))
+    result = train("cuda", TrainingConfig(iterations=5, adjoint_precision=precision))
     assert result.best_loss < result.history.loss[0]
     assert len(result.history.seconds) == 5
 
@@ -322,7 +322,7 @@ class Killed(Checkpoint):
 
 @pytest.mark.parametrize("device", ["cuda", "cpu"])
 def test_a_training_killed_on_the_gpu_resumes_on_either_device(tmp_path, device):
-    settings = MaterialConfig(iterations=6, checkpoint_every=3)
+    settings = TrainingConfig(iterations=6, checkpoint_every=3)
     whole = train("cuda", settings)
     with pytest.raises(KeyboardInterrupt):
         train("cuda", settings, Killed(tmp_path / "state.pt", {}))

@@ -2,7 +2,8 @@
 
 log, benchmark  <results>/{logs,benchmarks}/<one folder for each wildcard>/<rule>.{log,tsv}
 conda           the locked environment, for `--sdm conda` (not tried)
-params.code     digest of the script and of the library modules behind it: an edit there reruns the rule
+params.code     digest of the script, of the library modules behind it, and of own laws that other parameters name: an
+                edit there reruns the rule
 resources       `RESOURCES`, and one thread (Snakemake's own default)
 """
 
@@ -11,7 +12,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from pathlib import Path
 
-from workflow.provenance import code_digest
+from neuma_lib.mechanics.catalogue import DEFINED_IN
+from workflow.provenance import code_digest, digest_of_files, law_files
 
 RESOURCES = {"gpu": 0, "mem_mb": 4000, "runtime": 60}  # GPUs, MB, minutes
 CONDA = "../../envs/conda.yaml"  # relative to the files of the rules
@@ -41,6 +43,11 @@ def complete(workflow, results: str, known: Collection[str] = ()) -> None:
             rule.conda_env = CONDA
         if "code" not in rule.params.keys():
             rule.set_params(code=digest_of(_script(rule)))
+        if DEFINED_IN:
+            code = list(rule.params).index(rule.params.code)
+            rule.params[code] = _with_laws(
+                rule.params.code, [p for p in rule.params if p is not rule.params.code]
+            )
         resources = type(rule.resources).from_mapping(dict(RESOURCES))
         resources.update(said.resources[1] if said.resources else {})
         resources.update(workflow.resource_settings._parsed_overwrite_resources.get(rule.name, {}))
@@ -58,6 +65,16 @@ def digest_of(file: Path) -> Callable:
     Digests of all rules would be two fifths of what Snakemake takes to start, twice for each job of a cluster.
     """
     return lambda wildcards: code_digest(file)
+
+
+def _with_laws(code: Callable, others: list) -> Callable:
+    """A digest of code that includes the files of own laws which the other parameters name."""
+
+    def digest(wildcards):
+        files = law_files([value(wildcards) if callable(value) else value for value in others])
+        return code(wildcards) + (f" {digest_of_files(files)}" if files else "")
+
+    return digest
 
 
 def _wildcard_path(rule) -> str:

@@ -18,8 +18,10 @@ def image_list(place: str, stride: int | None, key: str, stride_key: str) -> str
         lists = [name for name in (*COUNTED, "transforms.json") if Path(place, name).is_file()]
         if len(lists) != 1:
             found = " and ".join(lists) or f"none of {', '.join(COUNTED)}, transforms.json"
-            raise InputError(f"{key}: the folder {place} has {found}; name the file that lists the images")
+            raise InputError(key, f"the folder {place} has {found}", "Give the file that lists the images")
         place = f"{place.rstrip('/')}/{lists[0]}"
     if Path(place).name in COUNTED and stride is None:
-        raise InputError(f"{stride_key}: {place} counts frames; say how many simulated steps lie between two")
+        raise InputError(
+            stride_key, f"missing, but {place} numbers frames", "Give the simulated steps between two frames"
+        )
     return place

@@ -1,4 +1,4 @@
-"""What scripts of fits and predictions share: the method of a job, its files, and its model."""
+"""The method of a job, its files and its model, for scripts of fits and predictions."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ class FitStage(FitRun):
 
 def files_of(inputs, names: Iterable[str]) -> dict[str, Any]:
     """Named input files of a job: one path, or a list of several."""
-    found = {name: listed(inputs[name]) for name in names}
-    return {name: paths[0] if len(paths) == 1 else paths for name, paths in found.items()}
+    files = {name: listed(inputs[name]) for name in names}
+    return {name: paths[0] if len(paths) == 1 else paths for name, paths in files.items()}
 
 
 class Prediction:

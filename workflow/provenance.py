@@ -12,7 +12,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
-from collections.abc import Mapping, Set
+from collections.abc import Iterable, Mapping, Set
 from functools import cache, cached_property
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,6 +21,7 @@ from typing import Any
 import grimp
 
 from neuma_lib.io.files import sha256_file
+from neuma_lib.mechanics.catalogue import DEFINED_IN
 
 PACKAGES = ("neuma_lib", "studies")
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
@@ -40,8 +41,14 @@ class Sources:
         return grimp.build_graph(*self._packages, cache_dir=None, exclude_type_checking_imports=True)
 
     def reached(self, script: Path, modules: tuple[str, ...] = ()) -> list[str]:
-        """Names of some modules, and of those that they and a script import, directly or through others, sorted."""
-        direct = _imports(script, self._graph.modules) | set(modules)
+        """Names of some modules, and of those that they and a script import, directly or through others, sorted.
+
+        Args:
+            modules: of the library, of other packages, or Python files.
+        """
+        own = self._graph.modules
+        files = [script, *(_file_of(module) for module in modules if module not in own)]
+        direct = (own & set(modules)).union(*(_imports(file, own) for file in files))
         through = (self._graph.find_upstream_modules(module) for module in direct)
         return sorted(direct.union(*through))
 
@@ -49,6 +56,11 @@ class Sources:
         """Digest of a script and of all modules that it reaches, and of further modules that it loads by name."""
         parts = [
             _file_digest(script),
+            *(
+                f"{name} {_file_digest(_file_of(name))}"
+                for name in modules
+                if name not in self._graph.modules
+            ),
             *(f"{name} {self._module_digest(name)}" for name in self.reached(script, modules)),
         ]
         return _hash("\n".join(parts).encode())
@@ -72,9 +84,22 @@ def code_digest(script: str | Path, *modules: str) -> str:
     """Digest of a script and of all that it reaches of the library, read once a process.
 
     Args:
-        modules: of the library, which the script loads by name.
+        modules: of the library, of other packages, or Python files, which the script loads by name.
     """
     return _library().digest(Path(script), modules)
+
+
+def digest_of_files(modules: Iterable[str]) -> str:
+    """Digest of Python files, and of modules that are not of the library."""
+    return _hash("\n".join(_file_digest(_file_of(module)) for module in sorted(modules)).encode())
+
+
+def law_files(value: Any) -> set[str]:
+    """Files of the laws in nested plain values that are not built in."""
+    if isinstance(value, Mapping):
+        named = {file for (_, name), file in DEFINED_IN.items() if value.get("name") == name}
+        return named.union(*map(law_files, value.values()))
+    return set().union(*map(law_files, value)) if isinstance(value, list | tuple) else set()
 
 
 def fingerprint(settings: Mapping[str, Any], inputs: Mapping[str, str | Path], code: str) -> dict[str, str]:
@@ -94,6 +119,11 @@ def fingerprint(settings: Mapping[str, Any], inputs: Mapping[str, str | Path], c
 
 def _hash(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()[:DIGITS]
+
+
+def _file_of(module: str) -> Path:
+    """The file of a module that is not of the library, or the Python file itself."""
+    return Path(module if module.endswith(".py") else find_spec(module).origin)
 
 
 def _file_digest(path: Path) -> str:

@@ -24,6 +24,7 @@ from typing import TextIO
 from tqdm import tqdm
 
 from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.extensions import load_laws
 from workflow.manager import end_with_snakemake
 
 PLAIN_INTERVAL = 15.0  # seconds between plain lines
@@ -78,6 +79,7 @@ def run_script(main: Callable, snakemake) -> None:
     name = " ".join(filter(None, [snakemake.rule, "/".join(snakemake.wildcards)]))
     started = _core_seconds()  # of the interpreter and all imports
     with stage(name, snakemake.log[0]) as run:
+        load_laws(snakemake.config.get("extensions") or ())
         main(snakemake.input, snakemake.output, snakemake.params, run)
         _SECONDS_LOGGER.info(_SECONDS.format(started, _core_seconds() - started))
 

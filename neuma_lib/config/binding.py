@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from neuma_lib.config.base import Section
+from neuma_lib.config.base import Section, internal
 
 
 class BindingConfig(Section):
     """Gaussian-particle binding (paper Algorithm 1)."""
 
-    confidence: float = Field(
-        0.95, gt=0, lt=1, description="probability tau of the chi-squared test, which defines the ellipsoid"
+    confidence: float = internal(
+        0.95, "probability tau of the chi-squared test that defines the ellipsoid", gt=0, lt=1
     )
     max_neighbours: int | None = Field(
-        10, ge=1, description="nearest particles kept for a Gaussian; null: all inside the ellipsoid (paper)"
+        10,
+        ge=1,
+        description="maximum number of particles of a Gaussian, the nearest; null: all in the ellipsoid (paper)",
     )
     equal_mass: bool = Field(
-        False, description="all particles, added ones too, share the volume equally (paper)"
+        False, description="give all particles, added ones included, equal volumes (paper)"
     )

@@ -1,4 +1,4 @@
-"""Settings of Blender: what an object looks like, and how large sets of images are."""
+"""Settings of Blender: appearance of objects, sizes of image sets, processes."""
 
 from __future__ import annotations
 
@@ -6,25 +6,24 @@ from typing import Literal
 
 from pydantic import Field
 
-from neuma_lib.config.base import Section
+from neuma_lib.config.base import Section, internal
 
 
 class AppearanceConfig(Section):
-    """What an object looks like in Blender."""
+    """Appearance of an object in Blender."""
 
     kind: Literal["solid", "grains", "liquid"] = Field(
-        "solid", description="textured mesh, grains, or a liquid's surface"
+        "solid", description="textured mesh, grains, or the surface of a liquid"
     )
     colors: dict[str, str] = Field(
-        description="part of the shape -> sRGB colour '#rrggbb'; 'body' for all others"
+        description="part of the shape -> sRGB colour '#rrggbb'; 'body' for all other parts"
     )
     accent: str = Field(
-        "",
-        description="colour of the soft patches on the body; other parts, and all if empty, get a darker shade",
+        "", description="colour of the patches on the body; on other parts, and if empty, a darker shade"
     )
     contrast: float = Field(0.5, ge=0, le=1, description="strength of the patches")
-    scale: float = Field(0.045, gt=0, description="size of the patches [m]")
-    seed: int = Field(0, description="seed of the patches")
+    scale: float = internal(0.045, "size of the patches [m]", gt=0)
+    seed: int = internal(0, "seed of the patches")
 
 
 class ImagesConfig(Section):
@@ -33,15 +32,15 @@ class ImagesConfig(Section):
     views: int = Field(gt=0, description="number of cameras")
     width: int = Field(128, ge=8, description="image width [px]")
     height: int = Field(128, ge=8, description="image height [px]")
-    samples: int = Field(16, ge=1, description="Cycles samples a pixel (denoised)")
+    samples: int = Field(16, ge=1, description="Cycles samples per pixel, denoised")
 
 
 class BlenderConfig(Section):
-    """The processes that render; each makes one image set."""
+    """Rendering processes, one for each image set."""
 
     device: Literal["cpu", "auto", "cuda"] = Field(
         "cpu",
-        description="what renders: CPU cores, to the same bytes every time; a CUDA GPU, to slightly other images; "
-        "or `auto`, CUDA where `device` is not cpu and there is one",
+        description="CPU (reproducible to the byte), a CUDA GPU, or `auto`: CUDA if the top-level `device` is not cpu "
+        "and there is a GPU",
     )
-    threads: int = Field(1, ge=1, description="CPU cores of each")
+    threads: int = Field(1, ge=1, description="CPU cores of each process")

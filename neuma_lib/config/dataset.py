@@ -1,4 +1,4 @@
-"""Settings of ground truths and their images."""
+"""Settings of the ground truth and its images."""
 
 from __future__ import annotations
 
@@ -9,51 +9,53 @@ from neuma_lib.config.blender import BlenderConfig, ImagesConfig
 
 
 class TruthConfig(Section):
-    """How finely the ground truth of one scene is simulated."""
+    """Resolution of the ground truth of one scene."""
 
-    grid: int | None = Field(None, ge=8, description="its grid; null: dataset.grid")
-    dt: float | None = Field(None, gt=0, description="its time step [s]; null: dataset.dt")
-    particles: int | None = Field(None, gt=0, description="its particles; null: dataset.particles")
+    grid: int | None = Field(None, ge=8, description="grid cells along each side; null: dataset.grid")
+    dt: float | None = Field(None, gt=0, description="time step [s]; null: dataset.dt")
+    particles: int | None = Field(None, gt=0, description="number of particles; null: dataset.particles")
 
 
 class DatasetConfig(Section):
     """Ground truth and its images."""
 
     particles: int = Field(
-        8000, gt=0, description="ground-truth particles, at least four times the reconstruction's"
+        8000, gt=0, description="particles of the ground truth, at least four times geometry.particles"
     )
     grid: int | None = Field(
-        None, ge=8, description="grid nodes of the ground truth along each side; null: simulation.grid"
+        None, ge=8, description="grid cells of the ground truth along each side; null: simulation.grid"
     )
     dt: float | None = Field(
         None,
         gt=0,
-        description="time step of the ground truth [s], which goes evenly into the scene's; null: the scene's",
+        description="time step of the ground truth [s], an integer fraction of the scene's; null: equal",
     )
     seed: int = Field(
         1000,
-        description="seed of the ground truth's particles; the next two draw its tracers. Apart from those of the "
-        "reconstruction: seed, and the chains after it",
+        description="seed of the particles of the ground truth; the next two sample its tracers. It must differ from "
+        "the seeds of the reconstruction",
     )
     steps: int | None = Field(None, gt=0, description="steps of every video; null: those of its scene")
     frames: int | None = Field(
-        25, ge=2, description="frames of a video, evenly from step 0 to the last, for scenes that list none"
+        25,
+        ge=2,
+        description="frames of a video, evenly spaced from step 0 to the last, if the scene lists none",
     )
     stride: int | None = Field(
-        None, ge=1, description="steps between two frames; in place of frames, which is null then"
+        None, ge=1, description="steps between frames; an alternative to frames, which is null then"
     )
-    sub_frames: int = Field(
+    exposure_samples: int = Field(
         5,
         ge=1,
-        description="most renders that are averaged to one frame where transforms.json states its exposure; they are "
-        "at least a step apart. 1: motion blur is ignored",
+        description="maximum number of renders averaged to a frame if transforms.json states its exposure, at least a "
+        "step apart; 1: no motion blur",
     )
-    tracers: int = Field(100_000, gt=0, description="passive tracers that measure the motion of the truth")
+    tracers: int = Field(100_000, gt=0, description="passive tracers that measure the motion")
     static: ImagesConfig = Field(ImagesConfig(views=50), description="views on a sphere at t = 0")
     dynamic: ImagesConfig = Field(
-        ImagesConfig(views=3, width=96, height=96), description="videos, view 0 frontal"
+        ImagesConfig(views=3, width=96, height=96), description="videos; view 0 is frontal"
     )
-    blender: BlenderConfig = Field(BlenderConfig(), description="how both sets of images are rendered")
+    blender: BlenderConfig = Field(BlenderConfig(), description="rendering of both image sets")
 
     @model_validator(mode="after")
     def _one_rule_for_frames(self) -> DatasetConfig:

@@ -1,4 +1,4 @@
-"""Settings of the first minute: `make demo`."""
+"""Settings of the demo and of films."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from neuma_lib.config.base import Section
 
 
 class DemoConfig(Section):
-    """One scene, from nothing to a film of what was learned."""
+    """The demo, `make demo`: one scene from its images to a film of the learned motion."""
 
-    scene: str = Field("BouncyBall", description="scene that is learned")
+    scene: str = Field("BouncyBall", description="scene of the demo")
     methods: tuple[str, ...] = Field(
         ("nclaw", "neuma"),
         min_length=1,
-        description="methods beside the video in the films `results/<scene>/film.mp4` and `film.gif` of any scene; the "
-        "law of the last one is exported",
+        description="methods next to the video in `film.mp4` and `film.gif` of every scene; the demo exports the law "
+        "of the last one",
     )
-    titles: dict[str, str] = Field({}, description="names of methods in the film, in place of their own")
-    magnify: int = Field(2, ge=1, description="enlargement of the film's pictures")
+    titles: dict[str, str] = Field({}, description="names of methods in the film, if not their own")
+    magnify: int = Field(2, ge=1, description="enlargement of the film")

@@ -4,35 +4,29 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from neuma_lib.config.base import Section
+from neuma_lib.config.base import Section, internal
 
 
 class EvaluationConfig(Section):
     """Rollout of the learned law and its measures."""
 
     tracers: int = Field(
-        100_000, gt=0, description="passive tracers in the prediction, as many as dataset.tracers"
+        100_000, gt=0, description="passive tracers in the prediction, equal to dataset.tracers"
     )
     views: tuple[int, ...] | None = Field(
         None,
         min_length=1,
-        description="views of the image metrics; null: those that training does not see. Where there are none, those "
-        "that `material.views` leaves out are taken, or else the training views, and results and figures say so",
+        description="views of the image metrics; null: views outside the training, else outside `training.views`, else "
+        "the training views, with a note in results and figures",
     )
     margin: float = Field(
         0.1,
         ge=0,
-        description="image metrics look at the bounding box of the object, observed and predicted, widened on each "
-        "side by this fraction of its longer side",
+        description="margin of the crop for image metrics around the object, observed and predicted, as a fraction of "
+        "the longer side",
     )
-    states: int = Field(
-        2000,
-        ge=1,
-        description="states of the true motion, drawn as they occur, that stresses are compared on",
-    )
-    paths: int = Field(
-        250, ge=1, description="particles along whose true motion stresses are compared, at most all of them"
-    )
-    video_view: int = Field(0, ge=0, description="view of the mp4 of prediction beside observation")
-    frame_rate: int = Field(12, ge=1, description="frames a second of the mp4")
-    video_magnify: int = Field(3, ge=1, description="enlargement of the mp4's pixels")
+    states: int = internal(2000, "states of the true motion on which stresses are compared", ge=1)
+    paths: int = internal(250, "maximum number of particles along whose motion stresses are compared", ge=1)
+    video_view: int = internal(0, "view of the mp4 of prediction and observation", ge=0)
+    frame_rate: int = Field(12, ge=1, description="frame rate of the mp4 [1/s]")
+    video_magnify: int = Field(3, ge=1, description="enlargement of the mp4")

@@ -1,4 +1,4 @@
-"""Settings of what other programs get of a motion."""
+"""Settings of motions exported to other programs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ class ExportsConfig(Section):
 
     rotate_harmonics: bool = Field(
         True,
-        description="whether the spherical harmonics of exported Gaussians turn with the body, so that its shine is "
-        "painted on; renders of this project leave them as they are",
+        description="rotate the spherical harmonics of exported Gaussians with the body; renders here do not",
     )
     size: int = Field(480, ge=32, description="width of export/motion.mp4 and .gif [px]")

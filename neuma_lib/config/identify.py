@@ -1,4 +1,4 @@
-"""Settings of the search for the analytic law that a video shows."""
+"""Settings of the identification of an analytic law from a video."""
 
 from __future__ import annotations
 
@@ -6,100 +6,69 @@ from typing import Literal
 
 from pydantic import Field
 
-from neuma_lib.config.base import Compared, Section
+from neuma_lib.config.base import Compared, Section, internal
 from neuma_lib.config.laws import LawConfig
 
 
 class IdentifyConfig(Section):
-    """Family and constants of the material, found in the video: the law without any training."""
+    """Identification of the family and the constants of the material from the video, without training."""
 
     families: dict[str, LawConfig] = Field(
         {},
-        description="candidates by name. Every constant that is given is fitted, from there or from the scene's prior "
-        "if that fits better; nu is kept between 0 and 0.5",
+        description="candidates by name. Every given constant is fitted, from its value here or from the scene's "
+        "prior, "
+        "whichever fits better; nu stays between 0 and 0.5",
     )
     views: tuple[int, ...] = Field(
         (0,),
         min_length=1,
-        description="views of the video that are used; for a method that trains on "
-        "other views than material.views, such as neuma_structured+views=0,1, those",
+        description="views of the video; a method that trains on views other than training.views uses those",
     )
-    compare: Compared = Field("colour", description="what of the images counts, as `material.compare`")
-    covariance_from: Literal["elastic", "total"] = Field(
-        "total", description="deformation that stretches the Gaussians, as `material.covariance_from`"
-    )
-    gaussian_motion: Literal["mean", "affine"] = Field(
-        "affine", description="how Gaussians follow their particles, as `material.gaussian_motion`"
-    )
-    frames: int = Field(33, ge=4, description="most frames that are compared, spread evenly over the video")
-    particles: int = Field(
+    compare: Compared = Field("colour", description="compared quantity, as `training.compare`")
+    covariance_from: Literal["elastic", "total"] = internal("total", "as `training.covariance_from`")
+    gaussian_motion: Literal["mean", "affine"] = internal("affine", "as `training.gaussian_motion`")
+    frames: int = Field(33, ge=4, description="maximum number of frames, evenly spaced")
+    # Residuals of bodies with these particles measure the discretisation error.
+    refined_particles: int = Field(
         8000,
         ge=0,
-        description="particles of the bodies that say what the coarseness of the reconstruction's changes, more than "
-        "`simulation.particles`; 0: ignored",
+        description="particles of the bodies that correct for the discretisation, more than `geometry.particles`; 0: "
+        "no "
+        "correction",
     )
-    misplaced: float = Field(
-        1e-3,
-        ge=0,
-        description="expected constant shift [m] and relative enlargement of the rendered body, fitted along",
+    pose_tolerance: float = internal(1e-3, "expected shift [m] and enlargement of the rendered body", ge=0)
+    resamplings: int = internal(
+        2, "bodies with refined particles; their difference enters the uncertainty", ge=1
     )
-    samplings: int = Field(2, ge=1, description="such bodies: their difference is a part of the uncertainty")
-    held_out: float = Field(
-        0.25,
-        gt=0,
-        lt=1,
-        description="part of the frames after the first contact, the last ones, that families are judged by",
+    held_out: float = internal(
+        0.25, "share of the frames after contact, the last, on which families are compared", gt=0, lt=1
     )
-    squares: tuple[int, ...] = Field(
-        (6, 12, 24, 96),
-        min_length=1,
-        description="images are averaged over squares, so many across, in turn: blurred images are what makes the fit "
-        "converge from afar. An image with fewer pixels across is taken as it is",
+    # Blurred images make the fit converge from far away.
+    pyramid: tuple[int, ...] = internal(
+        (6, 12, 24, 96), "widths of the images that are fitted in turn", min_length=1
     )
-    iterations: int = Field(6, ge=1, description="most Levenberg-Marquardt steps at each size of the squares")
-    least_gain: float = Field(
-        0.01,
-        gt=0,
-        description="part of the squared residuals that a step must promise to save; a tenth of it in the last round",
-    )
-    difference: float = Field(
-        0.04,
-        gt=0,
-        description="width of the forward differences of the unbounded constants (of logarithms: 4 %)",
-    )
-    longest_step: float = Field(
-        1.0, gt=0, description="largest change of an unbounded constant in a step (of a logarithm: factor e)"
-    )
-    spread: float = Field(
-        3.0,
-        gt=0,
-        description="expected distance of the unbounded constants from their start; it holds what the video does "
-        "not show, and bounds how uncertain they are",
-    )
-    give_up: float = Field(
+    iterations: int = internal(6, "maximum number of Levenberg-Marquardt steps for each width", ge=1)
+    min_gain: float = internal(0.01, "predicted relative gain below which a fit stops", gt=0)
+    difference: float = internal(0.04, "width of the forward differences of the unbounded constants", gt=0)
+    longest_step: float = internal(1.0, "maximum change of an unbounded constant in a step", gt=0)
+    # A prior on constants that the video does not determine.
+    spread: float = internal(3.0, "expected distance of the unbounded constants from their start", gt=0)
+    prune_factor: float = Field(
         4.0,
         gt=1,
-        description="a family whose squared residuals exceed the best one's by this factor is not refined further; "
-        "where held-out ones exceed the fitted ones by it, the fit to all frames begins anew",
+        description="families with squared residuals above this multiple of the best are dropped. If those of held-out "
+        "frames exceed those of fitted ones by it, the fit to all frames restarts",
     )
     penalty: float = Field(
-        0.05,
-        ge=0,
-        description="what a constant costs: a family with one more must lower the held-out loss by this part",
+        0.05, ge=0, description="relative decrease of the held-out loss required for each additional constant"
     )
-    tie: float = Field(
-        0.15,
-        ge=0,
-        description="families whose penalised held-out losses differ by less than this part are a tie",
-    )
+    tie: float = internal(0.15, "relative difference of penalised losses below which families tie", ge=0)
     model_std: float = Field(
         0.05,
         ge=0,
-        description="standard deviation of the logarithm of every constant beside that from the images, for what all "
-        "images share: shape, volume, density and appearance of the reconstruction",
+        description="standard deviation of the logarithm of each constant from errors that all images share: shape, "
+        "volume, density, appearance",
     )
-    determined: float = Field(
-        0.1,
-        gt=0,
-        description="a constant or combination is determined if the standard deviation of its logarithm is below this",
+    determined: float = internal(
+        0.1, "standard deviation of a logarithm below which a quantity is determined", gt=0
     )

@@ -1,4 +1,4 @@
-"""Analytic material laws, as they are specified in scenes and priors."""
+"""Analytic material laws, as scenes and priors specify them."""
 
 from __future__ import annotations
 
@@ -17,9 +17,7 @@ class LawPart(Section):
 
 
 class LawConfig(Section):
-    """An analytic material: two named laws with their constants in SI units."""
+    """An analytic material: elastic law and return map."""
 
-    elasticity: LawPart = Field(
-        description="name and constants of the elastic law, for example E [Pa] and nu"
-    )
-    plasticity: LawPart = Field(LawPart(name="identity"), description="name and constants of the return map")
+    elasticity: LawPart = Field(description="elastic law and its constants, for example E [Pa] and nu")
+    plasticity: LawPart = Field(LawPart(name="identity"), description="return map and its constants")

@@ -1,4 +1,4 @@
-"""Options that all methods share: how a motion is simulated and observed."""
+"""Options that all methods share: simulation of a motion, and motion of the Gaussians."""
 
 from __future__ import annotations
 
@@ -6,33 +6,30 @@ from typing import Literal
 
 from pydantic import Field
 
-from neuma_lib.config.base import Section
+from neuma_lib.config.base import Section, internal
 
 
 class MotionOptions(Section):
-    """How bodies are simulated, and how their Gaussians follow."""
+    """Simulation of bodies, and motion of their Gaussians."""
 
-    carrier: Literal["binding", "gaussians"] = Field(
-        "binding", description="bound volume particles, or the Gaussians themselves as particles (w/o Bind)"
-    )
+    # "gaussians": the Gaussians are the particles (w/o Bind).
+    particle_source: Literal["binding", "gaussians"] = internal("binding", "particles that are simulated")
     views: tuple[int, ...] = Field((0,), min_length=1, description="training views of the video")
     covariance_from: Literal["elastic", "total"] = Field(
         "elastic",
-        description="deformation that stretches the Gaussians: the elastic F (paper), or the total one, which includes "
-        "plastic flow",
+        description="deformation of the Gaussians: elastic F (paper), or total F, which includes plastic flow",
     )
     gaussian_motion: Literal["mean", "affine"] = Field(
         "mean",
-        description="how Gaussians follow their particles: by their mean displacement (paper), or by their affine "
-        "motion, which also rotates and stretches the distance of a Gaussian from them",
+        description="motion of a Gaussian: mean displacement of its particles (paper), or their affine motion",
     )
     start: Literal["estimated", "identified"] = Field(
         "estimated",
-        description="initial motion: estimated from the frames before contact (paper), or fitted to all frames along "
-        "with the constants (stage `identify`)",
+        description="initial motion: estimated from the frames before contact (paper), or fitted to all frames by the "
+        "identification",
     )
     assumed_density: float | None = Field(
-        None, gt=0, description="density that the method assumes [kg/m^3]; null: the scene's density"
+        None, gt=0, description="density that the method assumes [kg/m^3]; null: the scene's"
     )
 
 
@@ -41,5 +38,5 @@ class WithPrior(Section):
 
     prior: str | None = Field(
         None,
-        description="prior: one of priors.laws, or `identified`, the law identified in the video; null: the scene's",
+        description="a name in priors.laws, or `identified`, the law identified from the video; null: the scene's",
     )

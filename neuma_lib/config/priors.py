@@ -1,50 +1,39 @@
-"""Settings of the priors: which analytic laws neural ones are trained on, and how."""
+"""Settings of the priors: analytic laws, and the networks trained on them."""
 
 from __future__ import annotations
 
 from pydantic import Field
 
-from neuma_lib.config.base import Section
+from neuma_lib.config.base import Section, internal
 from neuma_lib.config.laws import LawConfig
 
 
 class RegressionConfig(Section):
     """Regression on pairs (F -> tau) and (F_trial -> F)."""
 
-    throws: int = Field(8, ge=1, description="cubes simulated with the analytic law")
-    side_particles: int = Field(8, ge=1, description="particles along a cube's edge")
-    grid: int = Field(20, ge=8, description="grid nodes along the box")
-    duration: float = Field(0.45, gt=0, description="length of a throw [s]")
-    dt: float = Field(1e-3, gt=0, description="longest time step [s]; shortened to a Courant number of 0.5")
-    samples: int = Field(131072, ge=1, description="pairs a network is fitted to, in each round")
-    noise_low: float = Field(1e-3, gt=0, description="smallest size of the log-uniform random log strains")
-    noise_high: float = Field(0.3, gt=0, description="largest size of the log-uniform random log strains")
+    throws: int = internal(8, "launches of a cube simulated with the analytic law", ge=1)
+    side_particles: int = internal(8, "particles along an edge of the cube", ge=1)
+    grid: int = internal(20, "grid cells along each side of the box", ge=8)
+    duration: float = internal(0.45, "duration of a launch [s]", gt=0)
+    dt: float = internal(1e-3, "maximum time step [s], reduced to a Courant number of 0.5", gt=0)
+    samples: int = Field(131072, ge=1, description="pairs that a network is fitted to, in each round")
+    noise_low: float = internal(1e-3, "minimum size of the log-uniform random log strains", gt=0)
+    noise_high: float = internal(0.3, "maximum size of the log-uniform random log strains", gt=0)
     rounds: int = Field(
-        2,
-        ge=1,
-        description="rounds of data; from the second on, states that the networks' own rollouts visit are added",
+        2, ge=1, description="rounds of data; later rounds add states of rollouts with the networks"
     )
-    further_rounds: int = Field(
-        2,
-        ge=0,
-        description="longer rounds after these at most, with faster throws added to the data, while the networks crush "
-        "elements in such throws that the law does not",
-    )
-    iterations: int = Field(2500, ge=1, description="SOAP iterations a network, in each round")
-    batch: int = Field(1024, ge=1, description="pairs an iteration")
-    learning_rate: float = Field(
-        2e-2, gt=0, description="SOAP's step, warmed up and decayed to zero by a cosine in each round"
-    )
-    floor: float = Field(
-        0.3,
-        gt=0,
-        description="targets smaller than this fraction of the median visited one are fitted in absolute terms",
-    )
+    # With faster launches, while the networks crush elements that the law does not.
+    further_rounds: int = internal(2, "maximum number of additional, longer rounds", ge=0)
+    iterations: int = Field(2500, ge=1, description="SOAP iterations of a network, in each round")
+    batch: int = internal(1024, "pairs per iteration", ge=1)
+    learning_rate: float = internal(2e-2, "step of SOAP, with warm-up and cosine decay in each round", gt=0)
+    # Relative to the median of the visited targets.
+    floor: float = internal(0.3, "size below which targets are fitted in absolute terms", gt=0)
 
 
 class PriorsConfig(Section):
     """Pre-trained neural constitutive laws."""
 
-    laws: dict[str, LawConfig] = Field({}, description="analytic law that each prior is trained on, by name")
-    seed: int = Field(0, description="seed of the data and of the initial weights")
+    laws: dict[str, LawConfig] = Field({}, description="analytic law behind each prior, by name")
+    seed: int = internal(0, "seed of the data and the initial weights")
     regression: RegressionConfig = Field(RegressionConfig(), description="the regression")

@@ -1,4 +1,4 @@
-"""Settings of a scene: a benchmark."""
+"""Settings of scenes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from neuma_lib.config.base import Section, Vector
+from neuma_lib.config.base import Section, Vector, internal
 from neuma_lib.config.blender import AppearanceConfig
 from neuma_lib.config.dataset import TruthConfig
 from neuma_lib.config.laws import LawConfig
@@ -17,14 +17,14 @@ from neuma_lib.config.splats import SplatConfig
 class SplitDensityConfig(Section):
     """Two mass densities on either side of a plane."""
 
-    axis: Literal["x", "y", "z"] = Field("x", description="axis that the plane is normal to")
-    at: float = Field(0.5, description="where the plane cuts the axis [m]")
-    below: float = Field(gt=0, description="density on the side of smaller coordinates [kg/m^3]")
-    above: float = Field(gt=0, description="density on the other side [kg/m^3]")
+    axis: Literal["x", "y", "z"] = Field("x", description="normal of the plane")
+    at: float = Field(0.5, description="position of the plane on the axis [m]")
+    below: float = Field(gt=0, description="density at smaller coordinates [kg/m^3]")
+    above: float = Field(gt=0, description="density at larger coordinates [kg/m^3]")
 
 
 class SuppliedConfig(Section):
-    """Image sets that were made elsewhere.
+    """Supplied image sets.
 
     A transforms.json, a list in the layout of the authors' release, or a folder or list in PAC-NeRF's layout
     (all_data.json) or that of Spring-Gaus' synthetic scenes (camera.json), whose first frames are the views at t = 0.
@@ -32,120 +32,108 @@ class SuppliedConfig(Section):
 
     static: str | None = Field(None, description="views at t = 0; null: rendered by Blender")
     dynamic: str | None = Field(
-        None, description="videos with the frames that the scene's settings name; null: rendered by Blender"
+        None, description="videos with the frames of the scene; null: rendered by Blender"
     )
     stride: int | None = Field(
         None,
         ge=1,
-        description="simulated steps from frame to frame of a folder that counts its frames, as PAC-NeRF's and "
-        "Spring-Gaus' do; then the scene's frames are all of these up to its steps, unless it lists some of them",
+        description="simulated steps between frames, in layouts that number frames (PAC-NeRF, Spring-Gaus); the scene "
+        "uses all of them, unless it lists frames",
     )
-    scale: float = Field(
-        1.0,
-        gt=0,
-        description="metres of the simulator to a metre of the images' world; all lengths are scaled",
-    )
+    scale: float = Field(1.0, gt=0, description="metres of the simulator per metre of the images' world")
     offset: Vector | None = Field(
         None,
-        description="where the scaled origin of the images' world is in the simulator's box [m]; null: as the layout "
-        "has it, (0.5, 0, 0.5) for PAC-NeRF, (0, -0.3, 0) for Spring-Gaus, else (0, 0, 0)",
+        description="position of the scaled origin of the images' world [m]; null: (0.5, 0, 0.5) for PAC-NeRF, (0, "
+        "-0.3, 0) for Spring-Gaus, else (0, 0, 0)",
     )
 
 
 class CapturedConfig(Section):
-    """What a scene shows of a capture; the workflow writes it for each folder of captures.root."""
+    """The capture of a scene. The workflow sets it for each folder of captures.root."""
 
-    capture: str = Field(description="name of the capture")
-    throw: str | None = Field(None, description="its throw; null: the object as photographed")
-    cameras: tuple[str, ...] = Field((), description="cameras that filmed the throw, by name")
-    scale: float = Field(1.0, gt=0, description="metres of the simulator to a metre of the room")
-    grid: int | None = Field(
-        None, ge=8, description="grid cells along each side of the box; null: captures.grid"
-    )
+    capture: str = internal(..., "name of the capture")
+    throw: str | None = internal(None, "its take; null: the object as photographed")
+    cameras: tuple[str, ...] = internal((), "cameras of the take, by name")
+    scale: float = internal(1.0, "metres of the simulator per metre of the room", gt=0)
+    grid: int | None = internal(None, "grid cells along each side of the box; null: captures.grid", ge=8)
 
 
 OF_THE_TRUTH = ("shape", "height", "velocity", "law", "appearance")
-"""Keys of what is simulated and rendered: nobody knows them of a captured object."""
+"""Keys of the simulation and the renders of the truth, unknown for a captured object."""
 OF_A_VIDEO = ("steps",)
-"""Keys that the files of a captured video tell."""
+"""Keys that follow from the files of a captured video."""
 OF_A_SPLAT = {
     "size": 0.4, "height": 0.5, "velocity": (0.0, 0.0, 0.0), "dt": 5e-4, "steps": 1000, "prior": "jelly",
     **dict.fromkeys(("shape", "law", "appearance")),
 }  # fmt: skip
-"""What the keys of a scene with a splat are where they are not given: half a second's fall from half a metre."""
+"""Defaults of a scene with a splat: half a second of fall from half a metre."""
 
 
 class SceneConfig(Section):
-    """A benchmark: what is thrown, of what, how, and what is believed about it.
+    """A simulated object with its true law and the prior of its reconstruction, a captured object, or a splat."""
 
-    Or a capture: what was filmed. Or a splat: what learned laws move.
-    """
-
-    like: str | None = Field(
-        None, description="scene whose settings stand wherever this one has none of its own; null: none"
-    )
+    like: str | None = Field(None, description="scene with the settings that this one does not set")
     shape: str | None = Field(
         description="name of the shape: ball, duck, pawn, cat, bottle, fish or letter_X"
     )
     size: float | None = Field(
         None, gt=0, description="longest side of the bounding box [m]; null: the shape's own"
     )
-    height: float | None = Field(description="y of the bounding box's centre at the start [m]")
-    center: tuple[float, float] = Field((0.5, 0.5), description="x and z of the bounding box's centre [m]")
+    height: float | None = Field(description="initial y of the centre of the bounding box [m]")
+    center: tuple[float, float] = Field(
+        (0.5, 0.5), description="initial x and z of the centre of the bounding box [m]"
+    )
     velocity: Vector | None = Field(description="initial velocity [m/s]")
     spin: Vector = Field(
         (0.0, 0.0, 0.0), description="initial angular velocity about the centre of mass, world axes [rad/s]"
     )
     density: Annotated[float, Field(gt=0)] | SplitDensityConfig = Field(
         1000.0,
-        description="mass density rho [kg/m^3], or two of them at t = 0: {axis: x, at: 0.5, below: 800, above: 1200}",
+        description="mass density [kg/m^3], or two at t = 0: {axis: x, at: 0.5, below: 800, above: 1200}",
     )
-    law: LawConfig | None = Field(description="the true material, known to the ground truth only")
-    truth: TruthConfig = Field(
-        TruthConfig(),
-        description="how finely its ground truth is simulated, where it has settings of its own",
-    )
-    dt: float = Field(gt=0, description="time step of the reconstruction, which frames are counted in [s]")
+    law: LawConfig | None = Field(description="the true material, used by the ground truth only")
+    truth: TruthConfig = Field(TruthConfig(), description="resolution of the ground truth")
+    dt: float = Field(gt=0, description="time step of the reconstruction, the unit of frames and steps [s]")
     steps: int | None = Field(gt=0, description="simulated steps of the video")
     frames: tuple[int, ...] | None = Field(
         None,
-        description="steps of the video's frames, ascending from 0; null: as images.stride, dataset.frames or "
-        "dataset.stride say",
+        description="steps of the frames of the video, ascending from 0; null: from images.stride, dataset.frames or "
+        "dataset.stride",
     )
-    prior: str = Field(description="name in priors.laws, or path of a .safetensors or a released .pt file")
-    appearance: AppearanceConfig | None = Field(description="how Blender shows it")
-    images: SuppliedConfig = Field(
-        SuppliedConfig(), description="files of its images, where Blender makes none"
+    prior: str = Field(
+        description="a name in priors.laws, or the path of a .safetensors or a released .pt file"
     )
-    captured: CapturedConfig | None = Field(
-        None,
-        description="which capture this is, whose scenes have no truth; written by the workflow, not by hand",
+    appearance: AppearanceConfig | None = Field(description="appearance in Blender")
+    images: SuppliedConfig = Field(SuppliedConfig(), description="supplied image sets")
+    captured: CapturedConfig | None = internal(
+        None, "the capture of a scene without truth; the workflow sets it"
     )
     splat: SplatConfig | None = Field(
         None,
-        description="Gaussians of an object made elsewhere, or their file alone. The scene has no truth then, "
-        "and size 0.4, height 0.5, velocity 0, dt 5e-4, steps 1000 and the prior jelly where it says nothing else",
+        description="Gaussians of an object, or their file alone. Such a scene has no truth. Its defaults are size "
+        "0.4, "
+        "height 0.5, velocity 0, dt 5e-4, steps 1000, prior jelly",
     )
     videos: tuple[str, ...] = Field(
         (),
-        description="further scenes of the same material: one law is trained with all these videos, which count alike, "
-        "however long. In place of a name, settings that differ from this scene's make another throw of its object, "
-        "the scene `<name>_throw2`, or 3, ... by its place in the list. Not handed on by `like`",
+        description="other scenes of the same material, whose videos train the same law with equal weights. Settings "
+        "that differ from this scene, in place of a name, define a take `<name>_throw2` of its object. "
+        "`like` does not inherit it",
     )
-    story: str = Field("", description="in which way the prior is wrong, in words")
-    material: dict[str, Any] = Field(
-        {}, description="settings of the section material that this scene overrides"
+    story: str = Field("", description="how the prior is wrong, in words")
+    training: dict[str, Any] = Field(
+        {}, description="settings of the section training that this scene overrides"
     )
 
     @property
     def has_truth(self) -> bool:
-        """Whether the material and the throw are known: not of captured objects, nor of splats."""
+        """Whether the true law and motion are known. They are not for captured objects and splats."""
         return self.captured is None and self.splat is None
 
     @model_validator(mode="before")
     @classmethod
     def _without_truth(cls, raw: Any) -> Any:
-        """A scene of a capture or a splat need not say that it has no truth."""
+        """Add the keys of the truth, null, to a scene of a capture or a splat."""
         if not isinstance(raw, Mapping):
             return raw
         if isinstance(raw.get("splat"), str):
@@ -159,9 +147,11 @@ class SceneConfig(Section):
         unknown = OF_A_SPLAT if self.splat else {}
         for key in (*OF_THE_TRUTH, *OF_A_VIDEO):
             if self.captured is None and getattr(self, key) is None and unknown.get(key, ...) is not None:
-                raise ValueError(f"{key}: null stands in scenes of captures only, give it a value")
+                raise ValueError(f"{key}: null is for scenes of captures only; give a value")
         if self.splat and self.captured:
-            raise ValueError("splat: this scene is one of a capture; name the scene of the splat otherwise")
+            raise ValueError(
+                "splat: this scene is one of a capture; give the scene of the splat another name"
+            )
         return self
 
     @model_validator(mode="after")
@@ -173,11 +163,9 @@ class SceneConfig(Section):
             or frames[0] != 0
             or frames[-1] > (self.steps or 0)
         ):
-            raise ValueError("frames must ascend from 0 to at most 'steps' without repeats")
+            raise ValueError("frames: they must ascend from 0 to at most 'steps' without repeats")
         stride = self.images.stride
         for step in frames or () if stride else ():
             if step % stride:
-                raise ValueError(
-                    f"frames: step {step} is none of the supplied frames, images.stride: {stride}"
-                )
+                raise ValueError(f"frames: step {step} is not a multiple of images.stride = {stride}")
         return self

@@ -9,20 +9,20 @@ from pydantic import Field
 from neuma_lib.config.base import Section, Vector
 
 GRAVITY = 9.81
-"""Of the room that a capture was filmed in [m/s^2]."""
+"""Gravity in the room of a capture [m/s^2]."""
 
 
 class SimulationConfig(Section):
     """The material point method."""
 
-    particles: int = Field(2000, gt=0, description="particles of the reconstructed body")
     grid: int = Field(24, ge=8, description="grid cells along each side of the unit cube")
     gravity: Vector = Field((0.0, -9.8, 0.0), description="acceleration [m/s^2]")
     boundary: str | dict[str, str] = Field(
-        "no_slip", description="condition of the walls: no_slip, slip or sticky, or one a wall (x_min, ...)"
+        "no_slip", description="condition of all walls, no_slip, slip or sticky, or of each wall (x_min, ...)"
     )
     walls: Literal["outside", "released"] = Field(
         "outside",
-        description="wall nodes outside the cube, so that bodies rest at y = 0; or inside it, and particles clamped, "
-        "as in the authors' code",
+        description="wall nodes outside the cube, so that bodies rest at y = 0; or inside, with clamped particles, as "
+        "in "
+        "the authors' released code",
     )

@@ -1,4 +1,4 @@
-"""Settings of a scene whose object is a splat that was made elsewhere."""
+"""Settings of a scene whose object is a splat."""
 
 from __future__ import annotations
 
@@ -6,53 +6,38 @@ from typing import Literal
 
 from pydantic import Field
 
-from neuma_lib.config.base import Section
+from neuma_lib.config.base import Section, internal
 
 
 class SplatConfig(Section):
-    """Gaussians from a file: how they stand, which of them are the object, and how its surface is found."""
+    """Gaussians from a file: orientation, selection of the object, surface."""
 
-    file: str = Field(
-        description="a .ply of 3D Gaussian splatting, as it is or compressed, a .splat or a .spz"
-    )
+    file: str = Field(description="a .ply of 3D Gaussian splatting, plain or compressed, a .splat or a .spz")
     up: Literal["x", "-x", "y", "-y", "z", "-z"] = Field(
-        "y", description="axis of the file that points up; photographs often give -y, Blender z"
+        "y", description="axis of the file that points up; often -y for photographs, z for Blender"
     )
     turn: float = Field(
-        0.0, description="turn about the vertical after that, counter-clockwise from above [degrees]"
+        0.0, description="rotation about the vertical, counter-clockwise from above [degrees]"
     )
-    min_opacity: float = Field(0.1, ge=0, lt=1, description="Gaussians at most this opaque are left out")
-    max_scale: float = Field(
-        0.1,
-        gt=0,
-        description="Gaussians with a standard deviation above this fraction of the object's longest side are left out",
+    min_opacity: float = internal(0.1, "opacity up to which Gaussians are omitted", ge=0, lt=1)
+    max_scale: float = internal(
+        0.1, "standard deviation above which Gaussians are omitted, relative to the object", gt=0
     )
-    reach: float = Field(
-        3.0,
-        gt=0,
-        description="Gaussians nearer to each other than this many times the median spacing are linked, and those "
-        "within two standard deviations of each other's middle axes",
-    )
-    min_links: int = Field(
-        4, ge=0, le=16, description="Gaussians with fewer links are isolated, and left out, as is what is linked to "
-        "the largest cluster by nothing"
-    )  # fmt: skip
+    # Gaussians within two standard deviations of each other's middle axes are linked, too.
+    reach: float = internal(3.0, "distance at which Gaussians are linked, in median spacings", gt=0)
+    # Clusters that are not linked to the largest one are omitted, too.
+    min_links: int = internal(4, "number of links below which a Gaussian is omitted", ge=0, le=16)
     count: int = Field(
-        30000,
-        ge=1,
-        description="Gaussians at most: n of N are kept, evenly over space, and (N/n)^(1/3) times as large",
+        30000, ge=1, description="maximum number of Gaussians: n of N are kept, enlarged by (N/n)^(1/3)"
     )
-    views: int = Field(60, ge=4, description="views around it in which its outline and depth are rendered")
-    pixels: int = Field(320, ge=32, description="width and height of these views [px]")
-    edge: float = Field(
-        0.01,
-        ge=0,
-        lt=0.5,
-        description="length of the edges of its surface after the repair with MeshLab, as a fraction of the longest "
-        "side; 0, and without pymeshlab (`make capture`): no repair",
+    views: int = internal(60, "views in which silhouette and depth are rendered", ge=4)
+    pixels: int = internal(320, "width and height of these views [px]", ge=32)
+    # Without pymeshlab (`make capture`) there is no repair either.
+    edge: float = internal(
+        0.01, "edge length of the repaired surface, relative to its longest side; 0: no repair", ge=0, lt=0.5
     )
     own_particles: bool = Field(
         False,
-        description="whether Gaussians that hold no particle get one of their own, as the paper's Algorithm 1 has it; "
-        "otherwise they follow the nearest ones, and small Gaussians do not make the simulation larger",
+        description="add a particle for each Gaussian that contains none (paper Algorithm 1); false: it follows the "
+        "nearest particles",
     )

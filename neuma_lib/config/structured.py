@@ -1,4 +1,4 @@
-"""Settings of laws with the structure of a material, and of how their correction is chosen."""
+"""Settings of structured corrections of analytic laws."""
 
 from __future__ import annotations
 
@@ -6,43 +6,28 @@ from typing import Literal
 
 from pydantic import Field
 
-from neuma_lib.config.base import Section
+from neuma_lib.config.base import Section, internal
 
 
 class StructuredConfig(Section):
-    """Correction of an analytic law by structured networks: which parts of the law it may change."""
+    """Correction of an analytic law by structured networks."""
 
     form: Literal["stretch", "energy"] = Field(
         "stretch",
-        description="elastic correction: stresses ordered as the stretches, or the derivative of an energy",
+        description="elastic correction: stresses ordered as the stretches, or the gradient of an energy",
     )
-    held_out: float = Field(0.25, gt=0, lt=1, description="part of the frames that corrections are judged by")
-    blocks: int = Field(
-        4,
-        ge=1,
-        description="the video is cut into so many equal parts, and the last frames of each are held out. With one the "
-        "correction has to foretell strains that it has not seen",
-    )
-    trial_iterations: int = Field(
-        10,
-        ge=1,
-        description="optimiser steps of all parts' corrections together, without the held-out frames, before the parts "
-        "are judged; `material.iterations` more follow on all frames, of those that are chosen",
-    )
+    held_out: float = internal(0.25, "share of the frames on which corrections are compared", gt=0, lt=1)
+    # With one block, a correction must extrapolate to strains that it has not seen.
+    blocks: int = internal(4, "equal parts of the video, of each of which the last frames are held out", ge=1)
+    # `training.iterations` follow on all frames, for the selected parts.
+    trial_iterations: int = internal(10, "optimiser steps before the parts are selected", ge=1)
     margin: float = Field(
-        0.05,
-        ge=0,
-        description="what a part of the law must gain to be corrected: the loss of the held-out frames falls by this "
-        "part of itself",
+        0.05, ge=0, description="relative decrease of the held-out loss required to correct a part of the law"
     )
     rivals: int = Field(
         1,
         ge=0,
-        description="so many of the families that tie with the identified one, and flow otherwise, are corrected for a "
-        "trial, too; the held-out frames choose between the corrections",
+        description="number of tied families with another return map that are corrected for comparison",
     )
-    penalties: tuple[float, ...] = Field(
-        (),
-        description="weights of `material.penalty` that are tried beside it, each for as many steps as a trial: of "
-        "those that the held-out frames do as well with, the largest is taken",
-    )
+    # The largest that the held-out frames fit equally well is used.
+    penalties: tuple[float, ...] = internal((), "candidates for `training.penalty`")

@@ -7,32 +7,32 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from neuma_lib.config.base import Section
-from neuma_lib.config.variants import DRAWN
+from neuma_lib.config.variants import SEEDS
 
 
 class TableConfig(Section):
-    """Rows and columns of a table of the paper."""
+    """Rows and columns of a table."""
 
     scenes: tuple[str, ...] = Field((), description="columns, in order")
     experiments: tuple[str, ...] = Field((), description="columns after the scenes, in order")
-    methods: tuple[str, ...] = Field((), description="rows, in order; variants such as neuma+rank=4 too")
-    titles: dict[str, str] = Field({}, description="names of rows other than the methods' own, by method")
-    note: str | None = Field(None, description="what a reader must know of the whole table; stands below it")
-    on_request: bool = Field(
-        False, description="true: made when it is asked for by name, not by the targets `tables` and `all`"
+    methods: tuple[str, ...] = Field((), description="rows, in order; also variants such as neuma+rank=4")
+    titles: dict[str, str] = Field({}, description="names of rows by method, if not the methods' own")
+    note: str | None = Field(None, description="note below the table")
+    default_target: bool = Field(
+        True,
+        description="whether the targets `tables` and `all` include it; false: on request by its file name",
     )
     seeds: int = Field(
         1,
         ge=1,
-        description="chains behind every number, in the folders `Scene`, `Scene+seed=1`, ...; with several, mean and "
-        "standard deviation are shown",
+        description="number of replicates, `Scene`, `Scene+seed=1`, ...; several give mean and standard deviation",
     )
-    vary: tuple[Literal[DRAWN], ...] = Field(
-        DRAWN, min_length=1, description="what the chains draw anew; what they share is computed once"
+    vary: tuple[Literal[SEEDS], ...] = Field(
+        SEEDS, min_length=1, description="what differs between replicates; the rest is shared"
     )
 
     @model_validator(mode="after")
     def _has_columns(self) -> TableConfig:
         if not self.scenes and not self.experiments:
-            raise ValueError("give at least one scene or experiment, a column each")
+            raise ValueError("give at least one scene or experiment")
         return self

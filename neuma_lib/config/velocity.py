@@ -4,43 +4,29 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from neuma_lib.config.base import Section
+from neuma_lib.config.base import Section, internal
 
 
 class VelocityConfig(Section):
     """Initial velocity and spin from the frames before contact."""
 
-    views: tuple[int, ...] = Field((0,), min_length=1, description="views of the video that are used")
+    views: tuple[int, ...] = internal((0,), "views of the video", min_length=1)
     ridge: float = Field(
         0.0,
         ge=0,
         description="penalty on the velocity along the viewing direction of the first view, relative to the curvature "
-        "of the best determined axis; 0: none",
+        "of the best determined axis",
     )
     initial_frames: int = Field(
-        3, ge=2, description="frames of the first estimate, which tells how many more come before contact"
+        3, ge=2, description="frames of the first estimate, which predicts the time of contact"
     )
-    frames: int = Field(
-        16,
-        ge=2,
-        description="most frames that are compared, spread evenly over those before contact: what the static Gaussians "
-        "get wrong is alike in all of them, so that more say little more",
+    # The errors of the static Gaussians are equal in all frames, so more frames add little.
+    frames: int = internal(16, "maximum number of frames before contact, evenly spaced", ge=2)
+    iterations: int = internal(30, "maximum number of Levenberg-Marquardt steps for a set of frames", ge=1)
+    # Gaussians do not change their shading. Divided by the time to contact it bounds the error of the spin.
+    angle_std: float = internal(0.01, "standard deviation of the apparent rotation [rad]", ge=0)
+    # 11.3: one percent of chi-squared variables with three degrees of freedom exceed it. 0: keep any spin.
+    spin_significance: float = internal(
+        11.3, "squared spin in standard deviations, below which it is zero", ge=0
     )
-    iterations: int = Field(30, ge=1, description="most Levenberg-Marquardt steps for a set of frames")
-    angle_std: float = Field(
-        0.01,
-        ge=0,
-        description="standard deviation of the angle [rad] by which images seem to show a body turned that is not, "
-        "because the Gaussians do not shade it as the light does; over the time to contact it bounds the spin",
-    )
-    spin_significance: float = Field(
-        11.3,
-        ge=0,
-        description="squared distance of the spin from 0, in standard deviations, below which the body does not spin; "
-        "11.3 is exceeded by one percent of chi-squared variables with three degrees of freedom; 0: any spin is kept",
-    )
-    difference: float = Field(
-        0.02,
-        gt=0,
-        description="half width of the central differences [m/s], of the spin as the speed of the particles",
-    )
+    difference: float = internal(0.02, "half width of the central differences [m/s]", gt=0)

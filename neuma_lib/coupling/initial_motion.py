@@ -1,4 +1,4 @@
-"""How a body is thrown, and how well that is known: what can be corrected once its material is known too."""
+"""Initial motion of a body with its uncertainty, which can be corrected once the material is known."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from neuma_lib.sim.state import State
 
 
 @dataclass(frozen=True)
-class Throw:
+class InitialMotion:
     """Initial motion of a body with its uncertainty.
 
     Attributes:
@@ -32,14 +32,14 @@ class Throw:
     std: np.ndarray
 
     @classmethod
-    def of(cls, found: Mapping[str, Any]) -> Throw:
+    def of(cls, found: Mapping[str, Any]) -> InitialMotion:
         """From the content of velocity.json; known exactly where that gives no standard deviations."""
         std = [found.get(key, (0, 0, 0)) for key in ("std_camera", "angular_velocity_std_camera")]
         motion = (np.asarray(found[key], dtype=float) for key in ("v0", "angular_velocity", "centre"))
         axes = np.asarray(found.get("camera_axes", np.eye(3)), dtype=float)
         return cls(*motion, axes, np.concatenate(std).astype(float))
 
-    def moved(self, deviations: np.ndarray) -> Throw:
+    def moved(self, deviations: np.ndarray) -> InitialMotion:
         """With a deviation (6,) in standard deviations added."""
         velocity, spin = (self.std * deviations).reshape(2, 3) @ self.axes
         return replace(self, velocity=self.velocity + velocity, spin=self.spin + spin)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -39,6 +43,31 @@ class Reconstruction:
     affine: bool = False
 
     @classmethod
+    def from_images(
+        cls, transforms: str | Path, density: Density, options: Mapping[str, Any] | None = None
+    ) -> Reconstruction:
+        """Reconstruct an object from views of it at rest.
+
+        Fits Gaussians to the images, extracts a watertight surface, fills it with particles and binds the Gaussians to
+        them. The work is done on the CPU.
+
+        Args:
+            transforms: ``transforms.json`` with cameras and RGBA images, whose alpha shows the object alone.
+            density: density [kg/m^3], or two densities on either side of a plane.
+            options: ``particles`` (number, default 2000), ``seed``, ``sampling``, and values of the sections
+                ``gaussians``, ``photographs``, ``surface`` and ``binding`` of the settings.
+
+        Raises:
+            InputError: a file or an option is invalid, or the views do not show one body.
+            NonFiniteError: the fit of the Gaussians diverges.
+
+        Example:
+            >>> body = Reconstruction.from_images("data/JellyDuck/static/transforms.json", density=1000.0)
+        """
+        # Imported by name, because the fit needs this class.
+        return import_module("neuma_lib.fitting.reconstruction").from_images(transforms, density, options)
+
+    @classmethod
     def of_gaussians(cls, gaussians: Gaussians, volume: float, density: Density) -> Reconstruction:
         """One particle per Gaussian (the paper's w/o Bind), with equal shares of the volume [m^3]."""
         count = len(gaussians.means)
@@ -58,12 +87,12 @@ class Reconstruction:
 
     def state(
         self,
-        v0: Sequence[float] | Tensor,
-        spin: Sequence[float] | Tensor = (0.0, 0.0, 0.0),
-        centre: Sequence[float] | Tensor | None = None,
+        v0: Sequence[float] | np.ndarray | Tensor,
+        spin: Sequence[float] | np.ndarray | Tensor = (0.0, 0.0, 0.0),
+        centre: Sequence[float] | np.ndarray | Tensor | None = None,
     ) -> State:
-        """The particles at t = 0 with velocity v0 [m/s] and angular velocity ``spin`` [rad/s] (`State.thrown`)."""
-        return State.thrown(self.x0, self.mass, self.vol0, v0, spin, centre)
+        """The particles at t = 0 with velocity v0 [m/s] and angular velocity ``spin`` [rad/s] (`State.rigid`)."""
+        return State.rigid(self.x0, self.mass, self.vol0, v0, spin, centre)
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Reconstruction:
         """The same body with another dtype or on another device."""

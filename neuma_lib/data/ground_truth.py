@@ -18,7 +18,7 @@ from torch import Tensor
 from neuma_lib.geometry.volume import check_apart, sample_tracers, sample_volume
 from neuma_lib.mechanics.density import Density, density_at
 from neuma_lib.mechanics.law import Law
-from neuma_lib.sim.model import MPMModel, consecutive
+from neuma_lib.sim.model import MPM, consecutive
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
@@ -65,7 +65,7 @@ class GroundTruth:
 
 
 def simulate_ground_truth(
-    model: MPMModel,
+    model: MPM,
     bodies: Sequence[TrueBody],
     frames: Sequence[int],
     *,
@@ -96,7 +96,7 @@ def simulate_ground_truth(
         density = density_at(x, body.density)
         model.check_courant(body.law, float(density.min()))
         vol0 = torch.full((len(x),), float(body.mesh.volume) / len(x))
-        solids.append(State.thrown(x, vol0 * density, vol0, body.velocity, body.spin))
+        solids.append(State.rigid(x, vol0 * density, vol0, body.velocity, body.spin))
     surface = trimesh.util.concatenate([body.mesh for body in bodies])
     start = [
         torch.as_tensor(sample_tracers(surface, tracers, seed=seed + 1 + k), dtype=torch.float32)

@@ -19,7 +19,7 @@ from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.evaluation.metrics import mechanical_energy, tracer_errors
 from neuma_lib.geometry.chamfer import chamfer_sequence
 from neuma_lib.mechanics.law import Law
-from neuma_lib.sim.model import Body, MPMModel
+from neuma_lib.sim.model import MPM, Body
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
@@ -71,7 +71,7 @@ class Evaluation:
 
 
 def predict(
-    model: MPMModel,
+    model: MPM,
     law: Law | Sequence[Body],
     start: State,
     frames: Sequence[int],
@@ -138,14 +138,14 @@ class Predictor(Protocol):
     """What predicts a motion: a model of `neuma_lib.methods.model`."""
 
     def predict(
-        self, mpm: MPMModel, state: State, frames: Sequence[int], tracers: Tensor | None, total: bool
+        self, mpm: MPM, state: State, frames: Sequence[int], tracers: Tensor | None, total: bool
     ) -> tuple[Trajectory, Failure | None]: ...
 
-    def courant(self, mpm: MPMModel, state: State) -> float | None: ...
+    def courant(self, mpm: MPM, state: State) -> float | None: ...
 
 
 def evaluate(
-    mpm: MPMModel,
+    mpm: MPM,
     motion: Predictor,
     start: State,
     frames: Sequence[int],

@@ -19,7 +19,7 @@ from torch import Tensor
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.material_point import returned, stress
 from neuma_lib.mechanics.law import Law
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 
@@ -65,7 +65,7 @@ class VisitedStates:
 
 
 def visit(
-    model: MPMModel, law: Law, start: State, frames: Sequence[int], states: int, paths: int, seed: int
+    model: MPM, law: Law, start: State, frames: Sequence[int], states: int, paths: int, seed: int
 ) -> VisitedStates:
     """Simulate a law, and draw states from its motion as they occur.
 

@@ -12,11 +12,36 @@ from neuma_lib.errors import InputError
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.catalogue import ELASTICITY, PLASTICITY, POISSON, Constant
 from neuma_lib.mechanics.combinations import Values
-from neuma_lib.sim.model import COURANT_LIMIT, MPMModel
+from neuma_lib.sim.model import COURANT_LIMIT, MPM
 
 _PARTS = {"elasticity": ELASTICITY, "plasticity": PLASTICITY}
 _LIMIT_SHARE = 0.999  # of the largest stable stiffness, since constants are rounded
 _MAX_LOGIT = 12.0  # logits beyond it equal the bound to six digits
+
+
+_GUESS = {"E": 2e5, "nu": 0.3}
+FAMILIES: dict[str, dict[str, dict[str, Any]]] = {
+    "hencky": {"elasticity": {"name": "hencky", **_GUESS}},
+    "fixed_corotated": {"elasticity": {"name": "fixed_corotated", **_GUESS}},
+    "neo_hookean": {"elasticity": {"name": "neo_hookean", **_GUESS}},
+    "von_mises": {
+        "elasticity": {"name": "hencky", **_GUESS},
+        "plasticity": {"name": "von_mises", "yield_stress": 5e3},
+    },
+    "drucker_prager": {
+        "elasticity": {"name": "hencky", **_GUESS},
+        "plasticity": {"name": "drucker_prager", "friction_angle": 30},
+    },
+    "viscous_flow": {
+        "elasticity": {"name": "hencky", **_GUESS},
+        "plasticity": {"name": "viscous_flow", "viscosity": 150},
+    },
+    "bingham": {
+        "elasticity": {"name": "hencky", **_GUESS},
+        "plasticity": {"name": "viscous_flow", "viscosity": 50, "yield_stress": 2e3},
+    },
+}
+"""Candidate families with initial guesses of their constants, as in ``identify.families`` of the shipped settings."""
 
 
 class Family:
@@ -57,7 +82,7 @@ class Family:
         """Unbounded constants (k,): logarithms, or logits of constants with two bounds."""
         return np.array([self._unbounded(key, values[key]) for key in self.constants])
 
-    def values(self, unbounded: np.ndarray, model: MPMModel, density: float) -> Values:
+    def values(self, unbounded: np.ndarray, model: MPM, density: float) -> Values:
         """Constants from unbounded ones, with E limited to what the time step admits at a density [kg/m^3]."""
         values = self.bounded(unbounded)
         unit = analytic_law(self.law_spec({**values, "E": 1.0}), model.dt)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuma_lib.sim.model import MPMModel, contact_clearance
+from neuma_lib.sim.model import MPM, contact_clearance
 
 
 def frame_batches(count: int, size: int) -> Iterator[slice]:
@@ -28,7 +28,7 @@ def spread_frames(count: int, limit: int) -> list[int]:
     return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(int)).tolist()
 
 
-def first_contact(model: MPMModel, x: Tensor) -> int:
+def first_contact(model: MPM, x: Tensor) -> int:
     """Index of the first frame of positions x (T, N, 3) [m] with a particle in contact with a wall, T if none."""
     touching = contact_clearance(model, x) <= 0
     return int(touching.int().argmax()) if bool(touching.any()) else len(x)

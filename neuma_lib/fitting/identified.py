@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from neuma_lib.config.identify import IdentifyConfig
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.fitting.families import Family
 from neuma_lib.mechanics.combinations import Values, named_combinations, physical
 
@@ -26,7 +26,7 @@ class FamilyFit:
         held_out: mean squared residual of the held-out frames at the finest level.
         score: logarithm of ``held_out`` plus the penalty on constants; lower is better.
         covariance: covariance (k, k) of the unbounded constants, including the uncertainty of the initial motions.
-        throws: fitted initial motion in each video, with its standard deviations.
+        motions: fitted initial motion in each video, with its standard deviations.
         refined: whether the fit reached the finest level.
         rollouts: number of simulations.
         steps: number of accepted Levenberg-Marquardt steps.
@@ -38,7 +38,7 @@ class FamilyFit:
     held_out: float = math.inf
     score: float = math.inf
     covariance: np.ndarray | None = None
-    throws: tuple[Throw, ...] = ()
+    motions: tuple[InitialMotion, ...] = ()
     refined: bool = False
     rollouts: int = 0
     steps: int = 0
@@ -90,7 +90,7 @@ class FamilyFit:
             }
             plain["combinations"] = self.combinations(settings)
             plain["unbounded"] = self.family.unbounded_dict(self.values, self.covariance)
-            plain["start"] = self.throws[0].as_dict()
+            plain["start"] = self.motions[0].as_dict()
         return plain
 
     def quantities(self, settings: IdentifyConfig) -> list[tuple[str, float, float]]:
@@ -141,8 +141,8 @@ class Identified:
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers for JSON; ``law`` is a specification for `analytic_law`."""
         videos = [
-            {"start": throw.as_dict(), "frames": list(frames), "held_out_frames": list(held_out)}
-            for throw, frames, held_out in zip(self.best.throws, self.frames, self.held_out, strict=True)
+            {"start": motion.as_dict(), "frames": list(frames), "held_out_frames": list(held_out)}
+            for motion, frames, held_out in zip(self.best.motions, self.frames, self.held_out, strict=True)
         ]
         return {
             "family": self.best.family.name,

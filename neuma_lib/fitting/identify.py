@@ -4,7 +4,7 @@ Fits the constants of every candidate family and selects the family with the low
 Levenberg-Marquardt through rollout and renderer, with a Jacobian of a few rollouts. It proceeds from coarse to fine
 levels of an image pyramid, because the basin of convergence of sharp images is about a pixel. Constants are unbounded
 logarithms or logits. A family is initialised from the best of its default guess, the scene's prior and the fits of
-simpler families. Families whose loss exceeds ``give_up`` times the best are dropped.
+simpler families. Families whose loss exceeds ``prune_factor`` times the best are dropped.
 
 The initial motion is estimated from the frames before contact, with an uncertainty that would bias the constants. The
 last level therefore also fits velocity and spin with a prior, and a constant shift and enlargement of the rendered
@@ -33,7 +33,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.config.identify import IdentifyConfig
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.families import Family
@@ -47,23 +47,23 @@ from neuma_lib.fitting.least_squares import (
 )
 from neuma_lib.fitting.thrown_video import MOTION, NUISANCES, Candidate, VideoResiduals, averaged
 from neuma_lib.mechanics.combinations import Values
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.splatting.observation import Observation, joint_frames, several
 
-_LAST_GAIN = 0.1  # factor on `least_gain` at the last level
+_LAST_GAIN = 0.1  # factor on `min_gain` at the last level
 _MIN_LOSS = 1e-12  # held-out loss of images that agree exactly
 
 
 def identify(
-    model: MPMModel,
-    throw: Throw,
+    model: MPM,
+    motion: InitialMotion,
     body: Reconstruction,
     observation: Observation | Sequence[Observation],
     settings: IdentifyConfig,
     published: Mapping[str, Mapping[str, Any]] | None = None,
     *,
     refined: Sequence[Sequence[Reconstruction]] = (),
-    other_videos: Sequence[tuple[Throw, Reconstruction, Observation | Sequence[Observation]]] = (),
+    other_videos: Sequence[tuple[InitialMotion, Reconstruction, Observation | Sequence[Observation]]] = (),
     progress: Callable[[int, int, float], None] | None = None,
     log: Callable[[str], None] = lambda text: None,
 ) -> Identified:
@@ -71,7 +71,7 @@ def identify(
 
     Args:
         model: simulator constants.
-        throw: estimate of the initial motion from the frames before contact.
+        motion: estimate of the initial motion from the frames before contact.
         body: reconstructed particles and Gaussians.
         observation: the video, or several of the same motion by cameras of different times, sizes or exposures, with
             the views of the settings.
@@ -86,7 +86,7 @@ def identify(
         InputError: fewer than four frames, no family, or one with unknown parts.
         NonFiniteError: every family diverges from every start.
     """
-    given = [(throw, body, observation), *other_videos]
+    given = [(motion, body, observation), *other_videos]
     if (count := min(len(joint_frames(several(video))) for *_, video in given)) < 4:
         raise InputError(
             "frames", f"{count} frames of the training view must be at least 4, to fit and to evaluate"
@@ -104,7 +104,7 @@ def identify(
         video.weight = (videos[0].fitted_pixels / video.fitted_pixels) ** 0.5
     published_values = _constants(published) if published else {}
     running: list[_Run] = []
-    rounds = len(settings.squares)
+    rounds = len(settings.pyramid)
     for family in families:
         running.append(_first_fit(family, videos, running, published_values, settings))
     for run, best in _better_later(running):
@@ -132,9 +132,8 @@ def identify(
     run.measure_discretisation()
     final = _Run(run.family, videos, [len(video.frames) for video in videos], settings)
     starts, first = [run.values], rounds - 1
-    if (
-        selected.held_out > settings.give_up * selected.loss
-    ):  # the first frames misled, so restart at the coarsest level
+    # If the first frames misled, restart at the coarsest level.
+    if selected.held_out > settings.prune_factor * selected.loss:
         starts = [run.values, *(run.family.with_guesses(values) for values in ({}, published_values))]
         first = 0
     final.begin(starts, first, run.deviations)
@@ -196,13 +195,15 @@ def _better_later(running: Sequence[_Run]) -> list[tuple[_Run, _Run]]:
 
 
 def _prune(running: Sequence[_Run], settings: IdentifyConfig) -> None:
-    """Drop families whose loss exceeds ``give_up`` times the best, and redundant families.
+    """Drop families whose loss exceeds ``prune_factor`` times the best, and redundant families.
 
     Families that do not improve on a simpler one at a coarse level are kept, since finer levels have more information.
     """
     alive = [run for run in running if run.alive]
     lowest = min((run.fit.cost for run in alive), default=0.0)
-    dropped = [run for run in alive if run.fit.cost > settings.give_up * lowest or _is_redundant(run, alive)]
+    dropped = [
+        run for run in alive if run.fit.cost > settings.prune_factor * lowest or _is_redundant(run, alive)
+    ]
     for run in dropped:
         run.alive = False
 
@@ -327,14 +328,14 @@ class _Run:
 
     def refine(self, level: int) -> None:
         """Continue the fit at a level of the pyramid."""
-        self._level, last = level, level == len(self.settings.squares) - 1
+        self._level, last = level, level == len(self.settings.pyramid) - 1
         unsure = [k for v, video in enumerate(self.videos) if video.by_deviation for k in self._unsure(v)]
         self._u, self.fit, steps = levenberg_marquardt(
             self,
             self._u,
             [*range(self._constants), *unsure],
             self._prior,
-            self.settings.least_gain * (_LAST_GAIN if last else 1.0),
+            self.settings.min_gain * (_LAST_GAIN if last else 1.0),
             self.settings.iterations,
             longest=self.settings.longest_step,
         )
@@ -370,7 +371,7 @@ class _Run:
             k = self._constants
             covariance = self._covariance()
             result.covariance, stds = covariance[:k, :k], np.sqrt(np.diag(covariance))
-            result.throws = tuple(self._motion(v, stds) for v in range(len(self.videos)))
+            result.motions = tuple(self._motion(v, stds) for v in range(len(self.videos)))
             if any(count < len(video.frames) for count, video in zip(self.counts, self.videos, strict=True)):
                 result.held_out = self._held_out()
                 result.score = math.log(max(result.held_out, _MIN_LOSS)) + self.settings.penalty * k
@@ -459,10 +460,10 @@ class _Run:
                     slope[i] += float((self._averaged(at, column) * r).sum())
         return slope
 
-    def _motion(self, v: int, stds: np.ndarray) -> Throw:
+    def _motion(self, v: int, stds: np.ndarray) -> InitialMotion:
         """The fitted initial motion of a video, from the standard deviations of all unknowns."""
-        motion, throw = self._own(v)[:MOTION], self.videos[v].throw
-        return replace(throw.moved(self._u[motion]), std=throw.std * stds[motion])
+        own, motion = self._own(v)[:MOTION], self.videos[v].motion
+        return replace(motion.moved(self._u[own]), std=motion.std * stds[own])
 
     def _constant_columns(self, unknowns: np.ndarray, residual: Sequence[Tensor]) -> list[list[Tensor]]:
         """Forward differences by the constants, or backward if the forward one diverges or exceeds the stiffness limit

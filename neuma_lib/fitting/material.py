@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from neuma_lib.config.base import Compared
-from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.coupling.filmed import Filmed
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
@@ -35,7 +35,7 @@ from neuma_lib.fitting.training_loop import TrainingLoop
 from neuma_lib.geometry.chamfer import chamfer_loss
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.mechanics.law import Law
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 from neuma_lib.splatting.observation import (
@@ -221,7 +221,7 @@ class TrainedMaterial:
         )
 
 
-def frame_weights(iteration: int, count: int, settings: MaterialConfig) -> Tensor:
+def frame_weights(iteration: int, count: int, settings: TrainingConfig) -> Tensor:
     """Weights (count,) of the frames: d^k for period k of the video; d rises to 1 in the first third of training."""
     rise = min(1.0, iteration / max(1.0, settings.iterations / 3))
     d = settings.frame_weight_start + (1 - settings.frame_weight_start) * rise
@@ -230,11 +230,11 @@ def frame_weights(iteration: int, count: int, settings: MaterialConfig) -> Tenso
 
 
 def train_material(
-    model: MPMModel,
+    model: MPM,
     law: Law,
     start: State,
     loss: TrajectoryLoss,
-    settings: MaterialConfig,
+    settings: TrainingConfig,
     *,
     other_videos: Sequence[tuple[State, TrajectoryLoss]] = (),
     stretch: Stretch | None = None,

@@ -14,7 +14,7 @@ from neuma_lib.config.priors import RegressionConfig
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.singular_values import svd3
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 
@@ -40,7 +40,7 @@ _SPIN = 6.0
 class Launch:
     """A cube of particles with its initial motion."""
 
-    model: MPMModel
+    model: MPM
     state: State
     steps: int
 
@@ -89,7 +89,7 @@ def random_launch(
         torch.full((count,), DENSITY * side**3 / count),
         torch.full((count,), side**3 / count),
     )
-    return Launch(MPMModel(grid=settings.grid, dt=dt), state, math.ceil(settings.duration / dt))
+    return Launch(MPM(grid=settings.grid, dt=dt), state, math.ceil(settings.duration / dt))
 
 
 def random_rotations(count: int, generator: torch.Generator) -> Tensor:

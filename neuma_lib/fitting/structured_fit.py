@@ -25,14 +25,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.structured import StructuredConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.frame_batches import first_contact, held_out_frames
 from neuma_lib.fitting.material import History, Stretch, TrainedMaterial, TrajectoryLoss, train_material
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.mechanics.structured import StructuredLaw
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
@@ -103,11 +103,11 @@ class Selection:
 
 
 def train_structured(
-    model: MPMModel,
+    model: MPM,
     law: StructuredLaw,
     start: State,
     loss: TrajectoryLoss,
-    settings: MaterialConfig,
+    settings: TrainingConfig,
     structured: StructuredConfig,
     *,
     rivals: Sequence[StructuredLaw] = (),
@@ -168,7 +168,7 @@ def train_structured(
         begin: LawState,
         parts: Sequence[str],
         videos: Sequence[Video],
-        settings: MaterialConfig,
+        settings: TrainingConfig,
         stretch: Stretch,
         before: int,
     ) -> TrainedMaterial:
@@ -326,7 +326,7 @@ def largest_similar(losses: dict[float, float]) -> float:
 
 
 def _simulate(
-    model: MPMModel, law: StructuredLaw, start: State, loss: TrajectoryLoss
+    model: MPM, law: StructuredLaw, start: State, loss: TrajectoryLoss
 ) -> tuple[Trajectory, list[float]] | None:
     """The motion at all steps of a loss, and the losses of its frames; None if it diverges."""
     with torch.no_grad():

@@ -18,13 +18,13 @@ from torch import Tensor
 
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.coupling.filmed import Filmed
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.frame_batches import first_contact, frame_batches, held_out_frames, spread_frames
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.sim.batch import rollout_batch
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.state import Trajectory
 from neuma_lib.splatting.observation import Observation, joint_frames, rendered_steps, several
 
@@ -41,7 +41,7 @@ class Candidate:
     Attributes:
         law: specification of the law.
         deviations: deviations (9,) of velocity and spin from their estimates in standard deviations, then shift right,
-            shift down and enlargement of the rendered body in units of the setting ``misplaced``.
+            shift down and enlargement of the rendered body in units of the setting ``pose_tolerance``.
     """
 
     law: Mapping[str, Mapping[str, Any]]
@@ -67,23 +67,25 @@ class VideoResiduals:
 
     def __init__(
         self,
-        model: MPMModel,
-        throw: Throw,
+        model: MPM,
+        motion: InitialMotion,
         body: Reconstruction,
         video: Observation | Sequence[Observation],
         settings: IdentifyConfig,
         refined: Sequence[Reconstruction] = (),
     ):
         observed = [each.select(spread_frames(len(each.frames), settings.frames)) for each in several(video)]
-        self.model, self.throw, self.frames, self.weight = model, throw, joint_frames(observed), 1.0
+        self.model, self.motion, self.frames, self.weight = model, motion, joint_frames(observed), 1.0
         self.fitted = len(self.frames)
         self.density = float((body.mass / body.vol0).min())
-        self.unsure = np.flatnonzero([*throw.std, *[settings.misplaced] * (NUISANCES - MOTION)]).tolist()
+        self.unsure = np.flatnonzero(
+            [*motion.std, *[settings.pose_tolerance] * (NUISANCES - MOTION)]
+        ).tolist()
         self.by_deviation: list[list[Tensor]] | None = None
         self.spread: list[Tensor] | None = None
         self.rollouts = 0
         self._correction: list[Tensor] | None = None
-        self._misplaced = settings.misplaced
+        self._pose_tolerance = settings.pose_tolerance
         self._total, self._axes = settings.covariance_from == "total", observed[0].cameras.viewmats[0, :3, :3]
         self._steps, self._own_frames = rendered_steps(observed), [each.frames for each in observed]
         self._last = [  # step at which the last exposure of the frames up to each ends
@@ -99,7 +101,7 @@ class VideoResiduals:
 
         self._body, *self._refined = [(each, films(each)) for each in (body, *refined)]
         sizes = [
-            [max(1, round(each.cameras.width / across)) for across in settings.squares] for each in observed
+            [max(1, round(each.cameras.width / across)) for across in settings.pyramid] for each in observed
         ]
         self._finest = [each[-1] for each in sizes]
         self.sizes = [max(1, round(size / self._finest[0])) for size in sizes[0]]
@@ -182,7 +184,7 @@ class VideoResiduals:
         """Rollouts to the end of the exposure of the first ``count`` frames."""
         self.rollouts += len(candidates)
         frames = self._steps[: bisect_right(self._steps, self._last[count - 1])]
-        starts = [self.throw.moved(one.deviations[:MOTION]).of_body(body) for one in candidates]
+        starts = [self.motion.moved(one.deviations[:MOTION]).of_body(body) for one in candidates]
         laws = [analytic_law(one.law, self.model.dt).to(starts[0].x.device) for one in candidates]
         options = dict(steps=frames[-1], frames=frames, total=self._total)
         return rollout_batch(self.model, laws, starts, **options)
@@ -193,7 +195,7 @@ class VideoResiduals:
     ) -> list[Tensor] | None:
         if path is None:
             return None
-        right, down, enlargement = (self._misplaced * one.deviations[MOTION:]).tolist()
+        right, down, enlargement = (self._pose_tolerance * one.deviations[MOTION:]).tolist()
         residuals = []
         for films, observed, size, T in zip(
             filmed, self._observed, self._finest, self.counts(count), strict=True

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import torch
 from torch.optim import Optimizer
 
-from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.io.checkpoint import Checkpoint
 
@@ -33,7 +33,7 @@ class TrainingLoop(ABC):
 
     RETURN: ClassVar[str] = "back to the best state, that of iteration"
 
-    settings: MaterialConfig
+    settings: TrainingConfig
     log: Callable[[str], None]
     optimizer: Optimizer
 

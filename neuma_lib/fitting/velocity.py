@@ -36,7 +36,7 @@ from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.fitting.frame_batches import frame_batches, spread_frames
 from neuma_lib.fitting.least_squares import Linearisation, in_blocks, jackknife, levenberg_marquardt
 from neuma_lib.mechanics.law import Law
-from neuma_lib.sim.model import MPMModel, contact_clearance
+from neuma_lib.sim.model import MPM, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import cross_matrix
 from neuma_lib.splatting.observation import (
@@ -131,7 +131,7 @@ class VelocityEstimate:
 
 
 def estimate_velocity(
-    model: MPMModel,
+    model: MPM,
     law: Law,
     body: Reconstruction,
     observation: Observation | Sequence[Observation],
@@ -216,8 +216,8 @@ def estimate_velocity(
 class _Flight:
     """Free flight of the body: the simulated motion of a spinning body, moved along a parabola.
 
-    In free flight the centre of mass moves on a parabola independently of the rotation, simulated without gravity in the
-    middle of the cube, far from walls.
+    In free flight the centre of mass moves on a parabola, independently of the rotation, simulated without gravity
+    in the middle of the cube, far from walls.
 
     Attributes:
         ends: step at which the exposure of each frame ends.
@@ -226,7 +226,7 @@ class _Flight:
             velocity of 1 m/s about the centre, `NUISANCE_SCALE`, 1 and 1.
     """
 
-    def __init__(self, model: MPMModel, law: Law, body: Reconstruction, ends: tuple[int, ...]):
+    def __init__(self, model: MPM, law: Law, body: Reconstruction, ends: tuple[int, ...]):
         self.model, self.law, self.body, self.ends = model, law, body, ends
         self.centre = body.mass @ body.x0 / body.mass.sum()
         gyration = ((body.x0 - self.centre).square().sum(1) @ body.mass / body.mass.sum()).sqrt()

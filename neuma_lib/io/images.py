@@ -324,7 +324,10 @@ def load_views(transforms: str | Path, views: Sequence[int] | None = None) -> tu
 
 
 def load_videos(
-    transforms: str | Path, views: Sequence[int], dt: float | None = None, sub_frames: int = EXPOSURE_SAMPLES
+    transforms: str | Path,
+    views: Sequence[int],
+    dt: float | None = None,
+    exposure_samples: int = EXPOSURE_SAMPLES,
 ) -> tuple[Observation, ...]:
     """The videos of some views, as uint8: 1 GB for 400 frames of 800 x 800 pixels.
 
@@ -335,13 +338,13 @@ def load_videos(
         transforms: .../transforms.json. The ``exposure`` [s] of a frame is centred at its step.
         views: numbers of the views.
         dt: duration of a step [s], which converts exposures to steps; None: instantaneous exposures.
-        sub_frames: maximum number of renders that are averaged to a frame, see `exposed_steps`.
+        exposure_samples: maximum number of renders that are averaged to a frame, see `exposed_steps`.
 
     Raises:
         InputError: see `read_image_set` and `Observation`; a view that was not filmed, or only before step 0.
     """
     observations = []
-    for (_, _, exposure), frames in _shots(transforms, views, dt, sub_frames).items():
+    for (_, _, exposure), frames in _shots(transforms, views, dt, exposure_samples).items():
         images = _read_frames(frames, transforms)
         order = list(dict.fromkeys(frame["view"] for frame in frames))
         steps, index, columns = images.video(order)
@@ -353,17 +356,20 @@ def load_videos(
 
 
 def filmed_steps(
-    transforms: str | Path, views: Sequence[int], dt: float | None = None, sub_frames: int = EXPOSURE_SAMPLES
+    transforms: str | Path,
+    views: Sequence[int],
+    dt: float | None = None,
+    exposure_samples: int = EXPOSURE_SAMPLES,
 ) -> tuple[int, ...]:
     """Steps needed to compare with `load_videos` of the same arguments, ascending. Reads no images."""
-    shots = _shots(transforms, views, dt, sub_frames)
+    shots = _shots(transforms, views, dt, exposure_samples)
     return tuple(sorted({
         step + offset for steps, _, (offsets, _) in shots for step in steps for offset in (*offsets, 0)
     }))  # fmt: skip
 
 
 def _shots(
-    transforms: str | Path, views: Sequence[int], dt: float | None, sub_frames: int
+    transforms: str | Path, views: Sequence[int], dt: float | None, exposure_samples: int
 ) -> dict[tuple, list[dict[str, Any]]]:
     """(steps, size, (offsets, shares) of the exposure) of each observation -> its frames, view by view.
 
@@ -375,13 +381,13 @@ def _shots(
         raise InputError(
             f"{transforms}: view {missing[0]}",
             f"is not one of the filmed views {filmed}",
-            "Film more views (dataset.dynamic.views), or use fewer (methods.<name>.material.views, identify.views)",
+            "Film more views (dataset.dynamic.views), or use fewer (training.views, identify.views)",
         )
     shots: dict[tuple, list[dict[str, Any]]] = {}
     for view in dict.fromkeys(views):
         columns: dict[tuple, list[dict[str, Any]]] = {}
         for frame in sorted((f for f in frames if f["view"] == view), key=lambda f: f["step"]):
-            exposure = exposed_steps(frame.get("exposure", 0) / dt if dt else 0.0, sub_frames)
+            exposure = exposed_steps(frame.get("exposure", 0) / dt if dt else 0.0, exposure_samples)
             if frame["step"] + exposure[0][0] >= 0:
                 columns.setdefault((exposure, _camera_key(frame)), []).append(frame)
         if not columns:

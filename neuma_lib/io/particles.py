@@ -124,7 +124,7 @@ def load_initial_state(
     if sum(counts) != len(x0) or len(densities) != len(counts):
         raise InputError(velocity, f"does not have the bodies of {particles}", "Regenerate both")
     return State.joined([
-        State.thrown(x, vol * density_at(x, density), vol, *(part[key] for key in INITIAL_MOTION))
+        State.rigid(x, vol * density_at(x, density), vol, *(part[key] for key in INITIAL_MOTION))
         for x, vol, density, part in zip(x0.split(counts), vol0.split(counts), densities, parts, strict=True)
     ]), counts  # fmt: skip
 

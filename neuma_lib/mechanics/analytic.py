@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import complete
 from neuma_lib.mechanics.elasticity import ELASTICITIES, AnalyticElasticity
-from neuma_lib.mechanics.law import Law, Plasticity
+from neuma_lib.mechanics.law import Elasticity, Law, Plasticity
 from neuma_lib.mechanics.plasticity import PLASTICITIES
-
-NAMES = {kind: name for name, kind in (ELASTICITIES | PLASTICITIES).items()}
 
 
 def analytic_law(spec: Mapping[str, Any], dt: float | None = None, name: str | None = None) -> Law:
@@ -34,10 +33,25 @@ def analytic_law(spec: Mapping[str, Any], dt: float | None = None, name: str | N
     return Law(elasticity, PLASTICITIES[names[1]](**parts["plasticity"]), name or " + ".join(names))
 
 
+def name_of(part: Elasticity | Plasticity) -> str | None:
+    """Name of an analytic part in specifications, None if it has none."""
+    return next((name for name, kind in part.named.items() if kind is type(part)), None)
+
+
 def specification(elasticity: AnalyticElasticity, plasticity: Plasticity) -> dict[str, Any]:
-    """Complete specification of two analytic parts, including inherited constants of the plasticity (E, nu, dt)."""
+    """Complete specification of two analytic parts, including inherited constants of the plasticity (E, nu, dt).
+
+    Raises:
+        InputError: a part has no name or does not hold constants, so that a specification cannot describe it.
+    """
     parts = {"elasticity": elasticity, "plasticity": plasticity}
+    for key, part in parts.items():
+        if name_of(part) is None or not hasattr(part, "values"):
+            problem = f"{type(part).__name__} is not described by a name and constants"
+            raise InputError(
+                key, problem, "Derive it from AnalyticElasticity or AnalyticPlasticity, with a name"
+            )
     return {
-        name: {"name": NAMES[type(part)], **{key: float(value) for key, value in part.values.items()}}
+        name: {"name": name_of(part), **{key: float(value) for key, value in part.values.items()}}
         for name, part in parts.items()
     }

@@ -111,6 +111,26 @@ PLASTICITY: dict[str, dict[str, Constant]] = {
 """Constants of the return maps by name. E, nu and dt default to those of the elasticity and of the simulation."""
 
 
+DEFINED_IN: dict[tuple[str, str], str] = {}
+"""Modules or Python files of laws that are not built in, by part and name."""
+
+
+def register(part: str, name: str, constants: Mapping[str, Constant], module: str) -> None:
+    """Add a law that is not built in.
+
+    Args:
+        part: "elasticity" or "plasticity".
+        module: module or Python file that defines it.
+
+    Raises:
+        InputError: another module has a law with this name.
+    """
+    laws = {"elasticity": ELASTICITY, "plasticity": PLASTICITY}[part]
+    if name in laws and DEFINED_IN.get((part, name)) != module:
+        raise InputError(module, f"another {part} has the name {name!r}", "Choose another name")
+    laws[name], DEFINED_IN[part, name] = dict(constants), module
+
+
 def complete(spec: Mapping[str, Any], dt: float | None = None) -> dict[str, dict[str, Any]]:
     """A specification with both parts, and E, nu and dt in a plasticity that has these constants.
 

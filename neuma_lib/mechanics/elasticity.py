@@ -58,7 +58,7 @@ def _deviator(y: Tensor) -> Tensor:
     return y - y.mean(1, keepdim=True)
 
 
-class FixedCorotated(AnalyticElasticity):
+class FixedCorotated(AnalyticElasticity, name="fixed_corotated"):
     """tau = 2 mu (F - R) F^T + lam J (J - 1) I (Stomakhin et al. 2012)."""
 
     def principal(self, sigma, mu, lam):
@@ -66,7 +66,7 @@ class FixedCorotated(AnalyticElasticity):
         return 2 * mu * (sigma - 1) * sigma + lam * J * (J - 1)
 
 
-class StVK(AnalyticElasticity):
+class StVK(AnalyticElasticity, name="stvk"):
     """Saint Venant-Kirchhoff: tau = F (2 mu E + lam tr(E) I) F^T with Green's strain E = (F^T F - I)/2."""
 
     def principal(self, sigma, mu, lam):
@@ -74,7 +74,7 @@ class StVK(AnalyticElasticity):
         return sigma**2 * (2 * mu * strain + lam * strain.sum(1, keepdim=True))
 
 
-class Hencky(AnalyticElasticity):
+class Hencky(AnalyticElasticity, name="hencky"):
     """tau = U (2 mu eps + lam tr(eps) I) U^T with the logarithmic strain eps = log sigma."""
 
     def principal(self, sigma, mu, lam):
@@ -82,7 +82,7 @@ class Hencky(AnalyticElasticity):
         return 2 * mu * strain + lam * strain.sum(1, keepdim=True)
 
 
-class NeoHookean(AnalyticElasticity):
+class NeoHookean(AnalyticElasticity, name="neo_hookean"):
     """Compressible neo-Hookean: tau = mu (F F^T - I) + lam log(J) I."""
 
     def principal(self, sigma, mu, lam):
@@ -90,7 +90,7 @@ class NeoHookean(AnalyticElasticity):
         return mu * (sigma - 1) * (sigma + 1) + lam * J.log()
 
 
-class Fluid(AnalyticElasticity):
+class Fluid(AnalyticElasticity, name="fluid"):
     """Weakly compressible fluid: tau = lam J (J - 1) I."""
 
     def principal(self, sigma, mu, lam):
@@ -98,7 +98,7 @@ class Fluid(AnalyticElasticity):
         return (lam * J * (J - 1)).expand_as(sigma)
 
 
-class Tait(AnalyticElasticity):
+class Tait(AnalyticElasticity, name="tait"):
     """tau = (K / 7) (J - J^-6) I + 2 mu dev eps, K = lam + 2 mu / 3: the Tait-Cole equation of state of a liquid with
     exponent 7, and `Hencky` in shear.
 
@@ -113,7 +113,7 @@ class Tait(AnalyticElasticity):
         return (lam + 2 * mu / 3) / 7 * (J - J**-6) + 2 * mu * strain
 
 
-class Ogden(AnalyticElasticity):
+class Ogden(AnalyticElasticity, name="ogden"):
     """One-term Ogden solid: tau_i = (2 mu / alpha) dev(s_i^alpha) + (lam + 2 mu / 3) log J, s_i = sigma_i J^(-1/3).
 
     Energy (2 mu / alpha^2) (sum_i s_i^alpha - 3) + (lam + 2 mu / 3) log(J)^2 / 2 (Ogden 1972). The solid stiffens with
@@ -127,7 +127,7 @@ class Ogden(AnalyticElasticity):
         return 2 * mu / alpha * _deviator((alpha * strain).exp()) + (lam + 2 * mu / 3) * log_J
 
 
-class MooneyRivlin(AnalyticElasticity):
+class MooneyRivlin(AnalyticElasticity, name="mooney_rivlin"):
     """tau = mu (1 - q) dev b - mu q dev b^-1 + (lam + 2 mu / 3) log J I with the isochoric b = J^(-2/3) F F^T.
 
     Energy C1 (I1 - 3) + C2 (I2 - 3) + (lam + 2 mu / 3) log(J)^2 / 2 of the isochoric invariants, with C1 + C2 = mu / 2
@@ -143,7 +143,7 @@ class MooneyRivlin(AnalyticElasticity):
         return mu * shear + (lam + 2 * mu / 3) * log_J
 
 
-class FibreReinforced(Hencky):
+class FibreReinforced(Hencky, name="fibre_reinforced"):
     """A `Hencky` matrix with one family of fibres along a (transversely isotropic), with a_F = F a and I4 = |a_F|^2:
 
     tau = tau_matrix + (H / 2) (I4 - 1) exp(b (I4 - 1)^2) a_F (x) a_F
@@ -172,14 +172,5 @@ class FibreReinforced(Hencky):
         return matrix + tension[:, None, None] * a_F[:, :, None] * a_F[:, None]
 
 
-ELASTICITIES: dict[str, type[AnalyticElasticity]] = {
-    "fixed_corotated": FixedCorotated,
-    "stvk": StVK,
-    "hencky": Hencky,
-    "neo_hookean": NeoHookean,
-    "fluid": Fluid,
-    "tait": Tait,
-    "ogden": Ogden,
-    "mooney_rivlin": MooneyRivlin,
-    "fibre_reinforced": FibreReinforced,
-}
+ELASTICITIES = Elasticity.named
+"""Elasticities by name."""

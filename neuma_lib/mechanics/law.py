@@ -10,13 +10,17 @@ step and returns their gradients to autograd once.
 
 from __future__ import annotations
 
-from collections.abc import Hashable
-from typing import Any, Literal
+from collections.abc import Hashable, Mapping
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
 from neuma_lib.errors import NonFiniteError
+from neuma_lib.mechanics.catalogue import register
 
 Weights = tuple[Tensor, ...]
 AdjointPrecision = Literal["single", "half"]
@@ -34,6 +38,21 @@ class Constitutive(nn.Module):
     adjoint_precision: AdjointPrecision = "single"
     """Precision of the matrix products in `vjp`. "half" uses factors of 11 bits and sums them in float32, for laws
     with such kernels."""
+
+    part: ClassVar[str]
+    named: ClassVar[dict[str, type]]
+    """Subclasses by name."""
+
+    def __init_subclass__(cls, name: str | None = None, **options: Any):
+        """``class Mine(Elasticity, name="mine")`` gives a law a name for specifications.
+
+        Its ``constants``, units and bounds by name, are those of the specification. They are arguments of ``__init__``.
+        """
+        super().__init_subclass__(**options)
+        if name is not None:
+            if not cls.__module__.startswith("neuma_lib."):
+                register(cls.part, name, getattr(cls, "constants", {}), cls.__module__)
+            cls.named[name] = cls
 
     def graph_key(self) -> Hashable:
         """Key that is equal for laws that can share recorded graphs because they differ only in weights."""
@@ -118,9 +137,15 @@ class Constitutive(nn.Module):
 class Elasticity(Constitutive):
     """Deformation gradient F -> Kirchhoff stress tau = P F^T [Pa], both (N, 3, 3)."""
 
+    part = "elasticity"
+    named: ClassVar[dict[str, type]] = {}
+
 
 class Plasticity(Constitutive):
     """Trial deformation gradient F_trial -> elastic deformation gradient F, both (N, 3, 3)."""
+
+    part = "plasticity"
+    named: ClassVar[dict[str, type]] = {}
 
 
 class Law(nn.Module):
@@ -131,6 +156,46 @@ class Law(nn.Module):
         self.elasticity = elasticity
         self.plasticity = plasticity
         self.name = name
+
+    @classmethod
+    def from_spec(cls, spec: Mapping[str, Any], dt: float | None = None) -> Law:
+        """An analytic law from the names and constants of its parts (`analytic_law`).
+
+        Args:
+            spec: ``elasticity`` and optionally ``plasticity``, each with its ``name`` and constants in SI units.
+            dt: time step of the simulation [s], required by rate-dependent plasticity.
+
+        Raises:
+            InputError: a part, name or constant is unknown or missing, or a constant is out of bounds.
+
+        Example:
+            >>> Law.from_spec({"elasticity": {"name": "neo_hookean", "E": 1e5, "nu": 0.3}}).name
+            'neo_hookean + identity'
+        """
+        return _imported("mechanics.analytic").analytic_law(spec, dt)
+
+    @classmethod
+    def load(cls, path: str | Path, dt: float | None = None) -> Law:
+        """A law from a file of `save`, a prior, or a released NCLaw or NeuMA network (`neuma_lib.io.laws.load_law`).
+
+        Args:
+            path: ``.safetensors`` or ``.pt``.
+            dt: time step of the simulation [s]. None: that of the training.
+
+        Raises:
+            InputError: the file is missing or damaged, or the law holds at another time step only.
+        """
+        return _imported("io.laws").load_law(path, dt=dt)
+
+    def save(self, path: str | Path, about: Mapping[str, Any]) -> None:
+        """Write the complete law to one ``.safetensors`` file, for `load`.
+
+        Args:
+            about: what is known of its origin, with the keys of `neuma_lib.io.exported`: at least ``dt``, the time step
+                of its training [s], or None for a law that does not depend on it.
+        """
+        known = {"dt": None, **about}
+        _imported("io.laws").save_law(path, self, _imported("io.exported").about_law(self, **known))
 
     def weights(self) -> tuple[Weights, Weights]:
         """Weights of the elasticity and of the plasticity."""
@@ -167,3 +232,8 @@ class Law(nn.Module):
     def wave_speed(self, rho: float) -> float:
         """Largest speed of small elastic waves at F = I [m/s], for density rho [kg/m^3]."""
         return max(self.longitudinal_modulus(), 0.0) ** 0.5 / rho**0.5
+
+
+def _imported(module: str) -> ModuleType:
+    """A module that imports this one. It is imported by name, because laws do not depend on the formats of files."""
+    return import_module(f"neuma_lib.{module}")

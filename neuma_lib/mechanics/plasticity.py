@@ -42,7 +42,7 @@ def hencky_strain(sigma: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return trace, deviator, (deviator**2).sum(1, keepdim=True).clamp(min=tiny).sqrt()
 
 
-class Identity(Constants, Plasticity):
+class Identity(Constants, Plasticity, name="identity"):
     """No plasticity: F = F_trial."""
 
     def response(self, F: Tensor, weights: Weights) -> Tensor:
@@ -53,7 +53,7 @@ class Identity(Constants, Plasticity):
         return result, () if grad_weights is None else grad_weights
 
 
-class VonMises(AnalyticPlasticity):
+class VonMises(AnalyticPlasticity, name="von_mises"):
     """Yield at |dev eps| > yield_stress / (2 mu), eps the logarithmic strain, with return along dev eps to the surface.
 
     With Hencky elasticity this bounds the norm of the deviatoric Kirchhoff stress by ``yield_stress`` [Pa].
@@ -69,7 +69,7 @@ class VonMises(AnalyticPlasticity):
         return torch.where(norm > limit, returned, sigma)
 
 
-class DruckerPrager(AnalyticPlasticity):
+class DruckerPrager(AnalyticPlasticity, name="drucker_prager"):
     """Granular flow (Klar et al. 2016): shear is bounded by friction times pressure, without tension.
 
     ``friction_angle`` in degrees; ``cohesion`` is the largest tensile logarithmic strain per axis.
@@ -100,7 +100,7 @@ class DruckerPrager(AnalyticPlasticity):
         return torch.where((shifted > 0) | (excess > 0), returned, sigma)
 
 
-class FluidProjection(AnalyticPlasticity):
+class FluidProjection(AnalyticPlasticity, name="fluid_projection"):
     """Removes all shear of a fluid: F = J^(1/3) R. Same stress as the usual J^(1/3) I, but objective."""
 
     def principal(self, sigma):
@@ -108,7 +108,7 @@ class FluidProjection(AnalyticPlasticity):
         return J.clamp(min=STRETCH_MIN**3).pow(1 / 3).expand_as(sigma)
 
 
-class ViscousFlow(AnalyticPlasticity):
+class ViscousFlow(AnalyticPlasticity, name="viscous_flow"):
     """Viscous relaxation of the deviatoric logarithmic strain, by one implicit step of length ``dt`` [s].
 
     The strain beyond the yield stress decays at the rate mu / viscosity. With Hencky elasticity the shear stress of a
@@ -126,7 +126,7 @@ class ViscousFlow(AnalyticPlasticity):
         return torch.where(norm > limit, returned, sigma)
 
 
-class CrushableFoam(AnalyticPlasticity):
+class CrushableFoam(AnalyticPlasticity, name="crushable_foam"):
     """Compactable foam: yield outside an ellipse in (p, q) that extends from -``tension`` to ``crush`` [Pa] along p
     and has a half axis in q of ``slope`` times that in p, with radial return.
 
@@ -157,7 +157,7 @@ class CrushableFoam(AnalyticPlasticity):
         return torch.where(outside, returned, sigma)
 
 
-class HerschelBulkley(AnalyticPlasticity):
+class HerschelBulkley(AnalyticPlasticity, name="herschel_bulkley"):
     """A yield-stress fluid that is shear-thinning (``exponent`` m < 1) or shear-thickening (m > 1).
 
     |dev tau| = yield_stress + sqrt(2) k g^m with the shear rate g = sqrt(2) |D| and k = ``consistency``. A steady
@@ -204,7 +204,7 @@ def _positive_root(rate: float | Tensor, power: float | Tensor, total: Tensor) -
     return newton_step(u).exp()
 
 
-class CohesiveDruckerPrager(AnalyticPlasticity):
+class CohesiveDruckerPrager(AnalyticPlasticity, name="cohesive_drucker_prager"):
     """Damp, dense granular material with friction, ``cohesion`` c [Pa] and dilatancy.
 
     q <= 6 (c cos phi + p sin phi) / (3 - sin phi), the compressive Mohr-Coulomb cone for phi = ``friction_angle``.
@@ -237,13 +237,5 @@ class CohesiveDruckerPrager(AnalyticPlasticity):
         return torch.where(excess > 0, torch.where(flow < norm, sheared, apex), sigma)
 
 
-PLASTICITIES: dict[str, type[Plasticity]] = {
-    "identity": Identity,
-    "von_mises": VonMises,
-    "drucker_prager": DruckerPrager,
-    "fluid_projection": FluidProjection,
-    "viscous_flow": ViscousFlow,
-    "crushable_foam": CrushableFoam,
-    "herschel_bulkley": HerschelBulkley,
-    "cohesive_drucker_prager": CohesiveDruckerPrager,
-}
+PLASTICITIES = Plasticity.named
+"""Return maps by name."""

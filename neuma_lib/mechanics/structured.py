@@ -57,7 +57,7 @@ from torch.nn.functional import pad
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics import structured_kernels as kernels
 from neuma_lib.mechanics.adaptor import LAYER_KEYS, AdaptableConstitutive, AdaptableLaw
-from neuma_lib.mechanics.analytic import NAMES, analytic_law, specification
+from neuma_lib.mechanics.analytic import analytic_law, name_of, specification
 from neuma_lib.mechanics.elasticity import (
     STRETCH_MIN,
     AnalyticElasticity,
@@ -241,7 +241,7 @@ class StructuredElasticity(StructuredConstitutive, Elasticity):
         self.terms = SHEAR_TERMS[type(base)]
         if form == "energy" and self.lam < 0 and type(base) is not Hencky:
             raise InputError("elasticity.nu", f"{base.values['nu']:g} must be >= 0 for the form 'energy'")
-        base_index = kernels.BASES.index(NAMES[type(base)])
+        base_index = kernels.BASES.index(name_of(base))
         self.kernel = form, kernels.Constants(base_index, (self.mu, self.lam, 0.0, 0.0))
         self.freeze(_checked("elasticity", weights, FORMS[form], seed))
 
@@ -420,7 +420,7 @@ def _sums(y: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _unsupported(part: str, base: AnalyticElasticity | Plasticity, choices: str) -> InputError:
-    name = NAMES.get(type(base), type(base).__name__)
+    name = name_of(base) or type(base).__name__
     return InputError(f"{part}.name", f"{name} is no base of a structured law, which are {choices}")
 
 

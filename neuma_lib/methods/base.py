@@ -6,7 +6,6 @@ module, or the module of a method, loads no torch, so that settings are read and
 
 from __future__ import annotations
 
-import importlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -15,6 +14,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from neuma_lib.config.base import Section
 from neuma_lib.config.motion import MotionOptions
+from neuma_lib.errors import InputError
+from neuma_lib.extensions import load_module
 
 if TYPE_CHECKING:
     import torch
@@ -37,7 +38,7 @@ class Preset:
     Attributes:
         title: name in tables.
         options: values that differ from the defaults of `Method.Options`.
-        note: what readers must know of its numbers. It is printed below tables.
+        note: remark on its numbers, printed below tables.
         same_fit_as: preset whose fit it takes, with its kind and options. None: its own fit.
         evaluate_on: what is simulated when it is evaluated: the particles of the body's volume, which all methods
             share, or the particles that it was fitted with.
@@ -83,8 +84,8 @@ class Case(ABC):
 
     @property
     @abstractmethod
-    def true_law(self) -> dict[str, Any]:
-        """Specification of the scene's true law. Raises InputError if nobody knows it."""
+    def scene_law(self) -> dict[str, Any]:
+        """Specification of the scene's true law. Raises InputError if the scene has none."""
 
     @abstractmethod
     def section(self, name: str) -> dict[str, Any]:
@@ -121,27 +122,28 @@ class Case(ABC):
 
 @dataclass(frozen=True)
 class Problem:
-    """What is known of a scene before a fit.
+    """Known quantities of a scene before a fit.
 
     Attributes:
-        simulation: constants of the simulator, as `MPMModel` takes them.
+        simulation: constants of the simulator, as `MPM` takes them.
         densities: density of the body of each video, as `density_at` takes it.
-        filming: what turns exposures into renders, see `load_videos`.
+        exposure: how frames with an exposure are rendered, see `load_videos`.
         seed: of the project.
     """
 
     simulation: Mapping[str, Any]
     densities: Sequence[Any]
-    filming: Mapping[str, Any]
+    exposure: Mapping[str, Any]
     seed: int = 0
 
 
 class FitRun(ABC):
-    """What a fit has of the process that it runs in.
+    """The process that a fit runs in.
 
     Attributes:
         device: where to compute.
-        product, history: files to write.
+        product: file of the model, to be written.
+        history: JSON file of learning curves, to be written. Equal settings must give equal files: no times.
     """
 
     device: torch.device
@@ -163,10 +165,10 @@ class FitRun(ABC):
 
 @dataclass(frozen=True)
 class ModelSource:
-    """What a model of motion is loaded from, in plain values: a parameter of jobs and of the viewer.
+    """Files and options of a model of motion as plain values, a parameter of jobs and of the viewer.
 
     Attributes:
-        module: module of the method.
+        module: module or Python file of the method.
         options: what `Method.model_options` gives.
         files: what `Method.model_inputs` gives.
         dt: time step that the model was obtained with [s].
@@ -203,17 +205,19 @@ class Method(ABC):
         presets: built-in presets by name.
         product: file that `fit` writes. None: nothing is fitted.
         fit_kernels, kernels: groups of Warp kernels that `fit` and predictions use.
+        body_kernels: groups that predictions and renderings with the files of `body_inputs` use in addition.
         has_law: whether the motion follows from a material law (`MotionModel.law`). Only laws move several bodies.
         moves_other_bodies: whether the model moves the bodies of other scenes (``+law_from=``).
     """
 
     name: ClassVar[str]
     Options: ClassVar[type[Section]] = MotionOptions
-    sections: ClassVar[tuple[str, ...]] = ("material",)
+    sections: ClassVar[tuple[str, ...]] = ("training",)
     presets: ClassVar[Mapping[str, Preset]] = {}
     product: ClassVar[str | None] = None
     fit_kernels: ClassVar[tuple[str, ...]] = ("laws", "rendering")
     kernels: ClassVar[tuple[str, ...]] = ("laws",)
+    body_kernels: ClassVar[tuple[str, ...]] = ()
     has_law: ClassVar[bool] = True
     moves_other_bodies: ClassVar[bool] = True
 
@@ -244,7 +248,7 @@ class Method(ABC):
         return {}
 
     def start_file(self, case: Case) -> str:
-        """The file with the initial motion: the estimated one, or the one that a fit found."""
+        """File of the initial motion: the estimated one, or the one that a fit contains."""
         own = case.on_moved()
         return own.result(own.identified() if own.options.start == "identified" else "velocity.json")
 
@@ -253,8 +257,8 @@ class Method(ABC):
         return ("prior", "gaussians", "particles")
 
     def carrier(self, case: Case) -> str:
-        """What is simulated in an evaluation: "binding" (particles of the volume), or what it was fitted with."""
-        return case.options.carrier if case.evaluate_on == "training_particles" else "binding"
+        """What an evaluation simulates: "binding" (particles of the volume), or the particles of the fit."""
+        return case.options.particle_source if case.evaluate_on == "training_particles" else "binding"
 
     def learns_from_video(self, case: Case) -> bool:
         """Whether the model comes from the scene itself. If not, it is the same for all scenes with one prior."""
@@ -283,7 +287,7 @@ class Method(ABC):
     def load_initial_state(
         self, inputs: Files, options: Mapping[str, Any], densities: Sequence[Any], carrier: str
     ) -> tuple[State, list[int]]:
-        """What a prediction starts from: particles in motion, and how many belong to each body.
+        """Initial state of a prediction, and the number of particles of each body.
 
         Args:
             inputs: ``particles``, ``binding``, ``gaussians``, ``velocity`` and the files of `body_inputs`.
@@ -314,12 +318,12 @@ class Method(ABC):
     def draws(
         self, inputs: Files, law: Law, F: Tensor | None, uncertainty: Mapping[str, Any], **drawn: Any
     ) -> list[Law]:
-        """Laws drawn from what the video leaves open. Empty if the uncertainty is unknown.
+        """Laws drawn from the uncertainty that remains after the video. Empty if it is unknown.
 
         Args:
             inputs: the files of `uncertainty_inputs`.
             law: from `load`.
-            F: deformation gradients that the body goes through, shape (T, N, 3, 3); None: read from `inputs`.
+            F: deformation gradients of the motion, shape (T, N, 3, 3); None: read from `inputs`.
             uncertainty: ``model_std`` and ``spread`` of the settings of `identify`.
             drawn: ``dt`` [s], ``count`` and ``seed``.
         """
@@ -332,17 +336,22 @@ def body_of_each_video(case: Case) -> Files:
     return {name: case.each_video(lambda each, file=file: each.result(file)) for name, file in names.items()}
 
 
-def method_of(module: str) -> Method:
-    """The method that a module defines.
-
-    Raises:
-        LookupError: it does not define exactly one.
-    """
-    found = [
-        value
-        for value in vars(importlib.import_module(module)).values()
+def methods_in(module: str) -> list[Method]:
+    """The methods that a module or a Python file defines."""
+    return [
+        value()
+        for value in vars(load_module(module)).values()
         if isinstance(value, type) and issubclass(value, Method) and value.__module__ == module
     ]
-    if len(found) != 1:
-        raise LookupError(f"{module} defines {len(found)} methods, expected one")
-    return found[0]()
+
+
+def method_of(module: str) -> Method:
+    """The method that a module or a Python file defines.
+
+    Raises:
+        InputError: it does not define exactly one.
+    """
+    methods = methods_in(module)
+    if len(methods) != 1:
+        raise InputError(module, f"it defines {len(methods)} methods", "Define one method in a file")
+    return methods[0]

@@ -1,4 +1,4 @@
-"""Models of motion: what `Method.load` gives, and what predicts the states of bodies."""
+"""Models of motion, which `Method.load` returns and which predict the states of bodies."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neuma_lib.evaluation.motion import Failure, predict
 from neuma_lib.mechanics.law import Law
-from neuma_lib.sim.model import MPMModel, as_bodies, consecutive
+from neuma_lib.sim.model import MPM, as_bodies, consecutive
 from neuma_lib.sim.state import State, Trajectory
 
 
@@ -27,13 +27,13 @@ class MotionModel(ABC):
     @abstractmethod
     def predict(
         self,
-        mpm: MPMModel,
+        mpm: MPM,
         state: State,
         frames: Sequence[int],
         tracers: Tensor | None = None,
         total: bool = False,
     ) -> tuple[Trajectory, Failure | None]:
-        """States at the frames. After a failure the last sound state is repeated.
+        """States at the frames. After a failure the last valid state is repeated.
 
         Args:
             state: particles and their initial motion.
@@ -42,7 +42,7 @@ class MotionModel(ABC):
             total: also carry the total deformation.
         """
 
-    def courant(self, mpm: MPMModel, state: State) -> float | None:
+    def courant(self, mpm: MPM, state: State) -> float | None:
         """Courant number of the simulation, None if it has none."""
         return None
 
@@ -73,7 +73,7 @@ class LawOnGrid(MotionModel):
     def predict(self, mpm, state, frames, tracers=None, total=False):
         return predict(mpm, self._bodies(state), state, frames, tracers, total)
 
-    def courant(self, mpm: MPMModel, state: State) -> float:
+    def courant(self, mpm: MPM, state: State) -> float:
         bodies = as_bodies(self._bodies(state), len(state.x))
         return max(mpm.courant(b.law, float(state.density[b.start : b.stop].min())) for b in bodies)
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.motion import WithPrior
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.methods.base import Case, Files, Method, Preset, body_of_each_video
 
 
-class NeumaOptions(MaterialConfig, WithPrior):
+class NeumaOptions(TrainingConfig, WithPrior):
     """Options of NeuMA: its training, and the prior that it starts from."""
 
 
@@ -20,7 +20,7 @@ class Neuma(Method):
         "neuma_particle_supervision": Preset("NeuMA w/ P.S.", {"supervision": "particles", "lr_scale": 2}),
         "neuma_without_binding": Preset(
             "NeuMA w/o Bind",
-            {"carrier": "gaussians", "lr_scale": 2},
+            {"particle_source": "gaussians", "lr_scale": 2},
             note="Trained with the Gaussians as particles, as the paper does it, but judged by its law on the volume "
             "particles that all rows share. The paper's experiment simulates the Gaussians in both.",
         ),

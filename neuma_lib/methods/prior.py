@@ -1,4 +1,4 @@
-"""The prior as it is (NCLaw): nothing is learned from the video."""
+"""The prior without adaptation (NCLaw): nothing is learned from the video."""
 
 from __future__ import annotations
 
@@ -29,5 +29,5 @@ class Prior(Method):
 
 
 def prior_source(path: str, dt: float) -> ModelSource:
-    """A law that is complete in one file: a prior, or a law to pass on."""
+    """A law that one file contains: a prior or an exported law."""
     return ModelSource(Prior.__module__, {}, {"prior": path}, dt)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.motion import WithPrior
 from neuma_lib.config.structured import StructuredConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.errors import InputError
 from neuma_lib.methods.base import Case, Files, Method, Preset
 from neuma_lib.methods.neuma import training_inputs
@@ -12,14 +12,14 @@ from neuma_lib.methods.neuma import training_inputs
 IDENTIFIED = "identified"
 
 
-class StructuredOptions(MaterialConfig, StructuredConfig, WithPrior):
+class StructuredOptions(TrainingConfig, StructuredConfig, WithPrior):
     """Options of the training, of the correction, and the prior whose analytic law is corrected."""
 
 
 class Structured(Method):
     name = "structured"
     Options = StructuredOptions
-    sections = ("material", "structured")
+    sections = ("training", "structured")
     product = "adaptor.safetensors"
     presets = {
         "neuma_structured": Preset(

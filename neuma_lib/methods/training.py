@@ -1,14 +1,14 @@
-"""What the trainings of `neuma` and `structured` share: bodies, starts and losses of all videos, and their report."""
+"""Training of `neuma` and `structured`: bodies, initial states and losses of all videos, and the report."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
 import torch
 
-from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.fitting.material import ParticleLoss, PixelLoss
 from neuma_lib.io.files import listed, write_json
@@ -17,7 +17,8 @@ from neuma_lib.io.images import load_videos
 from neuma_lib.io.particles import load_body, with_motion
 from neuma_lib.mechanics.adaptor import AdaptableLaw
 from neuma_lib.methods.base import Files, FitRun, Problem
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
+from neuma_lib.splatting.observation import Observation
 
 
 class Training:
@@ -34,7 +35,7 @@ class Training:
         self,
         inputs: Files,
         options: Mapping[str, Any],
-        settings: MaterialConfig,
+        settings: TrainingConfig,
         problem: Problem,
         run: FitRun,
         stamp: Mapping[str, Any] | None = None,
@@ -53,22 +54,28 @@ class Training:
         if settings.supervision == "particles":
             self.losses = [particle_loss(file, run.device) for file in listed(inputs["truth"])]
         else:
-            videos = zip(bodies, listed(inputs["transforms"]), strict=True)
-            self.losses = [pixel_loss(body, file, settings, problem.filming) for body, file in videos]
+            self.losses = [
+                pixel_loss(body, self._videos(file), settings)
+                for body, file in zip(bodies, listed(inputs["transforms"]), strict=True)
+            ]
         files = {
-            f"{name} {k}": file for name, found in inputs.items() for k, file in enumerate(listed(found))
+            f"{name} {k}": file for name, value in inputs.items() for k, file in enumerate(listed(value))
         }
         known = {
             "simulation": problem.simulation,
-            "filming": problem.filming,
+            "exposure": problem.exposure,
             "densities": problem.densities,
             **options,
         }
         self._checkpoint = run.checkpoint(known | dict(stamp or {}), files)
 
+    def _videos(self, transforms: str) -> list[Observation]:
+        videos = load_videos(transforms, self.settings.views, **self._problem.exposure)
+        return [video.to(torch.float32, self.run.device) for video in videos]
+
     def problem(self, law: AdaptableLaw) -> tuple:
         """Positional arguments of `train_material`."""
-        return MPMModel(**self._problem.simulation), law, self.starts[0], self.losses[0], self.settings
+        return MPM(**self._problem.simulation), law, self.starts[0], self.losses[0], self.settings
 
     def options(self) -> dict[str, Any]:
         """Keyword arguments of `train_material`."""
@@ -100,11 +107,7 @@ def particle_loss(truth: str, device: torch.device) -> ParticleLoss:
     return ParticleLoss(tuple(arrays["frames"].tolist()), torch.from_numpy(arrays["x"]).to(device))
 
 
-def pixel_loss(
-    body: Reconstruction, transforms: str, settings: MaterialConfig, filming: Mapping[str, Any]
-) -> PixelLoss:
+def pixel_loss(body: Reconstruction, videos: Sequence[Observation], settings: TrainingConfig) -> PixelLoss:
     """The loss of a video."""
-    videos = load_videos(transforms, settings.views, **filming)
-    videos = [video.to(body.x0.dtype, body.x0.device) for video in videos]
     total = settings.covariance_from == "total"
     return PixelLoss(body, videos, settings.covariance_gradient, total=total, compare=settings.compare)

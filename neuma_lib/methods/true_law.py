@@ -1,4 +1,4 @@
-"""The true law of the scene on the reconstructed body: the error that remains when the law is right."""
+"""The true law of the scene on the reconstructed body. Its error is that of reconstruction and initial motion."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class TrueLaw(Method):
         return {}
 
     def model_options(self, case: Case) -> dict:
-        return {"law": case.true_law}
+        return {"law": case.scene_law}
 
     def load(self, inputs, options, dt):
         from neuma_lib.mechanics.analytic import analytic_law

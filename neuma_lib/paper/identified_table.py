@@ -1,4 +1,4 @@
-"""Identified materials beside the true ones: family, errors of the constants, and how honest their uncertainty is."""
+"""Identified materials and the true ones: family, errors of the constants, and coverage of their uncertainty."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from typing import Any
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.text_tables import as_csv, as_markdown
 from neuma_lib.mechanics.combinations import named_combinations
-from neuma_lib.paper.tables import FAILS, HOLDS, VERDICTS
+from neuma_lib.paper.claims import Verdict, counted, verdict_lines
 
 WITHIN = 2.0
-"""Standard deviations that an error may have."""
+"""Maximum error in estimated standard deviations."""
 CLOSE = 10.0
-"""Percent within which a constant counts as right."""
-ASKED = Fraction(4, 5)
-"""Least part of families, of errors within `WITHIN` and of errors within `CLOSE` that is claimed."""
+"""Maximum error of a constant that counts as right [%]."""
+SHARE = Fraction(4, 5)
+"""Claimed share of right families, of errors within `WITHIN` and of errors within `CLOSE`."""
 RIGHT, TIE, WRONG = "right", "tie", "wrong"
 
 RULE = (
@@ -27,7 +27,7 @@ RULE = (
     "identification gives as less than `identify.determined`. A claim *holds* if the count is reached, else it *does "
     "not hold*; several chains of a scene are not independent."
 )
-"""How the verdicts come about, for people."""
+"""Explanation of the verdicts for readers of the table."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Quantity:
         name: as in `named_combinations`.
         value, truth: in SI units and degrees.
         log_std: estimated standard deviation of the logarithm.
-        determined: whether the identification says so.
+        determined: whether the identification counts it as determined.
     """
 
     name: str
@@ -60,68 +60,60 @@ class Quantity:
 
 @dataclass(frozen=True)
 class IdentifiedScene:
-    """What was found in a scene, in a chain.
+    """Identified material of a scene, in one replicate.
 
     Attributes:
         name: of the scene's folder.
-        group: what it is counted with.
-        found: content of identified.json.
+        group: scenes that claims count together.
+        identified: content of identified.json.
         truth: specification of the true law.
     """
 
     name: str
     group: str
-    found: Mapping[str, Any]
+    identified: Mapping[str, Any]
     truth: Mapping[str, Mapping[str, Any]]
 
     @property
     def family_is(self) -> str:
-        """`RIGHT`, `TIE` (the right one predicts as well) or `WRONG`."""
+        """`RIGHT`, `TIE` (the right family predicts equally well) or `WRONG`."""
         true = _kind(self.truth)
-        if _kind(self.found["law"]) == true:
+        if _kind(self.identified["law"]) == true:
             return RIGHT
-        ties = (_kind(self.found["families"][name]["law"]) for name in self.found["ties"])
+        ties = (_kind(self.identified["families"][name]["law"]) for name in self.identified["ties"])
         return TIE if true in ties else WRONG
 
     @property
     def quantities(self) -> list[Quantity]:
-        """Those that the true law has too."""
+        """Quantities that the true law has too."""
         constants = {
             key: float(value) for part in self.truth.values() for key, value in part.items() if key != "name"
         }
         true = named_combinations(constants)
         return [
             Quantity(name, entry["value"], true[name], entry["log_std"], entry["determined"])
-            for name, entry in self.found["best"]["quantities"].items()
+            for name, entry in self.identified["best"]["quantities"].items()
             if true.get(name, 0) > 0 and entry["value"] > 0
         ]
 
 
 def identified_table(scenes: Sequence[IdentifiedScene]) -> tuple[str, str]:
-    """CSV, a quantity a row, and Markdown, a scene a row, with verdicts for each group.
+    """CSV with a row for each quantity, and Markdown with a row for each scene and verdicts for each group.
 
     Raises:
         InputError: there are no scenes.
     """
     if not scenes:
         raise InputError(
-            "identified: there is nothing identified, name scenes in tables.table1 or set random.count"
+            "tables.table1", "no scene has been identified", "Name scenes there, or set random.count"
         )
     header = (
         "scene family family_is quantity value truth error_percent log_std error_in_std determined".split()
     )
     rows = [
         [
-            s.name,
-            s.found["family"],
-            s.family_is,
-            q.name,
-            q.value,
-            q.truth,
-            q.error,
-            q.log_std,
-            q.in_std,
-            q.determined,
+            *(s.name, s.identified["family"], s.family_is),
+            *(q.name, q.value, q.truth, q.error, q.log_std, q.in_std, q.determined),
         ]
         for s in scenes
         for q in s.quantities
@@ -131,13 +123,14 @@ def identified_table(scenes: Sequence[IdentifiedScene]) -> tuple[str, str]:
         "",
         "Error of each quantity, and in brackets in estimated standard deviations.",
     ]
+    verdicts = []
     for group in dict.fromkeys(scene.group for scene in scenes):
         members = [scene for scene in scenes if scene.group == group]
-        lines = [[s.name, _said(s), _listed(s, True), _listed(s, False)] for s in members]
+        lines = [[s.name, _family(s), _list(s, True), _list(s, False)] for s in members]
         heads = ["scene", "family", "determined", "not determined"]
         text += ["", f"**{group}**", "", *as_markdown(heads, lines)]
-    verdicts = [row for group in dict.fromkeys(s.group for s in scenes) for row in _verdicts(scenes, group)]
-    text += ["", "**What holds**", "", *as_markdown([*VERDICTS[:2], "here"], verdicts), "", RULE, ""]
+        verdicts += _verdicts(members, group)
+    text += ["", *verdict_lines(verdicts), RULE, ""]
     return as_csv([header, *rows]), "\n".join(text)
 
 
@@ -148,40 +141,33 @@ def _kind(spec: Mapping[str, Mapping[str, Any]]) -> tuple[str, str, bool]:
     return spec["elasticity"]["name"], plasticity["name"], yields
 
 
-def _said(scene: IdentifiedScene) -> str:
-    tied = f", as good: {', '.join(scene.found['ties'])}" if scene.found["ties"] else ""
-    return f"{scene.found['family']} ({scene.family_is}{tied})"
+def _family(scene: IdentifiedScene) -> str:
+    ties = scene.identified["ties"]
+    tied = f", as good: {', '.join(ties)}" if ties else ""
+    return f"{scene.identified['family']} ({scene.family_is}{tied})"
 
 
-def _listed(scene: IdentifiedScene, determined: bool) -> str:
-    parts = [
-        f"{q.name} {q.error:+.0f} % ({q.in_std:+.1f})" for q in scene.quantities if q.determined == determined
-    ]
-    return ", ".join(parts)
+def _list(scene: IdentifiedScene, determined: bool) -> str:
+    chosen = [q for q in scene.quantities if q.determined == determined]
+    return ", ".join(f"{q.name} {q.error:+.0f} % ({q.in_std:+.1f})" for q in chosen)
 
 
-def _verdicts(scenes: Sequence[IdentifiedScene], group: str) -> list[list[str]]:
-    members = [scene for scene in scenes if scene.group == group]
-    sure = [q for scene in members for q in scene.quantities if q.determined]
+def _verdicts(scenes: Sequence[IdentifiedScene], group: str) -> list[Verdict]:
+    sure = [q for scene in scenes for q in scene.quantities if q.determined]
+    stds, errors = [abs(q.in_std) for q in sure], [abs(q.error) for q in sure]
     claims = [
-        ("the family is right, or ties with the right one,", [s.family_is != WRONG for s in members], "scenes", ""),
+        ("the family is right, or ties with the right one,", [s.family_is != WRONG for s in scenes], "scenes", ""),
         (
             f"the truth lies within {WITHIN:g} estimated standard deviations",
-            [abs(q.in_std) <= WITHIN for q in sure],
+            [std <= WITHIN for std in stds],
             "determined quantities",
-            f"at most {max((abs(q.in_std) for q in sure), default=0):.1f}",
+            f"at most {max(stds, default=0):.1f}",
         ),
         (
             f"the error is below {CLOSE:g} %",
-            [abs(q.error) < CLOSE for q in sure],
+            [error < CLOSE for error in errors],
             "determined quantities",
-            f"at most {max((abs(q.error) for q in sure), default=0):.0f} %",
+            f"at most {max(errors, default=0):.0f} %",
         ),
     ]  # fmt: skip
-    rows = []
-    for text, met, what, numbers in claims:
-        least, count = math.ceil(ASKED * len(met)), sum(met)
-        here = ", ".join(filter(None, [f"{count} of {len(met)}", numbers]))
-        word = HOLDS if met and count >= least else FAILS
-        rows.append([f"{group}: {text} for at least {least} of {len(met)} {what}", f"**{word}**", here])
-    return rows
+    return [counted(f"{group}: {text} for", met, SHARE, what, numbers) for text, met, what, numbers in claims]

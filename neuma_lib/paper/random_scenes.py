@@ -1,8 +1,7 @@
-"""The benchmark of random scenes: one line a scene, and what can be said of all of them."""
+"""The benchmark of random scenes: a row for each scene, and statistics over all."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -11,19 +10,20 @@ from typing import Any
 
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.text_tables import as_csv, as_markdown
-from neuma_lib.paper.tables import FAILS, HOLDS, TRUE_LAW, VERDICTS
+from neuma_lib.paper.claims import Verdict, counted, verdict_lines
+from neuma_lib.paper.tables import TRUE_LAW
 
 REPORTED_SEED = 7
-"""Nothing is tuned on the scenes of this seed."""
-CLOSE = 2.0  # percent within which a velocity or a spin counts as right
-HONEST = 2.0  # estimated standard deviations within which an error lies if they are honest
-BETTER_ON, HONEST_ON = Fraction(11, 12), Fraction(10, 12)  # least parts of the scenes that are claimed
+"""Seed of the scenes that no setting was tuned on."""
+CLOSE = 2.0  # maximum error of a velocity or spin that counts as right [%]
+WITHIN = 2.0  # maximum error in estimated standard deviations
+BETTER_SHARE, WITHIN_SHARE = Fraction(11, 12), Fraction(10, 12)  # claimed shares of the scenes
 
 RULE = (
     "These claims count scenes, which are as many independent trials: one *holds* if the count is reached, else it "
     "*does not hold*."
 )
-"""`_verdicts` for people."""
+"""Explanation of the verdicts for readers of the table."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class RandomScene:
     Attributes:
         name, shape, family, prior: as in the settings.
         rmse: method -> tracer RMSE [mm].
-        failed: method -> what went wrong, for methods of which something did.
+        failed: method -> what failed, for methods that failed.
         start: content of its initial_state.json.
     """
 
@@ -58,7 +58,7 @@ class RandomScene:
 
 
 def failure(metrics: Mapping[str, Any]) -> str | None:
-    """What went wrong in a run, from its metrics.json; None: nothing."""
+    """What failed in a run, from its metrics.json. None if nothing did."""
     if metrics["diverged"]:
         return f"a particle {metrics['diverged']['happened']} in step {metrics['diverged']['step']}"
     return None if metrics["stable"] else "its training diverged"
@@ -67,18 +67,18 @@ def failure(metrics: Mapping[str, Any]) -> str | None:
 def random_table(
     scenes: Sequence[RandomScene], titles: Mapping[str, str], seed: int
 ) -> tuple[str, str, list[str]]:
-    """CSV and Markdown, a scene a row, and sentences on all scenes.
+    """CSV and Markdown with a row for each scene, and sentences on all scenes.
 
     Args:
         scenes: in order.
-        titles: method -> name, first the prior, second the method that is judged.
+        titles: method -> name. The first is the prior, the second the method that claims are about.
         seed: of the scenes.
 
     Raises:
         InputError: there are no scenes.
     """
     if not scenes:
-        raise InputError("random: there are no random scenes, set random.count")
+        raise InputError("random.count", "there are no random scenes", "Set it to a positive number")
     prior, judged, *_ = titles
     columns: dict[str, tuple[str, Callable[[RandomScene], Any]]] = {
         "scene": ("scene", lambda s: s.name),
@@ -123,32 +123,23 @@ def random_table(
         "Velocity and spin: error of the estimate from the frames before contact, also in units of the standard "
         "deviation that it comes with. In plane: across the viewing direction, for the spin about it.",
         "",
-        "**What holds**",
-        "",
-        *as_markdown([*VERDICTS[:2], "here"], _verdicts(scenes, titles)),
-        "",
+        *verdict_lines(_verdicts(scenes, titles)),
         RULE,
         "",
     ]
     return as_csv([columns, *values]), "\n".join(text), sentences
 
 
-def _verdicts(scenes: Sequence[RandomScene], titles: Mapping[str, str]) -> list[list[str]]:
-    """Claim, verdict and our numbers: what is asked of scenes that nothing was tuned on."""
+def _verdicts(scenes: Sequence[RandomScene], titles: Mapping[str, str]) -> list[Verdict]:
     prior, judged, *_ = titles
     ratios = [s.rmse[judged] / s.rmse[prior] for s in scenes]
-    plane = [
-        max(
-            s.start[f"{what}_percent"]
-            for what in ("velocity_error_in_plane", "angular_velocity_error_viewing")
-        )
-        for s in scenes
-    ]
+    measures = ("velocity_error_in_plane_percent", "angular_velocity_error_viewing_percent")
+    plane = [max(s.start[name] for name in measures) for s in scenes]
     depth = [s.depth_in_std for s in scenes]
     claims = [
         (
             f"{titles[judged]} is closer than its prior",
-            BETTER_ON,
+            BETTER_SHARE,
             [ratio < 1 for ratio in ratios],
             f"errors {min(ratios):.2f} to {max(ratios):.2f} times as large",
         ),
@@ -160,24 +151,20 @@ def _verdicts(scenes: Sequence[RandomScene], titles: Mapping[str, str]) -> list[
             f"at most {max(plane):.2g} %",
         ),
         (
-            f"the velocity in depth is within {HONEST:g} estimated standard deviations",
-            HONEST_ON,
-            [error <= HONEST for error in depth],
+            f"the velocity in depth is within {WITHIN:g} estimated standard deviations",
+            WITHIN_SHARE,
+            [error <= WITHIN for error in depth],
             f"at most {max(depth):.2g} of them",
         ),
     ]
-    rows = []
-    for text, part, met, numbers in claims:
-        least, count = math.ceil(part * len(scenes)), sum(met)
-        asked = f"at least {least}" if least < len(scenes) else "all"
-        word = HOLDS if count >= least else FAILS
-        here = ", ".join(filter(None, [f"{count} of {len(scenes)}", numbers]))
-        rows.append([f"{text} on {asked} of {len(scenes)} random scenes", f"**{word}**", here])
-    return rows
+    return [
+        counted(f"{text} on", met, share, "random scenes", numbers, whole="all")
+        for text, share, met, numbers in claims
+    ]
 
 
 def _summary(scenes: Sequence[RandomScene], titles: Mapping[str, str]) -> list[str]:
-    """What can be said of all scenes."""
+    """Sentences on all scenes."""
     prior, judged, *_ = titles
 
     def count(true: Callable[[RandomScene], bool]) -> str:
@@ -187,21 +174,21 @@ def _summary(scenes: Sequence[RandomScene], titles: Mapping[str, str]) -> list[s
         return f"{median(s.rmse[method] for s in scenes):.1f} mm ({titles[method]})"
 
     ratio = geometric_mean(s.rmse[judged] / s.rmse[prior] for s in scenes)
-    found = [
+    sentences = [
         f"{titles[judged]} is better than {titles[prior]} on {count(lambda s: s.rmse[judged] < s.rmse[prior])}; "
         f"medians {', '.join(map(middle, titles))}; RMSE {ratio:.2f} times as large (geometric mean).",
         f"Something failed on {count(lambda s: bool(s.failed))}.",
         f"Velocity in plane within {CLOSE:g} % on "
         f"{count(lambda s: s.start['velocity_error_in_plane_percent'] <= CLOSE)}, spin in plane on "
         f"{count(lambda s: s.start['angular_velocity_error_viewing_percent'] <= CLOSE)}.",
-        f"Error in depth within {HONEST:g} estimated standard deviations on "
-        f"{count(lambda s: s.depth_in_std <= HONEST)}, spin about every axis on "
-        f"{count(lambda s: s.spin_in_std <= HONEST)}.",
+        f"Error in depth within {WITHIN:g} estimated standard deviations on "
+        f"{count(lambda s: s.depth_in_std <= WITHIN)}, spin about every axis on "
+        f"{count(lambda s: s.spin_in_std <= WITHIN)}.",
     ]
     if TRUE_LAW in titles:
         closer = count(lambda s: s.rmse[judged] < s.rmse[TRUE_LAW])
-        found.append(
+        sentences.append(
             f"{titles[judged]} is closer to the truth than the true law, simulated as the reconstruction is, on "
             f"{closer}: there it has absorbed discretisation, or errors of the start."
         )
-    return found
+    return sentences

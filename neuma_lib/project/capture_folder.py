@@ -10,7 +10,7 @@ from pathlib import Path
 import yaml
 
 from neuma_lib.config.capture import CaptureConfig
-from neuma_lib.config.validation import hint, validate
+from neuma_lib.config.validation import hint, validate, with_advanced
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import existing, one_line, reading
 
@@ -92,9 +92,11 @@ def read_settings(path: str | Path) -> CaptureConfig:
     with reading(path, "YAML"):
         raw = yaml.safe_load(content)
     try:
-        return validate(CaptureConfig, {} if raw is None else raw)
+        return validate(
+            CaptureConfig, with_advanced(CaptureConfig, raw) if isinstance(raw, dict) else raw or {}
+        )
     except InputError as error:
-        raise InputError(path, str(error).removeprefix("settings: ")) from None
+        raise InputError(path, str(error)) from None
 
 
 def inside(folder: str | Path, name: str | Path) -> Path:

@@ -56,7 +56,7 @@ def scenes_of(capture: Capture) -> dict[str, dict[str, Any]]:
         scenes[scene_name(name, take)] = {
             **common,
             "captured": {**world, "throw": take, "cameras": list(cameras)},
-            "material": {"views": list(range(len(cameras)))},
+            "training": {"views": list(range(len(cameras)))},
             "videos": [scene_name(name, other) for other in trained[1:]] if take in trained[:1] else [],
         }
     return scenes

@@ -1,7 +1,4 @@
-"""Methods on scenes: options, runs and files of a preset or variant, as the settings have them.
-
-Names only: no file is read, and none has to exist.
-"""
+"""Methods on scenes: options, runs and paths of a preset or variant. No file is read or has to exist."""
 
 from __future__ import annotations
 
@@ -14,17 +11,17 @@ import yaml
 
 from neuma_lib.config.base import Section
 from neuma_lib.config.validation import hint, validate
-from neuma_lib.config.variants import DRAWN, folder, split_variant
+from neuma_lib.config.variants import SEEDS, replicate_folder, split_variant
 from neuma_lib.errors import InputError
 from neuma_lib.methods.base import Case, Method, ModelSource
 from neuma_lib.methods.registry import methods
-from neuma_lib.project import paths as places
+from neuma_lib.project import paths
 from neuma_lib.project.methods import PresetConfig
 from neuma_lib.project.paths import IDENTIFIED
 from neuma_lib.project.settings import NO_TRUTH, Config
 
 LAW_FROM = "law_from"
-"""Key of a variant: the scene whose model moves all bodies, in place of each scene's own."""
+"""Key of a variant: the scene whose model moves all bodies, instead of the model of each scene."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +51,7 @@ class ProjectCase(Case):
         return law.plain() if law else None
 
     @property
-    def true_law(self) -> dict[str, Any]:
+    def scene_law(self) -> dict[str, Any]:
         law = self.settings.scene(self.scene).law
         if law is None:
             raise InputError(f"{self.scene}/{self.name}", NO_TRUTH)
@@ -64,39 +61,39 @@ class ProjectCase(Case):
         return getattr(self.settings, name).plain()
 
     def result(self, file: str) -> str:
-        return places.home(self.settings, self.scene, file)
+        return paths.result_path(self.settings, self.scene, file)
 
     def data(self, file: str) -> str:
-        base, _ = self.settings.chain(self.scene)
+        base, _ = self.settings.replicate(self.scene)
         return f"{self.settings.data_root.rstrip('/')}/{base}/{file}"
 
     def rollout(self) -> str:
-        return f"{places.results_root(self.settings)}/{self.moved}/{self.folder}/rollout.h5"
+        return f"{paths.results_root(self.settings)}/{self.moved}/{self.folder}/rollout.h5"
 
     def product(self) -> str:
         run = f"{self._folder(self.scene)}/{self.name}"
-        return f"{places.results_root(self.settings)}/{run}/{self.method.product}"
+        return f"{paths.results_root(self.settings)}/{run}/{self.method.product}"
 
     def prior_file(self) -> str:
-        return places.prior_file(self.settings, self.scene, self.prior)
+        return paths.prior_file(self.settings, self.scene, self.prior)
 
     def identified(self) -> str:
         views = self.options.views
-        if views in (self.settings.material.views, self.settings.identify.views):
+        if views in (self.settings.training.views, self.settings.identify.views):
             return "identified.json"
         return f"identified+views={','.join(map(str, views))}.json"
 
     def each_video(self, choose: Callable[[Case], str]) -> str | list[str]:
-        found = [choose(replace(self, scene=scene)) for scene in self.settings.video_scenes(self.scene)]
-        return found if len(found) > 1 else found[0]
+        paths = [choose(replace(self, scene=scene)) for scene in self.settings.video_scenes(self.scene)]
+        return paths if len(paths) > 1 else paths[0]
 
     def seeds(self) -> tuple[str, ...]:
         """Seeds of a replicate that change the results."""
-        return tuple(name for name in DRAWN if name in self.method.seeds(self))
+        return tuple(name for name in SEEDS if name in self.method.seeds(self))
 
     def _folder(self, scene: str) -> str:
-        base, seeds = self.settings.chain(scene)
-        return folder(base, seeds, self.seeds())
+        base, seeds = self.settings.replicate(scene)
+        return replicate_folder(base, seeds, self.seeds())
 
     def density(self, scene: str) -> float | dict[str, Any]:
         """Density that the method assumes for the body of a scene [kg/m^3]."""
@@ -109,7 +106,7 @@ class ProjectCase(Case):
         return [self.density(scene) for scene in self.settings.video_scenes(self.scene)]
 
     @property
-    def learns_there(self) -> bool:
+    def learned_from_moved_scene(self) -> bool:
         """Whether the model is obtained from the moved scene itself."""
         return self.scene == self.moved and self.method.learns_from_video(self)
 
@@ -145,7 +142,7 @@ def kind_of(settings: Config, method: str) -> Method:
     """The method of a preset or variant."""
     name = method.partition("+")[0]
     chosen = settings.methods[settings.methods[name].same_fit_as or name]
-    return methods()[chosen.kind]
+    return methods(settings.extensions)[chosen.kind]
 
 
 def of_kind(settings: Config, name: str) -> list[str]:
@@ -171,7 +168,7 @@ def fit_name(settings: Config, method: str) -> str:
 def source_scene(settings: Config, scene: str, method: str) -> str:
     """Folder of the scene that a method's model is obtained from, in the replicate of a scene."""
     source = law_from(settings, method)
-    return scene if source is None else folder(source, settings.chain(scene)[1])
+    return scene if source is None else replicate_folder(source, settings.replicate(scene)[1])
 
 
 def law_from(settings: Config, method: str) -> str | None:
@@ -200,7 +197,6 @@ def case(settings: Config, scene: str, method: str) -> ProjectCase:
     chosen, _ = preset(settings, method)
     kind, source = kind_of(settings, method), source_scene(settings, scene, method)
     name, options = fit_name(settings, method), _options(settings, source, method)
-    found = ProjectCase(settings, source, scene, name, method, options, chosen.evaluate_on, kind)
     known = [*settings.priors.laws, IDENTIFIED]
     if getattr(options, "prior", None) not in (None, *known):
         raise InputError(
@@ -208,7 +204,7 @@ def case(settings: Config, scene: str, method: str) -> ProjectCase:
             f"no prior '{options.prior}' in priors.laws{hint(options.prior, known)}",
             "A law in a file is the prior of a scene",
         )
-    return found
+    return ProjectCase(settings, source, scene, name, method, options, chosen.evaluate_on, kind)
 
 
 def _options(settings: Config, scene: str, method: str) -> Section:
@@ -219,15 +215,15 @@ def _options(settings: Config, scene: str, method: str) -> Section:
     fitted = fit_name(settings, method)
     chosen, given = preset(settings, fitted)
     kind = kind_of(settings, fitted)
-    base, seeds = settings.chain(scene)
+    base, seeds = settings.replicate(scene)
     known = kind.Options.model_fields
     values: dict[str, Any] = {}
     for section in (
         *(getattr(settings, name).plain() for name in kind.sections),
-        settings.scene(base).material,
+        settings.scene(base).training,
     ):
         values |= {key: value for key, value in section.items() if key in known}
-    validate(kind.Options, values, f"scenes.{base}.material")
+    validate(kind.Options, values, f"scenes.{base}.training")
     values |= chosen.options
     validate(kind.Options, values, f"methods.{fitted.partition('+')[0]}.options")
     options = validate(kind.Options, values | given, fitted)
@@ -260,64 +256,64 @@ def run_folder(settings: Config, column: str, method: str) -> str:
         column: folder of a scene or experiment, with the seeds of its replicate. Seeds that change nothing in the run
             are left out, so that it is computed once.
     """
-    base, seeds = settings.chain(column)
+    base, seeds = settings.replicate(column)
     used = {name for each in body_cases(settings, column, method) for name in each.seeds()}
-    return f"{folder(base, seeds, [name for name in DRAWN if name in used])}/{method}"
+    return f"{replicate_folder(base, seeds, [name for name in SEEDS if name in used])}/{method}"
 
 
 def runs(settings: Config, table: str, method: str, column: str) -> list[str]:
     """Folders of the runs behind a cell of a table, in the order of its replicates, each once."""
     chosen = settings.tables[table]
-    replicates = (folder(column, dict.fromkeys(chosen.vary, k)) for k in range(chosen.seeds))
+    replicates = (replicate_folder(column, dict.fromkeys(chosen.vary, k)) for k in range(chosen.seeds))
     return list(dict.fromkeys(run_folder(settings, each, method) for each in replicates))
 
 
 def gaussian_motion(settings: Config, scene: str, method: str) -> str:
-    """How Gaussians follow their particles. Those of a splat, many of which lie outside the body, move affinely."""
+    """Motion of the Gaussians, affine for splats, many of whose Gaussians are outside the body."""
     return "affine" if settings.scene(scene).splat else case(settings, scene, method).options.gaussian_motion
 
 
-def moving_methods(settings: Config, scene: str, asked: Sequence[str]) -> list[str]:
-    """Methods that predict the motion of a scene: those asked for.
+def moving_methods(settings: Config, scene: str, requested: Sequence[str]) -> list[str]:
+    """Requested methods that predict the motion of a scene.
 
-    A splat has no video. Where a method would learn from it, the models of the scenes ``figures.i23d`` replace it.
+    A splat has no video, so methods that learn use the models of the scenes ``figures.i23d``.
 
     Raises:
         InputError: a splat, and a method whose model cannot come from another scene.
     """
     if not settings.scene(scene).splat:
-        return list(asked)
-    found = []
-    for method in asked:
+        return list(requested)
+    moving = []
+    for method in requested:
         if not kind_of(settings, method).moves_other_bodies:
             raise InputError(
-                f"{scene}/{method}", "a splat has no video to fit this method to; leave the method out"
+                f"{scene}/{method}", "a splat has no video to fit this method to", "Leave the method out"
             )
-        elsewhere = case(settings, scene, method).learns_there
+        elsewhere = case(settings, scene, method).learned_from_moved_scene
         sources = settings.figures.i23d if elsewhere else (None,)
-        found += [f"{method}+{LAW_FROM}={source}" if source else method for source in sources]
-    return list(dict.fromkeys(found))
+        moving += [f"{method}+{LAW_FROM}={source}" if source else method for source in sources]
+    return list(dict.fromkeys(moving))
 
 
 def motion_clock(settings: Config, scene: str, method: str) -> tuple[float, tuple[int, ...]]:
     """Time step of the prediction of a splat [s], and the steps of its frames.
 
-    A law holds at the time step that it was learned at, so this is the step of the scene that the model is from.
+    A law is valid for the time step of its training, so this is the step of the scene of the model.
     """
     dt, law_dt = settings.scene(scene).dt, settings.scene(source_scene(settings, scene, method)).dt
     return law_dt, tuple(round(step * dt / law_dt) for step in settings.frame_steps(scene))
 
 
 def law_origin(settings: Config, scene: str, method: str) -> dict[str, Any]:
-    """What the settings know of the origin of a method's law, with the keys of `neuma_lib.io.exported`."""
-    found = case(settings, scene, method)
-    chosen = settings.scene(found.scene)
+    """Origin of a method's law according to the settings, with the keys of `neuma_lib.io.exported`."""
+    of_law = case(settings, scene, method)
+    chosen = settings.scene(of_law.scene)
     return {
         "dt": chosen.dt,
-        **settings.scene_world(found.scene),
-        "density": found.density(found.scene),
+        **settings.scene_world(of_law.scene),
+        "density": of_law.density(of_law.scene),
         "scale": chosen.captured.scale if chosen.captured else chosen.images.scale,
-        "scene": found.scene,
+        "scene": of_law.scene,
         "method": method,
-        "prior": found.prior if "prior" in found.method.model_inputs(found) else None,
+        "prior": of_law.prior if "prior" in of_law.method.model_inputs(of_law) else None,
     }

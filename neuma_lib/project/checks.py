@@ -14,7 +14,7 @@ import numpy as np
 
 from neuma_lib.config.validation import hint
 from neuma_lib.errors import InputError
-from neuma_lib.mechanics.catalogue import COURANT_LIMIT, check_law, longitudinal_modulus
+from neuma_lib.mechanics.catalogue import COURANT_LIMIT, DEFINED_IN, check_law, longitudinal_modulus
 from neuma_lib.project.capture_folder import NAME, read_capture
 from neuma_lib.project.capture_scenes import training_takes
 from neuma_lib.project.random_scenes import SHAPES, DrawnPart, Outline
@@ -62,7 +62,7 @@ def law_problems(settings: Config) -> list[str]:
 
 def lines(error: InputError) -> list[str]:
     """The problems in an error of the settings, one line each."""
-    return [line.strip() for line in str(error).removeprefix("settings: ").splitlines()]
+    return [line.strip() for line in str(error).splitlines()]
 
 
 def _laws(settings: Config) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -152,9 +152,10 @@ def _start_problems(where: str, body: Mapping[str, Any], dt: float, grid: int) -
 
 
 def _courant_problem(where: str, spec: Mapping[str, Any], density: Any, grid: int, dt: float) -> list[str]:
-    """The problem of a time step that is unstable for a law; none for a law that `law_problems` reports."""
+    """The problem of a time step that is unstable for a law; none for a law that `law_problems` reports, or whose
+    modulus is unknown here because it is not built in."""
     law, _ = _checked(where, spec)
-    if law is None:
+    if law is None or ("elasticity", law["elasticity"]["name"]) in DEFINED_IN:
         return []
     rho = min(density["below"], density["above"]) if isinstance(density, Mapping) else density
     number = math.sqrt(longitudinal_modulus(law["elasticity"]) / rho) * dt * grid

@@ -36,7 +36,7 @@ class SceneFiles:
 
     Attributes:
         name: the scene, with the seeds of its replicate.
-        simulation: arguments of `MPMModel`.
+        simulation: arguments of `MPM`.
         density: of the body, as for `load_body`.
         particles, binding, gaussians, velocity: files of the reconstructed body.
         truth, transforms: files of the true motion and of the observed images, or None.

@@ -14,8 +14,7 @@ from neuma_lib.errors import InputError
 from neuma_lib.io.files import existing
 from neuma_lib.methods.base import ModelSource
 from neuma_lib.methods.prior import prior_source
-from neuma_lib.project import cases
-from neuma_lib.project import paths as places
+from neuma_lib.project import cases, paths
 from neuma_lib.project.files import RunFiles, SceneFiles
 from neuma_lib.project.project import settings_around
 from neuma_lib.project.settings import Config
@@ -33,8 +32,8 @@ def scene_files(settings: Config, scene: str, methods: Sequence[str]) -> SceneFi
     Args:
         scene: with the seeds of its replicate.
     """
-    base, _ = settings.chain(scene)
-    results, data = places.results_root(settings), settings.data_root.rstrip("/")
+    base, _ = settings.replicate(scene)
+    results, data = paths.results_root(settings), settings.data_root.rstrip("/")
     section, chosen = settings.simulation.plain(), settings.scene(scene)
     runs = tuple(
         RunFiles(
@@ -52,7 +51,7 @@ def scene_files(settings: Config, scene: str, methods: Sequence[str]) -> SceneFi
         name=scene,
         simulation={"dt": chosen.dt, **constants},
         density=chosen.plain()["density"],
-        **{name.partition(".")[0]: places.home(settings, scene, name) for name in names},
+        **{name.partition(".")[0]: paths.result_path(settings, scene, name) for name in names},
         truth=f"{data}/{base}/particles.h5" if chosen.has_truth else None,
         transforms=None if chosen.splat else f"{data}/{base}/dynamic/transforms.json",
         runs=runs,
@@ -112,7 +111,7 @@ def found_laws(settings: Config, scene: str | None = None) -> dict[str, ModelSou
     Includes laws trained or identified in scenes, ``scene: title of the method``, and priors, ``prior: name``, with the
     time step of a scene that uses them, preferably the given one.
     """
-    results = Path(places.results_root(settings))
+    results = Path(paths.results_root(settings))
     laws: dict[str, ModelSource] = {}
     for folder in sorted(results.glob("*/")):
         if folder.name.partition("+")[0] not in settings.scenes:
@@ -127,7 +126,7 @@ def found_laws(settings: Config, scene: str | None = None) -> dict[str, ModelSou
                 law = law_source(settings, folder.name, method)
             except InputError:
                 continue  # unknown variant
-            learned = law and law.paths and cases.case(settings, folder.name, method).learns_there
+            learned = law and law.paths and cases.case(settings, folder.name, method).learned_from_moved_scene
             if learned and all(Path(file).is_file() for file in law.paths):
                 laws[f"{folder.name}: {cases.title(settings, method)}"] = law
     own = [settings.scene(scene)] if scene else []

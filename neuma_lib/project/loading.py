@@ -1,7 +1,4 @@
-"""`load` turns the merged YAML that the user gave into a `Config`.
-
-On the way scenes are read from their table, drawn at random, or completed by those that they are like.
-"""
+"""`load` converts merged YAML into a `Config`. It reads, draws and completes the scenes on the way."""
 
 from __future__ import annotations
 
@@ -11,13 +8,17 @@ from typing import Any
 
 import yaml
 
+from neuma_lib.config.capture import CapturesConfig
 from neuma_lib.config.priors import PriorsConfig
 from neuma_lib.config.simulation import SimulationConfig
-from neuma_lib.config.validation import hint, validate
+from neuma_lib.config.validation import hint, validate, with_advanced
 from neuma_lib.errors import InputError
+from neuma_lib.extensions import load_laws
+from neuma_lib.io.files import one_line
 from neuma_lib.methods.registry import built_in_presets
-from neuma_lib.project.cases import law_from
+from neuma_lib.project.consistency import check_consistency
 from neuma_lib.project.random_scenes import RandomConfig, draw_scenes
+from neuma_lib.project.renames import refuse_old_keys
 from neuma_lib.project.settings import Config
 
 
@@ -33,42 +34,44 @@ def load(
         captured: scenes of captures (`neuma_lib.project.capture_scenes`), which ``scenes`` may change as well.
 
     Raises:
-        InputError: names every offending key by its path and suggests close matches.
+        InputError: names every wrong key by its path and suggests close matches.
     """
+    refuse_old_keys(raw)
+    raw = with_advanced(Config, raw)
     scenes_file = Path(root) / str(raw.get("scenes_file", Config.model_fields["scenes_file"].default))
-    scenes, changes = {**read_yaml(scenes_file), **_random_scenes(raw)}, raw.get("scenes") or {}
+    named = read_yaml(scenes_file)
+    refuse_old_keys({"scenes": named})
+    scenes, changes = {**named, **_random_scenes(raw)}, raw.get("scenes") or {}
     for name in captured or {}:
         if name in scenes:
-            raise InputError(
-                f"a capture makes the scene '{name}', and another scene is named so: rename its folder"
-            )
+            raise InputError(f"scenes.{name}", "a capture has a scene of this name", "Rename one of the two")
     scenes |= captured or {}
     if isinstance(changes, Mapping):
-        changes = _complete(_with_throws(merged(scenes, changes)))
-    presets = merged(built_in_presets(), raw.get("methods") or {})
-    settings = validate(Config, {**raw, "scenes": changes, "methods": presets})
-    check_methods(settings)
+        changes = _complete(_with_takes(merged(scenes, changes)))
+    extensions = _extensions(raw, root)
+    presets = merged(built_in_presets(extensions), raw.get("methods") or {})
+    settings = validate(Config, {**raw, "extensions": extensions, "scenes": changes, "methods": presets})
+    check_consistency(settings)
     return settings
 
 
-def check_methods(settings: Config) -> None:
-    """Check the presets and variants that tables, figures and the demo name. Raises InputError naming the key."""
-    figures, demo = settings.figures, settings.demo
-    named = {"figures.beside": figures.beside}
-    named["random.methods"] = settings.random.methods if settings.random.count else ()
-    named["demo.methods"] = demo.methods if "demo" in settings.model_fields_set else ()
-    for name, table in settings.tables.items():
-        named[f"tables.{name}"] = (*table.methods, *table.titles)
-    for where, methods in named.items():
-        for method in methods:
-            try:
-                law_from(settings, method)
-            except InputError as error:
-                raise InputError(where, str(error)) from None
+def load_captures(raw: Mapping[str, Any]) -> CapturesConfig:
+    """The section ``captures`` of merged settings, which `load` needs for the scenes of captures."""
+    return validate(CapturesConfig, with_advanced(Config, raw).get("captures") or {}, "captures")
+
+
+def _extensions(raw: Mapping[str, Any], root: str | Path) -> tuple[str, ...]:
+    """Paths of the extensions, which are loaded."""
+    files = raw.get("extensions") or ()
+    if not isinstance(files, list | tuple) or not all(isinstance(file, str) for file in files):
+        raise InputError("extensions", f"{files!r} is not a list of Python files", "Write [my_method.py]")
+    paths = tuple(str(Path(root) / file) for file in files)
+    load_laws(paths)
+    return paths
 
 
 def _random_scenes(raw: Mapping[str, Any]) -> dict[str, Any]:
-    """Random scenes; none where the settings behind them have mistakes, which are reported with all others."""
+    """Random scenes. Empty if their settings are invalid, which `load` reports with all other problems."""
     kinds = {"random": RandomConfig, "priors": PriorsConfig, "simulation": SimulationConfig}
     try:
         random, priors, simulation = (validate(kind, raw.get(key, {}), key) for key, kind in kinds.items())
@@ -77,27 +80,26 @@ def _random_scenes(raw: Mapping[str, Any]) -> dict[str, Any]:
     return draw_scenes(random, priors.laws, simulation.grid, simulation.gravity)
 
 
-def _with_throws(scenes: Mapping[str, Any]) -> dict[str, Any]:
-    """Scenes, and beside them the throws of their objects that their ``videos`` describe in place."""
-    found = dict(scenes)
+def _with_takes(scenes: Mapping[str, Any]) -> dict[str, Any]:
+    """Scenes, and a scene for each take of an object that ``videos`` describes in place."""
+    complete = dict(scenes)
     for name, scene in scenes.items():
         videos = scene.get("videos") if isinstance(scene, Mapping) else None
         if not isinstance(videos, list):
             continue
         names = [f"{name}_throw{k}" if isinstance(v, Mapping) else v for k, v in enumerate(videos, 2)]
-        for throw, video in zip(names, videos, strict=True):
+        for take, video in zip(names, videos, strict=True):
             if isinstance(video, Mapping):
-                if throw in found:
-                    raise InputError(
-                        f"settings: scenes.{name}.videos makes {throw}, which is another scene: rename it"
-                    )
-                found[throw] = {"like": name, **video}
-        found[name] = {**scene, "videos": names}
-    return found
+                if take in complete:
+                    problem = f"the name {take} of a video is that of another scene"
+                    raise InputError(f"scenes.{name}.videos", problem, "Rename the scene")
+                complete[take] = {"like": name, **video}
+        complete[name] = {**scene, "videos": names}
+    return complete
 
 
 def _complete(scenes: Mapping[str, Any]) -> dict[str, Any]:
-    """Scenes of which those that are like another one have its settings where they have none of their own."""
+    """Scenes in which those with ``like`` have the settings of that scene where they have none of their own."""
 
     def complete(name: str, asked: tuple[str, ...] = ()) -> Any:
         scene = scenes[name]
@@ -105,9 +107,9 @@ def _complete(scenes: Mapping[str, Any]) -> dict[str, Any]:
         if like is None:
             return scene
         if like not in scenes:
-            raise InputError(f"settings: scenes.{name}.like: no scene '{like}'{hint(like, scenes)}")
+            raise InputError(f"scenes.{name}.like", f"no scene '{like}'{hint(like, scenes)}")
         if like in (name, *asked):
-            raise InputError(f"settings: scenes.{name}.like: {like} is in turn like {name}")
+            raise InputError(f"scenes.{name}.like", f"{like} is in turn like {name}")
         base = complete(like, (name, *asked))
         return merged({key: value for key, value in base.items() if key != "videos"}, scene)
 
@@ -120,18 +122,20 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     try:
         content = yaml.load(Path(path).read_text(), Loader=loader)
     except FileNotFoundError:
-        raise InputError(f"{path} does not exist: give the path of an existing settings file") from None
+        raise InputError(
+            path, "the file does not exist", "Give the path of an existing settings file"
+        ) from None
     except yaml.YAMLError as error:
-        raise InputError(f"{path} is not valid YAML: {error}") from None
+        raise InputError(path, f"invalid YAML: {one_line(error)}") from None
     if content is None:
         return {}
     if not isinstance(content, dict):
-        raise InputError(f"{path} must hold 'key: value' lines, not a {type(content).__name__}")
+        raise InputError(path, f"expected lines 'key: value', not a {type(content).__name__}")
     return content
 
 
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """``base`` with ``changes`` laid over it, nested dicts merged, everything else replaced."""
+    """``base`` updated by ``changes``: nested dicts are merged, other values replaced."""
     result = dict(base)
     for key, value in changes.items():
         old = result.get(key)

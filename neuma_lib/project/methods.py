@@ -10,20 +10,19 @@ from neuma_lib.config.base import Section
 
 
 class PresetConfig(Section):
-    """A named set of options of a method. Presets of the built-in methods stand beside their code."""
+    """A named set of options of a method. Built-in presets are part of the code of their method."""
 
     kind: str | None = Field(
-        None,
-        description="method, for example `neuma` or `constants`; null: that of the preset in `same_fit_as`",
+        None, description="method, for example `neuma` or `constants`; null: that of `same_fit_as`"
     )
     title: str = Field(description="name in tables")
-    note: str | None = Field(None, description="remark on its numbers, printed below tables")
+    note: str | None = Field(None, description="note on its numbers, printed below tables")
     same_fit_as: str | None = Field(
-        None, description="preset whose fit it takes, with its options; null: its own fit"
+        None, description="preset with the fit and the options that it uses; null: its own fit"
     )
     evaluate_on: Literal["particles", "training_particles"] = Field(
         "particles",
-        description="what an evaluation simulates: particles of the body's volume, or the particles of the fit",
+        description="simulated particles in an evaluation: those of the body's volume, or those of the fit",
     )
     options: dict[str, Any] = Field({}, description="options of the method that differ from their defaults")
 

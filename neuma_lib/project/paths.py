@@ -1,19 +1,19 @@
-"""Where the files of a project lie: those of scenes and experiments in their chains, and those that a law is made of.
+"""Paths of the files of a project: of scenes and experiments in their replicates, and of priors.
 
-Names only; nothing is read, and nothing need exist.
+No file is read or has to exist.
 """
 
 from __future__ import annotations
 
 import re
 
-from neuma_lib.config.variants import folder
+from neuma_lib.config.variants import replicate_folder
 from neuma_lib.project.settings import Config
 
 FIELD = "pac_nerf/field.safetensors"
 IDENTIFIED = "identified"
-"""Name of the prior that is the law identified in the scene's own video."""
-DRAWN_IN = {
+"""Name of the prior that is the law identified from the scene's video."""
+SEEDS_OF = {
     **dict.fromkeys(["gaussians.ply", "gaussians.json", "mesh.ply", "tracers.h5", FIELD], ["gaussians"]),
     **dict.fromkeys(["sampled_particles.h5", "particles.h5", "binding.h5"], ["gaussians", "particles"]),
     **dict.fromkeys(
@@ -25,16 +25,16 @@ DRAWN_IN = {
 `neuma_lib.project.cases.run_folder`."""
 
 
-def home(settings: Config, name: str, file: str) -> str:
-    """The one path of a file of a scene or experiment in a chain."""
-    results, (base, seeds) = results_root(settings), settings.chain(name)
+def result_path(settings: Config, name: str, file: str) -> str:
+    """Path of a file of a scene or experiment in a replicate."""
+    results, (base, seeds) = results_root(settings), settings.replicate(name)
     if base in settings.scenes:
-        drawn = DRAWN_IN[re.sub("[+]views=[0-9,]+", "", file)]
-        return f"{results}/{folder(base, seeds, drawn)}/{file}"
-    # Solids are filled with particles; where a scene's own object is among them, all that led to its start counts.
+        seeds_used = SEEDS_OF[re.sub("[+]views=[0-9,]+", "", file)]
+        return f"{results}/{replicate_folder(base, seeds, seeds_used)}/{file}"
+    # Shapes are filled with particles. A reconstructed object depends on everything before its initial motion.
     rebuilt = any(body.shape is None for body in settings.experiments[base].bodies)
-    drawn = DRAWN_IN["velocity.json"] if rebuilt else ["particles"]
-    return f"{results}/experiments/{folder(base, seeds, drawn)}/{file}"
+    seeds_used = SEEDS_OF["velocity.json"] if rebuilt else ["particles"]
+    return f"{results}/experiments/{replicate_folder(base, seeds, seeds_used)}/{file}"
 
 
 def results_root(settings: Config) -> str:
@@ -42,9 +42,10 @@ def results_root(settings: Config) -> str:
 
 
 def prior_file(settings: Config, scene: str, prior: str) -> str:
-    """The file of a prior in the replicate of a scene: made here, or the user's own if the name is a path."""
+    """The file of a prior in the replicate of a scene: in the results, or the name itself if it is a path."""
     if prior == IDENTIFIED:
-        return home(settings, scene, "priors/identified.safetensors")
+        return result_path(settings, scene, "priors/identified.safetensors")
     if prior not in settings.priors.laws:
         return prior
-    return f"{results_root(settings)}/priors/{folder(prior, settings.chain(scene)[1], ['prior'])}.safetensors"
+    name = replicate_folder(prior, settings.replicate(scene)[1], ["prior"])
+    return f"{results_root(settings)}/priors/{name}.safetensors"

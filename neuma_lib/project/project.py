@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from neuma_lib.config.capture import CapturesConfig
-from neuma_lib.config.validation import validate
 from neuma_lib.errors import InputError
 from neuma_lib.project.capture_scenes import captured_scenes
-from neuma_lib.project.loading import load, merged, read_yaml
+from neuma_lib.project.loading import load, load_captures, merged, read_yaml
 from neuma_lib.project.settings import Config
 
 SETTINGS_FILE = Path("config/config.yaml")
@@ -29,13 +27,12 @@ def settings_around(place: str | Path, configfiles: Sequence[str | Path] = ()) -
     place = Path(place).absolute()
     root = next((folder for folder in (place, *place.parents) if (folder / SETTINGS_FILE).is_file()), None)
     if root is None:
-        raise InputError(
-            f"{place}: neither it nor a folder above it has {SETTINGS_FILE}: name a folder in a project's results"
-        )
+        problem = f"neither it nor a folder above it has {SETTINGS_FILE}"
+        raise InputError(place, problem, "Give a folder in a project's results")
     raw: dict[str, Any] = {}
     for file in (root / SETTINGS_FILE, *configfiles):
         raw = merged(raw, read_yaml(file))
-    captures = validate(CapturesConfig, raw.get("captures") or {}, "captures")
+    captures = load_captures(raw)
     released = {
         name: item.model_copy(update={"folder": str(root / item.folder)})
         for name, item in captures.released.items()

@@ -1,8 +1,8 @@
-"""Scenes drawn at random: bodies, throws and materials that nobody chose, for a benchmark that nothing was tuned on.
+"""Random scenes: bodies, motions and materials for a benchmark without manual choices.
 
-Draw k depends on the seed, on k, and on the settings that `draw_scenes` takes, so that more draws leave it as it is.
-Only `numpy.random.Generator.random` is used, whose stream numpy keeps, and numbers are rounded to three digits, so that
-every machine draws the same scenes.
+Scene k depends on the seed, on k, and on the arguments of `draw_scenes`, but not on the number of scenes. Only
+`numpy.random.Generator.random` is used, whose stream is stable, and numbers are rounded to three digits, so that all
+machines have the same scenes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field, PositiveFloat, model_validator
 
-from neuma_lib.config.base import Section, Vector
+from neuma_lib.config.base import Section, Vector, internal
 from neuma_lib.config.laws import LawConfig
 from neuma_lib.errors import InputError
 
@@ -24,12 +24,12 @@ Item = TypeVar("Item")
 
 
 class Outline(NamedTuple):
-    """What a draw has to know of a shape. Settings do not know `geometry.shapes`; a test compares the two.
+    """Proportions of a shape. A test compares them with `geometry.shapes`, which settings do not import.
 
     Attributes:
         sides: of the bounding box, the longest is 1.
-        mass_centre: centre of mass seen from the box's centre, in the same unit.
-        parts: what can be coloured.
+        mass_centre: centre of mass relative to the centre of the box, in the same unit.
+        parts: parts with a colour.
     """
 
     sides: Vector
@@ -63,9 +63,9 @@ FLAWS = {
 """Why a draw is rejected."""
 
 ATTEMPTS = 1000
-MARGIN = 0.02  # least distance of the bounding box from the walls at the start [m]
+MARGIN = 0.02  # minimum distance of the bounding box from the walls at the start [m]
 STEPS = 32  # the steps of a video are a multiple of this, so that its frames are evenly spaced
-MOMENTS = 200  # of a video at which contact is looked for
+MOMENTS = 200  # times of a video at which contact is tested
 DENSITY = 1000.0  # [kg/m^3]
 
 
@@ -80,7 +80,7 @@ PositiveRange = Annotated[tuple[PositiveFloat, PositiveFloat], AfterValidator(_a
 
 
 class DrawnPart(Section):
-    """One of the two parts of a law: its name, and the ranges that its constants are drawn from, log-uniformly."""
+    """One of the two parts of a law: its name, and ranges of its constants by name, sampled log-uniformly."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, PositiveRange]
@@ -89,19 +89,17 @@ class DrawnPart(Section):
 
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
-        """Lowest and highest value of each constant."""
+        """Minimum and maximum of each constant."""
         return self.__pydantic_extra__ or {}
 
 
 class FamilyConfig(Section):
     """A family of materials."""
 
-    prior: str = Field(
-        description="the prior that somebody who sees such a body would choose, see priors.laws"
-    )
-    look: Literal["solid", "grains", "liquid"] = Field("solid", description="how Blender shows it")
+    prior: str = Field(description="prior of its scenes, a name in priors.laws")
+    look: Literal["solid", "grains", "liquid"] = Field("solid", description="appearance in Blender")
     elasticity: DrawnPart = Field(
-        description="name, and lowest and highest value of each constant, for example E: [3e4, 3e5]"
+        description="elastic law, and minimum and maximum of each constant, for example E: [3e4, 3e5]"
     )
     plasticity: DrawnPart = Field(DrawnPart(name="identity"), description="the same of the return map")
 
@@ -114,60 +112,54 @@ class FamilyConfig(Section):
 
 
 class RandomConfig(Section):
-    """Scenes drawn at random, named after their draw, for example random7_03_duck_von_mises."""
+    """Random scenes, with names such as random7_03_duck_von_mises."""
 
-    count: int = Field(0, ge=0, description="number of scenes; more of them leave the first ones as they are")
-    seed: int = Field(0, ge=0, description="seed of the draws")
+    count: int = Field(0, ge=0, description="number of scenes; a larger number keeps the first ones")
+    seed: int = Field(0, ge=0, description="seed of the scenes")
     methods: tuple[str, ...] = Field(
         ("nclaw", "neuma", "constants", "neuma_structured", "true_law"),
         min_length=2,
-        description="rows of results/random.csv: the prior, the method that is judged, and others to be shown",
+        description="rows of results/random.csv: the prior, the evaluated method, others",
     )
     families: dict[str, FamilyConfig] = Field(
-        {}, description="materials by name; of as many scenes in a row as there are, each gets another one"
+        {}, description="materials by name, which consecutive scenes take in turn"
     )
     outside: dict[str, FamilyConfig] = Field(
-        {}, description="materials by name that no law of `families` describes, see draw_from"
+        {}, description="materials by name outside `families`, see draw_from"
     )
     draw_from: Literal["families", "outside", "both"] = Field(
-        "families", description="what the materials of the scenes are drawn from"
+        "families", description="source of the materials"
     )
-    shapes: tuple[Literal[tuple(SHAPES)], ...] = Field(
-        tuple(SHAPES), min_length=1, description="shapes, dealt in the same way"
+    shapes: tuple[Literal[tuple(SHAPES)], ...] = internal(
+        tuple(SHAPES), "shapes, which consecutive scenes take in turn", min_length=1
     )
-    size: PositiveRange = Field((0.24, 0.4), description="longest side of the bounding box [m]")
-    height: Range = Field((0.2, 0.7), description="y of the bounding box's centre at the start [m]")
-    center: Range = Field((0.35, 0.65), description="x and z of the bounding box's centre [m]")
-    velocity: tuple[Range, Range, Range] = Field(
-        ((-0.8, 0.8), (-1.8, -0.4), (-0.8, 0.8)), description="initial velocity along x, y and z [m/s]"
+    size: PositiveRange = internal((0.24, 0.4), "longest side of the bounding box [m]")
+    height: Range = internal((0.2, 0.7), "initial y of the centre of the bounding box [m]")
+    center: Range = internal((0.35, 0.65), "x and z of that centre [m]")
+    velocity: tuple[Range, Range, Range] = internal(
+        ((-0.8, 0.8), (-1.8, -0.4), (-0.8, 0.8)), "initial velocity along x, y and z [m/s]"
     )
-    spin: Range = Field(
-        (1.0, 5.0), description="initial angular speed about an axis of any direction [rad/s]"
+    spin: Range = internal((1.0, 5.0), "initial angular speed about a random axis [rad/s]")
+    duration: PositiveRange = internal((0.26, 0.34), "duration of the video [s]")
+    contact: Range = internal((0.2, 0.5), "time of the first contact as a fraction of the video")
+    dt: tuple[PositiveFloat, ...] = internal(
+        (1e-3, 5e-4), "time steps, of which the largest stable one is used [s]", min_length=1
     )
-    duration: PositiveRange = Field((0.26, 0.34), description="length of the video [s]")
-    contact: Range = Field(
-        (0.2, 0.5),
-        description="first touch of the ground as a part of the video; six of 33 frames come before 0.2",
-    )
-    dt: tuple[PositiveFloat, ...] = Field(
-        (1e-3, 5e-4), min_length=1, description="time steps, of which the largest stable one is taken [s]"
-    )
-    courant: float = Field(
+    courant: float = internal(
         0.6,
+        "maximum Courant number of true law and prior; training may stiffen a law up to 0.8",
         gt=0,
         le=0.8,
-        description="largest Courant number of the true law and the prior on the reconstruction's grid; below the "
-        "limit of 0.8, as training may stiffen a law",
     )
 
     @property
     def prefix(self) -> str:
-        """What the names of the scenes begin with."""
+        """Prefix of the names of the scenes."""
         return f"random{self.seed}_"
 
     @property
     def materials(self) -> dict[str, FamilyConfig]:
-        """The families that scenes are drawn from."""
+        """Families of the scenes."""
         return {
             **(self.families if self.draw_from != "outside" else {}),
             **(self.outside if self.draw_from != "families" else {}),
@@ -184,19 +176,19 @@ def draw_scenes(
     """Settings of random scenes by name.
 
     Args:
-        settings: how many, and from what.
+        settings: number, families and ranges.
         priors: laws of the priors by name.
-        grid: nodes along an edge of the reconstruction's grid.
+        grid: cells along each side of the reconstruction's grid.
         gravity: acceleration [m/s^2].
 
     Raises:
-        InputError: there are no families, or no draw of a scene can be used.
+        InputError: there are no families, or all draws of a scene are unusable.
     """
     families = settings.materials
     if settings.count and not families:
         where = "families" if settings.draw_from == "both" else settings.draw_from
-        raise InputError(f"settings: random.{where}: give at least one family of materials")
-    found = {}
+        raise InputError(f"random.{where}", "no families", "Give at least one family of materials")
+    scenes = {}
     for k in range(settings.count):
         family = _dealt(sorted(families), settings.seed, 0, k)
         shape = _dealt(settings.shapes, settings.seed, 1, k)
@@ -212,18 +204,16 @@ def draw_scenes(
             flaws[flaw] += 1
         else:
             counted = ", ".join(f"{number} {FLAWS[flaw]}" for flaw, number in flaws.most_common())
-            raise InputError(
-                f"settings: random: no draw of a {shape} of the family {family} can be used; of {ATTEMPTS}, "
-                f"{counted}: change the ranges"
-            )
+            problem = f"{ATTEMPTS} draws of a {shape} of the family {family} are unusable: {counted}"
+            raise InputError("random", problem, "Change the ranges")
         scene |= {"dt": dt, "steps": STEPS * max(1, round(scene.pop("duration") / dt / STEPS))}
         scene["appearance"] = _appearance(settings, k, shape, family)
-        found[f"{settings.prefix}{k:02d}_{shape}_{family}"] = scene
-    return found
+        scenes[f"{settings.prefix}{k:02d}_{shape}_{family}"] = scene
+    return scenes
 
 
 def _dealt(items: Sequence[Item], seed: int, deck: int, k: int) -> Item:
-    """The k-th of the items that are dealt from one shuffled deck after the other."""
+    """The k-th item, if all items in random order are used up before the next round."""
     number, place = divmod(k, len(items))
     return items[np.argsort(np.random.default_rng([seed, deck, number]).random(len(items)))[place]]
 
@@ -231,7 +221,7 @@ def _dealt(items: Sequence[Item], seed: int, deck: int, k: int) -> Item:
 def _drawn(
     rng: np.random.Generator, settings: RandomConfig, shape: str, family: FamilyConfig
 ) -> dict[str, Any]:
-    """A scene without time step and look, good or not."""
+    """A random scene without time step and appearance, usable or not."""
 
     def uniform(bounds: tuple[float, float]) -> float:
         return _rounded(bounds[0] + (bounds[1] - bounds[0]) * rng.random())
@@ -257,20 +247,20 @@ def _drawn(
 
 
 def _direction(rng: np.random.Generator) -> list[float]:
-    """A unit vector, all directions equally likely (Archimedes: its height is uniform)."""
+    """A uniformly distributed unit vector (Archimedes: its height is uniform)."""
     up, turn = 2 * rng.random() - 1, 2 * math.pi * rng.random()
     flat = math.sqrt(1 - up**2)
     return [flat * math.cos(turn), up, flat * math.sin(turn)]
 
 
 def _rounded(value: float) -> float:
-    """Three significant digits: readable, and free of the last bits in which machines differ."""
+    """Three significant digits, without the last bits in which machines differ."""
     return float(f"{value:.3g}")
 
 
 def _largest_stable(settings: RandomConfig, laws: Sequence[Mapping], grid: int) -> float | None:
     """The largest time step [s] that is stable for all laws, by the speed of pressure waves at small strains."""
-    moduli = [  # of waves along the fibres, where there are some
+    moduli = [  # including fibres
         part["E"] * (1 - part["nu"]) / ((1 + part["nu"]) * (1 - 2 * part["nu"]))
         + part.get("fibre_modulus", 0.0)
         for part in (law["elasticity"] for law in laws)
@@ -281,15 +271,14 @@ def _largest_stable(settings: RandomConfig, laws: Sequence[Mapping], grid: int) 
 
 
 def _flaw(settings: RandomConfig, scene: Mapping[str, Any], gravity: Vector) -> str | None:
-    """Why a scene cannot be used, one of `FLAWS`; None: it can be.
+    """Why a scene is unusable, one of `FLAWS`; None: it is usable.
 
-    Before contact the body falls and turns. It lies inside its bounding box, and fills about the ellipsoid in that
-    box: the ground is touched no sooner than by the turning box, and not much later than by the ellipsoid.
+    Before contact the body falls and rotates. It is inside its bounding box and about fills the ellipsoid in that box,
+    so it touches the ground no earlier than the rotating box, and not much later than the ellipsoid.
 
-    A wall is where it stands, at 0 and 1, so that a draw does not depend on the grid, although the simulator feels it
-    half a cell earlier (`MPMModel.walls`; 0.021 m on 24 cells). What remains is enough, and a test moves the meshes of
-    many draws to see it: no body feels a wall at the start, or another one before the ground, and at least five frames
-    come before the ground is felt.
+    Walls are at 0 and 1, so that scenes do not depend on the grid, although contact begins half a cell earlier
+    (`MPM.walls`; 0.021 m on 24 cells). A test moves the meshes of many scenes and confirms that no body touches a wall
+    at the start, or another wall before the ground, and that at least five frames precede contact.
     """
     outline = SHAPES[scene["shape"]]
     half = scene["size"] * np.array(outline.sides) / 2
@@ -329,7 +318,7 @@ def _first(true: np.ndarray) -> float:
 
 
 def _appearance(settings: RandomConfig, k: int, shape: str, family: str) -> dict[str, Any]:
-    """Colours: parts that can be told apart, and patches, by which the motion is seen."""
+    """Different colours of the parts, and patches that make the motion visible."""
     rng = np.random.default_rng([settings.seed, 3, k])
 
     def colour() -> str:

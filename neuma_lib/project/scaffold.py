@@ -11,6 +11,7 @@ from neuma_lib.project.capture_scenes import scene_name
 from neuma_lib.project.settings import Config
 
 SCENE = """\
+# yaml-language-server: $schema=schema.json
 # Settings of the scene {name}, on top of config/config.yaml. All keys: docs/settings.md.
 #   neuma check config/{name}.yaml
 #   snakemake --cores 2 --configfile config/{name}.yaml -- results/{name}/film.mp4 results/{name}/viewer.html

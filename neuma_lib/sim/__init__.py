@@ -1,12 +1,12 @@
 """Differentiable material point method."""
 
-from neuma_lib.sim.model import Body, MPMModel, consecutive, contact_clearance
+from neuma_lib.sim.model import MPM, Body, consecutive, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
 __all__ = [
     "Body",
-    "MPMModel",
+    "MPM",
     "State",
     "Trajectory",
     "consecutive",

@@ -9,7 +9,7 @@ import torch
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.mechanics.analytic_fused import fusible, side_by_side
 from neuma_lib.mechanics.law import Law
-from neuma_lib.sim.model import Body, MPMModel
+from neuma_lib.sim.model import MPM, Body
 from neuma_lib.sim.rollout import check_inside, checked_frames, fly_and_simulate
 from neuma_lib.sim.state import State, Trajectory
 
@@ -19,7 +19,7 @@ TOGETHER = {"cpu": 8, "cuda": 64}
 
 @torch.no_grad()
 def rollout_batch(
-    model: MPMModel,
+    model: MPM,
     laws: Sequence[Law],
     start: State | Sequence[State],
     *,
@@ -71,7 +71,7 @@ def rollout_batch(
 
 
 def _side_by_side(
-    model: MPMModel,
+    model: MPM,
     laws: Sequence[Law],
     starts: Sequence[State],
     frames: tuple[int, ...],

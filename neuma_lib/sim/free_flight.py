@@ -7,15 +7,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from neuma_lib.sim.model import Body, MPMModel, contact_clearance, law_weights
+from neuma_lib.sim.model import MPM, Body, contact_clearance, law_weights
 from neuma_lib.sim.state import State, Trajectory
 
 _MARGIN = 1e-3  # distance from the contact zone at which free flight ends [dx]
 
 
-def free_flight_steps(
-    model: MPMModel, bodies: Sequence[Body], state: State, last: int, copies: int = 1
-) -> int:
+def free_flight_steps(model: MPM, bodies: Sequence[Body], state: State, last: int, copies: int = 1) -> int:
     """Number of leading steps, at most `last`, in which only gravity acts and no particle deforms.
 
     Copies (see `kernels`) may have different velocities. The first contact of any copy ends free flight for all.
@@ -35,7 +33,7 @@ def free_flight_steps(
     return clear
 
 
-def _clear_of_walls(model: MPMModel, x0: Tensor, v0: Tensor, last: int) -> int:
+def _clear_of_walls(model: MPM, x0: Tensor, v0: Tensor, last: int) -> int:
     """Number of leading ballistic steps in which no particle of x0 (copies, N, 3) is in reach of a wall."""
     box = torch.stack([x0.amin(dim=1), x0.amax(dim=1)], dim=1).double().cpu()
     n = torch.arange(last, dtype=torch.float64)[:, None, None, None]
@@ -45,7 +43,7 @@ def _clear_of_walls(model: MPMModel, x0: Tensor, v0: Tensor, last: int) -> int:
     return int(touching.int().argmax()) if touching.any() else last
 
 
-def _at_rest(model: MPMModel, body: Body, state: State, copy: int) -> bool:
+def _at_rest(model: MPM, body: Body, state: State, copy: int) -> bool:
     """Whether the law preserves F = I, with a stress that has no effect in a step beyond round-off.
 
     The law of a body that spans several copies, of ``copy`` particles each, may differ from copy to copy.
@@ -62,7 +60,7 @@ def _at_rest(model: MPMModel, body: Body, state: State, copy: int) -> bool:
 
 
 def ballistic(
-    model: MPMModel, start: tuple[Tensor, ...], tracers: Tensor | None, frames: Sequence[int]
+    model: MPM, start: tuple[Tensor, ...], tracers: Tensor | None, frames: Sequence[int]
 ) -> Trajectory:
     """Free flight: x_n = x0 + n dt v0 + g dt^2 n (n + 1) / 2, v_n = v0 + n dt g."""
     x0, v0, *constant = start

@@ -22,7 +22,7 @@ _OUTSIDE = 2
 
 
 @dataclass(frozen=True)
-class MPMModel:
+class MPM:
     """Constants of the material point method on the unit cube.
 
     Nodes lie at integer multiples of dx = 1 / grid. A particle interacts with a wall if its stencil of three nodes per
@@ -176,7 +176,7 @@ def consecutive(laws: Sequence[Law], counts: Sequence[int]) -> tuple[Body, ...]:
     return tuple(Body(law, end - n, end) for law, n, end in zip(laws, counts, ends, strict=True))
 
 
-def contact_clearance(model: MPMModel, x: Tensor) -> Tensor:
+def contact_clearance(model: MPM, x: Tensor) -> Tensor:
     """Smallest distance [m] of particles x (..., N, 3) to the contact zone of the walls, <= 0 in contact."""
     low, high = model.free_range
     return torch.minimum(x - low, high - x).amin(dim=(-2, -1))

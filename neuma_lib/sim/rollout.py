@@ -16,13 +16,13 @@ from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.free_flight import ballistic, free_flight_steps
 from neuma_lib.sim.memory import DEFAULT_CACHE_BYTES, plan_memory
-from neuma_lib.sim.model import Body, MPMModel, as_bodies
+from neuma_lib.sim.model import MPM, Body, as_bodies
 from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import State, Trajectory
 
 
 def rollout(
-    model: MPMModel,
+    model: MPM,
     law: Law | Sequence[Body],
     state: State,
     *,
@@ -77,8 +77,47 @@ def rollout(
     return path
 
 
+def simulate(
+    mpm: MPM,
+    law: Law | Sequence[Body],
+    state: State,
+    frames: Sequence[int],
+    *,
+    tracers: Tensor | None = None,
+    total: bool = False,
+) -> Trajectory:
+    """Simulate particles up to the last frame and return their states at the frames.
+
+    Differentiable with respect to the weights of the law and to x, v, F and C of the state. `rollout` has further
+    options for speed and memory.
+
+    Args:
+        mpm: grid, time step, gravity and walls.
+        law: law of all particles, or one `Body` per range of particles.
+        state: initial state of N particles.
+        frames: time steps whose states are returned, strictly increasing, 0 is the initial state.
+        tracers: positions of passive points that follow the velocity of the grid [m], shape (M, 3).
+        total: also compute the total deformation gradients, elastic and plastic.
+
+    Returns:
+        States at the T frames: x (T, N, 3) [m], v [m/s], F and C.
+
+    Raises:
+        InputError: invalid frames or tracers, or a particle starts outside the grid.
+        NonFiniteError: the simulation is unstable, or a particle leaves the grid.
+
+    Example:
+        >>> path = simulate(MPM(grid=24, dt=1e-3), law, state, frames=range(0, 201, 10))
+        >>> path.x.shape  # 21 frames
+        torch.Size([21, 2000, 3])
+    """
+    frames = tuple(frames)
+    last = frames[-1] if frames else 0
+    return rollout(mpm, law, state, steps=last, frames=frames, tracers=tracers, total=total)
+
+
 def fly_and_simulate(
-    model: MPMModel,
+    model: MPM,
     bodies: tuple[Body, ...],
     state: State,
     frames: tuple[int, ...],
@@ -115,7 +154,7 @@ def fly_and_simulate(
 
 
 def _simulate(
-    model: MPMModel,
+    model: MPM,
     bodies: tuple[Body, ...],
     state: State,
     start: tuple[Tensor, ...],
@@ -174,7 +213,7 @@ def checked_frames(frames: Sequence[int], steps: int) -> tuple[int, ...]:
     return frames
 
 
-def check_inside(model: MPMModel, x0: Tensor) -> None:
+def check_inside(model: MPM, x0: Tensor) -> None:
     """Raise InputError unless the stencil of every particle exists."""
     low, high = model.stencil_range
     outside = ~((x0 >= low) & (x0 <= high)).all(dim=1)

@@ -20,7 +20,7 @@ from neuma_lib.errors import NonFiniteError
 from neuma_lib.mechanics.law import Constitutive, Weights
 from neuma_lib.sim.kernels import NO_FAULT
 from neuma_lib.sim.memory import MemoryPlan
-from neuma_lib.sim.model import Body, MPMModel, law_weights
+from neuma_lib.sim.model import MPM, Body, law_weights
 from neuma_lib.sim.scatter import scatter_for
 from neuma_lib.sim.state import State
 from neuma_lib.sim.workspace import Workspace, WorkspaceSize, pooled_workspace
@@ -63,7 +63,7 @@ class Simulation:
 
     def __init__(
         self,
-        model: MPMModel,
+        model: MPM,
         bodies: Sequence[Body],
         weight_slices: dict[tuple[int, str], slice],
         state: State,
@@ -350,7 +350,7 @@ class Simulation:
             "rollout",
             f"particle {particle} (law {law.name!r}) {happened} at step {step}, t = "
             f"{step * self.model.dt:.4g} s: the simulation is unstable. Use a smaller dt (see "
-            "MPMModel.check_courant), a slower start, or the last good weights with a lower rate",
+            "MPM.check_courant), a slower start, or the last good weights with a lower rate",
             step=step,
             particle=particle,
             happened=happened,

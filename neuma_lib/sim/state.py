@@ -33,8 +33,8 @@ class State:
     v: Tensor
     mass: Tensor
     vol0: Tensor
-    F: Tensor | None = None
-    C: Tensor | None = None
+    F: Tensor = None  # type: ignore[assignment]
+    C: Tensor = None  # type: ignore[assignment]
 
     def __post_init__(self):
         x = self.x
@@ -65,14 +65,14 @@ class State:
                 raise InputError(f"state.{name}", f"{float(value.min()):g} must be positive")
 
     @classmethod
-    def thrown(
+    def rigid(
         cls,
         x: Tensor,
         mass: Tensor,
         vol0: Tensor,
-        velocity: Sequence[float] | Tensor,
-        spin: Sequence[float] | Tensor = (0.0, 0.0, 0.0),
-        centre: Sequence[float] | Tensor | None = None,
+        velocity: Sequence[float] | np.ndarray | Tensor,
+        spin: Sequence[float] | np.ndarray | Tensor = (0.0, 0.0, 0.0),
+        centre: Sequence[float] | np.ndarray | Tensor | None = None,
     ) -> State:
         """Particles in rigid motion, v = velocity + spin x (x - centre).
 

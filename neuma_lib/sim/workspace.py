@@ -20,7 +20,7 @@ from neuma_lib.sim import kernels
 from neuma_lib.sim.adjoint_kernels import adjoint_kernels
 from neuma_lib.sim.graphs import MAX_GRAPHS, GraphCache
 from neuma_lib.sim.kernels import NO_FAULT, forward_kernels, warp_types
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 
 SORT_EVERY = 16
 """Steps between sorts of the particles by cell, for scatter methods that need it."""
@@ -37,7 +37,7 @@ _CONDITION_CODES = {"no_slip": kernels.NO_SLIP, "slip": kernels.SLIP, "sticky": 
 class WorkspaceSize(NamedTuple):
     """Parameters of the size and the launches of a workspace."""
 
-    model: MPMModel
+    model: MPM
     particles: int
     dtype: torch.dtype
     device: torch.device

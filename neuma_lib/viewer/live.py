@@ -23,7 +23,7 @@ from neuma_lib.io.exported import SAME_STEP
 from neuma_lib.mechanics.adaptor import AdaptableLaw
 from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.time_step import step_dependence
-from neuma_lib.sim.model import MPMModel, consecutive
+from neuma_lib.sim.model import MPM, consecutive
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
@@ -111,7 +111,7 @@ class LiveSimulation:
     """Bodies in the box, simulated by a thread.
 
     Args:
-        constants: arguments of `MPMModel`; dt and gravity are ignored.
+        constants: arguments of `MPM`; dt and gravity are ignored.
         start: initial state of the first body, restored by a reset. The simulation runs on its device.
         law: of the first body, on the same device.
         dt: time step of the law's training [s].
@@ -227,10 +227,10 @@ class LiveSimulation:
     # ---- in the thread -----------------------------------------------------------------------------------------------
 
     @property
-    def model(self) -> MPMModel:
+    def model(self) -> MPM:
         """Model of the next steps, with the smallest time step of the laws' trainings."""
         gravity = self.to_box((0.0, -self._strength, 0.0))
-        return MPMModel(**self._constants, dt=min(self._dts), gravity=tuple(gravity.tolist()))
+        return MPM(**self._constants, dt=min(self._dts), gravity=tuple(gravity.tolist()))
 
     def _loop(self) -> None:
         due = time.perf_counter()

@@ -21,7 +21,7 @@ from neuma_lib.io.particles import load_body, with_motion
 from neuma_lib.mechanics.law import Law
 from neuma_lib.methods.base import ModelSource
 from neuma_lib.project.files import SceneFiles, inside
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.viewer import scalars
@@ -97,7 +97,7 @@ class Playground:
     def _try(self, law: Law, dt: float) -> None:
         """Take one step to load kernels, because Warp must not load them in the simulating and the drawing thread at
         the same time."""
-        model = MPMModel(**{**self._constants, "dt": dt})
+        model = MPM(**{**self._constants, "dt": dt})
         with torch.no_grad(), suppress(NonFiniteError):  # the simulation reports it
             rollout(model, law, self._start, steps=1, frames=[1], total=True, skip_free_flight=False)
 

@@ -11,7 +11,7 @@ import trimesh
 from neuma_lib.data.ground_truth import GroundTruth, TrueBody, simulate_ground_truth
 from neuma_lib.geometry.skinning import skinning_matrix
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from studies.capture_benchmark.settings import DemoCapturesConfig
 from studies.capture_benchmark.stage import frame_steps, solid, start, time_step
 
@@ -37,7 +37,7 @@ def simulate_drop(
     initial, dt = item.drops[drop], time_step(demo)
     mesh = solid(item)
     mesh.vertices = start(item, initial, mesh).apply(mesh.vertices)
-    model = MPMModel(grid=settings.grid, dt=dt, gravity=(0.0, -settings.gravity, 0.0))
+    model = MPM(grid=settings.grid, dt=dt, gravity=(0.0, -settings.gravity, 0.0))
     law = analytic_law(item.law.plain(), dt=dt)
     frames = sorted({0, *(int(s) for camera in demo.cameras for s in frame_steps(demo, camera))})
     return simulate_ground_truth(

@@ -211,7 +211,7 @@ def filmed(tmp_path_factory):
     save(root / "photos/9.png", np.full((LENS.height, LENS.width, 3), 90, np.uint8))
     (root / "lenses.json").write_text(json.dumps({"photographs": LENS.plain(), "left": LENS.plain()}))
     (root / "capture.yaml").write_text(
-        "board: {square: 0.03}\nposes: board\nlens: lenses.json\nlongest: 720\n"
+        "board: {square: 0.03}\nposes: board\nlens: lenses.json\nadvanced: {longest: 720}\n"
     )
     return root, true
 

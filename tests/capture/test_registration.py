@@ -12,7 +12,7 @@ from neuma_lib.capture.registration.problem import Found, Problem
 from neuma_lib.capture.registration.registration import first_common, register
 from neuma_lib.capture.registration.rigid_motion import RigidMotion, angle_between, spread_rotations, turned
 from neuma_lib.capture.registration.rigid_views import Body, Pictures
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.errors import InputError
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.rasterizer import rasterize
@@ -72,7 +72,7 @@ def test_pose_velocity_spin_offset_and_gains_are_those_that_were_rendered():
     assert not found.ambiguous and found.rival[0] > 2 and found.spin_told
     x = body.particles @ found.rotation.T + found.translation
     np.testing.assert_allclose(body.mass @ x / body.mass.sum(), found.found.motion.centre, atol=1e-9)
-    throw = Throw.of(found.velocity())
+    throw = InitialMotion.of(found.velocity())
     np.testing.assert_allclose(throw.velocity, found.found.motion.velocity)
     assert (throw.std > 0).all() and (throw.axes == found.axes).all()
     report = json.loads(json.dumps(found.report(), allow_nan=False))

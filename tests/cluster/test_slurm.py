@@ -20,7 +20,7 @@ from neuma_lib.project.timings import core_seconds
 from tests.support.project import SCENE, TABLE, Project, copied, wait_for
 
 # Table 1 with a training that is long enough to be cancelled in the middle; all before it is there.
-LONGER = ("--config", "material={iterations: 400}", "--", TABLE)
+LONGER = ("--config", "training={iterations: 400}", "--", TABLE)
 CHECKPOINT = f"{SCENE}/neuma/checkpoint.pt"
 SCENE_RULES = (
     *("ground_truth", "render_static", "render_dynamic", "gaussians", "mesh", "sampled_particles"),

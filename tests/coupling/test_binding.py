@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from neuma_lib.config.binding import BindingConfig
 from neuma_lib.coupling.particle_binding import _Columns, _Ellipsoids, bind, bind_two_pass
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
@@ -148,7 +148,7 @@ def test_a_particle_off_the_plane_of_its_neighbours_has_a_volume(count):
         torch.testing.assert_close(centre[:2], particles.mean(0)[:2], rtol=0, atol=1e-13)
     law = analytic_law({"elasticity": {"name": "hencky", "E": 5e4, "nu": 0.3}})
     state = State(enlarged, torch.zeros(3, dtype=torch.float64), 1000 * volumes, volumes)
-    path = rollout(MPMModel(16, 1e-3), law, state, steps=2, frames=(2,), skip_free_flight=False)
+    path = rollout(MPM(16, 1e-3), law, state, steps=2, frames=(2,), skip_free_flight=False)
     assert torch.isfinite(path.x).all()
 
 

@@ -23,7 +23,7 @@ from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.density import density_at
 from neuma_lib.project import cases
 from neuma_lib.project.loading import load, merged
-from neuma_lib.sim.model import MPMModel, consecutive
+from neuma_lib.sim.model import MPM, consecutive
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from neuma_lib.splatting.cameras import Cameras
@@ -33,7 +33,7 @@ from tests.support.render_scenes import dense
 ROOT = Path(__file__).resolve().parents[2]
 JELLY = {"elasticity": {"name": "fixed_corotated", "E": 1e5, "nu": 0.2}}
 SPLIT = {"axis": "x", "at": 0.5, "below": 500.0, "above": 1500.0}
-FLOATING = MPMModel(grid=16, dt=1e-3, gravity=(0.0, 0.0, 0.0))
+FLOATING = MPM(grid=16, dt=1e-3, gravity=(0.0, 0.0, 0.0))
 
 
 def solid(x: float, shape: str = "ball", count: int = 150) -> tuple:
@@ -141,7 +141,7 @@ def test_a_coloured_solid_covers_its_outline_in_its_colour():
 
 
 def test_bodies_far_apart_move_as_they_do_alone():
-    model = MPMModel(grid=20, dt=1e-3)
+    model = MPM(grid=20, dt=1e-3)
     bodies = [solid(0.25)[2], solid(0.75)[2]]
     laws = [analytic_law(JELLY), analytic_law({"elasticity": {"name": "hencky", "E": 3e5, "nu": 0.25}})]
     velocities = [[0.0, -3.0, 0.0], [0.0, -2.0, 0.0]]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 
 import imageio.v2 as imageio
@@ -22,7 +20,6 @@ from neuma_lib.evaluation.video import side_by_side, write_gif, write_mp4
 from neuma_lib.geometry.chamfer import chamfer, chamfer_loss, chamfer_sequence
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.paper.published import BALL_PARTICLES, BALL_RADIUS, PAPER
-from neuma_lib.paper.reports import benchmark_table
 from tests.support.errors import refused
 
 
@@ -131,7 +128,7 @@ def test_the_papers_distance_on_its_ball_is_its_floor():
         method: chamfer(*(ball_points(BALL_PARTICLES, BALL_RADIUS, seed, method) for seed in (0, 1)))
         for method in ("jittered", "uniform")
     }
-    assert floors["jittered"] < PAPER["table1"].row("neuma", ["BouncyBall"])[0] < floors["uniform"]
+    assert floors["jittered"] < PAPER["table1"].rows["neuma"][0] < floors["uniform"]
     assert [round(floor, 1) for floor in floors.values()] == [1.1, 1.3]
     volume = 4 / 3 * math.pi * BALL_RADIUS**3
     inside = 2e4 * mean_square_nearest(volume, BALL_PARTICLES)
@@ -203,24 +200,6 @@ def test_unusable_points_and_images_are_named():
         psnr(np.zeros((4, 4, 3)), np.zeros((4, 5, 3)))
     with pytest.raises(InputError, match="smaller than the window"):
         ssim(np.zeros((8, 20, 3)), np.zeros((8, 20, 3)))
-
-
-def test_benchmarks_stand_beside_the_papers():
-    scene = {
-        "shape": "ball", "size": 0.26, "height": 0.28, "velocity": [0.0, -1.92, 0.0], "density": 1000.0,
-        "dt": 1e-3, "steps": 256, "prior": "jelly",
-        "law": {"elasticity": {"name": "fixed_corotated", "E": 3e4, "nu": 0.45}, "plasticity": {"name": "identity"}},
-    }  # fmt: skip
-    thrown = scene | {
-        "velocity": [0.5, -1.0, 0.0],
-        "density": {"axis": "x", "at": 0.5, "below": 1, "above": 2},
-    }
-    table, text = benchmark_table({"BouncyBall": scene, "JellyDuck": thrown, "Own": thrown})
-    rows = {row["benchmark"]: row for row in csv.DictReader(io.StringIO(table))}
-    assert rows["BouncyBall"]["elasticity"] == "fixed corotated: E 30000, nu 0.45"
-    assert rows["BouncyBall"]["dynamics"] == "Bouncy" and rows["Own"]["dynamics"] == ""
-    assert "are the paper's (tab:benchmark_details) for BouncyBall." in text
-    assert "(0.5, -1, 0) (*paper: (0, -1.62, 0)*)" in text and "differ from it for JellyDuck" in text
 
 
 def test_report_table_has_a_line_a_row():

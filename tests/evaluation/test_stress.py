@@ -17,7 +17,8 @@ from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.elasticity import Hencky
 from neuma_lib.mechanics.isotropic import lame
 from neuma_lib.mechanics.law import Law, Plasticity
-from neuma_lib.paper.published import PAPER, PaperTable, Target
+from neuma_lib.paper.claims import Bound
+from neuma_lib.paper.published import OUTSIDE, PAPER, PaperTable
 from neuma_lib.paper.stress_table import stress_table
 from neuma_lib.sim.state import State
 from tests.support.grounding_scene import MODEL, ball
@@ -197,8 +198,8 @@ def test_broken_paths_are_told():
     ],
 )
 def test_a_target_counts_scenes(runs, word):
-    target = Target("within {most:g} % on {count}", "constants", 20.0, count=2)
-    paper = PaperTable("", "Stresses", "", targets=(target,))
+    claim = Bound("within 20 % on 2", "constants", 20.0, count=2, quantity="stress")
+    paper = PaperTable(claims=(claim,))
     chains = [[errors(value) for value in values] for values in runs]
     _, markdown, (verdict,) = table(chains, chains, paper)
     assert verdict.word == word and f"| within 20 % on 2 | **{word}** |" in markdown
@@ -216,29 +217,27 @@ def response_of(inside, band=True):
     ("last", "word"), [((10, 10, 10), "holds"), ((10, 10), "mixed"), ((10, 9, 10), "does not hold")]
 )
 def test_bands_are_judged_by_the_worst_test_of_every_chain(last, word):
-    (target,) = [target for target in PAPER["stress"].targets if target.quantity]
-    target = replace(target, method="constants", count=3)
+    (claim,) = [claim for claim in PAPER["stress"].claims if claim.quantity == OUTSIDE]
+    claim = replace(claim, method="constants", count=3)
     runs = [[errors(0.1)] * len(last)] * 3
     whole = [[response_of(10)] * len(last)] * 2
     responses = {
         "neuma": dict.fromkeys(SCENES, [response_of(3, band=False)] * len(last)),
         "constants": dict(zip(SCENES, [*whole, [response_of(n) for n in last]], strict=True)),
     }
-    text, _, (verdict,) = table(runs, runs, PaperTable("", "Stresses", "", targets=(target,)), responses)
+    text, _, (verdict,) = table(runs, runs, PaperTable(claims=(claim,)), responses)
     rows = {r["method"]: r for r in csv.DictReader(io.StringIO(text)) if r["quantity"] == "outside_band"}
     assert list(rows) == ["constants"], "a law without a band has no row"
     assert float(rows["constants"]["c"]) == pytest.approx(np.mean([100 - 10 * n for n in last]), abs=1e-4)
     assert verdict.word == word, verdict.here
 
 
-def test_targets_of_the_project_are_about_rows_and_columns_of_their_tables():
+def test_bounds_are_about_columns_of_their_tables_and_state_their_numbers():
     for name, paper in PAPER.items():
-        for target in paper.targets:
-            assert set(target.columns) <= set(paper.columns), name
-            assert target.count is None or 0 < target.count <= len(target.columns or paper.columns)
-            assert "{most" in target.statement and ("{count" in target.statement) == (
-                target.count is not None
-            )
+        for bound in (claim for claim in paper.claims if isinstance(claim, Bound)):
+            assert set(bound.columns) <= set(paper.columns), name
+            assert bound.count is None or 0 < bound.count <= len(bound.columns or paper.columns)
+            assert {f"{bound.limit:g}", f"{bound.count or ''}"} <= {*bound.text.split(), ""}, bound.text
 
 
 def test_percentages_are_of_root_mean_squares(elastic):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.fitting.deviation import BLUR, FLOOR, REACH, Deviation, sample_unvisited
 from neuma_lib.fitting.material import PixelLoss, train_material
 from neuma_lib.mechanics.analytic import analytic_law
@@ -141,7 +141,7 @@ def problem():
 
 def train(problem, penalty, **options):
     body, loss = problem
-    settings = MaterialConfig(
+    settings = TrainingConfig(
         iterations=8, lr_elastic=0.02, lr_plastic=0.002, checkpoint_every=3, penalty=penalty
     )
     law = stiff_random_law()

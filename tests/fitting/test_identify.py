@@ -9,7 +9,7 @@ import torch
 
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.laws import LawConfig
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.frame_batches import first_contact
@@ -48,17 +48,17 @@ FLUID = law("hencky", "viscous_flow", viscosity=60)
 
 def settings(families: dict, **options) -> IdentifyConfig:
     families = {name: LawConfig(**spec) for name, spec in families.items()}
-    return IdentifyConfig(families=families, **{"squares": SQUARES, "misplaced": 0.0, **options})
+    return IdentifyConfig(families=families, **{"pyramid": SQUARES, "pose_tolerance": 0.0, **options})
 
 
 def pixel_noise(images: torch.Tensor) -> torch.Tensor:
     return 0.01 * torch.randn(images.shape, generator=torch.Generator().manual_seed(5), dtype=images.dtype)
 
 
-def known(body, std=(0.0,) * 6, v0=V0) -> Throw:
+def known(body, std=(0.0,) * 6, v0=V0) -> InitialMotion:
     """The true throw, up to standard deviations."""
     centre = (body.mass @ body.x0 / body.mass.sum()).numpy()
-    return Throw(np.array(v0), np.zeros(3), centre, np.eye(3), np.array(std))
+    return InitialMotion(np.array(v0), np.zeros(3), centre, np.eye(3), np.array(std))
 
 
 def found_in(spec: dict, families: dict, noise=pixel_noise, throw=None, **options):
@@ -100,7 +100,7 @@ def test_first_frames_that_mislead_are_not_where_the_last_fit_begins(monkeypatch
     monkeypatch.setattr(_Run, "begin", noted)
     truth = law("hencky", "von_mises", E=6e4, nu=0.3, yield_stress=2e3)
     for factor, expected in ((1e6, (1, len(SQUARES) - 1)), (1.2, (3, 0))):
-        assert found_in(truth, {"hencky": ELASTIC}, give_up=factor).best.refined
+        assert found_in(truth, {"hencky": ELASTIC}, prune_factor=factor).best.refined
         assert begun[-1] == expected
 
 
@@ -111,13 +111,13 @@ def test_an_uncertain_throw_is_corrected_and_widens_the_constants():
     off, std = np.array([0.03, -0.03, 0.06]), (0.03, 0.03, 0.06, 0.2, 0.2, 0.2)
     throw = known(ball(), std)
     found = found_in(truth, families, throw=replace(throw, velocity=throw.velocity + off)).best
-    assert (np.abs(found.throws[0].velocity - V0) < np.abs(off) / 3).all()
-    assert (np.abs(found.throws[0].spin) < 0.2).all()
-    assert (found.throws[0].std < std).all() and (found.throws[0].std > 0).all()
+    assert (np.abs(found.motions[0].velocity - V0) < np.abs(off) / 3).all()
+    assert (np.abs(found.motions[0].spin) < 0.2).all()
+    assert (found.motions[0].std < std).all() and (found.motions[0].std > 0).all()
     assert found.values["E"] == pytest.approx(3e4, rel=0.04)
     sure = found_in(truth, families).best
     assert (np.diag(found.covariance) > np.diag(sure.covariance)).all()
-    assert sure.throws[0].std.max() == 0 and sure.as_dict(settings(families))["start"]["v0"] == list(V0)
+    assert sure.motions[0].std.max() == 0 and sure.as_dict(settings(families))["start"]["v0"] == list(V0)
 
 
 def test_two_videos_have_the_constants_in_common_and_a_throw_each():
@@ -127,12 +127,12 @@ def test_two_videos_have_the_constants_in_common_and_a_throw_each():
     v0, off = (0.2, -2.5, 0.3), np.array([0.03, 0.05, 0.0])
     body, seen = video_of(truth, v0, FRAMES[:11])
     throw = known(body, (0.05, 0.05, 0.0, 0.0, 0.0, 0.0), np.array(v0) + off)
-    options = dict(squares=(8, 32))
+    options = dict(pyramid=(8, 32))
     alone = found_in(truth, families, **options)
     both = found_in(truth, families, other_videos=[(throw, body, seen)], **options)
     assert both.best.values["E"] == pytest.approx(3e4, rel=0.02)
     assert both.best.values["nu"] == pytest.approx(0.4, abs=0.02)
-    first, second = both.best.throws
+    first, second = both.best.motions
     assert (first.velocity == V0).all() and first.std.max() == 0
     assert (np.abs(second.velocity - v0) < np.abs(off) / 3 + 1e-12).all() and (second.std[:2] < 0.05).all()
     stds = [{name: std for name, _, std in found.best.quantities(found.settings)} for found in (alone, both)]
@@ -145,7 +145,7 @@ def test_two_videos_have_the_constants_in_common_and_a_throw_each():
 def test_videos_count_alike_however_long():
     """The same video again, in half as many frames: the loss is the mean of both, what is found the same."""
     families, truth = {"hencky": ELASTIC}, law("hencky", E=3e4, nu=0.4)
-    options = dict(squares=(8, 32), frames=33)
+    options = dict(pyramid=(8, 32), frames=33)
     body, half = video_of(truth, V0, FRAMES[::2])
     found = [
         found_in(truth, families, **options),
@@ -188,13 +188,15 @@ def test_a_throw_is_read_moved_and_written():
     """Deviations along the camera's axes are those of the world turned; what is known does not move."""
     axes = [[0, 0, 1], [0, -1, 0], [1, 0, 0]]
     content = {"v0": [1, 2, 3], "angular_velocity": [0, 1, 0], "centre": [0.5, 0.5, 0.5], "camera_axes": axes}
-    throw = Throw.of(content | {"std_camera": [0.1, 0.2, 0.3], "angular_velocity_std_camera": [1, 0, 0]})
+    throw = InitialMotion.of(
+        content | {"std_camera": [0.1, 0.2, 0.3], "angular_velocity_std_camera": [1, 0, 0]}
+    )
     moved = throw.moved(np.array([1.0, 2.0, 0.0, 1.0, 5.0, 5.0]))
     np.testing.assert_allclose(moved.velocity, [1, 1.6, 3.1])
     np.testing.assert_allclose(moved.spin, [0, 1, 1])
-    again = Throw.of(moved.as_dict())
+    again = InitialMotion.of(moved.as_dict())
     assert all(np.array_equal(getattr(again, field), getattr(moved, field)) for field in vars(moved))
-    assert not Throw.of(content).std.any()
+    assert not InitialMotion.of(content).std.any()
     body = ball()
     around = np.cross(moved.spin, body.x0.numpy() - moved.centre)
     np.testing.assert_allclose(moved.of_body(body).v, moved.velocity + around)
@@ -216,7 +218,7 @@ class Begun:
 def test_families_are_left_that_are_far_behind_or_show_what_one_within_them_shows():
     """What is merely no better in blurred images stays: with more constants, of another elasticity, or flowing where a
     body within it as soft as to lie flat does as well."""
-    options = settings({"hencky": ELASTIC}, give_up=3.0)
+    options = settings({"hencky": ELASTIC}, prune_factor=3.0)
     elastic, far = Begun(1.0, ELASTIC, "soft"), Begun(3.1, law("neo_hookean"), "far")
     never_yields, flat = Begun(0.99, PLASTIC, "soft"), Begun(1.2, FLUID, "flat")
     sibling = Begun(1.0, law("fixed_corotated"), "soft")
@@ -242,7 +244,7 @@ def test_fits_learn_of_better_ones_that_began_later():
 def test_a_flow_that_never_yields_shows_the_elastic_body():
     """And one that yields does not, whatever their squared residuals."""
     body, seen = video_of(ELASTIC, V0, FRAMES)
-    chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", particles=0)
+    chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", refined_particles=0)
     video = VideoResiduals(MODEL, known(body), body, seen, chosen)
     runs = [_Run(Family("x", spec), [video], [len(FRAMES)], chosen) for spec in (ELASTIC, PLASTIC, PLASTIC)]
     for run, limit in zip(runs, (1.0, 1e5, 1e3), strict=True):
@@ -257,7 +259,7 @@ def test_frames_after_the_contact_judge():
     """However late the contact is: a share of what follows it, and the others are fitted."""
     body, seen = video_of(ELASTIC, V0, FRAMES)
     for v0, share in ((V0, 0.25), ((0.5, -0.6, 0.0), 0.25), (V0, 0.5)):
-        chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", particles=0)
+        chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", refined_particles=0)
         video = VideoResiduals(MODEL, known(body, v0=v0), body, seen, chosen)
         video.hold_out(Family("hencky", ELASTIC), share)
         path = rollout(MODEL, analytic_law(ELASTIC), body.state(v0), steps=FRAMES[-1], frames=FRAMES)
@@ -381,7 +383,7 @@ def test_nesting_of_families():
 def test_stiffness_that_the_time_step_does_not_bear_has_a_difference_too():
     """At the stiffest that dt bears no small step changes the law: the difference is taken over a long one."""
     body, seen = video_of(ELASTIC, V0, FRAMES)
-    chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", particles=0)
+    chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", refined_particles=0)
     video, family = VideoResiduals(MODEL, known(body), body, seen, chosen), Family("hencky", ELASTIC)
     run = _Run(family, [video], [len(FRAMES)], chosen)
     run._origin = family.unbounded({"E": 1e9, "nu": 0.3})

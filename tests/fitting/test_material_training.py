@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.fitting.material import (
@@ -58,7 +58,7 @@ def test_gradient_of_the_whole_chain_from_adaptor_to_image_loss(problem):
     assert (values[0] - values[1]) / (2 * h) == pytest.approx(slope, rel=1e-5)
 
 
-SETTINGS = MaterialConfig(iterations=12, lr_elastic=0.02, lr_plastic=0.002, checkpoint_every=3)
+SETTINGS = TrainingConfig(iterations=12, lr_elastic=0.02, lr_plastic=0.002, checkpoint_every=3)
 
 
 def train(problem, law=None, settings=SETTINGS, **options):
@@ -179,7 +179,7 @@ def test_recovery_returns_to_the_best_state_as_a_whole(problem, zero_gradients):
 
 def test_training_ends_marked_after_too_many_recoveries(problem):
     messages = []
-    wild = MaterialConfig(
+    wild = TrainingConfig(
         iterations=8, lr_elastic=50.0, lr_plastic=5.0, max_recoveries=3, recovery_growth=1.0
     )
     body, loss = problem
@@ -238,7 +238,7 @@ def test_gaussians_can_be_the_particles(problem):
 
 
 def test_frame_weights_start_with_early_frames_and_end_uniform():
-    settings = MaterialConfig(iterations=90)
+    settings = TrainingConfig(iterations=90)
     first, last = frame_weights(0, 10, settings), frame_weights(60, 10, settings)
     assert first.tolist() == [1, 1, 0.5, 0.5, 0.25, 0.25, 0.125, 0.125, 0.0625, 0.0625]
     assert last.tolist() == [1] * 10

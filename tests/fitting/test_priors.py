@@ -22,8 +22,6 @@ from neuma_lib.mechanics.law import Law, Plasticity
 from neuma_lib.mechanics.neural import PLASTIC_SCALE
 from neuma_lib.mechanics.singular_values import svd3
 
-pytestmark = pytest.mark.core
-
 JELLY = {"elasticity": {"name": "fixed_corotated", "E": 1e5, "nu": 0.2}, "plasticity": {"name": "identity"}}
 PLASTICINE = {
     "elasticity": {"name": "hencky", "E": 3e5, "nu": 0.25},

@@ -11,11 +11,11 @@ from PIL import Image
 
 from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.laws import LawConfig
-from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.config.velocity import VelocityConfig
 from neuma_lib.coupling import particle_gs
 from neuma_lib.coupling.filmed import Filmed
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.fitting.identify import identify
 from neuma_lib.fitting.material import PixelLoss
 from neuma_lib.fitting.structured_fit import from_frame
@@ -290,9 +290,9 @@ def test_what_lies_under_a_transparent_pixel_does_not_count_and_masks_have_no_co
 # ---- identification and velocity
 
 
-def known(body, v0) -> Throw:
+def known(body, v0) -> InitialMotion:
     centre = (body.mass @ body.x0 / body.mass.sum()).numpy()
-    return Throw(np.array(v0), np.zeros(3), centre, np.eye(3), np.zeros(6))
+    return InitialMotion(np.array(v0), np.zeros(3), centre, np.eye(3), np.zeros(6))
 
 
 def law(E=3e4, nu=0.3) -> dict:
@@ -301,7 +301,7 @@ def law(E=3e4, nu=0.3) -> dict:
 
 def identified(body, videos, v0=V0, squares=(8, 24), **options):
     chosen = IdentifyConfig(
-        families={"hencky": LawConfig(**law(6e4))}, squares=squares, misplaced=0.0,
+        families={"hencky": LawConfig(**law(6e4))}, pyramid=squares, pose_tolerance=0.0,
         covariance_from="elastic", gaussian_motion="mean", **options,
     )  # fmt: skip
     return identify(MODEL, known(body, v0), body, videos, chosen).best
@@ -399,6 +399,6 @@ def test_springs_are_fitted_to_staggered_cameras_whose_exposures_overlap(truncat
     loss = PixelLoss(body, videos)
     assert loss.steps == steps and float(loss(path).max()) < 1e-20
     how = SpringsConfig(truncated=truncated, lr_springs=0.05, learn_gap=False)
-    problem = (model, anchored, guess, start, loss, MaterialConfig(iterations=12), how)
+    problem = (model, anchored, guess, start, loss, TrainingConfig(iterations=12), how)
     fitted = fit_springs(*problem, log=lambda _: None)
     assert fitted.stable and fitted.best_loss < 0.1 * fitted.history.loss[0]

@@ -6,8 +6,8 @@ from itertools import pairwise
 import pytest
 import torch
 
-from neuma_lib.config.material import MaterialConfig
 from neuma_lib.config.structured import StructuredConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.fitting.frame_batches import first_contact, held_out_frames
 from neuma_lib.fitting.material import ParticleLoss, PixelLoss, Stretch, train_material
 from neuma_lib.fitting.structured_fit import (
@@ -26,11 +26,9 @@ from neuma_lib.sim.rollout import rollout
 from tests.support.errors import refused
 from tests.support.grounding_scene import MODEL, TRUTH, ball, observe
 
-pytestmark = pytest.mark.core
-
 FRAMES = (0, 50, 60, 70, 80, 90, 100, 110)  # it touches the ground at about 50
 V0 = torch.tensor([0.0, -1.5, 0.0], dtype=torch.float64)
-SETTINGS = MaterialConfig(
+SETTINGS = TrainingConfig(
     iterations=3, rank=None, lr_elastic=0.02, lr_plastic=0.02, warm_up=0, checkpoint_every=1
 )
 STRUCTURED = StructuredConfig(trial_iterations=2, blocks=2)
@@ -146,7 +144,7 @@ def test_the_first_step_on_a_fluid_that_is_too_viscous_lowers_the_loss(viscosity
 
     law = structured_law(spec(1.08), MODEL.dt).double()
     law.attach_adaptor(rank=None)
-    how = MaterialConfig(iterations=2, rank=None, lr_elastic=0.02, lr_plastic=0.04)
+    how = TrainingConfig(iterations=2, rank=None, lr_elastic=0.02, lr_plastic=0.04)
     loss = PixelLoss(body, observe(body, V0, FRAMES, spec(1.0)))
     trained = train_material(MODEL, law, body.state(V0), loss, how, stretch=Stretch(after=24))
     first, second = trained.history.loss

@@ -13,8 +13,6 @@ from neuma_lib.splatting.observation import Observation
 from tests.support.errors import refused
 from tests.support.grounding_scene import MODEL, PRIOR, RADIUS, ball, observe
 
-pytestmark = pytest.mark.core
-
 FRAMES = (0, 4, 8, 12, 16, 20, 60)
 
 

@@ -196,6 +196,7 @@ def test_inside_counts_rays_through_edges_and_corners_once():
 
 
 def test_inside_of_a_letter_spares_its_holes():
+    pytest.importorskip("matplotlib")
     """Beyond a cell of the mesh, membership is the sign of the solid's own distance."""
     letter = shapes.build("letter_B", 0.3, resolution=48)
     assert letter.euler_number == -2  # two holes

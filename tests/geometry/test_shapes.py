@@ -1,5 +1,7 @@
 """Solids of the benchmarks, and their meshes carried by particles."""
 
+from importlib.util import find_spec
+
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -10,7 +12,8 @@ from tests.support.errors import refused
 
 pytestmark = pytest.mark.core
 
-SOLIDS = (*shapes.NAMES, "letter_N", "letter_B")
+NEEDS_FONT = pytest.mark.skipif(find_spec("matplotlib") is None, reason="the font of letters is matplotlib's")
+SOLIDS = (*shapes.NAMES, *(pytest.param(f"letter_{c}", marks=NEEDS_FONT) for c in "NB"))
 
 
 @pytest.mark.parametrize("name", SOLIDS)

@@ -22,7 +22,7 @@ from neuma_lib.mechanics.structured import (
     network,
     structured_law,
 )
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from tests.support.deformations import EYE, deformations, hencky_deviator, rotations, weights_of
@@ -535,7 +535,7 @@ def test_gradient_of_a_rollout(form):
     law = trained(form=form).double()
     x, mass, vol0 = cube(60, side=0.25, centre=(0.5, 0.12, 0.5))
     v, F, C = strained(x)
-    model = MPMModel(14, DT, boundary={"y_min": "sticky"})
+    model = MPM(14, DT, boundary={"y_min": "sticky"})
     parameters = [p for p in law.parameters() if p.requires_grad]
     weight = torch.randn(60, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 

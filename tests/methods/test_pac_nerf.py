@@ -25,7 +25,7 @@ from tests.support.radiance_scenes import kept_for_gradient
 V0 = torch.tensor(benchmark.V0, dtype=torch.float64)
 FRAMES = tuple(range(0, 145, 8))
 SMALL = PacNerfConfig(
-    particles=400, followed=8, velocity_iterations=20, iterations_contact=15, iterations_all=30, most_frames=8
+    particles=400, followed=8, velocity_iterations=20, iterations_contact=15, iterations_all=30, max_frames=8
 )
 ELASTIC = PacFamilyConfig(elasticity={"name": "neo_hookean", "E": 1e4, "nu": 0.3}, fitted=("E", "nu"))
 PLASTIC = PacFamilyConfig(
@@ -334,7 +334,7 @@ def test_bad_input_is_named(carried, loaded):
         fit_pac_nerf(MODEL, carried, video, 0, FamilyConstants(ELASTIC), SMALL)
     with pytest.raises(ValueError, match="fitted"):
         PacFamilyConfig(elasticity={"name": "hencky", "E": 1e5, "nu": 0.3}, fitted=("yield_stress",))
-    with pytest.raises(ValueError, match="not of both"):
+    with pytest.raises(ValueError, match="not both"):
         PacFamilyConfig(elasticity={"name": "hencky", "E": 1e5, "nu": 0.3}, fitted=("E", "mu"))
 
 
@@ -421,7 +421,7 @@ class TestOwnParticles:
     def test_a_file_gives_the_particles_that_the_fit_had(self, tmp_path):
         carried = CarriedField(ball().float(), 1.0, LEAST_OPACITY, SMALL, DENSITY)
         save_field(tmp_path / "field.safetensors", carried.field, {})
-        own = {"spacing": 1.0, "least_opacity": LEAST_OPACITY, "settings": SMALL.plain()}
+        own = {"spacing": 1.0, "min_opacity": LEAST_OPACITY, "settings": SMALL.plain()}
         loaded = CarriedField.load(tmp_path / "field.safetensors", own, DENSITY)
         assert torch.equal(loaded.moving.x, carried.moving.x) and torch.equal(loaded.mass, carried.mass)
         x = carried.moving.x[None] + 0.01

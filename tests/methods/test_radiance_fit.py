@@ -14,7 +14,7 @@ from neuma_lib.methods.pac_nerf.field_options import RadianceConfig
 from neuma_lib.methods.pac_nerf.io import load_field, save_field
 from neuma_lib.methods.pac_nerf.lattice import Lattice, interpolate
 from neuma_lib.methods.pac_nerf.rendering import END_LIGHT, ColourNetwork, Opacity, camera_rays
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from neuma_lib.splatting.cameras import Cameras, look_at
@@ -82,7 +82,7 @@ def test_gradient_from_a_picture_through_motion_to_the_law(wrt):
         E, v = (10**value, torch.tensor([0.2, -2.0, 0.1]).double()) if wrt == "log10 E" else (1e5, value)
         law = analytic_law({"elasticity": {"name": "neo_hookean", "E": E, "nu": 0.3}})
         state = State(x0, v, particles.masses(1000.0), particles.volumes())
-        path = rollout(MPMModel(grid=16, dt=1e-3), law, state, steps=60, frames=[60])
+        path = rollout(MPM(grid=16, dt=1e-3), law, state, steps=60, frames=[60])
         colours, passed = field.render(*particles.seen(path.x[0]), *camera_rays(camera, 0))
         assert passed.min() > 2 * END_LIGHT  # no ray ends early, where the picture has small steps
         weights = torch.linspace(-1, 1, colours.numel()).double().view_as(colours)
@@ -106,7 +106,7 @@ def test_default_settings_reach_25_decibels_inside_the_object():
 
 def test_particles_lie_in_the_body(fit):
     field, report = fit
-    particles = field.particles(SMALL.spacing, SMALL.least_opacity)
+    particles = field.particles(SMALL.spacing, SMALL.min_opacity)
     assert report.particles == len(particles.x)
     assert (raycast.distance(particles.x) < 1.5 * report.voxel).double().mean() > 0.95
     # nearly all of the body is filled

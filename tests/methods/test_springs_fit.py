@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.evaluation.motion import evaluate
 from neuma_lib.fitting.material import PixelLoss
 from neuma_lib.io.checkpoint import Checkpoint
@@ -103,7 +103,7 @@ def test_gradient_of_the_whole_chain_from_springs_to_image_loss(small):
 def test_motion_of_springs_is_recovered_to_a_millimetre(problem):
     assert problem.error(problem.guess()) > 25
     known = SpringsConfig(truncated=False, lr_springs=0.05, learn_gap=False)
-    fitted = problem.fit(MaterialConfig(iterations=150), known)
+    fitted = problem.fit(TrainingConfig(iterations=150), known)
     assert fitted.stable and fitted.best_loss < 1e-3 * fitted.history.loss[0]
     assert problem.error(fitted.springs) < 1.0
 
@@ -111,7 +111,7 @@ def test_motion_of_springs_is_recovered_to_a_millimetre(problem):
 def test_steps_of_single_frames_approach_it(problem):
     """As published; they cost as many renders as the whole gradient, and 18 optimiser steps in place of one."""
     known = SpringsConfig(truncated=True, lr_springs=0.02, learn_gap=False)
-    fitted = problem.fit(MaterialConfig(iterations=12), known)
+    fitted = problem.fit(TrainingConfig(iterations=12), known)
     assert problem.error(fitted.springs) < 2.0
 
 
@@ -127,14 +127,14 @@ def test_motion_of_an_elastic_body_is_recovered_to_a_centimetre():
     springs = Springs.of_modulus(anchored.network, 2e5, DENSITY, 0.1)
     loss = PixelLoss(body, observe(body, V0, frames))
     how = SpringsConfig(truncated=False, lr_springs=0.05)
-    fit_springs(BOX, anchored, springs, start, loss, MaterialConfig(iterations=100), how, log=lambda _: None)
+    fit_springs(BOX, anchored, springs, start, loss, TrainingConfig(iterations=100), how, log=lambda _: None)
     error = (moved(springs, anchored, start, frames).x - path.x).norm(dim=-1)
     assert 1e3 * float(error.square().mean().sqrt()) < 10
 
 
 @pytest.mark.parametrize("truncated", [True, False])
 def test_a_killed_fit_goes_on_to_the_same_bits(small, tmp_path, truncated):
-    settings = MaterialConfig(iterations=4, checkpoint_every=2)
+    settings = TrainingConfig(iterations=4, checkpoint_every=2)
     how = SpringsConfig(truncated=truncated, lr_springs=0.05, learn_resistance=True)
     whole, shown = small.fit(settings, how), []
     checkpoint = Checkpoint(tmp_path / "checkpoint.pt", {"run": 1})
@@ -153,7 +153,7 @@ def test_a_killed_fit_goes_on_to_the_same_bits(small, tmp_path, truncated):
 
 def test_springs_that_run_away_return_to_the_best(small):
     said = []
-    settings = MaterialConfig(iterations=9, max_recoveries=2)
+    settings = TrainingConfig(iterations=9, max_recoveries=2)
     soft = Springs.of_modulus(small.anchored.network, 1e3, DENSITY, 0.1)
     before = copy.deepcopy(soft.state_dict())
     fitted = small.fit(settings, SpringsConfig(truncated=False, lr_springs=90.0), soft, log=said.append)
@@ -163,7 +163,7 @@ def test_springs_that_run_away_return_to_the_best(small):
 
 def test_what_is_not_learned_stays(small):
     how = SpringsConfig(truncated=False, learn_gap=False, lr_springs=0.05)
-    fitted = small.fit(MaterialConfig(iterations=2), how)
+    fitted = small.fit(TrainingConfig(iterations=2), how)
     before, after = (copy.deepcopy(s.state_dict()) for s in (small.guess(), fitted.springs))
     assert {name for name in before if torch.equal(before[name], after[name])} == {"log_damping", "gap"}
 

@@ -119,10 +119,10 @@ def test_random_scenes_and_finer_truths_have_their_verdicts(project, monkeypatch
 
 
 def test_settings_of_the_run_are_told(project, monkeypatch):
-    recorded(project, monkeypatch, "--configfile", "config/three_chains.yaml")
+    recorded(project, monkeypatch, "--configfile", "config/studies/three_chains.yaml")
     table = (project / "docs/table1.md").read_text()
-    assert "default settings (`config/config.yaml`) with `config/three_chains.yaml`. Made by" in table
-    assert "`snakemake --configfile config/three_chains.yaml -- tables figures` and" in table
+    assert "default settings (`config/config.yaml`) with `config/studies/three_chains.yaml`. Made by" in table
+    assert "`snakemake --configfile config/studies/three_chains.yaml -- tables figures` and" in table
 
 
 def test_tables_that_are_not_recorded_are_named(project, monkeypatch):

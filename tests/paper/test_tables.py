@@ -11,9 +11,11 @@ import pytest
 import yaml
 
 from neuma_lib.errors import InputError
-from neuma_lib.paper.published import PAPER, Claim, PaperTable
-from neuma_lib.paper.tables import QUANTITIES, chamfer_table, shown
+from neuma_lib.paper.claims import Claim, Closer, shown
+from neuma_lib.paper.published import PAPER, PaperTable
+from neuma_lib.paper.tables import QUANTITIES, chamfer_table
 from neuma_lib.project.loading import load
+from tests.support.errors import refused
 from tests.support.table_results import run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -45,27 +47,12 @@ def test_table_has_the_papers_rows_and_columns():
     assert float(first["Average"]) == float(first["Median"]) == 102.5 and first["wins"] == "0"
     assert rows["tracer_rmse_mm", "neuma"]["wins"] == "6" and rows["chamfer", "neuma"]["wins"] == ""
     assert table.row("tracer_rmse_mm", "nclaw").mean[list(SCENES).index("SandFish")] == 104
-    text = table.markdown()
-    assert "| NeuMA | 10.0 | 11.0 | 12.0 | 13.0 | 14.0 | 15.0 | 12.5 | 12.5 | 25.0 | 37.5 | 6 of 6 |" in text
-    assert "| *paper* | *56.13* |" in text and "| *12.18* |" in text and "| Sampling floor | 0.50 |" in text
-    assert text.index("| NeuMA | 1.50 |") < text.index("| *paper* | *1.19* |") < text.index("**What holds**")
-    assert (
-        text.index("Tracer RMSE") < text.index("Chamfer")
-        and "1.19 for NeuMA on its ball is essentially its floor" in text
-    )
-    assert "†" not in text and "‡" not in text and "±" not in text.partition("**What holds**")[0]
 
 
 def test_table_is_open_for_more_methods():
     metrics = {"pac_nerf": {scene: [run(30.0)] for scene in SCENES}}
     text = chamfer_table(metrics, {"pac_nerf": "PAC-NeRF"}, SCENES, PAPER["table1"]).markdown()
     assert "| PAC-NeRF | 3.50 |" in text and "| *paper* | *516.30* |" in text and "| *114.80* |" in text
-
-
-def test_a_note_stands_below_the_table_and_its_sign_behind_the_row():
-    metrics = {method: {scene: [run(3.0)] for scene in SCENES} for method in TITLES}
-    text = chamfer_table(metrics, TITLES, SCENES, notes={"neuma": "Mind this."}).markdown()
-    assert text.count("| NeuMA (1) |") == 2 and "| NCLaw |" in text and "\n(1) Mind this.\n" in text
 
 
 def test_what_a_law_gains_over_the_true_one_is_told():
@@ -120,27 +107,17 @@ def test_tables_of_the_paper_are_whole():
         assert tuple(paper.columns) == (*table.scenes, *table.experiments)
         assert set(paper.rows) - {"pac_nerf"} <= set(table.methods)
         for claim in paper.claims:
-            assert {*claim.better, *claim.worse} <= set(table.methods)
-            assert set(claim.columns) <= set(paper.columns)
+            assert claim.methods <= set(table.methods) and set(claim.columns) <= set(paper.columns)
         assert all(len(row) == len(paper.columns) for row in paper.rows.values())
 
 
-def test_diverged_runs_and_averages_with_them_are_marked_and_explained():
+def test_diverged_runs_are_listed_in_the_csv():
     metrics = {
         "nclaw": {"BouncyBall": [run(5.0)], "Other": [run(4.0, **BROKEN)]},
         "neuma": {"BouncyBall": [run(1.0, stable=False)], "Other": [run(2.0)]},
     }
     table = chamfer_table(metrics, TITLES, {"BouncyBall": "Ball", "Other": "Other"}, PAPER["table1"])
-    text = table.markdown()
-    assert "| Method | Ball | Other | Average | Median | 95 % | Last frame | Best in |" in text
-    assert "| NCLaw | 5.0 | 4.0‡ | 4.5‡ | 4.5‡ | 9.0‡ | 13.5‡ | 0 of 2 |" in text
-    assert "| NeuMA | 1.0† | 2.0 | 1.5† |" in text and "| NCLaw | 1.00 | 0.90‡ | 0.95‡ |" in text
-    assert "† The training diverged" in text and "‡ A predicted motion broke off" in text
-    assert (
-        "- NCLaw on Other: particle 7 moved by more than a cell in a step at step 80 of 90; it had more energy than at"
-        " the start after step 60.\n" in text
-    )
-    assert "*paper*" not in text, "the paper has no such column"
+    assert "*paper*" not in table.markdown(), "the paper has no such column"
     rows = rows_of(table)
     assert rows["chamfer", "nclaw"]["diverged"] == "Other"
     assert rows["chamfer", "neuma"]["diverged"] == "BouncyBall"
@@ -161,10 +138,10 @@ def test_that_no_letter_breaks_off_is_judged_by_all_of_them(failing, word):
 
 def test_a_missing_or_broken_cell_is_named():
     column = {"BouncyBall": "BouncyBall"}
-    with pytest.raises(InputError, match="no metrics.json of neuma on BouncyBall"):
+    with pytest.raises(InputError, match="metrics.json of neuma on BouncyBall"):
         chamfer_table({"nclaw": {"BouncyBall": [run(1.0)]}}, TITLES, column)
     broken = {"nclaw": {"BouncyBall": [run(float("nan"))]}}
-    with pytest.raises(InputError, match="nclaw on BouncyBall is nan"):
+    with refused("BouncyBall/nclaw/metrics.json"):
         chamfer_table(broken, {"nclaw": "NCLaw"}, column)
 
 
@@ -174,14 +151,6 @@ def test_several_chains_give_mean_and_standard_deviation():
         "neuma": {"a": [run(1.0), run(2.0), run(3.0)], "b": [run(2.0), run(2.0), run(5.0)]},
     }
     table = chamfer_table(metrics, TITLES, AB)
-    text = table.markdown()
-    # Errors of the chains average 1.5, 2 and 4; of the six, 2 is the median.
-    assert "| NeuMA | 2.0 ± 1.0 | 3.0 ± 1.7 | 2.5 ± 1.3 | 2.0 |" in text
-    assert "| NCLaw | 5.0 ± < 0.1 | 8.0 ± 1.0‡ | 6.5 ± 0.5‡ | 6.0‡ |" in text
-    assert (
-        "± is the standard deviation over 3 chains" in text
-        and "- NCLaw on b, chain 3 of 3: particle 7" in text
-    )
     rows = rows_of(table)
     assert float(rows["tracer_rmse_mm_std", "neuma"]["Average"]) == pytest.approx(1.3229, abs=1e-4)
     assert ("chamfer_floor_std", "floor") not in rows
@@ -217,7 +186,7 @@ def judged(claim: Claim, errors: dict, paper: dict | None = None, columns=AB, **
     return verdict
 
 
-CLOSER = Claim("NeuMA is closer", ("neuma",), ("nclaw",))
+CLOSER = Closer("NeuMA is closer", ("neuma",), ("nclaw",))
 
 
 def test_a_claim_holds_on_average_in_most_columns_and_beyond_the_spread():
@@ -251,7 +220,7 @@ def test_a_claim_needs_average_and_majority():
 
 def test_a_claim_about_groups_is_one_about_all_their_pairs():
     """The worst of the first against the best of the others, in every column and with every spread."""
-    claim = Claim("they are closest", ("neuma", "other"), ("nclaw",), ("b",), by_paper=False)
+    claim = Closer("they are closest", ("neuma", "other"), ("nclaw",), ("b",), by_paper=False)
     errors = {"neuma": [[1] * 3, [1] * 3], "other": [[9] * 3, [2, 3, 4]], "nclaw": [[1] * 3, [6] * 3]}
     verdict = judged(claim, errors)
     assert verdict.word == "holds" and verdict.here.startswith(
@@ -270,7 +239,7 @@ def test_a_held_motion_proves_nothing_for_its_method():
 
 
 def test_verdicts_stand_in_the_table_if_its_rows_do():
-    claims = (CLOSER, Claim("nobody runs this", ("neuma",), ("pac_nerf",)))
+    claims = (CLOSER, Closer("nobody runs this", ("neuma",), ("pac_nerf",)))
     paper = PaperTable("tab:x", "X", "x", claims=claims)
     metrics = {method: {c: [run(value)] for c in AB} for method, value in (("nclaw", 1.0), ("neuma", 2.0))}
     text = chamfer_table(metrics, TITLES, AB, paper).markdown()
@@ -279,12 +248,3 @@ def test_verdicts_stand_in_the_table_if_its_rows_do():
         in text
     )
     assert "nobody runs this" not in text
-
-
-def test_a_note_stands_below_its_table_and_other_systems_beside_the_papers_row():
-    metrics = {"pac_nerf": {scene: [run(30.0)] for scene in SCENES}}
-    paper = PAPER["table1_systems"]
-    text = chamfer_table(metrics, {"pac_nerf": "PAC-NeRF"}, SCENES, paper, note="See elsewhere.").markdown()
-    assert text.rstrip().endswith("\n\nSee elsewhere.") and "| *paper* | *516.30* |" in text
-    plain = chamfer_table(metrics, {"pac_nerf": "PAC-NeRF"}, SCENES, paper)
-    assert plain.markdown() == text.replace("\nSee elsewhere.\n", "")

@@ -15,6 +15,7 @@ from neuma_lib.project import cases
 from neuma_lib.project.capture_scenes import captured_scenes
 from neuma_lib.project.loading import load, read_yaml
 from neuma_lib.project.settings import NO_TRUTH
+from tests.support.errors import refused
 
 
 @pytest.fixture
@@ -41,7 +42,7 @@ def test_a_capture_is_a_scene_and_each_throw_of_it_another(captures):
     found = loaded(captures).scenes
     assert found["mug"].captured.throw is None and found["mug_one"].captured.throw == "one"
     assert found["mug_one"].videos == ("mug_two",) and found["mug_two"].videos == ()
-    assert found["mug_one"].material["views"] == [0, 1]
+    assert found["mug_one"].training["views"] == [0, 1]
     assert found["mug_two"].density == 900 and found["mug_two"].captured.scale == 2
     assert "mug_one" not in loaded(captures).plain_scenes
 
@@ -75,12 +76,12 @@ def test_nobody_knows_the_truth_of_a_capture(captures):
 
 
 def test_two_scenes_of_one_name(captures):
-    with pytest.raises(InputError, match="BouncyBall.*rename"):
+    with refused("scenes.BouncyBall"):
         load({}, captured={"BouncyBall": captured_scenes(captures)["mug"]})
 
 
 def test_other_scenes_need_a_truth():
-    with pytest.raises(InputError, match="law: null stands in scenes of captures only"):
+    with pytest.raises(InputError, match="law: null is for scenes of captures only"):
         load({"scenes": {"BouncyBall": {"law": None}}})
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from neuma_lib.errors import InputError
 from neuma_lib.methods.registry import built_in_presets, methods
 from neuma_lib.project import cases, loading
 from tests.support.errors import refused
@@ -27,15 +28,15 @@ def test_a_name_holds_a_preset_and_options(loaded):
     ("name", "message"),
     [
         ("neumo", "no method 'neumo'; did you mean neuma"),
-        ("neuma+rank", "write variants as +key=value"),
-        ("neuma+rank=", "write variants as +key=value"),
+        ("neuma+rank", "a variant of a method is written +key=value"),
+        ("neuma+rank=", "a variant of a method is written +key=value"),
         ("neuma+rank=4+rank=8", "'rank' is given twice"),
-        ("neuma+ranks=4", "no setting 'ranks'; did you mean rank"),
-        ("neuma+anchors=50", "no setting 'anchors'"),
-        ("neuma+form=energy", "no setting 'form'"),
-        ("spring_gaus+margin=0", "no setting 'margin'"),
-        ("neuma+guesses=prior", "no setting 'guesses'"),
-        ("constants+prior=sand", "no setting 'prior'"),
+        ("neuma+ranks=4", "no option 'ranks'; did you mean rank"),
+        ("neuma+anchors=50", "no option 'anchors'"),
+        ("neuma+form=energy", "no option 'form'"),
+        ("spring_gaus+margin=0", "no option 'margin'"),
+        ("neuma+guesses=prior", "no option 'guesses'"),
+        ("constants+prior=sand", "no option 'prior'"),
     ],
 )
 def test_names_with_mistakes_are_refused(loaded, name, message):
@@ -54,8 +55,9 @@ def test_a_wrong_value_names_the_variant(loaded, name):
 def test_options_are_layers_of_section_scene_preset_and_variant(raw):
     loaded = changed(
         raw,
-        material={"lr_elastic": 1.0, "lr_plastic": 1.0, "alpha": 1.0, "iterations": 1},
-        scenes={"BouncyBall": {"material": {"lr_plastic": 2.0, "alpha": 2.0, "iterations": 2}}},
+        training={"lr_elastic": 1.0, "lr_plastic": 1.0, "iterations": 1},
+        advanced={"training.alpha": 1.0},
+        scenes={"BouncyBall": {"training": {"lr_plastic": 2.0, "alpha": 2.0, "iterations": 2}}},
         methods={"neuma": {"options": {"alpha": 3.0, "iterations": 3}}},
     )
     options = cases.case(loaded, "BouncyBall", "neuma+iterations=4").options
@@ -103,6 +105,25 @@ def test_presets_with_mistakes_name_the_key(raw, preset, where):
     assert where in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "new"),
+    [
+        ("law", "identified", "kind"),
+        ("material", {"rank": 4}, "options"),
+        ("structured", {"margin": 0.1}, "options"),
+        ("springs", {"anchors": 9}, "options"),
+        ("pac_nerf", {"guesses": "prior"}, "options"),
+        ("prior", "sand", "options.prior"),
+        ("trained_as", "neuma", "same_fit_as"),
+        ("judged_on", "carrier", "evaluate_on"),
+    ],
+)
+def test_keys_of_former_versions_name_the_new_one(raw, key, value, new):
+    with refused(f"methods.mine.{key}") as caught:
+        changed(raw, methods={"mine": {"title": "Mine", key: value}})
+    assert caught.value.problem.endswith(f" to methods.mine.{new}")
+
+
 def test_methods_that_tables_name_exist(raw):
     table = {"scenes": ["BouncyBall"], "methods": ["neuma+law_from=ClayCatt"]}
     with refused("tables.new"):
@@ -128,7 +149,7 @@ class TestPriors:
             {"priors": {"laws": {"identified": law}}},
             {"scenes": {"ClayCat": {"prior": "identified"}}},
         ):
-            with refused():
+            with pytest.raises(InputError):
                 changed(raw, **changes)
 
     def test_a_structured_method_corrects_an_analytic_law(self, raw, loaded):
@@ -154,7 +175,7 @@ class TestPriors:
         assert name(loaded, "BouncyBall", "neuma_structured") == "identified.json"
         assert name(loaded, "BouncyBall", "neuma_structured+views=0,2") == "identified+views=0,2.json"
         assert name(loaded, "BouncyBall", "constants+views=1") == "identified+views=1.json"
-        own = changed(raw, identify={"views": [0, 1]}, scenes={"ClayCat": {"material": {"views": [1, 2]}}})
+        own = changed(raw, identify={"views": [0, 1]}, scenes={"ClayCat": {"training": {"views": [1, 2]}}})
         assert name(own, "BouncyBall", "neuma_structured+views=0,1") == "identified.json"
         assert name(own, "ClayCat", "constants") == "identified+views=1,2.json"
 
@@ -163,7 +184,7 @@ class TestLawFrom:
     """A model that is obtained in one scene moves another."""
 
     def test_everything_about_the_law_is_of_its_scene(self, raw):
-        scenes = {"ClayCat": {"material": {"iterations": 7, "covariance_from": "total"}}}
+        scenes = {"ClayCat": {"training": {"iterations": 7, "covariance_from": "total"}}}
         loaded = changed(raw, scenes=scenes)
         found = cases.case(loaded, "BouncyBall+seed=2", "neuma+law_from=ClayCat+rank=4")
         assert (found.scene, found.moved, found.name) == (
@@ -171,7 +192,7 @@ class TestLawFrom:
             "BouncyBall+seed=2",
             "neuma+rank=4",
         )
-        assert found.prior == "plasticine" and not found.learns_there
+        assert found.prior == "plasticine" and not found.learned_from_moved_scene
         assert found.options == cases.case(loaded, "ClayCat+seed=2", "neuma+rank=4").options
         assert found.product() == "results/ClayCat+seed=2/neuma+rank=4/adaptor.safetensors"
         true = cases.case(loaded, "BouncyBall", "true_law+law_from=ClayCat")
@@ -213,4 +234,4 @@ def test_every_method_states_its_files_without_torch(loaded):
         found = cases.case(loaded, "ClayCat", name)
         assert all(isinstance(path, str) for path in found.source().paths)
         assert bool(found.method.product) == bool(found.method.fit_inputs(found))
-        assert found.method is methods()[found.method.name]
+        assert type(found.method) is type(methods()[found.method.name])

@@ -65,7 +65,8 @@ def main(inputs, output, params, run):
     burn(0.5)
 
 burn(1.0)
-run_script(main, SimpleNamespace(rule="rule", wildcards=[], log=[{str(log)!r}], input=0, output=0, params=0))
+snakemake = SimpleNamespace(rule="rule", wildcards=[], log=[{str(log)!r}], config={{}}, input=0, output=0, params=0)
+run_script(main, snakemake)
 """
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0 and "core seconds" not in done.stderr

@@ -8,7 +8,7 @@ from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.analytic_fused import fusible, side_by_side
 from neuma_lib.sim.batch import rollout_batch
 from neuma_lib.sim.memory import MemoryPlan
-from neuma_lib.sim.model import Body, MPMModel
+from neuma_lib.sim.model import MPM, Body
 from neuma_lib.sim.rollout import RolloutFunction, rollout
 from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import State
@@ -17,7 +17,7 @@ from tests.support.sim_scenes import DT, SPECS, cube, make_law, strained
 
 pytestmark = pytest.mark.core
 
-MODEL = MPMModel(16, DT)
+MODEL = MPM(16, DT)
 FRAMES = (0, 10, 25, 40)
 RUN = dict(steps=FRAMES[-1], frames=FRAMES)
 PARTS = ("x", "v", "F", "C")
@@ -122,7 +122,7 @@ def test_one_that_flies_away_leaves_the_others_alone():
 
 def test_every_copy_has_its_own_start():
     """Other velocities, a spin, a strained body; free flight ends for all with the first contact."""
-    plain, spin = falling(), State.thrown(*cube(300), velocity=(0.0, -1.0, 0.0), spin=(3.0, 5.0, -2.0))
+    plain, spin = falling(), State.rigid(*cube(300), velocity=(0.0, -1.0, 0.0), spin=(3.0, 5.0, -2.0))
     sideways = falling(velocity=(2.0, -1.0, -1.0))
     v, F, C = strained(plain.x)
     bent = State(plain.x, v, plain.mass, plain.vol0, F, C)

@@ -7,7 +7,7 @@ import torch
 
 from benchmarks import torch_simulation
 from neuma_lib.sim.memory import MemoryPlan, plan_memory
-from neuma_lib.sim.model import Body, MPMModel, contact_clearance
+from neuma_lib.sim.model import MPM, Body, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
@@ -15,9 +15,9 @@ from tests.support.sim_scenes import DT, cube, make_law, strained
 
 pytestmark = pytest.mark.core
 
-IN_THE_AIR = MPMModel(14, DT)
-ON_A_STICKY_FLOOR = MPMModel(14, DT, boundary={"y_min": "sticky"})  # stops its nodes always: no switch
-ON_A_RELEASED_FLOOR = MPMModel(14, DT, boundary={"y_min": "sticky"}, walls="released")
+IN_THE_AIR = MPM(14, DT)
+ON_A_STICKY_FLOOR = MPM(14, DT, boundary={"y_min": "sticky"})  # stops its nodes always: no switch
+ON_A_RELEASED_FLOOR = MPM(14, DT, boundary={"y_min": "sticky"}, walls="released")
 TOUCHING = 0.12
 """Height [m] at which the cube of `scene` is in the floor."""
 COUNT = 60
@@ -139,7 +139,7 @@ def assert_gradients_match(model, law, start, mass, vol0, frames, size=1e-6, **o
 def test_finite_differences_through_a_bounce(boundary):
     """From free flight to the way back, with respect to x0, v0, F0 and C0; nodes start and stop on the way."""
     start, mass, vol0 = falling()
-    model, law, frames = MPMModel(14, DT, boundary=boundary), make_law("hencky"), (0, 40, 100)
+    model, law, frames = MPM(14, DT, boundary=boundary), make_law("hencky"), (0, 40, 100)
     path = simulate(model, law, start, mass, vol0, frames)
     assert contact_clearance(model, path[0][0]) > 0 > contact_clearance(model, path[0][1])
     assert boundary == "sticky" or path[1][2, :, 1].mean() > 0.5
@@ -153,7 +153,7 @@ def test_finite_differences_of_the_total_deformation_where_a_body_flows(name, si
     A law without a yield point has no switches, so that a larger step can stand out of the round-off.
     """
     start, mass, vol0 = falling()
-    model, law, frames = MPMModel(14, DT), make_law(name), (0, 40, 100)
+    model, law, frames = MPM(14, DT), make_law(name), (0, 40, 100)
     x, _, F, _, F_total = simulate(model, law, start, mass, vol0, frames, total=True)
     assert contact_clearance(model, x[0]) > 0 > contact_clearance(model, x[1])
     assert (F_total[2] - F[2]).abs().max() > 0.1
@@ -184,7 +184,7 @@ def test_total_deformation_equals_torch_twin(name, cache_bytes):
 def test_carrying_the_total_deformation_changes_nothing_else():
     """States, and gradients of a loss that does not read it, are the same bytes."""
     start, mass, vol0 = scene(TOUCHING)
-    law, model, frames = make_law("von_mises"), MPMModel(14, DT), (0, 3, 12)
+    law, model, frames = make_law("von_mises"), MPM(14, DT), (0, 3, 12)
     for options in ({}, {"cache_bytes": 0}):
         found = []
         for total in (False, True):
@@ -199,7 +199,7 @@ def corner(walls="outside"):
     """A model whose walls differ, and a cube in the corner where three of them meet."""
     boundary = {"y_min": "no_slip", "x_min": "slip", "z_min": "sticky"}
     thickness = {"wall_cells": 2} if walls == "released" else {}
-    model = MPMModel(14, DT, boundary=boundary, walls=walls, **thickness)
+    model = MPM(14, DT, boundary=boundary, walls=walls, **thickness)
     x, mass, vol0 = cube(COUNT, side=0.25, centre=3 * (0.22 if walls == "released" else TOUCHING,))
     return model, (x, *strained(x)), mass, vol0
 
@@ -225,7 +225,7 @@ def test_equals_torch_twin(name, cache_bytes, walls):
 
 def test_pressed_against_the_end_of_the_grid():
     """Particles that the released walls clamp where the stencil ends: states and gradients of the torch twin."""
-    model = MPMModel(14, 2e-3, boundary="slip", walls="released")
+    model = MPM(14, 2e-3, boundary="slip", walls="released")
     x, mass, vol0 = cube(COUNT, side=0.2, centre=(0.5, 0.18, 0.5))
     _, F, C = strained(x)
     v = torch.tensor([0.3, -8.0, 0.1], dtype=x.dtype).repeat(COUNT, 1)
@@ -256,7 +256,7 @@ def test_what_is_cached_does_not_change_the_gradient():
     start, mass, vol0 = scene(TOUCHING)
     law = make_law("neural")
     parameters = trainable(law)
-    model = MPMModel(14, DT)
+    model = MPM(14, DT)
     step_bytes = 8 * (18 * COUNT + 8 * model.nodes**3)
     half_way = 12 * step_bytes + 7 * 2000 * COUNT
     everything, *others = (
@@ -277,7 +277,7 @@ def test_checkpoints_do_not_change_the_gradient(cache_bytes, segment, total):
     start, steps = (x, *strained(x)), 13
     law = make_law("neural")
     parameters = trainable(law)
-    model, frames = MPMModel(9, DT), (0, 3, 7, steps)
+    model, frames = MPM(9, DT), (0, 3, 7, steps)
     options = dict(cache_bytes=cache_bytes, total=total)
     _, expected = gradients(model, law, start, mass, vol0, frames, parameters, **options)
     state, step = 8 * (33 if total else 24) * len(x), 8 * (18 * len(x) + 8 * model.nodes**3)
@@ -294,7 +294,7 @@ def test_checkpoints_do_not_change_the_gradient(cache_bytes, segment, total):
 def test_too_little_memory():
     start, mass, vol0 = scene(TOUCHING)
     with refused("memory"):
-        gradients(MPMModel(14, DT), make_law("neural"), start, mass, vol0, (13,), memory=1000)
+        gradients(MPM(14, DT), make_law("neural"), start, mass, vol0, (13,), memory=1000)
 
 
 def test_backward_twice():
@@ -302,7 +302,7 @@ def test_backward_twice():
     start, mass, vol0 = scene(TOUCHING)
     law = make_law("neural")
     parameters = trainable(law)
-    model = MPMModel(14, DT)
+    model = MPM(14, DT)
     loss = random_loss()(simulate(model, law, start, mass, vol0, (3, 12), cache_bytes=math.inf))
     first = torch.autograd.grad(loss, parameters, retain_graph=True)
     random_loss()(simulate(model, law, start, mass, vol0, (3, 12))).backward()
@@ -330,7 +330,7 @@ def test_frames_add_up():
 @pytest.mark.parametrize("frames", [(3, 8), (5, 40)], ids=["in flight", "through contact"])
 def test_gradient_through_a_skipped_flight(frames):
     """Closed form and simulation have the same gradient with respect to x0, one common v0 and the weights."""
-    model = MPMModel(14, 2e-3)
+    model = MPM(14, 2e-3)
     x0, mass, vol0 = cube(COUNT, side=0.25, centre=(0.5, 0.2, 0.5))
     law = make_law("neural")
     parameters = trainable(law)

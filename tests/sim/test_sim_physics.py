@@ -7,7 +7,7 @@ from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Law, Plasticity
 from neuma_lib.sim.free_flight import free_flight_steps
-from neuma_lib.sim.model import WALLS, Body, MPMModel, as_bodies, contact_clearance
+from neuma_lib.sim.model import MPM, WALLS, Body, as_bodies, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, cross_matrix
 from neuma_lib.sim.workspace import Workspace, WorkspaceSize
@@ -27,7 +27,7 @@ from tests.support.sim_scenes import (
 
 pytestmark = pytest.mark.core
 
-WEIGHTLESS = MPMModel(16, DT, gravity=(0.0, 0.0, 0.0))
+WEIGHTLESS = MPM(16, DT, gravity=(0.0, 0.0, 0.0))
 EPS = {torch.float32: 1.2e-7, torch.float64: 2.2e-16}
 
 
@@ -36,7 +36,7 @@ EPS = {torch.float32: 1.2e-7, torch.float64: 2.2e-16}
 @pytest.mark.parametrize("name", EVERY_LAW)
 def test_free_fall(name, dtype, skip):
     """x_n = x0 + v0 n dt + g dt^2 n (n + 1) / 2 and F = I, to round-off, in every frame."""
-    model = MPMModel(16, DT, gravity=(1.0, -9.8, 0.5))
+    model = MPM(16, DT, gravity=(1.0, -9.8, 0.5))
     x0, mass, vol0 = cube(dtype=dtype)
     v0 = torch.tensor([0.3, 0.8, -0.2], dtype=dtype)
     frames = (0, 1, 17, 60)
@@ -104,7 +104,7 @@ def test_a_thrown_body_has_the_momenta_of_its_velocity_and_spin():
     x, _, vol0 = cube(side=0.25)
     mass = 1e3 * vol0 * (1 + 3 * (x[:, 0] > x[:, 0].mean()))
     velocity, spin = torch.tensor([[0.3, -1.0, 0.2], [2.0, -3.0, 4.0]], dtype=x.dtype)
-    state = State.thrown(x, mass, vol0, velocity, spin)
+    state = State.rigid(x, mass, vol0, velocity, spin)
     torch.testing.assert_close(linear_momentum(mass, state.v), mass.sum() * velocity)
     arm = x - mass @ x / mass.sum()
     inertia = (mass * arm.square().sum(1)).sum() * torch.eye(3).double() - (mass[:, None] * arm).mT @ arm
@@ -112,7 +112,7 @@ def test_a_thrown_body_has_the_momenta_of_its_velocity_and_spin():
     torch.testing.assert_close(found, inertia @ spin)
     # C is the gradient of v: it takes v from one particle to another.
     torch.testing.assert_close(state.v[7] + state.C[7] @ (x[3] - x[7]), state.v[3])
-    about_a_corner = State.thrown(x, mass, vol0, velocity, spin, centre=x[0])
+    about_a_corner = State.rigid(x, mass, vol0, velocity, spin, centre=x[0])
     torch.testing.assert_close(about_a_corner.v[0], velocity)
 
 
@@ -128,7 +128,7 @@ def test_free_rotation_of_a_stiff_cube():
     x0 = c + torch.cartesian_prod(ticks, ticks, ticks)
     vol0 = torch.full((len(x0),), 0.2**3 / len(x0), dtype=x0.dtype)
     velocity, spin = torch.tensor([[0.2, 0.4, -0.1], [1.5, -2.0, 2.5]], dtype=x0.dtype)
-    model, state = MPMModel(16, dt), State.thrown(x0, DENSITY * vol0, vol0, velocity, spin)
+    model, state = MPM(16, dt), State.rigid(x0, DENSITY * vol0, vol0, velocity, spin)
     assert not free_flight_steps(model, as_bodies(law, len(x0)), state, steps)
     path = rollout(model, law, state, steps=steps, frames=(steps,))
     assert contact_clearance(model, path.x) > 0
@@ -152,7 +152,7 @@ def test_thrown_at_a_wall(wall, condition):
     that does not hold only takes momentum that points into it, and no wall gives energy.
     """
     axis, side = WALLS.index(wall) // 2, 1 if wall.endswith("max") else -1
-    model = MPMModel(16, DT, gravity=(0.0, 0.0, 0.0), boundary=condition)
+    model = MPM(16, DT, gravity=(0.0, 0.0, 0.0), boundary=condition)
     centre = [0.5, 0.5, 0.5]
     centre[axis] = 0.69 if side > 0 else 0.25
     x0, mass, vol0 = cube(centre=centre, side=0.2)
@@ -178,14 +178,14 @@ def test_thrown_at_a_wall(wall, condition):
 
 
 def test_walls_have_their_own_conditions():
-    model = MPMModel(16, DT, boundary={"y_min": "slip", "x_max": "sticky"})
+    model = MPM(16, DT, boundary={"y_min": "slip", "x_max": "sticky"})
     assert model.boundary == ("no_slip", "sticky", "slip", "no_slip", "no_slip", "no_slip")
-    assert hash(model) == hash(MPMModel(16, DT, boundary=model.boundary))
+    assert hash(model) == hash(MPM(16, DT, boundary=model.boundary))
 
 
 def test_free_flight_ends_where_contact_begins():
     """The simulated body leaves its parabola in the step that starts inside the contact zone, not before."""
-    model = MPMModel(16, 2e-3)
+    model = MPM(16, 2e-3)
     x0, mass, vol0 = cube(centre=(0.5, 0.4, 0.5))
     v0 = torch.tensor([0.0, -2.0, 0.0], dtype=x0.dtype)
     steps = 60
@@ -205,7 +205,7 @@ def test_free_flight_ends_where_contact_begins():
 
 @pytest.mark.parametrize("name", ["fixed_corotated", "drucker_prager", "neural"])
 def test_skipping_the_flight_changes_nothing(name):
-    model = MPMModel(16, 2e-3)
+    model = MPM(16, 2e-3)
     x0, mass, vol0 = cube(centre=(0.5, 0.35, 0.5))
     v0 = torch.tensor([0.3, -2.0, 0.1], dtype=x0.dtype)
     tracers, _, _ = cube(50, side=0.2, centre=(0.5, 0.35, 0.5), seed=1)
@@ -229,7 +229,7 @@ def test_skipping_the_flight_changes_nothing(name):
 
 def test_tracers_follow_the_body():
     """A tracer on a particle stays on it, one in empty space stays where it is, and none is felt."""
-    model = MPMModel(16, 2e-3)
+    model = MPM(16, 2e-3)
     x0, mass, vol0 = cube(centre=(0.5, 0.3, 0.5))
     v0 = torch.tensor([0.3, -2.0, 0.1], dtype=x0.dtype)
     away = torch.tensor([[0.9, 0.9, 0.9]], dtype=x0.dtype)
@@ -245,7 +245,7 @@ def test_tracers_follow_the_body():
 
 def test_bodies_apart_do_not_feel_each_other():
     """Two bodies with two laws on one grid move as each would alone."""
-    model = MPMModel(20, DT)
+    model = MPM(20, DT)
     starts = [
         cube(200, side=0.2, centre=centre, seed=i)
         for i, centre in enumerate([(0.3, 0.2, 0.3), (0.7, 0.2, 0.7)])
@@ -294,7 +294,7 @@ def test_same_start_same_bytes():
     def run(count, **options):
         x = x0[:count].clone().requires_grad_()
         state = State(x, v0, mass[:count], vol0[:count])
-        path = rollout(MPMModel(16, DT), law, state, steps=50, frames=(5, 50), **options)
+        path = rollout(MPM(16, DT), law, state, steps=50, frames=(5, 50), **options)
         (path.x**2).sum().backward()
         return path.x.detach(), path.F.detach(), x.grad
 
@@ -306,14 +306,14 @@ def test_same_start_same_bytes():
 
 
 def test_courant_number_names_the_largest_step():
-    model = MPMModel(24, 5e-3)
+    model = MPM(24, 5e-3)
     law = make_law("hencky")
     with refused("dt") as error:
         model.check_courant(law, DENSITY)
     stable = float(error.value.remedy.split("dt <= ")[-1].split()[0])
-    assert MPMModel(24, 0.99 * stable).check_courant(law, DENSITY) == pytest.approx(0.792, rel=0.01)
+    assert MPM(24, 0.99 * stable).check_courant(law, DENSITY) == pytest.approx(0.792, rel=0.01)
     with pytest.raises(InputError):
-        MPMModel(24, 1.01 * stable).check_courant(law, DENSITY)
+        MPM(24, 1.01 * stable).check_courant(law, DENSITY)
 
 
 @pytest.mark.parametrize(
@@ -333,7 +333,7 @@ def test_courant_number_names_the_largest_step():
 )
 def test_wrong_model_is_named(settings, where):
     with refused(where):
-        MPMModel(**{"grid": 16, "dt": DT, **settings})
+        MPM(**{"grid": 16, "dt": DT, **settings})
 
 
 @pytest.mark.parametrize(
@@ -362,7 +362,7 @@ def test_wrong_start_is_named(change, where):
     for key, make in change.items():
         (state if key in (*state, "F") else rest)[key] = make(x0)
     with refused(where):
-        rollout(MPMModel(16, DT), state=State(**state), **rest)
+        rollout(MPM(16, DT), state=State(**state), **rest)
 
 
 class BreaksAt(Plasticity):
@@ -386,7 +386,7 @@ def test_nan_names_step_and_particle(last):
     law = Law(make_law("hencky").elasticity, BreaksAt(7, 123), "brittle")
     with pytest.raises(NonFiniteError, match="brittle") as error:
         state = State(x0, x0 * 0, mass, vol0)
-        rollout(MPMModel(16, DT), law, state, steps=20, frames=(last,), skip_free_flight=False)
+        rollout(MPM(16, DT), law, state, steps=20, frames=(last,), skip_free_flight=False)
     # F becomes NaN in step 7; its stress reaches the velocities, of neighbours too, one step later.
     assert error.value.step == (7 if last == 7 else 8)
     assert "dt" in str(error.value)
@@ -400,13 +400,13 @@ def test_instability_is_an_error():
     v0 = torch.tensor([0.0, -3.0, 0.0], dtype=x0.dtype)
     with pytest.raises(NonFiniteError, match="smaller dt"):
         state = State(x0, v0, mass, vol0)
-        rollout(MPMModel(16, 4e-2), make_law("neo_hookean"), state, steps=200, frames=(200,))
+        rollout(MPM(16, 4e-2), make_law("neo_hookean"), state, steps=200, frames=(200,))
 
 
 def test_hold_last_repeats_the_last_frame():
     x0, mass, vol0 = cube()
     state = State(x0, x0[0] * 0, mass, vol0)
-    path = rollout(MPMModel(16, DT), make_law("hencky"), state, steps=5, frames=(0, 5))
+    path = rollout(MPM(16, DT), make_law("hencky"), state, steps=5, frames=(0, 5))
     held = path.hold_last(3)
     assert held.frames == (0, 5, 5, 5, 5) and held.tracers is None
     assert torch.equal(held.x[1:], path.x[1:].expand(4, -1, -1))

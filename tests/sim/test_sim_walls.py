@@ -7,7 +7,7 @@ import torch
 
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.sim.model import CONDITIONS, WALLS, MPMModel
+from neuma_lib.sim.model import CONDITIONS, MPM, WALLS
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from tests.support.sim_scenes import DENSITY
@@ -61,7 +61,7 @@ def test_a_ball_comes_back_in_shape(wall, condition, form):
     Squeezed to half its height it comes back vibrating; so it is stopped after the bounce and may ring down. What is
     left is what the wall did to it for good: a tenth of the radius with released walls.
     """
-    model = MPMModel(24, DT, gravity=WEIGHTLESS, boundary=condition, walls=form)
+    model = MPM(24, DT, gravity=WEIGHTLESS, boundary=condition, walls=form)
     centre, towards = before(wall, 0.08)
     x0, mass, vol0 = ball(model.grid, centre)
     law = analytic_law(SOFT, dt=DT)
@@ -85,7 +85,7 @@ def test_a_hard_throw_leaves_no_particle_outside(wall, condition):
     nodes only. Its distance d from there, in cells, shrinks in a step by d^2 / 2 times the cells that the nearest free
     node moves, so it stays positive.
     """
-    model = MPMModel(16, DT, gravity=WEIGHTLESS, boundary=condition)
+    model = MPM(16, DT, gravity=WEIGHTLESS, boundary=condition)
     centre, towards = before(wall, 0.05)
     x0, mass, vol0 = ball(model.grid, centre)
     aside = (1 - towards.abs()) * torch.tensor([3.0, 2.0, -2.0])
@@ -102,7 +102,7 @@ def test_a_hard_throw_leaves_no_particle_outside(wall, condition):
 
 def test_a_particle_that_leaves_the_grid_stops_the_run():
     """One whose affine velocity throws a node further than its own velocity tells: the message names it."""
-    model = MPMModel(16, DT, gravity=WEIGHTLESS, boundary="sticky")
+    model = MPM(16, DT, gravity=WEIGHTLESS, boundary="sticky")
     x = torch.tensor([[0.5, 0.5, 0.5], [0.5, -model.dx, 0.5]])
     C = torch.zeros(2, 3, 3)
     C[1, 1, 1] = (
@@ -122,7 +122,7 @@ def test_bodies_rest_at_the_wall_of_the_cube(wall, E, fraction):
     towards = before(wall, 0.0)[1]
     for grid in (16, 24):
         dt = 0.3 / (grid * math.sqrt(2.5 * E / DENSITY))
-        model = MPMModel(grid, dt, gravity=tuple(9.8 * towards.tolist()[a] for a in range(3)))
+        model = MPM(grid, dt, gravity=tuple(9.8 * towards.tolist()[a] for a in range(3)))
         x0, mass, vol0 = ball(grid, before(wall, model.free_range[0])[0])
         law = analytic_law({"elasticity": {"name": "fixed_corotated", "E": E, "nu": 0.4}}, dt=dt)
         steps = round(0.6 / dt)
@@ -135,7 +135,7 @@ def test_bodies_rest_at_the_wall_of_the_cube(wall, E, fraction):
 
 def bounce(grid: int, E: float = 3e4) -> tuple[float, float]:
     """Lowest place [cells] of a particle of a ball thrown down, and height [m] that its centre comes back to."""
-    model = MPMModel(grid, DT)
+    model = MPM(grid, DT)
     x0, mass, vol0 = ball(grid, (0.5, RADIUS + 0.15, 0.5))
     state = State(x0, torch.tensor([0.0, -1.92, 0.0]), mass, vol0)
     law = analytic_law({"elasticity": {"name": "fixed_corotated", "E": E, "nu": 0.45}}, dt=DT)

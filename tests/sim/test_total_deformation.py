@@ -3,12 +3,13 @@
 import pytest
 import torch
 
-from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation import motion
 from neuma_lib.fitting.material import PixelLoss, train_material
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.neural import neural_law
+from neuma_lib.methods.model import LawOnGrid
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from tests.support.grounding_scene import MODEL, ball, observe
@@ -100,8 +101,8 @@ def test_evaluation_carries_it(body):
     law = analytic_law(PLASTIC)
     tracers = body.x0[:20]
     truth = tracers.expand(len(FRAMES), -1, -1)
-    elastic = motion.evaluate(MODEL, law, body.state(V0), FRAMES, truth, truth, tracers)
-    total = motion.evaluate(MODEL, law, body.state(V0), FRAMES, truth, truth, tracers, total=True)
+    elastic = motion.evaluate(MODEL, LawOnGrid(law), body.state(V0), FRAMES, truth, truth, tracers)
+    total = motion.evaluate(MODEL, LawOnGrid(law), body.state(V0), FRAMES, truth, truth, tracers, total=True)
     assert elastic.path.F_total is None
     assert total.metrics == elastic.metrics and torch.equal(total.tracers, elastic.tracers)
     assert total.path.frames == FRAMES and torch.equal(total.path.F, elastic.path.F)
@@ -128,7 +129,7 @@ def learning_law():
 
 def trained(body, iterations=3, total=False, **options):
     loss = PixelLoss(body, observe(body, V0, FRAMES), total=total)
-    settings = MaterialConfig(iterations=iterations, **options)
+    settings = TrainingConfig(iterations=iterations, **options)
     return train_material(MODEL, learning_law(), body.state(V0), loss, settings, log=lambda _: None)
 
 

@@ -7,13 +7,13 @@ import torch
 from neuma_lib.coupling.particle_binding import bind_two_pass
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.cameras import Cameras, look_at
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.observation import Observation
 
-MODEL = MPMModel(grid=16, dt=2e-3)
+MODEL = MPM(grid=16, dt=2e-3)
 TRUTH = {"elasticity": {"name": "fixed_corotated", "E": 3e4, "nu": 0.3}, "plasticity": {"name": "identity"}}
 PRIOR = {"elasticity": {"name": "fixed_corotated", "E": 1e5, "nu": 0.2}, "plasticity": {"name": "identity"}}
 RADIUS = 0.13

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from neuma_lib.errors import InputError
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.project.files import SceneFiles, inside
 from neuma_lib.project.find import found_scene
@@ -151,7 +150,7 @@ def test_bad_folders_say_what_to_do(folder, tmp_path):
     with refused("nothing"):
         found_scene(tmp_path / "nothing")
     (tmp_path / "results" / SCENE).mkdir(parents=True)
-    with pytest.raises(InputError, match="name a folder in a project"):
+    with refused(tmp_path / "results" / SCENE):
         found_scene(tmp_path / "results" / SCENE)
     with refused("priors"):
         found_scene(folder.parent / "priors")

@@ -9,7 +9,7 @@ import torch
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Elasticity, Law
 from neuma_lib.mechanics.neural import neural_law
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from neuma_lib.viewer.live import EARTH, FRAME, MAX_SPEED, PIVOT, LiveSimulation, tilted
@@ -21,7 +21,7 @@ DT = 1e-3
 
 def start(height=0.3, count=200, velocity=(0.0, 0.0, 0.0)):
     x, mass, vol0 = cube(count, 0.25, (0.5, height, 0.5), dtype=torch.float32)
-    return State.thrown(x, mass, vol0, velocity)
+    return State.rigid(x, mass, vol0, velocity)
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ def test_it_simulates_what_a_rollout_does(live):
     found = reached(live(), lambda s: s.time > 0.25)
     live_x, steps = found.x, round(found.time / DT)
     assert steps == pytest.approx(found.time / DT, abs=1e-6)
-    model = MPMModel(**CONSTANTS, dt=DT, gravity=(0.0, -EARTH, 0.0))
+    model = MPM(**CONSTANTS, dt=DT, gravity=(0.0, -EARTH, 0.0))
     wanted = rollout(
         model, make_law("hencky", torch.float32), start(), steps=steps, frames=[steps], total=True
     )
@@ -81,7 +81,7 @@ def test_a_tilted_floor_is_turned_gravity(live):
     found = reached(simulation, lambda s: s.time > 0.1)
     steps = round(found.time / DT)
     gravity = tilted(20.0, -10.0).T @ [0.0, -EARTH, 0.0]
-    model = MPMModel(**CONSTANTS, dt=DT, gravity=tuple(gravity.tolist()))
+    model = MPM(**CONSTANTS, dt=DT, gravity=tuple(gravity.tolist()))
     law = make_law("hencky", torch.float32)
     wanted = rollout(model, law, start(height=0.5), steps=steps, frames=[steps])
     assert np.linalg.norm(gravity) == pytest.approx(EARTH) and abs(gravity[0]) > 1

@@ -13,7 +13,7 @@ from tests.support.board_pictures import BOARD, LENS, around, looking_at, pictur
 from tests.support.project import copied
 
 PAGE = "tiny/results/mug/motion.md"
-SETTINGS = "board: {square: 0.03}\nposes: board\nlens: lenses.json\nlongest: 400\n"
+SETTINGS = "board: {square: 0.03}\nposes: board\nlens: lenses.json\nadvanced: {longest: 400}\n"
 MIDDLE = np.array([0.09, 0.12, 0.0])
 RADII = np.array([0.045, 0.035, 0.04])
 GRAVITY, RATE, COUNT, OFFSET = 9.81, 120, 40, 0.0035

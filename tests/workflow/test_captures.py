@@ -12,7 +12,7 @@ from tests.support.films import film
 from tests.support.project import copied
 
 PAGE = "tiny/results/mug/capture.md"
-BOARD_ALONE = "board: {square: 0.03}\nposes: board\nlens: lenses.json\nlongest: 400\n"
+BOARD_ALONE = "board: {square: 0.03}\nposes: board\nlens: lenses.json\nadvanced: {longest: 400}\n"
 
 
 @pytest.fixture
@@ -71,15 +71,12 @@ def test_what_is_wrong_is_said_before_anything_runs(project, mug):
     (mug / "capture.yaml").write_text("board: {square: 0.03, sqares: [6, 8]}\n")
     assert "captures/mug/capture.yaml: board.sqares" in refusal()
     (mug / "capture.yaml").write_text(BOARD_ALONE.replace("lenses.json", "../lenses.json"))
-    assert "a path must stay in the capture's folder" in refusal()
+    assert "the path must be relative and inside the folder of the capture" in refusal()
     (mug / "capture.yaml").write_text(BOARD_ALONE)
     (mug / "stills/left.png").rename(mug / "stills/right.png")
     assert "no picture of the empty scene for the camera 'left'" in refusal()
     mug.rename(mug.with_name("BouncyBall"))
-    assert (
-        "a capture makes the scene 'BouncyBall', and another scene is named so: rename its folder"
-        in refusal()
-    )
+    assert "scenes.BouncyBall: a capture has a scene of this name" in refusal()
 
 
 def test_a_failing_stage_leaves_nothing_half_written(project, mug):

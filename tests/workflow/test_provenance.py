@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from workflow.provenance import Sources, fingerprint
+from neuma_lib.mechanics.catalogue import DEFINED_IN
+from workflow.provenance import Sources, fingerprint, law_files
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = ROOT / "workflow" / "scripts"
@@ -104,6 +105,25 @@ class TestThisProject:
     def test_no_stage_can_reach_the_truth(self, script):
         reached = self.reached(script, *(["neuma_lib.methods.structured"] if script == "fit" else []))
         assert "neuma_lib.data.ground_truth" not in reached and "neuma_lib.geometry.shapes" not in reached
+
+
+def test_a_method_in_a_file_counts_with_what_it_imports(tmp_path):
+    file, script = tmp_path / "mine.py", SCRIPTS / "evaluate.py"
+    springs = "neuma_lib.methods.spring_gaus.fit"
+    digests = []
+    for text in ("x = 1\n", "x = 1  # one\n", "x = 2\n"):
+        file.write_text(text)
+        digests.append(Sources().digest(script, (str(file),)))
+    assert digests[0] == digests[1] != digests[2]
+    assert springs not in Sources().reached(script, (str(file),))
+    file.write_text(f"import {springs}\n")
+    assert springs in Sources().reached(script, (str(file),))
+
+
+def test_own_laws_are_noticed_in_parameters(monkeypatch):
+    monkeypatch.setitem(DEFINED_IN, ("elasticity", "mine"), "mine.py")
+    assert law_files([{"law": {"elasticity": {"name": "mine", "E": 1.0}}}, 3]) == {"mine.py"}
+    assert law_files({"laws": [{"elasticity": {"name": "hencky"}}], "title": "mine"}) == set()
 
 
 def test_fingerprint_names_what_changed(tmp_path):

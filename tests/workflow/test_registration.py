@@ -9,7 +9,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from neuma_lib.coupling.binding import Binding
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.gaussians import load_gaussians, save_gaussians
 from neuma_lib.io.images import OPENGL_TO_OPENCV, load_views, write_transforms
@@ -82,7 +82,10 @@ def test_placed_files_are_of_one_body_that_moves_as_it_was_filmed(project):
     assert "IoU" in output
     results = made.root / "tiny/results/mug_first"
     assert all((results / file).is_file() for file in FILES)
-    found, throw = read_json(results / "registration.json"), Throw.of(read_json(results / "velocity.json"))
+    found, throw = (
+        read_json(results / "registration.json"),
+        InitialMotion.of(read_json(results / "velocity.json")),
+    )
     at = np.array([found["t0_s"] - 3.0])
     (R,), (spin,) = motion.turn(at)
     (centre,), (velocity,) = motion.place(at)

@@ -20,7 +20,7 @@ def test_a_released_capture_goes_to_its_report_and_into_the_figure(tmp_path):
     tiny = made.root / "tests/workflow/tiny.yaml"
     settings = yaml.safe_load(tiny.read_text())
     settings["captures"]["released"] = {"bun": {"folder": str(tmp_path / "real_capture")}}
-    settings["photographs"] = {"longest": 64}
+    settings["advanced"]["photographs.longest"] = 64
     tiny.write_text(yaml.safe_dump(settings))
     made.run(PAGE, FIGURE)
     page = (made.root / PAGE).read_text()

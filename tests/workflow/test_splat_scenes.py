@@ -29,7 +29,7 @@ EXPORT = f"{RESULTS}/Splat/nclaw+law_from=BouncyBall/export"
 
 def settings(**splat):
     """Options of Snakemake for a splat that falls for 0.1 s, under a law that was passed on in a file."""
-    scene = {"splat": {"file": "made/ball.spz", "up": "z", "count": 300, "views": 12, "pixels": 48, **splat}}
+    scene = {"splat": {"file": "made/ball.spz", "up": "z", "count": 300, **splat}}
     scene |= {"height": 0.2, "size": 0.3, "velocity": [0.0, -2.0, 0.0], "dt": DT / 2, "steps": 100}
     scenes = {"Splat": scene, "BouncyBall": {"prior": "made/law.safetensors"}}
     return [
@@ -38,6 +38,7 @@ def settings(**splat):
             f"scenes={json.dumps(scenes)}",
             'figures={"i23d": ["BouncyBall"], "methods": ["nclaw"]}',
             'viewer={"methods": ["nclaw+law_from=BouncyBall"]}',
+            'advanced={"scenes.Splat.splat.views": 12, "scenes.Splat.splat.pixels": 48}',
         ),
         'dataset={"frames": 11}',
     ]
@@ -115,7 +116,7 @@ def test_what_is_done_is_not_done_again_and_the_placement_repeats_what_it_moves(
     "target, says",
     [
         ("Splat/neuma/rollout.h5", "no video to learn a law from"),
-        ("Splat/true_law/rollout.h5", "nobody knows the truth"),
+        ("Splat/true_law/rollout.h5", "true law and motion of a captured object or a splat are unknown"),
         ("Splat/pac_nerf_own+law_from=BouncyBall/rollout.h5", "field"),
         ("Splat/neuma/metrics.json", "No rule|Missing"),
     ],

@@ -107,7 +107,7 @@ def test_comments_and_docstrings_rerun_nothing(clone):
 
 
 def test_a_training_parameter_reruns_training_and_evaluation_only(clone):
-    change = ("--config", "material={iterations: 9}", "--")
+    change = ("--config", "training={iterations: 9}", "--")
     before = clone.artifacts()
     assert clone.plan(*change, TABLE) == {"fit_neuma": 1, "evaluate": 1, "chamfer_table": 1}
     clone.run(*change, TABLE)
@@ -164,6 +164,9 @@ def test_editing_the_rasterizer_reruns_what_renders(clone):
             {"ground_truth", "prior"},
         ),
         ("neuma_lib/sim/rollout.py", {"ground_truth", "prior", "fit_neuma"}, set()),
+        ("neuma_lib/methods/neuma.py", {"fit_neuma", "evaluate"}, {"velocity", "ground_truth"}),
+        ("neuma_lib/methods/spring_gaus/method.py", set(), {"fit_neuma", "evaluate"}),
+        ("neuma_lib/methods/spring_gaus/fit.py", set(), {"fit_neuma", "evaluate"}),
         (
             "workflow/scripts/binding.py",
             {"binding", "velocity", "evaluate"},
@@ -226,9 +229,10 @@ def test_pac_nerf_is_judged_and_shown_on_its_own_particles(clone):
     """In so short a fit that nothing is found: what moves, carries tracers and is seen are the field's particles."""
     own = "pac_nerf_own+views=0,1"
     small = (
-        'radiance={"iterations": 60, "rays": 256, "particles": 500}',
-        'pac_nerf={"particles": 100, "followed": 8, "velocity_iterations": 3, "iterations_contact": 1, '
-        '"iterations_all": 2, "most_frames": 3, "pixels": 200}',
+        'radiance={"iterations": 60}',
+        'advanced={"radiance.rays": 256, "radiance.particles": 500, "pac_nerf.particles": 100, '
+        '"pac_nerf.followed": 8, "pac_nerf.velocity_iterations": 3, "pac_nerf.iterations_contact": 1, '
+        '"pac_nerf.iterations_all": 2, "pac_nerf.max_frames": 3, "pac_nerf.pixels": 200}',
         f'figures={{beside: ["{own}"]}}',
     )
     files = [f"{SCENE}/{own}/{name}" for name in ("metrics.json", "video.mp4")]
@@ -338,7 +342,7 @@ def test_without_the_gpu_that_is_asked_for_nothing_is_begun(kernels, tmp_path):
 
 def test_what_a_failed_job_was_to_replace_counts_as_out_of_date(clone):
     """Its outputs are gone, and what was made of them with former settings is still there."""
-    longer = ("--config", "material={iterations: 9}", "--", TABLE)
+    longer = ("--config", "training={iterations: 9}", "--", TABLE)
     damaged = clone.root / SCENE / "neuma" / "checkpoint.pt"
     damaged.write_text("damaged")
     assert "cannot be read" in clone.run(*longer, succeeds=False)
@@ -408,16 +412,16 @@ def test_killed_snakemake_resumes_with_the_same_result(clone, uninterrupted):
 
 
 def test_mistyped_key(finished):
-    output = finished.run("--config", "material={iteratons: 3}", "--", TABLE, succeeds=False)
-    assert "material.iteratons: unknown key; did you mean iterations" in output
+    output = finished.run("--config", "training={iteratons: 3}", "--", TABLE, succeeds=False)
+    assert "training.iteratons: unknown key; did you mean iterations" in output
     assert "Traceback (most recent call last)" not in output
 
 
 @pytest.mark.parametrize(
     ("file", "message"),
     [
-        (f"{SCENE}/neuma+rnk=3/metrics.json", "no setting 'rnk'; did you mean rank"),
-        (f"{SCENE}+sed=3/gaussians.ply", "no setting 'sed'; did you mean seed"),
+        (f"{SCENE}/neuma+rnk=3/metrics.json", "no option 'rnk'; did you mean rank"),
+        (f"{SCENE}+sed=3/gaussians.ply", "no option 'sed'; did you mean seed"),
     ],
 )
 def test_mistyped_variant(finished, file, message):

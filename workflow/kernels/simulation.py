@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 
@@ -22,7 +22,7 @@ def compile_kernels(device: torch.device) -> None:
         vol0 = torch.full((16,), 1e-4, dtype=dtype, device=device)
         v0 = torch.tensor([0.0, -1.0, 0.0], dtype=dtype, device=device).requires_grad_()
         path = rollout(
-            MPMModel(grid=8, dt=1e-3),
+            MPM(grid=8, dt=1e-3),
             analytic_law(SPEC),
             State(x, v0, 1e3 * vol0, vol0),
             steps=2,

@@ -77,7 +77,7 @@ rule capture_view:
         prior_motion=lambda wildcards: (
             gaussian_motion(SimpleNamespace(scene=wildcards.scene, method=PRIOR)) if PRIOR else None
         ),
-        filming=filming,
+        exposure=exposure,
         margin=SETTINGS.evaluation.margin,
         measured=SETTINGS.captures.measured,
         frame_rate=SETTINGS.evaluation.frame_rate,

@@ -15,7 +15,7 @@ rule initial_state:
         scene=TRUE_SCENE,
     params:
         scene=scene_setting("shape", "size", "height", "center", "velocity", "spin", "density"),
-        particles=SETTINGS.simulation.particles,
+        particles=SETTINGS.geometry.particles,
     script:
         "../scripts/initial_state.py"
 
@@ -64,7 +64,7 @@ rule evaluate:
         "../scripts/evaluate.py"
 
 
-# Where nobody knows the truth: a filmed throw. Splats have a rule like it.
+# Scenes without a truth: takes of captures. `predict_splat` is the same for splats.
 rule predict:
     input:
         unpack(of_bodies(model_files)),
@@ -88,7 +88,7 @@ rule predict:
         frames=None,
         cameras=scene_cameras,
         scale=scene_scale,
-        filming=filming,
+        exposure=exposure,
         device=SETTINGS.device,
         code=code_of("predict.py"),
     script:
@@ -114,7 +114,7 @@ rule video:
         view=SETTINGS.evaluation.video_view,
         frame_rate=SETTINGS.evaluation.frame_rate,
         magnify=SETTINGS.evaluation.video_magnify,
-        filming=filming,
+        exposure=exposure,
         device=SETTINGS.device,
         code=code_of("video.py"),
     script:

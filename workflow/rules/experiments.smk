@@ -41,7 +41,7 @@ rule experiment_start:
         bodies=experiment_bodies(
             "scene", "reconstructed", "shape", "size", "height", "center", "velocity", "spin", "appearance"
         ),
-        particles=SETTINGS.simulation.particles,
+        particles=SETTINGS.geometry.particles,
         sampling=SETTINGS.geometry.sampling,
         seed=seed_of("particles"),
     script:

@@ -174,7 +174,7 @@ def splats():
     """The scenes with a splat. Raises InputError where there are none."""
     found = [name for name, scene in SETTINGS.scenes.items() if scene.splat]
     if not found:
-        raise InputError("i23d: no scene has a splat; name one, scenes: {Guitar: {splat: guitar.ply}}")
+        raise InputError("scenes", "no scene has a splat", "Add one, for example Guitar: {splat: guitar.ply}")
     return found
 
 
@@ -215,7 +215,7 @@ def filmed_constants(scenes):
         scene: {
             "dt": SETTINGS.scene(scene).dt,
             "cameras": len(SETTINGS.scene(scene).captured.cameras),
-            "filming": filming(SimpleNamespace(scene=scene)),
+            "exposure": exposure(SimpleNamespace(scene=scene)),
             "motion": {
                 method: gaussian_motion(SimpleNamespace(scene=scene, method=method))
                 for method in DRAWN.realworld_methods
@@ -316,7 +316,7 @@ FIGURES = {
             "shown": DRAWN.shown + 1,
             "size": DRAWN.size,
         },
-        "on_request": True,
+        "default_target": False,
     },
     "realworld": {
         "kind": "h5",
@@ -335,7 +335,7 @@ FIGURES = {
             "view": 0,
             "frames": DRAWN.shown + 2,
         },
-        "on_request": True,
+        "default_target": False,
     },
     "gradient_analysis": {
         "kind": "json",
@@ -402,7 +402,7 @@ FIGURES = {
             "titles": {method: cases.title(SETTINGS, method) for method in SETTINGS.random.methods[:2]},
             "scenes": random_scenes(),
         },
-        "on_request": True,
+        "default_target": False,
     },
 }
 

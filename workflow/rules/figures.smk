@@ -32,6 +32,6 @@ rule figures:
     input:
         expand(
             f"{RESULTS}/figures/{{figure}}.{{kind}}",
-            figure=[name for name, made_of in FIGURES.items() if not made_of.get("on_request")],
+            figure=[name for name, made_of in FIGURES.items() if made_of.get("default_target", True)],
             kind=["png", "pdf"],
         ),

@@ -25,7 +25,7 @@ rule sampled_particles:
     wildcard_constraints:
         scene=OBJECT_SCENE,
     params:
-        wanted=SETTINGS.simulation.particles,
+        wanted=SETTINGS.geometry.particles,
         sampling=SETTINGS.geometry.sampling,
         seed=seed_of("particles"),
     script:

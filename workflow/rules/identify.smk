@@ -19,7 +19,7 @@ rule identify:
         identify=identify_settings,
         seed=seed_of("particles"),
         stock=stock_law,
-        filming=filming,
+        exposure=exposure,
         device=SETTINGS.device,
     script:
         "../scripts/identify.py"

@@ -5,7 +5,7 @@ from functools import cache
 
 from neuma_lib.project.cases import LAW_FROM
 from neuma_lib.project.paths import IDENTIFIED
-from neuma_lib.config.variants import parse_chain
+from neuma_lib.config.variants import parse_replicate
 from neuma_lib.project.find import scene_files
 
 
@@ -35,7 +35,9 @@ def presets_of(method):
 def fit_files(case):
     """Everything that a fit may read."""
     if case.scene != case.moved:
-        raise InputError(f"{case.moved}/{case.name}", "it takes the law of another scene; ask for that one")
+        raise InputError(
+            f"{case.moved}/{case.name}", "its law is that of another scene", "Ask for the file of that scene"
+        )
     return case.method.fit_inputs(case)
 
 
@@ -47,7 +49,7 @@ def fit_parameter(case):
     }
 
 
-for fitted in (method for method in all_methods().values() if method.product):
+for fitted in (method for method in KINDS.values() if method.product):
 
     rule:
         name:
@@ -68,7 +70,7 @@ for fitted in (method for method in all_methods().values() if method.product):
             method=of_case(fit_parameter),
             simulation=simulation_settings,
             densities=of_case(lambda case: case.densities),
-            filming=filming,
+            exposure=exposure,
             seed=SETTINGS.seed,
             checkpoint=f"{RESULTS}/{{scene}}/{{method}}/checkpoint.pt",
             device=SETTINGS.device,
@@ -82,12 +84,12 @@ for fitted in (method for method in all_methods().values() if method.product):
 
 def model_files(bodies):
     """Files of the models of all bodies, by name: a list with one path a body."""
-    found = [{**case.method.model_inputs(case), **case.method.body_inputs(case)} for case in bodies]
-    return {name: [files[name] for files in found] for name in found[0]}
+    each = [{**case.method.model_inputs(case), **case.method.body_inputs(case)} for case in bodies]
+    return {name: [files[name] for files in each] for name in each[0]}
 
 
 def model_parameter(bodies):
-    """What `workflow.motion.Prediction` takes."""
+    """Method, files and options of the models, as `workflow.motion.Prediction` takes them."""
     return {
         "module": type(bodies[0].method).__module__,
         "files": sorted(model_files(bodies)),
@@ -111,20 +113,26 @@ def law_files(bodies):
 
 
 def uncertainty_files(bodies):
-    """Files of the law of one body, and of what is known of its uncertainty."""
+    """Files of the law of one body, and of its uncertainty."""
     return law_files(bodies) | bodies[0].method.uncertainty_inputs(bodies[0])
 
 
 def model_kernels(bodies):
-    return kernels(*bodies[0].method.kernels)
+    """Kernels of a prediction."""
+    return kernels(*bodies[0].method.kernels, *own_kernels(bodies[0]))
 
 
 def body_kernels(case):
-    return kernels("rendering", *(case.method.kernels if case.method.body_inputs(case) else ()))
+    """Kernels of a rendering."""
+    return kernels("rendering", *own_kernels(case))
+
+
+def own_kernels(case):
+    return case.method.body_kernels if case.method.body_inputs(case) else ()
 
 
 def carries_total(bodies):
-    """Whether a prediction carries the total deformation: the options ask for it for one of the bodies at least."""
+    """Whether the options of at least one body ask for the total deformation."""
     return any(case.options.covariance_from == "total" for case in bodies)
 
 
@@ -151,7 +159,7 @@ def gaussian_motion(wildcards):
 
 def prior_chain(wildcards):
     """Name of a prior, and the seeds of its chain."""
-    return parse_chain(wildcards.prior, SETTINGS.priors.laws, "prior")
+    return parse_replicate(wildcards.prior, SETTINGS.priors.laws, "prior")
 
 
 @checked
@@ -164,11 +172,11 @@ def stock_law(wildcards):
 @checked
 def identify_settings(wildcards):
     """Settings of an identification, in the views that its file names, if any."""
-    finer, own = SETTINGS.identify.particles, SETTINGS.simulation.particles
+    finer, own = SETTINGS.identify.refined_particles, SETTINGS.geometry.particles
     if 0 < finer <= own:
         raise InputError(
-            f"identify.particles = {finer}",
-            f"it must exceed simulation.particles = {own}",
+            "identify.refined_particles",
+            f"{finer} must exceed geometry.particles = {own}",
             f"Set it to {4 * own}, or to 0 to disable the discretisation correction",
         )
     views = getattr(wildcards, "views", None)
@@ -197,7 +205,7 @@ def evaluation_views(case):
     seen = case.options.views
     views = range(SETTINGS.dataset.dynamic.views)
     unseen, others = (
-        [view for view in views if view not in used] for used in (seen, SETTINGS.material.views)
+        [view for view in views if view not in used] for used in (seen, SETTINGS.training.views)
     )
     return list(SETTINGS.evaluation.views or unseen or others or seen)
 

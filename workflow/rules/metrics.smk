@@ -28,7 +28,7 @@ rule image_metrics:
         views=of_case(evaluation_views),
         training_views=of_case(lambda case: list(case.options.views)),
         margin=SETTINGS.evaluation.margin,
-        filming=filming,
+        exposure=exposure,
         device=SETTINGS.device,
         code=code_of("image_metrics.py"),
     script:

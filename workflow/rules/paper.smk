@@ -78,7 +78,7 @@ rule dataset:
         ),
 
 
-TABLES = [table for table in CHAMFER_TABLES if not SETTINGS.tables[table].on_request]
+TABLES = [table for table in CHAMFER_TABLES if SETTINGS.tables[table].default_target]
 
 
 rule tables:

@@ -27,6 +27,6 @@ rule identified_prior:
         name=IDENTIFIED,
         dt=lambda wildcards: SETTINGS.scene(wildcards.scene).dt,
         options=SETTINGS.priors.regression.plain(),
-        seed=lambda wildcards: SETTINGS.priors.seed + SETTINGS.chain(wildcards.scene)[1]["prior"],
+        seed=lambda wildcards: SETTINGS.priors.seed + SETTINGS.replicate(wildcards.scene)[1]["prior"],
     script:
         "../scripts/prior.py"

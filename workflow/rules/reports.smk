@@ -78,7 +78,7 @@ def method_names(wildcards):
 
 
 def report_law(name, method):
-    """What the law of a capture is loaded from, with its uncertainty: as `workflow.motion.law_of` takes it."""
+    """Method, files and options of the law of a capture, with the files of its uncertainty."""
     case = case_on(training_scene(name), method)
     files = {kind: paths[0] for kind, paths in law_files([case]).items()}
     return model_parameter([case]) | {"files": files | case.method.uncertainty_inputs(case)}

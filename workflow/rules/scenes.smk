@@ -2,19 +2,19 @@
 
 from types import SimpleNamespace
 
-from neuma_lib.project import paths as places
+from neuma_lib.project import paths
 from neuma_lib.project.settings import NO_TRUTH
 from workflow.inputs import image_list
 
 
 def home(name, file):
     """The one path of a file of a scene or experiment in a chain."""
-    return places.home(SETTINGS, name, file)
+    return paths.result_path(SETTINGS, name, file)
 
 
 def scene_prior(scene):
     """The file of the prior of a scene in its chain."""
-    return places.prior_file(SETTINGS, scene, SETTINGS.scene(scene).prior)
+    return paths.prior_file(SETTINGS, scene, SETTINGS.scene(scene).prior)
 
 
 def of_chain(file):
@@ -27,7 +27,7 @@ def of_scene(file):
 
     @checked
     def choose(wildcards):
-        base, _ = SETTINGS.chain(subject(wildcards))
+        base, _ = SETTINGS.replicate(subject(wildcards))
         return f"{DATA}/{base if base in SETTINGS.scenes else f'experiments/{base}'}/{file}"
 
     return choose
@@ -35,7 +35,7 @@ def of_scene(file):
 
 def seed_of(drawn):
     """A function of wildcards: the seed of what a scene or experiment draws in its chain."""
-    return checked(lambda wildcards: SETTINGS.seed + SETTINGS.chain(subject(wildcards))[1][drawn])
+    return checked(lambda wildcards: SETTINGS.seed + SETTINGS.replicate(subject(wildcards))[1][drawn])
 
 
 def subject(wildcards):
@@ -76,7 +76,7 @@ def scene_setting(*names):
         section = SETTINGS.scene(wildcards.scene)
         scene = section.plain()
         if not section.has_truth and any(scene[name] is None for name in names):
-            raise InputError(f"{wildcards.scene}: {NO_TRUTH}")
+            raise InputError(f"scenes.{wildcards.scene}", NO_TRUTH)
         return scene[names[0]] if len(names) == 1 else {name: scene[name] for name in names}
 
     return choose
@@ -147,9 +147,9 @@ def simulation_settings(wildcards):
     return {**simulator(SETTINGS.scene(wildcards.scene).dt), **SETTINGS.scene_world(wildcards.scene)}
 
 
-def filming(wildcards):
+def exposure(wildcards):
     """What turns the exposures that a video states into renders."""
-    return {"dt": SETTINGS.scene(wildcards.scene).dt, "sub_frames": SETTINGS.dataset.sub_frames}
+    return {"dt": SETTINGS.scene(wildcards.scene).dt, "exposure_samples": SETTINGS.dataset.exposure_samples}
 
 
 def simulator(dt, grid=None):

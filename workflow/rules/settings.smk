@@ -11,17 +11,16 @@ sys.path.insert(0, str(ROOT))
 from neuma_lib.project.capture_scenes import captured_scenes
 from neuma_lib.project.checks import law_problems
 from neuma_lib.project import cases
-from neuma_lib.config.capture import CapturesConfig
-from neuma_lib.project.loading import load
-from neuma_lib.config.validation import validate
+from neuma_lib.project.loading import load, load_captures
 from neuma_lib.errors import InputError
-from neuma_lib.methods.registry import methods as all_methods
+from neuma_lib.mechanics.catalogue import DEFINED_IN
+from neuma_lib.methods.registry import methods
 from workflow.defaults import complete, digest_of
 from workflow.provenance import code_digest
 from workflow.records import keep_records_of_failed_jobs
 
 try:
-    captures = validate(CapturesConfig, config.get("captures") or {}, "captures")
+    captures = load_captures(config)
     # A workflow that includes this one may plan captures before their files exist.
     PLANNED = plan_captures(config, captures.root) if "plan_captures" in globals() else {}
     SETTINGS = load(config, captured=captured_scenes(captures.root, captures.released, PLANNED))
@@ -30,6 +29,7 @@ except InputError as error:
 if wrong_laws := law_problems(SETTINGS):
     raise WorkflowError("\n".join(wrong_laws))
 
+KINDS = methods(SETTINGS.extensions)
 DATA = SETTINGS.data_root.rstrip("/")
 RESULTS = SETTINGS.results_root.rstrip("/")
 KERNELS = f"{DATA}/kernels"  # what is known of them; they themselves are in SETTINGS.kernel_cache
@@ -113,16 +113,20 @@ def checked(function):
 
 
 def code_of(script):
-    """A function of wildcards: digest of a script and of the method that it loads."""
+    """A function of wildcards: digest of a script and of the method that it loads.
+
+    A method in a file may name any of the own laws.
+    """
 
     def digest(wildcards):
         loaded = type(cases.kind_of(SETTINGS, wildcards.method)).__module__
-        return code_digest(ROOT / "workflow" / "scripts" / script, loaded)
+        laws = {*DEFINED_IN.values()} - {loaded} if loaded in SETTINGS.extensions else ()
+        return code_digest(ROOT / "workflow" / "scripts" / script, loaded, *sorted(laws))
 
     return digest
 
 
 def code_of_methods(script):
     """A function of wildcards: digest of a script that may load every method."""
-    modules = sorted(type(method).__module__ for method in all_methods().values())
+    modules = sorted(type(method).__module__ for method in KINDS.values())
     return lambda wildcards: code_digest(ROOT / "workflow" / "scripts" / script, *modules)

@@ -44,7 +44,7 @@ rule response:
         unpack(of_bodies(uncertainty_files)),
         kernels=kernels("laws"),
         # that of the first chain: the tests of all chains have one axis
-        visited=checked(lambda wildcards: home(SETTINGS.chain(wildcards.scene)[0], "visited.h5")),
+        visited=checked(lambda wildcards: home(SETTINGS.replicate(wildcards.scene)[0], "visited.h5")),
     output:
         response=f"{RESULTS}/{{scene}}/{{method}}/response.json",
     params:

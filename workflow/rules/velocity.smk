@@ -17,7 +17,7 @@ rule velocity:
         simulation=simulation_settings,
         density=scene_setting("density"),
         velocity=SETTINGS.velocity.plain(),
-        filming=filming,
+        exposure=exposure,
         device=SETTINGS.device,
     script:
         "../scripts/velocity.py"

@@ -52,9 +52,7 @@ class Prediction:
         arrays, _ = read_arrays(rollout, required=("frames",), only=("frames",))
         self.steps = arrays["frames"].tolist()
         if not set(needed) <= set(self.steps):
-            raise InputError(
-                rollout, "its steps are not those of the video", "Run the rule capture_prediction again"
-            )
+            raise InputError(rollout, "its steps are not those of the video", "Run the rule predict again")
         self.x, self.F = (state.to(body.x0) for state in load_motion(rollout))
 
     def frames(self, video):
@@ -70,7 +68,7 @@ def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
     weights, _ = read_weights(inputs.weights)
     networks = {name: LPIPS(weights, name).to(device) for name in ("vgg", "alex")}
-    needed = filmed_steps(inputs.shown, [params.view], **params.filming)
+    needed = filmed_steps(inputs.shown, [params.view], **params.exposure)
     predictions = []
     for rollout, motion in [(inputs.rollout, params.gaussian_motion), (inputs.prior, params.prior_motion)]:
         if rollout:
@@ -84,7 +82,7 @@ def main(inputs, output, params, run) -> None:
     steps = sorted(entries)
     measured = {steps[k] for k in spread_frames(len(steps), params.measured)}
     measures, panels = [], []
-    for video in load_videos(inputs.shown, [params.view], **params.filming):
+    for video in load_videos(inputs.shown, [params.view], **params.exposure):
         video = video.to(torch.float32, device)
         with torch.no_grad():
             renders = zip(*(prediction.frames(video) for prediction in predictions), strict=True)

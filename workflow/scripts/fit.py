@@ -7,7 +7,7 @@ from workflow.stage import run_script
 
 def main(inputs, output, params, run) -> None:
     method = method_of(params.method["module"])
-    problem = Problem(params.simulation, params.densities, params.filming, params.seed)
+    problem = Problem(params.simulation, params.densities, params.exposure, params.seed)
     stage = FitStage(output.product, output.history, params.checkpoint, params.device, params.code, run)
     method.fit(files_of(inputs, params.method["files"]), params.method["options"], problem, stage)
 

@@ -7,12 +7,12 @@ from neuma_lib.device import choose_device
 from neuma_lib.geometry.shapes import place
 from neuma_lib.io.hdf5 import write_arrays
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
-    model = MPMModel(**params.simulation)
+    model = MPM(**params.simulation)
     bodies = [
         TrueBody(
             place(body["shape"], body["size"], body["height"], body["center"]),

@@ -4,7 +4,7 @@ import torch
 
 from neuma_lib.config.binding import BindingConfig
 from neuma_lib.config.identify import IdentifyConfig
-from neuma_lib.coupling.initial_motion import Throw
+from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.device import choose_device
 from neuma_lib.fitting.identify import identify
 from neuma_lib.geometry.volume import sample_volume
@@ -12,7 +12,7 @@ from neuma_lib.io.files import listed, read_json, write_json
 from neuma_lib.io.images import load_videos
 from neuma_lib.io.mesh import read_mesh
 from neuma_lib.io.particles import load_body
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from workflow.stage import run_script
 
 
@@ -22,30 +22,35 @@ def main(inputs, output, params, run) -> None:
     names = ("particles", "binding", "gaussians", "velocity", "transforms")
     videos = [
         (
-            Throw.of(read_json(velocity)),
+            InitialMotion.of(read_json(velocity)),
             load_body(*body, density, gaussian_motion=settings.gaussian_motion).to(torch.float32, device),
             [
                 video.to(torch.float32, device)
-                for video in load_videos(transforms, settings.views, **params.filming)
+                for video in load_videos(transforms, settings.views, **params.exposure)
             ],
         )
         for *body, velocity, transforms, density in zip(
             *(listed(inputs[name]) for name in names), params.densities, strict=True
         )
     ]
-    seeds = range(params.seed + 1, params.seed + 1 + (settings.samplings if settings.particles else 0))
+    seeds = range(
+        params.seed + 1, params.seed + 1 + (settings.resamplings if settings.refined_particles else 0)
+    )
     meshes = [read_mesh(file) for file in listed(inputs.mesh)]
     finer = [
         [
             body.resampled(
-                torch.from_numpy(sample_volume(mesh, settings.particles, seed)), mesh.volume, density, binding
+                torch.from_numpy(sample_volume(mesh, settings.refined_particles, seed)),
+                mesh.volume,
+                density,
+                binding,
             )
             for seed in seeds
         ]
         for (_, body, _), mesh, density in zip(videos, meshes, params.densities, strict=True)
     ]
     found = identify(
-        MPMModel(**params.simulation),
+        MPM(**params.simulation),
         *videos[0],
         settings,
         params.stock,

@@ -45,7 +45,7 @@ def main(inputs, output, params, run) -> None:
     x, F = (state.to(device) for state in load_motion(inputs.rollout))
     steps, found = arrays["frames"].tolist(), {}
     for k, view in enumerate(params.views):
-        for video in load_videos(inputs.transforms, [view], **params.filming):
+        for video in load_videos(inputs.transforms, [view], **params.exposure):
             if not set(rendered_steps([video])) <= set(steps):
                 raise InputError(
                     f"{inputs.rollout} has other frames than {inputs.transforms}: run evaluation again"

@@ -1,4 +1,4 @@
-"""Predict a motion where nobody knows the truth: a filmed throw at the steps of its frames, or a splat."""
+"""Predict a motion without a truth: a take at the steps of its frames, or a splat."""
 
 from dataclasses import asdict
 
@@ -10,7 +10,7 @@ from neuma_lib.evaluation.motion import energy_gain_after
 from neuma_lib.io.files import write_json
 from neuma_lib.io.hdf5 import write_arrays
 from neuma_lib.io.images import filmed_steps, read_transforms
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from workflow.motion import Prediction
 from workflow.stage import run_script
 
@@ -19,10 +19,10 @@ def main(inputs, output, params, run) -> None:
     device, dt = choose_device(params.device), params.simulation["dt"]
     prediction = Prediction(inputs, params.method)
     start, counts = prediction.start(params.densities, params.carrier)
-    start, model, mpm = start.to(device), prediction.model(dt, counts), MPMModel(**params.simulation)
+    start, model, mpm = start.to(device), prediction.model(dt, counts), MPM(**params.simulation)
     frames = params.frames
     if params.cameras:
-        steps = filmed_steps(inputs.transforms, range(len(params.cameras)), **params.filming)
+        steps = filmed_steps(inputs.transforms, range(len(params.cameras)), **params.exposure)
         frames = sorted({0, *steps})
     path, failure = model.predict(mpm, start, frames, total=params.total)
     write_arrays(output.rollout, {**path.arrays(), "frames": np.asarray(frames)}, {"dt": dt})

@@ -32,7 +32,7 @@ def main(inputs, output, params, run) -> None:
         checkpoint=checkpoint,
         progress=lambda iteration, loss: run.progress(iteration + 1, settings.iterations, loss),
     )
-    particles = field.particles(settings.spacing, settings.least_opacity)
+    particles = field.particles(settings.spacing, settings.min_opacity)
     pairs = [
         torch.cat([over_white(images[view]), field.draw(cameras, view, particles).clamp(0, 1)])
         for view in report.held_out

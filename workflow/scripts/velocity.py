@@ -9,20 +9,20 @@ from neuma_lib.io.files import write_json
 from neuma_lib.io.images import load_videos
 from neuma_lib.io.laws import load_prior
 from neuma_lib.io.particles import load_body
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
     settings = VelocityConfig(**params.velocity)
     device = choose_device(params.device)
-    model = MPMModel(**params.simulation)
+    model = MPM(**params.simulation)
     law = load_prior(inputs.prior, device, model.dt)
     body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density)
     body = body.to(torch.float32, device)
     videos = [
         video.to(torch.float32, device)
-        for video in load_videos(inputs.transforms, settings.views, **params.filming)
+        for video in load_videos(inputs.transforms, settings.views, **params.exposure)
     ]
     estimate = estimate_velocity(model, law, body, videos, settings, run.progress)
     free = estimate

@@ -25,7 +25,7 @@ def main(inputs, output, params, run) -> None:
     x, F = load_motion(inputs.rollout)
     steps = read_arrays(inputs.rollout, required=("frames",), only=("frames",))[0]["frames"].tolist()
     panels, quality = {}, []
-    for observation in load_videos(inputs.transforms, [params.view], **params.filming):
+    for observation in load_videos(inputs.transforms, [params.view], **params.exposure):
         observation = observation.to(torch.float32, device)
         if not set(rendered_steps([observation])) <= set(steps):
             raise InputError(

@@ -5,7 +5,7 @@ from neuma_lib.evaluation.stress import visit
 from neuma_lib.io.hdf5 import write_arrays
 from neuma_lib.io.particles import load_initial_state
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from workflow.stage import run_script
 
 
@@ -16,7 +16,7 @@ def main(inputs, output, params, run) -> None:
     dt = params.simulation["dt"]
     law = analytic_law(params.law, dt).to(device)
     draws = {"states": params.states, "paths": params.paths, "seed": params.seed}
-    found = visit(MPMModel(**params.simulation), law, start.to(device), params.frames, **draws)
+    found = visit(MPM(**params.simulation), law, start.to(device), params.frames, **draws)
     write_arrays(output.visited, found.arrays(), {"dt": dt})
     run.say(f"{len(found.F)} states and {found.C.shape[1]} paths, from step {found.frames[0]} on")
 

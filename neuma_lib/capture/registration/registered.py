@@ -122,7 +122,7 @@ class Registration:
         return np.sqrt(np.maximum(np.diag(axes @ self.covariance[part, part] @ axes.T), 0))
 
     def velocity(self) -> dict[str, Any]:
-        """The initial motion, for velocity.json (`neuma_lib.coupling.initial_motion.Throw.of`)."""
+        """The initial motion, for velocity.json (`neuma_lib.coupling.initial_motion.InitialMotion.of`)."""
         motion = self.found.motion
         return {
             "v0": motion.velocity.tolist(),

@@ -8,14 +8,14 @@ from typing import Any
 from torch import Tensor
 
 from neuma_lib.fitting.frame_batches import first_contact
-from neuma_lib.sim.model import WALLS, MPMModel
+from neuma_lib.sim.model import MPM, WALLS
 from neuma_lib.sim.state import Trajectory
 
 FLOOR = "y_min"
 
 
 def motion_report(
-    model: MPMModel,
+    model: MPM,
     path: Trajectory,
     mass: Tensor,
     frames: Sequence[int],

@@ -25,7 +25,7 @@ class CarriedField:
 
     Args:
         field: of the first stage.
-        spacing, least_opacity: of the particles that are seen, see `RadianceField.particles`.
+        spacing, min_opacity: of the particles that are seen, see `RadianceField.particles`.
         settings: how many move.
         density: of the body [kg/m^3].
     """
@@ -34,16 +34,16 @@ class CarriedField:
         self,
         field: RadianceField,
         spacing: float,
-        least_opacity: float,
+        min_opacity: float,
         settings: PacNerfConfig,
         density: Density,
     ):
         self.field = field.requires_grad_(False)
-        self.shown = field.particles(spacing, least_opacity)
+        self.shown = field.particles(spacing, min_opacity)
         if not len(self.shown.x):
             raise InputError("pac_nerf: the field has no particles: run the rule radiance_field again")
         coarser = max(1.0, (len(self.shown.x) / settings.particles) ** (1 / 3))
-        self.moving = field.particles(coarser * spacing, max(least_opacity, settings.least_opacity))
+        self.moving = field.particles(coarser * spacing, max(min_opacity, settings.min_opacity))
         self.mass = self.moving.masses(density_at(self.moving.x, density))
         self._follow = Interpolation(self.shown.x, self.moving.x, settings.followed)
 
@@ -58,14 +58,14 @@ class CarriedField:
         """The field of a file as a method's particles carry it.
 
         Args:
-            own: ``spacing``, ``least_opacity`` and ``settings`` (a `PacNerfConfig` as plain values), with which the
+            own: ``spacing``, ``min_opacity`` and ``settings`` (a `PacNerfConfig` as plain values), with which the
                 method's constants were found.
         """
         field, _ = load_field(path)
         return cls(
             field.to(device),
             own["spacing"],
-            own["least_opacity"],
+            own["min_opacity"],
             PacNerfConfig(**own["settings"]),
             density,
         )
@@ -76,8 +76,8 @@ class CarriedField:
         spin: Sequence[float] | Tensor = (0.0, 0.0, 0.0),
         centre: Sequence[float] | Tensor | None = None,
     ) -> State:
-        """What moves, with the velocity v0 [m/s] and the spin [rad/s] of `State.thrown`."""
-        return State.thrown(self.moving.x, self.mass, self.moving.volumes(), v0, spin, centre)
+        """What moves, with the velocity v0 [m/s] and the spin [rad/s] of `State.rigid`."""
+        return State.rigid(self.moving.x, self.mass, self.moving.volumes(), v0, spin, centre)
 
     def positions(self, x: Tensor) -> Tensor:
         """Of what is seen, (T, N, 3) [m], for those of what moves, (T, A, 3)."""

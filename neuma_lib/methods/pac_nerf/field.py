@@ -112,7 +112,7 @@ class RadianceField(nn.Module):
         return field
 
     def particles(
-        self, spacing: float, least_opacity: float, generator: torch.Generator | None = None
+        self, spacing: float, min_opacity: float, generator: torch.Generator | None = None
     ) -> FieldParticles:
         """Particles in the occupied part, one at a random position in each cell of a cubic grid.
 
@@ -120,7 +120,7 @@ class RadianceField(nn.Module):
 
         Args:
             spacing: side of a cell [voxels]; PAC-NeRF uses 0.5, i.e. eight particles per voxel.
-            least_opacity: particles with less than this share of the largest opacity are omitted.
+            min_opacity: particles with less than this share of the largest opacity are omitted.
             generator: generator of the positions, on the CPU. None always gives the same positions.
         """
         generator = torch.Generator().manual_seed(0) if generator is None else generator
@@ -128,12 +128,12 @@ class RadianceField(nn.Module):
         counts = [max(1, int((n - 1) / spacing + 1e-6)) for n in self.lattice.nodes]
         ticks = [spacing * torch.arange(count, dtype=like.dtype, device=like.device) for count in counts]
         cells = torch.cartesian_prod(*ticks)
-        cells = cells[self.occupied(least_opacity)[tuple((cells + spacing / 2).round().long().unbind(1))]]
+        cells = cells[self.occupied(min_opacity)[tuple((cells + spacing / 2).round().long().unbind(1))]]
         jitter = torch.rand(len(cells), 3, generator=generator).to(like)
         x = torch.tensor(self.lattice.origin).to(like) + voxel * (cells + spacing * jitter)
         features = interpolate(self.lattice, self.values(), x)
         opacities = self.opacity(features[:, 0], 1.0)
-        kept = (opacities >= least_opacity * opacities.max()).detach().nonzero()[:, 0]
+        kept = (opacities >= min_opacity * opacities.max()).detach().nonzero()[:, 0]
         return FieldParticles(x[kept], features[kept], opacities[kept], (spacing * voxel) ** 3, voxel)
 
     def render(

@@ -95,7 +95,7 @@ def fit_radiance_field(
         if checkpoint and (iteration + 1) % settings.checkpoint_every == 0:
             checkpoint.save(fit.state(iteration + 1))
     field = fit.field.requires_grad_(False)
-    particles = field.particles(settings.spacing, settings.least_opacity)
+    particles = field.particles(settings.spacing, settings.min_opacity)
     scores = [evaluate(field, images, cameras, held_out, part) for part in (particles, None)]
     report = RadianceReport(
         fit.losses, field.lattice.voxel, field.lattice.nodes, len(particles.x), held_out,
@@ -161,12 +161,12 @@ class _Fit:
         view = self.order.pop()
         drawn = torch.randint(len(self.meeting[view]), (settings.rays,), generator=self.generator)
         chosen = self.meeting[view][drawn.to(self.targets.device)]
-        particles = self.field.particles(settings.spacing, settings.least_opacity, self.generator)
+        particles = self.field.particles(settings.spacing, settings.min_opacity, self.generator)
         rays = (part[chosen] for part in self.rays[view])
         colours, passed = self.field.render(*particles.seen(), *rays)
         loss = ((colours - self.targets[view, chosen]) ** 2).mean()
         doublings = math.floor(iteration / settings.iterations * settings.entropy_doublings)
-        weight = min(settings.entropy_weight * 2**doublings, settings.entropy_most)
+        weight = min(settings.entropy_weight * 2**doublings, settings.max_entropy_weight)
         passed = passed.clamp(CERTAIN, 1 - CERTAIN)
         entropy = -(passed * passed.log() + (1 - passed) * (1 - passed).log()).mean()
         fuzzy = particles.opacities.clamp(*VOLUME_RANGE).sum() * particles.volume / particles.voxel

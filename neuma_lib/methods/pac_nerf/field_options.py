@@ -4,85 +4,58 @@ from __future__ import annotations
 
 from pydantic import Field, model_validator
 
-from neuma_lib.config.base import Section
+from neuma_lib.config.base import Section, internal
 
 
 class RadianceConfig(Section):
-    """Voxel radiance field of the views at t = 0 (PAC-NeRF). What differs from the authors' values says so."""
+    """Voxel radiance field of the views at t = 0 (PAC-NeRF). Published values are in brackets."""
 
     iterations: int = Field(
-        1500, ge=1, description="optimiser steps, each on one view (authors: 6001, plasticine 10001)"
+        1500, ge=1, description="optimiser steps, each on one view (6001, plasticine 10001)"
     )
-    rays: int = Field(
-        1024,
-        ge=1,
-        description="pixels of a step, at random among those whose ray meets the lattice (authors: 2^17 of 800 x 800)",
+    rays: int = internal(
+        1024, "random pixels of a step whose ray intersects the lattice (2^17 of 800 x 800)", ge=1
     )
-    particles: int = Field(
-        12000, ge=1, description="about how many fill the visual hull at the end, which decides the voxel"
+    particles: int = internal(
+        12000, "approximate number of particles in the hull, which defines the voxel", ge=1
     )
-    voxel: float | None = Field(
-        None,
-        gt=0,
-        description="voxel of the coarsest lattice [m] (authors: 0.16, some scenes 0.1 or 0.12); null: by particles",
+    voxel: float | None = internal(
+        None, "voxel of the coarsest lattice [m] (0.16, some scenes 0.1 or 0.12); null: from particles", gt=0
     )
-    hull_resolution: int = Field(
-        32,
-        ge=2,
-        description="voxels along the visual hull, in whose box the field begins (authors: a box by hand)",
+    hull_resolution: int = internal(
+        32, "voxels along the visual hull, in whose box the field starts (a box by hand)", ge=2
     )
-    halvings: tuple[float, ...] = Field(
-        (0.17, 0.33, 0.67),
-        description="fractions of the iterations at which the voxel is halved (authors: at 1000, 2000, 4000)",
+    halvings: tuple[float, ...] = internal(
+        (0.17, 0.33, 0.67), "fractions of the iterations at which the voxel is halved (1000, 2000, 4000)"
     )
-    initial_opacity: float = Field(
-        1e-4, gt=0, lt=1, description="opacity of raw density 0, where all begins, over one interval"
+    initial_opacity: float = internal(1e-4, "initial opacity over one interval, at raw density 0", gt=0, lt=1)
+    spacing: float = internal(
+        1.0, "mean distance between neighbouring particles [voxels] (0.5, eight per voxel)", gt=0, le=1
     )
-    spacing: float = Field(
-        1.0,
-        gt=0,
-        le=1,
-        description="mean distance between neighbouring particles [voxels] (authors: 0.5, eight a voxel)",
+    min_opacity: float = internal(1e-3, "relative opacity below which particles are omitted", ge=0, lt=1)
+    rate_density: float = internal(
+        0.8, "learning rate of the raw density on the coarsest lattice, doubles with each halving (0.1)", ge=0
     )
-    least_opacity: float = Field(
-        1e-3,
-        ge=0,
-        lt=1,
-        description="particles less opaque than this part of the most opaque one are left out",
+    rate_features: float = internal(0.1, "learning rate of the colour features", ge=0)
+    rate_network: float = internal(1e-3, "learning rate of the network of the colours", ge=0)
+    rate_decay: float = internal(
+        0.1, "last over first of these rates, with exponential decay after the last halving (1)", gt=0, le=1
     )
-    rate_density: float = Field(
-        0.8,
-        ge=0,
-        description="learning rate of the raw density on the coarsest lattice; doubles with each halving, as"
-        " what makes a voxel opaque does (authors: 0.1 on all)",
+    entropy_weight: float = internal(
+        1e-4, "initial weight of the entropy of a ray's transmittance (1e-4, some scenes 1e-3)", ge=0
     )
-    rate_features: float = Field(0.1, ge=0, description="learning rate of the colour features")
-    rate_network: float = Field(1e-3, ge=0, description="learning rate of the network of the colours")
-    rate_decay: float = Field(
-        0.1,
-        gt=0,
-        le=1,
-        description="last over first of these rates: they fall exponentially after the last halving (authors: 1)",
+    entropy_doublings: int = internal(
+        6, "number of times that this weight doubles, evenly over the iterations", ge=0
     )
-    entropy_weight: float = Field(
-        1e-4,
-        ge=0,
-        description="weight of the entropy of a ray's transmittance, at the start (authors: 1e-4, some scenes 1e-3)",
+    max_entropy_weight: float = internal(0.1, "maximum weight of the entropy", ge=0)
+    volume_weight: float = internal(
+        1e-3, "weight of opacities times volume over voxel (1e-3, plasticine 1e-4)", ge=0
     )
-    entropy_doublings: int = Field(
-        6, ge=0, description="times that this weight doubles, evenly over the iterations"
-    )
-    entropy_most: float = Field(0.1, ge=0, description="largest weight of the entropy")
-    volume_weight: float = Field(
-        1e-3,
-        ge=0,
-        description="weight of the particles' opacities times volume over voxel (authors: 1e-3, plasticine 1e-4)",
-    )
-    held_out: int = Field(10, ge=2, description="every how many-th view is kept for measurement only")
-    checkpoint_every: int = Field(100, ge=1, description="iterations between two saves of the state")
+    held_out: int = internal(10, "every n-th view is held out for measurement", ge=2)
+    checkpoint_every: int = internal(100, "iterations between checkpoints", ge=1)
 
     @model_validator(mode="after")
     def _ascending(self) -> RadianceConfig:
         if list(self.halvings) != sorted(set(self.halvings)) or not all(0 < f < 1 for f in self.halvings):
-            raise ValueError("radiance.halvings: give fractions between 0 and 1, ascending, none twice")
+            raise ValueError("halvings: give ascending fractions between 0 and 1")
         return self

@@ -24,7 +24,7 @@ from neuma_lib.methods.pac_nerf.families import FamilyConstants
 from neuma_lib.methods.pac_nerf.lattice import Lattice
 from neuma_lib.methods.pac_nerf.options import PacNerfConfig
 from neuma_lib.methods.pac_nerf.rendering import camera_rays, sum_of_terms
-from neuma_lib.sim.model import COURANT_LIMIT, MPMModel
+from neuma_lib.sim.model import COURANT_LIMIT, MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.observation import Observation
 
@@ -145,7 +145,7 @@ class PacNerfFit:
 
 
 def fit_pac_nerf(
-    model: MPMModel,
+    model: MPM,
     body: CarriedField,
     observation: Observation,
     contact: int,
@@ -211,7 +211,7 @@ class _Fit:
         warm = contact + round(settings.after_contact / model.dt)
         near = [k for k in after if observation.frames[k] <= warm] or after[:1]
         self.flying = spread(before, settings.velocity_frames)
-        self.stages = [spread(near, settings.most_frames), spread(after, settings.most_frames)]
+        self.stages = [spread(near, settings.max_frames), spread(after, settings.max_frames)]
         self.iterations = settings.iterations_contact + settings.iterations_all
         self.optimizer = torch.optim.Adam(constants.groups(settings), betas=settings.betas)
         self.iteration, self.history = 0, PacNerfHistory()

@@ -1,4 +1,4 @@
-"""PAC-NeRF (Li et al., ICLR 2023): a radiance field, and the velocity and constants of a law whose family is named."""
+"""PAC-NeRF (Li et al., ICLR 2023): a radiance field, the initial velocity, and the constants of a given law."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ class PacNerfOptions(MotionOptions, PacNerfConfig):
 class PacNerf(Method):
     name = "pac_nerf"
     Options = PacNerfOptions
-    sections = ("material", "pac_nerf")
+    sections = ("training", "pac_nerf")
     product = "constants.json"
     fit_kernels = ("laws", "radiance")
+    body_kernels = ("radiance",)
     presets = {
         "pac_nerf": Preset(
             "PAC-NeRF",
@@ -77,7 +78,7 @@ class PacNerf(Method):
         from neuma_lib.methods.pac_nerf.families import choose_family
         from neuma_lib.methods.pac_nerf.fit import fit_pac_nerf
         from neuma_lib.methods.pac_nerf.io import load_field
-        from neuma_lib.sim.model import MPMModel
+        from neuma_lib.sim.model import MPM
 
         options = dict(options)
         prior, radiance = options.pop("prior"), options.pop("radiance")
@@ -94,16 +95,16 @@ class PacNerf(Method):
             )
         known = {"simulation": problem.simulation, "density": density, "seed": problem.seed}
         checkpoint = run.checkpoint({**known, "radiance": radiance, "guess": guess, **options}, inputs)
-        video, *others = load_videos(inputs["transforms"], settings.views, **problem.filming)
+        video, *others = load_videos(inputs["transforms"], settings.views, **problem.exposure)
         if others or video.exposure != (0,):
             raise InputError(
                 inputs["transforms"],
                 "PAC-NeRF compares images that all its views took at the same instants, and the views "
                 f"{list(settings.views)} differ in steps, size or exposure, or have an exposure",
-                "Choose one view by +views=0, and ignore motion blur by dataset.sub_frames: 1",
+                "Choose one view by +views=0, and ignore motion blur by dataset.exposure_samples: 1",
             )
         fit = fit_pac_nerf(
-            MPMModel(**problem.simulation),
+            MPM(**problem.simulation),
             body,
             video.to(torch.float32, run.device),
             estimated["frames"][-1],
@@ -153,6 +154,6 @@ class PacNerf(Method):
 
 
 def _seen(case: Case) -> dict:
-    """Which particles of the field are seen."""
+    """Options that select the visible particles of the field."""
     section = case.section("radiance")
-    return {name: section[name] for name in ("spacing", "least_opacity")}
+    return {name: section[name] for name in ("spacing", "min_opacity")}

@@ -41,7 +41,7 @@ class SpringBody:
         """The body of an existing network. Raises InputError if its anchors are not the particles ``index``."""
         if index.max() >= len(x0) or not torch.equal(x0[index], network.anchors):
             raise InputError(
-                "springs", "the anchors are not particles of the body", "Run the rule springs again"
+                "springs", "the anchors are not particles of the body", "Run the rule fit_spring_gaus again"
             )
         return cls(index, network, Interpolation(x0, network.anchors, carriers))
 

@@ -17,7 +17,7 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.fitting.material import PixelLoss, frame_weights
 from neuma_lib.fitting.training_loop import TrainingLoop
@@ -86,7 +86,7 @@ def fit_springs(
     springs: Springs,
     start: State,
     loss: PixelLoss,
-    settings: MaterialConfig,
+    settings: TrainingConfig,
     how: SpringsConfig,
     *,
     checkpoint: Checkpoint | None = None,

@@ -44,10 +44,10 @@ def load_springs(path: str | Path, like: Tensor) -> tuple[Tensor, Springs, dict[
     expected |= dict(zip(_PARAMETERS, [(A,), *4 * [(1,)]], strict=True))
     hard, exponent = metadata.get("hard"), metadata.get("exponent")
     if shapes != expected or not A or type(hard) is not int or not isinstance(exponent, float):
-        raise InputError(path, "is not a network of springs", "Run the rule springs again")
+        raise InputError(path, "is not a network of springs", "Run the rule fit_spring_gaus again")
     neighbours, index = tensors["neighbours"], tensors["index"]
     if not (0 <= int(neighbours.min()) and int(neighbours.max()) < A and 0 <= int(index.min())):
-        raise InputError(path, "refers to anchors that do not exist", "Run the rule springs again")
+        raise InputError(path, "refers to anchors that do not exist", "Run the rule fit_spring_gaus again")
     network = SpringNetwork(tensors["anchors"], neighbours, tensors["rest"], hard, exponent)
     springs = Springs(network.to(like.dtype, like.device), 1.0, 1.0)
     with torch.no_grad():

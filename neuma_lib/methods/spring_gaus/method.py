@@ -1,8 +1,8 @@
-"""Spring-Gaus (Zhong et al., ECCV 2024): a network of springs in the body, and no law of a material."""
+"""Spring-Gaus (Zhong et al., ECCV 2024): a network of springs in the body, without a material law."""
 
 from __future__ import annotations
 
-from neuma_lib.config.material import MaterialConfig
+from neuma_lib.config.training import TrainingConfig
 from neuma_lib.methods.base import Case, Files, Method, Preset
 from neuma_lib.methods.spring_gaus.options import SpringsConfig
 
@@ -11,14 +11,14 @@ OF_NETWORK = ("anchors", "neighbours", "hard_springs", "exponent", "carriers")
 """Options that a network of springs is built with."""
 
 
-class SpringGausOptions(MaterialConfig, SpringsConfig):
+class SpringGausOptions(TrainingConfig, SpringsConfig):
     """Options of the training and of the network."""
 
 
 class SpringGaus(Method):
     name = "spring_gaus"
     Options = SpringGausOptions
-    sections = ("material", "springs")
+    sections = ("training", "springs")
     product = "springs.safetensors"
     fit_kernels = ("springs", "rendering")
     kernels = ("springs",)
@@ -61,13 +61,13 @@ class SpringGaus(Method):
         from neuma_lib.methods.spring_gaus.io import save_springs
         from neuma_lib.methods.spring_gaus.network import Springs
         from neuma_lib.methods.spring_gaus.rollout import SpringModel
-        from neuma_lib.sim.model import MPMModel
+        from neuma_lib.sim.model import MPM
 
         settings = SpringGausOptions(**options)
         files = (inputs[name] for name in ("particles", "binding", "gaussians"))
         body = load_body(*files, problem.densities[0], gaussian_motion=settings.gaussian_motion)
         body = body.to(torch.float32, run.device)
-        videos = load_videos(inputs["transforms"], settings.views, **problem.filming)
+        videos = load_videos(inputs["transforms"], settings.views, **problem.exposure)
         videos = [video.to(torch.float32, run.device) for video in videos]
         start, density = with_motion(body, inputs["velocity"]), float(body.mass.sum() / body.vol0.sum())
         anchored = SpringBody.of(body.x0, *(getattr(settings, name) for name in OF_NETWORK))
@@ -76,12 +76,12 @@ class SpringGaus(Method):
         )
         known = {
             "simulation": problem.simulation,
-            "filming": problem.filming,
+            "exposure": problem.exposure,
             "density": problem.densities[0],
         }
         checkpoint = run.checkpoint({**known, **options}, inputs)
         fitted = fit_springs(
-            SpringModel.of(MPMModel(**problem.simulation), settings.substeps),
+            SpringModel.of(MPM(**problem.simulation), settings.substeps),
             anchored,
             springs,
             start,

@@ -15,14 +15,14 @@ from neuma_lib.methods.spring_gaus.body import SpringBody
 from neuma_lib.methods.spring_gaus.io import load_springs
 from neuma_lib.methods.spring_gaus.network import Springs
 from neuma_lib.methods.spring_gaus.rollout import SpringModel, spring_rollout
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 from neuma_lib.sim.state import State, Trajectory
 
 
 class SpringMotion(MotionModel):
-    """Springs of a file, on the body that they were fitted to, or on another one of the same material.
+    """Springs of a file, on the body that they were fitted to or on another body of the same material.
 
-    Another body gets a network of its own, with one stiffness: the modulus of the fitted network.
+    Another body gets a new network with one stiffness, that of the fitted network's modulus.
 
     Args:
         path: file of the springs.
@@ -33,7 +33,7 @@ class SpringMotion(MotionModel):
         self._path, self._options = path, options
         self.stable = read_weights(path)[1]["stable"]
 
-    def predict(self, mpm: MPMModel, state: State, frames: Sequence[int], tracers=None, total=False):
+    def predict(self, mpm: MPM, state: State, frames: Sequence[int], tracers=None, total=False):
         body, springs, about = self._on(state)
         model = SpringModel.of(mpm, about["substeps"])
         tracers = state.x[:0] if tracers is None else tracers

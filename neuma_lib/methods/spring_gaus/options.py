@@ -4,50 +4,28 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from neuma_lib.config.base import Section
+from neuma_lib.config.base import Section, internal
 
 
 class SpringsConfig(Section):
-    """A network of springs between anchors in the body, and how it is fitted. Iterations and views are those of
-    `material`. In brackets what Spring-Gaus has published."""
+    """A network of springs between anchors in the body (Spring-Gaus). Published values are in brackets."""
 
     anchors: int = Field(
         400, ge=4, description="particles of the body that are anchors, far from each other (2048)"
     )
-    neighbours: int = Field(48, ge=1, description="springs of an anchor, to its nearest (256)")
-    hard_springs: int = Field(
-        8,
-        ge=0,
-        description="of these, the nearest, which always pull fully (16); how fast the others fade is learned",
+    neighbours: int = internal(48, "springs of an anchor, to the nearest anchors (256)", ge=1)
+    hard_springs: int = internal(8, "nearest springs that always have full stiffness (16)", ge=0)
+    exponent: float = internal(0.5, "p of the factor (1 + |strain|)^p of a spring's force", ge=0)
+    guess: float = internal(2.0e5, "initial Young's modulus of all springs [Pa]", gt=0)
+    resistance: float = internal(0.1, "initial damping c along the springs [m/s]", gt=0)
+    learn_resistance: bool = internal(False, "whether the damping is learned")
+    carriers: int = internal(16, "nearest anchors that a particle or tracer follows", ge=4)
+    truncated: bool = internal(
+        False, "true: a step per frame, by the gradient since the previous frame (published)"
     )
-    exponent: float = Field(0.5, ge=0, description="p of the factor (1 + |strain|)^p of a spring's force")
-    guess: float = Field(
-        2.0e5,
-        gt=0,
-        description="Young's modulus that all stiffnesses start from, the same in every scene [Pa]",
+    lr_springs: float = internal(
+        0.05, "learning rate of log10 stiffness, softness and friction (0.001)", gt=0
     )
-    resistance: float = Field(0.1, gt=0, description="damping c along the springs at the start [m/s]")
-    learn_resistance: bool = Field(False, description="whether the damping is learned, too")
-    carriers: int = Field(16, ge=4, description="nearest anchors that a particle or tracer follows")
-    truncated: bool = Field(
-        False,
-        description="true: an optimiser step for every frame, by the gradient of the steps since the frame before it "
-        "(published); false: one for the whole video, by its whole gradient",
-    )
-    lr_springs: float = Field(
-        0.05,
-        gt=0,
-        description="learning rate of log10 stiffness, softness and friction (0.001); a tenth of it for log10 damping, "
-        "0.03 of it [m] for the gap",
-    )
-    gap: float = Field(
-        0.0,
-        description="how far inside the simulator's walls anchors are stopped at the start [m]; negative: beyond",
-    )
-    learn_gap: bool = Field(
-        True,
-        description="whether this is learned, too (no: the ground is known); the walls of a grid are not sharp",
-    )
-    substeps: int = Field(
-        1, ge=1, description="least parts of a time step; more are taken where the springs are stiff"
-    )
+    gap: float = internal(0.0, "initial distance inside the walls at which anchors stop [m]")
+    learn_gap: bool = internal(True, "whether the gap is learned (no); walls of a grid are not sharp")
+    substeps: int = internal(1, "minimum number of substeps of a time step; stiff springs need more", ge=1)

@@ -15,7 +15,7 @@ from neuma_lib.device import warp_stream
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.methods.spring_gaus.kernels import kernels, warp_types
 from neuma_lib.methods.spring_gaus.network import SpringNetwork, Springs
-from neuma_lib.sim.model import MPMModel
+from neuma_lib.sim.model import MPM
 
 MAX_SUBSTEPS = 256
 """Maximum number of substeps per time step. A network that needs more is considered unstable."""
@@ -39,7 +39,7 @@ class SpringModel:
     substeps: int = 1
 
     @classmethod
-    def of(cls, model: MPMModel, substeps: int = 1) -> SpringModel:
+    def of(cls, model: MPM, substeps: int = 1) -> SpringModel:
         """Gravity, time step and box of an MPM model, with planes where bodies come to rest in it."""
         low, high = model.free_range  # half a cell before the walls
         half = 0.5 * model.dx

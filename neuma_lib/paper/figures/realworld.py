@@ -30,7 +30,7 @@ def data(inputs, params, say) -> ImageGrid:
     blocks, times, measures = [], [], []
     rollouts, found = iter(inputs.rollouts), iter(inputs.measures)
     for k, setting in enumerate(params.scenes.values()):
-        (video,) = load_videos(inputs.shown[k], [params.view], **setting["filming"])
+        (video,) = load_videos(inputs.shown[k], [params.view], **setting["exposure"])
         files = (inputs.particles[k], inputs.binding[k], inputs.gaussians[k])
         shown = rendering.evenly(params.frames, len(video.frames))
         seen = video.select(shown)

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.io.files import read_json
 from neuma_lib.io.particles import load_motion
+from neuma_lib.paper.claims import shown
 from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images, note, place
-from neuma_lib.paper.tables import shown
 
 LEFT, TOP, BARS = 0.98, 0.2, 1.25
 PAPER = 1.33

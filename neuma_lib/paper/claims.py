@@ -1,0 +1,317 @@
+"""Claims about methods, and their verdicts.
+
+A claim is a statement and a rule that checks it with a `Frame`, the errors of a run. Errors of motion are tracer RMSE,
+which sees all motion and has no sampling floor. The paper gives Chamfer distances only.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from neuma_lib.errors import InputError
+from neuma_lib.evaluation.text_tables import as_markdown
+
+RMSE = "tracer_rmse_mm"
+"""Quantity that claims are checked with, unless they name another."""
+PRINTED = "chamfer_paper"
+"""Chamfer distances in the paper. NaN for columns that the paper does not have."""
+BROKEN = "broke_off"
+"""Runs whose prediction stopped early [%]."""
+MIN_REPLICATES = 3
+"""Number of replicates that a standard deviation needs to support a claim."""
+
+HOLDS, MIXED, FAILS = "holds", "mixed", "does not hold"
+UNPUBLISHED = "not compared there"
+VERDICTS = ("claim", "verdict", "RMSE here (mm)", "Chamfer distance in the paper")
+"""Columns of the table of verdicts."""
+RULE = (
+    "A claim *holds* if its methods are lower on average and in most columns, the intervals mean ± standard deviation "
+    f"of the averages do not overlap, there are at least {MIN_REPLICATES} chains, and no prediction of these broke off."
+    " It *does not hold* if neither the average nor most columns are on its side; else it is *mixed*."
+)
+"""Explanation of `Closer` for readers of a table."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Values of one quantity and method: a line for each replicate, a column for each scene or experiment, (S, C)."""
+
+    quantity: str
+    method: str
+    title: str
+    runs: np.ndarray
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Mean of each column over the replicates, then the average over all columns, shape (C + 1,)."""
+        return self._averaged().mean(axis=0)
+
+    @property
+    def std(self) -> np.ndarray | None:
+        """Standard deviations over the replicates, also of the average, (C + 1,). None for a single replicate."""
+        return self._averaged().std(axis=0, ddof=1) if len(self.runs) > 1 else None
+
+    @property
+    def median(self) -> float:
+        """Median over all runs."""
+        return float(np.median(self.runs))
+
+    def csv_rows(self) -> list[list[str]]:
+        """CSV cells of the means and, for several replicates, of the standard deviations."""
+        return [
+            [self.quantity + suffix, self.method, self.title, *(number(v, 4) for v in values)]
+            for suffix, values in (("", self.mean), ("_std", self.std))
+            if values is not None
+        ]
+
+    def cells(self, digits: int, text: Callable[[float, int], str]) -> list[str]:
+        """Markdown cells: each mean as text, with ± the standard deviation for several replicates."""
+        spreads = [""] * len(self.mean) if self.std is None else [f" ± {shown(s, digits)}" for s in self.std]
+        means = zip(self.mean, spreads, strict=True)
+        return [text(v, digits) + (spread if np.isfinite(v) else "") for v, spread in means]
+
+    def average(self) -> str:
+        """The average over the columns as text, with its standard deviation for several replicates."""
+        return self.cells(1, shown)[-1]
+
+    def _averaged(self) -> np.ndarray:
+        return np.concatenate([self.runs, self.runs.mean(axis=1, keepdims=True)], axis=1)
+
+
+def shown(value: float, digits: int) -> str:
+    """A number with fixed decimals. Those that would round to zero are "< 0.01" (for two digits)."""
+    text = f"{value:.{digits}f}"
+    return text if float(text) else f"< {10**-digits:.{digits}f}"
+
+
+def number(value: float, digits: int) -> str:
+    """A number with fixed decimals, or a dash for NaN."""
+    return f"{value:.{digits}f}" if np.isfinite(value) else "–"
+
+
+@dataclass
+class Frame:
+    """Values by quantity, method, column and replicate.
+
+    Attributes:
+        columns: name of each scene or experiment -> heading.
+        rows: (quantity, method) -> values, in the order of the tables.
+        broken: (method, column) of predictions that stopped early.
+    """
+
+    columns: dict[str, str]
+    rows: dict[tuple[str, str], Row] = field(default_factory=dict)
+    broken: set[tuple[str, str]] = field(default_factory=set)
+
+    def add(self, quantity: str, method: str, title: str, runs: Sequence[Sequence[float]]) -> None:
+        """Add the values of a quantity and method, (replicates, columns)."""
+        self.rows[quantity, method] = Row(quantity, method, title, np.array(runs, dtype=float))
+
+    def of(self, quantity: str) -> list[Row]:
+        """Rows of all methods."""
+        return [row for row in self.rows.values() if row.quantity == quantity]
+
+    def row(self, quantity: str, method: str) -> Row:
+        """One row.
+
+        Raises:
+            InputError: the frame does not have it.
+        """
+        if row := self.rows.get((quantity, method)):
+            return row
+        raise InputError("table", f"no row {quantity} of {method}", "Add the method to the table")
+
+    def select(self, quantity: str, methods: Iterable[str], columns: Sequence[str]) -> list[Row] | None:
+        """Rows of some methods in some columns (all if empty). None if the frame lacks a row or column."""
+        rows, names = [self.rows.get((quantity, method)) for method in methods], list(self.columns)
+        if any(row is None for row in rows) or not set(columns) <= set(names):
+            return None
+        index = [names.index(column) for column in columns or names]
+        return [Row(row.quantity, row.method, row.title, row.runs[:, index]) for row in rows]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Result of checking a claim.
+
+    Attributes:
+        text: the claim.
+        word: "holds", "mixed" or "does not hold".
+        here: our numbers, and what keeps the claim from holding.
+        paper: the paper's Chamfer distances, or why there are none.
+    """
+
+    text: str
+    word: str
+    here: str
+    paper: str = UNPUBLISHED
+
+    def __str__(self) -> str:
+        return f"{self.word.capitalize()}: {self.text}. {self.here}."
+
+
+@dataclass(frozen=True)
+class Claim(ABC):
+    """A statement about methods. Subclasses say how it is checked."""
+
+    text: str
+
+    @abstractmethod
+    def holds(self, frame: Frame) -> Verdict | None:
+        """The verdict. None if the frame lacks a row or column."""
+
+
+@dataclass(frozen=True)
+class Closer(Claim):
+    """Some methods are no further from the truth than others.
+
+    The claim *holds* only if the average error is lower, it is lower in more than half of the columns, the intervals
+    mean ± standard deviation of the averages do not overlap, there are `MIN_REPLICATES` replicates, and no prediction
+    of the better methods stopped early, since its error is then too small. (For three replicates of equal spread, no
+    overlap means t > 2.4, which occurs by chance in 4 of 100 cases.) It *does not hold* if neither the average nor the
+    majority of columns supports it. Otherwise it is *mixed*. "No worse" is checked like "closer", since a difference
+    that is not seen may still exist.
+
+    Attributes:
+        better, worse: methods. The worst of the first is compared with the best of the second.
+        columns: scenes or experiments; all columns if empty.
+        by_paper: whether the paper makes the comparison.
+    """
+
+    better: tuple[str, ...]
+    worse: tuple[str, ...]
+    columns: tuple[str, ...] = ()
+    by_paper: bool = True
+
+    @property
+    def methods(self) -> set[str]:
+        return {*self.better, *self.worse}
+
+    def holds(self, frame: Frame) -> Verdict | None:
+        groups = [frame.select(RMSE, group, self.columns) for group in (self.better, self.worse)]
+        if None in groups:
+            return None
+        better, worse = groups
+        high, low = max(better, key=lambda r: r.mean[-1]), min(worse, key=lambda r: r.mean[-1])
+        average = bool(high.mean[-1] < low.mean[-1])
+        first, second = (np.stack([row.mean[:-1] for row in rows]) for rows in groups)
+        lower, count = int((first.max(axis=0) < second.min(axis=0)).sum()), first.shape[1]
+        majority = 2 * lower > count
+        doubts = ([] if average else ["not on average"]) + ([] if majority else ["not in most columns"])
+        if few := _too_few(*better, *worse):
+            doubts.append(few)
+        elif average and max(r.mean[-1] + r.std[-1] for r in better) >= min(
+            r.mean[-1] - r.std[-1] for r in worse
+        ):
+            doubts.append("the ± overlap")
+        if any((m, c) in frame.broken for m in self.better for c in self.columns or frame.columns):
+            doubts.append("a prediction broke off")
+        here = f"{high.average()} ({high.title}) against {low.average()} ({low.title}), lower in {lower} of {count}"
+        if not (average or majority):
+            return Verdict(self.text, FAILS, here, self._paper(frame))
+        here += f"; {', '.join(doubts)}" if doubts else ""
+        return Verdict(self.text, MIXED if doubts else HOLDS, here, self._paper(frame))
+
+    def _paper(self, frame: Frame) -> str:
+        """The same comparison with the paper's distances."""
+        if not self.by_paper:
+            return UNPUBLISHED
+        groups = [frame.select(PRINTED, group, self.columns) for group in (self.better, self.worse)]
+        if None in groups:
+            return ""
+        first, second = ([row.mean[-1] for row in group] for group in groups)
+        return f"{max(first):.2f} against {min(second):.2f}" if np.isfinite([*first, *second]).all() else ""
+
+
+@dataclass(frozen=True)
+class Bound(Claim):
+    """A bound on the error of a method.
+
+    The claim *holds* if means plus standard deviations over at least `MIN_REPLICATES` replicates are within the bound,
+    and no prediction of the method stopped early. It is *mixed* if the means alone are, else it *does not hold*.
+
+    Attributes:
+        method: whose error is bounded.
+        limit: the bound in the unit of the quantity, or in multiples of the error of the method ``of``.
+        of: the method to compare with in the same column; none if empty.
+        count: number of columns that must be within the bound. None: the average over the columns must be.
+        columns: scenes or experiments; all columns if empty.
+        quantity: quantity that is bounded.
+    """
+
+    method: str
+    limit: float
+    of: str = ""
+    count: int | None = None
+    columns: tuple[str, ...] = ()
+    quantity: str = RMSE
+
+    @property
+    def methods(self) -> set[str]:
+        return {self.method, self.of} - {""}
+
+    def holds(self, frame: Frame) -> Verdict | None:
+        rows = frame.select(self.quantity, [self.method, *([self.of] if self.of else [])], self.columns)
+        if rows is None:
+            return None
+        row, *of = rows
+        bound = self.limit * (of[0].mean if of else np.ones(len(row.mean)))
+        within = row.mean <= bound
+        surely = within if row.std is None else row.mean + row.std <= bound
+        met, sure = (ok[-1] if self.count is None else ok[:-1].sum() >= self.count for ok in (within, surely))
+        doubts = [] if sure else ["not with the ±"]
+        doubts += filter(None, [_too_few(row)])
+        columns = self.columns or tuple(frame.columns)
+        away = sum((self.method, column) in frame.broken for column in columns)
+        if away and self.quantity != BROKEN:
+            doubts.append(f"broke off in {away} of {len(columns)}")
+        here = f"{row.average()} {'mm' if self.quantity == RMSE else '%'} ({row.title})"
+        here += f" against {of[0].average()} ({of[0].title})" if of else ""
+        here += f", kept in {within[:-1].sum()} of {len(columns)}" if self.count is not None else ""
+        word = FAILS if not met else MIXED if doubts else HOLDS
+        return Verdict(self.text, word, "; ".join([here, *doubts]) if word == MIXED else here)
+
+
+def counted(
+    text: str, met: Sequence[bool], share: float, what: str, numbers: str = "", whole: str = ""
+) -> Verdict:
+    """A claim about a share of independent trials, which holds if enough of them meet it.
+
+    Args:
+        text: the claim, followed by the number of trials that it needs.
+        met: whether each trial meets it.
+        what: name of the trials.
+        numbers: further numbers of ours.
+        whole: what stands instead of "at least n" if all trials are needed.
+    """
+    least, count = math.ceil(share * len(met)), sum(met)
+    needed = whole if whole and least == len(met) else f"at least {least}"
+    here = ", ".join(filter(None, [f"{count} of {len(met)}", numbers]))
+    return Verdict(f"{text} {needed} of {len(met)} {what}", HOLDS if met and count >= least else FAILS, here)
+
+
+def check(claims: Iterable[Claim], frame: Frame) -> list[Verdict]:
+    """Verdicts on the claims whose rows and columns the frame has."""
+    return [verdict for claim in claims if (verdict := claim.holds(frame))]
+
+
+def verdict_lines(verdicts: Sequence[Verdict], here: str = "here", paper: bool = False) -> list[str]:
+    """Markdown lines of a table of verdicts, with a heading. Nothing for no verdicts."""
+    if not verdicts:
+        return []
+    rows = [[v.text, f"**{v.word}**", v.here, *([v.paper] if paper else [])] for v in verdicts]
+    head = [*VERDICTS[:2], here, *([VERDICTS[3]] if paper else [])]
+    return ["**What holds**", "", *as_markdown(head, rows), ""]
+
+
+def _too_few(*rows: Row) -> str:
+    """A remark if a row has less than `MIN_REPLICATES` replicates, else nothing."""
+    fewest = min(len(row.runs) for row in rows)
+    return (
+        "" if fewest >= MIN_REPLICATES else f"{fewest} run{'s' if fewest > 1 else ''}, no spread to judge by"
+    )

@@ -1,0 +1,187 @@
+"""Checks of settings across sections: names that exist, options that fit their method, independent samplings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from neuma_lib.config.figures import FiguresConfig
+from neuma_lib.config.validation import hint, joined, validate
+from neuma_lib.errors import InputError
+from neuma_lib.methods.registry import methods
+from neuma_lib.project.cases import law_from
+from neuma_lib.project.paths import IDENTIFIED
+from neuma_lib.project.settings import Config
+
+TRUTH_SAMPLINGS = ("particles", "tracers", "second tracers")
+"""What the seeds dataset.seed, dataset.seed + 1 and dataset.seed + 2 sample, see `neuma_lib.data.ground_truth`."""
+SHARED_BY_VIDEOS = ("law", "prior", "dt")
+"""Keys that the scenes of several videos have in common."""
+
+
+def check_consistency(settings: Config) -> None:
+    """Raise an InputError that lists all problems, or all of the methods where there is no other one."""
+    for check in (_section_errors, _method_errors):
+        errors: dict[str, InputError] = {}
+        for error in check(settings):
+            errors.setdefault(error.where, error)  # one for each key
+        if errors:
+            raise joined(list(errors.values()))
+
+
+def _section_errors(settings: Config) -> Iterator[InputError]:
+    yield from _name_errors(settings)
+    for name in settings.scenes:
+        yield from _scene_errors(settings, name)
+    for name in settings.methods:
+        yield from _preset_errors(settings, name)
+    for where, kind, name in _references(settings):
+        known = settings.scenes if kind == "scene" else settings.experiments
+        if name not in known:
+            yield InputError(where, f"no {kind} '{name}'{hint(name, known)}")
+    for name, experiment in settings.experiments.items():
+        if all(body.scene in settings.scenes for body in experiment.bodies):
+            yield from _raised_by(settings.experiment_truth, name)
+    yield from _sampling_errors(settings)
+
+
+def _name_errors(settings: Config) -> Iterator[InputError]:
+    """Names are folders, in which + begins a variant, and differ from each other."""
+    named = {kind: getattr(settings, kind) for kind in ("scenes", "experiments", "methods")}
+    for kind, names in (named | {"priors.laws": settings.priors.laws}).items():
+        for name in names:
+            if "+" in name or "/" in name:
+                yield InputError(f"{kind}.{name}", "a name must not contain + or /")
+    if IDENTIFIED in settings.priors.laws:
+        where, problem = (
+            f"priors.laws.{IDENTIFIED}",
+            "the name is reserved for the law identified in the video",
+        )
+        yield InputError(where, problem, "Choose another name")
+    for name in settings.scenes.keys() & settings.experiments.keys():
+        yield InputError(f"experiments.{name}", "a scene has this name")
+
+
+def _scene_errors(settings: Config, name: str) -> Iterator[InputError]:
+    scene, laws = settings.scenes[name], settings.priors.laws
+    if "/" not in scene.prior and "." not in scene.prior and scene.prior not in laws:
+        yield InputError(
+            f"scenes.{name}.prior", f"no prior '{scene.prior}' in priors.laws{hint(scene.prior, laws)}"
+        )
+    changed = {**settings.training.plain(), **scene.training}
+    yield from _raised_by(validate, type(settings.training), changed, f"scenes.{name}.training")
+    yield from _raised_by(settings.scene_truth, name)
+    yield from _video_errors(settings, name)
+
+
+def _video_errors(settings: Config, name: str) -> Iterator[InputError]:
+    """The videos of a scene are of other scenes, of the same material and time step."""
+    scene, where = settings.scenes[name], f"scenes.{name}.videos"
+    for video in scene.videos:
+        if video not in settings.scenes:
+            yield InputError(where, f"no scene '{video}'{hint(video, settings.scenes)}")
+            continue
+        other, supplied = settings.scenes[video], settings.scenes[video].images.dynamic
+        if video == name or scene.videos.count(video) > 1:
+            yield InputError(where, f"'{video}' is listed twice", "The scene's own video always counts")
+        elif supplied is not None and supplied == scene.images.dynamic:
+            yield InputError(where, f"'{video}' has the same video, {supplied}", "Give it images.dynamic")
+        if other.videos:
+            yield InputError(where, f"'{video}' lists videos itself", "List all in one of the two scenes")
+        differing = [key for key in SHARED_BY_VIDEOS if getattr(other, key) != getattr(scene, key)]
+        if differing:
+            problem = f"'{video}' differs in {', '.join(differing)}, but one law is identified for all videos"
+            yield InputError(where, problem, "Give both the same")
+
+
+def _preset_errors(settings: Config, name: str) -> Iterator[InputError]:
+    """The kind of a preset exists, and its options are those of the kind."""
+    preset, where = settings.methods[name], f"methods.{name}"
+    if preset.same_fit_as is not None:
+        own = [known for known, entry in settings.methods.items() if entry.same_fit_as is None]
+        if preset.same_fit_as not in own:
+            problem = f"no preset '{preset.same_fit_as}' with a fit of its own{hint(preset.same_fit_as, own)}"
+            yield InputError(f"{where}.same_fit_as", problem)
+            return
+        kind = settings.methods[preset.same_fit_as].kind
+        if preset.kind not in (None, kind):
+            problem = f"{preset.kind} differs from the kind of '{preset.same_fit_as}', {kind}"
+            yield InputError(f"{where}.kind", problem, "Leave it out")
+        return
+    known_methods = methods(settings.extensions)
+    if preset.kind not in known_methods:
+        yield InputError(f"{where}.kind", f"no method '{preset.kind}'{hint(preset.kind, known_methods)}")
+        return
+    kind = known_methods[preset.kind]
+    sections = (getattr(settings, section).plain() for section in kind.sections)
+    known = kind.Options.model_fields
+    values = {key: value for section in sections for key, value in section.items() if key in known}
+    try:
+        options = validate(kind.Options, values | preset.options, f"{where}.options")
+    except InputError as error:
+        yield error
+        return
+    priors = (*settings.priors.laws, IDENTIFIED)
+    if getattr(options, "prior", None) not in (None, *priors):
+        problem = f"no prior '{options.prior}' in priors.laws{hint(options.prior, priors)}"
+        yield InputError(f"{where}.options.prior", problem)
+
+
+def _references(settings: Config) -> Iterator[tuple[str, str, str]]:
+    """Where a scene or an experiment is named: path of the key, "scene" or "experiment", name."""
+    for name, experiment in settings.experiments.items():
+        for k, body in enumerate(experiment.bodies):
+            yield f"experiments.{name}.bodies.{k}.scene", "scene", body.scene
+    # The default figures show scenes of the benchmark, which a project without scenes does not have.
+    for key, kind in FiguresConfig.SHOWN.items():
+        value = getattr(settings.figures, key) if kind == "experiment" or settings.scenes else ()
+        for name in filter(None, [value] if isinstance(value, str) else value):
+            yield f"figures.{key}", kind, name
+    if settings.scenes:
+        yield "demo.scene", "scene", settings.demo.scene
+    for name, table in settings.tables.items():
+        for kind in ("scene", "experiment"):
+            for column in getattr(table, f"{kind}s"):
+                yield f"tables.{name}.{kind}s", kind, column
+
+
+def _sampling_errors(settings: Config) -> Iterator[InputError]:
+    """Truth and prediction are sampled with equal counts and independent seeds, as the sampling floor assumes."""
+    dataset, tracers = settings.dataset, settings.evaluation.tracers
+    if tracers != dataset.tracers:
+        yield InputError(
+            "evaluation.tracers",
+            f"{tracers} in the prediction differ from dataset.tracers = {dataset.tracers} in the truth",
+            "Set both to the same number",
+        )
+    replicates = max((table.seeds for table in settings.tables.values()), default=1)
+    used = range(settings.seed, settings.seed + replicates)
+    shared = [(k, sampled) for k, sampled in enumerate(TRUTH_SAMPLINGS, dataset.seed) if k in used]
+    for k, sampled in shared[:1]:
+        yield InputError(
+            "dataset.seed",
+            f"{dataset.seed} samples the {sampled} of the truth with the seed {k}, which a replicate of the "
+            f"reconstruction has too (seed = {settings.seed})",
+            "Choose a larger dataset.seed",
+        )
+
+
+def _method_errors(settings: Config) -> Iterator[InputError]:
+    """Presets and variants that tables, figures and the demo name."""
+    named = {"figures.beside": settings.figures.beside}
+    named["random.methods"] = settings.random.methods if settings.random.count else ()
+    named["demo.methods"] = settings.demo.methods if "demo" in settings.model_fields_set else ()
+    for name, table in settings.tables.items():
+        named[f"tables.{name}"] = (*table.methods, *table.titles)
+    for where, names in named.items():
+        for method in names:
+            for error in _raised_by(law_from, settings, method):
+                yield InputError(where, str(error))
+
+
+def _raised_by(check, *values) -> list[InputError]:
+    """The InputError that a call raises, if any."""
+    try:
+        check(*values)
+    except InputError as error:
+        return [error]
+    return []
