@@ -34,7 +34,7 @@ from neuma_lib.evaluation.metrics import tracer_errors
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.identified import Identified
 from neuma_lib.fitting.identify import _LAST_GAIN, _Run, identify
-from neuma_lib.fitting.thrown_video import NUISANCES, ThrownVideo, Try, averaged
+from neuma_lib.fitting.thrown_video import NUISANCES, Candidate, VideoResiduals, averaged
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.hdf5 import read_arrays
@@ -74,7 +74,7 @@ def judge(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str, 
     model = simulator(settings, scene)
     stock = settings.priors.laws.get(scene.prior)
     before = _core_seconds()
-    found = identify(model, throw, body, video, chosen, stock.plain() if stock else None, finer=[finer])
+    found = identify(model, throw, body, video, chosen, stock.plain() if stock else None, refined=[finer])
     seconds = _core_seconds() - before
     truth = scene.law.plain()
     row = {
@@ -90,7 +90,7 @@ def judge(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str, 
     tracers = torch.from_numpy(arrays["tracers"])
     tracers = tracers[:, :: max(1, tracers.shape[1] // TRACERS)].to(body.x0)
     laws = {"identified": row["found"]["law"], "true_law": truth}
-    starts = {"velocity": throw, "fitted": found.best.throws[0]}
+    starts = {"velocity": throw, "fitted": found.best.motions[0]}
     for law, spec in laws.items():
         for start, thrown in starts.items():
             path, _ = predict(
@@ -119,7 +119,7 @@ def compare(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str
             f"identify.families has no family of the law of {name}: take another scene for --simplex"
         )
     model = simulator(settings, scene)
-    thrown = ThrownVideo(model, throw, body, video, chosen)
+    thrown = VideoResiduals(model, throw, body, video, chosen)
     thrown.hold_out(family, chosen.held_out)
     rounds = range(len(chosen.pyramid))
     origin, known = family.unbounded(family.guess), np.zeros(NUISANCES)
@@ -133,13 +133,13 @@ def compare(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str
         """A simplex only compares; in logarithms its tolerance is relative."""
         key = u.tobytes()
         if key not in images:
-            (images[key],) = thrown.residuals([Try(family.law_spec(values(u)), known)], thrown.fitted)
+            (images[key],) = thrown.residuals([Candidate(family.law_spec(values(u)), known)], thrown.fitted)
             finest.append(math.exp(log_cost(u, rounds[-1])))
         if images[key] is None:
             return math.inf
         return math.log(averaged(images[key], thrown.sizes[level]).square().sum(dtype=torch.float64))
 
-    thrown.residuals([Try(family.law_spec(family.guess), known)], thrown.fitted)  # compiles
+    thrown.residuals([Candidate(family.law_spec(family.guess), known)], thrown.fitted)  # compiles
     begun = _core_seconds()
     run = _Run(family, [thrown], [thrown.fitted], chosen)
     run.begin([family.guess])

@@ -29,7 +29,7 @@ from neuma_lib.fitting import structured_fit
 from neuma_lib.fitting.identify import identify
 from neuma_lib.fitting.material import PixelLoss
 from neuma_lib.fitting.structured_fit import rival_bases, train_structured
-from neuma_lib.fitting.thrown_video import ThrownVideo
+from neuma_lib.fitting.thrown_video import VideoResiduals
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.images import load_videos
@@ -41,8 +41,8 @@ from neuma_lib.project.settings import Config
 
 METHOD = "neuma_structured"
 IDENTIFYING = {
-    "simulating": (ThrownVideo, "_paths"),
-    "rendering": (ThrownVideo, "_residual"),
+    "simulating": (VideoResiduals, "_paths"),
+    "rendering": (VideoResiduals, "_residual"),
     "linearising": (identification._Run, "linearise"),
     "uncertainties": (identification._Run, "_covariance"),
 }
@@ -127,7 +127,9 @@ def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
         ]
     stock = settings.priors.laws.get(scene.prior)
     with clock.parts(IDENTIFYING), clock.part("identifying, the rest"):
-        found = identify(model, throw, body, videos, chosen, stock.plain() if stock else None, finer=[finer])
+        found = identify(
+            model, throw, body, videos, chosen, stock.plain() if stock else None, refined=[finer]
+        )
     plain = found.as_dict()
     options = cases.case(settings, name, METHOD).options
     with clock.part("preparing the correction"):
@@ -137,7 +139,7 @@ def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
         ]
         for law in laws:
             law.attach_adaptor(options.rank, options.alpha, options.seed)
-        start = found.best.throws[0].of_body(body)
+        start = found.best.motions[0].of_body(body)
         total = options.covariance_from == "total"
         loss = PixelLoss(body, videos, options.covariance_gradient, total=total, compare=options.compare)
     quiet = {"log": lambda text: None}

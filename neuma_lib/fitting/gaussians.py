@@ -1,9 +1,9 @@
 """Static Gaussians from posed RGBA images (paper Sec. 3.1 and supplement, 3D Gaussian Splatting).
 
-Start: points sampled in the visual hull of the alpha masks, coloured from the images. Loss: L1 and SSIM over
-a random background, which makes alpha a fourth supervised channel, plus the anisotropy regulariser of
-PhysGaussian. Gaussians with large screen-space gradients are cloned or split up to a fixed number; transparent
-ones are removed, at the end those with an opacity of at most 0.02, as in the paper.
+Initialisation: points sampled in the visual hull of the alpha masks, with colours from the images. Loss: L1 and SSIM
+over a random background, which supervises alpha as a fourth channel, and the anisotropy regulariser of PhysGaussian.
+Gaussians with large screen-space gradients are cloned or split up to a maximum number. Transparent ones are removed, at
+the end those with an opacity of at most 0.02, as in the paper.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from neuma_lib.splatting.spherical_harmonics import SH_C0, coefficient_count, rg
 
 @dataclass
 class GaussianFitReport:
-    """How a fit went.
+    """Report of a fit.
 
     Attributes:
         losses: training loss of every iteration.
-        count: Gaussians returned.
-        culled: Gaussians removed by the final opacity cull.
-        held_out: indices of the views kept for measurement.
+        count: number of Gaussians.
+        culled: number of Gaussians removed by the final opacity cull.
+        held_out: indices of the held-out views.
         psnr: mean PSNR [dB] of the held-out views, full frame over white.
         psnr_object: the same inside the object (pixels with alpha above 1/2).
-        train_psnr, train_psnr_object: of the views that were fitted.
-        gains: exposure of each view, for red, green and blue, where it was fitted; None elsewhere. Those of the fitted
-            views have a geometric mean of 1. Those of the held-out ones are least squares against the render (the
-            measures have them in), since nothing else tells the exposure of a photograph.
+        train_psnr, train_psnr_object: the same for the training views.
+        gains: red, green and blue exposure of each view, or None if not fitted. Those of the training views have a
+            geometric mean of 1. Those of the held-out views are least-squares fits to the render, because the exposure
+            of a photograph is otherwise unknown, and are applied in the measures.
     """
 
     losses: list[float]
@@ -56,21 +56,21 @@ class GaussianFitReport:
 EPS2D = 0.3
 """Variance that a pixel adds to a splat during the fit [px^2], as usual in Gaussian splatting."""
 _SHEET_PACKING = 1.15
-"""Squared spacing over the area a point, hexagonally packed sheet: 2 / sqrt(3), rounded."""
+"""Squared spacing per area of a point in a hexagonal sheet, 2 / sqrt(3) rounded."""
 _VOLUME_PACKING = 1.41
-"""Cubed spacing over the volume a point, close packing of spheres: sqrt(2), rounded."""
+"""Cubed spacing per volume of a point in close packing, sqrt(2) rounded."""
 _START_SCALE = 0.5
-"""Standard deviation at the start over the spacing."""
+"""Initial standard deviation relative to the spacing."""
 _COLOUR_DEPTHS = 0.05
-"""Depth [fraction of the mean depth] over which the weight of a farther camera falls by e in the first colours."""
+"""Decay length of the weights of cameras in the initial colours, as a share of the mean depth."""
 _BETAS, _EPS = (0.9, 0.99), 1e-15
-"""Adam's averaging factors and its smallest denominator (3DGS takes 0.9, 0.999; fits here are 20 times shorter)."""
+"""Betas and epsilon of Adam (3DGS uses 0.9, 0.999, but fits here are 20 times shorter)."""
 _MEANS_DECAY, _RATE_DECAY = 0.01, 0.1
-"""Last over first learning rate: of the centres (as 3DGS), of all else."""
+"""Ratio of last to first learning rate for centres (as in 3DGS) and for all other parameters."""
 _SPLIT_SHRINK = 1.6
-"""Standard deviation of a Gaussian over those that it is split into, as in 3DGS."""
+"""Ratio of the standard deviations of a Gaussian before and after a split, as in 3DGS."""
 _CLONE_OFFSET = 0.5
-"""Distance of a small Gaussian's clone over that of a large one's, both in random standard deviations."""
+"""Ratio of the offset of a clone to that of a split."""
 
 
 def fit_gaussians(
@@ -85,19 +85,19 @@ def fit_gaussians(
     """Fit Gaussians to images of an object.
 
     Args:
-        images: V of RGBA with straight alpha in [0, 1], shape (H, W, 4) each; alpha shows the object alone.
-        cameras: their V cameras, or V sets of one where sizes differ.
+        images: V RGBA images with straight alpha in [0, 1], shape (H, W, 4) each. Alpha is the object mask.
+        cameras: their V cameras, or V sets of one camera if sizes differ.
         settings: hyper-parameters.
-        seed: of everything random; the same seed gives the same Gaussians on a CPU.
+        seed: random seed; the same seed gives the same Gaussians on a CPU.
         progress: called with (iteration, loss) after each iteration.
-        floor: height y [m] below which no Gaussian starts; None: there is no floor.
-        gain_rate: learning rate of the logarithms of the views' exposures, one for each channel; 0: all are alike.
+        floor: height y of the floor [m], below which no Gaussian is initialised, or None.
+        gain_rate: learning rate of the logarithms of the exposures per view and channel; 0 for equal exposures.
 
     Returns:
-        The Gaussians, without gradient and with the pixels' blur absorbed (render them with ``eps2d=0``), and a report.
+        The Gaussians, without gradient and including the blur of pixels (render them with ``eps2d=0``), and a report.
 
     Raises:
-        InputError: shapes disagree, a mask is empty or covers the frame, or masks and poses contradict each other.
+        InputError: shapes do not match, a mask is empty or covers the frame, or masks and poses are inconsistent.
         NonFiniteError: the loss is not finite.
     """
     views = _Views.of(images, cameras)
@@ -106,9 +106,9 @@ def fit_gaussians(
     held_out = list(range(settings.held_out // 2, count, settings.held_out)) if settings.held_out else []
     fitted = [i for i in range(count) if i not in held_out]
 
-    seen = views.some(fitted)
-    hull = visual_hull(seen.masks(), seen.cameras, settings.hull_resolution, floor)
-    start, spacing = _initial_gaussians(hull, seen, settings, generator)
+    training = views.select(fitted)
+    hull = visual_hull(training.masks(), training.cameras, settings.hull_resolution, floor)
+    start, spacing = _initial_gaussians(hull, training, settings, generator)
     gains = _Gains(fitted, count, gain_rate, start.means) if gain_rate else None
     fit = _Fit(start, spacing, settings, gains)
 
@@ -127,7 +127,7 @@ def fit_gaussians(
         losses.append(loss)
         if not math.isfinite(loss):
             raise NonFiniteError(
-                "gaussians", f"loss is {loss} in iteration {iteration}; lower the learning rates"
+                "gaussians", f"the loss is {loss} in iteration {iteration}. Lower the learning rates"
             )
         if first <= iteration < last and (iteration + 1) % rounds.every == 0:
             fit.densify(generator)
@@ -136,7 +136,7 @@ def fit_gaussians(
 
     everything = fit.gaussians()
     gaussians = everything.cull(settings.cull_opacity).absorbing_blur(Cameras.joined(views.cameras), EPS2D)
-    exposures = gains.found() if gains else None
+    exposures = gains.values() if gains else None
     for view in held_out if gains else ():
         exposures[view] = _exposure(gaussians, views, view)
     psnr, psnr_object = _evaluate(gaussians, views, held_out, exposures)
@@ -157,14 +157,14 @@ def fit_gaussians(
 
 @dataclass(frozen=True, eq=False)
 class _Views:
-    """Images and their cameras: a tensor (V, H, W, 4) and V cameras, or V of each one by one where sizes differ."""
+    """Images and their cameras: a tensor (V, H, W, 4) and V cameras, or lists of V of each if sizes differ."""
 
     images: Tensor | list[Tensor]
     cameras: Cameras | list[Cameras]
 
     @classmethod
     def of(cls, images: Tensor | Sequence[Tensor], cameras: Cameras | Sequence[Cameras]) -> _Views:
-        """Checked. Raises InputError: shapes disagree, or a mask shows no outline."""
+        """Checked views. Raises InputError if shapes do not match or a mask has no outline."""
         if isinstance(images, Tensor) and isinstance(cameras, Cameras):
             images = images.to(cameras.viewmats.dtype)
             shape, expected = tuple(images.shape), (len(cameras), cameras.height, cameras.width, 4)
@@ -174,29 +174,29 @@ class _Views:
             shape = [tuple(image.shape) for image in images]
             expected = [(camera.height, camera.width, 4) for camera in cameras]
         if shape != expected:
-            raise InputError(f"gaussians: images have shape {shape}, the cameras ask for {expected}")
+            raise InputError("images", f"shape {shape} must be {expected}, as for the cameras")
         views = cls(images, cameras)
         check_masks(views.masks())
         return views
 
-    def some(self, views: list[int]) -> _Views:
+    def select(self, views: list[int]) -> _Views:
         if isinstance(self.cameras, Cameras):
             return _Views(self.images[views], self.cameras[views])
         return _Views([self.images[i] for i in views], [self.cameras[i] for i in views])
 
     def masks(self) -> Tensor | list[Tensor]:
-        """Alpha of each."""
+        """Alpha of each view."""
         return self.images[..., 3] if isinstance(self.images, Tensor) else [i[..., 3] for i in self.images]
 
     def batches(self, views: list[int], alone: bool) -> list[tuple[list[int], Tensor, Cameras]]:
-        """Numbers, images (B, H, W, 4) and cameras of views that can be rendered together."""
+        """Indices, images (B, H, W, 4) and cameras of views that are rendered together, or one by one if ``alone``."""
         if isinstance(self.cameras, Cameras) and not alone:
             return [(views, self.images[views], self.cameras[views])]
         return [([i], self.images[i][None], self.cameras[i]) for i in views]
 
 
 class _Gains:
-    """Exposure and white balance of each view against the mean of the fitted ones: a factor for each channel."""
+    """Exposure and white balance of each view relative to the mean of the training views, one factor per channel."""
 
     def __init__(self, fitted: list[int], count: int, rate: float, like: Tensor):
         self.fitted, self.rate = fitted, rate
@@ -204,7 +204,7 @@ class _Gains:
         self.optimizer = torch.optim.Adam([self.logarithms], betas=_BETAS, eps=_EPS)
 
     def of(self, view: int) -> Tensor:
-        """(3,), differentiable. The mean is taken off: brighter Gaussians and darker photographs look the same."""
+        """Gain (3,), differentiable, without the mean, which is equivalent to brighter Gaussians."""
         return (self.logarithms[view] - self.logarithms[self.fitted].mean(dim=0)).exp()
 
     def step(self, done: float) -> None:
@@ -212,19 +212,19 @@ class _Gains:
         self.optimizer.step()
 
     @torch.no_grad()
-    def found(self) -> Tensor:
-        """(V, 3); only those of fitted views mean something."""
+    def values(self) -> Tensor:
+        """Gains (V, 3), defined only for training views."""
         return torch.stack([self.of(view) for view in range(len(self.logarithms))])
 
 
 def _exposed(sh: Tensor, gain: Tensor) -> Tensor:
-    """Coefficients (G, K, 3) of colours that are ``gain`` (3,) times as bright; a colour is 0.5 + sum of harmonics."""
-    brighter = sh * gain
-    return torch.cat([brighter[:, :1] + 0.5 * (gain - 1) / SH_C0, brighter[:, 1:]], dim=1)
+    """Coefficients (G, K, 3) of colours multiplied by ``gain`` (3,). A colour is 0.5 + sum of harmonics."""
+    scaled = sh * gain
+    return torch.cat([scaled[:, :1] + 0.5 * (gain - 1) / SH_C0, scaled[:, 1:]], dim=1)
 
 
 def _render(gaussians: Gaussians, sh: Tensor, camera: Cameras) -> tuple[Tensor, Tensor]:
-    """Picture over white (H, W, 3) and its alpha (H, W)."""
+    """Image over white (H, W, 3) and its alpha (H, W)."""
     pictures, alphas = rasterize(
         gaussians.means[None], gaussians.covars()[None], gaussians.opacities, sh, camera.viewmats, camera.Ks,
         camera.width, camera.height, eps2d=0.0,
@@ -233,25 +233,25 @@ def _render(gaussians: Gaussians, sh: Tensor, camera: Cameras) -> tuple[Tensor, 
 
 
 def _exposure(gaussians: Gaussians, views: _Views, view: int) -> Tensor:
-    """Gain (3,) with which the render is nearest to an image inside the object, by least squares."""
+    """Least-squares gain (3,) between the render and an image inside the object."""
     picture, alpha = _render(gaussians, gaussians.sh(), views.cameras[view])
     rgba = views.images[view]
     inside = rgba[..., 3] > 0.5
-    found, target = (picture - (1 - alpha[..., None]))[inside], (rgba[..., :3] * rgba[..., 3:])[inside]
-    return (found * target).sum(dim=0) / found.square().sum(dim=0).clamp_min(_EPS)
+    colour, target = (picture - (1 - alpha[..., None]))[inside], (rgba[..., :3] * rgba[..., 3:])[inside]
+    return (colour * target).sum(dim=0) / colour.square().sum(dim=0).clamp_min(_EPS)
 
 
 def _evaluate(
     gaussians: Gaussians, views: _Views, chosen: list[int], exposures: Tensor | None
 ) -> tuple[float, float]:
-    """Mean PSNR [dB] over chosen views against RGBA images over white: full frame; where alpha > 1/2."""
+    """Mean PSNR [dB] over chosen views with respect to RGBA images over white: full frame, and where alpha > 1/2."""
     if not chosen:
         return math.nan, math.nan
     full, inside = [], []
     sh = gaussians.sh()
     for view in chosen:
-        seen = sh if exposures is None else _exposed(sh, exposures[view])
-        picture, _ = _render(gaussians, seen, views.cameras[view])
+        exposed = sh if exposures is None else _exposed(sh, exposures[view])
+        picture, _ = _render(gaussians, exposed, views.cameras[view])
         rgba = views.images[view]
         error = (picture.clamp(0, 1) - (rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:])) ** 2
         full.append(-10 * math.log10(float(error.mean())))
@@ -262,14 +262,14 @@ def _evaluate(
 def _initial_gaussians(
     hull: Hull, views: _Views, settings: GaussiansConfig, generator: torch.Generator
 ) -> tuple[Gaussians, float]:
-    """Isotropic Gaussians, most near the hull's surface, and their mean spacing [m]."""
+    """Isotropic Gaussians, mostly near the surface of the hull, and their mean spacing [m]."""
     solid = hull.occupied.float()[None, None]
     eroded = -torch.nn.functional.max_pool3d(-torch.nn.functional.pad(solid, (1,) * 6), 3, stride=1)
     shell = hull.occupied & (eroded[0, 0] < 0.5)
     inner = hull.occupied & ~shell
     wanted_inside = round(settings.interior * settings.initial_count) if inner.any() else 0
     wanted = ((shell, settings.initial_count - wanted_inside), (inner, wanted_inside))
-    # a shell voxel stands for about one voxel^2 of surface
+    # a shell voxel represents about one voxel^2 of surface
     surface_spacing = hull.voxel * math.sqrt(_SHEET_PACKING * float(shell.sum()) / wanted[0][1])
     volume_spacing = hull.voxel * (_VOLUME_PACKING * float(inner.sum()) / max(wanted_inside, 1)) ** (1 / 3)
     means, spacings = [], []
@@ -297,7 +297,7 @@ def _initial_gaussians(
 
 
 def _spread(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Indices of about ``count`` of the points, a random one of each cell of a grid with that many cells."""
+    """Indices of about ``count`` points, a random one in each cell of a grid with about that many occupied cells."""
     if count >= len(points):
         return torch.arange(len(points), device=points.device)
     low, high = 0.0, float((points.amax(0) - points.amin(0)).max())
@@ -314,31 +314,31 @@ def _spread(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
 
 
 def _cell_keys(points: Tensor, size: float) -> Tensor:
-    """One integer a point that is equal for points in the same cube of side ``size``."""
+    """Integer per point that is equal for points in the same cube of side ``size``."""
     cells = ((points - points.amin(0)) / size).long()
     extent = cells.amax(0) + 1
     return (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
 
 
 def _mean_colours(points: Tensor, views: _Views) -> Tensor:
-    """(P, 3) colour of each point averaged over the cameras that are nearest to looking straight at it."""
+    """Colour (P, 3) of each point, averaged over the nearest cameras."""
     pixels, depths = Cameras.joined(views.cameras).project(points)
     rgba = []
-    for place, image in zip(pixels.floor().long(), views.images):
-        column, row = place[:, 0].clamp(0, image.shape[1] - 1), place[:, 1].clamp(0, image.shape[0] - 1)
+    for pixel, image in zip(pixels.floor().long(), views.images):
+        column, row = pixel[:, 0].clamp(0, image.shape[1] - 1), pixel[:, 1].clamp(0, image.shape[0] - 1)
         rgba.append(image[row, column])
     rgba = torch.stack(rgba)
-    # a point on the surface is hidden from half of the cameras; those in front of it are the nearest
+    # a point on the surface is occluded in half of the views, but usually not in the nearest ones
     weights = rgba[..., 3] * torch.softmax(-depths / (_COLOUR_DEPTHS * depths.mean()), dim=0)
     return (weights[..., None] * rgba[..., :3]).sum(0) / weights.sum(0)[:, None].clamp_min(1e-6)
 
 
 class _Fit:
-    """Parameters of the Gaussians, the optimizer, and the rounds of densification."""
+    """Parameters of the Gaussians, optimizer, and densification."""
 
     def __init__(self, start: Gaussians, spacing: float, settings: GaussiansConfig, gains: _Gains | None):
         self.settings, self.spacing, self.gains = settings, spacing, gains
-        parameters = {  # value at the start, learning rate, its decay
+        parameters = {  # initial value, learning rate, its decay
             "means": (start.means.clone(), settings.rate_means * spacing, _MEANS_DECAY),
             "scales": (start.scales.log(), settings.rate_scales, _RATE_DECAY),
             "quats": (start.quats.clone(), settings.rate_quats, _RATE_DECAY),
@@ -359,7 +359,7 @@ class _Fit:
         self._reset_statistics()
 
     def parameters(self) -> dict[str, Tensor]:
-        """Means, log scales, quaternions, logits of the opacities, colours: leaves of the gradient."""
+        """Means, log scales, quaternions, logits of the opacities and colours, as leaves."""
         return {group["name"]: group["params"][0] for group in self.optimizer.param_groups}
 
     def _reset_statistics(self) -> None:
@@ -368,7 +368,7 @@ class _Fit:
 
     @torch.no_grad()
     def gaussians(self) -> Gaussians:
-        """The Gaussians as they are now."""
+        """The current Gaussians."""
         p = self.parameters()
         quats = torch.nn.functional.normalize(p["quats"], dim=-1)
         opacities = torch.sigmoid(p["opacities"])
@@ -377,7 +377,7 @@ class _Fit:
         )
 
     def step(self, views: _Views, batch: list[int], background: Tensor, done: float) -> float:
-        """One Adam step on some views; ``done`` in [0, 1) is the part of the schedule behind us."""
+        """One Adam step on a batch of views; ``done`` in [0, 1) is the position in the schedule."""
         self.optimizer.zero_grad(set_to_none=True)
         if self.gains:
             self.gains.optimizer.zero_grad(set_to_none=True)
@@ -403,7 +403,7 @@ class _Fit:
         return total
 
     def _loss(self, images: Tensor, cameras: Cameras, background: Tensor, gain: Tensor | None) -> Tensor:
-        """Of images (B, H, W, 4), which share the gain if there is one."""
+        """Loss of images (B, H, W, 4) with a common gain, if any."""
         settings, p = self.settings, self.parameters()
         sh = torch.cat([p["sh0"], p["shN"]], dim=1)
         pictures, _ = rasterize(
@@ -429,7 +429,7 @@ class _Fit:
 
     @torch.no_grad()
     def densify(self, generator: torch.Generator) -> None:
-        """Remove transparent Gaussians, then clone or split those whose screen-space gradients are largest."""
+        """Remove transparent Gaussians, then clone or split those with the largest screen-space gradients."""
         rules = self.settings.densification
         score = self.gradients / self.views.clamp_min(1)
         p = self.parameters()
@@ -444,7 +444,7 @@ class _Fit:
         self._reset_statistics()
 
     def _replace(self, values: dict[str, Tensor], edit: Callable[[Tensor], Tensor]) -> None:
-        """Put other values in the place of the parameters; ``edit`` makes their moments from the former ones."""
+        """Replace the values of the parameters. ``edit`` maps the old moments of Adam to the new ones."""
         for group in self.optimizer.param_groups:
             state = self.optimizer.state.pop(group["params"][0])
             state["exp_avg"], state["exp_avg_sq"] = edit(state["exp_avg"]), edit(state["exp_avg_sq"])
@@ -452,7 +452,7 @@ class _Fit:
             self.optimizer.state[group["params"][0]] = state
 
     def _multiply(self, chosen: Tensor, generator: torch.Generator) -> None:
-        """Give each chosen Gaussian a twin; both shrink if it is large, else they share its alpha."""
+        """Duplicate each chosen Gaussian. Large ones are shrunk, small ones share the alpha."""
         p = {name: value.clone() for name, value in self.parameters().items()}
         scales = p["scales"][chosen].exp()
         limit = self.settings.densification.split_scale * self.spacing * _START_SCALE
@@ -470,7 +470,7 @@ class _Fit:
         twins["means"] = twins["means"] + 0.5 * offsets
 
         def edit(moment: Tensor) -> Tensor:
-            """Both twins start without a past."""
+            """Both copies start with zero moments."""
             moment[chosen] = 0
             return torch.cat([moment, torch.zeros_like(moment[chosen])])
 
@@ -488,7 +488,7 @@ def image_loss(pictures: Tensor, targets: Tensor, ssim_weight: float) -> Tensor:
 def ssim_map(a: Tensor, b: Tensor, sigma: float = 1.5, radius: int = 5) -> Tensor:
     """SSIM (B, 3, H, W) of (B, H, W, 3) images in [0, 1]: 11 x 11 Gaussian window, zeros outside.
 
-    The window is applied as two banded matrices, which one GEMM a side does faster than a small convolution.
+    The window is applied as two banded matrices by GEMM, which is faster than a small convolution.
     """
     a, b = (image.movedim(-1, 1) for image in (a, b))
     rows, columns = (_window(n, sigma, radius, a.dtype, a.device) for n in a.shape[-2:])

@@ -1,4 +1,4 @@
-"""What an identification finds: the fit of every family, the chosen one, and how sure its constants are."""
+"""Results of an identification: fits of all families, the selected one, and the uncertainty of its constants."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from neuma_lib.mechanics.combinations import Values, named_combinations, physica
 
 @dataclass
 class FamilyFit:
-    """What was found for a family.
+    """Fit of a family.
 
     Attributes:
         family: the candidate.
-        values: its constants; those of the last start if every rollout diverged.
-        loss: mean squared residual of the fitted frames, at the last squares it came to; infinite if all diverged.
-        held_out: the same of the frames that were held out, at the finest squares.
-        score: logarithm of ``held_out`` plus the penalty on constants; smaller is better.
-        covariance: of the unbounded constants, shape (k, k); what is uncertain about the throws is in it.
-        throws: the initial motion in each video, which was fitted along, with its standard deviations.
-        refined: whether it came to the finest squares.
-        rollouts: simulations that it took.
-        steps: accepted Levenberg-Marquardt steps.
+        values: its constants, or those of the last start if every rollout diverged.
+        loss: mean squared residual of the fitted frames at the last level of the pyramid, infinite if all diverged.
+        held_out: mean squared residual of the held-out frames at the finest level.
+        score: logarithm of ``held_out`` plus the penalty on constants; lower is better.
+        covariance: covariance (k, k) of the unbounded constants, including the uncertainty of the initial motions.
+        motions: fitted initial motion in each video, with its standard deviations.
+        refined: whether the fit reached the finest level.
+        rollouts: number of simulations.
+        steps: number of accepted Levenberg-Marquardt steps.
     """
 
     family: Family
@@ -38,17 +38,18 @@ class FamilyFit:
     held_out: float = math.inf
     score: float = math.inf
     covariance: np.ndarray | None = None
-    throws: tuple[InitialMotion, ...] = ()
+    motions: tuple[InitialMotion, ...] = ()
     refined: bool = False
     rollouts: int = 0
     steps: int = 0
 
-    def disagree(self, first: FamilyFit, ties: Sequence[FamilyFit]) -> None:
-        """Add to the covariance what parts of the video, and families that are as good, disagree about.
+    def widen_by_ties(self, first: FamilyFit, ties: Sequence[FamilyFit]) -> None:
+        """Increase the covariance by the disagreement of parts of the video and of families with equal scores.
 
         Args:
-            first: the fit to the first frames: what the others change is how far one part of the video can lead.
-            ties: fits of other families to the same frames; their constants, where shared, scatter around ``first``.
+            first: fit to the first frames, whose difference from this fit to all frames is added.
+            ties: fits of other families to the same frames, whose differences from ``first`` in shared constants are
+                added.
         """
         u = self.family.unbounded
         before = u(first.values)
@@ -58,7 +59,7 @@ class FamilyFit:
             self.covariance += np.outer(u(shared) - before, u(shared) - before) / (len(ties) + 1)
 
     def log_covariance(self, of: Callable[[Values], Values]) -> tuple[list[str], np.ndarray]:
-        """Names (m,) and covariance (m, m) of the logarithms of positive functions of the constants, to first order."""
+        """Names (m,) and covariance (m, m) of logarithms of positive functions of the constants, to first order."""
         u, h = self.family.unbounded(self.values), 1e-4
         names = list(of(self.values))
 
@@ -69,7 +70,7 @@ class FamilyFit:
         return names, slope @ self.covariance @ slope.T
 
     def as_dict(self, settings: IdentifyConfig) -> dict[str, Any]:
-        """Plain numbers, for JSON."""
+        """Plain numbers for JSON."""
         plain = {"law": self.family.law_spec(self.values), "rollouts": self.rollouts, "steps": self.steps}
         if not math.isfinite(self.loss):
             return {**plain, "diverged": True}
@@ -89,7 +90,7 @@ class FamilyFit:
             }
             plain["combinations"] = self.combinations(settings)
             plain["unbounded"] = self.family.unbounded_dict(self.values, self.covariance)
-            plain["start"] = self.throws[0].as_dict()
+            plain["start"] = self.motions[0].as_dict()
         return plain
 
     def quantities(self, settings: IdentifyConfig) -> list[tuple[str, float, float]]:
@@ -99,21 +100,21 @@ class FamilyFit:
         return list(zip(names, named_combinations(self.values).values(), stds.tolist(), strict=True))
 
     def combinations(self, settings: IdentifyConfig) -> list[dict[str, Any]]:
-        """Products of powers of the physical constants whose errors are independent, the best determined first."""
+        """Products of powers of the physical constants with independent errors, the best determined first."""
         names, covariance = self.log_covariance(physical)
         variances, axes = np.linalg.eigh(covariance)
         logs = np.log(list(physical(self.values).values()))
-        found = []
+        combinations = []
         for variance, axis in zip(variances, axes.T, strict=True):
             axis = axis * np.sign(axis[np.abs(axis).argmax()])
             std = math.sqrt(max(variance, 0.0) + settings.model_std**2)
-            found.append({
+            combinations.append({
                 "powers": dict(zip(names, axis.tolist(), strict=True)),
                 "log_value": float(axis @ logs),
                 "log_std": std,
                 "determined": std < settings.determined,
             })  # fmt: skip
-        return found
+        return combinations
 
 
 @dataclass
@@ -121,12 +122,12 @@ class Identified:
     """Result of `identify`.
 
     Attributes:
-        best: the family that is chosen, fitted again to all frames.
-        ties: names of families that are as good, the best one not among them.
-        fits: all candidates as they were judged, by name.
-        frames: steps of the frames that were fitted, of each video.
-        held_out: steps of the frames that were held out, of each video.
-        rollouts: simulations that it took, some of which families share.
+        best: the selected family, fitted to all frames.
+        ties: names of other families with an equal score.
+        fits: all candidates at their evaluation, by name.
+        frames: steps of the fitted frames of each video.
+        held_out: steps of the held-out frames of each video.
+        rollouts: number of simulations, some of which families share.
     """
 
     best: FamilyFit
@@ -138,10 +139,10 @@ class Identified:
     settings: IdentifyConfig = field(repr=False)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, for JSON; ``law`` is what `analytic_law` takes."""
+        """Plain numbers for JSON; ``law`` is a specification for `analytic_law`."""
         videos = [
-            {"start": throw.as_dict(), "frames": list(frames), "held_out_frames": list(held_out)}
-            for throw, frames, held_out in zip(self.best.throws, self.frames, self.held_out, strict=True)
+            {"start": motion.as_dict(), "frames": list(frames), "held_out_frames": list(held_out)}
+            for motion, frames, held_out in zip(self.best.motions, self.frames, self.held_out, strict=True)
         ]
         return {
             "family": self.best.family.name,
@@ -156,14 +157,14 @@ class Identified:
         }
 
     def summary(self) -> str:
-        """One line for people: the family, its constants, and what is determined."""
+        """Summary line: family, constants, and determined quantities."""
         fit = self.best
         tied = f" (tie with {', '.join(self.ties)})" if self.ties else ""
         values = ", ".join(f"{key} = {value:.4g}" for key, value in fit.values.items())
-        sure = {key: std < self.settings.determined for key, _, std in fit.quantities(self.settings)}
+        determined = {key: std < self.settings.determined for key, _, std in fit.quantities(self.settings)}
         lists = [
             f"{'determined' if wanted else 'not determined'}: {', '.join(names)}"
             for wanted in (True, False)
-            if (names := [key for key, found in sure.items() if found == wanted])
+            if (names := [key for key, value in determined.items() if value == wanted])
         ]
         return f"{fit.family.name}{tied}: {values}; {'; '.join(lists)}"

@@ -1,8 +1,8 @@
-"""Images of a thrown body beside those of a video: the residuals that constants are found by.
+"""Residuals between simulated and observed images of a launched body, from which constants are identified.
 
-What is tried is a law, and how far the throw and the place of the rendered body are from what is known of them. A body
-of few particles, each at random in its cell, moves as if its material were another: what many particles change in the
-images is added to those of the few.
+A candidate is a law with deviations of the initial motion and of the position of the rendered body from their
+estimates. The coarse discretisation of a body with few particles changes its apparent material. The difference in the
+images between many and few particles is therefore added to the residuals.
 """
 
 from __future__ import annotations
@@ -29,87 +29,93 @@ from neuma_lib.sim.state import Trajectory
 from neuma_lib.splatting.observation import Observation, joint_frames, rendered_steps, several
 
 MOTION = 6
-"""Unknowns of a throw: velocity and spin."""
+"""Number of unknowns of an initial motion: velocity and spin."""
 NUISANCES = 9
-"""These, and of the rendered body: shift right and down, enlargement."""
+"""`MOTION`, and shift right, shift down and enlargement of the rendered body."""
 
 
 @dataclass(frozen=True)
-class Try:
-    """What is simulated and rendered.
+class Candidate:
+    """Parameters of a simulation and its rendering.
 
     Attributes:
-        law: specification.
-        deviations: of the throw from what is known of it, along velocity and spin, in standard deviations; then of the
-            rendered body to the right, down and in size, in the setting ``pose_tolerance``; shape (9,).
+        law: specification of the law.
+        deviations: deviations (9,) of velocity and spin from their estimates in standard deviations, then shift right,
+            shift down and enlargement of the rendered body in units of the setting ``pose_tolerance``.
     """
 
     law: Mapping[str, Mapping[str, Any]]
     deviations: np.ndarray
 
 
-class ThrownVideo:
-    """Simulated minus observed images, averaged over the finest squares.
+class VideoResiduals:
+    """Simulated minus observed images, averaged over the squares of the finest level.
 
-    Cameras may have other times, sizes and exposures: every step at which some camera has a picture that is compared is
-    a frame then, and residuals are lists, an entry for each observation.
+    If cameras differ in times, sizes or exposures, every step with a compared image of some camera is a frame.
+    Residuals are lists with one entry per observation.
 
     Attributes:
-        frames: steps of the frames that are compared.
-        fitted: the number of those that families are fitted to; the others judge them.
+        frames: steps of the compared frames.
+        fitted: number of leading frames for the fit; the others are held out.
         weight: factor on all residuals.
-        unsure: places of the deviations that are not known to be 0.
-        by_deviation: derivatives of the residuals of all frames with respect to the deviations; None: not taken yet.
-            All families share those of one that fits: they are mostly kinematics.
-        spread: how residuals of all frames differ between two fillings with many particles; None: not known.
-        rollouts: simulations so far.
+        unsure: indices of the deviations that are not fixed to 0.
+        by_deviation: derivatives of the residuals of all frames with respect to these deviations, or None if not
+            computed. All families share those of one family, because they are mostly kinematic.
+        spread: difference of the residuals of all frames between two samplings with many particles, or None.
+        rollouts: number of simulations.
     """
 
     def __init__(
         self,
         model: MPM,
-        throw: InitialMotion,
+        motion: InitialMotion,
         body: Reconstruction,
         video: Observation | Sequence[Observation],
         settings: IdentifyConfig,
-        finer: Sequence[Reconstruction] = (),
+        refined: Sequence[Reconstruction] = (),
     ):
-        seen = [each.select(spread_frames(len(each.frames), settings.frames)) for each in several(video)]
-        self.model, self.throw, self.frames, self.weight = model, throw, joint_frames(seen), 1.0
+        observed = [each.select(spread_frames(len(each.frames), settings.frames)) for each in several(video)]
+        self.model, self.motion, self.frames, self.weight = model, motion, joint_frames(observed), 1.0
         self.fitted = len(self.frames)
         self.density = float((body.mass / body.vol0).min())
-        self.unsure = np.flatnonzero([*throw.std, *[settings.pose_tolerance] * (NUISANCES - MOTION)]).tolist()
+        self.unsure = np.flatnonzero(
+            [*motion.std, *[settings.pose_tolerance] * (NUISANCES - MOTION)]
+        ).tolist()
         self.by_deviation: list[list[Tensor]] | None = None
         self.spread: list[Tensor] | None = None
         self.rollouts = 0
-        self._added: list[Tensor] | None = None
-        self._misplaced = settings.pose_tolerance
-        self._total, self._axes = settings.covariance_from == "total", seen[0].cameras.viewmats[0, :3, :3]
-        self._steps, self._own_frames = rendered_steps(seen), [each.frames for each in seen]
+        self._correction: list[Tensor] | None = None
+        self._pose_tolerance = settings.pose_tolerance
+        self._total, self._axes = settings.covariance_from == "total", observed[0].cameras.viewmats[0, :3, :3]
+        self._steps, self._own_frames = rendered_steps(observed), [each.frames for each in observed]
         self._last = [  # step at which the last exposure of the frames up to each ends
-            max(f + each.exposure[-1] for each in seen for f in each.frames if f <= n) for n in self.frames
+            max(f + each.exposure[-1] for each in observed for f in each.frames if f <= n)
+            for n in self.frames
         ]
 
         def films(body: Reconstruction) -> list[Filmed]:
             return [
-                Filmed(body.particle_gs(each.cameras), each, self._steps, settings.compare) for each in seen
+                Filmed(body.particle_gs(each.cameras), each, self._steps, settings.compare)
+                for each in observed
             ]
 
-        self._body, *self._finer = [(each, films(each)) for each in (body, *finer)]
-        sizes = [[max(1, round(each.cameras.width / across)) for across in settings.pyramid] for each in seen]
+        self._body, *self._refined = [(each, films(each)) for each in (body, *refined)]
+        sizes = [
+            [max(1, round(each.cameras.width / across)) for across in settings.pyramid] for each in observed
+        ]
         self._finest = [each[-1] for each in sizes]
         self.sizes = [max(1, round(size / self._finest[0])) for size in sizes[0]]
-        """Edge of each round's squares in squares of the finest ones."""
+        """Side of the squares of each level in squares of the finest level."""
         self._observed = [
             torch.cat([
                 averaged(each.colours(part) if settings.compare == "colour" else each.coverage(part), size)
                 for part in frame_batches(len(each.frames), filmed.batch)
             ])
-            for each, filmed, size in zip(seen, self._body[1], self._finest, strict=True)
+            for each, filmed, size in zip(observed, self._body[1], self._finest, strict=True)
         ]  # fmt: skip
 
     def counts(self, frames: int) -> list[int]:
-        """How many frames of each observation are among the first ones of all."""
+        """Number of frames of each observation among the first ``frames`` of all."""
         if frames == 0:
             return [0] * len(self._own_frames)
         return [bisect_right(own, self.frames[frames - 1]) for own in self._own_frames]
@@ -117,78 +123,81 @@ class ThrownVideo:
     @property
     def fitted_pixels(self) -> int:
         counts = self.counts(self.fitted)
-        return sum(seen[:count].numel() for seen, count in zip(self._observed, counts, strict=True))
+        return sum(images[:count].numel() for images, count in zip(self._observed, counts, strict=True))
 
     def hold_out(self, family: Family, share: float) -> None:
-        """Leave a share of the frames after the first contact, the last ones, to judge by; any law falls alike."""
+        """Hold out the last share of the frames after the first contact, whose time is the same for any law."""
         law = family.law_spec(family.values(family.unbounded(family.guess), self.model, self.density))
-        (path,) = self._paths([Try(law, np.zeros(NUISANCES))], len(self.frames), self._body[0])
+        (path,) = self._paths([Candidate(law, np.zeros(NUISANCES))], len(self.frames), self._body[0])
         contact = 0 if path is None else first_contact(self.model, path.at(self.frames).x)
         self.fitted = held_out_frames(len(self.frames), share, contact=contact)[0]
 
-    def residuals(self, tries: Sequence[Try], count: int) -> list[list[Tensor] | None]:
-        """Residuals (T, V, H', W', C) of the first frames for each try; None where the rollout diverges."""
-        paths = self._paths(tries, count, self._body[0])
-        found = [
-            self._residual(one, path, self._body[1], count) for one, path in zip(tries, paths, strict=True)
+    def residuals(self, candidates: Sequence[Candidate], count: int) -> list[list[Tensor] | None]:
+        """Residuals (T, V, H', W', C) of the first ``count`` frames per candidate, None if its rollout diverges."""
+        paths = self._paths(candidates, count, self._body[0])
+        residuals = [
+            self._residual(one, path, self._body[1], count)
+            for one, path in zip(candidates, paths, strict=True)
         ]
-        if self._added is None:
-            return found
+        if self._correction is None:
+            return residuals
         return [
-            None if one is None else [r + a[: len(r)] for r, a in zip(one, self._added, strict=True)]
-            for one in found
+            None if one is None else [r + a[: len(r)] for r, a in zip(one, self._correction, strict=True)]
+            for one in residuals
         ]
 
-    def differentiate(self, here: Try) -> None:
-        """Take the derivatives by the deviations there: forward differences, 0 where a rollout diverges."""
-        moved = [replace(here, deviations=here.deviations + step) for step in np.eye(NUISANCES)[self.unsure]]
-        flown = [here, *(one for one, k in zip(moved, self.unsure, strict=True) if k < MOTION)]
+    def differentiate(self, at: Candidate) -> None:
+        """Compute the derivatives by the deviations as forward differences, 0 where a rollout diverges."""
+        varied = [replace(at, deviations=at.deviations + step) for step in np.eye(NUISANCES)[self.unsure]]
+        simulated = [at, *(one for one, k in zip(varied, self.unsure, strict=True) if k < MOTION)]
         count = len(self.frames)
-        paths = self._paths(flown, count, self._body[0])
-        # What only moves the rendered body needs no rollout.
-        paths += [paths[0]] * (1 + len(moved) - len(flown))
-        base, *there = (
+        paths = self._paths(simulated, count, self._body[0])
+        # Shift and enlargement of the rendered body need no rollout.
+        paths += [paths[0]] * (1 + len(varied) - len(simulated))
+        base, *others = (
             self._residual(one, path, self._body[1], count)
-            for one, path in zip([here, *moved], paths, strict=True)
+            for one, path in zip([at, *varied], paths, strict=True)
         )
-        if base is not None:  # it held for the frames that are fitted
+        if base is not None:  # otherwise it diverges after the fitted frames
             self.by_deviation = [
                 [torch.zeros_like(r) for r in base] if each is None else _differences(each, base)
-                for each in there
+                for each in others
             ]
 
-    def refine_particles(self, here: Try) -> None:
-        """Add what more particles change in the images to all residuals from now on, and know how sure that is."""
-        if not self._finer:
+    def refine_particles(self, at: Candidate) -> None:
+        """Set the discretisation correction of all residuals, and its uncertainty, from bodies of more particles."""
+        if not self._refined:
             return
         coarse, *fine = (
-            self._residual(here, self._paths([here], len(self.frames), body)[0], filmed, len(self.frames))
-            for body, filmed in (self._body, *self._finer)
+            self._residual(at, self._paths([at], len(self.frames), body)[0], filmed, len(self.frames))
+            for body, filmed in (self._body, *self._refined)
         )
         fine = [residual for residual in fine if residual is not None]
         if coarse is not None and fine:
             means = [torch.stack(of_all).mean(0) for of_all in zip(*fine, strict=True)]
-            self._added = _differences(means, coarse)
+            self._correction = _differences(means, coarse)
             self.spread = _differences(fine[0], fine[-1]) if len(fine) > 1 else None
 
-    def _paths(self, tries: Sequence[Try], count: int, body: Reconstruction) -> list[Trajectory | None]:
-        """Rollouts over what the first frames need, and what lies between."""
-        self.rollouts += len(tries)
+    def _paths(
+        self, candidates: Sequence[Candidate], count: int, body: Reconstruction
+    ) -> list[Trajectory | None]:
+        """Rollouts to the end of the exposure of the first ``count`` frames."""
+        self.rollouts += len(candidates)
         frames = self._steps[: bisect_right(self._steps, self._last[count - 1])]
-        starts = [self.throw.moved(one.deviations[:MOTION]).of_body(body) for one in tries]
-        laws = [analytic_law(one.law, self.model.dt).to(starts[0].x.device) for one in tries]
+        starts = [self.motion.moved(one.deviations[:MOTION]).of_body(body) for one in candidates]
+        laws = [analytic_law(one.law, self.model.dt).to(starts[0].x.device) for one in candidates]
         options = dict(steps=frames[-1], frames=frames, total=self._total)
         return rollout_batch(self.model, laws, starts, **options)
 
     @torch.no_grad()
     def _residual(
-        self, one: Try, path: Trajectory | None, filmed: Sequence[Filmed], count: int
+        self, one: Candidate, path: Trajectory | None, filmed: Sequence[Filmed], count: int
     ) -> list[Tensor] | None:
         if path is None:
             return None
-        right, down, enlargement = (self._misplaced * one.deviations[MOTION:]).tolist()
-        found = []
-        for films, seen, size, T in zip(
+        right, down, enlargement = (self._pose_tolerance * one.deviations[MOTION:]).tolist()
+        residuals = []
+        for films, observed, size, T in zip(
             filmed, self._observed, self._finest, self.counts(count), strict=True
         ):
             images = []
@@ -198,8 +207,8 @@ class ThrownVideo:
                 x = centre + (1 + enlargement) * (x - centre)
                 x = x + right * self._axes[0] + down * self._axes[1]
                 images.append(averaged(films(x, (1 + enlargement) * films.states(path.stretch, part)), size))
-            found.append(self.weight * (torch.cat([*images, seen[:0]]) - seen[:T]))
-        return found if all(bool(residual.isfinite().all()) for residual in found) else None
+            residuals.append(self.weight * (torch.cat([*images, observed[:0]]) - observed[:T]))
+        return residuals if all(bool(residual.isfinite().all()) for residual in residuals) else None
 
 
 def _differences(these: Sequence[Tensor], those: Sequence[Tensor]) -> list[Tensor]:
@@ -207,7 +216,7 @@ def _differences(these: Sequence[Tensor], those: Sequence[Tensor]) -> list[Tenso
 
 
 def averaged(images: Tensor, size: int) -> Tensor:
-    """Images (T, V, H, W, C) averaged over squares of ``size`` pixels, those at the far edges over what is there."""
+    """Images (T, V, H, W, C) averaged over squares of ``size`` pixels, which are cut off at the far edges."""
     if size == 1 or not len(images):
         return images
     T, V = images.shape[:2]

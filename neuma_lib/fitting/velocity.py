@@ -1,22 +1,21 @@
 """Initial velocity and spin from the frames before contact (paper Sec. 3.1), through renderer and simulator.
 
-The unknowns are the velocity of the centre of mass and the angular velocity about it, so the image residuals are
-minimised by Levenberg-Marquardt with a numerical Jacobian instead of a thousand gradient steps. One camera sees motion
-along its own axis only as a change of size: that axis is determined far worse than the other two, and a ridge acts on
-it alone. The paper regularises the same weakness by a penalty on |v_x| and |v_z|, which would also pull an oblique
-throw towards the vertical.
+The unknowns are the velocity of the centre of mass and the angular velocity, so Levenberg-Marquardt with a numerical
+Jacobian minimises the image residuals instead of a thousand gradient steps. One camera observes motion along its axis
+only as a change of size. That component is much less certain than the others, and only it has a ridge penalty. The
+paper penalises |v_x| and |v_z| instead, which biases oblique motions towards the vertical.
 
-What the static Gaussians get wrong is the same in every frame: a body that is rendered one percent too large looks one
-percent too near. Taken for motion, that would be half a metre per second in depth. A constant shift of the rendered
-body is therefore estimated beside the motion, and thrown away.
+Errors of the static Gaussians are the same in every frame. A body rendered one percent too large appears one percent
+too near, which would become a velocity of half a metre per second in depth. A constant shift and enlargement of the
+rendered body are therefore estimated as nuisance parameters.
 
-A body that spins stretches, and the prior, which is wrong, does not say how far: a part that is held by nothing flies
-straight on, a rigid body keeps its size. Seen by one camera, growth is approach: honey that is taken for sand seems to
-recede by half a metre per second. So the difference between loose and rigid flight is added with a factor of its own,
-the looseness, which is 0 if the prior is right and expected within +-1; and beside it a shrinking along the axis of the
-spin, by which a fluid keeps its volume while it spreads.
+A spinning body stretches by an amount that depends on its unknown material: loose particles continue along straight
+lines, a rigid body keeps its size. One camera cannot distinguish growth from approach: honey simulated as sand appears
+to recede by half a metre per second. Two more nuisance parameters account for this: the looseness, a factor on the
+difference between loose and rigid flight with a prior of 0 +- 1, and a shrinking along the spin axis, by which a
+spreading fluid conserves its volume.
 
-Many bodies do not spin. A spin that is not told from 0 is none, and its standard deviation says how large it may be.
+A spin that does not differ significantly from 0 is set to 0, with its standard deviation as an upper limit.
 """
 
 from __future__ import annotations
@@ -49,15 +48,15 @@ from neuma_lib.splatting.observation import (
 )
 
 NUISANCE_SCALE = 0.02
-"""Unit of the constant shift [m] and of the relative enlargement: about 1 m/s over a few frames."""
+"""Unit of the constant shift [m] and of the relative enlargement, equivalent to about 1 m/s over a few frames."""
 UNKNOWNS = 11
-"""Velocity and spin (world axes), shift to the right and down, enlargement, looseness and shrinking (`_Flight`)."""
-_SPIN, _STRETCH = slice(3, 6), slice(9, 11)  # places of the spin, and of looseness and shrinking
-_ALL, _STILL = list(range(UNKNOWNS)), [0, 1, 2, 6, 7, 8]  # what is free, and what if the body does not spin
-_ROUNDS = 10  # sets of frames, and simulations of a spinning body
-_LEAST_GAIN = 1e-5  # part of the squares that a step may save at the end: a hundredth of the uncertainty
-_ROUGH_GAIN = 1e-3  # the same while more frames are to come
-_LEAST_TURN = 5e-3  # angle [rad] of a change of spin that calls for another simulation
+"""Velocity and spin (world axes), shift right and down, enlargement, looseness and shrinking (`_Flight`)."""
+_SPIN, _STRETCH = slice(3, 6), slice(9, 11)  # indices of the spin, and of looseness and shrinking
+_ALL, _NO_SPIN = list(range(UNKNOWNS)), [0, 1, 2, 6, 7, 8]  # free unknowns with and without spin
+_ROUNDS = 10  # maximum number of sets of frames and of simulations of a spinning body
+_MIN_GAIN = 1e-5  # relative decrease of the cost at convergence, a hundredth of the uncertainty
+_ROUGH_GAIN = 1e-3  # the same before all frames are used
+_MIN_TURN = 5e-3  # angle by which a change of the spin requires another simulation [rad]
 
 
 @dataclass(frozen=True)
@@ -68,18 +67,18 @@ class VelocityEstimate:
         v0: initial velocity of the centre [m/s], shape (3,).
         spin: angular velocity about the centre [rad/s], shape (3,).
         centre: centre of mass of the particles [m], shape (3,).
-        std: estimated standard deviation along each world axis [m/s], shape (3,), without the ridge's help.
+        std: standard deviation along each world axis without ridge penalty [m/s], shape (3,).
         axes: rows are the camera's right, down and viewing direction in world axes, shape (3, 3).
         std_camera: standard deviation along those axes [m/s], shape (3,).
         spin_std: standard deviation of the spin along each world axis [rad/s], shape (3,).
         spin_std_camera: standard deviation of the spin about the camera's axes [rad/s], shape (3,).
         information: curvature of the loss along the camera's axes relative to the best determined one, shape (3,).
-        frames: steps of the frames that were used.
-        nuisance: what was estimated along: constant shift of the rendered body to the right and down [m], its
-            relative enlargement, its looseness and its shrinking, shape (5,).
+        frames: steps of the frames used.
+        nuisance: shift right and down of the rendered body [m], relative enlargement, looseness and shrinking,
+            shape (5,).
         loss: root mean square image residual at the estimate.
-        iterations: accepted Levenberg-Marquardt steps.
-        ridge: the ridge that was used (0: none).
+        iterations: number of accepted Levenberg-Marquardt steps.
+        ridge: weight of the ridge penalty.
     """
 
     v0: np.ndarray
@@ -98,7 +97,7 @@ class VelocityEstimate:
     ridge: float
 
     def as_dict(self) -> dict:
-        """Plain numbers and lists, for JSON."""
+        """Plain numbers and lists for JSON."""
         return {
             "v0": self.v0.tolist(),
             "angular_velocity": self.spin.tolist(),
@@ -118,16 +117,16 @@ class VelocityEstimate:
         }
 
     def summary(self) -> str:
-        """One line for people: the estimate, how sure, and what holds the depth axis."""
+        """Summary line for the log: estimate, uncertainty, and regularisation of the depth axis."""
         v, s, i = self.v0, self.std_camera, self.information
         w, t = self.spin, self.spin_std_camera
-        held = f"ridge {self.ridge:g} on depth" if self.ridge else "no regularisation"
+        ridge = f"ridge {self.ridge:g} on depth" if self.ridge else "no regularisation"
         return (
             f"v0 = ({v[0]:+.3f}, {v[1]:+.3f}, {v[2]:+.3f}) m/s from {len(self.frames)} frames before contact; "
             f"std right {s[0]:.3f}, down {s[1]:.3f}, depth {s[2]:.3f} m/s; "
             f"spin ({w[0]:+.2f}, {w[1]:+.2f}, {w[2]:+.2f}) rad/s, "
             f"std about these axes {t[0]:.2f}, {t[1]:.2f}, {t[2]:.2f} rad/s; "
-            f"information {i[0]:.2f}, {i[1]:.2f}, {i[2]:.3f}; {held}"
+            f"information {i[0]:.2f}, {i[1]:.2f}, {i[2]:.3f}; {ridge}"
         )
 
 
@@ -139,15 +138,15 @@ def estimate_velocity(
     settings: VelocityConfig,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> VelocityEstimate:
-    """Estimate one velocity for the whole body from the frames before its first contact.
+    """Estimate the initial velocity and spin of a body from the frames before its first contact.
 
     Args:
         model: simulator constants.
-        law: the prior material; before contact it matters only by how far a spinning body stretches.
+        law: the prior law, which affects only the stretch of a spinning body before contact.
         body: reconstructed particles and Gaussians.
-        observation: the video, or several of the same throw by cameras of other times, sizes or exposures; frames from
-            contact on are ignored.
-        settings: hyper-parameters; its ``views`` are those of the observation.
+        observation: the video, or several of the same motion by cameras of different times, sizes or exposures. Frames
+            from the contact on are ignored.
+        settings: hyper-parameters, with the ``views`` of the observation.
         progress: called with (step, steps, loss).
 
     Raises:
@@ -156,10 +155,12 @@ def estimate_velocity(
     videos, precision = several(observation), body.x0.dtype
     frames = joint_frames(videos)
     if len(frames) < 2:
-        raise InputError("velocity needs at least two frames of the training view before contact")
+        raise InputError("frames", f"{len(frames)} of the training view before contact must be at least 2")
     videos, law = tuple(video.to(precision) for video in videos), copy.deepcopy(law).to(precision)
     if float(contact_clearance(model, body.x0)) <= 0:
-        raise InputError("the body touches a wall in the first frame: the video must start before contact")
+        raise InputError(
+            "frames", "the body touches a wall in the first frame", "Start the video before the contact"
+        )
     axes = videos[0].cameras.viewmats[0, :3, :3].cpu().numpy()
     ends = tuple(max(n + video.exposure[-1] for video in videos if n in video.frames) for n in frames)
     flight = _Flight(model, law, body, ends)
@@ -168,16 +169,16 @@ def estimate_velocity(
     used = min(settings.initial_frames, len(frames))
     growing = used < len(frames)
     for _ in range(_ROUNDS):
-        # No more than twice as many at a time: a spin from three frames says little about thirty.
+        # At most double the frames per round, because extrapolation of a spin is inaccurate.
         reach = min(2 * used, len(frames)) if growing else used
         flight.simulate(unknowns, rendered_steps(select_frames(videos, frames[:reach])))
         chosen = tuple(frames[k] for k in spread_frames(used, settings.frames))
         residuals = _Residuals(flight, select_frames(videos, chosen), settings.difference)
-        unknowns, fit, steps = minimise(residuals, unknowns, _ALL, _ROUGH_GAIN if growing else _LEAST_GAIN)
+        unknowns, fit, steps = minimise(residuals, unknowns, _ALL, _ROUGH_GAIN if growing else _MIN_GAIN)
         accepted += steps
         clear = flight.frames_before_contact(unknowns, reach)
-        settled = clear == used and not growing and flight.turned(unknowns, chosen) < _LEAST_TURN
-        if clear < 2 or settled:
+        converged = clear == used and not growing and flight.turn(unknowns, chosen) < _MIN_TURN
+        if clear < 2 or converged:
             break
         used, growing = clear, growing and clear == reach < len(frames)
     covariance, information = _uncertainty(fit, flight, chosen, axes, settings)
@@ -185,13 +186,13 @@ def estimate_velocity(
     if w @ np.linalg.solve(covariance[_SPIN, _SPIN], w) <= settings.spin_significance:
         unknowns[_SPIN] = unknowns[_STRETCH] = 0.0
         flight.simulate(unknowns, residuals.steps)
-        unknowns, fit, steps = minimise(residuals, unknowns, _STILL, _LEAST_GAIN)
+        unknowns, fit, steps = minimise(residuals, unknowns, _NO_SPIN, _MIN_GAIN)
         accepted += steps
     v0, spin = (vector.cpu().numpy() for vector in flight.motion(unknowns))
     covariance *= np.outer(flight.units, flight.units)
     std, spin_std, std_camera, spin_std_camera = (
-        np.sqrt(np.diag(turn @ covariance[part, part] @ turn.T))
-        for turn in (np.eye(3), axes)
+        np.sqrt(np.diag(basis @ covariance[part, part] @ basis.T))
+        for basis in (np.eye(3), axes)
         for part in (slice(0, 3), _SPIN)
     )
     return VelocityEstimate(
@@ -213,16 +214,16 @@ def estimate_velocity(
 
 
 class _Flight:
-    """Free flight of the body: the motion that the simulator makes of a spin, carried along a parabola.
+    """Free flight of the body: the simulated motion of a spinning body, moved along a parabola.
 
-    The spinning is simulated without weight in the middle of the cube, far from walls: in free flight the centre of
-    mass follows its parabola whatever the body does about it.
+    In free flight the centre of mass moves on a parabola, independently of the rotation, simulated without gravity
+    in the middle of the cube, far from walls.
 
     Attributes:
         ends: step at which the exposure of each frame ends.
         centre: centre of mass [m], shape (3,).
-        units: of the unknowns, shape (11,): 1 m/s, the spin that moves the particles by 1 m/s about their centre (root
-            mean square), `NUISANCE_SCALE`, 1 and 1. So all have effects of the same order on the images.
+        units: units (11,) of the unknowns with similar effects on the images: 1 m/s, the spin with a root mean square
+            velocity of 1 m/s about the centre, `NUISANCE_SCALE`, 1 and 1.
     """
 
     def __init__(self, model: MPM, law: Law, body: Reconstruction, ends: tuple[int, ...]):
@@ -241,12 +242,12 @@ class _Flight:
         return torch.as_tensor((self.units * unknowns)[:6]).to(self.body.x0).split(3)
 
     def simulate(self, unknowns: np.ndarray, frames: tuple[int, ...]) -> None:
-        """Let the body spin in the middle of the cube as the unknowns say, unless what is known of it is good enough.
+        """Simulate the rotation for the spin of the unknowns, unless an existing simulation is accurate enough.
 
-        What is known at first is a body at rest: it needs no simulation.
+        Initially that is a body at rest, which needs no simulation.
         """
         reached = self._path is None or set(self._path.frames).issuperset(frames)
-        if reached and self.turned(unknowns, frames) < _LEAST_TURN:
+        if reached and self.turn(unknowns, frames) < _MIN_TURN:
             return
         _, self._near = self.motion(unknowns)
         self._path = None
@@ -255,8 +256,8 @@ class _Flight:
             with torch.no_grad():
                 self._path = rollout(self._weightless, self.law, start, steps=frames[-1], frames=frames)
 
-    def turned(self, unknowns: np.ndarray, frames: tuple[int, ...]) -> float:
-        """Angle [rad] by which the spin of the unknowns and the simulated one come apart until the last frame."""
+    def turn(self, unknowns: np.ndarray, frames: tuple[int, ...]) -> float:
+        """Angle between rotations by the spin of the unknowns and the simulated one at the last frame [rad]."""
         _, spin = self.motion(unknowns)
         return float(frames[-1] * self.model.dt * (spin - self._near).norm())
 
@@ -265,11 +266,10 @@ class _Flight:
     ) -> tuple[Tensor, Tensor]:
         """Positions (T, N, 3) [m] and deformation gradients (T, N, 3, 3) of the particles at the frames.
 
-        What was simulated is turned rigidly by the angle between its spin and this one. What a change of the spin
-        does beyond this, by stretching the body and by unequal moments of inertia, is smaller by a factor of the
-        angle that the body turns, and the fit is spared a simulation at every try. Added to both is
-        `stretch`: the looseness times the difference between loose flight, x0 + t omega x x0, and rigid flight, and
-        the shrinking times -(t^2 / 2) omega omega^T x0.
+        The simulated body is rigidly rotated by the angle between its spin and the given one, which avoids a simulation
+        per evaluation. The neglected effect of the change of spin, by stretch and by unequal moments of inertia, is
+        smaller by a factor of the rotation angle. `stretch` adds the looseness times the difference between loose
+        flight, x0 + t omega x x0, and rigid flight, and the shrinking times -(t^2 / 2) omega omega^T x0.
         """
         dt, g = self.model.dt, torch.tensor(self.model.gravity).to(v0)
         n = torch.tensor(frames).to(v0)[:, None, None]
@@ -285,43 +285,43 @@ class _Flight:
         x, F = x + (self.body.x0 - self.centre) @ added.mT, F + added[:, None]
         return x + self.centre + n * dt * v0 + g * dt**2 * n * (n + 1) / 2, F
 
-    def frames_before_contact(self, unknowns: np.ndarray, most: int) -> int:
-        """How many of the first `most` frames end before the body touches a wall."""
-        x, _ = self(*self.motion(unknowns), self.ends[:most])
+    def frames_before_contact(self, unknowns: np.ndarray, count: int) -> int:
+        """Number of the first `count` frames that end before the body touches a wall."""
+        x, _ = self(*self.motion(unknowns), self.ends[:count])
         touching = contact_clearance(self.model, x) <= 0
         return int(touching.int().argmax()) if touching.any() else len(x)
 
 
 @dataclass
 class _Residuals:
-    """Rendered minus observed colours as a function of the unknowns. A few frames at a time are in memory."""
+    """Rendered minus observed colours as a function of the unknowns, evaluated in batches of frames."""
 
     flight: _Flight
-    seen: tuple[Observation, ...]
+    videos: tuple[Observation, ...]
     difference: float
 
     def __post_init__(self):
-        self.steps = rendered_steps(self.seen)
+        self.steps = rendered_steps(self.videos)
         self._filmed = [
-            Filmed(self.flight.body.particle_gs(video.cameras), video, self.steps) for video in self.seen
+            Filmed(self.flight.body.particle_gs(video.cameras), video, self.steps) for video in self.videos
         ]
-        self._axes = self.seen[0].cameras.viewmats[0, :3, :3]
+        self._axes = self.videos[0].cameras.viewmats[0, :3, :3]
 
     def cost(self, unknowns: np.ndarray) -> float:
         """Sum of squares."""
         return self._checked(
             sum(
                 self._residual(unknowns, k, part).square().sum().double()
-                for k in range(len(self.seen))
+                for k in range(len(self.videos))
                 for part in self._parts(k)
             ),
             unknowns,
         )
 
     def linearise(self, unknowns: np.ndarray, free: Sequence[int] = _ALL) -> Linearisation:
-        """Sums of the residuals and of their central differences, which are 0 for unknowns that are not free."""
+        """Sums of the residuals and of their central differences, 0 for unknowns that are not free."""
         cost, count, sums = 0.0, 0, []
-        for video in range(len(self.seen)):
+        for video in range(len(self.videos)):
             curvatures, scores = 0.0, 0.0
             for part in self._parts(video):
                 r = self._residual(unknowns, video, part)
@@ -339,17 +339,17 @@ class _Residuals:
         return Linearisation(curvatures, scores, cost, float(np.sqrt(cost / count)))
 
     def _parts(self, video: int):
-        return frame_batches(len(self.seen[video].frames), self._filmed[video].batch)
+        return frame_batches(len(self.videos[video].frames), self._filmed[video].batch)
 
     def _residual(self, unknowns: np.ndarray, video: int, part: slice) -> Tensor:
-        return self._render(unknowns, video, part) - self.seen[video].colours(part)
+        return self._render(unknowns, video, part) - self.videos[video].colours(part)
 
     def _render(self, unknowns: np.ndarray, video: int, part: slice) -> Tensor:
         v0, spin = self.flight.motion(unknowns)
         right, down, enlargement, *stretch = torch.as_tensor(self.flight.units * unknowns).to(v0)[6:]
-        seen, axes = self.seen[video], self._axes
-        exposed = len(seen.exposure)
-        steps = tuple(n + k for n in seen.frames[part] for k in seen.exposure)
+        observed, axes = self.videos[video], self._axes
+        exposed = len(observed.exposure)
+        steps = tuple(n + k for n in observed.frames[part] for k in observed.exposure)
         with torch.no_grad():
             x, F = self.flight(v0, spin, steps, stretch)
             centre = x.mean(dim=1, keepdim=True)
@@ -368,18 +368,18 @@ class _Residuals:
         return value
 
 
-def _held(fit: Linearisation) -> np.ndarray:
-    """Curvature that holds looseness and shrinking at 0 +- 1, shape (11, 11)."""
-    held = np.zeros(UNKNOWNS)
-    held[_STRETCH] = fit.block_cost
-    return np.diag(held)
+def _prior(fit: Linearisation) -> np.ndarray:
+    """Curvature (11, 11) of the prior 0 +- 1 of looseness and shrinking."""
+    curvature = np.zeros(UNKNOWNS)
+    curvature[_STRETCH] = fit.block_cost
+    return np.diag(curvature)
 
 
 def _minimise(
     residuals: _Residuals,
     start: np.ndarray,
     free: Sequence[int],
-    least_gain: float,
+    min_gain: float,
     axes: np.ndarray,
     settings: VelocityConfig,
     progress: Callable[[int, int, float], None] | None,
@@ -395,10 +395,10 @@ def _minimise(
         P[:3, :3] = (
             settings.ridge * np.linalg.eigvalsh(fit.curvature[:3, :3])[-1] * np.outer(axes[2], axes[2])
         )
-        return P + _held(fit)
+        return P + _prior(fit)
 
     u, fit, accepted = levenberg_marquardt(
-        residuals, start, free, penalty, least_gain, settings.iterations, progress
+        residuals, start, free, penalty, min_gain, settings.iterations, progress
     )
     return u, fit if free is _ALL else residuals.linearise(u), accepted
 
@@ -406,16 +406,14 @@ def _minimise(
 def _uncertainty(
     fit: Linearisation, flight: _Flight, frames: tuple[int, ...], axes: np.ndarray, settings: VelocityConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Covariance (11, 11) of an unregularised fit of all unknowns, by the jackknife over blocks of the image, and the
-    information on the velocity along the camera's axes (3,).
+    """Jackknife covariance (11, 11) of a fit of all unknowns without ridge, and the information (3,) on the velocity
+    along the camera's axes.
 
-    Where looseness and shrinking are held at 0, the error of that, 1, is passed on. The curvature that is left for
-    the velocity when the rest is free is the Schur complement of H.
-
-    What is wrong in every block alike, such as shading that stays with the light while the body turns, shows as a
-    turn by `angle_std`, which adds to the uncertainty of the spin.
+    The covariance includes the prior uncertainty of looseness and shrinking. The information is from the Schur
+    complement of H, i.e. with all other unknowns free. Errors common to all blocks, such as shading that does not
+    rotate with the body, correspond to a rotation by `angle_std`, which is added to the uncertainty of the spin.
     """
-    H, P = fit.curvature, _held(fit)
+    H, P = fit.curvature, _prior(fit)
     inverse = np.linalg.pinv(H + P)
     by_prior = (inverse @ P)[:, _STRETCH]
     information = 1 / np.diag(axes @ inverse[:3, :3] @ axes.T)

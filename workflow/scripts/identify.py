@@ -54,8 +54,8 @@ def main(inputs, output, params, run) -> None:
         *videos[0],
         settings,
         params.stock,
-        finer=finer,
-        further=videos[1:],
+        refined=finer,
+        other_videos=videos[1:],
         progress=run.progress,
         log=run.say,
     )

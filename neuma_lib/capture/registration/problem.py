@@ -1,4 +1,4 @@
-"""The least squares problem of registration: pictures of a rigid flight as a function of its pose, motion and times."""
+"""Least-squares problem of the registration: images of a rigid flight as a function of pose, motion and times."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from neuma_lib.capture.registration.rigid_motion import RigidMotion, turned
+from neuma_lib.capture.registration.rigid_motion import RigidMotion, rotate
 from neuma_lib.capture.registration.rigid_views import LOCAL, Pictures
 from neuma_lib.fitting.least_squares import Linearisation
 
 LIKELY_SPIN = 10.0
-"""Standard deviation of the spin of a dropped object [rad/s], before it is seen."""
+"""Prior standard deviation of the spin of a dropped object [rad/s]."""
 LIKELY_SIZE, ANY_SIZE = 0.01, 0.3
-"""Standard deviations of the relative size of its Gaussians, before: in metres, and in a world of unknown scale."""
+"""Prior standard deviations of the relative size for a known and for an unknown scale."""
 
 TURN, PLACE, VELOCITY, SPIN, SIZE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), 12
 GRAVITY, OFFSETS = slice(13, 16), 16
-"""Places of the unknowns; those of the offsets begin at the last."""
-_ANY_TURN = np.pi / np.sqrt(3)  # deviation of an angle that is not known at all [rad]
+"""Indices of the unknowns, with those of the offsets from the last one on."""
+_ANY_TURN = np.pi / np.sqrt(3)  # standard deviation of a uniform angle [rad]
 _UNITS = np.array([_ANY_TURN] * 3 + [0.1] * 3 + [1.0] * 3 + [LIKELY_SPIN] * 3)
 _NO_DIRECTIONS = np.zeros((0, 3))
 _GRAVITY_UNIT, _OFFSET_UNIT = 3.0, 0.01  # [m/s^2], [s]
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """A pose with what was fitted along.
+class FittedPose:
+    """A pose with its nuisance parameters.
 
     Attributes:
-        motion: of the body.
-        offsets: added to each camera's times [s], (cameras,).
-        enlargement: of the rendered body.
-        gains: of the cameras, (cameras, 3).
-        cost: sum of squares of the round that it comes from.
+        motion: motion of the body.
+        offsets: offsets (cameras,) to the times of each camera [s].
+        enlargement: relative enlargement of the rendered body.
+        gains: gains (cameras, 3) of the cameras.
+        cost: sum of squares in its stage.
     """
 
     motion: RigidMotion
@@ -47,20 +47,20 @@ class Found:
 
 
 class Problem:
-    """Residuals of pictures as a function of unknowns, in units of their own (`_UNITS`): a turn of the pose, changes of
-    place and velocity, the spin, the enlargement, and changes of gravity and of the cameras' offsets but the first.
+    """Residuals of images as a function of unknowns in units of `_UNITS`: rotation of the pose, changes of position and
+    velocity, spin, enlargement, and changes of gravity and of the offsets of all cameras but the first.
 
     Attributes:
         size: number of unknowns.
-        all: places of those that are fitted.
-        start: unknowns of what it begins with.
-        falling: directions along which gravity is fitted, rows (K, 3); none: it is known.
+        all: indices of the fitted unknowns.
+        start: initial unknowns.
+        falling: directions along which gravity is fitted, rows (K, 3), none if it is known.
     """
 
     def __init__(
         self,
         pictures: Pictures,
-        begin: Found,
+        begin: FittedPose,
         time: float,
         fitted: Sequence[int],
         size: float = LIKELY_SIZE,
@@ -76,8 +76,8 @@ class Problem:
         self.start /= self.units
         pictures.gains = begin.gains.copy()
 
-    def found(self, unknowns: np.ndarray) -> Found:
-        """What unknowns stand for."""
+    def pose(self, unknowns: np.ndarray) -> FittedPose:
+        """The pose of unknowns."""
         u, begin = self.units * unknowns, self.begin
         motion = replace(
             begin.motion,
@@ -92,16 +92,16 @@ class Problem:
 
     def cost(self, unknowns: np.ndarray) -> float:
         """Sum of squares."""
-        return float(costs(self.pictures, self.found(unknowns), self.time).sum())
+        return float(costs(self.pictures, self.pose(unknowns), self.time).sum())
 
     def linearise(self, unknowns: np.ndarray, free: Sequence[int], central: bool = False) -> Linearisation:
-        """The problem around unknowns; columns that are not free are 0."""
-        pictures, found = self.pictures, self.found(unknowns)
-        times = picture_times(pictures, found, self.time)
-        motion = found.motion
+        """The problem linearised at unknowns; columns that are not free are 0."""
+        pictures, pose = self.pictures, self.pose(unknowns)
+        times = picture_times(pictures, pose, self.time)
+        motion = pose.motion
         centres, speeds = motion.place(times)
         rotations, spins = motion.turn(times)
-        # How the pose in each picture, and the enlargement, depend on the unknowns: (pictures, 7, unknowns).
+        # Derivatives (pictures, 7, unknowns) of the pose in each picture, and of the enlargement.
         G = np.zeros((len(times), LOCAL, self.size))
         G[:, :3, TURN], G[:, :3, SPIN] = self._turns(motion, times)
         G[:, 3:6, PLACE], G[:, 3:6, VELOCITY] = np.eye(3), times[:, None, None] * np.eye(3)
@@ -113,10 +113,10 @@ class Problem:
         held = np.setdiff1d(np.arange(self.size), free)
         G[..., held] = 0.0
         G *= self.units
-        H, g, cost = pictures.normal_equations(rotations, centres, found.enlargement, central)
+        H, g, cost = pictures.normal_equations(rotations, centres, pose.enlargement, central)
         curvatures = np.einsum("nia,nbij,njc->nbac", G, H, G)
         scores = np.einsum("nia,nbi->nba", G, g)
-        # Blocks are those of a camera, over all its pictures.
+        # Blocks extend over all pictures of a camera.
         of = np.eye(pictures.cameras)[pictures.camera]
         curvatures, scores = (np.einsum("nc,nb...->cb...", of, each) for each in (curvatures, scores))
         total = float(cost.sum())
@@ -126,25 +126,25 @@ class Problem:
         )
 
     def penalty(self, fit: Linearisation) -> np.ndarray:
-        """Curvature that holds turn, spin and enlargement at 0 +- 1: what nobody sees, stays likely."""
-        held = np.zeros(self.size)
-        held[[*range(3), *range(9, 12), SIZE]] = fit.block_cost
-        return np.diag(held)
+        """Curvature of the prior 0 +- 1 of rotation, spin and enlargement."""
+        curvature = np.zeros(self.size)
+        curvature[[*range(3), *range(9, 12), SIZE]] = fit.block_cost
+        return np.diag(curvature)
 
     def _turns(self, motion: RigidMotion, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives (T, 3, 3) of the rotations at times by a turn and by the spin at the time 0, by differences."""
+        """Difference quotients (T, 3, 3) of the rotations at times by the initial rotation and by the initial spin."""
         step = 1e-4
         small = Rotation.from_rotvec(step * np.concatenate([np.eye(3), -np.eye(3)])).as_matrix()
-        stay = np.repeat(motion.rotation[None], 6, axis=0)
+        same = np.repeat(motion.rotation[None], 6, axis=0)
         spins = np.repeat(motion.spin[None], 6, axis=0)
-        moved = spins + step * np.concatenate([np.eye(3), -np.eye(3)])
-        turned_at, _ = turned(
-            np.concatenate([small @ motion.rotation, stay]),
-            np.concatenate([spins, moved]),
+        varied = spins + step * np.concatenate([np.eye(3), -np.eye(3)])
+        rotations, _ = rotate(
+            np.concatenate([small @ motion.rotation, same]),
+            np.concatenate([spins, varied]),
             motion.inertia,
             times,
         )
-        change = turned_at.reshape(2, 2, 3, *turned_at.shape[1:])  # (turn or spin, side, axis, T, 3, 3)
+        change = rotations.reshape(2, 2, 3, *rotations.shape[1:])  # (rotation or spin, side, axis, T, 3, 3)
         rotvecs = Rotation.from_matrix(
             (change[:, 0] @ np.swapaxes(change[:, 1], -1, -2)).reshape(-1, 3, 3)
         ).as_rotvec()
@@ -162,23 +162,23 @@ class Central:
         return self._problem.linearise(unknowns, free, central=True)
 
 
-def picture_times(pictures: Pictures, found: Found, start: float) -> np.ndarray:
-    return pictures.times + found.offsets[pictures.camera] - start
+def picture_times(pictures: Pictures, pose: FittedPose, start: float) -> np.ndarray:
+    return pictures.times + pose.offsets[pictures.camera] - start
 
 
-def render(pictures: Pictures, found: Found, start: float) -> torch.Tensor:
-    times = picture_times(pictures, found, start)
-    poses = found.motion.turn(times)[0], found.motion.place(times)[0]
-    return pictures.render(*poses, enlargement=found.enlargement)
+def render(pictures: Pictures, pose: FittedPose, start: float) -> torch.Tensor:
+    times = picture_times(pictures, pose, start)
+    poses = pose.motion.turn(times)[0], pose.motion.place(times)[0]
+    return pictures.render(*poses, enlargement=pose.enlargement)
 
 
-def costs(pictures: Pictures, found: Found, start: float) -> np.ndarray:
+def costs(pictures: Pictures, pose: FittedPose, start: float) -> np.ndarray:
     """Cost of each picture, (N,)."""
-    return pictures.residuals(render(pictures, found, start))[1].numpy()
+    return pictures.residuals(render(pictures, pose, start))[1].numpy()
 
 
-def difference(a: Found, b: Found) -> np.ndarray:
-    """From one pose to another, in the unknowns."""
+def difference(a: FittedPose, b: FittedPose) -> np.ndarray:
+    """Difference b - a of two poses in the unknowns."""
     p, q = a.motion, b.motion
     turn = Rotation.from_matrix(q.rotation @ p.rotation.T).as_rotvec()
     rest = [q.centre - p.centre, q.velocity - p.velocity, q.spin - p.spin, [b.enlargement - a.enlargement]]

@@ -1,4 +1,4 @@
-"""A photographed object as it was placed into its video: what is known of its pose and motion, and what is not told."""
+"""Result of the registration of a photographed object to its video: pose, motion, uncertainty and ambiguity."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from neuma_lib.capture.registration.problem import OFFSETS, PLACE, SIZE, SPIN, TURN, VELOCITY, Found
-from neuma_lib.capture.registration.rigid_views import Shown
+from neuma_lib.capture.registration.problem import OFFSETS, PLACE, SIZE, SPIN, TURN, VELOCITY, FittedPose
+from neuma_lib.capture.registration.rigid_views import Comparison
 
 CLEAR_MARGIN = 0.25
-"""Part of its cost by which the next distinct pose must be worse than the best one to be told from it: two standard
-deviations if the residuals of a block of the picture count as one (`Linearisation.block_cost`)."""
+"""Relative increase of the cost of the next distinct pose below which a pose is ambiguous: two standard deviations if
+the residuals of a block count as one (`Linearisation.block_cost`)."""
 CLEAR_ANGLE = 10.0
-"""Largest standard deviation of a rotation [degrees] that is known."""
+"""Standard deviation of the rotation above which it is ambiguous [degrees]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """How a pose looks like what was seen, each of shape (pictures,).
+    """Agreement of a pose with the images, each of shape (pictures,).
 
     Attributes:
-        camera: number of each picture's camera.
-        iou: of mask and rendered outline.
-        off: distance of their centroids, in pixels of the video.
-        rms: root mean square of the residual of colours and coverage over the mask.
+        camera: index of the camera.
+        iou: IoU of mask and rendered outline.
+        off: distance of their centroids [px of the video].
+        rms: root mean square residual of colours and coverage over the mask.
     """
 
     camera: np.ndarray
@@ -40,66 +40,65 @@ class Registration:
     """A photographed object placed into its video, x_video = s R x_photo + t at the time `start`.
 
     Attributes:
-        names: of the cameras.
-        start: the first frame of the flight that all cameras saw, by the first camera's clock [s].
-        pivot: the centre of mass as photographed [m], (3,).
-        scale_known: whether the photographs are in metres of the video, s = 1.
-        found: pose and motion.
-        covariance: of a turn about the world's axes [rad], the centre [m], velocity [m/s], spin [rad/s], enlargement,
-            gravity [m/s^2] and the offsets of the cameras but the first [s], (15 + cameras,) squared; 0 for what was
-            stated, as gravity is.
-        gravity, gravity_covariance: the acceleration that the pictures show where it is fitted along [m/s^2], (3,) and
-            (3, 3).
-        before, after: agreement of the object as photographed, where the masks' centres are, and as placed.
-        rival: cost of the next distinct pose relative to the best one's, and the angle between the two [degrees]; None:
-            no other was left.
-        spin_told: whether the spin is told from 0; it is 0 otherwise.
-        pictures: number of pictures that were compared at last, and the size of a side of them [px].
+        names: names of the cameras.
+        start: time of the first frame of the flight in all cameras, by the clock of the first one [s].
+        pivot: centre of mass as photographed [m], (3,).
+        scale_known: whether photographs and video have the same scale, s = 1.
+        pose: pose and motion.
+        covariance: covariance, (15 + cameras,) squared, of rotation about the world axes [rad], centre [m], velocity
+            [m/s], spin [rad/s], enlargement, gravity [m/s^2] and offsets of all cameras but the first [s]; 0 for fixed
+            values such as gravity.
+        gravity, gravity_covariance: fitted gravity [m/s^2], (3,) and (3, 3).
+        before, after: agreement of the object in the orientation of the photographs, and as registered.
+        rival: cost of the next distinct pose relative to that of the best one, and the angle between them [degrees], or
+            None if no other pose is left.
+        spin_significant: whether the spin differs significantly from 0; it is 0 otherwise.
+        pictures: number of pictures in the last stage, and their side [px].
         axes: rows are the first camera's right, down and viewing direction, (3, 3).
-        shown: some pictures of each camera beside their renders.
+        shown: pictures of each camera with their renders.
     """
 
     names: tuple[str, ...]
     start: float
     pivot: np.ndarray
     scale_known: bool
-    found: Found
+    pose: FittedPose
     covariance: np.ndarray
     gravity: np.ndarray
     gravity_covariance: np.ndarray
     before: Agreement
     after: Agreement
     rival: tuple[float, float] | None
-    spin_told: bool
+    spin_significant: bool
     pictures: tuple[int, int]
     axes: np.ndarray
-    shown: list[Shown]
+    shown: list[Comparison]
 
     @property
     def rotation(self) -> np.ndarray:
-        return self.found.motion.rotation
+        return self.pose.motion.rotation
 
     @property
     def scale(self) -> float:
-        return 1.0 if self.scale_known else 1.0 + self.found.enlargement
+        return 1.0 if self.scale_known else 1.0 + self.pose.enlargement
 
     @property
     def translation(self) -> np.ndarray:
-        return self.found.motion.centre - self.scale * self.rotation @ self.pivot
+        return self.pose.motion.centre - self.scale * self.rotation @ self.pivot
 
     def place(self, x: np.ndarray) -> np.ndarray:
-        """Points (N, 3) [m] of the object as photographed, in the video at the time `start`."""
+        """Transform points (N, 3) [m] of the photographed object to the video at the time `start`."""
         return self.scale * x @ self.rotation.T + self.translation
 
     @property
     def turn_deviations(self) -> np.ndarray:
-        """Standard deviations of the rotation about its best and worst known axes [degrees], ascending, (3,)."""
+        """Standard deviations of the rotation about its principal axes [degrees], ascending, (3,)."""
         return np.degrees(np.sqrt(np.maximum(np.linalg.eigvalsh(self.covariance[TURN, TURN]), 0)))
 
     @property
     def ambiguous(self) -> str:
-        """What is not told about the pose; nothing if all is."""
-        said = []
+        """Description of the ambiguity of the pose, empty if there is none."""
+        texts = []
         worst = self.turn_deviations[-1]
         if worst > CLEAR_ANGLE:
             values, vectors = np.linalg.eigh(self.covariance[TURN, TURN])
@@ -108,22 +107,22 @@ class Registration:
             about = (
                 f"about the axis ({axis})" if count == 1 else f"about {('two axes', 'any axis')[count - 2]}"
             )
-            said.append(f"the object looks alike when it is turned {about} (+-{worst:.0f} degrees)")
+            texts.append(f"the object looks alike when it is turned {about} (+-{worst:.0f} degrees)")
         if self.rival and self.rival[0] < 1 + CLEAR_MARGIN:
-            said.append(
+            texts.append(
                 f"a pose turned by {self.rival[1]:.0f} degrees explains the video nearly as well"
                 f" (squared residual {self.rival[0]:.2f} times as large)"
             )
-        return "; ".join(said)
+        return "; ".join(texts)
 
     def deviations(self, part: slice, axes: np.ndarray | None = None) -> np.ndarray:
-        """Standard deviations (3,) of a part of the unknowns, along the world's axes or others (3, 3)."""
+        """Standard deviations (3,) of some unknowns along the world axes or other axes (3, 3)."""
         axes = np.eye(3) if axes is None else axes
         return np.sqrt(np.maximum(np.diag(axes @ self.covariance[part, part] @ axes.T), 0))
 
     def velocity(self) -> dict[str, Any]:
         """The initial motion, for velocity.json (`neuma_lib.coupling.initial_motion.InitialMotion.of`)."""
-        motion = self.found.motion
+        motion = self.pose.motion
         return {
             "v0": motion.velocity.tolist(),
             "angular_velocity": motion.spin.tolist(),
@@ -137,18 +136,18 @@ class Registration:
         }
 
     def report(self) -> dict[str, Any]:
-        """What is known, for people and later stages."""
+        """Plain values for the report and later stages."""
         by_camera = {
             when: {
                 name: {
-                    "iou": float(found.iou[found.camera == k].mean()),
-                    "least_iou": float(found.iou[found.camera == k].min()),
-                    "centroid_px": float(found.off[found.camera == k].mean()),
-                    "rms": float(np.sqrt(np.square(found.rms[found.camera == k]).mean())),
+                    "iou": float(agreement.iou[agreement.camera == k].mean()),
+                    "least_iou": float(agreement.iou[agreement.camera == k].min()),
+                    "centroid_px": float(agreement.off[agreement.camera == k].mean()),
+                    "rms": float(np.sqrt(np.square(agreement.rms[agreement.camera == k]).mean())),
                 }
                 for k, name in enumerate(self.names)
             }
-            for when, found in (("before", self.before), ("after", self.after))
+            for when, agreement in (("before", self.before), ("after", self.after))
         }
         offsets = np.zeros(len(self.names))
         offsets[1:] = np.sqrt(np.maximum(np.diag(self.covariance)[OFFSETS:], 0))
@@ -158,18 +157,18 @@ class Registration:
             "translation": self.translation.tolist(),
             "scale": self.scale,
             "pivot": self.pivot.tolist(),
-            "centre": self.found.motion.centre.tolist(),
+            "centre": self.pose.motion.centre.tolist(),
             "turn_deg": float(np.degrees(Rotation.from_matrix(self.rotation).magnitude())),
             "rotation_std_deg": np.degrees(self.deviations(TURN)).tolist(),
             "rotation_std_deg_principal": self.turn_deviations.tolist(),
             "centre_std": self.deviations(PLACE).tolist(),
             "covariance": self.covariance.tolist(),
-            "enlargement": self.found.enlargement,
+            "enlargement": self.pose.enlargement,
             "enlargement_std": float(np.sqrt(max(self.covariance[SIZE, SIZE], 0))),
-            "offsets_s": dict(zip(self.names, self.found.offsets.tolist())),
+            "offsets_s": dict(zip(self.names, self.pose.offsets.tolist())),
             "offsets_std_s": dict(zip(self.names, offsets.tolist())),
-            "gains": dict(zip(self.names, self.found.gains.tolist())),
-            "spin_told": self.spin_told,
+            "gains": dict(zip(self.names, self.pose.gains.tolist())),
+            "spin_told": self.spin_significant,
             "rival": {"cost": self.rival[0], "angle_deg": self.rival[1]} if self.rival else None,
             "ambiguous": self.ambiguous,
             "pictures": self.pictures[0],
@@ -179,8 +178,8 @@ class Registration:
         }
 
     def summary(self) -> str:
-        """A line for people."""
-        motion, worst = self.found.motion, self.turn_deviations[-1]
+        """Summary line."""
+        motion, worst = self.pose.motion, self.turn_deviations[-1]
         other = f"next pose {self.rival[0]:.2f} times the squared residual" if self.rival else "no other pose"
         return (
             f"turned by {np.degrees(Rotation.from_matrix(self.rotation).magnitude()):.1f} +- {worst:.1f} degrees,"

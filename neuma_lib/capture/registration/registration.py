@@ -1,15 +1,14 @@
-"""Where a photographed object is in its video: its pose at the start of a free flight, its velocity and its spin.
+"""Registration of a photographed object to its video: pose, velocity and spin at the start of a free flight.
 
-The object has been photographed in a pose of its own, and in flight it is rigid. The place at the start is known
-roughly from the parabola of the masks' centres; nothing is known of the rotation. So rotations that lie evenly in all
-of them are rendered as small pictures, each moved to where its outline has the centroids of the masks; the best ones
-are refined on a few frames, then on more and more frames of the flight, in finer and finer pictures, and the worst are
-left behind (`STAGES`). The refinement is Levenberg and Marquardt's on all pixels of all cameras at once: pose,
-velocity, spin, the time between cameras, and, as in `velocity`, an enlargement of the rendered body, since what is
-rendered one percent too large looks one percent too near. Gravity is known there; freed at last, it is measured.
+The object is rigid in flight. Its initial position is approximately known from the parabola of the mask centres, its
+rotation is unknown. Evenly distributed rotations are rendered in small pictures, each shifted to match the centroids of
+the masks. The best ones are refined on an increasing number of frames at increasing resolution, and the worst are
+dropped (`STAGES`). The refinement is Levenberg-Marquardt on all pixels of all cameras with the unknowns pose, velocity,
+spin, time offsets of the cameras, and, as in `velocity`, an enlargement of the rendered body. Gravity is fixed, and
+fitted in the end as a check.
 
-A pose that another explains nearly as well is ambiguous. That is said and not an error: a plain ball has no rotation, a
-plain bottle none about its axis, and the deviations of such directions are large.
+If another pose explains the video nearly as well, the pose is ambiguous, which is reported but not an error. A ball
+without texture has no defined rotation, and a symmetric bottle none about its axis.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from neuma_lib.capture.registration.problem import (
     SIZE,
     SPIN,
     Central,
-    Found,
+    FittedPose,
     Problem,
     difference,
     picture_times,
@@ -48,37 +47,37 @@ from neuma_lib.fitting.least_squares import BLOCKS, MIN_COST, jackknife, levenbe
 from neuma_lib.splatting.gaussians import Gaussians
 
 GRID = 600
-"""Rotations that are tried beside the one of the photographs: none is farther than 25 degrees from one of them."""
+"""Initial rotations in addition to that of the photographs. Every rotation is within 25 degrees of one of them."""
 DISTINCT = np.radians(15)
-"""Angle from which on two rotations are different ones."""
-LEAST_IOU = 0.8
-"""Mean IoU of masks and rendered outlines below which the object is not the one in the video."""
+"""Minimum angle between distinct rotations."""
+MIN_IOU = 0.8
+"""Minimum mean IoU of masks and rendered outlines for a successful registration."""
 SPIN_SIGNIFICANCE = 11.3
-"""Squared distance of the spin from 0, in standard deviations, below which there is none: one percent of chi-squared
-variables with three degrees of freedom exceed it."""
+"""Squared spin in standard deviations below which it is set to 0: the 99th percentile of a chi-squared distribution
+with three degrees of freedom."""
 
-FEWEST = 4
-"""Frames of a camera that are kept, wherever the floor is."""
+MIN_FRAMES = 4
+"""Minimum number of frames of a camera that are kept above the floor."""
 SHOWN = 3
-"""Pictures of each camera that are shown beside their renders."""
+"""Number of pictures of each camera that are shown with their renders."""
 
 _ACROSS = 24  # diameter of the object in the pictures of the search [px]
-_STARTS = 24  # rotations of the grid that are refined
-_FIRST_WEIGHT, _LEAST_WEIGHT = 0.5, 0.1  # of colours beside coverage: at first, and at least
-_HOPELESS = 4.0  # times the cost of the best pose, all frames compared, from which on a pose is left behind
+_STARTS = 24  # number of rotations of the grid that are refined
+_FIRST_WEIGHT, _MIN_WEIGHT = 0.5, 0.1  # initial and minimum weight of colours relative to coverage
+_HOPELESS = 4.0  # cost relative to the best pose, on all frames, above which a pose is dropped
 
 
 class Stage(NamedTuple):
-    """A round of the refinement.
+    """A stage of the refinement.
 
     Attributes:
         across: diameter of the object [px].
-        reach: frame intervals of the first camera from the start that are compared.
-        frames: most frames of a camera, spread evenly.
-        free: places of the unknowns that are fitted; None: all.
-        kept: distinct poses that go on to the next round.
-        iterations: most steps.
-        central: whether differences are central.
+        reach: time from the start that is compared, in frame intervals of the first camera.
+        frames: maximum number of evenly spaced frames per camera.
+        free: indices of the fitted unknowns, or None for all.
+        kept: number of distinct poses for the next stage.
+        iterations: maximum number of steps.
+        central: whether to use central differences.
     """
 
     across: float
@@ -102,13 +101,13 @@ STAGES = (
 
 @dataclass(frozen=True, eq=False)
 class Parabola:
-    """What is known of a flight before.
+    """Initial estimate of a flight.
 
     Attributes:
-        time: at which the rest is given, by the first camera's clock [s].
-        place, velocity: of the masks' centre [m], [m/s], (3,).
-        gravity: [m/s^2], (3,).
-        spin: [rad/s], (3,); None: not known.
+        time: time of the other values by the clock of the first camera [s].
+        place, velocity: position [m] and velocity [m/s] of the mask centres, (3,).
+        gravity: gravity [m/s^2], (3,).
+        spin: spin [rad/s], (3,), or None if unknown.
     """
 
     time: float
@@ -118,7 +117,7 @@ class Parabola:
     spin: np.ndarray | None = None
 
     def at(self, time: float) -> Parabola:
-        """The same flight, given at another time."""
+        """The same flight at another reference time."""
         t = time - self.time
         return replace(
             self,
@@ -129,18 +128,15 @@ class Parabola:
 
 
 def first_common(sights: Sequence[Sight], name: str) -> float:
-    """Time of the first frame of the first camera that no camera's flight begins after [s].
-
-    Raises:
-        InputError: there is none.
-    """
+    """Time of the first frame of the first camera in the flights of all cameras [s]. Raises InputError if none."""
     begin, end = max(sight.clock[0] for sight in sights), min(sight.clock[-1] for sight in sights)
     clock = sights[0].clock
     common = clock[clock >= begin - np.diff(clock).min() / 2] if len(clock) > 1 else clock
     if len(common) == 0 or common[0] > end:
         raise InputError(
-            f"{name}: no time of the flight was seen by all cameras: check the offsets between them, and that the"
-            " videos show one throw"
+            name,
+            "no part of the flight is visible to all cameras at once",
+            "Check the time offsets of the cameras, and that the videos show the same take",
         )
     return float(common[0])
 
@@ -156,22 +152,22 @@ def register(
     progress: Callable[[int, int, float], None] | None = None,
     floor: float | None = None,
 ) -> Registration:
-    """Find pose and motion of a photographed object in its video.
+    """Estimate pose and motion of a photographed object in its video.
 
     Args:
-        gaussians: of the object as photographed.
-        particles, mass: of the same, (N, 3) [m] and (N,); they tell the centre of mass and how the body tumbles.
-        sights: frames of free flight of each camera, in metres of the Gaussians, the first of which keeps the time.
-        parabola: of the masks' centres.
-        name: of the throw, for messages.
-        scale_known: whether photographs and video are in the same metres; otherwise the size is found along, if it is
-            right within a factor of 1.5 or so.
+        gaussians: Gaussians of the photographed object.
+        particles, mass: particles of the object, (N, 3) [m] and (N,), for centre of mass and moment of inertia.
+        sights: frames of free flight of each camera in the unit of the Gaussians. The first camera defines the time.
+        parabola: parabola of the mask centres.
+        name: name of the take for messages.
+        scale_known: whether photographs and video have the same scale. Otherwise the size is fitted, which must be
+            correct within a factor of about 1.5.
         progress: called with (step, steps, root mean square residual).
-        floor: height of it [m]; frames in which the placed object would reach below are those after the contact, and
-            are left out. None: all frames are of free flight.
+        floor: height of the floor [m]. Frames in which the object would be below it are omitted, as after the contact.
+            None uses all frames.
 
     Raises:
-        InputError: no common time; or the object does not look like what was filmed, in any pose.
+        InputError: the cameras have no common time, or the object does not match the video in any pose.
     """
     start = first_common(sights, name)
     parabola = parabola.at(start)
@@ -180,31 +176,31 @@ def register(
     body = Body.about(gaussians, pivot)
     distances = [s.viewmat[2, :3] @ parabola.place + s.viewmat[2, 3] for s in sights]
     if min(distances) <= 0:
-        raise InputError(f"{name}: the flight lies behind a camera: its pose is wrong")
+        raise InputError(name, "the flight is behind a camera, so the pose of that camera is wrong")
     spin = np.zeros(3) if parabola.spin is None else parabola.spin
     motion = RigidMotion(np.eye(3), parabola.place, parabola.velocity, spin, parabola.gravity, inertia)
     offsets = np.array([sight.offset for sight in sights])
     fitted = [k for k in range(1, len(sights)) if not sights[k].offset_known]
     size = LIKELY_SIZE if scale_known else ANY_SIZE
-    nothing = Found(motion, offsets, 0.0, np.ones((len(sights), 3)))
+    nothing = FittedPose(motion, offsets, 0.0, np.ones((len(sights), 3)))
 
     interval = float(np.median(np.diff(sights[0].times))) if len(sights[0].times) > 1 else 1.0
-    candidates: list[Found] = []
-    others: list[tuple[float, Found]] = []
+    candidates: list[FittedPose] = []
+    others: list[tuple[float, FittedPose]] = []
     weights = np.full(len(sights), _FIRST_WEIGHT)
     for number, stage in enumerate(STAGES):
         flying = sights
         if floor is not None and stage.reach == np.inf:
             arms = particles - pivot
-            flying = [_above(s, arms, candidates[0], k, start, floor) for k, s in enumerate(sights)]
-        chosen = [sight.select(_near(sight.clock - start, stage, interval)) for sight in flying]
+            flying = [_above_floor(s, arms, candidates[0], k, start, floor) for k, s in enumerate(sights)]
+        chosen = [sight.select(_near_frames(sight.clock - start, stage, interval)) for sight in flying]
         pictures = Pictures(body, chosen, stage.across, distances)
         pictures.weights = weights
         if number == 0:
             candidates = _search(pictures, nothing, start, scale_known)
         refined = []
         for k, candidate in enumerate(candidates):
-            refined.append(_refined(Problem(pictures, candidate, start, fitted, size), stage))
+            refined.append(_refine(Problem(pictures, candidate, start, fitted, size), stage))
             if progress:
                 done = (number * 100 + 100 * (k + 1) // len(candidates), len(STAGES) * 100)
                 progress(*done, float(np.sqrt(refined[-1].cost / pictures.covered)))
@@ -220,69 +216,71 @@ def register(
     problem = Problem(pictures, best, start, fitted, size)
     covariance = _covariance(problem)
     spin, inverse = best.motion.spin, np.linalg.pinv(covariance[SPIN, SPIN])
-    told = bool(spin @ inverse @ spin > SPIN_SIGNIFICANCE)
-    if not told:
+    significant = bool(spin @ inverse @ spin > SPIN_SIGNIFICANCE)
+    if not significant:
         still = replace(best, motion=replace(best.motion, spin=np.zeros(3)))
         places = set(range(problem.size)) - set(range(*SPIN.indices(problem.size)))
         problem = Problem(pictures, still, start, fitted, size)
-        best = _refined(problem, STAGES[-1]._replace(free=tuple(sorted(places & set(problem.all)))))
+        best = _refine(problem, STAGES[-1]._replace(free=tuple(sorted(places & set(problem.all)))))
     gravity, gravity_covariance = _gravity(
         pictures, best, start, fitted, size, sights[0].viewmat[2, :3] if len(sights) == 1 else None
     )
-    others = [(ratio, other) for ratio, other in others if _apart(best, other) >= DISTINCT]
+    others = [(ratio, other) for ratio, other in others if _angle(best, other) >= DISTINCT]
     covariance += _spread(best, others)
     ratio, other = min(others, key=lambda each: each[0], default=(None, None))
     before = replace(best, motion=motion, enlargement=0.0)
-    found = Registration(
+    result = Registration(
         names=tuple(sight.name for sight in sights),
         start=start,
         pivot=pivot,
         scale_known=scale_known,
-        found=best,
+        pose=best,
         covariance=covariance,
         gravity=gravity,
         gravity_covariance=gravity_covariance,
         before=_agreement(pictures, before, start),
         after=_agreement(pictures, best, start),
-        rival=None if other is None else (ratio, float(np.degrees(_apart(best, other)))),
-        spin_told=told,
+        rival=None if other is None else (ratio, float(np.degrees(_angle(best, other)))),
+        spin_significant=significant,
         pictures=(len(pictures), pictures.side),
         axes=sights[0].viewmat[:3, :3],
-        shown=pictures.shown(render(pictures, best, start), SHOWN),
+        shown=pictures.comparisons(render(pictures, best, start), SHOWN),
     )
-    _check(found, name)
-    return found
+    _check(result, name)
+    return result
 
 
-def _colour_weights(pictures: Pictures, found: Found, start: float) -> np.ndarray:
-    """Weights of the colours beside coverage by how well they agree in a pose, (cameras,)."""
-    pictures.gains = found.gains.copy()
-    ratio = pictures.residual_ratio(render(pictures, found, start))
-    return np.clip(ratio, _LEAST_WEIGHT, 1.0)
+def _colour_weights(pictures: Pictures, pose: FittedPose, start: float) -> np.ndarray:
+    """Weights (cameras,) of colours relative to coverage, from their agreement in a pose."""
+    pictures.gains = pose.gains.copy()
+    ratio = pictures.residual_ratio(render(pictures, pose, start))
+    return np.clip(ratio, _MIN_WEIGHT, 1.0)
 
 
-def _near(times: np.ndarray, stage: Stage, interval: float) -> np.ndarray:
-    """Indices of the frames of a camera that a stage compares, at least one; ``times`` from the start on [s]."""
+def _near_frames(times: np.ndarray, stage: Stage, interval: float) -> np.ndarray:
+    """Indices of the frames of a camera in a stage, at least one, from their times relative to the start [s]."""
     near = np.flatnonzero(np.abs(times) <= stage.reach * interval)
     if len(near) == 0 or stage.frames == 1:
         return np.array([np.abs(times).argmin()])
     return near[spread_frames(len(near), stage.frames)]
 
 
-def _above(sight: Sight, arms: np.ndarray, found: Found, camera: int, start: float, floor: float) -> Sight:
-    """A camera's frames before particles at ``arms`` (N, 3) [m] from the centre reach the floor, `FEWEST` at least."""
-    times = sight.times + found.offsets[camera] - start
-    centres, _ = found.motion.place(times)
-    turns, _ = found.motion.turn(times)
-    lowest = (1 + found.enlargement) * np.einsum("tj,nj->tn", turns[:, 1], arms).min(axis=1) + centres[:, 1]
+def _above_floor(
+    sight: Sight, arms: np.ndarray, pose: FittedPose, camera: int, start: float, floor: float
+) -> Sight:
+    """Frames before particles at ``arms`` (N, 3) [m] from the centre reach the floor, at least `MIN_FRAMES`."""
+    times = sight.times + pose.offsets[camera] - start
+    centres, _ = pose.motion.place(times)
+    turns, _ = pose.motion.turn(times)
+    lowest = (1 + pose.enlargement) * np.einsum("tj,nj->tn", turns[:, 1], arms).min(axis=1) + centres[:, 1]
     after = np.flatnonzero((lowest < floor) & (times > 0))
     before = after[0] if len(after) else len(times)
-    return sight.select(range(max(before, min(FEWEST, len(times)))))
+    return sight.select(range(max(before, min(MIN_FRAMES, len(times)))))
 
 
-def _search(pictures: Pictures, nothing: Found, start: float, scale_known: bool) -> list[Found]:
-    """The likeliest rotations of a grid, each placed by the centroids of the masks; if the scale is not known, with the
-    size that their areas have in the mean."""
+def _search(pictures: Pictures, nothing: FittedPose, start: float, scale_known: bool) -> list[FittedPose]:
+    """The best rotations of a grid, with positions from the centroids of the masks, and the size from their mean area if
+    the scale is unknown."""
     motion, times = nothing.motion, picture_times(pictures, nothing, start)
     grid = np.concatenate([np.eye(3)[None], spread_rotations(GRID)])
     centres, _ = motion.place(times)
@@ -290,25 +288,26 @@ def _search(pictures: Pictures, nothing: Found, start: float, scale_known: bool)
     rotations = (turns @ grid[:, None]).reshape(-1, 3, 3)
     picture = np.tile(np.arange(len(times)), len(grid))
     every = np.tile(centres, (len(grid), 1))
-    renders, larger, (seen, seen_area) = pictures.render(rotations, every, picture), 0.0, pictures.moments()
-    there, area = pictures.moments(renders, picture)
+    renders, enlargement = pictures.render(rotations, every, picture), 0.0
+    observed, observed_area = pictures.moments()
+    rendered, area = pictures.moments(renders, picture)
     if not scale_known:
-        larger = float(np.sqrt(seen_area.mean() / area.mean())) - 1
-        renders = pictures.render(rotations, every, picture, larger)
-        there, area = pictures.moments(renders, picture)
+        enlargement = float(np.sqrt(observed_area.mean() / area.mean())) - 1
+        renders = pictures.render(rotations, every, picture, enlargement)
+        rendered, area = pictures.moments(renders, picture)
     pictures.fit_gains(renders, grey=True)
-    off = (seen[picture] - there).reshape(len(grid), -1, 2)
-    ratio = (seen_area[picture] / np.maximum(area, 1e-9)).reshape(len(grid), -1)
-    moved = pictures.shifts(np.nan_to_num(off), ratio, centres, np.arange(len(times)))
-    at = (centres + moved[:, None]).reshape(-1, 3)
-    costs = pictures.residuals(pictures.render(rotations, at, picture, larger), picture)[1].numpy()
+    off = (observed[picture] - rendered).reshape(len(grid), -1, 2)
+    ratio = (observed_area[picture] / np.maximum(area, 1e-9)).reshape(len(grid), -1)
+    shifts = pictures.shifts(np.nan_to_num(off), ratio, centres, np.arange(len(times)))
+    at = (centres + shifts[:, None]).reshape(-1, 3)
+    costs = pictures.residuals(pictures.render(rotations, at, picture, enlargement), picture)[1].numpy()
     costs = costs.reshape(len(grid), -1).sum(axis=1)
     gains = pictures.gains.copy()
     return [
         replace(
             nothing,
-            motion=replace(motion, rotation=grid[k], centre=motion.centre + moved[k]),
-            enlargement=larger,
+            motion=replace(motion, rotation=grid[k], centre=motion.centre + shifts[k]),
+            enlargement=enlargement,
             gains=gains,
             cost=float(costs[k]),
         )
@@ -316,8 +315,8 @@ def _search(pictures: Pictures, nothing: Found, start: float, scale_known: bool)
     ]
 
 
-def _refined(problem: Problem, stage: Stage) -> Found:
-    """The best pose near what a problem begins with, and the gains there."""
+def _refine(problem: Problem, stage: Stage) -> FittedPose:
+    """Refine the initial pose of a problem and fit the gains."""
     pictures, u = problem.pictures, problem.start
     pose = (*_POSE, SIZE) if problem.units[SIZE] == ANY_SIZE else _POSE
     free = [k for k in problem.all if stage.free is None or k in stage.free or k in pose]
@@ -332,53 +331,53 @@ def _refined(problem: Problem, stage: Stage) -> Found:
             stage.iterations,
             longest=0.3,
         )
-        found = problem.found(u)
-        pictures.fit_gains(render(pictures, found, problem.time))
-    return replace(found, gains=pictures.gains.copy(), cost=fit.cost)
+        pose = problem.pose(u)
+        pictures.fit_gains(render(pictures, pose, problem.time))
+    return replace(pose, gains=pictures.gains.copy(), cost=fit.cost)
 
 
-def _apart(a: Found, b: Found) -> float:
+def _angle(a: FittedPose, b: FittedPose) -> float:
     """Angle between two poses [rad]."""
     return float(angle_between(a.motion.rotation, b.motion.rotation)[0])
 
 
-def _distinct(found: Sequence[Found], count: int) -> tuple[list[Found], list[Found]]:
-    """The best ``count`` poses that are `DISTINCT`, best first, and what else is distinct from all better ones."""
-    kept: list[Found] = []
-    for each in sorted(found, key=lambda f: f.cost):
-        if all(_apart(each, k) >= DISTINCT for k in kept):
+def _distinct(poses: Sequence[FittedPose], count: int) -> tuple[list[FittedPose], list[FittedPose]]:
+    """The best ``count`` poses that are `DISTINCT` from all better ones, and the other distinct poses, best first."""
+    kept: list[FittedPose] = []
+    for each in sorted(poses, key=lambda f: f.cost):
+        if all(_angle(each, k) >= DISTINCT for k in kept):
             kept.append(each)
     return kept[:count], kept[count:]
 
 
 def _gravity(
     pictures: Pictures,
-    best: Found,
+    best: FittedPose,
     start: float,
     fitted: Sequence[int],
     size: float,
     view: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Acceleration (3,) and its covariance (3, 3), everything else fitted along.
+    """Gravity (3,) and its covariance (3, 3), fitted together with all other unknowns.
 
     Args:
-        view: direction of one camera alone, which hardly sees what happens along it: there gravity is taken as known.
+        view: viewing direction of a single camera, along which gravity is fixed because motion is hardly visible.
     """
     falling = np.eye(3)
     if view is not None:
         down = best.motion.gravity / np.linalg.norm(best.motion.gravity)
         side = np.cross(down, view)
         falling = np.stack([down, side / np.linalg.norm(side)])
-    free = _refined(Problem(pictures, best, start, fitted, size, falling), STAGES[-1])
+    free = _refine(Problem(pictures, best, start, fitted, size, falling), STAGES[-1])
     spread = _covariance(Problem(pictures, free, start, fitted, size, falling))[GRAVITY, GRAVITY]
     spread = spread[: len(falling), : len(falling)]
     return free.motion.gravity, falling.T @ spread @ falling
 
 
 def _covariance(problem: Problem) -> np.ndarray:
-    """Covariance of all unknowns, by the jackknife over blocks of the pictures, in SI units; 0 for what was not fitted.
+    """Block jackknife covariance of all unknowns in SI units, 0 for those not fitted.
 
-    Where what is likely holds an unknown that the pictures do not tell, the error of that is passed on.
+    It includes the uncertainty of the prior for unknowns that the pictures do not determine.
     """
     full = problem.linearise(problem.start, problem.all, central=True)
     free = np.array(problem.all)
@@ -390,34 +389,34 @@ def _covariance(problem: Problem) -> np.ndarray:
     return covariance * np.outer(problem.units, problem.units)
 
 
-def _spread(best: Found, others: Sequence[tuple[float, Found]]) -> np.ndarray:
-    """What other poses, which explain the video nearly as well, add to the covariance of the best one: they are
-    weighted by their likelihoods, residuals of a block of the picture counting as one.
+def _spread(best: FittedPose, others: Sequence[tuple[float, FittedPose]]) -> np.ndarray:
+    """Covariance from other poses, weighted by their likelihoods with the residuals of a block counted as one.
 
     Args:
-        others: cost relative to the best one's, and pose.
+        others: relative costs and poses.
     """
     weights = np.exp([-(ratio - 1) * BLOCKS**2 / 2 for ratio, _ in others])
-    moved = np.array([difference(best, other) for _, other in others]).reshape(len(others), -1)
-    added = np.einsum("n,ni,nj->ij", weights, moved, moved) / (1 + weights.sum())
+    d = np.array([difference(best, other) for _, other in others]).reshape(len(others), -1)
+    added = np.einsum("n,ni,nj->ij", weights, d, d) / (1 + weights.sum())
     return added if len(others) else 0.0
 
 
-def _agreement(pictures: Pictures, found: Found, start: float) -> Agreement:
-    pictures.gains, pictures.weights = found.gains.copy(), np.ones(pictures.cameras)
-    renders = render(pictures, found, start)
+def _agreement(pictures: Pictures, pose: FittedPose, start: float) -> Agreement:
+    pictures.gains, pictures.weights = pose.gains.copy(), np.ones(pictures.cameras)
+    renders = render(pictures, pose, start)
     costs = pictures.residuals(renders)[1].numpy()
     return Agreement(pictures.camera.copy(), *pictures.agreement(renders, costs))
 
 
-def _check(found: Registration, name: str) -> None:
-    iou = found.after.iou.mean()
-    if iou < LEAST_IOU:
-        size = 100 * found.found.enlargement
+def _check(result: Registration, name: str) -> None:
+    iou = result.after.iou.mean()
+    if iou < MIN_IOU:
+        size = 100 * result.pose.enlargement
         raise InputError(
-            f"{name}: the photographed object does not look like the one in the video in any pose: its outline covers"
-            f" the masks with an IoU of {iou:.2f} at best, {LEAST_IOU} is needed (size {size:+.0f} %). Likely causes:"
-            " the videos show another object; photographs and videos differ in scale (the board was moved, or another"
-            " print was laid); the object had another shape when it was photographed (soft, folded, opened); or masks"
-            " are wrong, of the photographs or of this throw (look at their contact sheets)"
+            name,
+            f"in the best pose the photographed object matches the masks of the video with an IoU of {iou:.2f} < {MIN_IOU}"
+            f" (size {size:+.0f} %). Possible causes: the video shows another object; photographs and video differ in"
+            " scale (another position or print of the board); the shape has changed (soft, folded, opened); or masks of"
+            " the photographs or of this take are wrong",
+            "Check the contact sheets of the masks",
         )

@@ -1,4 +1,4 @@
-"""Free flight of a rigid body: its centre falls on a parabola, its angular momentum stays as it is."""
+"""Free flight of a rigid body, with a parabola of its centre and constant angular momentum."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-_LONGEST_TURN = 0.1
-"""Angle [rad] of a step of the integration, whose error is of its fifth power."""
+_MAX_ANGLE = 0.1
+"""Maximum rotation angle per integration step, whose error is of fifth order [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigidMotion:
-    """A free flight from the time 0 on, x(t) = R(t) (x_photo - pivot) + c(t).
+    """A free flight, x(t) = R(t) (x_photo - pivot) + c(t).
 
     Attributes:
-        rotation: R(0), from the body as photographed to the world, (3, 3).
-        centre: c(0), where the centre of mass is [m], (3,).
-        velocity: of the centre [m/s], (3,).
-        spin: angular velocity at the time 0, in the world [rad/s], (3,).
-        gravity: [m/s^2], (3,).
-        inertia: about the centre of mass, of the body as photographed, for a mass of 1 kg [m^2], (3, 3).
+        rotation: R(0), from the photographed body to the world, (3, 3).
+        centre: c(0), centre of mass [m], (3,).
+        velocity: initial velocity of the centre [m/s], (3,).
+        spin: initial angular velocity in the world [rad/s], (3,).
+        gravity: gravity [m/s^2], (3,).
+        inertia: moment of inertia per mass of the photographed body about its centre of mass [m^2], (3, 3).
     """
 
     rotation: np.ndarray
@@ -38,20 +38,20 @@ class RigidMotion:
 
     def turn(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rotations (T, 3, 3) and angular velocities (T, 3) [rad/s] at times (T,) [s]."""
-        R, w = turned(self.rotation[None], self.spin[None], self.inertia, times)
+        R, w = rotate(self.rotation[None], self.spin[None], self.inertia, times)
         return R[0], w[0]
 
 
-def turned(
+def rotate(
     rotations: np.ndarray, spins: np.ndarray, inertia: np.ndarray, times: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations (B, T, 3, 3) and angular velocities (B, T, 3) of B free bodies at times (T,), negative ones too.
+    """Rotations (B, T, 3, 3) and angular velocities (B, T, 3) of B free bodies at times (T,) of any sign.
 
-    dR/dt = [omega]_x R, omega = R J^-1 R^T L with a constant angular momentum L, by Runge and Kutta's fourth order.
+    dR/dt = [omega]_x R, omega = R J^-1 R^T L with constant angular momentum L, by the fourth-order Runge-Kutta method.
 
     Args:
-        rotations, spins: at the time 0, (B, 3, 3) and (B, 3) [rad/s].
-        inertia: J of the body at R = 1, (3, 3); its unit does not matter.
+        rotations, spins: initial values, (B, 3, 3) and (B, 3) [rad/s].
+        inertia: J of the body at R = 1, (3, 3), in any unit.
     """
     times, inverse = np.asarray(times, float), np.linalg.inv(inertia)
     momentum = np.einsum("bij,jk,blk,bl->bi", rotations, inertia, rotations, spins)
@@ -63,34 +63,37 @@ def turned(
     def slope(R):
         return np.cross(rate(R)[:, :, None], R, axis=1)
 
-    found, speeds = np.empty((len(rotations), len(times), 3, 3)), np.empty((len(rotations), len(times), 3))
+    rotations_at, speeds = (
+        np.empty((len(rotations), len(times), 3, 3)),
+        np.empty((len(rotations), len(times), 3)),
+    )
     for side in (1, -1):
         R, now = rotations, 0.0
         for i in np.argsort(side * times, kind="stable"):
             if side * times[i] < 0 or (side < 0 and times[i] == 0):
                 continue
-            steps = max(1, int(np.ceil(abs(times[i] - now) * fastest / _LONGEST_TURN)))
+            steps = max(1, int(np.ceil(abs(times[i] - now) * fastest / _MAX_ANGLE)))
             h = (times[i] - now) / steps
             for _ in range(steps if h else 0):
                 k1 = slope(R)
                 k2 = slope(R + h / 2 * k1)
                 k3 = slope(R + h / 2 * k2)
                 R = R + h / 6 * (k1 + 2 * k2 + 2 * k3 + slope(R + h * k3))
-            now, found[:, i], speeds[:, i] = times[i], R, rate(R)
-    U, _, Vt = np.linalg.svd(found)
+            now, rotations_at[:, i], speeds[:, i] = times[i], R, rate(R)
+    U, _, Vt = np.linalg.svd(rotations_at)
     return U @ Vt, speeds
 
 
 def moment_of_inertia(arms: np.ndarray, mass: np.ndarray) -> np.ndarray:
-    """Moment of inertia (3, 3) [m^2] of points at arms (N, 3) [m] from their centre of mass, for 1 kg in all."""
+    """Moment of inertia per mass (3, 3) [m^2] of points at arms (N, 3) [m] from their centre of mass."""
     second = np.einsum("n,ni,nj->ij", mass / mass.sum(), arms, arms)
     return np.trace(second) * np.eye(3) - second
 
 
 def spread_rotations(count: int) -> np.ndarray:
-    """Rotations (count, 3, 3) that lie evenly in all of them: super-Fibonacci spirals (Alexa, CVPR 2022).
+    """Evenly distributed rotations (count, 3, 3): super-Fibonacci spirals (Alexa, CVPR 2022).
 
-    The farthest rotation is about 3.5 count^(-1/3) rad from one of them.
+    Every rotation is within about 3.5 count^(-1/3) rad of one of them.
     """
     s = np.arange(count) + 0.5
     inner, outer = np.sqrt(s / count), np.sqrt(1 - s / count)

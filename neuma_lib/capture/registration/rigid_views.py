@@ -1,11 +1,11 @@
-"""Pictures of a rigid body in flight, each by one camera at a time of its own, and their residuals.
+"""Pictures of a rigid body in flight by several cameras at different times, and their residuals.
 
-A camera that sees a moved body sees what a camera that moved the other way would see of the body at rest. So all
-pictures are views of the Gaussians as photographed, whose colours turn with the body, in one call of the rasterizer.
+A moving body in front of a fixed camera is equivalent to a fixed body in front of a moving camera. All pictures are
+therefore views of the photographed Gaussians, whose colours rotate with the body, in one call of the rasterizer.
 
-Compared are colours over black and coverage. The light of the photographs is in the colours of the Gaussians, and the
-body has turned in it. So a factor on each channel of a camera (its gain) and, for each picture, a grey factor that is
-linear across the body are fitted along, in closed form; and colours count the less, the less they agree (`weights`).
+Colours over black and coverage are compared. The colours of the Gaussians include the illumination of the photographs,
+in which the body has rotated. A gain per channel of a camera, and a grey factor per picture that is linear over the
+body, are therefore fitted in closed form, and colours that agree poorly have lower weights (`weights`).
 """
 
 from __future__ import annotations
@@ -27,31 +27,31 @@ from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.splatting.rasterizer import rasterize
 
 LOCAL = 7
-"""Unknowns that a picture depends on: a turn of the body [rad], a shift [m], both in world axes, its enlargement."""
+"""Unknowns of a picture: rotation of the body [rad] and shift [m], both in world axes, and enlargement."""
 SHADE_WEIGHT = 0.004
-"""A factor of shading that is off by 1 costs as much as a residual of the root of this all over the body."""
+"""Squared residual over the body that is equivalent to a change of the shading factor by 1."""
 _MARGIN = 1.2
 """Side of a crop, in diameters of the body."""
 _STEP = 0.3
 """Half width of the differences [px]."""
-_DARK, _LEAST_TOLD = 0.04, 20
-"""Colour below which a pixel tells no gain, and pixels that do."""
+_MIN_COLOUR, _MIN_PIXELS = 0.04, 20
+"""Minimum colour of pixels for the gain, and their minimum number."""
 _LIKELY_TINT = 0.15
-"""Standard deviation of a camera's tint, as a logarithm."""
+"""Prior standard deviation of the logarithm of the tint of a camera."""
 _BATCH_BYTES = 48e6
 
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What one camera saw of a flight.
+    """Frames of a flight by one camera.
 
     Attributes:
-        name: of the camera.
-        times: of the frames, by its clock [s], (T,).
+        name: name of the camera.
+        times: times of the frames by its clock [s], (T,).
         images: straight-alpha RGBA, uint8, (T, H, W, 4).
         viewmat, K: world to camera, OpenCV axes, (4, 4); intrinsics [px], (3, 3).
-        offset: what is added to its times to make them those of the first camera [s].
-        offset_known: whether that is exact.
+        offset: offset of its times to the clock of the first camera [s].
+        offset_known: whether the offset is exact.
     """
 
     name: str
@@ -64,7 +64,7 @@ class Sight:
 
     @property
     def clock(self) -> np.ndarray:
-        """Times by the first camera's clock [s], (T,)."""
+        """Times by the clock of the first camera [s], (T,)."""
         return self.times + self.offset
 
     def select(self, keep: Sequence[int]) -> Sight:
@@ -73,26 +73,28 @@ class Sight:
         return replace(self, times=self.times[keep], images=self.images[keep])
 
     def boxes(self) -> np.ndarray:
-        """Left, upper, right and lower end of the mask of each frame [px], (T, 4)."""
-        found = np.empty((len(self.images), 4))
+        """Left, upper, right and lower bound of the mask of each frame [px], (T, 4)."""
+        boxes = np.empty((len(self.images), 4))
         for k, image in enumerate(self.images):
             mask = image[..., 3] > 127
             if not mask.any():
-                raise InputError(f"{self.name}: a mask of the flight is empty: remove that frame")
+                raise InputError(
+                    self.name, f"the mask of frame {k} of the flight is empty", "Remove that frame"
+                )
             x, y = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
-            found[k] = x[0], y[0], x[-1] + 1, y[-1] + 1
-        return found
+            boxes[k] = x[0], y[0], x[-1] + 1, y[-1] + 1
+        return boxes
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """Gaussians about the centre of mass of their body.
+    """Gaussians relative to the centre of mass of their body.
 
     Attributes:
-        gaussians: with means from the centre on [m].
-        covars: (G, 3, 3) [m^2].
-        sh: (G, K, 3).
-        radius: distance of the farthest opaque part from the centre [m].
+        gaussians: Gaussians with means relative to the centre [m].
+        covars: covariances (G, 3, 3) [m^2].
+        sh: colours (G, K, 3).
+        radius: 98th percentile of the distances of means from the centre [m].
     """
 
     gaussians: Gaussians
@@ -102,19 +104,19 @@ class Body:
 
     @classmethod
     def about(cls, gaussians: Gaussians, centre: np.ndarray) -> Body:
-        """Gaussians about a centre (3,) [m]."""
+        """Gaussians relative to a centre (3,) [m]."""
         means = gaussians.means - torch.as_tensor(centre).to(gaussians.means)
         radius = float(torch.quantile(means.norm(dim=1), 0.98))
         moved = replace(gaussians, means=means).to(dtype=torch.float32)
         return cls(moved, moved.covars(), moved.sh(), radius)
 
 
-class Shown(NamedTuple):
+class Comparison(NamedTuple):
     """A picture and its render, over white, (side, side, 3) in [0, 1].
 
     Attributes:
-        camera: number of the camera.
-        time: by its clock [s].
+        camera: index of the camera.
+        time: time by its clock [s].
     """
 
     camera: int
@@ -124,25 +126,25 @@ class Shown(NamedTuple):
 
 
 class Pictures:
-    """Crops of N pictures at one resolution, and what a body renders there.
+    """Crops of N pictures with the same size, and renders of a body in these crops.
 
     Attributes:
-        camera: number of each picture's camera, (N,).
-        times: of each picture by its camera's clock [s], (N,).
-        side: of the crops [px].
-        spacing: of the world's points that are a pixel apart on the body [m], of each picture, (N,).
-        gains: factor on the body's colours of each camera, (cameras, 3).
-        weights: of the residuals of colours beside those of coverage, (cameras,).
-        covered: pixels of all masks.
+        camera: index of the camera of each picture, (N,).
+        times: time of each picture by the clock of its camera [s], (N,).
+        side: side of the crops [px].
+        spacing: size of a pixel on the body in each picture [m], (N,).
+        gains: factors on the colours of the body for each camera, (cameras, 3).
+        weights: weights of the residuals of colours relative to coverage, (cameras,).
+        covered: number of pixels of all masks.
     """
 
     def __init__(self, body: Body, sights: Sequence[Sight], across: float, distances: Sequence[float]):
-        """Crops in which the body's diameter takes about ``across`` pixels, or all that there are.
+        """Crops in which the diameter of the body is about ``across`` pixels, or its size in the video if that is less.
 
         Args:
-            body: what is rendered.
-            sights: frames of each camera, one at least.
-            distances: depth of the body from each camera [m].
+            body: the body to render.
+            sights: frames of each camera, at least one.
+            distances: depth of the body in each camera [m].
         """
         self.body, self.cameras = body, len(sights)
         sizes, factors = [], []
@@ -168,7 +170,7 @@ class Pictures:
                 Ks.append(K)
                 blur.append(
                     (1 - factor**-2) / 12
-                )  # variance of the average over a square, beyond a pixel's own
+                )  # variance of the average over a square minus that of a pixel
                 spacing.append(distance / K[0, 0])
         self._observed, self._valid = torch.stack(images), torch.stack(valid)[..., None]
         self._Ks, self._views = torch.tensor(np.stack(Ks)).float(), np.stack([s.viewmat for s in sights])
@@ -192,8 +194,8 @@ class Pictures:
         """Colours over black and coverage (M, side, side, 4) of the body at rotations (M, 3, 3) and centres (M, 3) [m].
 
         Args:
-            picture: number of the picture whose camera and crop each is rendered for, (M,); None: all in turn.
-            enlargement: of the body, relative.
+            picture: indices (M,) of the pictures whose cameras and crops are used, by default all in order.
+            enlargement: relative enlargement of the body.
         """
         picture = np.arange(len(self)) if picture is None else picture
         views = self._views[self.camera[picture]]
@@ -205,19 +207,19 @@ class Pictures:
         means, covars = size * g.means[None], size**2 * self.body.covars[None]
         per_view = 4 * (12 * len(g) + 14 * self.side**2)
         count = max(1, int(_BATCH_BYTES / per_view))
-        found = []
+        images = []
         for k in range(0, len(picture), count):
             image, alpha = rasterize(
                 means, covars, g.opacities, self.body.sh, viewmats[k : k + count], Ks[k : k + count],
                 self.side, self.side, background=(0.0, 0.0, 0.0), eps2d=self._eps2d,
             )  # fmt: skip
-            found.append(torch.cat([image[0], alpha[0, ..., None]], dim=-1))
-        return torch.cat(found)
+            images.append(torch.cat([image[0], alpha[0, ..., None]], dim=-1))
+        return torch.cat(images)
 
     def moments(
         self, images: Tensor | None = None, picture: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Centroid (M, 2) [px of the crop] and area (M,) [px] of the coverage of renders, or of what was seen."""
+        """Centroids (M, 2) [px of the crop] and areas (M,) [px] of the coverage of renders or observed pictures."""
         alpha = (self._observed if images is None else images)[..., 3]
         alpha = alpha * (self._valid if picture is None else self._valid[picture])[..., 0]
         area = alpha.sum(dim=(1, 2)).double()
@@ -228,42 +230,42 @@ class Pictures:
     def shifts(
         self, off: np.ndarray, area: np.ndarray, centres: np.ndarray, picture: np.ndarray
     ) -> np.ndarray:
-        """Shifts (B, 3) [m] of a body that take centroids by ``off`` (B, P, 2) [px]; of least size in a single view.
+        """Minimum-norm shifts (B, 3) [m] of a body that shift its centroids by ``off`` (B, P, 2) [px].
 
         Args:
-            area: ratio of the seen area to the rendered one, (B, P): tells the distance of one camera alone.
-            centres: where the body is in each picture, (P, 3).
-            picture: numbers of the P pictures.
+            area: ratios (B, P) of observed to rendered area, which determine the distance for a single camera.
+            centres: positions of the body in each picture, (P, 3).
+            picture: indices of the P pictures.
         """
         views, Ks = self._views[self.camera[picture]], self._Ks[picture].numpy()
         depth = np.einsum("pj,pj->p", views[:, 2, :3], centres) + views[:, 2, 3]
         A = (Ks[:, [0, 1], [0, 1]] / depth[:, None])[..., None] * views[:, :2, :3]  # (P, 2, 3)
-        found = off.reshape(len(off), -1) @ np.linalg.pinv(A.reshape(-1, 3), rcond=1e-2).T
+        shifts = off.reshape(len(off), -1) @ np.linalg.pinv(A.reshape(-1, 3), rcond=1e-2).T
         if len(set(self.camera[picture])) == 1:
             eye = -views[0, :3, :3].T @ views[0, :3, 3]
             farther = np.clip(np.median(area, axis=1) ** -0.5, 0.5, 2.0) - 1
-            found += farther[:, None] * (centres.mean(axis=0) - eye)
-        return found
+            shifts += farther[:, None] * (centres.mean(axis=0) - eye)
+        return shifts
 
     def fit_gains(self, renders: Tensor, grey: bool = False) -> None:
-        """Set the gains to medians of seen over rendered, where both show the body.
+        """Set the gains to medians of the ratio of observed to rendered colours, where both show the body.
 
-        What the light changes differs from place to place and is alike in all channels: so the channels of a pixel tell
-        the tint, and all pixels the brightness. Where pixels disagree on the tint, as they do on a side that was not
-        photographed, it is taken to be smaller.
+        Illumination changes differ between positions and are equal in all channels. The tint is therefore estimated
+        from the ratios of the channels of each pixel, and the brightness from all pixels. The tint is shrunk if pixels
+        disagree, as for a side without photographs.
 
         Args:
-            renders: of all pictures in turn, any number of times.
-            grey: whether the tint is left at 1, because renders show other parts of the body.
+            renders: renders of all pictures in order, any number of times.
+            grey: whether to keep a tint of 1, because renders show other parts of the body.
         """
         picture = np.arange(len(renders)) % len(self)
         for camera in range(self.cameras):
             of = self.camera[picture] == camera
-            seen, rendered = self._observed[picture[of]], renders[of]
-            both = torch.minimum(seen, rendered)
-            told = (both[..., 3] > 0.5) & (both[..., :3].amin(dim=-1) > _DARK)
-            if int(told.sum()) >= _LEAST_TOLD:
-                ratio = (seen[..., :3][told] / rendered[..., :3][told]).log()
+            observed, rendered = self._observed[picture[of]], renders[of]
+            both = torch.minimum(observed, rendered)
+            valid = (both[..., 3] > 0.5) & (both[..., :3].amin(dim=-1) > _MIN_COLOUR)
+            if int(valid.sum()) >= _MIN_PIXELS:
+                ratio = (observed[..., :3][valid] / rendered[..., :3][valid]).log()
                 brightness = ratio.mean(dim=1, keepdim=True)
                 tints = ratio - brightness
                 tint = tints.median(dim=0).values
@@ -272,9 +274,9 @@ class Pictures:
                 self.gains[camera] = (tint + brightness.median()).exp().double().numpy()
 
     def residual_ratio(self, renders: Tensor) -> np.ndarray:
-        """Root mean square residuals of coverage over those of colours, of each camera, (cameras,).
+        """Ratio (cameras,) of the root mean square residuals of coverage to those of colours for each camera.
 
-        Where light makes colours differ, they say less than outlines about the pose, by that ratio.
+        It weights colours, which are less reliable than outlines if the illumination differs.
         """
         self.weights = np.ones(self.cameras)
         squares = self.residuals(renders)[0].square().sum(dim=(1, 2)).double().numpy()
@@ -282,12 +284,12 @@ class Pictures:
         return np.sqrt(sums[:, 3] / np.maximum(sums[:, :3].mean(axis=1), 1e-12))
 
     def residuals(self, renders: Tensor, picture: np.ndarray | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Rendered minus seen (M, side, side, 4), with the best shading; its cost (M,); shading columns (M, P, 3)."""
+        """Rendered minus observed (M, side, side, 4) with optimal shading, costs (M,), shading columns (M, P, 3)."""
         picture = np.arange(len(self)) if picture is None else picture
         valid = self._valid[picture]
         lit = self._lit(renders, picture) * valid
         r = lit - self._weighted(self._observed[picture], picture) * valid
-        shade = _columns(lit[..., :3, None] * self._ramps[:, :, None])  # of the colours; coverage has none
+        shade = _columns(lit[..., :3, None] * self._ramps[:, :, None])  # colours only
         flat = r[..., :3].reshape(len(r), -1)
         a = -torch.linalg.solve(self._shade_normal(shade, picture), shade.mT @ flat[..., None])
         r = torch.cat([(flat + (shade @ a)[..., 0]).reshape(r[..., :3].shape), r[..., 3:]], dim=-1)
@@ -297,25 +299,25 @@ class Pictures:
     def normal_equations(
         self, rotations: np.ndarray, centres: np.ndarray, enlargement: float, central: bool
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Problem of each picture by its own unknowns (`LOCAL`), in the blocks of `in_blocks`, the shading eliminated.
+        """Linearised problem of each picture in its own unknowns (`LOCAL`) by blocks, with the shading eliminated.
 
         Args:
             rotations, centres: poses of the body in the pictures, (N, 3, 3) and (N, 3).
-            enlargement: of the body.
-            central: whether differences are central ones, at twice the cost of forward ones.
+            enlargement: relative enlargement of the body.
+            central: whether to use central differences, at twice the cost of forward ones.
 
         Returns:
-            Curvatures (N, blocks, 7, 7) and scores (N, blocks, 7), whose sums over the blocks are J^T J and J^T r, and
+            Curvatures (N, blocks, 7, 7) and scores (N, blocks, 7), whose sums over blocks are J^T J and J^T r, and
             costs (N,).
         """
         size = max(1, int(_BATCH_BYTES / (4 * 4 * 4 * LOCAL * self.side**2)))
-        found = [
+        batches = [
             self._normal_equations(
                 np.arange(len(self))[part], rotations[part], centres[part], enlargement, central
             )
             for part in frame_batches(len(self), size)
         ]
-        return tuple(np.concatenate(parts) for parts in zip(*found, strict=True))
+        return tuple(np.concatenate(parts) for parts in zip(*batches, strict=True))
 
     def _normal_equations(self, picture, rotations, centres, enlargement, central):
         here = self.render(rotations, centres, picture, enlargement)
@@ -356,8 +358,8 @@ class Pictures:
         return shade.mT @ shade + torch.diag_embed(self._shade_cost(picture)[:, None].expand(-1, 3))
 
     def agreement(self, renders: Tensor, costs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """IoU of outlines and masks, distance of their centroids in pixels of the video, and root mean square residual
-        over the mask, (N,) each, of renders of all pictures and their costs."""
+        """IoU of outlines and masks, distance of their centroids [px of the video], and root mean square residual over
+        the mask, (N,) each, from renders of all pictures and their costs."""
         valid = self._valid[..., 0] > 0
         a, b = ((image[..., 3] > 0.5) & valid for image in (renders, self._observed))
         iou = (a & b).sum(dim=(1, 2)) / (a | b).sum(dim=(1, 2)).clamp_min(1)
@@ -365,12 +367,12 @@ class Pictures:
         off = np.where(np.isfinite(off), off, self.side) * self._factor
         return iou.numpy(), off, np.sqrt(costs / self._mask_size.numpy())
 
-    def shown(self, renders: Tensor, most: int) -> list[Shown]:
-        """At most ``most`` pictures of each camera beside renders of all pictures, in the camera's gain."""
-        found = []
+    def comparisons(self, renders: Tensor, limit: int) -> list[Comparison]:
+        """At most ``limit`` pictures of each camera with their renders, multiplied by the gain of the camera."""
+        comparisons = []
         for camera in range(self.cameras):
             of = np.flatnonzero(self.camera == camera)
-            for k in of[spread_frames(len(of), most)]:
+            for k in of[spread_frames(len(of), limit)]:
                 seen, rendered = (
                     np.clip((image[..., :3] + 1 - image[..., 3:]).numpy(), 0, 1)
                     for image in (
@@ -378,8 +380,8 @@ class Pictures:
                         self._scaled(renders[k : k + 1], self.gains[[camera]])[0],
                     )
                 )
-                found.append(Shown(camera, float(self.times[k]), seen, rendered))
-        return found
+                comparisons.append(Comparison(camera, float(self.times[k]), seen, rendered))
+        return comparisons
 
     def _shade_cost(self, picture: np.ndarray) -> Tensor:
         weights = torch.tensor(self.weights[self.camera[picture]]).float()
@@ -393,7 +395,7 @@ class Pictures:
 
     @staticmethod
     def _scaled(images: Tensor, factors: np.ndarray) -> Tensor:
-        """Images (M, side, side, 4) with their colours times factors (M, 3)."""
+        """Images (M, side, side, 4) with colours multiplied by factors (M, 3)."""
         factors = torch.tensor(factors).float()
         return images * torch.cat([factors, torch.ones(len(factors), 1)], dim=1)[:, None, None]
 
@@ -404,8 +406,8 @@ def _columns(values: Tensor) -> Tensor:
 
 
 def _crop(image: np.ndarray, corner: np.ndarray, side: int, factor: int) -> tuple[Tensor, Tensor]:
-    """Colours over black and coverage (side, side, 4) of a square of straight-alpha RGBA (H, W, 4), uint8, averaged
-    over ``factor`` pixels each way; and where all of these lie in the picture (side, side)."""
+    """Colours over black and coverage (side, side, 4) of a square crop of straight-alpha RGBA (H, W, 4), uint8,
+    averaged over squares of ``factor`` pixels, and a mask (side, side) of squares within the image."""
     height, width = image.shape[:2]
     whole = np.zeros((side * factor, side * factor, 5), np.float32)
     (x0, y0), (x1, y1) = np.maximum(corner, 0), np.minimum(corner + side * factor, (width, height))

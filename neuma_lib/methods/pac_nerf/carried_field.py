@@ -1,4 +1,4 @@
-"""A radiance field that particles carry through a simulation, and its pictures (PAC-NeRF, Li et al. 2023, Sec. 3.2)."""
+"""A radiance field represented by particles in a simulation, and its images (PAC-NeRF, Li et al. 2023, Sec. 3.2)."""
 
 from __future__ import annotations
 
@@ -21,13 +21,16 @@ from neuma_lib.splatting.cameras import Cameras
 
 
 class CarriedField:
-    """A field as its particles carry it: fewer of them are simulated, the others follow.
+    """A field represented by particles, some of which are simulated while the others follow.
 
     Args:
-        field: of the first stage.
-        spacing, min_opacity: of the particles that are seen, see `RadianceField.particles`.
-        settings: how many move.
-        density: of the body [kg/m^3].
+        field: field of the first stage.
+        spacing, min_opacity: arguments of `RadianceField.particles` for the rendered particles.
+        settings: number of simulated particles.
+        density: density of the body [kg/m^3].
+
+    Raises:
+        InputError: the field has no particles.
     """
 
     def __init__(
@@ -41,7 +44,7 @@ class CarriedField:
         self.field = field.requires_grad_(False)
         self.shown = field.particles(spacing, min_opacity)
         if not len(self.shown.x):
-            raise InputError("pac_nerf: the field has no particles: run the rule radiance_field again")
+            raise InputError("radiance field", "it has no particles", "Run the rule radiance_field again")
         coarser = max(1.0, (len(self.shown.x) / settings.particles) ** (1 / 3))
         self.moving = field.particles(coarser * spacing, max(min_opacity, settings.min_opacity))
         self.mass = self.moving.masses(density_at(self.moving.x, density))
@@ -55,11 +58,8 @@ class CarriedField:
         density: Density,
         device: torch.device | str = "cpu",
     ) -> CarriedField:
-        """The field of a file as a method's particles carry it.
-
-        Args:
-            own: ``spacing``, ``min_opacity`` and ``settings`` (a `PacNerfConfig` as plain values), with which the
-                method's constants were found.
+        """The field of a file with the options ``own`` of the method: ``spacing``, ``min_opacity`` and ``settings`` (a
+        `PacNerfConfig` as plain values).
         """
         field, _ = load_field(path)
         return cls(
@@ -76,55 +76,53 @@ class CarriedField:
         spin: Sequence[float] | Tensor = (0.0, 0.0, 0.0),
         centre: Sequence[float] | Tensor | None = None,
     ) -> State:
-        """What moves, with the velocity v0 [m/s] and the spin [rad/s] of `State.rigid`."""
+        """The simulated particles with the velocity v0 [m/s] and the spin [rad/s] of `State.rigid`."""
         return State.rigid(self.moving.x, self.mass, self.moving.volumes(), v0, spin, centre)
 
     def positions(self, x: Tensor) -> Tensor:
-        """Of what is seen, (T, N, 3) [m], for those of what moves, (T, A, 3)."""
+        """Positions of the rendered particles (T, N, 3) [m] for those of the simulated ones (T, A, 3)."""
         return self._follow(x)[0]
 
     def particle_gs(self, cameras: Cameras, background: Sequence[float] = WHITE) -> FieldRenderer:
-        """The renderer of this body for the given cameras, as `Reconstruction` has one of its Gaussians."""
+        """The renderer of this body for the given cameras, see `Reconstruction.particle_gs`."""
         return FieldRenderer(self, cameras, background)
 
 
 class FieldRenderer:
-    """Renders the states of a carried field as `ParticleGS` does those of bound Gaussians.
+    """Renders the states of a carried field, with the interface of `ParticleGS`.
 
     Args:
-        body: what is seen.
+        body: the field.
         cameras: V views.
-        background: colour behind it.
+        background: colour of the background.
     """
 
     frames_per_batch = 1
-    """Every frame has a lattice of its own."""
+    """Every frame has its own lattice."""
 
     def __init__(self, body: CarriedField, cameras: Cameras, background: Sequence[float] = WHITE):
         self.body, self.background = body, background
         self.cameras = cameras.to(body.shown.x.device, body.shown.x.dtype)
 
     def __call__(self, x: Tensor, F: Tensor | None = None) -> Tensor:
-        """Images (T, V, H, W, 3) in [0, 1] of what moves at x (T, A, 3) [m]; its deformations F are not needed.
+        """Images (T, V, H, W, 3) in [0, 1] for simulated particles at x (T, A, 3) [m]. The deformations F are ignored.
 
         Raises:
-            InputError: other particles than those that this field moves by.
+            InputError: the number of particles is not that of this field.
         """
         moving = self.body.moving.x
         if x.shape[1:] != moving.shape:
-            raise InputError(
-                f"a rollout of {x.shape[1]} particles is not that of a field that {len(moving)} particles carry: run "
-                "evaluation again"
-            )
+            problem = f"{x.shape[1]} particles must be the {len(moving)} simulated ones of the field"
+            raise InputError("rollout", problem, "Run the evaluation again")
         field, shown = self.body.field, self.body.shown
-        places = self.body.positions(x.to(moving))
+        positions = self.body.positions(x.to(moving))
         views = range(len(self.cameras))
         images = [
-            field.draw(self.cameras, view, replace(shown, x=place), self.background)
-            for place in places
+            field.draw(self.cameras, view, replace(shown, x=at), self.background)
+            for at in positions
             for view in views
         ]
-        return torch.stack(images).unflatten(0, (len(places), len(views)))
+        return torch.stack(images).unflatten(0, (len(positions), len(views)))
 
     def batches(self, x: Tensor, F: Tensor, size: int | None = None) -> Iterator[tuple[slice, Tensor]]:
         """Render ``size`` frames at a time: yields (slice of frames, images)."""

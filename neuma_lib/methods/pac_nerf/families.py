@@ -1,7 +1,7 @@
-"""Constants of a family of laws as PAC-NeRF (Li et al. 2023) fits them, and the family of a scene.
+"""Constants of a family of laws in the parametrisation of PAC-NeRF (Li et al. 2023), and selection of the family.
 
-They are stored as the authors store them: moduli, yield stress and viscosity as log10, Poisson's ratio as x with
-nu = 0.45 tanh(x / 0.45), the friction angle in degrees.
+As in the authors' code, moduli, yield stress and viscosity are stored as log10, Poisson's ratio as x with
+nu = 0.45 tanh(x / 0.45), and the friction angle in degrees.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from neuma_lib.mechanics.isotropic import lame
 from neuma_lib.mechanics.law import Law
 from neuma_lib.methods.pac_nerf.options import MODULI, PacFamilyConfig, PacNerfConfig
 
-POISSON_MOST = 0.45
+MAX_POISSON = 0.45
 """Bound on Poisson's ratio (PAC-NeRF)."""
 ANGLES = (0.5, 85.0)
-"""Friction angles that a law is given [degrees]; the authors have no bounds, but a cone needs some."""
+"""Bounds on the friction angle [degrees], which the authors' code does not have."""
 
 
 class FamilyConstants(torch.nn.Module):
-    """The constants of a family of laws, those that are fitted as parameters.
+    """The constants of a family of laws, with the fitted ones as parameters.
 
     Args:
-        family: parts of the law with the constants of the stock guess, and which are fitted.
-        known: constants to start from instead, by name, where the family has them.
+        family: parts of the law with published initial constants, and names of the fitted ones.
+        known: other initial constants by name; those that the family does not have are ignored.
 
     Raises:
-        InputError: a guess that the parametrisation cannot hold.
+        InputError: an initial constant is outside the range of the parametrisation.
     """
 
     def __init__(self, family: PacFamilyConfig, known: Mapping[str, float] | None = None):
@@ -46,7 +46,7 @@ class FamilyConstants(torch.nn.Module):
             part.update(
                 {name: (known or {}).get(name, value) for name, value in part.items() if name != "name"}
             )
-        analytic_law(spec, dt=1.0)  # names unknown parts and constants, and those out of range
+        analytic_law(spec, dt=1.0)  # checks names and ranges
         E, nu = (spec["elasticity"][name] for name in ("E", "nu"))
         mu, _ = lame(E, nu)
         start = {**spec["plasticity"], "E": E, "nu": nu, "mu": mu, "kappa": E / (3 * (1 - 2 * nu))}
@@ -58,30 +58,30 @@ class FamilyConstants(torch.nn.Module):
 
     @torch.no_grad()
     def fitted_numbers(self) -> dict[str, float]:
-        """What is fitted, under the names that it is fitted by."""
+        """The fitted numbers by the names in the settings."""
         return {name: float(_from_stored(name, self.stored[name])) for name in self.fitted}
 
     def values(self) -> dict[str, Tensor]:
-        """What is fitted, as the law's own constants, differentiable."""
-        found = {name: _from_stored(name, self.stored[name]) for name in self.fitted}
-        if set(MODULI) & set(found):
-            mu, kappa = (found.pop(name, self.fixed[name]) for name in MODULI)
-            found["E"] = 9 * kappa * mu / (3 * kappa + mu)
-            found["nu"] = (3 * kappa - 2 * mu) / (2 * (3 * kappa + mu))
-        return found
+        """The fitted numbers as constants of the law, differentiable."""
+        values = {name: _from_stored(name, self.stored[name]) for name in self.fitted}
+        if set(MODULI) & set(values):
+            mu, kappa = (values.pop(name, self.fixed[name]) for name in MODULI)
+            values["E"] = 9 * kappa * mu / (3 * kappa + mu)
+            values["nu"] = (3 * kappa - 2 * mu) / (2 * (3 * kappa + mu))
+        return values
 
     def law(self, dt: float, device: torch.device | str = "cpu") -> Law:
-        """The law, differentiable with respect to what is fitted; dt [s] counts where it depends on the rate."""
+        """The law, differentiable in the fitted constants; dt [s] is used by rate-dependent laws."""
         values = {name: value.to(device) for name, value in self.values().items()}
         return analytic_law(self._filled(values), dt=dt)
 
     @torch.no_grad()
     def specification(self) -> dict[str, dict[str, Any]]:
-        """Names and constants as numbers, as `analytic_law` takes them."""
+        """The specification for `analytic_law` with numbers as constants."""
         return self._filled({name: float(value) for name, value in self.values().items()})
 
     def groups(self, settings: PacNerfConfig) -> list[dict[str, Any]]:
-        """Groups of parameters with their learning rates, for an optimiser."""
+        """Parameter groups with learning rates for an optimiser."""
         rates = {
             **dict.fromkeys(("E", *MODULI), settings.rate_modulus),
             "nu": settings.rate_poisson,
@@ -104,13 +104,13 @@ def _to_stored(name: str, value: float) -> float:
     if name == "friction_angle":
         return value
     if name == "nu":
-        if not abs(value) < POISSON_MOST:
+        if not abs(value) < MAX_POISSON:
             raise InputError(
-                f"pac_nerf: nu = {value:g} cannot be fitted, its size must be below {POISSON_MOST}"
+                "pac_nerf.families.nu", f"the size of {value:g} must be below {MAX_POISSON} to be fitted"
             )
-        return POISSON_MOST * math.atanh(value / POISSON_MOST)
+        return MAX_POISSON * math.atanh(value / MAX_POISSON)
     if not value > 0:
-        raise InputError(f"pac_nerf: {name} = {value:g} cannot be fitted, it must be positive")
+        raise InputError(f"pac_nerf.families.{name}", f"{value:g} must be positive to be fitted")
     return math.log10(value)
 
 
@@ -118,39 +118,40 @@ def _from_stored(name: str, stored: Tensor) -> Tensor:
     if name == "friction_angle":
         return stored.clamp(*ANGLES)
     if name == "nu":
-        return POISSON_MOST * torch.tanh(stored / POISSON_MOST)
+        return MAX_POISSON * torch.tanh(stored / MAX_POISSON)
     return 10**stored
 
 
 def choose_family(
     settings: PacNerfConfig, prior: Mapping[str, Mapping[str, Any]] | None
 ) -> tuple[str, FamilyConstants]:
-    """The family of a scene and its constants at the start, by the rule of the settings.
+    """The family of a scene and its initial constants.
 
     Args:
-        settings: families, and which one, if it is named.
-        prior: the analytic law of the scene's prior, as `analytic_law` takes it; None where there is none.
+        settings: the families, and optionally the name of one.
+        prior: specification of the analytic law of the scene's prior, or None.
 
     Raises:
-        InputError: there is no such family, or no prior to choose by.
+        InputError: the family does not exist, or cannot be selected without an analytic prior.
     """
     families, name = settings.families, settings.family
     if prior is None and (name is None or settings.guesses == "prior"):
         raise InputError(
-            "pac_nerf: the scene's prior is a file, not an analytic law: set pac_nerf.family, and guesses: stock"
+            "pac_nerf.family",
+            "it cannot be selected because the scene's prior is a file, not an analytic law",
+            "Set pac_nerf.family, and pac_nerf.guesses to stock",
         )
     if name is None:
         plasticity = prior["plasticity"]["name"]
-        fitting = [key for key, family in families.items() if family.plasticity.name == plasticity]
-        if not fitting:
+        matching = [key for key, family in families.items() if family.plasticity.name == plasticity]
+        if not matching:
             raise InputError(
-                f"pac_nerf: no family has the prior's return map {plasticity}: add one to pac_nerf.families, or set "
-                "pac_nerf.family"
+                "pac_nerf.families",
+                f"none has the return map {plasticity} of the scene's prior",
+                "Add one, or set pac_nerf.family",
             )
-        name = fitting[0]
+        name = matching[0]
     if name not in families:
-        raise InputError(
-            f"pac_nerf.family: no {name!r} in pac_nerf.families, which has {', '.join(families)}"
-        )
+        raise InputError("pac_nerf.family", f"{name!r} must be one of {', '.join(families)}")
     known = {key: value for part in (prior or {}).values() for key, value in part.items() if key != "name"}
     return name, FamilyConstants(families[name], known if settings.guesses == "prior" else None)

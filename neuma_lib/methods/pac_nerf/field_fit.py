@@ -1,8 +1,8 @@
 """Voxel radiance field from posed RGBA images: the first stage of PAC-NeRF (Li et al. 2023, Sec. 3.1).
 
-The field is rendered as the later stages will: its densities and features go to particles and back to the nodes before
-rays are drawn through them. This trains it to survive that round trip. Coarse to fine: at given iterations the voxel is
-halved, the lattice shrinks to what is occupied, and Adam begins anew.
+The field is rendered as in the later stages: its densities and features are transferred to particles and back to the
+nodes before rendering, so that it is trained for this round trip. At given iterations the voxel is halved, the lattice
+is restricted to occupied nodes, and Adam restarts.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.observation import over_white
 
 VOLUME_RANGE = (1e-4, 1e-1)
-"""Opacities between which a particle counts in the volume term (PAC-NeRF)."""
+"""Range of opacities in the volume term (PAC-NeRF)."""
 CERTAIN = 1e-5
-"""Transmittances are kept this far from 0 and 1 in their entropy (PAC-NeRF)."""
+"""Minimum distance of transmittances from 0 and 1 in their entropy (PAC-NeRF)."""
 
 
 @dataclass
 class RadianceReport:
-    """How a fit went.
+    """Report of a fit.
 
     Attributes:
         losses: training loss of every iteration.
-        voxel: of the last lattice [m].
-        nodes: of the last lattice, along each axis.
-        particles: in the field at the end.
-        held_out: indices of the views kept for measurement.
-        psnr, psnr_object: mean PSNR [dB] of the held-out views, full frame over white and inside the object (pixels
-            with alpha above 1/2), through particles and back.
-        direct_psnr, direct_psnr_object: the same of the field itself, without particles.
+        voxel: voxel of the last lattice [m].
+        nodes: nodes of the last lattice along each axis.
+        particles: number of particles of the final field.
+        held_out: indices of the held-out views.
+        psnr, psnr_object: mean PSNR [dB] of the held-out views rendered with particles, full frame over white and
+            inside the object (pixels with alpha above 1/2).
+        direct_psnr, direct_psnr_object: the same without particles.
     """
 
     losses: list[float]
@@ -64,18 +64,18 @@ def fit_radiance_field(
     checkpoint: Checkpoint | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> tuple[RadianceField, RadianceReport]:
-    """Fit a field to images of an object. It begins in the box of the object's visual hull.
+    """Fit a field to images of an object, initially in the bounding box of its visual hull.
 
     Args:
-        images: (V, H, W, 4) RGBA with straight alpha in [0, 1].
+        images: RGBA (V, H, W, 4) with straight alpha in [0, 1].
         cameras: their V cameras, more than half of `settings.held_out`.
         settings: hyper-parameters.
-        seed: of everything random; the same seed gives the same field on a CPU.
-        checkpoint: where the state is kept, so that a killed fit goes on.
+        seed: random seed; the same seed gives the same field on a CPU.
+        checkpoint: file for the state, so that an interrupted fit can resume; None for none.
         progress: called with (iteration, loss) after each iteration.
 
     Raises:
-        InputError: shapes disagree, a mask is empty or covers the frame, or masks and poses contradict each other.
+        InputError: shapes do not match, a mask is empty or covers the frame, or masks and poses are inconsistent.
         NonFiniteError: the loss is not finite.
     """
     _check(images, cameras, settings.held_out)
@@ -88,7 +88,7 @@ def fit_radiance_field(
         loss = fit.step(iteration)
         if not math.isfinite(loss):
             raise NonFiniteError(
-                "radiance field", f"loss is {loss} in iteration {iteration}; lower radiance.rate_density"
+                "radiance field", f"the loss is {loss} in iteration {iteration}. Lower radiance.rate_density"
             )
         if progress is not None:
             progress(iteration, loss)
@@ -111,7 +111,7 @@ def evaluate(
     views: list[int],
     particles: FieldParticles | None = None,
 ) -> tuple[float, float]:
-    """Mean PSNR [dB] over views against RGBA images over white: full frame; where alpha > 1/2."""
+    """Mean PSNR [dB] over views with respect to RGBA images over white: full frame, and where alpha > 1/2."""
     full, inside = [], []
     for view in views:
         error = (field.draw(cameras, view, particles).clamp(0, 1) - over_white(images[view])) ** 2
@@ -121,7 +121,7 @@ def evaluate(
 
 
 class _Fit:
-    """The field, its optimiser, and what is random."""
+    """The field, its optimiser, and the random state."""
 
     def __init__(self, images: Tensor, cameras: Cameras, settings: RadianceConfig, seed: int):
         self.settings, self.generator = settings, torch.Generator().manual_seed(seed)
@@ -131,13 +131,13 @@ class _Fit:
         self.order: list[int] = []
         self.losses: list[float] = []
         lattice = _around(visual_hull(images[..., 3], cameras, settings.hull_resolution), settings)
-        with torch.random.fork_rng(devices=[]):  # of the network
+        with torch.random.fork_rng(devices=[]):  # for the initial network
             torch.manual_seed(seed)
             field = RadianceField(lattice, Opacity(settings.initial_opacity, lattice.voxel))
         self._begin(field.to(images))
 
     def _begin(self, field: RadianceField) -> None:
-        """Go on with a field, with a new optimiser; only rays that meet its lattice are drawn."""
+        """Continue with a field, a new optimiser, and the rays that intersect its lattice."""
         self.field, settings = field, self.settings
         self.optimizer = torch.optim.Adam(
             [
@@ -180,12 +180,12 @@ class _Fit:
         return self.losses[-1]
 
     def _done(self, iteration: int) -> float:
-        """How much of what follows the last halving is behind us, from 0 to 1."""
+        """Progress since the last halving, from 0 to 1."""
         first = self.halvings[-1] if self.halvings else 0
         return max(0.0, (iteration - first) / (self.settings.iterations - first))
 
     def state(self, iteration: int) -> dict:
-        """All that a checkpoint must hold."""
+        """State for a checkpoint."""
         lattice = self.field.lattice
         return {
             "iteration": iteration,
@@ -198,7 +198,7 @@ class _Fit:
         }
 
     def resume(self, state: dict | None) -> int:
-        """Go back to a state, if there is one; the iteration to go on with."""
+        """Restore a state, if any, and return the next iteration."""
         if state is None:
             return 0
         origin, voxel, nodes = state["lattice"]
@@ -215,19 +215,19 @@ class _Fit:
 
 
 def _around(hull: Hull, settings: RadianceConfig) -> Lattice:
-    """The coarsest lattice, with the box of a visual hull in the middle of it."""
+    """The coarsest lattice, centred on the bounding box of a visual hull."""
     volume = float(hull.occupied.sum()) * hull.voxel**3
     last = (volume / settings.particles) ** (1 / 3) / settings.spacing
     voxel = settings.voxel or 2 ** len(settings.halvings) * last
-    found = hull.occupied.nonzero()
-    low, high = (hull.origin + hull.voxel * corner for corner in (found.amin(0), found.amax(0) + 1))
+    occupied = hull.occupied.nonzero()
+    low, high = (hull.origin + hull.voxel * corner for corner in (occupied.amin(0), occupied.amax(0) + 1))
     cells = ((high - low) / voxel).ceil().clamp(min=1)
     origin = (low + high - voxel * cells) / 2
     return Lattice(tuple(origin.tolist()), voxel, tuple(int(n) + 1 for n in cells.tolist()))
 
 
 def _meeting(lattice: Lattice, origins: Tensor, directions: Tensor) -> Tensor:
-    """Indices of the rays that meet a lattice's box."""
+    """Indices of the rays that intersect a lattice."""
     low, high = (torch.tensor(corner).to(origins) for corner in (lattice.origin, lattice.far))
     one, other = (low - origins) / directions, (high - origins) / directions
     first, last = torch.minimum(one, other).amax(1), torch.maximum(one, other).amin(1)
@@ -237,9 +237,9 @@ def _meeting(lattice: Lattice, origins: Tensor, directions: Tensor) -> Tensor:
 def _check(images: Tensor, cameras: Cameras, held_out: int) -> None:
     expected = (len(cameras), cameras.height, cameras.width, 4)
     if tuple(images.shape) != expected:
-        raise InputError(f"images of shape {tuple(images.shape)} do not fit the cameras: expected {expected}")
+        raise InputError("images", f"shape {tuple(images.shape)} must be {expected}, as for the cameras")
     if len(cameras) <= max(1, held_out // 2):
         raise InputError(
-            f"radiance field: {len(cameras)} views leave none to measure with; lower radiance.held_out ({held_out})"
+            "radiance.held_out", f"{held_out} leaves no held-out view of {len(cameras)}", "Lower it"
         )
     check_masks(images[..., 3])

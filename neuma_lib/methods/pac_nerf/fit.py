@@ -1,9 +1,9 @@
-"""Velocity and constants of a named family of laws from a video: the later stages of PAC-NeRF (Li et al. 2023).
+"""Velocity and constants of a family of laws from a video: the later stages of PAC-NeRF (Li et al. 2023).
 
-A radiance field stays as the first stage has left it. Particles carry it: first one velocity for all of them is found
-in frames before contact, by L-BFGS; then the constants of the law, by Adam, first in the frames until a little after
-contact, then in all. Every picture goes through the simulation, back to a lattice and along rays, and gradients go the
-same way back. Which constants, and how they are stored, is in `pac_families`.
+The radiance field of the first stage is fixed and represented by particles. L-BFGS estimates a uniform velocity from
+frames before contact. Adam then fits the constants of the law, first on the frames until shortly after contact, then on
+all. Every image is simulated, transferred to a lattice and rendered along rays, and gradients take the reverse path.
+The constants and their parametrisation are in `families`.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from neuma_lib.sim.model import COURANT_LIMIT, MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.splatting.observation import Observation
 
-MOST_HALVINGS = 4
-"""Times that a time step is halved before a rollout counts as unstable."""
-LEAST_STEP = 1e-3
-"""L-BFGS ends where a step changes no component of the velocity by more than this [m/s] (PAC-NeRF)."""
-LEAST_GAIN = 1e-6
-"""Or, as torch's knows no other way, where it lowers the loss by less than this part of the first one."""
+MAX_HALVINGS = 4
+"""Maximum number of halvings of the time step."""
+MIN_STEP = 1e-3
+"""L-BFGS ends if a step changes every component of the velocity by at most this [m/s] (PAC-NeRF)."""
+MIN_GAIN = 1e-6
+"""Share of the first loss by which a step of L-BFGS must lower the loss, tied to `MIN_STEP` in torch."""
 HISTORY = 20
-"""Steps that L-BFGS remembers (PAC-NeRF)."""
+"""History size of L-BFGS (PAC-NeRF)."""
 
 
 class Video:
-    """Pixels of a video and their rays. Images stay as they are stored: bytes become colours a picture at a time."""
+    """Pixels of a video and their rays. Images stay as bytes and are converted one at a time."""
 
     def __init__(self, observation: Observation):
         self.frames = observation.frames
@@ -49,13 +49,13 @@ class Video:
         ]
         self.rays = [camera_rays(view.cameras, 0) for view in self.views]
 
-    def picture(self, k: int, view: int) -> Tensor:
+    def image(self, k: int, view: int) -> Tensor:
         """Colours (P, 3) over white of the pixels of a frame, row by row."""
         return self.views[view].colours(slice(k, k + 1)).flatten(0, 3)
 
-    def shows_body(self, picture: Tensor, view: int, lattice: Lattice) -> Tensor:
-        """Indices of the pixels of a picture that are not white, or whose ray meets a lattice."""
-        coloured = (picture < 1 - 1 / 512).any(-1)
+    def shows_body(self, image: Tensor, view: int, lattice: Lattice) -> Tensor:
+        """Indices of the pixels of an image that are not white, or whose ray intersects a lattice."""
+        coloured = (image < 1 - 1 / 512).any(-1)
         origins, directions = self.rays[view]
         low, high = (torch.tensor(corner).to(origins) for corner in (lattice.origin, lattice.far))
         one, other = (low - origins) / directions, (high - origins) / directions
@@ -72,38 +72,37 @@ class Video:
         generator: torch.Generator | None,
         frames: int = 1,
     ) -> Tensor:
-        """Squared error of a frame over all its pixels, for the body's particles at x (N, 3): PAC-NeRF's loss.
+        """Mean squared error of a frame for particles of the body at x (N, 3), divided by ``frames``: PAC-NeRF's loss.
 
-        From at most ``pixels`` of those that show the body, drawn at random; the others are white in both. Divided by
-        the number of ``frames`` whose mean it is a part of. Differentiable with respect to x; the gradient is taken as
-        the picture is rendered, and for one piece of it at a time (`rendering.POINTS_AT_ONCE`), so that memory does not
-        depend on its size.
+        Estimated from at most ``pixels`` random pixels of those that show the body. The others are white in both
+        images. Differentiable with respect to x. The gradient is computed during rendering, piece by piece
+        (`rendering.POINTS_AT_ONCE`), so that the memory does not depend on the size of the image.
         """
         lattice, values = body.shown.seen(x)
-        picture = self.picture(k, view)
-        chosen = self.shows_body(picture, view, lattice)
+        image = self.image(k, view)
+        chosen = self.shows_body(image, view, lattice)
         count = len(chosen)
         if pixels is not None and count > pixels:
             drawn = torch.randperm(count, generator=generator)[:pixels]
             chosen = chosen[drawn.to(chosen.device)]
-        rays, seen = [part[chosen] for part in self.rays[view]], picture[chosen]
+        rays, observed = [part[chosen] for part in self.rays[view]], image[chosen]
 
         def terms(values):
             for part, colours, _ in body.field.render_in_pieces(lattice, values, *rays):
-                squares = (colours - seen[part]).square().sum()
-                yield squares * (count / max(1, len(chosen)) / len(picture)) / frames
+                squares = (colours - observed[part]).square().sum()
+                yield squares * (count / max(1, len(chosen)) / len(image)) / frames
 
         return sum_of_terms(terms, values)
 
 
 @dataclass
 class PacNerfHistory:
-    """Curves of a fit, one entry an Adam step: the state before it.
+    """Training curves with one entry per Adam step, before the step.
 
     Attributes:
-        loss: of the frames, views and pixels of the step.
-        constants: what is fitted, by name.
-        halvings: of the time step.
+        loss: loss of the frames, views and pixels of the step.
+        constants: fitted constants by name.
+        halvings: halvings of the time step.
         seconds: wall time [s].
     """
 
@@ -115,14 +114,14 @@ class PacNerfHistory:
 
 @dataclass
 class PacNerfFit:
-    """What was found.
+    """Result of `fit_pac_nerf`.
 
     Attributes:
-        velocity: of all particles [m/s], shape (3,).
-        velocity_losses: of every evaluation of L-BFGS.
-        constants: of the law.
-        history: of the constants.
-        particles: how many move, and how many are seen.
+        velocity: velocity of all particles [m/s], shape (3,).
+        velocity_losses: loss of every evaluation of L-BFGS.
+        constants: constants of the law.
+        history: training curves of the constants.
+        particles: numbers of simulated and of rendered particles.
     """
 
     velocity: Tensor
@@ -132,7 +131,7 @@ class PacNerfFit:
     particles: tuple[int, int]
 
     def summary(self) -> str:
-        """One line for people."""
+        """Summary line for the log."""
         v, h = self.velocity.tolist(), self.history
         curves = ", ".join(
             f"{name} {curve[0]:.4g} -> {float(self.constants.values()[name].detach()):.4g}"
@@ -140,7 +139,7 @@ class PacNerfFit:
         )
         return (
             f"v0 = ({v[0]:+.3f}, {v[1]:+.3f}, {v[2]:+.3f}) m/s in {len(self.velocity_losses)} evaluations; {curves} in"
-            f" {len(h.loss)} steps; {self.particles[0]} of {self.particles[1]} particles move"
+            f" {len(h.loss)} steps; {self.particles[0]} of {self.particles[1]} particles simulated"
         )
 
 
@@ -157,30 +156,30 @@ def fit_pac_nerf(
     progress: Callable[[int, int, float], None] | None = None,
     log: Callable[[str], None] = print,
 ) -> PacNerfFit:
-    """Find the velocity and the constants with which a body's pictures match a video.
+    """Fit the velocity and the constants so that images of a body match a video.
 
     Args:
         model: grid, time step, gravity and walls.
-        body: field and particles; their precision is that of the fit.
-        observation: the video, in all views that are to be used.
+        body: field and particles, whose precision is that of the fit.
+        observation: the video with the views to use.
         contact: step of the last frame before contact.
-        constants: of the law, at the guess; fitted in place.
+        constants: initial constants of the law, fitted in place.
         settings: hyper-parameters.
-        seed: of the views and pixels that are drawn.
-        checkpoint: where the state is kept, so that a killed fit goes on.
+        seed: seed of the random views and pixels.
+        checkpoint: file for the state, so that an interrupted fit can resume; None for none.
         progress: called with (step, steps, loss).
-        log: receives a line where something happens.
+        log: receives messages.
 
     Raises:
-        InputError: no frame before contact, or none after it; a guess that no time step here is short enough for.
-        NonFiniteError: a rollout runs away even in the shortest time step.
+        InputError: no frame before or after contact, or initial constants too stiff for the shortest time step.
+        NonFiniteError: a rollout diverges even with the shortest time step.
     """
     fit = _Fit(model, body, observation, contact, constants, settings, seed, log)
     if checkpoint is not None and (state := checkpoint.load()) is not None:
         fit.load_state_dict(state)
         log(f"resumed at step {fit.iteration} of {fit.iterations}")
     if fit.velocity is None:
-        fit.find_velocity()
+        fit.fit_velocity()
         if checkpoint is not None:
             checkpoint.save(fit.state_dict())
     while fit.iteration < fit.iterations:
@@ -204,8 +203,8 @@ class _Fit:
         after = [k for k, n in enumerate(observation.frames) if n > contact]
         if not before or not after:
             raise InputError(
-                f"pac_nerf: {len(before)} frames before contact and {len(after)} after it: both are needed, the "
-                "velocity is found in the former, the constants in the latter"
+                "frames",
+                f"{len(before)} before and {len(after)} after contact must both be at least 1, to fit velocity and law",
             )
         self._check_guess()
         warm = contact + round(settings.after_contact / model.dt)
@@ -220,30 +219,31 @@ class _Fit:
         self.velocity_losses: list[float] = []
 
     def _check_guess(self) -> None:
-        """Whether the law is stable at the guess, in the shortest steps."""
-        dt, rho = self.model.dt / 2**MOST_HALVINGS, float(self.body.state(torch.zeros(3)).density.min())
+        """Raise InputError unless the initial law is stable with the shortest time step."""
+        dt, rho = self.model.dt / 2**MAX_HALVINGS, float(self.body.state(torch.zeros(3)).density.min())
         number = replace(self.model, dt=dt).courant(self.constants.law(dt), rho)
         if not number <= COURANT_LIMIT:
             raise InputError(
-                f"pac_nerf: the guess {self.constants.specification()} has Courant number {number:.3g}, above"
-                f" {COURANT_LIMIT}, even in steps of {dt:g} s, the scene's halved {MOST_HALVINGS} times: give"
-                " pac_nerf.families a softer one, or the scene a smaller dt"
+                "pac_nerf.families",
+                f"{self.constants.specification()} has a Courant number of {number:.3g} > {COURANT_LIMIT} even with "
+                f"dt = {dt:g} s after {MAX_HALVINGS} halvings",
+                "Use softer initial constants, or a smaller dt of the scene",
             )
 
-    def find_velocity(self) -> None:
-        """One velocity for all particles, from rest, in all views of some frames before contact."""
+    def fit_velocity(self) -> None:
+        """Fit a uniform velocity, initially zero, to all views of some frames before contact."""
         velocity = torch.zeros(3, dtype=torch.float64, requires_grad=True)
         settings = self.settings
         optimizer = torch.optim.LBFGS(
             [velocity], lr=1, max_iter=settings.velocity_iterations, history_size=HISTORY, tolerance_grad=0,
-            tolerance_change=LEAST_STEP, line_search_fn="strong_wolfe",
+            tolerance_change=MIN_STEP, line_search_fn="strong_wolfe",
         )  # fmt: skip
 
         def evaluate():
             loss, _ = self._halving_steps(lambda halvings: self._velocity_loss(velocity, halvings))
             self.velocity_losses.append(loss)
-            # torch has one bound for both
-            scale = LEAST_STEP / LEAST_GAIN / max(self.velocity_losses[0], 1e-30)
+            # torch uses one tolerance for step and loss
+            scale = MIN_STEP / MIN_GAIN / max(self.velocity_losses[0], 1e-30)
             velocity.grad.mul_(scale)
             return torch.tensor(scale * loss, dtype=torch.float64)
 
@@ -252,7 +252,7 @@ class _Fit:
         self.log(f"v0 = {[round(v, 3) for v in self.velocity.tolist()]} m/s from {len(self.flying)} frames")
 
     def step(self) -> None:
-        """One Adam step on the constants, with one random view for each frame."""
+        """One Adam step on the constants with one random view per frame."""
         started, settings = time.perf_counter(), self.settings
         late = self.iteration >= settings.iterations_contact
         for name, value in self.constants.values().items():
@@ -268,9 +268,9 @@ class _Fit:
             self.log(f"step {self.iteration}: time steps of {self.model.dt / 2**halvings:g} s")
         decay = settings.rate_decay ** max(0.0, 2 * self.iteration / self.iterations - 1)
         for group in self.optimizer.param_groups:
-            # far from the modulus, Poisson's ratio only makes up for it, and has a long way back
-            waits = group["name"] == "nu" and self.iteration < settings.iterations_contact
-            group["lr"] = 0.0 if waits else decay * group["first_lr"]
+            # far from the optimal modulus, Poisson's ratio would compensate for its error and recover slowly
+            fixed = group["name"] == "nu" and self.iteration < settings.iterations_contact
+            group["lr"] = 0.0 if fixed else decay * group["first_lr"]
         self.optimizer.step()
         self.history.loss.append(loss)
         self.history.halvings.append(halvings)
@@ -278,60 +278,61 @@ class _Fit:
         self.iteration += 1
 
     def _halving_steps(self, evaluate: Callable[[int], float]) -> tuple[float, int]:
-        """A loss with its gradient, in time steps halved as often as it takes to be finite; and how often that is."""
-        for halvings in range(MOST_HALVINGS + 1):
+        """A finite loss with its gradient, and the number of halvings of the time step that it needs."""
+        for halvings in range(MAX_HALVINGS + 1):
             try:
                 return evaluate(halvings), halvings
             except NonFiniteError as error:
                 last = error
         raise NonFiniteError(
             "pac_nerf",
-            f"{last}, even in steps of {self.model.dt / 2**MOST_HALVINGS:g} s; lower pac_nerf.rate_modulus or choose "
-            "another guess",
+            f"{last}, even with dt = {self.model.dt / 2**MAX_HALVINGS:g} s. Lower pac_nerf.rate_modulus or use other "
+            "initial constants",
         )
 
     def _velocity_loss(self, velocity: Tensor, halvings: int) -> float:
-        """Mean loss of the frames before contact in all views, with its gradient in the velocity."""
+        """Mean loss of the frames before contact in all views, with its gradient by the velocity."""
         velocity.grad = None
-        moved, loss = self._moved(velocity, self.flying, halvings), 0.0
-        seen = moved.detach().requires_grad_()
-        for t, k in enumerate(self.flying):  # a piece of a picture at a time is in memory
+        x, loss = self._positions(velocity, self.flying, halvings), 0.0
+        leaf = x.detach().requires_grad_()
+        for t, k in enumerate(self.flying):
             for view in range(len(self.video.rays)):
-                error = self.video.error(self.body, seen[t], k, view, None, None, len(self.flying))
+                error = self.video.error(self.body, leaf[t], k, view, None, None, len(self.flying))
                 error.backward()
                 loss += float(error.detach())
-        moved.backward(seen.grad)
+        x.backward(leaf.grad)
         return self._finite(loss, [velocity])
 
-    def _moved(self, velocity: Tensor, chosen: Sequence[int], halvings: int) -> Tensor:
-        """Positions of what is seen at the chosen frames, (T, N, 3), in time steps halved so often."""
+    def _positions(self, velocity: Tensor, chosen: Sequence[int], halvings: int) -> Tensor:
+        """Positions of the rendered particles at the chosen frames, (T, N, 3), for a number of halvings."""
         model = replace(self.model, dt=self.model.dt / 2**halvings)
         frames = [self.video.frames[k] * 2**halvings for k in chosen]
         state = self.body.state(velocity)
         law = self.constants.law(model.dt, state.x.device)
         if (number := model.courant(law, float(state.density.min()))) > COURANT_LIMIT:
             raise NonFiniteError(
-                "pac_nerf", f"Courant number {number:.2g} of {self.constants.specification()}"
+                "pac_nerf", f"the Courant number of {self.constants.specification()} is {number:.2g}"
             )
         return self.body.positions(rollout(model, law, state, steps=frames[-1], frames=frames).x)
 
     def _loss(self, chosen: Sequence[int], halvings: int) -> float:
-        """Mean loss of the frames, each in a random view, with its gradient in the constants."""
+        """Mean loss of the frames, each in a random view, with its gradient by the constants."""
         self.optimizer.zero_grad()
-        moved, loss = self._moved(self.velocity, chosen, halvings), 0.0
-        if not moved.requires_grad:
+        x, loss = self._positions(self.velocity, chosen, halvings), 0.0
+        if not x.requires_grad:
             raise InputError(
-                f"pac_nerf: thrown at {self.velocity.tolist()} m/s the body touches nothing in the video, which says"
-                " nothing of its law then: look at the field, or leave this method out"
+                "velocity",
+                f"with {self.velocity.tolist()} m/s the body has no contact in the video that determines constants",
+                "Check the radiance field, or omit this method",
             )
-        seen = moved.detach().requires_grad_()
+        leaf = x.detach().requires_grad_()
         for t, k in enumerate(chosen):
             view = int(torch.randint(len(self.video.rays), (), generator=self.generator))
             pixels = self.settings.pixels
-            error = self.video.error(self.body, seen[t], k, view, pixels, self.generator, len(chosen))
+            error = self.video.error(self.body, leaf[t], k, view, pixels, self.generator, len(chosen))
             error.backward()
             loss += float(error.detach())
-        moved.backward(seen.grad)
+        x.backward(leaf.grad)
         return self._finite(loss, self.constants.parameters())
 
     def _finite(self, loss: float, of: Iterable[Tensor]) -> float:
@@ -363,8 +364,8 @@ class _Fit:
         self.history = PacNerfHistory(**state["history"])
 
 
-def spread(items: Sequence[int], most: int) -> list[int]:
-    """At most so many of the items, evenly spread, the last one among them."""
-    if len(items) <= most:
+def spread(items: Sequence[int], limit: int) -> list[int]:
+    """At most ``limit`` items, evenly spaced, including the last one."""
+    if len(items) <= limit:
         return list(items)
-    return [items[round((i + 1) * len(items) / most) - 1] for i in range(most)]
+    return [items[round((i + 1) * len(items) / limit) - 1] for i in range(limit)]

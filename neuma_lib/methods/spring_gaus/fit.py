@@ -1,8 +1,8 @@
-"""Fitting a network of springs to a video (Spring-Gaus, Zhong et al. 2024: the stage "dynamic").
+"""Fit of a network of springs to a video (Spring-Gaus, Zhong et al. 2024, stage "dynamic").
 
-Start, images and loss are those of all methods here. As published, an optimiser step is made at each frame with the
-gradient of the substeps since the frame before it, and the state is taken as given from there on (`truncated`). Beside
-it stands one step for the whole video, by the gradient through all substeps.
+Initial state, images and loss are the same as for other methods. As published, `truncated` makes an optimiser step at
+each frame with the gradient through the substeps since the previous frame, whose state is detached. The alternative is
+one step for the whole video with the gradient through all substeps.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from neuma_lib.sim.state import State
 
 @dataclass
 class SpringHistory:
-    """Curves of a fit, one entry an iteration: state before its optimiser steps.
+    """Training curves with one entry per iteration, before its optimiser steps.
 
     Attributes:
         loss: mean squared error over all frames.
         modulus: Young's modulus of the network [Pa].
-        softness: the parameter of the soft vector.
-        friction, resistance, gap: as `Springs.values` gives them.
-        substeps: parts of a time step.
+        softness: parameter of the soft vector.
+        friction, resistance, gap: see `Springs.values`.
+        substeps: substeps per time step.
         lr_scale: factor on the learning rate after recoveries.
         recoveries: returns to the best state.
         seconds: wall time [s].
@@ -58,7 +58,7 @@ class SpringHistory:
 
 @dataclass
 class FittedSprings:
-    """Result of `fit_springs`: the springs at their lowest loss, and how they got there."""
+    """Result of `fit_springs`: the springs at the lowest loss, and the training curves."""
 
     springs: Springs
     substeps: int
@@ -68,15 +68,15 @@ class FittedSprings:
     stable: bool
 
     def summary(self, density: float) -> str:
-        """One line for people; density [kg/m^3]."""
+        """Summary line for the log, for a density [kg/m^3]."""
         if not self.history.loss:
             return f"nothing fitted, loss {self.best_loss:.3e}"
-        note = "" if self.stable else "; UNSTABLE: best state kept"
+        note = "" if self.stable else "; UNSTABLE, best state kept"
         _, friction, gap = self.springs.shared()
         return (
             f"loss {self.history.loss[0]:.3e} -> {self.best_loss:.3e} at iteration {self.best_iteration}, E "
             f"{self.history.modulus[0]:.3g} -> {self.springs.modulus(density):.3g} Pa, friction {friction:.2f}, "
-            f"gap {1e3 * gap:.1f} mm, {self.substeps} substeps, {median(self.history.seconds):.3g} s an iteration{note}"
+            f"gap {1e3 * gap:.1f} mm, {self.substeps} substeps, {median(self.history.seconds):.3g} s/iteration{note}"
         )
 
 
@@ -87,30 +87,30 @@ def fit_springs(
     start: State,
     loss: PixelLoss,
     settings: TrainingConfig,
-    how: SpringsConfig,
+    options: SpringsConfig,
     *,
     checkpoint: Checkpoint | None = None,
     progress: Callable[[int, int, float], None] | None = None,
     log: Callable[[str], None] = print,
 ) -> FittedSprings:
-    """Optimise the parameters of the springs so that the particles that follow them match the video.
+    """Optimise the parameters of the springs so that the particles match the video.
 
     Args:
         model: time step, gravity and box.
         body: particles and network.
         springs: the network with its parameters, which are optimised in place.
-        start: the particles with their initial motion.
-        loss: of the particles' states at the frames.
-        settings: iterations, rate schedule, clipping, frame weights, recoveries.
-        how: mode, learning rate, and what is learned.
-        checkpoint: where to keep the state of the loop, so that a killed run goes on; None keeps none.
+        start: particles with their initial motion.
+        loss: loss of the states of the particles at the frames.
+        settings: iterations, schedule of learning rates, clipping, frame weights, recoveries.
+        options: mode, learning rate, and trainable parameters.
+        checkpoint: file for the state of the loop, so that an interrupted run can resume; None for none.
         progress: called with (iteration, iterations, loss).
-        log: receives a line for every halving of the step and every recovery.
+        log: receives a line for every halving of the substep and every recovery.
 
     Raises:
-        NonFiniteError: already the first rollout runs away.
+        NonFiniteError: the first rollout diverges.
     """
-    loop = _Loop(model, body, springs, start, loss, settings, how, log)
+    loop = _Loop(model, body, springs, start, loss, settings, options, log)
     loop.run(checkpoint, progress)
     best = loop.best
     springs.load_state_dict(best["springs"])
@@ -120,40 +120,40 @@ def fit_springs(
 
 
 class _Loop(TrainingLoop):
-    """The state of the fit, and one pass over the video."""
+    """State of the fit, and one pass over the video."""
 
     RETURN = "back to iteration"
 
-    def __init__(self, model, body, springs, start, loss, settings, how, log):
+    def __init__(self, model, body, springs, start, loss, settings, options, log):
         self.model, self.body, self.springs, self.loss = model, body, springs, loss
-        self.settings, self.how, self.log = settings, how, log
+        self.settings, self.options, self.log = settings, options, log
         self.start = body.start(start)
         self.density = float(start.mass.sum() / start.vol0.sum())
         later = [k for k, n in enumerate(loss.frames) if n > 0]
-        self.single = [loss.select([k]) for k in later] if how.truncated else []
-        springs.log_damping.requires_grad_(how.learn_resistance)
-        springs.gap.requires_grad_(how.learn_gap)
-        rates = {"log_damping": 0.1 * how.lr_springs, "gap": 0.03 * how.lr_springs}
+        self.single = [loss.select([k]) for k in later] if options.truncated else []
+        springs.log_damping.requires_grad_(options.learn_resistance)
+        springs.gap.requires_grad_(options.learn_gap)
+        rates = {"log_damping": 0.1 * options.lr_springs, "gap": 0.03 * options.lr_springs}
         groups = [
             {"params": p, "lr": rate, "base_lr": rate}
             for name, p in springs.named_parameters()
-            if p.requires_grad and (rate := rates.get(name, how.lr_springs))
+            if p.requires_grad and (rate := rates.get(name, options.lr_springs))
         ]
         self.optimizer = torch.optim.Adam(groups, betas=settings.betas)
         self._begin(SpringHistory())
 
     def advance(self) -> None:
-        """Judge the springs, then one pass of optimiser steps; or a return to the best state."""
+        """Evaluate the springs and make one pass of optimiser steps, or return to the best state."""
         started = time.perf_counter()
         try:
-            with torch.set_grad_enabled(not self.how.truncated):
+            with torch.set_grad_enabled(not self.options.truncated):
                 losses = self._frame_losses()
             value = float(losses.detach().mean())
             self.best = self._better_state(value)
-            self._note(value)
+            self._record(value)
             self.first_loss = self.first_loss or max(value, 1e-30)
             self._set_rates()
-            if self.how.truncated:
+            if self.options.truncated:
                 self._frame_by_frame()
             else:
                 weights = frame_weights(self.iteration, len(losses), self.settings).to(losses)
@@ -175,21 +175,21 @@ class _Loop(TrainingLoop):
         return self.loss(self.body.path(self.loss.steps, x, v))
 
     def _frame_by_frame(self) -> None:
-        """An optimiser step for every frame, by the gradient of the substeps since the frame before it.
+        """An optimiser step for every frame with the gradient through the substeps since the previous state.
 
-        Where exposures overlap, those since the last state before the frame's own.
+        That is the last state of the previous frame, or an earlier one if exposures overlap.
         """
-        known = [(0, *self.start)]
+        states = [(0, *self.start)]
         for loss in self.single:
-            reached, x, v = next(state for state in reversed(known) if state[0] <= loss.steps[0])
+            first, x, v = next(state for state in reversed(states) if state[0] <= loss.steps[0])
             xs, vs, self.model = spring_rollout(
-                self.model, self.springs, x, v, loss.steps, reached, log=self.log
+                self.model, self.springs, x, v, loss.steps, first, log=self.log
             )
             self._step(loss(self.body.path(loss.steps, xs, vs)).sum())
-            known += zip(loss.steps, xs.detach(), vs.detach(), strict=True)
+            states += zip(loss.steps, xs.detach(), vs.detach(), strict=True)
 
     def _step(self, loss: Tensor) -> None:
-        """One optimiser step down the gradient of a loss, which is divided by the first one before it is clipped."""
+        """One optimiser step on a loss divided by the first one, with clipped gradients."""
         self.optimizer.zero_grad(set_to_none=True)
         (loss / self.first_loss).backward()
         parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
@@ -205,15 +205,15 @@ class _Loop(TrainingLoop):
         for group in self.optimizer.param_groups:
             group["lr"] = group["base_lr"] * self.lr_scale * schedule
 
-    def _note(self, value: float) -> None:
+    def _record(self, value: float) -> None:
         history = self.history
         history.loss.append(value)
         history.modulus.append(self.springs.modulus(self.density))
         history.softness.append(float(self.springs.softness.detach()))
-        for curve, now in zip(
+        for curve, number in zip(
             (history.resistance, history.friction, history.gap), self.springs.shared(), strict=True
         ):
-            curve.append(now)
+            curve.append(number)
         history.substeps.append(self.model.substeps)
         history.lr_scale.append(self.lr_scale)
 
