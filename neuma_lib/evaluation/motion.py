@@ -19,7 +19,7 @@ from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.evaluation.metrics import mechanical_energy, tracer_errors
 from neuma_lib.geometry.chamfer import chamfer_sequence
 from neuma_lib.mechanics.law import Law
-from neuma_lib.sim.model import MPM, Body
+from neuma_lib.sim.model import MPM, MaterialRegion
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
@@ -72,7 +72,7 @@ class Evaluation:
 
 def predict(
     model: MPM,
-    law: Law | Sequence[Body],
+    law: Law | Sequence[MaterialRegion],
     start: State,
     frames: Sequence[int],
     tracers: Tensor | None = None,

@@ -279,8 +279,8 @@ def _above_floor(
 
 
 def _search(pictures: Pictures, nothing: FittedPose, start: float, scale_known: bool) -> list[FittedPose]:
-    """The best rotations of a grid, with positions from the centroids of the masks, and the size from their mean area if
-    the scale is unknown."""
+    """The best rotations of a grid, with positions from the centroids of the masks, and the size from their mean area
+    if the scale is unknown."""
     motion, times = nothing.motion, picture_times(pictures, nothing, start)
     grid = np.concatenate([np.eye(3)[None], spread_rotations(GRID)])
     centres, _ = motion.place(times)
@@ -414,9 +414,9 @@ def _check(result: Registration, name: str) -> None:
         size = 100 * result.pose.enlargement
         raise InputError(
             name,
-            f"in the best pose the photographed object matches the masks of the video with an IoU of {iou:.2f} < {MIN_IOU}"
-            f" (size {size:+.0f} %). Possible causes: the video shows another object; photographs and video differ in"
-            " scale (another position or print of the board); the shape has changed (soft, folded, opened); or masks of"
-            " the photographs or of this take are wrong",
+            f"in the best pose the photographed object matches the masks of the video with an IoU of {iou:.2f}"
+            f" < {MIN_IOU} (size {size:+.0f} %). Possible causes: the video shows another object; photographs and video"
+            " differ in scale (another position or print of the board); the shape has changed (soft, folded, opened); or"
+            " masks of the photographs or of this take are wrong",
             "Check the contact sheets of the masks",
         )
