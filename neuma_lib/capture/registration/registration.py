@@ -416,7 +416,7 @@ def _check(result: Registration, name: str) -> None:
             name,
             f"in the best pose the photographed object matches the masks of the video with an IoU of {iou:.2f}"
             f" < {MIN_IOU} (size {size:+.0f} %). Possible causes: the video shows another object; photographs and video"
-            " differ in scale (another position or print of the board); the shape has changed (soft, folded, opened); or"
+            " differ in scale (another position or print of the board); the shape has changed (soft, folded, open); or"
             " masks of the photographs or of this take are wrong",
             "Check the contact sheets of the masks",
         )
