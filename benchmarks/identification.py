@@ -31,7 +31,6 @@ from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.metrics import tracer_errors
-from neuma_lib.evaluation.motion import predict
 from neuma_lib.fitting.families import Family
 from neuma_lib.fitting.identified import Identified
 from neuma_lib.fitting.identify import _LAST_GAIN, _Run, identify
@@ -46,6 +45,7 @@ from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import named_combinations, physical
 from neuma_lib.project.loading import merged
 from neuma_lib.project.settings import Config
+from neuma_lib.sim.prediction import predict
 from neuma_lib.splatting.observation import Observation
 
 TRACERS = 2000  # of the truth's, for the motion

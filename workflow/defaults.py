@@ -45,7 +45,7 @@ def complete(workflow, results: str, known: Collection[str] = ()) -> None:
             rule.set_params(code=digest_of(_script(rule)))
         if DEFINED_IN:
             code = list(rule.params).index(rule.params.code)
-            rule.params[code] = _with_laws(
+            rule.params[code] = rule.params.code = _with_laws(
                 rule.params.code, [p for p in rule.params if p is not rule.params.code]
             )
         resources = type(rule.resources).from_mapping(dict(RESOURCES))

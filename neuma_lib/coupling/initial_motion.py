@@ -22,7 +22,7 @@ class InitialMotion:
         centre: point that moves with `velocity` [m], shape (3,).
         axes: rows are the directions in which errors are independent, shape (3, 3): the camera's right, down and depth.
         std: standard deviations of the velocity along these axes [m/s] and of the spin about them [rad/s], shape (6,).
-            What is 0 is known.
+            0 where the value is exact.
     """
 
     velocity: np.ndarray
@@ -32,20 +32,20 @@ class InitialMotion:
     std: np.ndarray
 
     @classmethod
-    def of(cls, found: Mapping[str, Any]) -> InitialMotion:
-        """From the content of velocity.json; known exactly where that gives no standard deviations."""
-        std = [found.get(key, (0, 0, 0)) for key in ("std_camera", "angular_velocity_std_camera")]
-        motion = (np.asarray(found[key], dtype=float) for key in ("v0", "angular_velocity", "centre"))
-        axes = np.asarray(found.get("camera_axes", np.eye(3)), dtype=float)
-        return cls(*motion, axes, np.concatenate(std).astype(float))
+    def of(cls, content: Mapping[str, Any]) -> InitialMotion:
+        """From the content of velocity.json. Without standard deviations the motion is exact."""
+        std = [content.get(key, (0, 0, 0)) for key in ("std_camera", "angular_velocity_std_camera")]
+        v0, spin, centre = (np.asarray(content[key], float) for key in ("v0", "angular_velocity", "centre"))
+        axes = np.asarray(content.get("camera_axes", np.eye(3)), dtype=float)
+        return cls(v0, spin, centre, axes, np.concatenate(std).astype(float))
 
     def moved(self, deviations: np.ndarray) -> InitialMotion:
-        """With a deviation (6,) in standard deviations added."""
+        """Add a deviation (6,), in units of the standard deviations."""
         velocity, spin = (self.std * deviations).reshape(2, 3) @ self.axes
         return replace(self, velocity=self.velocity + velocity, spin=self.spin + spin)
 
     def of_body(self, body: Reconstruction) -> State:
-        """The particles in this motion."""
+        """State of the particles of a body in this motion."""
         return body.state(self.velocity, self.spin, self.centre)
 
     def as_dict(self) -> dict[str, Any]:

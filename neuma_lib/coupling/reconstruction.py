@@ -98,7 +98,7 @@ class Reconstruction:
         """The same body with another dtype or on another device."""
         kind = dict(dtype=dtype, device=device)
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return Reconstruction(**{
+        return replace(self, **{
             name: value if isinstance(value, bool) else value.to(**kind) for name, value in values.items()
         })  # fmt: skip
 

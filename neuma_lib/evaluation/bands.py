@@ -1,25 +1,25 @@
-"""Which laws a video leaves possible: 95 % bands of response curves, by drawing laws.
+"""95 % bands of response curves from laws that are compatible with a video.
 
 **Constants.** An identified family has a covariance of its unbounded constants (`neuma_lib.fitting.families`). Laws are
-drawn from that normal distribution, with what all images share (`identify.model_std`) on top; families that tie with
-the best one give equal parts of the draws. Such a band is right if the truth lies in one of these families.
+sampled from that normal distribution, with the error that all images share (`identify.model_std`) added. Families that
+tie with the best one get equal parts of the samples. Such a band is correct if the truth belongs to one of them.
 
-**A structured correction** (`neuma_lib.mechanics.structured`) multiplies moduli m_a by exp(n_a(z)), z the invariants of
-the elastic strain. Deviations g_a(z) of the n_a are drawn from a Gaussian process:
+**A structured correction** (`neuma_lib.mechanics.structured`) multiplies moduli m_a by exp(n_a(z)), with invariants z
+of the elastic strain. Deviations g_a(z) of the n_a are sampled from a Gaussian process:
 
-- Before the video is seen: a squared exponential kernel of length `LENGTH`, that of the correction's own networks, and
-  standard deviation `SILENT`, so that two of them are the bound of the correction, whatever it was trained to; and a
-  constant with the standard deviation that `identify` gives to unbounded constants (`identify.spread`).
-- The video: its information on constant factors of the moduli, the inverse A of their covariance, is spread over the
-  states that it shows, so that deviations cost <g^T A g> / 2. A state counts by its squared strain, since a modulus
-  that is wrong by some factor is felt in proportion to the stress.
+- The prior is a squared exponential kernel of length `LENGTH`, that of the correction's networks, and standard
+  deviation `SILENT`, half the bound of the correction, plus a constant with the standard deviation of unbounded
+  constants (`identify.spread`).
+- The information of the video on constant factors of the moduli, the inverse A of their covariance, is distributed over
+  the visited states, so that deviations cost <g^T A g> / 2. States are weighted by their squared strain, because the
+  effect of a wrong modulus is proportional to the stress.
 
-So a band is about as wide as that of the constants where the video has shown most, wider in seldom states, and as wide
-as the correction is free where the video is silent. The process is one of random features (Rahimi and Recht 2007), so
-that a draw is a law. Not drawn: the exponent n2 of the form "stretch", whose part n1 can play, and outputs on constants
-that the base does not have. A part of the law is drawn even if training left it as it was.
+A band is about as wide as that of the constants in frequent states, wider in rare ones, and as wide as the bound of the
+correction in states without data. The process uses random features (Rahimi and Recht 2007), so that each sample is a
+law. The exponent n2 of the form "stretch", which n1 can replace, and outputs on constants that the base does not have
+are not sampled. A part of the law is sampled even if training did not change it.
 
-Chains, that is other reconstructions of the same video, are one more source of error: `envelope` holds all of theirs.
+Replicates, reconstructions of the same video with other seeds, add a further error. `envelope` contains their bands.
 """
 
 from __future__ import annotations
@@ -53,32 +53,32 @@ from neuma_lib.mechanics.structured import (
 COVERED = 0.95
 DRAWS = 100
 SILENT = LIMIT / 2
-"""Standard deviation of a log-modulus's deviation where the video is silent."""
+"""Standard deviation of the deviation of a log-modulus in states without data."""
 LENGTH = 3 * STRAIN
-"""Strain at which features of untrained networks are correlated by exp(-1/2)."""
+"""Strain at which features of untrained networks have the correlation exp(-1/2)."""
 FEATURES = 150
 """Random features of the Gaussian process."""
 STATES = 20_000
-"""About the most states of a motion that are looked at."""
-_DIFFERENCE = 1e-4  # of an unbounded constant
+"""Approximate maximum number of states of a motion."""
+_DIFFERENCE = 1e-4  # step of an unbounded constant
 Output = tuple[str, int]
-"""Part of a law and number of an output of its network."""
+"""Part of a law, and index of an output of its network."""
 Band = tuple[np.ndarray, np.ndarray]
 
 
 def constants_draws(
-    found: Mapping[str, Any], model_std: float, dt: float, count: int, seed: int
+    identified: Mapping[str, Any], model_std: float, dt: float, count: int, seed: int
 ) -> list[Law]:
-    """Laws of the family in an identified.json, and of those that tie with it, that the video leaves possible.
+    """Sample laws of the family in an identified.json, and of those that tie with it.
 
     Args:
-        found: content of the file.
-        model_std: standard deviation of every unbounded constant beside that from the images.
+        identified: content of the file.
+        model_std: standard deviation of every unbounded constant in addition to that from the images.
         dt: time step [s].
-        count: about how many; every family has the same number.
+        count: approximate number of laws, divided equally among the families.
     """
     generator = np.random.default_rng(seed)
-    fits = [found["best"], *(found["families"][name] for name in found["ties"])]
+    fits = [identified["best"], *(identified["families"][name] for name in identified["ties"])]
     each, laws = -(-count // len(fits)), []
     for fit in fits:
         family = Family("drawn", fit["law"])
@@ -98,22 +98,24 @@ def corrected_draws(
     count: int,
     seed: int,
 ) -> list[Law]:
-    """Laws around a structured one, whose base was identified, that the video leaves possible.
+    """Sample laws around a structured one whose base was identified.
 
     Args:
         law: the structured law.
         fit: ``best`` of its identified.json.
-        visited: elastic deformation gradients of its own motion, as they occur, shape (..., 3, 3).
-        model_std: as of `constants_draws`.
-        spread: standard deviation of the unbounded constants before the video is seen.
+        visited: elastic deformation gradients of its own motion, shape (..., 3, 3).
+        model_std: see `constants_draws`.
+        spread: prior standard deviation of the unbounded constants.
         dt: time step [s].
-        count: how many.
+        count: number of laws.
 
     Raises:
         InputError: a law of the form "energy".
     """
     if law.elasticity.form != "stretch":
-        raise InputError(f"bands are drawn of structured laws of the form stretch, not {law.elasticity.form}")
+        raise InputError(
+            "law", f'the form of the structured law is "{law.elasticity.form}", bands need "stretch"'
+        )
     generator = np.random.default_rng(seed)
     field = RandomField(generator.standard_normal((FEATURES, INVARIANTS)), generator.uniform(size=FEATURES))
     states = visited.reshape(-1, 3, 3)
@@ -131,7 +133,7 @@ def corrected_draws(
 
 @dataclass(frozen=True)
 class RandomField:
-    """Features of a squared exponential kernel of length `LENGTH`, and 1 as the last one.
+    """Random features of a squared exponential kernel of length `LENGTH`, and 1 as the last feature.
 
     Attributes:
         frequencies: standard normal, shape (M, 3).
@@ -152,21 +154,21 @@ def field_covariance(features: np.ndarray, information: np.ndarray, prior: np.nd
     """Posterior covariance (a f, a f) of weights w_a of log-moduli's deviations g_a = w_a . h.
 
     Args:
-        features: h at states, scaled by the roots of their weights, whose mean is 1, shape (N, f).
-        information: of the video on constant deviations (a,), shape (a, a).
-        prior: standard deviations of weights, shape (f,).
+        features: h at states times the square roots of the states' weights (mean 1), shape (N, f).
+        information: of the video on constant deviations, shape (a, a).
+        prior: standard deviations of the weights w_a, shape (f,).
     """
     seen = features.T @ features / len(features)
     return np.linalg.inv(np.kron(information, seen) + np.diag(np.tile(prior**-2.0, len(information))))
 
 
 class _Deviating:
-    """A structured part whose network's outputs deviate; evaluated by its `response`, which asks for them."""
+    """A structured part with deviations added to the outputs of its network."""
 
     evaluate = Constitutive.evaluate
 
     def deviate(self, field: RandomField, rows: Mapping[int, Tensor]) -> None:
-        """Deviations with weights (f,) of the field's features by the number of the output."""
+        """Set deviations: weights (f,) of the field's features by index of the output."""
         self.field, self.rows = field, rows
 
     def outputs(self, z: Tensor, weights: Weights) -> Tensor:
@@ -185,7 +187,7 @@ class _DeviatingPlasticity(_Deviating, StructuredPlasticity):
 
 
 def _deviating(law: StructuredLaw, field: RandomField, rows: Mapping[Output, Tensor]) -> Law:
-    """A structured law whose outputs deviate."""
+    """A structured law with deviations of its outputs."""
 
     def of_part(name: str) -> dict[int, Tensor]:
         return {k: row for (part, k), row in rows.items() if part == name}
@@ -201,9 +203,9 @@ def _deviating(law: StructuredLaw, field: RandomField, rows: Mapping[Output, Ten
 
 
 def band(laws: Sequence[Law], curve: Callable[[Law], Tensor]) -> Band:
-    """Lower and upper end (P,) of what `COVERED` of the curves (P,) of laws lie between at each point.
+    """Lower and upper end (P,) of the central interval that contains `COVERED` of the curves (P,) at each point.
 
-    A curve counts where it is finite.
+    Non-finite values are ignored.
     """
     curves = np.stack([curve(law).numpy() for law in laws])
     curves[~np.isfinite(curves)] = np.nan
@@ -212,13 +214,13 @@ def band(laws: Sequence[Law], curve: Callable[[Law], Tensor]) -> Band:
 
 
 def envelope(bands: Sequence[Band]) -> Band:
-    """The band that holds all bands of several chains."""
+    """The smallest band that contains the bands of all replicates."""
     lows, highs = zip(*bands, strict=True)
     return np.min(lows, axis=0), np.max(highs, axis=0)
 
 
 def _log_moduli(fit: Mapping[str, Any], dt: float, model_std: float) -> tuple[list[Output], np.ndarray]:
-    """Outputs of networks whose constants a family has, and the covariance of their logarithms, to first order."""
+    """Outputs that act on constants of a family, and the first-order covariance of the logarithms of these."""
     family = Family("drawn", fit["law"])
     u = np.array(fit["unbounded"]["values"])
 

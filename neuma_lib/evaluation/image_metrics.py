@@ -1,7 +1,7 @@
-"""How alike a rendered frame and the observed one are: PSNR, SSIM and LPIPS where the object is.
+"""PSNR, SSIM and LPIPS between a rendered frame and the observed one.
 
-The white background around the object is easy to get right and would only dilute the measures. They are taken on the
-bounding box of the object, observed and predicted, and a margin around it.
+The measures are restricted to the bounding box of the observed and predicted object plus a margin, because the white
+background is the same for any prediction.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from neuma_lib.errors import InputError
 from neuma_lib.evaluation.lpips import LPIPS, SMALLEST
 
 VISIBLE = 0.05
-"""Opacity from which a pixel belongs to the object."""
+"""Minimum opacity of a pixel of the object."""
 MEASURES = ("psnr", "ssim", "lpips_vgg", "lpips_alex")
 
 
 def object_window(visible: np.ndarray, margin: float) -> tuple[slice, slice]:
-    """Rows and columns of the part of an image that is compared: at least `SMALLEST` pixels each, inside the image.
+    """Rows and columns of the compared part of an image, at least `SMALLEST` pixels each.
 
     Args:
         visible: pixels of the object, observed or predicted, shape (H, W).
@@ -31,11 +31,11 @@ def object_window(visible: np.ndarray, margin: float) -> tuple[slice, slice]:
         InputError: nothing is visible, or the image is smaller than `SMALLEST`.
     """
     if not visible.any():
-        raise InputError(
-            "image metrics: the object is neither in the observed frame nor in the predicted one"
-        )
+        raise InputError("image metrics", "the object is neither in the observed nor in the predicted frame")
     if min(visible.shape) < SMALLEST:
-        raise InputError(f"image metrics need images of {SMALLEST} pixels a side, not {visible.shape}")
+        raise InputError(
+            "image metrics", f"an image of {visible.shape} pixels is smaller than {SMALLEST} a side"
+        )
     spans = [np.flatnonzero(visible.any(axis=axis)) for axis in (1, 0)]
     grow = round(margin * max(int(s[-1] - s[0]) + 1 for s in spans))
     return tuple(
@@ -45,10 +45,10 @@ def object_window(visible: np.ndarray, margin: float) -> tuple[slice, slice]:
 
 
 def _span(start: int, stop: int, size: int) -> slice:
-    """The span cut to an image of `size` pixels, grown about its middle where it is shorter than `SMALLEST`."""
+    """A span inside an image of `size` pixels, widened about its middle to at least `SMALLEST`."""
     missing = max(0, SMALLEST - (stop - start))
     start, stop = max(0, start - missing // 2), min(size, stop + missing - missing // 2)
-    # What was cut at one border is given back at the other.
+    # A part cut off at one border is added at the other.
     start, stop = max(0, min(start, stop - SMALLEST)), min(size, max(stop, start + SMALLEST))
     return slice(start, stop)
 
@@ -61,13 +61,13 @@ def image_metrics(
     networks: Mapping[str, LPIPS],
     margin: float,
 ) -> dict[str, float]:
-    """Measures of one frame, by the names of `MEASURES` of which there are networks.
+    """Measures of one frame: those of `MEASURES` for which there are networks.
 
     Args:
         image, reference: predicted and observed colours over white in [0, 1], shape (H, W, 3).
         alpha, mask: their opacities in [0, 1], shape (H, W).
-        networks: "alex" and "vgg", or fewer.
-        margin: as of `object_window`.
+        networks: LPIPS networks by name, "alex" and "vgg".
+        margin: see `object_window`.
     """
     rows, columns = object_window(((alpha > VISIBLE) | (mask > VISIBLE)).cpu().numpy(), margin)
     pair = [picture[rows, columns].clamp(0, 1) for picture in (image, reference)]
@@ -95,7 +95,7 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> float:
     """
     image, reference = _alike("ssim", image, reference)
     if min(image.shape[:2]) < 11:
-        raise InputError(f"ssim: an image of {image.shape[:2]} pixels is smaller than the window of 11")
+        raise InputError("ssim", f"an image of {image.shape[:2]} pixels is smaller than the window of 11")
     return float(
         structural_similarity(
             image,
@@ -113,5 +113,5 @@ def _alike(name: str, image: np.ndarray, reference: np.ndarray) -> tuple[np.ndar
     """Both as float64. Raises InputError when their shapes differ."""
     image, reference = np.asarray(image, np.float64), np.asarray(reference, np.float64)
     if image.shape != reference.shape:
-        raise InputError(f"{name}: images of shapes {image.shape} and {reference.shape} do not match")
+        raise InputError(name, f"shapes {image.shape} and {reference.shape} of the images differ")
     return image, reference

@@ -1,4 +1,4 @@
-"""Write a law into one file with what is known of it, and read that again."""
+"""Export a law and its metadata to one file, and read them."""
 
 from __future__ import annotations
 
@@ -32,24 +32,24 @@ def export_law(
     page: str | Path | None = None,
     **known: Any,
 ) -> dict[str, Any]:
-    """Write a law with what is known of it.
+    """Write a law and its metadata.
 
     Args:
         path: ``.safetensors``.
         dt: time step that it was learned at [s].
-        apart, any_step: as of `save_law` and `about_law`.
+        apart, any_step: see `save_law` and `about_law`.
         metrics, rollout: metrics.json and rollout.h5 of its method, or None.
-        page: picture of `neuma_lib.evaluation.law_page`.
+        page: file for the picture of `neuma_lib.evaluation.law_page`.
         known: further keys of `neuma_lib.io.exported`.
 
     Returns:
-        what the file says of the law.
+        the metadata.
 
     Raises:
-        InputError: another ending, files that cannot be read, ``apart`` without an adaptor. Nothing is written then.
+        InputError: another suffix, unreadable files, or ``apart`` without an adaptor. Nothing is written then.
     """
     if Path(path).suffix != ".safetensors":
-        raise InputError(f"{path}: a law is written as .safetensors; name the file so")
+        raise InputError(path, "the suffix is not .safetensors", "Give the file that suffix")
     if metrics is not None:
         known["metrics"] = _numbers(read_json(metrics))
     if rollout is not None:
@@ -64,7 +64,7 @@ def export_law(
 
 
 def show_law(path: str | Path, page: str | Path | None = None) -> dict[str, Any]:
-    """What the file of a law says of it; draws its page if asked to."""
+    """Metadata of a law's file. Draws its page if ``page`` is given."""
     about = read_about(path)
     if page is not None:
         _drawn(load_law(path), about, page)()
@@ -72,7 +72,7 @@ def show_law(path: str | Path, page: str | Path | None = None) -> dict[str, Any]
 
 
 def _drawn(law: Law, about: Mapping[str, Any], page: str | Path) -> Callable[[], None]:
-    """Draw a law's page; the function that writes it. Raises InputError where matplotlib is missing."""
+    """Draw a law's page and return the function that writes it. Raises InputError if matplotlib is missing."""
     require("matplotlib", "workflow")
     from neuma_lib.evaluation.law_page import law_page
     from neuma_lib.evaluation.plotting import style
@@ -81,9 +81,11 @@ def _drawn(law: Law, about: Mapping[str, Any], page: str | Path) -> Callable[[],
 
 
 def visited_by(law: Law, F: torch.Tensor) -> dict[str, Any] | None:
-    """Ranges of the elastic deformation gradients F (T, N, 3, 3) of a motion, from the first frame in which something
-    is deformed: ``stretch``, ``shear``, ``pressed`` (`Visited`) and ``shear_stress``, the largest [Pa]. None if nothing
-    ever is."""
+    """Ranges of the elastic deformation gradients F (T, N, 3, 3) of a motion, from the first deformed frame on.
+
+    Returns:
+        ``stretch``, ``shear``, ``pressed`` (`Visited`) and ``shear_stress``, the largest [Pa]. None if undeformed.
+    """
     deformed = (F - torch.eye(3, dtype=F.dtype)).abs().flatten(1).amax(1) > STRAINED
     if not deformed.any():
         return None
@@ -93,7 +95,7 @@ def visited_by(law: Law, F: torch.Tensor) -> dict[str, Any] | None:
 
 
 def head_commit(root: str | Path) -> str | None:
-    """The commit of a project, with "+" behind it where files differ from it; None without git."""
+    """The commit of a project, followed by "+" if files differ from it. None without git."""
     commands = ["rev-parse", "HEAD"], ["status", "--porcelain", "--untracked-files=no"]
     try:
         commit, changes = (
@@ -108,6 +110,6 @@ def head_commit(root: str | Path) -> str | None:
 
 
 def _numbers(metrics: Any) -> dict[str, Any] | None:
-    """Single numbers and truth values of a metrics.json; curves are left out."""
+    """Scalars of a metrics.json, without curves."""
     kept = (int, float, bool)
     return {k: v for k, v in metrics.items() if type(v) in kept} if isinstance(metrics, dict) else None

@@ -1,4 +1,4 @@
-"""A page of a law: three tests of a material point."""
+"""A page that shows a law in three tests of a material point."""
 
 from __future__ import annotations
 
@@ -23,13 +23,15 @@ TESTS = {
     "yield": ("total shear at {rate:g}/s", "shear stress"),
 }
 UNSEEN = Visited(stretch=(0.8, 1.2), shear=(-0.3, 0.3), pressed=1.0)
-"""Range of the tests of a law of which nobody says what it went through."""
+"""Range of the tests of a law without known states."""
 
 
 @style.styled
 def law_page(law: Law, about: Mapping[str, Any]) -> Figure:
-    """Three tests of a material point: uniaxial stretch, elastic shear, and shear at a constant rate with the return
-    map; blue ground: what the law went through in its scene."""
+    """Draw uniaxial stretch, elastic shear, and shear at a constant rate with the return map.
+
+    A blue background marks the range that the law was exposed to in its scene.
+    """
     seen, largest = _ranges(about)
     settings, dt = FiguresConfig(), about.get("dt") or 1e-3
     tests = tests_within(seen, largest or 0.0, settings.shear_rate, settings.total_shear, dt)
@@ -50,16 +52,15 @@ def law_page(law: Law, about: Mapping[str, Any]) -> Figure:
 
 
 def _ranges(about: Mapping[str, Any]) -> tuple[Visited, float | None]:
-    """Visited ranges and largest shear stress [Pa]; `UNSEEN` and None where they are not known."""
-    found = about.get("visited")
-    if found is None:
+    """Visited ranges and largest shear stress [Pa]. `UNSEEN` and None if they are unknown."""
+    visited = about.get("visited")
+    if visited is None:
         return UNSEEN, None
     try:
-        pairs = {key: tuple(map(float, found[key])) for key in ("stretch", "shear")}
+        pairs = {key: tuple(map(float, visited[key])) for key in ("stretch", "shear")}
         if not all(len(pair) == 2 and np.isfinite(pair).all() for pair in pairs.values()):
             raise ValueError
-        return Visited(**pairs, pressed=float(found["pressed"])), float(found["shear_stress"])
+        return Visited(**pairs, pressed=float(visited["pressed"])), float(visited["shear_stress"])
     except (KeyError, TypeError, ValueError):
-        raise InputError(
-            f"the visited ranges in its metadata are not those of export-law: {one_line(found)}"
-        ) from None
+        problem = f"{one_line(visited)} is not a range that `neuma law export` writes"
+        raise InputError("visited in the law's metadata", problem, "Export the law again") from None

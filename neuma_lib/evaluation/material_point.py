@@ -1,4 +1,4 @@
-"""Tests of a material point: the stress of a law under prescribed deformations, without grid and body."""
+"""Tests of a material point: stress of a law under prescribed deformations."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from torch import Tensor
 from neuma_lib.mechanics.law import Constitutive, Law
 
 OUTER = 0.005
-"""Part of the visited states that is left out at either end of a range, as outliers."""
+"""Share of the visited states that is ignored at each end of a range, as outliers."""
 _COMPRESSED = 0.05
 """Quantile of the volume ratio at which shear is tested."""
 _NEWTON_STEPS, _LARGEST_STEP, _DIFFERENCE = 30, 0.05, 1e-6
-"""Of the search for traction-free sides, in stretches."""
+"""Parameters of the search for traction-free sides, in stretches."""
 
 
 @dataclass(frozen=True)
 class Visited:
-    """Elastic states that a motion went through.
+    """Elastic states of a motion.
 
     Attributes:
         stretch: range of the principal stretches.
-        shear: range of the elastic shear, the amount gamma of the simple shear that has the same ratio of largest and
-            smallest stretch; both signs, as a shear is as strong either way.
-        pressed: 5th percentile of the volume ratio J, at most 1: a compressed state, as shear in an impact mostly is.
+        shear: range of the elastic shear, the amount gamma of the simple shear with the same ratio of largest and
+            smallest stretch, with both signs.
+        pressed: 5th percentile of the volume ratio J, at most 1. Shear in an impact is mostly compressed.
     """
 
     stretch: tuple[float, float]
@@ -34,7 +34,7 @@ class Visited:
 
     @classmethod
     def of(cls, F: Tensor) -> Visited:
-        """Of elastic deformation gradients F (..., 3, 3)."""
+        """Ranges of elastic deformation gradients F (..., 3, 3)."""
         sigma = torch.linalg.svdvals(F.reshape(-1, 3, 3).double())
         J = torch.linalg.det(F.reshape(-1, 3, 3).double())
         ratio = (sigma[:, 0] / sigma[:, 2].clamp(min=1e-6)).sqrt()
@@ -48,21 +48,21 @@ class Visited:
 
 
 def largest_shear_stress(law: Law, F: Tensor) -> float:
-    """Largest shear stress that a law gives to visited elastic states F (..., 3, 3), outliers left out [Pa]."""
+    """Largest shear stress of a law in visited elastic states F (..., 3, 3), without outliers [Pa]."""
     tau = stress(law, F.reshape(-1, 3, 3).double())
     principal = torch.linalg.eigvalsh(0.5 * (tau + tau.mT))
     return _quantile(0.5 * (principal[:, 2] - principal[:, 0]), 1 - OUTER)
 
 
 def uniaxial(law: Law, stretch: Tensor) -> Tensor:
-    """Axial Kirchhoff stress [Pa] (n,) of the elastic law for axial stretches (n,), the sides free of traction.
+    """Axial Kirchhoff stress [Pa] (n,) of the elastic law for axial stretches (n,) with traction-free sides.
 
-    The two lateral stretches are equal and such that the lateral stresses cancel in the mean; they are followed from
-    1 outwards, so that a law with several equilibria is on the branch of the undeformed state.
+    The two lateral stretches are equal, with zero mean lateral stress. They are followed from stretch 1 outwards, so
+    that a law with several equilibria stays on the branch of the undeformed state.
     """
     axial = torch.empty_like(stretch)
     order = (stretch - 1).abs().argsort().tolist()
-    lateral = {True: 1.0, False: 1.0}  # of the last point in tension and in compression
+    lateral = {True: 1.0, False: 1.0}  # at the last point in tension and in compression
     for index in order:
         tension = bool(stretch[index] > 1)
         lateral[tension], axial[index] = _free_sides(law, float(stretch[index]), lateral[tension])
@@ -85,7 +85,7 @@ def _free_sides(law: Law, axial: float, lateral: float) -> tuple[float, Tensor]:
 
 
 def sheared(law: Law, shear: Tensor, J: float = 1.0) -> Tensor:
-    """Shear Kirchhoff stress [Pa] (n,) of the elastic law for simple shears (n,) at the volume ratio J."""
+    """Kirchhoff shear stress [Pa] (n,) of the elastic law for simple shears (n,) at the volume ratio J."""
     F = torch.eye(3, dtype=shear.dtype).repeat(len(shear), 1, 1)
     F[:, 0, 1] = shear
     return stress(law, J ** (1 / 3) * F)[:, 0, 1]
@@ -97,8 +97,8 @@ def yielding(law: Law, rate: float, dt: float, steps: int, J: float = 1.0) -> Te
     Args:
         rate: of shear [1/s].
         dt: time step [s].
-        steps: n of them.
-        J: volume ratio of the start.
+        steps: number n of steps.
+        J: initial volume ratio.
 
     Returns:
         Shear Kirchhoff stress [Pa] at the total shears 0, rate dt, ..., n rate dt, shape (n + 1,).

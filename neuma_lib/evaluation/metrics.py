@@ -1,4 +1,4 @@
-"""Measures of motion (paper Sec. 4.1); the Chamfer distance is in `neuma_lib.geometry.chamfer`."""
+"""Measures of motion (paper Sec. 4.1). The Chamfer distance is in `neuma_lib.geometry.chamfer`."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from neuma_lib.errors import InputError
 
 
 def tracer_errors(a: Tensor, b: Tensor) -> dict:
-    """How far the same points are apart on two paths, (T, n, 3) [m] each, in numbers for ``metrics.json`` [mm].
+    """Distances between the same points on two paths, (T, n, 3) [m] each, as numbers for ``metrics.json`` [mm].
 
     Returns:
-        ``tracer_rmse_mm``, root mean square distance over all points and frames; ``tracer_error_p95_mm``, the distance
-        that 95 % of them, again over all points and frames, stay below (linear interpolation);
-        ``tracer_rmse_last_mm``, root mean square over the points of the last frame; ``tracer_rmse_mm_per_frame``.
+        ``tracer_rmse_mm`` and ``tracer_error_p95_mm``, root mean square and 95th percentile (linear interpolation) over
+        all points and frames; ``tracer_rmse_last_mm``, root mean square in the last frame;
+        ``tracer_rmse_mm_per_frame``.
 
     Raises:
         InputError: shapes differ.
     """
     if a.shape != b.shape:
-        raise InputError(f"tracer_errors: paths of shapes {tuple(a.shape)} and {tuple(b.shape)} do not match")
+        raise InputError("tracer_errors", f"shapes {tuple(a.shape)} and {tuple(b.shape)} of the paths differ")
     distance = 1e3 * (a.double() - b.double()).norm(dim=-1).cpu()
     per_frame = distance.square().mean(-1).sqrt()
     return {
@@ -35,14 +35,14 @@ def tracer_errors(a: Tensor, b: Tensor) -> dict:
 
 
 def mechanical_energy(x: Tensor, v: Tensor, mass: Tensor, gravity: Sequence[float]) -> Tensor:
-    """Kinetic and gravitational energy [J] at T times, of particles at x [m] with velocities v [m/s], (T, N, 3) each.
+    """Kinetic and gravitational energy [J] of particles at x [m] with velocities v [m/s], (T, N, 3) each.
 
     Args:
         mass: of the particles [kg], shape (N,).
-        gravity: acceleration [m/s^2]; its potential is zero at the lowest point of the unit cube.
+        gravity: acceleration [m/s^2]. Its potential is zero at the lowest point of the unit cube.
 
     Returns:
-        shape (T,), float64. Elastic energy and the rotation inside particles, which are never negative, are left out.
+        shape (T,), float64. Elastic and rotational energy of the particles, never negative, are not included.
     """
     g = torch.tensor(gravity, dtype=torch.float64, device=x.device)
     potential = g.clamp(min=0).sum() - x.double() @ g  # [J/kg]

@@ -1,47 +1,32 @@
-"""How well a law predicts the motion: rollout from the estimated start, compared with the ground truth.
+"""Evaluate a predicted motion: rollout from the estimated start, compared with the ground truth.
 
-What counts is how far tracers are from where the truth takes them from the same start. The Chamfer distance between
-filled volumes (paper Sec. 4.1) sees their outlines only: of points that are d apart those within d of the surface are
-noticed, so it grows with the cube of d, and a ball that has turned is no other ball. It also contains a sampling floor:
-two samplings of one and the same body are apart, by less the denser they are. The excess is what remains without it.
+The main measure is the distance of tracers from the true positions of tracers with the same start. The Chamfer distance
+between filled volumes (paper Sec. 4.1) depends on silhouettes only: of points displaced by d, those within d of the
+surface contribute, so it grows with the cube of d and ignores the rotation of a ball. It also contains a sampling
+floor, the distance between two samplings of the same body, which decreases with their density. The excess is the
+distance without the floor.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from neuma_lib.errors import InputError, NonFiniteError
+from neuma_lib.errors import InputError
 from neuma_lib.evaluation.metrics import mechanical_energy, tracer_errors
 from neuma_lib.geometry.chamfer import chamfer_sequence
-from neuma_lib.mechanics.law import Law
-from neuma_lib.sim.model import MPM, MaterialRegion
-from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.model import MPM
+from neuma_lib.sim.prediction import Failure
 from neuma_lib.sim.state import State, Trajectory
 
 COUNT_TOLERANCE = 0.1
-"""Two jittered samplings of the same wanted count differ by at most this fraction: each keeps to 5 % of it."""
+"""Maximum relative difference of the counts of two jittered samplings, each within 5 % of the requested count."""
 ENERGY_TOLERANCE = 0.01
-"""Fraction of the energy at the start by which no passive body exceeds it (the integrator's own error is smaller)."""
-
-
-@dataclass(frozen=True)
-class Failure:
-    """Where a prediction ended before its last frame.
-
-    Attributes:
-        happened: what a particle did: "became non-finite", "moved by more than a cell in a step", "left the grid".
-        step: simulation step in which it did.
-        particle: the first particle that did.
-    """
-
-    happened: str
-    step: int | None
-    particle: int | None
+"""Maximum gain of a passive body relative to its initial energy. The error of the integrator is smaller."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +34,7 @@ class Evaluation:
     """Result of `evaluate`.
 
     Attributes:
-        path: predicted particle states at the frames, with the total deformation if it was asked for.
+        path: predicted particle states at the frames, with the total deformation if requested.
         tracers: tracers that started in the reconstructed shape [m], shape (T, M, 3).
         metrics: plain numbers and lists for ``metrics.json``.
     """
@@ -59,71 +44,22 @@ class Evaluation:
     metrics: dict
 
     def summary(self) -> str:
-        """One line for people."""
+        """One line for the log."""
         m = self.metrics
-        said = (
+        text = (
             f"tracer RMSE {m['tracer_rmse_mm']:.2f} mm (95 % below {m['tracer_error_p95_mm']:.2f}, last frame "
             f"{m['tracer_rmse_last_mm']:.2f}), Chamfer {m['chamfer']:.3f}e-4 m^2 (floor {m['chamfer_floor']:.3f})"
         )
         if failure := m["diverged"]:
-            said += f"; DIVERGED: a particle {failure['happened']} at step {failure['step']}"
-        return said
-
-
-def predict(
-    model: MPM,
-    law: Law | Sequence[MaterialRegion],
-    start: State,
-    frames: Sequence[int],
-    tracers: Tensor | None = None,
-    total: bool = False,
-) -> tuple[Trajectory, Failure | None]:
-    """Rollout of a law; one that becomes unstable is held at its last sound frame.
-
-    Args:
-        start: particles and their initial motion.
-        frames: simulation steps of the frames, T of them.
-        tracers: start positions of passive tracers [m], shape (M, 3).
-        total: also carry the total deformation.
-
-    Returns:
-        The trajectory at the frames, and how it failed (None: it did not).
-    """
-    return sound_frames(
-        lambda kept: rollout(model, law, start, steps=kept[-1], frames=kept, tracers=tracers, total=total),
-        frames,
-    )
-
-
-def sound_frames(
-    simulate: Callable[[Sequence[int]], Trajectory], frames: Sequence[int]
-) -> tuple[Trajectory, Failure | None]:
-    """What a simulation gives up to its last sound frame, held from there on, and how it failed (None: it did not).
-
-    Args:
-        simulate: called with the frames that are wanted; raises NonFiniteError where one of them is not sound.
-        frames: simulation steps of all frames.
-    """
-    kept, failure = list(frames), None
-    while True:
-        try:
-            with torch.no_grad():
-                path = simulate(kept)
-            break
-        except NonFiniteError as error:
-            failure = failure or Failure(error.happened, error.step, error.particle)
-            kept = kept[:-1] if error.step is None else [n for n in kept if n < error.step]
-            if not kept:
-                raise
-    missing = len(frames) - len(kept)
-    return path.hold_last(missing) if missing else path, failure
+            text += f"; DIVERGED: a particle {failure['happened']} at step {failure['step']}"
+        return text
 
 
 def energy_gain_after(gravity: Sequence[float], start: State, path: Trajectory) -> int | None:
-    """The last step of a path up to which no more energy was seen than at the start; None if there never was more.
+    """The last frame of a path before its energy first exceeds the initial energy. None if it never does.
 
-    A body without a motor turns its kinetic and gravitational energy into others and back, and never has more of it
-    than at the start: one that does, by `ENERGY_TOLERANCE`, has begun to go wrong. Seen at the path's frames.
+    The kinetic and gravitational energy of a passive body never exceeds its initial value. A gain by more than
+    `ENERGY_TOLERANCE` marks the beginning of an instability.
     """
     x, v, *_ = start.motion
     allowed = (1 + ENERGY_TOLERANCE) * mechanical_energy(x, v, start.mass, gravity)
@@ -135,7 +71,7 @@ def energy_gain_after(gravity: Sequence[float], start: State, path: Trajectory) 
 
 
 class Predictor(Protocol):
-    """What predicts a motion: a model of `neuma_lib.methods.model`."""
+    """A model that predicts a motion, see `neuma_lib.methods.model`."""
 
     def predict(
         self, mpm: MPM, state: State, frames: Sequence[int], tracers: Tensor | None, total: bool

@@ -1,4 +1,4 @@
-"""Response of laws to tests of a material point, over the range of states that a motion went through."""
+"""Response of laws in tests of a material point, over the range of states of a motion."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from neuma_lib.evaluation.material_point import Visited, largest_shear_stress, s
 from neuma_lib.mechanics.law import Law
 
 BEYOND = 1.6
-"""How far the tests go beyond the visited range, relative to its distance from the undeformed state."""
+"""Range of the tests relative to the visited range, measured from the undeformed state."""
 SMALLEST_STRETCH = 0.05
 POINTS = 121
 """Points of a curve."""
 EVERY = 5
-"""Points of a curve for one of its band."""
+"""Points of a curve per point of its band."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class PointTest:
     """A test of a material point.
 
     Attributes:
-        x: what is prescribed, (P,).
-        curve: the stresses (P',) [Pa] of a law at some of these.
-        visited: range of x that was visited; of the stress [Pa], if ``by_stress``.
+        x: prescribed values, (P,).
+        curve: stresses (P',) [Pa] of a law at some of these.
+        visited: visited range of x, or of the stress [Pa] if ``by_stress``.
     """
 
     x: Tensor
@@ -44,7 +44,7 @@ def material_tests(truth: Law, F: Tensor, rate: float, total_shear: float, dt: f
     """Uniaxial stretch and shear of the elastic law, and shear at a constant rate with the return map.
 
     Args:
-        truth: the true law, for the largest stress that was visited.
+        truth: the true law, which gives the largest visited stress.
         F: visited elastic deformation gradients (S, 3, 3).
         rate: of the last test [1/s].
         total_shear: at its end.
@@ -56,7 +56,7 @@ def material_tests(truth: Law, F: Tensor, rate: float, total_shear: float, dt: f
 def tests_within(
     seen: Visited, shear_stress: float, rate: float, total_shear: float, dt: float
 ) -> dict[str, PointTest]:
-    """The same for ranges of visited states, and the largest shear stress in them [Pa]."""
+    """The tests of `material_tests` for known ranges of visited states and their largest shear stress [Pa]."""
     low, high = (1 + BEYOND * (end - 1) for end in seen.stretch)
     steps = round(total_shear / (rate * dt))
     total = rate * dt * torch.arange(steps + 1, dtype=torch.float64)
@@ -74,13 +74,13 @@ def tests_within(
 
 
 def response(law: Law, truth: Law, test: PointTest, draws: Sequence[Law] = ()) -> dict[str, Any]:
-    """Curves of a law and of the true one in a test, and a band of laws, as plain numbers.
+    """Curves of a law and of the true one in a test, and a band of sampled laws, as plain numbers.
 
     Returns:
-        ``x``, ``visited``, ``by_stress``, ``stress`` and ``true`` [Pa]; where there are draws, ``band`` with its own
-        ``x``, ``low`` and ``high``.
+        ``x``, ``visited``, ``by_stress``, ``stress`` and ``true`` [Pa]; with samples, ``band`` with its own ``x``,
+        ``low`` and ``high``.
     """
-    found: dict[str, Any] = {
+    curves: dict[str, Any] = {
         "x": test.x.tolist(),
         "visited": list(test.visited),
         "by_stress": test.by_stress,
@@ -90,17 +90,16 @@ def response(law: Law, truth: Law, test: PointTest, draws: Sequence[Law] = ()) -
     if draws:
         x = test.x[::EVERY].contiguous()
         low, high = band(draws, lambda law: test.curve(law, x))
-        found["band"] = {"x": x.tolist(), "low": low.tolist(), "high": high.tolist()}
-    return found
+        curves["band"] = {"x": x.tolist(), "low": low.tolist(), "high": high.tolist()}
+    return curves
 
 
-def inside(found: Mapping[str, Any]) -> float | None:
-    """Part of the points of a band, within the visited range of its test, at which the true curve lies in it; None
-    where no point was visited."""
-    x, low, high = (np.array(found["band"][key]) for key in ("x", "low", "high"))
-    true = np.interp(x, found["x"], found["true"])
-    start, end = found["visited"]
-    where = true if found["by_stress"] else x
+def inside(curves: Mapping[str, Any]) -> float | None:
+    """Share of the visited points of a band at which the true curve lies in it. None without visited points."""
+    x, low, high = (np.array(curves["band"][key]) for key in ("x", "low", "high"))
+    true = np.interp(x, curves["x"], curves["true"])
+    start, end = curves["visited"]
+    where = true if curves["by_stress"] else x
     seen = (where >= start) & (where <= end)
     return float(((low <= true) & (true <= high))[seen].mean()) if seen.any() else None
 

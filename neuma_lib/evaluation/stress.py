@@ -1,10 +1,10 @@
-"""How wrong the stresses of a law are on the states that a motion goes through.
+"""Errors of a law's stresses on the states of a motion.
 
-States are those of the true law on the reconstruction, so that laws are compared where the video could show them, and
-nothing else (particles, start, grid) differs. Elastic F and trial F of single steps test the two parts of a law one by
-one. But how a deformation is shared between elastic F and flow is a law's own affair: a stiffer one that yields at a
-smaller strain may carry the same stress. What the motion feels is the stress along a path of total deformation, on
-which every law carries its own elastic F from the start.
+The states come from the true law on the reconstruction, so that laws are compared on deformations that the video can
+show, with the same particles, start and grid. Elastic F and trial F of single steps test the two parts of a law
+separately. Laws may divide a deformation differently into elastic F and flow: a stiffer one that yields at a smaller
+strain can have the same stress. Only the stress along a path of total deformation affects the motion, where each law
+updates its own elastic F from the start.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 
 STRAINED = 1e-4
-"""Largest component of F - I from which a body counts as deformed: its contact has begun."""
+"""Component of F - I above which a body counts as deformed, which marks its first contact."""
 PARTS = {
     "stress": "Kirchhoff stress of the visited elastic states",
     "volumetric": "Its volumetric part, the mean of the normal stresses",
@@ -32,19 +32,18 @@ PARTS = {
     "returned": "Stress of the visited trial states after the return map of a step",
     "path": "Stress along the visited paths of total deformation, every law with its own elastic state",
 }
-"""What the errors of `stress_errors` are of."""
+"""Stresses that `stress_errors` compares."""
 
 
 @dataclass(frozen=True)
 class VisitedStates:
-    """What material points of a motion went through.
+    """Deformations of material points during a motion.
 
     Attributes:
         F: elastic deformation gradients, shape (S, 3, 3).
-        F_trial: those of the same points and steps before the return map, shape (S, 3, 3).
-        C: velocity gradients of P points at the steps 0, 1, ..., T - 1 [1/s], shape (T, P, 3, 3); step n deforms them
-            by I + dt C_n.
-        frames: steps at which the stress of these points is looked at, after the first contact.
+        F_trial: the same before the return map, shape (S, 3, 3).
+        C: velocity gradients of P points at steps 0 to T - 1 [1/s], shape (T, P, 3, 3). Step n applies I + dt C_n.
+        frames: steps after the first contact at which the stresses of these points are compared.
     """
 
     F: Tensor
@@ -54,7 +53,7 @@ class VisitedStates:
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, np.ndarray]) -> VisitedStates:
-        """The states in the arrays of `arrays`."""
+        """Inverse of `arrays`."""
         values = (torch.from_numpy(arrays[name]) for name in ("F", "F_trial", "C"))
         return cls(*values, tuple(arrays["frames"].tolist()))
 
@@ -67,14 +66,14 @@ class VisitedStates:
 def visit(
     model: MPM, law: Law, start: State, frames: Sequence[int], states: int, paths: int, seed: int
 ) -> VisitedStates:
-    """Simulate a law, and draw states from its motion as they occur.
+    """Simulate a law and sample states of its motion.
 
     Args:
         start: particles with their initial motion.
-        frames: steps of the video's frames; states are drawn from those after the first contact, evenly.
-        states: S, drawn independently; a particle in proportion to its volume.
-        paths: P, of different particles, likewise; at most as many as there are.
-        seed: of the draws.
+        frames: steps of the video's frames. States are sampled uniformly from those after the first contact.
+        states: S, sampled independently, with particles in proportion to their volumes.
+        paths: P, sampled the same way without replacement, at most one for each particle.
+        seed: of the random numbers.
 
     Raises:
         InputError: nothing is deformed up to the last frame.
@@ -85,9 +84,8 @@ def visit(
     F, C = motion.F, motion.C
     deformed = (F - torch.eye(3, dtype=F.dtype)).abs().amax(dim=(1, 2, 3)) > STRAINED
     if not deformed[[n for n in frames if n > 0]].any():
-        raise InputError(
-            f"no particle is deformed up to step {frames[-1]}: there are no stresses to compare; let the video go on"
-        )
+        problem = f"no particle is deformed up to step {frames[-1]}, so there are no stresses to compare"
+        raise InputError("frames", problem, "Extend the video until after the first contact")
     first = max(1, int(deformed.int().argmax()))
     after = torch.tensor([n for n in frames if n >= first])
     generator, volumes = torch.Generator().manual_seed(seed), start.vol0.cpu()
@@ -102,10 +100,10 @@ def stress_errors(law: Law, truth: Law, visited: VisitedStates, dt: float) -> di
     """Errors of a law's stresses, relative to the true ones.
 
     Returns:
-        of each of `PARTS` the root mean square of the error over that of the truth's stress; ``asymmetric``, the same
-        of the antisymmetric part of the law's stress; ``true_rms``, the root mean square of the true stress [Pa];
-        ``broken_paths``, on how many paths the law's stress became non-finite: these are left out of ``path``, which is
-        None if there is no other.
+        for each of `PARTS`, root mean square of the error over that of the true stress; ``asymmetric``, the same for
+        the antisymmetric part of the law's stress; ``true_rms``, root mean square of the true stress [Pa];
+        ``broken_paths``, number of paths on which the law's stress became non-finite. ``path`` leaves these out and is
+        None without other paths.
     """
     F, F_trial = visited.F.double(), visited.F_trial.double()
     tau, true = stress(law, F), stress(truth, F)
@@ -126,17 +124,17 @@ def stress_errors(law: Law, truth: Law, visited: VisitedStates, dt: float) -> di
 
 
 def _along(law: Law, visited: VisitedStates, dt: float) -> Tensor:
-    """Stresses (frames, P, 3, 3) of a law along the paths; not finite from where they break on."""
+    """Stresses (frames, P, 3, 3) of a law along the paths, NaN after a path becomes non-finite."""
     F = torch.eye(3, dtype=torch.float64).expand(visited.C.shape[1], 3, 3)
-    wanted, found = set(visited.frames), []
+    wanted, stresses = set(visited.frames), []
     broken = torch.zeros(len(F), dtype=torch.bool)
     for step, C in enumerate(visited.C.double()):
         F = returned(law, F + dt * (C @ F)) if step else F
         broken = broken | ~F.isfinite().all(dim=-1).all(dim=-1)
         F = torch.where(broken[:, None, None], torch.eye(3, dtype=F.dtype), F)
         if step in wanted:
-            found.append(torch.where(broken[:, None, None], torch.nan, stress(law, F)))
-    return torch.stack(found)
+            stresses.append(torch.where(broken[:, None, None], torch.nan, stress(law, F)))
+    return torch.stack(stresses)
 
 
 def _volumetric(tau: Tensor) -> Tensor:

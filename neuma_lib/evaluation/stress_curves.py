@@ -1,7 +1,7 @@
-"""Stress curves of laws that were found for one object, over the states that its motion went through, without a truth.
+"""Stress curves of laws that were learned for one object, over the states of its motion, without ground truth.
 
-Simulated lengths are ``scale`` times those of the room, times and densities are the same; so a stress in the room is
-the simulator's divided by the square of it.
+Simulated lengths are ``scale`` times those of the room. Times and densities are equal, so a stress in the room is the
+simulated one divided by the square of the scale.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ TESTS = {
 VISITED = "#d9e6ef"
 """Colour of the visited ranges."""
 HEADROOM = 0.6
-"""How far the curve of a law without error bars may go beyond the others, relative to their range; then it is cut."""
+"""Limit of the curve of a law without error bars beyond the others, relative to their range."""
 
 
 def stress_curves(
@@ -46,34 +46,34 @@ def stress_curves(
 
     Args:
         laws: by method.
-        learned: the method whose motion went through F, and whose stress there is the visited range of the last test.
+        learned: the method whose motion is F, and whose stress gives the visited range of the last test.
         F: its elastic deformation gradients (..., 3, 3).
-        rate, total_shear: of the last test, as of `material_tests` [1/s] and 1.
+        rate, total_shear: of the last test, see `material_tests` [1/s] and 1.
         dt: time step [s].
-        draws: laws that the video leaves possible, by method; those of a method without an account of that are missing.
-        scale: metres of the simulator to a metre of the room.
+        draws: sampled laws by method, for methods with an estimate of uncertainty.
+        scale: simulated metres per metre of the room.
 
     Returns:
-        ``rate``, ``learned`` and ``tests``: of each ``x``, ``visited`` (low, high), ``by_stress`` and ``laws`` with
-        ``stress`` [Pa] and ``band``: None, or ``x``, ``low`` and ``high`` [Pa].
+        ``rate``, ``learned`` and ``tests``: for each ``x``, ``visited`` (low, high), ``by_stress`` and ``laws`` with
+        ``stress`` [Pa] and ``band``, which is None, or ``x``, ``low`` and ``high`` [Pa].
     """
     per = 1 / scale**2
     tests: dict[str, Any] = {}
     for name, test in material_tests(laws[learned], F, rate, total_shear, dt).items():
-        found: dict[str, Any] = {}
+        curves: dict[str, Any] = {}
         for method, law in laws.items():
-            found[method] = {"stress": (per * test.curve(law, test.x)).tolist(), "band": None}
+            curves[method] = {"stress": (per * test.curve(law, test.x)).tolist(), "band": None}
             if draws.get(method):
                 x = test.x[::EVERY].contiguous()
                 low, high = band(draws[method], partial(_curve, test, x))
                 ends = {"low": (per * low).tolist(), "high": (per * high).tolist()}
-                found[method]["band"] = {"x": x.tolist(), **ends}
+                curves[method]["band"] = {"x": x.tolist(), **ends}
         visited = [per * end for end in test.visited] if test.by_stress else list(test.visited)
         tests[name] = {
             "x": test.x.tolist(),
             "visited": visited,
             "by_stress": test.by_stress,
-            "laws": found,
+            "laws": curves,
         }
     return {"rate": rate, "learned": learned, "tests": tests}
 
@@ -83,21 +83,23 @@ def _curve(test: PointTest, x: Tensor, law: Law) -> Tensor:
 
 
 def share_inside(test: Mapping[str, Any], method: str, band_of: str) -> float | None:
-    """Part of the visited range of a test at which a law lies in the band of another; None where there is no band, or
-    nothing was visited."""
-    found = test["laws"].get(band_of, {}).get("band")
-    if not found:
+    """Share of the visited range of a test at which a law lies in the band of another.
+
+    None without a band or visited points.
+    """
+    limits = test["laws"].get(band_of, {}).get("band")
+    if not limits:
         return None
-    return inside({**test, "band": found, "true": test["laws"][method]["stress"]})
+    return inside({**test, "band": limits, "true": test["laws"][method]["stress"]})
 
 
 @style.styled
 def draw(curves: Mapping[str, Any], titles: Mapping[str, str]) -> Figure:
-    """A panel for each test, one below the other.
+    """Draw a panel for each test, one below the other.
 
     Args:
-        curves: as of `stress_curves`.
-        titles: of the methods.
+        curves: result of `stress_curves`.
+        titles: method -> name.
     """
     figure = style.new_figure(style.COLUMN, 0.4 + 1.5 * len(curves["tests"]))
     panels = figure.subplots(len(curves["tests"]), 1, squeeze=False)[:, 0]
@@ -129,11 +131,11 @@ def _panel(axes, test: Mapping[str, Any], titles: Mapping[str, str], learned: st
 
 
 def _limits(test: Mapping[str, Any], learned: str) -> tuple[float, float]:
-    """Lowest and highest stress [kPa] of a panel: all laws where something was seen, as far as there is room."""
+    """Lowest and highest stress [kPa] of a panel: all laws in the visited range, within `HEADROOM`."""
     x, (first, last) = np.asarray(test["x"]), test["visited"]
     seen = np.ones(len(x), bool) if test["by_stress"] else (x >= first) & (x <= last)
     laws = {method: 1e-3 * np.asarray(law["stress"])[seen] for method, law in test["laws"].items()}
-    # what has error bars is compared with the learned law in any case
+    # laws with error bars are always compared with the learned law
     kept = np.concatenate([v for m, v in laws.items() if m == learned or test["laws"][m]["band"]])
     whole, room = np.concatenate(list(laws.values())), HEADROOM * (np.ptp(kept) or 1.0)
     return max(whole.min(), kept.min() - room), min(whole.max(), kept.max() + room)

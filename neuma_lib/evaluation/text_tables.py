@@ -16,7 +16,7 @@ def as_csv(rows: Iterable[Iterable[Any]]) -> str:
 
 
 def as_markdown(header: Sequence[Any], rows: Iterable[Iterable[Any]], numbers: bool = False) -> list[str]:
-    """Lines of a Markdown table; with ``numbers`` all columns but the first are set flush right."""
+    """Lines of a Markdown table. With ``numbers``, all columns but the first are right-aligned."""
     rule = "---:|" if numbers else "---|"
     lines = [f"| {' | '.join(map(str, cells))} |" for cells in (header, *rows)]
     return [lines[0], f"|---|{rule * (len(header) - 1)}", *lines[1:]]
@@ -25,7 +25,7 @@ def as_markdown(header: Sequence[Any], rows: Iterable[Iterable[Any]], numbers: b
 def report_table(
     rows: Mapping[str, Mapping[str, float]], columns: Mapping[str, str], corner: str
 ) -> tuple[str, str]:
-    """A plain table of numbers as CSV and as Markdown.
+    """A table of numbers as CSV and as Markdown.
 
     Args:
         rows: row name -> quantity -> value.

@@ -1,4 +1,4 @@
-"""Moving pictures: prediction beside observation as mp4 or gif."""
+"""Videos of prediction and observation side by side, as mp4 or gif."""
 
 from __future__ import annotations
 
@@ -15,30 +15,32 @@ from neuma_lib.extras import require
 _LABEL_HEIGHT = 18
 """Line of text above each panel [px]."""
 _GIF_RATE = 50
-"""Frames a second that browsers show: shorter delays than 20 ms they take for 100."""
+"""Maximum frames per second of a GIF. Browsers replace delays below 20 ms by 100 ms."""
 _REPEATABLE = ("-fflags", "+bitexact", "-flags:v", "+bitexact", "-threads", "1", "-map_metadata", "-1")
-"""Encoder options that keep versions and dates out of the file, and threads from changing it."""
+"""Encoder options that make the file reproducible: no versions, no dates, one thread."""
 
 
 def side_by_side(panels: Sequence[np.ndarray], labels: Sequence[str], magnify: int = 1) -> np.ndarray:
-    """Put videos next to each other under their labels.
+    """Place videos side by side, each below its label.
 
     Args:
         panels: videos (T, H, W, 3) in [0, 1] of one length and height.
-        labels: one a video.
-        magnify: whole factor of enlargement.
+        labels: one for each video.
+        magnify: integer factor of enlargement.
 
     Returns:
-        uint8 video (T, H', W', 3) with even sides, as video codecs want them.
+        uint8 video (T, H', W', 3) with even sides, as video codecs require.
 
     Raises:
         InputError: no panels or frames, panels that differ in length or height, or labels that do not match them.
     """
     panels = [_as_bytes(panel) for panel in panels]
     if len({panel.shape[:2] for panel in panels}) != 1:
-        raise InputError(f"side_by_side: videos differ in length or height: {[p.shape for p in panels]}")
+        raise InputError(
+            "side_by_side", f"videos of shapes {[p.shape for p in panels]} differ in length or height"
+        )
     if len(labels) != len(panels):
-        raise InputError(f"side_by_side: {len(labels)} labels for {len(panels)} videos")
+        raise InputError("side_by_side", f"{len(labels)} labels for {len(panels)} videos")
     columns = []
     for panel, label in zip(panels, labels, strict=True):
         pixels = panel.repeat(magnify, axis=1).repeat(magnify, axis=2)
@@ -52,11 +54,11 @@ def side_by_side(panels: Sequence[np.ndarray], labels: Sequence[str], magnify: i
 
 
 def write_mp4(path: str | Path, video: np.ndarray, frame_rate: float, quality: int = 18) -> None:
-    """Encode frames (T, H, W, 3) of `side_by_side` as H.264; the same frames give the same bytes.
+    """Encode frames (T, H, W, 3) of `side_by_side` as H.264. The same frames give the same bytes.
 
     Args:
-        frame_rate: frames a second.
-        quality: constant rate factor of x264; 6 more halve the size of the file.
+        frame_rate: frames per second.
+        quality: constant rate factor of x264. An increase by 6 halves the size of the file.
 
     Raises:
         InputError: imageio is not installed.
@@ -70,11 +72,11 @@ def write_mp4(path: str | Path, video: np.ndarray, frame_rate: float, quality: i
 
 
 def write_gif(path: str | Path, video: np.ndarray, frame_rate: float) -> None:
-    """Write frames (T, H, W, 3) of `side_by_side` as a GIF that repeats for ever; the same frames give the same bytes.
+    """Write frames (T, H, W, 3) of `side_by_side` as a looping GIF. The same frames give the same bytes.
 
-    All frames share one palette, without dithering, which would flicker and compress badly. Delays are whole hundredths
-    of a second, of several lengths where the rate has none (30, 30 and 40 ms at 30 frames a second), so that the film
-    lasts as long as it should. Above `_GIF_RATE` every second frame is left out, or more.
+    All frames share one palette without dithering, which would flicker and compress badly. Delays are multiples of
+    10 ms and vary where needed (30, 30 and 40 ms at 30 frames per second) to keep the duration. Frames are skipped
+    above `_GIF_RATE`.
     """
     stride = math.ceil(frame_rate / _GIF_RATE)
     shown = video[::stride]
@@ -90,9 +92,9 @@ def _as_bytes(video: np.ndarray) -> np.ndarray:
     """A video in [0, 1] as uint8."""
     video = np.asarray(video)
     if video.ndim != 4 or video.shape[3] != 3 or len(video) == 0:
-        raise InputError(f"video: shape {video.shape}; expected frames (T, H, W, 3)")
+        raise InputError("video", f"shape {video.shape}, expected frames (T, H, W, 3)")
     if not np.isfinite(video).all():
-        raise InputError("video: a frame holds values that are not finite")
+        raise InputError("video", "a frame holds values that are not finite")
     return (np.clip(video, 0, 1) * 255).round().astype(np.uint8)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import complete
-from neuma_lib.mechanics.elasticity import ELASTICITIES, AnalyticElasticity
+from neuma_lib.mechanics.elasticity import ELASTICITIES
 from neuma_lib.mechanics.law import Elasticity, Law, Plasticity
 from neuma_lib.mechanics.plasticity import PLASTICITIES
 
@@ -38,7 +38,7 @@ def name_of(part: Elasticity | Plasticity) -> str | None:
     return next((name for name, kind in part.named.items() if kind is type(part)), None)
 
 
-def specification(elasticity: AnalyticElasticity, plasticity: Plasticity) -> dict[str, Any]:
+def specification(elasticity: Elasticity, plasticity: Plasticity) -> dict[str, Any]:
     """Complete specification of two analytic parts, including inherited constants of the plasticity (E, nu, dt).
 
     Raises:

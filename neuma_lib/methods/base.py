@@ -206,6 +206,7 @@ class Method(ABC):
         product: file that `fit` writes. None: nothing is fitted.
         fit_kernels, kernels: groups of Warp kernels that `fit` and predictions use.
         body_kernels: groups that predictions and renderings with the files of `body_inputs` use in addition.
+        draws_module: module with the function `draws`, apart from the method, so that its edits repeat no fit.
         has_law: whether the motion follows from a material law (`MotionModel.law`). Only laws move several bodies.
         moves_other_bodies: whether the model moves the bodies of other scenes (``+law_from=``).
     """
@@ -218,6 +219,7 @@ class Method(ABC):
     fit_kernels: ClassVar[tuple[str, ...]] = ("laws", "rendering")
     kernels: ClassVar[tuple[str, ...]] = ("laws",)
     body_kernels: ClassVar[tuple[str, ...]] = ()
+    draws_module: ClassVar[str | None] = None
     has_law: ClassVar[bool] = True
     moves_other_bodies: ClassVar[bool] = True
 
@@ -327,13 +329,30 @@ class Method(ABC):
             uncertainty: ``model_std`` and ``spread`` of the settings of `identify`.
             drawn: ``dt`` [s], ``count`` and ``seed``.
         """
-        return []
+        if self.draws_module is None:
+            return []
+        return load_module(self.draws_module).draws(inputs, law, F, uncertainty, **drawn)
 
 
 def body_of_each_video(case: Case) -> Files:
     """The reconstructed body of each video of a scene: particles, binding and Gaussians."""
     names = {"particles": "particles.h5", "binding": "binding.h5", "gaussians": "gaussians.ply"}
     return {name: case.each_video(lambda each, file=file: each.result(file)) for name, file in names.items()}
+
+
+def training_inputs(case: Case) -> Files:
+    """Body, supervision and initial motion of each video of a scene."""
+    supervision = (
+        {"transforms": case.each_video(lambda each: each.data("dynamic/transforms.json"))}
+        if case.options.supervision == "pixels"
+        else {"truth": case.each_video(lambda each: each.data("particles.h5"))}
+    )
+    start = case.identified() if case.options.start == "identified" else "velocity.json"
+    return {
+        **body_of_each_video(case),
+        **supervision,
+        "velocity": case.each_video(lambda each: each.result(start)),
+    }
 
 
 def methods_in(module: str) -> list[Method]:

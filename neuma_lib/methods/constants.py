@@ -7,6 +7,7 @@ from neuma_lib.methods.base import Case, Files, Method, Preset
 
 class Constants(Method):
     name = "constants"
+    draws_module = "neuma_lib.methods.draws"
     presets = {
         "constants": Preset(
             "Constants",
@@ -28,9 +29,3 @@ class Constants(Method):
 
     def uncertainty_inputs(self, case: Case) -> Files:
         return self.model_inputs(case)
-
-    def draws(self, inputs, law, F, uncertainty, **drawn):
-        from neuma_lib.evaluation.bands import constants_draws
-        from neuma_lib.io.files import read_json
-
-        return constants_draws(read_json(inputs["identified"]), uncertainty["model_std"], **drawn)

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from neuma_lib.evaluation.motion import Failure, predict
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.model import MPM, as_bodies, consecutive
+from neuma_lib.sim.prediction import Failure, predict
 from neuma_lib.sim.state import State, Trajectory
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from neuma_lib.config.motion import WithPrior
 from neuma_lib.config.training import TrainingConfig
-from neuma_lib.methods.base import Case, Files, Method, Preset, body_of_each_video
+from neuma_lib.methods.base import Case, Files, Method, Preset, training_inputs
 
 
 class NeumaOptions(TrainingConfig, WithPrior):
@@ -66,18 +66,3 @@ class Neuma(Method):
 
         stable = read_weights(inputs["adaptor"])[1]["stable"]
         return LawOnGrid(load_law(inputs.get("prior"), inputs["adaptor"], dt), stable=stable)
-
-
-def training_inputs(case: Case) -> Files:
-    """Body, supervision and initial motion of each video of a scene."""
-    supervision = (
-        {"transforms": case.each_video(lambda each: each.data("dynamic/transforms.json"))}
-        if case.options.supervision == "pixels"
-        else {"truth": case.each_video(lambda each: each.data("particles.h5"))}
-    )
-    start = case.identified() if case.options.start == "identified" else "velocity.json"
-    return {
-        **body_of_each_video(case),
-        **supervision,
-        "velocity": case.each_video(lambda each: each.result(start)),
-    }

@@ -6,8 +6,7 @@ from neuma_lib.config.motion import WithPrior
 from neuma_lib.config.structured import StructuredConfig
 from neuma_lib.config.training import TrainingConfig
 from neuma_lib.errors import InputError
-from neuma_lib.methods.base import Case, Files, Method, Preset
-from neuma_lib.methods.neuma import training_inputs
+from neuma_lib.methods.base import Case, Files, Method, Preset, training_inputs
 
 IDENTIFIED = "identified"
 
@@ -21,6 +20,7 @@ class Structured(Method):
     Options = StructuredOptions
     sections = ("training", "structured")
     product = "adaptor.safetensors"
+    draws_module = "neuma_lib.methods.draws"
     presets = {
         "neuma_structured": Preset(
             "NeuMA, structured",
@@ -95,19 +95,6 @@ class Structured(Method):
         if case.prior != IDENTIFIED:
             return {}
         return {"identified": case.result(case.identified()), "rollout": case.rollout()}
-
-    def draws(self, inputs, law, F, uncertainty, **drawn):
-        import torch
-
-        from neuma_lib.evaluation.bands import corrected_draws
-        from neuma_lib.io.files import read_json
-        from neuma_lib.io.hdf5 import read_arrays
-
-        if not inputs or law.elasticity.form != "stretch":
-            return []
-        if F is None:
-            F = torch.from_numpy(read_arrays(inputs["rollout"], required=("F",), only=("F",))[0]["F"])
-        return corrected_draws(law, read_json(inputs["identified"])["best"], F, **uncertainty, **drawn)
 
     def _base(self, case: Case) -> dict | None:
         """The analytic law of the prior, or None for the law identified in the video."""

@@ -25,7 +25,7 @@ class Training:
     """A training on all videos of a scene.
 
     Args:
-        inputs: files of `neuma.training_inputs`, and those of the method.
+        inputs: files of `training_inputs`, and those of the method.
         options: as the method got them.
         settings: the same, validated.
         stamp: further settings that a checkpoint must agree with.
@@ -43,7 +43,7 @@ class Training:
         self.settings, self.run, self._problem = settings, run, problem
         parts = zip(*(listed(inputs[name]) for name in ("particles", "binding", "gaussians")), strict=True)
         bodies = [
-            load_body(*files, density, settings.carrier, settings.gaussian_motion).to(
+            load_body(*files, density, settings.particle_source, settings.gaussian_motion).to(
                 torch.float32, run.device
             )
             for files, density in zip(parts, problem.densities, strict=True)

@@ -1,4 +1,4 @@
-"""One page of what was identified in a video: families by the loss of held-out frames, and the best one's constants."""
+"""A page on the material identified in a video: losses of all families, and constants of the best one."""
 
 from __future__ import annotations
 
@@ -14,35 +14,36 @@ from neuma_lib.mechanics.combinations import named_combinations
 
 _BARS = 2  # standard deviations that error bars show
 _RATIOS = (0.01, 0.1, 0.3, 0.5, 0.7, 1, 1.5, 2, 3, 10, 100)  # ticks
-_WIDEST = 1.5  # decades that an error bar may reach to either side: beyond it, nothing is known
+_WIDEST = 1.5  # maximum length of an error bar to either side, in decades
 
 
 @style.styled
-def identified_page(found: Mapping[str, Any], truth: Mapping[str, Mapping[str, Any]] | None) -> Figure:
-    """Left: held-out loss of every family that was judged. Right: constants and ratios of the best one over their
-    values, with two standard deviations, and the truth as crosses.
+def identified_page(identified: Mapping[str, Any], truth: Mapping[str, Mapping[str, Any]] | None) -> Figure:
+    """Draw the held-out loss of each evaluated family, and the best one's constants relative to their values.
+
+    Error bars are two standard deviations, crosses are the truth.
 
     Args:
-        found: content of identified.json.
-        truth: specification of the true law; None if unknown. Its constants are shown where the best family has them.
+        identified: content of identified.json.
+        truth: specification of the true law. None if unknown.
     """
     figure = style.new_figure(style.PAGE, 0.6 * style.COLUMN)
     losses, constants = figure.subplots(1, 2)
-    judged = {name: fit for name, fit in found["families"].items() if "held_out_loss" in fit}
-    order = sorted(judged, key=lambda name: judged[name]["score"], reverse=True)
-    as_good = {found["family"]: style.BLACK} | dict.fromkeys(found["ties"], style.GREY)
+    scored = {name: fit for name, fit in identified["families"].items() if "held_out_loss" in fit}
+    order = sorted(scored, key=lambda name: scored[name]["score"], reverse=True)
+    as_good = {identified["family"]: style.BLACK} | dict.fromkeys(identified["ties"], style.GREY)
     for place, name in enumerate(order):
-        loss = judged[name]["held_out_loss"]
+        loss = scored[name]["held_out_loss"]
         losses.plot([loss], [place], "o", color=as_good.get(name, style.SKY))
         losses.annotate(f"{loss:.1e}", (loss, place), (0, 4), textcoords="offset points", ha="center")
     losses.margins(0.15)
     losses.set_yticks(range(len(order)), order)
-    given_up = [name for name in found["families"] if name not in judged]
-    title = f"given up: {', '.join(given_up)}" if given_up else "all families"
+    dropped = [name for name in identified["families"] if name not in scored]
+    title = f"given up: {', '.join(dropped)}" if dropped else "all families"
     losses.set(xscale="log", xlabel="mean squared residual of held-out frames", title=title)
     losses.xaxis.set_minor_formatter(NullFormatter())
 
-    quantities = found["best"]["quantities"]
+    quantities = identified["best"]["quantities"]
     true = _true_values(truth) if truth else {}
     for place, (name, entry) in enumerate(reversed(quantities.items())):
         std = min(_BARS * entry["log_std"], _WIDEST * math.log(10))
@@ -55,16 +56,16 @@ def identified_page(found: Mapping[str, Any], truth: Mapping[str, Mapping[str, A
     constants.set_yticks(range(len(names)), names[::-1])
     constants.set(xscale="log", xlabel="over what was found\n(cross: truth, grey: not determined)")
     low, high = constants.get_xlim()
-    shown = [tick for tick in _RATIOS if low < tick < high]
-    constants.set_xticks(shown, [f"{tick:g}" for tick in shown], minor=False)
+    ticks = [tick for tick in _RATIOS if low < tick < high]
+    constants.set_xticks(ticks, [f"{tick:g}" for tick in ticks], minor=False)
     constants.xaxis.set_minor_formatter(NullFormatter())
     constants.axvline(1, color=style.LIGHT, zorder=0)
-    tied = f", tie with {', '.join(found['ties'])}" if found["ties"] else ""
-    constants.set_title(found["family"] + tied)
+    tied = f", tie with {', '.join(identified['ties'])}" if identified["ties"] else ""
+    constants.set_title(identified["family"] + tied)
     return figure
 
 
 def _true_values(truth: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Constants and their combinations of a true law."""
+    """Constants of a true law and their combinations."""
     values = {key: float(value) for part in truth.values() for key, value in part.items() if key != "name"}
     return named_combinations(values) if {"E", "nu"} <= values.keys() else values

@@ -1,4 +1,4 @@
-"""Pictures in rows and columns: the data file of a figure, and where they are placed on its page."""
+"""Pictures in rows and columns: data file of a figure, and placement on its page."""
 
 from __future__ import annotations
 
@@ -14,25 +14,26 @@ from matplotlib.figure import Figure
 from matplotlib.textpath import TextPath
 
 from neuma_lib.errors import InputError
+from neuma_lib.evaluation.plotting import style
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 
 GAP = 0.02
-"""Between pictures [in]."""
+"""Gap between pictures [in]."""
 TITLE = 6.5
-"""Size of the titles of rows and columns [pt]."""
+"""Font size of the titles of rows and columns [pt]."""
 _TITLE_DISTANCE = 0.04
-"""Of a row's title from its pictures, relative to the width of one."""
+"""Distance of a row's title from its pictures, relative to the width of one."""
 
 
 @dataclass(frozen=True)
 class ImageGrid:
-    """Pictures of one size in rows and columns, with the numbers that stand beside them.
+    """Pictures of one size in rows and columns, with further numbers of the figure.
 
     Attributes:
         images: colours 0 to 255, uint8, shape (R, C, H, W, 3).
         rows: R titles.
         columns: C titles.
-        numbers: whatever else the figure shows: plain numbers, lists and texts by name.
+        numbers: other plain numbers, lists and texts of the figure by name.
     """
 
     images: np.ndarray
@@ -43,13 +44,11 @@ class ImageGrid:
     def __post_init__(self):
         expected = (len(self.rows), len(self.columns))
         if self.images.ndim != 5 or self.images.shape[:2] != expected or self.images.dtype != np.uint8:
-            raise InputError(
-                f"{self.images.dtype} pictures of shape {self.images.shape} for {expected} titles; expected"
-                " uint8 (rows, columns, H, W, 3)"
-            )
+            problem = f"{self.images.dtype} of shape {self.images.shape} for {expected} titles"
+            raise InputError("images", f"{problem}, expected uint8 (rows, columns, H, W, 3)")
 
     def height(self, width: float, columns: int | None = None) -> float:
-        """Height [in] of a picture where ``columns`` of them (all, if None) and their gaps fill ``width`` [in]."""
+        """Height [in] of a picture if ``columns`` of them (all if None) with gaps fill ``width`` [in]."""
         count = columns or len(self.columns)
         return _picture_width(width, count) * self.images.shape[-3] / self.images.shape[-2]
 
@@ -61,17 +60,19 @@ def save_image_grid(path: str | Path, grid: ImageGrid) -> None:
 
 
 def load_image_grid(path: str | Path) -> ImageGrid:
-    """Read pictures and titles. Raises InputError when the file is no data file of a figure."""
+    """Read pictures and titles. Raises InputError if the file is not the data of a figure."""
     arrays, attributes = read_arrays(path, required=("images",))
     missing = [name for name in ("rows", "columns", "numbers") if name not in attributes]
     if missing:
-        raise InputError(f"{path} has no {', '.join(missing)}: it is not the data of a figure; make it again")
+        raise InputError(
+            path, f"not the data of a figure, it has no {', '.join(missing)}", "Build the figure again"
+        )
     rows, columns, numbers = (json.loads(attributes[name]) for name in ("rows", "columns", "numbers"))
     return ImageGrid(arrays["images"], tuple(rows), tuple(columns), numbers)
 
 
 def place(figure: Figure, left: float, top: float, width: float, height: float, **options) -> Axes:
-    """Axes whose upper left corner lies at (left, top) inches from that of the figure."""
+    """Axes with their upper left corner at (left, top) inches from that of the figure."""
     full_width, full_height = figure.get_size_inches()
     box = (left / full_width, 1 - (top + height) / full_height, width / full_width, height / full_height)
     return figure.add_axes(box, **options)
@@ -89,8 +90,8 @@ def draw_images(
     """Draw pictures (R, C, H, W, 3) below and right of (left, top) [in].
 
     Args:
-        width: of the pictures together [in].
-        rows: titles left of the pictures, broken where they are wider than `left`.
+        width: total width of the pictures [in].
+        rows: titles left of the pictures, wrapped to the width `left`.
         columns: titles above them.
     """
     each = _picture_width(width, images.shape[1])
@@ -108,8 +109,16 @@ def draw_images(
                 axes.text(-_TITLE_DISTANCE, 0.5, title, ha="right", va="center", **options)
 
 
+def rows_figure(grid: ImageGrid, left: float, top: float, rows: Sequence[str]) -> Figure:
+    """A figure of the page's width with the pictures and titles of a grid only."""
+    width = style.PAGE - left - 0.02
+    figure = style.new_canvas(style.PAGE, top + len(rows) * (grid.height(width) + GAP) + 0.03)
+    draw_images(figure, grid.images, left, top, width, rows, grid.columns)
+    return figure
+
+
 def broken(text: str, width: float) -> str:
-    """The text with lines broken at spaces so that none is wider than `width` [in], unless a word is."""
+    """Wrap a text at spaces to lines of at most `width` [in], longer only for long words."""
     lines: list[str] = []
     for line in text.split("\n"):
         words = line.split(" ")
@@ -124,7 +133,7 @@ def broken(text: str, width: float) -> str:
 
 
 def note(figure: Figure, left: float, top: float, text: str, **options) -> None:
-    """Text at (left, top) inches from the upper left corner."""
+    """Add text at (left, top) inches from the upper left corner."""
     width, height = figure.get_size_inches()
     figure.text(
         left / width, 1 - top / height, text, **{"ha": "left", "va": "center", "fontsize": 7, **options}

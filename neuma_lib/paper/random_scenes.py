@@ -79,13 +79,13 @@ def random_table(
     """
     if not scenes:
         raise InputError("random.count", "there are no random scenes", "Set it to a positive number")
-    prior, judged, *_ = titles
+    prior, method, *_ = titles
     columns: dict[str, tuple[str, Callable[[RandomScene], Any]]] = {
         "scene": ("scene", lambda s: s.name),
         "family": ("family", lambda s: s.family),
         "prior": ("prior", lambda s: s.prior),
         **{f"{m}_rmse_mm": (f"{title} (mm)", lambda s, m=m: s.rmse[m]) for m, title in titles.items()},
-        "ratio": (f"{titles[judged]} / {titles[prior]}", lambda s: s.rmse[judged] / s.rmse[prior]),
+        "ratio": (f"{titles[method]} / {titles[prior]}", lambda s: s.rmse[method] / s.rmse[prior]),
         "velocity_error_in_plane_percent": (
             "velocity in plane (%)",
             lambda s: s.start["velocity_error_in_plane_percent"],
@@ -131,14 +131,14 @@ def random_table(
 
 
 def _verdicts(scenes: Sequence[RandomScene], titles: Mapping[str, str]) -> list[Verdict]:
-    prior, judged, *_ = titles
-    ratios = [s.rmse[judged] / s.rmse[prior] for s in scenes]
+    prior, method, *_ = titles
+    ratios = [s.rmse[method] / s.rmse[prior] for s in scenes]
     measures = ("velocity_error_in_plane_percent", "angular_velocity_error_viewing_percent")
     plane = [max(s.start[name] for name in measures) for s in scenes]
     depth = [s.depth_in_std for s in scenes]
     claims = [
         (
-            f"{titles[judged]} is closer than its prior",
+            f"{titles[method]} is closer than its prior",
             BETTER_SHARE,
             [ratio < 1 for ratio in ratios],
             f"errors {min(ratios):.2f} to {max(ratios):.2f} times as large",
@@ -165,7 +165,7 @@ def _verdicts(scenes: Sequence[RandomScene], titles: Mapping[str, str]) -> list[
 
 def _summary(scenes: Sequence[RandomScene], titles: Mapping[str, str]) -> list[str]:
     """Sentences on all scenes."""
-    prior, judged, *_ = titles
+    prior, method, *_ = titles
 
     def count(true: Callable[[RandomScene], bool]) -> str:
         return f"{sum(map(true, scenes))} of {len(scenes)}"
@@ -173,9 +173,9 @@ def _summary(scenes: Sequence[RandomScene], titles: Mapping[str, str]) -> list[s
     def middle(method: str) -> str:
         return f"{median(s.rmse[method] for s in scenes):.1f} mm ({titles[method]})"
 
-    ratio = geometric_mean(s.rmse[judged] / s.rmse[prior] for s in scenes)
+    ratio = geometric_mean(s.rmse[method] / s.rmse[prior] for s in scenes)
     sentences = [
-        f"{titles[judged]} is better than {titles[prior]} on {count(lambda s: s.rmse[judged] < s.rmse[prior])}; "
+        f"{titles[method]} is better than {titles[prior]} on {count(lambda s: s.rmse[method] < s.rmse[prior])}; "
         f"medians {', '.join(map(middle, titles))}; RMSE {ratio:.2f} times as large (geometric mean).",
         f"Something failed on {count(lambda s: bool(s.failed))}.",
         f"Velocity in plane within {CLOSE:g} % on "
@@ -186,9 +186,9 @@ def _summary(scenes: Sequence[RandomScene], titles: Mapping[str, str]) -> list[s
         f"{count(lambda s: s.spin_in_std <= WITHIN)}.",
     ]
     if TRUE_LAW in titles:
-        closer = count(lambda s: s.rmse[judged] < s.rmse[TRUE_LAW])
+        closer = count(lambda s: s.rmse[method] < s.rmse[TRUE_LAW])
         sentences.append(
-            f"{titles[judged]} is closer to the truth than the true law, simulated as the reconstruction is, on "
+            f"{titles[method]} is closer to the truth than the true law, simulated as the reconstruction is, on "
             f"{closer}: there it has absorbed discretisation, or errors of the start."
         )
     return sentences

@@ -1,4 +1,4 @@
-"""Plain tables of numbers as CSV and Markdown: reports of stages, the benchmarks."""
+"""The table of the benchmarks (Table 4) as CSV and Markdown."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from neuma_lib.paper.published import BENCHMARKS, BENCHMARKS_LABEL
 
 
 def benchmark_table(scenes: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:
-    """Properties of the benchmarks (the paper's table of them), with the materials that it does not publish.
+    """Properties of the benchmarks, with the materials that the paper does not publish.
 
     Args:
-        scenes: scene -> its complete plain settings, with ``steps`` as simulated.
+        scenes: scene -> its complete plain settings, with the number of simulated ``steps``.
 
     Returns:
-        CSV, and Markdown with the paper's numbers beside ours where they differ, and a line that says so.
+        CSV, and Markdown with the paper's numbers in brackets where they differ from ours.
     """
     header = {
         "benchmark": "Benchmark",
@@ -32,7 +32,7 @@ def benchmark_table(scenes: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:
         "plasticity": "Plasticity",
         "prior": "Prior",
     }
-    table, shown, same, other = [], [], [], []
+    table, cells, same, other = [], [], [], []
     for name, scene in scenes.items():
         printed = BENCHMARKS.get(name, {})
         row = {
@@ -42,29 +42,30 @@ def benchmark_table(scenes: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:
         }
         table.append([row[key] for key in header])
         if printed:
-            apart = {k: _constant(printed[k]) for k in ("dt", "velocity", "height") if printed[k] != scene[k]}
-            row |= {key: f"{row[key]} (*paper: {value}*)" for key, value in apart.items()}
-            (other if apart else same).append(name)
-        shown.append([row[key] for key in header])
-    verdict = []
+            differing = [key for key in ("dt", "velocity", "height") if printed[key] != scene[key]]
+            row |= {key: f"{row[key]} (*paper: {_constant(printed[key])}*)" for key in differing}
+            (other if differing else same).append(name)
+        cells.append([row[key] for key in header])
+    remarks = []
     if same:
-        agree = f"Step size, velocity and height are the paper's ({BENCHMARKS_LABEL}) for {', '.join(same)}."
-        verdict.append(agree)
+        remarks.append(
+            f"Step size, velocity and height are the paper's ({BENCHMARKS_LABEL}) for {', '.join(same)}."
+        )
     if other:
-        verdict.append(f"They differ from it for {', '.join(other)}; the paper's numbers stand in brackets.")
+        remarks.append(f"They differ from it for {', '.join(other)}; the paper's numbers stand in brackets.")
     text = [
         "# Table 4: the benchmarks",
         "",
-        *as_markdown(list(header.values()), shown),
+        *as_markdown(list(header.values()), cells),
         "",
-        " ".join(verdict),
+        " ".join(remarks),
     ]
     text += ["", "The paper does not publish materials, sizes and densities: those are ours.", ""]
     return as_csv([header, *table]), "\n".join(text)
 
 
 def _constant(value: Any) -> str:
-    """A setting in a cell: numbers short, mappings as name and constants, lists in brackets."""
+    """A setting as the text of a cell."""
     if isinstance(value, Mapping):
         name = str(value.get("name", "")).replace("_", " ")
         constants = ", ".join(f"{key} {_constant(v)}" for key, v in value.items() if key != "name")

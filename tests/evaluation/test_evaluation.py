@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from neuma_lib.errors import NonFiniteError
-from neuma_lib.evaluation.motion import evaluate, predict
+from neuma_lib.evaluation.motion import evaluate
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Elasticity, Law
 from neuma_lib.methods.model import LawOnGrid
+from neuma_lib.sim.prediction import predict
 from neuma_lib.sim.rollout import rollout
 from tests.support.errors import refused
 from tests.support.grounding_scene import MODEL, PRIOR, RADIUS, TRUTH, ball

@@ -27,6 +27,7 @@ from neuma_lib.evaluation.lpips import (
 )
 from neuma_lib.io.packages import download
 from neuma_lib.io.weights import read_weights
+from tests.support.errors import refused
 
 pytestmark = pytest.mark.core
 
@@ -77,9 +78,9 @@ def test_the_window_of_a_small_object_is_large_enough_and_inside(corner):
 
 
 def test_unusable_windows_are_named():
-    with pytest.raises(InputError, match="neither in the observed"):
+    with refused("image metrics"):
         object_window(np.zeros((64, 64), bool), 0.1)
-    with pytest.raises(InputError, match="images of 32 pixels"):
+    with refused("image metrics"):
         object_window(np.ones((64, 20), bool), 0.1)
 
 
@@ -162,9 +163,9 @@ def test_distances_are_those_of_the_authors_package(true_weights, net):
 def test_unusable_images_and_weights_are_named():
     weights = random_weights("alex")
     network = LPIPS(weights, "alex")
-    with pytest.raises(InputError, match="both sides must have 32"):
+    with refused("LPIPS"):
         network(waves(0.0, 30), waves(0.0, 30))
-    with pytest.raises(InputError, match="expected \\(B, 3, H, W\\) twice"):
+    with refused("LPIPS"):
         network(waves(0.0), waves(0.0)[0])
     with pytest.raises(InputError, match="alex.head2 is missing"):
         LPIPS({name: t for name, t in weights.items() if name != "alex.head2"}, "alex")
@@ -219,7 +220,7 @@ def test_weights_are_converted(tmp_path):
 @pytest.mark.parametrize("protocol", [0, 2, 4, 5])
 def test_a_pickle_that_asks_for_code_is_refused(tmp_path, protocol):
     content = pickle.dumps({"AlexNet_0": Harmful(tmp_path / "made")}, protocol)
-    with pytest.raises(InputError, match="mkdir: only plain numpy arrays"):
+    with pytest.raises(InputError, match="mkdir is refused"):
         read_plain_pickle(content, "weights")
     assert not (tmp_path / "made").exists()
 
@@ -235,7 +236,7 @@ def test_damaged_and_foreign_pickles_are_named(content):
 
 
 def test_another_package_is_refused(tmp_path):
-    with pytest.raises(InputError, match="holds no file"):
+    with pytest.raises(InputError, match="no file ends with"):
         convert(archive(tmp_path / "a.tar", {"other": b""}))
     with pytest.raises(InputError, match="no entry AlexNet_0/Conv_0/kernel"):
         convert(archive(tmp_path / "b.tar", {"alexnet": pickle.dumps({"x": 1}, 2)}))

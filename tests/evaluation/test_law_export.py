@@ -324,7 +324,7 @@ def test_nothing_is_written_where_something_is_wrong(tmp_path, capsys):
     save_law(law, bare, about_law(bare, DT))
     (tmp_path / "folder").mkdir()
     for words, complaint in (
-        ([law, "new.npz"], "written as .safetensors"),
+        ([law, "new.npz"], "suffix is not .safetensors"),
         ([law, "new.safetensors", "--apart"], "no adaptor"),
         ([law, "new.safetensors", "--weight", "0.5"], "no adaptor"),
         ([law, "new.safetensors", "--weight", "0.5", "--separate"], "--separate"),

@@ -80,7 +80,7 @@ def test_tracer_error_of_a_shift_is_its_length():
     found = tracer_errors(path + shift, path)
     assert found.pop("tracer_rmse_mm_per_frame") == pytest.approx([5] * 4)
     assert list(found.values()) == pytest.approx([5] * 3)
-    with pytest.raises(InputError, match="do not match"):
+    with pytest.raises(InputError, match="differ"):
         tracer_errors(path, path[:, 1:])
 
 
@@ -196,9 +196,9 @@ def test_unusable_points_and_images_are_named():
         chamfer(points(4), torch.zeros(0, 3))
     with refused("chamfer"):
         chamfer_sequence(points(2, 4), points(3, 4))
-    with pytest.raises(InputError, match="do not match"):
+    with pytest.raises(InputError, match="differ"):
         psnr(np.zeros((4, 4, 3)), np.zeros((4, 5, 3)))
-    with pytest.raises(InputError, match="smaller than the window"):
+    with refused("ssim"):
         ssim(np.zeros((8, 20, 3)), np.zeros((8, 20, 3)))
 
 
@@ -260,11 +260,11 @@ def test_a_gif_lasts_as_long_as_its_frames(tmp_path, rate):
 
 
 def test_unusable_videos_are_named(film):
-    with pytest.raises(InputError, match="differ in length"):
+    with refused("side_by_side"):
         side_by_side([film, film[:5]], ["a", "b"])
     with pytest.raises(InputError, match="1 labels for 2"):
         side_by_side([film, film], ["a"])
-    with pytest.raises(InputError, match="expected frames"):
+    with refused("video"):
         side_by_side([film[0]], ["a"])
-    with pytest.raises(InputError, match="not finite"):
+    with refused("video"):
         side_by_side([film * np.nan], ["a"])

@@ -22,7 +22,6 @@ from matplotlib.text import Text
 from matplotlib.textpath import TextPath
 from PIL import Image
 
-from neuma_lib.errors import InputError
 from neuma_lib.evaluation.material_point import Visited, largest_shear_stress, sheared, uniaxial, yielding
 from neuma_lib.evaluation.plotting import style
 from neuma_lib.evaluation.plotting.rendering import cropped, evenly, frontal, magnified
@@ -39,6 +38,7 @@ from neuma_lib.paper.image_grid import (
     save_image_grid,
 )
 from neuma_lib.splatting.cameras import Cameras
+from tests.support.errors import refused
 
 ROOT = Path(__file__).resolve().parents[2]
 SETTINGS = yaml.safe_load((ROOT / "config/config.yaml").read_text())
@@ -475,7 +475,7 @@ def test_pictures_and_titles_survive_the_disk(tmp_path):
     again = load_image_grid(tmp_path / "a.h5")
     assert (again.images == grid.images).all()
     assert (again.rows, again.columns, again.numbers) == (grid.rows, grid.columns, grid.numbers)
-    with pytest.raises(InputError, match="titles"):
+    with refused("images"):
         ImageGrid(grid.images, ("one",), grid.columns)
 
 

@@ -94,6 +94,12 @@ class TestThisProject:
         assert "neuma_lib.splatting.rasterizer" in self.reached("fit", springs)
         assert "neuma_lib.fitting.material" not in self.reached("evaluate", "neuma_lib.methods.true_law")
 
+    @pytest.mark.parametrize("method", ["neuma", "structured", "spring_gaus.method", "pac_nerf.method"])
+    def test_fits_are_free_of_measures(self, method):
+        reached = self.reached("fit", f"neuma_lib.methods.{method}")
+        rooms = ("evaluation", "paper", "project", "viewer")
+        assert not [name for name in reached if name.split(".")[1] in rooms]
+
     @pytest.mark.parametrize(
         "script",
         ["ground_truth", "prior", "sampled_particles", "render_static", "render_dynamic", "chamfer_table"],

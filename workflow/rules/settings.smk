@@ -112,21 +112,24 @@ def checked(function):
     return call
 
 
-def code_of(script):
-    """A function of wildcards: digest of a script and of the method that it loads.
+def code_of(script, draws=False):
+    """A function of wildcards: digest of a script, of the method that it loads, and of what draws laws.
 
     A method in a file may name any of the own laws.
     """
 
     def digest(wildcards):
-        loaded = type(cases.kind_of(SETTINGS, wildcards.method)).__module__
+        kind = cases.kind_of(SETTINGS, wildcards.method)
+        loaded = type(kind).__module__
         laws = {*DEFINED_IN.values()} - {loaded} if loaded in SETTINGS.extensions else ()
-        return code_digest(ROOT / "workflow" / "scripts" / script, loaded, *sorted(laws))
+        drawing = [kind.draws_module] if draws and kind.draws_module else []
+        return code_digest(ROOT / "workflow" / "scripts" / script, loaded, *drawing, *sorted(laws))
 
     return digest
 
 
 def code_of_methods(script):
     """A function of wildcards: digest of a script that may load every method."""
-    modules = sorted(type(method).__module__ for method in KINDS.values())
+    modules = {type(method).__module__ for method in KINDS.values()}
+    modules = sorted(modules | {kind.draws_module for kind in KINDS.values() if kind.draws_module})
     return lambda wildcards: code_digest(ROOT / "workflow" / "scripts" / script, *modules)

@@ -57,7 +57,7 @@ rule response:
         model_std=SETTINGS.identify.model_std,
         spread=SETTINGS.identify.spread,
         seed=SETTINGS.seed,
-        code=code_of("response.py"),
+        code=code_of("response.py", draws=True),
     script:
         "../scripts/response.py"
 

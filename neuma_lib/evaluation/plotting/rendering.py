@@ -1,4 +1,4 @@
-"""Pictures for figures: frames of the video, renders at a higher magnification, particles, and their crops."""
+"""Pictures for figures: video frames, magnified renders, particles, and crops."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ from neuma_lib.splatting.observation import Observation
 from neuma_lib.splatting.viewpoints import video_views
 
 _WHITE = 250
-"""A colour at least this light is background."""
+"""Minimum value of a background colour."""
+_FLATTEST, _TALLEST = 0.6, 1.5
+"""Limits of a picture's height relative to its width."""
 _BATCH = 4
-"""Frames that are rendered at a time."""
+"""Number of frames rendered at a time."""
 _UNIT_BALL_RADIUS = 0.62
 """Radius of the ball of volume 1: (3 / (4 pi))^(1/3)."""
 
@@ -37,14 +39,19 @@ def magnified(cameras: Cameras, factor: int) -> Cameras:
 
 
 def film(inputs, params, k: int, density: Density) -> tuple[Observation, Reconstruction, Cameras]:
-    """A figure's scene ``k``: its video in one view, the body, and the camera at the magnification of the figure."""
+    """Scene ``k`` of a figure: video in one view, body, and camera at the magnification of the figure."""
     video = load_observation(inputs.transforms[k], [params.view])
     body = load_body(inputs.particles[k], inputs.binding[k], inputs.gaussians[k], density)
     return video, body, magnified(video.cameras, params.magnify)
 
 
+def picture_size(wide: float, high: float, width: int) -> tuple[int, int]:
+    """Width and height [px] of a picture of a body that is ``wide`` and ``high``."""
+    return width, round(width * float(np.clip(high / wide, _FLATTEST, _TALLEST)))
+
+
 def frontal(points: np.ndarray, width: int, height: int) -> Cameras:
-    """A horizontal camera that sees points (..., 3) [m], as view 0 of the videos does."""
+    """A horizontal camera that sees points (..., 3) [m], like view 0 of the videos."""
     views = video_views(points.reshape(-1, 3), 1, width, height)
     return Cameras(
         torch.from_numpy(views.viewmats).float(), torch.from_numpy(views.K[None]).float(), width, height
@@ -52,16 +59,16 @@ def frontal(points: np.ndarray, width: int, height: int) -> Cameras:
 
 
 def seen_around(body: Reconstruction, x: Tensor, F: Tensor) -> np.ndarray:
-    """Points (n, 3) [m] around what is seen of a body's Gaussians in states x (T, N, 3) [m] and F (T, N, 3, 3)."""
+    """Points (n, 3) [m] around the visible Gaussians of a body in states x (T, N, 3) [m] and F (T, N, 3, 3)."""
     g, covars = body.gaussians, body.gaussians.covars()
     arms = arms_at_rest(g.means, body.binding, body.x0) if body.affine else None
-    found = []
+    points = []
     with torch.no_grad():
         for k in range(len(x)):
             state = x[k : k + 1].to(body.x0), F[k : k + 1].to(body.x0)
             means, moved = deform(g.means, covars, body.binding, body.x0, *state, arms=arms)
-            found.append(outermost(means[0], moved[0], g.opacities))
-    return torch.cat(found).cpu().numpy()
+            points.append(outermost(means[0], moved[0], g.opacities))
+    return torch.cat(points).cpu().numpy()
 
 
 def as_bytes(images: Tensor) -> np.ndarray:
@@ -72,7 +79,7 @@ def as_bytes(images: Tensor) -> np.ndarray:
 def renders(body: Reconstruction, cameras: Cameras, x: Tensor, F: Tensor) -> np.ndarray:
     """Pictures of states x (T, N, 3) [m] and F (T, N, 3, 3) in the first view: uint8 (T, H, W, 3).
 
-    Of a reconstruction, or of what else has its ``particle_gs``, as a carried field does.
+    ``body`` is a reconstruction or another object with ``particle_gs``.
     """
     with torch.no_grad():
         parts = [images[:, 0] for _, images in body.particle_gs(cameras[0]).batches(x, F, size=_BATCH)]
@@ -80,7 +87,7 @@ def renders(body: Reconstruction, cameras: Cameras, x: Tensor, F: Tensor) -> np.
 
 
 def observed(observation: Observation, index: Sequence[int], factor: int) -> np.ndarray:
-    """Frames of the video as they are, each pixel repeated: uint8 (T, H factor, W factor, 3)."""
+    """Frames of the video with each pixel repeated: uint8 (T, H factor, W factor, 3)."""
     images = as_bytes(observation.colours(list(index))[:, 0])
     return images.repeat(factor, axis=1).repeat(factor, axis=2)
 
@@ -91,7 +98,7 @@ def particle_pictures(
     """Particles x (T, N, 3) [m] as spheres in the first view: uint8 (T, H, W, 3).
 
     Args:
-        color: one name or code of matplotlib, or colours (N, 3) in [0, 1].
+        color: a colour of matplotlib, or colours (N, 3) in [0, 1].
         radius: of the spheres [m].
     """
     colors = np.asarray(to_rgb(color) if isinstance(color, str) else color)
@@ -106,27 +113,27 @@ def sphere_radius(vol0: np.ndarray | Tensor) -> float:
 
 
 def evenly(count: int, total: int) -> list[int]:
-    """Indices of ``count`` frames out of ``total``, the first and the last among them."""
+    """Indices of ``count`` evenly spaced frames out of ``total``, including the first and the last."""
     return sorted(set(np.linspace(0, total - 1, min(count, total)).round().astype(int).tolist()))
 
 
 def milliseconds(steps: Sequence[int], dt: float) -> list[str]:
-    """Titles of pictures at simulation steps of ``dt`` [s]."""
+    """Times of simulation steps as titles of pictures."""
     return [f"{1e3 * dt * step:.0f} ms" for step in steps]
 
 
 def cropped(
     groups: Sequence[np.ndarray], margin: float = 0.03, guides: Sequence[np.ndarray] | None = None
 ) -> list[np.ndarray]:
-    """Cut pictures to what is not white, each group by a box of its own, all boxes of one size.
+    """Crop pictures to their non-white part, each group with its own box, all boxes of one size.
 
     Args:
         groups: uint8 pictures (..., H, W, 3) of one camera each.
         margin: of the box, relative to the longer side of a picture.
-        guides: pictures that say where the boxes lie, one array a group; the groups themselves if None.
+        guides: pictures that determine the boxes, one array for each group; the groups themselves if None.
 
     Returns:
-        The groups, all of one height and width; white is added where a box leaves its picture.
+        The groups, all of one height and width, padded with white.
     """
     boxes = []
     for images in guides or groups:
@@ -141,7 +148,7 @@ def cropped(
     width = max(right - left for _, _, left, right in boxes) + 2 * pad
     cut = []
     for images, (_, bottom, left, right) in zip(groups, boxes, strict=True):
-        # Indices in the padded picture; bodies stand on the lower edge.
+        # Indices in the padded picture. Boxes are aligned at the lower edge of the bodies.
         row = bottom + pad
         column = (left + right - width) // 2 + width
         border = [(0, 0)] * (images.ndim - 3) + [(height, height), (width, width), (0, 0)]

@@ -1,4 +1,4 @@
-"""Particles as shaded spheres: a small picture maker for figures, not for training."""
+"""Render particles as shaded spheres, for figures."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 _LIGHT = np.array([-0.45, -0.75, -0.5]) / np.linalg.norm([-0.45, -0.75, -0.5])
 """Direction towards the light in camera axes (x right, y down, z forward): from above, left, behind the camera."""
 _AMBIENT = 0.45
-"""Brightness of a side that the light does not reach."""
+"""Brightness of a side without light."""
 _SUPERSAMPLING = 2
 """Samples of a pixel along each axis."""
 
@@ -21,7 +21,7 @@ def draw_spheres(
     width: int,
     height: int,
 ) -> np.ndarray:
-    """Picture of equal spheres over white, hidden surfaces removed, lit by one distant light.
+    """Render equal spheres over white, with hidden surfaces removed and one distant light.
 
     Args:
         points: centres [m], shape (N, 3).

@@ -1,8 +1,8 @@
-"""The one place for the look of figures: sizes, fonts, colours of methods, and how a figure is saved.
+"""Style of figures: sizes, fonts, colours of methods, and saving.
 
-Widths are those of a two-column page; fonts are 7 points in print, never below 6. Colours are those of Okabe and Ito
-(2008), which people with any colour vision can tell apart; lines also differ in dash, points in marker, so that
-nothing is lost in black and white.
+Widths are those of a two-column page. Fonts have 7 points in print, at least 6. Colours are those of Okabe and Ito
+(2008), which people with any colour vision can distinguish. Lines also differ in dash and points in marker, for print
+in black and white.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILION, PURPLE = (
     "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7",
 )  # fmt: skip
 SEQUENCE = (BLUE, ORANGE, GREEN, PURPLE, VERMILION, SKY)
-"""Colours of things that are not methods, in order."""
+"""Colours of other things than methods, in order."""
 RAMP = "cividis"
-"""Colour map of ordered quantities: even in lightness, and the same to colour-blind eyes."""
+"""Colour map of ordered quantities, uniform in lightness and suited to colour-blind readers."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,9 @@ METHODS = {
     "pac_nerf_own": Look("#2d78ff", "<", (0, (1, 2, 4, 2))),
     "spring_gaus": Look(YELLOW, "X", (0, (3, 2))),
 }
-"""One look a method, everywhere."""
+"""Look of each method in all figures."""
 TRUE_PARTICLES = "#8c8c8c"
-"""The truth as shaded spheres, whose shading black would hide."""
+"""Colour of true particles as spheres. Black would hide their shading."""
 
 SETTINGS = {
     "font.family": "sans-serif",
@@ -100,12 +100,12 @@ SETTINGS = {
 
 
 def look(method: str) -> Look:
-    """The look of a method; a variant such as ``neuma+rank=4`` has that of its base, unknown ones are grey."""
+    """Look of a method. A variant such as ``neuma+rank=4`` has that of its base, unknown methods are grey."""
     return METHODS.get(method.partition("+")[0], Look(GREY))
 
 
 def styled(draw: Callable[..., Figure]) -> Callable[..., Figure]:
-    """Make a drawing function draw in this style, whatever the user's own settings of matplotlib are."""
+    """Decorate a drawing function to use this style instead of the user's settings of matplotlib."""
 
     @functools.wraps(draw)
     def inside(*args, **kwargs) -> Figure:
@@ -118,18 +118,24 @@ def styled(draw: Callable[..., Figure]) -> Callable[..., Figure]:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of a size in print [in] whose panels find their places without overlap."""
+    """An empty figure of a size in print [in] with automatic placement of its panels."""
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def new_canvas(width: float, height: float) -> Figure:
-    """An empty figure of a size in print [in] whose parts are placed by hand (`image_grid`)."""
+    """An empty figure of a size in print [in] with manual placement of its parts (`image_grid`)."""
     return Figure(figsize=(width, height))
 
 
 def scene_labels(scenes: Iterable[str], seen: Collection[str]) -> list[str]:
-    """Names of scenes, with a remark where images were measured in a view that training saw."""
+    """Names of scenes, with a remark for images measured in a training view."""
     return [f"{scene}\n(training view)" if scene in seen else scene for scene in scenes]
+
+
+def separate(axes: Axes, count: int) -> None:
+    """Draw vertical lines between ``count`` categories at 0, 1, ..."""
+    for edge in range(count - 1):
+        axes.axvline(edge + 0.5, color=LIGHT, linewidth=0.5)
 
 
 def legend_above(figure: Figure, axes: Axes, columns: int) -> None:
@@ -138,13 +144,13 @@ def legend_above(figure: Figure, axes: Axes, columns: int) -> None:
 
 
 def save(figure: Figure, *paths: str | Path) -> None:
-    """Write a figure; the ending of each path gives the format. The same figure gives the same bytes."""
+    """Write a figure. The suffix of each path gives the format. The same figure gives the same bytes."""
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(SETTINGS)
         for path in paths:
             kind = Path(path).suffix[1:]
-            # Dates and versions would make every file new.
+            # Without dates and versions, so that files are reproducible.
             nothing = {"pdf": {"CreationDate": None, "Producer": None}, "png": {"Software": None}}
             with atomic(path) as partial:
                 figure.savefig(partial, format=kind, dpi=DPI, metadata=nothing.get(kind))

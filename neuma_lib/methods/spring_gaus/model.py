@@ -8,7 +8,6 @@ from typing import Any
 import torch
 
 from neuma_lib.coupling.interpolation import Interpolation
-from neuma_lib.evaluation.motion import sound_frames
 from neuma_lib.io.weights import read_weights
 from neuma_lib.methods.model import MotionModel
 from neuma_lib.methods.spring_gaus.body import SpringBody
@@ -16,6 +15,7 @@ from neuma_lib.methods.spring_gaus.io import load_springs
 from neuma_lib.methods.spring_gaus.network import Springs
 from neuma_lib.methods.spring_gaus.rollout import SpringModel, spring_rollout
 from neuma_lib.sim.model import MPM
+from neuma_lib.sim.prediction import valid_frames
 from neuma_lib.sim.state import State, Trajectory
 
 
@@ -43,7 +43,7 @@ class SpringMotion(MotionModel):
             x, v, _ = spring_rollout(model, springs, *body.start(state), kept)
             return body.path(tuple(kept), x, v, follow(x)[0])
 
-        return sound_frames(simulate, frames)
+        return valid_frames(simulate, frames)
 
     def _on(self, state: State) -> tuple[SpringBody, Springs, dict[str, Any]]:
         index, springs, about = load_springs(self._path, state.x)

@@ -1,8 +1,7 @@
-"""The figures of the paper and two of our own: one module a figure.
+"""The figures of the paper and some of our own, one module for each.
 
-A module holds a figure's data and its drawing; a line of the table in ``workflow/rules/figure_table.smk`` says what
-it is made of. The docstring of the module is the figure's caption in the report (reStructuredText). ``data(inputs,
-params, say)`` gives what is shown: an `ImageGrid`, or plain numbers for a JSON file. ``inputs`` and ``params`` have
-the attributes that the table names, files as paths; ``say`` takes a line for the log. ``draw(data)`` gives the figure
-of matplotlib, from what was read back from the data file.
+The docstring of a module is the figure's caption in the report (reStructuredText). ``data(inputs, params, say)``
+returns the data of the figure, an `ImageGrid` or plain numbers for a JSON file. ``inputs`` and ``params`` have the
+attributes of the figure's entry in ``workflow/rules/figure_table.smk``, and ``say`` logs a line. ``draw(data)`` returns
+the figure of matplotlib, drawn from the data file.
 """

@@ -27,7 +27,7 @@ MARKERS = "osDv^P"
 def data(inputs, params, say) -> dict:
     """``scenes`` in order, ``titles`` {variant: name} and for each of `MEASURES` {variant: {scene: value}}.
 
-    ``seen``: scenes whose images were measured in a training view, for want of others.
+    ``seen``: scenes without other views than those of the training.
     """
     values = {
         "tracer_rmse_mm": (inputs.metrics, itemgetter("tracer_rmse_mm")),
@@ -44,7 +44,7 @@ def data(inputs, params, say) -> dict:
 
 @style.styled
 def draw(data: Mapping) -> Figure:
-    """One panel a measure; every variant has a point in every scene."""
+    """A panel for each measure, with a point for each variant and scene."""
     scenes, titles = data["scenes"], data["titles"]
     figure = style.new_figure(style.PAGE, 2.1)
     panels = figure.subplots(1, len(MEASURES))
@@ -65,7 +65,6 @@ def draw(data: Mapping) -> Figure:
         if measure != "psnr":
             axes.set_ylim(bottom=0)
         axes.grid(axis="y")
-        for edge in range(len(scenes) - 1):
-            axes.axvline(edge + 0.5, color=style.LIGHT, linewidth=0.5)
+        style.separate(axes, len(scenes))
     style.legend_above(figure, panels[0], len(titles))
     return figure

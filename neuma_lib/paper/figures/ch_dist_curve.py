@@ -39,7 +39,7 @@ def data(inputs, params, say) -> dict:
 
 @style.styled
 def draw(data: Mapping) -> Figure:
-    """Two panels a scene: rows of errors, and rows of distances below them."""
+    """Two panels for each scene: rows of errors, and rows of distances below them."""
     scenes = data["scenes"]
     columns = min(COLUMNS, len(scenes))
     rows = math.ceil(len(scenes) / columns)

@@ -19,7 +19,7 @@ LEFT, TOP, CURVE = 0.92, 0.2, 1.3
 def data(inputs, params, say) -> ImageGrid:
     """Columns are times, rows the truth and the methods.
 
-    Numbers: ``observed`` [s], ``time`` [s], ``titles`` and ``heights`` [m] by method, "truth" among them.
+    Numbers: ``observed`` [s], ``time`` [s], ``titles`` and ``heights`` [m] by method, including "truth".
     """
     names = ("x", "mass", "vol0", "frames")
     truth, attributes = read_arrays(inputs.truth, required=names, only=names)
@@ -54,7 +54,7 @@ def data(inputs, params, say) -> ImageGrid:
 
 @style.styled
 def draw(grid: ImageGrid) -> Figure:
-    """A row a method above the curves of all."""
+    """A row for each method above the curves of all."""
     numbers = grid.numbers
     width = style.PAGE - LEFT - 0.02
     below = TOP + len(grid.rows) * (grid.height(width) + GAP) + 0.12

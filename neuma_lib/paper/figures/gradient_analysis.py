@@ -20,21 +20,21 @@ NETWORKS = {"elastic": (style.BLUE, "-"), "plastic": (style.VERMILION, (0, (4, 1
 
 
 def data(inputs, params, say) -> dict:
-    """Of every scene ``norms`` {network: values an iteration}, ``change`` {network: ||W - W0|| / ||W0||}, ``wrong``.
+    """For each scene ``norms`` {network: a value per iteration} and ``change`` {network: ||W - W0|| / ||W0||}.
 
-    The last tells the laws of the prior that differ from the truth, as text.
+    ``wrong`` names the laws of the prior that differ from the truth.
     """
-    found = {}
+    scenes = {}
     for k, (scene, wrong) in enumerate(params.scenes.items()):
         history = read_json(inputs.history[k])
         law = load_law(inputs.prior[k], inputs.adaptor[k])
         norms = {name: history[f"gradient_norm_{name}"] for name in NETWORKS}
         change = {"elastic": _relative_change(law.elasticity), "plastic": _relative_change(law.plasticity)}
-        found[scene] = {"norms": norms, "change": change, "wrong": wrong}
+        scenes[scene] = {"norms": norms, "change": change, "wrong": wrong}
         middle = ", ".join(f"{median(values):.2f} {name}" for name, values in norms.items())
         moved = " and ".join(f"{100 * c:.1f} %" for c in change.values())
         say(f"{scene}: median gradient norm {middle}; weights moved {moved}")
-    return found
+    return scenes
 
 
 def _relative_change(part) -> float:
@@ -47,7 +47,7 @@ def _relative_change(part) -> float:
 def draw(data: Mapping) -> Figure:
     """Gradient norms over iterations, their medians, and the relative change of the weights.
 
-    Medians, because one unstable iteration would rule a mean.
+    Medians are insensitive to single unstable iterations.
     """
     scenes = list(data)
     figure = style.new_figure(style.PAGE, 1.8)
@@ -76,5 +76,5 @@ def draw(data: Mapping) -> Figure:
 
 
 def _on_two_lines(name: str) -> str:
-    """A name such as BouncyBall, broken before its second capital."""
+    """A name such as BouncyBall with a line break before its second capital."""
     return "".join("\n" + c if c.isupper() and i else c for i, c in enumerate(name))

@@ -13,19 +13,17 @@ from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.io.files import read_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.particles import load_body, load_motion
-from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images
+from neuma_lib.paper.image_grid import ImageGrid, rows_figure
 
 LEFT, TOP = 1.05, 0.2
 DENSITY = 1000.0
-"""Of all bodies [kg/m^3]: it does not show in pictures."""
-TALLEST, WIDEST = 1.5, 0.6
-"""Limits of a picture's height relative to its width."""
+"""Density of all bodies [kg/m^3]. It does not affect the pictures."""
 
 
 def data(inputs, params, say) -> ImageGrid:
-    """Rows are splats, each under all laws one after the other; columns are times.
+    """Rows are splats, each with all laws. Columns are times.
 
-    Numbers: ``laws``, the count of rows of a splat; ``diverged``, rows whose prediction broke off.
+    Numbers: ``laws``, number of rows of a splat; ``diverged``, rows with a prediction that stopped early.
     """
     laws, splats = len(params.laws), list(params.splats)
     files = zip(inputs.particles, inputs.binding, inputs.gaussians, strict=True)
@@ -37,8 +35,9 @@ def data(inputs, params, say) -> ImageGrid:
         motions.append([torch.as_tensor(state[shown]) for state in load_motion(file)])
     around = [rendering.seen_around(bodies[k // laws], *motion) for k, motion in enumerate(motions)]
     clouds = [np.concatenate(around[k : k + laws]) for k in range(0, len(around), laws)]
-    wide, high = np.max([np.ptp(cloud, axis=0)[:2] for cloud in clouds], axis=0)
-    width, height = params.size, round(params.size * float(np.clip(high / wide, WIDEST, TALLEST)))
+    width, height = rendering.picture_size(
+        *np.max([np.ptp(cloud, axis=0)[:2] for cloud in clouds], axis=0), params.size
+    )
     pictures, times = [], []
     for k, (arrays, attributes) in enumerate(paths):
         body, cameras = bodies[k // laws], rendering.frontal(clouds[k // laws], width, height)
@@ -55,11 +54,8 @@ def data(inputs, params, say) -> ImageGrid:
 
 @style.styled
 def draw(grid: ImageGrid) -> Figure:
-    """A row a splat and law; predictions that broke off are marked."""
-    width = style.PAGE - LEFT - 0.02
+    """A row for each splat and law. Predictions that stopped early are marked."""
     titles = [
         title + (", broke off" if k in grid.numbers["diverged"] else "") for k, title in enumerate(grid.rows)
     ]
-    figure = style.new_canvas(style.PAGE, TOP + len(titles) * (grid.height(width) + GAP) + 0.03)
-    draw_images(figure, grid.images, LEFT, TOP, width, titles, grid.columns)
-    return figure
+    return rows_figure(grid, LEFT, TOP, titles)

@@ -23,21 +23,21 @@ MEASURES = {
     "lpips_alex": "LPIPS (Alex) ↓",
 }
 SPREAD = 0.62
-"""Part of a scene's slot over which the methods stand side by side."""
+"""Share of a scene's slot that the methods fill side by side."""
 LEGEND_COLUMNS = 5
-"""Most names in a row of the legend."""
+"""Maximum number of names in a row of the legend."""
 
 
 def data(inputs, params, say) -> dict:
     """``titles`` {method: name}, ``scenes`` in order, and a {method: {scene: value}} for each of `MEASURES`.
 
-    ``seen``: scenes that have no view that a method's training did not see.
+    ``seen``: scenes without other views than those of the training.
     """
     cells = inputs.metrics, params.titles, params.scenes
     values = {measure: read_results(*cells, itemgetter(measure)) for measure in MEASURES}
-    found = read_results(*cells)
-    everywhere = seen_everywhere(found, params.scenes)
-    seen = seen_in_training({m: row for m, row in found.items() if m not in everywhere}, params.scenes)
+    metrics = read_results(*cells)
+    everywhere = seen_everywhere(metrics, params.scenes)
+    seen = seen_in_training({m: row for m, row in metrics.items() if m not in everywhere}, params.scenes)
     titles = {
         m: f"{title} (training views)" if m in everywhere else title for m, title in params.titles.items()
     }
@@ -47,7 +47,7 @@ def data(inputs, params, say) -> dict:
 
 @style.styled
 def draw(data: Mapping) -> Figure:
-    """One row a measure; every method has a point in every scene, and one for the mean over scenes."""
+    """A row for each measure, with a point for each method and scene, and one for the mean over scenes."""
     scenes, titles = list(data["scenes"]), data["titles"]
     figure = style.new_figure(style.PAGE, 0.4 + 1.15 * len(MEASURES))
     panels = figure.subplots(len(MEASURES), 1, sharex=True)
@@ -61,8 +61,7 @@ def draw(data: Mapping) -> Figure:
         axes.axvspan(len(scenes) - 0.5, len(scenes) + 0.5, color=style.LIGHT, alpha=0.6, linewidth=0)
         axes.set(ylabel=label, xlim=(-0.5, len(scenes) + 0.5))
         axes.grid(axis="y")
-        for edge in range(len(scenes) - 1):
-            axes.axvline(edge + 0.5, color=style.LIGHT, linewidth=0.5)
+        style.separate(axes, len(scenes))
     panels[-1].set_xticks(range(len(scenes) + 1), [*style.scene_labels(scenes, data["seen"]), "average"])
     figure.align_ylabels(panels)
     rows = -(-len(titles) // LEGEND_COLUMNS)

@@ -15,23 +15,23 @@ from matplotlib.figure import Figure
 
 from neuma_lib.device import choose_device
 from neuma_lib.evaluation.metrics import mean_height
-from neuma_lib.evaluation.motion import predict
 from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.laws import load_law
 from neuma_lib.io.particles import with_motion
 from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images, note, place
 from neuma_lib.sim.model import MPM
+from neuma_lib.sim.prediction import predict
 
 LEFT, LEGEND, TITLE, PICTURES, CURVES, BETWEEN = 0.5, 0.2, 0.34, 4.0, 1.85, 0.38
 APART = 0.002
-"""Before contact all motions are the same; their heights count from this distance on [m]."""
+"""Minimum difference of heights that counts [m]. Before contact, all motions are equal."""
 
 
 def data(inputs, params, say) -> ImageGrid:
-    """Rows scene by scene; columns are the weights and the observation.
+    """Rows are times, scene by scene. Columns are the weights and the observation.
 
-    Numbers: ``weights`` and ``scenes`` {scene: {rows, time [s], heights [m] a weight, truth [m]}}.
+    Numbers: ``weights`` and ``scenes`` {scene: {rows, time [s], heights [m] of each weight, truth [m]}}.
     """
     device = choose_device(params.device)
     blocks, rows, scenes = [], [], {}
@@ -70,9 +70,9 @@ def data(inputs, params, say) -> ImageGrid:
 
 
 def monotone_frames(heights: Sequence[Sequence[float]]) -> tuple[int, int]:
-    """In how many frames heights (W, T) [m] rise or fall with every step of the weight, and of how many.
+    """Number of frames in which heights (W, T) [m] are monotone in the weight, and number of frames that count.
 
-    Counted are frames whose heights are more than `APART` from each other.
+    Frames count if their heights differ by more than `APART`.
     """
     steps = np.diff(heights, axis=0)
     parted = np.ptp(heights, axis=0) > APART
@@ -82,7 +82,7 @@ def monotone_frames(heights: Sequence[Sequence[float]]) -> tuple[int, int]:
 
 @style.styled
 def draw(grid: ImageGrid) -> Figure:
-    """For each scene a column a weight, a row a time, and the mean heights beside them."""
+    """For each scene, a column for each weight, a row for each time, and the mean heights at the right."""
     numbers = grid.numbers
     heights = [scene["rows"] * (grid.height(PICTURES) + GAP) for scene in numbers["scenes"].values()]
     blocks = [max(h, 1.3) + TITLE + BETWEEN for h in heights]

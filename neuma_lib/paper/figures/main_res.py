@@ -17,7 +17,7 @@ LEFT, TOP, BETWEEN = 0.92, 0.3, 0.06
 
 
 def data(inputs, params, say) -> ImageGrid:
-    """A row for the observation and each method; ``groups`` in the numbers: (scene, its columns) in order."""
+    """A row for the observation and each method. Numbers: ``groups``, (scene, number of its columns) in order."""
     blocks, times, groups = [], [], []
     rollouts = iter(inputs.rollouts)
     for k, (scene, setting) in enumerate(params.scenes.items()):
@@ -38,14 +38,14 @@ def data(inputs, params, say) -> ImageGrid:
 
 
 def own_body(source, density):
-    """A body of particles that a method was fitted with."""
+    """The body of particles that a method was fitted with."""
     method = method_of(source["module"])
     return method.load_body(source["files"], source["options"][0], density, source["carrier"], "mean")
 
 
 @style.styled
 def draw(grid: ImageGrid) -> Figure:
-    """One block of columns a scene."""
+    """A block of columns for each scene."""
     groups = grid.numbers["groups"]
     width = (style.PAGE - LEFT - BETWEEN * (len(groups) - 1)) / len(grid.columns)
     height = grid.height(width, columns=1)

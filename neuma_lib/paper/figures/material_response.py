@@ -30,45 +30,46 @@ TESTS = {
     "yield": ("total shear", "shear stress"),
 }
 HEADROOM = 0.6
-"""How far the curves of compared laws may go beyond those of the truth, relative to the truth's; then they are cut."""
+"""Limit of the curves of compared laws beyond those of the truth, relative to the range of the truth."""
 
 
 def data(inputs, params, say) -> dict:
-    """Titles of the laws; of every scene the tests of `TESTS`: ``x``, ``visited`` (low, high), ``by_stress``, ``true``
-    [Pa] and ``laws``: of each its ``stress`` [Pa], ``title``, and ``band``, if there is one, with ``x``, ``low``,
-    ``high``, and ``inside``, the part of its visited points at which the truth lies in it.
+    """``titles`` of the laws, and ``scenes`` with the tests of `TESTS`.
+
+    A test has ``x``, ``visited`` (low, high), ``by_stress``, ``true`` [Pa] and ``laws`` with ``stress`` [Pa] and
+    ``band``: None, or ``x``, ``low``, ``high``, and ``inside``, the share of visited points with the truth in it.
     """
     files = iter(inputs.responses)
     runs = [(*cell, [read_json(next(files)) for _ in range(chains)]) for *cell, chains in params.cells]
-    found: dict = {}
+    scenes: dict = {}
     for scene, method, chains in runs:
         for test in TESTS:
             of_test = [chain[test] for chain in chains]
             first = of_test[0]
             shared = {key: first[key] for key in ("x", "visited", "by_stress", "true")}
-            entry = found.setdefault(scene, {}).setdefault(test, {**shared, "laws": {}})
+            entry = scenes.setdefault(scene, {}).setdefault(test, {**shared, "laws": {}})
             entry["laws"][method] = {"stress": first["stress"], "band": _band(of_test)}
-    gathered = {"titles": params.titles, "scenes": found}
-    for method, parts in covered(gathered).items():
+    content = {"titles": params.titles, "scenes": scenes}
+    for method, parts in covered(content).items():
         whole = sum(part == 1 for values in parts.values() for part in values)
         total = sum(map(len, parts.values()))
         say(f"{params.titles[method]}: the truth is inside {whole} of {total} bands everywhere")
-    return gathered
+    return content
 
 
 def covered(data: Mapping) -> dict[str, dict[str, list[float]]]:
-    """Of each law with bands and each scene, the parts of visited points of its tests at which the truth is inside."""
-    found: dict[str, dict[str, list[float]]] = {}
+    """Shares of visited points inside the band, {law: {scene: a value for each test}}, for laws with bands."""
+    shares: dict[str, dict[str, list[float]]] = {}
     for scene, tests in data["scenes"].items():
         for test in tests.values():
             for method, law in test["laws"].items():
                 if law["band"] and law["band"]["inside"] is not None:
-                    found.setdefault(method, {}).setdefault(scene, []).append(law["band"]["inside"])
-    return found
+                    shares.setdefault(method, {}).setdefault(scene, []).append(law["band"]["inside"])
+    return shares
 
 
 def _band(chains: Sequence[Mapping]) -> dict | None:
-    """The band of all chains of a law in a test; that of their curves where they have none."""
+    """The band of all replicates of a law in a test, or of their curves for laws without bands."""
     if all("band" in chain for chain in chains):
         x, ends = chains[0]["band"]["x"], [(chain["band"]["low"], chain["band"]["high"]) for chain in chains]
     elif len(chains) > 1:
@@ -76,13 +77,13 @@ def _band(chains: Sequence[Mapping]) -> dict | None:
     else:
         return None
     low, high = envelope(ends)
-    found = {"x": x, "low": low.tolist(), "high": high.tolist()}
-    return {**found, "inside": inside({**chains[0], "band": found})}
+    band = {"x": x, "low": low.tolist(), "high": high.tolist()}
+    return {**band, "inside": inside({**chains[0], "band": band})}
 
 
 @style.styled
 def draw(data: Mapping) -> Figure:
-    """A column a scene and a row a test."""
+    """A column for each scene and a row for each test."""
     scenes = data["scenes"]
     figure = style.new_figure(style.PAGE if len(scenes) > 2 else style.COLUMN, 0.35 + 1.25 * len(TESTS))
     panels = figure.subplots(len(TESTS), len(scenes), squeeze=False)
@@ -125,7 +126,7 @@ def _curves(axes, test: str, values: Mapping, titles: Mapping[str, str]) -> None
 
 
 def _ticks(test: str, x: np.ndarray) -> list[float]:
-    """Few and round: panels are narrow."""
+    """Few round ticks, because panels are narrow."""
     if test == "uniaxial":
         return [float(f"{1 + 0.6 * (x.min() - 1):.2g}"), 1.0]
     if test == "shear":

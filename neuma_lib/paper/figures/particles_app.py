@@ -9,13 +9,13 @@ from matplotlib.figure import Figure
 
 from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.io.hdf5 import read_arrays
-from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images
+from neuma_lib.paper.image_grid import ImageGrid, rows_figure
 
 LEFT, TOP = 0.92, 0.18
 
 
 def data(inputs, params, say) -> ImageGrid:
-    """A row for the truth and each method, a column a time."""
+    """A row for the truth and each method, a column for each time."""
     truth, _ = read_arrays(inputs.truth, required=("x", "vol0"), only=("x", "vol0", "frames"))
     simulated, _ = read_arrays(inputs.particles, required=("vol0",), only=("vol0",))
     shown = rendering.evenly(params.shown, len(truth["x"]))
@@ -38,8 +38,5 @@ def data(inputs, params, say) -> ImageGrid:
 
 @style.styled
 def draw(grid: ImageGrid) -> Figure:
-    """A row a method and a column a time."""
-    width = style.PAGE - LEFT - 0.02
-    figure = style.new_canvas(style.PAGE, TOP + len(grid.rows) * (grid.height(width) + GAP) + 0.03)
-    draw_images(figure, grid.images, LEFT, TOP, width, grid.rows, grid.columns)
-    return figure
+    """A row for each method, a column for each time."""
+    return rows_figure(grid, LEFT, TOP, grid.rows)

@@ -32,17 +32,17 @@ from neuma_lib.splatting.spherical_harmonics import rgb_to_sh0, sh0_to_rgb
 
 LEFT, RIGHT, HEAD, TITLES = 0.8, 0.42, 0.2, 0.16
 SHOWN = 5
-"""Pictures of every stage."""
+"""Number of pictures of each stage."""
 _SHRINK, _OPAQUE = 0.45, 0.8
-"""Size of Gaussians, relative to their own, and their smallest opacity, where each shall be seen."""
+"""Scale of the Gaussians, and their minimum opacity, in the picture that shows each of them."""
 _LIGHT = np.array([-0.45, 0.75, 0.5]) / np.linalg.norm([-0.45, 0.75, 0.5])
 """Direction to the light in the world (y up, the frontal camera at +z)."""
 _AMBIENT = 0.35
-"""Brightness of a face that the light does not reach."""
+"""Brightness of a face without light."""
 _NEUTRAL = np.array([0.72, 0.75, 0.80])
-"""Colour of what has none."""
+"""Colour of objects without one."""
 _THICKNESS = 1e-8
-"""Variance of the surface's splats across their faces [m^2]."""
+"""Variance of the splats of the surface normal to their faces [m^2]."""
 _STRONGEST = 0.95
 """Quantile of the stresses at the end of the colour map."""
 
@@ -50,7 +50,7 @@ _STRONGEST = 0.95
 def data(inputs, params, say) -> ImageGrid:
     """Rows: initial state, simulation, rendering, observation, difference.
 
-    Numbers: ``first``, titles of the pictures of the first row; ``heads``, what happens before each row.
+    Numbers: ``first``, titles of the pictures of the first row; ``heads``, the step before each row.
     """
     video, body, cameras = rendering.film(inputs, params, 0, params.scene["density"])
     law = load_law(inputs.prior[0], inputs.adaptor[0])
@@ -87,7 +87,7 @@ def data(inputs, params, say) -> ImageGrid:
 
 
 def _montage(images: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Four pictures (4, H, W, 3) as one (height, width, 3), white around them."""
+    """Join four pictures (4, H, W, 3) to one (height, width, 3) on white."""
     (images,) = rendering.cropped([images], margin=0.0)
     both = np.concatenate([np.concatenate(list(images[i : i + 2]), axis=1) for i in (0, 2)], axis=0)
     factor = min(height / both.shape[0], width / both.shape[1])
@@ -100,7 +100,7 @@ def _montage(images: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def _gaussians(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
-    """The Gaussians, shrunk so that each can be seen: uint8 (H, W, 3)."""
+    """The Gaussians, shrunk to be distinguishable: uint8 (H, W, 3)."""
     small = dataclasses.replace(gaussians, scales=_SHRINK * gaussians.scales)
     return _splat(small.means, small.covars(), small.opacities.clamp(min=_OPAQUE), small.sh(), cameras)
 
@@ -125,7 +125,7 @@ def _splat(means: Tensor, covars: Tensor, opacities: Tensor, sh: Tensor, cameras
 
 
 def _carried_colors(body: Reconstruction) -> np.ndarray:
-    """Mean colours (N, 3) of the Gaussians that particles carry, without their dependence on the view; else grey."""
+    """Mean view-independent colours (N, 3) of the Gaussians that particles carry, grey for particles without."""
     colors = sh0_to_rgb(body.gaussians.sh0[:, 0]).clamp(0, 1)
     binding, count = body.binding, len(body.x0)
     rows = torch.repeat_interleave(torch.arange(len(colors)), binding.counts)
@@ -139,11 +139,11 @@ def _carried_colors(body: Reconstruction) -> np.ndarray:
 def _stressed_particles(
     law: Law, body: Reconstruction, x: Tensor, F: Tensor, cameras: Cameras
 ) -> tuple[np.ndarray, float]:
-    """Particles coloured by the von Mises stress that a law gives them at states x (T, N, 3), F (T, N, 3, 3).
+    """Particles coloured by their von Mises stress under a law at states x (T, N, 3), F (T, N, 3, 3).
 
     Returns:
-        uint8 pictures (T, H, W, 3), and the stress at the end of the colour map [Pa]: the quantile `_STRONGEST` of
-        the states after the first.
+        uint8 pictures (T, H, W, 3), and the stress at the end of the colour map [Pa], the quantile `_STRONGEST` of the
+        states after the first.
     """
     weights = tuple(w.detach() for w in law.elasticity.weights())
     with torch.no_grad():
@@ -162,14 +162,14 @@ def _stressed_particles(
 
 
 def _difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Absolute difference of uint8 pictures, black where they differ most, white where they agree."""
+    """Absolute difference of uint8 pictures, from white (none) to black."""
     largest = np.abs(a.astype(np.int16) - b.astype(np.int16)).max(-1, keepdims=True)
     return 255 - largest.repeat(3, -1).astype(np.uint8)
 
 
 @style.styled
 def draw(grid: ImageGrid) -> Figure:
-    """A row a stage, arrows between them, and the gradient's way back."""
+    """A row for each stage, arrows between them, and the path of the gradient."""
     numbers = grid.numbers
     count = len(grid.columns)
     width = style.PAGE - LEFT - RIGHT
@@ -199,7 +199,7 @@ def draw(grid: ImageGrid) -> Figure:
 
 
 def _arrow(figure: Figure, start, end, color: str = style.GREY, bend: float = 0.0) -> None:
-    """An arrow between two points, inches from the upper left corner."""
+    """Draw an arrow between two points, in inches from the upper left corner."""
     width, height = figure.get_size_inches()
     ends = [(x / width, 1 - y / height) for x, y in (start, end)]
     look = {"arrowstyle": "-|>", "mutation_scale": 7, "color": color, "linewidth": 1.0, "zorder": 5}

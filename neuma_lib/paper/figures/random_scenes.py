@@ -30,7 +30,7 @@ def data(inputs, params, say) -> dict:
 
 @style.styled
 def draw(data: Mapping) -> Figure:
-    """One square panel with logarithmic axes and the diagonal."""
+    """A square panel with logarithmic axes and the diagonal."""
     figure = style.new_figure(style.COLUMN, style.COLUMN + 0.6)
     axes = figure.subplots()
     values = [v for scenes in data["families"].values() for point, _ in scenes.values() for v in point]
@@ -43,13 +43,13 @@ def draw(data: Mapping) -> Figure:
         broken = [point for point, failed in scenes.values() if failed]
         if broken:
             axes.plot(*zip(*broken), "x", color=style.BLACK, markersize=6)
-    prior, judged = data["titles"]
+    prior, method = data["titles"]
     axes.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high), aspect="equal")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(NullFormatter())
-    axes.set(xlabel=f"{prior}: tracer RMSE [mm]", ylabel=f"{judged}: tracer RMSE [mm]")
+    axes.set(xlabel=f"{prior}: tracer RMSE [mm]", ylabel=f"{method}: tracer RMSE [mm]")
     axes.grid()
     style.legend_above(figure, axes, 2)
     return figure

@@ -19,16 +19,16 @@ from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images, note
 
 LEFT, TOP, UNDER = 0.92, 0.3, 0.12
 DENSITY = 1000.0
-"""Of all bodies [kg/m^3]: it does not show in pictures."""
+"""Density of all bodies [kg/m^3]. It does not affect the pictures."""
 
 
 def data(inputs, params, say) -> ImageGrid:
-    """Blocks of rows are throws: the video, then each method; columns are times.
+    """Blocks of rows are takes: the video, then each method. Columns are times.
 
     Numbers: ``scenes``; ``measures``, for each scene and method PSNR [dB] and LPIPS.
     """
     blocks, times, measures = [], [], []
-    rollouts, found = iter(inputs.rollouts), iter(inputs.measures)
+    rollouts, files_of_measures = iter(inputs.rollouts), iter(inputs.measures)
     for k, setting in enumerate(params.scenes.values()):
         (video,) = load_videos(inputs.shown[k], [params.view], **setting["exposure"])
         files = (inputs.particles[k], inputs.binding[k], inputs.gaussians[k])
@@ -44,7 +44,7 @@ def data(inputs, params, say) -> ImageGrid:
             x, F = (renders.states(state.to(body.x0)) for state in load_motion(rollout))
             with torch.no_grad():
                 rows.append(rendering.as_bytes(renders(x, F)[:, 0]))
-            means = [read_json(next(found))["mean"] for _ in range(setting["cameras"])]
+            means = [read_json(next(files_of_measures))["mean"] for _ in range(setting["cameras"])]
             measures[-1].append([float(np.mean([m[key] for m in means])) for key in ("psnr", "lpips_vgg")])
         blocks.append(np.stack(rows))
         times.append(rendering.milliseconds(seen.frames, setting["dt"]))
@@ -57,20 +57,20 @@ def data(inputs, params, say) -> ImageGrid:
 
 
 def _one_size(blocks: list[np.ndarray]) -> np.ndarray:
-    """Blocks (1, R, C, H, W, 3) as one, padded with white at the right and below, with as many columns as all have."""
+    """Join blocks (1, R, C, H, W, 3), padded with white at the right and below, with their common number of columns."""
     columns = min(block.shape[2] for block in blocks)
     height, width = (max(block.shape[axis] for block in blocks) for axis in (3, 4))
-    found = []
+    joined = []
     for block in blocks:
         padded = np.full((*block.shape[1:2], columns, height, width, 3), 255, np.uint8)
         padded[:, :, : block.shape[3], : block.shape[4]] = block[0, :, :columns]
-        found.append(padded)
-    return np.concatenate(found)
+        joined.append(padded)
+    return np.concatenate(joined)
 
 
 @style.styled
 def draw(grid: ImageGrid) -> Figure:
-    """A block a throw, with its times above and the measures beside its rows."""
+    """A block for each take, with times above and measures next to its rows."""
     numbers, right = grid.numbers, 0.95
     width = style.PAGE - LEFT - right
     height = grid.height(width)

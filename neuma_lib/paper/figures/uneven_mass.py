@@ -17,7 +17,7 @@ from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images, note, place
 
 LEFT, TOP, BARS = 0.98, 0.2, 1.25
 PAPER = 1.33
-"""Chamfer distance of the paper [1e-4 m^2], which contains a sampling floor of its own."""
+"""Chamfer distance of the paper [1e-4 m^2], including the sampling floor of its particles."""
 
 
 def data(inputs, params, say) -> ImageGrid:
@@ -29,8 +29,8 @@ def data(inputs, params, say) -> ImageGrid:
     density = (body.mass / body.vol0).numpy()
     heavy = density > 0.5 * (density.min() + density.max())
     colors = np.where(heavy[:, None], to_rgb(style.ORANGE), to_rgb(style.SKY))
-    told, _ = motions[list(params.titles).index("neuma")]
-    pictures = [rendering.particle_pictures(told, colors, rendering.sphere_radius(body.vol0), cameras)]
+    known, _ = motions[list(params.titles).index("neuma")]
+    pictures = [rendering.particle_pictures(known, colors, rendering.sphere_radius(body.vol0), cameras)]
     pictures.append(rendering.observed(video, shown, params.magnify))
     pictures += [rendering.renders(body, cameras, *motion) for motion in motions]
     rows = [f"NeuMA's particles:\n{density.max():.0f} (orange) and\n{density.min():.0f} kg/m³", "Observation"]
@@ -49,7 +49,7 @@ def data(inputs, params, say) -> ImageGrid:
 
 @style.styled
 def draw(grid: ImageGrid) -> Figure:
-    """Rows of pictures and the error of each prediction beside its row."""
+    """Rows of pictures, with the error of each prediction next to its row."""
     numbers = grid.numbers
     width = style.PAGE - LEFT - BARS - 0.2
     high = len(grid.rows) * (grid.height(width) + GAP)

@@ -15,23 +15,20 @@ from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images, note
 
 LEFT, TOP, BETWEEN = 0.92, 0.36, 0.42
 DENSITY = 1000.0
-"""Of all bodies [kg/m^3]: it does not show in pictures."""
-TALLEST, WIDEST = 1.5, 0.6
-"""Limits of a picture's height relative to its width."""
+"""Density of all bodies [kg/m^3]. It does not affect the pictures."""
 
 
 def data(inputs, params, say) -> ImageGrid:
-    """Rows are the times of (a), a letter a column, and then the scenes of (b), a time a column.
+    """Rows are the times of (a), with a column for each letter, then the scenes of (b), with a column for each time.
 
-    Numbers: ``letters``, the count of rows of (a); ``materials``, one a letter; ``times``, column titles of (b).
+    Numbers: ``letters``, number of rows of (a); ``materials``, of the letters; ``times``, column titles of (b).
     """
     paths = [read_arrays(file, required=("x", "frames"), only=("x", "frames")) for file in inputs.rollouts]
     reconstructed = zip(inputs.particles, inputs.binding, inputs.gaussians, strict=True)
     bodies = [load_body(*files, DENSITY) for files in reconstructed]
     letters, count = len(params.letters), len(params.letters) or params.shown
     points = np.concatenate([arrays["x"].reshape(-1, 3) for arrays, _ in paths[:letters] or paths])
-    wide, high = np.ptp(points, axis=0)[:2]
-    width, height = params.size, round(params.size * float(np.clip(high / wide, WIDEST, TALLEST)))
+    width, height = rendering.picture_size(*np.ptp(points, axis=0)[:2], params.size)
 
     def filmed(k: int, cameras, shown) -> np.ndarray:
         motion = load_motion(inputs.rollouts[k])
@@ -64,7 +61,7 @@ def data(inputs, params, say) -> ImageGrid:
 
 @style.styled
 def draw(grid: ImageGrid) -> Figure:
-    """(a) a letter a column, time downwards, above (b) scenes of several bodies, time to the right."""
+    """(a) letters in columns, time downwards, above (b) scenes of several bodies, time to the right."""
     numbers = grid.numbers
     split = numbers["letters"]
     width = style.PAGE - LEFT - 0.02
