@@ -28,7 +28,7 @@ from benchmarks.timing import arithmetic, bandwidth, device_name, peak_memory, s
 from neuma_lib.config.training import TrainingConfig
 from neuma_lib.fitting.material import PixelLoss, train_material
 from neuma_lib.sim.memory import MemoryPlan
-from neuma_lib.sim.model import as_bodies
+from neuma_lib.sim.model import as_regions
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import Trajectory
@@ -70,7 +70,7 @@ def simulation_parts(scene: BenchmarkScene, device: torch.device) -> list[Part]:
     middle = size.steps // 2
     with torch.no_grad():
         path = _roll(scene, steps=middle, frames=(middle,))
-    bodies = as_bodies(law, N)
+    bodies = as_regions(law, N)
     weights, slices = gather_weights(bodies, torch.float32)
     flat = [w.detach() for w in weights]
     elastic, plastic = flat[:3], flat[3:]

@@ -24,7 +24,7 @@ from neuma_lib.mechanics.adaptor import AdaptableLaw
 from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.mechanics.structured import FORMS, structured_law
 from neuma_lib.sim.memory import MemoryPlan
-from neuma_lib.sim.model import MPM, as_bodies
+from neuma_lib.sim.model import MPM, as_regions
 from neuma_lib.sim.rollout import RolloutFunction, rollout
 from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import State
@@ -37,7 +37,7 @@ def rollout_step_by_step(model, law, state, frames):
     The same code as a rollout of one step after another: every node has its own buffers, keeps its state and
     computes the rest again. The adaptor is merged once, as in the rollout.
     """
-    bodies = as_bodies(law, len(state.x))
+    bodies = as_regions(law, len(state.x))
     weights, slices = gather_weights(bodies, state.x.dtype)
     now, seen = state.motion, []
     for n in range(1, frames[-1] + 1):

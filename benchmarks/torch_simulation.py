@@ -2,7 +2,7 @@
 
 import torch
 
-from neuma_lib.sim.model import as_bodies
+from neuma_lib.sim.model import as_regions
 
 
 def step(model, bodies, x, v, F, C, mass, vol0):
@@ -71,7 +71,7 @@ def rollout(model, law, state, frames, total=False):
 
     Each has the shape (T, N, ...).
     """
-    bodies = as_bodies(law, len(state.x))
+    bodies = as_regions(law, len(state.x))
     now, seen = state.motion, []
     F_total = (state.F,) if total else ()
     for n in range(frames[-1] + 1):

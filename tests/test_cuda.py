@@ -22,7 +22,7 @@ from neuma_lib.methods.pac_nerf.rendering import render as render_field
 from neuma_lib.methods.spring_gaus.body import SpringBody
 from neuma_lib.methods.spring_gaus.network import Springs
 from neuma_lib.methods.spring_gaus.rollout import SpringModel, spring_rollout
-from neuma_lib.sim.model import Body
+from neuma_lib.sim.model import MaterialRegion
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from neuma_lib.splatting import observation, rasterizer
@@ -165,7 +165,7 @@ def test_graphs_of_one_body_survive_a_rollout_of_two(drop):
     """Other weights at other places in between: nothing recorded may read the old ones."""
     law, arguments = drop
     count = len(arguments[2].x)
-    pair = [Body(law, 0, count // 2), Body(copy.deepcopy(law), count // 2, count)]
+    pair = [MaterialRegion(law, 0, count // 2), MaterialRegion(copy.deepcopy(law), count // 2, count)]
     x, grad = gradient(law, arguments)
     for _ in range(4):
         x_two, _ = gradient(law, (arguments[0], pair, *arguments[2:]))

@@ -188,8 +188,8 @@ def _better_later(running: Sequence[_Run]) -> list[tuple[_Run, _Run]]:
     """Pairs of a fit and a better one that started later: the best of all, and the best with the same constants."""
     ranked, pairs = sorted((run for run in running if run.alive), key=lambda run: run.fit.cost), []
     for at, run in enumerate(running):
-        alike = [other for other in ranked if other.family.constants == run.family.constants]
-        leaders = dict.fromkeys([*ranked[:1], *alike[:1]])
+        same = [other for other in ranked if other.family.constants == run.family.constants]
+        leaders = dict.fromkeys([*ranked[:1], *same[:1]])
         pairs += [(run, best) for best in leaders if run.alive and best in running[at + 1 :]]
     return pairs
 

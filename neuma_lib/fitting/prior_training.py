@@ -59,7 +59,7 @@ def evaluate_prior(
     spec: Mapping[str, Any],
     settings: RegressionConfig,
     seed: int = 0,
-    throws: int = 3,
+    launches: int = 3,
     frames: int = 20,
 ) -> dict[str, float]:
     """Deviation of rollouts of a law from those of the analytic law, on unseen motions.
@@ -71,7 +71,7 @@ def evaluate_prior(
     generator = torch.Generator().manual_seed(_EVALUATION_SEEDS + seed)
     chamfers, errors = [], []
     reference = reference_law(spec, settings)
-    for _ in range(throws):
+    for _ in range(launches):
         launch = random_launch(reference, generator, settings)
         steps = [round(i * launch.steps / frames) for i in range(1, frames + 1)]
         try:
@@ -85,7 +85,7 @@ def evaluate_prior(
         chamfers.append(float(chamfer_sequence(path.x, truth.x).mean()))
     rmse = torch.stack(errors)
     return {
-        "chamfer": sum(chamfers) / throws,
+        "chamfer": sum(chamfers) / launches,
         "rmse": float(rmse.mean()),
         "rmse_worst": float(rmse.max()),
     }

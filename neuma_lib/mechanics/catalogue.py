@@ -165,11 +165,11 @@ def check_law(spec: Mapping[str, Any], dt: float | None = None) -> dict[str, dic
         InputError: what `complete` refuses, or a constant is unknown, missing, no number or outside its interval.
     """
     parts = complete(spec, dt)
-    found = {}
+    checked = {}
     for part, known in (("elasticity", ELASTICITY), ("plasticity", PLASTICITY)):
         name = parts[part].pop("name")
-        found[part] = {"name": name, **check_constants(part, known[name], parts[part])}
-    return found
+        checked[part] = {"name": name, **check_constants(part, known[name], parts[part])}
+    return checked
 
 
 def check_constants(

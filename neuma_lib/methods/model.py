@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from neuma_lib.mechanics.law import Law
-from neuma_lib.sim.model import MPM, as_bodies, consecutive
+from neuma_lib.sim.model import MPM, as_regions, consecutive
 from neuma_lib.sim.prediction import Failure, predict
 from neuma_lib.sim.state import State, Trajectory
 
@@ -74,7 +74,7 @@ class LawOnGrid(MotionModel):
         return predict(mpm, self._bodies(state), state, frames, tracers, total)
 
     def courant(self, mpm: MPM, state: State) -> float:
-        bodies = as_bodies(self._bodies(state), len(state.x))
+        bodies = as_regions(self._bodies(state), len(state.x))
         return max(mpm.courant(b.law, float(state.density[b.start : b.stop].min())) for b in bodies)
 
     def _bodies(self, state: State):

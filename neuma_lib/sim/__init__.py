@@ -1,11 +1,11 @@
 """Differentiable material point method."""
 
-from neuma_lib.sim.model import MPM, Body, consecutive, contact_clearance
+from neuma_lib.sim.model import MPM, MaterialRegion, consecutive, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
 __all__ = [
-    "Body",
+    "MaterialRegion",
     "MPM",
     "State",
     "Trajectory",

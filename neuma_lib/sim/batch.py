@@ -9,7 +9,7 @@ import torch
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.mechanics.analytic_fused import fusible, side_by_side
 from neuma_lib.mechanics.law import Law
-from neuma_lib.sim.model import MPM, Body
+from neuma_lib.sim.model import MPM, MaterialRegion
 from neuma_lib.sim.rollout import check_inside, checked_frames, fly_and_simulate
 from neuma_lib.sim.state import State, Trajectory
 
@@ -82,13 +82,15 @@ def _side_by_side(
     """Simulate laws in the same launches, those with fused kernels first."""
     N, copies = len(starts[0].x), len(laws)
     fused = sum(map(fusible, laws))
-    bodies = [Body(law, copy * N, (copy + 1) * N) for copy, law in enumerate(laws) if copy >= fused]
+    regions = [
+        MaterialRegion(law, copy * N, (copy + 1) * N) for copy, law in enumerate(laws) if copy >= fused
+    ]
     if fused:
-        bodies.insert(0, Body(side_by_side(laws[:fused], starts[0].x.device), 0, fused * N))
+        regions.insert(0, MaterialRegion(side_by_side(laws[:fused], starts[0].x.device), 0, fused * N))
     state = State.joined(starts) if copies > 1 else starts[0]
     try:
         path, errors = fly_and_simulate(
-            model, tuple(bodies), state, frames, None, total, skip_free_flight, scatter, copies
+            model, tuple(regions), state, frames, None, total, skip_free_flight, scatter, copies
         )
     except NonFiniteError:
         return [None] * copies

@@ -7,13 +7,15 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from neuma_lib.sim.model import MPM, Body, contact_clearance, law_weights
+from neuma_lib.sim.model import MPM, MaterialRegion, contact_clearance, law_weights
 from neuma_lib.sim.state import State, Trajectory
 
 _MARGIN = 1e-3  # distance from the contact zone at which free flight ends [dx]
 
 
-def free_flight_steps(model: MPM, bodies: Sequence[Body], state: State, last: int, copies: int = 1) -> int:
+def free_flight_steps(
+    model: MPM, regions: Sequence[MaterialRegion], state: State, last: int, copies: int = 1
+) -> int:
     """Number of leading steps, at most `last`, in which only gravity acts and no particle deforms.
 
     Copies (see `kernels`) may have different velocities. The first contact of any copy ends free flight for all.
@@ -28,7 +30,7 @@ def free_flight_steps(model: MPM, bodies: Sequence[Body], state: State, last: in
         if not (F == torch.eye(3, dtype=F.dtype, device=F.device)).all() or C.any():
             return 0
         clear = _clear_of_walls(model, x.unflatten(0, (copies, -1)), v[:, :1], last)
-        if clear and not all(_at_rest(model, body, state, len(x) // copies) for body in bodies):
+        if clear and not all(_at_rest(model, region, state, len(x) // copies) for region in regions):
             return 0
     return clear
 
@@ -43,17 +45,17 @@ def _clear_of_walls(model: MPM, x0: Tensor, v0: Tensor, last: int) -> int:
     return int(touching.int().argmax()) if touching.any() else last
 
 
-def _at_rest(model: MPM, body: Body, state: State, copy: int) -> bool:
+def _at_rest(model: MPM, region: MaterialRegion, state: State, copy: int) -> bool:
     """Whether the law preserves F = I, with a stress that has no effect in a step beyond round-off.
 
-    The law of a body that spans several copies, of ``copy`` particles each, may differ from copy to copy.
+    The law of a region that spans several copies, of ``copy`` particles each, may differ from copy to copy.
     """
-    x0, firsts = state.x, slice(body.start, body.stop, copy)
+    x0, firsts = state.x, slice(region.start, region.stop, copy)
     mass, vol0 = state.mass[firsts], state.vol0[firsts]
     eye = torch.eye(3, dtype=x0.dtype, device=x0.device).repeat(len(mass), 1, 1)
-    elastic, plastic = law_weights(body.law, x0.dtype)
-    tau = body.law.elasticity.evaluate(eye, elastic)
-    F = body.law.plasticity.evaluate(eye, plastic)
+    elastic, plastic = law_weights(region.law, x0.dtype)
+    tau = region.law.elasticity.evaluate(eye, elastic)
+    F = region.law.plasticity.evaluate(eye, plastic)
     eps = torch.finfo(x0.dtype).eps
     kick = float((tau.abs().amax(dim=(1, 2)) * vol0 / mass).max()) * model.dt / model.dx
     return kick <= eps and float((F - eye).abs().max()) <= 4 * eps

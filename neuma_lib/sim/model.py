@@ -134,7 +134,7 @@ class MPM:
 
 
 @dataclass(frozen=True)
-class Body:
+class MaterialRegion:
     """Particles ``start`` to ``stop`` (excluded) follow ``law``."""
 
     law: Law
@@ -148,32 +148,32 @@ def law_weights(law: Law, dtype: torch.dtype) -> tuple[Weights, Weights]:
     return tuple(w.to(dtype) for w in elastic), tuple(w.to(dtype) for w in plastic)
 
 
-def as_bodies(law: Law | Sequence[Body], count: int) -> tuple[Body, ...]:
-    """Bodies that cover `count` particles in order. A single law applies to all particles.
+def as_regions(law: Law | Sequence[MaterialRegion], count: int) -> tuple[MaterialRegion, ...]:
+    """Regions that cover `count` particles in order. A single law applies to all particles.
 
     Raises:
         InputError: the ranges overlap, have a gap, or do not end at `count`.
     """
     if isinstance(law, Law):
-        return (Body(law, 0, count),)
-    bodies = tuple(law)
+        return (MaterialRegion(law, 0, count),)
+    regions = tuple(law)
     expected = 0
-    for body in bodies:
-        if body.start != expected or body.stop <= body.start:
+    for region in regions:
+        if region.start != expected or region.stop <= region.start:
             raise InputError(
-                f"body {body.law.name!r}",
-                f"particles {body.start} to {body.stop} must be a range that starts at {expected}",
+                f"region {region.law.name!r}",
+                f"particles {region.start} to {region.stop} must be a range that starts at {expected}",
             )
-        expected = body.stop
+        expected = region.stop
     if expected != count:
-        raise InputError("bodies", f"particles 0 to {expected} must be all of the {count} particles")
-    return bodies
+        raise InputError("regions", f"particles 0 to {expected} must be all of the {count} particles")
+    return regions
 
 
-def consecutive(laws: Sequence[Law], counts: Sequence[int]) -> tuple[Body, ...]:
-    """Consecutive bodies with the given laws and numbers of particles."""
+def consecutive(laws: Sequence[Law], counts: Sequence[int]) -> tuple[MaterialRegion, ...]:
+    """Consecutive regions with the given laws and numbers of particles."""
     ends = list(accumulate(counts))
-    return tuple(Body(law, end - n, end) for law, n, end in zip(laws, counts, ends, strict=True))
+    return tuple(MaterialRegion(law, end - n, end) for law, n, end in zip(laws, counts, ends, strict=True))
 
 
 def contact_clearance(model: MPM, x: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.mechanics.law import Law
-from neuma_lib.sim.model import MPM, Body
+from neuma_lib.sim.model import MPM, MaterialRegion
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, Trajectory
 
@@ -32,7 +32,7 @@ class Failure:
 
 def predict(
     model: MPM,
-    law: Law | Sequence[Body],
+    law: Law | Sequence[MaterialRegion],
     start: State,
     frames: Sequence[int],
     tracers: Tensor | None = None,

@@ -16,14 +16,14 @@ from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.free_flight import ballistic, free_flight_steps
 from neuma_lib.sim.memory import DEFAULT_CACHE_BYTES, plan_memory
-from neuma_lib.sim.model import MPM, Body, as_bodies
+from neuma_lib.sim.model import MPM, MaterialRegion, as_regions
 from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import State, Trajectory
 
 
 def rollout(
     model: MPM,
-    law: Law | Sequence[Body],
+    law: Law | Sequence[MaterialRegion],
     state: State,
     *,
     steps: int,
@@ -42,7 +42,7 @@ def rollout(
 
     Args:
         model: grid, time step, gravity and walls.
-        law: law of all particles, or bodies that each have a law and a range of particles on one grid.
+        law: law of all particles, or regions with their own laws.
         state: initial state of N particles.
         steps: number of time steps, not less than the last frame, at which the simulation ends.
         frames: steps whose states are returned, strictly increasing, 0 is the initial state.
@@ -59,12 +59,12 @@ def rollout(
         scatter: scatter method, see `scatter`. None chooses the fastest.
 
     Raises:
-        InputError: invalid frames, tracers or bodies, or a particle starts outside the grid.
+        InputError: invalid frames, tracers or regions, or a particle starts outside the grid.
         NonFiniteError: a particle became non-finite, moved by more than a cell in a step or left the grid; has
             `step` and `particle`.
     """
     frames = checked_frames(frames, steps)
-    bodies = as_bodies(law, len(state.x))
+    regions = as_regions(law, len(state.x))
     check_inside(model, state.x)
     if tracers is not None and (tracers.ndim != 2 or tracers.shape[1] != 3 or tracers.dtype != state.x.dtype):
         given = f"shape {tuple(tracers.shape)} as {tracers.dtype}"
@@ -72,14 +72,14 @@ def rollout(
 
     plan = dict(memory=memory, cache_bytes=cache_bytes)
     path, _ = fly_and_simulate(
-        model, bodies, state, frames, tracers, total, skip_free_flight, scatter, **plan
+        model, regions, state, frames, tracers, total, skip_free_flight, scatter, **plan
     )
     return path
 
 
 def simulate(
     mpm: MPM,
-    law: Law | Sequence[Body],
+    law: Law | Sequence[MaterialRegion],
     state: State,
     frames: Sequence[int],
     *,
@@ -93,7 +93,7 @@ def simulate(
 
     Args:
         mpm: grid, time step, gravity and walls.
-        law: law of all particles, or one `Body` per range of particles.
+        law: law of all particles, or one `MaterialRegion` per range of particles.
         state: initial state of N particles.
         frames: time steps whose states are returned, strictly increasing, 0 is the initial state.
         tracers: positions of passive points that follow the velocity of the grid [m], shape (M, 3).
@@ -118,7 +118,7 @@ def simulate(
 
 def fly_and_simulate(
     model: MPM,
-    bodies: tuple[Body, ...],
+    regions: tuple[MaterialRegion, ...],
     state: State,
     frames: tuple[int, ...],
     tracers: Tensor | None = None,
@@ -134,7 +134,7 @@ def fly_and_simulate(
     Returns one error per copy, or None. The states of a copy with an error are undefined. If all copies have one, the
     first is raised.
     """
-    first = free_flight_steps(model, bodies, state, frames[-1], copies) if skip_free_flight else 0
+    first = free_flight_steps(model, regions, state, frames[-1], copies) if skip_free_flight else 0
     start = (*state.motion, state.F) if total else state.motion
     in_flight = sum(n < first for n in frames)
     parts, errors = [], [None] * copies
@@ -147,7 +147,7 @@ def fly_and_simulate(
             tracers = None if tracers is None else landed.tracers[0]
         plan = dict(memory=memory, cache_bytes=cache_bytes)
         path, errors = _simulate(
-            model, bodies, state, start, tracers, first, frames[in_flight:], scatter, copies, **plan
+            model, regions, state, start, tracers, first, frames[in_flight:], scatter, copies, **plan
         )
         parts.append(path)
     return parts[0] if len(parts) == 1 else parts[0].followed_by(parts[1]), errors
@@ -155,7 +155,7 @@ def fly_and_simulate(
 
 def _simulate(
     model: MPM,
-    bodies: tuple[Body, ...],
+    regions: tuple[MaterialRegion, ...],
     state: State,
     start: tuple[Tensor, ...],
     tracers: Tensor | None,
@@ -168,14 +168,14 @@ def _simulate(
 ) -> tuple[Trajectory, list[NonFiniteError | None]]:
     """Simulate from (x, v, F, C) and optionally F_total at step `first` to the last frame."""
     x, steps, total = state.x, frames[-1] - first, len(start) == 5
-    weights, slices = gather_weights(bodies, x.dtype)
+    weights, slices = gather_weights(regions, x.dtype)
     inputs = (*start, *weights)
     plan = None
     if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
         cache_bytes = DEFAULT_CACHE_BYTES[x.device.type] if cache_bytes is None else cache_bytes
         nodes = copies * model.nodes**3
         plan = plan_memory(steps, len(x), nodes, x.element_size(), cache_bytes, memory, total)
-    simulation = Simulation(model, bodies, slices, state, steps, first, plan, scatter, total, copies)
+    simulation = Simulation(model, regions, slices, state, steps, first, plan, scatter, total, copies)
     *states, seen = RolloutFunction.apply(simulation, [n - first for n in frames], tracers, *inputs)
     return Trajectory(frames, *states[:4], seen, *states[4:]), simulation.errors
 

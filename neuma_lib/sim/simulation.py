@@ -20,7 +20,7 @@ from neuma_lib.errors import NonFiniteError
 from neuma_lib.mechanics.law import Constitutive, Weights
 from neuma_lib.sim.kernels import NO_FAULT
 from neuma_lib.sim.memory import MemoryPlan
-from neuma_lib.sim.model import MPM, Body, law_weights
+from neuma_lib.sim.model import MPM, MaterialRegion, law_weights
 from neuma_lib.sim.scatter import scatter_for
 from neuma_lib.sim.state import State
 from neuma_lib.sim.workspace import Workspace, WorkspaceSize, pooled_workspace
@@ -29,11 +29,11 @@ PARTS = ("elasticity", "plasticity")
 
 
 def gather_weights(
-    bodies: Sequence[Body], dtype: torch.dtype
+    regions: Sequence[MaterialRegion], dtype: torch.dtype
 ) -> tuple[list[Tensor], dict[tuple[int, str], slice]]:
     """Weights of all laws in one list, and the slice of each part by (id(law), part)."""
     weights, slices = [], {}
-    for law in {id(body.law): body.law for body in bodies}.values():
+    for law in {id(region.law): region.law for region in regions}.values():
         for part, own in zip(PARTS, law_weights(law, dtype), strict=True):
             slices[id(law), part] = slice(len(weights), len(weights) + len(own))
             weights += own
@@ -47,7 +47,7 @@ class Simulation:
     the last one is, and segments end at the frames. On a GPU a segment in one direction is a CUDA graph (`GraphCache`).
 
     Args:
-        model, bodies: as in `rollout`.
+        model, regions: see `rollout`.
         weight_slices: second result of `gather_weights`; the weights are an argument of each call.
         state: number of particles, masses and volumes, precision and device.
         steps: number of steps.
@@ -64,7 +64,7 @@ class Simulation:
     def __init__(
         self,
         model: MPM,
-        bodies: Sequence[Body],
+        regions: Sequence[MaterialRegion],
         weight_slices: dict[tuple[int, str], slice],
         state: State,
         steps: int,
@@ -74,7 +74,7 @@ class Simulation:
         total: bool = False,
         copies: int = 1,
     ):
-        self.model, self.bodies, self.steps, self.first, self.plan = model, bodies, steps, first, plan
+        self.model, self.regions, self.steps, self.first, self.plan = model, regions, steps, first, plan
         x = state.x
         scatter = scatter or scatter_for(x.device, x.dtype)
         size = WorkspaceSize(model, len(x), x.dtype, x.device, total=total, copies=copies, scatter=scatter)
@@ -92,10 +92,10 @@ class Simulation:
         self._cached: set[tuple] = set()  # evaluations of laws with valid caches
         self._segment_in_memory = 0
         self._weight_slices = weight_slices
-        laws = [getattr(body.law, part) for body in bodies for part in PARTS]
+        laws = [getattr(region.law, part) for region in regions for part in PARTS]
         self._uses_graphs = x.device.type == "cuda" and all(law.capturable for law in laws)
         self.errors: list[NonFiniteError | None] = [None] * copies
-        self._graph_key = tuple((b.start, b.stop) for b in bodies), tuple(law.graph_key() for law in laws)
+        self._graph_key = tuple((b.start, b.stop) for b in regions), tuple(law.graph_key() for law in laws)
 
     def run(
         self,
@@ -191,7 +191,7 @@ class Simulation:
 
     def step_adjoint(self, n: int, weights: Sequence[Tensor], sums: Mapping[str, Sequence[Weights]]) -> None:
         """From gradients of state n + 1, in the workspace, to those of state n. Gradients of the weights are added to
-        `sums`, the `Constitutive.accumulators` of all bodies by part of the law."""
+        `sums`, the `Constitutive.accumulators` of all regions by part of the law."""
         ws = self.workspace
         cached = ws.cached_at(n)
         F, F_trial = ws.F[ws.at(n)], ws.F_trial[cached]
@@ -276,7 +276,7 @@ class Simulation:
     def _evaluate(
         self, part: str, n: int, F: Tensor, weights: Sequence[Tensor], out: Tensor, fill_cache: bool = False
     ) -> None:
-        """Evaluate elasticity or plasticity of every body, with a cache for `_vjp` if requested or if it fits."""
+        """Evaluate elasticity or plasticity of every region, with a cache for `_vjp` if requested or if it fits."""
         for law, here, own, key in self._laws(part, n):
             if fill_cache or self._law_cache_bytes > 0:
                 caches = self.workspace.law_caches
@@ -310,15 +310,17 @@ class Simulation:
             )
 
     def _laws(self, part: str, n: int) -> list[tuple[Constitutive, slice, slice, tuple]]:
-        """For every body: law, slice of particles, slice of weights, and key of the cache in step n.
+        """For every region: law, slice of particles, slice of weights, and key of the cache in step n.
 
         Laws of the same type with the same particles can reuse a cache.
         """
         laws = []
-        for body in self.bodies:
-            law = getattr(body.law, part)
-            key = (type(law), body.start, body.stop, self.workspace.cached_at(n))
-            laws.append((law, slice(body.start, body.stop), self._weight_slices[id(body.law), part], key))
+        for region in self.regions:
+            law = getattr(region.law, part)
+            key = (type(law), region.start, region.stop, self.workspace.cached_at(n))
+            laws.append(
+                (law, slice(region.start, region.stop), self._weight_slices[id(region.law), part], key)
+            )
         return laws
 
     def _find_errors(self, faults: Tensor, F: Tensor) -> None:
@@ -338,7 +340,7 @@ class Simulation:
         if fault == NO_FAULT:
             return None
         step, particle = self.first + (fault >> 31) + 1, fault & (1 << 31) - 1
-        law = next(body.law for body in self.bodies if body.start <= particle < body.stop)
+        law = next(region.law for region in self.regions if region.start <= particle < region.stop)
         happened = {
             not_finite: "became non-finite",
             too_fast: "moved by more than a cell in a step",

@@ -8,7 +8,7 @@ from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.analytic_fused import fusible, side_by_side
 from neuma_lib.sim.batch import rollout_batch
 from neuma_lib.sim.memory import MemoryPlan
-from neuma_lib.sim.model import MPM, Body
+from neuma_lib.sim.model import MPM, MaterialRegion
 from neuma_lib.sim.rollout import RolloutFunction, rollout
 from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import State
@@ -165,7 +165,7 @@ def test_gradients_of_copies_are_those_of_each():
     own = make_law("hencky")
 
     def gradients(state, copies):
-        bodies = (Body(own, 0, len(state.x)),)
+        bodies = (MaterialRegion(own, 0, len(state.x)),)
         weights, slices = gather_weights(bodies, state.x.dtype)
         plan = MemoryPlan(FRAMES[-1], True, 0)
         simulation = Simulation(MODEL, bodies, slices, state, FRAMES[-1], plan=plan, copies=copies)

@@ -7,7 +7,7 @@ import torch
 
 from benchmarks import torch_simulation
 from neuma_lib.sim.memory import MemoryPlan, plan_memory
-from neuma_lib.sim.model import MPM, Body, contact_clearance
+from neuma_lib.sim.model import MPM, MaterialRegion, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
@@ -243,7 +243,7 @@ def test_several_bodies_equal_torch_twin():
     model, start, mass, vol0 = corner()
     law, other = make_law("neural"), make_law("hencky")
     parameters = trainable(law)
-    bodies = [Body(law, 0, 25), Body(other, 25, 40), Body(law, 40, COUNT)]
+    bodies = [MaterialRegion(law, 0, 25), MaterialRegion(other, 25, 40), MaterialRegion(law, 40, COUNT)]
 
     _, grads = gradients(model, bodies, start, mass, vol0, (10,), parameters)
     _, expected = gradients(model, bodies, start, mass, vol0, (10,), parameters, run=simulate_slowly)

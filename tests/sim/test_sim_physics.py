@@ -7,7 +7,7 @@ from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Law, Plasticity
 from neuma_lib.sim.free_flight import free_flight_steps
-from neuma_lib.sim.model import MPM, WALLS, Body, as_bodies, contact_clearance
+from neuma_lib.sim.model import MPM, WALLS, MaterialRegion, as_regions, contact_clearance
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State, cross_matrix
 from neuma_lib.sim.workspace import Workspace, WorkspaceSize
@@ -129,7 +129,7 @@ def test_free_rotation_of_a_stiff_cube():
     vol0 = torch.full((len(x0),), 0.2**3 / len(x0), dtype=x0.dtype)
     velocity, spin = torch.tensor([[0.2, 0.4, -0.1], [1.5, -2.0, 2.5]], dtype=x0.dtype)
     model, state = MPM(16, dt), State.rigid(x0, DENSITY * vol0, vol0, velocity, spin)
-    assert not free_flight_steps(model, as_bodies(law, len(x0)), state, steps)
+    assert not free_flight_steps(model, as_regions(law, len(x0)), state, steps)
     path = rollout(model, law, state, steps=steps, frames=(steps,))
     assert contact_clearance(model, path.x) > 0
     t, gravity = steps * dt, torch.tensor(model.gravity)
@@ -258,7 +258,7 @@ def test_bodies_apart_do_not_feel_each_other():
         for law, (x0, mass, vol0) in zip(laws, starts, strict=True)
     ]
     x0, mass, vol0 = (torch.cat(parts) for parts in zip(*starts, strict=True))
-    bodies = [Body(laws[0], 0, 200), Body(laws[1], 200, 400)]
+    bodies = [MaterialRegion(laws[0], 0, 200), MaterialRegion(laws[1], 200, 400)]
     both = rollout(model, bodies, State(x0, v0, mass, vol0), steps=60, frames=frames)
     for field in ("x", "v", "F", "C"):
         separate = torch.cat([getattr(path, field) for path in alone], dim=1)
@@ -275,7 +275,7 @@ def test_bodies_collide():
     right = left + torch.tensor([0.28, 0.0, 0.0], dtype=left.dtype)
     v0 = torch.zeros(400, 3, dtype=left.dtype)
     v0[:200, 0] = 2.0
-    bodies = [Body(make_law("hencky"), 0, 200), Body(make_law("neo_hookean"), 200, 400)]
+    bodies = [MaterialRegion(make_law("hencky"), 0, 200), MaterialRegion(make_law("neo_hookean"), 200, 400)]
     masses = mass.repeat(2)
     state = State(torch.cat([left, right]), v0, masses, vol0.repeat(2))
     path = rollout(WEIGHTLESS, bodies, state, steps=80, frames=(0, 80))
@@ -351,8 +351,16 @@ def test_wrong_model_is_named(settings, where):
         (dict(frames=lambda x: (3, 2)), "frames"),
         (dict(frames=lambda x: (0, 21)), "frames"),
         (dict(tracers=lambda x: x[:, :2]), "tracers"),
-        (dict(law=lambda x: [Body(make_law("hencky"), 0, 299)]), "bodies"),
-        (dict(law=lambda x: [Body(make_law("hencky"), 0, 200), Body(make_law("hencky"), 199, 300)]), "body"),
+        (dict(law=lambda x: [MaterialRegion(make_law("hencky"), 0, 299)]), "regions"),
+        (
+            dict(
+                law=lambda x: [
+                    MaterialRegion(make_law("hencky"), 0, 200),
+                    MaterialRegion(make_law("hencky"), 199, 300),
+                ]
+            ),
+            "region",
+        ),
     ],
 )
 def test_wrong_start_is_named(change, where):
