@@ -1,5 +1,6 @@
 """A method and a law in files of the user, from the settings to a row of a table."""
 
+import csv
 import json
 
 import pytest
@@ -92,7 +93,7 @@ def test_a_method_in_a_file_gets_a_row_of_a_table(project):
         for name in ("brightness", "brightness+scale=100000")
     ]
     assert moduli[0] == pytest.approx(2 * moduli[1]) and f"E = {moduli[0]:.4g} Pa" in output
-    rows = [line.split(",") for line in (project.root / TABLE).read_text().splitlines()]
+    rows = list(csv.reader((project.root / TABLE).read_text().splitlines()))
     errors = {row[1]: float(row[3]) for row in rows if row[0] == "tracer_rmse_mm"}
     assert [*errors] == ["nclaw", "brightness", "brightness+scale=100000"]
     assert errors["brightness"] != errors["brightness+scale=100000"]
