@@ -85,6 +85,6 @@ def test_a_failing_stage_leaves_nothing_half_written(project, mug):
     assert "photos/a.png" in said and "Traceback" not in said
     (mug / "videos/left.mp4").write_text("no video")
     said = project.run("tiny/results/mug/frames/first/left.json", succeeds=False)
-    assert "left.mp4 cannot be read as a video" in said
+    assert "left.mp4: cannot be read as a video" in said
     made = (project.root / "tiny/results/mug").rglob("*")
     assert not [file for file in made if file.is_file()]
