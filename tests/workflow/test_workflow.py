@@ -239,7 +239,7 @@ def test_pac_nerf_is_judged_and_shown_on_its_own_particles(clone):
     targets = ("--config", *small, "--", *files, "tiny/results/figures/main_res.png")
     said = clone.run(*targets)
     assert clone.plan(*targets) == {}
-    moving, shown = re.search(r"(\d+) of (\d+) particles move", said).groups()
+    moving, shown = re.search(r"(\d+) of (\d+) particles simulated", said).groups()
     x = read_arrays(clone.root / SCENE / own / "rollout.h5", only=("x",))[0]["x"]
     shared = read_arrays(clone.root / SCENE / "neuma" / "rollout.h5", only=("x",))[0]["x"]
     assert x.shape == (7, int(moving), 3) and int(moving) < int(shown)
