@@ -82,7 +82,7 @@ def learned(scenes, method="neuma"):
     return {
         "kernels": kernels("laws"),
         "prior": [law["prior"] for law in laws if "prior" in law],
-        "adaptor": [law["adaptor"] for law in laws],
+        "adaptor": of_methods(scenes, [method], "adaptor.safetensors"),
     }
 
 
