@@ -81,5 +81,7 @@ use rule predict as predict_splat with:
         carrier=of_bodies(shared_carrier),
         frames=splat_frames,
         cameras=None,
+        scale=None,
+        exposure=None,
         device=SETTINGS.device,
         code=code_of("predict.py"),
