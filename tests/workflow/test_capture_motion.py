@@ -162,6 +162,8 @@ def test_bad_videos_and_masks_end_with_one_line(project):
     (mug / "videos/left.mp4").write_bytes(video)
     (mug / "masks/first/left").mkdir(parents=True)
     Image.new("L", (800, 600), 255).save(mug / "masks/first/left/900.png")
-    assert "900.png: it must be named after a frame of the video, 0 to 39" in project.run(left, succeeds=False)
+    assert "900.png: it must be named after a frame of the video, 0 to 39" in project.run(
+        left, succeeds=False
+    )
     assert not (project.root / left).exists()
     assert not (project.root / "tiny/data/mug/videos/first/left/transforms.json").exists()
