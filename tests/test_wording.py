@@ -67,12 +67,13 @@ IDENTIFIERS = {
 
 # English words that are no names of variables, functions or classes: pattern of their use as one.
 _VARIABLE = r"(?<![\w-])(?:{0}(?=\s*(?:(?:[-+*/|&]|//)?=(?!=)|\[|\.[a-z]|,\s*\w+\s*=))|for {0} in\b|{0}_\w+|\w+_{0}\b)"
+_ALONE = r"(?<![\w-]){0}(?=\s*(?:(?:[-+*/|&]|//)?=(?!=)|\[|\.[a-z]|,\s*\w+\s*=))"
 _CALLED = r"(?<![\w-])\w*{0}\("
 _CLASS = r"\b(?:class {0}|{0}(?=[]()]))"
 NAMES = {
     "found": (_VARIABLE, "the name of the object"),
     "shown": (_VARIABLE, "displayed, visible, selected, or the name of the object"),
-    "finer further apart filming": (_VARIABLE, "refined, other_*, separate_adaptor, exposure"),
+    "finer further apart filming": (_ALONE, "refined, other_*, separate_adaptor, exposure"),
     "forget": (_CALLED, "clear_cache"),
     "reconsider": (_CALLED, "restart_from"),
     "disagree": (_CALLED, "widen_by_ties"),
@@ -86,13 +87,14 @@ NAMES = {
 ALLOWED = {
     r"throw new |throw e\b": "statements of JavaScript",
     r"chain rule|import chain|\bchain\(|chain\.from_iterable": "names of analysis and of Python",
-    r"finer_truth|\w+_finer\b": "names of a table and of its scenes",
     r"arc3,rad": "an argument of matplotlib",
     r"three_chains|table1_chains|two_throws\w*": "names of settings and of result files",
-    r"\byardstick(?:\.\w+\b|(?=[\"':,}])| in )": "name of a table",
+    r"\byardstick(?:\.\w+\b|(?=[\"':,}\]])| in )": "name of a table",
+    r"_throw\d|figures\.beside|\bbeside(?:: tuple|: \[|(?=[\"'`]))": "names of scenes and of a setting",
+    r"from outlines|gravity in outlines|down in outlines": "rows of the table captures_demo",
     r"\bthrows?(?::|\.<name>|(?=[\"'`]))|(?:captures?|settings|regression)\.throws": "names of settings",
     r"springs\.carriers|carriers(?:: int|(?=[\"'`]))": "name of a setting",
-    r"[\"'`](?:plate|plate_gain|plate_offset|shown|arcs)[\"'`]": "keys of JSON files",
+    r"[\"'`](?:plate|plate_gain|plate_offset|shown|arcs|says)[\"'`]": "keys of JSON files",
 }
 
 # Rooms that are not clean yet, as prefixes of paths: reason.
