@@ -155,6 +155,7 @@ class ParticleLoss:
 
     frames: tuple[int, ...]
     targets: Tensor
+
     @property
     def total(self) -> bool:
         return False
