@@ -73,7 +73,7 @@ _CLASS = r"\b(?:class {0}|{0}(?=[]()]))"
 NAMES = {
     "found": (_VARIABLE, "the name of the object"),
     "shown": (_VARIABLE, "displayed, visible, selected, or the name of the object"),
-    "finer further apart filming": (_ALONE, "refined, other_*, separate_adaptor, exposure"),
+    "finer further apart": (_ALONE, "refined, other_*, separate_adaptor"),
     "forget": (_CALLED, "clear_cache"),
     "reconsider": (_CALLED, "restart_from"),
     "disagree": (_CALLED, "widen_by_ties"),
@@ -92,7 +92,7 @@ ALLOWED = {
     r"\byardstick(?:\.\w+\b|(?=[\"':,}\]])| in )": "name of a table",
     r"_throw\d|figures\.beside|\bbeside(?:: tuple|: \[|(?=[\"'`]))": "names of scenes and of a setting",
     r"from outlines|gravity in outlines|down in outlines": "rows of the table captures_demo",
-    r"\bthrows?(?::|\.<name>|(?=[\"'`]))|(?:captures?|settings|regression)\.throws": "names of settings",
+    r"\bthrows?(?::|\.<name>|(?=[\"'`]))|(?:captures?|settings|regression|TINY)\.throws|throws=\d": "names of settings",
     r"springs\.carriers|carriers(?:: int|(?=[\"'`]))": "name of a setting",
     r"[\"'`](?:plate|plate_gain|plate_offset|shown|arcs|says)[\"'`]": "keys of JSON files",
 }
