@@ -121,8 +121,8 @@ def test_exposed_steps_are_symmetric_and_as_wide_as_the_exposure(length, most):
     if len(steps) > 1:
         spacing = steps[1] - steps[0]
         variance = sum(share * n**2 for n, share in zip(steps, shares, strict=True))
-        assert {b - a for a, b in zip(steps, steps[1:], strict=False)} == {apart}
-        assert variance == pytest.approx(length**2 / 12, abs=apart**2 / 4)
+        assert {b - a for a, b in zip(steps, steps[1:], strict=False)} == {spacing}
+        assert variance == pytest.approx(length**2 / 12, abs=spacing**2 / 4)
     else:
         assert most < 3 or length <= 1.01
 
@@ -195,7 +195,7 @@ def test_views_in_one_observation_are_the_same_as_one_each(compare, exposure):
     separate = [
         replace(together, images=together.images[:, [v]], cameras=together.cameras[v]) for v in (1, 0)
     ]
-    one, two = (PixelLoss(body, videos, compare=compare) for videos in (together, apart))
+    one, two = (PixelLoss(body, videos, compare=compare) for videos in (together, separate))
     assert one.frames == two.frames and one.steps == two.steps
     for mine, twin in zip(evaluated(two, two.steps), evaluated(one, one.steps), strict=True):
         assert torch.allclose(mine, twin, rtol=1e-10, atol=1e-12 * float(twin.abs().max()))
@@ -320,7 +320,7 @@ def test_views_apart_identify_what_they_do_together():
     separate = [
         replace(together, images=together.images[:, [v]], cameras=together.cameras[v]) for v in (0, 1)
     ]
-    one, two = (identified(body, videos, iterations=2) for videos in (together, apart))
+    one, two = (identified(body, videos, iterations=2) for videos in (together, separate))
     assert two.values == pytest.approx(one.values, rel=1e-6)
     assert two.loss == pytest.approx(one.loss, rel=1e-8)
     np.testing.assert_allclose(two.covariance, one.covariance, rtol=1e-3)
@@ -364,8 +364,8 @@ def test_views_apart_have_the_velocity_residuals_that_they_have_together():
     ]
     flight = _Flight(MODEL, analytic_law(law(), MODEL.dt), body, (1, 9, 17))
     unknowns = np.array([0.4, -1.4, 0.2, 0.1, 0, 0, 0.05, 0, 0.1, 0, 0])
-    flight.simulate(unknowns, rendered_steps(apart))
-    one, two = (_Residuals(flight, videos, 0.02).linearise(unknowns) for videos in ((together,), apart))
+    flight.simulate(unknowns, rendered_steps(separate))
+    one, two = (_Residuals(flight, videos, 0.02).linearise(unknowns) for videos in ((together,), separate))
     assert two.cost == pytest.approx(one.cost, rel=1e-10) and two.rms == pytest.approx(one.rms, rel=1e-10)
     np.testing.assert_allclose(two.curvatures, one.curvatures, rtol=1e-8, atol=1e-9)
     np.testing.assert_allclose(two.scores, one.scores, rtol=1e-8, atol=1e-9)

@@ -9,8 +9,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from neuma_lib.project.capture_folder import read_capture
-from studies.capture_benchmark import evaluation
-from studies.capture_benchmark import filming, stage
+from studies.capture_benchmark import evaluation, filming, stage
 from studies.capture_benchmark.pictures import dead_leaves, page_picture
 from studies.capture_benchmark.planned import capture_settings, planned_captures
 from studies.capture_benchmark.room import Moving, Shot, shoot
