@@ -95,7 +95,9 @@ class DemoPhotographsConfig(Section):
     elevations: tuple[float, ...] = Field((30.0, 58.0), description="of the rings above the floor [degrees]")
     distances: tuple[float, ...] = Field((1.0, 0.9), description="of the rings from their target [m]")
     beside_cameras: int = Field(2, ge=0, description="more cameras next to each video camera")
-    target: Vector = Field((-0.12, 0.08, 0.0), description="centre of the pictures, with random deviations [m]")
+    target: Vector = Field(
+        (-0.12, 0.08, 0.0), description="centre of the pictures, with random deviations [m]"
+    )
     shake: float = Field(0.04, ge=0, description="standard deviation of their places and targets [m]")
     upright: int = Field(4, ge=2, description="every so many, the phone is held upright")
     lens: LensConfig = Field(description="of the phone")
@@ -168,7 +170,7 @@ class DemoRoomConfig(Section):
 
 
 class DemoCapturesConfig(Section):
-    """Captures rendered by Blender, to evaluate every stage with a known truth ([guide](capture.md#the-demo-captures))."""
+    """Captures rendered by Blender, to evaluate stages with a known truth ([guide](capture.md#the-demo-captures))."""
 
     objects: dict[str, DemoObjectConfig] = Field(
         {}, description="objects by name; the capture of each is `demo_<name>`"

@@ -178,7 +178,7 @@ def test_the_table_has_means_spreads_and_the_size_of_the_true_stress():
     assert float(rows["path_std", "neuma"]["Average"]) == pytest.approx(10)
     assert float(rows["true_rms_pa", "truth"]["b"]) == 2e3
     assert "| NeuMA | 20.0 ± 10.0 | 20.0 ± 10.0 |" in markdown and "| *2* | *2* |" in markdown
-    assert "over 3 chains" in markdown and "What holds" not in markdown and verdicts == []
+    assert "over 3 replicates" in markdown and "What holds" not in markdown and verdicts == []
 
 
 def test_broken_paths_are_reported():

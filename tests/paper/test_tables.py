@@ -162,7 +162,9 @@ def test_a_replicate_above_twice_the_mean_of_its_cell_is_named():
         "neuma": {"a": [run(1.0), run(9.0), run(1.0)], "b": [run(2.0)] * 3},
     }
     table = chamfer_table(metrics, TITLES, {"a": "A", "b": "b"})
-    assert table.outliers() == ["NeuMA on A, chain 2 of 3: 9.0 mm, more than twice the mean of its chains."]
+    assert table.outliers() == [
+        "NeuMA on A, replicate 2 of 3: 9.0 mm, more than twice the mean of its replicates."
+    ]
     assert f"\n- {table.outliers()[0]}\n" in table.markdown()
 
 
