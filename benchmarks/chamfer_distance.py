@@ -7,13 +7,12 @@ Truth and prediction are two samplings of the ball, as in an evaluation; the tra
 
 from __future__ import annotations
 
-import argparse
-
 import numpy as np
 import trimesh
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
+from benchmarks.timing import parser_of
 from neuma_lib.evaluation.text_tables import as_markdown
 from neuma_lib.geometry.chamfer import chamfer
 from neuma_lib.geometry.volume import sample_volume
@@ -42,9 +41,7 @@ def rmse(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--radius", type=float, default=0.13, help="of the ball [m]")
     parser.add_argument("--points", type=int, default=100_000)
     parser.add_argument(

@@ -13,7 +13,6 @@ rasterizer are also compared with their plain twins in torch, differentiated by 
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
 import statistics
@@ -24,7 +23,15 @@ import torch
 
 from benchmarks import torch_simulation
 from benchmarks.scene import SMALL, BenchmarkScene, Size, make_scene
-from benchmarks.timing import arithmetic, bandwidth, device_name, peak_memory, seconds, seconds_a_call
+from benchmarks.timing import (
+    arithmetic,
+    bandwidth,
+    device_name,
+    parser_of,
+    peak_memory,
+    seconds,
+    seconds_a_call,
+)
 from neuma_lib.config.training import TrainingConfig
 from neuma_lib.fitting.material import PixelLoss, train_material
 from neuma_lib.sim.memory import MemoryPlan
@@ -242,9 +249,7 @@ def twin_render(device: torch.device) -> tuple[float, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     for field in dataclasses.fields(Size):
         parser.add_argument(f"--{field.name}", type=type(field.default), help=f"{field.default} on a GPU")

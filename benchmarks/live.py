@@ -15,7 +15,6 @@ of real time.
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 from collections.abc import Callable
@@ -25,7 +24,7 @@ import torch
 
 from benchmarks.rollout import SOFT
 from benchmarks.scene import SMALL, BenchmarkScene, make_scene
-from benchmarks.timing import device_name, synchronize
+from benchmarks.timing import device_name, parser_of, synchronize
 from neuma_lib.coupling.deformation import arms_at_rest, deform
 from neuma_lib.device import choose_device
 from neuma_lib.mechanics.analytic import analytic_law
@@ -90,7 +89,7 @@ def measured(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--law", default="neural", choices=("neural", "structured", "analytic"))
     parser.add_argument("--particles", type=int, default=SMALL.particles)
     parser.add_argument("--gaussians", type=int, default=SMALL.gaussians)

@@ -11,15 +11,14 @@ Every family has one bound at least, see `BOUNDS`; the other constants are print
 
 from __future__ import annotations
 
-import argparse
 import json
-import resource
 from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from benchmarks.timing import core_seconds, parser_of
 from neuma_lib.evaluation.text_tables import as_markdown
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.methods.pac_nerf.carried_field import CarriedField
@@ -146,9 +145,7 @@ def error(name: str, truth: float, value: float) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("families", nargs="*", default=list(TRUTHS), help="names")
     parser.add_argument("--settings", default="config/config.yaml", help="YAML file")
     parser.add_argument("--set", default="{}", help="changes of the settings of `pac_nerf`, as JSON")
@@ -160,9 +157,9 @@ def main() -> None:
     settings = PacNerfConfig(**merged(plain, SMALL | json.loads(args.set)))
     rows = []
     for name in args.families:
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_utime
+        before = core_seconds()
         fit = recover(name, settings.families[name], settings, lambda line: None)
-        seconds = resource.getrusage(resource.RUSAGE_SELF).ru_utime - before
+        seconds = core_seconds() - before
         guess = FamilyConstants(settings.families[name]).fitted_numbers()
         for key, value in fit.constants.fitted_numbers().items():
             off, bound = error(key, TRUTHS[name][key], value), BOUNDS[name].get(key)

@@ -12,7 +12,6 @@ between, as in training; the device's clock counts. The last columns compare one
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from collections.abc import Callable
@@ -20,6 +19,7 @@ from collections.abc import Callable
 import torch
 
 from benchmarks import gsplat_backend
+from benchmarks.timing import parser_of
 from neuma_lib.splatting import compositor_cuda, projection
 from neuma_lib.splatting.cameras import Cameras, look_at
 from neuma_lib.splatting.compositing import Settings
@@ -165,9 +165,7 @@ def reference(inputs, cameras: Cameras) -> torch.Tensor:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--gaussians", type=int)
     parser.add_argument("--size", type=int, help="width and height [px]")

@@ -10,7 +10,6 @@ scaling.csv and scaling.png, and prints the exponent p of time ~ size^p between 
 
 from __future__ import annotations
 
-import argparse
 import csv
 import dataclasses
 import gc
@@ -21,7 +20,7 @@ import torch
 
 from benchmarks.iteration import iterations, simulate_and_back
 from benchmarks.scene import SMALL, Size, make_scene
-from benchmarks.timing import device_name, peak_memory, seconds
+from benchmarks.timing import device_name, parser_of, peak_memory, seconds
 from neuma_lib.sim.workspace import free_pool
 
 SWEEPS = {
@@ -124,9 +123,7 @@ def draw(rows: list[dict], path: Path, title: str) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--small", action="store_true", help="around the default scale, for a CPU")
     parser.add_argument("--axes", nargs="+", choices=list(SWEEPS), default=list(SWEEPS))

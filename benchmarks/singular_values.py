@@ -11,12 +11,10 @@ against central differences of LAPACK in float64, over the norms of both.
 
 from __future__ import annotations
 
-import argparse
-
 import torch
 import warp as wp
 
-from benchmarks.timing import seconds
+from benchmarks.timing import parser_of, seconds
 from neuma_lib.device import start_warp, warp_stream
 from neuma_lib.mechanics.singular_values import rotation_and_singular_values, svd3
 from neuma_lib.mechanics.singular_values_kernels import warp_types
@@ -126,9 +124,7 @@ def accuracy(F: torch.Tensor, U, sigma, Vh) -> list[float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--rows", type=int, nargs="+", default=[COUNT])
     parser.add_argument("--repetitions", type=int, default=50)
     parser.add_argument("--device", default="cpu")

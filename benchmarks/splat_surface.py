@@ -22,6 +22,7 @@ import torch
 import trimesh
 from scipy.spatial import cKDTree
 
+from benchmarks.timing import parser_of
 from neuma_lib.config.geometry import SurfaceConfig
 from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.splat_surface import splat_surface, views_around
@@ -120,7 +121,7 @@ def compare(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--shapes", nargs="+", choices=SHAPES, default=[*SHAPES])
     parser.add_argument("--discs", type=int, default=6000)
     parser.add_argument("--gaussians", nargs="+", help="files of Gaussians to take in place of shapes")

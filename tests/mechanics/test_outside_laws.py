@@ -18,7 +18,7 @@ from neuma_lib.mechanics.plasticity import (
     VonMises,
     _positive_root,
 )
-from tests.support.deformations import EYE, E, deformations, hencky_deviator, rotations
+from tests.support.deformations import EYE, E, deformations, hencky_deviator, rotations, steady_shear
 from tests.support.errors import refused
 
 pytestmark = pytest.mark.core
@@ -231,11 +231,7 @@ def test_steady_shear_of_herschel_bulkley(exponent):
     part = HerschelBulkley(
         E=E, nu=NU, consistency=consistency, exponent=exponent, yield_stress=yield_stress, dt=DT
     )
-    gradient = torch.zeros(3, 3, dtype=torch.float64)
-    gradient[0, 1] = rate
-    F = EYE[None].clone()
-    for _ in range(400):
-        F = part.evaluate((EYE + DT * gradient) @ F, ())
+    F = steady_shear(part, rate, DT)
     expected = yield_stress / math.sqrt(2) + consistency * rate**exponent
     strain = expected / MU
     assert float(HENCKY.evaluate(F, ())[0, 0, 1]) == pytest.approx(expected, rel=4 * (strain + rate * DT))
