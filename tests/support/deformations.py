@@ -55,7 +55,7 @@ def assert_adjoint(part: Constitutive, F: torch.Tensor) -> None:
     weights = weights_of(part)
     generator = torch.Generator().manual_seed(30)
     direction, probe = torch.randn(2, *F.shape, generator=generator, dtype=F.dtype)
-    turns = tuple(torch.randn(w.shape, generator=generator, dtype=F.dtype) for w in weights)
+    turns = tuple(w.abs().max() * torch.randn(w.shape, generator=generator, dtype=F.dtype) for w in weights)
     grad_F, grads = part.vjp(F, weights, probe)
     step = 1e-6
 
