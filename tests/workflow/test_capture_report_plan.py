@@ -79,6 +79,6 @@ def test_what_cannot_be_reported_is_said(project):
     settings = project.root / "captures/mug/capture.yaml"
     settings.write_text(SETTINGS.replace("two", "two, one, three"))
     try:
-        assert "capture.yaml: held_out" in refusal(REPORT.format(method="neuma"))
+        assert "capture.yaml: held_out: all takes are held out" in refusal(REPORT.format(method="neuma"))
     finally:
         settings.write_text(SETTINGS)

@@ -66,10 +66,10 @@ def test_what_is_wrong_is_said_before_anything_runs(project, mug):
         assert "capture_" not in "".join(p.name for p in (project.root / "tiny").rglob("*")), "something ran"
         return output
 
-    assert "captures/cup/capture.yaml" in refusal("tiny/results/cup/capture.md")
+    assert "captures/cup/capture.yaml: does not exist" in refusal("tiny/results/cup/capture.md")
     assert "no take 'second'; known: first" in refusal("tiny/results/mug/frames/second/left.json")
     (mug / "capture.yaml").write_text("board: {square: 0.03, sqares: [6, 8]}\n")
-    assert "captures/mug/capture.yaml: board.sqares" in refusal()
+    assert "captures/mug/capture.yaml: board.sqares: unknown key; did you mean squares" in refusal()
     (mug / "capture.yaml").write_text(BOARD_ALONE.replace("lenses.json", "../lenses.json"))
     assert "the path must be relative and inside the folder of the capture" in refusal()
     (mug / "capture.yaml").write_text(BOARD_ALONE)
@@ -82,7 +82,7 @@ def test_what_is_wrong_is_said_before_anything_runs(project, mug):
 def test_a_failing_stage_leaves_nothing_half_written(project, mug):
     (mug / "photos/a.png").write_text("no picture")
     said = project.run("tiny/results/mug/poses.json", succeeds=False)
-    assert "photos/a.png" in said and "Traceback" not in said
+    assert "photos/a.png: cannot be read as an image" in said and "Traceback" not in said
     (mug / "videos/left.mp4").write_text("no video")
     said = project.run("tiny/results/mug/frames/first/left.json", succeeds=False)
     assert "left.mp4: cannot be read as a video" in said

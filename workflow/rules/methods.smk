@@ -25,8 +25,8 @@ def of_bodies(choose):
 
 
 def presets_of(method):
-    """Pattern of the presets of a method that are fitted, and of their variants."""
-    return names_of(cases.of_kind(SETTINGS, method.name))
+    """Pattern of the presets of a method, and of their variants. Those without a fit are refused by `fit_files`."""
+    return names_of(name for name in SETTINGS.methods if cases.kind_of(SETTINGS, name).name == method.name)
 
 
 # ---- fits
@@ -34,9 +34,11 @@ def presets_of(method):
 
 def fit_files(case):
     """Everything that a fit may read."""
-    if case.scene != case.moved:
+    if case.folder != case.name:
         raise InputError(
-            f"{case.moved}/{case.name}", "its law is that of another scene", "Ask for the file of that scene"
+            f"{case.moved}/{case.folder}",
+            f"it has no fit, its model is that of {case.scene}/{case.name}",
+            "Request the file of that folder",
         )
     return case.method.fit_inputs(case)
 
@@ -147,7 +149,7 @@ def shared_carrier(bodies):
         raise InputError(
             f"{case.moved}/{case.name}",
             "it is evaluated on particles of its own fit, which only scenes with rendered videos have",
-            "Choose the preset with the same fit on the particles that all methods share",
+            f"Choose {case.name}, which has the same fit and is evaluated on the particles that all methods share",
         )
     return carrier(bodies)
 

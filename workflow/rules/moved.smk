@@ -10,7 +10,9 @@ def splat_setting(choose):
 def splat_start(wildcards):
     """The start of a splat; its law comes from elsewhere, as it has no video to learn one from."""
     scene, method = wildcards.scene, wildcards.method
-    if case_on(scene, method).learned_from_moved_scene:
+    case = case_on(scene, method)
+    case.method.model_options(case)  # refuses a true law, which a splat does not have
+    if case.learned_from_moved_scene:
         raise InputError(
             f"{scene}/{method}",
             "a splat has no video to learn a law from",
