@@ -1,8 +1,9 @@
-"""What the Chamfer distance of a filled body sees of errors of its motion: a ball that is moved, squashed or turned.
+"""Sensitivity of the Chamfer distance of a filled body to errors of its motion: a ball moved, squashed or rotated.
 
 python -m benchmarks.chamfer_distance
 
-Truth and prediction are two samplings of the ball, as in an evaluation; the tracer RMSE is that of the displacement.
+Truth and prediction are two sets of samples of the ball, as in an evaluation. The tracer RMSE is that of the
+displacement.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Identification compared with known truths: constants with their uncertainty, choice of family, motion, time.
 
     python -m benchmarks.identification RubberPawn                          # reads data/, results/, config/config.yaml
-    python -m benchmarks.identification random1_05 random2_03 --seeds 1 2 --count 12 --jobs 16 --out found.json
+    python -m benchmarks.identification random1_05 random2_03 --seeds 1 2 --count 12 --jobs 16 --out identified.json
     python -m benchmarks.identification random1_05 --set '{"prune_factor": 3}'   # other settings of `identify`
 
 A scene may be named by the beginning of its name. Without names, all random scenes with results are used.
@@ -59,23 +59,23 @@ def evaluate(job: tuple[str, Config, Mapping[str, Any]]) -> dict[str, Any]:
     refined = refined_bodies(name, settings, chosen, body)
     model = simulator(settings, scene)
     before = core_seconds()
-    found = identify(model, motion, body, video, chosen, prior_of(settings, scene), refined=[refined])
+    identified = identify(model, motion, body, video, chosen, prior_of(settings, scene), refined=[refined])
     seconds = core_seconds() - before
     truth = scene.law.plain()
     row = {
         "scene": name,
         "truth": truth,
         "core_seconds": seconds,
-        **_family(found, truth),
-        "quantities": _quantities(found, truth),
-        "combinations": _combinations(found, truth),
-        "found": found.as_dict(),
+        **_family(identified, truth),
+        "quantities": _quantities(identified, truth),
+        "combinations": _combinations(identified, truth),
+        "found": identified.as_dict(),
     }
     arrays, _ = read_arrays(data / "particles.h5", required=("tracers",), only=("tracers",))
     tracers = torch.from_numpy(arrays["tracers"])
     tracers = tracers[:, :: max(1, tracers.shape[1] // TRACERS)].to(body.x0)
     laws = {"identified": row["found"]["law"], "true_law": truth}
-    starts = {"velocity": motion, "fitted": found.best.motions[0]}
+    starts = {"velocity": motion, "fitted": identified.best.motions[0]}
     for (law, spec), (start, initial) in product(laws.items(), starts.items()):
         state = initial.of_body(body)
         path, _ = predict(model, analytic_law(spec, model.dt), state, video.frames, tracers[0])
@@ -87,23 +87,27 @@ def _kind(spec: Mapping[str, Any]) -> tuple[str, str]:
     return spec["elasticity"]["name"], (spec.get("plasticity") or {"name": "identity"})["name"]
 
 
-def _family(found: Identified, truth: Mapping[str, Any]) -> dict[str, Any]:
+def _family(identified: Identified, truth: Mapping[str, Any]) -> dict[str, Any]:
     """Whether the family is right, or tied with the right one; None if the truth is no candidate."""
-    kinds = {name: _kind(fit.family.spec) for name, fit in found.fits.items()}
+    kinds = {name: _kind(fit.family.spec) for name, fit in identified.fits.items()}
     right = [name for name, kind in kinds.items() if kind == _kind(truth) and "bingham" not in name]
     ok = None
     if right:
         ok = (
-            "right" if found.best.family.name in right else "tie" if set(right) & set(found.ties) else "wrong"
+            "right"
+            if identified.best.family.name in right
+            else "tie"
+            if set(right) & set(identified.ties)
+            else "wrong"
         )
-    return {"family": found.best.family.name, "ties": found.ties, "family_is": ok}
+    return {"family": identified.best.family.name, "ties": identified.ties, "family_is": ok}
 
 
 def _constants(spec: Mapping[str, Any]) -> dict[str, float]:
     return {key: float(value) for part in spec.values() for key, value in part.items() if key != "name"}
 
 
-def _quantities(found: Identified, truth: Mapping[str, Any]) -> dict[str, Any]:
+def _quantities(identified: Identified, truth: Mapping[str, Any]) -> dict[str, Any]:
     """Named combinations that also exist in the truth: value, truth, standard deviation of the logarithm, z score."""
     true = named_combinations(_constants(truth))
     return {
@@ -112,20 +116,20 @@ def _quantities(found: Identified, truth: Mapping[str, Any]) -> dict[str, Any]:
             "truth": true[key],
             "log_std": std,
             "z": math.log(value / true[key]) / std,
-            "determined": std < found.settings.determined,
+            "determined": std < identified.settings.determined,
         }
-        for key, value, std in found.best.quantities(found.settings)
+        for key, value, std in identified.best.quantities(identified.settings)
         if key in true
     }
 
 
-def _combinations(found: Identified, truth: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _combinations(identified: Identified, truth: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The same of combinations whose errors are independent, if the truth has all of the constants."""
     true = physical(_constants(truth))
-    if set(true) != set(physical(found.best.values)):
+    if set(true) != set(physical(identified.best.values)):
         return []
     rows = []
-    for entry in found.best.combinations(found.settings):
+    for entry in identified.best.combinations(identified.settings):
         error = entry["log_value"] - sum(
             power * math.log(true[key]) for key, power in entry["powers"].items()
         )

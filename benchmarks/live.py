@@ -5,12 +5,11 @@
     python -m benchmarks.live --device cuda                 # also --particles 30000 --grid 32 --dt 5e-4
 
 The simulation has its own thread, as in the viewer, and another one makes the Gaussians of every frame that it sees,
-or the stresses of its particles. Sending them to a browser is not in it, nor drawing there, which is another process.
+or the stresses of its particles. Transfer to a browser and drawing there are excluded.
 
-The viewer never runs faster than real time, so the steps of a frame are also taken without its clock: real time over
-the best and the median time of some frames. Other load takes from all times by the clock, and hardly from the
-processor's; the last column is of these alone: what the steps that fit beside a picture into 0.1 s of one core make up
-of real time.
+The viewer never runs faster than real time, so the steps of a frame are also timed without its clock: real time over
+the best and the median time of some frames. Other load affects all wall times and hardly the processor times. The last
+column uses the latter: the share of real time of the steps that fit, with one picture, into 0.1 s of one core.
 """
 
 from __future__ import annotations

@@ -71,8 +71,8 @@ def measure(
     return min(times), peak
 
 
-def forget(device: torch.device) -> None:
-    """Give all memory back, so that the next size does not pay for this one."""
+def free_memory(device: torch.device) -> None:
+    """Free all memory, so that it does not affect the next size."""
     free_pool()
     gc.collect()
     if device.type == "cuda":
@@ -139,7 +139,7 @@ def main() -> None:
     for axis in args.axes:
         for value in sweeps[axis]:
             time, peak = measure(axis, value, base, device, memory)
-            forget(device)
+            free_memory(device)
             rows.append({"axis": axis, "size": value, "seconds": time, "bytes": peak})
             print(f"| {UNITS[axis]} | {value} | {1e3 * time:.1f} | {peak / 2**30:.2f} |", flush=True)
     args.output.mkdir(parents=True, exist_ok=True)

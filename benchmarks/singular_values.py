@@ -23,7 +23,7 @@ start_warp()
 
 COUNT = 2000
 STEP = 1e-6
-"""Step of the central differences: truncation 1e-12 and rounding 1e-10, far below what is told apart here."""
+"""Step of the central differences: truncation 1e-12 and rounding 1e-10, far below the differences measured here."""
 
 
 @wp.kernel
@@ -98,7 +98,7 @@ def families() -> dict[str, torch.Tensor]:
         return (U * torch.tensor(sigma, dtype=torch.float64)) @ V.mT
 
     eye = torch.eye(3, dtype=torch.float64).repeat(COUNT, 1, 1)
-    found = {
+    matrices = {
         "F = I": eye,
         "I + 1e-5 noise": eye + 1e-5 * noise(),
         "I + 0.1 noise": eye + 0.1 * noise(),
@@ -108,7 +108,7 @@ def families() -> dict[str, torch.Tensor]:
         "det < 0: 1, 1, -0.9": stretched(1.0, 1.0, -0.9),
         "flat: 1, 1e-2, 1e-5": stretched(1.0, 1e-2, 1e-5),
     }
-    return {name: F.float() for name, F in found.items()}
+    return {name: F.float() for name, F in matrices.items()}
 
 
 def accuracy(F: torch.Tensor, U, sigma, Vh) -> list[float]:

@@ -1,13 +1,13 @@
-"""How far the surface that is found of a splat lies from the one that its Gaussians were drawn on.
+"""Distance of the surface of a splat from the one on which its Gaussians lie.
 
     python -m benchmarks.splat_surface                # 6,000 discs, 96 voxels, 60 views of 320 px; minutes
     python -m benchmarks.splat_surface --shapes bowl --discs 3000
     python -m benchmarks.splat_surface --gaussians results/Guitar/gaussians.ply
 
-Opaque discs lie at random on a bowl, whose inside no outline shows, on a cat, between whose discs a few views look
-through gaps, and on shapes that nothing was chosen on, a pot with a thin wall among them: mean distance of points on
-either surface to the other, and volume over the true one, of outlines alone and with depth. Of Gaussians whose true
-surface nobody knows: both volumes.
+Opaque discs lie at random on a bowl, whose inside no silhouette shows, on a cat, with gaps between the discs in a few
+views, and on shapes that did not influence any setting, such as a pot with a thin wall. Prints the mean distance of
+points on either surface to the other, and the volume over the true one, from silhouettes alone and with depth. For
+Gaussians with an unknown surface it prints both volumes.
 """
 
 from __future__ import annotations
@@ -106,17 +106,18 @@ def compare(
     )
     for dents in (False, True):
         began = time.process_time()
-        found = splat_surface(gaussians, cameras, settings, dents=dents)
+        surface = splat_surface(gaussians, cameras, settings, dents=dents)
         used = time.process_time() - began
-        said = f"{1e3 * found.volume:.3f} l"
+        result = f"{1e3 * surface.volume:.3f} l"
         if truth is not None:
-            gaps = 1e3 * between(found, truth)
+            gaps = 1e3 * between(surface, truth)
             far = np.quantile(gaps, 0.95)
-            said = f"{found.volume / truth.volume:.2f} of the true one, {gaps.mean():.1f} mm, 95 % below {far:.1f} mm"
-        bodies = len(found.split(only_watertight=False))
+            share = surface.volume / truth.volume
+            result = f"{share:.2f} of the true one, {gaps.mean():.1f} mm, 95 % below {far:.1f} mm"
+        bodies = len(surface.split(only_watertight=False))
         print(
-            f"{name}, {'with depth' if dents else 'outlines alone'}: volume {said}; closed: {found.is_watertight}, "
-            f"bodies: {bodies}, {used:.1f} core s"
+            f"{name}, {'with depth' if dents else 'silhouettes alone'}: volume {result}; "
+            f"closed: {surface.is_watertight}, bodies: {bodies}, {used:.1f} core s"
         )
 
 

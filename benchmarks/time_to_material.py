@@ -50,7 +50,7 @@ IDENTIFYING = {
 }
 CORRECTING = {
     "training": (structured_fit, "train_material"),
-    "judging": (structured_fit, "_simulated"),
+    "scoring": (structured_fit, "_simulated"),
 }
 
 
@@ -115,8 +115,8 @@ def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
         refined = refined_bodies(name, settings, chosen, body)
     prior = prior_of(settings, scene)
     with clock.parts(IDENTIFYING), clock.part("identifying, the rest"):
-        found = identify(model, motion, body, videos, chosen, prior, refined=[refined])
-    plain = found.as_dict()
+        identified = identify(model, motion, body, videos, chosen, prior, refined=[refined])
+    plain = identified.as_dict()
     options = cases.case(settings, name, METHOD).options
     with clock.part("preparing the correction"):
         bases = [plain["law"], *rival_bases(plain, options.rivals)]
@@ -125,7 +125,7 @@ def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
         ]
         for law in laws:
             law.attach_adaptor(options.rank, options.alpha, options.seed)
-        start = found.best.motions[0].of_body(body)
+        start = identified.best.motions[0].of_body(body)
         total = options.covariance_from == "total"
         loss = PixelLoss(body, videos, options.covariance_gradient, total=total, compare=options.compare)
     quiet = {"log": lambda text: None}
@@ -139,9 +139,9 @@ def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
         "identifying": sum(parts[part]["seconds"] for part in (*IDENTIFYING, "identifying, the rest")),
         "correcting": sum(parts[part]["seconds"] for part in (*CORRECTING, "correcting, the rest")),
         "all": sum(part["seconds"] for part in parts.values()),
-        "rollouts": found.rollouts,
-        "rollouts of families": {family: fit.rollouts for family, fit in found.fits.items()},
-        "found": found.summary(),
+        "rollouts": identified.rollouts,
+        "rollouts of families": {family: fit.rollouts for family, fit in identified.fits.items()},
+        "found": identified.summary(),
         "correction": choice.summary(),
         "loss": trained.best_loss,
     }

@@ -11,7 +11,7 @@ import torch
 
 
 def parser_of(description: str) -> argparse.ArgumentParser:
-    """A parser that prints the docstring of a benchmark as it is written."""
+    """A parser that prints the docstring of a benchmark without new line breaks."""
     return argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -114,7 +114,7 @@ def test_two_passes_leave_no_gaussian_empty_and_rows_sum_to_one(equal_mass):
 @pytest.mark.parametrize("outside", [0.0, 0.15])
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-13), (torch.float32, 3e-7)])
 def test_added_particles_keep_mass_and_centre_of_mass(dtype, tolerance, outside):
-    """Also with Gaussians outside the body, as they are at a fitted surface, and with uneven volumes."""
+    """Also with Gaussians outside the body, as at a fitted surface, and with uneven volumes."""
     means, covars = random_gaussians(1500, seed=9, size=0.006, spread=1 + 2 * outside, dtype=dtype)
     means = means - outside
     particles = random_particles(2000, seed=10, dtype=dtype)
@@ -167,7 +167,7 @@ def test_same_input_gives_the_same_bytes():
 
 
 def splat_of_a_ball(count, seed=20):
-    """Discs and needles of a splat on a sphere: in its surface, up to hundreds of times as long as they are thick."""
+    """Discs and needles of a splat on a sphere: in its surface, with lengths up to hundreds of times the thickness."""
     generator = torch.Generator().manual_seed(seed)
     normal = torch.nn.functional.normalize(
         torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=1

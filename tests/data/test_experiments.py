@@ -48,15 +48,15 @@ def settings(**changes):
 
 def test_bodies_of_an_experiment_are_complete():
     bodies = [{"scene": "BouncyBall", "shape": "letter_N", "height": 0.5}, {"scene": "ClayCat"}]
-    found = settings(experiments={"x": {"title": "X", "bodies": bodies, "steps": 100}})
-    letter, cat = found.experiment_bodies("x")
-    ball = found.scene("BouncyBall").plain()
+    config = settings(experiments={"x": {"title": "X", "bodies": bodies, "steps": 100}})
+    letter, cat = config.experiment_bodies("x")
+    ball = config.scene("BouncyBall").plain()
     assert (letter["shape"], letter["height"], letter["size"]) == ("letter_N", 0.5, None)
     assert letter["velocity"] == ball["velocity"] and letter["law"] == ball["law"]
     assert not letter["reconstructed"] and cat["reconstructed"]
-    scene = found.scene("ClayCat").plain()
+    scene = config.scene("ClayCat").plain()
     assert all(cat[key] == scene[key] for key in ("shape", "size", "height", "velocity"))
-    assert found.experiment_dt("x") == scene["dt"] < ball["dt"]
+    assert config.experiment_dt("x") == scene["dt"] < ball["dt"]
 
 
 def test_mistakes_in_experiments_and_tables_are_named():
@@ -74,10 +74,10 @@ def test_mistakes_in_experiments_and_tables_are_named():
 
 
 def test_density_that_a_method_assumes():
-    found = settings()
-    own = found.scene("UnevenCat").plain()["density"]
-    assert cases.case(found, "UnevenCat", "neuma").density("UnevenCat") == own
-    assert cases.case(found, "UnevenCat", "neuma+assumed_density=900").density("UnevenCat") == 900
+    config = settings()
+    own = config.scene("UnevenCat").plain()["density"]
+    assert cases.case(config, "UnevenCat", "neuma").density("UnevenCat") == own
+    assert cases.case(config, "UnevenCat", "neuma+assumed_density=900").density("UnevenCat") == 900
 
 
 def test_densities_on_both_sides_of_a_plane():

@@ -173,8 +173,8 @@ def test_inside_of_a_torus_is_its_closed_form():
     torus = trimesh.creation.torus(0.2, 0.08, major_sections=96, minor_sections=48)
     points = np.random.default_rng(1).uniform(-0.3, 0.3, (50_000, 3))
     depth = 0.08 - np.hypot(np.hypot(points[:, 0], points[:, 1]) - 0.2, points[:, 2])
-    found = inside(torus, points)
-    assert found[depth > 1e-3].all() and not found[depth < -1e-3].any()
+    actual = inside(torus, points)
+    assert actual[depth > 1e-3].all() and not actual[depth < -1e-3].any()
 
 
 def test_inside_counts_rays_through_edges_and_corners_once():
@@ -182,9 +182,9 @@ def test_inside_counts_rays_through_edges_and_corners_once():
     box = trimesh.creation.box((2, 2, 2)).subdivide()
     ticks = np.array([-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5])
     points = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-    found = inside(box, points)
+    actual = inside(box, points)
     clearly_in, clearly_out = (np.abs(points) < 1).all(axis=1), (np.abs(points) > 1).any(axis=1)
-    assert found[clearly_in].all() and not found[clearly_out].any()
+    assert actual[clearly_in].all() and not actual[clearly_out].any()
 
 
 def test_inside_of_a_letter_spares_its_holes():
@@ -194,8 +194,8 @@ def test_inside_of_a_letter_spares_its_holes():
     assert letter.euler_number == -2  # two holes
     points = np.random.default_rng(2).uniform(*letter.bounds, (20_000, 3))
     depth, cell = shapes.depth(letter, points), 0.4 / 48
-    found = inside(letter, points)
-    assert found[depth > cell].all() and not found[depth < -cell].any()
+    actual = inside(letter, points)
+    assert actual[depth > cell].all() and not actual[depth < -cell].any()
 
 
 def test_inside_of_overlapping_parts_is_their_union():

@@ -40,7 +40,7 @@ from tests.support.errors import refused
 pytestmark = pytest.mark.core
 
 MU, LAM = lame(E, NU)
-BESIDE_E_AND_NU = {
+FURTHER_CONSTANTS = {
     "ogden": {"alpha": 6.0},
     "mooney_rivlin": {"q": 0.7},
     "fibre_reinforced": {"fibre_modulus": 2e5, "fibre_exponent": 1.5},
@@ -58,7 +58,7 @@ PLASTICITIES = {
 
 
 def elastic_spec(name: str) -> dict:
-    return {"name": name, "E": E, "nu": NU, **BESIDE_E_AND_NU.get(name, {})}
+    return {"name": name, "E": E, "nu": NU, **FURTHER_CONSTANTS.get(name, {})}
 
 
 def elasticity(name: str):
@@ -160,7 +160,9 @@ def test_stress_is_the_textbook_form(name):
 @pytest.mark.parametrize("name", ELASTICITIES)
 def test_wave_speed_is_that_of_linear_elasticity(name):
     law = analytic_law({"elasticity": elastic_spec(name)})
-    modulus = LAM if name == "fluid" else LAM + 2 * MU + BESIDE_E_AND_NU.get(name, {}).get("fibre_modulus", 0)
+    modulus = (
+        LAM if name == "fluid" else LAM + 2 * MU + FURTHER_CONSTANTS.get(name, {}).get("fibre_modulus", 0)
+    )
     # one-sided differences of step 1e-5
     assert law.wave_speed(1000.0) == pytest.approx(math.sqrt(modulus / 1000.0), rel=1e-4)
 

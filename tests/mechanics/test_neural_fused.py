@@ -58,8 +58,8 @@ def test_emulated_kernels_are_as_near_to_float64_as_the_float32_twin(emulated, k
     part, F = law_part(kind), deformations(regime, n)
     g = probe(F)
     truth, plain = twin(part, F, g, torch.float64), twin(part, F, g, torch.float32)
-    found = emulated(part, F, g, blocks)
-    for exact, slow, fast in zip(truth, plain, found, strict=True):
+    actual = emulated(part, F, g, blocks)
+    for exact, slow, fast in zip(truth, plain, actual, strict=True):
         assert distance(fast, exact) < 5 * distance(slow, exact) + 1e-7
 
 
@@ -133,9 +133,9 @@ def test_fused_is_as_near_to_float64_as_the_float32_twin(kind, regime, n):
     assert part.uses_fused(F32)
     value = part.evaluate(F32, weights)
     grad_F, grad_weights = part.vjp(F32, weights, g32)
-    found = [x.double() for x in (value, grad_F, *grad_weights)]
+    actual = [x.double() for x in (value, grad_F, *grad_weights)]
     truth, plain = (twin(part, F.cuda(), g.cuda(), dtype) for dtype in (torch.float64, torch.float32))
-    for exact, slow, fast in zip(truth, plain, found, strict=True):
+    for exact, slow, fast in zip(truth, plain, actual, strict=True):
         assert distance(fast, exact) < 5 * distance(slow, exact) + 1e-7
 
 

@@ -259,7 +259,7 @@ def test_newton_reaches_round_off():
         for rate in torch.logspace(-12, 12, 25, dtype=torch.float64).tolist():
             y = _positive_root(rate, 1 / exponent, total)
             residual = (y + rate * y ** (1 / exponent)) / total - 1
-            # u = log y is kept to round-off of its own size, up to log(1e30), and raised to the power
+            # u = log y is kept to round-off relative to its size, up to log(1e30), and raised to the power
             assert float(residual.abs().max()) < 1e-11, (exponent, rate)
 
 
@@ -311,7 +311,7 @@ def test_foam_loses_volume_and_von_mises_does_not():
 # ------------------------------------------------------------------------------------------------ scenes
 
 
-def least_misfit(target: np.ndarray, curves: list[np.ndarray]) -> float:
+def smallest_misfit(target: np.ndarray, curves: list[np.ndarray]) -> float:
     """Relative residual of the best sum of the curves with factors >= 0."""
     return nnls(np.stack(curves, axis=1), target)[1] / float(np.linalg.norm(target))
 
@@ -330,7 +330,7 @@ def test_no_shear_modulus_fits_the_elastic_scenes(loaded, scene, first, last):
 
     truth = curve(loaded.scene(scene).law.elasticity.plain())
     for family in loaded.identify.families.values():
-        assert least_misfit(truth, [curve(family.elasticity.plain())]) > 0.2
+        assert smallest_misfit(truth, [curve(family.elasticity.plain())]) > 0.2
 
 
 def test_no_bingham_line_fits_the_paste_scene(loaded):
@@ -338,7 +338,7 @@ def test_no_bingham_line_fits_the_paste_scene(loaded):
     law = loaded.scene("OutsidePaste").law.plasticity.plain()
     rate = np.linspace(2, 30, 40)
     stress = law["yield_stress"] / math.sqrt(2) + law["consistency"] * rate ** law["exponent"]
-    assert least_misfit(stress, [np.ones(40), rate]) > 0.2
+    assert smallest_misfit(stress, [np.ones(40), rate]) > 0.2
 
 
 def test_no_candidate_returns_like_the_plastic_scenes(loaded):

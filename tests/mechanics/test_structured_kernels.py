@@ -69,20 +69,20 @@ def rounding(part, F, weights, g):
     """
     frames = torch.cat([torch.eye(3, dtype=torch.float64)[None], rotations(5, 60)])
     singles, doubles = tuple(w.float() for w in weights), tuple(w.double() for w in weights)
-    found = []
+    actual = []
     for Q in frames:
         turned, probed = (Q @ F.double()).float(), (Q @ g.double()).float()
         exact = twin(part, turned.double(), doubles, probed.double())
-        found.append(
+        actual.append(
             [distance(*pair) for pair in zip(twin(part, turned, singles, probed), exact, strict=True)]
         )
-    return [max(draws) for draws in zip(*found, strict=True)]
+    return [max(draws) for draws in zip(*actual, strict=True)]
 
 
-def assert_as_near(part, F, weights, g, found):
+def assert_as_near(part, F, weights, g, actual):
     """Results in float32 are as near to float64 as those of the twin in float32."""
     truth = twin(part, F.double(), tuple(w.double() for w in weights), g.double())
-    for value, exact, bound in zip(found, truth, rounding(part, F, weights, g), strict=True):
+    for value, exact, bound in zip(actual, truth, rounding(part, F, weights, g), strict=True):
         assert distance(value, exact) < 3 * bound + 8 * torch.finfo(torch.float32).eps
 
 
@@ -159,12 +159,12 @@ def test_cuda_text_equals_the_twin_in_emulation(emulated, name):
     weights = tuple(w.float().double() for w in random_weights(part, 4))
     g = probe(F)
     for blocks in (1, 2):
-        found = emulated(part, F, weights, g, blocks)
+        actual = emulated(part, F, weights, g, blocks)
         if emulated.dtype == torch.float32:
-            assert_as_near(part, F, weights, g, found)
+            assert_as_near(part, F, weights, g, actual)
             continue
         bound = 8 * torch.finfo(torch.float64).eps * gain(weights)
-        for value, expected in zip(found, twin(part, F, weights, g), strict=True):
+        for value, expected in zip(actual, twin(part, F, weights, g), strict=True):
             assert float((value - expected).norm()) < bound * float(expected.norm())
 
 
@@ -178,13 +178,13 @@ CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA de
 def test_cuda_equals_the_cpu(name, dtype, repeats):
     part, F = part_of(name), states(name).repeat(repeats, 1, 1).to(dtype)
     weights, g = random_weights(part, 4, dtype), probe(F)
-    found = fast(part, F.cuda(), tuple(w.cuda() for w in weights), g.cuda())
-    found = [x.cpu() for x in found]
+    actual = fast(part, F.cuda(), tuple(w.cuda() for w in weights), g.cuda())
+    actual = [x.cpu() for x in actual]
     if dtype == torch.float32:
-        assert_as_near(part, F, weights, g, found)
+        assert_as_near(part, F, weights, g, actual)
         return
     bound = 8 * torch.finfo(torch.float64).eps * gain(weights)
-    for value, expected in zip(found, fast(part, F, weights, g), strict=True):
+    for value, expected in zip(actual, fast(part, F, weights, g), strict=True):
         assert float((value - expected).norm()) < bound * float(expected.norm())
 
 

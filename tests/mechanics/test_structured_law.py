@@ -226,10 +226,10 @@ def test_return_at_the_ends_of_its_outputs(name):
         returned, _ = part.principal(sigma, weights)
         assert bool((elastic_energy(returned) <= energy + 64 * EPS * (1 + energy) * MU).all())
         for dtype in (torch.float32, torch.float64):
-            found = part.vjp(
+            actual = part.vjp(
                 F.to(dtype), tuple(w.to(dtype) for w in weights), torch.ones_like(F, dtype=dtype)
             )
-            assert all(bool(x.isfinite().all()) for x in (found[0], *found[1]))
+            assert all(bool(x.isfinite().all()) for x in (actual[0], *actual[1]))
 
 
 @pytest.mark.parametrize("dilation", [0.0, 12.0, 34.0])
@@ -307,7 +307,7 @@ def test_work_in_closed_cycles(base, form):
             bound = (tau - reference).norm(dim=2).amax(0) * step.norm(dim=2).sum(0)
         assert bool((work <= bound + quadrature * size).all())
         gained = max(gained, float((work / size).max()))
-    assert form == "energy" or gained > 1e-3  # the test can tell the forms apart
+    assert form == "energy" or gained > 1e-3  # the test distinguishes the forms
 
 
 def tangent(part, sigma, weights):
@@ -319,8 +319,8 @@ def tangent(part, sigma, weights):
 
 
 def acoustic_minimum(part, sigma, weights, spared=0.0, directions=100):
-    """Least m . dtau n - (m . n)(m . tau n) of dF = (m n^T) F over unit m and n (half a sphere of them), (N,) [Pa];
-    ``spared`` (m . n)^2 is taken away.
+    """Minimum of m . dtau n - (m . n)(m . tau n) of dF = (m n^T) F over unit m and n (half a sphere), (N,) [Pa];
+    ``spared`` (m . n)^2 is subtracted.
 
     That is m n^T : (dP) F^T; positive: strongly elliptic, waves in all directions and no jump of F. In the axes of the
     stress dtau_ij = (y_i - y_j) / (b_i - b_j) (b_j L_ij + b_i L_ji) off the diagonal, with b = sigma^2, L = m n^T.
@@ -331,8 +331,8 @@ def acoustic_minimum(part, sigma, weights, spared=0.0, directions=100):
     y, D = tangent(part, sigma, weights)
     b = sigma**2
     eye = torch.eye(3, dtype=torch.bool)
-    apart = torch.where(eye, 1.0, b[:, :, None] - b[:, None])
-    shear = torch.where(eye, 0.0, (y[:, :, None] - y[:, None]) / apart)
+    difference = torch.where(eye, 1.0, b[:, :, None] - b[:, None])
+    shear = torch.where(eye, 0.0, (y[:, :, None] - y[:, None]) / difference)
     Q = torch.einsum("sij,di,dj->sdij", D + shear * b[:, :, None] - y[:, :, None], n, n)
     Q = Q + torch.diag_embed(torch.einsum("sij,sj,dj->sdi", shear, b, n**2))
     Q = 0.5 * (Q + Q.mT) - spared * torch.einsum("di,dj->dij", n, n)

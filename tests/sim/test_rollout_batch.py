@@ -75,20 +75,20 @@ def test_kernels_agree_with_the_laws_themselves(name, dtype):
         for part in (both.elasticity, both.plasticity):
             weights = tuple(w.to(dtype) for w in part.weights())
             expected = part.response(F, weights)
-            found = part.evaluate(F, weights, out=torch.full_like(F, torch.nan))
+            actual = part.evaluate(F, weights, out=torch.full_like(F, torch.nan))
             # Three rotations, an exponential and up to a dozen products; the stress of a strain e has the round-off
             # of F times the stiffness.
             stiffness = 0.0 if part is both.plasticity else 2e5 * F.abs().max() ** 2
             scale = stiffness + expected.abs().max()
-            assert (found - expected).abs().max() <= 32 * torch.finfo(dtype).eps * scale
+            assert (actual - expected).abs().max() <= 32 * torch.finfo(dtype).eps * scale
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_copies_equal_rollouts_of_their_own(dtype):
     """All kinds of laws in one launch; a rollout alone differs by the kernels' round-off, which 40 steps carry on."""
     laws = [law(name, stiffness) for name in FUSED for stiffness in (1.0, 1.3)]
-    found = rollout_batch(MODEL, laws, falling(dtype), **RUN, total=True, together=len(laws))
-    for own, path in zip(laws, found, strict=True):
+    actual = rollout_batch(MODEL, laws, falling(dtype), **RUN, total=True, together=len(laws))
+    for own, path in zip(laws, actual, strict=True):
         alone = rollout(MODEL, own, falling(dtype), **RUN, total=True)
         assert_same(path, alone, 1e4 * torch.finfo(dtype).eps)
         assert (path.F_total - alone.F_total).abs().max() < 1e4 * torch.finfo(dtype).eps
@@ -174,8 +174,8 @@ def test_gradients_of_copies_are_those_of_each():
 
     together = gradients(State.joined(starts), 2)
     alone = [gradients(state, 1) for state in starts]
-    for found, expected in zip(together, zip(*alone, strict=True), strict=True):
-        assert torch.equal(found, torch.cat(expected))
+    for actual, expected in zip(together, zip(*alone, strict=True), strict=True):
+        assert torch.equal(actual, torch.cat(expected))
 
 
 def test_constants_are_weights_so_that_graphs_serve_all():
@@ -196,7 +196,7 @@ def test_the_gpu_agrees_also_when_it_replays(dtype):
         start = falling(dtype)
         on_gpu = rollout_batch(MODEL, laws, start.to("cuda"), **RUN, total=True)
         on_cpu = rollout_batch(MODEL, laws, start, **RUN, total=True)
-        for found, expected in zip(on_gpu, on_cpu, strict=True):
-            assert (found is None) == (expected is None)
-            if found:
-                assert_same(found.cpu(), expected, 1e4 * torch.finfo(dtype).eps)
+        for actual, expected in zip(on_gpu, on_cpu, strict=True):
+            assert (actual is None) == (expected is None)
+            if actual:
+                assert_same(actual.cpu(), expected, 1e4 * torch.finfo(dtype).eps)

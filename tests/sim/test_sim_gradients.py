@@ -108,7 +108,7 @@ def assert_gradients_match(model, law, state, frames, sizes, **options):
             return random_loss(simulate(model, law, moved, frames, **options))
 
     points = [p.detach().clone() for p in (*(getattr(state, name) for name in MOTION), *parameters)]
-    # Plastic weights move F by a thousandth of their own change: a larger step stands out of the round-off.
+    # Plastic weights move F by a thousandth of their change: a larger step exceeds the round-off.
     relative = [1e-5] * 3 + [1e-3] * 3
     steps = [*sizes, *(r * float(p.norm()) for r, p in zip(relative, points[4:], strict=False))]
     assert_slopes_match(value, points, grads, steps)

@@ -102,8 +102,8 @@ def test_a_rigid_motion_has_the_momenta_of_its_velocity_and_spin():
     torch.testing.assert_close(linear_momentum(mass, state.v), mass.sum() * velocity)
     arm = x - mass @ x / mass.sum()
     inertia = (mass * arm.square().sum(1)).sum() * torch.eye(3).double() - (mass[:, None] * arm).mT @ arm
-    found = (mass[:, None] * torch.linalg.cross(arm, state.v)).sum(0)
-    torch.testing.assert_close(found, inertia @ spin)
+    actual = (mass[:, None] * torch.linalg.cross(arm, state.v)).sum(0)
+    torch.testing.assert_close(actual, inertia @ spin)
     # C is the gradient of v: it takes v from one particle to another.
     torch.testing.assert_close(state.v[7] + state.C[7] @ (x[3] - x[7]), state.v[3])
     about_a_corner = State.rigid(x, mass, vol0, velocity, spin, centre=x[0])

@@ -91,7 +91,7 @@ def test_error_of_a_render_is_that_of_its_images(dtype, decoded):
     observed = random_pixels(3, 2, 21, 26)
     if not decoded:
         observed = over_white(observed.to(dtype) / 255)
-    found = []
+    actual = []
     for drawn in (False, True):
         inputs = [tensor.clone().requires_grad_() for tensor in scene[:4]]
         setting = (*inputs, *scene[4:], 26, 21)
@@ -101,8 +101,8 @@ def test_error_of_a_render_is_that_of_its_images(dtype, decoded):
             images, _ = rasterize(*setting, background=BACKGROUND, eps2d=0.1)
             losses = mean_squared_error(images, observed)
         weight = torch.tensor([0.5, 0.0, 3.0], dtype=dtype)
-        found.append([losses.detach(), *torch.autograd.grad(losses, inputs, weight)])
-    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+        actual.append([losses.detach(), *torch.autograd.grad(losses, inputs, weight)])
+    assert all(torch.equal(a, b) for a, b in zip(*actual, strict=True))
 
 
 @pytest.mark.parametrize("index", range(4), ids=["means", "covars", "opacities", "sh"])
@@ -196,10 +196,10 @@ def test_gradient_stops_at_the_covariances_on_request():
     binding, means, covars, x0, x, F = deformation(torch.float64, "cpu")
     moved, stretched = deform(means, covars, binding, x0, x, F, covariance_gradient=False)
     weight = normal(4, 70, 3, seed=4)
-    found = torch.autograd.grad((weight * moved).sum() + stretched.sum(), (x, F), allow_unused=True)
+    actual = torch.autograd.grad((weight * moved).sum() + stretched.sum(), (x, F), allow_unused=True)
     expected = torch.einsum("gn,tgi->tni", dense(binding), weight)
-    assert_near(found[0], expected, torch.float64)
-    assert found[1] is None
+    assert_near(actual[0], expected, torch.float64)
+    assert actual[1] is None
 
 
 def test_states_of_other_particles_are_refused():
@@ -215,11 +215,11 @@ def test_states_of_other_particles_are_refused():
 
 @pytest.mark.parametrize(("count", "size"), [(1, 1), (7, 3), (8, 4), (33, 8), (5, 100)])
 def test_parts_cover_all_frames_evenly(count, size):
-    found = list(frame_batches(count, size))
-    assert [i for part in found for i in range(count)[part]] == list(range(count))
-    lengths = [part.stop - part.start for part in found]
+    actual = list(frame_batches(count, size))
+    assert [i for part in actual for i in range(count)[part]] == list(range(count))
+    lengths = [part.stop - part.start for part in actual]
     assert max(lengths) <= size and max(lengths) - min(lengths) <= 1
-    assert len(found) == -(-count // size)
+    assert len(actual) == -(-count // size)
 
 
 @pytest.mark.parametrize("size", [1, 2, 5, 9])
@@ -236,12 +236,12 @@ def test_frames_in_parts_give_the_value_and_gradient_of_all_at_once(size):
     split = evaluate_in_batches(function, size, x, F, unused)
     assert torch.allclose(split, whole, rtol=1e-14)
     expected = torch.autograd.grad(whole, (x, F), weight)
-    found = torch.autograd.grad(split, (x, F, unused), weight, allow_unused=True, retain_graph=True)
-    for a, b in zip(found, expected, strict=False):
+    actual = torch.autograd.grad(split, (x, F, unused), weight, allow_unused=True, retain_graph=True)
+    for a, b in zip(actual, expected, strict=False):
         assert torch.allclose(a, b, rtol=1e-13)
-    assert found[2] is None
+    assert actual[2] is None
     again = torch.autograd.grad(split, (x, F), weight)
-    assert torch.equal(again[0], found[0]) and torch.equal(again[1], found[1])
+    assert torch.equal(again[0], actual[0]) and torch.equal(again[1], actual[1])
     with torch.no_grad():
         assert torch.equal(evaluate_in_batches(function, size, x, F, unused), split)
 
@@ -297,12 +297,12 @@ def test_pixel_loss_is_equation_2_whatever_the_batch(dtype, device, covariance_g
     expected = value_and_gradients((renderer(x, F) - video.colours()).square().flatten(1).mean(1))
     for batch in (None, 1, 2):
         loss = PixelLoss(body, video, covariance_gradient, batch)
-        found = value_and_gradients(loss(Trajectory(video.frames, x, x, F, F)))
-        for mine, twin in zip(found, expected, strict=True):
+        actual = value_and_gradients(loss(Trajectory(video.frames, x, x, F, F)))
+        for mine, twin in zip(actual, expected, strict=True):
             assert (mine is None and twin is None) or torch.allclose(
                 mine, twin, rtol=1e3 * TOLERANCE[dtype], atol=10 * TOLERANCE[dtype] * float(twin.abs().max())
             )
-        assert (found[2] is None) == (not covariance_gradient)
+        assert (actual[2] is None) == (not covariance_gradient)
 
 
 def test_batches_of_a_renderer_are_its_images():

@@ -130,7 +130,7 @@ def test_statistics(render):
 
 
 def frame_errors(function, device, scene, observed, width, height, **options):
-    """Losses (T,) of a render and gradients of all inputs, of frames with weights of their own."""
+    """Losses (T,) of a render and gradients of all inputs, with a weight per frame."""
     inputs = [tensor.float().to(device) for tensor in scene]
     leaves = [tensor.requires_grad_() for tensor in inputs[:4]]
     losses = function(*inputs, width, height, observed.to(device), background=BACKGROUND, **options)
@@ -184,8 +184,8 @@ def test_direct_error_is_that_of_the_images(name, device, monkeypatch):
     assert torch.equal(drawn[0][0], drawn[1][0]), "sums have a fixed order"
     # covariances of needles are badly conditioned: the twin's own gradients are 1e-4 away from those in float64
     bound = 1e-3 if name == "needles" else 5e-6
-    for found, twin in zip(drawn[0], expected, strict=True):
-        assert (found - twin).norm() <= bound * twin.norm()
+    for actual, twin in zip(drawn[0], expected, strict=True):
+        assert (actual - twin).norm() <= bound * twin.norm()
     assert all(bool(grad.abs().max() > 0) == (name != "no splats at all") for grad in drawn[0][1:3])
 
 
@@ -194,13 +194,13 @@ def test_omitted_gradients_change_no_other(wanted, device):
     """Other code runs without those of opacities."""
     scene = [tensor.float().to(device) for tensor in random_scene(2, 80, 2, 37, 29, 4, scale=0.04)]
     observed = torch.full((2, 2, 29, 37, 4), 99, dtype=torch.uint8, device=device)
-    found = []
+    actual = []
     for leaves in (range(4), wanted):
         inputs = [tensor.clone().requires_grad_(i in leaves) for i, tensor in enumerate(scene[:4])]
         losses = rasterized_error(*inputs, *scene[4:], 37, 29, observed)
         losses.sum().backward()
-        found.append([tensor.grad for tensor in inputs])
-    for i, (all_wanted, some_wanted) in enumerate(zip(*found, strict=True)):
+        actual.append([tensor.grad for tensor in inputs])
+    for i, (all_wanted, some_wanted) in enumerate(zip(*actual, strict=True)):
         if i not in wanted:
             assert some_wanted is None
         else:
@@ -215,8 +215,8 @@ def test_errors_of_other_tile_sizes(tile, lane_pixels, monkeypatch, build_folder
     setting = ("cpu", scene, observed, 37, 29)
     expected = frame_errors(error_of_images, *setting)
     monkeypatch.setitem(rasterizer.COMPOSITORS, "rows", EmulatedTiles(build_folder, tile, lane_pixels))
-    for found, twin in zip(frame_errors(rasterized_error, *setting), expected, strict=True):
-        assert (found - twin).norm() <= 1e-4 * twin.norm()
+    for actual, twin in zip(frame_errors(rasterized_error, *setting), expected, strict=True):
+        assert (actual - twin).norm() <= 1e-4 * twin.norm()
 
 
 def project(scene, width, height, alpha_min=1 / 255, eps2d=0.3):
