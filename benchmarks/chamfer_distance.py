@@ -9,13 +9,14 @@ displacement.
 from __future__ import annotations
 
 import numpy as np
+import torch
 import trimesh
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from benchmarks.timing import parser_of
 from neuma_lib.evaluation.text_tables import as_markdown
-from neuma_lib.geometry.chamfer import chamfer
+from neuma_lib.geometry.chamfer import chamfer_sequence
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.paper.claims import shown
 
@@ -39,6 +40,11 @@ def turned(x: np.ndarray, amount: float) -> np.ndarray:
 def rmse(x: np.ndarray, y: np.ndarray) -> float:
     """Root mean square distance of corresponding points [mm]."""
     return 1e3 * float(np.sqrt(np.square(x - y).sum(axis=1).mean()))
+
+
+def chamfer(a: np.ndarray, b: np.ndarray) -> float:
+    """Chamfer distance of two point sets [1e-4 m^2]."""
+    return float(chamfer_sequence(torch.from_numpy(a)[None], torch.from_numpy(b)[None]))
 
 
 def main() -> None:

@@ -289,6 +289,6 @@ def test_colours_on_the_image_are_those_of_the_surface(tmp_path):
     gray = np.full((len(mesh.vertices), 3), 0.6)
     body = Surface(mesh.vertices[None], mesh.faces, gray)
     render_static(body, cameras.static_views(body.points, 6, 48, 48), tmp_path, 8)
-    pictures = read_image_set(tmp_path / "transforms.json").images
+    pictures = read_image_set(tmp_path / "transforms.json").images / 255.0
     inside = pictures[pictures[..., 3] == 1.0]
     assert np.abs(inside[:, :3] - 0.6).max() < 0.12

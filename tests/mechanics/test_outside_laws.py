@@ -8,8 +8,8 @@ import torch
 from scipy.optimize import nnls
 
 from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.catalogue import lame
 from neuma_lib.mechanics.elasticity import FibreReinforced, Hencky, MooneyRivlin, NeoHookean, Ogden
-from neuma_lib.mechanics.isotropic import lame
 from neuma_lib.mechanics.plasticity import (
     CohesiveDruckerPrager,
     CrushableFoam,

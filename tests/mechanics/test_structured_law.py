@@ -9,7 +9,8 @@ from neuma_lib.errors import InputError
 from neuma_lib.io.laws import load_law, save_adaptor, save_prior
 from neuma_lib.io.weights import write_weights
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.mechanics.isotropic import PAIRS, lame
+from neuma_lib.mechanics.catalogue import lame
+from neuma_lib.mechanics.isotropic import PAIRS
 from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.mechanics.plasticity import CohesiveDruckerPrager, hencky_strain
 from neuma_lib.mechanics.structured import (
@@ -25,7 +26,7 @@ from neuma_lib.mechanics.structured import (
 from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
-from tests.support.deformations import EYE, deformations, hencky_deviator, weights_of
+from tests.support.deformations import EYE, deformations, hencky_deviator, randomise_adaptor, weights_of
 from tests.support.errors import refused
 from tests.support.sim_scenes import cube, strained
 from tests.support.structured_laws import (
@@ -101,14 +102,11 @@ def test_identity_stays_the_identity():
     assert torch.equal(law.plasticity.evaluate(F, ()), F)
 
 
-def trained(seed=3, **options):
+def trained(**options):
     """A law with an adaptor that has been moved."""
     law = structured_law({**specification(plastic="bingham"), **options}, dt=DT, seed=1)
     law.attach_adaptor(rank=None)
-    generator = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for p in (p for p in law.parameters() if p.requires_grad):
-            p.copy_(0.3 * torch.randn(p.shape, generator=generator))
+    randomise_adaptor(law, seed=3)
     return law
 
 
@@ -495,10 +493,7 @@ def test_files_round_trip(tmp_path, rank):
         prior, adaptor, merged = (tmp_path / f"{name}.safetensors" for name in ("prior", "adaptor", "merged"))
         save_prior(prior, law, {"prior": "jelly"})
         law.attach_adaptor(rank=rank)
-        generator = torch.Generator().manual_seed(0)
-        with torch.no_grad():
-            for p in (p for p in law.parameters() if p.requires_grad):
-                p.copy_(0.3 * torch.randn(p.shape, generator=generator))
+        randomise_adaptor(law)
         save_adaptor(adaptor, law, rank, 16.0, {})
         save_prior(merged, law, {})
         F = deformations(50)
@@ -518,9 +513,7 @@ def test_a_law_from_a_file_flows_as_much_in_a_second_at_any_time_step(tmp_path, 
     spec, path = specification(plastic="viscous_flow"), tmp_path / "adaptor.safetensors"
     law = structured_law(spec, dt=DT, seed=5)
     law.attach_adaptor(rank=rank)
-    with torch.no_grad():
-        for p in (p for p in law.parameters() if p.requires_grad):
-            p.copy_(0.3 * torch.randn(p.shape, generator=torch.Generator().manual_seed(len(p))))
+    randomise_adaptor(law)
     save_adaptor(path, law, rank, 16.0, {})
     half = load_law(None, path, dt=DT / 2)
     assert half.plasticity.rate == pytest.approx(2 * law.plasticity.rate)

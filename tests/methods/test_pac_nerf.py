@@ -8,7 +8,7 @@ import torch
 from benchmarks import pac_nerf as benchmark
 from benchmarks.pac_nerf import BOUNDS, DENSITY, MIN_OPACITY, MODEL, spotted_ball
 from neuma_lib.io.checkpoint import Checkpoint
-from neuma_lib.mechanics.isotropic import lame
+from neuma_lib.mechanics.catalogue import lame
 from neuma_lib.methods.pac_nerf import rendering
 from neuma_lib.methods.pac_nerf.carried_field import CarriedField
 from neuma_lib.methods.pac_nerf.families import FamilyConstants, choose_family

@@ -2,6 +2,7 @@
 
 import torch
 
+from neuma_lib.mechanics.adaptor import AdaptableLaw
 from neuma_lib.mechanics.law import Constitutive
 
 E, NU = 1e5, 0.3
@@ -27,7 +28,7 @@ def weights_of(part: Constitutive, dtype=torch.float64) -> tuple[torch.Tensor, .
 
 
 def hencky_deviator(F: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Trace and deviator (N, 3) of the log strain, through an eigenvalue solver of its own."""
+    """Trace and deviator (N, 3) of the log strain, through an eigenvalue solver."""
     strain = 0.5 * torch.linalg.eigvalsh(F.mT @ F).log()
     trace = strain.sum(1, keepdim=True)
     return trace, strain - trace / 3
@@ -71,3 +72,11 @@ def assert_adjoint(part: Constitutive, F: torch.Tensor) -> None:
     exact = float(sum((g * t).sum() for g, t in zip(grads, turns, strict=True)))
     size = float(sum(g.norm() * t.norm() for g, t in zip(grads, turns, strict=True)))
     assert abs(difference - exact) <= 1e-7 * size
+
+
+def randomise_adaptor(law: AdaptableLaw, size: float = 0.3, seed: int = 0) -> None:
+    """Set the trainable parameters of a law to random numbers of a size."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for p in (p for p in law.parameters() if p.requires_grad):
+            p.copy_(size * torch.randn(p.shape, generator=generator))
