@@ -37,7 +37,7 @@ SAMPLES = 20_000
 
 def bowl() -> trimesh.Trimesh:
     """A bowl that is open upwards, 0.4 m wide and 0.2 m high, its wall 0.03 m thick."""
-    outline = [
+    profile = [
         (0, 0),
         (0.15, 0),
         (0.18, 0.05),
@@ -47,18 +47,18 @@ def bowl() -> trimesh.Trimesh:
         (0.12, 0.03),
         (0, 0.03),
     ]
-    return upright(outline)
+    return upright(profile)
 
 
 def pot() -> trimesh.Trimesh:
     """A pot that is open upwards, 0.3 m wide and 0.4 m high, its wall 0.02 m thick."""
-    outline = [(0, 0), (0.15, 0), (0.15, 0.4), (0.13, 0.4), (0.13, 0.02), (0, 0.02)]
-    return upright(outline)
+    profile = [(0, 0), (0.15, 0), (0.15, 0.4), (0.13, 0.4), (0.13, 0.02), (0, 0.02)]
+    return upright(profile)
 
 
-def upright(outline: list[tuple[float, float]]) -> trimesh.Trimesh:
-    """What an outline (radius, height) [m] sweeps about the vertical, above the middle of the floor."""
-    mesh = trimesh.creation.revolve(np.array(outline), sections=64)
+def upright(profile: list[tuple[float, float]]) -> trimesh.Trimesh:
+    """Solid of revolution of a profile (radius, height) [m] about the vertical, above the middle of the floor."""
+    mesh = trimesh.creation.revolve(np.array(profile), sections=64)
     mesh.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
     mesh.apply_translation([0.5, 0.4, 0.5])
     return mesh
@@ -70,7 +70,7 @@ def solid(name: str) -> Callable[[], trimesh.Trimesh]:
 
 
 CHOSEN_ON = {"bowl": bowl, "cat": solid("cat")}
-"""What the settings of the search were chosen on."""
+"""Shapes on which the settings of the search were chosen."""
 SHAPES = {**CHOSEN_ON, "pot": pot, **{name: solid(name) for name in ("duck", "fish", "pawn")}}
 
 
