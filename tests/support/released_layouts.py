@@ -9,7 +9,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from neuma_lib.capture.calibration.lens import Lens
-from neuma_lib.capture.released import CALIBRATED_SIZE, GROUND, MIDDLE, RATE, video_lens
+from neuma_lib.capture.released import CALIBRATED_SIZE, MIDDLE, RATE, video_lens
+from neuma_lib.project.released_captures import GROUND
 from tests.support.board_pictures import looking_at
 
 OBJECT = "bun"
