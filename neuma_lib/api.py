@@ -37,7 +37,7 @@ from neuma_lib.mechanics.structured import StructuredLaw, structured_law
 from neuma_lib.methods.neuma import Neuma, NeumaOptions
 from neuma_lib.methods.structured import Structured, StructuredOptions
 from neuma_lib.methods.training import pixel_loss
-from neuma_lib.project.find import found_scene
+from neuma_lib.project.find import find_scene
 from neuma_lib.sim.model import MPM
 from neuma_lib.sim.state import State, Trajectory
 from neuma_lib.splatting.cameras import Cameras
@@ -132,7 +132,7 @@ class Scene:
             >>> scene = Scene.load("results/BouncyBall")
             >>> path = simulate(scene.mpm, law, scene.state(), scene.video.frames)
         """
-        settings, files = found_scene(folder)
+        settings, files = find_scene(folder)
         mpm = MPM(**files.simulation)
         body = load_body(files.particles, files.binding, files.gaussians, files.density)
         blur = {"dt": mpm.dt, "exposure_samples": settings.dataset.exposure_samples}

@@ -110,7 +110,7 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument(
         "--separate",
         "--apart",
-        dest="apart",
+        dest="separate_adaptor",
         action="store_true",
         help="keep prior and adaptor separate, so that the adaptor's weight can be changed later",
     )
@@ -229,10 +229,10 @@ def _demo(options: argparse.Namespace) -> int:
 
 
 def _new_scene(options: argparse.Namespace) -> None:
-    from neuma_lib.project.project import settings_around
+    from neuma_lib.project.project import find_project
     from neuma_lib.project.scaffold import new_scene
 
-    settings, root = settings_around(_project())
+    settings, root = find_project(_project())
     path = new_scene(root, options.name, settings)
     file, name = path.relative_to(root), options.name
     print(f"Created {file}. Edit it, then run in {root}:")
@@ -241,10 +241,10 @@ def _new_scene(options: argparse.Namespace) -> None:
 
 
 def _new_capture(options: argparse.Namespace) -> None:
-    from neuma_lib.project.project import settings_around
+    from neuma_lib.project.project import find_project
     from neuma_lib.project.scaffold import new_capture
 
-    settings, root = settings_around(_project())
+    settings, root = find_project(_project())
     path = new_capture(root, options.name, settings)
     folder = path.parent.relative_to(root)
     print(f"Created {path.relative_to(root)}. docs/capture.md explains how to photograph and film. Next:")
@@ -257,7 +257,7 @@ def _new_capture(options: argparse.Namespace) -> None:
 def _check(options: argparse.Namespace) -> int:
     from neuma_lib.project import checks
     from neuma_lib.project.capture_folder import read_capture
-    from neuma_lib.project.project import settings_around
+    from neuma_lib.project.project import find_project
 
     captures = [file for file in options.files if Path(file).name == "capture.yaml"]
     files = [file for file in options.files if file not in captures]
@@ -271,7 +271,7 @@ def _check(options: argparse.Namespace) -> int:
     if files or not captures:
         root = _project()
         try:
-            settings, _ = settings_around(root, files)
+            settings, _ = find_project(root, files)
         except InputError as error:
             found += checks.lines(error)
         else:
@@ -300,13 +300,15 @@ def _export(options: argparse.Namespace) -> None:
     source = Path(options.source)
     law, known = _of_method(options) if source.is_dir() else _of_file(options)
     if options.weight != 1.0:
-        if options.apart:
+        if options.separate_adaptor:
             raise InputError("--weight", "a separate adaptor has no fixed weight", "Leave out --separate")
         if not isinstance(law, AdaptableLaw):
             raise InputError("--weight", f"{source} is an analytic law without an adaptor")
         law.set_adaptor_weight(options.weight)
         known["weight"] = options.weight
-    about = export_law(options.target, law, apart=options.apart, page=options.page, **known)
+    about = export_law(
+        options.target, law, separate_adaptor=options.separate_adaptor, page=options.page, **known
+    )
     step = "" if about["dt"] is None else f", learned at dt = {about['dt']:g} s"
     print(f"{options.target}: {about['kind']}{step}" + (f"; {options.page}" if options.page else ""))
 
@@ -315,7 +317,7 @@ def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
     """The law of a method's folder, and what `export_law` needs to know of it."""
     from neuma_lib.evaluation.law_export import head_commit
     from neuma_lib.project import cases
-    from neuma_lib.project.project import settings_around
+    from neuma_lib.project.project import find_project
 
     if options.adaptor or options.dt:
         raise InputError(
@@ -324,7 +326,7 @@ def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
             "Leave out --adaptor and --dt",
         )
     place = Path(options.source).absolute()
-    settings, root = settings_around(place, options.configfile)
+    settings, root = find_project(place, options.configfile)
     settings = settings.model_copy(update={"results_root": str(place.parent.parent)})
     scene, method = place.parent.name, place.name
     case = cases.case(settings, scene, method)

@@ -38,25 +38,25 @@ def save_prior(path: str | Path, law: AdaptableLaw, metadata: Mapping[str, Any])
     write_weights(path, law.prior_state(), {**metadata, **own})
 
 
-def save_law(path: str | Path, law: Law, about: Mapping[str, Any], apart: bool = False) -> None:
+def save_law(path: str | Path, law: Law, about: Mapping[str, Any], separate_adaptor: bool = False) -> None:
     """Write a complete law to one file, for `load_law` and `load_prior`.
 
     Args:
         law: networks with or without an adaptor, a structured or an analytic law.
         about: result of `neuma_lib.io.exported.about_law`.
-        apart: keep the adaptor separate from the weights that it corrects, instead of merging it with its weight w.
+        separate_adaptor: do not merge the adaptor, with its weight w, with the weights that it corrects.
 
     Raises:
-        InputError: ``apart`` for a law without an adaptor.
+        InputError: ``separate_adaptor`` for a law without an adaptor.
     """
     own = {EXPORT: dict(about)}
     if not isinstance(law, AdaptableLaw):
         own[ANALYTIC] = specification(law.elasticity, law.plasticity)
         write_weights(path, {}, own)
-    elif apart:
+    elif separate_adaptor:
         adaptor = next(iter(law.parts.values())).adaptor
         if adaptor is None:
-            raise InputError(f"law {law.name}", "has no adaptor to keep separate", "Omit apart")
+            raise InputError(f"law {law.name}", "has no adaptor to keep separate", "Omit separate_adaptor")
         save_adaptor(path, law, adaptor.rank, adaptor.alpha, own, complete=True)
     else:
         save_prior(path, law, own)

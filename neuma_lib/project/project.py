@@ -15,7 +15,7 @@ SETTINGS_FILE = Path("config/config.yaml")
 """Settings of a project, below its folder."""
 
 
-def settings_around(place: str | Path, configfiles: Sequence[str | Path] = ()) -> tuple[Config, Path]:
+def find_project(place: str | Path, configfiles: Sequence[str | Path] = ()) -> tuple[Config, Path]:
     """Settings of the project that a folder lies in, as the workflow has them, and the project's folder.
 
     Args:
