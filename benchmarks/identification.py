@@ -40,7 +40,7 @@ from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_observation
 from neuma_lib.io.mesh import read_mesh
-from neuma_lib.io.particles import load_body
+from neuma_lib.io.particles import load_reconstruction
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import named_combinations, physical
 from neuma_lib.project.loading import merged
@@ -200,7 +200,9 @@ def _read(
     data, results = Path(settings.data_root) / name, Path(settings.results_root) / name
     chosen = IdentifyConfig(**merged(settings.identify.plain(), changes))
     files = (results / name for name in ("particles.h5", "binding.h5", "gaussians.ply"))
-    body = load_body(*files, scene.density, gaussian_motion=chosen.gaussian_motion).to(torch.float32)
+    body = load_reconstruction(*files, scene.density, gaussian_motion=chosen.gaussian_motion).to(
+        torch.float32
+    )
     video = load_observation(data / "dynamic/transforms.json", chosen.views).to(torch.float32)
     return scene, chosen, InitialMotion.of(read_json(results / "velocity.json")), body, video
 

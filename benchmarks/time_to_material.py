@@ -34,7 +34,7 @@ from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.images import load_videos
 from neuma_lib.io.mesh import read_mesh
-from neuma_lib.io.particles import load_body
+from neuma_lib.io.particles import load_reconstruction
 from neuma_lib.mechanics.structured import structured_law
 from neuma_lib.project import cases
 from neuma_lib.project.settings import Config
@@ -105,7 +105,7 @@ def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
     binding, exposure = settings.binding, {"dt": dt, "exposure_samples": settings.dataset.exposure_samples}
     with clock.part("reading body"):
         files = (results / file for file in ("particles.h5", "binding.h5", "gaussians.ply"))
-        body = load_body(*files, scene.density, gaussian_motion=chosen.gaussian_motion).to(
+        body = load_reconstruction(*files, scene.density, gaussian_motion=chosen.gaussian_motion).to(
             torch.float32, device
         )
         throw = InitialMotion.of(read_json(results / "velocity.json"))

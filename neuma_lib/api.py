@@ -29,7 +29,7 @@ from neuma_lib.geometry.chamfer import chamfer_sequence
 from neuma_lib.io.files import read_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import EXPOSURE_SAMPLES, load_videos
-from neuma_lib.io.particles import load_body
+from neuma_lib.io.particles import load_reconstruction
 from neuma_lib.mechanics.adaptor import AdaptableLaw
 from neuma_lib.mechanics.analytic import specification
 from neuma_lib.mechanics.law import Law
@@ -134,7 +134,7 @@ class Scene:
         """
         settings, files = find_scene(folder)
         mpm = MPM(**files.simulation)
-        body = load_body(files.particles, files.binding, files.gaussians, files.density)
+        body = load_reconstruction(files.particles, files.binding, files.gaussians, files.density)
         blur = {"dt": mpm.dt, "exposure_samples": settings.dataset.exposure_samples}
         return cls(
             mpm,

@@ -58,7 +58,7 @@ IDENTIFIERS = {
     "sub_frames": "exposure_samples",
     "_leave_behind _adds_nothing _begun": "_prune, _is_redundant, _first_fit",
     "load_body load_start": "load_reconstruction, load_initial_state",
-    "find_project": "Project.find",
+    "settings_around": "Project.find",
     "any_step": "any_time_step",
     "redrawn_masks": "mask_refinement",
     "on_request": "default_target",

@@ -26,7 +26,7 @@ def export_law(
     law: Law,
     dt: float | None,
     separate_adaptor: bool = False,
-    any_step: bool = False,
+    any_time_step: bool = False,
     metrics: str | Path | None = None,
     rollout: str | Path | None = None,
     page: str | Path | None = None,
@@ -37,7 +37,7 @@ def export_law(
     Args:
         path: ``.safetensors``.
         dt: time step that it was learned at [s].
-        separate_adaptor, any_step: see `save_law` and `about_law`.
+        separate_adaptor, any_time_step: see `save_law` and `about_law`.
         metrics, rollout: metrics.json and rollout.h5 of its method, or None.
         page: file for the picture of `neuma_lib.evaluation.law_page`.
         known: further keys of `neuma_lib.io.exported`.
@@ -55,7 +55,7 @@ def export_law(
     if rollout is not None:
         arrays, _ = read_arrays(rollout, required=("F",), only=("F",))
         known["visited"] = visited_by(law, torch.from_numpy(arrays["F"]))
-    about = about_law(law, dt, any_step, **known)
+    about = about_law(law, dt, any_time_step, **known)
     write_page = _drawn(law, about, page) if page else None
     save_law(path, law, about, separate_adaptor)
     if write_page is not None:

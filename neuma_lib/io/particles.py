@@ -42,7 +42,7 @@ def save_binding(path: str | Path, binding: Binding) -> None:
     write_arrays(path, arrays, {"gaussians": binding.shape[0], "particles": binding.shape[1]})
 
 
-def load_body(
+def load_reconstruction(
     particles: str | Path,
     binding: str | Path,
     gaussians: str | Path,
@@ -111,7 +111,7 @@ def load_initial_state(
     Raises:
         InputError: files of different bodies, or several bodies with Gaussians as particles.
     """
-    together = load_body(particles, binding, gaussians, 1.0, particle_source)
+    together = load_reconstruction(particles, binding, gaussians, 1.0, particle_source)
     x0, vol0 = together.x0, together.vol0
     motion = _initial_motion(velocity)
     parts = motion.get("bodies", [{**motion, "particles": len(x0)}])

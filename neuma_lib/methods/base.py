@@ -234,7 +234,7 @@ class Method(ABC):
         """Files of the model, for `load`: one path a name."""
 
     def body_inputs(self, case: Case) -> Files:
-        """Further files of `load_initial_state` and `load_body`: one path a name."""
+        """Further files of `load_initial_state` and `load_reconstruction`: one path a name."""
         return {}
 
     def uncertainty_inputs(self, case: Case) -> Files:
@@ -246,7 +246,7 @@ class Method(ABC):
         return case.options.plain()
 
     def model_options(self, case: Case) -> dict[str, Any]:
-        """Options of `load`, `load_initial_state` and `load_body` as plain values."""
+        """Options of `load`, `load_initial_state` and `load_reconstruction` as plain values."""
         return {}
 
     def start_file(self, case: Case) -> str:
@@ -300,7 +300,7 @@ class Method(ABC):
         files = (inputs[name] for name in ("particles", "binding", "gaussians", "velocity"))
         return load_initial_state(*files, densities, carrier)
 
-    def load_body(
+    def load_reconstruction(
         self,
         inputs: Files,
         options: Mapping[str, Any],
@@ -312,10 +312,10 @@ class Method(ABC):
         """The body that renders a predicted motion, with ``particle_gs(cameras)``."""
         import torch
 
-        from neuma_lib.io.particles import load_body
+        from neuma_lib.io.particles import load_reconstruction
 
         files = (inputs[name] for name in ("particles", "binding", "gaussians"))
-        return load_body(*files, density, carrier, gaussian_motion).to(torch.float32, device)
+        return load_reconstruction(*files, density, carrier, gaussian_motion).to(torch.float32, device)
 
     def draws(
         self, inputs: Files, law: Law, F: Tensor | None, uncertainty: Mapping[str, Any], **drawn: Any

@@ -9,7 +9,7 @@ from typing import Any
 from neuma_lib.config.capture import ReleasedConfig
 from neuma_lib.config.validation import hint
 from neuma_lib.errors import InputError
-from neuma_lib.project.capture_folder import NAME, Capture, read_capture
+from neuma_lib.project.capture_folder import NAME, Capture, capture_folders, read_capture
 from neuma_lib.project.released_captures import released_captures
 
 
@@ -27,8 +27,7 @@ def captured_scenes(
     scenes: dict[str, dict[str, Any]] = {}
     for capture in (*(planned or {}).values(), *released_captures(released or {}).values()):
         scenes |= scenes_of(capture)
-    folders = sorted(p for p in Path(root).iterdir() if p.is_dir()) if Path(root).is_dir() else []
-    for folder in folders:
+    for folder in capture_folders(root):
         if not NAME.fullmatch(folder.name) or folder.name in (planned or {}):
             continue
         try:

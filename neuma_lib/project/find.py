@@ -16,7 +16,7 @@ from neuma_lib.methods.base import ModelSource
 from neuma_lib.methods.prior import prior_source
 from neuma_lib.project import cases, paths
 from neuma_lib.project.files import RunFiles, SceneFiles
-from neuma_lib.project.project import find_project
+from neuma_lib.project.project import Project
 from neuma_lib.project.settings import Config
 
 
@@ -74,7 +74,7 @@ def find_scene(place: str | Path, configfiles: Sequence[str | Path] = ()) -> tup
     place = Path(place).absolute()
     if not place.is_dir():
         raise InputError(place, "is not a folder", "Give that of a scene, for example results/BouncyBall")
-    settings, _ = find_project(place, configfiles)
+    settings, _ = Project.find(place, configfiles)
     base, results = place.name.partition("+")[0], place.parent
     if base not in settings.scenes:
         problem = f"the settings have no scene '{base}', only {', '.join(sorted(settings.scenes))}"

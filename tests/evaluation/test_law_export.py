@@ -202,7 +202,7 @@ def test_another_step_is_refused(tmp_path, make, load):
 def test_another_step_can_be_asked_for(tmp_path, make):
     law, path = make(), tmp_path / "law.safetensors"
     save_law(path, law, about_law(law, DT))
-    same(load_law(path, dt=2 * DT, any_step=True), law)
+    same(load_law(path, dt=2 * DT, any_time_step=True), law)
     assert main(["law", "export", str(path), str(tmp_path / "any.safetensors"), "--any-step"]) == 0
     same(load_prior(tmp_path / "any.safetensors", dt=2 * DT), law)
     assert read_about(tmp_path / "any.safetensors")["dt"] == DT
