@@ -244,8 +244,8 @@ def identify(
         NonFiniteError: every family diverges.
 
     Example:
-        >>> found = identify(scene)
-        >>> found.family, found.constants
+        >>> material = identify(scene)
+        >>> material.family, material.constants
         ('hencky', {'E': 61000.0, 'nu': 0.31})
     """
     values = {

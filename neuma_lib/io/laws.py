@@ -1,7 +1,7 @@
 """Files of laws: priors (our ``.safetensors``, the released NCLaw / NeuMA ``.pt``), adaptors (ours, the released
 ``*_lora.pt``) and exported laws (`save_law`).
 
-The metadata of a ``.safetensors`` tell its kind: :data:`STRUCTURED` holds names and constants of the base of a
+The metadata of a ``.safetensors`` determine its kind: :data:`STRUCTURED` holds names and constants of the base of a
 structured law, :data:`ANALYTIC` those of an analytic law without tensors. Any other file is a pair of NCLaw networks. A
 file may contain an adaptor and the weights that it corrects, as that of a structured law does. It needs no prior then.
 """

@@ -26,11 +26,13 @@ def released_captures(released: Mapping[str, ReleasedConfig]) -> dict[str, Captu
     """
     captures = {}
     for name, settings in released.items():
-        shown = settings.object or name
-        floor_height(shown, settings.ground)
-        folder, is_spring_gaus = object_folder(settings.folder, shown)
+        object_name = settings.object or name
+        floor_height(object_name, settings.ground)
+        folder, is_spring_gaus = object_folder(settings.folder, object_name)
         calibration = folder / "cameras_calib.json"
-        cameras = sequence(folder, shown)[0] if is_spring_gaus else read_json(existing(calibration, UNPACK))
+        cameras = (
+            sequence(folder, object_name)[0] if is_spring_gaus else read_json(existing(calibration, UNPACK))
+        )
         videos = dict.fromkeys(sorted(cameras), folder)
         captures[name] = Capture(Path(name), settings.as_capture(), (), {}, {TAKE: videos})
     return captures

@@ -52,8 +52,8 @@ def timings_table(results: Path) -> str:
 
 def core_seconds(log: Path) -> tuple[float, float] | None:
     """Core seconds that a script took to start and to work, from its log; None if it did not finish."""
-    found = _CORE_SECONDS.findall(log.read_text()) if log.exists() else []
-    return tuple(map(float, found[-1])) if found else None
+    runs = _CORE_SECONDS.findall(log.read_text()) if log.exists() else []
+    return tuple(map(float, runs[-1])) if runs else None
 
 
 def _aggregate(column: str):
