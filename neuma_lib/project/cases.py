@@ -181,7 +181,9 @@ def law_from(settings: Config, method: str) -> str | None:
     if source is not None and source not in settings.scenes:
         raise InputError(method, f"no scene '{source}'{hint(source, settings.scenes)}")
     if source is not None and not kind_of(settings, method).moves_other_bodies:
-        raise InputError(method, "its model moves only the body that it is fitted to", f"Leave out {LAW_FROM}")
+        raise InputError(
+            method, "its model moves only the body that it is fitted to", f"Leave out {LAW_FROM}"
+        )
     return source
 
 
