@@ -157,16 +157,9 @@ def test_gltf_holds_the_motion(tmp_path, surface):
     animated = base + np.einsum("tk,kvc->tvc", weights, targets)
     np.testing.assert_allclose(animated, vertices, atol=2 * np.finfo(np.float32).eps)  # metres, below 1
     np.testing.assert_allclose(array(primitive["attributes"]["COLOR_0"]), linear(colors), atol=1e-7)
-
-
-def test_gltf_is_valid_to_its_library(tmp_path, surface):
-    pygltflib = pytest.importorskip("pygltflib")
-    write_glb(tmp_path / "a.glb", *surface)
-    moving = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))
-    assert len(moving.meshes[0].primitives[0].targets) == 3 and len(moving.animations[0].channels) == 1
     write_glb(tmp_path / "b.glb", *(part[:1] if k in (0, 2) else part for k, part in enumerate(surface)))
-    still = pygltflib.GLTF2().load(str(tmp_path / "b.glb"))
-    assert not still.animations and not still.meshes[0].primitives[0].targets
+    still = (tmp_path / "b.glb").read_bytes()
+    assert b"animations" not in still and b"targets" not in still
 
 
 @pytest.mark.parametrize("kind", ["usda", "usdc"])
