@@ -15,7 +15,7 @@ from neuma_lib.io.gaussians import load_gaussians, save_gaussians
 from neuma_lib.io.images import OPENGL_TO_OPENCV, load_views, write_transforms
 from neuma_lib.io.mesh import read_mesh, write_mesh
 from neuma_lib.io.particles import load_particles, load_reconstruction, save_binding, save_particles
-from tests.support.flight_scene import GAINS, PLACE, VELOCITY, filmed, thing, true_motion
+from tests.support.flight_scene import GAINS, PLACE, VELOCITY, ellipsoid_body, filmed, true_motion
 from tests.support.project import copied
 
 OFFSET, SIZE, FRAMES = 0.0035, (80, 60), 10
@@ -33,7 +33,7 @@ def project(tmp_path):
         (capture / name).parent.mkdir(parents=True, exist_ok=True)
         Image.new("RGB", (8, 8)).save(capture / name, "PNG")
     (capture / "capture.yaml").write_text("board: {square: 0.03}\n")
-    body = thing(count=150)
+    body = ellipsoid_body(count=150)
     motion = true_motion(body, Rotation.random(random_state=1).as_matrix())
     for sight in filmed(body, motion, frames=FRAMES, offset=OFFSET, size=SIZE):
         folder = data / f"videos/first/{sight.name}"
