@@ -5,7 +5,7 @@ import re
 import pytest
 
 from neuma_lib.project import cases
-from neuma_lib.project.project import settings_around
+from neuma_lib.project.project import Project
 from tests.support.job_graph import jobs
 from tests.support.project import SCENE, TABLE, copied
 
@@ -190,7 +190,7 @@ def test_a_structured_law_corrects_what_the_video_shows(project):
 
 def test_the_command_line_exports_the_law_that_the_rule_exports(project):
     """Of every kind of law, in a chain too: the files that `export-law` finds are those that the rule reads."""
-    settings, _ = settings_around(project.root, [project.root / "tests/workflow/tiny.yaml"])
+    settings, _ = Project.find(project.root, [project.root / "tests/workflow/tiny.yaml"])
     methods = (
         "neuma",
         "nclaw",

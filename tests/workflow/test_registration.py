@@ -14,8 +14,8 @@ from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.gaussians import load_gaussians, save_gaussians
 from neuma_lib.io.images import OPENGL_TO_OPENCV, load_views, write_transforms
 from neuma_lib.io.mesh import read_mesh, write_mesh
-from neuma_lib.io.particles import load_body, load_particles, save_binding, save_particles
-from tests.support.flight_scene import GAINS, PLACE, VELOCITY, filmed, thing, true_motion
+from neuma_lib.io.particles import load_particles, load_reconstruction, save_binding, save_particles
+from tests.support.flight_scene import GAINS, PLACE, VELOCITY, ellipsoid_body, filmed, true_motion
 from tests.support.project import copied
 
 OFFSET, SIZE, FRAMES = 0.0035, (80, 60), 10
@@ -33,7 +33,7 @@ def project(tmp_path):
         (capture / name).parent.mkdir(parents=True, exist_ok=True)
         Image.new("RGB", (8, 8)).save(capture / name, "PNG")
     (capture / "capture.yaml").write_text("board: {square: 0.03}\n")
-    body = thing(count=150)
+    body = ellipsoid_body(count=150)
     motion = true_motion(body, Rotation.random(random_state=1).as_matrix())
     for sight in filmed(body, motion, frames=FRAMES, offset=OFFSET, size=SIZE):
         folder = data / f"videos/first/{sight.name}"
@@ -96,7 +96,9 @@ def test_placed_files_are_of_one_body_that_moves_as_it_was_filmed(project):
     assert found["offsets_s"]["b"] == pytest.approx(OFFSET, abs=3e-4)
     np.testing.assert_allclose([found["gains"][k] for k in "ab"], GAINS[:2], rtol=0.03)
     # All files are moved alike, and fit together.
-    body_there = load_body(*(results / f for f in ("particles.h5", "binding.h5", "gaussians.ply")), 1000.0)
+    body_there = load_reconstruction(
+        *(results / f for f in ("particles.h5", "binding.h5", "gaussians.ply")), 1000.0
+    )
     x = body.particles @ np.array(found["rotation"]).T + found["translation"]
     np.testing.assert_allclose(body_there.x0, x, atol=1e-6)
     np.testing.assert_allclose(x.mean(axis=0), throw.centre, atol=1e-6)
