@@ -26,7 +26,7 @@ demo: env unlock
 	$(SNAKEMAKE) --configfile config/demo.yaml -- demo
 	@echo "Now open $(CURDIR)/results/demo/SoftDuck/viewer.html in a browser; film and numbers: results/demo/demo.md"
 
-# The film of the README, made anew.
+# The film of the README.
 docs/learned.gif: demo
 	cp results/demo/SoftDuck/film.gif $@
 

@@ -59,7 +59,7 @@ WIDTH = 1400
 
 
 def processor() -> str:
-    """Name of the processor, as Linux tells it."""
+    """Name of the processor, as Linux reports it."""
     for line in Path("/proc/cpuinfo").read_text().splitlines():
         if line.startswith("model name"):
             return line.partition(":")[2].strip()
@@ -68,8 +68,8 @@ def processor() -> str:
 
 def head() -> str:
     """The commit that is checked out."""
-    found = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
-    return found.stdout.strip() or "unknown"
+    done = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
+    return done.stdout.strip() or "unknown"
 
 
 def filled(page: str, name: str, content: str) -> str:
@@ -79,7 +79,7 @@ def filled(page: str, name: str, content: str) -> str:
         SystemExit: the page has not exactly one such place.
     """
     place = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
-    page, count = place.subn(lambda found: f"{found[1]}{content.strip()}\n{found[2]}", page)
+    page, count = place.subn(lambda match: f"{match[1]}{content.strip()}\n{match[2]}", page)
     if count != 1:
         raise SystemExit(f"a page has {count} places <!-- {name} --> ... <!-- /{name} -->; it needs one")
     return page
@@ -109,9 +109,9 @@ def overview(markdown: str) -> str:
 
 
 def verdicts(tables: dict[str, str]) -> str:
-    """What recorded tables say of claims, as one Markdown table, and how far laws are closer than the true one.
+    """Verdicts of the recorded tables as one Markdown table, and how much closer laws are than the true law.
 
-    Tables that are not recorded, or not with verdicts, are named.
+    Tables that are not recorded, or recorded without verdicts, are listed.
 
     Args:
         tables: name -> its Markdown.
@@ -137,12 +137,14 @@ def verdicts(tables: dict[str, str]) -> str:
             if name in PAPER and PAPER[name].claims and VERDICT_HEAD not in text
         ],
     }
-    said = [line for what, names in lacking.items() if names for line in ("", f"{what}: {', '.join(names)}.")]
-    return "\n".join([*as_markdown(header, rows), *absorbed, *said])
+    missing = [
+        line for what, names in lacking.items() if names for line in ("", f"{what}: {', '.join(names)}.")
+    ]
+    return "\n".join([*as_markdown(header, rows), *absorbed, *missing])
 
 
 def figure_numbers(folder: Path) -> str:
-    """What the data of figures say in numbers: qualities of images, gradients, heights; empty where there are none."""
+    """Numbers from the data of figures: quality of images, gradients, heights. Empty without data."""
     parts = []
     if (folder / "image_quality.json").exists():
         quality = read_json(folder / "image_quality.json")
@@ -159,10 +161,10 @@ def figure_numbers(folder: Path) -> str:
     if (folder / "gradient_analysis.json").exists():
         parts += ["Which network training turns to (`gradient_analysis`):", ""]
         rows = []
-        for scene, found in read_json(folder / "gradient_analysis.json").items():
-            norms = [f"{median(values):.2g}" for values in found["norms"].values()]
+        for scene, analysis in read_json(folder / "gradient_analysis.json").items():
+            norms = [f"{median(values):.2g}" for values in analysis["norms"].values()]
             rows.append(
-                [scene, found["wrong"], *norms, *(f"{100 * c:.1f} %" for c in found["change"].values())]
+                [scene, analysis["wrong"], *norms, *(f"{100 * c:.1f} %" for c in analysis["change"].values())]
             )
         names = "wrong in the prior", "gradient, elastic", "plastic", "change of weights, elastic", "plastic"
         parts += [*as_markdown(["Scene", *names], rows), ""]
@@ -170,8 +172,8 @@ def figure_numbers(folder: Path) -> str:
         numbers = load_image_grid(folder / "lora_alphav.h5").numbers
         inside = [k for k, weight in enumerate(numbers["weights"]) if 0 <= weight <= 1]
         counts = []
-        for scene, found in numbers["scenes"].items():
-            monotone, parted = lora_alphav.monotone_frames([found["heights"][k] for k in inside])
+        for scene, film in numbers["scenes"].items():
+            monotone, parted = lora_alphav.monotone_frames([film["heights"][k] for k in inside])
             counts.append(f"{monotone} of {parted} ({scene})")
         parts += [
             "Between w = 0 (prior) and 1 (trained law) the mean height is monotone in w in so many of the frames after "
@@ -190,7 +192,7 @@ def figure_numbers(folder: Path) -> str:
         if rows:
             about = (
                 "Part of the visited points of response curves at which the truth lies in a law's 95 % band "
-                "or, where it has none, in the range of its chains"
+                "or, where it has none, in the range of its replicates"
             )
             parts += [f"{about} (`material_response`):", ""]
             parts += [*as_markdown(["Method", *responses["scenes"]], rows, numbers=True), ""]

@@ -94,10 +94,16 @@ def _reset_orientation(content: bytes, exif: bytes) -> bytes:
     return content.replace(exif, bytes(changed), 1)
 
 
-def read_picture(file: Path) -> np.ndarray:
+def read_picture(file: str | Path) -> np.ndarray:
     """RGB (H, W, 3), uint8, in sensor orientation."""
-    with open_image(file.read_bytes(), file) as image, reading(file, "an image"):
+    with open_image(Path(file).read_bytes(), file) as image, reading(file, "an image"):
         return np.asarray(image.convert("RGB"))
+
+
+def write_png(path: str | Path, pixels: np.ndarray) -> None:
+    """Write RGB or RGBA pixels, uint8."""
+    with atomic(path) as partial:
+        Image.fromarray(pixels).save(partial, "PNG")
 
 
 def undistorted(pixels: np.ndarray, lens: Lens, longest: int) -> np.ndarray:
@@ -134,5 +140,4 @@ def picture_sheet(
         x, y = (i % columns) * width, line + sum(rows[:row]) + line * row
         draw.text((x + 4, y + 2), text, fill="black", font=font)
         sheet.paste(Image.fromarray(pixels).resize((width - 2, height), Image.LANCZOS), (x, y + line))
-    with atomic(path) as partial:
-        sheet.save(partial, "PNG")
+    write_png(path, np.asarray(sheet))

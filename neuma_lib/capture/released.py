@@ -34,9 +34,8 @@ from scipy.spatial.transform import Rotation
 from neuma_lib.capture.calibration.lens import Lens, lens_of_colmap
 from neuma_lib.capture.calibration.placement import Similarity
 from neuma_lib.capture.calibration.room import BOX_MIDDLE
-from neuma_lib.capture.masks.agreement import nearest_point
+from neuma_lib.capture.masks.agreement import middle_and_radii
 from neuma_lib.capture.masks.mattes import own_mask
-from neuma_lib.capture.masks.regions import centroid
 from neuma_lib.capture.pictures import picture_size, read_picture, undistorted
 from neuma_lib.config.capture import ReleasedConfig
 from neuma_lib.config.validation import hint
@@ -336,9 +335,7 @@ def seen_size(masks: Sequence[np.ndarray], viewmats: np.ndarray, Ks: np.ndarray)
         viewmats: world to camera, OpenCV axes, (N, 4, 4).
         Ks: [px], (N, 3, 3).
     """
-    middle = nearest_point(np.stack([centroid(mask) for mask in masks]), viewmats, Ks)
-    depths = viewmats[:, 2, :3] @ middle + viewmats[:, 2, 3]
-    radii = np.sqrt([mask.sum() / np.pi for mask in masks]) * depths / Ks[:, 0, 0]
+    middle, radii = middle_and_radii(masks, viewmats, Ks)
     if not (radii > 0).all():
         raise InputError(
             "masks", "the object is behind a camera", "Check that poses and masks are of the same capture"

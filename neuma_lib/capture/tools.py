@@ -1,12 +1,18 @@
-"""Optional packages for captures."""
+"""Optional packages for captures: OpenCV, COLMAP and Matplotlib."""
 
 from __future__ import annotations
 
 import signal
 import threading
+from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 from neuma_lib.extras import require
+from neuma_lib.io.files import atomic
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def opencv() -> ModuleType:
@@ -21,3 +27,16 @@ def colmap() -> ModuleType:
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
     return module
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """A figure of a size [in]. Raises InputError if Matplotlib is not installed."""
+    figure = require("matplotlib.figure", "capture").Figure
+    return figure(figsize=(width, height), layout="constrained")
+
+
+def save_figure(path: str | Path, figure: Figure) -> None:
+    """Write a figure as PNG."""
+    canvas = require("matplotlib.backends.backend_agg", "capture").FigureCanvasAgg(figure)
+    with atomic(path) as partial:
+        canvas.print_png(partial, metadata={"Software": None})

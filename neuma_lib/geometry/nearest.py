@@ -7,7 +7,6 @@ rings of cells until no point outside can be nearer, so the result is exact at a
 # No `from __future__ import annotations` here: Warp reads the annotations of kernels as objects.
 import functools
 from collections.abc import Sequence
-from types import SimpleNamespace
 
 import torch
 import warp as wp
@@ -19,8 +18,8 @@ start_warp()
 
 
 @functools.cache
-def _kernels(dtype: torch.dtype) -> SimpleNamespace:
-    """Kernel `search`, over the queries, for a dtype."""
+def _search_kernel(dtype: torch.dtype) -> wp.Kernel:
+    """Kernel over the queries for a dtype."""
     real = {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
     vec3 = wp.types.vector(length=3, dtype=real)
     module = wp.get_module(f"{__name__}.{str(dtype).removeprefix('torch.')}")
@@ -83,7 +82,7 @@ def _kernels(dtype: torch.dtype) -> SimpleNamespace:
                 break
         out[k] = closest
 
-    return SimpleNamespace(search=search)
+    return search
 
 
 def nearest(points: Tensor, points_of: Sequence[int], queries: Tensor, queries_of: Sequence[int]) -> Tensor:
@@ -125,7 +124,7 @@ def nearest(points: Tensor, points_of: Sequence[int], queries: Tensor, queries_o
     which = sets.repeat_interleave(torch.tensor(queries_of, device=device))
     out = torch.empty(len(queries), dtype=torch.int32, device=device)
     launch(
-        _kernels(points.dtype).search,
+        _search_kernel(points.dtype),
         len(queries),
         points[order].contiguous(),
         starts.int(),

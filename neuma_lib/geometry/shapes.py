@@ -62,9 +62,9 @@ class Shape:
         Borders between parts are ``softness`` [nominal m] wide, for antialiasing.
         """
         distances = np.stack([part(points) for part in self.parts.values()], axis=1)
-        weights = np.zeros((len(points), len(self.part_names)))
         nearest = np.clip(1.0 - (distances - distances.min(axis=1, keepdims=True)) / softness, 0.0, 1.0)
-        weights[:, : len(self.parts)] = nearest / nearest.sum(axis=1, keepdims=True)
+        painted = len(self.part_names) - len(self.parts)
+        weights = np.pad(nearest / nearest.sum(axis=1, keepdims=True), ((0, 0), (0, painted)))
         for name, region in self.paint.items():
             cover = np.clip(0.5 - region(points) / softness, 0.0, 1.0)[:, None]
             weights *= 1.0 - cover
@@ -151,6 +151,11 @@ def polygon(corners: list[tuple[float, float]], rounding: float = 0.0) -> Distan
     return distance
 
 
+def cylinder(radius: float, bottom: float, top: float, rounding: float) -> Distance:
+    """Upright cylinder on the vertical axis, enlarged by ``rounding`` [m] on all sides with rounded edges."""
+    return revolved(polygon([(0, bottom), (radius, bottom), (radius, top), (0, top)], rounding))
+
+
 def extruded(profile: Distance, half_depth: float, rounding: float) -> Distance:
     """Extrusion along z of a 2-D distance over (x, y), with rounded edges; total depth 2 ``half_depth`` [m]."""
 
@@ -163,14 +168,9 @@ def extruded(profile: Distance, half_depth: float, rounding: float) -> Distance:
     return distance
 
 
-def mirrored_x(part: Distance) -> Distance:
-    """The part, given for x >= 0, and its mirror image in the plane x = 0."""
-    return lambda p: part(np.abs(p, where=[True, False, False], out=p.copy()))
-
-
-def mirrored_z(part: Distance) -> Distance:
-    """The part, given for z >= 0, and its mirror image in the plane z = 0."""
-    return lambda p: part(np.abs(p, where=[False, False, True], out=p.copy()))
+def mirrored(part: Distance, axis: int) -> Distance:
+    """The part, given for coordinates >= 0 along an axis, and its mirror image in the plane at 0."""
+    return lambda p: part(np.abs(p, where=np.arange(3) == axis, out=p.copy()))
 
 
 def turned(part: Distance, degrees: float) -> Distance:
@@ -226,20 +226,17 @@ def _duck() -> Shape:
         tapered_capsule((-0.10, 0.02, 0.0), (-0.185, 0.105, 0.0), 0.075, 0.032),
         tapered_capsule((0.06, 0.05, 0.0), (0.075, 0.16, 0.0), 0.085, 0.07),
     )
-    wing = mirrored_z(ellipsoid((-0.035, 0.02, 0.105), (0.085, 0.052, 0.032), tilt=-14.0))
+    wing = mirrored(ellipsoid((-0.035, 0.02, 0.105), (0.085, 0.052, 0.032), tilt=-14.0), 2)
     head = sphere((0.085, 0.185, 0.0), 0.092)
     beak = union(
         0.02,
         ellipsoid((0.185, 0.172, 0.0), (0.052, 0.024, 0.048), tilt=8.0),
         ellipsoid((0.172, 0.152, 0.0), (0.042, 0.020, 0.040), tilt=-6.0),
     )
-    eye = mirrored_z(sphere((0.135, 0.215, 0.070), 0.0235))
+    eye = mirrored(sphere((0.135, 0.215, 0.070), 0.0235), 2)
+    parts = {"body": union(0.03, body, head), "wing": wing, "beak": beak}
     return Shape(
-        parts={
-            "body": turned(union(0.03, body, head), -turn),
-            "wing": turned(wing, -turn),
-            "beak": turned(beak, -turn),
-        },
+        parts={name: turned(part, -turn) for name, part in parts.items()},
         blend=0.018,
         lower=(-0.27, -0.13, -0.24),
         upper=(0.27, 0.31, 0.24),
@@ -249,15 +246,15 @@ def _duck() -> Shape:
 
 def _pawn() -> Shape:
     """A chess pawn: foot, waist, collar and head, turned on a lathe."""
-    foot = polygon([(0, 0.012), (0.118, 0.012), (0.118, 0.045), (0, 0.045)], rounding=0.012)
-    step = polygon([(0, 0.05), (0.092, 0.05), (0.092, 0.075), (0, 0.075)], rounding=0.012)
+    foot = cylinder(0.118, 0.012, 0.045, rounding=0.012)
+    step = cylinder(0.092, 0.05, 0.075, rounding=0.012)
     waist = polygon([(0, 0.06), (0.082, 0.08), (0.058, 0.13), (0.046, 0.19), (0.044, 0.26), (0, 0.26)], 0.006)
-    collar = polygon([(0, 0.248), (0.074, 0.248), (0.074, 0.262), (0, 0.262)], rounding=0.014)
+    collar = cylinder(0.074, 0.248, 0.262, rounding=0.014)
     return Shape(
         parts={
-            "body": union(0.03, revolved(step), revolved(waist), sphere((0, 0.335, 0), 0.082)),
-            "foot": revolved(foot),
-            "collar": revolved(collar),
+            "body": union(0.03, step, revolved(waist), sphere((0, 0.335, 0), 0.082)),
+            "foot": foot,
+            "collar": collar,
         },
         blend=0.012,
         lower=(-0.14, -0.01, -0.14),
@@ -272,19 +269,15 @@ def _cat() -> Shape:
         ellipsoid((0, 0.085, -0.02), (0.098, 0.088, 0.098)),
         tapered_capsule((0, 0.07, -0.01), (0, 0.185, 0.015), 0.090, 0.060),
     )
-    legs = mirrored_x(tapered_capsule((0.042, 0.14, 0.055), (0.045, 0.032, 0.085), 0.034, 0.032))
-    thighs = mirrored_x(ellipsoid((0.088, 0.055, 0.015), (0.042, 0.056, 0.072)))
+    legs = mirrored(tapered_capsule((0.042, 0.14, 0.055), (0.045, 0.032, 0.085), 0.034, 0.032), 0)
+    thighs = mirrored(ellipsoid((0.088, 0.055, 0.015), (0.042, 0.056, 0.072)), 0)
     head = ellipsoid((0, 0.232, 0.035), (0.096, 0.076, 0.076))
-    muzzle = mirrored_x(sphere((0.020, 0.208, 0.098), 0.029))
-    ears = mirrored_x(tapered_capsule((0.058, 0.272, 0.030), (0.079, 0.338, 0.026), 0.040, 0.013))
-    tail = union(
-        0.02,
-        tapered_capsule((0.05, 0.035, -0.085), (0.145, 0.035, -0.045), 0.032, 0.031),
-        tapered_capsule((0.145, 0.035, -0.045), (0.163, 0.060, 0.03), 0.031, 0.030),
-        tapered_capsule((0.163, 0.060, 0.03), (0.152, 0.125, 0.065), 0.030, 0.028),
-    )
-    inner_ear = mirrored_x(ellipsoid((0.066, 0.300, 0.060), (0.020, 0.034, 0.034)))
-    eyes = mirrored_x(ellipsoid((0.038, 0.243, 0.105), (0.017, 0.020, 0.024)))
+    muzzle = mirrored(sphere((0.020, 0.208, 0.098), 0.029), 0)
+    ears = mirrored(tapered_capsule((0.058, 0.272, 0.030), (0.079, 0.338, 0.026), 0.040, 0.013), 0)
+    spine = (0.05, 0.035, -0.085), (0.145, 0.035, -0.045), (0.163, 0.060, 0.03), (0.152, 0.125, 0.065)
+    tail = union(0.02, *map(tapered_capsule, spine, spine[1:], (0.032, 0.031, 0.030), (0.031, 0.030, 0.028)))
+    inner_ear = mirrored(ellipsoid((0.066, 0.300, 0.060), (0.020, 0.034, 0.034)), 0)
+    eyes = mirrored(ellipsoid((0.038, 0.243, 0.105), (0.017, 0.020, 0.024)), 0)
     nose = ellipsoid((0, 0.222, 0.128), (0.014, 0.010, 0.014))
 
     def stripes(p: Array) -> Array:
@@ -298,7 +291,7 @@ def _cat() -> Shape:
         return np.where((tail(p) < 0.01) & (p[:, 0] > 0.1), 0.098 - p[:, 1], 1.0)
 
     white = union(0.0, muzzle, ellipsoid((0, 0.135, 0.08), (0.036, 0.05, 0.05)))
-    paws = mirrored_x(sphere((0.045, 0.022, 0.09), 0.045))
+    paws = mirrored(sphere((0.045, 0.022, 0.09), 0.045), 0)
     return Shape(
         parts={
             "body": union(0.018, union(0.03, body, legs, head, ears), muzzle),
@@ -324,8 +317,8 @@ def _bottle() -> Shape:
         [(0, 0.02), (0.090, 0.02), (0.098, 0.05), (0.098, 0.215), (0.075, 0.265), (0.045, 0.30), (0, 0.30)],
         0.016,
     )
-    neck = polygon([(0, 0.28), (0.042, 0.28), (0.042, 0.37), (0, 0.37)], 0.010)
-    cap = polygon([(0, 0.375), (0.056, 0.375), (0.056, 0.430), (0, 0.430)], 0.012)
+    neck = cylinder(0.042, 0.28, 0.37, 0.010)
+    cap = cylinder(0.056, 0.375, 0.430, 0.012)
 
     def label(p: Array) -> Array:
         return np.abs(p[:, 1] - 0.135) - 0.062
@@ -335,7 +328,7 @@ def _bottle() -> Shape:
         return np.where(np.abs(p[:, 2]) > 0.05, hexagon - 0.040, 1.0)
 
     return Shape(
-        parts={"body": union(0.02, revolved(body), revolved(neck)), "cap": revolved(cap)},
+        parts={"body": union(0.02, revolved(body), neck), "cap": cap},
         blend=0.008,
         lower=(-0.13, -0.01, -0.13),
         upper=(0.13, 0.46, 0.13),
@@ -347,25 +340,16 @@ def _fish() -> Shape:
     """A fish that swims to the right, seen from its side."""
     body = ellipsoid((0.03, 0, 0), (0.155, 0.098, 0.075))
     stalk = tapered_capsule((-0.08, 0, 0), (-0.15, 0, 0), 0.055, 0.036)
-    tail_fin = extruded(
-        polygon([(-0.135, -0.012), (-0.195, -0.085), (-0.175, 0.0), (-0.195, 0.085), (-0.135, 0.012)], 0.022),
-        half_depth=0.031,
-        rounding=0.022,
+    tail_fin = polygon(
+        [(-0.135, -0.012), (-0.195, -0.085), (-0.175, 0.0), (-0.195, 0.085), (-0.135, 0.012)], 0.022
     )
-    dorsal = extruded(
-        polygon([(-0.055, 0.06), (-0.055, 0.115), (0.0, 0.118), (0.075, 0.07)], 0.018),
-        half_depth=0.029,
-        rounding=0.02,
-    )
-    belly = extruded(
-        polygon([(-0.02, -0.06), (-0.05, -0.115), (-0.01, -0.112), (0.04, -0.07)], 0.016),
-        half_depth=0.029,
-        rounding=0.02,
-    )
-    side_fin = mirrored_z(tapered_capsule((0.06, -0.025, 0.060), (0.0, -0.050, 0.092), 0.032, 0.024))
-    eye = mirrored_z(sphere((0.128, 0.030, 0.052), 0.026))
-    pupil = mirrored_z(sphere((0.134, 0.030, 0.060), 0.0165))
-    mouth = mirrored_z(ellipsoid((0.178, -0.026, 0.0), (0.030, 0.007, 0.06), tilt=12.0))
+    dorsal = polygon([(-0.055, 0.06), (-0.055, 0.115), (0.0, 0.118), (0.075, 0.07)], 0.018)
+    belly = polygon([(-0.02, -0.06), (-0.05, -0.115), (-0.01, -0.112), (0.04, -0.07)], 0.016)
+    fins = extruded(tail_fin, 0.031, 0.022), extruded(dorsal, 0.029, 0.02), extruded(belly, 0.029, 0.02)
+    side_fin = mirrored(tapered_capsule((0.06, -0.025, 0.060), (0.0, -0.050, 0.092), 0.032, 0.024), 2)
+    eye = mirrored(sphere((0.128, 0.030, 0.052), 0.026), 2)
+    pupil = mirrored(sphere((0.134, 0.030, 0.060), 0.0165), 2)
+    mouth = mirrored(ellipsoid((0.178, -0.026, 0.0), (0.030, 0.007, 0.06), tilt=12.0), 2)
 
     def stripes(p: Array) -> Array:
         wave = p[:, 0] - 0.9 * p[:, 1] ** 2 / 0.1
@@ -375,7 +359,7 @@ def _fish() -> Shape:
     return Shape(
         parts={
             "body": union(0.04, body, stalk),
-            "fins": union(0.01, tail_fin, dorsal, belly),
+            "fins": union(0.01, *fins),
             "side_fins": side_fin,
         },
         blend=0.02,

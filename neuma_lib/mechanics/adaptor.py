@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +12,19 @@ from neuma_lib.mechanics.law import Constitutive, Law, Weights
 
 LAYER_KEYS = ("layers.0.fc.weight", "layers.1.fc.weight", "final_layer.fc.weight")
 """Names of the three matrices of a network in files, as in NCLaw's checkpoints."""
+
+
+def layers_of(state: Mapping[str, Tensor], part: str, where: str) -> Weights:
+    """The three matrices of a part of a law, in float32, from the tensors of :meth:`AdaptableLaw.prior_state`.
+
+    Raises:
+        InputError: a tensor is missing.
+    """
+    keys = [f"{part}.{key}" for key in LAYER_KEYS]
+    missing = [key for key in keys if key not in state]
+    if missing:
+        raise InputError(where, f"weights {', '.join(missing)} are missing")
+    return tuple(state[key].float() for key in keys)
 
 
 class Adaptor(nn.Module):

@@ -24,7 +24,7 @@ from torch.nn.functional import gelu, pad
 from neuma_lib.device import launch
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics import neural_fused
-from neuma_lib.mechanics.adaptor import LAYER_KEYS, AdaptableConstitutive, AdaptableLaw
+from neuma_lib.mechanics.adaptor import AdaptableConstitutive, AdaptableLaw, layers_of
 from neuma_lib.mechanics.law import Elasticity, Plasticity, Weights
 from neuma_lib.mechanics.neural_kernels import FEATURES, feature_kernel, output_kernels
 from neuma_lib.mechanics.singular_values import rotation_and_singular_values
@@ -233,13 +233,5 @@ def neural_law(state: dict[str, Tensor] | None = None, name: str = "neural", see
     """
     if state is None:
         return NeuralLaw(NeuralElasticity(seed=2 * seed), NeuralPlasticity(seed=2 * seed + 1), name)
-    parts = []
-    for kind in (NeuralElasticity, NeuralPlasticity):
-        keys = [f"{kind.kind}.{key}" for key in LAYER_KEYS]
-        missing = [key for key in keys if key not in state]
-        if missing:
-            raise InputError(
-                f"prior {name}", f"weights {', '.join(missing)} of an NCLaw checkpoint are missing"
-            )
-        parts.append(kind(tuple(state[key].float() for key in keys)))
-    return NeuralLaw(*parts, name)
+    kinds = NeuralElasticity, NeuralPlasticity
+    return NeuralLaw(*(kind(layers_of(state, kind.kind, f"prior {name}")) for kind in kinds), name)

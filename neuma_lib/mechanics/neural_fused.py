@@ -27,7 +27,14 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from neuma_lib.device import native_source, warp_stream
+from neuma_lib.device import native_source
+from neuma_lib.mechanics.fused_launch import (
+    BLOCKS_PER_PROCESSOR,
+    block_count,
+    contiguous,
+    launch_blocks,
+    warp_device,
+)
 from neuma_lib.mechanics.law import Weights
 from neuma_lib.mechanics.neural_kernels import FEATURES, GRAM
 from neuma_lib.mechanics.singular_values_kernels import SVD, SWEEPS
@@ -37,7 +44,6 @@ ROWS = 128
 EVALUATE_TILES, VJP_TILES = 2, 1
 """Tiles of 16 rows per warp, forward and backward. One tile gives twice as many warps with half the registers, which
 hides more latency for few rows, but two lanes then compute the features and stress of each row redundantly."""
-BLOCKS_PER_PROCESSOR = 2
 HIDDEN, OUTPUTS = 64, 9
 WEIGHTS = HIDDEN * (FEATURES + HIDDEN + OUTPUTS)
 ALIGNMENT = 128
@@ -127,7 +133,6 @@ def source(kind: str, backward: bool, machine: str | None = None, precision: str
     return constants + (machine or parts["machine"]) + parts["tools"] + features + body
 
 
-# Arrays are passed as addresses because Warp's array objects take more time than the launch.
 @cache
 def evaluate_kernel(kind: str):
     """Kernel (F, W0, W1, W2, factor, n, out) over blocks of :data:`ROWS` rows."""
@@ -199,33 +204,16 @@ def add_kernel():
 
 
 @cache
-def _device(device: torch.device) -> wp.Device:
-    return wp.device_from_torch(device)
-
-
-@cache
 def supported(device: torch.device, dtype: torch.dtype) -> bool:
     """Whether these kernels run: float32 on a GPU with float16 tensor cores and enough shared memory."""
     if device.type != "cuda" or dtype != torch.float32:
         return False
-    gpu = _device(device)
+    gpu = warp_device(device)
     return gpu.arch >= 80 and gpu.max_shared_memory_per_block >= VJP_BYTES + 4 * threads(VJP_TILES)
 
 
-def _launch(kernel, blocks: int, threads: int, device: torch.device, *inputs) -> None:
-    inputs = [x.data_ptr() if isinstance(x, Tensor) else x for x in inputs]
-    wp.launch(
-        kernel,
-        dim=blocks * threads,
-        inputs=inputs,
-        block_dim=threads,
-        device=_device(device),
-        stream=warp_stream(device),
-    )
-
-
-def _blocks(rows: int, device: torch.device) -> int:
-    return min(-(-rows // ROWS), BLOCKS_PER_PROCESSOR * _device(device).sm_count)
+def _blocks(F: Tensor) -> int:
+    return block_count(len(F), ROWS, F.device)
 
 
 def _packed(weights: Weights) -> list[Tensor]:
@@ -238,13 +226,12 @@ def _packed(weights: Weights) -> list[Tensor]:
 def evaluate(F: Tensor, weights: Weights, kind: str, factor: float, out: Tensor | None = None) -> Tensor:
     """Evaluate the law of ``kind`` at F (n, 3, 3), plasticity as F + factor R X. See :class:`Constitutive`."""
     F = F.detach().contiguous()
-    result = out if out is not None and out.is_contiguous() else torch.empty_like(F)
-    if len(F):
-        W, blocks = _packed(weights), _blocks(len(F), F.device)
-        _launch(
-            evaluate_kernel(kind), blocks, threads(EVALUATE_TILES), F.device, F, *W, factor, len(F), result
-        )
-    return result if out is None or out is result else out.copy_(result)
+    out = torch.empty_like(F) if out is None else out
+    with contiguous(out) as (result,):
+        if len(F):
+            inputs = (F, *_packed(weights), factor, len(F), result)
+            launch_blocks(evaluate_kernel(kind), _blocks(F), threads(EVALUATE_TILES), *inputs)
+    return out
 
 
 @torch.no_grad()
@@ -263,29 +250,27 @@ def vjp(
     ``grad_weights`` may be :func:`partial_sums`. ``precision`` is :attr:`Constitutive.adjoint_precision`.
     """
     F, grad_out = F.detach().contiguous(), grad_out.contiguous()
-    result = grad_F if grad_F is not None and grad_F.is_contiguous() else torch.empty_like(F)
+    grad_F = torch.empty_like(F) if grad_F is None else grad_F
     W = _packed(weights)
     totals = tuple(torch.zeros_like(w) for w in W) if grad_weights is None else grad_weights
     if len(F):
-        blocks, fresh = _blocks(len(F), F.device), len(totals) == len(W)
+        blocks, fresh = _blocks(F), len(totals) == len(W)
         partials = F.new_empty(blocks, WEIGHTS) if fresh else totals[0]
-        inputs = (F, *W, grad_out, factor, len(F), result, int(fresh), partials)
-        _launch(vjp_kernel(kind, precision), blocks, threads(VJP_TILES), F.device, *inputs)
+        with contiguous(grad_F) as (result,):
+            inputs = (F, *W, grad_out, factor, len(F), result, int(fresh), partials)
+            launch_blocks(vjp_kernel(kind, precision), blocks, threads(VJP_TILES), *inputs)
         if fresh:
             add_up(partials, totals)
-    return (result if grad_F is None or grad_F is result else grad_F.copy_(result)), totals
+    return grad_F, totals
 
 
 def partial_sums(F: Tensor) -> Tensor:
     """Zero gradients of the weights for each block of `vjp` at F (n, 3, 3), shape (blocks, WEIGHTS)."""
-    return F.new_zeros(_blocks(len(F), F.device), WEIGHTS)
+    return F.new_zeros(_blocks(F), WEIGHTS)
 
 
 @torch.no_grad()
 def add_up(partials: Tensor, totals: Weights) -> None:
     """Add the sums over the blocks to the gradients of the three weight matrices."""
-    sums = [total if total.is_contiguous() else total.contiguous() for total in totals]
-    _launch(add_kernel(), WEIGHTS // 32, 1024, partials.device, partials, len(partials), *sums)
-    for total, summed in zip(totals, sums, strict=True):
-        if total is not summed:
-            total.copy_(summed)
+    with contiguous(*totals) as sums:
+        launch_blocks(add_kernel(), WEIGHTS // 32, 1024, partials, len(partials), *sums)

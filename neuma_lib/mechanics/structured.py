@@ -56,7 +56,7 @@ from torch.nn.functional import pad
 
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics import structured_kernels as kernels
-from neuma_lib.mechanics.adaptor import LAYER_KEYS, AdaptableConstitutive, AdaptableLaw
+from neuma_lib.mechanics.adaptor import AdaptableConstitutive, AdaptableLaw, layers_of
 from neuma_lib.mechanics.analytic import analytic_law, name_of, specification
 from neuma_lib.mechanics.elasticity import (
     STRETCH_MIN,
@@ -196,12 +196,17 @@ class _Pairs:
 class StructuredConstitutive(AdaptableConstitutive):
     """A network that corrects an analytic law. :mod:`structured_kernels` evaluates it, with `response` as reference."""
 
+    isotropic = True
     capturable = True
     kernel: tuple[str, kernels.Constants]
     """Kind of the kernel, and the constants of the law."""
 
     def graph_key(self) -> Hashable:
         return type(self), self.kernel
+
+    def outputs(self, z: Tensor, weights: Weights) -> Tensor:
+        """Outputs of the network (N, k) for invariants z (N, 3)."""
+        return network(z, weights)
 
     def evaluate(self, F: Tensor, weights: Weights, out: Tensor | None = None) -> Tensor:
         return kernels.evaluate(*self.kernel, F, weights, out)
@@ -226,8 +231,6 @@ class StructuredElasticity(StructuredConstitutive, Elasticity):
         InputError: the form or the base is not supported, or the weights have other shapes.
     """
 
-    isotropic = True
-
     def __init__(
         self, base: AnalyticElasticity, form: str = "stretch", weights: Weights | None = None, seed: int = 0
     ):
@@ -244,10 +247,6 @@ class StructuredElasticity(StructuredConstitutive, Elasticity):
         base_index = kernels.BASES.index(name_of(base))
         self.kernel = form, kernels.Constants(base_index, (self.mu, self.lam, 0.0, 0.0))
         self.freeze(_checked("elasticity", weights, FORMS[form], seed))
-
-    def outputs(self, z: Tensor, weights: Weights) -> Tensor:
-        """Outputs of the network (N, k) for invariants z (N, 3)."""
-        return network(z, weights)
 
     def response(self, F: Tensor, weights: Weights) -> Tensor:
         _, sigma = rotation_and_singular_values(F)
@@ -347,8 +346,6 @@ class StructuredPlasticity(StructuredConstitutive, Plasticity):
         InputError: the base is not supported, or the weights have other shapes.
     """
 
-    isotropic = True
-
     def __init__(self, base: Plasticity, weights: Weights | None = None, seed: int = 0):
         super().__init__()
         if type(base) not in (VonMises, DruckerPrager, ViscousFlow):
@@ -364,10 +361,6 @@ class StructuredPlasticity(StructuredConstitutive, Plasticity):
         constants = self.threshold, self.friction, self.rate, self.associated
         self.kernel = "return", kernels.Constants(int(self.granular), tuple(map(float, constants)))
         self.freeze(_checked("plasticity", weights, PLASTIC_OUTPUTS, seed))
-
-    def outputs(self, z: Tensor, weights: Weights) -> Tensor:
-        """Outputs of the network (N, k) for invariants z (N, 3)."""
-        return network(z, weights)
 
     def response(self, F: Tensor, weights: Weights) -> Tensor:
         _, sigma = rotation_and_singular_values(F)
@@ -466,16 +459,12 @@ def structured_law(
     spec = dict(spec)
     form = spec.pop("form", "stretch")
     base = analytic_law(spec, dt)
-    weights: dict[str, Weights | None] = {}
-    for part in ("elasticity", "plasticity"):
-        keys = [f"{part}.{key}" for key in LAYER_KEYS]
-        if state is not None and (part == "elasticity" or not isinstance(base.plasticity, Identity)):
-            missing = [key for key in keys if key not in state]
-            if missing:
-                raise InputError("structured law", f"weights {', '.join(missing)} are missing")
-            weights[part] = tuple(state[key].float() for key in keys)
-    elasticity = StructuredElasticity(base.elasticity, form, weights.get("elasticity"), 2 * seed)
+
+    def weights(part: str) -> Weights | None:
+        return None if state is None else layers_of(state, part, "structured law")
+
+    elasticity = StructuredElasticity(base.elasticity, form, weights("elasticity"), 2 * seed)
     plasticity = base.plasticity
     if not isinstance(plasticity, Identity):
-        plasticity = StructuredPlasticity(plasticity, weights.get("plasticity"), 2 * seed + 1)
+        plasticity = StructuredPlasticity(plasticity, weights("plasticity"), 2 * seed + 1)
     return StructuredLaw(elasticity, plasticity, name or f"structured {base.name}")

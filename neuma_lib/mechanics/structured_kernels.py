@@ -14,8 +14,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from neuma_lib.device import native_source, warp_stream
+from neuma_lib.device import native_source
 from neuma_lib.mechanics.elasticity import STRETCH_MIN
+from neuma_lib.mechanics.fused_launch import block_count, contiguous, launch_blocks
 from neuma_lib.mechanics.law import Weights
 from neuma_lib.mechanics.singular_values_kernels import CPU_WIDTH, END, SVD, TYPES, filled, warp_types
 
@@ -42,7 +43,6 @@ CACHED = 21
 """Numbers per row that a CPU caches: U, V and the singular values."""
 THREADS = {torch.float32: 128, torch.float64: 64}
 """Rows, and threads, per block. They use at most 40 KB of the 48 KB of shared memory that every GPU has."""
-BLOCKS_PER_PROCESSOR = 2
 LANES, GROUPS = 32, 8  # of the kernel that adds the sums of blocks
 
 
@@ -135,10 +135,9 @@ def add_source(kind: str, dtype: torch.dtype) -> str:
     return filled(TYPES + _constants(kind, dtype) + native_source(__file__, ".h")["add"] + END, dtype)
 
 
-# Arrays are passed as addresses because Warp's array objects take more time than the kernel.
 @cache
 def evaluate_kernel(kind: str, dtype: torch.dtype):
-    """Kernel (F, W0, W1, W2, index of the base, four constants, n, cached, cache, out), launched by `_launch`.
+    """Kernel (F, W0, W1, W2, index of the base, four constants, n, cached, cache, out), launched by `launch_blocks`.
 
     If ``cached`` is 1, it writes the SVD to the cache (n / CPU_WIDTH packs, CACHED, CPU_WIDTH).
     """
@@ -207,32 +206,9 @@ def add_kernel(kind: str, dtype: torch.dtype):
     return structured_add
 
 
-@cache
-def _device(device: torch.device) -> wp.Device:
-    return wp.device_from_torch(device)
-
-
 def _blocks(F: Tensor) -> int:
     """Thread blocks for the rows of F. On a CPU one thread processes all rows."""
-    if F.device.type == "cpu":
-        return 1
-    return min(-(-len(F) // THREADS[F.dtype]), BLOCKS_PER_PROCESSOR * _device(F.device).sm_count)
-
-
-def _launch(kernel, blocks: int, threads: int, device: torch.device, *inputs) -> None:
-    tensors = [x for x in inputs if isinstance(x, Tensor)]
-    if any(x.dtype != tensors[0].dtype or x.device != device for x in tensors):  # addresses have no type
-        raise TypeError("F, weights and buffers of a structured law must have one dtype and one device")
-    inputs = [x.data_ptr() if isinstance(x, Tensor) else 0 if x is None else x for x in inputs]
-    threads = 1 if device.type == "cpu" else threads
-    wp.launch(
-        kernel,
-        dim=blocks * threads,
-        inputs=inputs,
-        block_dim=threads,
-        device=_device(device),
-        stream=warp_stream(device),
-    )
+    return 1 if F.device.type == "cpu" else block_count(len(F), THREADS[F.dtype], F.device)
 
 
 def new_cache(F: Tensor) -> Tensor | None:
@@ -251,12 +227,13 @@ def evaluate(
 ) -> Tensor:
     """Evaluate the law of ``kind`` at F (n, 3, 3) and store the SVD in ``cache`` if given. See `Constitutive`."""
     F = F.detach().contiguous()
-    result = out if out is not None and out.is_contiguous() else torch.empty_like(F)
-    if len(F):
-        W = [w.detach().contiguous() for w in weights]
-        inputs = *W, constants.kind, *constants.values, len(F), int(cache is not None), cache, result
-        _launch(evaluate_kernel(kind, F.dtype), _blocks(F), THREADS[F.dtype], F.device, F, *inputs)
-    return result if out is None or out is result else out.copy_(result)
+    out = torch.empty_like(F) if out is None else out
+    with contiguous(out) as (result,):
+        if len(F):
+            W = [w.detach().contiguous() for w in weights]
+            inputs = *W, constants.kind, *constants.values, len(F), int(cache is not None), cache, result
+            launch_blocks(evaluate_kernel(kind, F.dtype), _blocks(F), THREADS[F.dtype], F, *inputs)
+    return out
 
 
 @torch.no_grad()
@@ -272,20 +249,16 @@ def vjp(
 ) -> tuple[Tensor, Weights]:
     """Gradients of F and, added to ``grad_weights``, of the weights. See `Constitutive`."""
     F, grad_out = F.detach().contiguous(), grad_out.contiguous()
-    result = grad_F if grad_F is not None and grad_F.is_contiguous() else torch.empty_like(F)
+    grad_F = torch.empty_like(F) if grad_F is None else grad_F
     totals = tuple(torch.zeros_like(w) for w in weights) if grad_weights is None else grad_weights
-    if len(F):
-        W, on_gpu = [w.detach().contiguous() for w in weights], F.device.type != "cpu"
-        blocks, threads = _blocks(F), THREADS[F.dtype]
-        partials = F.new_empty(blocks, weight_count(kind)) if on_gpu else None
-        sums = [total if total.is_contiguous() else total.contiguous() for total in totals]
-        cached = 0 if cache is None else 2
-        inputs = *W, constants.kind, *constants.values, len(F), cached, cache, grad_out, result
-        _launch(vjp_kernel(kind, F.dtype), blocks, threads, F.device, F, *inputs, *sums, partials)
-        if on_gpu:
-            columns = -(-weight_count(kind) // LANES)
-            _launch(add_kernel(kind, F.dtype), columns, LANES * GROUPS, F.device, partials, blocks, *sums)
-        for total, summed in zip(totals, sums, strict=True):
-            if total is not summed:
-                total.copy_(summed)
-    return (result if grad_F is None or grad_F is result else grad_F.copy_(result)), totals
+    with contiguous(grad_F, *totals) as (result, *sums):
+        if len(F):
+            W, blocks = [w.detach().contiguous() for w in weights], _blocks(F)
+            partials = None if F.device.type == "cpu" else F.new_empty(blocks, weight_count(kind))
+            cached = 0 if cache is None else 2
+            inputs = (*W, constants.kind, *constants.values, len(F), cached, cache, grad_out, result, *sums)
+            launch_blocks(vjp_kernel(kind, F.dtype), blocks, THREADS[F.dtype], F, *inputs, partials)
+            if partials is not None:
+                columns = -(-weight_count(kind) // LANES)
+                launch_blocks(add_kernel(kind, F.dtype), columns, LANES * GROUPS, partials, blocks, *sums)
+    return grad_F, totals

@@ -22,16 +22,11 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
     """Kernels `g2p_adjoint`, `grid_adjoint`, `p2g_adjoint` and `total_adjoint` for a precision and a scatter method."""
     t, functions = warp_types(dtype), grid_functions(dtype)
     ordered = scatter != "atomic"
-    run_of, deposit = vars(scatter_functions(dtype, scatter, 3)).values()
+    run_of, deposit = scatter_functions(dtype, scatter, 3)
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
-    copy_of, stencil, slopes, moments = (
-        functions.copy_of,
-        functions.stencil,
-        functions.slopes,
-        functions.moments,
-    )
+    stencil, slopes, moments = functions.stencil, functions.slopes, functions.moments
     column, wall_mask, moved_mask = functions.column, functions.wall_mask, functions.moved_mask
-    gather, three_nodes = vars(gather_functions(dtype)).values()
+    gather, three_nodes = gather_functions(dtype)
     module = f"neuma_lib.sim.adjoint_{str(dtype).removeprefix('torch.')}_{scatter}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
 
@@ -61,10 +56,8 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         alive = p < grad_x.shape[0]
         if wp.static(ordered):
             p = order[sort, wp.min(p, grad_x.shape[0] - 1)]
-        xp = x[now, p]
-        bi, bj, bk, f, wi, wj, wk = stencil(c, xp)
-        plane = copy_of(c, p) * c.n + bi
-        run = run_of(wp.where(alive, (plane * c.n + bj) * c.n + bk, -1))
+        first, f, wi, wj, wk = stencil(c, p, x[now, p])
+        run = run_of(wp.where(alive, first, -1))
         si, sj, sk = slopes(f[0]), slopes(f[1]), slopes(f[2])
         # gradients of C, F and v from F_trial = (I + dt C) F and x = x + dt v
         g_trial = grad_F_trial[p]
@@ -83,7 +76,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         for i in range(3):
             u_ij = u_i
             for j in range(3):
-                row = ((plane + i) * c.n + bj + j) * c.n + bk
+                row = first + (i * c.n + j) * c.n
                 deposit(grad_grid_rows, side, row, (wi[i] * wj[j]) * (wp.outer(wk, u_ij) + slope_k), run)
                 nodes = three_nodes(grid_v_rows, cached, row)
                 vu = nodes * u_ij + wp.cw_mul(step_k, nodes * column(D, 2))
@@ -135,9 +128,7 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
     ):
         """From gradients of momentum and mass of the nodes to those of x (added), v, C and tau (set)."""
         p = wp.tid()
-        xp = x[now, p]
-        bi, bj, bk, f, wi, wj, wk = stencil(c, xp)
-        plane = copy_of(c, p) * c.n + bi
+        first, f, wi, wj, wk = stencil(c, p, x[now, p])
         si, sj, sk = slopes(f[0]), slopes(f[1]), slopes(f[2])
         wd_i, wd_j, wd_k = moments(wi, f[0]), moments(wj, f[1]), moments(wk, f[2])
         # q_i = (m v + A d_i, m) as in p2g
@@ -148,12 +139,12 @@ def adjoint_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         q_i = vec4(q0[0], q0[1], q0[2], m)
         step_k = vec3(real(0.0), real(1.0), real(2.0))
         # rows: sum w g, then the columns of G = sum w g d^T / dx
-        S = gather(grad_grid_rows, side, (plane * c.n + bj) * c.n + bk, c.n, wi, wj, wk, wd_i, wd_j, wd_k)
+        S = gather(grad_grid_rows, side, first, c.n, wi, wj, wk, wd_i, wd_j, wd_k)
         moving = vec3()  # sum (g_i . q_i) N'_i
         for i in range(3):
             q_ij = q_i
             for j in range(3):
-                nodes = three_nodes(grad_grid_rows, side, ((plane + i) * c.n + bj + j) * c.n + bk)
+                nodes = three_nodes(grad_grid_rows, side, first + (i * c.n + j) * c.n)
                 gq = nodes * q_ij + wp.cw_mul(step_k, nodes * column(A, 2))
                 gq_w, gq_s = wp.dot(gq, wk), wp.dot(gq, sk)
                 moving += vec3(si[i] * wj[j] * gq_w, wi[i] * sj[j] * gq_w, wi[i] * wj[j] * gq_s)

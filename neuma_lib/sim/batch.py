@@ -27,7 +27,6 @@ def rollout_batch(
     frames: Sequence[int],
     total: bool = False,
     skip_free_flight: bool = True,
-    scatter: str | None = None,
     together: int | None = None,
 ) -> list[Trajectory | None]:
     """`rollout` for each of several laws, equal to round-off, without gradients and in fewer launches.
@@ -39,7 +38,7 @@ def rollout_batch(
         model: as in `rollout`.
         laws: B laws, each for all particles.
         start: N particles, one initial state for all laws or one per law.
-        steps, frames, total, scatter: as in `rollout`.
+        steps, frames, total: as in `rollout`.
         skip_free_flight: as in `rollout`, up to the first contact of any copy in the same launches.
         together: number of copies that share launches, by default `TOGETHER` of the device.
 
@@ -64,7 +63,7 @@ def rollout_batch(
     together = together or TOGETHER[starts[0].x.device.type]
     for copies in (order[i : i + together] for i in range(0, len(laws), together)):
         own = [laws[copy] for copy in copies], [starts[copy] for copy in copies]
-        paths = _side_by_side(model, *own, frames, total, skip_free_flight, scatter)
+        paths = _side_by_side(model, *own, frames, total, skip_free_flight)
         for copy, path in zip(copies, paths, strict=True):
             result[copy] = path
     return result
@@ -77,7 +76,6 @@ def _side_by_side(
     frames: tuple[int, ...],
     total: bool,
     skip_free_flight: bool,
-    scatter: str | None,
 ) -> list[Trajectory | None]:
     """Simulate laws in the same launches, those with fused kernels first."""
     N, copies = len(starts[0].x), len(laws)
@@ -90,7 +88,7 @@ def _side_by_side(
     state = State.joined(starts) if copies > 1 else starts[0]
     try:
         path, errors = fly_and_simulate(
-            model, tuple(regions), state, frames, None, total, skip_free_flight, scatter, copies
+            model, tuple(regions), state, frames, None, total, skip_free_flight, copies
         )
     except NonFiniteError:
         return [None] * copies

@@ -2,7 +2,6 @@
 
 # No `from __future__ import annotations` here: Warp reads the annotations of functions as objects.
 import functools
-from types import SimpleNamespace
 
 import torch
 import warp as wp
@@ -13,7 +12,7 @@ start_warp()
 
 
 @functools.cache
-def gather_functions(dtype: torch.dtype) -> SimpleNamespace:
+def gather_functions(dtype: torch.dtype) -> tuple[wp.Function, wp.Function]:
     """Functions `gather` and `three_nodes` for kernels with one particle per thread.
 
     ``gather(rows, index, row, n, wi, wj, wk, wd_i, wd_j, wd_k)`` returns a 4 x 4 matrix whose rows are the sums of w q,
@@ -39,4 +38,4 @@ def gather_functions(dtype: torch.dtype) -> SimpleNamespace:
     @wp.func_native(node + parts["three"] + parts["end"])
     def three_nodes(rows: wp.array2d(dtype=mat34), index: wp.int32, row: wp.int32) -> mat34: ...
 
-    return SimpleNamespace(gather=gather, three_nodes=three_nodes)
+    return gather, three_nodes

@@ -104,11 +104,12 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
         return vec3(f - real(1.5), real(2.0) - real(2.0) * f, f - real(0.5))
 
     @wp.func
-    def stencil(c: GridConstants, x: vec3):
-        """First of the 27 nodes (i, j, k) around x, distance of x from it [dx], and weights along each axis."""
+    def stencil(c: GridConstants, p: wp.int32, x: vec3):
+        """First of the 27 nodes of particle p at x, distance of x from it [dx], and weights along each axis."""
         i, j, k = base_node(c, x[0]), base_node(c, x[1]), base_node(c, x[2])
         f = x * c.inv_dx - vec3(real(i) + c.first, real(j) + c.first, real(k) + c.first)
-        return i, j, k, f, weights(f[0]), weights(f[1]), weights(f[2])
+        first = ((copy_of(c, p) * c.n + i) * c.n + j) * c.n + k
+        return first, f, weights(f[0]), weights(f[1]), weights(f[2])
 
     @wp.func
     def moments(w: vec3, f: real):
@@ -158,7 +159,6 @@ def grid_functions(dtype: torch.dtype) -> SimpleNamespace:
         return mask
 
     return SimpleNamespace(
-        base_node=base_node,
         copy_of=copy_of,
         stencil=stencil,
         slopes=slopes,
@@ -176,11 +176,11 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
     scatter method."""
     t, functions = warp_types(dtype), grid_functions(dtype)
     ordered = scatter != "atomic"
-    run_of, deposit = vars(scatter_functions(dtype, scatter, 4)).values()
+    run_of, deposit = scatter_functions(dtype, scatter, 4)
     real, vec3, vec4, mat33, mat34, GridConstants = t.real, t.vec3, t.vec4, t.mat33, t.mat34, t.GridConstants
-    base_node, copy_of, gather = functions.base_node, functions.copy_of, gather_functions(dtype).gather
-    stencil, moments = functions.stencil, functions.moments
+    copy_of, stencil, moments = functions.copy_of, functions.stencil, functions.moments
     column, wall_mask, moved = functions.column, functions.wall_mask, functions.moved
+    gather, _ = gather_functions(dtype)
     module = f"neuma_lib.sim.forward_{str(dtype).removeprefix('torch.')}_{scatter}"
     kernel = functools.partial(wp.kernel, enable_backward=False, module=module)
 
@@ -188,9 +188,8 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
     def cells(c: GridConstants, now: wp.int32, x: wp.array2d(dtype=vec3), cell: wp.array(dtype=wp.int32)):
         """Index of the first node of a particle's stencil, as a sort key."""
         p = wp.tid()
-        xp = x[now, p]
-        bi, bj, bk = base_node(c, xp[0]), base_node(c, xp[1]), base_node(c, xp[2])
-        cell[p] = ((copy_of(c, p) * c.n + bi) * c.n + bj) * c.n + bk
+        first, _, _, _, _ = stencil(c, p, x[now, p])
+        cell[p] = first
 
     @kernel
     def p2g(
@@ -212,10 +211,8 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         alive = p < mass.shape[0]
         if wp.static(ordered):
             p = order[sort, wp.min(p, mass.shape[0] - 1)]
-        xp = x[now, p]
-        bi, bj, bk, f, wi, wj, wk = stencil(c, xp)
-        plane = copy_of(c, p) * c.n + bi
-        run = run_of(wp.where(alive, (plane * c.n + bj) * c.n + bk, -1))
+        first, f, wi, wj, wk = stencil(c, p, x[now, p])
+        run = run_of(wp.where(alive, first, -1))
         m = mass[p]
         A = c.dx * (m * C[now, p] - (real(4.0) * c.dt * c.inv_dx * c.inv_dx * vol0[p]) * tau[cached, p])
         # q = (m v + A d, m) grows by a column of A from node to node
@@ -225,7 +222,7 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         for i in range(3):
             q_ij = q_i
             for j in range(3):
-                row = ((plane + i) * c.n + bj + j) * c.n + bk
+                row = first + (i * c.n + j) * c.n
                 deposit(grid_rows, cached, row, (wi[i] * wj[j]) * (wp.outer(wk, q_ij) + slope_k), run)
                 q_ij += column(A, 1)
             q_i += column(A, 0)
@@ -262,12 +259,10 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         """v = sum w_i v_i,  C = (4/dx^2) sum w_i v_i d_i^T,  x += dt v (clamped),  F_trial = (I + dt C) F."""
         p = wp.tid()
         xp = x[now, p]
-        bi, bj, bk, f, wi, wj, wk = stencil(c, xp)
-        copy = copy_of(c, p)
-        plane = copy * c.n + bi
+        first, f, wi, wj, wk = stencil(c, p, xp)
         wd_i, wd_j, wd_k = moments(wi, f[0]), moments(wj, f[1]), moments(wk, f[2])
         # rows: sum w v, then the columns of B = sum w v d^T / dx
-        S = gather(grid_v_rows, cached, (plane * c.n + bj) * c.n + bk, c.n, wi, wj, wk, wd_i, wd_j, wd_k)
+        S = gather(grid_v_rows, cached, first, c.n, wi, wj, wk, wd_i, wd_j, wd_k)
         v_new = vec3(S[0, 0], S[0, 1], S[0, 2])
         C_new = (real(4.0) * c.inv_dx) * mat33(
             S[1, 0], S[2, 0], S[3, 0], S[1, 1], S[2, 1], S[3, 1], S[1, 2], S[2, 2], S[3, 2]
@@ -278,7 +273,7 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         C[after, p] = C_new
         F_trial[cached, p] = F[now, p] + c.dt * (C_new * F[now, p])
         # Faults keep the first (step, particle). Velocities are checked because clamping hides errors of positions.
-        here = wp.int64(step) * wp.int64(2147483648) + wp.int64(p)
+        copy, here = copy_of(c, p), wp.int64(step) * wp.int64(2147483648) + wp.int64(p)
         if not (wp.isfinite(v_new) and wp.isfinite(C_new)):
             wp.atomic_min(faults, copy, 0, here)
         elif c.dt * wp.max(wp.abs(v_new)) > c.dx:
@@ -310,11 +305,11 @@ def forward_kernels(dtype: torch.dtype, scatter: str = "atomic") -> SimpleNamesp
         """x += dt v, interpolated over nodes with mass of the first copy. A tracer without such nodes stays."""
         p = wp.tid()
         xp = x[p]
-        bi, bj, bk, f, wi, wj, wk = stencil(c, xp)
+        first, _, wi, wj, wk = stencil(c, 0, xp)
         total = vec4()
         for i in range(3):
             for j in range(3):
-                total += (wi[i] * wj[j]) * (wk * grid_v_rows[cached, ((bi + i) * c.n + bj + j) * c.n + bk])
+                total += (wi[i] * wj[j]) * (wk * grid_v_rows[cached, first + (i * c.n + j) * c.n])
         if total[3] > real(0.0):
             x[p] = moved(c, xp, vec3(total[0], total[1], total[2]) / total[3])
 

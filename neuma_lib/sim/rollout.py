@@ -70,9 +70,8 @@ def rollout(
         given = f"shape {tuple(tracers.shape)} as {tracers.dtype}"
         raise InputError("tracers", f"{given} must be (M, 3) as {state.x.dtype}")
 
-    plan = dict(memory=memory, cache_bytes=cache_bytes)
     path, _ = fly_and_simulate(
-        model, regions, state, frames, tracers, total, skip_free_flight, scatter, **plan
+        model, regions, state, frames, tracers, total, skip_free_flight, 1, scatter, memory, cache_bytes
     )
     return path
 
@@ -121,11 +120,11 @@ def fly_and_simulate(
     regions: tuple[MaterialRegion, ...],
     state: State,
     frames: tuple[int, ...],
-    tracers: Tensor | None = None,
-    total: bool = False,
-    skip_free_flight: bool = True,
-    scatter: str | None = None,
+    tracers: Tensor | None,
+    total: bool,
+    skip_free_flight: bool,
     copies: int = 1,
+    scatter: str | None = None,
     memory: float | None = None,
     cache_bytes: float | None = None,
 ) -> tuple[Trajectory, list[NonFiniteError | None]]:
@@ -137,47 +136,25 @@ def fly_and_simulate(
     first = free_flight_steps(model, regions, state, frames[-1], copies) if skip_free_flight else 0
     start = (*state.motion, state.F) if total else state.motion
     in_flight = sum(n < first for n in frames)
-    parts, errors = [], [None] * copies
-    if in_flight:
-        parts.append(ballistic(model, start, tracers, frames[:in_flight]))
-    if in_flight < len(frames):
-        if first:
-            landed = ballistic(model, start, tracers, (first,))
-            start = (landed.x[0], landed.v[0], *start[2:])
-            tracers = None if tracers is None else landed.tracers[0]
-        plan = dict(memory=memory, cache_bytes=cache_bytes)
-        path, errors = _simulate(
-            model, regions, state, start, tracers, first, frames[in_flight:], scatter, copies, **plan
-        )
-        parts.append(path)
-    return parts[0] if len(parts) == 1 else parts[0].followed_by(parts[1]), errors
-
-
-def _simulate(
-    model: MPM,
-    regions: tuple[MaterialRegion, ...],
-    state: State,
-    start: tuple[Tensor, ...],
-    tracers: Tensor | None,
-    first: int,
-    frames: tuple[int, ...],
-    scatter: str | None,
-    copies: int,
-    memory: float | None,
-    cache_bytes: float | None,
-) -> tuple[Trajectory, list[NonFiniteError | None]]:
-    """Simulate from (x, v, F, C) and optionally F_total at step `first` to the last frame."""
-    x, steps, total = state.x, frames[-1] - first, len(start) == 5
+    flight = ballistic(model, start, tracers, frames[:in_flight]) if in_flight else None
+    frames = frames[in_flight:]
+    if not frames:
+        return flight, [None] * copies
+    if first:
+        landed = ballistic(model, start, tracers, (first,))
+        start = (landed.x[0], landed.v[0], *start[2:])
+        tracers = None if tracers is None else landed.tracers[0]
+    x, steps, plan = state.x, frames[-1] - first, None
     weights, slices = gather_weights(regions, x.dtype)
     inputs = (*start, *weights)
-    plan = None
     if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
         cache_bytes = DEFAULT_CACHE_BYTES[x.device.type] if cache_bytes is None else cache_bytes
         nodes = copies * model.nodes**3
         plan = plan_memory(steps, len(x), nodes, x.element_size(), cache_bytes, memory, total)
     simulation = Simulation(model, regions, slices, state, steps, first, plan, scatter, total, copies)
     *states, seen = RolloutFunction.apply(simulation, [n - first for n in frames], tracers, *inputs)
-    return Trajectory(frames, *states[:4], seen, *states[4:]), simulation.errors
+    path = Trajectory(frames, *states[:4], seen, *states[4:])
+    return path if flight is None else flight.followed_by(path), simulation.errors
 
 
 class RolloutFunction(torch.autograd.Function):

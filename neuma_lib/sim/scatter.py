@@ -11,7 +11,6 @@ The 27 contributions of a particle overlap with those of its neighbours and are 
 
 # No `from __future__ import annotations` here: Warp reads the annotations of functions as objects.
 import functools
-from types import SimpleNamespace
 
 import torch
 import warp as wp
@@ -27,8 +26,8 @@ def scatter_for(device: torch.device, dtype: torch.dtype) -> str:
 
 
 @functools.cache
-def scatter_functions(dtype: torch.dtype, scatter: str, components: int) -> SimpleNamespace:
-    """Functions for kernels with one particle per thread.
+def scatter_functions(dtype: torch.dtype, scatter: str, components: int) -> tuple[wp.Function, wp.Function]:
+    """Functions `run_of` and `deposit` for kernels with one particle per thread.
 
     Args:
         dtype: precision.
@@ -54,7 +53,7 @@ def scatter_functions(dtype: torch.dtype, scatter: str, components: int) -> Simp
         ):
             wp.atomic_add(rows, index, row, value)
 
-        return SimpleNamespace(run_of=run_of, deposit=deposit)
+        return run_of, deposit
 
     if dtype != torch.float32:
         raise ValueError(f"scatter {scatter!r} is for float32, not {dtype}")
@@ -70,4 +69,4 @@ def scatter_functions(dtype: torch.dtype, scatter: str, components: int) -> Simp
         rows: wp.array2d(dtype=mat34), index: wp.int32, row: wp.int32, value: mat34, run: wp.int32
     ): ...
 
-    return SimpleNamespace(run_of=run_of_lanes, deposit=deposit_run)
+    return run_of_lanes, deposit_run

@@ -86,35 +86,35 @@ class Workspace:
         self._frame_grads: dict[Hashable, list[Tensor | None]] = {}
         N, nodes = size.particles, self._node_count
         states, cached = size.n_states, size.n_cached_steps
-        self.x, self.v = self._vectors(states, N), self._vectors(states, N)
-        self.C, self.F = self._matrices(states, N), self._matrices(states, N)
+        self.x, self.v = self._buffer((states, N), "vec3"), self._buffer((states, N), "vec3")
+        self.C, self.F = self._buffer((states, N), "mat33"), self._buffer((states, N), "mat33")
         self.states = (self.x, self.v, self.F, self.C)
         if size.total:
-            self.F_total = self._matrices(states, N)
+            self.F_total = self._buffer((states, N), "mat33")
             self.states += (self.F_total,)
-        self.tau, self.F_trial = self._matrices(cached, N), self._matrices(cached, N)
-        self.grid, self.grid_v = self._nodes(cached, nodes), self._nodes(cached, nodes)
-        self.mass, self.vol0 = self._scalars(N), self._scalars(N)
-        self.faults = self._buffer((size.copies, 3), None, torch.int64)
+        self.tau, self.F_trial = self._buffer((cached, N), "mat33"), self._buffer((cached, N), "mat33")
+        self.grid, self.grid_v = self._buffer((cached, nodes), "vec4"), self._buffer((cached, nodes), "vec4")
+        self.mass, self.vol0 = self._buffer((N,), "real"), self._buffer((N,), "real")
+        self.faults = self._buffer((size.copies, 3), dtype=torch.int64)
         self.checkpoints = tuple(
             value.new_empty(size.n_checkpoints, *value.shape[1:]) for value in self.states
         )
         self.sorts = size.scatter != "atomic"
         n_sorts = -(-max(states - 1, 1) // SORT_EVERY) if self.sorts and size.differentiable else 1
-        self.order = self._buffer((n_sorts, N if self.sorts else 1), None, torch.int32)
-        self.cells = self._buffer((N if self.sorts else 1,), None, torch.int32)
+        self.order = self._buffer((n_sorts, N if self.sorts else 1), dtype=torch.int32)
+        self.cells = self._buffer((N if self.sorts else 1,), dtype=torch.int32)
         self._constants = _grid_constants(size)
         self._record_forward()
         if size.differentiable:
-            self.grad_x, self.grad_v = self._vectors(N), self._vectors(N)
-            self.grad_C, self.grad_F = self._matrices(N), self._matrices(N)
-            self.grad_F_trial, self.grad_tau = self._matrices(N), self._matrices(N)
-            self.grad_F_elastic = self._matrices(N)
+            self.grad_x, self.grad_v = self._buffer((N,), "vec3"), self._buffer((N,), "vec3")
+            self.grad_C, self.grad_F = self._buffer((N,), "mat33"), self._buffer((N,), "mat33")
+            self.grad_F_trial, self.grad_tau = self._buffer((N,), "mat33"), self._buffer((N,), "mat33")
+            self.grad_F_elastic = self._buffer((N,), "mat33")
             self.grad_states = (self.grad_x, self.grad_v, self.grad_F, self.grad_C)
             if size.total:
-                self.grad_F_total = self._matrices(N)
+                self.grad_F_total = self._buffer((N,), "mat33")
                 self.grad_states += (self.grad_F_total,)
-            self.grad_grid = self._nodes(2, nodes)
+            self.grad_grid = self._buffer((2, nodes), "vec4")
             self._record_adjoint()
 
     def at(self, step: int) -> int:
@@ -214,23 +214,13 @@ class Workspace:
         with wp.ScopedStream(stream, sync_enter=False):
             yield
 
-    def _buffer(self, shape: tuple[int, ...], warp_type, dtype: torch.dtype | None = None) -> Tensor:
-        """Zeros, with a Warp view for the launches."""
-        tensor = torch.zeros(shape, dtype=dtype or self.size.dtype, device=self.size.device)
+    def _buffer(self, shape: tuple[int, ...], kind: str = "", dtype: torch.dtype | None = None) -> Tensor:
+        """Zeros of a kind of `warp_types`, or else numbers of a dtype, with a Warp view for the launches."""
+        warp_type = getattr(warp_types(self.size.dtype), kind) if kind else None
+        tail = {"vec3": (3,), "vec4": (4,), "mat33": (3, 3)}.get(kind, ())
+        tensor = torch.zeros(shape + tail, dtype=dtype or self.size.dtype, device=self.size.device)
         self._views[id(tensor)] = wp.from_torch(tensor, dtype=warp_type)
         return tensor
-
-    def _scalars(self, *shape: int) -> Tensor:
-        return self._buffer(shape, warp_types(self.size.dtype).real)
-
-    def _vectors(self, *shape: int) -> Tensor:
-        return self._buffer((*shape, 3), warp_types(self.size.dtype).vec3)
-
-    def _matrices(self, *shape: int) -> Tensor:
-        return self._buffer((*shape, 3, 3), warp_types(self.size.dtype).mat33)
-
-    def _nodes(self, *shape: int) -> Tensor:
-        return self._buffer((*shape, 4), warp_types(self.size.dtype).vec4)
 
     def _rows(self, nodes: Tensor) -> wp.array:
         """View of nodes (..., nodes, 4) whose element b is the 3 x 4 matrix of nodes b, b + 1 and b + 2."""

@@ -76,7 +76,7 @@ def composite_adjoint(
         kernel, (len(starts) - 1) * threads, splats, *kept, settings.alpha_min, settings.alpha_max, background,
         grad_pictures, grad_alphas, grad_splats, block_dim=threads,
     )  # fmt: skip
-    _, _, finish = list_kernels()
+    _, finish = list_kernels()
     launch(finish, splats.shape[:2], splats, grad_splats)
 
 
@@ -104,7 +104,7 @@ def compare_adjoint(splats, kept, background, settings: Settings, scales, opacit
         kernel, (len(starts) - 1) * threads, splats, *kept, settings.alpha_min, settings.alpha_max, background,
         settings.width, settings.height, scales, grad_splats, block_dim=threads,
     )  # fmt: skip
-    _, _, finish = list_kernels()
+    _, finish = list_kernels()
     launch(finish, splats.shape[:2], splats, grad_splats)
 
 
@@ -127,11 +127,11 @@ def lists(
     """
     images, count = depths.shape
     tiles = images * -(-width // tile) * -(-height // tile)
-    count_tiles, list_tiles, _ = list_kernels()
+    visit_tiles, _ = list_kernels()
     order = by_depth(depths)
     sizes = torch.empty_like(order)
     geometry = (order, splats, depths, width, height, tile)
-    launch(count_tiles, len(order), *geometry, sizes)
+    launch(visit_tiles, len(order), *geometry, sizes, None, None, None)
     ends = torch.cumsum(sizes, dim=0, dtype=torch.int64)
     total = int(ends[-1]) if len(ends) else 0
     if max(total, len(order), tiles * tile**2) >= 2**31:
@@ -143,7 +143,7 @@ def lists(
     if total == 0:
         return sizes.new_empty(0), sizes.new_zeros(tiles + 1)
     keys, ids = sizes.new_empty(2 * total), sizes.new_empty(2 * total)
-    launch(list_tiles, len(order), *geometry, sizes, ends, keys, ids)
+    launch(visit_tiles, len(order), *geometry, sizes, ends, keys, ids)
     sort_pairs(keys, ids, total, bits=(tiles - 1).bit_length())
     limits = torch.arange(tiles + 1, dtype=torch.int32, device=keys.device)
     return ids[:total], torch.searchsorted(keys[:total], limits, out_int32=True)
@@ -161,7 +161,8 @@ def by_depth(depths: torch.Tensor) -> torch.Tensor:
 
 @functools.cache
 def list_kernels():
-    """``(count_tiles, list_tiles, finish)`` Warp kernels; ``finish`` converts sums to gradients."""
+    """``(visit_tiles, finish)`` Warp kernels. ``visit_tiles`` counts the tiles of splats, or lists them where they are
+    counted, and ``finish`` converts sums to gradients."""
     module = wp.get_module(f"{__name__}.lists")
     # Counting and listing must agree to the last bit, so fused multiply-add is disabled.
     wp.set_module_options({"fuse_fp": False}, module)
@@ -202,19 +203,24 @@ def list_kernels():
         return first, last
 
     @wp.kernel(module=module, enable_backward=False)
-    def count_tiles(
+    def visit_tiles(
         order: wp.array(dtype=int),  # (I G,) by depth
         splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
         depths: wp.array2d(dtype=float),  # (I, G)
         width: int,
         height: int,
         tile: int,
-        sizes: wp.array(dtype=int),  # (I G,) number of tiles, out
+        sizes: wp.array(dtype=int),  # (I G,) number of tiles, out if there are no `ends`
+        ends: wp.array(dtype=wp.int64),  # (I G,) sums of sizes, or None
+        keys: wp.array(dtype=int),  # (N,) tile of every entry, out, or None
+        ids: wp.array(dtype=int),  # (N,) splat of every entry, out, or None
     ):
         rank = wp.tid()
         splat = order[rank]
         image = splat // splats.shape[1]
         g = splat - image * splats.shape[1]
+        tiles_x = (width + tile - 1) // tile
+        tiles_y = (height + tile - 1) // tile
         size = int(0)  # noqa: UP018, Warp cannot modify a constant in a loop
         if depths[image, g] < culled:
             place, ellipse = load(splats, image, g, 0), load(splats, image, g, 2)
@@ -227,44 +233,14 @@ def list_kernels():
                     high = float(wp.min(row * tile + tile - 1, bottom)) + 0.5 - centre
                     first, last = columns(place, C, ellipse, low, high, width)
                     if first <= last:
+                        if ends:
+                            position = int(ends[rank]) - sizes[rank] + size - first // tile
+                            for column in range(first // tile, last // tile + 1):
+                                keys[position + column] = (image * tiles_y + row) * tiles_x + column
+                                ids[position + column] = splat
                         size += last // tile - first // tile + 1
-        sizes[rank] = size
-
-    @wp.kernel(module=module, enable_backward=False)
-    def list_tiles(
-        order: wp.array(dtype=int),  # (I G,)
-        splats: wp.array3d(dtype=float),  # (I, G, SPLAT_SIZE)
-        depths: wp.array2d(dtype=float),  # (I, G)
-        width: int,
-        height: int,
-        tile: int,
-        sizes: wp.array(dtype=int),  # (I G,)
-        ends: wp.array(dtype=wp.int64),  # (I G,) sums of sizes
-        keys: wp.array(dtype=int),  # (N,) tile of every entry, out
-        ids: wp.array(dtype=int),  # (N,) splat of every entry, out
-    ):
-        rank = wp.tid()
-        if sizes[rank] == 0:
-            return
-        splat = order[rank]
-        image = splat // splats.shape[1]
-        g = splat - image * splats.shape[1]
-        tiles_x = (width + tile - 1) // tile
-        tiles_y = (height + tile - 1) // tile
-        position = int(ends[rank]) - sizes[rank]
-        place, ellipse = load(splats, image, g, 0), load(splats, image, g, 2)
-        C = splats[image, g, 4]
-        centre, half_height = place[1], ellipse[3]
-        top, bottom = pixels(centre - half_height, centre + half_height, height)
-        for row in range(top // tile, bottom // tile + 1):
-            low = float(wp.max(row * tile, top)) + 0.5 - centre
-            high = float(wp.min(row * tile + tile - 1, bottom)) + 0.5 - centre
-            first, last = columns(place, C, ellipse, low, high, width)
-            if first <= last:
-                for column in range(first // tile, last // tile + 1):
-                    keys[position] = (image * tiles_y + row) * tiles_x + column
-                    ids[position] = splat
-                    position += 1
+        if not ends:
+            sizes[rank] = size
 
     @wp.kernel(module=module, enable_backward=False)
     def finish(
@@ -279,7 +255,7 @@ def list_kernels():
         store(grad_splats, image, g, 0, A * s_x + B * s_y, B * s_x + C * s_y, -0.5 * s_xx, -s_xy)
         store(grad_splats, image, g, 1, -0.5 * s_yy, s / shade[1], far[2], far[3])
 
-    return count_tiles, list_tiles, finish
+    return visit_tiles, finish
 
 
 def source(name: str, tile: int, lane_pixels: int, compares: bool = False, opacities: bool = True) -> str:

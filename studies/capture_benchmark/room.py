@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from neuma_lib.data.blender.appearance import to_linear
 from neuma_lib.data.blender.scene import Progress, run_worker
+from neuma_lib.io.gltf import linear
 from studies.capture_benchmark import room_worker
 
 
@@ -115,7 +115,7 @@ def shoot(
             vertex_start=np.arange(frames + 1) * count,
             faces=body.faces.astype(np.int32),
             face_start=np.array([0, len(body.faces)]),
-            colors=to_linear(body.colors).astype(np.float32),
+            colors=linear(body.colors).astype(np.float32),
             radius=np.array(0.0),
             velocities=body.velocities.astype(np.float32),
             lenses=lenses,

@@ -10,7 +10,7 @@ import torch
 from PIL import Image, ImageDraw
 
 from neuma_lib.config.blender import AppearanceConfig
-from neuma_lib.data.blender.appearance import colors_at, smooth_noise, to_linear
+from neuma_lib.data.blender.appearance import colors_at, smooth_noise
 from neuma_lib.data.blender.bodies import make_body
 from neuma_lib.data.blender.libraries import explain_import_error
 from neuma_lib.data.blender.scene import (
@@ -20,6 +20,7 @@ from neuma_lib.data.blender.scene import (
     render_static,
 )
 from neuma_lib.geometry import shapes
+from neuma_lib.io.gltf import linear
 from neuma_lib.io.images import read_image_set
 from neuma_lib.splatting import viewpoints as cameras
 from neuma_lib.splatting.cameras import Cameras
@@ -111,7 +112,7 @@ def test_parts_have_their_colours():
 
 
 def test_srgb_decodes_to_linear_light():
-    np.testing.assert_allclose(to_linear(np.array([0.0, 0.5, 1.0])), [0.0, 0.21404, 1.0], atol=1e-5)
+    np.testing.assert_allclose(linear(np.array([0.0, 0.5, 1.0])), [0.0, 0.21404, 1.0], atol=1e-5)
 
 
 # ------------------------------------------------------------------------------------------- bodies

@@ -120,7 +120,7 @@ class EmulatedTiles:
             starts, transmittances, stops, settings.alpha_min, settings.alpha_max, background, grad_pictures,
             grad_alphas, grad_splats,
         )  # fmt: skip
-        _, _, finish = compositor_cuda.list_kernels()
+        _, finish = compositor_cuda.list_kernels()
         launch(finish, splats.shape[:2], splats, grad_splats)
 
     def compare(self, splats, depths, background, settings, observed, empty):
@@ -148,7 +148,7 @@ class EmulatedTiles:
             self.threads, 0, settings.width, settings.height, splats, ids, starts, states, stops, settings.alpha_min,
             settings.alpha_max, background, scales, grad_splats,
         )  # fmt: skip
-        _, _, finish = compositor_cuda.list_kernels()
+        _, finish = compositor_cuda.list_kernels()
         launch(finish, splats.shape[:2], splats, grad_splats)
 
 

@@ -20,7 +20,7 @@ def main(inputs, output, params, run) -> None:
     missing = None if names else "There are no videos yet."
     write_text(output.page, markdown(params.title, results, pictures, missing))
     for check in results:
-        run.say(f"{check.what}: {check.value}" + ("" if check.good else f" (wanted: {check.wanted})"))
+        run.say(f"{check.what}: {check.value}" + ("" if check.good else f" (expected: {check.wanted})"))
 
 
 run_script(main, snakemake)

@@ -12,7 +12,6 @@ from neuma_lib.capture.masks.mask_refinement import redrawn_masks
 from neuma_lib.capture.masks.mattes import (
     metric_camera,
     own_mask,
-    read_pixels,
     room_frames,
     world_of,
     write_mattes,
@@ -20,7 +19,7 @@ from neuma_lib.capture.masks.mattes import (
 from neuma_lib.capture.masks.photograph_masks import photograph_mask
 from neuma_lib.capture.masks.regions import overlay
 from neuma_lib.capture.masks.saliency import Saliency
-from neuma_lib.capture.pictures import picture_sheet
+from neuma_lib.capture.pictures import picture_sheet, read_picture
 from neuma_lib.config.board import BoardConfig
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import listed, read_json, write_json
@@ -40,7 +39,7 @@ def main(inputs, output, params, run) -> None:
     names, pictures, masks = [], [], []
     for number, frame in enumerate(frames):
         file = Path(inputs.room).parent / frame["file_path"]
-        pixels = read_pixels(file)
+        pixels = read_picture(file)
         if file.stem in own:
             mask = own_mask(own[file.stem], lens, params.longest)
         else:

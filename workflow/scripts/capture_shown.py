@@ -4,8 +4,8 @@ from pathlib import Path
 
 from neuma_lib.capture.calibration.lens import read_lens
 from neuma_lib.capture.frames import read_frames, read_timeline
-from neuma_lib.capture.masks.mattes import read_pixels, room_frames
-from neuma_lib.capture.pictures import undistorted
+from neuma_lib.capture.masks.mattes import room_frames
+from neuma_lib.capture.pictures import read_picture, undistorted
 from neuma_lib.capture.report.display_video import numbers_of, shown_frames
 from neuma_lib.io.files import listed, read_json
 from neuma_lib.io.images import read_transforms, write_transforms
@@ -22,7 +22,7 @@ def main(inputs, output, params, run) -> None:
     for camera, file, mattes, rate in files:
         lens = read_lens(lenses[camera], inputs.report)
         (still,) = room_frames(inputs.room, camera)
-        background = read_pixels(Path(inputs.room).parent / still["file_path"])
+        background = read_picture(Path(inputs.room).parent / still["file_path"])
         frames = (
             (frame.number, undistorted(frame.pixels, lens, params.longest))
             for frame in read_frames(file, read_timeline(file, rate), numbers_of(video, camera))

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from neuma_lib.capture.motion.synchronisation import (
     chosen_frames,
@@ -12,7 +11,8 @@ from neuma_lib.capture.motion.synchronisation import (
     reduced_intrinsics,
     without_gain,
 )
-from neuma_lib.io.files import atomic, listed, read_json
+from neuma_lib.capture.pictures import write_png
+from neuma_lib.io.files import listed, read_json
 from neuma_lib.io.images import read_image_set, read_transforms, write_transforms
 from workflow.stage import run_script
 
@@ -40,8 +40,7 @@ def main(inputs, output, params, run) -> None:
         for k in chosen:
             pixels = reduced(without_gain(images[k], registration["gains"][camera]), params.width)
             name = f"{camera}_{frames[k]['step']:05d}.png"
-            with atomic(folder / name) as partial:
-                Image.fromarray(pixels).save(partial, "PNG")
+            write_png(folder / name, pixels)
             entry = {
                 "file_path": name,
                 "transform_matrix": frames[k]["transform_matrix"],

@@ -6,10 +6,10 @@ import numpy as np
 
 from neuma_lib.capture.calibration.lens import read_lens
 from neuma_lib.capture.frames import contact_sheet, read_frames, read_timeline, sheet_numbers
-from neuma_lib.capture.masks.mattes import own_mask, read_pixels, room_frames, world_of, write_mattes
+from neuma_lib.capture.masks.mattes import own_mask, room_frames, world_of, write_mattes
 from neuma_lib.capture.masks.regions import area_jumps, check_flight, overlay
 from neuma_lib.capture.masks.video_masks import given_masks, video_masks
-from neuma_lib.capture.pictures import undistorted
+from neuma_lib.capture.pictures import read_picture, undistorted
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import listed, read_json, write_json
 from workflow.stage import run_script
@@ -37,7 +37,7 @@ def main(inputs, output, params, run) -> None:
     if own:
         result = given_masks(_own(own, lens, params.longest, pixels), timeline.times, down)
     else:
-        background = read_pixels(Path(inputs.room).parent / still["file_path"])
+        background = read_picture(Path(inputs.room).parent / still["file_path"])
         result = video_masks(pixels, inputs.video, background, timeline.times, down=down)
     masks, areas = result.masks, result.areas
     arc = list(result.arcs[0].frames) if result.arcs else None

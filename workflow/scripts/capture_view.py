@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from neuma_lib.capture.pictures import read_picture
 from neuma_lib.capture.report.images import (
     as_planes,
     averaged,
@@ -23,15 +24,10 @@ from neuma_lib.evaluation.video import side_by_side, write_mp4
 from neuma_lib.fitting.frame_batches import frame_batches, spread_frames
 from neuma_lib.io.files import atomic, write_json
 from neuma_lib.io.hdf5 import read_arrays
-from neuma_lib.io.images import filmed_steps, load_videos, open_image, read_transforms
+from neuma_lib.io.images import filmed_steps, load_videos, read_transforms
 from neuma_lib.io.particles import load_body, load_motion
 from neuma_lib.io.weights import read_weights
 from workflow.stage import run_script
-
-
-def read_rgb(path: Path) -> np.ndarray:
-    with open_image(path.read_bytes(), path) as image:
-        return np.asarray(image.convert("RGB"))
 
 
 class Layers(NamedTuple):
@@ -78,7 +74,7 @@ def main(inputs, output, params, run) -> None:
             predictions.append(Prediction(body, rollout, needed))
     folder = Path(inputs.shown).parent
     entries = {f["step"]: f for f in read_transforms(inputs.shown)["frames"] if f["view"] == params.view}
-    background = read_rgb(folder / next(iter(entries.values()))["plate"])
+    background = read_picture(folder / next(iter(entries.values()))["plate"])
     steps = sorted(entries)
     measured = {steps[k] for k in spread_frames(len(steps), params.measured)}
     measures, panels = [], []
@@ -88,7 +84,7 @@ def main(inputs, output, params, run) -> None:
             renders = zip(*(prediction.frames(video) for prediction in predictions), strict=True)
             for k, (step, rendered) in enumerate(zip(video.frames, renders, strict=True)):
                 entry = entries[step]
-                filmed = as_planes(read_rgb(folder / entry["picture"])).to(device)
+                filmed = as_planes(read_picture(folder / entry["picture"])).to(device)
                 empty = exposed(background, entry["plate_gain"], entry["plate_offset"])
                 empty = torch.from_numpy(empty).float().to(device)
                 gain = torch.tensor(entry["gain"], dtype=torch.float32, device=device)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from neuma_lib.capture.calibration.lens import HALF_PIXEL, Lens
-from neuma_lib.capture.calibration.placement import Similarity, fit_similarity, triangulate
+from neuma_lib.capture.calibration.placement import Similarity, fit_similarity, project, triangulate
 from neuma_lib.capture.tools import opencv
 from neuma_lib.config.board import PAPERS, BoardConfig
 from neuma_lib.errors import InputError
@@ -347,11 +347,9 @@ def board_outline(
     columns, rows = board.squares
     ends = [(-1, -1), (columns + 1, -1), (columns + 1, rows + 1), (-1, rows + 1)]
     corners = np.array([(x * board.square, y * board.square, 0.0) for x, y in ends])
-    seen = room_from_board(board, center).apply(corners) @ viewmat[:3, :3].T + viewmat[:3, 3]
-    if (seen[:, 2] <= 0).any():
-        return None
-    pixels = seen @ K.T
-    return pixels[:, :2] / pixels[:, 2:]
+    corners = room_from_board(board, center).apply(corners)
+    depths = corners @ viewmat[2, :3] + viewmat[2, 3]
+    return project(corners, viewmat, K) if (depths > 0).all() else None
 
 
 def _dictionary(board: BoardConfig):

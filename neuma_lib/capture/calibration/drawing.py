@@ -12,9 +12,9 @@ from PIL import Image, ImageDraw
 from neuma_lib.capture.calibration.placement import camera_centres, upright
 from neuma_lib.capture.calibration.poses import Poses
 from neuma_lib.capture.calibration.room import BOX_MIDDLE, Room
-from neuma_lib.capture.pictures import group_of, picture_sheet
-from neuma_lib.extras import require
-from neuma_lib.io.files import atomic
+from neuma_lib.capture.pictures import group_of, picture_sheet, read_picture
+from neuma_lib.capture.tools import new_figure, save_figure
+from neuma_lib.fitting.frame_batches import spread_frames
 from neuma_lib.io.images import OPENGL_TO_OPENCV, read_transforms
 from neuma_lib.project.capture_folder import PHOTOGRAPHS
 
@@ -52,7 +52,7 @@ def draw_cameras(path: str | Path, poses: Poses, unit: str, suffix: str = "", fl
     if near.any():
         extent = np.concatenate([centres, np.quantile(poses.points[near], QUANTILES, axis=0)])
     low, high = extent.min(axis=0) - 0.1 * reach, extent.max(axis=0) + 0.1 * reach
-    figure = require("matplotlib.figure", "capture").Figure(figsize=(12, 6), layout="constrained")
+    figure = new_figure(12, 6)
     groups = ((~fixed, "tab:blue", "photographs"), (fixed, "tab:red", "fixed cameras"))
     arrows = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.004}
     sides = ((0, 2, "from above"), (0, 1, "from the side"))
@@ -74,9 +74,7 @@ def draw_cameras(path: str | Path, poses: Poses, unit: str, suffix: str = "", fl
     title = f"{len(poses.names)} of {len(poses.names) + len(poses.lost)} pictures"
     title += f", {poses.error:.2f} px" if np.isfinite(poses.error) else ""
     figure.suptitle(title + suffix)
-    with atomic(path) as partial:
-        canvas = require("matplotlib.backends.backend_agg", "capture").FigureCanvasAgg(figure)
-        canvas.print_png(partial, metadata={"Software": None})
+    save_figure(path, figure)
 
 
 def draw_floor(path: str | Path, transforms: str | Path) -> None:
@@ -87,14 +85,11 @@ def draw_floor(path: str | Path, transforms: str | Path) -> None:
     data = read_transforms(transforms)
     scale = data.get("world", {}).get("scale", 1.0)
     photographs = [frame for frame in data["frames"] if frame["group"] == PHOTOGRAPHS]
-    count = min(MAX_PHOTOGRAPHS, len(photographs))
-    some = sorted({round(i) for i in np.linspace(0, len(photographs) - 1, count)})
     frames = [frame for frame in data["frames"] if frame["group"] != PHOTOGRAPHS]
-    frames += [photographs[i] for i in some]
+    frames += [photographs[i] for i in spread_frames(len(photographs), MAX_PHOTOGRAPHS)]
     pictures = []
     for frame in frames:
-        with Image.open(Path(transforms).parent / frame["file_path"]) as image:
-            picture = image.convert("RGB")
+        picture = Image.fromarray(read_picture(Path(transforms).parent / frame["file_path"]))
         viewmat = np.linalg.inv(np.array(frame["transform_matrix"]) @ OPENGL_TO_OPENCV)
         draw = ImageDraw.Draw(picture)
         wide = max(1, picture.width // 400)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -17,9 +17,9 @@ RANSAC_DRAWS = 2000
 class Similarity:
     """x -> scale rotation x + translation, with scale > 0, a proper rotation (3, 3) and translation (3,)."""
 
-    scale: float
-    rotation: np.ndarray
-    translation: np.ndarray
+    scale: float = 1.0
+    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
+    translation: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     def apply(self, points: np.ndarray) -> np.ndarray:
         """Transform points (N, 3)."""
@@ -50,10 +50,6 @@ class Similarity:
         }
 
 
-def identity() -> Similarity:
-    return Similarity(1.0, np.eye(3), np.zeros(3))
-
-
 def fit_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
     """Least-squares similarity between points (N, 3) (Umeyama 1991). Raises InputError for points on a line."""
     middle, aim = source.mean(axis=0), target.mean(axis=0)
@@ -72,6 +68,18 @@ def camera_centres(viewmats: np.ndarray) -> np.ndarray:
     return -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
 
 
+def unit_rays(viewmats: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Unit vectors (N, 3) in the world towards x/z and y/z (N, 2) in the frames of cameras (N, 4, 4)."""
+    rays = np.concatenate([directions, np.ones((len(directions), 1))], axis=1)
+    return np.einsum("nji,nj->ni", viewmats[:, :3, :3], rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def project(points: np.ndarray, viewmat: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Pixels (N, 2) of points (N, 3) in front of a pinhole camera: world to camera (4, 4), intrinsics (3, 3)."""
+    pixels = (points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
+    return pixels[:, :2] / pixels[:, 2:]
+
+
 def triangulate(
     viewmats: np.ndarray, directions: np.ndarray, iterations: int = 10
 ) -> tuple[np.ndarray, float]:
@@ -86,9 +94,7 @@ def triangulate(
         The point (3,), NaN if it is behind a camera or the rays are parallel, and the largest angle between two rays
         [rad].
     """
-    R, t = viewmats[:, :3, :3], viewmats[:, :3, 3]
-    rays = np.concatenate([directions, np.ones((len(directions), 1))], axis=1)
-    rays = np.einsum("nji,nj->ni", R, rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    R, t, rays = viewmats[:, :3, :3], viewmats[:, :3, 3], unit_rays(viewmats, directions)
     angle = float(np.arccos(np.clip((rays @ rays.T).min(), -1, 1)))
     away = np.eye(3) - np.einsum("ni,nj->nij", rays, rays)
     normal = away.sum(axis=0)

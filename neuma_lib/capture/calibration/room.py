@@ -8,22 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from neuma_lib.capture.calibration.board import BoardFit, Detection, fit_board, room_from_board
 from neuma_lib.capture.calibration.placement import (
     Similarity,
     camera_centres,
     fit_floor,
-    identity,
     scale_from_length,
     upright,
 )
 from neuma_lib.capture.calibration.poses import Poses, find_boards
-from neuma_lib.capture.pictures import group_of, read_picture, undistorted
+from neuma_lib.capture.pictures import group_of, read_picture, undistorted, write_png
 from neuma_lib.config.capture import CaptureConfig, LengthConfig
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import atomic
 from neuma_lib.io.images import OPENGL_TO_OPENCV, transform_world, write_transforms
 from neuma_lib.project.capture_folder import PHOTOGRAPHS
 
@@ -55,7 +52,7 @@ def find_room(poses: Poses, pictures: Mapping[str, Path], settings: CaptureConfi
     if settings.poses == "photographs":
         placed = {name: pictures[name] for name in poses.names}
         return room_of(poses, find_boards(placed, settings.board) if settings.board else {}, settings)
-    room = room_from_board(settings.board, settings.center) if settings.poses == "board" else identity()
+    room = room_from_board(settings.board, settings.center) if settings.poses == "board" else Similarity()
     return Room(poses.moved(room), room)
 
 
@@ -82,7 +79,7 @@ def room_of(poses: Poses, detections: Mapping[str, Detection], settings: Capture
     middle = np.median(poses.points, axis=0)
     level = upright(normal, middle - ((middle - point) @ normal) * normal)
     scale = _metres_per_unit(poses, settings.length)
-    room = Similarity(scale, np.eye(3), np.zeros(3)).after(level)
+    room = Similarity(scale).after(level)
     return Room(poses.moved(room), room, floor=share)
 
 
@@ -123,8 +120,7 @@ def write_room(
         smaller = lens.pinhole().resized(settings.longest)
         pixels = undistorted(read_picture(pictures[name]), lens, settings.longest)
         file = folder / Path(name).with_suffix(".png")
-        with atomic(file) as partial:
-            Image.fromarray(pixels).save(partial, "PNG")
+        write_png(file, pixels)
         group = group_of(name)
         view = photographs if group == PHOTOGRAPHS else views[group]
         photographs += group == PHOTOGRAPHS

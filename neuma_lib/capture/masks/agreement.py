@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neuma_lib.capture.masks.regions import centroid, iou
+from neuma_lib.capture.calibration.placement import camera_centres, unit_rays
+from neuma_lib.capture.masks.regions import centroid, iou, radius_of
 from neuma_lib.capture.tools import opencv
 from neuma_lib.errors import InputError
 
@@ -73,13 +74,10 @@ def common_body(masks: Sequence[np.ndarray], viewmats: np.ndarray, Ks: np.ndarra
     Raises:
         InputError: no point in space lies in most of the masks.
     """
-    centres = np.stack([centroid(mask) for mask in masks])
-    middle = nearest_point(centres, viewmats, Ks)
-    depths = viewmats[:, 2, :3] @ middle + viewmats[:, 2, 3]
-    radii = np.array([np.sqrt(mask.sum() / np.pi) for mask in masks]) * depths / Ks[:, 0, 0]
-    if not (depths > 0).any():
+    middle, radii = middle_and_radii(masks, viewmats, Ks)
+    if not (radii > 0).any():
         raise InputError(*_NO_COMMON_VOLUME)
-    reach = _MARGIN * 2 * float(np.median(radii[depths > 0]))
+    reach = _MARGIN * 2 * float(np.median(radii[radii > 0]))
     views = list(zip(masks, viewmats, Ks))
     chosen = views
     for share in MIN_SHARES:
@@ -103,13 +101,22 @@ def check_one_object(ious: Sequence[float], cameras: Sequence[str], name: str) -
         )
 
 
+def middle_and_radii(
+    masks: Sequence[np.ndarray], viewmats: np.ndarray, Ks: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Centre (3,) of an object, and its radius by each of N masks, negative behind a camera, (N,).
+
+    Arguments are those of `common_body`.
+    """
+    middle = nearest_point(np.stack([centroid(mask) for mask in masks]), viewmats, Ks)
+    depths = viewmats[:, 2, :3] @ middle + viewmats[:, 2, 3]
+    return middle, np.array([radius_of(mask) for mask in masks]) * depths / Ks[:, 0, 0]
+
+
 def nearest_point(centres: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> np.ndarray:
     """Point nearest to the rays through pixels (N, 2) of N cameras, robust against single outliers, (3,)."""
-    rays = np.concatenate(
-        [(centres - Ks[:, :2, 2]) / Ks[:, [0, 1], [0, 1]], np.ones((len(centres), 1))], axis=1
-    )
-    rays = np.einsum("nji,nj->ni", viewmats[:, :3, :3], rays / np.linalg.norm(rays, axis=1, keepdims=True))
-    eyes = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    rays = unit_rays(viewmats, (centres - Ks[:, :2, 2]) / Ks[:, [0, 1], [0, 1]])
+    eyes = camera_centres(viewmats)
     across = np.eye(3) - rays[:, :, None] * rays[:, None]
     weights = np.ones(len(rays))
     for _ in range(20):

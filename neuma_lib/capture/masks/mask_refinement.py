@@ -18,7 +18,7 @@ import numpy as np
 from scipy import ndimage
 
 from neuma_lib.capture.masks.agreement import common_body
-from neuma_lib.capture.masks.regions import box_of, component, grown, in_full, shrunk
+from neuma_lib.capture.masks.regions import box_of, component, grown, in_full, radius_of, shrunk
 from neuma_lib.capture.masks.silhouettes import UNSEEN, cheapest
 from neuma_lib.capture.tools import opencv
 
@@ -99,7 +99,7 @@ def _view(picture: np.ndarray, body: np.ndarray, voxel: float) -> _View | None:
     if not likely.any():
         return None
     band = max(2, round(BAND * scale * voxel))
-    box = box_of(likely, band + round(AROUND * float(np.sqrt(likely.sum() / np.pi))))
+    box = box_of(likely, band + round(AROUND * radius_of(likely)))
     pixels = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)[box]
     return _View(likely.shape, box, pixels, shrunk(likely, band)[box], grown(likely, band)[box])
 

@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from neuma_lib.capture.calibration.lens import Lens
 from neuma_lib.capture.masks.regions import matted, read_mask
-from neuma_lib.capture.pictures import undistorted
+from neuma_lib.capture.pictures import undistorted, write_png
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import atomic
-from neuma_lib.io.images import OPENGL_TO_OPENCV, open_image, read_transforms, write_transforms
+from neuma_lib.io.images import OPENGL_TO_OPENCV, read_transforms, write_transforms
 
 
 def room_frames(path: str | Path, group: str) -> list[dict[str, Any]]:
@@ -25,12 +23,6 @@ def room_frames(path: str | Path, group: str) -> list[dict[str, Any]]:
             path, f"no pose was estimated for the pictures of '{group}'", "See the report of the poses"
         )
     return frames
-
-
-def read_pixels(path: str | Path) -> np.ndarray:
-    """RGB (H, W, 3), uint8, of a picture of the room."""
-    with open_image(Path(path).read_bytes(), path) as image:
-        return np.asarray(image.convert("RGB"))
 
 
 def own_mask(path: str | Path, lens: Lens, longest: int) -> np.ndarray:
@@ -79,7 +71,6 @@ def write_mattes(
     for frame, pixels, mask in mattes:
         rgba = matted(pixels, mask)
         rgba[rgba[..., 3] == 0] = 0  # compresses better
-        with atomic(folder / frame["file_path"]) as partial:
-            Image.fromarray(rgba).save(partial, "PNG")
+        write_png(folder / frame["file_path"], rgba)
         frames.append({key: value for key, value in frame.items() if key != "sha256"})
     write_transforms(path, {}, frames, **world)

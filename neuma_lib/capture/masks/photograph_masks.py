@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neuma_lib.capture.masks.regions import component, cross, grabcut, grown, shrunk
+from neuma_lib.capture.masks.regions import component, cross, grabcut, grown, radius_of, shrunk
 from neuma_lib.capture.tools import opencv
 from neuma_lib.errors import InputError
 
@@ -48,7 +48,7 @@ def photograph_mask(
             "the mask is empty, no salient object was detected",
             "Photograph the object closer and in front of a plain background, leave the picture out, or provide a mask",
         )
-    radius = np.sqrt(likely.sum() / np.pi)
+    radius = radius_of(likely)
     reach = grown(likely, max(3, round(0.1 * radius)))
     sure = shrunk(likely & (probability > 0.9), max(1, round(0.08 * radius)))
     mask = grabcut(small, sure, likely, ~reach | (probability < 0.02))

@@ -37,6 +37,11 @@ def centroid(mask: np.ndarray) -> np.ndarray:
     return np.array([x.mean(), y.mean()]) + 0.5 if len(x) else np.full(2, np.nan)
 
 
+def radius_of(mask: np.ndarray) -> float:
+    """Radius of a disc with the area of a mask [px]."""
+    return float(np.sqrt(mask.sum() / np.pi))
+
+
 def iou(a: np.ndarray, b: np.ndarray) -> float:
     """Intersection over union of two masks. 1 if both are empty."""
     union = np.logical_or(a, b).sum()

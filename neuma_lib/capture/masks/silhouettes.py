@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neuma_lib.capture.masks.regions import box_of, component, grown, in_full, shrunk
+from neuma_lib.capture.masks.regions import box_of, component, grown, in_full, radius_of, shrunk
 from neuma_lib.capture.tools import opencv
 
 NOISE = 3.0
@@ -98,7 +98,7 @@ def learn_palette(
         if mask.any():
             box = box_of(mask, _WINDOW)
             picture = frame[box].astype(np.float32)
-            inside = shrunk(mask, max(1, round(0.1 * _radius(mask))))[box]
+            inside = shrunk(mask, max(1, round(0.1 * radius_of(mask))))[box]
             seen.append(picture[inside & (_explain_by_background(picture, background[box]).cost > _AWAY)])
     pixels = np.concatenate(seen)
     if len(pixels) < MIN_LEARNED:
@@ -119,7 +119,7 @@ def outline(frame: np.ndarray, background: np.ndarray, mask: np.ndarray, palette
         background: the empty scene at its exposure, float32, (H, W, 3).
         mask: the initial one, not empty.
     """
-    reach = max(3, round(_REACH * _radius(mask)))
+    reach = max(3, round(_REACH * radius_of(mask)))
     box = box_of(mask, reach + _WINDOW)
     picture, empty = frame[box].astype(np.float32), background[box]
     fit = _explain_by_background(picture, empty)
@@ -128,10 +128,6 @@ def outline(frame: np.ndarray, background: np.ndarray, mask: np.ndarray, palette
     if inside.any():
         inside = _mixed(picture, empty, fit.shade, inside)
     return in_full(component(inside), box, mask.shape)
-
-
-def _radius(mask: np.ndarray) -> float:
-    return float(np.sqrt(mask.sum() / np.pi))
 
 
 def linear(levels: np.ndarray) -> np.ndarray:

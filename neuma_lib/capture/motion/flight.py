@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from neuma_lib.capture.masks.agreement import agreement
+from neuma_lib.capture.masks.regions import centroid
 from neuma_lib.capture.motion.contact import contact_time, lowest_points
 from neuma_lib.capture.motion.free_fall import FreeFall, Track, fit_flight
-from neuma_lib.capture.motion.gravity import gravity_checks
 from neuma_lib.capture.motion.spin import Spin, fit_spin, follow
 from neuma_lib.capture.motion.timing import (
     Offset,
@@ -21,9 +21,8 @@ from neuma_lib.capture.motion.timing import (
     offset_from_sound,
     row_times,
 )
+from neuma_lib.capture.tools import new_figure, save_figure
 from neuma_lib.errors import InputError
-from neuma_lib.extras import require
-from neuma_lib.io.files import atomic
 
 TOLERATED_DEVIATIONS = 2.0
 """Standard deviations by which gravity from masks must exceed its limit to be refused.
@@ -66,7 +65,7 @@ class Filmed:
     @property
     def centroids(self) -> np.ndarray:
         """(T, 2) [px]."""
-        return np.array([np.argwhere(mask).mean(axis=0)[::-1] + 0.5 for mask in self.masks])
+        return np.array([centroid(mask) for mask in self.masks])
 
     @property
     def row_times(self) -> np.ndarray:
@@ -211,8 +210,7 @@ def report(flight: Flight, views: Sequence[Filmed]) -> dict[str, Any]:
 
 def draw_flight(path: str | Path, flight: Flight, views: Sequence[Filmed], title: str) -> None:
     """Plot observed and fitted positions of the object's centre in each camera, and their distances."""
-    size = (5 * (len(views) + 1), 5)
-    figure = require("matplotlib.figure", "capture").Figure(figsize=size, layout="constrained")
+    figure = new_figure(5 * (len(views) + 1), 5)
     *cameras, last = figure.subplots(1, len(views) + 1)
     for number, (axes, view, track) in enumerate(zip(cameras, views, flight.tracks)):
         fitted = flight.fall.seen(track, number)
@@ -226,17 +224,4 @@ def draw_flight(path: str | Path, flight: Flight, views: Sequence[Filmed], title
     last.set(title="off the fit", xlabel="time [ms]", ylabel="[px]", yscale="log")
     last.legend()
     figure.suptitle(title)
-    with atomic(path) as partial:
-        canvas = require("matplotlib.backends.backend_agg", "capture").FigureCanvasAgg(figure)
-        canvas.print_png(partial, metadata={"Software": None})
-
-
-def flight_checks(name: str, flight: Mapping[str, Any]) -> list[tuple[str, str, str, bool]]:
-    """Checks of a flight's `report`, with the fields of `neuma_lib.capture.report.page.Check`."""
-    checks = [
-        *gravity_checks(f"outlines of {name}", flight),
-        (f"flight in {name}", f"{flight['rms_px']:.2f} px off the fit", "< 1 px", flight["rms_px"] < 1),
-    ]
-    for camera, value in (flight["agreement"] or {}).items():
-        checks.append((f"mask of {camera} at rest, {name}", f"IoU {value:.2f}", "> 0.7", value > 0.7))
-    return checks
+    save_figure(path, figure)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
+from neuma_lib.capture.calibration.placement import project
 from neuma_lib.capture.masks.agreement import CHECK_VIDEOS
 from neuma_lib.capture.motion.ballistic_tracks import MIN_FRAMES
 from neuma_lib.capture.motion.gravity import Gravity
@@ -76,9 +77,7 @@ class FreeFall:
 
     def seen(self, track: Track, camera: int) -> np.ndarray:
         """Projection of the fall into a camera, by its number, at the times of a track, (T, 2) [px]."""
-        x = self.place(track.times + self.offsets[camera])
-        p = (x @ track.viewmat[:3, :3].T + track.viewmat[:3, 3]) @ track.K.T
-        return p[:, :2] / p[:, 2:]
+        return project(self.place(track.times + self.offsets[camera]), track.viewmat, track.K)
 
     @property
     def gravity(self) -> Gravity:
@@ -141,8 +140,7 @@ def fit_free_fall(
         parts = []
         for track, offset in zip(tracks, shift):
             t = (track.times + offset - start)[:, None]
-            p = ((x0 + v0 * t + a * t**2 / 2) @ track.viewmat[:3, :3].T + track.viewmat[:3, 3]) @ track.K.T
-            parts.append(p[:, :2] / p[:, 2:] - track.places)
+            parts.append(project(x0 + v0 * t + a * t**2 / 2, track.viewmat, track.K) - track.places)
         return np.concatenate(parts).ravel()
 
     linear = _linear(tracks, start, known, basis, base)

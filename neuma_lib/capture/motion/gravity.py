@@ -6,7 +6,7 @@ the floor are right. A relative error e of the times appears as 2 e.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -114,15 +114,3 @@ class Gravity:
             "gravity_angle_deg": angle,
             "gravity_angle_deviation_deg": angle_std,
         }
-
-
-def gravity_checks(name: str, report: Mapping[str, Any]) -> list[tuple[str, str, str, bool]]:
-    """Checks of a `Gravity.report`, with the fields of `neuma_lib.capture.report.page.Check`."""
-    ratio, spread = report["gravity_ratio"], report["gravity_ratio_deviation"]
-    angle, angle_std = report["gravity_angle_deg"], report["gravity_angle_deviation_deg"]
-    size = f"{ratio:.3f} +- {spread:.3f} of {GRAVITY} m/s^2"
-    direction = f"{angle:.1f} +- {angle_std:.1f} degrees off the floor's normal"
-    return [
-        (f"gravity in {name}", size, "1 +- 0.03", abs(ratio - 1) < 0.03 + 2 * spread),
-        (f"down in {name}", direction, "< 1.5 degrees", angle < 1.5 + 2 * angle_std),
-    ]

@@ -14,6 +14,8 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from neuma_lib.capture.calibration.placement import camera_centres
+from neuma_lib.capture.masks.regions import radius_of
 from neuma_lib.capture.motion.free_fall import FreeFall, Track
 from neuma_lib.capture.tools import opencv
 
@@ -77,7 +79,7 @@ def follow(frames: Sequence[np.ndarray], masks: np.ndarray, times: np.ndarray, c
     cv2 = opencv()
     grey = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames]
     # Windows should be inside the object, but a small object must keep some pixels.
-    edge = 2 * max(2, min(_WINDOW // 2, round(0.25 * float(np.sqrt(masks[0].sum() / np.pi))))) + 1
+    edge = 2 * max(2, min(_WINDOW // 2, round(0.25 * radius_of(masks[0])))) + 1
     shape = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (edge, edge))
     inner = [cv2.erode(mask.astype(np.uint8), shape) for mask in masks]
     middles = [np.argwhere(mask).mean(axis=0)[::-1] for mask in masks]
@@ -104,7 +106,7 @@ def follow(frames: Sequence[np.ndarray], masks: np.ndarray, times: np.ndarray, c
             alive = alive[kept]
             for k, place in zip(alive, there[kept, 0].astype(np.float64)):
                 places[k].append(place)
-        radius = float(np.sqrt(masks[first].sum() / np.pi))
+        radius = radius_of(masks[first])
         long = [p for p in places if len(p) > 2]
         paths += [Path(camera, times[first : first + len(p)], np.array(p) + 0.5, radius) for p in long]
     return paths
@@ -139,7 +141,7 @@ def fit_spin(paths: Sequence[Path], tracks: Sequence[Track], fall: FreeFall) -> 
         [(start - K[camera, :2, 2]) / K[camera][:, [0, 1], [0, 1]], np.ones((len(start), 1))], axis=1
     )
     rays = np.einsum("nji,nj->ni", R[camera], rays)
-    eyes = -np.einsum("nji,nj->ni", R[camera], t[camera])
+    eyes = camera_centres(np.stack([track.viewmat for track in tracks]))[camera]
     nearest = np.einsum("ni,ni->n", centres - eyes, rays) / (rays**2).sum(axis=1)
     away = np.linalg.norm(eyes + nearest[:, None] * rays - centres, axis=1)
     radii = np.array([p.radius for p in paths]) * nearest / K[camera, 0, 0]

@@ -11,8 +11,8 @@ from PIL import Image
 
 from neuma_lib.capture.masks.background import match_exposure
 from neuma_lib.capture.motion.synchronisation import reduced, reduced_intrinsics
+from neuma_lib.capture.pictures import write_png
 from neuma_lib.errors import InputError
-from neuma_lib.io.files import atomic
 from neuma_lib.io.images import open_image, read_transforms
 
 
@@ -88,6 +88,5 @@ def numbers_of(video: Sequence[Mapping[str, Any]], camera: str) -> list[int]:
 
 
 def _save(folder: Path, name: str, pixels: np.ndarray) -> str:
-    with atomic(folder / name) as partial:
-        Image.fromarray(pixels).save(partial, "PNG")
+    write_png(folder / name, pixels)
     return name

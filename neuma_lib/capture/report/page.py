@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from neuma_lib.capture.masks.agreement import MIN_AGREEMENT
-from neuma_lib.capture.motion.flight import flight_checks
-from neuma_lib.capture.motion.gravity import gravity_checks
+from neuma_lib.config.simulation import GRAVITY
 
 MAX_ERROR = 1.0
 """Mean reprojection error of good photographs [px]."""
@@ -88,8 +87,29 @@ def motion_checks(
         good = jump is not None and jump < MAX_JUMP
         result.append(Check(f"area of {name}, frame to frame", text, f"< {100 * MAX_JUMP:.0f} %", good))
     for take, flight in flights.items():
-        result += [Check(*values) for values in flight_checks(take, flight)]
+        result += [*gravity_checks(f"silhouettes of {take}", flight), *flight_checks(take, flight)]
     return result
+
+
+def flight_checks(take: str, flight: Mapping[str, Any]) -> list[Check]:
+    """Checks of the report of a free flight (`neuma_lib.capture.motion.flight.report`)."""
+    rms, ious = flight["rms_px"], flight["agreement"] or {}
+    return [Check(f"flight in {take}", f"{rms:.2f} px off the fit", "< 1 px", rms < 1)] + [
+        Check(f"mask of {camera} at rest, {take}", f"IoU {iou:.2f}", "> 0.7", iou > 0.7)
+        for camera, iou in ious.items()
+    ]
+
+
+def gravity_checks(name: str, report: Mapping[str, Any]) -> list[Check]:
+    """Checks of a `Gravity.report`."""
+    ratio, spread = report["gravity_ratio"], report["gravity_ratio_deviation"]
+    angle, angle_std = report["gravity_angle_deg"], report["gravity_angle_deviation_deg"]
+    size = f"{ratio:.3f} +- {spread:.3f} of {GRAVITY} m/s^2"
+    direction = f"{angle:.1f} +- {angle_std:.1f} degrees off the floor's normal"
+    return [
+        Check(f"gravity in {name}", size, "1 +- 0.03", abs(ratio - 1) < 0.03 + 2 * spread),
+        Check(f"down in {name}", direction, "< 1.5 degrees", angle < 1.5 + 2 * angle_std),
+    ]
 
 
 def object_checks(fit: Mapping[str, Any]) -> list[Check]:
@@ -106,7 +126,7 @@ def registration_checks(placed: Mapping[str, Mapping[str, Any]]) -> list[Check]:
         turn = max(report["rotation_std_deg_principal"])
         text, wanted = f"+-{turn:.1f} degrees", f"< {MAX_TURN:g} degrees"
         result.append(Check(f"pose of the object in {take}", text, wanted, turn < MAX_TURN))
-        result += [Check(*values) for values in gravity_checks(take, report)]
+        result += gravity_checks(take, report)
         for camera, after in report["after"].items():
             text, wanted = f"IoU {after['iou']:.3f}", f"> {MIN_OVERLAP:g}"
             what = f"placed object in {take}, {camera}"
@@ -116,10 +136,10 @@ def registration_checks(placed: Mapping[str, Mapping[str, Any]]) -> list[Check]:
 
 def markdown(title: str, checks: list[Check], pictures: Mapping[str, str], missing: str | None = None) -> str:
     """A page with a table of checks, a note on what is missing, and pictures: caption -> path relative to the page."""
-    lines = [f"# {title}", "", "| check | found | wanted | |", "|---|---|---|---|"]
+    lines = [f"# {title}", "", "| check | measured | expected | |", "|---|---|---|---|"]
     for check in checks:
         lines.append(
-            f"| {check.what} | {check.value} | {check.wanted} | {'ok' if check.good else '**look**'} |"
+            f"| {check.what} | {check.value} | {check.wanted} | {'ok' if check.good else '**failed**'} |"
         )
     lines += ["", missing] if missing else []
     for caption, file in pictures.items():

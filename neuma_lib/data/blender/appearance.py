@@ -73,8 +73,3 @@ def colors_at(mesh: trimesh.Trimesh, points: np.ndarray, appearance: AppearanceC
     patch = np.clip((noise - 0.35) / 0.3, 0.0, 1.0)
     patch = (appearance.contrast * patch * patch * (3.0 - 2.0 * patch))[:, None]
     return (1.0 - patch) * (weights @ plain) + patch * (weights @ patched)
-
-
-def to_linear(srgb: np.ndarray) -> np.ndarray:
-    """Linear values of sRGB values in [0, 1]."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
-from neuma_lib.data.blender.libraries import explain_import_error
+from neuma_lib.data.blender.scene import run_worker
 from neuma_lib.io.files import atomic
 from neuma_lib.io.gltf import linear
 from neuma_lib.splatting.viewpoints import video_views
@@ -44,21 +41,7 @@ def write_blend(
             colors=linear(colors).astype(np.float32), pose=views.c2w[0], focal=views.focal, size=np.array(_SIZE),
             samples=_SAMPLES, threads=1, shown=times[-1],
         )  # fmt: skip
-        root = str(Path(__file__).resolve().parents[3])
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
-        done = subprocess.run(
-            [sys.executable, "-m", _WORKER, str(job)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            env=environment,
-            text=True,
-            errors="replace",
-        )
-        if done.returncode:
-            if error := explain_import_error(done.stdout):
-                raise error
-            tail = "\n".join(done.stdout.strip().splitlines()[-12:])
-            raise RuntimeError(f"Blender ended with status {done.returncode}:\n{tail}")
+        run_worker(_WORKER, job)
         for source, target in ((job.with_name("motion.blend"), path), (job.with_name("proof.png"), picture)):
             with atomic(target) as partial:
                 partial.write_bytes(source.read_bytes())

@@ -10,8 +10,8 @@ from neuma_lib.config.blender import AppearanceConfig
 from neuma_lib.data.blender.appearance import colors_at
 from neuma_lib.data.blender.scene import Liquid, Surface
 from neuma_lib.extras import require
+from neuma_lib.geometry.moving_surface import moving_surface
 from neuma_lib.geometry.shapes import depth
-from neuma_lib.geometry.skinning import carry, skinning_matrix
 
 MAX_GRAINS = 30_000
 MAX_DROPS = 12_000  # points that define the surface of a liquid
@@ -34,8 +34,9 @@ def make_body(
     """
     x = np.asarray(x, dtype=np.float64)
     if appearance.kind == "solid":
-        vertices = carry(skinning_matrix(mesh.vertices, x[0]), x)
-        return Surface(vertices, np.asarray(mesh.faces), colors_at(mesh, mesh.vertices, appearance))
+        return Surface(
+            moving_surface(mesh, x), np.asarray(mesh.faces), colors_at(mesh, mesh.vertices, appearance)
+        )
     points = x if tracers is None else np.asarray(tracers)
     make, limit = (_grains, MAX_GRAINS) if appearance.kind == "grains" else (_liquid, MAX_DROPS)
     return make(mesh, appearance, _subsampled(points, limit))

@@ -20,9 +20,9 @@ from pathlib import Path
 import numpy as np
 
 from neuma_lib.data.blender import worker
-from neuma_lib.data.blender.appearance import to_linear
 from neuma_lib.data.blender.libraries import explain_import_error
 from neuma_lib.errors import InputError
+from neuma_lib.io.gltf import linear
 from neuma_lib.io.images import write_transforms
 from neuma_lib.splatting.viewpoints import Views
 
@@ -63,7 +63,7 @@ class Surface:
             "vertex_start": np.arange(frames + 1) * count,
             "faces": self.faces.astype(np.int32),
             "face_start": np.array([0, len(self.faces)]),
-            "colors": to_linear(self.colors).astype(np.float32),
+            "colors": linear(self.colors).astype(np.float32),
             "radius": np.array(float(self.radius)),
         }
 
@@ -90,7 +90,7 @@ class Liquid:
             "vertex_start": np.cumsum([0, *(len(vertices) for vertices, _, _ in self.surfaces)]),
             "faces": faces.astype(np.int32),
             "face_start": np.cumsum([0, *(len(faces) for _, faces, _ in self.surfaces)]),
-            "colors": to_linear(colors).astype(np.float32),
+            "colors": linear(colors).astype(np.float32),
             "radius": np.array(0.0),
         }
 
@@ -160,7 +160,7 @@ def _pixels_only(png: bytes) -> bytes:
     return b"".join(kept)
 
 
-def run_worker(module: str, job: Path, total: int, progress: Progress | None) -> None:
+def run_worker(module: str, job: Path, total: int = 0, progress: Progress | None = None) -> None:
     """Run a module of this package in a Blender process on a job file.
 
     Raises:

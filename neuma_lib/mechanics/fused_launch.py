@@ -1,0 +1,56 @@
+"""Launches of fused kernels, which take arrays as addresses: Warp's array objects take more time than the kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from neuma_lib.device import warp_stream
+
+BLOCKS_PER_PROCESSOR = 2
+
+
+@cache
+def warp_device(device: torch.device) -> wp.Device:
+    """Warp's view of a device."""
+    return wp.device_from_torch(device)
+
+
+def block_count(rows: int, rows_per_block: int, device: torch.device) -> int:
+    """Thread blocks on a GPU for a number of rows, at most `BLOCKS_PER_PROCESSOR` per processor."""
+    return min(-(-rows // rows_per_block), BLOCKS_PER_PROCESSOR * warp_device(device).sm_count)
+
+
+def launch_blocks(kernel: wp.Kernel, blocks: int, threads: int, *inputs: Tensor | float | None) -> None:
+    """Queue a kernel over blocks of threads, in order with torch. On a CPU a block has one thread.
+
+    Raises:
+        TypeError: tensors differ in dtype or device, which addresses do not show.
+    """
+    first, *others = (x for x in inputs if isinstance(x, Tensor))
+    if any(x.dtype != first.dtype or x.device != first.device for x in others):
+        raise TypeError("F, weights and buffers of a law must have one dtype and one device")
+    threads = 1 if first.device.type == "cpu" else threads
+    wp.launch(
+        kernel,
+        dim=blocks * threads,
+        inputs=[x.data_ptr() if isinstance(x, Tensor) else 0 if x is None else x for x in inputs],
+        block_dim=threads,
+        device=warp_device(first.device),
+        stream=warp_stream(first.device),
+    )
+
+
+@contextmanager
+def contiguous(*tensors: Tensor) -> Iterator[list[Tensor]]:
+    """Contiguous views or copies of tensors that a kernel writes. Copies are written back at the end."""
+    buffers = [tensor.contiguous() for tensor in tensors]
+    yield buffers
+    for tensor, buffer in zip(tensors, buffers, strict=True):
+        if buffer is not tensor:
+            tensor.copy_(buffer)

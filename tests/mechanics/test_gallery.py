@@ -1,0 +1,26 @@
+"""The gallery of laws on the site agrees with the laws. `python -m docs.laws` writes it again."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from docs import laws
+
+ROOT = Path(__file__).resolve().parents[2]
+NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
+
+
+def test_the_page_lists_the_built_in_laws():
+    assert (ROOT / laws.PAGE).read_text() == laws.page()
+
+
+def test_pictures_show_the_curves_of_the_laws():
+    """To 0.2 px, since the last digit depends on the processor."""
+    pictures = laws.pictures()
+    assert {file.name for file in (ROOT / laws.PICTURES).iterdir()} == set(pictures)
+    for name, expected in pictures.items():
+        text = (ROOT / laws.PICTURES / name).read_text()
+        assert NUMBER.sub("", text) == NUMBER.sub("", expected), name
+        numbers = [np.array(NUMBER.findall(svg), float) for svg in (text, expected)]
+        np.testing.assert_allclose(*numbers, atol=0.2, err_msg=name)
