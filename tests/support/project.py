@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 import shutil
 import subprocess
 import sys
 import time
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import yaml
@@ -37,6 +42,78 @@ def wait_for(condition, seconds: float = 60.0):
         assert time.monotonic() < end, "waited in vain"
         time.sleep(0.02)
     return value
+
+
+@dataclass(frozen=True)
+class Job:
+    """A job as Snakemake prints it, in a dry run or when it starts."""
+
+    rule: str
+    text: str
+
+    def listed(self, key: str) -> list[str]:
+        found = re.search(rf"^    {key}: (.*)$", self.text, re.MULTILINE)
+        return found[1].split(", ") if found else []
+
+    @cached_property
+    def inputs(self) -> list[str]:
+        return self.listed("input")
+
+    @cached_property
+    def outputs(self) -> list[str]:
+        return self.listed("output")
+
+
+class Plan(Counter):
+    """Rules with the number of their jobs, and the jobs of a run or a dry run.
+
+    Args:
+        requested: options of Snakemake, with the targets.
+    """
+
+    def __init__(self, jobs: Iterable[Job], requested: Iterable[str] = ()):
+        self.jobs, self.requested = list(jobs), {*requested}
+        super().__init__(job.rule for job in self.jobs)
+
+    @classmethod
+    def of(cls, output: str, requested: Iterable[str] = ()) -> Plan:
+        """Jobs that Snakemake prints. Raises AssertionError if these are not all that it counts."""
+        blocks = re.findall(r"^(?:local)?rule (\w+):\n((?:    .*\n)*)", output, re.MULTILINE)
+        plan = cls((Job(*block) for block in blocks), requested)
+        assert "Nothing to be done" in output or re.search(
+            rf"^total +{len(plan.jobs)}$", output, re.MULTILINE
+        )
+        return plan
+
+    def of_rule(self, rule: str) -> list[Job]:
+        return [job for job in self.jobs if job.rule == rule]
+
+    def one(self, rule: str) -> Job:
+        """The only job of a rule."""
+        (job,) = self.of_rule(rule)
+        return job
+
+    @cached_property
+    def makers(self) -> dict[str, Job]:
+        """The job of each output; a target rule is its own output."""
+        return {name: job for job in self.jobs for name in job.outputs or [job.rule]}
+
+    def behind(self, *targets: str) -> Plan:
+        """The jobs that a dry run of these targets alone would have, with the files as they are for this plan."""
+        unknown = {*targets} - self.makers.keys() - self.requested
+        assert not unknown, unknown
+        chosen, open_files = {}, list(targets)
+        while open_files:
+            job = self.makers.get(open_files.pop())
+            if job and job not in chosen:
+                chosen[job] = None
+                open_files += job.inputs
+        return Plan(chosen)
+
+
+def overlay(**settings) -> tuple[str, ...]:
+    """Options of Snakemake that change sections of the settings. Targets follow them."""
+    return "--config", *(f"{name}={json.dumps(value)}" for name, value in settings.items()), "--"
 
 
 class Project:
@@ -75,12 +152,9 @@ class Project:
         assert (done.returncode == 0) == succeeds, done.stdout[-4000:]
         return done.stdout
 
-    def plan(self, *words: str) -> dict[str, int]:
-        """Rules that Snakemake would run, with the number of their jobs."""
-        text = self.run("--dry-run", *words)
-        stats = re.search(r"^job +count\n[- ]+\n(.*?)^total", text, re.MULTILINE | re.DOTALL)
-        assert stats or "Nothing to be done" in text, text[-4000:]
-        return {line.split()[0]: int(line.split()[1]) for line in stats[1].splitlines()} if stats else {}
+    def plan(self, *words: str) -> Plan:
+        """The jobs that Snakemake would run."""
+        return Plan.of(self.run("--dry-run", *words), words)
 
     def start(self, *words: str) -> subprocess.Popen:
         """Start Snakemake as the leader of a process group of its own."""
