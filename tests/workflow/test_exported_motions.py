@@ -1,7 +1,6 @@
 """Motions for other programs, made by the workflow and read by other readers: of springs, of an experiment with another
 body, and of several bodies."""
 
-import importlib.util
 import json
 import struct
 
@@ -15,45 +14,19 @@ from plyfile import PlyData
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.splats import load_splat
 from tests.support.blends import read_blend
-from tests.support.project import SCENE
+from tests.support.full_run import EXPORTED, USD
 
-EXPERIMENTS = "tiny/results/experiments"
-SPRINGS = "spring_gaus+iterations=2"
-MOVED = {  # folders, with the number of bodies
-    f"{SCENE}/{SPRINGS}": 1,
-    f"{EXPERIMENTS}/letter/{SPRINGS}": 1,
-    f"{EXPERIMENTS}/letter_and_ball/nclaw": 2,
-}
-LETTER = {
-    "title": "I",
-    "bodies": [{"scene": "BouncyBall", "shape": "letter_I", "height": 0.4, "velocity": [0, -2, 0]}],
-    "steps": 60,
-}
-FILES = ["gaussians", "compressed", "particles.h5", "surface.glb", "motion.gif", "motion.blend"]
-USD = importlib.util.find_spec("pxr") is not None  # comes with `make viewer`
 MARGIN = 0.05
 """Gaussians and surface lie at most this far from the box of the particles [m]; these are about 0.02 m apart."""
 
 
-@pytest.fixture(scope="module")
-def project(finished, tmp_path_factory):
-    """The finished copy, with all exports of all motions."""
-    made = finished.clone(tmp_path_factory.mktemp("exports") / "project")
-    files = [*FILES, *(["surface.usdc", "surface.usda"] if USD else [])]
-    targets = [f"{folder}/export/{file}" for folder in MOVED for file in files]
-    settings = ("--config", f"experiments={json.dumps({'letter': LETTER})}", "--")
-    made.run(*settings, *targets)
-    assert made.plan(*settings, *targets) == {}
-    return made
-
-
-@pytest.fixture(params=MOVED, ids=["springs", "experiment", "bodies"])
-def moved(project, request):
+@pytest.fixture(params=EXPORTED, ids=["springs", "experiment", "bodies"])
+def moved(full, request):
     """Its export folder, its bodies, positions (T, N, 3) [m] and times (T,) [s]."""
-    folder = project.root / request.param
+    folder = full.root / request.param
     path, attributes = read_arrays(folder / "rollout.h5")
     assert len(path["x"]) == len(path["frames"]) > 5
-    return folder / "export", MOVED[request.param], path["x"], path["frames"] * attributes["dt"]
+    return folder / "export", EXPORTED[request.param], path["x"], path["frames"] * attributes["dt"]
 
 
 def assert_around(points, x):

@@ -12,7 +12,7 @@ from tests.support.project import ROOT, SCENE, TABLE, copied, overlay
 
 RESULTS = SCENE.rpartition("/")[0]
 EXPERIMENTS = f"{RESULTS}/experiments"
-CHAIN = f"{SCENE}+seed=1"
+REPLICATE = f"{SCENE}+seed=1"
 SUPERVISED = f"{SCENE}/neuma_particle_supervision"  # the one method that trains on the truth
 EVERYTHING = ("tables", "figures", "videos", f"{SUPERVISED}/image_metrics.json", f"{SCENE}/viewer.html")
 # Blender films the truth, evaluation measures against it; figures and viewer show it.
@@ -23,6 +23,7 @@ MAY_READ_THE_TRUTH = {
 }
 SYSTEMS = f"{RESULTS}/table2_systems.csv"
 COMPARED = [f"{RESULTS}/figures/{name}.png" for name in ("main_res", "image_quality", "ch_dist_curve")]
+REALWORLD = f"{RESULTS}/figures/realworld.png"
 LAWS = [
     *("neuma", "nclaw", "constants", "neuma_structured", "neuma+prior=identified", "pac_nerf", "true_law"),
     *("neuma_structured+views=0,1", "neuma+law_from=JellyDuck"),
@@ -41,24 +42,24 @@ EXPORTS = ("gaussians", "compressed", "particles.h5", "surface.glb", "motion.ble
 RUNS = [
     f"{SCENE}/constants/metrics.json",
     f"{SCENE}/identified.png",
-    f"{CHAIN}/constants/metrics.json",
+    f"{REPLICATE}/constants/metrics.json",
     f"{SCENE}/spring_gaus+anchors=50/metrics.json",
     f"{EXPERIMENTS}/letter_N_bouncy/spring_gaus/metrics.json",
-    f"{CHAIN}/pac_nerf+guesses=prior/metrics.json",
-    f"{CHAIN}/pac_nerf_own+guesses=prior/image_metrics.json",
-    f"{CHAIN}/pac_nerf_own+guesses=prior/video.mp4",
-    f"{CHAIN}/neuma_structured/metrics.json",
+    f"{REPLICATE}/pac_nerf+guesses=prior/metrics.json",
+    f"{REPLICATE}/pac_nerf_own+guesses=prior/image_metrics.json",
+    f"{REPLICATE}/pac_nerf_own+guesses=prior/video.mp4",
+    f"{REPLICATE}/neuma_structured/metrics.json",
     f"{SCENE}/neuma_structured+prior=jelly+start=estimated/metrics.json",
-    f"{CHAIN}/neuma_structured+views=0,1/metrics.json",
-    f"{CHAIN}/constants+views=0,1/metrics.json",
-    f"{CHAIN}/neuma_structured/stress.json",
-    f"{CHAIN}/neuma_structured/response.json",
-    f"{CHAIN}/neuma+prior=identified/metrics.json",
-    f"{CHAIN}/neuma+start=identified/metrics.json",
+    f"{REPLICATE}/neuma_structured+views=0,1/metrics.json",
+    f"{REPLICATE}/constants+views=0,1/metrics.json",
+    f"{REPLICATE}/neuma_structured/stress.json",
+    f"{REPLICATE}/neuma_structured/response.json",
+    f"{REPLICATE}/neuma+prior=identified/metrics.json",
+    f"{REPLICATE}/neuma+start=identified/metrics.json",
     f"{EXPERIMENTS}/letter_and_ball+seed=1/neuma/metrics.json",
 ]
 VARIED = ("adaptor", "prior", "particles", "gaussians")
-CHAINS = {"scenes": ["BouncyBall"], "methods": ["nclaw", "neuma"], "seeds": 3}
+REPLICATES = {"scenes": ["BouncyBall"], "methods": ["nclaw", "neuma"], "seeds": 3}
 FILMED = f"{RESULTS}/Filmed"
 TWO_VIDEOS = {"scenes": {"Filmed": {"like": "BouncyBall", "videos": [{"velocity": [0.5, -1.0, 0.0]}]}}}
 
@@ -82,12 +83,12 @@ def tiny_settings():
 @pytest.fixture(scope="module")
 def plan(project):
     exports = [f"{folder}/export/{file}" for folder in MOVED for file in EXPORTS]
-    return project.plan(*EVERYTHING, SYSTEMS, *COMPARED, *EXPORTED_LAWS, *exports, *RUNS)
+    return project.plan(*EVERYTHING, "random", REALWORLD, SYSTEMS, *COMPARED, *EXPORTED_LAWS, *exports, *RUNS)
 
 
 @pytest.fixture(scope="module")
 def wider(project):
-    """A plan with a scene of two videos, several chains of a table, other systems in figures, and Blender on a GPU."""
+    """A plan with a scene of two videos, replicates of tables, other systems in figures, and Blender on a GPU."""
     learned = ["neuma", "constants", "constants+law_from=Filmed_throw2"]
     changes = overlay(
         device="cpu",
@@ -96,8 +97,8 @@ def wider(project):
         identify={"refined_particles": 201},
         **TWO_VIDEOS,
         tables={
-            "chains": CHAINS,
-            **{f"vary_{drawn}": CHAINS | {"vary": [drawn]} for drawn in VARIED},
+            "replicates": REPLICATES,
+            **{f"vary_{drawn}": REPLICATES | {"vary": [drawn]} for drawn in VARIED},
             "filmed": {"scenes": ["Filmed"], "methods": learned},
         },
     )
@@ -105,16 +106,29 @@ def wider(project):
         *(
             "figures",
             *COMPARED,
-            f"{RESULTS}/chains.csv",
+            f"{RESULTS}/replicates.csv",
             *(f"{RESULTS}/vary_{drawn}.csv" for drawn in VARIED),
         ),
         *(
             f"{FILMED}+seed=1/neuma/metrics.json",
             f"{FILMED}_throw2+seed=1/neuma+law_from=Filmed/metrics.json",
         ),
-        *(f"{FILMED}+seed=1/identified.json", f"{RESULTS}/identified_filmed.csv", f"{CHAIN}/neuma/video.mp4"),
+        *(
+            f"{FILMED}+seed=1/identified.json",
+            f"{RESULTS}/identified_filmed.csv",
+            f"{REPLICATE}/neuma/video.mp4",
+        ),
     ]
     return project.plan("--set-resources", "mesh:runtime=7", *changes, *targets)
+
+
+def test_every_table_and_figure_can_be_planned(plan):
+    tables, figures = plan.behind("tables"), plan.behind("figures", "random", REALWORLD)
+    assert {"experiment_truth", "experiment_start", "evaluate_experiment", "benchmark_table"} <= set(tables)
+    assert tables["chamfer_table"] >= 4 and tables["prior"] == 8
+    modules = {module.stem for module in (ROOT / "neuma_lib/paper/figures").glob("[!_]*.py")}
+    # i23d needs a splat: test_splat_scenes.py makes it.
+    assert modules - {"i23d"} <= set(figures)
 
 
 def is_truth(file):
@@ -161,7 +175,7 @@ def test_identified_constants_need_the_video_and_no_training(plan):
     assert any(file.endswith("transforms.json") for file in identify.inputs)
     assert not any(map(is_truth, identify.inputs))
     assert f"{SCENE}/identified.json" in graph.one("evaluate").inputs
-    assert f"{CHAIN}/identified.json" in plan.behind(RUNS[2]).makers
+    assert f"{REPLICATE}/identified.json" in plan.behind(RUNS[2]).makers
 
 
 def test_springs_are_fitted_to_the_video_alone(plan):
@@ -199,15 +213,15 @@ def test_springs_and_laws_of_a_table_are_put_to_use_elsewhere_as_their_scenes_ta
 
 def test_pac_nerf_needs_images_its_field_and_contact_alone(plan):
     """Its own start and law are evaluated; no networks, and no truth, lead to them."""
-    run = f"{CHAIN}/pac_nerf+guesses=prior"
+    run = f"{REPLICATE}/pac_nerf+guesses=prior"
     graph = plan.behind(f"{run}/metrics.json")
     fit, evaluation = graph.one("fit_pac_nerf"), graph.one("evaluate")
     assert fit.outputs[0] == f"{run}/constants.json"
     assert not graph.keys() & {"fit_neuma", "fit_structured", "identify"}
-    assert graph.one("radiance_field").outputs[0] == f"{CHAIN}/pac_nerf/field.safetensors"
+    assert graph.one("radiance_field").outputs[0] == f"{REPLICATE}/pac_nerf/field.safetensors"
     assert {
-        *("tiny/data/BouncyBall/dynamic/transforms.json", f"{CHAIN}/velocity.json"),
-        f"{CHAIN}/pac_nerf/field.safetensors",
+        *("tiny/data/BouncyBall/dynamic/transforms.json", f"{REPLICATE}/velocity.json"),
+        f"{REPLICATE}/pac_nerf/field.safetensors",
     } <= set(fit.inputs)
     assert not any("/priors/" in file or is_truth(file) for file in fit.inputs)
     assert f"{run}/constants.json" in evaluation.inputs
@@ -215,12 +229,14 @@ def test_pac_nerf_needs_images_its_field_and_contact_alone(plan):
 
 
 def test_pac_nerfs_own_particles_are_evaluated_with_its_field_and_fit_nothing_again(plan):
-    own, base = (f"{CHAIN}/{name}+guesses=prior" for name in ("pac_nerf_own", "pac_nerf"))
+    own, base = (f"{REPLICATE}/{name}+guesses=prior" for name in ("pac_nerf_own", "pac_nerf"))
     graph = plan.behind(f"{own}/image_metrics.json", f"{own}/video.mp4")
     assert graph.one("fit_pac_nerf").outputs == [f"{base}/constants.json", f"{base}/history.json"]
     for rule in ("evaluate", "image_metrics", "video"):
         job = graph.one(rule)
-        assert job.outputs[0].startswith(f"{own}/") and f"{CHAIN}/pac_nerf/field.safetensors" in job.inputs
+        assert (
+            job.outputs[0].startswith(f"{own}/") and f"{REPLICATE}/pac_nerf/field.safetensors" in job.inputs
+        )
         assert any(file.endswith("radiance.ready") for file in job.inputs)
     assert graph["radiance_field"] and f"{base}/constants.json" in graph.one("evaluate").inputs
 
@@ -236,17 +252,17 @@ def test_other_systems_are_in_figures_that_ask_for_them_alone(plan, wider):
 
 
 def test_a_structured_law_corrects_what_the_video_shows(plan):
-    """Around the constants of its scene, in its chain, and without networks to start from."""
-    graph = plan.behind(f"{CHAIN}/neuma_structured/metrics.json")
+    """Around the constants of its scene, in its replicate, and without networks to start from."""
+    graph = plan.behind(f"{REPLICATE}/neuma_structured/metrics.json")
     fit, evaluation = graph.one("fit_structured").inputs, graph.one("evaluate").inputs
-    assert f"{CHAIN}/identified.json" in fit
+    assert f"{REPLICATE}/identified.json" in fit
     assert not any("/priors/" in file for file in fit + evaluation)
-    assert f"{CHAIN}/neuma_structured/adaptor.safetensors" in evaluation
+    assert f"{REPLICATE}/neuma_structured/adaptor.safetensors" in evaluation
     assert not plan.behind(f"{SCENE}/neuma_structured+prior=jelly+start=estimated/metrics.json")["identify"]
 
 
 def test_the_command_line_exports_the_law_that_the_rule_exports(plan, tiny_settings):
-    """Of every kind of law, in a chain too: the files that `export-law` finds are those that the rule reads."""
+    """Of every kind of law, in a replicate too: the files that `export-law` finds are those that the rule reads."""
     settings = tiny_settings()
     for target, (scene, method) in EXPORTED_LAWS.items():
         read = set(plan.makers[target].inputs)
@@ -257,10 +273,10 @@ def test_the_command_line_exports_the_law_that_the_rule_exports(plan, tiny_setti
 
 
 def test_more_views_have_constants_of_their_own(plan):
-    methods = [f"{CHAIN}/{method}+views=0,1/metrics.json" for method in ("neuma_structured", "constants")]
+    methods = [f"{REPLICATE}/{method}+views=0,1/metrics.json" for method in ("neuma_structured", "constants")]
     graph = plan.behind(*methods)
     (identify,) = [job for job in graph.jobs if job.rule.startswith("identify")]
-    assert identify.outputs == [f"{CHAIN}/identified+views=0,1.json"]
+    assert identify.outputs == [f"{REPLICATE}/identified+views=0,1.json"]
     readers = [job.rule for job in graph.jobs if identify.outputs[0] in job.inputs]
     assert sorted(readers) == [
         "evaluate",
@@ -269,30 +285,32 @@ def test_more_views_have_constants_of_their_own(plan):
     ]  # of both methods: law and initial motion
 
 
-def test_stresses_are_compared_in_the_states_of_their_chain_and_drawn_over_those_of_the_first(plan):
+def test_stresses_are_compared_in_the_states_of_their_replicate_and_drawn_over_those_of_the_first(plan):
     stress, response = (
-        plan.makers[f"{CHAIN}/neuma_structured/{name}.json"].inputs for name in ("stress", "response")
+        plan.makers[f"{REPLICATE}/neuma_structured/{name}.json"].inputs for name in ("stress", "response")
     )
-    assert f"{CHAIN}/visited.h5" in stress and f"{SCENE}/visited.h5" in response
-    assert f"{CHAIN}/identified.json" in response
-    assert f"{CHAIN}/neuma_structured/rollout.h5" in response
+    assert f"{REPLICATE}/visited.h5" in stress and f"{SCENE}/visited.h5" in response
+    assert f"{REPLICATE}/identified.json" in response
+    assert f"{REPLICATE}/neuma_structured/rollout.h5" in response
     assert not any("/data/" in file and "kernels" not in file for file in stress + response)
 
 
 def test_networks_can_start_from_what_the_video_shows(plan):
-    graph = plan.behind(f"{CHAIN}/neuma+prior=identified/metrics.json")
+    graph = plan.behind(f"{REPLICATE}/neuma+prior=identified/metrics.json")
     prior = graph.one("identified_prior")
-    assert f"{CHAIN}/identified.json" in prior.inputs
-    assert prior.outputs[0] == f"{CHAIN}/priors/identified.safetensors"
+    assert f"{REPLICATE}/identified.json" in prior.inputs
+    assert prior.outputs[0] == f"{REPLICATE}/priors/identified.safetensors"
     assert all(prior.outputs[0] in graph.one(rule).inputs for rule in ("fit_neuma", "evaluate"))
     assert f"{RESULTS}/priors/jelly+seed=1.safetensors" in graph.one("velocity").inputs
 
 
 def test_a_method_can_start_as_identification_found(plan):
-    graph = plan.behind(f"{CHAIN}/neuma+start=identified/metrics.json")
+    graph = plan.behind(f"{REPLICATE}/neuma+start=identified/metrics.json")
     for rule in ("fit_neuma", "evaluate"):
         read = graph.one(rule).inputs
-        assert f"{CHAIN}/identified.json" in read and not any(file.endswith("velocity.json") for file in read)
+        assert f"{REPLICATE}/identified.json" in read and not any(
+            file.endswith("velocity.json") for file in read
+        )
 
 
 def test_refined_bodies_are_finer_or_none(plan, wider):
@@ -302,7 +320,7 @@ def test_refined_bodies_are_finer_or_none(plan, wider):
 
 def test_rules_with_a_script_get_what_they_leave_out(wider):
     """Fails where a Snakemake no longer reads what `workflow.defaults.complete` writes."""
-    graph = wider.behind(f"{CHAIN}/neuma/video.mp4")
+    graph = wider.behind(f"{REPLICATE}/neuma/video.mp4")
     for rule, expected in {
         "video": (
             f"log: {RESULTS}/logs/BouncyBall+seed=1/neuma/video.log",
@@ -326,8 +344,8 @@ def test_images_are_rendered_where_the_settings_say(plan, wider):
     assert {job.rule for job in wider.jobs if "gpu=1" in job.text} == {"render_static", "render_dynamic"}
 
 
-def test_three_chains_share_their_data_and_nothing_else(plan, wider):
-    one, three = plan.behind(TABLE), wider.behind(f"{RESULTS}/chains.csv")
+def test_three_replicates_share_their_data_and_nothing_else(plan, wider):
+    one, three = plan.behind(TABLE), wider.behind(f"{RESULTS}/replicates.csv")
     shared = {"kernels", "ground_truth", "render_static", "render_dynamic", "chamfer_table"}
     assert {"prior", "gaussians", "sampled_particles", "velocity", "fit_neuma", "evaluate"} <= set(one)
     assert three == {rule: count if rule in shared else 3 * count for rule, count in one.items()}
@@ -361,14 +379,14 @@ def test_what_varies_alone_repeats_what_depends_on_it(plan, wider, drawn, repeat
     assert three == {rule: count + more.get(rule, 0) for rule, count in one.items()}
 
 
-def test_an_experiment_follows_the_chains_of_its_scenes(plan):
+def test_an_experiment_follows_the_replicates_of_its_scenes(plan):
     graph = plan.behind(f"{EXPERIMENTS}/letter_and_ball+seed=1/neuma/metrics.json")
     assert {
-        f"{CHAIN}/neuma/adaptor.safetensors",
+        f"{REPLICATE}/neuma/adaptor.safetensors",
         f"{RESULTS}/priors/jelly+seed=1.safetensors",
         "tiny/data/experiments/letter_and_ball/particles.h5",
     } <= set(graph.one("evaluate_experiment").inputs)
-    assert f"{CHAIN}/velocity.json" in graph.one("experiment_start").inputs
+    assert f"{REPLICATE}/velocity.json" in graph.one("experiment_start").inputs
 
 
 def test_several_videos_train_one_law_which_is_evaluated_on_all(wider):
@@ -426,7 +444,7 @@ def test_motions_of_springs_and_of_experiments_are_exported_too(plan):
         ),
         ([f"{SCENE}/spring_gaus/stress.json"], "its motion follows from no material law"),
         (
-            [f"{CHAIN}/pac_nerf_own+guesses=prior/constants.json"],
+            [f"{REPLICATE}/pac_nerf_own+guesses=prior/constants.json"],
             "it has no fit, its model is that of BouncyBall+seed=1/pac_nerf+guesses=prior",
         ),
         (

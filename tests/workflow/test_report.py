@@ -37,21 +37,22 @@ setTimeout(next, 700);
 
 
 @pytest.fixture(scope="module")
-def project(tmp_path_factory):
+def project(tmp_path_factory, kernels):
     """A small run."""
-    project = copied(tmp_path_factory.mktemp("project"), tmp_path_factory.mktemp("kernels"))
+    project = copied(tmp_path_factory.mktemp("project"), kernels)
     project.run(*TARGETS)
     return project
 
 
-def test_an_edit_of_a_figure_makes_this_figure_again(project):
-    module = project.root / "neuma_lib/paper/figures/main_res.py"
-    original = module.read_text()
-    module.write_text(original.replace('"""', '"""Another caption. ', 1))
-    assert project.plan(*TARGETS) == {}
-    module.write_text(original + "\nEDITED = True\n")
-    assert project.plan(*TARGETS) == {"main_res": 1}
-    module.write_text(original)
+def test_an_edit_of_a_figure_repeats_this_figure_and_that_of_a_caption_none(project):
+    figures = project.root / "neuma_lib/paper/figures"
+    texts = {figures / f"{name}.py": (figures / f"{name}.py").read_text() for name in FIGURES[:2]}
+    caption, code = texts
+    caption.write_text(texts[caption].replace('"""', '"""Another caption. ', 1))
+    code.write_text(texts[code] + "\nEDITED = True\n")
+    assert project.plan(*TARGETS) == {FIGURES[1]: 1}
+    for file, text in texts.items():
+        file.write_text(text)
 
 
 @pytest.fixture(scope="module")
