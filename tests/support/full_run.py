@@ -1,4 +1,4 @@
-"""One run of all that can be made of the scene of tiny.yaml, besides Table 1: measures, figures, exports, own files."""
+"""One run of all that tiny.yaml's scene allows in addition to Table 1: measures, figures, exports, own files."""
 
 import importlib.util
 import shutil

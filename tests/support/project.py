@@ -1,4 +1,4 @@
-"""A copy of the project in a folder of its own, run by real Snakemake on the settings of tiny.yaml."""
+"""A copy of the project in its own folder, run by real Snakemake on the settings of tiny.yaml."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ class Job:
     text: str
 
     def listed(self, key: str) -> list[str]:
-        found = re.search(rf"^    {key}: (.*)$", self.text, re.MULTILINE)
-        return found[1].split(", ") if found else []
+        line = re.search(rf"^    {key}: (.*)$", self.text, re.MULTILINE)
+        return line[1].split(", ") if line else []
 
     @cached_property
     def inputs(self) -> list[str]:
@@ -99,7 +99,7 @@ class Plan(Counter):
         return {name: job for job in self.jobs for name in job.outputs or [job.rule]}
 
     def behind(self, *targets: str) -> Plan:
-        """The jobs that a dry run of these targets alone would have, with the files as they are for this plan."""
+        """The jobs that a dry run of these targets alone would have, with the present files."""
         unknown = {*targets} - self.makers.keys() - self.requested
         assert not unknown, unknown
         chosen, open_files = {}, list(targets)
@@ -117,11 +117,11 @@ def overlay(**settings) -> tuple[str, ...]:
 
 
 class Project:
-    """A copy of the working tree in a folder of its own.
+    """A copy of the working tree in its own folder.
 
     Args:
         root: that folder.
-        executor: options of Snakemake that say where jobs run.
+        executor: options of Snakemake that state where jobs run.
         seconds: the longest that a run may take.
     """
 
@@ -157,7 +157,7 @@ class Project:
         return Plan.of(self.run("--dry-run", *words), words)
 
     def start(self, *words: str) -> subprocess.Popen:
-        """Start Snakemake as the leader of a process group of its own."""
+        """Start Snakemake as the leader of a separate process group."""
         with open(self.root / "started.log", "w") as log:
             return subprocess.Popen(
                 self.command(*words),
@@ -169,7 +169,7 @@ class Project:
 
     def processes(self, script: str) -> list[int]:
         """Running Python processes of a script of this copy."""
-        found = []
+        numbers = []
         for process in Path("/proc").glob("[0-9]*"):
             try:
                 here = (process / "cwd").resolve() == self.root
@@ -177,8 +177,8 @@ class Project:
             except OSError:
                 continue
             if here and b"python" in words[0] and any(w.endswith(f".{script}.py".encode()) for w in words):
-                found.append(int(process.name))
-        return found
+                numbers.append(int(process.name))
+        return numbers
 
     def artifacts(self) -> dict[str, str]:
         """Digests of all data and results; logs and benchmarks are no artifacts."""
@@ -193,7 +193,7 @@ class Project:
 
 
 def copied(folder: Path, kernels: Path, origin: Path = ROOT) -> Project:
-    """A copy of the sources at ``origin`` in a folder of its own."""
+    """A copy of the sources at ``origin`` in its own folder."""
     for part in PARTS:
         source, target = origin / part, folder / part
         target.parent.mkdir(parents=True, exist_ok=True)

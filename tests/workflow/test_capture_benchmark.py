@@ -1,4 +1,4 @@
-"""From pictures that Blender takes of a simulated object to its place in the video, by real runs, beside the truth."""
+"""From images that Blender renders of a simulated object to its place in the video, compared with the truth."""
 
 import json
 
@@ -61,11 +61,11 @@ def test_a_filmed_object_is_found_where_it_was(project):
     rows |= {row.what: row for row in compare_registration(placed, velocity, known, truth, "first")}
     print("\n".join(f"{row.what}: {row.value:.3g} {row.unit}" for row in rows.values()))
     # Half as many pixels each way as the demo captures have, and a third of the photographs: twice their goals. Fewer
-    # than 20 photographs do not tell the centre of their lens, by which all cameras are turned.
-    judged = {
+    # than 20 photographs do not determine the centre of their lens, by which all cameras are turned.
+    relative = {
         what: row.value / row.goal for what, row in rows.items() if row.goal and "directions" not in what
     }
-    assert len(judged) == 8 and max(judged.values()) < 2, judged
+    assert len(relative) == 8 and max(relative.values()) < 2, relative
     assert rows["size of gravity, from the placed object"].value < 3
     assert max(row.value for what, row in rows.items() if what.startswith("offset")) < 1.5
     assert np.isfinite([row.value for row in rows.values()]).all()

@@ -1,4 +1,4 @@
-"""The report of a capture: what it asks for, with throws that are learned from and throws that are held out."""
+"""The report of a capture: what it asks for, with takes that are learned from and takes that are held out."""
 
 import re
 
@@ -12,11 +12,11 @@ REPORT = "tiny/results/mug/{method}/report.html"
 
 @pytest.fixture(scope="module")
 def project(tmp_path_factory, kernels):
-    """A capture with three throws of two cameras, one of them held out; nothing runs, so files are empty."""
+    """A capture with three takes of two cameras, one of them held out; nothing runs, so files are empty."""
     made = copied(tmp_path_factory.mktemp("report") / "project", kernels)
     root = made.root / "captures/mug"
     videos = [
-        f"videos/{throw}/{camera}.mp4" for throw in ("one", "two", "three") for camera in ("left", "right")
+        f"videos/{take}/{camera}.mp4" for take in ("one", "two", "three") for camera in ("left", "right")
     ]
     for name in ("photos/a.jpg", "stills/left.png", "stills/right.png", *videos):
         (root / name).parent.mkdir(parents=True, exist_ok=True)
@@ -35,8 +35,8 @@ def plan(project):
 def test_the_report_plans_every_stage_once(plan):
     planned = plan.behind(REPORT.format(method="neuma_structured"))
     once = ("poses", "room", "photograph_masks", "curves", "images", "report")
-    throws = ("flight", "registration", "video", "shown")
-    expected = {f"capture_{name}": 1 for name in once} | {f"capture_{name}": 3 for name in throws}
+    takes = ("flight", "registration", "video", "shown")
+    expected = {f"capture_{name}": 1 for name in once} | {f"capture_{name}": 3 for name in takes}
     expected |= {"capture_frames": 6, "capture_video_masks": 6}
     expected |= {"predict": 9, "capture_view": 18}  # the prior, the constants, and the law
     expected |= dict.fromkeys(
@@ -48,7 +48,7 @@ def test_the_report_plans_every_stage_once(plan):
     assert planned["identify_views"] == 2
 
 
-def test_a_held_out_throw_has_the_law_of_the_others_and_the_start_of_its_flight(plan):
+def test_a_held_out_take_has_the_law_of_the_others_and_the_start_of_its_flight(plan):
     fit = plan.behind(REPORT.format(method="neuma_structured")).one("fit_structured")
     law = "tiny/results/mug_one/neuma_structured/adaptor.safetensors"
     assert law in fit.outputs
@@ -57,9 +57,9 @@ def test_a_held_out_throw_has_the_law_of_the_others_and_the_start_of_its_flight(
         "tiny/data/mug_one/dynamic/transforms.json",
         "tiny/data/mug_three/dynamic/transforms.json",
     ]
-    for throw, start in (("two", "velocity"), ("three", "identified\\+views=0,1")):
-        read = plan.makers[f"tiny/results/mug_{throw}/neuma_structured+law_from=mug_one/rollout.h5"].inputs
-        assert law in read and any(re.search(f"mug_{throw}/{start}.json$", file) for file in read)
+    for take, start in (("two", "velocity"), ("three", "identified\\+views=0,1")):
+        read = plan.makers[f"tiny/results/mug_{take}/neuma_structured+law_from=mug_one/rollout.h5"].inputs
+        assert law in read and any(re.search(f"mug_{take}/{start}.json$", file) for file in read)
     assert not any("mug_two/" in file for file in fit.inputs)
 
 
@@ -69,12 +69,12 @@ def test_reports_of_the_prior_and_the_constants_train_nothing(plan):
     assert planned["capture_report"] == 2 and planned["predict"] == 6
 
 
-def test_what_cannot_be_reported_is_said(project):
+def test_what_cannot_be_reported_is_refused(project):
     def refusal(target):
         return project.run("--dry-run", target, succeeds=False)
 
-    said = refusal("tiny/results/mug_one/neuma/views/top.mp4")
-    assert "filmed by left, right, and by no camera 'top'" in said
+    output = refusal("tiny/results/mug_one/neuma/views/top.mp4")
+    assert "filmed by left, right, and by no camera 'top'" in output
     settings = project.root / "captures/mug/capture.yaml"
     settings.write_text(SETTINGS.replace("two", "two, one, three"))
     try:

@@ -49,7 +49,7 @@ def mug(project, drawn):
 
 
 def test_from_pictures_to_the_page(project, mug):
-    """Every stage leaves something to look at; a setting repeats what depends on it and no more."""
+    """Every stage leaves an image; a setting repeats what depends on it and no more."""
     output = project.run(PAGE, "captures/board.pdf")
     assert "5 of 5 pictures registered" in output and "8 frames, 240.00 per second" in output
     assert (project.root / "captures/board.pdf").read_bytes().startswith(b"%PDF")
@@ -60,8 +60,8 @@ def test_from_pictures_to_the_page(project, mug):
         in page
     )
     for file in ("poses.png", "cameras.png", "floor.png", "frames/first/left.png"):
-        with Image.open((project.root / PAGE).parent / file) as shown:
-            assert shown.width > 500
+        with Image.open((project.root / PAGE).parent / file) as image:
+            assert image.width > 500
         assert file == "poses.png" or f"({file})" in page
     data = read_transforms(project.root / "tiny/data/mug/room/transforms.json")
     assert [frame["group"] for frame in data["frames"]] == ["photographs"] * 4 + ["left"]

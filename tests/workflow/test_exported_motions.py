@@ -57,12 +57,12 @@ def test_gaussians_plain_and_compressed(moved):
         rows = PlyData.read(plain[k])["vertex"]
         means = np.stack([rows[axis] for axis in "xyz"], axis=1)
         assert_around(means, x[k])
-        found = load_splat(packed[k])
+        loaded = load_splat(packed[k])
         ranges = np.ptp(means, axis=0) / 1023
-        assert len(found) == len(means)
-        nearest = np.linalg.norm((found.means.numpy()[:, None] - means) / ranges, axis=2).min(axis=1)
+        assert len(loaded) == len(means)
+        nearest = np.linalg.norm((loaded.means.numpy()[:, None] - means) / ranges, axis=2).min(axis=1)
         assert nearest.max() < 1.0  # half a step in each of three directions
-        assert found.scales.min() > 0 and np.isfinite(found.sh().numpy()).all()
+        assert loaded.scales.min() > 0 and np.isfinite(loaded.sh().numpy()).all()
 
 
 def shown(file):
@@ -109,8 +109,8 @@ def test_surface_as_usd(moved, kind):
     mesh = UsdGeom.Mesh(stage.GetDefaultPrim().GetChild("surface"))
     samples = mesh.GetPointsAttr().GetTimeSamples()
     np.testing.assert_allclose(np.array(samples) / stage.GetTimeCodesPerSecond(), time, rtol=1e-6)
-    found = np.stack([np.array(mesh.GetPointsAttr().Get(sample)) for sample in samples])
-    np.testing.assert_allclose(found, shown(folder / "surface.glb")[0], atol=1e-6)
+    loaded = np.stack([np.array(mesh.GetPointsAttr().Get(sample)) for sample in samples])
+    np.testing.assert_allclose(loaded, shown(folder / "surface.glb")[0], atol=1e-6)
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     errors = UsdValidation.ValidationContext(validators).Validate(stage)
     assert [error.GetMessage() for error in errors] == []
@@ -131,8 +131,8 @@ def test_films(moved):
 
 def test_blend(moved):
     folder, _, _, time = moved
-    found = read_blend(folder / "motion.blend", time.tolist())
+    loaded = read_blend(folder / "motion.blend", time.tolist())
     # times are single precision in Blender, a frame is 1/24 s
-    np.testing.assert_allclose(found["co"], shown(folder / "surface.glb")[0], atol=1e-4)
+    np.testing.assert_allclose(loaded["co"], shown(folder / "surface.glb")[0], atol=1e-4)
     with Image.open(folder / "motion.png") as image:
         assert 0.002 < (np.asarray(image)[..., 3] > 128).mean() < 0.9

@@ -246,8 +246,8 @@ def test_other_systems_are_in_figures_that_ask_for_them_alone(plan, wider):
     files = [file for job in graph.jobs for file in job.inputs + job.outputs]
     assert not any("pac_nerf" in file or "spring_gaus" in file for file in files)
     for figure, file in zip(COMPARED, ("rollout.h5", "image_metrics.json", "metrics.json"), strict=True):
-        shown = {f"{SCENE}/{method}/{file}" for method in ("neuma", "spring_gaus", "pac_nerf_own")}
-        assert shown <= set(wider.makers[figure].inputs)
+        displayed = {f"{SCENE}/{method}/{file}" for method in ("neuma", "spring_gaus", "pac_nerf_own")}
+        assert displayed <= set(wider.makers[figure].inputs)
     assert f"{SCENE}/pac_nerf/field.safetensors" in wider.one("main_res").inputs
 
 
@@ -304,7 +304,7 @@ def test_networks_can_start_from_what_the_video_shows(plan):
     assert f"{RESULTS}/priors/jelly+seed=1.safetensors" in graph.one("velocity").inputs
 
 
-def test_a_method_can_start_as_identification_found(plan):
+def test_a_method_can_start_as_identified(plan):
     graph = plan.behind(f"{REPLICATE}/neuma+start=identified/metrics.json")
     for rule in ("fit_neuma", "evaluate"):
         read = graph.one(rule).inputs
@@ -472,7 +472,7 @@ def test_settings_are_refused_where_they_are_read(tiny_settings):
         tiny_settings(extensions=3)
 
 
-def test_cases_of_other_models_are_known_to_have_no_fit_of_their_own(tiny_settings):
+def test_cases_of_other_models_are_known_to_have_no_own_fit(tiny_settings):
     """These are what the workflow refuses: a model of several bodies without a law, and the fit of another folder."""
     with refused("letter_and_ball/spring_gaus") as caught:
         cases.body_cases(tiny_settings(), "letter_and_ball", "spring_gaus")

@@ -123,7 +123,7 @@ def jobs_with_code(finished, loaded):
 
     The digest of these files is the one that Snakemake has recorded of the job.
     """
-    sources, found = Sources(), []
+    sources, jobs = Sources(), []
     for job in Plan.of(finished.output).jobs:
         wildcards = dict(word.split("=", 1) for word in job.listed("wildcards"))
         folder, name = ("kernels", wildcards["group"]) if job.rule == "kernels" else ("scripts", job.rule)
@@ -134,8 +134,8 @@ def jobs_with_code(finished, loaded):
         recorded = json.loads((finished.root / ".snakemake/metadata" / record).read_text())["params"]
         assert repr(sources.digest(ROOT / script, modules)) in recorded, job.rule
         reached = (f"{module.replace('.', '/')}.py" for module in sources.reached(ROOT / script, modules))
-        found.append((job, {str(script), *reached}))
-    return found
+        jobs.append((job, {str(script), *reached}))
+    return jobs
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The photographed object is placed into its video, and the video brought to the simulator's clock, by Snakemake."""
+"""The photographed object is placed into its video, and the video converted to the simulator's clock, by Snakemake."""
 
 import json
 
@@ -103,29 +103,29 @@ def test_placed_files_are_of_one_body_that_moves_as_it_was_filmed(placed):
     assert "IoU" in placed.output
     results = placed.root / "tiny/results/mug_first"
     assert all((results / file).is_file() for file in FILES)
-    found, throw = (
+    placement, start = (
         read_json(results / "registration.json"),
         InitialMotion.of(read_json(results / "velocity.json")),
     )
-    at = np.array([found["t0_s"] - 3.0])
+    at = np.array([placement["t0_s"] - 3.0])
     (R,), (spin,) = motion.turn(at)
     (centre,), (velocity,) = motion.place(at)
-    off = Rotation.from_matrix(np.array(found["rotation"]) @ R.T).magnitude()
-    assert np.degrees(off) < 1.5 and np.linalg.norm(throw.centre - centre) < 0.003
-    assert np.linalg.norm(throw.velocity - velocity) < 0.03 * np.linalg.norm(velocity)
-    assert np.linalg.norm(throw.spin - spin) < 0.1 * np.linalg.norm(spin)
-    assert found["offsets_s"]["b"] == pytest.approx(OFFSET, abs=3e-4)
-    np.testing.assert_allclose([found["gains"][k] for k in "ab"], GAINS[:2], rtol=0.03)
+    off = Rotation.from_matrix(np.array(placement["rotation"]) @ R.T).magnitude()
+    assert np.degrees(off) < 1.5 and np.linalg.norm(start.centre - centre) < 0.003
+    assert np.linalg.norm(start.velocity - velocity) < 0.03 * np.linalg.norm(velocity)
+    assert np.linalg.norm(start.spin - spin) < 0.1 * np.linalg.norm(spin)
+    assert placement["offsets_s"]["b"] == pytest.approx(OFFSET, abs=3e-4)
+    np.testing.assert_allclose([placement["gains"][k] for k in "ab"], GAINS[:2], rtol=0.03)
     # All files are moved alike, and fit together.
     body_there = load_body(*(results / f for f in ("particles.h5", "binding.h5", "gaussians.ply")), 1000.0)
-    x = body.particles @ np.array(found["rotation"]).T + found["translation"]
+    x = body.particles @ np.array(placement["rotation"]).T + placement["translation"]
     np.testing.assert_allclose(body_there.x0, x, atol=1e-6)
-    np.testing.assert_allclose(x.mean(axis=0), throw.centre, atol=1e-6)
+    np.testing.assert_allclose(x.mean(axis=0), start.centre, atol=1e-6)
     np.testing.assert_allclose(read_mesh(results / "mesh.ply", watertight=False).vertices, x[:4], atol=1e-6)
     sampled, _, attributes = load_particles(results / "sampled_particles.h5")
     np.testing.assert_allclose(sampled, x, atol=1e-6)
     assert attributes["kind"] == "sampled_particles.h5"
-    means = body.gaussians.means.numpy() @ np.array(found["rotation"]).T + found["translation"]
+    means = body.gaussians.means.numpy() @ np.array(placement["rotation"]).T + placement["translation"]
     np.testing.assert_allclose(load_gaussians(results / "gaussians.ply").means, means, atol=1e-5)
     with Image.open(results / "registration.png") as picture:
         assert picture.width > 1000

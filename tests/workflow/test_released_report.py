@@ -24,7 +24,7 @@ def test_a_released_capture_goes_to_its_report_and_into_the_figure(tmp_path, ker
     assert (made.root / FIGURE).stat().st_size > 10_000
     results = made.root / "tiny/results"
     placed = json.loads((results / "bun_first/registration.json").read_text())
-    # The drawn ellipsoid was photographed in a world of another scale, and falls as things do in metres.
+    # The drawn ellipsoid was photographed in a world of another scale, and falls as bodies do in metres.
     assert min(camera["iou"] for camera in placed["after"].values()) > 0.9
     assert abs(placed["gravity_ratio"] - 1) < 0.03 + 2 * placed["gravity_ratio_deviation"] < 0.2
     for method in ("spring_gaus", "neuma"):

@@ -20,7 +20,7 @@ BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "
 FIGURES = ("main_res", "gradient_analysis", "material_response")
 TARGETS = ["tiny/results/table1.csv", *(f"tiny/results/figures/{name}.png" for name in FIGURES)]
 
-# Clicks on one thing after the other: a menu entry by its text, or the first (show) or second (about) button of a row.
+# Clicks on elements in turn: a menu entry by its text, or the first (show) or second (about) button of a row.
 CLICKS = """<script>addEventListener("load", () => {
 const steps = STEPS;
 const next = () => {
@@ -76,12 +76,12 @@ def browse(report: Path, steps: str, *options: str) -> str:
 
 def test_report_lists_figures_and_tables(report):
     page = browse(report, '[["Figures", null]]', "--dump-dom")
-    shown = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
-    assert all(name in shown for name in FIGURES)
-    shown = re.sub(
+    text = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+    assert all(name in text for name in FIGURES)
+    text = re.sub(
         r"<script.*?</script>", "", browse(report, '[["Tables", null]]', "--dump-dom"), flags=re.DOTALL
     )
-    assert "table1" in shown
+    assert "table1" in text
 
 
 def test_report_shows_a_figure_with_its_caption(report):
@@ -92,7 +92,7 @@ def test_report_shows_a_figure_with_its_caption(report):
     content = screen[:, 420:]
     assert (content < 200).any(-1).mean() > 0.005  # the figure is there, not an empty page
     page = browse(report, '[["Figures", null], ["main_res", 1]]', "--dump-dom")
-    shown = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+    text = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
     module = ast.parse((ROOT / "neuma_lib/paper/figures/main_res.py").read_text())
     caption = ast.get_docstring(module).split(":")[0]
-    assert caption in " ".join(shown.split())
+    assert caption in " ".join(text.split())

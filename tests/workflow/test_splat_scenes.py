@@ -97,9 +97,9 @@ def test_a_law_from_elsewhere_moves_a_splat_and_the_motion_can_be_taken_away(pro
     with Image.open(project.root / f"{EXPORT}/motion.gif") as image:
         assert image.n_frames == 11
     page = (project.root / viewer).read_text()
-    told = json.loads(re.search(r'id="meta">(.*?)</script>', page)[1])
-    assert [motion["name"] for motion in told["motions"]] == ["nclaw+law_from=BouncyBall"]
-    assert told["steps"] == list(range(0, 101, 10)) and told["motions"][0]["means"]["count"] == 300
+    meta = json.loads(re.search(r'id="meta">(.*?)</script>', page)[1])
+    assert [motion["name"] for motion in meta["motions"]] == ["nclaw+law_from=BouncyBall"]
+    assert meta["steps"] == list(range(0, 101, 10)) and meta["motions"][0]["means"]["count"] == 300
 
 
 def test_what_is_done_is_not_done_again_and_the_placement_repeats_what_it_moves(project):
@@ -110,7 +110,7 @@ def test_what_is_done_is_not_done_again_and_the_placement_repeats_what_it_moves(
 
 
 @pytest.mark.parametrize(
-    "target, says",
+    "target, message",
     [
         ("Splat/neuma/rollout.h5", "no video to learn a law from"),
         ("Splat/true_law/rollout.h5", "true law and motion of a captured object or a splat are unknown"),
@@ -118,12 +118,12 @@ def test_what_is_done_is_not_done_again_and_the_placement_repeats_what_it_moves(
         ("Splat/neuma/metrics.json", "No rule|Missing"),
     ],
 )
-def test_what_a_splat_cannot_have_is_said(project, target, says):
-    assert re.search(says, project.run("-n", *settings(), f"{RESULTS}/{target}", succeeds=False))
+def test_what_a_splat_cannot_have_is_refused(project, target, message):
+    assert re.search(message, project.run("-n", *settings(), f"{RESULTS}/{target}", succeeds=False))
 
 
 def test_a_damaged_file_is_one_line(project):
     (project.root / "made/bad.spz").write_bytes(b"nothing")
-    said = project.run(*settings(file="made/bad.spz"), f"{RESULTS}/Splat/gaussians.ply", succeeds=False)
-    assert re.search(r"splat_gaussians Splat: ERROR: made/bad.spz: cannot be read", said)
+    output = project.run(*settings(file="made/bad.spz"), f"{RESULTS}/Splat/gaussians.ply", succeeds=False)
+    assert re.search(r"splat_gaussians Splat: ERROR: made/bad.spz: cannot be read", output)
     assert not (project.root / f"{RESULTS}/Splat/gaussians.ply").exists()
