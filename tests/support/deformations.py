@@ -27,7 +27,7 @@ def weights_of(part: Constitutive, dtype=torch.float64) -> tuple[torch.Tensor, .
 
 
 def hencky_deviator(F: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Trace and deviator (N, 3) of the log strain, through an eigenvalue solver of its own."""
+    """Trace and deviator (N, 3) of the log strain, through a separate eigenvalue solver."""
     strain = 0.5 * torch.linalg.eigvalsh(F.mT @ F).log()
     trace = strain.sum(1, keepdim=True)
     return trace, strain - trace / 3

@@ -97,8 +97,8 @@ def film_of_contact(plate, colour, size=(40.0, 30.0), noise=2.0):
         under = ellipse((place[0] + 0.25 * height + 6, foot), 0.6 * rx, 0.4 * ry).astype(float)
         under = ndimage.gaussian_filter(under, 2 + 0.1 * height) * (height < 40)
         lit = np.minimum(1 - 0.55 * lamps[0] - 0.40 * lamps[1], 1 - 0.95 * under)
-        thrown_back = 0.05 * np.exp(-height / 30) * lamps[0][..., None] * own
-        floor = light * (lit[..., None] + thrown_back)
+        reflected = 0.05 * np.exp(-height / 30) * lamps[0][..., None] * own
+        floor = light * (lit[..., None] + reflected)
         body = own * np.clip(1 - 0.75 * (y - place[1] + ry) / (2 * ry), 0.2, 1)[..., None]
         top, left = (int(c) for c in (HEIGHT - place[1], WIDTH - place[0]))
         body = body * grain[top : top + HEIGHT, left : left + WIDTH, None]

@@ -1,4 +1,4 @@
-"""A coloured body of Gaussians that falls, spinning, before cameras with gains, offsets and noise of their own."""
+"""A coloured body of Gaussians that falls, spinning, before cameras that each have gains, offsets and noise."""
 
 from __future__ import annotations
 
@@ -156,6 +156,6 @@ def filmed(
 
 
 def guess(spin=None) -> Parabola:
-    """What the masks' parabola would say: some millimetres and centimetres a second off."""
+    """A parabola as fitted to masks: some millimetres and centimetres a second off."""
     off = np.array([0.004, -0.003, 0.005])
     return Parabola(3.0, PLACE + off, VELOCITY + 3 * off, GRAVITY, spin)

@@ -20,7 +20,7 @@ def centre_of(kind, frame):
 
 
 def poses_of(kind, count):
-    """OpenGL cameras (camera to world) on a ring, which look at the ball's start from above."""
+    """OpenGL cameras (camera to world) on a ring, which view the ball's start from above."""
     target, poses = centre_of(kind, 0), []
     for angle in np.linspace(0.3, 5.0, count):
         eye = target + np.array([1.4 * np.cos(angle), 0.5, 1.4 * np.sin(angle)])

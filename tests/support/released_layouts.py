@@ -68,11 +68,14 @@ def poses():
 
 
 def calibration(names):
-    found = {}
+    calibrations = {}
     for name, viewmat in zip(names, poses().values()):
         turn = Rotation.from_matrix(viewmat[:3, :3]).as_rotvec()
-        found[name] = {"rvecs": [[v] for v in turn.tolist()], "tvecs": [[v] for v in viewmat[:3, 3].tolist()]}
-    return found
+        calibrations[name] = {
+            "rvecs": [[v] for v in turn.tolist()],
+            "tvecs": [[v] for v in viewmat[:3, 3].tolist()],
+        }
+    return calibrations
 
 
 def write_picture(folder, name, pixels, mask, suffix=".jpg", mask_folder=None):

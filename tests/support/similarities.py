@@ -17,9 +17,9 @@ def random_similarity(rng):
 def exact(poses, lens=LENS):
     """The corners as each camera must see them."""
     points = boards.corner_positions(BOARD)
-    found = []
+    detections = []
     for pose in poses:
         pixels = lens.project(points @ pose[:3, :3].T + pose[:3, 3])
         inside = ((pixels > 0) & (pixels < [lens.width, lens.height])).all(axis=1)
-        found.append(boards.Detection(np.flatnonzero(inside), pixels[inside]))
-    return found
+        detections.append(boards.Detection(np.flatnonzero(inside), pixels[inside]))
+    return detections

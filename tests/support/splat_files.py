@@ -1,4 +1,4 @@
-"""Small splats, and the layouts that splats are passed on in, written a Gaussian at a time as their authors say."""
+"""Small splats, and the layouts that splats are passed on in, written a Gaussian at a time as their authors specify."""
 
 import gzip
 import math
