@@ -70,7 +70,7 @@ def test_rays_through_loaded_pixels_meet_the_placed_body_where_the_mask_is(tmp_p
         np.testing.assert_array_equal(image[..., 3] > 0, b**2 > a * ((away**2).sum() - RADIUS**2))
 
 
-@pytest.mark.parametrize("form", ["matted", "plate", "alpha"])
+@pytest.mark.parametrize("form", ["matted", "background", "alpha"])
 def test_images_of_pac_nerf_keep_their_colours_and_get_their_mask(tmp_path, form):
     source, truth = write_pac_nerf(tmp_path / "set", form=form)
     target = tmp_path / "ours/transforms.json"
@@ -82,7 +82,7 @@ def test_images_of_pac_nerf_keep_their_colours_and_get_their_mask(tmp_path, form
 
 
 def test_white_in_the_object_is_seen_where_the_plate_is_not_white_and_no_matte_is_there(tmp_path):
-    source, truth = write_pac_nerf(tmp_path / "set", cameras=2, frames=1, form="plate")
+    source, truth = write_pac_nerf(tmp_path / "set", cameras=2, frames=1, form="background")
     file = tmp_path / "set/data/r_0_0.png"
     pixels = truth[0, 0][..., :3].copy()
     row, column = np.argwhere(truth[0, 0][..., 3] > 0).mean(axis=0).astype(int)
@@ -150,7 +150,7 @@ def test_mistakes_are_named(tmp_path, kind, change, where):
 
 
 def test_images_without_any_mask_and_occluders_are_refused(tmp_path):
-    source, _ = write_pac_nerf(tmp_path / "set", cameras=2, form="plate")
+    source, _ = write_pac_nerf(tmp_path / "set", cameras=2, form="background")
     with_plates = source.read_text()
     edit(source, lambda e: [e.remove(x) for x in list(e) if x["file_path"].endswith("_-1.png")])
     target = tmp_path / "ours/transforms.json"

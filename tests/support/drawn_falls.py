@@ -27,12 +27,12 @@ def ellipse(place, rx=17.0, ry=13.0):
     return ((x - place[0]) / rx) ** 2 + ((y - place[1]) / ry) ** 2 <= 1
 
 
-def film(plate, hand=False, shadow=False, gain=(1.0, 1.0, 1.0), noise=2.0, colour=(225, 70, 40)):
-    """Frames (T, H, W, 3), uint8, of a red ball before a plate."""
+def film(background, hand=False, shadow=False, gain=(1.0, 1.0, 1.0), noise=2.0, colour=(225, 70, 40)):
+    """Frames (T, H, W, 3), uint8, of a red ball in front of a background."""
     rng = np.random.default_rng(3)
     frames = []
     for i, place in enumerate(places()):
-        picture = plate.copy()
+        picture = background.copy()
         if shadow:  # soft, on the floor below the ball
             dark = ellipse((place[0] + 12, 193.0), 26, 7).astype(float)
             picture *= 1 - 0.35 * ndimage.gaussian_filter(dark, 2)[..., None]
@@ -74,7 +74,7 @@ def to_light(levels):
     return (np.asarray(levels, float) / 255) ** 2.2
 
 
-def film_of_contact(plate, colour, size=(40.0, 30.0), noise=2.0):
+def film_of_contact(background, colour, size=(40.0, 30.0), noise=2.0):
     """Frames (T, H, W, 3), uint8, and silhouettes (T, H, W) of a ball that is lit from above and lands on a floor.
 
     Two lamps cast its shadows, which are the darker and sharper, the nearer it is to the floor; in the end next to no
@@ -83,7 +83,7 @@ def film_of_contact(plate, colour, size=(40.0, 30.0), noise=2.0):
     rng = np.random.default_rng(3)
     rx, ry = size
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    light, own = to_light(plate), to_light(colour)
+    light, own = to_light(background), to_light(colour)
     grain = ndimage.gaussian_filter(rng.normal(size=(2 * HEIGHT, 2 * WIDTH)), 2.5)
     grain = 1 + 0.15 * grain / grain.std()
     frames, silhouettes = [], []
@@ -104,7 +104,9 @@ def film_of_contact(plate, colour, size=(40.0, 30.0), noise=2.0):
         body = body * grain[top : top + HEIGHT, left : left + WIDTH, None]
         whole = ellipse(place, rx, ry)
         cover = ndimage.gaussian_filter(whole.astype(float), 0.6)[..., None]
-        seen = 255 * (cover * body + (1 - cover) * floor) ** (1 / 2.2) + rng.normal(0, noise, plate.shape)
+        seen = 255 * (cover * body + (1 - cover) * floor) ** (1 / 2.2) + rng.normal(
+            0, noise, background.shape
+        )
         frames.append(np.clip(np.rint(seen), 0, 255).astype(np.uint8))
         silhouettes.append(whole)
     return frames, np.array(silhouettes)

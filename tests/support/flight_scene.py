@@ -28,7 +28,7 @@ EYES = np.array([[0.5, 0.75, 1.5], [1.45, 0.7, 0.4], [-0.2, 0.9, -0.2]])
 
 
 @dataclass
-class Thing:
+class FilmedBody:
     """Gaussians and particles as photographed."""
 
     gaussians: Gaussians
@@ -42,7 +42,7 @@ class Thing:
         return self.mass @ self.particles / self.mass.sum()
 
 
-def thing(count=500, radii=(0.06, 0.04, 0.05), coloured=True, bump=0.5, seed=0) -> Thing:
+def knobbed_body(count=500, radii=(0.06, 0.04, 0.05), coloured=True, bump=0.5, seed=0) -> FilmedBody:
     """An ellipsoid with a knob, its colour a smooth function of the place; with ``bump`` 0 and one radius, a ball."""
     rng = np.random.default_rng(seed)
     k = np.arange(count) + 0.5
@@ -71,7 +71,7 @@ def thing(count=500, radii=(0.06, 0.04, 0.05), coloured=True, bump=0.5, seed=0) 
     grown = 1 + bump * np.exp(
         -((inside / np.linalg.norm(inside, axis=1, keepdims=True) - (0.8, 0.6, 0)) ** 2).sum(axis=1) / 0.15
     )
-    return Thing(gaussians, inside * radii * grown[:, None] + photographed, np.ones(800), normal, colour)
+    return FilmedBody(gaussians, inside * radii * grown[:, None] + photographed, np.ones(800), normal, colour)
 
 
 def _frame(normal):
@@ -88,7 +88,7 @@ def lit(albedo, normals):
     return np.clip(albedo * light[:, None], 0, 1)
 
 
-def photographed_in_light(body: Thing) -> Thing:
+def photographed_in_light(body: FilmedBody) -> FilmedBody:
     """The body with the light of its photographs in its colours, and something grey where it lay on the floor."""
     colour = lit(body.albedo, body.normals)
     colour[body.normals[:, 1] < -0.6] = 0.25
@@ -96,13 +96,13 @@ def photographed_in_light(body: Thing) -> Thing:
     return replace(body, gaussians=replace(g, sh0=torch.tensor((colour - 0.5) / SH_C0).float()[:, None]))
 
 
-def true_motion(body: Thing, rotation, spin=SPIN) -> RigidMotion:
+def true_motion(body: FilmedBody, rotation, spin=SPIN) -> RigidMotion:
     inertia = moment_of_inertia(body.particles - body.pivot, body.mass)
     return RigidMotion(np.asarray(rotation), PLACE, VELOCITY, np.asarray(spin, float), GRAVITY, inertia)
 
 
 def filmed(
-    body: Thing,
+    body: FilmedBody,
     motion: RigidMotion,
     views=2,
     frames=12,

@@ -45,21 +45,21 @@ def picture(pose, centre, background):
 
 
 def write_pac_nerf(folder, cameras=3, frames=4, form="matted"):
-    """A set as PAC-NeRF lays it out, and its pictures by camera and frame; masks as 'matted', 'plate' or 'alpha'."""
+    """A set as PAC-NeRF lays it out, and its pictures by camera and frame; masks as stated by ``form``."""
     (folder / "data").mkdir(parents=True)
     entries, truth, seed = [], {}, np.random.default_rng(0)
     for view, pose in enumerate(poses_of("pac_nerf", cameras)):
-        plate = seed.integers(100, 180, (HEIGHT, WIDTH, 3)).astype(np.uint8)
-        plate[..., 2] = 250
+        background = seed.integers(100, 180, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+        background[..., 2] = 250
         for frame in (-1, *range(frames)):
             name = f"data/r_{view}_{frame}.png"
             entries.append(
                 {"file_path": name, "c2w": pose.tolist(), "intrinsic": K, "time": max(frame, 0) / 24}
             )
             if frame < 0:
-                Image.fromarray(plate).save(folder / name)
+                Image.fromarray(background).save(folder / name)
                 continue
-            image = picture(pose, centre_of("pac_nerf", frame), plate)
+            image = picture(pose, centre_of("pac_nerf", frame), background)
             truth[view, frame] = image
             Image.fromarray(image if form == "alpha" else image[..., :3]).save(folder / name)
             if form == "matted":

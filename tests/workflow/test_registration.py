@@ -15,7 +15,7 @@ from neuma_lib.io.gaussians import load_gaussians, save_gaussians
 from neuma_lib.io.images import OPENGL_TO_OPENCV, load_views, write_transforms
 from neuma_lib.io.mesh import read_mesh, write_mesh
 from neuma_lib.io.particles import load_body, load_particles, save_binding, save_particles
-from tests.support.flight_scene import GAINS, PLACE, VELOCITY, filmed, thing, true_motion
+from tests.support.flight_scene import GAINS, PLACE, VELOCITY, filmed, knobbed_body, true_motion
 from tests.support.project import copied
 
 OFFSET, SIZE, FRAMES = 0.0035, (80, 60), 10
@@ -87,7 +87,7 @@ def write_capture(root, name, body, sights, stretch):
 def placed(tmp_path_factory, kernels):
     """A run on two captures. The times of the second are off by 10 percent, as if of another frame rate."""
     project = copied(tmp_path_factory.mktemp("registration") / "project", kernels)
-    project.body = thing(count=150)
+    project.body = knobbed_body(count=150)
     project.motion = true_motion(project.body, Rotation.random(random_state=1).as_matrix())
     sights = filmed(project.body, project.motion, frames=FRAMES, offset=OFFSET, size=SIZE)
     for name, stretch in (("mug", 1.0), ("slow", 1.1)):
