@@ -45,7 +45,7 @@ def picture(pose, centre, background):
 
 
 def write_pac_nerf(folder, cameras=3, frames=4, form="matted"):
-    """A set as PAC-NeRF lays it out, and its pictures by camera and frame; masks as stated by ``form``."""
+    """A set in PAC-NeRF's layout, and its pictures by camera and frame; masks are 'matted', 'background' or 'alpha'."""
     (folder / "data").mkdir(parents=True)
     entries, truth, seed = [], {}, np.random.default_rng(0)
     for view, pose in enumerate(poses_of("pac_nerf", cameras)):
