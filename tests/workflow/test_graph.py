@@ -21,9 +21,7 @@ MAY_READ_THE_TRUTH = {
     *("tracers", "experiment_tracers"),
     *("particles_app", "lora_alphav", "ext_time"),
 }
-SYSTEMS = f"{RESULTS}/table2_systems.csv"
 COMPARED = [f"{RESULTS}/figures/{name}.png" for name in ("main_res", "image_quality", "ch_dist_curve")]
-REALWORLD = f"{RESULTS}/figures/realworld.png"
 LAWS = [
     *("neuma", "nclaw", "constants", "neuma_structured", "neuma+prior=identified", "pac_nerf", "true_law"),
     *("neuma_structured+views=0,1", "neuma+law_from=JellyDuck"),
@@ -35,33 +33,30 @@ EXPORTED_LAWS = {
 }
 MOVED = [
     f"{SCENE}/spring_gaus",
-    f"{EXPERIMENTS}/letter_N_bouncy/neuma",
-    f"{EXPERIMENTS}/letter_N_bouncy/spring_gaus",
+    *(f"{EXPERIMENTS}/letter_N_bouncy/{law}" for law in ("neuma", "spring_gaus")),
 ]
 EXPORTS = ("gaussians", "compressed", "particles.h5", "surface.glb", "motion.blend", "motion.gif")
-RUNS = [
-    f"{SCENE}/constants/metrics.json",
-    f"{SCENE}/identified.png",
-    f"{REPLICATE}/constants/metrics.json",
-    f"{SCENE}/spring_gaus+anchors=50/metrics.json",
-    f"{EXPERIMENTS}/letter_N_bouncy/spring_gaus/metrics.json",
-    f"{REPLICATE}/pac_nerf+guesses=prior/metrics.json",
-    f"{REPLICATE}/pac_nerf_own+guesses=prior/image_metrics.json",
-    f"{REPLICATE}/pac_nerf_own+guesses=prior/video.mp4",
-    f"{REPLICATE}/neuma_structured/metrics.json",
-    f"{SCENE}/neuma_structured+prior=jelly+start=estimated/metrics.json",
-    f"{REPLICATE}/neuma_structured+views=0,1/metrics.json",
-    f"{REPLICATE}/constants+views=0,1/metrics.json",
-    f"{REPLICATE}/neuma_structured/stress.json",
-    f"{REPLICATE}/neuma_structured/response.json",
-    f"{REPLICATE}/neuma+prior=identified/metrics.json",
-    f"{REPLICATE}/neuma+start=identified/metrics.json",
-    f"{EXPERIMENTS}/letter_and_ball+seed=1/neuma/metrics.json",
-]
 VARIED = ("adaptor", "prior", "particles", "gaussians")
 REPLICATES = {"scenes": ["BouncyBall"], "methods": ["nclaw", "neuma"], "seeds": 3}
 FILMED = f"{RESULTS}/Filmed"
 TWO_VIDEOS = {"scenes": {"Filmed": {"like": "BouncyBall", "videos": [{"velocity": [0.5, -1.0, 0.0]}]}}}
+TARGETS = {
+    "plan": [TABLE, *EXPORTED_LAWS, *(f"{folder}/export/{file}" for folder in MOVED for file in EXPORTS)],
+    "wider": [*COMPARED, *(f"{RESULTS}/{name}.csv" for name in ("replicates", *VARIED, "identified_filmed"))],
+}
+"""Targets of the two plans, to which `behind` adds."""
+
+
+def behind(*targets, of="plan"):
+    """A decorator: the test's ``graph`` is the jobs behind some targets in one of the plans."""
+    TARGETS[of] += targets
+    return pytest.mark.parametrize("graph", [(of, targets)], indirect=True, ids=[of])
+
+
+@pytest.fixture
+def graph(request):
+    name, targets = request.param
+    return request.getfixturevalue(name).behind(*targets)
 
 
 @pytest.fixture(scope="module")
@@ -82,8 +77,8 @@ def tiny_settings():
 
 @pytest.fixture(scope="module")
 def plan(project):
-    exports = [f"{folder}/export/{file}" for folder in MOVED for file in EXPORTS]
-    return project.plan(*EVERYTHING, "random", REALWORLD, SYSTEMS, *COMPARED, *EXPORTED_LAWS, *exports, *RUNS)
+    """A plan with the settings of tiny.yaml."""
+    return project.plan(*TARGETS["plan"])
 
 
 @pytest.fixture(scope="module")
@@ -98,52 +93,35 @@ def wider(project):
         **TWO_VIDEOS,
         tables={
             "replicates": REPLICATES,
-            **{f"vary_{drawn}": REPLICATES | {"vary": [drawn]} for drawn in VARIED},
+            **{drawn: REPLICATES | {"vary": [drawn]} for drawn in VARIED},
             "filmed": {"scenes": ["Filmed"], "methods": learned},
         },
     )
-    targets = [
-        *(
-            "figures",
-            *COMPARED,
-            f"{RESULTS}/replicates.csv",
-            *(f"{RESULTS}/vary_{drawn}.csv" for drawn in VARIED),
-        ),
-        *(
-            f"{FILMED}+seed=1/neuma/metrics.json",
-            f"{FILMED}_throw2+seed=1/neuma+law_from=Filmed/metrics.json",
-        ),
-        *(
-            f"{FILMED}+seed=1/identified.json",
-            f"{RESULTS}/identified_filmed.csv",
-            f"{REPLICATE}/neuma/video.mp4",
-        ),
-    ]
-    return project.plan("--set-resources", "mesh:runtime=7", *changes, *targets)
+    return project.plan("--set-resources", "mesh:runtime=7", *changes, *TARGETS["wider"])
 
 
-def test_every_table_and_figure_can_be_planned(plan):
-    tables, figures = plan.behind("tables"), plan.behind("figures", "random", REALWORLD)
-    assert {"experiment_truth", "experiment_start", "evaluate_experiment", "benchmark_table"} <= set(tables)
-    assert tables["chamfer_table"] >= 4 and tables["prior"] == 8
+@behind("tables")
+def test_every_table_can_be_planned(graph):
+    assert {"experiment_truth", "experiment_start", "evaluate_experiment", "benchmark_table"} <= set(graph)
+    assert graph["chamfer_table"] >= 4 and graph["prior"] == 8
+
+
+@behind("figures", "random", f"{RESULTS}/figures/realworld.png")
+def test_every_figure_can_be_planned(graph):
     modules = {module.stem for module in (ROOT / "neuma_lib/paper/figures").glob("[!_]*.py")}
     # i23d needs a splat: test_splat_scenes.py makes it.
-    assert modules - {"i23d"} <= set(figures)
+    assert modules - {"i23d"} <= set(graph)
 
 
 def is_truth(file):
     return "/data/" in file and file.endswith("/particles.h5")
 
 
-def test_only_evaluation_and_figures_of_it_and_one_ablation_read_the_truth(plan):
-    graph = plan.behind(*EVERYTHING)
+@behind(*EVERYTHING)
+def test_only_evaluation_and_figures_of_it_and_one_ablation_read_the_truth(graph):
     assert len(graph.jobs) > 80
-    truths = {
-        file
-        for rule in ("ground_truth", "experiment_truth")
-        for job in graph.of_rule(rule)
-        for file in job.outputs
-    }
+    simulated = graph.of_rule("ground_truth") + graph.of_rule("experiment_truth")
+    truths = {file for job in simulated for file in job.outputs}
     assert len(truths) > 5
     readers = [job for job in graph.jobs if truths & set(job.inputs)]
     assert {job.rule for job in readers} == MAY_READ_THE_TRUTH | {"fit_neuma"}
@@ -153,8 +131,9 @@ def test_only_evaluation_and_figures_of_it_and_one_ablation_read_the_truth(plan)
     assert not any(file.endswith("transforms.json") for file in supervised)
 
 
-def test_a_figure_that_shows_one_law_is_there_for_each_method(wider):
-    read = {job.rule: " ".join(job.inputs) for job in wider.behind("figures").jobs}
+@behind("figures", of="wider")
+def test_a_figure_that_shows_one_law_is_there_for_each_method(graph):
+    read = {job.rule: " ".join(job.inputs) for job in graph.jobs}
     for figure, file in {"lora_alphav": "adaptor.safetensors", "vis_generalize": "rollout.h5"}.items():
         published, structured = read[figure], read[f"{figure}_neuma_structured"]
         assert f"/neuma/{file}" in published and "structured" not in published
@@ -167,31 +146,38 @@ def test_a_figure_that_shows_one_law_is_there_for_each_method(wider):
     )
 
 
-def test_identified_constants_need_the_video_and_no_training(plan):
-    graph = plan.behind(*RUNS[:2])
+@behind(f"{SCENE}/constants/metrics.json", f"{SCENE}/identified.png")
+def test_identified_constants_need_the_video_and_no_training(graph):
     identify = graph.one("identify")
     assert identify.outputs == [f"{SCENE}/identified.json"]
     assert graph["identified_page"] and not graph["fit_neuma"]
     assert any(file.endswith("transforms.json") for file in identify.inputs)
     assert not any(map(is_truth, identify.inputs))
     assert f"{SCENE}/identified.json" in graph.one("evaluate").inputs
-    assert f"{REPLICATE}/identified.json" in plan.behind(RUNS[2]).makers
 
 
-def test_springs_are_fitted_to_the_video_alone(plan):
-    graph = plan.behind(f"{SCENE}/spring_gaus+anchors=50/metrics.json")
+@behind(f"{REPLICATE}/constants/metrics.json")
+def test_identified_constants_are_those_of_the_replicate(graph):
+    assert f"{REPLICATE}/identified.json" in graph.makers
+
+
+@behind(f"{SCENE}/spring_gaus+anchors=50/metrics.json")
+def test_springs_are_fitted_to_the_video_alone(graph):
     fit = graph.one("fit_spring_gaus")
     assert fit.outputs[0] == f"{SCENE}/spring_gaus+anchors=50/springs.safetensors" and not graph["fit_neuma"]
     assert {"tiny/data/BouncyBall/dynamic/transforms.json", f"{SCENE}/velocity.json"} <= set(fit.inputs)
     assert not any("/priors/" in file or is_truth(file) for file in fit.inputs)
     assert fit.outputs[0] in graph.one("evaluate").inputs
-    experiment = plan.behind(f"{EXPERIMENTS}/letter_N_bouncy/spring_gaus/metrics.json")
-    assert f"{SCENE}/spring_gaus/springs.safetensors" in experiment.one("evaluate_experiment").inputs
 
 
-def test_springs_and_laws_of_a_table_are_put_to_use_elsewhere_as_their_scenes_taught_them(plan):
+@behind(f"{EXPERIMENTS}/letter_N_bouncy/spring_gaus/metrics.json")
+def test_springs_move_another_body(graph):
+    assert f"{SCENE}/spring_gaus/springs.safetensors" in graph.one("evaluate_experiment").inputs
+
+
+@behind(f"{RESULTS}/table2_systems.csv")
+def test_springs_and_laws_of_a_table_are_put_to_use_elsewhere_as_their_scenes_taught_them(graph):
     """Fits are those of the scenes: the table repeats none, and none sees more than the video."""
-    graph = plan.behind(SYSTEMS)
     fitted = [job.outputs[0] for job in graph.of_rule("fit_spring_gaus") + graph.of_rule("fit_pac_nerf")]
     scenes = ("BouncyBall", "JellyDuck", "RubberPawn")
     files = ("spring_gaus/springs.safetensors", "pac_nerf/constants.json")
@@ -211,10 +197,10 @@ def test_springs_and_laws_of_a_table_are_put_to_use_elsewhere_as_their_scenes_ta
     assert not any(f"{RESULTS}/{scene}/" in file for scene in scenes for file in table)
 
 
-def test_pac_nerf_needs_images_its_field_and_contact_alone(plan):
+@behind(f"{REPLICATE}/pac_nerf+guesses=prior/metrics.json")
+def test_pac_nerf_needs_images_its_field_and_contact_alone(graph):
     """Its own start and law are evaluated; no networks, and no truth, lead to them."""
     run = f"{REPLICATE}/pac_nerf+guesses=prior"
-    graph = plan.behind(f"{run}/metrics.json")
     fit, evaluation = graph.one("fit_pac_nerf"), graph.one("evaluate")
     assert fit.outputs[0] == f"{run}/constants.json"
     assert not graph.keys() & {"fit_neuma", "fit_structured", "identify"}
@@ -228,9 +214,9 @@ def test_pac_nerf_needs_images_its_field_and_contact_alone(plan):
     assert not any("velocity.json" in file for file in evaluation.inputs)
 
 
-def test_pac_nerfs_own_particles_are_evaluated_with_its_field_and_fit_nothing_again(plan):
+@behind(*(f"{REPLICATE}/pac_nerf_own+guesses=prior/{name}" for name in ("image_metrics.json", "video.mp4")))
+def test_pac_nerfs_own_particles_are_evaluated_with_its_field_and_fit_nothing_again(graph):
     own, base = (f"{REPLICATE}/{name}+guesses=prior" for name in ("pac_nerf_own", "pac_nerf"))
-    graph = plan.behind(f"{own}/image_metrics.json", f"{own}/video.mp4")
     assert graph.one("fit_pac_nerf").outputs == [f"{base}/constants.json", f"{base}/history.json"]
     for rule in ("evaluate", "image_metrics", "video"):
         job = graph.one(rule)
@@ -241,8 +227,8 @@ def test_pac_nerfs_own_particles_are_evaluated_with_its_field_and_fit_nothing_ag
     assert graph["radiance_field"] and f"{base}/constants.json" in graph.one("evaluate").inputs
 
 
-def test_other_systems_are_in_figures_that_ask_for_them_alone(plan, wider):
-    graph = plan.behind("figures", *COMPARED)
+@behind("figures", *COMPARED)
+def test_other_systems_are_in_figures_that_ask_for_them_alone(graph, wider):
     files = [file for job in graph.jobs for file in job.inputs + job.outputs]
     assert not any("pac_nerf" in file or "spring_gaus" in file for file in files)
     for figure, file in zip(COMPARED, ("rollout.h5", "image_metrics.json", "metrics.json"), strict=True):
@@ -251,14 +237,18 @@ def test_other_systems_are_in_figures_that_ask_for_them_alone(plan, wider):
     assert f"{SCENE}/pac_nerf/field.safetensors" in wider.one("main_res").inputs
 
 
-def test_a_structured_law_corrects_what_the_video_shows(plan):
+@behind(f"{REPLICATE}/neuma_structured/metrics.json")
+def test_a_structured_law_corrects_what_the_video_shows(graph):
     """Around the constants of its scene, in its replicate, and without networks to start from."""
-    graph = plan.behind(f"{REPLICATE}/neuma_structured/metrics.json")
     fit, evaluation = graph.one("fit_structured").inputs, graph.one("evaluate").inputs
     assert f"{REPLICATE}/identified.json" in fit
     assert not any("/priors/" in file for file in fit + evaluation)
     assert f"{REPLICATE}/neuma_structured/adaptor.safetensors" in evaluation
-    assert not plan.behind(f"{SCENE}/neuma_structured+prior=jelly+start=estimated/metrics.json")["identify"]
+
+
+@behind(f"{SCENE}/neuma_structured+prior=jelly+start=estimated/metrics.json")
+def test_a_structured_law_of_a_prior_needs_no_identification(graph):
+    assert graph["fit_structured"] and not graph["identify"]
 
 
 def test_the_command_line_exports_the_law_that_the_rule_exports(plan, tiny_settings):
@@ -272,9 +262,8 @@ def test_the_command_line_exports_the_law_that_the_rule_exports(plan, tiny_setti
         assert bool(named) == (method != "true_law") and (own <= read or "law_from" in method)
 
 
-def test_more_views_have_constants_of_their_own(plan):
-    methods = [f"{REPLICATE}/{method}+views=0,1/metrics.json" for method in ("neuma_structured", "constants")]
-    graph = plan.behind(*methods)
+@behind(*(f"{REPLICATE}/{method}+views=0,1/metrics.json" for method in ("neuma_structured", "constants")))
+def test_more_views_have_constants_of_their_own(graph):
     (identify,) = [job for job in graph.jobs if job.rule.startswith("identify")]
     assert identify.outputs == [f"{REPLICATE}/identified+views=0,1.json"]
     readers = [job.rule for job in graph.jobs if identify.outputs[0] in job.inputs]
@@ -285,9 +274,10 @@ def test_more_views_have_constants_of_their_own(plan):
     ]  # of both methods: law and initial motion
 
 
-def test_stresses_are_compared_in_the_states_of_their_replicate_and_drawn_over_those_of_the_first(plan):
+@behind(*(f"{REPLICATE}/neuma_structured/{name}.json" for name in ("stress", "response")))
+def test_stresses_are_compared_in_the_states_of_their_replicate_and_drawn_over_those_of_the_first(graph):
     stress, response = (
-        plan.makers[f"{REPLICATE}/neuma_structured/{name}.json"].inputs for name in ("stress", "response")
+        graph.makers[f"{REPLICATE}/neuma_structured/{name}.json"].inputs for name in ("stress", "response")
     )
     assert f"{REPLICATE}/visited.h5" in stress and f"{SCENE}/visited.h5" in response
     assert f"{REPLICATE}/identified.json" in response
@@ -295,8 +285,8 @@ def test_stresses_are_compared_in_the_states_of_their_replicate_and_drawn_over_t
     assert not any("/data/" in file and "kernels" not in file for file in stress + response)
 
 
-def test_networks_can_start_from_what_the_video_shows(plan):
-    graph = plan.behind(f"{REPLICATE}/neuma+prior=identified/metrics.json")
+@behind(f"{REPLICATE}/neuma+prior=identified/metrics.json")
+def test_networks_can_start_from_what_the_video_shows(graph):
     prior = graph.one("identified_prior")
     assert f"{REPLICATE}/identified.json" in prior.inputs
     assert prior.outputs[0] == f"{REPLICATE}/priors/identified.safetensors"
@@ -304,8 +294,8 @@ def test_networks_can_start_from_what_the_video_shows(plan):
     assert f"{RESULTS}/priors/jelly+seed=1.safetensors" in graph.one("velocity").inputs
 
 
-def test_a_method_can_start_as_identified(plan):
-    graph = plan.behind(f"{REPLICATE}/neuma+start=identified/metrics.json")
+@behind(f"{REPLICATE}/neuma+start=identified/metrics.json")
+def test_a_method_can_start_as_identified(graph):
     for rule in ("fit_neuma", "evaluate"):
         read = graph.one(rule).inputs
         assert f"{REPLICATE}/identified.json" in read and not any(
@@ -318,9 +308,9 @@ def test_refined_bodies_are_finer_or_none(plan, wider):
     assert plan["identify"] and wider["identify"]
 
 
-def test_rules_with_a_script_get_what_they_leave_out(wider):
+@behind(f"{REPLICATE}/neuma/video.mp4", of="wider")
+def test_rules_with_a_script_get_what_they_leave_out(graph):
     """Fails where a Snakemake no longer reads what `workflow.defaults.complete` writes."""
-    graph = wider.behind(f"{REPLICATE}/neuma/video.mp4")
     for rule, expected in {
         "video": (
             f"log: {RESULTS}/logs/BouncyBall+seed=1/neuma/video.log",
@@ -372,15 +362,15 @@ def test_three_replicates_share_their_data_and_nothing_else(plan, wider):
     ],
 )
 def test_what_varies_alone_repeats_what_depends_on_it(plan, wider, drawn, repeated):
-    one, three = plan.behind(TABLE), wider.behind(f"{RESULTS}/vary_{drawn}.csv")
+    one, three = plan.behind(TABLE), wider.behind(f"{RESULTS}/{drawn}.csv")
     more = dict.fromkeys(repeated, 2) | {
         "evaluate": 2 if drawn == "adaptor" else 4
     }  # the prior's motion has no adaptor
     assert three == {rule: count + more.get(rule, 0) for rule, count in one.items()}
 
 
-def test_an_experiment_follows_the_replicates_of_its_scenes(plan):
-    graph = plan.behind(f"{EXPERIMENTS}/letter_and_ball+seed=1/neuma/metrics.json")
+@behind(f"{EXPERIMENTS}/letter_and_ball+seed=1/neuma/metrics.json")
+def test_an_experiment_follows_the_replicates_of_its_scenes(graph):
     assert {
         f"{REPLICATE}/neuma/adaptor.safetensors",
         f"{RESULTS}/priors/jelly+seed=1.safetensors",
@@ -389,9 +379,13 @@ def test_an_experiment_follows_the_replicates_of_its_scenes(plan):
     assert f"{REPLICATE}/velocity.json" in graph.one("experiment_start").inputs
 
 
-def test_several_videos_train_one_law_which_is_evaluated_on_all(wider):
-    runs = [f"{FILMED}+seed=1/neuma", f"{FILMED}_throw2+seed=1/neuma+law_from=Filmed"]
-    graph = wider.behind(*(f"{run}/metrics.json" for run in runs), f"{FILMED}+seed=1/identified.json")
+@behind(
+    f"{FILMED}+seed=1/neuma/metrics.json",
+    f"{FILMED}_throw2+seed=1/neuma+law_from=Filmed/metrics.json",
+    f"{FILMED}+seed=1/identified.json",
+    of="wider",
+)
+def test_several_videos_train_one_law_which_is_evaluated_on_all(graph):
     fit = graph.one("fit_neuma")
     bodies = {
         f"{folder}+seed=1/{file}"
