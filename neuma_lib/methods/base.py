@@ -235,7 +235,7 @@ class Method(ABC):
         """Files of the model, for `load`: one path a name."""
 
     def body_inputs(self, case: Case) -> Files:
-        """Further files of `load_initial_state` and `load_body`: one path a name."""
+        """Further files of `load_initial_state` and `load_reconstruction`: one path a name."""
         return {}
 
     def uncertainty_inputs(self, case: Case) -> Files:
@@ -247,7 +247,7 @@ class Method(ABC):
         return case.options.plain()
 
     def model_options(self, case: Case) -> dict[str, Any]:
-        """Options of `load`, `load_initial_state` and `load_body` as plain values."""
+        """Options of `load`, `load_initial_state` and `load_reconstruction` as plain values."""
         return {}
 
     def start_file(self, case: Case) -> str:
@@ -301,7 +301,7 @@ class Method(ABC):
         files = (inputs[name] for name in ("particles", "binding", "gaussians", "velocity"))
         return load_initial_state(*files, densities=densities, carrier=carrier)
 
-    def load_body(
+    def load_reconstruction(
         self,
         inputs: Files,
         options: Mapping[str, Any],
@@ -313,10 +313,10 @@ class Method(ABC):
         """The body that renders a predicted motion, with ``particle_gs(cameras)``."""
         import torch
 
-        from neuma_lib.io.particles import load_body
+        from neuma_lib.io.particles import load_reconstruction
 
         files = (inputs[name] for name in ("particles", "binding", "gaussians"))
-        body = load_body(*files, density=density, carrier=carrier, gaussian_motion=gaussian_motion)
+        body = load_reconstruction(*files, density=density, carrier=carrier, gaussian_motion=gaussian_motion)
         return body.to(torch.float32, device)
 
     def draws(

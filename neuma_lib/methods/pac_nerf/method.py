@@ -142,12 +142,12 @@ class PacNerf(Method):
             return super().load_initial_state(inputs, options, densities, carrier)
         from neuma_lib.io.particles import with_motion
 
-        body = self.load_body(inputs, options, densities[0], carrier, "mean")
+        body = self.load_reconstruction(inputs, options, densities[0], carrier, "mean")
         return with_motion(body, inputs["velocity"]), [len(body.moving.x)]
 
-    def load_body(self, inputs, options, density, carrier, gaussian_motion, device="cpu"):
+    def load_reconstruction(self, inputs, options, density, carrier, gaussian_motion, device="cpu"):
         if carrier != "field":
-            return super().load_body(inputs, options, density, carrier, gaussian_motion, device)
+            return super().load_reconstruction(inputs, options, density, carrier, gaussian_motion, device)
         from neuma_lib.methods.pac_nerf.carried_field import CarriedField
 
         return CarriedField.load(inputs["field"], options, density, device)
