@@ -86,7 +86,7 @@ def judge(name: str, settings: Config, changes: Mapping[str, Any]) -> dict[str, 
         "combinations": _combinations(found, truth),
         "found": found.as_dict(),
     }
-    arrays, _ = read_arrays(data / "particles.h5", required=("tracers",), only=("tracers",))
+    arrays, _ = read_arrays(data / "truth.h5", required=("tracers",), only=("tracers",))
     tracers = torch.from_numpy(arrays["tracers"])
     tracers = tracers[:, :: max(1, tracers.shape[1] // TRACERS)].to(body.x0)
     laws = {"identified": row["found"]["law"], "true_law": truth}

@@ -79,11 +79,11 @@ def test_a_scene_is_made_of_another_systems_folder(tmp_path, layout):
 def test_a_finer_truth_has_the_same_frames_and_one_as_fine_the_same_bytes(kernels, tmp_path):
     """tiny.yaml's truth has 14 nodes, a step of 2e-3 s and 800 particles."""
     project = copied(tmp_path / "project", kernels)
-    file = project.root / "tiny/data/BouncyBall/particles.h5"
+    file = project.root / "tiny/data/BouncyBall/truth.h5"
 
     def truth(settings):
         own = f"scenes={{BouncyBall: {{truth: {{{settings}}}}}}}"
-        project.run("--config", own, "--", "tiny/data/BouncyBall/particles.h5")
+        project.run("--config", own, "--", "tiny/data/BouncyBall/truth.h5")
         return file.read_bytes(), read_arrays(file)
 
     plain, (arrays, attributes) = truth("")

@@ -69,7 +69,7 @@ def test_identified_constants_need_the_video_and_no_training(project):
     read, outputs = made["identify"]
     assert outputs == [f"{SCENE}/identified.json"] and "identified_page" in made and "fit_neuma" not in made
     assert any(file.endswith("transforms.json") for file in read)
-    assert not any("particles.h5" in file and "/data/" in file for file in read), "the truth"
+    assert not any("truth.h5" in file for file in read), "the truth"
     assert f"{SCENE}/identified.json" in made["evaluate"][0]
     chained = project.run("--dry-run", target.replace("/constants", "+seed=1/constants"))
     assert f"{SCENE}+seed=1/identified.json" in chained
@@ -81,7 +81,7 @@ def test_springs_are_fitted_to_the_video_alone(project):
     read, outputs = made["fit_spring_gaus"]
     assert outputs[0] == f"{SCENE}/spring_gaus+anchors=50/springs.safetensors" and "fit_neuma" not in made
     assert "tiny/data/BouncyBall/dynamic/transforms.json" in read and f"{SCENE}/velocity.json" in read
-    assert not any("/priors/" in file or "/data/BouncyBall/particles.h5" in file for file in read)
+    assert not any("/priors/" in file or "/data/BouncyBall/truth.h5" in file for file in read)
     assert outputs[0] in made["evaluate"][0]
     target = "tiny/results/experiments/{}/spring_gaus/metrics.json"
     graph = jobs(project.run("--dry-run", target.format("letter_N_bouncy")))
@@ -117,7 +117,7 @@ def test_springs_and_laws_of_a_table_are_put_to_use_elsewhere_as_their_scenes_ta
         ("longer_bouncy", "BouncyBall"),
     ):
         assert f"tiny/results/{scene}/spring_gaus/springs.safetensors" in used[experiment]
-        assert f"tiny/data/experiments/{experiment}/particles.h5" in used[experiment]
+        assert f"tiny/data/experiments/{experiment}/truth.h5" in used[experiment]
     table = next(read for rule, read, _ in graph if rule == "chamfer_table")
     assert len(table) == 6 * 5 and not any(
         f"tiny/results/{scene}/" in file for scene in scenes for file in table
@@ -135,7 +135,7 @@ def test_pac_nerf_needs_images_its_field_and_contact_alone(project):
     )
     assert made["radiance_field"][1][0] == f"{SCENE}+seed=1/pac_nerf/field.safetensors" in read
     assert "tiny/data/BouncyBall/dynamic/transforms.json" in read and f"{SCENE}+seed=1/velocity.json" in read
-    assert not any("/priors/" in file or "/data/BouncyBall/particles.h5" in file for file in read)
+    assert not any("/priors/" in file or "/data/BouncyBall/truth.h5" in file for file in read)
     judged = made["evaluate"][0]
     assert f"{run}/constants.json" in judged and not any("velocity.json" in file for file in judged)
 
@@ -352,7 +352,7 @@ def test_an_experiment_follows_the_chains_of_its_scenes(project):
     read = {rule: files for rule, files, _ in graph}
     assert f"{SCENE}+seed=1/neuma/adaptor.safetensors" in read["evaluate_experiment"]
     assert "tiny/results/priors/jelly+seed=1.safetensors" in read["evaluate_experiment"]
-    assert "tiny/data/experiments/letter_and_ball/particles.h5" in read["evaluate_experiment"]
+    assert "tiny/data/experiments/letter_and_ball/truth.h5" in read["evaluate_experiment"]
     assert f"{SCENE}+seed=1/velocity.json" in read["experiment_start"]
 
 

@@ -123,7 +123,7 @@ def test_an_own_law_of_a_scene_repeats_that_scene_alone(project):
     law = {"elasticity": {"name": "cubic_hencky", "E": 1e5, "nu": 0.3, "b": 10.0}}
     scene = {"like": "BouncyBall", "law": law}
     settings = ("--config", "extensions=[my_law.py]", f"scenes={json.dumps({'Cubic': scene})}", "--")
-    truths = [f"tiny/data/{name}/particles.h5" for name in ("BouncyBall", "Cubic")]
+    truths = [f"tiny/data/{name}/truth.h5" for name in ("BouncyBall", "Cubic")]
     assert project.plan(*settings, *truths) == {"ground_truth": 1}
     output = project.run(*settings, truths[1])
     assert "ground_truth Cubic: " in output and project.plan(*settings, *truths) == {}

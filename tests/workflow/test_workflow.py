@@ -137,7 +137,7 @@ def test_editing_the_rasterizer_reruns_what_renders(clone):
     } <= set(plan)
     assert not {"ground_truth", "render_static", "render_dynamic", "prior"} & set(plan)
     assert plan["kernels"] == 1
-    truth = clone.root / "tiny/data/BouncyBall/particles.h5"
+    truth = clone.root / "tiny/data/BouncyBall/truth.h5"
     made = truth.stat().st_mtime_ns
     clone.run(f"{SCENE}/gaussians.ply")
     assert truth.stat().st_mtime_ns == made
@@ -336,7 +336,7 @@ def test_without_the_gpu_that_is_asked_for_nothing_is_begun(kernels, tmp_path):
     assert "torch sees no CUDA device" in output and "fit_neuma, gaussians, velocity" in output
     assert "Traceback (most recent call last)" not in output
     assert not (tmp_path / "tiny").exists()
-    output = project.run(*cuda, "tiny/data/BouncyBall/particles.h5")
+    output = project.run(*cuda, "tiny/data/BouncyBall/truth.h5")
     assert "ground_truth BouncyBall: " in output
 
 

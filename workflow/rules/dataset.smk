@@ -32,7 +32,7 @@ rule ground_truth:
     input:
         kernels=kernels("geometry", "simulation"),
     output:
-        particles=f"{DATA}/{{scene}}/particles.h5",
+        particles=f"{DATA}/{{scene}}/truth.h5",
     wildcard_constraints:
         scene=scenes_with("truth", "made"),
     resources:
@@ -53,7 +53,7 @@ rule ground_truth:
 
 rule render_static:
     input:
-        particles=f"{DATA}/{{scene}}/particles.h5",
+        particles=f"{DATA}/{{scene}}/truth.h5",
     output:
         transforms=f"{DATA}/{{scene}}/static/transforms.json",
     wildcard_constraints:
@@ -73,7 +73,7 @@ rule render_static:
 
 rule render_dynamic:
     input:
-        particles=f"{DATA}/{{scene}}/particles.h5",
+        particles=f"{DATA}/{{scene}}/truth.h5",
     output:
         transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
     wildcard_constraints:

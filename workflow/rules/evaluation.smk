@@ -4,7 +4,7 @@
 rule initial_state:
     input:
         kernels=kernels("geometry"),
-        truth=of_scene("particles.h5"),
+        truth=of_scene("truth.h5"),
         gaussians=of_chain("gaussians.json"),
         mesh=of_chain("mesh.ply"),
         particles=of_chain("particles.h5"),
@@ -23,7 +23,7 @@ rule initial_state:
 rule tracers:
     input:
         kernels=kernels("geometry"),
-        truth=of_scene("particles.h5"),
+        truth=of_scene("truth.h5"),
         mesh=of_chain("mesh.ply"),
     output:
         tracers=f"{RESULTS}/{{scene}}/tracers.h5",
@@ -41,7 +41,7 @@ rule evaluate:
         unpack(of_bodies(model_files)),
         **body_files(),
         kernels=of_bodies(model_kernels),
-        truth=of_scene("particles.h5"),
+        truth=of_scene("truth.h5"),
         tracers=of_chain("tracers.h5"),
         velocity=of_case(lambda case: case.method.start_file(case)),
     output:

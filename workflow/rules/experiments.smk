@@ -5,7 +5,7 @@ rule experiment_truth:
     input:
         kernels=kernels("geometry", "simulation"),
     output:
-        particles=f"{DATA}/experiments/{{experiment}}/particles.h5",
+        particles=f"{DATA}/experiments/{{experiment}}/truth.h5",
     wildcard_constraints:
         experiment="|".join(SETTINGS.experiments) or "none",
     resources:
@@ -58,7 +58,7 @@ use rule evaluate as evaluate_experiment with:
         unpack(of_bodies(model_files)),
         **body_files(),
         kernels=of_bodies(model_kernels),
-        truth=of_scene("particles.h5"),
+        truth=of_scene("truth.h5"),
         tracers=of_chain("tracers.h5"),
         velocity=of_chain("velocity.json"),
     output:
