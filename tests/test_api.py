@@ -78,10 +78,10 @@ def test_the_motion_is_estimated_from_the_frames_before_contact(scene):
 def test_a_material_is_identified(scene):
     families = {"hencky": {"elasticity": {"name": "hencky", "E": 3e4, "nu": 0.3}}}
     options = {"pyramid": (8, 24), "iterations": 4, "covariance_from": "elastic", "gaussian_motion": "mean"}
-    found = nm.identify(scene, families, options)
-    assert found.family == "hencky" and found.ties == () and set(found.std) == {"E", "nu"}
-    assert found.constants["E"] == pytest.approx(1.5e4, rel=0.1)
-    assert float(found.law.elasticity.values["E"]) == found.constants["E"]
+    identified = nm.identify(scene, families, options)
+    assert identified.family == "hencky" and identified.ties == () and set(identified.std) == {"E", "nu"}
+    assert identified.constants["E"] == pytest.approx(1.5e4, rel=0.1)
+    assert float(identified.law.elasticity.values["E"]) == identified.constants["E"]
     with refused("options.particles"):
         nm.identify(scene, families, {"particles": 100})
 

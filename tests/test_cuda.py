@@ -1,4 +1,4 @@
-"""The CPU and a CUDA GPU run the same functions and agree. Skipped, saying so, where there is no GPU."""
+"""The CPU and a CUDA GPU run the same functions and agree. Skipped without a GPU."""
 
 import copy
 from dataclasses import replace
@@ -43,7 +43,7 @@ STRUCTURED = {
 }
 
 
-def throw(law, device, dtype):
+def launch(law, device, dtype):
     """Start and gradient of a rollout through contact: positions, and gradients of x0, v0 and the weights."""
     body = ball(height=0.24, dtype=dtype)
     law = copy.deepcopy(law).to(device=device, dtype=dtype)
@@ -99,17 +99,17 @@ def law(request):
 
 
 def test_rollout_through_contact_agrees_in_float64(law):
-    x_cpu, grads_cpu = throw(law, "cpu", torch.float64)
-    x_gpu, grads_gpu = throw(law, "cuda", torch.float64)
+    x_cpu, grads_cpu = launch(law, "cpu", torch.float64)
+    x_gpu, grads_gpu = launch(law, "cuda", torch.float64)
     assert float((x_cpu - x_gpu).abs().max()) < 1e-9
     for on_gpu, on_cpu in zip(grads_gpu, grads_cpu, strict=True):
         assert relative(on_gpu, on_cpu) < 1e-7
 
 
 def test_float32_stays_as_near_to_float64_as_the_cpu_does(law):
-    truth, _ = throw(law, "cpu", torch.float64)
-    x_cpu, _ = throw(law, "cpu", torch.float32)
-    x_gpu, _ = throw(law, "cuda", torch.float32)
+    truth, _ = launch(law, "cpu", torch.float64)
+    x_cpu, _ = launch(law, "cpu", torch.float32)
+    x_gpu, _ = launch(law, "cuda", torch.float32)
     gpu, cpu = relative(x_gpu, truth), relative(x_cpu, truth)
     assert gpu < 5 * cpu and cpu < 5 * gpu
 
@@ -203,7 +203,7 @@ def test_particle_gs_agrees():
 
 
 def falling(dtype=torch.float32, frames=5, out_of_sight=()):
-    """A falling ball before two cameras, each frame with a weight of its own, some frames far away."""
+    """A falling ball before two cameras, each frame with its own weight, some frames far away."""
     body = ball(dtype=dtype).to(dtype, "cuda")
     views = camera(size=90, dtype=dtype)
     turned = views.viewmats.clone()
@@ -225,7 +225,7 @@ def test_error_taken_while_drawing_is_that_of_the_images(out_of_sight, monkeypat
     """Value, and gradients of Gaussians and particles, by way of images and without."""
     renderer, x, F, seen = falling(out_of_sight=out_of_sight)
     weight = torch.linspace(0.3, 2.0, len(x), device="cuda")
-    found = []
+    results = []
     for drawn in (False, True):
         states = x.clone().requires_grad_(), F.clone().requires_grad_()
         deformed = renderer.deformed(*states)
@@ -235,12 +235,12 @@ def test_error_taken_while_drawing_is_that_of_the_images(out_of_sight, monkeypat
                 losses = renderer.splatted_error(*deformed, seen)
         else:
             losses = mean_squared_error(renderer.splatted(*deformed), seen)
-        found.append([losses.detach(), *torch.autograd.grad(losses, (*deformed, *states), weight)])
-    for index, (by_images, at_once) in enumerate(zip(*found, strict=True)):
+        results.append([losses.detach(), *torch.autograd.grad(losses, (*deformed, *states), weight)])
+    for index, (by_images, at_once) in enumerate(zip(*results, strict=True)):
         assert float((at_once - by_images).norm()) <= 1e-5 * float(by_images.norm()), index
     empty = torch.zeros(len(x), dtype=torch.bool)
     empty[list(out_of_sight)] = True
-    for grad in found[1][1:]:
+    for grad in results[1][1:]:
         assert torch.equal(grad.flatten(1).norm(dim=1).cpu() == 0, empty), (
             "frames out of sight, and they alone"
         )
@@ -329,24 +329,24 @@ def test_a_training_killed_on_the_gpu_resumes_on_either_device(tmp_path, device)
     resumed = train(device, settings, Checkpoint(tmp_path / "state.pt", {}))
     assert resumed.history.loss == pytest.approx(whole.history.loss, rel=0.02)
     for name, value in whole.law.adaptor_state().items():
-        found = resumed.law.adaptor_state()[name]
-        assert found.device.type == device
-        assert relative(found.cpu(), value.cpu()) < 0.05, name
+        result = resumed.law.adaptor_state()[name]
+        assert result.device.type == device
+        assert relative(result.cpu(), value.cpu()) < 0.05, name
 
 
 def test_velocity_from_bytes_agrees():
-    """Frames before contact on both devices, from images as they are decoded."""
-    found = {}
+    """Frames before contact on both devices, from decoded images."""
+    results = {}
     for device in ("cpu", "cuda"):
         body = ball().to(torch.float64, device)
         seen = observe(body, [0.5, -1.2, 0.4], (0, 4, 8, 12, 16))
         opaque = torch.ones_like(seen.images[..., :1])
         pixels = (255 * torch.cat([seen.images, opaque], -1).clamp(0, 1)).round().to(torch.uint8)
         law = analytic_law(TRUTH, MODEL.dt).to(device)
-        found[device] = estimate_velocity(MODEL, law, body, replace(seen, images=pixels), VelocityConfig())
+        results[device] = estimate_velocity(MODEL, law, body, replace(seen, images=pixels), VelocityConfig())
     # single precision on the GPU, double on the CPU: far below what the images leave open
-    assert (abs(found["cuda"].v0 - found["cpu"].v0) < 0.25 * found["cpu"].std).all()
-    assert (abs(found["cuda"].std - found["cpu"].std) < 0.1 * found["cpu"].std).all()
+    assert (abs(results["cuda"].v0 - results["cpu"].v0) < 0.25 * results["cpu"].std).all()
+    assert (abs(results["cuda"].std - results["cpu"].std) < 0.1 * results["cpu"].std).all()
 
 
 def test_a_video_that_does_not_fit_stays_off_the_device(monkeypatch):
@@ -365,7 +365,7 @@ def test_a_video_that_does_not_fit_stays_off_the_device(monkeypatch):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_springs_agree(dtype):
     """Motion of the particles that follow them, and gradients, of a fall onto the ground."""
-    found = []
+    results = []
     for device in ("cpu", "cuda"):
         body = ball(height=0.24, dtype=dtype).to(dtype, device)
         anchored = SpringBody.of(body.x0, 60, 12, 4, 0.5, 12)
@@ -374,14 +374,14 @@ def test_springs_agree(dtype):
         x, v, _ = spring_rollout(SpringModel.of(MODEL), springs, *anchored.start(state), FRAMES)
         path = anchored.path(FRAMES, x, v)
         grads = torch.autograd.grad(path.x.square().sum() + path.F.square().sum(), list(springs.parameters()))
-        found.append([t.detach().cpu().double() for t in (path.x, path.F, *grads)])
+        results.append([t.detach().cpu().double() for t in (path.x, path.F, *grads)])
     bound = {torch.float32: 1e-3, torch.float64: 1e-9}[dtype]
-    for cpu, cuda in zip(*found, strict=True):
+    for cpu, cuda in zip(*results, strict=True):
         assert relative(cuda, cpu) < bound
 
 
 def test_the_live_mode_simulates_on_the_gpu_what_it_does_on_the_cpu():
-    found = []
+    results = []
     for device in ("cpu", "cuda"):
         body, law = ball(height=0.2, dtype=torch.float32), with_network("neural", torch.float32)
         start = body.state(torch.tensor([0.3, -2.0, 0.1])).to(device)
@@ -400,8 +400,8 @@ def test_the_live_mode_simulates_on_the_gpu_what_it_does_on_the_cpu():
             live.hold(None)
             live.reset()
             live.run(False)
-            found.append(live.do().x)
+            results.append(live.do().x)
         finally:
             live.close()
         assert last.x.device == last.total.device == torch.device("cpu")
-    assert torch.equal(*found)
+    assert torch.equal(*results)

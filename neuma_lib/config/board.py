@@ -22,7 +22,7 @@ class BoardConfig(Section):
         "DICT_5X5_100", "dictionary of markers, as OpenCV names it"
     )
     thickness: float = Field(
-        0.0, ge=0, lt=0.1, description="height of the print above the floor, for example on a plate [m]"
+        0.0, ge=0, lt=0.1, description="height of the print above the floor, for example on a panel [m]"
     )
 
     @model_validator(mode="after")

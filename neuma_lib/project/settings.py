@@ -53,7 +53,7 @@ class Config(Section):
     device: Literal["auto", "cpu", "cuda"] = Field(
         "auto", description="device of all computations; auto: CUDA if there is a GPU"
     )
-    seed: int = Field(0, description="seed of every stage without a seed of its own")
+    seed: int = Field(0, description="seed of every stage without its own seed")
     extensions: tuple[str, ...] = Field(
         (), description="Python files with own methods and laws, relative to the folder of the project"
     )
