@@ -34,16 +34,16 @@ rule ground_truth:
     output:
         particles=f"{DATA}/{{scene}}/truth.h5",
     wildcard_constraints:
-        scene=scenes_with("truth", "made"),
+        scene=f"{scenes_with('truth', 'made')}|experiments/({'|'.join(SETTINGS.experiments) or 'none'})",
     resources:
         gpu=EITHER_GPU,
         mem_mb=truth_memory,
     params:
-        bodies=scene_bodies,
+        bodies=body_settings("shape", "size", "height", "center", "velocity", "spin", "density", "law"),
         simulation=truth_simulation,
-        dt=scene_setting("dt"),
+        dt=time_step,
         frames=frame_steps,
-        particles=truth_particles,
+        particles=lambda wildcards: truth_settings(wildcards).particles,
         tracers=SETTINGS.dataset.tracers,
         seed=SETTINGS.dataset.seed,
         device=EITHER_DEVICE,

@@ -28,7 +28,7 @@ rule tracers:
     output:
         tracers=f"{RESULTS}/{{scene}}/tracers.h5",
     wildcard_constraints:
-        scene=TRUE_SCENE,
+        scene=f"{TRUE_SCENE}|{EXPERIMENT}",
     params:
         tracers=SETTINGS.evaluation.tracers,
         seed=SETTINGS.seed,
@@ -43,20 +43,20 @@ rule evaluate:
         kernels=of_bodies(model_kernels),
         truth=of_scene("truth.h5"),
         tracers=of_chain("tracers.h5"),
-        velocity=of_case(lambda case: case.method.start_file(case)),
+        velocity=evaluated_start,
     output:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
         metrics=f"{RESULTS}/{{scene}}/{{method}}/metrics.json",
     wildcard_constraints:
-        scene=TRUE_SCENE,
+        scene=f"{TRUE_SCENE}|{EXPERIMENT}",
     resources:
         gpu=GPU,
     params:
         method=of_bodies(model_parameter),
         simulation=simulation_settings,
-        densities=of_case(lambda case: [case.density(case.moved)]),
+        densities=of_bodies(lambda bodies: [case.density(case.moved) for case in bodies]),
         total=of_bodies(carries_total),
-        carrier=of_bodies(carrier),
+        carrier=evaluated_carrier,
         frames=frame_steps,
         device=SETTINGS.device,
         code=code_of("evaluate.py"),
