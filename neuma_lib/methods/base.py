@@ -347,7 +347,7 @@ def training_inputs(case: Case) -> Files:
     supervision = (
         {"transforms": case.each_video(lambda each: each.data("dynamic/transforms.json"))}
         if case.options.supervision == "pixels"
-        else {"truth": case.each_video(lambda each: each.data("particles.h5"))}
+        else {"truth": case.each_video(lambda each: each.data("truth.h5"))}
     )
     start = case.identified() if case.options.start == "identified" else "velocity.json"
     return {

@@ -14,7 +14,7 @@ EXPERIMENTS = f"{RESULTS}/experiments"
 LONG = f"{SCENE}/neuma+iterations=60+checkpoint_every=1/adaptor.safetensors"
 OWN_PARTICLES = f"{SCENE}/pac_nerf_own+views=0,1"
 OWN_TABLE, REPLICATES = f"{RESULTS}/own.csv", f"{RESULTS}/replicates.csv"
-CUBIC = "tiny/data/Cubic/particles.h5"
+CUBIC = "tiny/data/Cubic/truth.h5"
 USD = importlib.util.find_spec("pxr") is not None  # comes with `make viewer`
 SPRINGS = "spring_gaus+iterations=2"
 EXPORTED = {  # folders, with the number of bodies

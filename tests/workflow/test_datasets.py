@@ -38,7 +38,7 @@ def supplied(tmp_path_factory, kernels):
     scenes = {name: {"like": "BouncyBall", **scene} for name, scene in scenes.items()}
     settings = overlay(scenes=scenes, dataset={"blender": {"device": "auto"}}, device="cpu")
     targets = [file for name in ("Released", *WRITERS) for file in transforms(name)]
-    targets += [f"tiny/data/{name}/particles.h5" for name in TRUTHS]
+    targets += [f"tiny/data/{name}/truth.h5" for name in TRUTHS]
     others = [f"tiny/results/{layout}/neuma/metrics.json" for layout in WRITERS]
     others.append("tiny/data/ClayCat/static/transforms.json")
     project.lists, project.output = lists, project.run(*settings, *targets)
@@ -103,7 +103,7 @@ def test_frames_that_a_layout_counts_need_a_stride(supplied):
 
 
 def test_a_refined_truth_has_the_same_frames_and_an_equal_one_the_same_bytes(supplied):
-    files = [supplied.root / f"tiny/data/{name}/particles.h5" for name in TRUTHS]
+    files = [supplied.root / f"tiny/data/{name}/truth.h5" for name in TRUTHS]
     default, same, _ = (file.read_bytes() for file in files)
     assert default == same
     (arrays, attributes), _, (refined, others) = map(read_arrays, files)

@@ -114,7 +114,7 @@ def test_every_figure_can_be_planned(graph):
 
 
 def is_truth(file):
-    return "/data/" in file and file.endswith("/particles.h5")
+    return "/data/" in file and file.endswith("/truth.h5")
 
 
 @behind(*EVERYTHING)
@@ -191,7 +191,7 @@ def test_springs_and_laws_of_a_table_are_put_to_use_elsewhere_as_their_scenes_ta
         ("longer_bouncy", "BouncyBall"),
     ):
         assert f"{RESULTS}/{scene}/spring_gaus/springs.safetensors" in used[experiment]
-        assert f"tiny/data/experiments/{experiment}/particles.h5" in used[experiment]
+        assert f"tiny/data/experiments/{experiment}/truth.h5" in used[experiment]
     table = graph.one("chamfer_table").inputs
     assert len(table) == 6 * 5
     assert not any(f"{RESULTS}/{scene}/" in file for scene in scenes for file in table)
@@ -374,7 +374,7 @@ def test_an_experiment_follows_the_replicates_of_its_scenes(graph):
     assert {
         f"{REPLICATE}/neuma/adaptor.safetensors",
         f"{RESULTS}/priors/jelly+seed=1.safetensors",
-        "tiny/data/experiments/letter_and_ball/particles.h5",
+        "tiny/data/experiments/letter_and_ball/truth.h5",
     } <= set(graph.one("evaluate_experiment").inputs)
     assert f"{REPLICATE}/velocity.json" in graph.one("experiment_start").inputs
 

@@ -97,7 +97,7 @@ def test_editing_the_rasterizer_reruns_what_renders(clone):
     """Of other edits, test_provenance.py computes what they rerun."""
     file = clone.root / "neuma_lib" / "splatting" / "rasterizer.py"
     file.write_text(file.read_text() + "\nEDITED = True\n")
-    truth = clone.root / "tiny/data/BouncyBall/particles.h5"
+    truth = clone.root / "tiny/data/BouncyBall/truth.h5"
     written = truth.stat().st_mtime_ns
     assert Plan.of(clone.run(f"{SCENE}/gaussians.ply")) == {"kernels": 1, "gaussians": 1}
     assert truth.stat().st_mtime_ns == written
@@ -207,7 +207,7 @@ def test_without_the_requested_gpu_nothing_is_begun(kernels, tmp_path):
     assert "torch sees no CUDA device" in output and "fit_neuma, gaussians, velocity" in output
     assert "Traceback (most recent call last)" not in output
     assert not (tmp_path / "tiny").exists()
-    assert "ground_truth BouncyBall: " in project.run(*cuda, "tiny/data/BouncyBall/particles.h5")
+    assert "ground_truth BouncyBall: " in project.run(*cuda, "tiny/data/BouncyBall/truth.h5")
 
 
 @pytest.fixture(scope="module")
