@@ -55,7 +55,7 @@ def body(settings=SMALL):
 
 def film(carried, spec):
     """The video of a body with this law, thrown with V0; its own particles move."""
-    return benchmark.film(carried.field, carried.shown, spec, FRAMES, benchmark.cameras(24, torch.float64))
+    return benchmark.film(carried.field, carried.rendered, spec, FRAMES, benchmark.cameras(24, torch.float64))
 
 
 def contact(carried):
@@ -117,7 +117,7 @@ class TestMemory:
     def video(carried, size):
         """A picture of the body where it is in three views, and one of noise, as files have them."""
         cameras = benchmark.cameras(size, torch.float64)
-        drawn = torch.stack([carried.field.draw(cameras, view, carried.shown) for view in range(3)])
+        drawn = torch.stack([carried.field.draw(cameras, view, carried.rendered) for view in range(3)])
         opaque = torch.full((3, size, size, 1), 255, dtype=torch.uint8)
         rgba = torch.cat([(255 * drawn.clamp(0, 1)).byte(), opaque], dim=-1)
         other = torch.randint(256, rgba.shape, generator=torch.Generator().manual_seed(0)).byte()
@@ -126,7 +126,7 @@ class TestMemory:
     @staticmethod
     def error(carried, video):
         """Loss of the body a little aside, its gradient in the positions, and the bytes that were kept for it."""
-        x = (carried.shown.x + 0.01).requires_grad_()
+        x = (carried.rendered.x + 0.01).requires_grad_()
         with kept_for_gradient() as kept:
             error = video.error(carried, x, 0, 1, None, None, 3)
             error.backward()
@@ -356,12 +356,12 @@ class TestOwnParticles:
         """At t = 0 the pictures are those of the field's particles where they were drawn, bit for bit."""
         (images,) = self.rendered(carried, carried.moving.x[None])
         for view, image in enumerate(images):
-            assert torch.equal(image, carried.field.draw(self.CAMERAS, view, carried.shown))
+            assert torch.equal(image, carried.field.draw(self.CAMERAS, view, carried.rendered))
         assert images.amin() < 0.6 and images.amax() <= 1
 
     def test_a_rigid_motion_by_voxels_is_one_of_the_cameras(self, carried):
         """Nodes are multiples of the voxel, so that a shift by some of them is the same as moving the cameras back."""
-        shift = carried.shown.voxel * torch.tensor([2.0, -1.0, 3.0], dtype=torch.float64)
+        shift = carried.rendered.voxel * torch.tensor([2.0, -1.0, 3.0], dtype=torch.float64)
         x = carried.moving.x
         (moved,) = self.rendered(carried, (x + shift)[None])
         viewmats = self.CAMERAS.viewmats.clone()
@@ -378,7 +378,7 @@ class TestOwnParticles:
         over_white, over_black = (self.rendered(carried, x, background=(c, c, c)) for c in (1.0, 0.0))
         through = (over_white - over_black).mean(-1)[0, 1].flatten()
         rays = camera_rays(self.CAMERAS, 1)
-        _, passed = carried.field.render(*carried.shown.seen(), *rays)
+        _, passed = carried.field.render(*carried.rendered.seen(), *rays)
         assert torch.allclose(through, passed, atol=1e-12) and passed.amin() < 0.3 and passed.amax() == 1
         assert torch.equal(self.rendered(carried, x), over_white)
 

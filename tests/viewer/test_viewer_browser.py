@@ -127,7 +127,7 @@ def served(folder):
 def test_the_server_plays_moves_and_simulates(served):
     assert served.host == "127.0.0.1", "this machine alone, unless told otherwise"
     with opened(f"http://127.0.0.1:{served.port}", 800, 600) as (page, complaints):
-        page.wait_for_selector("text=beside it", timeout=60_000)
+        page.wait_for_selector("text=next to it", timeout=60_000)
 
         def settled():
             """The picture once it stands still, and something has faded in."""
