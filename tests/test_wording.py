@@ -127,7 +127,6 @@ PENDING = {
     "tests/paper/": "being rewritten",
     "tests/project/": "being rewritten",
     "tests/studies/": "being rewritten",
-    "tests/support/": "being rewritten",
     "tests/test_api.py": "being rewritten",
     "tests/test_cli.py": "being rewritten",
     "tests/test_cuda.py": "being rewritten",

@@ -325,7 +325,7 @@ def test_rules_with_a_script_get_what_they_leave_out(graph):
             assert all(text in job.text for text in expected), job
 
 
-def test_images_are_rendered_where_the_settings_say(plan, wider):
+def test_images_are_rendered_where_the_settings_request(plan, wider):
     """On one CPU core unless a GPU or more cores are asked for; images alone, not what is computed from them."""
     images = "tiny/data/BouncyBall/static/transforms.json"
     by_default, asked_for = plan.makers[images].text, wider.makers[images].text
