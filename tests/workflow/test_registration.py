@@ -117,7 +117,9 @@ def test_placed_files_are_of_one_body_that_moves_as_it_was_filmed(placed):
     assert placement["offsets_s"]["b"] == pytest.approx(OFFSET, abs=3e-4)
     np.testing.assert_allclose([placement["gains"][k] for k in "ab"], GAINS[:2], rtol=0.03)
     # All files are moved alike, and fit together.
-    body_there = load_reconstruction(*(results / f for f in ("particles.h5", "binding.h5", "gaussians.ply")), 1000.0)
+    body_there = load_reconstruction(
+        *(results / f for f in ("particles.h5", "binding.h5", "gaussians.ply")), 1000.0
+    )
     x = body.particles @ np.array(placement["rotation"]).T + placement["translation"]
     np.testing.assert_allclose(body_there.x0, x, atol=1e-6)
     np.testing.assert_allclose(x.mean(axis=0), start.centre, atol=1e-6)
