@@ -14,8 +14,8 @@ from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.gaussians import load_gaussians, save_gaussians
 from neuma_lib.io.images import OPENGL_TO_OPENCV, load_views, write_transforms
 from neuma_lib.io.mesh import read_mesh, write_mesh
-from neuma_lib.io.particles import load_reconstruction, load_particles, save_binding, save_particles
-from tests.support.flight_scene import GAINS, PLACE, VELOCITY, filmed, ellipsoid_body, true_motion
+from neuma_lib.io.particles import load_particles, load_reconstruction, save_binding, save_particles
+from tests.support.flight_scene import GAINS, PLACE, VELOCITY, ellipsoid_body, filmed, true_motion
 from tests.support.project import copied
 
 OFFSET, SIZE, FRAMES = 0.0035, (80, 60), 10
