@@ -93,7 +93,7 @@ ALLOWED = {
     r"_throw(?:\d|\{)|figures\.beside|\bbeside(?:: tuple|: \[|(?=[\"'`]))": "names of scenes and of a setting",
     r"\bthrows?(?::|\.<name>|(?=[\"'`]))|throws=\d|\w+\.throws\b|captured\.throw\b": "names of settings",
     r"\bcarriers\b": "name of a setting",
-    r"[\"'`](?:plate|plate_gain|plate_offset|shown|arcs|says|any_step|on_request|trained_as|judged_on)[\"'`]": (
+    r"[\"'`.](?:plate|plate_gain|plate_offset|shown|arcs|says|any_step|on_request|trained_as|judged_on)[\"'`]": (
         "keys of files, and former names of settings"
     ),
     r"[\"'`]stock[\"'`]|guesses to stock": "value of a setting",
