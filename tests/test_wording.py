@@ -95,7 +95,7 @@ ALLOWED = {
         "names of settings"
     ),
     r"\bcarriers\b": "name of a setting",
-    r"[\"'`](?:plate|plate_gain|plate_offset|shown|arcs|says|any_step|on_request|trained_as|judged_on)[\"'`]": (
+    r"[\"'`.](?:plate|plate_gain|plate_offset|shown|arcs|says|any_step|on_request|trained_as|judged_on)[\"'`]": (
         "keys of files, and former names of settings"
     ),
     r"[\"'`]stock[\"'`]|guesses to stock": "value of a setting",
