@@ -113,8 +113,6 @@ PENDING = {
     "neuma_lib/capture/": "being rewritten",
     "neuma_lib/paper/": "being rewritten",
     "tests/capture/": "being rewritten",
-    "tests/methods/": "being rewritten",
-    "tests/viewer/": "being rewritten",
     "tests/workflow/": "being rewritten",
 }
 
