@@ -66,7 +66,7 @@ def test_the_file_opens_without_a_server_plays_and_follows_its_controls(folder, 
 
         seen = at(0)
         pictures = {name: None for name in ("speed", "von_mises", "plastic_strain", "volume_ratio")}
-        for name in current:
+        for name in pictures:
             page.select_option("#show", name)
             pictures[name] = at(2)
             assert page.is_visible("#legend") and differ(seen, pictures[name]) > 0.01
