@@ -10,14 +10,12 @@ analytic laws save by themselves.
 
 from __future__ import annotations
 
-import argparse
 import time
-from collections.abc import Callable
 
 import torch
 
 from benchmarks.rollout import falling_cube
-from benchmarks.timing import synchronize
+from benchmarks.timing import parser_of, seconds
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Law
 from neuma_lib.sim.batch import rollout_batch
@@ -47,20 +45,8 @@ def laws_of(name: str, copies: int, dt: float) -> list[Law]:
     ]
 
 
-def seconds(work: Callable[[], object], device: torch.device) -> float:
-    """Core seconds on a CPU, seconds on a GPU."""
-    clock = time.process_time if device.type == "cpu" else time.perf_counter
-    synchronize(device)
-    started = clock()
-    work()
-    synchronize(device)
-    return clock() - started
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--copies", type=int, default=8)
     parser.add_argument("--particles", type=int, default=2000)
     parser.add_argument("--grid", type=int, default=24)
@@ -73,6 +59,7 @@ def main() -> None:
 
     torch.set_num_threads(1)
     device = torch.device(args.device)
+    clock = time.process_time if device.type == "cpu" else time.perf_counter
     model, start = MPM(args.grid, args.dt), falling_cube(args.particles, device)
     run = dict(
         steps=args.steps,
@@ -92,14 +79,7 @@ def main() -> None:
             lambda laws=laws: rollout_batch(model, laws, start, **run, together=1),
             lambda laws=laws: rollout_batch(model, laws, start, **run),
         )
-        best = [float("inf")] * len(rows)
-        uncounted = 1 if device.type == "cpu" else 2  # compilation, recording of graphs
-        for repetition in range(args.repetitions + uncounted):
-            for row, work in enumerate(rows):
-                taken = seconds(work, device)
-                if repetition >= uncounted:
-                    best[row] = min(best[row], taken)
-        alone, ones, together = best
+        alone, ones, together = (seconds(work, device, args.repetitions, clock) for work in rows)
         print(f"{name:20}{alone:12.3f}{ones:14.3f}{together:12.3f}{alone / together:8.2f}")
 
 

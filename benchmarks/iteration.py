@@ -1,19 +1,18 @@
-"""Where the time of one training iteration goes, on whatever device there is.
+"""Time of one training iteration by part, on a CPU or a GPU.
 
     python -m benchmarks.iteration                      # the paper's scale on a GPU, the default scale on a CPU
     python -m benchmarks.iteration --particles 60000 --pixels 400
     python -m benchmarks.iteration --adjoint-precision half
     python -m benchmarks.iteration --whole --frames 100 # whole iterations alone
 
-Every part is timed alone, on the state in the middle of the motion, and compared with its floor: the bytes that it
-must move (each input read once, each result written once) over the bandwidth of a copy, or the operations of its
-networks over the rate of a matrix product, whichever is longer, both measured here. The simulation as a whole and the
-rasterizer are also compared with their plain twins in torch, differentiated by autograd, at a size that these can do.
+Every part is timed alone, on the state in the middle of the motion, and compared with a lower bound, the longer of
+two measured times: that of moving its bytes (each input read once, each result written once) at the bandwidth of a
+copy, and that of the operations of its networks at the rate of a matrix product. The whole simulation and the
+rasterizer are also compared with plain torch code under autograd, at a size for which that is possible.
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
 import statistics
@@ -24,7 +23,15 @@ import torch
 
 from benchmarks import torch_simulation
 from benchmarks.scene import SMALL, BenchmarkScene, Size, make_scene
-from benchmarks.timing import arithmetic, bandwidth, device_name, peak_memory, seconds, seconds_a_call
+from benchmarks.timing import (
+    arithmetic,
+    bandwidth,
+    device_name,
+    parser_of,
+    peak_memory,
+    seconds,
+    seconds_a_call,
+)
 from neuma_lib.config.training import TrainingConfig
 from neuma_lib.fitting.material import PixelLoss, train_material
 from neuma_lib.sim.memory import MemoryPlan
@@ -43,13 +50,13 @@ NETWORK = 2 * (13 * 64 + 64 * 64 + 64 * 9)
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """One line of the table.
+    """A line of the table.
 
     Attributes:
-        name: what it does.
+        name: of the part.
         seconds: time of one call.
         calls: calls in an iteration.
-        bytes, operations: least that a call must move and compute.
+        bytes, operations: minimum that a call moves and computes.
     """
 
     name: str
@@ -64,7 +71,7 @@ class Part:
 
 
 def simulation_parts(scene: BenchmarkScene, device: torch.device) -> list[Part]:
-    """The kernels of a step, there and back, on a state in contact."""
+    """The kernels of a step, forward and backward, on a state in contact."""
     size, law = scene.size, scene.law
     N, nodes = size.particles, size.grid**3
     middle = size.steps // 2
@@ -137,7 +144,7 @@ def simulation_parts(scene: BenchmarkScene, device: torch.device) -> list[Part]:
 
 
 def rendering_parts(scene: BenchmarkScene, device: torch.device, frames: int) -> list[Part]:
-    """Binding, rasterizer and loss of a batch of frames, there and back."""
+    """Binding, rasterizer and loss of a batch of frames, forward and backward."""
     size, body = scene.size, scene.body
     with torch.no_grad():
         path = _roll(scene, steps=size.steps, frames=size.frame_steps[-frames:])
@@ -242,9 +249,7 @@ def twin_render(device: torch.device) -> tuple[float, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     for field in dataclasses.fields(Size):
         parser.add_argument(f"--{field.name}", type=type(field.default), help=f"{field.default} on a GPU")
@@ -320,10 +325,10 @@ def report(scene: BenchmarkScene, device: torch.device, batch: int) -> list[str]
         "| whole | time | torch twin | twin / ours |",
         "|---|---:|---:|---:|",
         f"| training iteration | {1e3 * fastest:.1f} ms, {gibibytes} | | |",
-        f"| simulation and networks, there and back | {1e3 * simulation:.1f} ms | {step * size.steps:.2f} s | "
+        f"| simulation and networks, forward and backward | {1e3 * simulation:.1f} ms | {step * size.steps:.2f} s | "
         f"{step * size.steps / simulation:.0f} |",
         f"| the same with half of the memory for states | {1e3 * bounded:.1f} ms | | |",
-        f"| rasterizer and loss of {batch} frames at rest, there and back | {1e3 * drawn:.2f} ms | | |",
+        f"| rasterizer and loss of {batch} frames at rest, forward and backward | {1e3 * drawn:.2f} ms | | |",
         f"| the same by way of images | {1e3 * by_images:.2f} ms | | |",
         f"| one image of 300 Gaussians at 48×48 and its gradient | {1e3 * fast:.2f} ms | {1e3 * slow:.0f} ms | "
         f"{slow / fast:.0f} |",

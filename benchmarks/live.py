@@ -5,17 +5,15 @@
     python -m benchmarks.live --device cuda                 # also --particles 30000 --grid 32 --dt 5e-4
 
 The simulation has its own thread, as in the viewer, and another one makes the Gaussians of every frame that it sees,
-or the stresses of its particles. Sending them to a browser is not in it, nor drawing there, which is another process.
+or the stresses of its particles. Transfer to a browser and drawing there are excluded.
 
-The viewer never runs faster than real time, so the steps of a frame are also taken without its clock: real time over
-the best and the median time of some frames. Other load takes from all times by the clock, and hardly from the
-processor's; the last column is of these alone: what the steps that fit beside a picture into 0.1 s of one core make up
-of real time.
+The viewer never runs faster than real time, so the steps of a frame are also timed without its clock: real time over
+the best and the median time of some frames. Other load affects all wall times and hardly the processor times. The last
+column uses the latter: the share of real time of the steps that fit, with one picture, into 0.1 s of one core.
 """
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 from collections.abc import Callable
@@ -25,7 +23,7 @@ import torch
 
 from benchmarks.rollout import SOFT
 from benchmarks.scene import SMALL, BenchmarkScene, make_scene
-from benchmarks.timing import device_name, synchronize
+from benchmarks.timing import device_name, parser_of, synchronize
 from neuma_lib.coupling.deformation import arms_at_rest, deform
 from neuma_lib.device import choose_device
 from neuma_lib.mechanics.analytic import analytic_law
@@ -90,7 +88,7 @@ def measured(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--law", default="neural", choices=("neural", "structured", "analytic"))
     parser.add_argument("--particles", type=int, default=SMALL.particles)
     parser.add_argument("--gaussians", type=int, default=SMALL.gaussians)

@@ -1,25 +1,24 @@
-"""PAC-NeRF on its own ground: the constants of a named family, found in a film of a body that moves by that family.
+"""PAC-NeRF with a known family: constants from a video of a body that follows that family.
 
     python -m benchmarks.pac_nerf                                   # all families of config/config.yaml; a few minutes
     python -m benchmarks.pac_nerf elastic sand --set '{"iterations_all": 100}'
 
-The body is a radiance field of a spotted ball, written down instead of fitted, so that what is judged is the stages
-that follow. It is thrown on the floor, moved by the simulator with more particles than the fit has, and filmed through
-the same rays. The fit starts from the family's stock guess, with a modulus, yield stress or viscosity a decade off.
-Every family has one bound at least, see `BOUNDS`; the other constants are printed.
+The body is a given radiance field of a spotted ball, so that only the later stages are evaluated. It falls on the
+floor, is simulated with more particles than in the fit, and rendered with the same rays. The fit starts from the
+family's published guess, with a modulus, yield stress or viscosity wrong by a decade. Every family has at least one
+bound, see `BOUNDS`. The other constants are printed.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import resource
 from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from benchmarks.timing import core_seconds, parser_of
 from neuma_lib.evaluation.text_tables import as_markdown
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.methods.pac_nerf.carried_field import CarriedField
@@ -42,7 +41,7 @@ DENSITY = 1000.0
 CENTRE, RADIUS, EDGE = (0.5, 0.25, 0.5), 0.08, 0.025
 """Of the ball, and how wide its edge is [m]."""
 VOXEL, NODES = 0.025, 17
-LEAST_OPACITY = 1e-3
+MIN_OPACITY = 1e-3
 TRUTH_SPACING = 0.75
 """Side of a cell that holds one particle of the truth [voxels]; 1 in the fit."""
 STEPS, STEPS_A_FRAME = 200, 8
@@ -99,7 +98,7 @@ def film(
     frames: tuple[int, ...],
     view: Cameras,
 ) -> Observation:
-    """The video of a field whose particles all move by a law, thrown with `V0`."""
+    """The video of a field whose particles all follow a law, launched with `V0`."""
     velocity = torch.tensor(V0).to(body.x)
     start = State(body.x, velocity, body.masses(DENSITY), body.volumes())
     path = rollout(MODEL, analytic_law(spec, dt=MODEL.dt), start, steps=frames[-1], frames=frames)
@@ -111,7 +110,7 @@ def film(
 
 
 def contact(x: Tensor, frames: tuple[int, ...]) -> int:
-    """Step of the last frame before particles at x, thrown with `V0`, are near enough to the floor to feel it."""
+    """Step of the last frame before particles at x, launched with `V0`, interact with the floor."""
     low = float(x[:, 1].min()) - MODEL.free_range[0]
     fall = [V0[1] * n * MODEL.dt + MODEL.gravity[1] / 2 * (n * MODEL.dt) ** 2 for n in frames]
     return max(n for n, y in zip(frames, fall, strict=True) if low + y > 0)
@@ -129,12 +128,12 @@ def specification(family: PacFamilyConfig, values: Mapping[str, float]) -> dict[
 
 
 def recover(name: str, family: PacFamilyConfig, settings: PacNerfConfig, log=print) -> PacNerfFit:
-    """Fit a family to the film of its truth, from its stock guess."""
+    """Fit a family to the video of its truth, from its published guess."""
     field = spotted_ball()
-    truth = field.particles(TRUTH_SPACING, LEAST_OPACITY)
+    truth = field.particles(TRUTH_SPACING, MIN_OPACITY)
     frames = tuple(range(0, STEPS + 1, STEPS_A_FRAME))
     video = film(field, truth, specification(family, TRUTHS[name]), frames, cameras())
-    body = CarriedField(field, 1.0, LEAST_OPACITY, settings, DENSITY)
+    body = CarriedField(field, 1.0, MIN_OPACITY, settings, DENSITY)
     return fit_pac_nerf(
         MODEL, body, video, contact(truth.x, frames), FamilyConstants(family), settings, log=log
     )
@@ -146,9 +145,7 @@ def error(name: str, truth: float, value: float) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("families", nargs="*", default=list(TRUTHS), help="names")
     parser.add_argument("--settings", default="config/config.yaml", help="YAML file")
     parser.add_argument("--set", default="{}", help="changes of the settings of `pac_nerf`, as JSON")
@@ -160,9 +157,9 @@ def main() -> None:
     settings = PacNerfConfig(**merged(plain, SMALL | json.loads(args.set)))
     rows = []
     for name in args.families:
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_utime
+        before = core_seconds()
         fit = recover(name, settings.families[name], settings, lambda line: None)
-        seconds = resource.getrusage(resource.RUSAGE_SELF).ru_utime - before
+        seconds = core_seconds() - before
         guess = FamilyConstants(settings.families[name]).fitted_numbers()
         for key, value in fit.constants.fitted_numbers().items():
             off, bound = error(key, TRUTHS[name][key], value), BOUNDS[name].get(key)

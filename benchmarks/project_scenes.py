@@ -1,22 +1,31 @@
-"""Scenes of a project on the command line of a benchmark: which ones, with which settings, in which folders."""
+"""Scenes of a project for benchmarks: arguments that select them, settings and files."""
 
 from __future__ import annotations
 
 import argparse
 from functools import reduce
+from pathlib import Path
 from typing import Any
 
+import torch
+
+from benchmarks.timing import parser_of
+from neuma_lib.config.identify import IdentifyConfig
 from neuma_lib.config.scenes import SceneConfig
+from neuma_lib.coupling.initial_motion import InitialMotion
+from neuma_lib.coupling.reconstruction import Reconstruction
+from neuma_lib.geometry.volume import sample_volume
+from neuma_lib.io.files import read_json
+from neuma_lib.io.mesh import read_mesh
+from neuma_lib.io.particles import load_reconstruction
 from neuma_lib.project.loading import load, merged, read_yaml
 from neuma_lib.project.settings import Config
 from neuma_lib.sim.model import MPM
 
 
 def scene_parser(description: str, nargs: str) -> argparse.ArgumentParser:
-    """A parser of scenes' names and of where to look for them."""
-    parser = argparse.ArgumentParser(
-        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    """A parser of names of scenes and of the folders of their files."""
+    parser = parser_of(description)
     parser.add_argument("scenes", nargs=nargs, help="names, or their beginnings")
     parser.add_argument("--settings", nargs="+", default=["config/config.yaml"], help="YAML files")
     parser.add_argument("--seeds", type=int, nargs="*", default=[], help="of random scenes")
@@ -27,7 +36,7 @@ def scene_parser(description: str, nargs: str) -> argparse.ArgumentParser:
 
 
 def chosen_scenes(args: argparse.Namespace) -> dict[str, Config]:
-    """Settings by name of the scenes that are asked for; of all, if none is."""
+    """Settings by name of the scenes that are named, or of all."""
     folders = {key: path for key in ("data_root", "results_root") if (path := getattr(args, key))}
     raw = reduce(merged, [*map(read_yaml, args.settings), folders])
     drawn = [{"random": {"seed": seed, "count": args.count}} for seed in args.seeds]
@@ -48,3 +57,30 @@ def simulation(settings: Config, scene: SceneConfig) -> dict[str, Any]:
 def simulator(settings: Config, scene: SceneConfig) -> MPM:
     """The simulator for a scene's reconstruction."""
     return MPM(**simulation(settings, scene))
+
+
+def read_body(
+    name: str, settings: Config, chosen: IdentifyConfig, device: torch.device | str = "cpu"
+) -> tuple[Reconstruction, InitialMotion]:
+    """Reconstruction of a scene in float32, and its estimated initial motion."""
+    results = Path(settings.results_root) / name
+    files = (results / file for file in ("particles.h5", "binding.h5", "gaussians.ply"))
+    body = load_reconstruction(*files, settings.scene(name).density, gaussian_motion=chosen.gaussian_motion)
+    return body.to(torch.float32, device), InitialMotion.of(read_json(results / "velocity.json"))
+
+
+def refined_bodies(
+    name: str, settings: Config, chosen: IdentifyConfig, body: Reconstruction
+) -> list[Reconstruction]:
+    """The body with more particles, for each resampling that the discretisation correction uses."""
+    mesh = read_mesh(Path(settings.results_root) / name / "mesh.ply")
+    seeds = range(1, 1 + (chosen.resamplings if chosen.refined_particles else 0))
+    clouds = (torch.from_numpy(sample_volume(mesh, chosen.refined_particles, seed)) for seed in seeds)
+    density = settings.scene(name).density
+    return [body.resampled(x, mesh.volume, density, settings.binding) for x in clouds]
+
+
+def prior_of(settings: Config, scene: SceneConfig) -> dict[str, Any] | None:
+    """Specification of the law of a scene's prior, if it is analytic."""
+    known = settings.priors.laws.get(scene.prior)
+    return known.plain() if known else None

@@ -10,12 +10,12 @@ Settings are to be tuned on draws that are not reported.
 from __future__ import annotations
 
 import json
-import resource
 from pathlib import Path
 
 import torch
 
 from benchmarks.project_scenes import chosen_scenes, scene_parser
+from benchmarks.timing import core_seconds
 from neuma_lib.io.images import load_views
 from neuma_lib.methods.pac_nerf.field_fit import fit_radiance_field
 from neuma_lib.methods.pac_nerf.field_options import RadianceConfig
@@ -34,9 +34,9 @@ def main() -> None:
     for name, settings in chosen_scenes(args).items():
         chosen = RadianceConfig(**merged(settings.radiance.plain(), json.loads(args.set)))
         views = load_views(Path(settings.data_root, name, "static/transforms.json"))
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_utime
+        before = core_seconds()
         field, report = fit_radiance_field(*views, chosen, settings.seed)
-        seconds = resource.getrusage(resource.RUSAGE_SELF).ru_utime - before
+        seconds = core_seconds() - before
         particles = field.particles(chosen.spacing, chosen.min_opacity)
         numbers = (1e3 * float(particles.masses(1.0).sum()), report.psnr, report.psnr_object)
         numbers += (report.direct_psnr, report.direct_psnr_object)

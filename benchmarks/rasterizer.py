@@ -1,18 +1,17 @@
-"""Time of the rasterizer by stage: milliseconds an image, for every compositor asked for.
+"""Time of the rasterizer by stage: milliseconds per image, for each selected compositor.
 
     python -m benchmarks.rasterizer                                # CPU: 2,000 Gaussians, 2 frames at 96 px
     python -m benchmarks.rasterizer --device cuda                  # 20,000 Gaussians, 40 frames at 800 px
     python -m benchmarks.rasterizer --device cuda --frames 1 --views 50 --appearance
     python -m benchmarks.rasterizer --device cuda --compositors tiles gsplat --tiles 16x2 16x4 8x2 32x2
 
-The Gaussians fill a ball of 0.15 m radius, 2 to 4 mm wide, opacities from 0.1 to 0.95; cameras stand 1.6 m away and see
-the ball over three eighths of the image's width. A stage runs several times without waiting for the device in
-between, as in training; the device's clock counts. The last columns compare one image with the CPU's in float64.
+The Gaussians fill a ball of 0.15 m radius. They are 2 to 4 mm wide, with opacities from 0.1 to 0.95. Cameras are 1.6 m
+away, where the ball covers three eighths of the image's width. A stage runs several times without synchronisation, as
+in training, measured by the clock of the device. The last rows compare one image with that of the CPU in float64.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from collections.abc import Callable
@@ -20,6 +19,7 @@ from collections.abc import Callable
 import torch
 
 from benchmarks import gsplat_backend
+from benchmarks.timing import parser_of
 from neuma_lib.splatting import compositor_cuda, projection
 from neuma_lib.splatting.cameras import Cameras, look_at
 from neuma_lib.splatting.compositing import Settings
@@ -59,7 +59,7 @@ def ball(
 
 
 def milliseconds(work: Callable[[], object], device: torch.device, repetitions: int) -> float:
-    """Time of one of ``repetitions`` runs in a row, after two that do not count."""
+    """Time of one of ``repetitions`` runs in a row, after two that are not counted."""
     for _ in range(2):
         work()
     if device.type == "cuda":
@@ -78,7 +78,7 @@ def milliseconds(work: Callable[[], object], device: torch.device, repetitions: 
 
 
 def stages(name: str, inputs, cameras: Cameras, repetitions: int) -> dict[str, float]:
-    """Milliseconds a call of the stages of one of our compositors."""
+    """Milliseconds per call of the stages of one of our compositors."""
     means, covars, opacities, sh = inputs
     sh = projection.for_device(sh)
     settings = Settings(cameras.width, cameras.height, 1 / 255, 0.99, 1e-4, 0.3)
@@ -128,7 +128,7 @@ def stages(name: str, inputs, cameras: Cameras, repetitions: int) -> dict[str, f
 def whole(
     name: str, inputs, cameras: Cameras, appearance: bool, repetitions: int
 ) -> tuple[dict[str, float], torch.Tensor]:
-    """Milliseconds a call through autograd, memory, and the first image."""
+    """Milliseconds per call through autograd, memory, and the first image."""
     leaves = [value.clone().requires_grad_(index < 2 or appearance) for index, value in enumerate(inputs)]
     trained = [leaf for leaf in leaves if leaf.requires_grad]
     device = inputs[0].device
@@ -165,9 +165,7 @@ def reference(inputs, cameras: Cameras) -> torch.Tensor:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--gaussians", type=int)
     parser.add_argument("--size", type=int, help="width and height [px]")

@@ -11,13 +11,13 @@ differentiable simulator. The best of several repetitions counts: other load onl
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from collections.abc import Callable
 
 import torch
 
+from benchmarks.timing import parser_of
 from neuma_lib.coupling.deformation import deform
 from neuma_lib.coupling.particle_binding import bind
 from neuma_lib.mechanics.adaptor import AdaptableLaw
@@ -126,9 +126,7 @@ def now() -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--law", choices=["neural", *FORMS], default="neural")
     parser.add_argument("--particles", type=int, default=2000)
     parser.add_argument("--grid", type=int, default=24)

@@ -10,7 +10,6 @@ scaling.csv and scaling.png, and prints the exponent p of time ~ size^p between 
 
 from __future__ import annotations
 
-import argparse
 import csv
 import dataclasses
 import gc
@@ -21,7 +20,7 @@ import torch
 
 from benchmarks.iteration import iterations, simulate_and_back
 from benchmarks.scene import SMALL, Size, make_scene
-from benchmarks.timing import device_name, peak_memory, seconds
+from benchmarks.timing import device_name, parser_of, peak_memory, seconds
 from neuma_lib.sim.workspace import free_pool
 
 SWEEPS = {
@@ -72,8 +71,8 @@ def measure(
     return min(times), peak
 
 
-def forget(device: torch.device) -> None:
-    """Give all memory back, so that the next size does not pay for this one."""
+def free_memory(device: torch.device) -> None:
+    """Free all memory, so that it does not affect the next size."""
     free_pool()
     gc.collect()
     if device.type == "cuda":
@@ -124,9 +123,7 @@ def draw(rows: list[dict], path: Path, title: str) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--small", action="store_true", help="around the default scale, for a CPU")
     parser.add_argument("--axes", nargs="+", choices=list(SWEEPS), default=list(SWEEPS))
@@ -142,7 +139,7 @@ def main() -> None:
     for axis in args.axes:
         for value in sweeps[axis]:
             time, peak = measure(axis, value, base, device, memory)
-            forget(device)
+            free_memory(device)
             rows.append({"axis": axis, "size": value, "seconds": time, "bytes": peak})
             print(f"| {UNITS[axis]} | {value} | {1e3 * time:.1f} | {peak / 2**30:.2f} |", flush=True)
     args.output.mkdir(parents=True, exist_ok=True)

@@ -11,12 +11,10 @@ against central differences of LAPACK in float64, over the norms of both.
 
 from __future__ import annotations
 
-import argparse
-
 import torch
 import warp as wp
 
-from benchmarks.timing import seconds
+from benchmarks.timing import parser_of, seconds
 from neuma_lib.device import start_warp, warp_stream
 from neuma_lib.mechanics.singular_values import rotation_and_singular_values, svd3
 from neuma_lib.mechanics.singular_values_kernels import warp_types
@@ -25,7 +23,7 @@ start_warp()
 
 COUNT = 2000
 STEP = 1e-6
-"""Step of the central differences: truncation 1e-12 and rounding 1e-10, far below what is told apart here."""
+"""Step of the central differences: truncation 1e-12 and rounding 1e-10, far below the differences measured here."""
 
 
 @wp.kernel
@@ -100,7 +98,7 @@ def families() -> dict[str, torch.Tensor]:
         return (U * torch.tensor(sigma, dtype=torch.float64)) @ V.mT
 
     eye = torch.eye(3, dtype=torch.float64).repeat(COUNT, 1, 1)
-    found = {
+    matrices = {
         "F = I": eye,
         "I + 1e-5 noise": eye + 1e-5 * noise(),
         "I + 0.1 noise": eye + 0.1 * noise(),
@@ -110,7 +108,7 @@ def families() -> dict[str, torch.Tensor]:
         "det < 0: 1, 1, -0.9": stretched(1.0, 1.0, -0.9),
         "flat: 1, 1e-2, 1e-5": stretched(1.0, 1e-2, 1e-5),
     }
-    return {name: F.float() for name, F in found.items()}
+    return {name: F.float() for name, F in matrices.items()}
 
 
 def accuracy(F: torch.Tensor, U, sigma, Vh) -> list[float]:
@@ -126,9 +124,7 @@ def accuracy(F: torch.Tensor, U, sigma, Vh) -> list[float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--rows", type=int, nargs="+", default=[COUNT])
     parser.add_argument("--repetitions", type=int, default=50)
     parser.add_argument("--device", default="cpu")

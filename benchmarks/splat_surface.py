@@ -1,13 +1,13 @@
-"""How far the surface that is found of a splat lies from the one that its Gaussians were drawn on.
+"""Distance of the surface of a splat from the one on which its Gaussians lie.
 
     python -m benchmarks.splat_surface                # 6,000 discs, 96 voxels, 60 views of 320 px; minutes
     python -m benchmarks.splat_surface --shapes bowl --discs 3000
     python -m benchmarks.splat_surface --gaussians results/Guitar/gaussians.ply
 
-Opaque discs lie at random on a bowl, whose inside no outline shows, on a cat, between whose discs a few views look
-through gaps, and on shapes that nothing was chosen on, a pot with a thin wall among them: mean distance of points on
-either surface to the other, and volume over the true one, of outlines alone and with depth. Of Gaussians whose true
-surface nobody knows: both volumes.
+Opaque discs lie at random on a bowl, whose inside no silhouette shows, on a cat, with gaps between the discs in a few
+views, and on shapes that did not influence any setting, such as a pot with a thin wall. Prints the mean distance of
+points on either surface to the other, and the volume over the true one, from silhouettes alone and with depth. For
+Gaussians with an unknown surface it prints both volumes.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import torch
 import trimesh
 from scipy.spatial import cKDTree
 
+from benchmarks.timing import parser_of
 from neuma_lib.config.geometry import SurfaceConfig
 from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.splat_surface import splat_surface, views_around
@@ -36,7 +37,7 @@ SAMPLES = 20_000
 
 def bowl() -> trimesh.Trimesh:
     """A bowl that is open upwards, 0.4 m wide and 0.2 m high, its wall 0.03 m thick."""
-    outline = [
+    profile = [
         (0, 0),
         (0.15, 0),
         (0.18, 0.05),
@@ -46,18 +47,18 @@ def bowl() -> trimesh.Trimesh:
         (0.12, 0.03),
         (0, 0.03),
     ]
-    return upright(outline)
+    return upright(profile)
 
 
 def pot() -> trimesh.Trimesh:
     """A pot that is open upwards, 0.3 m wide and 0.4 m high, its wall 0.02 m thick."""
-    outline = [(0, 0), (0.15, 0), (0.15, 0.4), (0.13, 0.4), (0.13, 0.02), (0, 0.02)]
-    return upright(outline)
+    profile = [(0, 0), (0.15, 0), (0.15, 0.4), (0.13, 0.4), (0.13, 0.02), (0, 0.02)]
+    return upright(profile)
 
 
-def upright(outline: list[tuple[float, float]]) -> trimesh.Trimesh:
-    """What an outline (radius, height) [m] sweeps about the vertical, above the middle of the floor."""
-    mesh = trimesh.creation.revolve(np.array(outline), sections=64)
+def upright(profile: list[tuple[float, float]]) -> trimesh.Trimesh:
+    """Solid of revolution of a profile (radius, height) [m] about the vertical, above the middle of the floor."""
+    mesh = trimesh.creation.revolve(np.array(profile), sections=64)
     mesh.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
     mesh.apply_translation([0.5, 0.4, 0.5])
     return mesh
@@ -69,7 +70,7 @@ def solid(name: str) -> Callable[[], trimesh.Trimesh]:
 
 
 CHOSEN_ON = {"bowl": bowl, "cat": solid("cat")}
-"""What the settings of the search were chosen on."""
+"""Shapes on which the settings of the search were chosen."""
 SHAPES = {**CHOSEN_ON, "pot": pot, **{name: solid(name) for name in ("duck", "fish", "pawn")}}
 
 
@@ -105,22 +106,23 @@ def compare(
     )
     for dents in (False, True):
         began = time.process_time()
-        found = splat_surface(gaussians, cameras, settings, dents=dents)
+        surface = splat_surface(gaussians, cameras, settings, dents=dents)
         used = time.process_time() - began
-        said = f"{1e3 * found.volume:.3f} l"
+        result = f"{1e3 * surface.volume:.3f} l"
         if truth is not None:
-            gaps = 1e3 * between(found, truth)
+            gaps = 1e3 * between(surface, truth)
             far = np.quantile(gaps, 0.95)
-            said = f"{found.volume / truth.volume:.2f} of the true one, {gaps.mean():.1f} mm, 95 % below {far:.1f} mm"
-        bodies = len(found.split(only_watertight=False))
+            share = surface.volume / truth.volume
+            result = f"{share:.2f} of the true one, {gaps.mean():.1f} mm, 95 % below {far:.1f} mm"
+        bodies = len(surface.split(only_watertight=False))
         print(
-            f"{name}, {'with depth' if dents else 'outlines alone'}: volume {said}; closed: {found.is_watertight}, "
-            f"bodies: {bodies}, {used:.1f} core s"
+            f"{name}, {'with depth' if dents else 'silhouettes alone'}: volume {result}; "
+            f"closed: {surface.is_watertight}, bodies: {bodies}, {used:.1f} core s"
         )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--shapes", nargs="+", choices=SHAPES, default=[*SHAPES])
     parser.add_argument("--discs", type=int, default=6000)
     parser.add_argument("--gaussians", nargs="+", help="files of Gaussians to take in place of shapes")

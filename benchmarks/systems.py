@@ -11,13 +11,13 @@ the folder of --fields. Only the comparison reads the truth. Tune settings on sc
 
 from __future__ import annotations
 
-import resource
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import torch
 
 from benchmarks.project_scenes import chosen_scenes, scene_parser, simulation, simulator
+from benchmarks.timing import core_seconds
 from neuma_lib.evaluation.metrics import tracer_errors
 from neuma_lib.io.checkpoint import Checkpoint
 from neuma_lib.io.hdf5 import read_arrays
@@ -60,9 +60,9 @@ def measure(name: str, settings: Config, method: str, fields: Path) -> str:
     problem = Problem(simulation(settings, scene), case.densities, exposure, settings.seed)
     with TemporaryDirectory() as folder:
         run = Run(Path(folder), case.method.product)
-        before = _core_seconds()
+        before = core_seconds()
         case.method.fit(files, case.method.fit_options(case), problem, run)
-        seconds = _core_seconds() - before
+        seconds = core_seconds() - before
         own = {case.product(): str(run.product)}
         inputs = {key: own.get(path, path) for key, path in case.method.model_inputs(case).items()}
         model = case.method.load(inputs, case.method.model_options(case), scene.dt)
@@ -95,11 +95,6 @@ def _field(file: str, name: str, settings: Config, fields: Path | None) -> str:
         views = load_views(Path(settings.data_root) / name / "static/transforms.json")
         save_field(path, fit_radiance_field(*views, settings.radiance, settings.seed)[0], {})
     return str(path)
-
-
-def _core_seconds() -> float:
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    return used.ru_utime + used.ru_stime
 
 
 def main() -> None:

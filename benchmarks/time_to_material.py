@@ -1,11 +1,10 @@
-"""Seconds from images to a law: where they go, from the files of a reconstructed scene to constants and a correction.
+"""Seconds from images to a law by part: from the files of a reconstructed scene to constants and a correction.
 
     python -m benchmarks.time_to_material BouncyBall --settings config/config.yaml config/paper.yaml
 
-Dataset and reconstruction must exist (`snakemake results/SCENE/velocity.json`). Everything is done several times over
-in one process: the first time includes what a process does once (CUDA's start, loading compiled kernels). Parts are
-exclusive of each other, and the device is waited for at their ends. On a CPU its seconds are core seconds, which other
-work beside it does not change.
+Dataset and reconstruction must exist (`snakemake results/SCENE/velocity.json`). Everything is repeated in one
+process: the first time includes work that a process does once (start of CUDA, loading of compiled kernels). Parts
+exclude each other and end when the device is idle. On a CPU they are core seconds, which hardly depend on other load.
 """
 
 from __future__ import annotations
@@ -20,9 +19,15 @@ from typing import Any
 
 import torch
 
-from benchmarks.project_scenes import chosen_scenes, scene_parser, simulator
+from benchmarks.project_scenes import (
+    chosen_scenes,
+    prior_of,
+    read_body,
+    refined_bodies,
+    scene_parser,
+    simulator,
+)
 from benchmarks.timing import device_name, synchronize
-from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.device import choose_device
 from neuma_lib.fitting import identify as identification
 from neuma_lib.fitting import structured_fit
@@ -30,11 +35,8 @@ from neuma_lib.fitting.identify import identify
 from neuma_lib.fitting.material import PixelLoss
 from neuma_lib.fitting.structured_fit import rival_bases, train_structured
 from neuma_lib.fitting.thrown_video import VideoResiduals
-from neuma_lib.geometry.volume import sample_volume
-from neuma_lib.io.files import read_json, write_json
+from neuma_lib.io.files import write_json
 from neuma_lib.io.images import load_videos
-from neuma_lib.io.mesh import read_mesh
-from neuma_lib.io.particles import load_reconstruction
 from neuma_lib.mechanics.structured import structured_law
 from neuma_lib.project import cases
 from neuma_lib.project.settings import Config
@@ -48,7 +50,7 @@ IDENTIFYING = {
 }
 CORRECTING = {
     "training": (structured_fit, "train_material"),
-    "judging": (structured_fit, "_simulated"),
+    "scoring": (structured_fit, "_simulated"),
 }
 
 
@@ -100,37 +102,21 @@ class Clock:
 def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
     """One scene, from its files to a structured law: plain numbers."""
     clock, scene, chosen = Clock(device), settings.scene(name), settings.identify
-    data, results = Path(settings.data_root) / name, Path(settings.results_root) / name
     model, dt = simulator(settings, scene), scene.dt
-    binding, exposure = settings.binding, {"dt": dt, "exposure_samples": settings.dataset.exposure_samples}
+    exposure = {"dt": dt, "exposure_samples": settings.dataset.exposure_samples}
     with clock.part("reading body"):
-        files = (results / file for file in ("particles.h5", "binding.h5", "gaussians.ply"))
-        body = load_reconstruction(*files, scene.density, gaussian_motion=chosen.gaussian_motion).to(
-            torch.float32, device
-        )
-        throw = InitialMotion.of(read_json(results / "velocity.json"))
+        body, motion = read_body(name, settings, chosen, device)
+    transforms = Path(settings.data_root) / name / "dynamic/transforms.json"
     with clock.part("reading images"):
         videos = [
-            video.to(torch.float32, device)
-            for video in load_videos(data / "dynamic/transforms.json", chosen.views, **exposure)
+            video.to(torch.float32, device) for video in load_videos(transforms, chosen.views, **exposure)
         ]
-    with clock.part("finer bodies"):
-        mesh = read_mesh(results / "mesh.ply")
-        finer = [
-            body.resampled(
-                torch.from_numpy(sample_volume(mesh, chosen.refined_particles, seed)),
-                mesh.volume,
-                scene.density,
-                binding,
-            )
-            for seed in range(1, 1 + (chosen.resamplings if chosen.refined_particles else 0))
-        ]
-    stock = settings.priors.laws.get(scene.prior)
+    with clock.part("refined bodies"):
+        refined = refined_bodies(name, settings, chosen, body)
+    prior = prior_of(settings, scene)
     with clock.parts(IDENTIFYING), clock.part("identifying, the rest"):
-        found = identify(
-            model, throw, body, videos, chosen, stock.plain() if stock else None, refined=[finer]
-        )
-    plain = found.as_dict()
+        identified = identify(model, motion, body, videos, chosen, prior, refined=[refined])
+    plain = identified.as_dict()
     options = cases.case(settings, name, METHOD).options
     with clock.part("preparing the correction"):
         bases = [plain["law"], *rival_bases(plain, options.rivals)]
@@ -139,7 +125,7 @@ def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
         ]
         for law in laws:
             law.attach_adaptor(options.rank, options.alpha, options.seed)
-        start = found.best.motions[0].of_body(body)
+        start = identified.best.motions[0].of_body(body)
         total = options.covariance_from == "total"
         loss = PixelLoss(body, videos, options.covariance_gradient, total=total, compare=options.compare)
     quiet = {"log": lambda text: None}
@@ -153,9 +139,9 @@ def run(name: str, settings: Config, device: torch.device) -> dict[str, Any]:
         "identifying": sum(parts[part]["seconds"] for part in (*IDENTIFYING, "identifying, the rest")),
         "correcting": sum(parts[part]["seconds"] for part in (*CORRECTING, "correcting, the rest")),
         "all": sum(part["seconds"] for part in parts.values()),
-        "rollouts": found.rollouts,
-        "rollouts of families": {family: fit.rollouts for family, fit in found.fits.items()},
-        "found": found.summary(),
+        "rollouts": identified.rollouts,
+        "rollouts of families": {family: fit.rollouts for family, fit in identified.fits.items()},
+        "found": identified.summary(),
         "correction": choice.summary(),
         "loss": trained.best_loss,
     }

@@ -1,15 +1,30 @@
-"""Time and memory of work on a device, and what the device could do at best."""
+"""Time and memory of work on a device, the limits of the device, and the parser of a benchmark's arguments."""
 
 from __future__ import annotations
 
+import argparse
+import resource
 import time
 from collections.abc import Callable
 
 import torch
 
 
+def parser_of(description: str) -> argparse.ArgumentParser:
+    """A parser that prints the docstring of a benchmark without new line breaks."""
+    return argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+
+
+def core_seconds() -> float:
+    """Processor time [s] that this process has used."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
 def synchronize(device: torch.device) -> None:
-    """Wait for all work handed out so far."""
+    """Wait for all queued work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
@@ -20,7 +35,7 @@ def seconds(
     repetitions: int = 5,
     clock: Callable[[], float] = time.perf_counter,
 ) -> float:
-    """Time of the fastest of some repetitions, after one that does not count (compilation, memory).
+    """Time of the fastest of some repetitions, after one that is not counted (compilation, memory).
 
     Other load only adds time, so the best is the least disturbed. Wall time, or core seconds by `time.process_time`.
     """
@@ -49,7 +64,7 @@ def seconds_a_call(work: Callable[[], object], device: torch.device, calls: int 
 
 
 def peak_memory(work: Callable[[], object], device: torch.device) -> float:
-    """Largest memory that torch held on a GPU during the work [bytes]; NaN on a CPU, where nobody counts."""
+    """Largest memory that torch held on a GPU during the work [bytes]; NaN on a CPU, where it is not counted."""
     if device.type == "cpu":
         work()
         return float("nan")
@@ -74,7 +89,7 @@ def arithmetic(device: torch.device) -> float:
 
 
 def device_name(device: torch.device) -> str:
-    """What a reader has to know of the machine."""
+    """Name of a device for tables."""
     if device.type == "cuda":
         return f"one {torch.cuda.get_device_name(device)}"
     return f"CPU, {torch.get_num_threads()} thread(s)"

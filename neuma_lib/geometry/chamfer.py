@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,34 +14,17 @@ CHAMFER_SCALE = 1e4
 """Factor of squared metres in the paper's unit."""
 
 
-def _points(points: Tensor | np.ndarray, name: str) -> np.ndarray:
-    array = points.detach().cpu().numpy() if isinstance(points, Tensor) else np.asarray(points)
-    if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0:
-        raise InputError(f"chamfer: {name}", f"has shape {array.shape}, expected a non-empty (n, 3)")
-    if not np.isfinite(array).all():
-        raise InputError(f"chamfer: {name}", "has values that are not finite")
-    return array
-
-
-def chamfer(a: Tensor | np.ndarray, b: Tensor | np.ndarray) -> float:
-    """Chamfer distance of points a (n, 3) and b (m, 3) [m], in 1e-4 m^2.
-
-    Raises:
-        InputError: an empty set, a wrong shape, or values that are not finite.
-    """
-    a, b = _points(a, "a"), _points(b, "b")
-    return float(chamfer_sequence(torch.from_numpy(a)[None], torch.from_numpy(b)[None]))
-
-
 def chamfer_sequence(a: Tensor, b: Tensor) -> Tensor:
     """Chamfer distance of each frame: a (T, n, 3) and b (T, m, 3) [m] -> (T,) in 1e-4 m^2, float64, on the CPU.
 
     Raises:
-        InputError: different numbers of frames, or values that are not finite.
+        InputError: different numbers of frames, no points, or values that are not finite.
     """
     if len(a) != len(b):
         raise InputError("chamfer", f"a has {len(a)} frames, b has {len(b)}")
     for points, name in ((a, "a"), (b, "b")):
+        if points.numel() == 0:
+            raise InputError(f"chamfer: {name}", "has no points")
         if not bool(points.isfinite().all()):
             raise InputError(f"chamfer: {name}", "has values that are not finite")
     with torch.no_grad():

@@ -103,8 +103,8 @@ def reconstruct(
         inside = np.flatnonzero(field.ravel() > -grid.spacing)
         behind = REACH * grid.spacing * settings.resolution
         points = np.stack(np.unravel_index(inside, field.shape), axis=1) * grid.spacing + grid.origin
-        shown = fused_distance(torch.from_numpy(points), depths, cameras, behind)
-        field.ravel()[inside] = np.minimum(field.ravel()[inside], shown.numpy())
+        fused = fused_distance(torch.from_numpy(points), depths, cameras, behind)
+        field.ravel()[inside] = np.minimum(field.ravel()[inside], fused.numpy())
 
     mesh = _polygonise(_one_solid_body(field), grid)
     if settings.smoothing:

@@ -22,7 +22,7 @@ start_warp()
 Array = NDArray[np.float64]
 
 _ATTEMPTS = 12
-"""Maximum number of samplings to reach the requested count."""
+"""Maximum number of draws to reach the requested count."""
 _COUNT_TOLERANCE = 0.01
 """Relative error of the count at which the attempts stop; the guaranteed error is 5 %."""
 _CELLS_PER_POINT = 4

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from neuma_lib.device import launch, native_source, start_warp
 from neuma_lib.mechanics import elasticity, plasticity
-from neuma_lib.mechanics.isotropic import lame
+from neuma_lib.mechanics.catalogue import lame
 from neuma_lib.mechanics.law import Constitutive, Elasticity, Law, Weights
 from neuma_lib.mechanics.singular_values_kernels import LOAD, SVD, pack_count, snippet, warp_types
 

@@ -206,14 +206,18 @@ def check_constants(
     return numbers
 
 
+def lame(E, nu):
+    """Lamé parameters mu, lam [Pa] of Young's modulus E [Pa] and Poisson's ratio nu, numbers or tensors."""
+    return E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
+
+
 def longitudinal_modulus(elasticity: Mapping[str, Any]) -> float:
     """Largest eigenvalue of the acoustic tensor of a checked elasticity at F = I [Pa], as `Law.longitudinal_modulus`.
 
     Isotropic laws: lam + 2 mu, or lam of a fluid. Fibres along a with modulus H add H (a . n)^2 a (x) a to the acoustic
     tensor of the direction n; the same 26 directions are evaluated.
     """
-    E, nu = elasticity["E"], elasticity["nu"]
-    mu, lam = E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
+    mu, lam = lame(elasticity["E"], elasticity["nu"])
     if elasticity["name"] == "fluid":
         return max(lam, 0.0)
     if "fibre_modulus" not in elasticity:

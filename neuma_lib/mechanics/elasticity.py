@@ -14,8 +14,8 @@ import math
 import torch
 from torch import Tensor
 
-from neuma_lib.mechanics.catalogue import ELASTICITY, MODULI
-from neuma_lib.mechanics.isotropic import Constants, isotropic_stress, lame
+from neuma_lib.mechanics.catalogue import ELASTICITY, MODULI, lame
+from neuma_lib.mechanics.isotropic import Constants, isotropic_stress
 from neuma_lib.mechanics.law import Elasticity, Weights
 
 STRETCH_MIN = 0.05

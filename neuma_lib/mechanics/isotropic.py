@@ -170,8 +170,3 @@ class Constants(nn.Module):
     def with_weights(self, weights: tuple[Tensor, ...]) -> dict[str, float | Tensor]:
         """All constants, with the given weights in place of the fitted ones."""
         return {**self.values, **dict(zip(self._fitted(), weights, strict=True))}
-
-
-def lame(E: float | Tensor, nu: float | Tensor) -> tuple[float | Tensor, float | Tensor]:
-    """Lamé parameters mu, lam [Pa] of Young's modulus E [Pa] and Poisson's ratio nu."""
-    return E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))

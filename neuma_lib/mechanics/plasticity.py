@@ -15,9 +15,9 @@ import math
 import torch
 from torch import Tensor
 
-from neuma_lib.mechanics.catalogue import PLASTICITY
+from neuma_lib.mechanics.catalogue import PLASTICITY, lame
 from neuma_lib.mechanics.elasticity import STRETCH_MIN
-from neuma_lib.mechanics.isotropic import Constants, isotropic_deformation, lame
+from neuma_lib.mechanics.isotropic import Constants, isotropic_deformation
 from neuma_lib.mechanics.law import Plasticity, Weights
 
 

@@ -26,11 +26,11 @@ def outermost(means: Tensor, covars: Tensor, opacities: Tensor) -> Tensor:
         covars: (G, 3, 3) [m^2].
         opacities: (G,) in [0, 1]; those below `SEEN` are ignored. The result is empty if all are.
     """
-    shown = opacities > SEEN
-    means, covars = means[shown].double(), covars[shown].double()
+    visible = opacities > SEEN
+    means, covars = means[visible].double(), covars[visible].double()
     if not len(means):
         return means
-    reach = (2 * (opacities[shown].double() / SEEN).log()).sqrt()
+    reach = (2 * (opacities[visible].double() / SEEN).log()).sqrt()
     axes = torch.from_numpy(np.concatenate([np.eye(3), -np.eye(3), sphere_directions(DIRECTIONS)])).to(means)
     # exclude Gaussians whose bounding ball is inside the extent of the centres
     balls = reach * covars.diagonal(dim1=1, dim2=2).sum(dim=1).sqrt()

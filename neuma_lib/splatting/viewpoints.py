@@ -52,7 +52,7 @@ class Views:
 
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Pose (4, 4) of an upright camera at ``eye`` that looks at ``target`` [m], not straight up or down."""
+    """Pose (4, 4) of an upright camera at ``eye`` that faces ``target`` [m], not straight up or down."""
     back = np.asarray(eye, dtype=np.float64) - target
     back /= np.linalg.norm(back)
     right = np.cross([0.0, 1.0, 0.0], back)

@@ -20,6 +20,9 @@ from tests.support.render_scenes import dense
 
 pytestmark = pytest.mark.core
 
+UNIT_BALL = torch.zeros(1, 3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)[None]
+"""Mean and covariance of one Gaussian."""
+
 
 def algorithm_1(means, covars, particles, confidence=0.95, max_neighbours=None):
     """The paper's double loop, one row at a time, with the released code's limit on the neighbours."""
@@ -51,29 +54,21 @@ def test_needles_far_longer_than_the_particle_spacing_are_exact():
     means, covars = random_gaussians(40, seed=3, size=0.02)
     covars = covars * 0 + torch.diag(torch.tensor([0.25, 2e-3, 1e-3], dtype=torch.float64)) ** 2
     particles = random_particles(4000, seed=4)
-    torch.testing.assert_close(
-        dense(bind(means, covars, particles)), algorithm_1(means, covars, particles, max_neighbours=10)
-    )
+    expected = algorithm_1(means, covars, particles, max_neighbours=10)
+    torch.testing.assert_close(dense(bind(means, covars, particles)), expected)
 
 
 def test_confidence_widens_the_ellipsoid():
     means, covars = random_gaussians(80, seed=5)
     particles = random_particles(500, seed=6)
     for confidence in (0.5, 0.99):
-        torch.testing.assert_close(
-            dense(bind(means, covars, particles, BindingConfig(confidence=confidence, max_neighbours=None))),
-            algorithm_1(means, covars, particles, confidence),
-        )
+        sparse = bind(means, covars, particles, BindingConfig(confidence=confidence, max_neighbours=None))
+        torch.testing.assert_close(dense(sparse), algorithm_1(means, covars, particles, confidence))
 
 
 def test_ties_go_to_the_smaller_index():
     particles = torch.tensor([[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0], [0, 0, 1.0]], dtype=torch.float64)
-    binding = bind(
-        torch.zeros(1, 3, dtype=torch.float64),
-        torch.eye(3, dtype=torch.float64)[None],
-        particles,
-        BindingConfig(max_neighbours=2),
-    )
+    binding = bind(*UNIT_BALL, particles, BindingConfig(max_neighbours=2))
     assert binding.indices.tolist() == [0, 1]
 
 
@@ -108,8 +103,8 @@ def test_two_passes_leave_no_gaussian_empty_and_rows_sum_to_one(equal_mass):
     assert binding.shape == (300, 500 + added) and enlarged.shape == (500 + added, 3)
     torch.testing.assert_close(enlarged[500:], means[first.counts == 0])
     assert (binding.counts > 0).all()
-    anew = bind(means, covars, enlarged)
-    assert torch.equal(binding.indptr, anew.indptr) and torch.equal(binding.indices, anew.indices)
+    single = bind(means, covars, enlarged)
+    assert torch.equal(binding.indptr, single.indptr) and torch.equal(binding.indices, single.indices)
     torch.testing.assert_close(dense(binding).sum(1), torch.ones(300, dtype=torch.float64))
     torch.testing.assert_close(dense(binding), algorithm_1(means, covars, enlarged, max_neighbours=10))
     assert (volumes > 0).all()
@@ -119,7 +114,7 @@ def test_two_passes_leave_no_gaussian_empty_and_rows_sum_to_one(equal_mass):
 @pytest.mark.parametrize("outside", [0.0, 0.15])
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-13), (torch.float32, 3e-7)])
 def test_added_particles_keep_mass_and_centre_of_mass(dtype, tolerance, outside):
-    """Also with Gaussians outside the body, as they are at a fitted surface, and with uneven volumes."""
+    """Also with Gaussians outside the body, as at a fitted surface, and with uneven volumes."""
     means, covars = random_gaussians(1500, seed=9, size=0.006, spread=1 + 2 * outside, dtype=dtype)
     means = means - outside
     particles = random_particles(2000, seed=10, dtype=dtype)
@@ -172,7 +167,7 @@ def test_same_input_gives_the_same_bytes():
 
 
 def splat_of_a_ball(count, seed=20):
-    """Discs and needles of a splat on a sphere: in its surface, up to hundreds of times as long as they are thick."""
+    """Discs and needles of a splat on a sphere: in its surface, with lengths up to hundreds of times the thickness."""
     generator = torch.Generator().manual_seed(seed)
     normal = torch.nn.functional.normalize(
         torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=1
@@ -197,16 +192,16 @@ def test_the_flat_gaussians_of_a_splat_are_bound_as_the_dense_algorithm_binds_th
     torch.testing.assert_close(dense(binding), expected, rtol=1e-14, atol=0)
 
 
-def test_the_search_looks_only_at_particles_near_each_gaussian():
-    """Particles in the boxes of the ellipsoids, widened to whole cells; a search by distance alone looks at more."""
+def test_the_search_tests_only_particles_near_each_gaussian():
+    """Particles in the boxes of the ellipsoids, enlarged to whole cells; a search by distance alone tests more."""
     means, covars = splat_of_a_ball(20000)
     binding = bind(means, covars, means, BindingConfig(max_neighbours=None))
     ellipsoids = _Ellipsoids.of(means, covars, BindingConfig())
     all_inside = ellipsoids._replace(whitening=torch.zeros_like(covars))
-    looked = int(all_inside.counts(_Columns.of(means), None).sum())
+    tested = int(all_inside.counts(_Columns.of(means), None).sum())
     reach = (chi2.ppf(0.95, 3) * torch.linalg.eigvalsh(covars)[:, 2]).sqrt()
     within = cKDTree(means.numpy()).query_ball_point(means.numpy(), reach.numpy(), return_length=True).sum()
-    assert len(binding.indices) < looked < 0.5 * within
+    assert len(binding.indices) < tested < 0.5 * within
 
 
 @pytest.mark.parametrize(
@@ -236,5 +231,5 @@ def test_threshold_is_the_papers():
     """chi2 with three degrees of freedom at 95 %: 7.815."""
     edge = np.sqrt(7.8147)
     particles = torch.tensor([[edge - 1e-3, 0, 0], [edge + 1e-3, 0, 0]], dtype=torch.float64)
-    binding = bind(torch.zeros(1, 3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)[None], particles)
+    binding = bind(*UNIT_BALL, particles)
     assert binding.indices.tolist() == [0]

@@ -1,4 +1,4 @@
-"""Cameras, colours, and what the Blender process makes of them."""
+"""Cameras, colours, and the images of the Blender process."""
 
 import importlib.util
 import json
@@ -13,12 +13,7 @@ from neuma_lib.config.blender import AppearanceConfig
 from neuma_lib.data.blender.appearance import colors_at, smooth_noise
 from neuma_lib.data.blender.bodies import make_body
 from neuma_lib.data.blender.libraries import explain_import_error
-from neuma_lib.data.blender.scene import (
-    Surface,
-    render_dynamic,
-    render_images,
-    render_static,
-)
+from neuma_lib.data.blender.scene import Surface, render_dynamic, render_static
 from neuma_lib.geometry import shapes
 from neuma_lib.io.gltf import linear
 from neuma_lib.io.images import read_image_set
@@ -47,10 +42,8 @@ def test_training_view_is_frontal():
     views = cameras.video_views(points, 3, 96, 96)
     np.testing.assert_allclose(views.c2w[0, :3, :3], np.eye(3), atol=1e-12)
     assert views.c2w[0, 2, 3] > 1.0
-    right, up = (
-        views.project(np.array([[0.5, 0.5, 0.5], [0.6, 0.5, 0.5], [0.5, 0.6, 0.5]]))[0, 1:]
-        - views.project(np.array([[0.5, 0.5, 0.5]]))[0]
-    )
+    middle, *ends = views.project(np.array([[0.5, 0.5, 0.5], [0.6, 0.5, 0.5], [0.5, 0.6, 0.5]]))[0]
+    right, up = ends - middle
     assert right[0] > 0 and abs(right[1]) < 1e-9
     assert up[1] < 0 and abs(up[0]) < 1e-9
 
@@ -99,16 +92,10 @@ def test_colors_name_what_is_wrong():
 
 def test_parts_have_their_colours():
     mesh = shapes.build("pawn", 0.4, 48)
-    colors = colors_at(
-        mesh, mesh.vertices, AppearanceConfig(colors={"body": "#0000ff", "foot": "#ff0000"}, contrast=0.0)
-    )
-    y = mesh.vertices[:, 1]
-    np.testing.assert_allclose(
-        colors[y > y.max() - 0.05], np.broadcast_to([0, 0, 1.0], (sum(y > y.max() - 0.05), 3))
-    )
-    np.testing.assert_allclose(
-        colors[y < y.min() + 0.02], np.broadcast_to([1.0, 0, 0], (sum(y < y.min() + 0.02), 3))
-    )
+    look = AppearanceConfig(colors={"body": "#0000ff", "foot": "#ff0000"}, contrast=0.0)
+    colors, y = colors_at(mesh, mesh.vertices, look), mesh.vertices[:, 1]
+    for part, color in ((y > y.max() - 0.05, [0, 0, 1.0]), (y < y.min() + 0.02, [1.0, 0, 0])):
+        np.testing.assert_allclose(colors[part], np.broadcast_to(color, (sum(part), 3)))
 
 
 def test_srgb_decodes_to_linear_light():
@@ -118,23 +105,27 @@ def test_srgb_decodes_to_linear_light():
 # ------------------------------------------------------------------------------------------- bodies
 
 
+def filling(mesh, count: int, seed: int) -> np.ndarray:
+    """Those of random points in the bounds that lie inside a mesh."""
+    points = np.random.default_rng(seed).uniform(*mesh.bounds, (count, 3))
+    return points[shapes.depth(mesh, points) > 0]
+
+
 @pytest.mark.parametrize("shape, size", [("fish", 0.4), ("ball", 0.26)])
-def test_grains_show_the_outlines_of_the_body(shape, size):
+def test_grains_have_the_silhouette_of_the_body(shape, size):
     mesh = shapes.place(shape, size, 0.3, (0.5, 0.5), 48)
-    rng = np.random.default_rng(5)
-    points = rng.uniform(mesh.bounds[0], mesh.bounds[1], (80000, 3))
-    points = points[shapes.depth(mesh, points) > 0][:30000]
+    points = filling(mesh, 80000, seed=5)[:30000]
     look = AppearanceConfig(kind="grains", colors={"body": "#c9a86a"})
     body = make_body(mesh, look, points[None], points[None])
     assert len(body.colors) == body.vertices.shape[1] < len(points)
     covered = [
-        outline(body.vertices[0], axes, body.radius).sum() / outline(mesh.triangles, axes).sum()
+        silhouette(body.vertices[0], axes, body.radius).sum() / silhouette(mesh.triangles, axes).sum()
         for axes in ([0, 1], [1, 2], [0, 2])
     ]
     np.testing.assert_allclose(np.mean(covered), 1.0, atol=0.01)
 
 
-def outline(parts: np.ndarray, axes: list[int], radius: float = 0.0) -> np.ndarray:
+def silhouette(parts: np.ndarray, axes: list[int], radius: float = 0.0) -> np.ndarray:
     """Mask of what balls (N, 3) or triangles (N, 3, 3) in the unit cube cover, seen along the third axis."""
     image = Image.new("1", (1000, 1000))
     draw = ImageDraw.Draw(image)
@@ -151,12 +142,9 @@ def test_liquid_surface_is_closed_and_holds_the_volume():
     import trimesh
 
     mesh = shapes.place("bottle", 0.4, 0.42, (0.5, 0.5), 48)
-    rng = np.random.default_rng(6)
-    points = rng.uniform(mesh.bounds[0], mesh.bounds[1], (30000, 3))
-    points = points[shapes.depth(mesh, points) > 0]
-    body = make_body(
-        mesh, AppearanceConfig(kind="liquid", colors={"body": "#d98f24"}), points[None], points[None]
-    )
+    points = filling(mesh, 30000, seed=6)
+    look = AppearanceConfig(kind="liquid", colors={"body": "#d98f24"})
+    body = make_body(mesh, look, points[None], points[None])
     vertices, faces, colors = body.surfaces[0]
     surface = trimesh.Trimesh(vertices, faces, process=False)
     assert surface.is_watertight and len(colors) == len(vertices)
@@ -252,16 +240,7 @@ def test_same_job_same_bytes_and_moving_mesh(tmp_path):
     done = []
     (tmp_path / "b" / ".render-abandoned").mkdir(parents=True)
     for folder in ("a", "b"):
-        render_dynamic(
-            body,
-            views,
-            [0, 8],
-            1e-3,
-            tmp_path / folder,
-            4,
-            1,
-            lambda k, n: done.append((k, n)),
-        )
+        render_dynamic(body, views, [0, 8], 1e-3, tmp_path / folder, 4, 1, lambda *count: done.append(count))
     assert done == [(k, 4) for k in (1, 2, 3, 4)] * 2
     names = sorted(p.name for p in (tmp_path / "a").iterdir())
     assert names == ["d_0_0000.png", "d_0_0008.png", "d_1_0000.png", "d_1_0008.png", "transforms.json"]
@@ -309,17 +288,7 @@ def test_colours_on_the_image_are_those_of_the_surface(tmp_path):
     mesh = shapes.place("ball", 0.26, 0.3, (0.5, 0.5), 48)
     gray = np.full((len(mesh.vertices), 3), 0.6)
     body = Surface(mesh.vertices[None], mesh.faces, gray)
-    render_images(
-        body,
-        cameras.static_views(body.points, 6, 48, 48),
-        [(0, k) for k in range(6)],
-        tmp_path,
-        [f"{k}.png" for k in range(6)],
-        8,
-    )
-    import imageio.v3 as imageio
-
-    inside = np.concatenate(
-        [(p := imageio.imread(tmp_path / f"{k}.png") / 255.0)[p[..., 3] == 1.0] for k in range(6)]
-    )
+    render_static(body, cameras.static_views(body.points, 6, 48, 48), tmp_path, 8)
+    pictures = read_image_set(tmp_path / "transforms.json").images / 255.0
+    inside = pictures[pictures[..., 3] == 1.0]
     assert np.abs(inside[:, :3] - 0.6).max() < 0.12

@@ -13,8 +13,8 @@ import torch
 from neuma_lib.evaluation.material_point import returned
 from neuma_lib.evaluation.stress import PARTS, VisitedStates, stress_errors, visit
 from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.catalogue import lame
 from neuma_lib.mechanics.elasticity import Hencky
-from neuma_lib.mechanics.isotropic import lame
 from neuma_lib.mechanics.law import Law, Plasticity
 from neuma_lib.paper.claims import Bound
 from neuma_lib.paper.published import OUTSIDE, PAPER, PaperTable

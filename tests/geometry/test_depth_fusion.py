@@ -24,20 +24,20 @@ def test_distances_to_a_plane_are_cut_at_the_reach_and_end_behind_it():
     heights = [0.5, 0.04, 0.0, -0.06, -0.2]
     points = torch.tensor([[0.05, -0.1, z] for z in heights], dtype=torch.float64)
     depth = torch.ones(64, 64, dtype=torch.float64)
-    found = fused_distance(points, [depth], list(seen), 0.1)
-    torch.testing.assert_close(found, torch.tensor([-0.1, -0.04, 0.0, 0.06, 0.1], dtype=torch.float64))
+    actual = fused_distance(points, [depth], list(seen), 0.1)
+    torch.testing.assert_close(actual, torch.tensor([-0.1, -0.04, 0.0, 0.06, 0.1], dtype=torch.float64))
     nothing = fused_distance(points, [torch.full_like(depth, torch.nan)], list(seen), 0.1)
-    assert (nothing == 0.1).all(), "no view says anything"
+    assert (nothing == 0.1).all(), "no view has information"
 
 
-def test_views_are_averaged_and_those_that_look_from_behind_a_body_say_nothing():
-    """A sheet of 0.5 m, seen from both sides: each side is told by the view that sees it, the less the deeper."""
+def test_views_are_averaged_without_those_from_behind_a_body():
+    """A sheet of 0.5 m, seen from both sides: the view of a side determines it, with less weight at depth."""
     seen = cameras((0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (0.0, 0.0, 1.0))
     front, back = (torch.full((64, 64), d, dtype=torch.float64) for d in (0.75, 0.75))
     points = torch.tensor([[0.0, 0.0, 0.22], [0.0, 0.0, -0.22], [9.0, 0.0, 0.0]], dtype=torch.float64)
-    found = fused_distance(points, [front, back, front - 0.02], list(seen), 0.1)
+    actual = fused_distance(points, [front, back, front - 0.02], list(seen), 0.1)
     mean = (0.7 * 0.03 + 0.5 * 0.05) / (0.7 + 0.5)
-    torch.testing.assert_close(found, torch.tensor([mean, 0.03, 0.1], dtype=torch.float64))
+    torch.testing.assert_close(actual, torch.tensor([mean, 0.03, 0.1], dtype=torch.float64))
 
 
 def test_the_other_side_of_a_thin_wall_hardly_moves_a_surface():

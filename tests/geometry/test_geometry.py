@@ -1,4 +1,4 @@
-"""Surface from silhouettes, points in volumes: overlap with the truth, counts, evenness, bad input."""
+"""Surface from silhouettes, points in volumes: overlap with the truth, counts, evenness, invalid input."""
 
 from __future__ import annotations
 
@@ -31,12 +31,17 @@ def bodies():
     return {name: shapes.build(name, 0.35, resolution=40) for name in SIX}
 
 
+def views_of(mesh, **options):
+    """Cameras around a mesh, and their mattes of it."""
+    cameras = cameras_around(mesh, **options)
+    return cameras, mattes(mesh, cameras)
+
+
 @pytest.mark.parametrize("name", SIX)
 def test_surface_of_six_bodies(bodies, name):
     """50 views of 128 px with the noise of 16 samples a pixel: watertight, one body, volume IoU at least 0.93."""
     truth = bodies[name]
-    cameras = cameras_around(truth)
-    images = mattes(truth, cameras)
+    cameras, images = views_of(truth)
     covered = images[..., 3].numpy()
     images[..., 3] = torch.as_tensor(np.random.default_rng(0).binomial(16, covered) / 16)
     mesh = reconstruct(some_gaussians(truth), cameras, images, SurfaceConfig(resolution=64))
@@ -47,8 +52,7 @@ def test_surface_of_six_bodies(bodies, name):
 def test_surface_of_a_sphere_is_finer_than_pixels():
     """The radius is found to a tenth of a pixel (here 4 mm)."""
     truth = trimesh.creation.icosphere(4, 0.15)
-    cameras = cameras_around(truth, fill=0.6)
-    images = mattes(truth, cameras)
+    cameras, images = views_of(truth, fill=0.6)
     mesh = reconstruct(some_gaussians(truth), cameras, images, SurfaceConfig(resolution=48, smoothing=0))
     pixel = float(0.3 / images[0, ..., 3].sum(1).max())
     radii = np.linalg.norm(mesh.vertices, axis=1)
@@ -56,11 +60,10 @@ def test_surface_of_a_sphere_is_finer_than_pixels():
     assert radii.std() < 0.1 * pixel
 
 
-def test_surface_depends_on_the_gaussians_only_for_where_to_look(bodies):
+def test_surface_depends_on_the_gaussians_only_for_the_search(bodies):
     """Floaters outside, or Gaussians on one side of the body only, leave its shape alone."""
     truth = bodies["duck"]
-    cameras = cameras_around(truth, views=20, size=64)
-    images = mattes(truth, cameras)
+    cameras, images = views_of(truth, views=20, size=64)
     plain = reconstruct(some_gaussians(truth), cameras, images, SURFACE)
     floaters = reconstruct(some_gaussians(truth, outliers=3), cameras, images, SURFACE)
     everything = some_gaussians(truth)
@@ -71,8 +74,7 @@ def test_surface_depends_on_the_gaussians_only_for_where_to_look(bodies):
 
 def test_smoothing_does_not_shrink(bodies):
     truth = bodies["fish"]
-    cameras = cameras_around(truth, views=20, size=64)
-    images = mattes(truth, cameras)
+    cameras, images = views_of(truth, views=20, size=64)
     rough, smooth = (
         reconstruct(some_gaussians(truth), cameras, images, SurfaceConfig(smoothing=n)) for n in (0, 20)
     )
@@ -83,21 +85,21 @@ def test_smoothing_does_not_shrink(bodies):
 def test_nothing_beyond_the_frame_is_in_the_hull():
     """A body that nearly fills small images, a coarse grid: the edge of the frame is near its outline everywhere."""
     ball = trimesh.creation.icosphere(3, 0.13)
-    cameras = cameras_around(ball, views=12, size=40, fill=0.98)
-    hull = visual_hull(mattes(ball, cameras)[..., 3], cameras, 24)
+    cameras, images = views_of(ball, views=12, size=40, fill=0.98)
+    hull = visual_hull(images[..., 3], cameras, 24)
     centres = hull.origin + (hull.occupied.nonzero() + 0.5) * hull.voxel
     # twelve cones touch the ball; between them the hull bulges out by less than 1 / cos(38 degrees)
     assert float(centres.norm(dim=1).max()) < 0.13 / np.cos(np.radians(38)) + hull.voxel
 
 
-def test_what_some_frames_cut_off_is_in_the_hull_as_others_show_it():
+def test_parts_cropped_by_some_frames_are_in_the_hull():
     """A wide hat on a narrow neck: ten of twenty pictures end at the neck, and must not make the hat as narrow."""
     neck = trimesh.creation.cylinder(0.03, 0.2, sections=48)
     hat = trimesh.creation.cylinder(0.1, 0.06, sections=48).apply_translation([0, 0, 0.12])
     truth = trimesh.util.concatenate([neck, hat])
     truth.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
-    cameras = cameras_around(truth, views=20, size=64)
-    whole, cut, views = mattes(truth, cameras)[..., 3], [], []
+    cameras, images = views_of(truth, views=20, size=64)
+    whole, cut, views = images[..., 3], [], []
     for k in range(20):
         first = 0
         camera = cameras[k].to("cpu", torch.float64)
@@ -123,17 +125,15 @@ def test_surface_of_two_parts_keeps_the_larger():
     large = trimesh.creation.icosphere(3, 0.1)
     small = trimesh.creation.icosphere(3, 0.03).apply_translation([0.2, 0, 0])
     both = trimesh.util.concatenate([large, small])
-    cameras = cameras_around(both, views=30, size=64)
-    mesh = reconstruct(some_gaussians(both), cameras, mattes(both, cameras), SURFACE)
+    mesh = reconstruct(some_gaussians(both), *views_of(both, views=30, size=64), SURFACE)
     assert mesh.body_count == 1 and volume_iou(mesh, large, 48) > 0.93
 
 
 def test_same_input_gives_the_same_surface():
     truth = trimesh.creation.box((0.2, 0.1, 0.3))
-    cameras = cameras_around(truth, views=10, size=48)
-    images = mattes(truth, cameras)
+    views = views_of(truth, views=10, size=48)
     first, second = (
-        reconstruct(some_gaussians(truth), cameras, images, SurfaceConfig(resolution=32)) for _ in range(2)
+        reconstruct(some_gaussians(truth), *views, SurfaceConfig(resolution=32)) for _ in range(2)
     )
     assert np.array_equal(first.vertices, second.vertices) and np.array_equal(first.faces, second.faces)
 
@@ -141,16 +141,7 @@ def test_same_input_gives_the_same_surface():
 @pytest.fixture(scope="module")
 def scene():
     truth = trimesh.creation.icosphere(2, 0.1)
-    cameras = cameras_around(truth, views=4, size=32)
-    return some_gaussians(truth), cameras, mattes(truth, cameras)
-
-
-def test_empty_mask_is_named(scene):
-    gaussians, cameras, images = scene
-    images = images.clone()
-    images[2, ..., 3] = 0.0
-    with refused("masks: view 2"):
-        reconstruct(gaussians, cameras, images, SURFACE)
+    return some_gaussians(truth), *views_of(truth, views=4, size=32)
 
 
 def test_poses_of_other_images_are_noticed(scene):
@@ -170,10 +161,11 @@ def test_other_bad_input_of_the_surface_is_named(scene):
         reconstruct(gaussians, cameras, torch.full_like(images, float("nan")), SURFACE)
     with refused("surface: gaussians"):
         reconstruct(gaussians[:0], cameras, images, SURFACE)
-    full = images.clone()
-    full[..., 3] = 1.0
-    with refused("masks: view 0"):
-        reconstruct(gaussians, cameras, full, SURFACE)
+    for view, alpha in ((0, 1.0), (2, 0.0)):
+        changed = images.clone()
+        changed[view, ..., 3] = alpha
+        with refused(f"masks: view {view}"):
+            reconstruct(gaussians, cameras, changed, SURFACE)
 
 
 def test_inside_of_a_torus_is_its_closed_form():
@@ -181,8 +173,8 @@ def test_inside_of_a_torus_is_its_closed_form():
     torus = trimesh.creation.torus(0.2, 0.08, major_sections=96, minor_sections=48)
     points = np.random.default_rng(1).uniform(-0.3, 0.3, (50_000, 3))
     depth = 0.08 - np.hypot(np.hypot(points[:, 0], points[:, 1]) - 0.2, points[:, 2])
-    found = inside(torus, points)
-    assert found[depth > 1e-3].all() and not found[depth < -1e-3].any()
+    actual = inside(torus, points)
+    assert actual[depth > 1e-3].all() and not actual[depth < -1e-3].any()
 
 
 def test_inside_counts_rays_through_edges_and_corners_once():
@@ -190,20 +182,20 @@ def test_inside_counts_rays_through_edges_and_corners_once():
     box = trimesh.creation.box((2, 2, 2)).subdivide()
     ticks = np.array([-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5])
     points = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-    found = inside(box, points)
+    actual = inside(box, points)
     clearly_in, clearly_out = (np.abs(points) < 1).all(axis=1), (np.abs(points) > 1).any(axis=1)
-    assert found[clearly_in].all() and not found[clearly_out].any()
+    assert actual[clearly_in].all() and not actual[clearly_out].any()
 
 
 def test_inside_of_a_letter_spares_its_holes():
-    pytest.importorskip("matplotlib")
     """Beyond a cell of the mesh, membership is the sign of the solid's own distance."""
+    pytest.importorskip("matplotlib")
     letter = shapes.build("letter_B", 0.3, resolution=48)
     assert letter.euler_number == -2  # two holes
     points = np.random.default_rng(2).uniform(*letter.bounds, (20_000, 3))
     depth, cell = shapes.depth(letter, points), 0.4 / 48
-    found = inside(letter, points)
-    assert found[depth > cell].all() and not found[depth < -cell].any()
+    actual = inside(letter, points)
+    assert actual[depth > cell].all() and not actual[depth < -cell].any()
 
 
 def test_inside_of_overlapping_parts_is_their_union():
@@ -213,7 +205,7 @@ def test_inside_of_overlapping_parts_is_their_union():
 
 
 @pytest.mark.parametrize("count", [40, 60_000])
-def test_one_point_decides_for_all_that_no_face_separates(monkeypatch, count):
+def test_one_point_represents_all_that_no_face_separates(monkeypatch, count):
     """Against the winding number of every point: holes, overlaps, large faces, a leaf, an island in a hollow."""
     ball = trimesh.creation.icosphere(3, radius=0.1)
     hole = trimesh.creation.icosphere(3, radius=0.08)
@@ -245,7 +237,7 @@ def test_one_point_decides_for_all_that_no_face_separates(monkeypatch, count):
 
 @pytest.mark.parametrize("method", ["jittered", "uniform"])
 @pytest.mark.parametrize("count", [500, 20_000])
-def test_volume_samples_have_the_wanted_count_and_lie_inside(bodies, method, count):
+def test_volume_samples_have_the_requested_count_and_lie_inside(bodies, method, count):
     for name, mesh in bodies.items():
         points = sample_volume(mesh, count, seed=3, method=method)
         assert abs(len(points) - count) <= 0.05 * count, name
@@ -285,11 +277,11 @@ def test_volume_iou_of_boxes_is_exact():
     a, b = trimesh.creation.box((1, 1, 1)), trimesh.creation.box((1, 1, 1)).apply_translation([0.5, 0, 0])
     assert volume_iou(a, b) == pytest.approx(1 / 3, abs=2e-3)
     assert volume_iou(a, a) == 1.0
-    apart = trimesh.creation.box((1, 1, 1)).apply_translation([3.0, 0, 0])
-    assert volume_iou(a, apart) == 0.0
+    distant = trimesh.creation.box((1, 1, 1)).apply_translation([3.0, 0, 0])
+    assert volume_iou(a, distant) == 0.0
 
 
-def test_meshes_without_an_inside_are_refused():
+def test_open_meshes_are_refused():
     ball = trimesh.creation.icosphere(2, 0.1)
     broken = ball.copy()
     broken.vertices[7] = np.nan

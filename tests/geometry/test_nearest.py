@@ -15,7 +15,7 @@ BOXES = {  # of points: sides and offset
     "same": (7, (0.0, 0.0, 0.0), 0.2),
     "sheet": (900, (1.0, 1.0, 0.01), -1.0),
 }
-REACH = [1.0, 0.3, 100.0, 1.0, 0.01]  # of queries about the origin, inside, beside and far from the points
+REACH = [1.0, 0.3, 100.0, 1.0, 0.01]  # of queries about the origin, inside, next to and far from the points
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -28,9 +28,9 @@ def test_nearest_of_many_sets_against_all_distances(dtype):
     ]
     queries = [torch.randn(20 + k, 3, generator=generator).to(dtype) * reach for k, reach in enumerate(REACH)]
     sizes, counts = [len(points) for points in sets], [len(q) for q in queries]
-    found = nearest(torch.cat(sets), sizes, torch.cat(queries), counts)
+    actual = nearest(torch.cat(sets), sizes, torch.cat(queries), counts)
     first = 0
-    for points, q, rows in zip(sets, queries, found.split(counts), strict=True):
+    for points, q, rows in zip(sets, queries, actual.split(counts), strict=True):
         rows, first = rows - first, first + len(points)
         assert 0 <= int(rows.min()) and int(rows.max()) < len(points)
         least = torch.cdist(q.double(), points.double(), compute_mode="donot_use_mm_for_euclid_dist").amin(1)

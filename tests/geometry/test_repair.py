@@ -1,4 +1,4 @@
-"""Repair of surfaces: whatever comes in, one closed body of even triangles comes out, or a message."""
+"""Repair of surfaces: the result is one closed body of even triangles, or an error."""
 
 import sys
 
@@ -28,7 +28,7 @@ def with_holes(letter):
     return plain(letter.vertices, np.delete(letter.faces, np.r_[100:160, 3000:3004, 5000], axis=0))
 
 
-def beside_others(letter):
+def next_to_others(letter):
     parts = [with_holes(letter), trimesh.creation.icosphere(2, 0.02).apply_translation([1, 1, 1])]
     return trimesh.util.concatenate(parts)
 
@@ -45,7 +45,7 @@ def turned_at_random(letter):
 
 
 def folded(letter):
-    """Pushed in so far that it comes out at the other side."""
+    """Indented beyond the opposite side."""
     vertices = letter.vertices.copy()
     pushed = np.linalg.norm(vertices - vertices[800], axis=1) < 0.03
     vertices[pushed] -= 0.06 * letter.vertex_normals[800]
@@ -53,7 +53,7 @@ def folded(letter):
 
 
 SPOILT = {
-    f.__name__: f for f in (with_holes, beside_others, without_shared_vertices, turned_at_random, folded)
+    f.__name__: f for f in (with_holes, next_to_others, without_shared_vertices, turned_at_random, folded)
 }
 
 
@@ -78,7 +78,7 @@ def test_same_surface_same_body(letter):
     assert np.array_equal(a.vertices, b.vertices) and np.array_equal(a.faces, b.faces)
 
 
-def test_what_has_no_inside_is_named(letter):
+def test_surfaces_without_an_inside_are_refused(letter):
     pytest.importorskip("pymeshlab")
     with refused("surface") as error:
         repaired(plain([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]), 0.1, "surface")

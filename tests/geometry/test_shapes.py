@@ -17,7 +17,7 @@ SOLIDS = (*shapes.NAMES, *(pytest.param(f"letter_{c}", marks=NEEDS_FONT) for c i
 
 
 @pytest.mark.parametrize("name", SOLIDS)
-def test_solid_is_one_closed_body_of_the_wanted_size(name):
+def test_solid_is_one_closed_body_of_the_requested_size(name):
     mesh = shapes.build(name, size=0.3, resolution=48)
     assert mesh.is_watertight and mesh.is_winding_consistent
     assert mesh.body_count == 1
@@ -32,8 +32,8 @@ def test_every_part_shows_on_the_surface(name):
     solid = shapes.shape(name)
     weights = solid.part_weights(shapes.to_nominal(mesh, mesh.vertices)[1], softness=0.005)
     np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=1e-12)
-    shown = dict(zip(solid.part_names, weights.max(axis=0), strict=True))
-    assert min(shown.values()) > 0.5, shown
+    largest = dict(zip(solid.part_names, weights.max(axis=0), strict=True))
+    assert min(largest.values()) > 0.5, largest
 
 
 @pytest.mark.parametrize("name", shapes.NAMES)

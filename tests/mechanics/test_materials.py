@@ -9,20 +9,39 @@ from safetensors.torch import load
 from neuma_lib.errors import InputError
 from neuma_lib.io.laws import load_prior
 from neuma_lib.io.weights import write_weights
-from neuma_lib.mechanics.adaptor import Adaptor
+from neuma_lib.mechanics.adaptor import LAYER_KEYS, Adaptor
 from neuma_lib.mechanics.analytic import analytic_law
+from neuma_lib.mechanics.catalogue import lame
 from neuma_lib.mechanics.elasticity import ELASTICITIES, Hencky, Tait
-from neuma_lib.mechanics.isotropic import lame
 from neuma_lib.mechanics.law import Constitutive, Law
 from neuma_lib.mechanics.neural import CPU_ROWS, SHAPES, neural_law
-from neuma_lib.mechanics.plasticity import DruckerPrager, FluidProjection, ViscousFlow, VonMises
-from tests.support.deformations import EYE, NU, E, deformations, hencky_deviator, rotations, weights_of
+from neuma_lib.mechanics.plasticity import (
+    DruckerPrager,
+    FluidProjection,
+    ViscousFlow,
+    VonMises,
+    hencky_strain,
+)
+from tests.support import structured_laws as structured
+from tests.support.deformations import (
+    EYE,
+    NU,
+    E,
+    assert_adjoint,
+    deformations,
+    hencky_deviator,
+    randomise_adaptor,
+    rotations,
+    steady_shear,
+    stiffness,
+    weights_of,
+)
 from tests.support.errors import refused
 
 pytestmark = pytest.mark.core
 
 MU, LAM = lame(E, NU)
-BESIDE_E_AND_NU = {
+FURTHER_CONSTANTS = {
     "ogden": {"alpha": 6.0},
     "mooney_rivlin": {"q": 0.7},
     "fibre_reinforced": {"fibre_modulus": 2e5, "fibre_exponent": 1.5},
@@ -40,7 +59,7 @@ PLASTICITIES = {
 
 
 def elastic_spec(name: str) -> dict:
-    return {"name": name, "E": E, "nu": NU, **BESIDE_E_AND_NU.get(name, {})}
+    return {"name": name, "E": E, "nu": NU, **FURTHER_CONSTANTS.get(name, {})}
 
 
 def elasticity(name: str):
@@ -55,123 +74,96 @@ def plasticity(name: str):
     return analytic_law(spec, dt=1e-3).plasticity
 
 
-def all_parts() -> dict[str, Constitutive]:
-    """Every analytic law and random networks, the elastic one adapted."""
-    parts = {name: elasticity(name) for name in ELASTICITIES}
-    parts |= {name: plasticity(name) for name in PLASTICITIES}
+STRUCTURED_STRESS = [f"{base} {form} {seed}" for base, form in structured.ELASTIC for seed in range(3)]
+STRUCTURED_RETURN = [f"{name} {seed}" for name in structured.RETURNS for seed in range(3)]
+STRUCTURED = STRUCTURED_STRESS + STRUCTURED_RETURN
+PARTS = [*ELASTICITIES, *PLASTICITIES, "neural elasticity", "neural plasticity"]
+STRESSES = [*ELASTICITIES, "neural elasticity", *STRUCTURED_STRESS]
+RETURNS = [*PLASTICITIES, "neural plasticity", *STRUCTURED_RETURN]
+DTYPES = torch.float32, torch.float64
+
+
+def part_of(name: str) -> Constitutive:
+    """An analytic law, a random network, the elastic one adapted, or a structured law with random weights."""
+    if name in ELASTICITIES:
+        return elasticity(name)
+    if name in PLASTICITIES:
+        return plasticity(name)
+    *words, last = name.split()
+    if last.isdigit():
+        part = structured.elasticity(*words) if len(words) == 2 else structured.plasticity(*words)
+        part.freeze(structured.random_weights(part, int(last)))
+        return part
     law = neural_law(seed=4)
     law.attach_adaptor(rank=4)
     with torch.no_grad():
         for parameter in law.elasticity.adaptor.parameters():
             parameter.add_(0.1)
-    return parts | {"neural elasticity": law.elasticity, "neural plasticity": law.plasticity}
-
-
-PARTS = list(all_parts())
-IS_STRESS = [*ELASTICITIES, "neural elasticity"]
+    return getattr(law, last)
 
 
 def evaluate(part: Constitutive, F: torch.Tensor) -> torch.Tensor:
     return part.evaluate(F, weights_of(part, F.dtype))
 
 
-def stiffness(part: Constitutive) -> float:
-    """Largest change of the law's value per change of F about the deformations used here."""
-    F = deformations(50).requires_grad_()
-    probe = torch.randn(F.shape, generator=torch.Generator().manual_seed(8), dtype=F.dtype)
-    return float(part.vjp(F.detach(), weights_of(part), probe)[0].norm(dim=(1, 2)).max())
-
-
 # ------------------------------------------------------------------------------------------- closed forms
 
 
-def uniaxial_stress(name: str, a: float) -> list[float]:
-    """Kirchhoff stresses along and across the axis for F = diag(a, 1, 1), from each law's textbook form."""
+def textbook_stress(name: str, F: torch.Tensor) -> torch.Tensor:
+    """Kirchhoff stress (N, 3, 3) by the tensor form of each law, through eigenvectors of b = F F^T."""
+    b, J = F @ F.mT, torch.linalg.det(F)[:, None, None]
+    squares, axes = torch.linalg.eigh(b)
+
+    def of_stretch(function):
+        return axes @ torch.diag_embed(function(squares.sqrt())) @ axes.mT
+
+    def deviator(A):
+        return A - A.diagonal(dim1=1, dim2=2).mean(1)[:, None, None] * EYE
+
+    strain, isochoric, bulk = of_stretch(torch.log), b * J ** (-2 / 3), LAM + 2 * MU / 3
+    hencky = 2 * MU * strain + LAM * J.log() * EYE
     if name == "fixed_corotated":  # P = 2 mu (F - R) + lam (J - 1) J F^-T
-        volumetric = LAM * (a - 1) * a
-        return [2 * MU * (a - 1) * a + volumetric, volumetric]
+        R = of_stretch(torch.reciprocal) @ F
+        return 2 * MU * (F - R) @ F.mT + LAM * J * (J - 1) * EYE
     if name == "stvk":  # S = 2 mu G + lam tr(G) I, tau = F S F^T
-        green = (a * a - 1) / 2
-        return [a * a * (2 * MU + LAM) * green, LAM * green]
+        green = (F.mT @ F - EYE) / 2
+        trace = green.diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
+        return F @ (2 * MU * green + LAM * trace * EYE) @ F.mT
     if name == "hencky":
-        return [(2 * MU + LAM) * math.log(a), LAM * math.log(a)]
-    if name == "tait":  # dev eps = (2/3, -1/3, -1/3) log a
-        pressure, shear = (LAM + 2 * MU / 3) / 7 * (a - a**-6), 2 * MU * math.log(a) / 3
-        return [pressure + 2 * shear, pressure - shear]
-    if name == "neo_hookean":  # tau = mu (b - I) + lam log J I
-        return [MU * (a * a - 1) + LAM * math.log(a), LAM * math.log(a)]
-    if name in ("ogden", "mooney_rivlin"):  # isochoric stretches a^(2/3), a^(-1/3) twice
-        s, pressure = (a ** (2 / 3), a ** (-1 / 3)), (LAM + 2 * MU / 3) * math.log(a)
-        if name == "ogden":  # alpha = 6
-            shear = 2 * MU / 6 * (s[0] ** 6 - s[1] ** 6)
-        else:  # q = 0.7
-            shear = MU * (0.3 * (s[0] ** 2 - s[1] ** 2) - 0.7 * (s[0] ** -2 - s[1] ** -2))
-        return [2 / 3 * shear + pressure, -shear / 3 + pressure]
-    if name == "fibre_reinforced":  # Hencky, and the fibres along the axis
-        green = a * a - 1
-        fibre = 1e5 * green * math.exp(min(1.5 * green**2, 8)) * a * a
-        return [(2 * MU + LAM) * math.log(a) + fibre, LAM * math.log(a)]
-    return [LAM * a * (a - 1)] * 2
-
-
-def simple_shear_stress(name: str, k: float) -> torch.Tensor:
-    """tau for F = I + k e_x (x) e_y; J = 1. In the plane; the third principal stretch is 1."""
-    F = torch.tensor([[1.0, k], [0.0, 1.0]], dtype=torch.float64)
-    plane, eye = torch.zeros(2, 2, dtype=torch.float64), torch.eye(2, dtype=torch.float64)
-    out_of_plane = 0.0
-    if name == "fixed_corotated":  # the rotation of a simple shear turns by -atan(k / 2)
-        angle = -math.atan(k / 2)
-        R = torch.tensor(
-            [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]], dtype=torch.float64
-        )
-        plane = 2 * MU * (F - R) @ F.mT
-    elif name == "stvk":
-        green = (F.mT @ F - eye) / 2
-        plane = F @ (2 * MU * green + LAM * green.trace() * eye) @ F.mT
-        out_of_plane = LAM * float(green.trace())
-    elif name in ("hencky", "tait", "fibre_reinforced"):  # fibres along e_x are not strained
-        # principal log stretches +-asinh(k / 2), the larger one at atan(k/2 + sqrt(1+k^2/4))
-        strain = math.asinh(k / 2)
-        angle = math.atan2(1.0, math.sqrt(1 + k * k / 4) - k / 2)  # of the axis, from e_y side
-        n = torch.tensor([math.sin(angle), math.cos(angle)], dtype=torch.float64)
-        plane = 2 * MU * strain * (2 * torch.outer(n, n) - eye)
-    elif name == "neo_hookean":
-        plane = MU * (F @ F.mT - eye)
-    elif name in ("ogden", "mooney_rivlin"):
-        b = F @ F.mT
-        if name == "ogden":  # (2 mu / 6) dev b^3
-            plane, out_of_plane = MU / 3 * b @ b @ b, MU / 3
-        else:
-            plane, out_of_plane = MU * (0.3 * b - 0.7 * torch.linalg.inv(b)), MU * (0.3 - 0.7)
-        mean = (float(plane.trace()) + out_of_plane) / 3
-        plane, out_of_plane = plane - mean * eye, out_of_plane - mean
-    tau = torch.zeros(3, 3, dtype=torch.float64)
-    tau[:2, :2], tau[2, 2] = plane, out_of_plane
-    return tau
+        return hencky
+    if name == "tait":
+        return bulk / 7 * (J - J**-6) * EYE + 2 * MU * deviator(strain)
+    if name == "neo_hookean":
+        return MU * (b - EYE) + LAM * J.log() * EYE
+    if name == "ogden":  # alpha = 6
+        return 2 * MU / 6 * deviator(isochoric @ isochoric @ isochoric) + bulk * J.log() * EYE
+    if name == "mooney_rivlin":  # q = 0.7
+        shear = 0.3 * deviator(isochoric) - 0.7 * deviator(torch.linalg.inv(isochoric))
+        return MU * shear + bulk * J.log() * EYE
+    if name == "fibre_reinforced":  # Hencky, and fibres along x
+        a = F[:, :, 0]
+        green = (a * a).sum(1)[:, None, None] - 1
+        return hencky + 1e5 * green * (1.5 * green**2).clamp(max=8).exp() * a[:, :, None] * a[:, None]
+    return LAM * J * (J - 1) * EYE
 
 
 @pytest.mark.parametrize("name", ELASTICITIES)
-@pytest.mark.parametrize("a", [0.6, 0.95, 1.0, 1.05, 1.7])
-def test_uniaxial_stress(name, a):
-    along, across = uniaxial_stress(name, a)
-    tau = elasticity(name).evaluate(torch.diag(torch.tensor([a, 1.0, 1.0], dtype=torch.float64))[None], ())
-    expected = torch.diag(torch.tensor([along, across, across], dtype=torch.float64))[None]
-    torch.testing.assert_close(tau, expected, rtol=1e-12, atol=1e-12 * E)
-
-
-@pytest.mark.parametrize("name", ELASTICITIES)
-@pytest.mark.parametrize("k", [-0.4, 0.01, 0.3, 1.5])
-def test_simple_shear_stress(name, k):
-    F = EYE.clone()
-    F[0, 1] = k
-    tau = elasticity(name).evaluate(F[None], ())[0]
-    torch.testing.assert_close(tau, simple_shear_stress(name, k), rtol=1e-12, atol=1e-12 * E)
+def test_stress_is_the_textbook_form(name):
+    """In uniaxial strain, in simple shear, and for random deformations."""
+    F = EYE.repeat(9, 1, 1)
+    F[:5, 0, 0] = torch.tensor([0.6, 0.95, 1.0, 1.05, 1.7])
+    F[5:, 0, 1] = torch.tensor([-0.4, 0.01, 0.3, 1.5])
+    F = torch.cat([F, deformations(50)])
+    tau = elasticity(name).evaluate(F, ())
+    torch.testing.assert_close(tau, textbook_stress(name, F), rtol=1e-12, atol=1e-12 * E)
 
 
 @pytest.mark.parametrize("name", ELASTICITIES)
 def test_wave_speed_is_that_of_linear_elasticity(name):
     law = analytic_law({"elasticity": elastic_spec(name)})
-    modulus = LAM if name == "fluid" else LAM + 2 * MU + BESIDE_E_AND_NU.get(name, {}).get("fibre_modulus", 0)
+    modulus = (
+        LAM if name == "fluid" else LAM + 2 * MU + FURTHER_CONSTANTS.get(name, {}).get("fibre_modulus", 0)
+    )
     # one-sided differences of step 1e-5
     assert law.wave_speed(1000.0) == pytest.approx(math.sqrt(modulus / 1000.0), rel=1e-4)
 
@@ -201,56 +193,63 @@ def test_wave_speed_of_a_network_is_its_tangent():
 # ------------------------------------------------------------------------------------------- invariances
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("name", PARTS)
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", PARTS + STRUCTURED)
 def test_objectivity(name, dtype):
     """tau(QF) = Q tau(F) Q^T and F_new(QF) = Q F_new(F), to the rounding of the inputs."""
-    part = all_parts()[name]
+    part = part_of(name)
     F, Q = deformations().to(dtype), rotations(400, 20).to(dtype)
     turned = evaluate(part, Q @ F)
-    expected = Q @ evaluate(part, F) @ (Q.mT if name in IS_STRESS else torch.eye(3, dtype=dtype))
+    expected = Q @ evaluate(part, F) @ (Q.mT if name in STRESSES else torch.eye(3, dtype=dtype))
     tolerance = 64 * torch.finfo(dtype).eps * max(stiffness(part), float(expected.abs().max()))
     assert float((turned - expected).abs().max()) < tolerance
 
 
-@pytest.mark.parametrize("name", [n for n in PARTS if not n.startswith(("neural", "fibre"))])
-def test_analytic_laws_are_isotropic(name):
-    part = all_parts()[name]
-    F, Q = deformations(), rotations(400, 21)
-    expected = evaluate(part, F) if name in IS_STRESS else evaluate(part, F) @ Q
-    tolerance = 64 * torch.finfo(F.dtype).eps * max(stiffness(part), float(expected.abs().max()))
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    [(name, torch.float64) for name in PARTS if not name.startswith(("neural", "fibre"))]
+    + [(name, dtype) for name in STRUCTURED for dtype in DTYPES],
+)
+def test_laws_without_directions_are_isotropic(name, dtype):
+    part = part_of(name)
+    F, Q = deformations().to(dtype), rotations(400, 21).to(dtype)
+    expected = evaluate(part, F) if name in STRESSES else evaluate(part, F) @ Q
+    tolerance = 64 * torch.finfo(dtype).eps * max(stiffness(part), float(expected.abs().max()))
     assert float((evaluate(part, F @ Q) - expected).abs().max()) < tolerance
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("name", IS_STRESS)
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", STRESSES)
 def test_rotation_is_free_of_stress(name, dtype):
-    part = all_parts()[name]
+    part = part_of(name)
     tau = evaluate(part, rotations(300, 22).to(dtype))
     assert float(tau.abs().max()) < 32 * torch.finfo(dtype).eps * stiffness(part)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("name", [*PLASTICITIES, "neural plasticity"])
-def test_rotation_is_left_alone_by_plasticity(name, dtype):
-    part, Q = all_parts()[name], rotations(300, 22).to(dtype)
-    assert float((evaluate(part, Q) - Q).abs().max()) < 32 * torch.finfo(dtype).eps
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", RETURNS)
+def test_plasticity_preserves_rotations(name, dtype):
+    """A learned friction may yield at rest, but there is nothing to return."""
+    part, Q = part_of(name), rotations(300, 22).to(dtype)
+    size = max(stiffness(part), 1.0) if name in STRUCTURED else 1.0
+    assert float((evaluate(part, Q) - Q).abs().max()) < 32 * torch.finfo(dtype).eps * size
 
 
-@pytest.mark.parametrize("name", ELASTICITIES)
-def test_analytic_stress_is_symmetric(name):
-    tau = elasticity(name).evaluate(deformations(), ())
-    assert float((tau - tau.mT).abs().max()) < 8 * torch.finfo(tau.dtype).eps * float(tau.abs().max())
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", [*ELASTICITIES, *STRUCTURED_STRESS])
+def test_stress_is_symmetric(name, dtype):
+    tau = evaluate(part_of(name), deformations().to(dtype))
+    assert float((tau - tau.mT).abs().max()) < 8 * torch.finfo(dtype).eps * float(tau.abs().max())
 
 
-@pytest.mark.parametrize("name", PARTS)
+@pytest.mark.parametrize("name", PARTS + STRUCTURED)
 def test_finite_for_crushed_and_inverted_elements(name):
-    part = all_parts()[name]
-    F = torch.stack([EYE.clone() for _ in range(4)])
-    F[0, 1, 1], F[1, 2, 2] = 1e-4, -0.3
+    part = part_of(name)
+    F = EYE.repeat(5, 1, 1)
+    F[0, 1, 1], F[1, 2, 2], F[4, 0, 0] = 1e-4, -0.3, 0.05
     F[2] *= 0
     F[3] *= 5
-    for dtype in (torch.float32, torch.float64):
+    for dtype in DTYPES:
         value = evaluate(part, F.to(dtype))
         grad_F, grad_weights = part.vjp(F.to(dtype), weights_of(part, dtype), torch.ones_like(value))
         assert all(bool(torch.isfinite(x).all()) for x in (value, grad_F, *grad_weights))
@@ -336,19 +335,14 @@ def test_fluid_keeps_volume_and_pressure_and_forgets_shear():
     )
 
 
-def test_viscous_flow_is_newtonian_in_steady_shear():
-    """tau_xy = viscosity * shear rate, up to the elastic strain (1e-4 here)."""
+@pytest.mark.parametrize("limit", [0.0, 20.0])
+def test_viscous_flow_is_a_bingham_fluid_in_steady_shear(limit):
+    """tau_xy = yield_stress / sqrt(2) + viscosity * shear rate, up to the elastic strain (6e-4 here)."""
     viscosity, rate, dt = 10.0, 1.0, 1e-4
-    part, law = ViscousFlow(E=E, nu=NU, viscosity=viscosity, dt=dt), Hencky(E=E, nu=NU)
-    velocity_gradient = torch.zeros(3, 3, dtype=torch.float64)
-    velocity_gradient[0, 1] = rate
-    F = EYE[None].clone()
-    for _ in range(400):
-        F = part.evaluate((EYE + dt * velocity_gradient) @ F, ())
-    strain = viscosity * rate / MU
-    assert float(law.evaluate(F, ())[0, 0, 1]) == pytest.approx(
-        viscosity * rate, rel=4 * (strain + rate * dt)
-    )
+    part = ViscousFlow(E=E, nu=NU, viscosity=viscosity, dt=dt, yield_stress=limit)
+    expected = limit / 2**0.5 + viscosity * rate
+    shear = float(Hencky(E=E, nu=NU).evaluate(steady_shear(part, rate, dt), ())[0, 0, 1])
+    assert shear == pytest.approx(expected, rel=4 * (expected / MU + rate * dt))
 
 
 def test_a_projected_tait_fluid_knows_its_volume_alone():
@@ -358,20 +352,6 @@ def test_a_projected_tait_fluid_knows_its_volume_alone():
     J = torch.linalg.det(F)[:, None, None]
     expected = (LAM + 2 * MU / 3) / 7 * (J - J**-6) * EYE
     torch.testing.assert_close(law.evaluate(part.evaluate(F, ()), ()), expected, rtol=1e-10, atol=1e-10 * E)
-
-
-def test_a_bingham_body_bears_its_yield_stress_and_flows_beyond_it():
-    """Steady shear: tau_xy = yield_stress / sqrt(2) + viscosity * shear rate, up to the elastic strain (6e-4 here)."""
-    viscosity, rate, dt, limit = 10.0, 1.0, 1e-4, 20.0
-    part = ViscousFlow(E=E, nu=NU, viscosity=viscosity, dt=dt, yield_stress=limit)
-    velocity_gradient = torch.zeros(3, 3, dtype=torch.float64)
-    velocity_gradient[0, 1] = rate
-    F = EYE[None].clone()
-    for _ in range(400):
-        F = part.evaluate((EYE + dt * velocity_gradient) @ F, ())
-    expected = limit / 2**0.5 + viscosity * rate
-    shear = float(Hencky(E=E, nu=NU).evaluate(F, ())[0, 0, 1])
-    assert shear == pytest.approx(expected, rel=4 * (expected / MU + rate * dt))
 
 
 def test_a_held_bingham_body_relaxes_to_its_yield_stress():
@@ -414,6 +394,14 @@ def test_limits_of_a_bingham_body():
 
 def smooth_states(name: str) -> torch.Tensor:
     """Deformations, F = I and repeated stretches, without those near a switch of the law (yield, sorting)."""
+    if name.endswith("4"):  # structured
+        F = structured.near_states()
+        if (
+            name.split()[0] in structured.RETURNS
+        ):  # away from the tip of the cone, where rest lies, and from yield
+            trace, _, norm = hencky_strain(torch.linalg.svdvals(F))
+            F = F[(trace[:, 0].abs() > 1e-3) & (norm[:, 0] > 1e-3)]
+        return F
     F = torch.cat(
         [deformations(60), EYE[None], torch.diag(torch.tensor([1.2, 1.2, 0.8], dtype=torch.float64))[None]]
     )
@@ -423,48 +411,28 @@ def smooth_states(name: str) -> torch.Tensor:
     return F[:60] if name.startswith("neural") else F
 
 
-@pytest.mark.parametrize("name", PARTS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        *PARTS,
+        *(f"{base} {form} 4" for base, form in structured.ELASTIC),
+        *(f"{r} 4" for r in structured.RETURNS),
+    ],
+)
 def test_adjoint_against_differences(name):
-    part, F = all_parts()[name], smooth_states(name)
-    weights = weights_of(part)
-    generator = torch.Generator().manual_seed(30)
-    direction = torch.randn(F.shape, generator=generator, dtype=F.dtype)
-    probe = torch.randn(F.shape, generator=generator, dtype=F.dtype)
-    turns = tuple(torch.randn(w.shape, generator=generator, dtype=F.dtype) for w in weights)
-    grad_F, grad_weights = part.vjp(F, weights, probe)
-    step = 1e-6
-
-    def along(sign: float) -> torch.Tensor:
-        moved = tuple(w + sign * step * t for w, t in zip(weights, turns, strict=True))
-        return (part.evaluate(F + sign * step * direction, moved) * probe).sum()
-
-    difference = float((along(1) - along(-1)) / (2 * step))
-    exact = float(
-        (grad_F * direction).sum() + sum((g * t).sum() for g, t in zip(grad_weights, turns, strict=True))
-    )
-    size = float((grad_F * direction).abs().sum())
-    assert abs(difference - exact) < 1e-7 * size
+    assert_adjoint(part_of(name), smooth_states(name))
 
 
 def test_constants_given_as_tensors_are_fitted():
     modulus = torch.tensor(E, dtype=torch.float64, requires_grad=True)
-    law = analytic_law(
-        {
-            "elasticity": {"name": "hencky", "E": modulus, "nu": NU},
-            "plasticity": {"name": "von_mises", "yield_stress": 5e3},
-        }
-    )
-    F = deformations(50)
-    probe = torch.ones_like(F)
+    von_mises = {"name": "von_mises", "yield_stress": 5e3}
+    law = analytic_law({"elasticity": {"name": "hencky", "E": modulus, "nu": NU}, "plasticity": von_mises})
     for part in (law.elasticity, law.plasticity):
         assert part.weights() == (modulus,)
-        _, (grad,) = part.vjp(F, part.weights(), probe)
-        step = 1.0
-        values = [part.evaluate(F, (modulus.detach() + s * step,)).sum() for s in (1, -1)]
-        assert float(grad) == pytest.approx(float(values[0] - values[1]) / (2 * step), rel=1e-5)
+        assert_adjoint(part, deformations(50))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("kind", ["elasticity", "plasticity"])
 @pytest.mark.parametrize("count", [1, 33, CPU_ROWS + 5])
 def test_network_equals_its_torch_twin(kind, count, dtype):
@@ -549,9 +517,7 @@ def test_adaptor_scales_with_the_layer():
 def test_adaptor_state_round_trip_and_interpolation(rank):
     law, copy = neural_law(seed=3), neural_law(seed=3)
     law.attach_adaptor(rank=rank)
-    with torch.no_grad():
-        for p in (p for p in law.parameters() if p.requires_grad):
-            p.normal_(generator=torch.Generator().manual_seed(len(p)))
+    randomise_adaptor(law, size=1.0)
     copy.load_adaptor_state(law.adaptor_state(), rank=rank)
     for part, other in ((law.elasticity, copy.elasticity), (law.plasticity, copy.plasticity)):
         assert all(torch.equal(a, b) for a, b in zip(part.weights(), other.weights(), strict=True))
@@ -575,9 +541,10 @@ def test_prior_files_round_trip(tmp_path):
     law = neural_law(seed=5)
     own = tmp_path / "jelly.safetensors"
     write_weights(own, law.prior_state(), {})
-    names = ("layers.0.fc.weight", "layers.1.fc.weight", "final_layer.fc.weight")
     parts = {"elasticity": law.elasticity, "plasticity": law.plasticity}
-    content = {k: dict(zip(names, (w.detach() for w in p.weights()), strict=True)) for k, p in parts.items()}
+    content = {
+        k: dict(zip(LAYER_KEYS, (w.detach() for w in p.weights()), strict=True)) for k, p in parts.items()
+    }
     released = tmp_path / "released.pt"
     torch.save(content, released)
     for path in (own, released):
@@ -585,7 +552,10 @@ def test_prior_files_round_trip(tmp_path):
         assert loaded.name == path.stem
         for part, other in ((law.elasticity, loaded.elasticity), (law.plasticity, loaded.plasticity)):
             assert all(torch.equal(a, b) for a, b in zip(part.weights(), other.weights(), strict=True))
-    assert set(load(own.read_bytes())) == {f"{part}.{name}" for part in parts for name in names}
+    assert set(load(own.read_bytes())) == {f"{part}.{name}" for part in parts for name in LAYER_KEYS}
+
+
+NARROW = dict(zip(LAYER_KEYS, map(torch.zeros, ((64, 12), (64, 64), (9, 64))), strict=True))
 
 
 @pytest.mark.parametrize(
@@ -597,18 +567,7 @@ def test_prior_files_round_trip(tmp_path):
         ("weights.npz", b"", "expected .safetensors or .pt"),
         ("list.pt", [1, 2], "expected a dict"),
         ("half.pt", {"elasticity": {}, "plasticity": {}}, "missing"),
-        (
-            "shapes.pt",
-            {
-                part: {
-                    "layers.0.fc.weight": torch.zeros(64, 12),
-                    "layers.1.fc.weight": torch.zeros(64, 64),
-                    "final_layer.fc.weight": torch.zeros(9, 64),
-                }
-                for part in ("elasticity", "plasticity")
-            },
-            "shapes",
-        ),
+        ("shapes.pt", dict.fromkeys(("elasticity", "plasticity"), NARROW), "shapes"),
     ],
 )
 def test_bad_prior_files_are_named(tmp_path, name, content, message):
@@ -625,21 +584,12 @@ def test_bad_prior_files_are_named(tmp_path, name, content, message):
 @pytest.mark.parametrize(
     ("spec", "where"),
     [
-        ({"elasticity": {"name": "henky", "E": 1, "nu": 0.2}}, "elasticity.name"),
         ({"elasticity": {"name": "hencky", "E": 1, "nu": 0.2}, "plastic": {}}, "law"),
-        ({}, "law"),
         ({"elasticity": {"name": "hencky", "E": 1, "nu": 0.2, "G": 3}}, "Hencky"),
         ({"elasticity": {"name": "hencky", "E": 1}}, "Hencky.nu"),
         ({"elasticity": {"name": "hencky", "E": -1, "nu": 0.2}}, "Hencky.E"),
         ({"elasticity": {"name": "hencky", "E": "soft", "nu": 0.2}}, "Hencky.E"),
         ({"elasticity": {"name": "hencky", "E": 1, "nu": 0.5}}, "Hencky.nu"),
-        (
-            {
-                "elasticity": {"name": "hencky", "E": 1, "nu": 0.2},
-                "plasticity": {"name": "viscous_flow", "viscosity": 1},
-            },
-            "dt",
-        ),
     ],
 )
 def test_bad_specifications_are_named(spec, where):
@@ -660,10 +610,10 @@ def test_plasticity_shares_or_overrides_the_elastic_constants():
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", PARTS)
 def test_cuda_equals_cpu(name, dtype):
-    part, F = all_parts()[name], deformations(3000).to(dtype)
+    part, F = part_of(name), deformations(3000).to(dtype)
     probe = torch.randn(F.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype)
     weights = weights_of(part, dtype)
     on_gpu = tuple(w.cuda() for w in weights)

@@ -1,4 +1,4 @@
-"""The fused kernels of the neural law agree with their twin; on a CPU the same kernel text runs in an emulation."""
+"""The fused kernels of the neural law agree with their twin. On a CPU the same source runs in an emulation."""
 
 import pytest
 import torch
@@ -6,6 +6,7 @@ import torch
 from neuma_lib.mechanics import neural_fused as fused
 from neuma_lib.mechanics.neural import neural_law
 from tests.support.emulated_cuda import COMPILER, EmulatedLaws
+from tests.support.fused_laws import assert_can_be_captured, distance, probe
 
 pytestmark = pytest.mark.core
 
@@ -21,12 +22,6 @@ def deformations(regime, n, seed=0):
     if regime == "inverted":
         F = torch.linalg.qr(noise)[0] @ torch.diag(torch.tensor([1.3, 0.8, -0.6], dtype=torch.float64)) @ F
     return F.float().double()
-
-
-def probe(n):
-    return (
-        torch.randn(n, 3, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64).float().double()
-    )
 
 
 def law_part(kind):
@@ -48,10 +43,6 @@ def twin(part, F, g, dtype):
     return [x.double() for x in (value, grad_F, *grad_weights)]
 
 
-def distance(a, b):
-    return float((a - b).norm() / b.norm())
-
-
 @pytest.fixture(scope="module")
 def emulated(tmp_path_factory):
     if COMPILER is None:
@@ -64,15 +55,17 @@ def emulated(tmp_path_factory):
     "regime, n, blocks", [(REGIMES[0], 1, 1), (REGIMES[1], 133, 1), (REGIMES[2], 133, 2)]
 )
 def test_emulated_kernels_are_as_near_to_float64_as_the_float32_twin(emulated, kind, regime, n, blocks):
-    part, F, g = law_part(kind), deformations(regime, n), probe(n)
+    part, F = law_part(kind), deformations(regime, n)
+    g = probe(F)
     truth, plain = twin(part, F, g, torch.float64), twin(part, F, g, torch.float32)
-    found = emulated(part, F, g, blocks)
-    for exact, slow, fast in zip(truth, plain, found, strict=True):
+    actual = emulated(part, F, g, blocks)
+    for exact, slow, fast in zip(truth, plain, actual, strict=True):
         assert distance(fast, exact) < 5 * distance(slow, exact) + 1e-7
 
 
 def test_emulated_gradients_of_many_calls_add_up(emulated):
-    part, F, g = law_part("elasticity"), deformations("large strain", 133), probe(133)
+    part, F = law_part("elasticity"), deformations("large strain", 133)
+    g = probe(F)
     once, twice = emulated(part, F, g, 1), emulated(part, F, g, 1, additions=2)
     assert torch.equal(once[1], twice[1])
     for single, double in zip(once[2:], twice[2:], strict=True):
@@ -94,7 +87,8 @@ def check_half(half, single):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("regime", REGIMES)
 def test_emulated_half_adjoint_is_near_the_single_one(emulated, kind, regime):
-    part, F, g = law_part(kind), deformations(regime, 133), probe(133)
+    part, F = law_part(kind), deformations(regime, 133)
+    g = probe(F)
 
     def gradients(precision):
         return lambda size: emulated(part, F, size * g, 2, precision)[1:]
@@ -102,14 +96,15 @@ def test_emulated_half_adjoint_is_near_the_single_one(emulated, kind, regime):
     check_half(gradients("half"), gradients("single"))
 
 
-def test_small_gradients_beside_large_ones_survive_half_precision(emulated):
-    part, F, g = law_part("elasticity"), deformations("large strain", 64), probe(64)
+def test_small_gradients_next_to_large_ones_survive_half_precision(emulated):
+    part, F = law_part("elasticity"), deformations("large strain", 64)
+    g = probe(F)
     g[:16] *= 1e-6
     rough, fine = (emulated(part, F, g, 1, precision)[1][:16] for precision in ("half", "single"))
     assert distance(rough, fine) < 3 * HALF_ERROR
 
 
-def test_a_cpu_and_float64_go_to_the_twin():
+def test_a_cpu_and_float64_use_the_twin():
     part = law_part("elasticity")
     assert part.fused is None and not part.uses_fused(torch.zeros(1, 3, 3))
     assert not fused.supported(torch.device("cuda"), torch.float64)
@@ -132,14 +127,15 @@ def on_gpu(part, F, g):
 @pytest.mark.parametrize("regime", REGIMES)
 @pytest.mark.parametrize("n", [1, 31, 4096 + 5, 30_000, 70_001])
 def test_fused_is_as_near_to_float64_as_the_float32_twin(kind, regime, n):
-    part, F, g = law_part(kind), deformations(regime, n), probe(n)
+    part, F = law_part(kind), deformations(regime, n)
+    g = probe(F)
     F32, weights, g32 = on_gpu(part, F, g)
     assert part.uses_fused(F32)
     value = part.evaluate(F32, weights)
     grad_F, grad_weights = part.vjp(F32, weights, g32)
-    found = [x.double() for x in (value, grad_F, *grad_weights)]
+    actual = [x.double() for x in (value, grad_F, *grad_weights)]
     truth, plain = (twin(part, F.cuda(), g.cuda(), dtype) for dtype in (torch.float64, torch.float32))
-    for exact, slow, fast in zip(truth, plain, found, strict=True):
+    for exact, slow, fast in zip(truth, plain, actual, strict=True):
         assert distance(fast, exact) < 5 * distance(slow, exact) + 1e-7
 
 
@@ -148,7 +144,8 @@ def test_fused_is_as_near_to_float64_as_the_float32_twin(kind, regime, n):
 @pytest.mark.parametrize("regime", REGIMES)
 @pytest.mark.parametrize("n", [31, 30_000])
 def test_half_adjoint_is_near_the_single_one(kind, regime, n):
-    part, F, g = law_part(kind), deformations(regime, n), probe(n)
+    part, F = law_part(kind), deformations(regime, n)
+    g = probe(F)
     F, weights, g = on_gpu(part, F, g)
     before = part.evaluate(F, weights)
 
@@ -169,7 +166,7 @@ def test_half_adjoint_is_near_the_single_one(kind, regime, n):
 @pytest.mark.parametrize("kind", KINDS)
 def test_fused_fills_buffers_accumulates_and_repeats_itself(kind):
     part = law_part(kind)
-    F, weights, g = on_gpu(part, deformations("large strain", 1000), probe(1000))
+    F, weights, g = on_gpu(part, F := deformations("large strain", 1000), probe(F))
     out, grad_F = torch.empty_like(F), torch.empty_like(F)
     totals = tuple(torch.ones_like(w) for w in weights)
     assert part.evaluate_with_cache(F, weights, out) == (out, None)
@@ -192,9 +189,9 @@ def test_fused_fills_buffers_accumulates_and_repeats_itself(kind):
 
 
 @CUDA
-def test_what_is_not_finite_shows():
+def test_non_finite_rows_stay_non_finite():
     part = law_part("elasticity")
-    F, weights, g = on_gpu(part, deformations("near identity", 300), probe(300))
+    F, weights, g = on_gpu(part, F := deformations("near identity", 300), probe(F))
     F[200, 1, 1] = float("nan")
     value = part.evaluate(F, weights)
     grad_F, _ = part.vjp(F, weights, g)
@@ -205,22 +202,6 @@ def test_what_is_not_finite_shows():
 @CUDA
 @pytest.mark.parametrize("kind", KINDS)
 def test_fused_can_be_captured_in_a_graph(kind):
-    part = law_part(kind)
-    F, weights, g = on_gpu(part, deformations("large strain", 5000), probe(5000))
-    out, grad_F = torch.empty_like(F), torch.empty_like(F)
-    totals = tuple(torch.zeros_like(w) for w in weights)
-
-    def work():
-        part.evaluate(F, weights, out)
-        part.vjp(F, weights, g, grad_F=grad_F, grad_weights=totals)
-
-    work()
-    expected = [out.clone(), grad_F.clone(), *(2 * t for t in totals)]
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        work()
-    for buffer in (out, grad_F):
-        buffer.zero_()
-    graph.replay()
-    for found, value in zip((out, grad_F, *totals), expected, strict=True):
-        assert torch.equal(found, value)
+    part, F = law_part(kind), deformations("large strain", 5000)
+    F, weights, g = on_gpu(part, F, probe(F))
+    assert_can_be_captured(part, F, weights, g)

@@ -4,18 +4,11 @@ import pytest
 import torch
 
 from neuma_lib.mechanics.singular_values import rotation_and_singular_values, svd3
+from tests.support.deformations import rotations
 
 pytestmark = pytest.mark.core
 
 ROUNDINGS = 32  # units of eps: some 15 rotations of three-vectors, each rounding a few times
-
-
-def rotations(count: int, seed: int = 0, dtype=torch.float64) -> torch.Tensor:
-    """Random rotations (count, 3, 3) by QR with its signs mended."""
-    generator = torch.Generator().manual_seed(seed)
-    Q, R = torch.linalg.qr(torch.randn(count, 3, 3, generator=generator, dtype=torch.float64))
-    Q = Q * R.diagonal(dim1=1, dim2=2).sign()[:, None]
-    return (Q * torch.linalg.det(Q)[:, None, None]).to(dtype)
 
 
 def stretched(sigma: list[float], count: int = 500) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""The kernels of the structured laws agree with their torch twin; on a CPU the CUDA text runs in an emulation."""
+"""The kernels of the structured laws agree with their torch twin. On a CPU the CUDA source runs in an emulation."""
 
 import pytest
 import torch
@@ -8,6 +8,7 @@ from neuma_lib.mechanics.plasticity import hencky_strain
 from neuma_lib.mechanics.structured_kernels import STRAIN
 from tests.support.deformations import rotations
 from tests.support.emulated_cuda import COMPILER, EmulatedStructuredLaws
+from tests.support.fused_laws import assert_can_be_captured, distance, probe
 from tests.support.structured_laws import (
     ELASTIC,
     RETURNS,
@@ -45,10 +46,6 @@ def states(name):
     return F.float().double()
 
 
-def probe(F):
-    return torch.randn(F.shape, generator=torch.Generator().manual_seed(9), dtype=torch.float64).to(F)
-
-
 def gain(weights):
     """Largest change of the network's outputs by a change of the strains."""
     return float(torch.stack([torch.linalg.matrix_norm(w.double(), 2) for w in weights]).prod()) / STRAIN
@@ -65,31 +62,27 @@ def fast(part, F, weights, g):
     return [part.evaluate(F, weights), grad_F, *grads]
 
 
-def distance(a, b):
-    return float((a.double() - b.double()).norm() / b.double().norm())
-
-
 def rounding(part, F, weights, g):
     """Distance of the twin in float32 from float64, of each result: the largest over some frames of reference.
 
-    In each of them singular values of the same states round otherwise, so that one frame is one draw.
+    Singular values of the same states round differently in each of them.
     """
     frames = torch.cat([torch.eye(3, dtype=torch.float64)[None], rotations(5, 60)])
     singles, doubles = tuple(w.float() for w in weights), tuple(w.double() for w in weights)
-    found = []
+    actual = []
     for Q in frames:
         turned, probed = (Q @ F.double()).float(), (Q @ g.double()).float()
         exact = twin(part, turned.double(), doubles, probed.double())
-        found.append(
+        actual.append(
             [distance(*pair) for pair in zip(twin(part, turned, singles, probed), exact, strict=True)]
         )
-    return [max(draws) for draws in zip(*found, strict=True)]
+    return [max(draws) for draws in zip(*actual, strict=True)]
 
 
-def assert_as_near(part, F, weights, g, found):
-    """What was found in float32 is as near to float64 as the twin in float32 is."""
+def assert_as_near(part, F, weights, g, actual):
+    """Results in float32 are as near to float64 as those of the twin in float32."""
     truth = twin(part, F.double(), tuple(w.double() for w in weights), g.double())
-    for value, exact, bound in zip(found, truth, rounding(part, F, weights, g), strict=True):
+    for value, exact, bound in zip(actual, truth, rounding(part, F, weights, g), strict=True):
         assert distance(value, exact) < 3 * bound + 8 * torch.finfo(torch.float32).eps
 
 
@@ -130,7 +123,7 @@ def test_cache_buffers_and_accumulators(name, dtype):
             )
 
 
-def test_rows_do_not_know_of_each_other():
+def test_rows_are_independent():
     """A row that is not finite spoils neither its neighbours in a pack nor their gradients."""
     part = part_of("hencky stretch")
     F = states("hencky stretch")[:16].float()
@@ -164,14 +157,14 @@ def test_cuda_text_equals_the_twin_in_emulation(emulated, name):
     part, F = part_of(name), states(name)
     F = torch.cat([F, F])[: 67 + len(F)]  # one tile and a part of another
     weights = tuple(w.float().double() for w in random_weights(part, 4))
-    g = probe(F).float().double()
+    g = probe(F)
     for blocks in (1, 2):
-        found = emulated(part, F, weights, g, blocks)
+        actual = emulated(part, F, weights, g, blocks)
         if emulated.dtype == torch.float32:
-            assert_as_near(part, F, weights, g, found)
+            assert_as_near(part, F, weights, g, actual)
             continue
         bound = 8 * torch.finfo(torch.float64).eps * gain(weights)
-        for value, expected in zip(found, twin(part, F, weights, g), strict=True):
+        for value, expected in zip(actual, twin(part, F, weights, g), strict=True):
             assert float((value - expected).norm()) < bound * float(expected.norm())
 
 
@@ -185,13 +178,13 @@ CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA de
 def test_cuda_equals_the_cpu(name, dtype, repeats):
     part, F = part_of(name), states(name).repeat(repeats, 1, 1).to(dtype)
     weights, g = random_weights(part, 4, dtype), probe(F)
-    found = fast(part, F.cuda(), tuple(w.cuda() for w in weights), g.cuda())
-    found = [x.cpu() for x in found]
+    actual = fast(part, F.cuda(), tuple(w.cuda() for w in weights), g.cuda())
+    actual = [x.cpu() for x in actual]
     if dtype == torch.float32:
-        assert_as_near(part, F, weights, g, found)
+        assert_as_near(part, F, weights, g, actual)
         return
     bound = 8 * torch.finfo(torch.float64).eps * gain(weights)
-    for value, expected in zip(found, fast(part, F, weights, g), strict=True):
+    for value, expected in zip(actual, fast(part, F, weights, g), strict=True):
         assert float((value - expected).norm()) < bound * float(expected.norm())
 
 
@@ -201,21 +194,4 @@ def test_cuda_can_be_captured_and_repeats_itself(name):
     part = part_of(name)
     F = states(name).float().repeat(70, 1, 1).cuda()
     weights, g = tuple(w.cuda() for w in random_weights(part, 4, torch.float32)), probe(F)
-    out, grad_F = torch.empty_like(F), torch.empty_like(F)
-    totals = tuple(torch.zeros_like(w) for w in weights)
-
-    def work():
-        _, cache = part.evaluate_with_cache(F, weights, out)
-        assert cache is None
-        part.vjp(F, weights, g, cache=cache, grad_F=grad_F, grad_weights=totals)
-
-    work()
-    expected = [out.clone(), grad_F.clone(), *(2 * t for t in totals)]
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        work()
-    for buffer in (out, grad_F):
-        buffer.zero_()
-    graph.replay()
-    for found, value in zip((out, grad_F, *totals), expected, strict=True):
-        assert torch.equal(found, value)
+    assert_can_be_captured(part, F, weights, g)

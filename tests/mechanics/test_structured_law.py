@@ -9,7 +9,8 @@ from neuma_lib.errors import InputError
 from neuma_lib.io.laws import load_law, save_adaptor, save_prior
 from neuma_lib.io.weights import write_weights
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.mechanics.isotropic import PAIRS, lame
+from neuma_lib.mechanics.catalogue import lame
+from neuma_lib.mechanics.isotropic import PAIRS
 from neuma_lib.mechanics.neural import neural_law
 from neuma_lib.mechanics.plasticity import CohesiveDruckerPrager, hencky_strain
 from neuma_lib.mechanics.structured import (
@@ -25,7 +26,7 @@ from neuma_lib.mechanics.structured import (
 from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
-from tests.support.deformations import EYE, deformations, hencky_deviator, rotations, weights_of
+from tests.support.deformations import EYE, deformations, hencky_deviator, randomise_adaptor, weights_of
 from tests.support.errors import refused
 from tests.support.sim_scenes import cube, strained
 from tests.support.structured_laws import (
@@ -36,7 +37,6 @@ from tests.support.structured_laws import (
     RETURNS,
     E,
     elasticity,
-    near_states,
     plasticity,
     random_weights,
     specification,
@@ -46,13 +46,6 @@ pytestmark = pytest.mark.core
 
 MU, LAM = lame(E, NU)
 EPS = torch.finfo(torch.float64).eps
-
-
-def stiffness(part, weights) -> float:
-    """Largest change of the value per change of F about the deformations used here."""
-    F = deformations(50)
-    probe = torch.randn(F.shape, generator=torch.Generator().manual_seed(8), dtype=F.dtype)
-    return float(part.vjp(F, weights, probe)[0].norm(dim=(1, 2)).max())
 
 
 def test_random_weights_exercise_the_network():
@@ -109,14 +102,11 @@ def test_identity_stays_the_identity():
     assert torch.equal(law.plasticity.evaluate(F, ()), F)
 
 
-def trained(seed=3, **options):
+def trained(**options):
     """A law with an adaptor that has been moved."""
     law = structured_law({**specification(plastic="bingham"), **options}, dt=DT, seed=1)
     law.attach_adaptor(rank=None)
-    generator = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for p in (p for p in law.parameters() if p.requires_grad):
-            p.copy_(0.3 * torch.randn(p.shape, generator=generator))
+    randomise_adaptor(law, seed=3)
     return law
 
 
@@ -135,38 +125,6 @@ def test_adaptor_weight_interpolates_from_the_base():
 
 
 # ---------------------------------------------------------------------------------- true for any weights
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize(("base", "form"), ELASTIC)
-def test_stress_is_objective_isotropic_symmetric_and_zero_at_rest(base, form, dtype):
-    part = elasticity(base, form)
-    eps, F = torch.finfo(dtype).eps, deformations().to(dtype)
-    Q = rotations(400, 20).to(dtype)
-    for seed in range(3):
-        weights = random_weights(part, seed, dtype)
-        tau = part.evaluate(F, weights)
-        size = max(stiffness(part, random_weights(part, seed)), float(tau.abs().max()))
-        assert float((part.evaluate(Q @ F, weights) - Q @ tau @ Q.mT).abs().max()) < 64 * eps * size
-        assert float((part.evaluate(F @ Q, weights) - tau).abs().max()) < 64 * eps * size
-        assert float((tau - tau.mT).abs().max()) < 8 * eps * float(tau.abs().max())
-        assert float(part.evaluate(Q, weights).abs().max()) < 32 * eps * size
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("name", RETURNS)
-def test_return_is_objective_and_isotropic(name, dtype):
-    part = plasticity(name)
-    eps, F = torch.finfo(dtype).eps, deformations().to(dtype)
-    Q = rotations(400, 20).to(dtype)
-    for seed in range(3):
-        weights = random_weights(part, seed, dtype)
-        value = part.evaluate(F, weights)
-        size = max(stiffness(part, random_weights(part, seed)), 1.0)
-        assert float((part.evaluate(Q @ F, weights) - Q @ value).abs().max()) < 64 * eps * size
-        assert float((part.evaluate(F @ Q, weights) - value @ Q).abs().max()) < 64 * eps * size
-        # a learned friction may yield at rest, but there is nothing to return
-        assert float((part.evaluate(Q, weights) - Q).abs().max()) < 32 * eps * size
 
 
 @pytest.mark.parametrize("base", BASES)
@@ -266,10 +224,10 @@ def test_return_at_the_ends_of_its_outputs(name):
         returned, _ = part.principal(sigma, weights)
         assert bool((elastic_energy(returned) <= energy + 64 * EPS * (1 + energy) * MU).all())
         for dtype in (torch.float32, torch.float64):
-            found = part.vjp(
+            actual = part.vjp(
                 F.to(dtype), tuple(w.to(dtype) for w in weights), torch.ones_like(F, dtype=dtype)
             )
-            assert all(bool(x.isfinite().all()) for x in (found[0], *found[1]))
+            assert all(bool(x.isfinite().all()) for x in (actual[0], *actual[1]))
 
 
 @pytest.mark.parametrize("dilation", [0.0, 12.0, 34.0])
@@ -313,20 +271,6 @@ def test_shear_compacts_by_its_share():
     torch.testing.assert_close(trace_after, trace * (1 - share * (1 - q_after / q)), rtol=1e-12, atol=0)
 
 
-@pytest.mark.parametrize("name", [*map(str, range(len(ELASTIC))), *RETURNS])
-def test_finite_for_crushed_and_inverted_elements(name):
-    part = plasticity(name) if name in RETURNS else elasticity(*ELASTIC[int(name)])
-    F = EYE.repeat(5, 1, 1)
-    F[0, 1, 1], F[1, 2, 2], F[4, 0, 0] = 1e-4, -0.3, 0.05
-    F[2] *= 0
-    F[3] *= 5
-    for dtype in (torch.float32, torch.float64):
-        weights = random_weights(part, 1, dtype)
-        value = part.evaluate(F.to(dtype), weights)
-        grad_F, grads = part.vjp(F.to(dtype), weights, torch.ones_like(value))
-        assert all(bool(torch.isfinite(x).all()) for x in (value, grad_F, *grads))
-
-
 def cycles(count=12, points=4096):
     """Circles in the space of principal logarithmic strains, (points, count, 3), and their steps de."""
     generator = torch.Generator().manual_seed(5)
@@ -361,7 +305,7 @@ def test_work_in_closed_cycles(base, form):
             bound = (tau - reference).norm(dim=2).amax(0) * step.norm(dim=2).sum(0)
         assert bool((work <= bound + quadrature * size).all())
         gained = max(gained, float((work / size).max()))
-    assert form == "energy" or gained > 1e-3  # the test can tell the forms apart
+    assert form == "energy" or gained > 1e-3  # the test distinguishes the forms
 
 
 def tangent(part, sigma, weights):
@@ -373,8 +317,8 @@ def tangent(part, sigma, weights):
 
 
 def acoustic_minimum(part, sigma, weights, spared=0.0, directions=100):
-    """Least m . dtau n - (m . n)(m . tau n) of dF = (m n^T) F over unit m and n (half a sphere of them), (N,) [Pa];
-    ``spared`` (m . n)^2 is taken away.
+    """Minimum of m . dtau n - (m . n)(m . tau n) of dF = (m n^T) F over unit m and n (half a sphere), (N,) [Pa];
+    ``spared`` (m . n)^2 is subtracted.
 
     That is m n^T : (dP) F^T; positive: strongly elliptic, waves in all directions and no jump of F. In the axes of the
     stress dtau_ij = (y_i - y_j) / (b_i - b_j) (b_j L_ij + b_i L_ji) off the diagonal, with b = sigma^2, L = m n^T.
@@ -385,8 +329,8 @@ def acoustic_minimum(part, sigma, weights, spared=0.0, directions=100):
     y, D = tangent(part, sigma, weights)
     b = sigma**2
     eye = torch.eye(3, dtype=torch.bool)
-    apart = torch.where(eye, 1.0, b[:, :, None] - b[:, None])
-    shear = torch.where(eye, 0.0, (y[:, :, None] - y[:, None]) / apart)
+    difference = torch.where(eye, 1.0, b[:, :, None] - b[:, None])
+    shear = torch.where(eye, 0.0, (y[:, :, None] - y[:, None]) / difference)
     Q = torch.einsum("sij,di,dj->sdij", D + shear * b[:, :, None] - y[:, :, None], n, n)
     Q = Q + torch.diag_embed(torch.einsum("sij,sj,dj->sdi", shear, b, n**2))
     Q = 0.5 * (Q + Q.mT) - spared * torch.einsum("di,dj->dij", n, n)
@@ -484,33 +428,6 @@ def test_a_moderate_correction_is_elliptic_in_the_visited_range(base):
 # ---------------------------------------------------------------------------------------------- adjoints
 
 
-@pytest.mark.parametrize("name", [*map(str, range(len(ELASTIC))), *RETURNS])
-def test_adjoint_against_differences(name):
-    part, F = (plasticity(name) if name in RETURNS else elasticity(*ELASTIC[int(name)])), near_states()
-    weights = random_weights(part, 4)
-    if name in RETURNS:  # away from the tip of the cone, where rest lies, and from yield
-        trace, _, norm = hencky_strain(torch.linalg.svdvals(F))
-        F = F[(trace[:, 0].abs() > 1e-3) & (norm[:, 0] > 1e-3)]
-    generator = torch.Generator().manual_seed(30)
-    direction, probe = torch.randn(2, *F.shape, generator=generator, dtype=F.dtype)
-    turns = tuple(torch.randn(w.shape, generator=generator, dtype=F.dtype) for w in weights)
-    grad_F, grads = part.vjp(F, weights, probe)
-    step = 1e-6
-
-    def along(sign, moves_F, moves_weights):
-        moved = tuple(w + sign * step * moves_weights * t for w, t in zip(weights, turns, strict=True))
-        return (part.evaluate(F + sign * step * moves_F * direction, moved) * probe).sum((1, 2))
-
-    difference = (along(1, 1, 0) - along(-1, 1, 0)) / (2 * step)
-    exact = (grad_F * direction).sum((1, 2))
-    # rounding eps / step, and the third derivatives of a network whose input is strain / STRAIN
-    assert float((difference - exact).abs().max()) < 1e-7 * float(grad_F.norm(dim=(1, 2)).max())
-    difference = float((along(1, 0, 1) - along(-1, 0, 1)).sum() / (2 * step))
-    exact = float(sum((g * t).sum() for g, t in zip(grads, turns, strict=True)))
-    size = float(sum(g.norm() * t.norm() for g, t in zip(grads, turns, strict=True)))
-    assert abs(difference - exact) < 1e-7 * size
-
-
 @pytest.mark.parametrize("name", RETURNS)
 def test_what_a_base_does_not_have_can_be_learned(name):
     """The slopes of g at a last layer of zeros count, so that training starts."""
@@ -576,10 +493,7 @@ def test_files_round_trip(tmp_path, rank):
         prior, adaptor, merged = (tmp_path / f"{name}.safetensors" for name in ("prior", "adaptor", "merged"))
         save_prior(prior, law, {"prior": "jelly"})
         law.attach_adaptor(rank=rank)
-        generator = torch.Generator().manual_seed(0)
-        with torch.no_grad():
-            for p in (p for p in law.parameters() if p.requires_grad):
-                p.copy_(0.3 * torch.randn(p.shape, generator=generator))
+        randomise_adaptor(law)
         save_adaptor(adaptor, law, rank, 16.0, {})
         save_prior(merged, law, {})
         F = deformations(50)
@@ -599,9 +513,7 @@ def test_a_law_from_a_file_flows_as_much_in_a_second_at_any_time_step(tmp_path, 
     spec, path = specification(plastic="viscous_flow"), tmp_path / "adaptor.safetensors"
     law = structured_law(spec, dt=DT, seed=5)
     law.attach_adaptor(rank=rank)
-    with torch.no_grad():
-        for p in (p for p in law.parameters() if p.requires_grad):
-            p.copy_(0.3 * torch.randn(p.shape, generator=torch.Generator().manual_seed(len(p))))
+    randomise_adaptor(law)
     save_adaptor(path, law, rank, 16.0, {})
     half = load_law(None, path, dt=DT / 2)
     assert half.plasticity.rate == pytest.approx(2 * law.plasticity.rate)

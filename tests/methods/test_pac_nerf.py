@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from benchmarks import pac_nerf as benchmark
-from benchmarks.pac_nerf import BOUNDS, DENSITY, LEAST_OPACITY, MODEL, spotted_ball
+from benchmarks.pac_nerf import BOUNDS, DENSITY, MIN_OPACITY, MODEL, spotted_ball
 from neuma_lib.io.checkpoint import Checkpoint
-from neuma_lib.mechanics.isotropic import lame
+from neuma_lib.mechanics.catalogue import lame
 from neuma_lib.methods.pac_nerf import rendering
 from neuma_lib.methods.pac_nerf.carried_field import CarriedField
 from neuma_lib.methods.pac_nerf.families import FamilyConstants, choose_family
@@ -50,7 +50,7 @@ def ball():
 
 
 def body(settings=SMALL):
-    return CarriedField(ball(), 1.0, LEAST_OPACITY, settings, DENSITY)
+    return CarriedField(ball(), 1.0, MIN_OPACITY, settings, DENSITY)
 
 
 def film(carried, spec):
@@ -419,9 +419,9 @@ class TestOwnParticles:
         assert torch.allclose(fallen, (path.x[-1] - state.x).mean(0).expand(3, 3), atol=1e-4)
 
     def test_a_file_gives_the_particles_that_the_fit_had(self, tmp_path):
-        carried = CarriedField(ball().float(), 1.0, LEAST_OPACITY, SMALL, DENSITY)
+        carried = CarriedField(ball().float(), 1.0, MIN_OPACITY, SMALL, DENSITY)
         save_field(tmp_path / "field.safetensors", carried.field, {})
-        own = {"spacing": 1.0, "min_opacity": LEAST_OPACITY, "settings": SMALL.plain()}
+        own = {"spacing": 1.0, "min_opacity": MIN_OPACITY, "settings": SMALL.plain()}
         loaded = CarriedField.load(tmp_path / "field.safetensors", own, DENSITY)
         assert torch.equal(loaded.moving.x, carried.moving.x) and torch.equal(loaded.mass, carried.mass)
         x = carried.moving.x[None] + 0.01
@@ -429,7 +429,7 @@ class TestOwnParticles:
 
     @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
     def test_cuda_shows_the_same(self, carried):
-        on_gpu = CarriedField(ball().cuda(), 1.0, LEAST_OPACITY, SMALL, DENSITY)
+        on_gpu = CarriedField(ball().cuda(), 1.0, MIN_OPACITY, SMALL, DENSITY)
         x = carried.moving.x[None] + 0.01
         assert torch.allclose(
             self.rendered(on_gpu, x).cpu(), self.rendered(carried, x), atol=1e-9

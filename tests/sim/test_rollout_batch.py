@@ -1,4 +1,6 @@
-"""Several rollouts in the same launches: each as alone, one that diverges among others, laws without kernels."""
+"""Several rollouts in the same launches: equality with single rollouts, divergence of one, laws without kernels."""
+
+from dataclasses import replace
 
 import pytest
 import torch
@@ -13,7 +15,7 @@ from neuma_lib.sim.rollout import RolloutFunction, rollout
 from neuma_lib.sim.simulation import Simulation, gather_weights
 from neuma_lib.sim.state import State
 from tests.support.errors import refused
-from tests.support.sim_scenes import DT, SPECS, cube, make_law, strained
+from tests.support.sim_scenes import DT, SPECS, cube, make_law, moving_cube, strained
 
 pytestmark = pytest.mark.core
 
@@ -45,8 +47,7 @@ def law(name, stiffness=1.0):
 
 def falling(dtype=torch.float64, velocity=(0.3, -2.0, 0.1), count=300):
     """A cube just above the floor."""
-    x, mass, vol0 = cube(count, centre=(0.5, 0.21, 0.5), dtype=dtype)
-    return State(x, torch.tensor(velocity, dtype=dtype), mass, vol0)
+    return moving_cube(velocity, count=count, centre=(0.5, 0.21, 0.5), dtype=dtype)
 
 
 def assert_same(a, b, tolerance=0.0):
@@ -74,27 +75,27 @@ def test_kernels_agree_with_the_laws_themselves(name, dtype):
         for part in (both.elasticity, both.plasticity):
             weights = tuple(w.to(dtype) for w in part.weights())
             expected = part.response(F, weights)
-            found = part.evaluate(F, weights, out=torch.full_like(F, torch.nan))
+            actual = part.evaluate(F, weights, out=torch.full_like(F, torch.nan))
             # Three rotations, an exponential and up to a dozen products; the stress of a strain e has the round-off
             # of F times the stiffness.
             stiffness = 0.0 if part is both.plasticity else 2e5 * F.abs().max() ** 2
             scale = stiffness + expected.abs().max()
-            assert (found - expected).abs().max() <= 32 * torch.finfo(dtype).eps * scale
+            assert (actual - expected).abs().max() <= 32 * torch.finfo(dtype).eps * scale
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_copies_equal_rollouts_of_their_own(dtype):
     """All kinds of laws in one launch; a rollout alone differs by the kernels' round-off, which 40 steps carry on."""
     laws = [law(name, stiffness) for name in FUSED for stiffness in (1.0, 1.3)]
-    found = rollout_batch(MODEL, laws, falling(dtype), **RUN, total=True, together=len(laws))
-    for own, path in zip(laws, found, strict=True):
+    actual = rollout_batch(MODEL, laws, falling(dtype), **RUN, total=True, together=len(laws))
+    for own, path in zip(laws, actual, strict=True):
         alone = rollout(MODEL, own, falling(dtype), **RUN, total=True)
         assert_same(path, alone, 1e4 * torch.finfo(dtype).eps)
         assert (path.F_total - alone.F_total).abs().max() < 1e4 * torch.finfo(dtype).eps
         assert (path.F[-1] - torch.eye(3, dtype=dtype)).abs().max() > 1e-2
 
 
-def test_how_many_go_together_changes_no_bit():
+def test_number_of_copies_changes_no_bit():
     laws = [law("von_mises", 1 + 0.1 * copy) for copy in range(5)]
     groups = [rollout_batch(MODEL, laws, falling(), **RUN, together=together) for together in (1, 2, 5)]
     for paths in zip(*groups, strict=True):
@@ -102,7 +103,7 @@ def test_how_many_go_together_changes_no_bit():
         assert_same(paths[2], paths[0])
 
 
-def test_one_that_diverges_leaves_the_others_alone():
+def test_divergence_does_not_affect_other_copies():
     laws = [law("hencky"), analytic_law(UNSTABLE), law("von_mises")]
     with pytest.raises(NonFiniteError):
         rollout(MODEL, laws[1], falling(), **RUN)
@@ -113,7 +114,7 @@ def test_one_that_diverges_leaves_the_others_alone():
     assert rollout_batch(MODEL, [laws[1]] * 2, falling(), **RUN) == [None, None]
 
 
-def test_one_that_flies_away_leaves_the_others_alone():
+def test_leaving_the_grid_does_not_affect_other_copies():
     slow, fast = falling(), falling(velocity=(0.0, 100.0, 0.0))
     lost, kept = rollout_batch(MODEL, [law("fluid")] * 2, [fast, slow], **RUN, skip_free_flight=False)
     assert lost is None
@@ -133,9 +134,7 @@ def test_every_copy_has_its_own_start():
 
 
 def test_a_batch_in_free_flight_needs_no_grid():
-    high = State(
-        falling().x + torch.tensor([0, 0.3, 0]), *(getattr(falling(), n) for n in ("v", "mass", "vol0"))
-    )
+    high = replace(falling(), x=falling().x + torch.tensor([0, 0.3, 0]))
     for path in rollout_batch(MODEL, [law("hencky"), law("fluid")], high, **RUN):
         assert_same(path, rollout(MODEL, law("hencky"), high, **RUN))
         assert torch.equal(path.F[-1], torch.eye(3, dtype=torch.float64).expand(300, 3, 3))
@@ -160,7 +159,7 @@ def test_wrong_starts_are_named():
 
 
 def test_gradients_of_copies_are_those_of_each():
-    """The adjoint keeps copies apart as well: same gradients of x and v as of each simulation alone."""
+    """The adjoint separates copies as well: same gradients of x and v as of each simulation alone."""
     starts = [falling(), falling(velocity=(1.0, -2.5, 0.5))]
     own = make_law("hencky")
 
@@ -175,8 +174,8 @@ def test_gradients_of_copies_are_those_of_each():
 
     together = gradients(State.joined(starts), 2)
     alone = [gradients(state, 1) for state in starts]
-    for found, expected in zip(together, zip(*alone, strict=True), strict=True):
-        assert torch.equal(found, torch.cat(expected))
+    for actual, expected in zip(together, zip(*alone, strict=True), strict=True):
+        assert torch.equal(actual, torch.cat(expected))
 
 
 def test_constants_are_weights_so_that_graphs_serve_all():
@@ -189,7 +188,7 @@ def test_constants_are_weights_so_that_graphs_serve_all():
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_gpu_agrees_also_when_it_replays(dtype):
-    """Three times, with other constants each time: as it is, recorded, replayed; one copy diverges in the second."""
+    """Three times, with other constants each time: run, recorded, replayed. One copy diverges in the second."""
     for stiffness in (1.0, 1.2, 0.8):
         laws = [law(name, stiffness) for name in FUSED]
         if stiffness == 1.2:
@@ -197,7 +196,7 @@ def test_the_gpu_agrees_also_when_it_replays(dtype):
         start = falling(dtype)
         on_gpu = rollout_batch(MODEL, laws, start.to("cuda"), **RUN, total=True)
         on_cpu = rollout_batch(MODEL, laws, start, **RUN, total=True)
-        for found, expected in zip(on_gpu, on_cpu, strict=True):
-            assert (found is None) == (expected is None)
-            if found:
-                assert_same(found.cpu(), expected, 1e4 * torch.finfo(dtype).eps)
+        for actual, expected in zip(on_gpu, on_cpu, strict=True):
+            assert (actual is None) == (expected is None)
+            if actual:
+                assert_same(actual.cpu(), expected, 1e4 * torch.finfo(dtype).eps)

@@ -1,4 +1,4 @@
-"""Balls against the walls: that nothing leaves the grid, that they come back in shape, and where they come to rest."""
+"""Balls against the walls: no particle leaves the grid, the shape recovers, and the position at rest."""
 
 import math
 
@@ -55,18 +55,18 @@ def largest_error(x: torch.Tensor, start: torch.Tensor) -> float:
     [*((wall, "no_slip", "outside") for wall in WALLS), ("y_min", "slip", "outside")]
     + [("y_min", "no_slip", "released")],
 )
-def test_a_ball_comes_back_in_shape(wall, condition, form):
-    """At rest again, no particle of a soft ball that was thrown at a wall is off by more than 1 % of the radius.
+def test_a_ball_recovers_its_shape(wall, condition, form):
+    """At rest again, no particle of a soft ball that hit a wall is displaced by more than 1 % of the radius.
 
-    Squeezed to half its height it comes back vibrating; so it is stopped after the bounce and may ring down. What is
-    left is what the wall did to it for good: a tenth of the radius with released walls.
+    Squeezed to half its height it vibrates after the bounce, so it is stopped there and the vibration decays. The
+    remaining error is permanent: a tenth of the radius with released walls.
     """
     model = MPM(24, DT, gravity=WEIGHTLESS, boundary=condition, walls=form)
     centre, towards = before(wall, 0.08)
     x0, mass, vol0 = ball(model.grid, centre)
     law = analytic_law(SOFT, dt=DT)
     path = rollout(model, law, State(x0, 2.5 * towards, mass, vol0), steps=500, frames=(200, 500))
-    assert ((path.x[0] - x0) @ towards).min() > 0.05  # it was in contact
+    assert ((path.x[0] - x0) @ towards).min() > 0.05  # contact
     x, F = path.x[1], path.F[1]
     assert (x.mean(dim=0) - path.x[0].mean(dim=0)) @ towards < 0
     aside = x - x.mean(dim=0) + 0.5
@@ -78,8 +78,8 @@ def test_a_ball_comes_back_in_shape(wall, condition, form):
 
 @pytest.mark.parametrize("condition", CONDITIONS)
 @pytest.mark.parametrize("wall", WALLS)
-def test_a_hard_throw_leaves_no_particle_outside(wall, condition):
-    """Thrown at 8 m/s, over four times the speed of its shear waves, obliquely into a corner of walls.
+def test_a_fast_impact_leaves_no_particle_outside(wall, condition):
+    """Launched at 8 m/s, over four times the speed of its shear waves, obliquely into a corner of walls.
 
     Half a cell beyond the first wall node the velocity is zero, whatever the body does: there a particle sees wall
     nodes only. Its distance d from there, in cells, shrinks in a step by d^2 / 2 times the cells that the nearest free
@@ -100,14 +100,13 @@ def test_a_hard_throw_leaves_no_particle_outside(wall, condition):
         assert ahead.max() < 0.5
 
 
-def test_a_particle_that_leaves_the_grid_stops_the_run():
-    """One whose affine velocity throws a node further than its own velocity tells: the message names it."""
+def test_a_particle_outside_the_grid_is_an_error():
+    """The message names a particle whose affine velocity moves a node further than the particle's velocity."""
     model = MPM(16, DT, gravity=WEIGHTLESS, boundary="sticky")
     x = torch.tensor([[0.5, 0.5, 0.5], [0.5, -model.dx, 0.5]])
     C = torch.zeros(2, 3, 3)
-    C[1, 1, 1] = (
-        -5 / DT
-    )  # the free node above moves down by five cells, and the particle with an eighth of it
+    # the free node above moves down by five cells, and the particle with an eighth of it
+    C[1, 1, 1] = -5 / DT
     one = torch.full((2,), 1e-3)
     law = analytic_law(SOFT, dt=DT)
     with pytest.raises(NonFiniteError, match="particle 1 .* left the grid at step 1") as error:
@@ -134,7 +133,7 @@ def test_bodies_rest_at_the_wall_of_the_cube(wall, E, fraction):
 
 
 def bounce(grid: int, E: float = 3e4) -> tuple[float, float]:
-    """Lowest place [cells] of a particle of a ball thrown down, and height [m] that its centre comes back to."""
+    """Lowest place [cells] of a particle of a falling ball, and height [m] to which its centre rebounds."""
     model = MPM(grid, DT)
     x0, mass, vol0 = ball(grid, (0.5, RADIUS + 0.15, 0.5))
     state = State(x0, torch.tensor([0.0, -1.92, 0.0]), mass, vol0)

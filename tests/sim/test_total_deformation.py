@@ -36,13 +36,13 @@ def run(body, spec, frames=FRAMES, **options):
 
 def product_of_increments(path):
     """The product of I + dt C over all steps, at each of them, from a path that holds them all."""
-    found = [EYE.expand_as(path.C[0])]
+    actual = [EYE.expand_as(path.C[0])]
     for C in path.C[1:]:
-        found.append((EYE + MODEL.dt * C) @ found[-1])
-    return torch.stack(found)
+        actual.append((EYE + MODEL.dt * C) @ actual[-1])
+    return torch.stack(actual)
 
 
-def test_is_none_unless_asked_for(body):
+def test_is_none_by_default(body):
     path = run(body, ELASTIC, total=False)
     assert path.F_total is None and torch.equal(path.stretch, path.F)
 
@@ -55,13 +55,13 @@ def test_is_the_product_of_the_increments(body):
     assert torch.equal(path.F_total, every.F_total[list(FRAMES)]) and path.stretch is path.F_total
 
 
-def test_equals_the_elastic_one_where_nothing_flows(body):
+def test_equals_the_elastic_deformation_without_flow(body):
     path = run(body, ELASTIC)
     assert (path.F_total[-1] - EYE).abs().max() > 1e-3
     assert torch.allclose(path.F_total, path.F, atol=1e-12)
 
 
-def test_keeps_what_has_flowed(body):
+def test_includes_plastic_deformation(body):
     path = run(body, PLASTIC)
     # The return map of von Mises keeps volume, so both have the same determinant but not the same shape.
     assert torch.allclose(torch.linalg.det(path.F_total), torch.linalg.det(path.F), rtol=1e-8)
@@ -76,7 +76,7 @@ def test_is_exact_over_a_skipped_free_flight(body):
     assert (skipped.F_total - simulated.F_total).abs().max() < 1e-10
 
 
-def test_turns_with_a_spinning_body_in_flight():
+def test_rotates_with_a_spinning_body_in_flight():
     """Affine motions are exact in APIC: each step multiplies by I + dt C, with C that follows the motion."""
     x, mass, vol0 = cube(200)
     v, C = spinning(x)
@@ -97,7 +97,7 @@ def test_starts_from_the_deformation_of_the_start(body):
 
 
 def test_evaluation_carries_it(body):
-    """Same states and metrics as without it, and the total deformation of a rollout of its own, to the bit."""
+    """Same states and metrics as without it, and the total deformation of a separate rollout, to the bit."""
     law = analytic_law(PLASTIC)
     tracers = body.x0[:20]
     truth = tracers.expand(len(FRAMES), -1, -1)

@@ -40,7 +40,7 @@ def test_opengl_camera_looks_along_minus_z():
 
 
 def test_rendered_centroid_is_the_projected_point():
-    """A small Gaussian's light lies where ``project`` says, with pixel centres at half integers."""
+    """The centroid of a small Gaussian is the result of ``project``, with pixel centres at half integers."""
     cameras, _ = ring()
     point = torch.tensor([[0.25, 0.1, -0.15]], dtype=torch.float64)
     _, alphas = rasterize(

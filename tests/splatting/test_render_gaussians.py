@@ -111,7 +111,7 @@ def test_affine_motion_carries_gaussians_exactly():
     assert torch.allclose(covars[0], A @ covars0 @ A.T)
 
 
-def test_affine_motion_carries_gaussians_beside_their_particles_exactly():
+def test_affine_motion_carries_offset_gaussians_exactly():
     """With arms, x -> A x + b on every particle takes the centres to A x + b too, wherever they lie."""
     gaussians, binding, x0, _, _, generator = deformation_case()
     A = torch.eye(3) + 0.3 * torch.randn(3, 3, generator=generator, dtype=torch.float64)

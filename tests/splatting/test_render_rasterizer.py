@@ -8,23 +8,32 @@ import torch
 from neuma_lib.splatting import torch_reference
 from neuma_lib.splatting.rasterizer import RenderBuffers, Statistics, rasterize
 from tests.support.errors import refused
-from tests.support.render_scenes import random_scene
+from tests.support.render_scenes import (
+    BACKGROUND,
+    LOOSE,
+    SMOOTH,
+    assert_each_image_is_rendered_alone,
+    assert_slope,
+    random_scene,
+    with_gradients,
+)
 
 pytestmark = pytest.mark.core
 
-SMOOTH = dict(alpha_min=0.0, alpha_max=2.0, transmittance_min=0.0)
-LOOSE = dict(alpha_min=1 / 255, alpha_max=0.6, transmittance_min=0.05)
 WIDTH, HEIGHT = 26, 21
 
 
-def render_with_gradients(render, scene, seed=1, **options):
-    """Images, alphas and the gradients of a random linear function of them."""
-    inputs = [tensor.clone().requires_grad_() for tensor in scene[:4]]
-    images, alphas = render(*inputs, *scene[4:], WIDTH, HEIGHT, background=(0.2, 0.5, 0.9), **options)
-    generator = torch.Generator().manual_seed(seed)
-    weights = [torch.randn(out.shape, generator=generator, dtype=out.dtype) for out in (images, alphas)]
-    loss = sum((weight * out).sum() for weight, out in zip(weights, (images, alphas), strict=True))
-    return (images.detach(), alphas.detach()), torch.autograd.grad(loss, inputs)
+def render_with_gradients(render, scene, **options):
+    return with_gradients(render, scene, WIDTH, HEIGHT, **options)
+
+
+def assert_equals_twin(scene, **options):
+    expected, expected_grads = render_with_gradients(torch_reference.rasterize, scene, **options)
+    actual, grads = render_with_gradients(rasterize, scene, **options)
+    for a, b in zip(expected, actual, strict=True):
+        assert (a - b).abs().max() < 1e-9
+    for a, b in zip(expected_grads, grads, strict=True):
+        assert (a - b).abs().max() < 1e-9 * max(1.0, float(a.abs().max()))
 
 
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
@@ -34,24 +43,14 @@ def test_equals_twin(options, coefficients):
     # colours below zero
     scene = random_scene(2, 50, 2, WIDTH, HEIGHT, coefficients, scale=0.06)
     scene[3] = scene[3] * 3
-    expected, expected_grads = render_with_gradients(torch_reference.rasterize, scene, **options)
-    actual, grads = render_with_gradients(rasterize, scene, **options)
-    for a, b in zip(expected, actual, strict=True):
-        assert (a - b).abs().max() < 1e-9
-    for a, b in zip(expected_grads, grads, strict=True):
-        assert (a - b).abs().max() < 1e-9 * max(1.0, float(a.abs().max()))
+    assert_equals_twin(scene, **options)
 
 
 def test_equals_twin_close_to_the_camera():
     # Gaussians behind the camera, at the near plane and far outside the image, where the tangents are limited
     scene = random_scene(1, 60, 1, WIDTH, HEIGHT, 4, scale=0.05)
     scene[0] = scene[0] * 6
-    expected, expected_grads = render_with_gradients(torch_reference.rasterize, scene)
-    actual, grads = render_with_gradients(rasterize, scene)
-    for a, b in zip(expected, actual, strict=True):
-        assert (a - b).abs().max() < 1e-9
-    for a, b in zip(expected_grads, grads, strict=True):
-        assert (a - b).abs().max() < 1e-9 * max(1.0, float(a.abs().max()))
+    assert_equals_twin(scene)
 
 
 def test_float32_agrees_with_float64():
@@ -66,14 +65,8 @@ def test_float32_agrees_with_float64():
 def test_float32_gradients_agree_with_float64():
     scene = random_scene(1, 200, 1, WIDTH, HEIGHT, 4, scale=0.03)
     _, precise = render_with_gradients(rasterize, scene, **SMOOTH)
-    inputs = [tensor.float().requires_grad_() for tensor in scene[:4]]
-    images, alphas = rasterize(
-        *inputs, *(t.float() for t in scene[4:]), WIDTH, HEIGHT, background=(0.2, 0.5, 0.9), **SMOOTH
-    )
-    generator = torch.Generator().manual_seed(1)
-    weights = [torch.randn(out.shape, generator=generator, dtype=torch.float64) for out in (images, alphas)]
-    loss = sum((weight.float() * out).sum() for weight, out in zip(weights, (images, alphas), strict=True))
-    for a, b in zip(precise, torch.autograd.grad(loss, inputs), strict=True):
+    _, single = render_with_gradients(rasterize, [tensor.float() for tensor in scene], **SMOOTH)
+    for a, b in zip(precise, single, strict=True):
         assert (a - b.double()).norm() < 1e-3 * a.norm()
 
 
@@ -88,38 +81,23 @@ def test_gradient_along_random_directions(argument, seed):
         direction = direction * 1e-3  # of the size of the covariances themselves
     weights = torch.randn(2, 2, HEIGHT, WIDTH, 3, generator=generator, dtype=torch.float64)
 
-    def loss(step, requires_grad=False):
-        inputs = list(scene)
-        inputs[index] = (scene[index] + step * direction).requires_grad_(requires_grad)
+    def loss(value):
+        inputs = [*scene[:index], value, *scene[index + 1 :]]
         images, alphas = rasterize(*inputs, WIDTH, HEIGHT, **SMOOTH)
-        return (weights * images).sum() + (weights[..., 0] * alphas).sum(), inputs[index]
+        return (weights * images).sum() + (weights[..., 0] * alphas).sum()
 
-    value, leaf = loss(0.0, requires_grad=True)
-    exact = (torch.autograd.grad(value, leaf)[0] * direction).sum()
-    h = 1e-5
-    difference = (8 * (loss(h)[0] - loss(-h)[0]) - (loss(2 * h)[0] - loss(-2 * h)[0])) / (12 * h)
-    assert abs(exact - difference) < 1e-6 * abs(exact) + 1e-8
+    assert_slope(loss, scene[index], direction)
 
 
 def test_single_gaussian_closed_form():
     """An isotropic Gaussian on the axis: alpha = o exp(-r^2 / 2 s^2) with s^2 = (f sigma / z)^2 + eps2d."""
     sigma, depth, focal, size, opacity = 0.05, 2.0, 80.0, 31, 0.7
     means = torch.tensor([[[0.0, 0.0, depth]]], dtype=torch.float64)
-    covars = sigma**2 * torch.eye(3, dtype=torch.float64)[None, None]
+    covars, view = sigma**2 * torch.eye(3).double()[None, None], torch.eye(4).double()[None]
     sh = torch.tensor([[[0.4, -0.3, 0.1]]], dtype=torch.float64)
     K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]], dtype=torch.float64)[None]
-    view = torch.eye(4, dtype=torch.float64)[None]
-    images, alphas = rasterize(
-        means,
-        covars,
-        torch.tensor([opacity], dtype=torch.float64),
-        sh,
-        view,
-        K,
-        size,
-        size,
-        background=(0, 0, 1.0),
-    )
+    scene = (means, covars, torch.tensor([opacity], dtype=torch.float64), sh, view, K)
+    images, alphas = rasterize(*scene, size, size, background=(0, 0, 1.0))
     centre = torch.arange(size, dtype=torch.float64) + 0.5 - size / 2
     r2 = centre[:, None] ** 2 + centre**2
     expected = opacity * torch.exp(-r2 / (2 * ((focal * sigma / depth) ** 2 + 0.3)))
@@ -127,9 +105,8 @@ def test_single_gaussian_closed_form():
     assert (alphas[0, 0] - expected).abs().max() < 1e-12
     colour = 0.5 + sh[0, 0] * 0.5 / math.sqrt(math.pi)
     blue = torch.tensor([0, 0, 1.0], dtype=torch.float64)
-    assert (
-        images[0, 0] - (expected[..., None] * colour + (1 - expected[..., None]) * blue)
-    ).abs().max() < 1e-12
+    expected = expected[..., None] * colour + (1 - expected[..., None]) * blue
+    assert (images[0, 0] - expected).abs().max() < 1e-12
 
 
 def test_nearer_gaussian_hides_the_farther():
@@ -145,35 +122,14 @@ def test_nearer_gaussian_hides_the_farther():
 
 def test_frames_and_views_are_independent():
     scene = random_scene(3, 80, 2, WIDTH, HEIGHT, 4)
-    means, covars, opacities, sh, viewmats, Ks = scene
-    images, alphas = rasterize(*scene, WIDTH, HEIGHT)
-    for t in range(3):
-        for v in range(2):
-            image, alpha = rasterize(
-                means[t : t + 1],
-                covars[t : t + 1],
-                opacities,
-                sh,
-                viewmats[v : v + 1],
-                Ks[v : v + 1],
-                WIDTH,
-                HEIGHT,
-            )
-            assert torch.equal(images[t, v], image[0, 0]) and torch.equal(alphas[t, v], alpha[0, 0])
+    assert_each_image_is_rendered_alone(rasterize, scene, WIDTH, HEIGHT)
 
 
 def test_order_of_gaussians_does_not_matter():
     scene = random_scene(1, 80, 1, WIDTH, HEIGHT, 4)
     permutation = torch.randperm(80, generator=torch.Generator().manual_seed(0))
-    shuffled = [
-        scene[0][:, permutation],
-        scene[1][:, permutation],
-        scene[2][permutation],
-        scene[3][permutation],
-    ]
-    assert torch.equal(
-        rasterize(*scene, WIDTH, HEIGHT)[0], rasterize(*shuffled, *scene[4:], WIDTH, HEIGHT)[0]
-    )
+    shuffled = [*(x[:, permutation] for x in scene[:2]), *(x[permutation] for x in scene[2:4]), *scene[4:]]
+    assert torch.equal(rasterize(*scene, WIDTH, HEIGHT)[0], rasterize(*shuffled, WIDTH, HEIGHT)[0])
 
 
 def test_kept_buffers_change_nothing():
@@ -182,7 +138,8 @@ def test_kept_buffers_change_nothing():
     for _ in range(2):
         expected, expected_grads = render_with_gradients(rasterize, scene)
         actual, grads = render_with_gradients(rasterize, scene, buffers=buffers)
-        assert all(torch.equal(a, b) for a, b in zip(expected + expected_grads, actual + grads, strict=True))
+        pairs = zip((*expected, *expected_grads), (*actual, *grads), strict=True)
+        assert all(torch.equal(a, b) for a, b in pairs)
 
 
 def test_two_renders_before_backward():
@@ -209,7 +166,7 @@ def test_empty_image_is_background():
     scene = random_scene(1, 10, 1, WIDTH, HEIGHT, 1)
     scene[0] = scene[0] + 100.0
     (images, alphas), grads = render_with_gradients(rasterize, scene)
-    assert torch.equal(images, torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64).expand_as(images))
+    assert torch.equal(images, torch.tensor(BACKGROUND, dtype=torch.float64).expand_as(images))
     assert alphas.abs().max() == 0
     assert all(grad.abs().max() == 0 for grad in grads)
 

@@ -13,7 +13,14 @@ from neuma_lib.splatting.image_loss import mean_squared_error
 from neuma_lib.splatting.rasterizer import RenderBuffers, Statistics, rasterize, rasterized_error
 from tests.support.emulated_cuda import COMPILER, EmulatedTiles
 from tests.support.errors import refused
-from tests.support.render_scenes import random_scene
+from tests.support.render_scenes import (
+    BACKGROUND,
+    LOOSE,
+    SMOOTH,
+    assert_each_image_is_rendered_alone,
+    random_scene,
+    with_gradients,
+)
 
 pytestmark = pytest.mark.core
 
@@ -21,9 +28,6 @@ CUDA = pytest.param(
     "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 )
 EMULATED = pytest.param("emulated", marks=pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler"))
-SMOOTH = dict(alpha_min=0.0, alpha_max=2.0, transmittance_min=0.0)
-LOOSE = dict(alpha_min=1 / 255, alpha_max=0.6, transmittance_min=0.05)
-BACKGROUND = (0.2, 0.5, 0.9)
 
 
 @pytest.fixture(scope="session")
@@ -46,15 +50,6 @@ def render(request, monkeypatch, build_folder):
         return tuple(output.to("cpu", torch.float64) for output in outputs)
 
     return run
-
-
-def with_gradients(render, scene, width, height, **options):
-    inputs = [tensor.clone().requires_grad_() for tensor in scene[:4]]
-    outputs = render(*inputs, *scene[4:], width, height, background=BACKGROUND, **options)
-    generator = torch.Generator().manual_seed(1)
-    weights = [torch.randn(out.shape, generator=generator, dtype=out.dtype) for out in outputs]
-    loss = sum((weight * out).sum() for weight, out in zip(weights, outputs, strict=True))
-    return [out.detach() for out in outputs], torch.autograd.grad(loss, inputs)
 
 
 def check_images(images, alphas, expected, expected_alphas):
@@ -109,7 +104,7 @@ def test_other_tile_sizes(tile, lane_pixels, monkeypatch, build_folder):
         assert (a - b).norm() < 1e-4 * a.norm()
 
 
-def test_nothing_to_see(render):
+def test_empty_images(render):
     scene = random_scene(2, 10, 1, 37, 29, 1)
     scene[0] = scene[0] + 100.0
     (images, alphas), grads = with_gradients(render, scene, 37, 29)
@@ -120,19 +115,7 @@ def test_nothing_to_see(render):
 
 def test_a_batch_equals_single_calls(render):
     scene = random_scene(3, 80, 2, 37, 29, 4, scale=0.03)
-    images, alphas = render(*scene, 37, 29)
-    for t in range(3):
-        for v in range(2):
-            image, alpha = render(
-                scene[0][t : t + 1],
-                scene[1][t : t + 1],
-                *scene[2:4],
-                scene[4][v : v + 1],
-                scene[5][v : v + 1],
-                37,
-                29,
-            )
-            assert torch.equal(images[t, v], image[0, 0]) and torch.equal(alphas[t, v], alpha[0, 0])
+    assert_each_image_is_rendered_alone(render, scene, 37, 29)
 
 
 def test_statistics(render):
@@ -147,7 +130,7 @@ def test_statistics(render):
 
 
 def frame_errors(function, device, scene, observed, width, height, **options):
-    """Losses (T,) of a render and gradients of all inputs, of frames with weights of their own."""
+    """Losses (T,) of a render and gradients of all inputs, with a weight per frame."""
     inputs = [tensor.float().to(device) for tensor in scene]
     leaves = [tensor.requires_grad_() for tensor in inputs[:4]]
     losses = function(*inputs, width, height, observed.to(device), background=BACKGROUND, **options)
@@ -175,15 +158,20 @@ COMPARED = SCENES | {
 }
 
 
-@pytest.mark.parametrize("device", [EMULATED, CUDA])
+@pytest.fixture(params=[EMULATED, CUDA])
+def device(request, monkeypatch, build_folder):
+    """Device on which the tile compositor runs. In an emulation it replaces the compositor of the CPU."""
+    if request.param == "cuda":
+        return "cuda"
+    monkeypatch.setitem(rasterizer.COMPOSITORS, "rows", EmulatedTiles(build_folder))
+    return "cpu"
+
+
 @pytest.mark.parametrize("name", COMPARED)
-def test_an_error_taken_while_drawing_is_that_of_the_images(name, device, monkeypatch, build_folder):
+def test_direct_error_is_that_of_the_images(name, device, monkeypatch):
     """Images, their loss and its gradient one after the other are the twin; only the order of sums differs."""
     make, width, height, options = COMPARED[name]
     scene = make()
-    if device == "emulated":
-        monkeypatch.setitem(rasterizer.COMPOSITORS, "rows", EmulatedTiles(build_folder))
-        device = "cpu"
     shape = (len(scene[0]), len(scene[4]), height, width, 4)
     observed = torch.randint(0, 256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(2))
     setting = (device, scene, observed, width, height)
@@ -196,27 +184,23 @@ def test_an_error_taken_while_drawing_is_that_of_the_images(name, device, monkey
     assert torch.equal(drawn[0][0], drawn[1][0]), "sums have a fixed order"
     # covariances of needles are badly conditioned: the twin's own gradients are 1e-4 away from those in float64
     bound = 1e-3 if name == "needles" else 5e-6
-    for found, twin in zip(drawn[0], expected, strict=True):
-        assert (found - twin).norm() <= bound * twin.norm()
+    for actual, twin in zip(drawn[0], expected, strict=True):
+        assert (actual - twin).norm() <= bound * twin.norm()
     assert all(bool(grad.abs().max() > 0) == (name != "no splats at all") for grad in drawn[0][1:3])
 
 
-@pytest.mark.parametrize("device", [EMULATED, CUDA])
 @pytest.mark.parametrize("wanted", [[0], [1], [0, 1], [0, 1, 3], [2], [3]])
-def test_gradients_that_nobody_wants_change_no_other(wanted, device, monkeypatch, build_folder):
-    """Without those of opacities other code runs."""
-    if device == "emulated":
-        monkeypatch.setitem(rasterizer.COMPOSITORS, "rows", EmulatedTiles(build_folder))
-        device = "cpu"
+def test_omitted_gradients_change_no_other(wanted, device):
+    """Other code runs without those of opacities."""
     scene = [tensor.float().to(device) for tensor in random_scene(2, 80, 2, 37, 29, 4, scale=0.04)]
     observed = torch.full((2, 2, 29, 37, 4), 99, dtype=torch.uint8, device=device)
-    found = []
+    actual = []
     for leaves in (range(4), wanted):
         inputs = [tensor.clone().requires_grad_(i in leaves) for i, tensor in enumerate(scene[:4])]
         losses = rasterized_error(*inputs, *scene[4:], 37, 29, observed)
         losses.sum().backward()
-        found.append([tensor.grad for tensor in inputs])
-    for i, (all_wanted, some_wanted) in enumerate(zip(*found, strict=True)):
+        actual.append([tensor.grad for tensor in inputs])
+    for i, (all_wanted, some_wanted) in enumerate(zip(*actual, strict=True)):
         if i not in wanted:
             assert some_wanted is None
         else:
@@ -231,8 +215,8 @@ def test_errors_of_other_tile_sizes(tile, lane_pixels, monkeypatch, build_folder
     setting = ("cpu", scene, observed, 37, 29)
     expected = frame_errors(error_of_images, *setting)
     monkeypatch.setitem(rasterizer.COMPOSITORS, "rows", EmulatedTiles(build_folder, tile, lane_pixels))
-    for found, twin in zip(frame_errors(rasterized_error, *setting), expected, strict=True):
-        assert (found - twin).norm() <= 1e-4 * twin.norm()
+    for actual, twin in zip(frame_errors(rasterized_error, *setting), expected, strict=True):
+        assert (actual - twin).norm() <= 1e-4 * twin.norm()
 
 
 def project(scene, width, height, alpha_min=1 / 255, eps2d=0.3):
@@ -242,7 +226,7 @@ def project(scene, width, height, alpha_min=1 / 255, eps2d=0.3):
 
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("tile", [8, 16])
-def test_lists_hold_what_tiles_see_and_little_more(name, tile):
+def test_lists_are_complete_and_tight(name, tile):
     make, width, height, options = SCENES[name]
     alpha_min = options.get("alpha_min", 1 / 255)
     splats, depths = project(make(), width, height, alpha_min, options.get("eps2d", 0.3))
@@ -275,15 +259,13 @@ def test_lists_hold_what_tiles_see_and_little_more(name, tile):
 
 
 def test_lists_of_no_splats():
-    ids, starts = compositor_cuda.lists(torch.zeros(2, 0, 12), torch.zeros(2, 0), 20, 20, 16)
-    assert len(ids) == 0 and torch.equal(starts, torch.zeros(9, dtype=torch.int32))
-    ids, starts = compositor_cuda.lists(
-        torch.zeros(2, 3, 12), torch.full((2, 3), projection.CULLED), 20, 20, 16
-    )
-    assert len(ids) == 0 and torch.equal(starts, torch.zeros(9, dtype=torch.int32))
+    for count in (0, 3):
+        depths = torch.full((2, count), projection.CULLED)
+        ids, starts = compositor_cuda.lists(torch.zeros(2, count, 12), depths, 20, 20, 16)
+        assert len(ids) == 0 and torch.equal(starts, torch.zeros(9, dtype=torch.int32))
 
 
-def test_splats_that_are_no_numbers_stay_out():
+def test_non_finite_splats_are_not_listed():
     scene = random_scene(1, 20, 1, 37, 29, 1, dtype=torch.float32)
     scene[0][0, 0] = float("nan")
     scene[1][0, 1] = float("nan")
@@ -306,25 +288,20 @@ def test_errors_name_compositors_that_work():
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_equals_gsplat_image_by_image():
     pytest.importorskip("gsplat", exc_type=ImportError)
-    scene = [
-        tensor.cuda() for tensor in random_scene(3, 2000, 2, 150, 100, 16, scale=0.01, dtype=torch.float32)
-    ]
-    results = {}
-    for compositor in ("tiles", "gsplat"):
-        inputs = [tensor.clone().requires_grad_() for tensor in scene[:4]]
-        render = gsplat_backend.rasterize if compositor == "gsplat" else rasterize
-        images, alphas = render(*inputs, *scene[4:], 150, 100, background=BACKGROUND, alpha_max=0.999)
+    scene = random_scene(3, 2000, 2, 150, 100, 16, scale=0.01, dtype=torch.float32)
+    results = []
+    for render in (rasterize, gsplat_backend.rasterize):
+        inputs = [tensor.cuda().requires_grad_() for tensor in scene[:4]]
+        cameras = [tensor.cuda() for tensor in scene[4:]]
+        images, alphas = render(*inputs, *cameras, 150, 100, background=BACKGROUND, alpha_max=0.999)
         weights = torch.linspace(-1, 1, images.numel(), device="cuda").view_as(images)
-        results[compositor] = (
-            images,
-            alphas,
-            torch.autograd.grad((weights * images).sum() + alphas.sum(), inputs),
-        )
-    images, alphas, grads = results["tiles"]
+        grads = torch.autograd.grad((weights * images).sum() + alphas.sum(), inputs)
+        results.append((images, alphas, grads))
+    (images, alphas, grads), (expected, expected_alphas, expected_grads) = results
     for t in range(3):
         for v in range(2):
-            error = (images[t, v] - results["gsplat"][0][t, v]).abs()
+            error = (images[t, v] - expected[t, v]).abs()
             assert error.mean() < 1e-4 and (error.amax(dim=-1) > 2 / 255).float().mean() < 1e-3
-    assert (alphas - results["gsplat"][1]).abs().mean() < 1e-4
-    for a, b in zip(grads, results["gsplat"][2], strict=True):
+    assert (alphas - expected_alphas).abs().mean() < 1e-4
+    for a, b in zip(grads, expected_grads, strict=True):
         assert (a - b).norm() < 1e-2 * a.norm()

@@ -1,4 +1,4 @@
-"""Random Gaussian scenes, and bindings as dense matrices."""
+"""Random Gaussian scenes, checks of renderers, and bindings as dense matrices."""
 
 import torch
 
@@ -24,6 +24,42 @@ def random_scene(frames, count, views, width, height, coefficients, scale=0.03, 
     K = torch.tensor([[1.6 * width, 0, 0.52 * width], [0, 1.5 * width, 0.48 * height], [0, 0, 1]])
     Ks = K.double().expand(views, 3, 3).contiguous()
     return [tensor.to(dtype) for tensor in (means, covars, opacities, sh, viewmats, Ks)]
+
+
+SMOOTH = dict(alpha_min=0.0, alpha_max=2.0, transmittance_min=0.0)
+LOOSE = dict(alpha_min=1 / 255, alpha_max=0.6, transmittance_min=0.05)
+BACKGROUND = (0.2, 0.5, 0.9)
+
+
+def with_gradients(render, scene, width, height, **options):
+    """Images and alphas, and gradients of a random linear function of them."""
+    inputs = [tensor.clone().requires_grad_() for tensor in scene[:4]]
+    outputs = render(*inputs, *scene[4:], width, height, background=BACKGROUND, **options)
+    generator = torch.Generator().manual_seed(1)
+    weights = [torch.randn(out.shape, generator=generator, dtype=torch.float64) for out in outputs]
+    loss = sum((weight.to(out) * out).sum() for weight, out in zip(weights, outputs, strict=True))
+    return [out.detach() for out in outputs], torch.autograd.grad(loss, inputs)
+
+
+def assert_each_image_is_rendered_alone(render, scene, width, height):
+    """Frames and views of a batch are the same bytes as in single calls."""
+    means, covars, opacities, sh, viewmats, Ks = scene
+    images, alphas = render(*scene, width, height)
+    for t in range(len(means)):
+        for v in range(len(viewmats)):
+            one = (means[t][None], covars[t][None], opacities, sh, viewmats[v][None], Ks[v][None])
+            image, alpha = render(*one, width, height)
+            assert torch.equal(images[t, v], image[0, 0]) and torch.equal(alphas[t, v], alpha[0, 0])
+
+
+def assert_slope(function, point, direction):
+    """Gradient of a smooth function along a direction, against a central difference of fourth order."""
+    leaf = point.clone().requires_grad_()
+    exact = (torch.autograd.grad(function(leaf), leaf)[0] * direction).sum()
+    h = 1e-5
+    near, far = (function(point + k * h * direction) - function(point - k * h * direction) for k in (1, 2))
+    difference = (8 * near - far) / (12 * h)
+    assert abs(exact - difference) < 1e-6 * abs(exact) + 1e-8
 
 
 def dense(binding):

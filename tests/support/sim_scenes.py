@@ -6,6 +6,8 @@ from torch.nn.functional import gelu
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.neural import features, neural_law
 from neuma_lib.mechanics.singular_values import rotation_and_singular_values
+from neuma_lib.sim.rollout import rollout
+from neuma_lib.sim.state import State
 
 DENSITY = 1000.0
 DT = 1e-3
@@ -65,6 +67,17 @@ def cube(count=300, side=0.3, centre=(0.5, 0.5, 0.5), seed=0, dtype=torch.float6
     x = torch.tensor(centre, dtype=torch.float64) + side * spread
     vol0 = torch.full((count,), side**3 / count, dtype=torch.float64)
     return x.to(dtype), (DENSITY * vol0).to(dtype), vol0.to(dtype)
+
+
+def moving_cube(velocity, **options):
+    """Undeformed particles of `cube` with one velocity [m/s]."""
+    x, mass, vol0 = cube(**options)
+    return State(x, torch.tensor(velocity, dtype=x.dtype), mass, vol0)
+
+
+def simulate(model, law, start, frames, **options):
+    """Rollout up to the last of the frames."""
+    return rollout(model, law, start, steps=frames[-1], frames=frames, **options)
 
 
 def spinning(x, omega=(3.0, -2.0, 5.0), velocity=(0.0, 0.0, 0.0)):

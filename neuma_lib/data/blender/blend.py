@@ -39,7 +39,7 @@ def write_blend(
         np.savez(
             job, vertices=np.asarray(vertices, np.float32), faces=np.asarray(faces, np.int32), times=times,
             colors=linear(colors).astype(np.float32), pose=views.c2w[0], focal=views.focal, size=np.array(_SIZE),
-            samples=_SAMPLES, threads=1, shown=times[-1],
+            samples=_SAMPLES, threads=1, preview_time=times[-1],
         )  # fmt: skip
         run_worker(_WORKER, job)
         for source, target in ((job.with_name("motion.blend"), path), (job.with_name("proof.png"), picture)):

@@ -52,7 +52,8 @@ def main(path: str) -> None:
     bpy.context.view_layer.update()
     for each in scene.objects:
         each.matrix_world = stand @ each.matrix_world
-    scene.frame_set(int(job["shown"] * RATE), subframe=float(job["shown"] * RATE % 1))
+    preview = float(job["preview_time"] * RATE)
+    scene.frame_set(int(preview), subframe=preview % 1)
     cycles.render(folder / "proof.png")
     scene.frame_set(0)
     # keep the folder of the render out of the file

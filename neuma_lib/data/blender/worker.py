@@ -57,11 +57,11 @@ def main(path: str) -> None:
     cycles.start(*(int(s) for s in job["size"]), int(job["samples"]), threads, str(job["device"]))
     body = cycles.Body(job)
     camera = cycles.add_camera(float(job["focal"]), int(job["size"][0]))
-    shown = None
+    current = None
     for index, (frame, view) in enumerate(job["shots"]):
-        if frame != shown:
+        if frame != current:
             body.show(int(frame))
-            shown = frame
+            current = frame
         cycles.place(camera, job["c2w"][view])
         cycles.render(folder / f"{index:05d}.png")
         print(index + 1, file=report, flush=True)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from neuma_lib.errors import InputError
 from neuma_lib.mechanics.analytic import analytic_law
-from neuma_lib.mechanics.isotropic import lame
+from neuma_lib.mechanics.catalogue import lame
 from neuma_lib.mechanics.law import Law
 from neuma_lib.methods.pac_nerf.options import MODULI, PacFamilyConfig, PacNerfConfig
 
