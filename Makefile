@@ -1,7 +1,8 @@
 # make table1   the environment, then Table 1 of the paper at the default scale
 # make demo     the environment, then one small scene from nothing to a film and a viewer: minutes
 # make test     the tests (make test-all adds the slow ones)
-# make env      the environment alone        make lint    style checks
+# make env      the environment alone        make lint    style, types and import contracts
+# make coverage the fast unit tests with the coverage of neuma_lib and of its public functions
 # make capture  the environment, with OpenCV, COLMAP and MeshLab for own photographs and videos (docs/capture.md)
 # make viewer   the environment, with viser for the viewer in a browser (docs/viewer.md)
 # make docs-env the environment, with mkdocs for the site
@@ -17,7 +18,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 READY := $(VENV)/.ready
 SNAKEMAKE := $(BIN)/snakemake --cores $(CORES)
 
-.PHONY: table1 demo all dataset test test-all test-core lint env capture viewer docs-env check unlock lock clean
+.PHONY: table1 demo all dataset test test-all test-core coverage lint env capture viewer docs-env check unlock lock clean
 
 table1: env unlock
 	$(SNAKEMAKE) results/table1.csv
@@ -41,6 +42,11 @@ test-all: env
 	$(BIN)/python -m pytest -n $(CORES) --ignore=tests/workflow
 	$(BIN)/python -m pytest tests/workflow
 
+coverage: env
+	$(BIN)/python -m pytest -m "not slow" -n $(CORES) --ignore=tests/workflow --cov=neuma_lib \
+	  --cov-report=json:coverage.json --cov-report=term:skip-covered
+	$(BIN)/python -m tests.support.public_coverage coverage.json
+
 # In a fresh environment; VERSIONS=lowest takes the lower bounds of pyproject.toml.
 VERSIONS ?= newest
 test-core:
@@ -51,6 +57,7 @@ lint: env
 	$(BIN)/ruff format --check .
 	$(BIN)/snakefmt --check Snakefile studies workflow
 	$(BIN)/lint-imports --no-cache
+	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/snakemake --lint
 
 # A killed Snakemake leaves its lock behind.
@@ -88,4 +95,4 @@ lock: envs/lock.py pyproject.toml envs/pins.txt
 	$(BIN)/python envs/lock.py $(UPGRADE)
 
 clean:
-	rm -rf data results .cache .snakemake .pytest_cache .ruff_cache
+	rm -rf data results .cache .snakemake .pytest_cache .ruff_cache .coverage coverage.json

@@ -71,7 +71,7 @@ def evaluate(job: tuple[str, Config, Mapping[str, Any]]) -> dict[str, Any]:
         "combinations": _combinations(identified, truth),
         "found": identified.as_dict(),
     }
-    arrays, _ = read_arrays(data / "particles.h5", required=("tracers",), only=("tracers",))
+    arrays, _ = read_arrays(data / "truth.h5", required=("tracers",), only=("tracers",))
     tracers = torch.from_numpy(arrays["tracers"])
     tracers = tracers[:, :: max(1, tracers.shape[1] // TRACERS)].to(body.x0)
     laws = {"identified": row["found"]["law"], "true_law": truth}

@@ -78,7 +78,7 @@ def measure(name: str, settings: Config, method: str, fields: Path) -> str:
 
 def _errors(case, start: str, settings: Config, model):
     """Errors of tracers that start as those of the truth, and how the prediction failed, if it did."""
-    truth = case.data("particles.h5")
+    truth = case.data("truth.h5")
     arrays, _ = read_arrays(truth, required=("tracers", "frames"), only=("tracers", "frames"))
     tracers = torch.from_numpy(arrays["tracers"]).to(torch.float32)
     tracers = tracers[:, :: max(1, tracers.shape[1] // TRACERS)]

@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import median
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -56,9 +56,14 @@ class TrajectoryLoss(Protocol):
         total: whether it needs the total deformation of the trajectory.
     """
 
-    frames: tuple[int, ...]
-    steps: tuple[int, ...]
-    total: bool
+    @property
+    def frames(self) -> tuple[int, ...]: ...
+
+    @property
+    def steps(self) -> tuple[int, ...]: ...
+
+    @property
+    def total(self) -> bool: ...
 
     def __call__(self, path: Trajectory) -> Tensor:
         """Losses of the frames, shape (T,), of a trajectory at the steps."""
@@ -150,7 +155,10 @@ class ParticleLoss:
 
     frames: tuple[int, ...]
     targets: Tensor
-    total: ClassVar[bool] = False
+
+    @property
+    def total(self) -> bool:
+        return False
 
     @property
     def steps(self) -> tuple[int, ...]:

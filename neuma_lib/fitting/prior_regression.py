@@ -30,9 +30,10 @@ from neuma_lib.fitting.prior_throws import (
     visited_stretches,
 )
 from neuma_lib.fitting.soap import SOAP
+from neuma_lib.mechanics.adaptor import LAYER_KEYS
 from neuma_lib.mechanics.elasticity import STRETCH_MIN
 from neuma_lib.mechanics.law import Law
-from neuma_lib.mechanics.neural import LAYER_KEYS, PLASTIC_SCALE, SHAPES, NeuralLaw, features, neural_law
+from neuma_lib.mechanics.neural import PLASTIC_SCALE, SHAPES, NeuralLaw, features, neural_law
 from neuma_lib.mechanics.singular_values import svd3
 
 _AS_VISITED = 0.5

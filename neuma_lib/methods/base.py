@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from neuma_lib.io.checkpoint import Checkpoint
+    from neuma_lib.io.particles import Carrier, GaussianMotion
     from neuma_lib.mechanics.law import Law
     from neuma_lib.methods.model import MotionModel
     from neuma_lib.sim.state import State
@@ -58,14 +59,14 @@ class Case(ABC):
         scene: folder of the scene that the model is obtained from, with the seeds of its replicate.
         moved: folder of the scene whose motion is predicted. It differs from `scene` only with ``+law_from=``.
         name: preset or variant whose fit is used, for example ``neuma+rank=4``.
-        options: validated options.
+        options: validated, an instance of `Method.Options`.
         evaluate_on: of the preset.
     """
 
     scene: str
     moved: str
     name: str
-    options: MotionOptions
+    options: Any
     evaluate_on: EvaluatedOn
 
     @abstractmethod
@@ -287,7 +288,7 @@ class Method(ABC):
         """
 
     def load_initial_state(
-        self, inputs: Files, options: Mapping[str, Any], densities: Sequence[Any], carrier: str
+        self, inputs: Files, options: Mapping[str, Any], densities: Sequence[Any], carrier: Carrier
     ) -> tuple[State, list[int]]:
         """Initial state of a prediction, and the number of particles of each body.
 
@@ -298,15 +299,15 @@ class Method(ABC):
         from neuma_lib.io.particles import load_initial_state
 
         files = (inputs[name] for name in ("particles", "binding", "gaussians", "velocity"))
-        return load_initial_state(*files, densities, carrier)
+        return load_initial_state(*files, densities=densities, carrier=carrier)
 
     def load_reconstruction(
         self,
         inputs: Files,
         options: Mapping[str, Any],
         density: Any,
-        carrier: str,
-        gaussian_motion: str,
+        carrier: Carrier,
+        gaussian_motion: GaussianMotion,
         device: torch.device | str = "cpu",
     ) -> Any:
         """The body that renders a predicted motion, with ``particle_gs(cameras)``."""
@@ -315,7 +316,8 @@ class Method(ABC):
         from neuma_lib.io.particles import load_reconstruction
 
         files = (inputs[name] for name in ("particles", "binding", "gaussians"))
-        return load_reconstruction(*files, density, carrier, gaussian_motion).to(torch.float32, device)
+        body = load_reconstruction(*files, density=density, carrier=carrier, gaussian_motion=gaussian_motion)
+        return body.to(torch.float32, device)
 
     def draws(
         self, inputs: Files, law: Law, F: Tensor | None, uncertainty: Mapping[str, Any], **drawn: Any
@@ -345,7 +347,7 @@ def training_inputs(case: Case) -> Files:
     supervision = (
         {"transforms": case.each_video(lambda each: each.data("dynamic/transforms.json"))}
         if case.options.supervision == "pixels"
-        else {"truth": case.each_video(lambda each: each.data("particles.h5"))}
+        else {"truth": case.each_video(lambda each: each.data("truth.h5"))}
     )
     start = case.identified() if case.options.start == "identified" else "velocity.json"
     return {

@@ -12,8 +12,8 @@ class Constants(Method):
         "constants": Preset(
             "Constants",
             {"covariance_from": "total", "gaussian_motion": "affine", "start": "identified"},
-            note="The analytic law whose family and few constants fit the training video best, thrown as the same fit "
-            "found; nothing else is learned.",
+            note="The analytic law whose family and few constants fit the training video best, launched with the "
+            "initial motion of the same fit. Nothing else is learned.",
         )
     }
 

@@ -21,7 +21,7 @@ class Neuma(Method):
         "neuma_without_binding": Preset(
             "NeuMA w/o Bind",
             {"particle_source": "gaussians", "lr_scale": 2},
-            note="Trained with the Gaussians as particles, as the paper does it, but judged by its law on the volume "
+            note="Trained with the Gaussians as particles, as in the paper, but evaluated with its law on the volume "
             "particles that all rows share. The paper's experiment simulates the Gaussians in both.",
         ),
         "neuma_without_binding_own": Preset(

@@ -34,8 +34,9 @@ class Structured(Method):
                 "lr_elastic": 0.02,
                 "lr_plastic": 0.04,
             },
-            note="The law and the throw of the row Constants, corrected by small networks that keep it isotropic, its "
-            "stress symmetric and zero at rest; a part of it that gains nothing on held-out frames stays as it is.",
+            note="The law and the initial motion of the row Constants, corrected by small networks that keep the law "
+            "isotropic and its stress symmetric and zero at rest. A part without gain on held-out frames stays "
+            "unchanged.",
         )
     }
 

@@ -31,8 +31,8 @@ VERDICTS = ("claim", "verdict", "RMSE here (mm)", "Chamfer distance in the paper
 """Columns of the table of verdicts."""
 RULE = (
     "A claim *holds* if its methods are lower on average and in most columns, the intervals mean ± standard deviation "
-    f"of the averages do not overlap, there are at least {MIN_REPLICATES} chains, and no prediction of these broke off."
-    " It *does not hold* if neither the average nor most columns are on its side; else it is *mixed*."
+    f"of the averages do not overlap, there are at least {MIN_REPLICATES} replicates, and no prediction of these "
+    "broke off. It *does not hold* if neither the average nor most columns are on its side; else it is *mixed*."
 )
 """Explanation of `Closer` for readers of a table."""
 
@@ -312,6 +312,4 @@ def verdict_lines(verdicts: Sequence[Verdict], here: str = "here", paper: bool =
 def _too_few(*rows: Row) -> str:
     """A remark if a row has less than `MIN_REPLICATES` replicates, else nothing."""
     fewest = min(len(row.runs) for row in rows)
-    return (
-        "" if fewest >= MIN_REPLICATES else f"{fewest} run{'s' if fewest > 1 else ''}, no spread to judge by"
-    )
+    return "" if fewest >= MIN_REPLICATES else f"{fewest} run{'s' if fewest > 1 else ''}, no spread"

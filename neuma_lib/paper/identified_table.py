@@ -23,9 +23,9 @@ RIGHT, TIE, WRONG = "right", "tie", "wrong"
 
 RULE = (
     "A family is right if it is the one that the truth was simulated with, or ties with it. Constants, moduli and "
-    "ratios of the found family count that the truth has too; *determined* are those whose standard deviation the "
+    "ratios of the identified family count that the truth has too; *determined* are those whose standard deviation the "
     "identification gives as less than `identify.determined`. A claim *holds* if the count is reached, else it *does "
-    "not hold*; several chains of a scene are not independent."
+    "not hold*; several replicates of a scene are not independent."
 )
 """Explanation of the verdicts for readers of the table."""
 

@@ -51,8 +51,8 @@ PAPER = {
 
 BALL_PARTICLES, BALL_RADIUS = _CONTENT["ball"]["particles"], _CONTENT["ball"]["radius"]
 BALL_FLOOR = (
-    f"Two samplings of a ball of the released {BALL_PARTICLES:,} particles and {BALL_RADIUS} m radius are 1.1 "
-    "(jittered) to 1.3 (independent points) apart, so the paper's 1.19 for NeuMA on its ball is essentially its floor."
+    f"Two random sets of the released {BALL_PARTICLES:,} particles in a ball of {BALL_RADIUS} m radius have a distance "
+    "of 1.1 (jittered) to 1.3 (independent points), so the paper's 1.19 for NeuMA on its ball is essentially its floor."
 )
 """Sampling floor of the paper's smallest distance. Both numbers are measured in tests/evaluation/test_metrics.py."""
 

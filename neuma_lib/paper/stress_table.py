@@ -70,7 +70,7 @@ def stress_table(
         text += [f"**{heading}**", "", *as_markdown(header, cells, numbers=True), ""]
     if chains > 1:
         text += [
-            f"± is the standard deviation over {chains} chains; behind an average, of their averages.",
+            f"± is the standard deviation over {chains} replicates; behind an average, of their averages.",
             "",
         ]
     broken = [

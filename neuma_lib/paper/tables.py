@@ -97,9 +97,7 @@ class Table(Frame):
         parts += [*self._errors(), *self._distances()]
         paragraphs = []
         if chains := max(len(row.runs) for row in self.rows.values()) - 1:
-            spread = (
-                f"± is the standard deviation over {chains + 1} chains; behind an average, of their averages."
-            )
+            spread = f"± is the standard deviation over {chains + 1} replicates; behind an average, of their averages."
             paragraphs.append(spread)
         signs = "".join(self.marks.values())
         paragraphs += [f"{sign} {note}" for sign, note in FOOTNOTES.items() if sign in signs]
@@ -119,8 +117,8 @@ class Table(Frame):
     def outliers(self) -> list[str]:
         """A sentence for each run whose RMSE is more than twice the mean of its method in the column."""
         return [
-            f"{row.title} on {heading}, chain {k + 1} of {len(row.runs)}: {row.runs[k, c]:.1f} mm, more than twice the "
-            "mean of its chains."
+            f"{row.title} on {heading}, replicate {k + 1} of {len(row.runs)}: {row.runs[k, c]:.1f} mm, more than twice "
+            "the mean of its replicates."
             for row in self.of(RMSE)
             for c, heading in enumerate(self.columns.values())
             for k in range(len(row.runs))
@@ -180,8 +178,8 @@ class Table(Frame):
         """The table of Chamfer distances with the paper's below ours, and the floor."""
         rows = []
         note = (
-            "The floor is the distance between two samplings of the true motion with as many tracers. The distance "
-            "sees outlines alone, so small errors of the motion hardly show in it."
+            "The floor is the distance between two random sets of as many tracers with the true motion. The distance "
+            "compares shapes only, so small errors of the motion hardly change it."
         )
         printed = {row.method: row.mean for row in self.of(PRINTED) if np.isfinite(row.mean[-1])}
         for row in self.of("chamfer"):
@@ -191,8 +189,8 @@ class Table(Frame):
         rows += [self._cells(row, 2) for row in self.of(FLOOR)]
         if printed:
             note += (
-                f" The paper's numbers ({self.paper.label}) are of materials that it does not publish, and contain a "
-                "floor of its own, set by its particles."
+                f" The paper's numbers ({self.paper.label}) are of materials that it does not publish, and contain "
+                "another floor, set by its particles."
             )
             note += f" {BALL_FLOOR}" if "BouncyBall" in self.columns else ""
         return self._section("chamfer", ["Average"], rows, note)
@@ -268,7 +266,7 @@ def chamfer_table(
             for k, run in enumerate(runs):
                 if run.get("diverged"):
                     table.broken.add((method, column))
-                    chain = f", chain {k + 1} of {len(runs)}" if len(runs) > 1 else ""
+                    chain = f", replicate {k + 1} of {len(runs)}" if len(runs) > 1 else ""
                     table.failures.append(f"{title} on {heading}{chain}: {_describe_failure(run)}")
             if signs := signs + ROLLOUT_DIVERGED * ((method, column) in table.broken):
                 table.marks[method, column] = signs

@@ -52,7 +52,7 @@ def scene_files(settings: Config, scene: str, methods: Sequence[str]) -> SceneFi
         simulation={"dt": chosen.dt, **constants},
         density=chosen.plain()["density"],
         **{name.partition(".")[0]: paths.result_path(settings, scene, name) for name in names},
-        truth=f"{data}/{base}/particles.h5" if chosen.has_truth else None,
+        truth=f"{data}/{base}/truth.h5" if chosen.has_truth else None,
         transforms=None if chosen.splat else f"{data}/{base}/dynamic/transforms.json",
         runs=runs,
         roots=(results, data),

@@ -138,12 +138,12 @@ def fly_and_simulate(
     in_flight = sum(n < first for n in frames)
     flight = ballistic(model, start, tracers, frames[:in_flight]) if in_flight else None
     frames = frames[in_flight:]
-    if not frames:
+    if flight is not None and not frames:
         return flight, [None] * copies
     if first:
         landed = ballistic(model, start, tracers, (first,))
         start = (landed.x[0], landed.v[0], *start[2:])
-        tracers = None if tracers is None else landed.tracers[0]
+        tracers = None if landed.tracers is None else landed.tracers[0]
     x, steps, plan = state.x, frames[-1] - first, None
     weights, slices = gather_weights(regions, x.dtype)
     inputs = (*start, *weights)
@@ -153,7 +153,7 @@ def fly_and_simulate(
         plan = plan_memory(steps, len(x), nodes, x.element_size(), cache_bytes, memory, total)
     simulation = Simulation(model, regions, slices, state, steps, first, plan, scatter, total, copies)
     *states, seen = RolloutFunction.apply(simulation, [n - first for n in frames], tracers, *inputs)
-    path = Trajectory(frames, *states[:4], seen, *states[4:])
+    path = Trajectory(frames, *states[:4], tracers=seen, F_total=states[4] if total else None)
     return path if flight is None else flight.followed_by(path), simulation.errors
 
 

@@ -26,11 +26,11 @@ def main(path: str) -> None:
         cycles_room.add_rectangle(f"rectangle{number}", corners, job[f"picture{number}"])
     cameras = cycles_room.Cameras(job["lenses"])
     body = cycles_room.MovingBody(job)
-    shown = None
+    current = None
     for number, (lens, frame) in enumerate(job["shots"]):
-        if frame != shown:
+        if frame != current:
             body.pose(int(frame), float(job["exposure"]))
-            shown = frame
+            current = frame
         cameras.become(int(lens), job["c2w"][number], job["regions"][number])
         pixels = cycles_room.shoot(str(folder / "shot.exr"), int(job["samples"]))
         np.save(folder / f"{number:05d}.npy", pixels.astype(np.float16))

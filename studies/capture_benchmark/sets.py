@@ -14,7 +14,7 @@ from studies.capture_benchmark.room import Moving, Scenery
 from studies.capture_benchmark.settings import DemoCapturesConfig
 from studies.capture_benchmark.stage import frame_steps, lying, solid, start
 
-PLATE = "plate_"
+BACKGROUND = "plate_"
 
 
 def write_room(path: str | Path, where: Scenery, backgrounds: dict[str, np.ndarray]) -> None:
@@ -22,7 +22,9 @@ def write_room(path: str | Path, where: Scenery, backgrounds: dict[str, np.ndarr
     values = {name: getattr(where, name) for name in Scenery.__dataclass_fields__ if name != "pictures"}
     pictures = {f"picture{number}": picture for number, picture in enumerate(where.pictures)}
     with atomic(path) as partial, open(partial, "wb") as file:
-        np.savez(file, **values, **pictures, **{PLATE + name: each for name, each in backgrounds.items()})
+        np.savez(
+            file, **values, **pictures, **{BACKGROUND + name: each for name, each in backgrounds.items()}
+        )
 
 
 def read_room(path: str | Path) -> tuple[Scenery, dict[str, np.ndarray]]:
@@ -30,7 +32,9 @@ def read_room(path: str | Path) -> tuple[Scenery, dict[str, np.ndarray]]:
     with np.load(path) as file:
         values = {name: file[name][()] for name in Scenery.__dataclass_fields__ if name != "pictures"}
         pictures = [file[f"picture{number}"] for number in range(len(values["corners"]))]
-        backgrounds = {name.removeprefix(PLATE): file[name] for name in file if name.startswith(PLATE)}
+        backgrounds = {
+            name.removeprefix(BACKGROUND): file[name] for name in file if name.startswith(BACKGROUND)
+        }
     return Scenery(pictures=pictures, **values), backgrounds
 
 

@@ -43,7 +43,7 @@ class DemoCameraConfig(Section):
     """A fixed video camera; places are from the middle of the drop, on the floor: x right, y up, z to the front."""
 
     place: Vector = Field(description="where it stands [m]")
-    target: Vector = Field((-0.06, 0.26, 0.0), description="what it looks at [m]")
+    target: Vector = Field((-0.06, 0.26, 0.0), description="centre of its picture [m]")
     lens: LensConfig = Field(description="its lens")
     late: int = Field(
         0, ge=0, description="when its first frame is taken, in steps of the truth after the start"
@@ -93,9 +93,11 @@ class DemoPhotographsConfig(Section):
 
     rings: tuple[int, ...] = Field((17, 17), description="photographs in each ring")
     elevations: tuple[float, ...] = Field((30.0, 58.0), description="of the rings above the floor [degrees]")
-    distances: tuple[float, ...] = Field((1.0, 0.9), description="of the rings from what they look at [m]")
-    beside_cameras: int = Field(2, ge=0, description="further ones beside each video camera")
-    target: Vector = Field((-0.12, 0.08, 0.0), description="what they look at, give or take [m]")
+    distances: tuple[float, ...] = Field((1.0, 0.9), description="of the rings from their target [m]")
+    beside_cameras: int = Field(2, ge=0, description="more cameras next to each video camera")
+    target: Vector = Field(
+        (-0.12, 0.08, 0.0), description="centre of the pictures, with random deviations [m]"
+    )
     shake: float = Field(0.04, ge=0, description="standard deviation of their places and targets [m]")
     upright: int = Field(4, ge=2, description="every so many, the phone is held upright")
     lens: LensConfig = Field(description="of the phone")
@@ -168,7 +170,7 @@ class DemoRoomConfig(Section):
 
 
 class DemoCapturesConfig(Section):
-    """Captures that Blender makes, to judge the whole way by a known truth ([guide](capture.md#the-demo-captures))."""
+    """Captures rendered by Blender, to evaluate stages with a known truth ([guide](capture.md#the-demo-captures))."""
 
     objects: dict[str, DemoObjectConfig] = Field(
         {}, description="objects by name; the capture of each is `demo_<name>`"
@@ -179,7 +181,7 @@ class DemoCapturesConfig(Section):
     truth: DemoTruthConfig = Field(DemoTruthConfig(), description="simulation of the drops")
     room: DemoRoomConfig = Field(DemoRoomConfig(), description="the room")
     methods: tuple[str, ...] = Field(
-        (), description="methods whose predictions are compared with the truth, the prior as it is first"
+        (), description="methods whose predictions are compared with the truth, the untrained prior first"
     )
     resolution: float = Field(1.0, gt=0, le=4, description="factor of the size of all pictures")
     seed: int = Field(0, ge=0, description="of what is held, walked and exposed by hand, and of noise")

@@ -23,6 +23,7 @@ from tests.support.flight_scene import (
     ellipsoid_body,
     filmed,
     guess,
+    ellipsoid_body,
     photographed_in_light,
     true_motion,
 )
@@ -77,10 +78,8 @@ def test_pose_velocity_spin_offset_and_gains_are_those_that_were_rendered():
     assert (throw.std > 0).all() and (throw.axes == found.axes).all()
     report = json.loads(json.dumps(found.report(), allow_nan=False))
     assert set(report["offsets_s"]) == set(report["gains"]) == {"a", "b"} and report["ambiguous"] == ""
-    assert found.shown[0].seen.shape == found.shown[0].rendered.shape and {s.camera for s in found.shown} == {
-        0,
-        1,
-    }
+    assert {each.camera for each in found.comparisons} == {0, 1}
+    assert all(each.seen.shape == each.rendered.shape for each in found.comparisons)
 
 
 @pytest.mark.slow
@@ -211,8 +210,8 @@ def test_slopes_are_those_of_the_cost():
         centre=motion.centre + (0.002, -0.003, 0.002),
     )
     begin = FittedPose(off, np.array([0.0, 0.002]), 0.01, GAINS[:2])
-    problem = Problem(pictures, begin, 3.0, [1], falling=np.eye(3))
-    fit = problem.linearise(problem.start, problem.all, central=True)
+    problem = Problem(pictures, begin, 3.0, [1], falling=np.eye(3), central=True)
+    fit = problem.linearise(problem.start, problem.all)
     # steps of about a third of a pixel, over which the cost bends
     steps = np.array([0.002] * 3 + [0.01] * 3 + [0.05] * 3 + [0.05] * 3 + [0.5] + [1.0] * 3 + [0.1])
     for k in problem.all:

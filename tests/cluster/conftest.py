@@ -9,7 +9,7 @@ from tests.support.project import TABLE, Project, copied
 from tests.support.slurm import cluster, missing
 
 PLUGIN = "snakemake_executor_plugin_slurm"
-# The plugin's first look at its jobs comes after 40 seconds by default.
+# The plugin's first query of its jobs comes after 40 seconds by default.
 EXECUTOR = ("--workflow-profile", "profiles/slurm", "--slurm-init-seconds-before-status-checks", "3")
 SECONDS = 3 * 3600.0
 
@@ -21,7 +21,7 @@ def slurm():
         pytest.fail(f"SLURM: {problem}", pytrace=False)
     if importlib.util.find_spec(PLUGIN) is None:
         pytest.fail(
-            f"{sys.executable} has no {PLUGIN}: the head of profiles/slurm/config.yaml says how to install it",
+            f"{sys.executable} has no {PLUGIN}: see the head of profiles/slurm/config.yaml",
             pytrace=False,
         )
     with cluster(gpus=1, min_job_age=86400) as running, pytest.MonkeyPatch.context() as patch:

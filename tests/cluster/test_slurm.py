@@ -1,7 +1,7 @@
 """The workflow through a real SLURM on this machine: profiles/slurm, as a user of a cluster runs it.
 
 One host, no cgroups, no accounting database and no GPU: what a second host, a filesystem between hosts and a real GPU
-would change is not tested. Beside the table itself these tests say what a job of SLURM asks for and what becomes of it.
+would change is not tested. These tests check the table, what a SLURM job requests, and how it ends.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ SCENE_RULES = (
 
 
 def jobs(slurm) -> dict[str, dict[str, str]]:
-    """All jobs that SLURM remembers, the last first: number, and what ``scontrol show job`` says of each."""
+    """All jobs that SLURM remembers, the last first: number, and the fields of ``scontrol show job``."""
     lines = [
         line for line in slurm.ask("scontrol", "-o", "show", "job").splitlines() if line.startswith("JobId=")
     ]
-    told = [dict(re.findall(r"(\S+?)=(\S*)", line)) for line in lines]
-    return {job["JobId"]: job for job in sorted(told, key=lambda job: -int(job["JobId"]))}
+    fields = [dict(re.findall(r"(\S+?)=(\S*)", line)) for line in lines]
+    return {job["JobId"]: job for job in sorted(fields, key=lambda job: -int(job["JobId"]))}
 
 
 def job_of(slurm, rule: str) -> dict[str, str]:
@@ -55,13 +55,13 @@ def seconds(clock: str) -> int:
 
 
 def comment(rule: str, wildcards: Sequence[str]) -> str:
-    """What a job of SLURM is called by the plugin, beside its number."""
+    """Name that the plugin gives to a job of SLURM, in addition to its number."""
     return "_".join([f"rule_{rule}", *(["wildcards", *wildcards] if wildcards else [])])
 
 
-def said_by_rules(project: Project) -> dict[str, dict[str, int]]:
+def requested_by_rules(project: Project) -> dict[str, dict[str, int]]:
     """Resources of all jobs behind the table, by their comment, as Snakemake plans them without SLURM."""
-    found = {}
+    results = {}
     for block in re.split(
         r"^\[", Project(project.root).run("--dry-run", "--forceall", TABLE), flags=re.MULTILINE
     ):
@@ -69,20 +69,20 @@ def said_by_rules(project: Project) -> dict[str, dict[str, int]]:
             lines = dict(re.findall(r"^ +(wildcards|resources): (.*)$", block, re.MULTILINE))
             wildcards = re.findall(r"\w+=([^,]+)", lines.get("wildcards", ""))
             resources = re.findall(r"(gpu|mem_mb|runtime)=(\d+)", lines["resources"])
-            found[comment(rule[1], wildcards)] = {name: int(value) for name, value in resources}
-    return found
+            results[comment(rule[1], wildcards)] = {name: int(value) for name, value in resources}
+    return results
 
 
 def measured(project: Project) -> dict[str, dict[str, float]]:
     """Benchmarks of a run: the comment that the job of each has, and its seconds and MB."""
-    found = {}
+    results = {}
     for folder in (project.root / "tiny/results/benchmarks", project.root / "tiny/data/kernels/benchmarks"):
         for file in folder.rglob("*.tsv"):
             *wildcards, rule = file.relative_to(folder).with_suffix("").parts
             names, values, *_ = (line.split("\t") for line in file.read_text().splitlines())
             row = dict(zip(names, values))
-            found[comment(rule, wildcards)] = {name: float(row[name]) for name in ("s", "max_rss")}
-    return found
+            results[comment(rule, wildcards)] = {name: float(row[name]) for name in ("s", "max_rss")}
+    return results
 
 
 def slurm_log(job: dict[str, str]) -> str:
@@ -111,20 +111,20 @@ def test_every_job_ends_well_and_its_log_arrives(finished, slurm):
     assert not [*(finished.root / ".snakemake/slurm_logs").rglob("*.log")]
 
 
-def test_jobs_ask_for_what_their_rules_say_and_use_no_more(finished, slurm):
-    """Memory beyond what was asked for would have ended a job: SLURM looks at all its processes every second."""
-    planned = said_by_rules(finished)
+def test_jobs_ask_for_what_their_rules_state_and_use_no_more(finished, slurm):
+    """Memory beyond what was asked for would have ended a job: SLURM samples all its processes every second."""
+    planned = requested_by_rules(finished)
     ran = set(submitted(finished.output))
     asked = {job["Comment"]: job for number, job in jobs(slurm).items() if number in ran}
     used = measured(finished)
     assert set(planned) == set(asked) == set(used)
     assert planned[f"rule_fit_neuma_wildcards_{Path(SCENE).name}_neuma"]["mem_mb"] == 6000
     for name, job in asked.items():
-        said = planned[name]
-        assert f"cpu=1,mem={said['mem_mb']}M,node=1," in job["TRES"], name
-        assert seconds(job["TimeLimit"]) == 60 * said["runtime"], name
-        assert said["gpu"] == 0 and "TresPerJob" not in job, name
-        assert used[name]["max_rss"] < said["mem_mb"], name
+        requested = planned[name]
+        assert f"cpu=1,mem={requested['mem_mb']}M,node=1," in job["TRES"], name
+        assert seconds(job["TimeLimit"]) == 60 * requested["runtime"], name
+        assert requested["gpu"] == 0 and "TresPerJob" not in job, name
+        assert used[name]["max_rss"] < requested["mem_mb"], name
         assert used[name]["s"] <= seconds(job["RunTime"]) < seconds(job["TimeLimit"]), name
 
 
@@ -142,7 +142,7 @@ def uninterrupted(finished, tmp_path_factory):
 
 @pytest.fixture
 def interruptible():
-    """Ctrl-C reaches processes that are started here, even where this one was told to ignore it (``nohup``, ``&``)."""
+    """Ctrl-C reaches processes that are started here, even if this one ignores it (``nohup``, ``&``)."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -164,12 +164,12 @@ def started_training(project: Project, slurm) -> tuple[subprocess.Popen, dict[st
 
 
 def goes_on(project: Project, slurm, uninterrupted: dict[str, str]) -> None:
-    """The same command again: nothing that was finished is made again, and what comes out is the same."""
+    """The same command again: finished files are kept, and the results are the same."""
     iteration, finished = reached(project), made(project)
     assert 20 <= iteration < 400
     output = project.run(*LONGER)
-    told = jobs(slurm)
-    names = {told[number]["Comment"].split("_wildcards_")[0] for number in submitted(output)}
+    listed = jobs(slurm)
+    names = {listed[number]["Comment"].split("_wildcards_")[0] for number in submitted(output)}
     assert names == {"rule_fit_neuma", "rule_evaluate", "rule_chamfer_table"}
     assert len(submitted(output)) == 3
     (log,) = (project.root / "tiny/results/logs").rglob("neuma/fit_neuma.log")
@@ -192,9 +192,9 @@ def test_a_cancelled_job_goes_on_by_the_same_command(clone, slurm, uninterrupted
     snakemake, job = started_training(clone, slurm)
     slurm.ask("scancel", job["JobId"])
     assert snakemake.wait(300) != 0
-    said = (clone.root / "started.log").read_text()
-    assert f"SLURM-job '{job['JobId']}' failed, SLURM status is: 'CANCELLED'" in said
-    assert job["StdOut"] in said and "CANCELLED" in slurm_log(job)
+    log = (clone.root / "started.log").read_text()
+    assert f"SLURM-job '{job['JobId']}' failed, SLURM status is: 'CANCELLED'" in log
+    assert job["StdOut"] in log and "CANCELLED" in slurm_log(job)
     goes_on(clone, slurm, uninterrupted)
 
 
@@ -206,7 +206,7 @@ def test_an_interrupted_snakemake_takes_its_jobs_along(interruptible, clone, slu
     goes_on(clone, slurm, uninterrupted)
 
 
-def test_a_job_that_needs_more_memory_than_it_asks_for_is_ended_and_says_so(clone, slurm):
+def test_a_job_that_needs_more_memory_than_it_asks_for_is_ended_with_a_message(clone, slurm):
     target = f"{SCENE}/neuma+rank=3/adaptor.safetensors"
     clone.run("--set-resources", "fit_neuma:mem_mb=300", "--", target, succeeds=False)
     job = job_of(slurm, "fit_neuma")
@@ -228,7 +228,7 @@ def test_all_of_a_scene_may_be_one_job(clone, slurm):
     scene, table = (jobs(slurm)[number] for number in submitted(output))
     assert scene["JobState"] == table["JobState"] == "COMPLETED"
     assert table["Comment"].startswith("rule_chamfer_table")
-    # NeuMA's training beside the evaluation of the prior; and nine stages, of which training takes up to four hours.
+    # NeuMA's training next to the evaluation of the prior; and nine stages, of which training takes up to four hours.
     assert "cpu=2,mem=10000M,node=1," in scene["TRES"]
     assert seconds(scene["TimeLimit"]) == 60 * (8 * 60 + 240)
     assert clone.artifacts() == before
@@ -241,15 +241,15 @@ def test_all_of_a_scene_may_be_one_job(clone, slurm):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
-def test_a_job_asks_for_a_gpu_where_the_settings_do_and_says_that_it_sees_none(clone, slurm):
-    """SLURM hands out a GPU in name: what is tested is that a job waits for one, and what it says without."""
+def test_a_job_asks_for_a_gpu_where_the_settings_do_and_reports_that_it_sees_none(clone, slurm):
+    """SLURM hands out a GPU in name: tested are that a job waits for one, and its message without."""
     clone.run("--config", "device=cuda", "--", f"{SCENE}/gaussians.ply", succeeds=False)
     job = job_of(slurm, "gaussians")
     assert job["TresPerJob"] == "gres:gpu:1" and job["JobState"] == "FAILED"
     assert "torch sees no CUDA device" in slurm_log(job)
 
 
-# ---- beside a run without SLURM
+# ---- compared with a run without SLURM
 
 
 def test_the_table_and_all_before_it_are_those_of_a_run_without_slurm(finished, kernels, tmp_path):

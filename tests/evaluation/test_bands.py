@@ -1,4 +1,4 @@
-"""Bands of responses: they cover the truth as often as they say where everything is linear, and are wide in silence."""
+"""Bands of responses: they have the stated coverage for linear problems, and are wide without data."""
 
 from __future__ import annotations
 
@@ -79,11 +79,11 @@ def test_fields_cover_truths_of_their_model():
     assert ((low <= covered) & (covered <= min(high, trials))).all(), covered / trials
 
 
-def test_constant_changes_are_known_as_well_as_the_video_says():
+def test_constant_changes_are_known_as_well_as_the_video_determines():
     """With a free bias and no other feature the posterior is the covariance of the constants."""
     covariance = np.array([[0.04, 0.03], [0.03, 0.09]])
-    found = field_covariance(np.ones((50, 1)), np.linalg.inv(covariance), np.array([1e6]))
-    np.testing.assert_allclose(found, covariance, rtol=1e-9)
+    posterior = field_covariance(np.ones((50, 1)), np.linalg.inv(covariance), np.array([1e6]))
+    np.testing.assert_allclose(posterior, covariance, rtol=1e-9)
 
 
 def test_constants_cover_truths_around_their_estimates():
@@ -122,10 +122,10 @@ def test_constants_that_go_together_stay_together():
 
 
 def test_families_that_tie_give_equal_parts():
-    found = fit(ties=["other"])
+    fitted = fit(ties=["other"])
     other = {"elasticity": {"name": "neo_hookean", "E": 1e5, "nu": 0.3}}
-    found["families"]["other"] = fit(other)["best"]
-    laws = constants_draws(found, 0.0, DT, 20, 0)
+    fitted["families"]["other"] = fit(other)["best"]
+    laws = constants_draws(fitted, 0.0, DT, 20, 0)
     kinds = [type(law.elasticity).__name__ for law in laws]
     assert kinds.count("Hencky") == kinds.count("NeoHookean") == 10
 
@@ -168,7 +168,7 @@ def test_bands_are_wide_where_the_video_is_silent():
 
 def test_deviations_vary_over_strains_as_the_networks_of_a_correction_do():
     """Correlation of the features of untrained networks at states that are LENGTH apart, their mean left out."""
-    generator, found = torch.Generator().manual_seed(0), []
+    generator, result = torch.Generator().manual_seed(0), []
     last = 1e-3 * torch.eye(WIDTH, WIDTH + 1)  # gives the features themselves
     for seed in range(100):
         *hidden, _ = initial_weights(WIDTH, seed)
@@ -178,8 +178,8 @@ def test_deviations_vary_over_strains_as_the_networks_of_a_correction_do():
         H = [network(end, (*hidden, last)) for end in ends]
         mean = torch.cat(H).mean(dim=0)
         a, b = (h - mean for h in H)
-        found.append(float((a * b).sum() / (a.square().sum() * b.square().sum()).sqrt()))
-    assert np.mean(found) == pytest.approx(np.exp(-0.5), abs=0.05)
+        result.append(float((a * b).sum() / (a.square().sum() * b.square().sum()).sqrt()))
+    assert np.mean(result) == pytest.approx(np.exp(-0.5), abs=0.05)
 
 
 def test_what_is_known_together_stays_known_together():
@@ -199,7 +199,7 @@ def test_what_is_known_together_stays_known_together():
     assert plateau < 0.6 * slope
 
 
-def test_an_envelope_holds_all_chains():
+def test_an_envelope_holds_all_replicates():
     low, high = envelope([(np.array([0.0, 2]), np.array([1.0, 3])), (np.array([1.0, 1]), np.array([2.0, 2]))])
     assert low.tolist() == [0, 1] and high.tolist() == [2, 3]
 
@@ -222,20 +222,20 @@ def test_responses_of_all_kinds_of_laws_have_bands(part):
         (structured_law(spec, DT), corrected(spec=spec, count=10)),
     ):
         for name, test in tests.items():
-            found = response(law, truth, test, draws)
-            assert len(found["x"]) == len(found["stress"]) == len(found["true"])
-            np.testing.assert_allclose(found["stress"], found["true"], rtol=1e-3, atol=5.0)
-            assert np.isfinite([found["band"]["low"], found["band"]["high"]]).all()
-            assert inside(found) > 0.8, name
+            curve = response(law, truth, test, draws)
+            assert len(curve["x"]) == len(curve["stress"]) == len(curve["true"])
+            np.testing.assert_allclose(curve["stress"], curve["true"], rtol=1e-3, atol=5.0)
+            assert np.isfinite([curve["band"]["low"], curve["band"]["high"]]).all()
+            assert inside(curve) > 0.8, name
     alone = response(truth, truth, tests["shear"])
     assert "band" not in alone
 
 
 def test_inside_counts_visited_points_alone():
-    found = {"x": [0, 1, 2, 3], "true": [0, 1, 2, 3], "visited": [0.5, 2.5], "by_stress": False}
-    found["band"] = {"x": [0, 1, 2, 3], "low": [9, 0, 3, 9], "high": [9, 2, 4, 9]}
-    assert inside(found) == 0.5
-    assert inside({**found, "visited": [5, 6]}) is None
-    assert inside({**found, "true": [0, 0, 0, 9], "by_stress": True, "visited": [0, 0.1]}) == pytest.approx(
+    results = {"x": [0, 1, 2, 3], "true": [0, 1, 2, 3], "visited": [0.5, 2.5], "by_stress": False}
+    results["band"] = {"x": [0, 1, 2, 3], "low": [9, 0, 3, 9], "high": [9, 2, 4, 9]}
+    assert inside(results) == 0.5
+    assert inside({**results, "visited": [5, 6]}) is None
+    assert inside({**results, "true": [0, 0, 0, 9], "by_stress": True, "visited": [0, 0.1]}) == pytest.approx(
         1 / 3
     )

@@ -1,4 +1,4 @@
-"""Predicting a motion and comparing it with the truth: what is known of the error must come out."""
+"""Predicting a motion and comparing it with the truth: known errors are measured."""
 
 from __future__ import annotations
 
@@ -47,27 +47,27 @@ def test_the_true_law_from_another_sampling_is_as_good_as_the_sampling_allows():
         ball(count=particles, seed=0), frames, in_ball(tracers, 10), in_ball(tracers, 11)
     )
     body, starts = ball(count=particles, seed=1), in_ball(tracers, 12)
-    found, wrong = (
+    result, wrong = (
         evaluate(MODEL, LawOnGrid(law), body.state(V0), frames, truth, again, starts).metrics
         for law in (LAW, analytic_law(PRIOR, MODEL.dt))
     )
-    # A coordinate of uniform points in the ball has the variance R^2 / 5, so the centres of mass of two samplings
+    # A coordinate of uniform points in the ball has the variance R^2 / 5, so the centres of mass of two random sets
     # are sqrt(2 * 3 * R^2 / (5 N)) apart; the floor meets each with its own. Three standard deviations.
     limit = 3e3 * math.sqrt(6 / (5 * particles)) * RADIUS
-    assert found["tracer_rmse_mm"] < limit < wrong["tracer_rmse_mm"] / 3
-    assert max(found["tracer_rmse_mm_per_frame"][:2]) < 1e-9  # before contact no sampling matters
+    assert result["tracer_rmse_mm"] < limit < wrong["tracer_rmse_mm"] / 3
+    assert max(result["tracer_rmse_mm_per_frame"][:2]) < 1e-9  # before contact no sampling matters
     # Squared distances r^2 to the nearest of M points (r^3 is exponential) deviate by 0.68 of their mean. Two sets of
     # M against the truth, two directions each, whose neighbours share points (a factor of sqrt(2) at most): three
     # standard deviations of the difference.
-    floor = found["chamfer_floor"]
+    floor = result["chamfer_floor"]
     sampling = 3 * 0.68 * floor / math.sqrt(tracers) * math.sqrt(2)
     # Tracers that are e away from where they should be change mean r^2 by at most 2 e r + e^2, in both directions.
-    e = 1e-3 * found["tracer_rmse_mm"]
+    e = 1e-3 * result["tracer_rmse_mm"]
     displaced = 2e4 * (2 * e * math.sqrt(0.5e-4 * floor) + e**2)
-    assert abs(found["chamfer_excess"]) < sampling + displaced < wrong["chamfer_excess"]
-    in_flight = [a - b for a, b in zip(found["chamfer_per_frame"], found["chamfer_floor_per_frame"])][:2]
+    assert abs(result["chamfer_excess"]) < sampling + displaced < wrong["chamfer_excess"]
+    in_flight = [a - b for a, b in zip(result["chamfer_per_frame"], result["chamfer_floor_per_frame"])][:2]
     assert max(map(abs, in_flight)) < sampling
-    assert found["diverged_at_step"] is found["diverged"] is found["energy_gain_after_step"] is None
+    assert result["diverged_at_step"] is result["diverged"] is result["energy_gain_after_step"] is None
 
 
 def test_a_known_shift_of_the_truth_is_the_error():
@@ -79,18 +79,18 @@ def test_a_known_shift_of_the_truth_is_the_error():
     truth = path + shift
     truth[0] = lattice
     evaluation = evaluate(MODEL, LawOnGrid(LAW), ball(seed=1).state(V0), IN_FLIGHT, truth, path, lattice)
-    found = evaluation.metrics
-    assert found["tracer_rmse_mm_per_frame"] == pytest.approx([0, 5, 5, 5], abs=1e-9)
-    assert found["tracer_rmse_mm"] == pytest.approx(5 * math.sqrt(3 / 4), rel=1e-9)
+    result = evaluation.metrics
+    assert result["tracer_rmse_mm_per_frame"] == pytest.approx([0, 5, 5, 5], abs=1e-9)
+    assert result["tracer_rmse_mm"] == pytest.approx(5 * math.sqrt(3 / 4), rel=1e-9)
     assert (
-        found["tracer_error_p95_mm"]
-        == pytest.approx(found["tracer_rmse_last_mm"])
+        result["tracer_error_p95_mm"]
+        == pytest.approx(result["tracer_rmse_last_mm"])
         == pytest.approx(5, rel=1e-9)
     )
     # 25 mm^2 in both directions, in units of 1e-4 m^2: for the prediction, and for the floor that is shifted too.
-    assert found["chamfer_per_frame"] == pytest.approx([0, 0.5, 0.5, 0.5], rel=1e-9, abs=1e-12)
-    assert found["chamfer_floor_per_frame"] == found["chamfer_per_frame"]
-    assert found["chamfer"] == pytest.approx(0.375) and found["chamfer_excess"] == 0
+    assert result["chamfer_per_frame"] == pytest.approx([0, 0.5, 0.5, 0.5], rel=1e-9, abs=1e-12)
+    assert result["chamfer_floor_per_frame"] == result["chamfer_per_frame"]
+    assert result["chamfer"] == pytest.approx(0.375) and result["chamfer_excess"] == 0
     torch.testing.assert_close(evaluation.tracers, path)
     # The prediction is wrong by the fall that a slower start lacks.
     slower = evaluate(
@@ -123,18 +123,18 @@ def test_a_motion_that_diverges_is_held_and_marked():
     evaluation = evaluate(
         MODEL, LawOnGrid(Law(FailsOnce(6), LAW.plasticity)), body.state(V0), frames, truth, truth, tracers
     )
-    path, found = evaluation.path, evaluation.metrics
-    assert found["diverged_at_step"] == 6
-    assert found["diverged"] == {"happened": "became non-finite", "step": 6, "particle": 0}
+    path, result = evaluation.path, evaluation.metrics
+    assert result["diverged_at_step"] == 6
+    assert result["diverged"] == {"happened": "became non-finite", "step": 6, "particle": 0}
     assert evaluation.summary().endswith("DIVERGED: a particle became non-finite at step 6")
-    assert path.frames == (0, 4, 4, 4) and len(found["chamfer_per_frame"]) == 4
+    assert path.frames == (0, 4, 4, 4) and len(result["chamfer_per_frame"]) == 4
     sound, _ = predict(MODEL, LAW, body.state(V0), [0, 4])
     for name in ("x", "F", "tracers"):
         values = getattr(path, name)
         assert torch.isfinite(values).all()
         assert torch.equal(values[2], values[1]) and torch.equal(values[3], values[1])
     assert torch.equal(path.x[:2], sound.x) and torch.equal(path.F[:2], sound.F)
-    errors = found["tracer_rmse_mm_per_frame"]
+    errors = result["tracer_rmse_mm_per_frame"]
     assert errors[:2] == [0, 0]
     expected = 1e3 * (truth[1] - truth[3]).square().sum(-1).mean().sqrt()  # the truth goes on
     assert errors[3] == pytest.approx(float(expected)) and errors[3] > errors[2] > 1
@@ -148,16 +148,16 @@ class Repelling(Elasticity):
 
 
 def test_a_motion_that_explodes_had_too_much_energy_before():
-    """Which fault it was is told from a number that is no more; the energy, a frame or more before it."""
+    """The kind of failure is read from the first invalid number, the energy from a frame before it."""
     frames, body = list(range(0, 61, 2)), ball(height=ON_THE_FLOOR)
     tracers = in_ball(50, 0, ON_THE_FLOOR)
     (truth,) = true_tracers(body, frames, tracers)
-    found = evaluate(
+    result = evaluate(
         MODEL, LawOnGrid(Law(Repelling(), LAW.plasticity)), body.state(V0), frames, truth, truth, tracers
     ).metrics
-    failure = found["diverged"]
-    assert failure["happened"] != "became non-finite" and failure["step"] == found["diverged_at_step"]
-    assert 0 <= found["energy_gain_after_step"] < failure["step"] - 2
+    failure = result["diverged"]
+    assert failure["happened"] != "became non-finite" and failure["step"] == result["diverged_at_step"]
+    assert 0 <= result["energy_gain_after_step"] < failure["step"] - 2
     sound = evaluate(MODEL, LawOnGrid(LAW), body.state(V0), frames, truth, truth, tracers).metrics
     assert sound["diverged"] is sound["energy_gain_after_step"] is None
 

@@ -89,9 +89,9 @@ def test_measures_are_those_of_scikit_image_inside_the_window():
     image, reference = (torch.rand(80, 90, 3, generator=generator) for _ in range(2))
     alpha, mask = torch.zeros(80, 90), torch.zeros(80, 90)
     alpha[20:60, 10:40], mask[25:50, 30:70] = 1.0, 0.4
-    found = image_metrics(image, alpha, reference, mask, {}, margin=0.1)
+    metrics = image_metrics(image, alpha, reference, mask, {}, margin=0.1)
     a, b = (picture[14:66, 4:76].numpy().astype(np.float64) for picture in (image, reference))
-    assert found["psnr"] == pytest.approx(peak_signal_noise_ratio(b, a, data_range=1.0))
+    assert metrics["psnr"] == pytest.approx(peak_signal_noise_ratio(b, a, data_range=1.0))
     expected = structural_similarity(
         *(a, b),
         channel_axis=-1,
@@ -100,10 +100,10 @@ def test_measures_are_those_of_scikit_image_inside_the_window():
         sigma=1.5,
         use_sample_covariance=False,
     )
-    assert found["ssim"] == pytest.approx(expected)
+    assert metrics["ssim"] == pytest.approx(expected)
     # Nothing outside the window counts.
     image[:14], alpha[:14] = 0.0, 0.0
-    assert image_metrics(image, alpha, reference, mask, {}, margin=0.1) == found
+    assert image_metrics(image, alpha, reference, mask, {}, margin=0.1) == metrics
 
 
 # ---- LPIPS
@@ -138,9 +138,9 @@ def test_the_network_is_the_one_written_out(net):
     widths = {"alex": [64, 192, 384, 256, 256], "vgg": [64, 128, 256, 512, 512]}[net]
     features = network.features(waves(0.0))
     assert [tuple(f.shape) for f in features] == [(1, c, n, n) for c, n in zip(widths, shapes, strict=True)]
-    found = network(torch.cat([waves(0.0)] * 2), torch.cat([waves(0.7), waves(0.0)]))
-    assert float(found[0]) == pytest.approx(plainly(weights, net, waves(0.0), waves(0.7)), rel=1e-4)
-    assert float(found[1]) == 0.0
+    distances = network(torch.cat([waves(0.0)] * 2), torch.cat([waves(0.7), waves(0.0)]))
+    assert float(distances[0]) == pytest.approx(plainly(weights, net, waves(0.0), waves(0.7)), rel=1e-4)
+    assert float(distances[1]) == 0.0
 
 
 @pytest.fixture(scope="module")
@@ -156,8 +156,8 @@ def true_weights(tmp_path_factory):
 def test_distances_are_those_of_the_authors_package(true_weights, net):
     network = LPIPS(true_weights, net)
     a = waves(0.0)
-    found = [float(network(a, b)) for b in (waves(0.7), waves(2.5), 1 - a)]
-    assert found == pytest.approx(REFERENCE[net], rel=1e-5)
+    results = [float(network(a, b)) for b in (waves(0.7), waves(2.5), 1 - a)]
+    assert results == pytest.approx(REFERENCE[net], rel=1e-5)
 
 
 def test_unusable_images_and_weights_are_named():
@@ -211,10 +211,10 @@ def tree(net: str, inner: str) -> dict:
 
 def test_weights_are_converted(tmp_path):
     trees = {"alexnet": tree("alex", "AlexNet_0"), "vgg16": tree("vgg", "VGG16_0")}
-    found = convert(archive(tmp_path / "a.tar", {n: pickle.dumps(t, 4) for n, t in trees.items()}))
+    converted = convert(archive(tmp_path / "a.tar", {n: pickle.dumps(t, 4) for n, t in trees.items()}))
     for net in ("alex", "vgg"):
         for name, tensor in random_weights(net).items():
-            assert torch.equal(found[name], tensor), name
+            assert torch.equal(converted[name], tensor), name
 
 
 @pytest.mark.parametrize("protocol", [0, 2, 4, 5])

@@ -248,8 +248,8 @@ def test_released_adaptors_mean_the_unscaled_merge(tmp_path, rank):
     law = load_law(tmp_path / "jelly_0300.pt", tmp_path / "1000_lora.pt")
     for kind, part in (NeuralElasticity, "elasticity"), (NeuralPlasticity, "plasticity"):
         wanted = kind(tuple(merged[f"{part}.{key}"] for key in LAYER_KEYS))(deformations())
-        found = law.parts[part](deformations())
-        torch.testing.assert_close(found, wanted, rtol=0, atol=1e-5 * float(wanted.abs().max()))
+        result = law.parts[part](deformations())
+        torch.testing.assert_close(result, wanted, rtol=0, atol=1e-5 * float(wanted.abs().max()))
     law.set_adaptor_weight(0.0)
     same(law, load_prior(tmp_path / "jelly_0300.pt"))
 
@@ -284,7 +284,7 @@ def test_other_files_are_no_released_adaptors(tmp_path, damage):
         load_law(tmp_path / "jelly_0300.pt", tmp_path / "1000_lora.pt")
 
 
-# Files that are not what they say.
+# Files with a wrong format.
 
 METADATA = {
     "a later schema": {"schema": 2, "dt": DT},
@@ -360,8 +360,8 @@ def project(tmp_path):
     )
     F = torch.stack([torch.eye(3).expand(50, 3, 3), deformations(50, 0.05)]).numpy()
     write_arrays(run / "rollout.h5", {"F": F, "frames": np.array([0, 9])}, {"dt": DT})
-    found = {"law": {"elasticity": HENCKY, "plasticity": {"name": "viscous_flow", "viscosity": 80.0}}}
-    write_json(tmp_path / "results/ClayCat/identified.json", found)
+    results = {"law": {"elasticity": HENCKY, "plasticity": {"name": "viscous_flow", "viscosity": 80.0}}}
+    write_json(tmp_path / "results/ClayCat/identified.json", results)
     (tmp_path / "results/ClayCat/constants").mkdir()
     return tmp_path
 
@@ -432,11 +432,11 @@ def in_numpy(folder, laws, module):
     return F, [np.load(folder / f"out{k}.npz") for k in range(len(laws))]
 
 
-def assert_as_ours(law, F, found):
+def assert_as_ours(law, F, result):
     for part in ("elasticity", "plasticity"):
         ours = getattr(law, part)
         value = ours.evaluate(F, tuple(w.detach().double() for w in ours.weights()))
-        np.testing.assert_allclose(found[part], value, rtol=0, atol=1e-5 * float(value.abs().max()))
+        np.testing.assert_allclose(result[part], value, rtol=0, atol=1e-5 * float(value.abs().max()))
         moved = (value - (F if part == "plasticity" else 0)).abs().max()
         assert moved > 1e-3 or isinstance(ours, PLASTICITIES["identity"])
 
@@ -444,8 +444,8 @@ def assert_as_ours(law, F, found):
 def test_numpy_alone_evaluates_networks(tmp_path):
     law = networks()
     law.plasticity.base[-1].data *= 50
-    F, (found,) = in_numpy(tmp_path, [law], "law_in_numpy")
-    assert_as_ours(law, F, found)
+    F, (result,) = in_numpy(tmp_path, [law], "law_in_numpy")
+    assert_as_ours(law, F, result)
 
 
 def test_numpy_alone_evaluates_every_law(tmp_path):
@@ -457,8 +457,8 @@ def test_numpy_alone_evaluates_every_law(tmp_path):
     ]
     laws.append(networks())  # are handed on
     F, results = in_numpy(tmp_path, laws, "isotropic_in_numpy")
-    for law, found in zip(laws, results, strict=True):
-        assert_as_ours(law, F, found)
+    for law, result in zip(laws, results, strict=True):
+        assert_as_ours(law, F, result)
 
 
 def test_the_example_simulates_as_we_do(tmp_path, monkeypatch):
@@ -490,11 +490,11 @@ def test_the_example_runs_from_the_command_line(tmp_path):
     law = analytic()
     export_law(tmp_path / "law.safetensors", law, 1e-3)
     command = [sys.executable, str(ROOT / "examples/mpm_in_numpy.py"), str(tmp_path / "law.safetensors")]
-    said = subprocess.run(command, check=True, timeout=60, capture_output=True, text=True).stdout
-    assert said.startswith("0.00 s: lowest 0.2") and "0.28 s" in said
+    printed = subprocess.run(command, check=True, timeout=60, capture_output=True, text=True).stdout
+    assert printed.startswith("0.00 s: lowest 0.2") and "0.28 s" in printed
 
 
-def test_foreign_safetensors_say_nothing(tmp_path):
+def test_foreign_safetensors_are_no_laws(tmp_path):
     save_file({"x": torch.zeros(2)}, tmp_path / "x.safetensors")
     with refused("x.safetensors"):
         read_about(tmp_path / "x.safetensors")

@@ -82,9 +82,9 @@ def test_chamfer_loss_names_what_is_wrong():
 def test_tracer_error_of_a_shift_is_its_length():
     path = points(4, 30)
     shift = torch.tensor([3e-3, 0.0, 4e-3], dtype=torch.float64)
-    found = tracer_errors(path + shift, path)
-    assert found.pop("tracer_rmse_mm_per_frame") == pytest.approx([5] * 4)
-    assert list(found.values()) == pytest.approx([5] * 3)
+    errors = tracer_errors(path + shift, path)
+    assert errors.pop("tracer_rmse_mm_per_frame") == pytest.approx([5] * 4)
+    assert list(errors.values()) == pytest.approx([5] * 3)
     with pytest.raises(InputError, match="differ"):
         tracer_errors(path, path[:, 1:])
 
@@ -94,14 +94,14 @@ def test_tracer_error_over_points_and_frames():
     t, k = torch.meshgrid(torch.arange(10.0), torch.arange(10.0), indexing="ij")
     off = torch.zeros(10, 10, 3)
     off[..., 1] = 1e-3 * t * k
-    found = tracer_errors(points(10, 10) + off, points(10, 10))
+    errors = tracer_errors(points(10, 10) + off, points(10, 10))
     squares = np.arange(10.0) ** 2
-    assert found["tracer_rmse_mm"] == pytest.approx(squares.mean())
-    assert found["tracer_rmse_last_mm"] == pytest.approx(9 * math.sqrt(squares.mean()))
-    assert found["tracer_error_p95_mm"] == pytest.approx(np.quantile((t * k).numpy(), 0.95))
+    assert errors["tracer_rmse_mm"] == pytest.approx(squares.mean())
+    assert errors["tracer_rmse_last_mm"] == pytest.approx(9 * math.sqrt(squares.mean()))
+    assert errors["tracer_error_p95_mm"] == pytest.approx(np.quantile((t * k).numpy(), 0.95))
 
 
-def test_energy_of_a_throw_is_that_of_its_parabola():
+def test_energy_of_a_launch_is_that_of_its_parabola():
     g, mass, time = torch.tensor([0.5, -9.8, 0.0]), torch.tensor([2.0, 3.0]), torch.linspace(0, 0.3, 4)
     v0, x0 = points(2, seed=1), points(2, seed=2)
     v = v0 + time[:, None, None].double() * g
@@ -128,7 +128,7 @@ def ball_points(count: int, radius: float, seed: int, method: str = "uniform") -
 
 
 def test_the_papers_distance_on_its_ball_is_its_floor():
-    """The paper's 1.19 lies between two samplings of the very same ball, on jittered grids and independent."""
+    """The paper's 1.19 lies between two random sets of points of the same ball, on jittered grids and independent."""
     floors = {
         method: chamfer(*(ball_points(BALL_PARTICLES, BALL_RADIUS, seed, method) for seed in (0, 1)))
         for method in ("jittered", "uniform")
@@ -232,10 +232,10 @@ def test_video_shows_both_panels_and_is_the_same_every_time(film, tmp_path):
     assert read.shape == video.shape
     # The step of H.264 at QP 18, 0.625 * 2^(18 / 6), is 5 levels: its orthonormal transform leaves pixels at most half
     # of that off in quadratic mean. Blocks of 2 x 2 equal pixels lose nothing to the coarser colour planes.
-    apart = [[np.sqrt(np.square(a - b).mean()) for b in video.astype(float)] for a in read.astype(float)]
-    assert max(np.diag(apart)) < 2.5
+    distances = [[np.sqrt(np.square(a - b).mean()) for b in video.astype(float)] for a in read.astype(float)]
+    assert max(np.diag(distances)) < 2.5
     # A frame more or less would be noticed: neighbours are further apart.
-    assert (np.argmin(apart, axis=1) == range(10)).all() and np.diag(apart, 1).min() > 5
+    assert (np.argmin(distances, axis=1) == range(10)).all() and np.diag(distances, 1).min() > 5
 
 
 def test_gif_shows_every_frame_and_is_the_same_every_time(film, tmp_path):
@@ -247,8 +247,8 @@ def test_gif_shows_every_frame_and_is_the_same_every_time(film, tmp_path):
         assert read.n_frames == len(video) and read.info["loop"] == 0
         frames = np.stack([np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(read)])
     # Few colours, which one palette has all; Pillow looks colours up in boxes of 4 levels.
-    apart = np.abs(frames.astype(int) - video)
-    assert apart[:, 18:].max() < 4 and apart.max() < 16
+    difference = np.abs(frames.astype(int) - video)
+    assert difference[:, 18:].max() < 4 and difference.max() < 16
 
 
 @pytest.mark.parametrize("rate", [12, 18, 30, 50, 60, 144])

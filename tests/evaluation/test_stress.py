@@ -69,34 +69,34 @@ def test_particles_are_drawn_in_proportion_to_their_volume():
     vol0 = torch.full_like(start.vol0, 1e-12)
     vol0[7] = 1e-9  # of hundreds, one that has almost all of it
     uneven = State(start.x, start.v, start.mass, vol0)
-    found = visit(MODEL, hencky(1.0), uneven, (0, 50, 60), 300, 10, seed=0)
-    _, counts = found.F.unique(dim=0, return_counts=True)
-    assert counts.max() > 80 and len(found.F) - counts.topk(2).values.sum() < 120
+    visited = visit(MODEL, hencky(1.0), uneven, (0, 50, 60), 300, 10, seed=0)
+    _, counts = visited.F.unique(dim=0, return_counts=True)
+    assert counts.max() > 80 and len(visited.F) - counts.topk(2).values.sum() < 120
 
 
 def test_the_true_law_has_no_error(plastic):
     truth = hencky(yield_stress=YIELD)
-    found = stress_errors(truth, truth, plastic, MODEL.dt)
-    assert all(found[part] == 0 for part in PARTS)
-    assert found["broken_paths"] == 0 and found["asymmetric"] < 1e-12 and found["true_rms"] > 10
+    errors = stress_errors(truth, truth, plastic, MODEL.dt)
+    assert all(errors[part] == 0 for part in PARTS)
+    assert errors["broken_paths"] == 0 and errors["asymmetric"] < 1e-12 and errors["true_rms"] > 10
 
 
 def test_a_law_that_is_twice_as_stiff_is_wrong_by_its_whole_stress(elastic):
-    found = stress_errors(hencky(2 * E), hencky(), elastic, MODEL.dt)
-    assert all(found[part] == pytest.approx(1.0, rel=1e-9) for part in PARTS)
+    errors = stress_errors(hencky(2 * E), hencky(), elastic, MODEL.dt)
+    assert all(errors[part] == pytest.approx(1.0, rel=1e-9) for part in PARTS)
 
 
-def test_volumetric_and_deviatoric_parts_are_told_apart(elastic):
+def test_volumetric_and_deviatoric_parts_are_distinguished(elastic):
     """Another bulk modulus at the same shear modulus."""
     mu, lam = lame(E, NU)
     bulk = 1.5 * (lam + 2 * mu / 3)
     other = hencky(9 * bulk * mu / (3 * bulk + mu), (3 * bulk - 2 * mu) / (2 * (3 * bulk + mu)))
-    found = stress_errors(other, hencky(), elastic, MODEL.dt)
-    assert found["volumetric"] == pytest.approx(0.5, rel=1e-6) and found["deviatoric"] < 1e-6
-    assert 0 < found["stress"] < 0.5 and found["returned"] == pytest.approx(found["stress"], rel=1e-2)
+    errors = stress_errors(other, hencky(), elastic, MODEL.dt)
+    assert errors["volumetric"] == pytest.approx(0.5, rel=1e-6) and errors["deviatoric"] < 1e-6
+    assert 0 < errors["stress"] < 0.5 and errors["returned"] == pytest.approx(errors["stress"], rel=1e-2)
 
 
-def test_flow_is_judged_by_the_stress_along_paths():
+def test_flow_is_scored_by_the_stress_along_paths():
     """A steady shear far beyond yield: half the stiffness is half the stress of an elastic state, and the same flow."""
     dt, steps = 1e-3, 200
     C = torch.zeros(steps + 1, 2, 3, 3, dtype=torch.float64)
@@ -104,18 +104,18 @@ def test_flow_is_judged_by_the_stress_along_paths():
     F = torch.eye(3, dtype=torch.float64) + dt * C[steps]
     late = VisitedStates(F, F, C, frames=(100, 200))
     truth, softer = hencky(yield_stress=YIELD), hencky(E / 2, yield_stress=YIELD)
-    found = stress_errors(softer, truth, late, dt)
-    assert found["deviatoric"] == pytest.approx(0.5, rel=1e-9)
+    errors = stress_errors(softer, truth, late, dt)
+    assert errors["deviatoric"] == pytest.approx(0.5, rel=1e-9)
     # What is left: the plateaus of two simple shears turn their principal axes a little apart.
-    assert found["path"] < 0.02
+    assert errors["path"] < 0.02
     assert stress_errors(hencky(), truth, late, dt)["path"] > 5, "without a return map"
     early = VisitedStates(F, F, C, frames=(1,))
     assert stress_errors(softer, truth, early, dt)["path"] == pytest.approx(0.5, rel=1e-9)
 
 
 def test_the_return_map_of_a_step_counts(plastic):
-    found = stress_errors(hencky(), hencky(yield_stress=YIELD), plastic, MODEL.dt)
-    assert found["stress"] == 0 and found["returned"] > 0.02 and found["path"] > 0.2
+    errors = stress_errors(hencky(), hencky(yield_stress=YIELD), plastic, MODEL.dt)
+    assert errors["stress"] == 0 and errors["returned"] > 0.02 and errors["path"] > 0.2
 
 
 class Broken(Plasticity):
@@ -137,14 +137,14 @@ class Lopsided(Hencky):
 
 def test_broken_paths_are_counted_and_left_out(elastic):
     truth = hencky()
-    found = stress_errors(Law(truth.elasticity, Broken()), truth, elastic, MODEL.dt)
-    assert 0 < found["broken_paths"] < 50 and found["path"] == pytest.approx(0.0, abs=1e-12)
+    errors = stress_errors(Law(truth.elasticity, Broken()), truth, elastic, MODEL.dt)
+    assert 0 < errors["broken_paths"] < 50 and errors["path"] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_stress_that_is_not_symmetric(elastic):
-    found = stress_errors(Law(Lopsided(E=E, nu=NU), hencky().plasticity), hencky(), elastic, MODEL.dt)
-    assert found["asymmetric"] == pytest.approx(0.1, rel=1e-6) == found["stress"]
-    assert found["volumetric"] < 1e-12
+    errors = stress_errors(Law(Lopsided(E=E, nu=NU), hencky().plasticity), hencky(), elastic, MODEL.dt)
+    assert errors["asymmetric"] == pytest.approx(0.1, rel=1e-6) == errors["stress"]
+    assert errors["volumetric"] < 1e-12
 
 
 def test_a_body_that_touches_nothing_has_no_stresses_to_compare():
@@ -178,10 +178,10 @@ def test_the_table_has_means_spreads_and_the_size_of_the_true_stress():
     assert float(rows["path_std", "neuma"]["Average"]) == pytest.approx(10)
     assert float(rows["true_rms_pa", "truth"]["b"]) == 2e3
     assert "| NeuMA | 20.0 ± 10.0 | 20.0 ± 10.0 |" in markdown and "| *2* | *2* |" in markdown
-    assert "over 3 chains" in markdown and "What holds" not in markdown and verdicts == []
+    assert "over 3 replicates" in markdown and "What holds" not in markdown and verdicts == []
 
 
-def test_broken_paths_are_told():
+def test_broken_paths_are_reported():
     whole = [errors(0.1, broken_paths=3, path=None)]
     _, markdown, _ = table([whole, [errors(0.1)], [errors(0.1)]], [[errors(0.1)]] * 3)
     assert "| NeuMA | – | 10.0 | 10.0 | – |" in markdown
@@ -200,23 +200,23 @@ def test_broken_paths_are_told():
 def test_a_target_counts_scenes(runs, word):
     claim = Bound("within 20 % on 2", "constants", 20.0, count=2, quantity="stress")
     paper = PaperTable(claims=(claim,))
-    chains = [[errors(value) for value in values] for values in runs]
-    _, markdown, (verdict,) = table(chains, chains, paper)
+    replicates = [[errors(value) for value in values] for values in runs]
+    _, markdown, (verdict,) = table(replicates, replicates, paper)
     assert verdict.word == word and f"| within 20 % on 2 | **{word}** |" in markdown
 
 
 def response_of(inside, band=True):
     """A response with two tests, in the second of which so many of ten visited points are in the band."""
     x = list(range(10))
-    found = {"x": x, "visited": [0, 9], "by_stress": False, "true": [1.0] * 10}
+    results = {"x": x, "visited": [0, 9], "by_stress": False, "true": [1.0] * 10}
     bands = [{"x": x, "low": [0.0] * 10, "high": [2.0] * n + [0.5] * (10 - n)} for n in (10, inside)]
-    return {name: found | ({"band": b} if band else {}) for name, b in zip("st", bands, strict=True)}
+    return {name: results | ({"band": b} if band else {}) for name, b in zip("st", bands, strict=True)}
 
 
 @pytest.mark.parametrize(
     ("last", "word"), [((10, 10, 10), "holds"), ((10, 10), "mixed"), ((10, 9, 10), "does not hold")]
 )
-def test_bands_are_judged_by_the_worst_test_of_every_chain(last, word):
+def test_bands_are_scored_by_the_worst_test_of_every_replicate(last, word):
     (claim,) = [claim for claim in PAPER["stress"].claims if claim.quantity == OUTSIDE]
     claim = replace(claim, method="constants", count=3)
     runs = [[errors(0.1)] * len(last)] * 3
@@ -242,7 +242,7 @@ def test_bounds_are_about_columns_of_their_tables_and_state_their_numbers():
 
 def test_percentages_are_of_root_mean_squares(elastic):
     """Against plain numpy."""
-    found = stress_errors(hencky(nu=0.2), hencky(), elastic, MODEL.dt)
+    errors = stress_errors(hencky(nu=0.2), hencky(), elastic, MODEL.dt)
     sigma = np.linalg.svd(elastic.F.numpy())[1]
 
     def principal(nu):
@@ -252,4 +252,4 @@ def test_percentages_are_of_root_mean_squares(elastic):
 
     true = principal(NU)
     expected = np.sqrt(((principal(0.2) - true) ** 2).sum() / (true**2).sum())
-    assert found["stress"] == pytest.approx(expected, rel=1e-5)
+    assert errors["stress"] == pytest.approx(expected, rel=1e-5)

@@ -68,8 +68,8 @@ def test_a_state_counts_where_the_video_is_silent():
     visited = stretches(500, 0.05)
     F, weights = sample_unvisited(visited, 512, isotropic=True)
     largest = REACH * float(log_strains(visited).norm(dim=1).quantile(0.99))
-    apart = torch.cdist(log_strains(F), log_strains(visited)).amin(1)  # both in descending order
-    assert torch.allclose(weights, -torch.expm1(-((apart / (BLUR * largest)) ** 2)), atol=1e-6)
+    distances = torch.cdist(log_strains(F), log_strains(visited)).amin(1)  # both in descending order
+    assert torch.allclose(weights, -torch.expm1(-((distances / (BLUR * largest)) ** 2)), atol=1e-6)
     assert float(weights.min()) < 0.1 and float(weights.max()) > 0.99  # both kinds occur
 
 
@@ -155,13 +155,13 @@ def trained(problem):
 
 
 def test_a_weight_keeps_the_law_near_its_prior_where_the_video_is_silent(trained):
-    found = {}
+    results = {}
     for penalty, (_, law) in trained.items():
         law.set_adaptor_weight(0)
         deviation = Deviation(law, visited_by_all(0.1))
         law.set_adaptor_weight(1)
-        found[penalty] = float(deviation().detach())
-    assert 0 < found[10.0] < 0.5 * found[0.0]
+        results[penalty] = float(deviation().detach())
+    assert 0 < results[10.0] < 0.5 * results[0.0]
 
 
 def test_the_first_loss_is_that_without_penalty(trained):

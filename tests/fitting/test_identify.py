@@ -56,17 +56,17 @@ def pixel_noise(images: torch.Tensor) -> torch.Tensor:
 
 
 def known(body, std=(0.0,) * 6, v0=V0) -> InitialMotion:
-    """The true throw, up to standard deviations."""
+    """The true initial motion, up to standard deviations."""
     centre = (body.mass @ body.x0 / body.mass.sum()).numpy()
     return InitialMotion(np.array(v0), np.zeros(3), centre, np.eye(3), np.array(std))
 
 
-def found_in(spec: dict, families: dict, noise=pixel_noise, throw=None, **options):
+def identified_in(spec: dict, families: dict, noise=pixel_noise, motion=None, **options):
     """What is identified in a noisy video of the ball under a law."""
     body, seen = video_of(spec, V0, FRAMES, noise)
     other_videos = options.pop("other_videos", ())
     chosen = settings(families, covariance_from="elastic", **options)
-    return identify(MODEL, throw or known(body), body, seen, chosen, other_videos=other_videos)
+    return identify(MODEL, motion or known(body), body, seen, chosen, other_videos=other_videos)
 
 
 def video_of(spec: dict, v0, frames, noise=pixel_noise):
@@ -76,16 +76,16 @@ def video_of(spec: dict, v0, frames, noise=pixel_noise):
     return body, Observation(seen.frames, seen.images + noise(seen.images), seen.cameras)
 
 
-def test_constants_and_family_of_the_truth_are_found():
-    """The truth among the candidates, beside one that contains it: constants to 3 %, from four times too stiff."""
+def test_constants_and_family_of_the_truth_are_identified():
+    """The truth among the candidates, with one that contains it: constants to 3 %, from four times too stiff."""
     families = {"von_mises": PLASTIC, "hencky": ELASTIC}
     truth = law("hencky", E=1.5e4, nu=0.35)
-    found = found_in(truth, families)
-    assert found.best.family.name == "hencky" and found.ties == []
-    assert found.best.values["E"] == pytest.approx(1.5e4, rel=0.03)
-    assert found.best.values["nu"] == pytest.approx(0.35, abs=0.02)
-    assert found.frames[0] + found.held_out[0] == FRAMES and len(found.held_out[0]) == 3
-    assert found.as_dict()["law"]["plasticity"] == {"name": "identity"}
+    identified = identified_in(truth, families)
+    assert identified.best.family.name == "hencky" and identified.ties == []
+    assert identified.best.values["E"] == pytest.approx(1.5e4, rel=0.03)
+    assert identified.best.values["nu"] == pytest.approx(0.35, abs=0.02)
+    assert identified.frames[0] + identified.held_out[0] == FRAMES and len(identified.held_out[0]) == 3
+    assert identified.as_dict()["law"]["plasticity"] == {"name": "identity"}
 
 
 def test_first_frames_that_mislead_are_not_where_the_last_fit_begins(monkeypatch):
@@ -100,42 +100,44 @@ def test_first_frames_that_mislead_are_not_where_the_last_fit_begins(monkeypatch
     monkeypatch.setattr(_Run, "begin", noted)
     truth = law("hencky", "von_mises", E=6e4, nu=0.3, yield_stress=2e3)
     for factor, expected in ((1e6, (1, len(SQUARES) - 1)), (1.2, (3, 0))):
-        assert found_in(truth, {"hencky": ELASTIC}, prune_factor=factor).best.refined
+        assert identified_in(truth, {"hencky": ELASTIC}, prune_factor=factor).best.refined
         assert begun[-1] == expected
 
 
-def test_an_uncertain_throw_is_corrected_and_widens_the_constants():
+def test_an_uncertain_motion_is_corrected_and_widens_the_constants():
     """A velocity that is off by a standard deviation along all axes is found to a third of that, and the constants as
     well as with the true one; what is left of the uncertainty is passed on to them."""
     truth, families = law("hencky", E=3e4, nu=0.35), {"hencky": ELASTIC}
     off, std = np.array([0.03, -0.03, 0.06]), (0.03, 0.03, 0.06, 0.2, 0.2, 0.2)
-    throw = known(ball(), std)
-    found = found_in(truth, families, throw=replace(throw, velocity=throw.velocity + off)).best
-    assert (np.abs(found.motions[0].velocity - V0) < np.abs(off) / 3).all()
-    assert (np.abs(found.motions[0].spin) < 0.2).all()
-    assert (found.motions[0].std < std).all() and (found.motions[0].std > 0).all()
-    assert found.values["E"] == pytest.approx(3e4, rel=0.04)
-    sure = found_in(truth, families).best
-    assert (np.diag(found.covariance) > np.diag(sure.covariance)).all()
+    motion = known(ball(), std)
+    result = identified_in(truth, families, motion=replace(motion, velocity=motion.velocity + off)).best
+    assert (np.abs(result.motions[0].velocity - V0) < np.abs(off) / 3).all()
+    assert (np.abs(result.motions[0].spin) < 0.2).all()
+    assert (result.motions[0].std < std).all() and (result.motions[0].std > 0).all()
+    assert result.values["E"] == pytest.approx(3e4, rel=0.04)
+    sure = identified_in(truth, families).best
+    assert (np.diag(result.covariance) > np.diag(sure.covariance)).all()
     assert sure.motions[0].std.max() == 0 and sure.as_dict(settings(families))["start"]["v0"] == list(V0)
 
 
-def test_two_videos_have_the_constants_in_common_and_a_throw_each():
-    """A harder throw, with fewer frames, and an uncertain one at that, beside the ordinary one: both throws and the
-    constants are found, and that of them which the first video tells least, the bulk modulus, more surely."""
+def test_two_videos_have_the_constants_in_common_and_a_motion_each():
+    """A faster and uncertain motion with fewer frames in addition to the ordinary one: both motions and the constants
+    are estimated, and the bulk modulus, which the first video determines least, with less uncertainty."""
     families, truth = {"hencky": ELASTIC}, law("hencky", E=3e4, nu=0.4)
     v0, off = (0.2, -2.5, 0.3), np.array([0.03, 0.05, 0.0])
     body, seen = video_of(truth, v0, FRAMES[:11])
-    throw = known(body, (0.05, 0.05, 0.0, 0.0, 0.0, 0.0), np.array(v0) + off)
+    motion = known(body, (0.05, 0.05, 0.0, 0.0, 0.0, 0.0), np.array(v0) + off)
     options = dict(pyramid=(8, 32))
-    alone = found_in(truth, families, **options)
-    both = found_in(truth, families, other_videos=[(throw, body, seen)], **options)
+    alone = identified_in(truth, families, **options)
+    both = identified_in(truth, families, other_videos=[(motion, body, seen)], **options)
     assert both.best.values["E"] == pytest.approx(3e4, rel=0.02)
     assert both.best.values["nu"] == pytest.approx(0.4, abs=0.02)
     first, second = both.best.motions
     assert (first.velocity == V0).all() and first.std.max() == 0
     assert (np.abs(second.velocity - v0) < np.abs(off) / 3 + 1e-12).all() and (second.std[:2] < 0.05).all()
-    stds = [{name: std for name, _, std in found.best.quantities(found.settings)} for found in (alone, both)]
+    stds = [
+        {name: std for name, _, std in result.best.quantities(result.settings)} for result in (alone, both)
+    ]
     assert stds[1]["K"] < stds[0]["K"]
     written = both.as_dict()
     assert written["start"]["v0"] == list(V0) and len(written["further_videos"]) == 1
@@ -147,20 +149,20 @@ def test_videos_count_alike_however_long():
     families, truth = {"hencky": ELASTIC}, law("hencky", E=3e4, nu=0.4)
     options = dict(pyramid=(8, 32), frames=33)
     body, half = video_of(truth, V0, FRAMES[::2])
-    found = [
-        found_in(truth, families, **options),
+    results = [
+        identified_in(truth, families, **options),
         identify(MODEL, known(body), body, half, settings(families, covariance_from="elastic", **options)),
-        found_in(truth, families, other_videos=[(known(body), body, half)], **options),
+        identified_in(truth, families, other_videos=[(known(body), body, half)], **options),
     ]
-    held_out = [one.fits["hencky"].held_out for one in found]
+    held_out = [one.fits["hencky"].held_out for one in results]
     assert held_out[2] == pytest.approx((held_out[0] + held_out[1]) / 2, rel=0.02)
-    losses = [one.fits["hencky"].loss for one in found]
+    losses = [one.fits["hencky"].loss for one in results]
     assert losses[2] == pytest.approx((losses[0] + losses[1]) / 2, rel=0.02)
 
 
 def test_what_many_particles_change_is_added_and_its_scatter_is_uncertainty():
     """The video is of a body of many particles: identified with few alone, the constants are those of another body.
-    With other fillings of many beside them, they come nearer, and are less sure than if one filling told all."""
+    With other fillings of many particles they are closer, and less certain than with a single filling."""
     truth, families = law("hencky", E=3e4, nu=0.35), {"hencky": ELASTIC}
     generator = torch.Generator().manual_seed(1)
     few = ball(count=60)
@@ -173,25 +175,25 @@ def test_what_many_particles_change_is_added_and_its_scatter_is_uncertainty():
 
     many = filled(3000)
     assert len(many.x0) >= 3000 and float(many.mass.sum()) == pytest.approx(float(few.mass.sum()))
-    seen, throw = observe(many, V0, FRAMES, truth), known(many)
+    seen, motion = observe(many, V0, FRAMES, truth), known(many)
     options = settings(families, covariance_from="elastic")
-    found = [
-        identify(MODEL, throw, few, seen, options, refined=[finer] if finer else ()).best
+    results = [
+        identify(MODEL, motion, few, seen, options, refined=[finer] if finer else ()).best
         for finer in ((), (filled(3000), filled(3000)))
     ]
-    errors = [abs(math.log(fit.values["E"] / 3e4)) for fit in found]
+    errors = [abs(math.log(fit.values["E"] / 3e4)) for fit in results]
     assert errors[1] < errors[0] / 2
-    assert found[1].loss < found[0].loss / 2
+    assert results[1].loss < results[0].loss / 2
 
 
-def test_a_throw_is_read_moved_and_written():
+def test_a_motion_is_read_moved_and_written():
     """Deviations along the camera's axes are those of the world turned; what is known does not move."""
     axes = [[0, 0, 1], [0, -1, 0], [1, 0, 0]]
     content = {"v0": [1, 2, 3], "angular_velocity": [0, 1, 0], "centre": [0.5, 0.5, 0.5], "camera_axes": axes}
-    throw = InitialMotion.of(
+    motion = InitialMotion.of(
         content | {"std_camera": [0.1, 0.2, 0.3], "angular_velocity_std_camera": [1, 0, 0]}
     )
-    moved = throw.moved(np.array([1.0, 2.0, 0.0, 1.0, 5.0, 5.0]))
+    moved = motion.moved(np.array([1.0, 2.0, 0.0, 1.0, 5.0, 5.0]))
     np.testing.assert_allclose(moved.velocity, [1, 1.6, 3.1])
     np.testing.assert_allclose(moved.spin, [0, 1, 1])
     again = InitialMotion.of(moved.as_dict())
@@ -255,7 +257,7 @@ def test_a_flow_that_never_yields_shows_the_elastic_body():
     assert never_yields.resembles(elastic) and not yields.resembles(elastic)
 
 
-def test_frames_after_the_contact_judge():
+def test_frames_after_the_contact_decide():
     """However late the contact is: a share of what follows it, and the others are fitted."""
     body, seen = video_of(ELASTIC, V0, FRAMES)
     for v0, share in ((V0, 0.25), ((0.5, -0.6, 0.0), 0.25), (V0, 0.5)):
@@ -263,14 +265,14 @@ def test_frames_after_the_contact_judge():
         video = VideoResiduals(MODEL, known(body, v0=v0), body, seen, chosen)
         video.hold_out(Family("hencky", ELASTIC), share)
         path = rollout(MODEL, analytic_law(ELASTIC), body.state(v0), steps=FRAMES[-1], frames=FRAMES)
-        told = len(FRAMES) - first_contact(MODEL, path.x)
-        assert 0 < told < len(FRAMES)
-        assert len(FRAMES) - video.fitted == round(share * told)
+        informative = len(FRAMES) - first_contact(MODEL, path.x)
+        assert 0 < informative < len(FRAMES)
+        assert len(FRAMES) - video.fitted == round(share * informative)
 
 
 def test_what_parts_of_the_video_and_tied_families_disagree_about_is_uncertain():
     """The change since the fit to the first frames, and the scatter of shared constants over families that are as good,
-    are added to the covariance; what is not shared stays as it is."""
+    are added to the covariance; what is not shared stays unchanged."""
     family, other = Family("plastic", PLASTIC), Family("elastic", law("neo_hookean"))
     values = {"E": 6e4, "nu": 0.3, "yield_stress": 4e3}
     first = FamilyFit(family, {**values, "E": 5e4})
@@ -302,10 +304,10 @@ def test_a_plateau_widens_what_is_not_determined(flat):
 
 def test_a_plastic_body_is_no_elastic_one_and_is_pictured(tmp_path):
     truth = law("hencky", "von_mises", E=6e4, nu=0.3, yield_stress=2e3)
-    found = found_in(truth, {"hencky": ELASTIC, "von_mises": PLASTIC})
-    assert found.best.family.name == "von_mises" and "hencky" not in found.ties
-    assert found.best.values["yield_stress"] == pytest.approx(2e3, rel=0.03)
-    content = found.as_dict()
+    identified = identified_in(truth, {"hencky": ELASTIC, "von_mises": PLASTIC})
+    assert identified.best.family.name == "von_mises" and "hencky" not in identified.ties
+    assert identified.best.values["yield_stress"] == pytest.approx(2e3, rel=0.03)
+    content = identified.as_dict()
     write_json(tmp_path / "identified.json", content)  # refuses what is no number
     quantities = content["best"]["quantities"]
     assert quantities["yield_stress"]["determined"] and "yield_stress" in content["says"]
@@ -323,14 +325,14 @@ def test_uncertainty_covers_the_error_of_patches_that_last():
     def patches(images):
         T, V, H, W, C = images.shape
         coarse = torch.randn(V, H // 8, W // 8, C, generator=generator, dtype=images.dtype)
-        shown = (images < 0.99).any(-1, keepdim=True)  # where the body is
-        return 0.05 * coarse.repeat_interleave(8, 1).repeat_interleave(8, 2) * shown
+        visible = (images < 0.99).any(-1, keepdim=True)  # where the body is
+        return 0.05 * coarse.repeat_interleave(8, 1).repeat_interleave(8, 2) * visible
 
-    found = found_in(law("hencky", E=4e4, nu=0.3), {"hencky": ELASTIC}, noise=patches)
+    identified = identified_in(law("hencky", E=4e4, nu=0.3), {"hencky": ELASTIC}, noise=patches)
     true = named_combinations({"E": 4e4, "nu": 0.3})
-    for name, value, std in found.best.quantities(found.settings):
+    for name, value, std in identified.best.quantities(identified.settings):
         assert abs(math.log(value / true[name])) < 3 * std, name
-        assert std >= found.settings.model_std
+        assert std >= identified.settings.model_std
 
 
 def test_a_family_that_diverges_loses_and_alone_is_an_error(monkeypatch):
@@ -344,10 +346,13 @@ def test_a_family_that_diverges_loses_and_alone_is_an_error(monkeypatch):
     real = module.rollout_batch
     monkeypatch.setattr(module, "rollout_batch", rollout_batch)
     truth, wild = law("hencky", E=5e4), law("neo_hookean")
-    found = found_in(truth, {"hencky": ELASTIC, "neo_hookean": wild})
-    assert found.best.family.name == "hencky" and found.as_dict()["families"]["neo_hookean"]["diverged"]
+    identified = identified_in(truth, {"hencky": ELASTIC, "neo_hookean": wild})
+    assert (
+        identified.best.family.name == "hencky"
+        and identified.as_dict()["families"]["neo_hookean"]["diverged"]
+    )
     with pytest.raises(NonFiniteError, match="softer"):
-        found_in(truth, {"neo_hookean": wild})
+        identified_in(truth, {"neo_hookean": wild})
 
 
 def fits(**scores: float) -> list[FamilyFit]:
@@ -407,9 +412,9 @@ def test_unbounded_constants_return_and_stay_within_bounds_and_the_time_step():
 def test_less_flow_is_towards_the_elastic_limit_and_within_bounds():
     values = {"E": 3e4, "nu": 0.2}
     family = Family("plastic", law("hencky", "von_mises", yield_stress=4e3))
-    found = family.with_other_limits({**values, "yield_stress": 1e3}, (1, 2))
-    assert [v["yield_stress"] for v in found] == pytest.approx([4e3, 1.6e4])
-    assert all(v["E"] == pytest.approx(3e4) and v["nu"] == pytest.approx(0.2) for v in found)
+    result = family.with_other_limits({**values, "yield_stress": 1e3}, (1, 2))
+    assert [v["yield_stress"] for v in result] == pytest.approx([4e3, 1.6e4])
+    assert all(v["E"] == pytest.approx(3e4) and v["nu"] == pytest.approx(0.2) for v in result)
     grains = Family("grains", law("hencky", "drucker_prager", friction_angle=30))
     angles = [
         v["friction_angle"] for v in grains.with_other_limits({**values, "friction_angle": 30.0}, (1, 2))
@@ -418,7 +423,7 @@ def test_less_flow_is_towards_the_elastic_limit_and_within_bounds():
     assert Family("elastic", ELASTIC).with_other_limits(values, (1, 2)) == []
 
 
-def test_a_stock_law_gives_what_the_family_has():
+def test_a_published_law_gives_what_the_family_has():
     family = Family("plastic", PLASTIC)
     known = {"E": 1e5, "nu": -0.2, "friction_angle": 25.0}
     assert family.with_guesses(known) == {"E": 1e5, "nu": 0.3, "yield_stress": 4e3}

@@ -1,4 +1,4 @@
-"""The training loop: gradients of the whole chain, progress, recovery, and resuming."""
+"""The training loop: gradients from the adaptor to the loss, progress, recovery, and resuming."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def problem():
     return body, PixelLoss(body, observe(body, V0, FRAMES))
 
 
-def test_gradient_of_the_whole_chain_from_adaptor_to_image_loss(problem):
+def test_gradient_from_adaptor_to_image_loss(problem):
     body, loss = problem
     law = stiff_random_law()
     parameters = [p for p in law.parameters() if p.requires_grad]
@@ -81,7 +81,7 @@ def test_training_lowers_the_loss_and_moves_the_adaptor_only(trained):
 
 
 def video_of(body, v0, frames):
-    """Start and loss of another throw, which shows the same material as `observe`."""
+    """Start and loss of another motion, which shows the same material as `observe`."""
     return body.state(v0), PixelLoss(body, observe(body, v0, frames))
 
 
@@ -96,13 +96,11 @@ def test_the_same_video_twice_trains_as_once(problem, trained):
 def test_videos_count_alike_however_long(problem):
     """Loss and gradient of the first iteration are the means of those of the videos, one of which has more frames."""
     once = SETTINGS.model_copy(update={"iterations": 1, "gradient_clip": 1e30})
-    further = video_of(
-        problem[0], torch.tensor([0.4, -0.8, 0.1], dtype=torch.float64), tuple(range(0, 55, 6))
-    )
-    both = train(problem, settings=once, other_videos=[further])
+    other = video_of(problem[0], torch.tensor([0.4, -0.8, 0.1], dtype=torch.float64), tuple(range(0, 55, 6)))
+    both = train(problem, settings=once, other_videos=[other])
     alone = [train((problem[0], problem[1]), settings=once)]
     law = stiff_random_law()
-    alone.append(train_material(MODEL, law, *further, once, log=lambda _: None))
+    alone.append(train_material(MODEL, law, *other, once, log=lambda _: None))
     first = [run.history.loss[0] for run in alone]
     assert both.history.loss[0] == pytest.approx(sum(first) / 2, rel=1e-12)
     weighted = [run.history.weighted_loss[0] for run in alone]
@@ -118,14 +116,14 @@ def test_videos_count_alike_however_long(problem):
 
 
 def test_one_law_fits_two_videos(problem):
-    further = video_of(problem[0], torch.tensor([0.4, -0.8, 0.1], dtype=torch.float64), FRAMES)
-    both = train(problem, other_videos=[further])
+    other = video_of(problem[0], torch.tensor([0.4, -0.8, 0.1], dtype=torch.float64), FRAMES)
+    both = train(problem, other_videos=[other])
 
     def loss_of(law, start, loss):
         with torch.no_grad():
             return float(loss(rollout(MODEL, law, start, steps=FRAMES[-1], frames=FRAMES)).mean())
 
-    for start, loss in ((problem[0].state(V0), problem[1]), further):
+    for start, loss in ((problem[0].state(V0), problem[1]), other):
         assert loss_of(both.law, start, loss) < 0.8 * loss_of(stiff_random_law(), start, loss)
 
 

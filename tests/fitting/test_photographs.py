@@ -66,14 +66,14 @@ def written(folder, images, cameras, **extra):
 
 def held_upright(images, cameras):
     """Every second view in a taller frame, whose picture lies elsewhere in it: what a phone held upright gives."""
-    found = []
+    results = []
     for i, (image, camera) in enumerate(zip(images, cameras)):
         if i % 2:
             image = torch.nn.functional.pad(image, (0, 0, 3, 0, 15, 8))
             K = camera.Ks + torch.tensor([[0, 0, 3.0], [0, 0, 15.0], [0, 0, 0]])
             camera = Cameras(camera.viewmats, K, image.shape[1], image.shape[0])
-        found.append((image, camera))
-    return map(list, zip(*found))
+        results.append((image, camera))
+    return map(list, zip(*results))
 
 
 # ---- reading
@@ -162,7 +162,7 @@ def test_a_step_over_views_of_several_sizes_is_their_mean(duck):
     np.testing.assert_allclose(first, second, rtol=1e-4)
 
 
-def test_exposures_that_were_put_in_are_found(duck, plain):
+def test_exposures_that_were_put_in_are_recovered(duck, plain):
     """Down to half as bright, in three channels apart: less than a third of it is left, and held-out views are as good.
 
     What is left is shading that few Gaussians draw coarsely: the views from above are the brighter ones.
@@ -171,15 +171,17 @@ def test_exposures_that_were_put_in_are_found(duck, plain):
     put_in = torch.exp(0.7 * (torch.rand(VIEWS, 3, generator=torch.Generator().manual_seed(1)) - 1.0))
     exposed = images.clone()
     exposed[..., :3] *= put_in[:, None, None]
-    blind, found = (fit_gaussians(exposed, cameras, SHORT, seed=3, gain_rate=rate)[1] for rate in (0.0, 0.02))
-    fitted = [i for i in range(VIEWS) if i not in found.held_out]
+    blind, result = (
+        fit_gaussians(exposed, cameras, SHORT, seed=3, gain_rate=rate)[1] for rate in (0.0, 0.02)
+    )
+    fitted = [i for i in range(VIEWS) if i not in result.held_out]
     spread = put_in.log() - put_in[fitted].log().mean(0)
-    gains = torch.tensor(found.gains).log()
-    for views in (fitted, found.held_out):
+    gains = torch.tensor(result.gains).log()
+    for views in (fitted, result.held_out):
         assert (gains - spread)[views].square().mean().sqrt() < spread[views].square().mean().sqrt() / 3
     assert gains[fitted].mean(0).abs().max() < 1e-5
-    assert found.train_psnr_object > blind.train_psnr_object + 1.5
-    assert found.psnr_object > plain.psnr_object - 0.5
+    assert result.train_psnr_object > blind.train_psnr_object + 1.5
+    assert result.psnr_object > plain.psnr_object - 0.5
 
 
 def test_upright_and_across_fit_as_one_size_does(duck, plain, tmp_path):
@@ -211,7 +213,7 @@ def spoilt(images):
     return images
 
 
-def test_masks_are_judged_by_what_nearly_all_hold():
+def test_masks_are_scored_by_what_nearly_all_hold():
     """Good masks lack little of the body, bad ones much, although the intersection of all is half as large."""
     cameras = cameras_around(BALL, views=20, size=48)
     images = mattes(BALL, cameras)
@@ -225,7 +227,7 @@ def test_masks_are_judged_by_what_nearly_all_hold():
 
 
 def test_photographs_with_spoilt_masks_are_left_out(tmp_path):
-    """The surface is then that of the good masks; where many are bad, a message says what to do."""
+    """The surface is then that of the good masks; where many are bad, a message gives a remedy."""
     ball = BALL.copy().apply_translation([0.5, 0.1, 0.5])
     cameras = cameras_around(ball, views=20, size=48)
     images = mattes(ball, cameras)

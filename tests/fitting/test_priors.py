@@ -82,7 +82,7 @@ def test_random_rotations_are_rotations_and_uniform():
     assert float((R.square().mean(0) - 1 / 3).abs().max()) < 5 * 0.3 / math.sqrt(len(R))
 
 
-def test_throws_stay_in_the_box_and_hit_its_floor():
+def test_launches_stay_in_the_box_and_hit_its_floor():
     law, settings = reference_law(JELLY, RegressionConfig()), RegressionConfig(side_particles=4)
     generator = torch.Generator().manual_seed(0)
     strains = []
@@ -229,15 +229,15 @@ def test_default_settings_reach_the_released_priors(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(ROUGH))
 def test_a_rough_prior_is_rough_by_its_return_map_alone(name):
-    """The elasticity is a tenth of the bound away; the whole is as far as the authors' own priors, and says so."""
+    """The elasticity is a tenth of the bound away; the whole is as far as the authors' own priors, and warns."""
     settings = RegressionConfig()
     law, report = train_prior(LAWS[name], settings)
     reference = reference_law(LAWS[name], settings)
-    apart = {
+    parts = {
         "elasticity": Law(law.elasticity, reference.plasticity),
         "plasticity": Law(reference.elasticity, law.plasticity),
     }
-    apart = {part: evaluate_prior(each, LAWS[name], settings)["chamfer"] for part, each in apart.items()}
-    assert apart["elasticity"] < 0.01 and apart["plasticity"] > 0.1
+    parts = {part: evaluate_prior(each, LAWS[name], settings)["chamfer"] for part, each in parts.items()}
+    assert parts["elasticity"] < 0.01 and parts["plasticity"] > 0.1
     assert 0.1 <= report["chamfer"] < 0.5
     assert f"Chamfer {report['chamfer']:.4f}e-4 m^2. WARNING" in remark(report)

@@ -1,4 +1,4 @@
-"""Cameras with times, sizes and exposures of their own in one rollout: lists, loss, fits, motion blur, masks."""
+"""Cameras that differ in times, sizes and exposures in one rollout: lists, loss, fits, motion blur, masks."""
 
 import json
 from dataclasses import replace
@@ -44,7 +44,7 @@ FRAMES = (8, 20, 44, 60)
 
 
 def write_list(folder, shots, exposures=(), **shared):
-    """A list of frames, (view, step, (width, height)) each; every picture is told by its red channel."""
+    """A list of frames, (view, step, (width, height)) each; every picture is identified by its red channel."""
     frames = []
     for k, (view, step, (width, height)) in enumerate(shots):
         pixels = np.full((height, width, 4), k, dtype=np.uint8)
@@ -85,9 +85,9 @@ def test_views_of_other_steps_sizes_and_exposures_are_observations_of_their_own(
     assert first.exposure == (-1, 0, 1) and sum(first.shares) == pytest.approx(1)
     assert first.shares[0] == pytest.approx(0.95 / 2.9)
     assert first.images[0, 0, 0, 0, 0] == 1 and second.cameras.width == 20
-    found = load_videos(path, [0, 1, 2, 3], DT)
-    assert filmed_steps(path, [0, 1, 2, 3], DT) == rendered_steps(found) == (4, 8, 9, 10, 13, 17, 18, 19)
-    # Nothing says how long a step is: pictures of an instant.
+    videos = load_videos(path, [0, 1, 2, 3], DT)
+    assert filmed_steps(path, [0, 1, 2, 3], DT) == rendered_steps(videos) == (4, 8, 9, 10, 13, 17, 18, 19)
+    # The length of a step is unknown: pictures of an instant.
     assert [video.exposure for video in load_videos(path, [0, 3])] == [(0,), (0,)]
     with refused(path):
         load_observation(path, [0, 2])
@@ -119,10 +119,10 @@ def test_exposed_steps_are_symmetric_and_as_wide_as_the_exposure(length, most):
     assert 1 <= len(steps) <= most and len(steps) % 2 == 1 and sum(shares) == pytest.approx(1)
     assert steps == tuple(-n for n in reversed(steps)) and shares == pytest.approx(shares[::-1])
     if len(steps) > 1:
-        apart = steps[1] - steps[0]
+        spacing = steps[1] - steps[0]
         variance = sum(share * n**2 for n, share in zip(steps, shares, strict=True))
-        assert {b - a for a, b in zip(steps, steps[1:], strict=False)} == {apart}
-        assert variance == pytest.approx(length**2 / 12, abs=apart**2 / 4)
+        assert {b - a for a, b in zip(steps, steps[1:], strict=False)} == {spacing}
+        assert variance == pytest.approx(length**2 / 12, abs=spacing**2 / 4)
     else:
         assert most < 3 or length <= 1.01
 
@@ -177,14 +177,14 @@ def filmed(body, video: Observation, spec=TRUTH, v0=V0, masks=False) -> Observat
     return replace(video, images=(255 * pixels).round().byte())
 
 
-def judged(loss, steps, spec=PRIOR):
+def evaluated(loss, steps, spec=PRIOR):
     """Losses of a rollout, and their gradients with respect to its states."""
     with torch.no_grad():
         path = rollout(MODEL, analytic_law(spec, MODEL.dt), ball().state(V0), steps=steps[-1], frames=steps)
     x, F = path.x.requires_grad_(), path.F.requires_grad_()
-    found = loss(Trajectory(steps, x, path.v, F, path.C))
-    weight = torch.linspace(1, 2, len(found), dtype=torch.float64)
-    return (found.detach(), *torch.autograd.grad(found, (x, F), weight, allow_unused=True))
+    value = loss(Trajectory(steps, x, path.v, F, path.C))
+    weight = torch.linspace(1, 2, len(value), dtype=torch.float64)
+    return (value.detach(), *torch.autograd.grad(value, (x, F), weight, allow_unused=True))
 
 
 @pytest.mark.parametrize("compare", ["colour", "masks"])
@@ -192,19 +192,21 @@ def judged(loss, steps, spec=PRIOR):
 def test_views_in_one_observation_are_the_same_as_one_each(compare, exposure):
     body = ball()
     together = filmed(body, blank(cameras_from(LEFT, RIGHT), FRAMES, exposure), masks=True)
-    apart = [replace(together, images=together.images[:, [v]], cameras=together.cameras[v]) for v in (1, 0)]
-    one, two = (PixelLoss(body, videos, compare=compare) for videos in (together, apart))
+    separate = [
+        replace(together, images=together.images[:, [v]], cameras=together.cameras[v]) for v in (1, 0)
+    ]
+    one, two = (PixelLoss(body, videos, compare=compare) for videos in (together, separate))
     assert one.frames == two.frames and one.steps == two.steps
-    for mine, twin in zip(judged(two, two.steps), judged(one, one.steps), strict=True):
+    for mine, twin in zip(evaluated(two, two.steps), evaluated(one, one.steps), strict=True):
         assert torch.allclose(mine, twin, rtol=1e-10, atol=1e-12 * float(twin.abs().max()))
 
 
 def test_an_exposure_of_one_step_changes_no_bit():
     body = ball()
     plain = filmed(body, blank(cameras_from(LEFT), FRAMES), masks=True)
-    said = replace(plain, exposure=(0,), shares=(1.0,))
+    instant = replace(plain, exposure=(0,), shares=(1.0,))
     for mine, twin in zip(
-        judged(PixelLoss(body, [said]), FRAMES), judged(PixelLoss(body, plain), FRAMES), strict=True
+        evaluated(PixelLoss(body, [instant]), FRAMES), evaluated(PixelLoss(body, plain), FRAMES), strict=True
     ):
         assert torch.equal(mine, twin)
 
@@ -228,9 +230,9 @@ def test_loss_and_gradient_of_unlike_cameras(compare, monkeypatch):
     loss = PixelLoss(body, videos, compare=compare)
     assert loss.frames == (8, 14, 20, 44, 52, 60)
     assert loss.steps == (6, 8, 10, 13, 14, 15, 18, 19, 20, 21, 22, 42, 44, 46, 51, 52, 53, 58, 60, 62)
-    value, in_x, in_F = judged(loss, loss.steps)
+    value, in_x, in_F = evaluated(loss, loss.steps)
     first, second = (PixelLoss(body, video, compare=compare) for video in videos)
-    a, b = (judged(each, each.steps)[0] for each in (first, second))
+    a, b = (evaluated(each, each.steps)[0] for each in (first, second))
     expected = torch.stack([a[0], b[0], (a[1] + b[1]) / 2, a[2], b[2], a[3]])
     assert torch.allclose(value, expected, rtol=1e-10) and (value > 1e-9).all()
     with torch.no_grad():
@@ -281,10 +283,10 @@ def test_what_lies_under_a_transparent_pixel_does_not_count_and_masks_have_no_co
         ("colour", repainted, False),
     ):  # fmt: skip
         one, two = (PixelLoss(body, each, compare=compare) for each in (video, replace(video, images=other)))
-        assert torch.equal(judged(one, one.steps)[0], judged(two, two.steps)[0]) == same
+        assert torch.equal(evaluated(one, one.steps)[0], evaluated(two, two.steps)[0]) == same
     renders = PixelLoss(body, unlike(body), compare="masks")
     with refused("observation: images"):
-        judged(renders, renders.steps)
+        evaluated(renders, renders.steps)
 
 
 # ---- identification and velocity
@@ -315,8 +317,10 @@ def test_views_apart_identify_what_they_do_together():
         together.images.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64
     )
     together = replace(together, images=together.images + 0.01 * noise)
-    apart = [replace(together, images=together.images[:, [v]], cameras=together.cameras[v]) for v in (0, 1)]
-    one, two = (identified(body, videos, iterations=2) for videos in (together, apart))
+    separate = [
+        replace(together, images=together.images[:, [v]], cameras=together.cameras[v]) for v in (0, 1)
+    ]
+    one, two = (identified(body, videos, iterations=2) for videos in (together, separate))
     assert two.values == pytest.approx(one.values, rel=1e-6)
     assert two.loss == pytest.approx(one.loss, rel=1e-8)
     np.testing.assert_allclose(two.covariance, one.covariance, rtol=1e-3)
@@ -355,11 +359,13 @@ def test_motion_blur_that_is_rendered_does_not_bias_the_stiffness():
 def test_views_apart_have_the_velocity_residuals_that_they_have_together():
     body, steps = ball(0.45), (0, 8, 16)
     together = filmed(body, blank(cameras_from(LEFT, RIGHT, size=(16, 14)), steps, (0, 1)), law())
-    apart = [replace(together, images=together.images[:, [v]], cameras=together.cameras[v]) for v in (0, 1)]
+    separate = [
+        replace(together, images=together.images[:, [v]], cameras=together.cameras[v]) for v in (0, 1)
+    ]
     flight = _Flight(MODEL, analytic_law(law(), MODEL.dt), body, (1, 9, 17))
     unknowns = np.array([0.4, -1.4, 0.2, 0.1, 0, 0, 0.05, 0, 0.1, 0, 0])
-    flight.simulate(unknowns, rendered_steps(apart))
-    one, two = (_Residuals(flight, videos, 0.02).linearise(unknowns) for videos in ((together,), apart))
+    flight.simulate(unknowns, rendered_steps(separate))
+    one, two = (_Residuals(flight, videos, 0.02).linearise(unknowns) for videos in ((together,), separate))
     assert two.cost == pytest.approx(one.cost, rel=1e-10) and two.rms == pytest.approx(one.rms, rel=1e-10)
     np.testing.assert_allclose(two.curvatures, one.curvatures, rtol=1e-8, atol=1e-9)
     np.testing.assert_allclose(two.scores, one.scores, rtol=1e-8, atol=1e-9)
@@ -373,9 +379,9 @@ def test_velocity_from_staggered_cameras_that_blur():
         filmed(body, blank(cameras_from(LEFT), (2, 10, 18, 26, 90), (-2, 0, 2)), law(), v0),
         filmed(body, blank(cameras_from(RIGHT, size=(20, 16)), (5, 13, 21, 29, 90), (-1, 0, 1)), law(), v0),
     ]
-    found = estimate_velocity(MODEL, analytic_law(law(), MODEL.dt), body, videos, VelocityConfig(frames=4))
-    assert max(found.frames) <= 29 and {2, 5} & set(found.frames)
-    np.testing.assert_allclose(found.v0, v0, atol=0.01)
+    estimate = estimate_velocity(MODEL, analytic_law(law(), MODEL.dt), body, videos, VelocityConfig(frames=4))
+    assert max(estimate.frames) <= 29 and {2, 5} & set(estimate.frames)
+    np.testing.assert_allclose(estimate.v0, v0, atol=0.01)
 
 
 @pytest.mark.parametrize("truncated", [True, False])

@@ -1,4 +1,4 @@
-"""Which parts of a structured law are corrected, and that the others stay as they are."""
+"""Which parts of a structured law are corrected, and that the others stay unchanged."""
 
 import copy
 from itertools import pairwise
@@ -59,13 +59,13 @@ def deltas(law, part):
 
 @pytest.fixture(scope="module")
 def too_stiff(problem):
-    said, shown = [], []
-    trained, choice = fit(problem, FLOWS, log=said.append, progress=lambda *state: shown.append(state))
-    return trained, choice, said, shown
+    messages, states = [], []
+    trained, choice = fit(problem, FLOWS, log=messages.append, progress=lambda *state: states.append(state))
+    return trained, choice, messages, states
 
 
 def test_the_part_that_gains_is_corrected_and_the_other_stays_exactly(too_stiff):
-    trained, choice, said, shown = too_stiff
+    trained, choice, messages, states = too_stiff
     assert choice.parts == ("elastic",)
     assert set(choice.trials) == {"nothing", "elastic", "plastic", "elastic + plastic"}
     before, after = choice.trials["nothing"], choice.trials["elastic"]
@@ -73,13 +73,13 @@ def test_the_part_that_gains_is_corrected_and_the_other_stays_exactly(too_stiff)
     assert choice.trials["plastic"] == before, "no state yields"
     assert any(bool(p.any()) for p in deltas(trained.law, "elasticity"))
     assert not any(bool(p.any()) for p in deltas(trained.law, "plasticity"))
-    assert trained.best_loss < trained.history.loss[0] and len(said) == 3
-    done = [state[0] for state in shown]
-    assert done == sorted(done) and done[-1] == 5 and {state[1] for state in shown} == {5}
+    assert trained.best_loss < trained.history.loss[0] and len(messages) == 3
+    done = [state[0] for state in states]
+    assert done == sorted(done) and done[-1] == 5 and {state[1] for state in states} == {5}
     assert choice.held_out_frames == ((80, 110),) and choice.as_dict()["held_out_frames"] == [[80, 110]]
 
 
-def test_the_last_training_goes_on_from_the_law_that_was_judged(problem, too_stiff):
+def test_the_last_training_goes_on_from_the_law_that_was_scored(problem, too_stiff):
     """Its first loss is that of the trial, over all frames from the contact on."""
     trained, choice, *_ = too_stiff
     body, _ = problem
@@ -88,9 +88,9 @@ def test_the_last_training_goes_on_from_the_law_that_was_judged(problem, too_sti
     )
     contact = first_contact(MODEL, path.x)
     trial, out = choice.trials["elastic"], len(choice.held_out_frames[0])
-    told = len(FRAMES) - contact
+    informative = len(FRAMES) - contact
     assert contact > 0
-    mean = (trial.loss * (told - out) + trial.held_out_loss * out) / told
+    mean = (trial.loss * (informative - out) + trial.held_out_loss * out) / informative
     assert trained.history.loss[0] == pytest.approx(mean, rel=1e-9)
 
 
@@ -258,20 +258,20 @@ def test_rivals_are_ties_that_flow_otherwise_the_best_first():
     scores = {"sand": -7.2, "clay": -7.0, "hencky": -7.1, "bingham": -7.3, "fluid": -7.4}
     families = {name: {"law": law(flow), "score": scores[name]} for name, flow in flows.items()}
     families["fluid"] = {"law": law("viscous_flow"), "score": scores["fluid"]}
-    found = {"law": law("von_mises"), "families": families, "ties": ["clay", "hencky", "bingham", "fluid"]}
-    assert rival_bases(found, 3) == [law("viscous_flow"), law("identity")]
-    assert rival_bases(found, 1) == [law("viscous_flow")]
-    assert rival_bases(found, 0) == [] == rival_bases({**found, "ties": []}, 1)
+    results = {"law": law("von_mises"), "families": families, "ties": ["clay", "hencky", "bingham", "fluid"]}
+    assert rival_bases(results, 3) == [law("viscous_flow"), law("identity")]
+    assert rival_bases(results, 1) == [law("viscous_flow")]
+    assert rival_bases(results, 0) == [] == rival_bases({**results, "ties": []}, 1)
 
 
 def test_the_largest_penalty_that_held_out_frames_bear_is_taken(problem):
     """A crushing weight leaves the law at its base, which these frames do not bear."""
-    said = []
+    messages = []
     structured = STRUCTURED.model_copy(update={"penalties": (1e-9, 1e9)})
     spec = {"elasticity": FLOWS["elasticity"]}
-    trained, choice = fit(problem, spec, structured=structured, log=said.append)
+    trained, choice = fit(problem, spec, structured=structured, log=messages.append)
     assert set(choice.trials) == {"nothing", "elastic", "elastic, penalty 1e-09", "elastic, penalty 1e+09"}
-    assert choice.penalty == 1e-9 == choice.as_dict()["penalty"] and any("1e-09" in line for line in said)
+    assert choice.penalty == 1e-9 == choice.as_dict()["penalty"] and any("1e-09" in line for line in messages)
     free, held = (choice.trials[f"elastic{w}"].held_out_loss for w in ("", ", penalty 1e+09"))
     assert held > (1 + TOLERANCE) * free and trained.best_loss < trained.history.loss[0]
     assert largest_similar({0.0: 1.0, 0.1: 1 + TOLERANCE / 2, 1.0: 1 + 2 * TOLERANCE}) == 0.1
@@ -293,16 +293,16 @@ def test_some_frames_of_a_loss_are_those_of_the_loss(problem):
 @pytest.mark.parametrize("blocks", [1, 2, 4, 50])
 @pytest.mark.parametrize("count", [4, 7, 33, 400])
 @pytest.mark.parametrize("share", [0.01, 0.25, 0.9])
-def test_frames_that_judge_end_every_part_of_what_follows_the_contact(blocks, count, share, contact):
+def test_frames_that_decide_end_every_part_of_what_follows_the_contact(blocks, count, share, contact):
     """They are about the share of all, the last frame is among them, the first is not, and every part keeps some."""
-    found = held_out_frames(count, share, blocks, contact)
+    held_out = held_out_frames(count, share, blocks, contact)
     first = contact if contact < count - 1 else 0
     parts = min(blocks, (count - first) // 2)
-    assert found == sorted(set(found)) and found[-1] == count - 1 and found[0] > first
-    assert abs(len(found) - share * (count - first)) <= parts
+    assert held_out == sorted(set(held_out)) and held_out[-1] == count - 1 and held_out[0] > first
+    assert abs(len(held_out) - share * (count - first)) <= parts
     edges = [first + round(k * (count - first) / parts) for k in range(parts + 1)]
     for start, end in pairwise(edges):
-        assert end - 1 in found and start not in found
+        assert end - 1 in held_out and start not in held_out
 
 
 @pytest.mark.parametrize("first", [0, 1, 3])
@@ -321,7 +321,7 @@ def test_a_video_from_a_frame_on_is_the_rest_of_the_whole(problem, first):
     assert torch.allclose(rest(again), targets(path)[first:], rtol=1e-9)
 
 
-def test_frames_from_the_contact_on_tell_of_the_law_unless_too_few_follow():
+def test_frames_after_the_contact_inform_on_the_law_unless_too_few_follow():
     assert [first_informative_frame(10, contact) for contact in (0, 1, 6, 7, 10)] == [0, 1, 6, 0, 0]
 
 

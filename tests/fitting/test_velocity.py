@@ -31,46 +31,46 @@ def simulated(law, body, frames, spin):
     return flight
 
 
-def test_recovers_an_oblique_throw_from_its_own_renders():
+def test_recovers_an_oblique_launch_from_its_own_renders():
     body = ball()
     v0 = np.array([0.5, -1.2, 0.4])
-    found = estimate(body, observe(body, v0, FRAMES), ridge=0.0)
-    assert np.abs(found.v0 - v0).max() < 1e-4
-    assert found.frames[-1] < 60, "frames after contact must not be used"
-    assert not found.spin.any(), "a body that does not spin starts with one velocity"
+    motion = estimate(body, observe(body, v0, FRAMES), ridge=0.0)
+    assert np.abs(motion.v0 - v0).max() < 1e-4
+    assert motion.frames[-1] < 60, "frames after contact must not be used"
+    assert not motion.spin.any(), "a body that does not spin starts with one velocity"
     kept = estimate(body, observe(body, v0, FRAMES), ridge=0.0, spin_significance=0.0)
     assert np.abs(kept.v0 - v0).max() < 1e-4 and np.abs(kept.spin).max() < 1e-3
 
 
-def test_a_spin_below_its_uncertainty_is_none_and_one_above_is_found():
+def test_a_spin_below_its_uncertainty_is_zero_and_one_above_is_estimated():
     """The angle that images leave open, over the time to contact, divides both; depth does not suffer from either."""
     body = ball()
     v0, duration = np.array([0.5, -1.2, 0.4]), 20 * MODEL.dt
     for angle, kept in ((0.01, False), (0.1, True)):
         spin = np.array([0.0, angle / duration, 0.0])
-        found = estimate(body, observe(body, v0, FRAMES, spin=spin), angle_std=0.01)
-        assert found.spin.any() == kept
-        assert (np.abs(found.spin - spin) < 2 * found.spin_std).all()
-        assert (found.spin_std >= 0.01 / duration).all()
-        assert np.abs(found.v0 - v0).max() < 0.02
+        motion = estimate(body, observe(body, v0, FRAMES, spin=spin), angle_std=0.01)
+        assert motion.spin.any() == kept
+        assert (np.abs(motion.spin - spin) < 2 * motion.spin_std).all()
+        assert (motion.spin_std >= 0.01 / duration).all()
+        assert np.abs(motion.v0 - v0).max() < 0.02
 
 
 def test_few_frames_are_spread_over_the_flight():
     body = ball()
     v0 = np.array([0.5, -1.2, 0.4])
-    found = estimate(body, observe(body, v0, FRAMES), frames=3)
-    assert found.frames == (0, 8, 20) and np.abs(found.v0 - v0).max() < 1e-4
+    motion = estimate(body, observe(body, v0, FRAMES), frames=3)
+    assert motion.frames == (0, 8, 20) and np.abs(motion.v0 - v0).max() < 1e-4
 
 
-def test_recovers_a_spinning_throw_of_another_material():
+def test_recovers_a_spinning_launch_of_another_material():
     """The prior is three times stiffer than what was filmed: both hardly stretch, and turn alike."""
     body = ball()
     v0, spin = np.array([0.5, -0.9, 0.4]), np.array([2.0, -3.0, 4.0])
-    found = estimate(body, observe(body, v0, FRAMES, spin=spin))
+    motion = estimate(body, observe(body, v0, FRAMES, spin=spin))
     # Centrifugal strain rho w^2 R^2 / E = 0.016 of the filmed ball, of which the prior's ball has a third.
-    assert np.abs(found.v0 - v0)[:2].max() < 0.01 * np.linalg.norm(v0)
-    assert np.abs(found.spin - spin).max() < 0.016 * np.linalg.norm(spin)
-    np.testing.assert_allclose(found.centre, (body.mass @ body.x0 / body.mass.sum()).numpy())
+    assert np.abs(motion.v0 - v0)[:2].max() < 0.01 * np.linalg.norm(v0)
+    assert np.abs(motion.spin - spin).max() < 0.016 * np.linalg.norm(spin)
+    np.testing.assert_allclose(motion.centre, (body.mass @ body.x0 / body.mass.sum()).numpy())
 
 
 def test_the_flight_that_is_fitted_is_the_simulated_one():
@@ -121,18 +121,18 @@ def test_what_nothing_holds_flies_straight_on():
 def test_depth_is_the_weakest_axis_and_the_ridge_acts_on_it_alone():
     body = ball()
     v0 = np.array([0.5, -1.2, 0.4])
-    found = estimate(body, observe(body, v0, FRAMES), ridge=0.05)
-    assert found.information[2] < 0.2 * found.information[:2].min()
-    assert np.abs(found.v0 - v0)[:2].max() < 0.02
-    assert 0 < found.v0[2] < v0[2]
+    motion = estimate(body, observe(body, v0, FRAMES), ridge=0.05)
+    assert motion.information[2] < 0.2 * motion.information[:2].min()
+    assert np.abs(motion.v0 - v0)[:2].max() < 0.02
+    assert 0 < motion.v0[2] < v0[2]
 
 
 def test_another_sampling_of_the_body_gives_the_plane_within_two_percent():
     v0 = np.array([0.3, -1.4, 0.0])
     observation = observe(ball(seed=0), v0, FRAMES)
     other = ball(seed=0, count=500)  # same kernels are drawn first, other particles and binding
-    found = estimate(other, observation)
-    assert np.abs(found.v0 - v0)[:2].max() < 0.02 * np.linalg.norm(v0)
+    motion = estimate(other, observation)
+    assert np.abs(motion.v0 - v0)[:2].max() < 0.02 * np.linalg.norm(v0)
 
 
 @pytest.mark.parametrize("correlated", [False, True], ids=["pixel noise", "patches that last"])
@@ -151,9 +151,9 @@ def test_uncertainty_covers_the_error_of_noisy_images(correlated):
         noisy = clean.colours() + drawn
         # The spin is kept, and the Gaussians are perfect: nothing but the noise of the images is left.
         options = dict(ridge=0.0, spin_significance=0.0, angle_std=0.0)
-        found = estimate(body, type(clean)(clean.frames, noisy, clean.cameras), **options)
-        errors.append([*(found.v0 - v0), *found.spin])
-        stds.append([*found.std, *found.spin_std])
+        motion = estimate(body, type(clean)(clean.frames, noisy, clean.cameras), **options)
+        errors.append([*(motion.v0 - v0), *motion.spin])
+        stds.append([*motion.std, *motion.spin_std])
     ratio = np.sqrt(np.mean(np.square(errors), 0)) / np.mean(stds, 0)
     assert (ratio < 3).all() and (ratio > 0.2).all()
 
@@ -164,12 +164,12 @@ def test_bytes_are_their_colours_and_few_frames_at_a_time_give_the_sums_of_all(m
     opaque = torch.ones_like(clean.images[..., :1])
     pixels = (255 * torch.cat([clean.images, opaque], -1).clamp(0, 1)).round().to(torch.uint8)
     decoded = Observation(clean.frames, pixels, clean.cameras)
-    found = estimate(body, decoded, ridge=0.0)
-    assert found.loss > 0
+    motion = estimate(body, decoded, ridge=0.0)
+    assert motion.loss > 0
     monkeypatch.setattr(ParticleGS, "frames_per_batch", 2)
     again = estimate(body, Observation(clean.frames, decoded.colours(), clean.cameras), ridge=0.0)
     for name in ("v0", "std", "information", "loss"):
-        np.testing.assert_allclose(getattr(again, name), getattr(found, name), rtol=1e-6)
+        np.testing.assert_allclose(getattr(again, name), getattr(motion, name), rtol=1e-6)
 
 
 def test_a_body_that_starts_in_contact_is_an_input_error():

@@ -164,10 +164,10 @@ def draws(module, files, law=None, F=None, **uncertainty):
 
 
 def test_constants_are_drawn_from_their_covariance(tmp_path):
-    found = draws("constants", {"identified": identified(tmp_path / "identified.json")})
-    moduli = np.log([law.elasticity.values["E"] for law in found])
-    stresses = np.log([law.plasticity.values["yield_stress"] for law in found])
-    assert len(found) == 200
+    laws = draws("constants", {"identified": identified(tmp_path / "identified.json")})
+    moduli = np.log([law.elasticity.values["E"] for law in laws])
+    stresses = np.log([law.plasticity.values["yield_stress"] for law in laws])
+    assert len(laws) == 200
     # the mean of 200 draws is within four standard errors, and their spread within 20 %
     assert abs(moduli.mean() - 11.5) < 4 * 0.1 / 200**0.5 and moduli.std() == pytest.approx(0.1, rel=0.2)
     assert abs(stresses.mean() - 7.6) < 4 * 0.03**0.5 / 200**0.5

@@ -218,10 +218,10 @@ def test_gradient_of_pieces_is_that_of_the_whole(most, monkeypatch):
     for factor in (1.0, 3.0):
         loss = sum_of_terms(terms, values)
         expected = render(LATTICE, values, OPACITY, network, *rays)[0].square().sum()
-        (found,), (whole,) = (torch.autograd.grad(factor * value, values) for value in (loss, expected))
+        (result,), (whole,) = (torch.autograd.grad(factor * value, values) for value in (loss, expected))
         assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-14)
-        assert (found - whole).abs().max() < 1e-13 * whole.abs().max()
-        assert most < 10**9 or factor != 1 or (loss == expected and torch.equal(found, whole))
+        assert (result - whole).abs().max() < 1e-13 * whole.abs().max()
+        assert most < 10**9 or factor != 1 or (loss == expected and torch.equal(result, whole))
     assert not sum_of_terms(terms, values.detach()).requires_grad
 
 

@@ -149,13 +149,13 @@ def test_halving_keeps_the_field_and_leaves_out_what_is_empty():
     field = ball()
     torch.manual_seed(0)
     field.features.data = torch.rand_like(field.features)
-    finer = field.halved()
-    assert finer.lattice.voxel == field.lattice.voxel / 2
-    low, high = torch.tensor(finer.lattice.origin), torch.tensor(finer.lattice.far)
+    refined = field.halved()
+    assert refined.lattice.voxel == field.lattice.voxel / 2
+    low, high = torch.tensor(refined.lattice.origin), torch.tensor(refined.lattice.far)
     # what a particle may lie in: nodes in the ball reach 0.24 to 0.76, and their cells a voxel further
     assert (low - 0.2).abs().max() < 1e-6 and (high - 0.8).abs().max() < 1e-6
     points = low + (high - low) * torch.rand(500, 3)
-    coarse, fine = (interpolate(f.lattice, f.values(), points.double()) for f in (field, finer))
+    coarse, fine = (interpolate(f.lattice, f.values(), points.double()) for f in (field, refined))
     assert (coarse - fine).abs().max() < 1e-9  # trilinear interpolation of itself
 
 

@@ -41,10 +41,10 @@ def twin(model, springs, x, v, frames):
     stiffness, eta, damping, friction, gap = springs.values()
     network, dt = springs.network, model.dt / model.substeps
     near, rest = network.neighbours.long(), network.rest
-    found = []
+    results = []
     for step in range(frames[-1] * model.substeps + 1):
         if step in [n * model.substeps for n in frames]:
-            found.append((x, v))
+            results.append((x, v))
         d = x[near] - x[:, None]
         length = d.norm(dim=-1)
         n = d / length[..., None]
@@ -56,7 +56,7 @@ def twin(model, springs, x, v, frames):
         hit = (x <= model.low + gap) | (x >= model.high - gap)
         v = torch.where(hit, 0.0, v * friction ** hit.sum(1, keepdim=True))
         x = torch.where(hit, torch.minimum(torch.maximum(x, model.low + gap), model.high - gap), x)
-    return tuple(torch.stack(part) for part in zip(*found, strict=True))
+    return tuple(torch.stack(part) for part in zip(*results, strict=True))
 
 
 def falling(dtype=torch.float64, exponent=0.5):
@@ -181,13 +181,13 @@ def strained(springs):
 
 def test_energy_is_kept_without_damping_and_falls_with_it():
     model, frames = SpringModel(1e-3, FREE, 0.0, 1.0, 8), range(0, 100, 2)
-    found = {}
+    results = {}
     for damping in (1e-12, 0.05):
         springs = full_network(damping)
         with torch.no_grad():
             x, v, _ = spring_rollout(model, springs, *strained(springs), frames)
-            found[damping] = energy(springs, x, v)
-    kept, falling_energy = found.values()
+            results[damping] = energy(springs, x, v)
+    kept, falling_energy = results.values()
     assert (kept / kept[0] - 1).abs().max() < 0.01  # of first order in the substep
     assert (falling_energy[1:] < falling_energy[:-1]).all() and falling_energy[-1] < 0.8 * falling_energy[0]
 
@@ -220,14 +220,14 @@ def test_modulus_of_a_network_is_that_of_its_energy():
     springs = Springs.of_modulus(network, 2e5, density, 0.1)
     assert springs.modulus(density) == pytest.approx(2e5)
     stiffness, eta, *_ = (value.detach() for value in springs.values())
-    found = []
+    results = []
     for axis in range(3):
         x = points.clone()
         x[:, axis] *= 1 + strain
         elongation = (x[network.neighbours.long()] - x[:, None]).norm(dim=-1) - network.rest
         stored = 0.25 * (eta * stiffness[:, None] / network.rest * elongation**2).sum()
-        found.append(float(stored * density / len(points) / (0.6 * strain**2)))
-    assert sum(found) / 3 == pytest.approx(2e5, rel=0.02) and min(found) > 0.9 * max(found)
+        results.append(float(stored * density / len(points) / (0.6 * strain**2)))
+    assert sum(results) / 3 == pytest.approx(2e5, rel=0.02) and min(results) > 0.9 * max(results)
 
 
 def test_springs_of_another_body_have_the_same_modulus():
@@ -250,15 +250,15 @@ def test_soft_vector_is_that_of_the_paper():
 def test_guard_halves_the_step_and_gives_up_at_its_limit(monkeypatch):
     springs = springs_of(k=3000.0)
     x0, v0 = strained(springs)
-    model, said = SpringModel(1e-2, FREE, 0.0, 1.0), []
+    model, messages = SpringModel(1e-2, FREE, 0.0, 1.0), []
     with torch.no_grad():
-        *_, safe = spring_rollout(model, springs, x0, v0, (40,), log=said.append)
-    assert safe.substeps > 2 and not said  # foreseen
+        *_, safe = spring_rollout(model, springs, x0, v0, (40,), log=messages.append)
+    assert safe.substeps > 2 and not messages  # foreseen
     monkeypatch.setattr(SpringNetwork, "stable_step", lambda *_: 1.0)  # a bound that is wrong
     with torch.no_grad():
-        x, *_, used = spring_rollout(model, springs, x0, v0, (40,), log=said.append)
-    assert used.substeps in (2, 4, 8, 16) and len(said) == math.log2(used.substeps)
-    assert f"{used.substeps} substeps" in said[-1] and x.isfinite().all()
+        x, *_, used = spring_rollout(model, springs, x0, v0, (40,), log=messages.append)
+    assert used.substeps in (2, 4, 8, 16) and len(messages) == math.log2(used.substeps)
+    assert f"{used.substeps} substeps" in messages[-1] and x.isfinite().all()
     monkeypatch.undo()
     stiff = Springs(springs.network, 1e12, 0.1)
     with pytest.raises(NonFiniteError, match=f"too stiff for {MAX_SUBSTEPS} substeps"):
@@ -306,8 +306,8 @@ def test_farthest_points_cover_the_cloud():
     index = farthest_points(points, 100)
     assert len(set(index.tolist())) == 100 and torch.equal(index, index.sort().values)
     gap = torch.cdist(points, points[index]).amin(1).max()
-    apart = torch.cdist(points[index], points[index]).fill_diagonal_(1).min()
-    assert apart >= gap  # each chosen one was farther from the others than any point is now
+    distance = torch.cdist(points[index], points[index]).fill_diagonal_(1).min()
+    assert distance >= gap  # each chosen one was farther from the others than any point is now
     assert torch.equal(farthest_points(points[:5], 9), torch.arange(5))
 
 

@@ -1,4 +1,4 @@
-"""Springs fitted to a video: gradients of the whole chain, recovered motions, resuming, files, and their judging."""
+"""Springs fitted to a video: gradients, recovered motions, resuming, files, and evaluation."""
 
 import copy
 from dataclasses import replace
@@ -78,7 +78,7 @@ def small():
     return Problem(size=24, frames=(0, 30, 40, 55))
 
 
-def test_gradient_of_the_whole_chain_from_springs_to_image_loss(small):
+def test_gradient_from_springs_to_image_loss(small):
     springs = small.guess()
     parameters = dict(springs.named_parameters())
     generator = torch.Generator().manual_seed(0)
@@ -136,7 +136,7 @@ def test_motion_of_an_elastic_body_is_recovered_to_a_centimetre():
 def test_a_killed_fit_goes_on_to_the_same_bits(small, tmp_path, truncated):
     settings = TrainingConfig(iterations=4, checkpoint_every=2)
     how = SpringsConfig(truncated=truncated, lr_springs=0.05, learn_resistance=True)
-    whole, shown = small.fit(settings, how), []
+    whole, states = small.fit(settings, how), []
     checkpoint = Checkpoint(tmp_path / "checkpoint.pt", {"run": 1})
 
     def kill(iteration, *_):
@@ -145,19 +145,19 @@ def test_a_killed_fit_goes_on_to_the_same_bits(small, tmp_path, truncated):
 
     with pytest.raises(KeyboardInterrupt):
         small.fit(settings, how, checkpoint=checkpoint, progress=kill)
-    resumed = small.fit(settings, how, checkpoint=checkpoint, progress=lambda *now: shown.append(now[:2]))
-    assert shown == [(3, 4), (4, 4)] and resumed.history.loss == whole.history.loss
+    resumed = small.fit(settings, how, checkpoint=checkpoint, progress=lambda *now: states.append(now[:2]))
+    assert states == [(3, 4), (4, 4)] and resumed.history.loss == whole.history.loss
     for name, value in whole.springs.state_dict().items():
         assert torch.equal(value, resumed.springs.state_dict()[name]), name
 
 
 def test_springs_that_run_away_return_to_the_best(small):
-    said = []
+    messages = []
     settings = TrainingConfig(iterations=9, max_recoveries=2)
     soft = Springs.of_modulus(small.anchored.network, 1e3, DENSITY, 0.1)
     before = copy.deepcopy(soft.state_dict())
-    fitted = small.fit(settings, SpringsConfig(truncated=False, lr_springs=90.0), soft, log=said.append)
-    assert not fitted.stable and len(fitted.history.recoveries) == 3 and "back to iteration 0" in said[0]
+    fitted = small.fit(settings, SpringsConfig(truncated=False, lr_springs=90.0), soft, log=messages.append)
+    assert not fitted.stable and len(fitted.history.recoveries) == 3 and "back to iteration 0" in messages[0]
     assert all(torch.equal(value, before[name]) for name, value in fitted.springs.state_dict().items())
 
 

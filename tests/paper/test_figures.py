@@ -294,11 +294,11 @@ def test_every_number_is_of_its_method_and_scene(tmp_path):
     )
     histories = results(tmp_path, "history", lambda k: {"loss": [4.0, 1.0], "best_loss": 4.0 * k})
 
-    said = []
+    messages = []
     curves = ch_dist_curve.data(
         SimpleNamespace(metrics=motion),
         SimpleNamespace(titles=titles, scenes={"A": 0.5, "B": 0.25}),
-        said.append,
+        messages.append,
     )
     assert curves["titles"] == titles
     assert curves["scenes"]["B"] == {
@@ -308,25 +308,25 @@ def test_every_number_is_of_its_method_and_scene(tmp_path):
         "chamfer": {"nclaw": [1, 10], "neuma": [3, 30]},
     }
     params = SimpleNamespace(titles=titles, scenes=scenes)
-    quality = image_quality.data(SimpleNamespace(metrics=images), params, said.append)
+    quality = image_quality.data(SimpleNamespace(metrics=images), params, messages.append)
     assert quality["seen"] == ["B"], "a method has no other view of it"
     assert quality["ssim"] == {"nclaw": {"A": 4, "B": 5}, "neuma": {"A": 6, "B": 7}}
     assert quality["titles"] == titles
     files = [json.loads(Path(file).read_text()) for file in images]
     for name, file in zip(images, files, strict=True):  # NeuMA now trains on all views
         Path(name).write_text(json.dumps({**file, "views_seen_in_training": [1] if file["ssim"] > 5 else []}))
-    quality = image_quality.data(SimpleNamespace(metrics=images), params, said.append)
+    quality = image_quality.data(SimpleNamespace(metrics=images), params, messages.append)
     assert quality["titles"] == {**titles, "neuma": "NeuMA (training views)"} and quality["seen"] == []
     choices = ablation_gradients.data(
-        SimpleNamespace(histories=histories, metrics=motion, image_metrics=images), params, said.append
+        SimpleNamespace(histories=histories, metrics=motion, image_metrics=images), params, messages.append
     )
     assert choices["loss"] == {"nclaw": {"A": 0, "B": 1}, "neuma": {"A": 2, "B": 3}}
     assert choices["tracer_rmse_mm"]["neuma"] == {"A": 2.2, "B": 3.2}
     assert choices["psnr"]["nclaw"] == {"A": 4, "B": 5}
-    assert len(said) == 4
+    assert len(messages) == 4
 
 
-def test_responses_are_of_their_law_and_bands_of_all_chains(tmp_path):
+def test_responses_are_of_their_law_and_bands_of_all_replicates(tmp_path):
     def content(k):
         test = {"x": [0, 1, 2], "visited": [0, 2], "by_stress": False, "true": [0, 1, 2], "stress": [k, k, k]}
         band = {"x": [0, 2], "low": [-k, -k], "high": [k, k]}
@@ -336,19 +336,19 @@ def test_responses_are_of_their_law_and_bands_of_all_chains(tmp_path):
     params = SimpleNamespace(
         titles={"neuma": "NeuMA", "constants": "Constants"}, cells=[["A", "neuma", 2], ["A", "constants", 2]]
     )
-    said = []
-    found = material_response.data(SimpleNamespace(responses=files), params, said.append)
-    laws = found["scenes"]["A"]["shear"]["laws"]
+    messages = []
+    result = material_response.data(SimpleNamespace(responses=files), params, messages.append)
+    laws = result["scenes"]["A"]["shear"]["laws"]
     assert laws["neuma"]["stress"] == [0, 0, 0] and laws["constants"]["stress"] == [2, 2, 2]
     assert (laws["neuma"]["band"]["low"], laws["neuma"]["band"]["high"]) == ([0, 0, 0], [1, 1, 1])
     assert (laws["constants"]["band"]["low"], laws["constants"]["band"]["high"]) == ([-3, -3], [3, 3])
     assert (
         laws["neuma"]["band"]["inside"] == pytest.approx(2 / 3) and laws["constants"]["band"]["inside"] == 1
     )
-    assert said[1] == "Constants: the truth is inside 3 of 3 bands everywhere"
+    assert messages[1] == "Constants: the truth is inside 3 of 3 bands everywhere"
     alone = SimpleNamespace(titles={"neuma": "NeuMA"}, cells=[["A", "neuma", 1]])
-    found = material_response.data(SimpleNamespace(responses=files[:1]), alone, said.append)
-    assert found["scenes"]["A"]["yield"]["laws"]["neuma"]["band"] is None
+    result = material_response.data(SimpleNamespace(responses=files[:1]), alone, messages.append)
+    assert result["scenes"]["A"]["yield"]["laws"]["neuma"]["band"] is None
 
 
 # ---- style
@@ -383,11 +383,11 @@ PROTANOPIA = [
 def test_methods_look_different_to_all_eyes(eyes):
     from skimage.color import rgb2lab
 
-    shown = {
+    colours = {
         m: rgb2lab(np.clip(np.asarray(eyes) @ to_rgb(kind.color), 0, 1)) for m, kind in style.METHODS.items()
     }
-    for a, b in combinations(shown, 2):
-        assert np.linalg.norm(shown[a] - shown[b]) > 12, (a, b)
+    for a, b in combinations(colours, 2):
+        assert np.linalg.norm(colours[a] - colours[b]) > 12, (a, b)
 
 
 # ---- pictures

@@ -1,6 +1,6 @@
 """Texts of all tables, compared byte by byte with files in ``golden/``.
 
-After an intended change of a text, run ``python -m tests.paper.test_golden`` and look at the difference.
+After an intended change of a text, run ``python -m tests.paper.test_golden`` and inspect the difference.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Identified materials beside the true ones."""
+"""Identified materials compared with the true ones."""
 
 import csv
 import io
@@ -30,14 +30,14 @@ def scene(truth, family, ties=(), group="all", **quantities):
         name: {"value": value, "log_std": std, "determined": sure}
         for name, (value, std, sure) in quantities.items()
     }
-    found = {
+    results = {
         "family": family,
         "law": LAWS[family],
         "ties": list(ties),
         "families": {name: {"law": law} for name, law in LAWS.items()},
         "best": {"quantities": entries},
     }
-    return IdentifiedScene("S", group, found, truth)
+    return IdentifiedScene("S", group, results, truth)
 
 
 @pytest.mark.parametrize(
@@ -51,16 +51,16 @@ def scene(truth, family, ties=(), group="all", **quantities):
         (BINGHAM, "viscous_flow", ["bingham"], TIE),
     ],
 )
-def test_the_family_is_judged_by_its_laws(truth, family, ties, verdict):
+def test_the_family_is_scored_by_its_laws(truth, family, ties, verdict):
     assert scene(truth, family, ties).family_is == verdict
 
 
 def test_errors_are_those_of_the_truths_quantities():
-    judged = scene(HENCKY, "hencky", E=(1.1e5, 0.05, True), G=(3.6e4, 0.1, False), viscosity=(3.0, 0.1, True))
-    young, shear = judged.quantities  # the truth has no viscosity
+    scored = scene(HENCKY, "hencky", E=(1.1e5, 0.05, True), G=(3.6e4, 0.1, False), viscosity=(3.0, 0.1, True))
+    young, shear = scored.quantities  # the truth has no viscosity
     assert young.error == pytest.approx(10) and young.in_std == pytest.approx(1.906, abs=1e-3)
     assert shear.truth == pytest.approx(4e4) and shear.error == pytest.approx(-10)
-    table, text = identified_table([judged])
+    table, text = identified_table([scored])
     rows = list(csv.DictReader(io.StringIO(table)))
     assert [row["quantity"] for row in rows] == ["E", "G"]
     assert float(rows[0]["error_percent"]) == pytest.approx(10, rel=1e-3)
@@ -78,7 +78,7 @@ def test_four_of_five_are_asked(close, word):
     assert f"**{word}**" in error
 
 
-def test_groups_are_judged_apart():
+def test_groups_are_scored_separately():
     scenes = [scene(HENCKY, "hencky", group="a"), scene(HENCKY, "neo_hookean", group="b")]
     text = identified_table(scenes)[1]
     assert "| a: the family is right" in text and "| b: the family is right" in text

@@ -21,7 +21,7 @@ PAGE = "# Title\n\nBefore.\n\n<!-- {0} -->\nold\n<!-- /{0} -->\n\nAfter.\n"
 
 @pytest.fixture
 def project(tmp_path):
-    """A run with a table 1 of two methods in three chains, and data of three figures."""
+    """A run with a table 1 of two methods in three replicates, and data of three figures."""
     scenes = {scene: scene for scene in PAPER["table1"].columns}
     metrics = {
         method: {scene: [run(error + k) for k in range(3)] for scene in scenes}
@@ -118,7 +118,7 @@ def test_random_scenes_and_finer_truths_have_their_verdicts(project, monkeypatch
     assert "Made by `snakemake random` and" in (project / "docs/random.md").read_text()
 
 
-def test_settings_of_the_run_are_told(project, monkeypatch):
+def test_settings_of_the_run_are_named(project, monkeypatch):
     recorded(project, monkeypatch, "--configfile", "config/studies/three_chains.yaml")
     table = (project / "docs/table1.md").read_text()
     assert "default settings (`config/config.yaml`) with `config/studies/three_chains.yaml`. Made by" in table

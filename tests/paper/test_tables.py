@@ -1,4 +1,4 @@
-"""Tables of errors: their numbers, what stands beside them, and what they say of the paper's claims."""
+"""Tables of errors: their numbers, notes, and verdicts on the paper's claims."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_table_is_open_for_more_methods():
     assert "| PAC-NeRF | 3.50 |" in text and "| *paper* | *516.30* |" in text and "| *114.80* |" in text
 
 
-def test_what_a_law_gains_over_the_true_one_is_told():
+def test_what_a_law_gains_over_the_true_one_is_reported():
     values = {"nclaw": (9.0, 9.0, 1.0), "neuma": (2.0, 3.0, 9.0), "true_law": (4.0, 6.0, 5.0)}
     metrics = {
         method: {column: [run(value)] for column, value in zip("abc", row)} for method, row in values.items()
@@ -126,7 +126,7 @@ def test_diverged_runs_are_listed_in_the_csv():
 @pytest.mark.parametrize(
     ("failing", "word"), [({}, "holds"), ({"letter_N_jelly_fast": BROKEN}, "does not hold")]
 )
-def test_that_no_letter_breaks_off_is_judged_by_all_of_them(failing, word):
+def test_that_no_letter_breaks_off_is_scored_by_all_of_them(failing, word):
     columns = dict.fromkeys(PAPER["letters"].columns, "")
     metrics = {"neuma_structured": {c: [run(2.0), run(2.1), run(2.2, **failing.get(c, {}))] for c in columns}}
     table = chamfer_table(metrics, {"neuma_structured": "ours"}, columns, PAPER["letters"])
@@ -145,7 +145,7 @@ def test_a_missing_or_broken_cell_is_named():
         chamfer_table(broken, {"nclaw": "NCLaw"}, column)
 
 
-def test_several_chains_give_mean_and_standard_deviation():
+def test_several_replicates_give_mean_and_standard_deviation():
     metrics = {
         "nclaw": {"a": [run(5.0), run(5.0), run(5.0)], "b": [run(7.0), run(8.0), run(9.0, **BROKEN)]},
         "neuma": {"a": [run(1.0), run(2.0), run(3.0)], "b": [run(2.0), run(2.0), run(5.0)]},
@@ -156,13 +156,15 @@ def test_several_chains_give_mean_and_standard_deviation():
     assert ("chamfer_floor_std", "floor") not in rows
 
 
-def test_a_chain_above_twice_the_mean_of_its_cell_is_named():
+def test_a_replicate_above_twice_the_mean_of_its_cell_is_named():
     metrics = {
         "nclaw": {"a": [run(5.0)] * 3, "b": [run(1.0), run(1.0), run(3.0)]},
         "neuma": {"a": [run(1.0), run(9.0), run(1.0)], "b": [run(2.0)] * 3},
     }
     table = chamfer_table(metrics, TITLES, {"a": "A", "b": "b"})
-    assert table.outliers() == ["NeuMA on A, chain 2 of 3: 9.0 mm, more than twice the mean of its chains."]
+    assert table.outliers() == [
+        "NeuMA on A, replicate 2 of 3: 9.0 mm, more than twice the mean of its replicates."
+    ]
     assert f"\n- {table.outliers()[0]}\n" in table.markdown()
 
 
@@ -171,13 +173,13 @@ def test_a_chain_above_twice_the_mean_of_its_cell_is_named():
 METHODS = {**TITLES, "other": "Other"}
 
 
-def judged(claim: Claim, errors: dict, paper: dict | None = None, columns=AB, **broken):
-    """Verdict on a claim; `errors`: method -> one list of chains a column, broken: method -> what its runs add."""
+def verdict_on(claim: Claim, errors: dict, paper: dict | None = None, columns=AB, **broken):
+    """Verdict on a claim; `errors`: method -> one list of replicates a column, broken: method -> what its runs add."""
     printed = PaperTable("tab:x", "X", "x", tuple(columns), paper or {}, (claim,))
     metrics = {
         method: {
-            column: [run(value, **broken.get(method, {})) for value in chains]
-            for column, chains in zip(columns, values, strict=True)
+            column: [run(value, **broken.get(method, {})) for value in replicates]
+            for column, replicates in zip(columns, values, strict=True)
         }
         for method, values in errors.items()
     }
@@ -191,30 +193,32 @@ CLOSER = Closer("NeuMA is closer", ("neuma",), ("nclaw",))
 
 def test_a_claim_holds_on_average_in_most_columns_and_beyond_the_spread():
     far = {"nclaw": [[5, 6, 7], [5, 6, 7]], "neuma": [[1, 2, 3], [1, 2, 3]]}
-    verdict = judged(CLOSER, far, {"neuma": (1.0, 2.0), "nclaw": (3.0, 3.0)})
+    verdict = verdict_on(CLOSER, far, {"neuma": (1.0, 2.0), "nclaw": (3.0, 3.0)})
     assert verdict.word == "holds" and verdict.paper == "1.50 against 3.00"
     assert verdict.here == "2.0 ± 1.0 (NeuMA) against 6.0 ± 1.0 (NCLaw), lower in 2 of 2"
     assert str(verdict) == f"Holds: NeuMA is closer. {verdict.here}."
     # The intervals 2 to 4 and 4 to 6 touch.
-    near = judged(CLOSER, far | {"nclaw": [[4, 5, 6], [2, 3, 4]]})
+    near = verdict_on(CLOSER, far | {"nclaw": [[4, 5, 6], [2, 3, 4]]})
     assert near.word == "mixed" and near.here.endswith("lower in 2 of 2; the ± overlap") and near.paper == ""
 
 
 def test_a_claim_with_too_few_runs_is_mixed_at_most():
-    for chains in (1, 2):
-        verdict = judged(CLOSER, {"nclaw": [[9] * chains] * 2, "neuma": [[1] * chains] * 2})
-        assert verdict.word == "mixed" and f"; {chains} run" in verdict.here
-    assert judged(CLOSER, {"nclaw": [[1], [1]], "neuma": [[9], [9]]}).word == "does not hold"
+    for replicates in (1, 2):
+        verdict = verdict_on(CLOSER, {"nclaw": [[9] * replicates] * 2, "neuma": [[1] * replicates] * 2})
+        assert verdict.word == "mixed" and f"; {replicates} run" in verdict.here
+    assert verdict_on(CLOSER, {"nclaw": [[1], [1]], "neuma": [[9], [9]]}).word == "does not hold"
 
 
 def test_a_claim_needs_average_and_majority():
     outlier = {"nclaw": [[9, 9, 9], [1, 1, 1]], "neuma": [[2, 2, 2], [2, 2, 2]]}
-    verdict = judged(CLOSER, outlier)
+    verdict = verdict_on(CLOSER, outlier)
     assert verdict.word == "mixed" and verdict.here.endswith("lower in 1 of 2; not in most columns")
     columns = {**AB, "c": "c"}
-    verdict = judged(CLOSER, {"nclaw": [[2] * 3] * 3, "neuma": [[1] * 3, [1] * 3, [9] * 3]}, columns=columns)
+    verdict = verdict_on(
+        CLOSER, {"nclaw": [[2] * 3] * 3, "neuma": [[1] * 3, [1] * 3, [9] * 3]}, columns=columns
+    )
     assert verdict.word == "mixed" and verdict.here.endswith("lower in 2 of 3; not on average")
-    verdict = judged(CLOSER, {"nclaw": [[1] * 3] * 2, "neuma": [[1] * 3] * 2})
+    verdict = verdict_on(CLOSER, {"nclaw": [[1] * 3] * 2, "neuma": [[1] * 3] * 2})
     assert verdict.word == "does not hold", "equal is not lower"
 
 
@@ -222,20 +226,20 @@ def test_a_claim_about_groups_is_one_about_all_their_pairs():
     """The worst of the first against the best of the others, in every column and with every spread."""
     claim = Closer("they are closest", ("neuma", "other"), ("nclaw",), ("b",), by_paper=False)
     errors = {"neuma": [[1] * 3, [1] * 3], "other": [[9] * 3, [2, 3, 4]], "nclaw": [[1] * 3, [6] * 3]}
-    verdict = judged(claim, errors)
+    verdict = verdict_on(claim, errors)
     assert verdict.word == "holds" and verdict.here.startswith(
         "3.0 ± 1.0 (Other) against 6.0 ± < 0.1 (NCLaw)"
     )
     assert verdict.here.endswith("lower in 1 of 1") and verdict.paper == "not compared there"
     # The lower average has the wider spread.
-    assert judged(claim, errors | {"neuma": [[1] * 3, [-8, 1, 10]]}).word == "mixed"
+    assert verdict_on(claim, errors | {"neuma": [[1] * 3, [-8, 1, 10]]}).word == "mixed"
 
 
 def test_a_held_motion_proves_nothing_for_its_method():
     errors = {"nclaw": [[9, 9, 9]] * 2, "neuma": [[1, 1, 1]] * 2}
-    verdict = judged(CLOSER, errors, neuma=BROKEN)
+    verdict = verdict_on(CLOSER, errors, neuma=BROKEN)
     assert verdict.word == "mixed" and verdict.here.endswith("; a prediction broke off")
-    assert judged(CLOSER, errors, nclaw=BROKEN).word == "holds", "its error is even larger"
+    assert verdict_on(CLOSER, errors, nclaw=BROKEN).word == "holds", "its error is even larger"
 
 
 def test_verdicts_stand_in_the_table_if_its_rows_do():

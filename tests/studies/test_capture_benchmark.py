@@ -9,8 +9,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from neuma_lib.project.capture_folder import read_capture
-from studies.capture_benchmark import evaluation as judged
-from studies.capture_benchmark import filming, stage
+from studies.capture_benchmark import evaluation, filming, stage
 from studies.capture_benchmark.pictures import dead_leaves, page_picture
 from studies.capture_benchmark.planned import capture_settings, planned_captures
 from studies.capture_benchmark.room import Moving, Shot, shoot
@@ -91,7 +90,7 @@ def test_drops_start_as_stated():
         np.testing.assert_allclose(moved.rotation, (z * y * x).as_matrix(), atol=1e-12)
 
 
-def test_what_is_rendered_anew_holds_the_body_and_its_shadow():
+def test_what_is_rendered_again_holds_the_body_and_its_shadow():
     rng = np.random.default_rng(0)
     lamps = np.array(DEMO.room.lamps) + stage.MIDDLE
     for eye in stage.video_cameras(DEMO).values():
@@ -142,8 +141,8 @@ def test_the_plan_is_what_lies_there(tmp_path):
         file.touch()
     (plan.folder / "capture.yaml").write_text(yaml.safe_dump(capture_settings(DEMO, "duck")))
     assert read_capture(plan.folder) == plan
-    told = str(capture_settings(DEMO, "duck"))
-    assert all(word not in told for word in ("spin", "turn", "velocity", "late", "offset", "law", "E'"))
+    text = str(capture_settings(DEMO, "duck"))
+    assert all(word not in text for word in ("spin", "turn", "velocity", "late", "offset", "law", "E'"))
 
 
 # ------------------------------------------------------------------------------------- comparison
@@ -160,7 +159,7 @@ def box_motion(times, velocity, spin, center):
         return Rotation.from_rotvec(np.array(spin) * time).apply(points) + shift
 
     x = np.stack([at(time) for time in times])
-    return judged.Truth(np.asarray(times), x, np.ones(200), x[:, ::2]), at
+    return evaluation.Truth(np.asarray(times), x, np.ones(200), x[:, ::2]), at
 
 
 def known_and_truth():
@@ -191,7 +190,7 @@ def test_a_registration_that_is_right_is_not_off():
     turn = Rotation.from_rotvec(spin * time).as_matrix()
     photographed = np.array(drop["rotation"]).T @ (np.array([0.5, 0.6, 0.5]) - drop["translation"])
     rotation = turn @ drop["rotation"]
-    found = {
+    results = {
         "t0_s": t0,
         "rotation": rotation.tolist(),
         "translation": (center - rotation @ photographed).tolist(),
@@ -200,16 +199,22 @@ def test_a_registration_that_is_right_is_not_off():
         "gravity_ratio": 1.0,
     }
     velocity = {"v0": [0.2, -0.5 - G * time, 0.1], "angular_velocity": spin.tolist()}
-    rows = {row.what: row for row in judged.compare_registration(found, velocity, known, truth, "first")}
+    rows = {
+        row.what: row for row in evaluation.compare_registration(results, velocity, known, truth, "first")
+    }
     assert all(row.value < 1e-3 for row in rows.values()), rows
     assert all(row.reached for row in rows.values() if row.goal)
-    found["translation"][0] += 0.004
+    results["translation"][0] += 0.004
     tilt = Rotation.from_rotvec(np.radians([0, 0, 2.0])).as_matrix()
-    worse = {row.what: row for row in judged.compare_registration(found, velocity, known, truth, "first")}
+    worse = {
+        row.what: row for row in evaluation.compare_registration(results, velocity, known, truth, "first")
+    }
     assert worse["registration, place"].value == pytest.approx(4) and not worse["registration, place"].reached
-    found["rotation"] = (tilt @ rotation).tolist()
-    found["gravity_m_s2"] = (tilt @ [0, -G, 0]).tolist()
-    worse = {row.what: row for row in judged.compare_registration(found, velocity, known, truth, "first")}
+    results["rotation"] = (tilt @ rotation).tolist()
+    results["gravity_m_s2"] = (tilt @ [0, -G, 0]).tolist()
+    worse = {
+        row.what: row for row in evaluation.compare_registration(results, velocity, known, truth, "first")
+    }
     down = worse["direction of gravity, from the placed object"]
     for tilted in (worse["registration, turn"], down):
         assert tilted.value == pytest.approx(2) and not tilted.reached
@@ -221,10 +226,10 @@ def test_tracer_errors():
     times = np.arange(20) / 500
     x = np.stack([at(start + time) for time in times])
     # Between frames the truth is taken to go straight, over 1/240 s: a t^2 / 8.
-    assert judged.tracer_error(x, times, truth, start) < (G + 0.1 * 5.3) / 240**2 / 8
+    assert evaluation.tracer_error(x, times, truth, start) < (G + 0.1 * 5.3) / 240**2 / 8
     moved = x + np.linspace(0, 1, 20)[:, None, None] * [0.0, 0.03, 0.0]
     expected = 0.03 * np.sqrt(np.mean(np.linspace(0, 1, 20)[1:] ** 2))
-    assert judged.tracer_error(moved, times, truth, start) == pytest.approx(expected, rel=1e-3)
+    assert evaluation.tracer_error(moved, times, truth, start) == pytest.approx(expected, rel=1e-3)
 
 
 def test_a_flight_that_is_right_is_not_off():
@@ -238,7 +243,7 @@ def test_a_flight_that_is_right_is_not_off():
         "offsets_s": {"a": 0.0, "b": -0.0015},
         "spin_rad_s": spin.tolist(),
     }
-    rows = {row.what: row.value for row in judged.compare_flight(flight, known, truth, "first")}
+    rows = {row.what: row.value for row in evaluation.compare_flight(flight, known, truth, "first")}
     assert rows.pop("offset of b, from the fall") == pytest.approx(0.5)
     assert max(rows.values()) < 1e-3
 
@@ -251,13 +256,13 @@ def test_cameras_that_are_right_are_not_off():
         {"group": "photographs", "file_path": f"photographs/{k}.png", **v} for k, v in photographs.items()
     ]
     cameras = {name: eye.plain() for name, eye in eyes.items()}
-    rows = {row.what: row.value for row in judged.compare_cameras(frames, photographs, cameras)}
+    rows = {row.what: row.value for row in evaluation.compare_cameras(frames, photographs, cameras)}
     assert max(rows.values()) < 1e-5
     for frame in frames:
         pose = np.array(frame["transform_matrix"])
         pose[:3, 3] = 1.01 * pose[:3, 3]
         frame["transform_matrix"] = pose.tolist()
-    rows = {row.what: row.value for row in judged.compare_cameras(frames, photographs, cameras)}
+    rows = {row.what: row.value for row in evaluation.compare_cameras(frames, photographs, cameras)}
     assert rows["scale, from the cameras"] == pytest.approx(1.0, rel=0.02)
     assert rows["up, from the cameras"] < 1e-5
 
@@ -268,8 +273,8 @@ def test_the_silhouette_of_a_ball():
     eye = stage.video_cameras(DEMO)["left"]
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.1)
     center = np.array([0.5, 0.2, 0.5])
-    lens = judged.true_lens(eye.plain())
-    drawn = judged.silhouette(ball.vertices + center, ball.faces, eye.c2w, lens)
+    lens = evaluation.true_lens(eye.plain())
+    drawn = evaluation.silhouette(ball.vertices + center, ball.faces, eye.c2w, lens)
     x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     flat = lens.directions(np.stack([x.ravel(), y.ravel()], axis=1))
     rays = np.stack([flat[:, 0], -flat[:, 1], -np.ones(len(flat))], axis=1) @ eye.c2w[:3, :3].T
@@ -298,7 +303,7 @@ def room():
 
 
 @pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="needs Blender (bpy)")
-def test_rendered_pictures_are_where_the_truth_says(room):
+def test_rendered_pictures_are_where_the_truth_is(room):
     """Corners of the board, and the silhouette of a body that moves, in pictures of a lens with distortion."""
     from neuma_lib.capture.calibration.board import corner_positions, find_board
 
@@ -313,16 +318,16 @@ def test_rendered_pictures_are_where_the_truth_says(room):
     row = stage.lens_row(lens)
     empty, full = shoot(room, body, [Shot(eye.c2w, row, -1), Shot(eye.c2w, row, 0)], samples=8)
     rng = np.random.default_rng(0)
-    found = find_board(filming.developed(empty, 1.0, rng), DEMO.room.board)
+    result = find_board(filming.developed(empty, 1.0, rng), DEMO.room.board)
     board = DEMO.room.board
-    flat = corner_positions(board)[found.ids] - [*np.multiply(board.squares, board.square / 2), 0]
+    flat = corner_positions(board)[result.ids] - [*np.multiply(board.squares, board.square / 2), 0]
     true = eye.project(middle + np.stack([flat[:, 0], 0 * flat[:, 0] + filming.PAPER, -flat[:, 1]], axis=1))
-    assert len(found.ids) >= 20
-    off = found.pixels - true
+    assert len(result.ids) >= 20
+    off = result.pixels - true
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.3 and np.linalg.norm(off.mean(axis=0)) < 0.1
     red = (full[..., 0] > 4 * full[..., 1]) & (full[..., 0] > 0.02)
-    silhouette = judged.silhouette(rest, mesh.faces, eye.c2w, judged.true_lens(eye.plain()))
-    assert judged.iou(red, silhouette) > 0.97
+    silhouette = evaluation.silhouette(rest, mesh.faces, eye.c2w, evaluation.true_lens(eye.plain()))
+    assert evaluation.iou(red, silhouette) > 0.97
 
 
 @pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="needs Blender (bpy)")

@@ -32,18 +32,18 @@ rule ground_truth:
     input:
         kernels=kernels("geometry", "simulation"),
     output:
-        particles=f"{DATA}/{{scene}}/particles.h5",
+        particles=f"{DATA}/{{scene}}/truth.h5",
     wildcard_constraints:
-        scene=scenes_with("truth", "made"),
+        scene=f"{scenes_with('truth', 'made')}|experiments/({'|'.join(SETTINGS.experiments) or 'none'})",
     resources:
         gpu=EITHER_GPU,
         mem_mb=truth_memory,
     params:
-        bodies=scene_bodies,
+        bodies=body_settings("shape", "size", "height", "center", "velocity", "spin", "density", "law"),
         simulation=truth_simulation,
-        dt=scene_setting("dt"),
+        dt=time_step,
         frames=frame_steps,
-        particles=truth_particles,
+        particles=lambda wildcards: truth_settings(wildcards).particles,
         tracers=SETTINGS.dataset.tracers,
         seed=SETTINGS.dataset.seed,
         device=EITHER_DEVICE,
@@ -53,7 +53,7 @@ rule ground_truth:
 
 rule render_static:
     input:
-        particles=f"{DATA}/{{scene}}/particles.h5",
+        particles=f"{DATA}/{{scene}}/truth.h5",
     output:
         transforms=f"{DATA}/{{scene}}/static/transforms.json",
     wildcard_constraints:
@@ -73,7 +73,7 @@ rule render_static:
 
 rule render_dynamic:
     input:
-        particles=f"{DATA}/{{scene}}/particles.h5",
+        particles=f"{DATA}/{{scene}}/truth.h5",
     output:
         transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
     wildcard_constraints:

@@ -4,7 +4,7 @@
 rule initial_state:
     input:
         kernels=kernels("geometry"),
-        truth=of_scene("particles.h5"),
+        truth=of_scene("truth.h5"),
         gaussians=of_chain("gaussians.json"),
         mesh=of_chain("mesh.ply"),
         particles=of_chain("particles.h5"),
@@ -23,12 +23,12 @@ rule initial_state:
 rule tracers:
     input:
         kernels=kernels("geometry"),
-        truth=of_scene("particles.h5"),
+        truth=of_scene("truth.h5"),
         mesh=of_chain("mesh.ply"),
     output:
         tracers=f"{RESULTS}/{{scene}}/tracers.h5",
     wildcard_constraints:
-        scene=TRUE_SCENE,
+        scene=f"{TRUE_SCENE}|{EXPERIMENT}",
     params:
         tracers=SETTINGS.evaluation.tracers,
         seed=SETTINGS.seed,
@@ -41,22 +41,22 @@ rule evaluate:
         unpack(of_bodies(model_files)),
         **body_files(),
         kernels=of_bodies(model_kernels),
-        truth=of_scene("particles.h5"),
+        truth=of_scene("truth.h5"),
         tracers=of_chain("tracers.h5"),
-        velocity=of_case(lambda case: case.method.start_file(case)),
+        velocity=evaluated_start,
     output:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
         metrics=f"{RESULTS}/{{scene}}/{{method}}/metrics.json",
     wildcard_constraints:
-        scene=TRUE_SCENE,
+        scene=f"{TRUE_SCENE}|{EXPERIMENT}",
     resources:
         gpu=GPU,
     params:
         method=of_bodies(model_parameter),
         simulation=simulation_settings,
-        densities=of_case(lambda case: [case.density(case.moved)]),
+        densities=of_bodies(lambda bodies: [case.density(case.moved) for case in bodies]),
         total=of_bodies(carries_total),
-        carrier=of_bodies(carrier),
+        carrier=evaluated_carrier,
         frames=frame_steps,
         device=SETTINGS.device,
         code=code_of("evaluate.py"),

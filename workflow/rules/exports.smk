@@ -4,8 +4,7 @@ EXPORT = f"{RESULTS}/{{scene}}/{{method}}/export"
 
 
 MOVED = {**body_files(), "rollout": f"{RESULTS}/{{scene}}/{{method}}/rollout.h5"}
-OF_EXPERIMENTS = f"{RESULTS}/experiments/{{experiment}}/{{method}}"
-MOVED_TOGETHER = {**body_files(), "rollout": f"{OF_EXPERIMENTS}/rollout.h5"}
+SCENE_OR_EXPERIMENT = f"{names_of(SETTINGS.scenes)}|{EXPERIMENT}"
 
 
 rule export_gaussians:
@@ -15,10 +14,11 @@ rule export_gaussians:
     output:
         frames=directory(f"{EXPORT}/{{layout}}"),
     wildcard_constraints:
+        scene=SCENE_OR_EXPERIMENT,
         layout="gaussians|compressed",
     params:
         carrier=of_bodies(shared_carrier),
-        gaussian_motion=exported_motion,
+        gaussian_motion=gaussian_motion,
         rotate_harmonics=SETTINGS.exports.rotate_harmonics,
         compressed=lambda wildcards: wildcards.layout == "compressed",
     script:
@@ -32,6 +32,8 @@ rule export_particles:
     output:
         frames=directory(f"{EXPORT}/particles"),
         together=f"{EXPORT}/particles.h5",
+    wildcard_constraints:
+        scene=SCENE_OR_EXPERIMENT,
     params:
         densities=moved_densities,
         carrier=of_bodies(shared_carrier),
@@ -46,6 +48,7 @@ rule export_surface:
     output:
         surface=f"{EXPORT}/surface.{{kind}}",
     wildcard_constraints:
+        scene=SCENE_OR_EXPERIMENT,
         kind="glb|usda|usdc",
     params:
         carrier=of_bodies(shared_carrier),
@@ -60,6 +63,8 @@ rule export_blend:
     output:
         blend=f"{EXPORT}/motion.blend",
         picture=f"{EXPORT}/motion.png",
+    wildcard_constraints:
+        scene=SCENE_OR_EXPERIMENT,
     params:
         carrier=of_bodies(shared_carrier),
     script:
@@ -73,54 +78,12 @@ rule export_film:
     output:
         film=f"{EXPORT}/motion.mp4",
         gif=f"{EXPORT}/motion.gif",
+    wildcard_constraints:
+        scene=SCENE_OR_EXPERIMENT,
     params:
         carrier=of_bodies(shared_carrier),
-        gaussian_motion=exported_motion,
+        gaussian_motion=gaussian_motion,
         size=SETTINGS.exports.size,
         frame_rate=SETTINGS.evaluation.frame_rate,
     script:
         "../scripts/export_film.py"
-
-
-# The same of experiments, of all bodies together.
-use rule export_gaussians as export_experiment_gaussians with:
-    input:
-        **MOVED_TOGETHER,
-        kernels=kernels("rendering"),
-    output:
-        frames=directory(f"{OF_EXPERIMENTS}/export/{{layout}}"),
-
-
-use rule export_particles as export_experiment_particles with:
-    input:
-        **MOVED_TOGETHER,
-        velocity=of_chain("velocity.json"),
-    output:
-        frames=directory(f"{OF_EXPERIMENTS}/export/particles"),
-        together=f"{OF_EXPERIMENTS}/export/particles.h5",
-
-
-use rule export_surface as export_experiment_surface with:
-    input:
-        **MOVED_TOGETHER,
-        mesh=of_chain("mesh.ply"),
-    output:
-        surface=f"{OF_EXPERIMENTS}/export/surface.{{kind}}",
-
-
-use rule export_blend as export_experiment_blend with:
-    input:
-        **MOVED_TOGETHER,
-        mesh=of_chain("mesh.ply"),
-    output:
-        blend=f"{OF_EXPERIMENTS}/export/motion.blend",
-        picture=f"{OF_EXPERIMENTS}/export/motion.png",
-
-
-use rule export_film as export_experiment_film with:
-    input:
-        **MOVED_TOGETHER,
-        kernels=kernels("rendering"),
-    output:
-        film=f"{OF_EXPERIMENTS}/export/motion.mp4",
-        gif=f"{OF_EXPERIMENTS}/export/motion.gif",

@@ -47,7 +47,7 @@ def titles_of(table):
 
 
 def truths_of(scenes):
-    return [f"{DATA}/{scene}/particles.h5" for scene in scenes]
+    return [f"{DATA}/{scene}/truth.h5" for scene in scenes]
 
 
 def own_bodies(scenes):
@@ -273,7 +273,7 @@ FIGURES = {
     "particles_app": {
         "kind": "h5",
         "input": {
-            "truth": f"{DATA}/{DRAWN.particles_app}/particles.h5",
+            "truth": f"{DATA}/{DRAWN.particles_app}/truth.h5",
             "particles": f"{RESULTS}/{DRAWN.particles_app}/particles.h5",
             "rollouts": of_methods([DRAWN.particles_app], SHARED, "rollout.h5"),
         },
@@ -290,7 +290,7 @@ FIGURES = {
         "kind": "h5",
         "input": {
             "kernels": kernels("rendering"),
-            "truth": f"{DATA}/experiments/{DRAWN.ext_time}/particles.h5",
+            "truth": f"{DATA}/experiments/{DRAWN.ext_time}/truth.h5",
             **{name: home(DRAWN.ext_time, file) for name, file in BODY.items()},
             "rollouts": [f"{RESULTS}/experiments/{DRAWN.ext_time}/{m}/rollout.h5" for m in PREDICTED],
         },

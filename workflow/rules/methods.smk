@@ -154,9 +154,23 @@ def shared_carrier(bodies):
     return carrier(bodies)
 
 
+def evaluated_carrier(wildcards):
+    return of_bodies(shared_carrier if of_experiment(wildcards) else carrier)(wildcards)
+
+
+@checked
+def evaluated_start(wildcards):
+    """File of the initial motion: of the method on a scene, or of an experiment."""
+    if of_experiment(wildcards):
+        return home(subject(wildcards), "velocity.json")
+    case = case_on(wildcards.scene, wildcards.method)
+    return case.method.start_file(case)
+
+
 @checked
 def gaussian_motion(wildcards):
-    return cases.gaussian_motion(SETTINGS, wildcards.scene, wildcards.method)
+    """How Gaussians follow their particles in a scene, or as in the first one of an experiment."""
+    return cases.gaussian_motion(SETTINGS, SETTINGS.body_scenes(subject(wildcards))[0], wildcards.method)
 
 
 def prior_chain(wildcards):

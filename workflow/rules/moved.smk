@@ -34,12 +34,6 @@ def splat_frames(wildcards):
 
 
 @checked
-def exported_motion(wildcards):
-    """How Gaussians follow their particles in a scene, or as in the first one of an experiment."""
-    return cases.gaussian_motion(SETTINGS, SETTINGS.body_scenes(subject(wildcards))[0], wildcards.method)
-
-
-@checked
 def moved_densities(wildcards):
     """Densities of the bodies of a scene or an experiment."""
     scenes = SETTINGS.body_scenes(subject(wildcards))

@@ -74,7 +74,7 @@ rule dataset:
         expand(
             f"{DATA}/{{scene}}/{{part}}",
             scene=SCENES,
-            part=["particles.h5", "static/transforms.json", "dynamic/transforms.json"],
+            part=["truth.h5", "static/transforms.json", "dynamic/transforms.json"],
         ),
 
 

@@ -39,8 +39,22 @@ def seed_of(drawn):
 
 
 def subject(wildcards):
-    """The scene or experiment, with the seeds of its chain, that a job is about."""
-    return getattr(wildcards, "scene", None) or wildcards.experiment
+    """Name of the scene or experiment of a job, with the seeds of its replicate."""
+    return wildcards.scene.removeprefix("experiments/")
+
+
+def of_experiment(wildcards):
+    return wildcards.scene.startswith("experiments/")
+
+
+def by_subject(scene, experiment):
+    """A function of wildcards: one function of a scene or another of an experiment, applied to its name."""
+
+    @checked
+    def choose(wildcards):
+        return (experiment if of_experiment(wildcards) else scene)(subject(wildcards))
+
+    return choose
 
 
 # Files of a reconstructed body: the particles that are simulated, the Gaussians, and what binds them.
@@ -126,7 +140,7 @@ def supplied_world(wildcards):
 def truth_memory(wildcards):
     """Memory that a ground truth takes [MB]: twice the particles (x, v, F, C) and tracers of all frames."""
     bytes_a_frame = 96 * truth_settings(wildcards).particles + 24 * SETTINGS.dataset.tracers
-    return 2000 + 2 * len(SETTINGS.frame_steps(wildcards.scene)) * bytes_a_frame // 10**6
+    return 2000 + 2 * len(frame_steps(wildcards)) * bytes_a_frame // 10**6
 
 
 def render_minutes(images, frames):
@@ -138,13 +152,18 @@ def render_minutes(images, frames):
     return 60 + round(samples / 16e6)
 
 
-def frame_steps(wildcards):
-    return list(SETTINGS.frame_steps(wildcards.scene))
+frame_steps = by_subject(
+    lambda scene: list(SETTINGS.frame_steps(scene)),
+    lambda experiment: list(SETTINGS.dataset.frame_steps(SETTINGS.experiment(experiment).steps)),
+)
+time_step = by_subject(lambda scene: SETTINGS.scene(scene).dt, SETTINGS.experiment_dt)
+truth_settings = by_subject(SETTINGS.scene_truth, SETTINGS.experiment_truth)
 
 
 def simulation_settings(wildcards):
-    """Constants of the simulator for a scene."""
-    return {**simulator(SETTINGS.scene(wildcards.scene).dt), **SETTINGS.scene_world(wildcards.scene)}
+    """Constants of the simulator for a scene or experiment."""
+    world = by_subject(SETTINGS.scene_world, lambda experiment: {})(wildcards)
+    return simulator(time_step(wildcards)) | world
 
 
 def exposure(wildcards):
@@ -158,22 +177,10 @@ def simulator(dt, grid=None):
     return {"dt": dt, **{name: section[name] for name in ("grid", "gravity", "boundary", "walls")}}
 
 
-@checked
-def truth_settings(wildcards):
-    """How finely the ground truth of a scene or experiment is simulated."""
-    if hasattr(wildcards, "scene"):
-        return SETTINGS.scene_truth(wildcards.scene)
-    return SETTINGS.experiment_truth(wildcards.experiment)
-
-
 def truth_simulation(wildcards):
     """Constants of the simulator for the ground truth of a scene or experiment."""
     truth = truth_settings(wildcards)
     return simulator(truth.dt, truth.grid)
-
-
-def truth_particles(wildcards):
-    return truth_settings(wildcards).particles
 
 
 @checked
@@ -182,29 +189,14 @@ def video_densities(wildcards):
     return [SETTINGS.scene(scene).plain()["density"] for scene in SETTINGS.video_scenes(wildcards.scene)]
 
 
-def scene_bodies(wildcards):
-    """What the ground truth of a scene simulates."""
-    keys = ("shape", "size", "height", "center", "velocity", "spin", "density", "law")
-    return [scene_setting(*keys)(wildcards)]
-
-
-def experiment_bodies(*keys):
-    """A function of wildcards: the named settings of an experiment's bodies."""
-
-    @checked
-    def choose(wildcards):
-        return [{key: body[key] for key in keys} for body in SETTINGS.experiment_bodies(wildcards.experiment)]
-
-    return choose
-
-
-def experiment_frames(wildcards):
-    return list(SETTINGS.dataset.frame_steps(SETTINGS.experiment(wildcards.experiment).steps))
-
-
-def experiment_simulation(wildcards):
-    """Constants of the simulator for an experiment."""
-    return simulator(SETTINGS.experiment_dt(wildcards.experiment))
+def body_settings(*keys):
+    """A function of wildcards: the named settings of the bodies of a scene or experiment."""
+    return by_subject(
+        lambda scene: [scene_setting(*keys)(SimpleNamespace(scene=scene))],
+        lambda experiment: [
+            {key: body[key] for key in keys} for body in SETTINGS.experiment_bodies(experiment)
+        ],
+    )
 
 
 def reconstructed_files(name):
@@ -212,20 +204,8 @@ def reconstructed_files(name):
 
     @checked
     def choose(wildcards):
-        bodies = SETTINGS.experiment(wildcards.experiment).bodies
-        scenes = SETTINGS.body_scenes(wildcards.experiment)
+        bodies = SETTINGS.experiment(subject(wildcards)).bodies
+        scenes = SETTINGS.body_scenes(subject(wildcards))
         return [home(scene, name) for body, scene in zip(bodies, scenes) if body.shape is None]
-
-    return choose
-
-
-def of_each_body(function):
-    """A function of wildcards of scene and method, applied to the scene of each body of an experiment."""
-
-    @checked
-    def choose(wildcards):
-        scenes = SETTINGS.body_scenes(wildcards.experiment)
-        found = [function(SimpleNamespace(scene=scene, method=wildcards.method)) for scene in scenes]
-        return [value for value in found if value != []]
 
     return choose

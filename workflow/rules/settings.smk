@@ -84,13 +84,14 @@ SPLAT_SCENE = scenes_that(lambda scene: scene.splat)
 OBJECT_SCENE = scenes_that(lambda scene: not (scene.captured and scene.captured.throw))
 PICTURED_SCENE = scenes_that(lambda scene: not scene.splat and not (scene.captured and scene.captured.throw))
 THROW_SCENE = scenes_that(lambda scene: scene.captured and scene.captured.throw, chains=False)
+# Experiments are folders of their own, and rules that also accept scenes have the wildcard `scene` for both.
+EXPERIMENT = f"experiments/{names_of(SETTINGS.experiments)}"
 
 
 wildcard_constraints:
     scene=f"({'|'.join(SETTINGS.scenes) or 'none'})([+][^/]*)?",
     prior=f"({'|'.join(SETTINGS.priors.laws) or 'none'})([+]seed=[1-9][0-9]*)?",
     method=f"({'|'.join(SETTINGS.methods) or 'none'})([+][^/]*)?",
-    experiment=f"({'|'.join(SETTINGS.experiments) or 'none'})([+][^/]*)?",
     group="binding|geometry|simulation|laws|rendering|radiance|springs",
     views="[0-9]+(,[0-9]+)*",
 

@@ -26,8 +26,8 @@ class PacNerf(Method):
             "PAC-NeRF",
             {"covariance_from": "total", "gaussian_motion": "affine", "views": [0, 1, 2]},
             note="PAC-NeRF (ICLR 2023) in the family of the scene's prior and in all three views, from the authors' "
-            "stock guesses unless the row says otherwise; its constants and its own velocity on the particles that all "
-            "rows share. docs/systems.md says what is as published and what is reduced.",
+            "initial constants unless the row names others. Its constants and its own velocity on the particles that "
+            "all rows share. docs/systems.md lists what is as published and what is reduced.",
         ),
         "pac_nerf_own": Preset(
             "PAC-NeRF, own particles",

@@ -29,7 +29,7 @@ class SpringGaus(Method):
             "Spring-Gaus",
             {"rank": None, "gaussian_motion": "affine", "iterations": 80},
             note="The spring-mass model of Spring-Gaus (ECCV 2024) on this project's reconstruction, start, images and "
-            "measures; docs/systems.md says what is as published and what is reduced.",
+            "measures; docs/systems.md lists what is as published and what is reduced.",
         )
     }
 
