@@ -23,7 +23,6 @@ from tests.support.flight_scene import (
     ellipsoid_body,
     filmed,
     guess,
-    ellipsoid_body,
     photographed_in_light,
     true_motion,
 )

@@ -14,8 +14,8 @@ from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.gaussians import load_gaussians, save_gaussians
 from neuma_lib.io.images import OPENGL_TO_OPENCV, load_views, write_transforms
 from neuma_lib.io.mesh import read_mesh, write_mesh
-from neuma_lib.io.particles import load_reconstruction, load_particles, save_binding, save_particles
-from tests.support.flight_scene import GAINS, PLACE, VELOCITY, filmed, ellipsoid_body, true_motion
+from neuma_lib.io.particles import load_particles, load_reconstruction, save_binding, save_particles
+from tests.support.flight_scene import GAINS, PLACE, VELOCITY, ellipsoid_body, filmed, true_motion
 from tests.support.project import copied
 
 OFFSET, SIZE, FRAMES = 0.0035, (80, 60), 10
@@ -117,7 +117,9 @@ def test_placed_files_are_of_one_body_that_moves_as_it_was_filmed(placed):
     assert placement["offsets_s"]["b"] == pytest.approx(OFFSET, abs=3e-4)
     np.testing.assert_allclose([placement["gains"][k] for k in "ab"], GAINS[:2], rtol=0.03)
     # All files are moved alike, and fit together.
-    body_there = load_reconstruction(*(results / f for f in ("particles.h5", "binding.h5", "gaussians.ply")), 1000.0)
+    body_there = load_reconstruction(
+        *(results / f for f in ("particles.h5", "binding.h5", "gaussians.ply")), 1000.0
+    )
     x = body.particles @ np.array(placement["rotation"]).T + placement["translation"]
     np.testing.assert_allclose(body_there.x0, x, atol=1e-6)
     np.testing.assert_allclose(x.mean(axis=0), start.centre, atol=1e-6)
