@@ -128,9 +128,8 @@ def preset(settings: Config, method: str) -> tuple[PresetConfig, dict[str, Any]]
         InputError: unknown preset or option, an option that is given twice, a piece without '='.
     """
     base = method.partition("+")[0]
-    keys = [LAW_FROM, *(kind_of(settings, base).Options.model_fields if base in settings.methods else ())]
-    base, texts = split_variant(method, settings.methods, keys, "method")
-    options = kind_of(settings, base).Options.model_fields
+    options = kind_of(settings, base).Options.model_fields if base in settings.methods else {}
+    base, texts = split_variant(method, settings.methods, [LAW_FROM, *options], "method")
     given: dict[str, Any] = {}
     for key, value in texts.items():
         is_list = key in options and typing.get_origin(options[key].annotation) is tuple
