@@ -198,14 +198,16 @@ def case(settings: Config, scene: str, method: str) -> ProjectCase:
     chosen, _ = preset(settings, method)
     kind, source = kind_of(settings, method), source_scene(settings, scene, method)
     name, options = fit_name(settings, method), _options(settings, source, method)
-    known = [*settings.priors.laws, IDENTIFIED]
-    if getattr(options, "prior", None) not in (None, *known):
-        raise InputError(
-            method,
-            f"no prior '{options.prior}' in priors.laws{hint(options.prior, known)}",
-            "A law in a file is the prior of a scene",
-        )
+    check_prior(settings, method, options)
     return ProjectCase(settings, source, scene, name, method, options, chosen.evaluate_on, kind)
+
+
+def check_prior(settings: Config, where: str, options: Section) -> None:
+    """Raise an InputError if the option ``prior`` of a method is neither in priors.laws nor the identified law."""
+    prior, known = getattr(options, "prior", None), [*settings.priors.laws, IDENTIFIED]
+    if prior is not None and prior not in known:
+        problem = f"no prior '{prior}' in priors.laws{hint(prior, known)}"
+        raise InputError(where, problem, "A law in a file is the prior of a scene")
 
 
 def _options(settings: Config, scene: str, method: str) -> Section:
