@@ -17,7 +17,7 @@ from neuma_lib.geometry import shapes
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.paper.random_scenes import failure, random_table
-from neuma_lib.project.random_scenes import DENSITY, FLAWS, SHAPES, draw_scenes
+from neuma_lib.project.random_scenes import DENSITY, FLAWS, LETTER, SHAPES, draw_scenes
 from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
 from neuma_lib.sim.state import State
@@ -41,13 +41,21 @@ def many(loaded):
 
 
 def test_settings_know_the_shapes():
-    """Sides, centre of mass and colours of the shapes as geometry makes them."""
+    """Size, sides, centre of mass and colours of the shapes as geometry makes them."""
     assert set(SHAPES) == set(shapes.NAMES)
-    for name, outline in SHAPES.items():
+    for name, proportions in SHAPES.items():
         mesh = shapes.build(name, size=1.0)
-        np.testing.assert_allclose(mesh.extents, outline.sides, atol=1e-3)
-        np.testing.assert_allclose(mesh.center_mass, outline.mass_centre, atol=2e-3)
-        assert set(outline.parts) == set(shapes.shape(name).part_names)
+        np.testing.assert_allclose(mesh.extents, proportions.sides, atol=1e-3)
+        np.testing.assert_allclose(mesh.center_mass, proportions.mass_centre, atol=2e-3)
+        assert set(proportions.parts) == set(shapes.shape(name).part_names)
+        assert shapes.build(name).extents.max() == pytest.approx(proportions.size, rel=0.01)
+
+
+def test_letters_have_at_least_the_size_and_sides_that_are_checked():
+    pytest.importorskip("matplotlib")
+    for letter in "IMWN":
+        sides = shapes.build(f"letter_{letter}").extents
+        assert (sides / sides.max() >= LETTER.sides).all() and sides.max() >= LETTER.size * 0.99
 
 
 def test_they_are_ordinary_scenes(loaded):
