@@ -86,29 +86,26 @@ NAMES = {
 # Text that is not read: pattern, reason.
 ALLOWED = {
     r"throw new |throw e\b": "statements of JavaScript",
-    r"chain rule|import chain|\bchain\(|chain\.from_iterable": "names of analysis and of Python",
+    r"chain rule|import chain|\bchain\(|chain\.from_iterable|\.most_common": "names of analysis and of Python",
     r"arc3,rad": "an argument of matplotlib",
     r"three_chains|table1_chains|two_throws\w*": "names of settings and of result files",
     r"\byardstick(?:\.\w+\b|(?=[\"':,}\]])| in )": "name of a table",
-    r"_throw\d|figures\.beside|\bbeside(?:: tuple|: \[|(?=[\"'`]))": "names of scenes and of a setting",
-    r"from outlines|gravity in outlines|down in outlines|\"outlines\"\)": "rows of the table captures_demo",
-    r"\bthrows?(?::|\.<name>|(?=[\"'`]))|(?:captures?|settings|regression|TINY)\.throws|throws=\d": "names of settings",
-    r"_throw\{k\}": "names of scenes",
-    r"captured\.throw\b": "name of a setting",
-    r"[\"'`.](?:on_request|judged_on|trained_as)[\"'`]": "former names of settings",
-    r"\.most_common\b": "a method of Counter",
-    r"[\"'`]any_step[\"'`]": "key in the files of laws",
-    r"two samplings of the true body": "description in files of trajectories",
+    r"_throw(?:\d|\{)|figures\.beside|\bbeside(?:: tuple|: \[|(?=[\"'`]))": "names of scenes and of a setting",
+    r"\bthrows?(?::|\.<name>|(?=[\"'`]))|throws=\d|\w+\.throws\b|captured\.throw\b": "names of settings",
+    r"\bcarriers\b": "name of a setting",
+    r"[\"'`.](?:plate|plate_gain|plate_offset|shown|arcs|says|any_step|on_request|trained_as|judged_on)[\"'`]": (
+        "keys of files, and former names of settings"
+    ),
     r"[\"'`]stock[\"'`]|guesses to stock": "value of a setting",
     r"plate_samples|beside_cameras|\"plate_\"": "settings and arrays of the demo captures",
-    r"springs\.carriers|carriers(?:: int|(?=[\"'`]))": "name of a setting",
-    r"[\"'`](?:plate|plate_gain|plate_offset|shown|arcs|says)[\"'`]": "keys of JSON files",
+    r"from outlines|gravity in outlines|down in outlines|\"outlines\"\)": "rows of the table captures_demo",
+    r"two samplings of the true body": "a description that files store",
 }
 
 # Rooms that are not clean yet, as prefixes of paths: reason.
 PENDING = {
     "CHANGELOG.md": "names of former versions",
-    "benchmarks/": "being rewritten",
+    "neuma_lib/project/renames.py": "names of former versions",
     "studies/": "being rewritten",
     "workflow/": "being rewritten",
     "neuma_lib/capture/": "being rewritten",
@@ -116,13 +113,11 @@ PENDING = {
     "neuma_lib/fitting/": "being rewritten",
     "neuma_lib/methods/": "being rewritten",
     "neuma_lib/paper/": "being rewritten",
-    "neuma_lib/project/renames.py": "old names of settings",
     "neuma_lib/viewer/": "being rewritten",
     "tests/capture/": "being rewritten",
     "tests/evaluation/": "being rewritten",
     "tests/fitting/": "being rewritten",
     "tests/methods/": "being rewritten",
-    "tests/project/test_cases.py": "being rewritten",
     "tests/viewer/": "being rewritten",
     "tests/workflow/": "being rewritten",
 }

@@ -71,7 +71,7 @@ def test_a_preset_may_take_the_fit_of_another(loaded):
     own, other = (cases.case(loaded, "BouncyBall", f"{name}+lr_scale=1") for name in (f"{base}_own", base))
     assert own.name == other.name == f"{base}+lr_scale=1"
     assert own.options == other.options and own.product() == other.product()
-    sources = [case.method.carrier(case) for case in (own, other)]
+    sources = [case.method.particle_source(case) for case in (own, other)]
     assert sources == ["gaussians", "binding"]
 
 
@@ -199,7 +199,10 @@ def test_pac_nerf_has_its_own_start_and_particles(loaded):
         mine, shared = (cases.case(loaded, "BouncyBall", name) for name in (own, base))
         assert mine.options == shared.options and mine.product() == shared.product()
         assert mine.method.start_file(mine) == shared.product()
-        assert (mine.method.carrier(mine), shared.method.carrier(shared)) == ("field", "binding")
+        assert (mine.method.particle_source(mine), shared.method.particle_source(shared)) == (
+            "field",
+            "binding",
+        )
         assert mine.method.body_inputs(mine) and not shared.method.body_inputs(shared)
         assert {own, base} <= set(loaded.tables["table1_systems"].methods)
     assert cases.run_folder(loaded, "BouncyBall+adaptor_seed=2", "pac_nerf") == "BouncyBall/pac_nerf"

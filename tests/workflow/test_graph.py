@@ -17,8 +17,7 @@ SUPERVISED = f"{SCENE}/neuma_particle_supervision"  # the one method that trains
 EVERYTHING = ("tables", "figures", "videos", f"{SUPERVISED}/image_metrics.json", f"{SCENE}/viewer.html")
 # Blender films the truth, evaluation measures against it; figures and viewer show it.
 MAY_READ_THE_TRUTH = {
-    *("render_static", "render_dynamic", "initial_state", "evaluate", "viewer", "evaluate_experiment"),
-    *("tracers", "experiment_tracers"),
+    *("render_static", "render_dynamic", "initial_state", "tracers", "evaluate", "viewer"),
     *("particles_app", "lora_alphav", "ext_time"),
 }
 COMPARED = [f"{RESULTS}/figures/{name}.png" for name in ("main_res", "image_quality", "ch_dist_curve")]
@@ -102,7 +101,9 @@ def wider(project):
 
 @behind("tables")
 def test_every_table_can_be_planned(graph):
-    assert {"experiment_truth", "experiment_start", "evaluate_experiment", "benchmark_table"} <= set(graph)
+    assert {"experiment_start", "benchmark_table"} <= set(graph)
+    evaluated = {job.outputs[0].startswith(f"{EXPERIMENTS}/") for job in graph.of_rule("evaluate")}
+    assert evaluated == {True, False}
     assert graph["chamfer_table"] >= 4 and graph["prior"] == 8
 
 
@@ -120,8 +121,7 @@ def is_truth(file):
 @behind(*EVERYTHING)
 def test_only_evaluation_and_figures_of_it_and_one_ablation_read_the_truth(graph):
     assert len(graph.jobs) > 80
-    simulated = graph.of_rule("ground_truth") + graph.of_rule("experiment_truth")
-    truths = {file for job in simulated for file in job.outputs}
+    truths = {file for job in graph.of_rule("ground_truth") for file in job.outputs}
     assert len(truths) > 5
     readers = [job for job in graph.jobs if truths & set(job.inputs)]
     assert {job.rule for job in readers} == MAY_READ_THE_TRUTH | {"fit_neuma"}
@@ -172,7 +172,7 @@ def test_springs_are_fitted_to_the_video_alone(graph):
 
 @behind(f"{EXPERIMENTS}/letter_N_bouncy/spring_gaus/metrics.json")
 def test_springs_move_another_body(graph):
-    assert f"{SCENE}/spring_gaus/springs.safetensors" in graph.one("evaluate_experiment").inputs
+    assert f"{SCENE}/spring_gaus/springs.safetensors" in graph.one("evaluate").inputs
 
 
 @behind(f"{RESULTS}/table2_systems.csv")
@@ -182,9 +182,9 @@ def test_springs_and_laws_of_a_table_are_put_to_use_elsewhere_as_their_scenes_ta
     scenes = ("BouncyBall", "JellyDuck", "RubberPawn")
     files = ("spring_gaus/springs.safetensors", "pac_nerf/constants.json")
     assert sorted(fitted) == sorted(f"{RESULTS}/{scene}/{file}" for scene in scenes for file in files)
-    evaluated = {job.outputs[0]: job.inputs for job in graph.of_rule("evaluate_experiment")}
+    evaluated = {job.outputs[0]: job.inputs for job in graph.of_rule("evaluate")}
     used = {file.split("/")[3]: read for file, read in evaluated.items() if "/spring_gaus/" in file}
-    assert len(used) == 5 and graph["evaluate_experiment"] == 6 * 5
+    assert len(used) == 5 and graph["evaluate"] == 6 * 5
     for experiment, scene in (
         ("letter_N_jelly", "JellyDuck"),
         ("longer_jelly", "JellyDuck"),
@@ -325,7 +325,7 @@ def test_rules_with_a_script_get_what_they_leave_out(graph):
             assert all(text in job.text for text in expected), job
 
 
-def test_images_are_rendered_where_the_settings_say(plan, wider):
+def test_images_are_rendered_where_the_settings_request(plan, wider):
     """On one CPU core unless a GPU or more cores are asked for; images alone, not what is computed from them."""
     images = "tiny/data/BouncyBall/static/transforms.json"
     by_default, asked_for = plan.makers[images].text, wider.makers[images].text
@@ -375,7 +375,7 @@ def test_an_experiment_follows_the_replicates_of_its_scenes(graph):
         f"{REPLICATE}/neuma/adaptor.safetensors",
         f"{RESULTS}/priors/jelly+seed=1.safetensors",
         "tiny/data/experiments/letter_and_ball/truth.h5",
-    } <= set(graph.one("evaluate_experiment").inputs)
+    } <= set(graph.one("evaluate").inputs)
     assert f"{REPLICATE}/velocity.json" in graph.one("experiment_start").inputs
 
 
@@ -411,9 +411,8 @@ def test_motions_of_springs_and_of_experiments_are_exported_too(plan):
     for folder in MOVED:
         planned = plan.behind(*(f"{folder}/export/{file}" for file in EXPORTS))
         exports = {rule: count for rule, count in planned.items() if rule.startswith("export_")}
-        prefix = "export_experiment_" if folder.startswith(EXPERIMENTS) else "export_"
         kinds = ("gaussians", "particles", "surface", "blend", "film")
-        assert exports == {f"{prefix}{kind}": 2 if kind == "gaussians" else 1 for kind in kinds}
+        assert exports == {f"export_{kind}": 2 if kind == "gaussians" else 1 for kind in kinds}
 
 
 # ---- what cannot be had

@@ -65,7 +65,7 @@ def report(project):
 
 
 def browse(report: Path, steps: str, *options: str) -> str:
-    """Open the report, click, and let the browser do what the options say; its output."""
+    """Open the report, click, and run the browser with further options; its output."""
     before, after = report.read_text().rsplit("</body>", 1)
     page = report.with_name("clicked.html")
     page.write_text(f"{before}{CLICKS.replace('STEPS', steps)}</body>{after}")
