@@ -76,7 +76,7 @@ rule predict:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
         report=f"{RESULTS}/{{scene}}/{{method}}/prediction.json",
     wildcard_constraints:
-        scene=THROW_SCENE,
+        scene=TAKE_SCENE,
     resources:
         gpu=GPU,
     params:

@@ -83,7 +83,7 @@ TRUE_SCENE = scenes_that(lambda scene: scene.has_truth)
 SPLAT_SCENE = scenes_that(lambda scene: scene.splat)
 OBJECT_SCENE = scenes_that(lambda scene: not (scene.captured and scene.captured.throw))
 PICTURED_SCENE = scenes_that(lambda scene: not scene.splat and not (scene.captured and scene.captured.throw))
-THROW_SCENE = scenes_that(lambda scene: scene.captured and scene.captured.throw, chains=False)
+TAKE_SCENE = scenes_that(lambda scene: scene.captured and scene.captured.throw, chains=False)
 # Experiments are folders of their own, and rules that also accept scenes have the wildcard `scene` for both.
 EXPERIMENT = f"experiments/{names_of(SETTINGS.experiments)}"
 
