@@ -10,8 +10,10 @@ rule binding:
         binding=f"{RESULTS}/{{scene}}/binding.h5",
         particles=f"{RESULTS}/{{scene}}/particles.h5",
     wildcard_constraints:
-        scene=PICTURED_SCENE,
+        scene=f"{PICTURED_SCENE}|{SPLAT_SCENE}",
     params:
         binding=SETTINGS.binding.plain(),
+        # a splat may be bound to the sampled particles alone
+        own_particles=splat_setting(lambda scene: scene.splat.own_particles if scene.splat else True),
     script:
         "../scripts/binding.py"

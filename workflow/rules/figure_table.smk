@@ -62,11 +62,6 @@ def own_bodies(scenes):
     return found
 
 
-def priors_of(scenes):
-    """The priors that NeuMA starts from."""
-    return [case_on(scene, "neuma").prior_file() for scene in scenes]
-
-
 def filmed(scenes):
     """What renders of scenes beside their videos need."""
     return {

@@ -143,13 +143,17 @@ def truth_memory(wildcards):
     return 2000 + 2 * len(frame_steps(wildcards)) * bytes_a_frame // 10**6
 
 
-def render_minutes(images, frames):
-    """Minutes that the renders of all frames may take: an hour, and a minute a megapixel at 16 samples.
+def render_minutes(part):
+    """A function of wildcards: minutes that the renders of all frames of a part ('static', 'dynamic') may take.
 
-    At the paper's scale a core took 0.2 minutes a megapixel, and 0.8 for a liquid (docs/scale.md).
+    An hour, and a minute a megapixel at 16 samples. At the paper's scale a core took 0.2 minutes a megapixel, and 0.8
+    for a liquid (docs/scale.md).
     """
-    samples = frames * images.views * images.width * images.height * images.samples
-    return 60 + round(samples / 16e6)
+    images = getattr(SETTINGS.dataset, part)
+    samples = images.views * images.width * images.height * images.samples
+    return lambda wildcards: 60 + round(
+        (len(frame_steps(wildcards)) if part == "dynamic" else 1) * samples / 16e6
+    )
 
 
 frame_steps = by_subject(

@@ -34,23 +34,6 @@ rule splat_mesh:
         "../scripts/splat_mesh.py"
 
 
-rule splat_binding:
-    input:
-        kernels=kernels("binding"),
-        gaussians=of_chain("gaussians.ply"),
-        sampled=of_chain("sampled_particles.h5"),
-    output:
-        binding=f"{RESULTS}/{{scene}}/binding.h5",
-        particles=f"{RESULTS}/{{scene}}/particles.h5",
-    wildcard_constraints:
-        scene=SPLAT_SCENE,
-    params:
-        binding=SETTINGS.binding.plain(),
-        own_particles=splat_setting(lambda scene: scene.splat.own_particles),
-    script:
-        "../scripts/splat_binding.py"
-
-
 rule splat_velocity:
     output:
         velocity=f"{RESULTS}/{{scene}}/velocity.json",

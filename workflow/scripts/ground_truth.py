@@ -40,7 +40,7 @@ def main(inputs, output, params, run) -> None:
         **{name: getattr(truth, name).numpy() for name in ("vol0", "mass", "tracers", "tracers_again")},
     }
     write_arrays(
-        output.particles,
+        output.truth,
         arrays,
         {"dt": params.dt, "bodies": params.bodies, "simulation": params.simulation},
     )
