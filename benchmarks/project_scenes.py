@@ -17,7 +17,7 @@ from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import read_json
 from neuma_lib.io.mesh import read_mesh
-from neuma_lib.io.particles import load_body
+from neuma_lib.io.particles import load_reconstruction
 from neuma_lib.project.loading import load, merged, read_yaml
 from neuma_lib.project.settings import Config
 from neuma_lib.sim.model import MPM
@@ -65,7 +65,7 @@ def read_body(
     """Reconstruction of a scene in float32, and its estimated initial motion."""
     results = Path(settings.results_root) / name
     files = (results / file for file in ("particles.h5", "binding.h5", "gaussians.ply"))
-    body = load_body(*files, settings.scene(name).density, gaussian_motion=chosen.gaussian_motion)
+    body = load_reconstruction(*files, settings.scene(name).density, gaussian_motion=chosen.gaussian_motion)
     return body.to(torch.float32, device), InitialMotion.of(read_json(results / "velocity.json"))
 
 

@@ -34,7 +34,7 @@ from neuma_lib.fitting import structured_fit
 from neuma_lib.fitting.identify import identify
 from neuma_lib.fitting.material import PixelLoss
 from neuma_lib.fitting.structured_fit import rival_bases, train_structured
-from neuma_lib.fitting.thrown_video import VideoResiduals
+from neuma_lib.fitting.video_residuals import VideoResiduals
 from neuma_lib.io.files import write_json
 from neuma_lib.io.images import load_videos
 from neuma_lib.mechanics.structured import structured_law

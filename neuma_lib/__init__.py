@@ -61,39 +61,27 @@ __all__ = [
     "view",
 ]
 
-_HOMES = {
-    "Adaptation": "api",
-    "Elasticity": "mechanics.law",
-    "Identification": "api",
-    "InitialMotion": "coupling.initial_motion",
-    "InputError": "errors",
-    "Law": "mechanics.law",
-    "METHODS": "methods.registry",
-    "MPM": "sim.model",
-    "Method": "methods.base",
-    "NonFiniteError": "errors",
-    "Plasticity": "mechanics.law",
-    "Reconstruction": "coupling.reconstruction",
-    "Scene": "api",
-    "State": "sim.state",
-    "Trajectory": "sim.state",
-    "Video": "api",
-    "adapt": "api",
-    "estimate_motion": "api",
-    "evaluate": "api",
-    "identify": "api",
-    "render": "api",
-    "rollout": "sim.rollout",
-    "simulate": "sim.rollout",
-    "view": "viewer.open",
+_PUBLIC = {
+    "api": "Adaptation Identification Scene Video adapt estimate_motion evaluate identify render",
+    "coupling.initial_motion": "InitialMotion",
+    "coupling.reconstruction": "Reconstruction",
+    "errors": "InputError NonFiniteError",
+    "mechanics.law": "Elasticity Law Plasticity",
+    "methods.base": "Method",
+    "methods.registry": "METHODS",
+    "sim.model": "MPM",
+    "sim.rollout": "rollout simulate",
+    "sim.state": "State Trajectory",
+    "viewer.open": "view",
 }
-"""Module of each public name below this package."""
+"""Public names of each module below this package."""
+_MODULES = {name: module for module, names in _PUBLIC.items() for name in names.split()}
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    value = getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
     globals()[name] = value
     return value
 

@@ -29,7 +29,7 @@ from neuma_lib.geometry.chamfer import chamfer_sequence
 from neuma_lib.io.files import read_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import EXPOSURE_SAMPLES, load_videos
-from neuma_lib.io.particles import load_body
+from neuma_lib.io.particles import load_reconstruction
 from neuma_lib.mechanics.adaptor import AdaptableLaw
 from neuma_lib.mechanics.analytic import specification
 from neuma_lib.mechanics.law import Law
@@ -37,7 +37,7 @@ from neuma_lib.mechanics.structured import StructuredLaw, structured_law
 from neuma_lib.methods.neuma import Neuma, NeumaOptions
 from neuma_lib.methods.structured import Structured, StructuredOptions
 from neuma_lib.methods.training import pixel_loss
-from neuma_lib.project.find import found_scene
+from neuma_lib.project.find import find_scene
 from neuma_lib.sim.model import MPM
 from neuma_lib.sim.state import State, Trajectory
 from neuma_lib.splatting.cameras import Cameras
@@ -132,9 +132,9 @@ class Scene:
             >>> scene = Scene.load("results/BouncyBall")
             >>> path = simulate(scene.mpm, law, scene.state(), scene.video.frames)
         """
-        settings, files = found_scene(folder)
+        settings, files = find_scene(folder)
         mpm = MPM(**files.simulation)
-        body = load_body(files.particles, files.binding, files.gaussians, files.density)
+        body = load_reconstruction(files.particles, files.binding, files.gaussians, files.density)
         blur = {"dt": mpm.dt, "exposure_samples": settings.dataset.exposure_samples}
         return cls(
             mpm,
@@ -244,8 +244,8 @@ def identify(
         NonFiniteError: every family diverges.
 
     Example:
-        >>> found = identify(scene)
-        >>> found.family, found.constants
+        >>> material = identify(scene)
+        >>> material.family, material.constants
         ('hencky', {'E': 61000.0, 'nu': 0.31})
     """
     values = {

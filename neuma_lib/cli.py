@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from neuma_lib.mechanics.law import Law
 
 CONFIGFILE = "settings on top of config/config.yaml, as for snakemake"
+PAGE = "also draw the law's stress curves, .png or .pdf"
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -46,149 +47,111 @@ def _parser() -> argparse.ArgumentParser:
 
     demo = _command(
         commands,
-        "demo",
         _demo,
-        "run a small example, from a rendered video to a learned material (minutes)",
-        "Runs the small example of the project: renders a video of a falling duck, learns its material, and writes a "
-        "film, a table and a viewer page to results/demo. Takes a few minutes on two cores. Run it in the project's "
-        "folder.",
+        "demo: run a small example, from a rendered video to a learned material (minutes)",
+        "Renders a video of a falling duck, learns its material, and writes a film, a table and a viewer page to "
+        "results/demo. Takes a few minutes on two cores. Run it in the project's folder.",
     )
     demo.add_argument("--cores", type=int, default=2, help="CPU cores to use (default %(default)s)")
 
     new = _group(commands, "new", "create the settings of a scene or a capture")
     scene = _command(
         new,
-        "scene",
         _new_scene,
-        "create config/NAME.yaml with a scene to edit",
-        "Writes config/NAME.yaml: a scene that runs as it is, with comments on what to change. Prints the commands to "
-        "run next.",
+        "scene: create config/NAME.yaml with a scene to edit",
+        "The scene runs unchanged and has comments on what to change. Prints the commands to run next.",
     )
     scene.add_argument("name", metavar="NAME", help="name of the scene and of its folder in results/")
     capture = _command(
         new,
-        "capture",
         _new_capture,
-        "create captures/NAME for your own photographs and videos",
-        "Writes captures/NAME/capture.yaml and creates the folders for photographs, stills and videos. Prints what to "
-        "do next.",
+        "capture: create captures/NAME for your own photographs and videos",
+        "Writes captures/NAME/capture.yaml and creates the folders of the files. Prints what to do next.",
     )
     capture.add_argument("name", metavar="NAME", help="name of the capture and of its folder in captures/")
 
     check = _command(
         commands,
-        "check",
         _check,
-        "check settings without running anything",
-        "Checks the settings of the project: keys and values, laws and their constants, shapes, start positions and "
-        "velocities, time steps, captures, and the GPU. Takes seconds and runs nothing. Prints each problem on a line "
-        "and exits with status 1 if there is one.",
+        "check: check settings without running anything",
+        "Checks keys and values, laws and their constants, shapes, start positions and velocities, time steps, "
+        "captures, and the GPU, in seconds. Prints each problem on a line and exits with status 1 if there is one.",
     )
-    check.add_argument(
-        "files",
-        nargs="*",
-        metavar="FILE",
-        help=f"{CONFIGFILE}; or a capture.yaml. None: config/config.yaml alone",
-    )
+    files = f"{CONFIGFILE}; or a capture.yaml. None: config/config.yaml alone"
+    check.add_argument("files", nargs="*", metavar="FILE", help=files)
 
     law = _group(commands, "law", "export a learned material to one file, or show such a file")
     export = _command(
         law,
-        "export",
         _export,
-        "write a learned law to one file",
+        "export: write a learned law to one file",
         "Writes a learned law to one .safetensors file, with its time step, origin and the range of deformations that "
         "it was learned from. Example: neuma law export results/RubberPawn/neuma law.safetensors --page law.png",
     )
-    export.add_argument(
-        "source",
-        metavar="SOURCE",
-        help="folder of a method, such as results/RubberPawn/neuma, or file of a law",
-    )
+    export.add_argument("source", metavar="SOURCE", help="folder of a method, or file of a law")
     export.add_argument("target", metavar="TARGET", help="file to write, .safetensors")
-    export.add_argument("--page", metavar="FILE", help="also draw the law's stress curves, .png or .pdf")
+    export.add_argument("--page", metavar="FILE", help=PAGE)
     export.add_argument(
         "--separate",
         "--apart",
-        dest="apart",
+        dest="separate_adaptor",
         action="store_true",
         help="keep prior and adaptor separate, so that the adaptor's weight can be changed later",
     )
-    export.add_argument(
-        "--weight",
-        type=float,
-        default=1.0,
-        help="weight of the adaptor when it is merged (default %(default)g)",
-    )
-    export.add_argument(
-        "--any-step", action="store_true", help="allow time steps other than the one that it was learned with"
-    )
+    weight = "weight of the adaptor when it is merged (default %(default)g)"
+    export.add_argument("--weight", type=float, default=1.0, help=weight)
+    steps = "allow time steps other than the one that it was learned with"
+    export.add_argument("--any-step", dest="any_time_step", action="store_true", help=steps)
     export.add_argument("--configfile", nargs="+", default=[], metavar="FILE", help=CONFIGFILE)
-    export.add_argument(
-        "--adaptor",
-        metavar="FILE",
-        help="if SOURCE is the file of a prior: adaptor, ours or a released *_lora.pt",
-    )
+    adaptor = "if SOURCE is the file of a prior: adaptor, ours or a released *_lora.pt"
+    export.add_argument("--adaptor", metavar="FILE", help=adaptor)
     export.add_argument("--alpha", type=float, help="scale of a released adaptor (default 16)")
     export.add_argument(
         "--dt", type=float, help="if SOURCE is a file: time step that it was learned with [s]"
     )
     show = _command(
         law,
-        "show",
         _show,
-        "print what an exported file states about its law",
+        "show: print what an exported file states about its law",
         "Prints the metadata of a file that `neuma law export` wrote.",
     )
     show.add_argument("law", metavar="FILE", help="file written by `neuma law export`")
-    show.add_argument("--page", metavar="FILE", help="also draw the law's stress curves, .png or .pdf")
+    show.add_argument("--page", metavar="FILE", help=PAGE)
 
     view = _command(
         commands,
-        "view",
         _view,
-        "show a scene's motions in a browser",
+        "view: show a scene's motions in a browser",
         "Serves the motions of a scene to a browser, with a live mode that simulates its object under any learned law. "
         "Example: neuma view results/BouncyBall. With --file it writes one HTML page instead, without a server.",
     )
-    view.add_argument("scene", metavar="FOLDER", help="folder of a scene, such as results/BouncyBall")
+    view.add_argument("folder", metavar="FOLDER", help="folder of a scene, such as results/BouncyBall")
     view.add_argument("--file", help="write one HTML file that needs no server, and exit")
+    view.add_argument("--host", default="127.0.0.1", help="address (default %(default)s, this machine)")
+    port = "port, or the next free one (default %(default)s)"
+    view.add_argument("--port", type=int, default=8080, help=port)
+    view.add_argument("--methods", nargs="+", metavar="METHOD", help="methods to show (default: all)")
     view.add_argument(
-        "--host", default="127.0.0.1", help="address to serve at (default %(default)s, this machine)"
+        "--configfile", dest="configfiles", nargs="+", default=(), metavar="FILE", help=CONFIGFILE
     )
-    view.add_argument(
-        "--port", type=int, default=8080, help="port, or the next free one (default %(default)s)"
-    )
-    view.add_argument(
-        "--methods", nargs="+", metavar="METHOD", help="methods to show (default: all with a motion)"
-    )
-    view.add_argument("--configfile", nargs="+", default=(), metavar="FILE", help=CONFIGFILE)
-    view.add_argument(
-        "--device",
-        default="auto",
-        choices=("auto", "cpu", "cuda"),
-        help="where the live mode simulates (default: a GPU if there is one)",
-    )
+    device = "where the live mode simulates (default: a GPU if there is one)"
+    view.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help=device)
 
     timings = _command(
         commands,
-        "timings",
         _timings,
-        "print how long each stage took",
+        "timings: print how long each stage took",
         "Prints a table of run times and memory of all stages, from the benchmark files below a folder of results.",
     )
-    timings.add_argument(
-        "folder",
-        nargs="?",
-        default="results",
-        metavar="FOLDER",
-        help="folder of results (default %(default)s)",
-    )
+    results = "folder of results (default %(default)s)"
+    timings.add_argument("folder", nargs="?", default="results", metavar="FOLDER", help=results)
     return parser
 
 
-def _command(commands: Any, name: str, run: Any, summary: str, description: str) -> argparse.ArgumentParser:
-    parser = commands.add_parser(name, help=summary, description=description)
+def _command(commands: Any, run: Any, summary: str, description: str) -> argparse.ArgumentParser:
+    """Add a command. The summary begins with its name and a colon."""
+    name, _, text = summary.partition(": ")
+    parser = commands.add_parser(name, help=text, description=description)
     parser.set_defaults(run=run)
     return parser
 
@@ -229,59 +192,51 @@ def _demo(options: argparse.Namespace) -> int:
 
 
 def _new_scene(options: argparse.Namespace) -> None:
-    from neuma_lib.project.project import settings_around
+    from neuma_lib.project.project import Project
     from neuma_lib.project.scaffold import new_scene
 
-    settings, root = settings_around(_project())
-    path = new_scene(root, options.name, settings)
-    file, name = path.relative_to(root), options.name
+    settings, root = Project.find(_project())
+    file, name = new_scene(root, options.name, settings).relative_to(root), options.name
     print(f"Created {file}. Edit it, then run in {root}:")
     print(f"  neuma check {file}")
     print(f"  snakemake --cores 2 --configfile {file} -- results/{name}/film.mp4 results/{name}/viewer.html")
 
 
 def _new_capture(options: argparse.Namespace) -> None:
-    from neuma_lib.project.project import settings_around
+    from neuma_lib.project.project import Project
     from neuma_lib.project.scaffold import new_capture
 
-    settings, root = settings_around(_project())
-    path = new_capture(root, options.name, settings)
-    folder = path.parent.relative_to(root)
-    print(f"Created {path.relative_to(root)}. docs/capture.md explains how to photograph and film. Next:")
+    settings, root = Project.find(_project())
+    file = new_capture(root, options.name, settings).relative_to(root)
+    folder = file.parent
+    print(f"Created {file}. docs/capture.md explains how to photograph and film. Next:")
     print(f"  snakemake --cores 2 {settings.captures.root}/board.pdf   # print it and lay it on the floor")
     print(f"  copy your files to {folder}/photos, {folder}/stills and {folder}/videos")
-    print(f"  neuma check {path.relative_to(root)}")
+    print(f"  neuma check {file}")
     print(f"  snakemake --cores 2 results/{options.name}/capture.md")
 
 
 def _check(options: argparse.Namespace) -> int:
     from neuma_lib.project import checks
-    from neuma_lib.project.capture_folder import read_capture
-    from neuma_lib.project.project import settings_around
+    from neuma_lib.project.capture_folder import capture_folders
+    from neuma_lib.project.project import Project
 
     captures = [file for file in options.files if Path(file).name == "capture.yaml"]
     files = [file for file in options.files if file not in captures]
-    found: list[str] = []
-    for file in captures:
-        try:
-            read_capture(Path(file).parent)
-        except InputError as error:
-            found += checks.lines(error)
+    problems = checks.capture_problems([Path(file).parent for file in captures])
     text = f"{', '.join(captures)}: no problems"
     if files or not captures:
         root = _project()
         try:
-            settings, _ = settings_around(root, files)
+            settings, _ = Project.find(root, files)
         except InputError as error:
-            found += checks.lines(error)
+            problems += checks.lines(error)
         else:
-            found += checks.problems(settings) + checks.capture_problems(root / settings.captures.root)
+            problems += checks.problems(settings)
+            problems += checks.capture_problems(capture_folders(root / settings.captures.root))
             text = checks.summary(settings, ["config/config.yaml", *files])
-    if found:
-        print("\n".join(dict.fromkeys(found)))
-        return 1
-    print(text)
-    return 0
+    print("\n".join(dict.fromkeys(problems)) or text)
+    return 1 if problems else 0
 
 
 def _timings(options: argparse.Namespace) -> None:
@@ -300,13 +255,15 @@ def _export(options: argparse.Namespace) -> None:
     source = Path(options.source)
     law, known = _of_method(options) if source.is_dir() else _of_file(options)
     if options.weight != 1.0:
-        if options.apart:
+        if options.separate_adaptor:
             raise InputError("--weight", "a separate adaptor has no fixed weight", "Leave out --separate")
         if not isinstance(law, AdaptableLaw):
             raise InputError("--weight", f"{source} is an analytic law without an adaptor")
         law.set_adaptor_weight(options.weight)
         known["weight"] = options.weight
-    about = export_law(options.target, law, apart=options.apart, page=options.page, **known)
+    about = export_law(
+        options.target, law, separate_adaptor=options.separate_adaptor, page=options.page, **known
+    )
     step = "" if about["dt"] is None else f", learned at dt = {about['dt']:g} s"
     print(f"{options.target}: {about['kind']}{step}" + (f"; {options.page}" if options.page else ""))
 
@@ -315,7 +272,7 @@ def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
     """The law of a method's folder, and what `export_law` needs to know of it."""
     from neuma_lib.evaluation.law_export import head_commit
     from neuma_lib.project import cases
-    from neuma_lib.project.project import settings_around
+    from neuma_lib.project.project import Project
 
     if options.adaptor or options.dt:
         raise InputError(
@@ -324,7 +281,7 @@ def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
             "Leave out --adaptor and --dt",
         )
     place = Path(options.source).absolute()
-    settings, root = settings_around(place, options.configfile)
+    settings, root = Project.find(place, options.configfile)
     settings = settings.model_copy(update={"results_root": str(place.parent.parent)})
     scene, method = place.parent.name, place.name
     case = cases.case(settings, scene, method)
@@ -332,9 +289,9 @@ def _of_method(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
         raise InputError(options.source, "its motion follows from no material law", "Choose another method")
     law = case.source().load(lambda file: str(root / file)).law
     origin = cases.law_origin(settings, scene, method)
-    beside = {"metrics": place / "metrics.json", "rollout": place / "rollout.h5"}
-    of_this = {name: file for name, file in beside.items() if file.is_file() and origin["scene"] == scene}
-    return law, {**origin, **of_this, "any_step": options.any_step, "commit": head_commit(root)}
+    files = {"metrics": place / "metrics.json", "rollout": place / "rollout.h5"}
+    of_this = {name: file for name, file in files.items() if file.is_file() and origin["scene"] == scene}
+    return law, {**origin, **of_this, "any_time_step": options.any_time_step, "commit": head_commit(root)}
 
 
 def _of_file(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
@@ -353,14 +310,14 @@ def _of_file(options: argparse.Namespace) -> tuple[Law, dict[str, Any]]:
         raise InputError("--dt", f"{options.dt:g} must be a positive time step in seconds")
     dt = options.dt or stated.get("dt")
     alpha = RELEASED_ALPHA if options.alpha is None else options.alpha
-    law = load_law(source, options.adaptor, dt, options.any_step, alpha)
+    law = load_law(source, options.adaptor, dt, options.any_time_step, alpha)
     of_the_law = ("grid", "gravity", "density", "scale")
     if not options.adaptor:
         of_the_law += ("scene", "method", "prior", "weight", "commit", "metrics", "visited")
     kept = {key: stated[key] for key in of_the_law if key in stated}
     kept |= {"prior": source.name} if options.adaptor else {}
-    any_step = options.any_step or stated.get("any_step") is True
-    return law, {**kept, "dt": stated.get("dt") or dt, "any_step": any_step}
+    any_time_step = options.any_time_step or stated.get("any_step") is True
+    return law, {**kept, "dt": stated.get("dt") or dt, "any_time_step": any_time_step}
 
 
 def _show(options: argparse.Namespace) -> None:
@@ -375,15 +332,7 @@ def _show(options: argparse.Namespace) -> None:
 def _view(options: argparse.Namespace) -> None:
     from neuma_lib.viewer.open import view
 
-    view(
-        options.scene,
-        methods=options.methods,
-        file=options.file,
-        configfiles=options.configfile,
-        host=options.host,
-        port=options.port,
-        device=options.device,
-    )
+    view(**{key: value for key, value in vars(options).items() if key != "run"})
 
 
 if __name__ == "__main__":

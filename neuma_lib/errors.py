@@ -11,7 +11,7 @@ class InputError(ValueError):
     Args:
         where: file, key or argument that is wrong.
         problem: what is wrong with it, with the given value.
-        remedy: what the user can do. Empty if the problem already says it.
+        remedy: what the user can do. Empty if it follows from the problem.
     """
 
     def __init__(self, where: str | PathLike, problem: str = "", remedy: str = ""):
@@ -29,11 +29,11 @@ class NonFiniteError(ArithmeticError):
     """A simulated or optimised quantity became NaN or infinite.
 
     Args:
-        stage: pipeline stage or function in which it happened.
-        detail: what is known of the place (iteration, step, particle) and what to try.
-        step: simulation step at which it happened, if known.
-        particle: first particle that it happened to, if known.
-        happened: what did, in words that follow "a particle".
+        stage: pipeline stage or function.
+        detail: iteration, step and particle if known, and a remedy.
+        step: simulation step, if known.
+        particle: first affected particle, if known.
+        happened: the event, in words that follow "a particle".
     """
 
     def __init__(

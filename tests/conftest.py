@@ -29,3 +29,9 @@ def raw():
 @pytest.fixture(scope="module")
 def loaded(raw):
     return loading.load(raw, ROOT)
+
+
+@pytest.fixture(scope="module")
+def changed(raw):
+    """A function of changes to the settings that returns the result."""
+    return lambda **changes: loading.load(loading.merged(raw, changes), ROOT)

@@ -12,7 +12,6 @@ from PIL import Image
 
 import neuma_lib as nm
 from neuma_lib.fitting.families import FAMILIES
-from neuma_lib.io.files import write_json
 from neuma_lib.io.images import write_transforms
 from neuma_lib.mechanics.neural import neural_law
 from tests.support.errors import refused
@@ -78,10 +77,10 @@ def test_the_motion_is_estimated_from_the_frames_before_contact(scene):
 def test_a_material_is_identified(scene):
     families = {"hencky": {"elasticity": {"name": "hencky", "E": 3e4, "nu": 0.3}}}
     options = {"pyramid": (8, 24), "iterations": 4, "covariance_from": "elastic", "gaussian_motion": "mean"}
-    identified = nm.identify(scene, families, options)
-    assert identified.family == "hencky" and identified.ties == () and set(identified.std) == {"E", "nu"}
-    assert identified.constants["E"] == pytest.approx(1.5e4, rel=0.1)
-    assert float(identified.law.elasticity.values["E"]) == identified.constants["E"]
+    material = nm.identify(scene, families, options)
+    assert material.family == "hencky" and material.ties == () and set(material.std) == {"E", "nu"}
+    assert material.constants["E"] == pytest.approx(1.5e4, rel=0.1)
+    assert float(material.law.elasticity.values["E"]) == material.constants["E"]
     with refused("options.particles"):
         nm.identify(scene, families, {"particles": 100})
 
@@ -139,11 +138,8 @@ def test_a_scene_is_read_from_a_folder_of_results(tmp_path, capsys):
     scene = nm.Scene.load(folder)
     assert scene.mpm.dt > 0 and scene.video.frames == STEPS and scene.truth.frames == STEPS
     assert (scene.motion.velocity == 0).all() and len(scene.state().x) == len(scene.reconstruction.x0)
-    images = nm.render(
-        nm.simulate(scene.mpm, nm.Law.from_spec(SOFT), scene.state(), [0]),
-        scene.reconstruction,
-        scene.video.cameras,
-    )
+    path = nm.simulate(scene.mpm, nm.Law.from_spec(SOFT), scene.state(), [0])
+    images = nm.render(path, scene.reconstruction, scene.video.cameras)
     assert images.shape == (1, 1, 24, 32, 4)
     with refused(tmp_path / "missing"):
         nm.Scene.load(tmp_path / "missing")
@@ -174,16 +170,12 @@ def test_a_body_is_reconstructed_from_images(tmp_path):
         frames.append({"file_path": f"s_{k}.png", "transform_matrix": pose.tolist()})
     intrinsics = {"w": size, "h": size, "fl_x": focal, "fl_y": focal, "cx": size / 2, "cy": size / 2}
     write_transforms(tmp_path / "transforms.json", intrinsics, frames)
-    options = {
-        "particles": 300,
-        "gaussians": {"iterations": 30, "initial_count": 150},
-        "surface": {"resolution": 24},
-    }
+    gaussians, surface = {"iterations": 30, "initial_count": 150}, {"resolution": 24}
+    options = {"particles": 300, "gaussians": gaussians, "surface": surface}
     body = nm.Reconstruction.from_images(tmp_path / "transforms.json", 1000.0, options)
     assert float(body.mass.sum()) == pytest.approx(1000 * 4 / 3 * np.pi * radius**3, rel=0.15)
     centre = body.mass @ body.x0 / body.mass.sum()
     assert (centre - 0.5).abs().max() < 0.01
-    write_json(tmp_path / "empty.json", {})
     with refused("options.grid"):
         nm.Reconstruction.from_images(tmp_path / "transforms.json", 1000.0, {"grid": 3})
 

@@ -53,12 +53,8 @@ def test_a_new_scene_is_valid_and_named_in_the_next_commands(project, capsys):
 @core
 def test_a_new_capture_is_valid_and_becomes_a_scene(project, capsys):
     assert main(["new", "capture", "mug"]) == 0
-    assert {p.name for p in (project / "captures/mug").iterdir()} == {
-        "capture.yaml",
-        "photos",
-        "stills",
-        "videos",
-    }
+    names = {"capture.yaml", "photos", "stills", "videos"}
+    assert {p.name for p in (project / "captures/mug").iterdir()} == names
     assert main(["check"]) == 0 and main(["check", "captures/mug/capture.yaml"]) == 0
     assert main(["new", "capture", "mug"]) == 1
     (project / "captures/mug/capture.yaml").write_text("board: {square: -1}\n")
@@ -116,7 +112,7 @@ def test_check_reports_a_missing_gpu(project, capsys, monkeypatch):
 
 
 @core
-def test_outside_of_a_project_the_commands_say_so(tmp_path, monkeypatch, capsys):
+def test_commands_are_refused_outside_of_a_project(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for words in (["check"], ["demo"], ["new", "scene", "Mine"]):
         assert main(words) == 1
@@ -132,9 +128,9 @@ def test_check_loads_no_torch(project):
 
 
 @core
-@pytest.mark.parametrize("name", checks.OWN_SIZES)
-def test_sizes_of_shapes_are_their_own(name):
-    assert build(name).extents.max() == pytest.approx(checks.OWN_SIZES[name], rel=0.01)
+def test_sizes_of_shapes_are_their_own():
+    for name, size in checks.OWN_SIZES.items():
+        assert build(name).extents.max() == pytest.approx(size, rel=0.01), name
 
 
 def test_letters_have_at_least_the_sides_that_are_checked():

@@ -241,9 +241,7 @@ def test_error_taken_while_drawing_is_that_of_the_images(out_of_sight, monkeypat
     empty = torch.zeros(len(x), dtype=torch.bool)
     empty[list(out_of_sight)] = True
     for grad in results[1][1:]:
-        assert torch.equal(grad.flatten(1).norm(dim=1).cpu() == 0, empty), (
-            "frames out of sight, and they alone"
-        )
+        assert torch.equal(grad.flatten(1).norm(dim=1).cpu() == 0, empty), "exactly the frames out of sight"
 
 
 def test_equal_renders_have_equal_errors():
@@ -256,7 +254,7 @@ def test_equal_renders_have_equal_errors():
 
 
 def test_error_of_a_large_image_of_one_colour():
-    """Nothing is drawn: what the sum of a million and more pixels must be is known."""
+    """Nothing is drawn, so the sum over more than a million pixels is known."""
     renderer, x, F, _ = falling(frames=1, out_of_sight=(0,))
     size = 1203
     views = replace(renderer.cameras, width=size, height=size)
@@ -329,24 +327,27 @@ def test_a_training_killed_on_the_gpu_resumes_on_either_device(tmp_path, device)
     resumed = train(device, settings, Checkpoint(tmp_path / "state.pt", {}))
     assert resumed.history.loss == pytest.approx(whole.history.loss, rel=0.02)
     for name, value in whole.law.adaptor_state().items():
-        result = resumed.law.adaptor_state()[name]
-        assert result.device.type == device
-        assert relative(result.cpu(), value.cpu()) < 0.05, name
+        again = resumed.law.adaptor_state()[name]
+        assert again.device.type == device
+        assert relative(again.cpu(), value.cpu()) < 0.05, name
 
 
 def test_velocity_from_bytes_agrees():
     """Frames before contact on both devices, from decoded images."""
-    results = {}
+    estimates = {}
     for device in ("cpu", "cuda"):
         body = ball().to(torch.float64, device)
         seen = observe(body, [0.5, -1.2, 0.4], (0, 4, 8, 12, 16))
         opaque = torch.ones_like(seen.images[..., :1])
         pixels = (255 * torch.cat([seen.images, opaque], -1).clamp(0, 1)).round().to(torch.uint8)
         law = analytic_law(TRUTH, MODEL.dt).to(device)
-        results[device] = estimate_velocity(MODEL, law, body, replace(seen, images=pixels), VelocityConfig())
+        estimates[device] = estimate_velocity(
+            MODEL, law, body, replace(seen, images=pixels), VelocityConfig()
+        )
     # single precision on the GPU, double on the CPU: far below what the images leave open
-    assert (abs(results["cuda"].v0 - results["cpu"].v0) < 0.25 * results["cpu"].std).all()
-    assert (abs(results["cuda"].std - results["cpu"].std) < 0.1 * results["cpu"].std).all()
+    gpu, cpu = estimates["cuda"], estimates["cpu"]
+    assert (abs(gpu.v0 - cpu.v0) < 0.25 * cpu.std).all()
+    assert (abs(gpu.std - cpu.std) < 0.1 * cpu.std).all()
 
 
 def test_a_video_that_does_not_fit_stays_off_the_device(monkeypatch):

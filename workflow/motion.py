@@ -95,4 +95,6 @@ class Prediction:
     def body(self, density, carrier: str, gaussian_motion: str, device: torch.device):
         """The body that renders the motion."""
         files = self._files[0] | {name: self._inputs[name] for name in START[:3]}
-        return self.method.load_body(files, self._options[0], density, carrier, gaussian_motion, device)
+        return self.method.load_reconstruction(
+            files, self._options[0], density, carrier, gaussian_motion, device
+        )

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,8 @@ from neuma_lib.config.validation import hint
 from neuma_lib.errors import InputError
 from neuma_lib.io.files import existing, read_json, reading
 from neuma_lib.io.images import OPENGL_TO_OPENCV
-from neuma_lib.project.capture_folder import PHOTOGRAPHS, Capture
+from neuma_lib.project.capture_folder import PHOTOGRAPHS
+from neuma_lib.project.released_captures import UNPACK, floor_height, object_folder, sequence
 
 RATE = 120.0
 """Frames per second of the videos."""
@@ -52,14 +53,11 @@ ROOM_FROM_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """From the axes of the files (z down) to the room's (y up)."""
 MIDDLE = (0.15, 0.20)
 """x and y of the middle of the volume for objects in Spring-Gaus' settings."""
-GROUND = {"bun": -0.010, "burger": -0.025, "dog": -0.025, "pig": -0.025, "potato": -0.010}
-"""z of the floor under each object in Spring-Gaus' settings."""
 MASK_MARGIN = 3
 """Width of the border around a mask that may still show the object [px]."""
 _MODELS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV"}
 _PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8}
 _SUFFIXES = (".jpg", ".jpeg", ".png")
-_UNPACK = "Unpack the archive again"
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,28 +106,11 @@ def read_released(folder: str | Path, name: str, ground: float | None = None) ->
     Raises:
         InputError: a file is missing or damaged, there is no such object, or its floor is unknown.
     """
-    folder = Path(folder)
-    if ground is None and name not in GROUND:
-        raise InputError(
-            name,
-            "the floor of this object is unknown",
-            "Set `ground`, z of the floor in the world of the files",
-        )
-    ground = GROUND[name] if ground is None else ground
-    if (folder / "dynamic/sequences").is_dir():
-        return _spring_gaus(folder, name, ground)
-    for own in (folder / name, folder):
-        if (own / "dynamics").is_dir():
-            return _neuma(own, ground)
-    raise InputError(
-        folder,
-        f"the layout is neither that of Spring-Gaus (dynamic/sequences/) nor that of NeuMA ({name}/dynamics/)",
-        "Give the folder that contains one of these",
-    )
+    ground = floor_height(name, ground)
+    folder, is_spring_gaus = object_folder(folder, name)
+    return _spring_gaus(folder, name, ground) if is_spring_gaus else _neuma(folder, ground)
 
 
-TAKE = "first"
-"""Name of the only take."""
 CONTACT = 5
 """Number of frames of free flight in NeuMA's settings."""
 
@@ -151,41 +132,20 @@ def read_configured(name: str, settings: ReleasedConfig) -> Released:
     return replace(capture, photographs=photographs, contact=contact)
 
 
-def released_captures(released: Mapping[str, ReleasedConfig]) -> dict[str, Capture]:
-    """Released captures of the settings, in the form of `neuma_lib.project.capture_folder.read_capture`."""
-    captures = {}
-    for name, settings in released.items():
-        shots = read_released(settings.folder, settings.object or name, settings.ground).videos
-        videos = {camera: frames[0].picture for camera, frames in sorted(shots.items())}
-        captures[name] = Capture(Path(name), settings.as_capture(), (), {}, {TAKE: videos})
-    return captures
-
-
 def _spring_gaus(folder: Path, name: str, ground: float) -> Released:
-    sequences = folder / "dynamic/sequences"
-    if not (sequences / name).is_dir():
-        raise InputError(sequences, f"no object '{name}'{hint(name, [p.name for p in sequences.iterdir()])}")
-    listed = sequences / name / "0.json"
-    frames = read_json(existing(listed, _UNPACK))
-    colmap = folder / "static/colmap" / name
-    lens = read_cameras(colmap / "cameras.bin")
+    frames, contact = sequence(folder, name)
+    lens = read_cameras(folder / "static/colmap" / name / "cameras.bin")
     poses = _poses(folder / "dynamic/cameras_calib.json")
     videos = {}
     for camera, files in frames.items():
-        if camera == "hit_frame":
-            continue
-        if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
-            raise InputError(f"{listed}: {camera}", "expected a list of names of pictures")
         if camera not in poses:
-            raise InputError(f"{listed}: {camera}", f"no pose in cameras_calib.json{hint(camera, poses)}")
+            raise InputError(
+                f"{folder / 'dynamic/sequences' / name / '0.json'}: {camera}",
+                f"no pose in cameras_calib.json{hint(camera, poses)}",
+            )
         pictures = [_picture(folder / "dynamic/videos_images" / camera, file) for file in files]
         masks = [_picture(folder / "dynamic/videos_masks" / camera, Path(file).stem) for file in files]
-        if not pictures:
-            raise InputError(f"{listed}: {camera}", "it has no pictures", _UNPACK)
         videos[camera] = _video(pictures, masks, range(len(files)), next(iter(lens.values())), poses[camera])
-    contact = frames.get("hit_frame")
-    if contact is not None and (type(contact) is not int or contact < 0):
-        raise InputError(f"{listed}: hit_frame", f"{contact!r} must be the number of a frame")
     return Released(videos, _photographs(folder, name, lens), contact, ground)
 
 
@@ -201,7 +161,7 @@ def _neuma(folder: Path, ground: float) -> Released:
             if match and file.suffix.lower() in _SUFFIXES:
                 files[int(match[1])] = file
         if not files:
-            raise InputError(folder / "dynamics", f"no picture {camera}_<step>.jpg", _UNPACK)
+            raise InputError(folder / "dynamics", f"no picture {camera}_<step>.jpg", UNPACK)
         numbers = sorted(files)
         pictures = [files[k] for k in numbers]
         masks = [_picture(folder / "dynamic_masks", file.stem) for file in pictures]
@@ -228,7 +188,7 @@ def _photographs(folder: Path, name: str, lenses: dict[int, Lens]) -> list[Shot]
     shots = []
     for k, (file, camera, viewmat) in enumerate(sorted(read_images(path), key=lambda image: image[0])):
         if camera not in lenses:
-            raise InputError(f"{path}: {file}", f"its camera {camera} is not in cameras.bin", _UNPACK)
+            raise InputError(f"{path}: {file}", f"its camera {camera} is not in cameras.bin", UNPACK)
         picture = _picture(folder / "static/images" / name, Path(file).stem)
         mask = _picture(folder / "static/masks" / name, Path(file).stem)
         width, height = picture_size(mask)
@@ -248,13 +208,13 @@ def _picture(folder: Path, name: str) -> Path:
             if folder.resolve() not in file.resolve().parents:
                 raise InputError(file, f"it is a link to a file outside {folder}", "Copy the file there")
             return file
-    raise InputError(folder / stem, f"no such picture ({', '.join(_SUFFIXES)})", _UNPACK)
+    raise InputError(folder / stem, f"no such picture ({', '.join(_SUFFIXES)})", UNPACK)
 
 
 def _poses(path: Path) -> dict[str, np.ndarray]:
     """World to camera (4, 4) of each camera."""
     poses = {}
-    for camera, entry in read_json(existing(path, _UNPACK)).items():
+    for camera, entry in read_json(existing(path, UNPACK)).items():
         if not isinstance(entry, dict) or not {"rvecs", "tvecs"} <= entry.keys():
             raise InputError(f"{path}: {camera}", "expected rvecs and tvecs")
         try:
@@ -275,7 +235,7 @@ def read_cameras(path: Path) -> dict[int, Lens]:
     Raises:
         InputError: missing, damaged, or of another model than `COLMAP_MODELS`.
     """
-    content = existing(path, _UNPACK).read_bytes()
+    content = existing(path, UNPACK).read_bytes()
     lenses = {}
     with reading(path, "COLMAP's cameras"):
         (count,), at = struct.unpack_from("<Q", content), 8
@@ -287,13 +247,13 @@ def read_cameras(path: Path) -> dict[int, Lens]:
             at += 24 + 8 * _PARAMETERS[model]
             lenses[number] = lens_of_colmap(_MODELS[model], np.array(values), width, height)
     if not lenses:
-        raise InputError(path, "it has no camera", _UNPACK)
+        raise InputError(path, "it has no camera", UNPACK)
     return lenses
 
 
 def read_images(path: Path) -> list[tuple[str, int, np.ndarray]]:
     """Name, camera number and world to camera (4, 4) of each picture in COLMAP's images.bin, or InputError."""
-    content = existing(path, _UNPACK).read_bytes()
+    content = existing(path, UNPACK).read_bytes()
     images = []
     with reading(path, "COLMAP's images"):
         (count,), at = struct.unpack_from("<Q", content), 8
@@ -428,7 +388,7 @@ def read_shots(shots: Sequence[Shot], longest: int) -> Iterator[tuple[np.ndarray
                 raise InputError(
                     shot.picture,
                     f"{pixels.shape[1]}x{pixels.shape[0]} pixels, which does not fit the mask of {width}x{height}",
-                    _UNPACK,
+                    UNPACK,
                 )
             pixels = np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.BOX))
         yield undistorted(pixels, shot.lens, longest), own_mask(shot.mask, shot.lens, longest)

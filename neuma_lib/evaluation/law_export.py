@@ -25,8 +25,8 @@ def export_law(
     path: str | Path,
     law: Law,
     dt: float | None,
-    apart: bool = False,
-    any_step: bool = False,
+    separate_adaptor: bool = False,
+    any_time_step: bool = False,
     metrics: str | Path | None = None,
     rollout: str | Path | None = None,
     page: str | Path | None = None,
@@ -37,7 +37,7 @@ def export_law(
     Args:
         path: ``.safetensors``.
         dt: time step that it was learned at [s].
-        apart, any_step: see `save_law` and `about_law`.
+        separate_adaptor, any_time_step: see `save_law` and `about_law`.
         metrics, rollout: metrics.json and rollout.h5 of its method, or None.
         page: file for the picture of `neuma_lib.evaluation.law_page`.
         known: further keys of `neuma_lib.io.exported`.
@@ -46,7 +46,7 @@ def export_law(
         the metadata.
 
     Raises:
-        InputError: another suffix, unreadable files, or ``apart`` without an adaptor. Nothing is written then.
+        InputError: another suffix, unreadable files, or no adaptor to keep separate. Nothing is written then.
     """
     if Path(path).suffix != ".safetensors":
         raise InputError(path, "the suffix is not .safetensors", "Give the file that suffix")
@@ -55,9 +55,9 @@ def export_law(
     if rollout is not None:
         arrays, _ = read_arrays(rollout, required=("F",), only=("F",))
         known["visited"] = visited_by(law, torch.from_numpy(arrays["F"]))
-    about = about_law(law, dt, any_step, **known)
+    about = about_law(law, dt, any_time_step, **known)
     write_page = _drawn(law, about, page) if page else None
-    save_law(path, law, about, apart)
+    save_law(path, law, about, separate_adaptor)
     if write_page is not None:
         write_page()
     return about

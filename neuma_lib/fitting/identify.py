@@ -8,7 +8,7 @@ simpler families. Families whose loss exceeds ``prune_factor`` times the best ar
 
 The initial motion is estimated from the frames before contact, with an uncertainty that would bias the constants. The
 last level therefore also fits velocity and spin with a prior, and a constant shift and enlargement of the rendered
-body, which would otherwise appear as motion (`thrown_video`).
+body, which would otherwise appear as motion (`video_residuals`).
 
 Families are fitted to the first frames and evaluated on the last ones, so that additional constants have no advantage.
 Frames before the first contact do not depend on the law and are always fitted. A family is dropped if its images equal
@@ -45,7 +45,7 @@ from neuma_lib.fitting.least_squares import (
     jackknife,
     levenberg_marquardt,
 )
-from neuma_lib.fitting.thrown_video import MOTION, NUISANCES, Candidate, VideoResiduals, averaged
+from neuma_lib.fitting.video_residuals import MOTION, NUISANCES, Candidate, VideoResiduals, averaged
 from neuma_lib.mechanics.combinations import Values
 from neuma_lib.sim.model import MPM
 from neuma_lib.splatting.observation import Observation, joint_frames, several

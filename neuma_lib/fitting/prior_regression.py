@@ -21,7 +21,7 @@ from torch.nn.functional import gelu
 
 from neuma_lib.config.priors import RegressionConfig
 from neuma_lib.errors import NonFiniteError
-from neuma_lib.fitting.prior_throws import (
+from neuma_lib.fitting.prior_launches import (
     Launch,
     Progress,
     random_launch,

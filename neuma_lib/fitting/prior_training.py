@@ -13,8 +13,8 @@ import torch
 
 from neuma_lib.config.priors import RegressionConfig
 from neuma_lib.errors import NonFiniteError
+from neuma_lib.fitting.prior_launches import Progress, random_launch, reference_law
 from neuma_lib.fitting.prior_regression import train_by_regression
-from neuma_lib.fitting.prior_throws import Progress, random_launch, reference_law
 from neuma_lib.geometry.chamfer import chamfer_sequence
 from neuma_lib.mechanics.law import Law
 from neuma_lib.mechanics.neural import NeuralLaw

@@ -44,7 +44,7 @@ SAME_STEP = 1e-6
 """Relative difference up to which two time steps are equal."""
 
 
-def about_law(law: Law, dt: float | None, any_step: bool = False, **known: Any) -> dict[str, Any]:
+def about_law(law: Law, dt: float | None, any_time_step: bool = False, **known: Any) -> dict[str, Any]:
     """Metadata of a law; keys of the module that are neither given nor derived from the law are null."""
     conditions = ("grid", "gravity", "density", "scale")
     origin = ("scene", "method", "prior", "commit", "metrics", "visited")
@@ -55,7 +55,7 @@ def about_law(law: Law, dt: float | None, any_step: bool = False, **known: Any) 
         "kind": "structured" if isinstance(law, StructuredLaw) else kind,
         "dt": dt,
         "step": step_dependence(law),
-        "any_step": any_step,
+        "any_step": any_time_step,
         "units": UNITS,
         "weight": 1.0,
         **known,
@@ -89,7 +89,7 @@ def checked_export(metadata: Mapping[str, Any]) -> dict[str, Any]:
     return about
 
 
-def fitting_step(about: Mapping[str, Any], dt: float | None, any_step: bool = False) -> float | None:
+def fitting_step(about: Mapping[str, Any], dt: float | None, any_time_step: bool = False) -> float | None:
     """The time step of a law [s]: the given one, or that of its training.
 
     Raises:
@@ -100,12 +100,12 @@ def fitting_step(about: Mapping[str, Any], dt: float | None, any_step: bool = Fa
     if dt is None or own is None:
         return own if dt is None else dt
     other = abs(dt - own) > SAME_STEP * own
-    if other and about.get("step") == "fixed" and not (any_step or about.get("any_step") is True):
+    if other and about.get("step") == "fixed" and not (any_time_step or about.get("any_step") is True):
         raise InputError(
             "dt",
             f"the law was trained at a time step of {own:g} s and its plastic network is applied once a step, so at "
             f"{dt:g} s it is another material",
-            f"Use dt: {own:g}, or allow other steps by any_step=True in Python or by "
+            f"Use dt: {own:g}, or allow other steps by any_time_step=True in Python or by "
             "`neuma law export ... --any-step`",
         )
     return dt

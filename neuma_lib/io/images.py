@@ -49,25 +49,6 @@ class ImageSet:
     def height(self) -> int:
         return self.images.shape[1]
 
-    def video(self, views: Sequence[int]) -> tuple[tuple[int, ...], np.ndarray, np.ndarray]:
-        """Frames of some views: steps, indices into the images of shape (T, V), and camera indices of shape (V,).
-
-        Raises:
-            InputError: a view is missing, or the views have frames at different steps.
-        """
-        columns = []
-        for view in views:
-            chosen = np.flatnonzero(self.views == view)
-            if len(chosen) == 0:
-                filmed = sorted(set(self.views.tolist()))
-                raise InputError("views", f"{view} is not one of the filmed views {filmed}")
-            columns.append(chosen[np.argsort(self.steps[chosen], kind="stable")])
-        steps = [tuple(self.steps[c].tolist()) for c in columns]
-        if any(s != steps[0] for s in steps):
-            raise InputError("views", f"{list(views)} have frames at different steps")
-        index = np.stack(columns, axis=1)
-        return steps[0], index, index[0]
-
 
 FORMATS = ("PNG", "JPEG", "WEBP")
 """Supported image formats, by Pillow's names. Decoders of other formats are less well tested."""
@@ -344,11 +325,10 @@ def load_videos(
         InputError: see `read_image_set` and `Observation`; a view that was not filmed, or only before step 0.
     """
     observations = []
-    for (_, _, exposure), frames in _shots(transforms, views, dt, exposure_samples).items():
+    for (steps, _, exposure), frames in _shots(transforms, views, dt, exposure_samples).items():
         images = _read_frames(frames, transforms)
-        order = list(dict.fromkeys(frame["view"] for frame in frames))
-        steps, index, columns = images.video(order)
-        pixels, cameras = torch.from_numpy(images.images[index]), _cameras(images, columns)
+        index = np.arange(len(frames)).reshape(-1, len(steps)).T  # (T, V)
+        pixels, cameras = torch.from_numpy(images.images[index]), _cameras(images, index[0])
         offsets, shares = exposure
         shares = shares if len(offsets) > 1 else None
         observations.append(Observation(steps, pixels, cameras, offsets, shares))

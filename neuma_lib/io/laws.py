@@ -1,7 +1,7 @@
 """Files of laws: priors (our ``.safetensors``, the released NCLaw / NeuMA ``.pt``), adaptors (ours, the released
 ``*_lora.pt``) and exported laws (`save_law`).
 
-The metadata of a ``.safetensors`` tell its kind: :data:`STRUCTURED` holds names and constants of the base of a
+The metadata of a ``.safetensors`` determine its kind: :data:`STRUCTURED` holds names and constants of the base of a
 structured law, :data:`ANALYTIC` those of an analytic law without tensors. Any other file is a pair of NCLaw networks. A
 file may contain an adaptor and the weights that it corrects, as that of a structured law does. It needs no prior then.
 """
@@ -38,32 +38,32 @@ def save_prior(path: str | Path, law: AdaptableLaw, metadata: Mapping[str, Any])
     write_weights(path, law.prior_state(), {**metadata, **own})
 
 
-def save_law(path: str | Path, law: Law, about: Mapping[str, Any], apart: bool = False) -> None:
+def save_law(path: str | Path, law: Law, about: Mapping[str, Any], separate_adaptor: bool = False) -> None:
     """Write a complete law to one file, for `load_law` and `load_prior`.
 
     Args:
         law: networks with or without an adaptor, a structured or an analytic law.
         about: result of `neuma_lib.io.exported.about_law`.
-        apart: keep the adaptor separate from the weights that it corrects, instead of merging it with its weight w.
+        separate_adaptor: do not merge the adaptor, with its weight w, with the weights that it corrects.
 
     Raises:
-        InputError: ``apart`` for a law without an adaptor.
+        InputError: ``separate_adaptor`` for a law without an adaptor.
     """
     own = {EXPORT: dict(about)}
     if not isinstance(law, AdaptableLaw):
         own[ANALYTIC] = specification(law.elasticity, law.plasticity)
         write_weights(path, {}, own)
-    elif apart:
+    elif separate_adaptor:
         adaptor = next(iter(law.parts.values())).adaptor
         if adaptor is None:
-            raise InputError(f"law {law.name}", "has no adaptor to keep separate", "Omit apart")
+            raise InputError(f"law {law.name}", "has no adaptor to keep separate", "Omit separate_adaptor")
         save_adaptor(path, law, adaptor.rank, adaptor.alpha, own, complete=True)
     else:
         save_prior(path, law, own)
 
 
 def load_prior(
-    path: str | Path, device: torch.device | str = "cpu", dt: float | None = None, any_step: bool = False
+    path: str | Path, device: torch.device | str = "cpu", dt: float | None = None, any_time_step: bool = False
 ) -> Law:
     """Law from a file; an adaptor in it is merged.
 
@@ -71,29 +71,29 @@ def load_prior(
         path: ``.safetensors`` of `save_prior` or `save_law`, or ``.pt``: a dict with ``elasticity`` and ``plasticity``,
             each with the three weights of an NCLaw network.
         dt: time step of the simulation [s]; None: that of the training.
-        any_step: allow another time step than that of the training even if the law depends on it
+        any_time_step: allow another time step than that of the training even if the law depends on it
             (`neuma_lib.mechanics.time_step`). Only files of `save_law` contain the step of the training.
 
     Raises:
         InputError: missing file, unknown format, missing weights or other shapes, unknown base, another time step.
     """
-    law = _read_law(path, dt, any_step)
+    law = _read_law(path, dt, any_time_step)
     for part in law.parts.values() if isinstance(law, AdaptableLaw) else ():
         if part.adaptor is not None:
             part.freeze(part.weights())
     return law.to(device)
 
 
-def load_adaptable(path: str | Path, dt: float | None = None, any_step: bool = False) -> AdaptableLaw:
+def load_adaptable(path: str | Path, dt: float | None = None, any_time_step: bool = False) -> AdaptableLaw:
     """`load_prior` of a law to be trained. Raises InputError also for a law without networks."""
-    law = load_prior(path, dt=dt, any_step=any_step)
+    law = load_prior(path, dt=dt, any_time_step=any_time_step)
     if not isinstance(law, AdaptableLaw):
         problem = "an analytic law has no networks to adapt"
         raise InputError(f"prior {path}", problem, "Use it with a method that trains nothing (nclaw)")
     return law
 
 
-def _read_law(path: str | Path, dt: float | None, any_step: bool) -> Law:
+def _read_law(path: str | Path, dt: float | None, any_time_step: bool) -> Law:
     path = existing(path)
     metadata: Mapping[str, Any] = {}
     if path.suffix == ".safetensors":
@@ -104,7 +104,7 @@ def _read_law(path: str | Path, dt: float | None, any_step: bool) -> Law:
         raise InputError(f"prior {path}", "expected .safetensors or .pt")
     try:
         if EXPORT in metadata:
-            dt = fitting_step(checked_export(metadata), dt, any_step)
+            dt = fitting_step(checked_export(metadata), dt, any_time_step)
         if ANALYTIC in metadata:
             return analytic_law(_specification(metadata[ANALYTIC], dt, ANALYTIC))
         if STRUCTURED in metadata:
@@ -200,7 +200,7 @@ def load_law(
     prior: str | Path | None,
     adaptor: str | Path | None = None,
     dt: float | None = None,
-    any_step: bool = False,
+    any_time_step: bool = False,
     released_alpha: float = RELEASED_ALPHA,
 ) -> Law:
     """A law from one file, with its adaptor attached if it has one, or from a prior and a trained adaptor.
@@ -208,18 +208,18 @@ def load_law(
     Args:
         prior: file of the prior, or of `save_law`; None for the adaptor of a structured law, whose file has its base.
         adaptor: file of the adaptor, ours or a released ``*_lora.pt``.
-        dt, any_step: see `load_prior`.
+        dt, any_time_step: see `load_prior`.
         released_alpha: numerator of the scale of a released adaptor.
     """
     if adaptor is None:
         if prior is None:
             raise InputError("prior", "is missing", "Give a prior, or the adaptor of a structured law")
-        return _read_law(prior, dt, any_step)
+        return _read_law(prior, dt, any_time_step)
     without_prior = InputError(adaptor, "the adaptor corrects a prior", "Give the file of the prior too")
     if Path(adaptor).suffix in PICKLED:
         if prior is None:
             raise without_prior
-        law = load_adaptable(prior, dt, any_step)
+        law = load_adaptable(prior, dt, any_time_step)
         _attach_released(law, existing(adaptor), released_alpha)
         return law
     tensors, metadata = read_weights(adaptor)
@@ -227,7 +227,7 @@ def load_law(
         raise InputError(adaptor, "is not an adaptor of this project: its metadata have no rank and alpha")
     if prior is None and STRUCTURED not in metadata:
         raise without_prior
-    law = None if prior is None else load_adaptable(prior, dt, any_step)
+    law = None if prior is None else load_adaptable(prior, dt, any_time_step)
     try:
         if law is None:
             spec = _specification(metadata[STRUCTURED], dt)

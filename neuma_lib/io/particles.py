@@ -17,7 +17,7 @@ from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.mechanics.density import Density, density_at
 from neuma_lib.sim.state import State
 
-Carrier = Literal["binding", "gaussians"]
+ParticleSource = Literal["binding", "gaussians"]
 """Simulated particles: the volume particles of the binding, or the Gaussians themselves."""
 GaussianMotion = Literal["mean", "affine"]
 """How Gaussians follow their particles: by the mean displacement, or by the affine motion."""
@@ -42,17 +42,17 @@ def save_binding(path: str | Path, binding: Binding) -> None:
     write_arrays(path, arrays, {"gaussians": binding.shape[0], "particles": binding.shape[1]})
 
 
-def load_body(
+def load_reconstruction(
     particles: str | Path,
     binding: str | Path,
     gaussians: str | Path,
     density: Density,
-    carrier: Carrier = "binding",
+    particle_source: ParticleSource = "binding",
     gaussian_motion: GaussianMotion = "mean",
 ) -> Reconstruction:
     """The reconstructed body of a scene or experiment: particles with their volumes, and the Gaussians bound to them.
 
-    With ``carrier="gaussians"`` the Gaussians are the particles, with equal shares of the same volume. With
+    With ``particle_source="gaussians"`` the Gaussians are the particles, with equal shares of the same volume. With
     ``gaussian_motion="affine"`` Gaussians follow the affine motion of their particles in renders.
 
     Raises:
@@ -65,7 +65,7 @@ def load_body(
         if attributes.get(kind) != count:
             problem = f"has {attributes.get(kind)} {kind}, but {file} has {count}"
             raise InputError(binding, problem, "Run the rule binding again")
-    if carrier == "gaussians":
+    if particle_source == "gaussians":
         return Reconstruction.of_gaussians(splats, float(vol0.sum()), density)
     return Reconstruction(
         x0=x0,
@@ -101,7 +101,7 @@ def load_initial_state(
     gaussians: str | Path,
     velocity: str | Path,
     densities: Sequence[Density],
-    carrier: Carrier = "binding",
+    particle_source: ParticleSource = "binding",
 ) -> tuple[State, list[int]]:
     """Initial state of a prediction: the reconstructed bodies of a scene (one) or of an experiment.
 
@@ -111,11 +111,11 @@ def load_initial_state(
     Raises:
         InputError: files of different bodies, or several bodies with Gaussians as particles.
     """
-    together = load_body(particles, binding, gaussians, 1.0, carrier)
+    together = load_reconstruction(particles, binding, gaussians, 1.0, particle_source)
     x0, vol0 = together.x0, together.vol0
     motion = _initial_motion(velocity)
     parts = motion.get("bodies", [{**motion, "particles": len(x0)}])
-    if carrier == "gaussians":
+    if particle_source == "gaussians":
         if len(parts) > 1:
             problem = f"has {len(parts)} bodies, but the Gaussians can be the particles of one body only"
             raise InputError(velocity, problem, "Choose a method that is evaluated on particles")

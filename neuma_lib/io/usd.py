@@ -45,6 +45,6 @@ def write_usd(
             points.Set(Vt.Vec3fArray.FromNumpy(frame), float(code))
             ends = [Gf.Vec3f(*end.tolist()) for end in (frame.min(axis=0), frame.max(axis=0))]
             extent.Set(Vt.Vec3fArray(ends), float(code))
-        shown = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
-        shown.Set(Vt.Vec3fArray.FromNumpy(linear(colors).astype(np.float32)))
+        display_color = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+        display_color.Set(Vt.Vec3fArray.FromNumpy(linear(colors).astype(np.float32)))
         stage.GetRootLayer().Save()

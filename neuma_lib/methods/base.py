@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from neuma_lib.io.checkpoint import Checkpoint
-    from neuma_lib.io.particles import Carrier, GaussianMotion
+    from neuma_lib.io.particles import GaussianMotion, ParticleSource
     from neuma_lib.mechanics.law import Law
     from neuma_lib.methods.model import MotionModel
     from neuma_lib.sim.state import State
@@ -235,7 +235,7 @@ class Method(ABC):
         """Files of the model, for `load`: one path a name."""
 
     def body_inputs(self, case: Case) -> Files:
-        """Further files of `load_initial_state` and `load_body`: one path a name."""
+        """Further files of `load_initial_state` and `load_reconstruction`: one path a name."""
         return {}
 
     def uncertainty_inputs(self, case: Case) -> Files:
@@ -247,7 +247,7 @@ class Method(ABC):
         return case.options.plain()
 
     def model_options(self, case: Case) -> dict[str, Any]:
-        """Options of `load`, `load_initial_state` and `load_body` as plain values."""
+        """Options of `load`, `load_initial_state` and `load_reconstruction` as plain values."""
         return {}
 
     def start_file(self, case: Case) -> str:
@@ -259,7 +259,7 @@ class Method(ABC):
         """Seeds of a replicate that change its results. They name the folder of its runs."""
         return ("prior", "gaussians", "particles")
 
-    def carrier(self, case: Case) -> str:
+    def particle_source(self, case: Case) -> str:
         """What an evaluation simulates: "binding" (particles of the volume), or the particles of the fit."""
         return case.options.particle_source if case.evaluate_on == "training_particles" else "binding"
 
@@ -288,7 +288,11 @@ class Method(ABC):
         """
 
     def load_initial_state(
-        self, inputs: Files, options: Mapping[str, Any], densities: Sequence[Any], carrier: Carrier
+        self,
+        inputs: Files,
+        options: Mapping[str, Any],
+        densities: Sequence[Any],
+        particle_source: ParticleSource,
     ) -> tuple[State, list[int]]:
         """Initial state of a prediction, and the number of particles of each body.
 
@@ -299,24 +303,26 @@ class Method(ABC):
         from neuma_lib.io.particles import load_initial_state
 
         files = (inputs[name] for name in ("particles", "binding", "gaussians", "velocity"))
-        return load_initial_state(*files, densities=densities, carrier=carrier)
+        return load_initial_state(*files, densities=densities, particle_source=particle_source)
 
-    def load_body(
+    def load_reconstruction(
         self,
         inputs: Files,
         options: Mapping[str, Any],
         density: Any,
-        carrier: Carrier,
+        particle_source: ParticleSource,
         gaussian_motion: GaussianMotion,
         device: torch.device | str = "cpu",
     ) -> Any:
         """The body that renders a predicted motion, with ``particle_gs(cameras)``."""
         import torch
 
-        from neuma_lib.io.particles import load_body
+        from neuma_lib.io.particles import load_reconstruction
 
         files = (inputs[name] for name in ("particles", "binding", "gaussians"))
-        body = load_body(*files, density=density, carrier=carrier, gaussian_motion=gaussian_motion)
+        body = load_reconstruction(
+            *files, density=density, particle_source=particle_source, gaussian_motion=gaussian_motion
+        )
         return body.to(torch.float32, device)
 
     def draws(

@@ -14,7 +14,7 @@ from neuma_lib.fitting.material import ParticleLoss, PixelLoss
 from neuma_lib.io.files import listed, write_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_videos
-from neuma_lib.io.particles import load_body, with_motion
+from neuma_lib.io.particles import load_reconstruction, with_motion
 from neuma_lib.mechanics.adaptor import AdaptableLaw
 from neuma_lib.methods.base import Files, FitRun, Problem
 from neuma_lib.sim.model import MPM
@@ -43,7 +43,7 @@ class Training:
         self.settings, self.run, self._problem = settings, run, problem
         parts = zip(*(listed(inputs[name]) for name in ("particles", "binding", "gaussians")), strict=True)
         bodies = [
-            load_body(*files, density, settings.particle_source, settings.gaussian_motion).to(
+            load_reconstruction(*files, density, settings.particle_source, settings.gaussian_motion).to(
                 torch.float32, run.device
             )
             for files, density in zip(parts, problem.densities, strict=True)

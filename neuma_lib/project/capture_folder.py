@@ -86,6 +86,11 @@ def _no_videos(folder: Path) -> InputError:
     )
 
 
+def capture_folders(root: str | Path) -> list[Path]:
+    """The folders of all captures below a folder, sorted. Empty if it does not exist."""
+    return sorted(p for p in Path(root).iterdir() if p.is_dir()) if Path(root).is_dir() else []
+
+
 def read_settings(path: str | Path) -> CaptureConfig:
     """Settings of a capture.yaml. Raises InputError: names the file and each invalid, missing or unknown key."""
     content = existing(path, "Create it as in the example of docs/capture.md").read_bytes()

@@ -9,7 +9,8 @@ from typing import Any
 from neuma_lib.config.capture import ReleasedConfig
 from neuma_lib.config.validation import hint
 from neuma_lib.errors import InputError
-from neuma_lib.project.capture_folder import NAME, Capture, read_capture
+from neuma_lib.project.capture_folder import NAME, Capture, capture_folders, read_capture
+from neuma_lib.project.released_captures import released_captures
 
 
 def captured_scenes(
@@ -24,16 +25,9 @@ def captured_scenes(
     skipped, since their own rules report the error.
     """
     scenes: dict[str, dict[str, Any]] = {}
-    for capture in (planned or {}).values():
+    for capture in (*(planned or {}).values(), *released_captures(released or {}).values()):
         scenes |= scenes_of(capture)
-    if released:
-        # Imported here, because it is too slow for every start of the workflow.
-        from neuma_lib.capture.released import released_captures
-
-        for capture in released_captures(released).values():
-            scenes |= scenes_of(capture)
-    folders = sorted(p for p in Path(root).iterdir() if p.is_dir()) if Path(root).is_dir() else []
-    for folder in folders:
+    for folder in capture_folders(root):
         if not NAME.fullmatch(folder.name) or folder.name in (planned or {}):
             continue
         try:

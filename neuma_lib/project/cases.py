@@ -146,7 +146,7 @@ def kind_of(settings: Config, method: str) -> Method:
 
 
 def of_kind(settings: Config, name: str) -> list[str]:
-    """Presets of a method that have a fit of their own, in the order of the settings."""
+    """Presets of a method with their own fit, in the order of the settings."""
     own = (key for key, chosen in settings.methods.items() if chosen.same_fit_as is None)
     return [key for key in own if settings.methods[key].kind == name]
 
@@ -175,13 +175,15 @@ def law_from(settings: Config, method: str) -> str | None:
     """The scene that a variant's model is obtained from. None: the scene whose motion is predicted.
 
     Raises:
-        InputError: unknown names, or a model that moves the body of its own scene only.
+        InputError: unknown names, or a model that moves only the body that it is fitted to.
     """
     source = preset(settings, method)[1].get(LAW_FROM)
     if source is not None and source not in settings.scenes:
         raise InputError(method, f"no scene '{source}'{hint(source, settings.scenes)}")
     if source is not None and not kind_of(settings, method).moves_other_bodies:
-        raise InputError(method, "its model moves the body of its own scene only", f"Leave out {LAW_FROM}")
+        raise InputError(
+            method, "its model moves only the body that it is fitted to", f"Leave out {LAW_FROM}"
+        )
     return source
 
 
@@ -217,12 +219,8 @@ def _options(settings: Config, scene: str, method: str) -> Section:
     kind = kind_of(settings, fitted)
     base, seeds = settings.replicate(scene)
     known = kind.Options.model_fields
-    values: dict[str, Any] = {}
-    for section in (
-        *(getattr(settings, name).plain() for name in kind.sections),
-        settings.scene(base).training,
-    ):
-        values |= {key: value for key, value in section.items() if key in known}
+    own = settings.scene(base).training
+    values = section_values(settings, kind) | {key: value for key, value in own.items() if key in known}
     validate(kind.Options, values, f"scenes.{base}.training")
     values |= chosen.options
     validate(kind.Options, values, f"methods.{fitted.partition('+')[0]}.options")
@@ -230,6 +228,14 @@ def _options(settings: Config, scene: str, method: str) -> Section:
     if "seed" in known:
         options = options.model_copy(update={"seed": options.seed + seeds["adaptor"]})
     return options
+
+
+def section_values(settings: Config, kind: Method) -> dict[str, Any]:
+    """Options of a method that the sections of the settings define."""
+    values: dict[str, Any] = {}
+    for name in kind.sections:
+        values |= getattr(settings, name).plain()
+    return {key: value for key, value in values.items() if key in kind.Options.model_fields}
 
 
 # ---- runs

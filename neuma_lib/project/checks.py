@@ -6,7 +6,7 @@ import ctypes
 import importlib.metadata
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import COURANT_LIMIT, DEFINED_IN, check_law, longitudinal_modulus
 from neuma_lib.project.capture_folder import NAME, read_capture
 from neuma_lib.project.capture_scenes import training_takes
-from neuma_lib.project.random_scenes import SHAPES, DrawnPart, Outline
+from neuma_lib.project.random_scenes import SHAPES, Outline
 from neuma_lib.project.settings import Config
 
 OWN_SIZES = {"ball": 0.26, "duck": 0.41, "pawn": 0.417, "cat": 0.376, "bottle": 0.438, "fish": 0.402}
@@ -37,27 +37,22 @@ def problems(settings: Config) -> list[str]:
     ]
 
 
-def capture_problems(root: str | Path) -> list[str]:
-    """Captures below a folder whose capture.yaml or files cannot be used, one line each."""
-    folders = sorted(p for p in Path(root).iterdir() if p.is_dir()) if Path(root).is_dir() else []
-    found = []
+def capture_problems(folders: Iterable[Path]) -> list[str]:
+    """Problems of the capture.yaml, the name and the files of captures, one line each."""
+    problems = []
     for folder in folders:
         try:
             if not NAME.fullmatch(folder.name):
                 raise InputError(folder, "the name is invalid", "Use letters, digits, - and _")
             training_takes(read_capture(folder))
         except InputError as error:
-            found += lines(error)
-    return found
+            problems += lines(error)
+    return problems
 
 
 def law_problems(settings: Config) -> list[str]:
-    """Laws with an unknown name, an unknown or missing constant, or one outside its bounds; one line each."""
-    found = []
-    for where, spec in _laws(settings):
-        _, problem = _checked(where, spec)
-        found += problem
-    return found
+    """Laws with an unknown name, an unknown or missing constant, or one outside its bounds, one line each."""
+    return [problem for where, spec in _laws(settings) for problem in _checked(where, spec)[1]]
 
 
 def lines(error: InputError) -> list[str]:
@@ -81,11 +76,7 @@ def _laws(settings: Config) -> Iterator[tuple[str, dict[str, Any]]]:
         for name, family in getattr(settings.random, group).items():
             for end in (0, 1):
                 parts = {"elasticity": family.elasticity, "plasticity": family.plasticity}
-                yield f"random.{group}.{name}", {key: _end(part, end) for key, part in parts.items()}
-
-
-def _end(part: DrawnPart, end: int) -> dict[str, Any]:
-    return {"name": part.name, **{key: bounds[end] for key, bounds in part.ranges.items()}}
+                yield f"random.{group}.{name}", {key: part.at(end) for key, part in parts.items()}
 
 
 def _checked(where: str, spec: Mapping[str, Any]) -> tuple[dict[str, Any] | None, list[str]]:
@@ -97,89 +88,78 @@ def _checked(where: str, spec: Mapping[str, Any]) -> tuple[dict[str, Any] | None
         return None, [str(InputError(f"{where}.{error.where}", error.problem, error.remedy))]
 
 
-def _scene_problems(settings: Config) -> list[str]:
-    found, priors = [], settings.priors.laws
+def _scene_problems(settings: Config) -> Iterator[str]:
+    priors = settings.priors.laws
     for name, scene in settings.scenes.items():
         where, world, plain = f"scenes.{name}", settings.scene_world(name), scene.plain()
         if scene.has_truth:
             truth = settings.scene_truth(name)
-            found += _start_problems(where, plain, scene.dt, world["grid"])
-            found += _courant_problem(f"{where}.law", plain["law"], plain["density"], truth.grid, truth.dt)
+            yield from _start_problems(where, plain, scene.dt, world["grid"])
+            yield from _courant_problem(f"{where}.law", plain["law"], plain["density"], truth.grid, truth.dt)
         if scene.prior in priors:
             spec, label = priors[scene.prior].plain(), f"{where}.prior = {scene.prior}"
-            found += _courant_problem(label, spec, plain["density"], world["grid"], scene.dt)
-    return found
+            yield from _courant_problem(label, spec, plain["density"], world["grid"], scene.dt)
 
 
-def _experiment_problems(settings: Config) -> list[str]:
-    found = []
+def _experiment_problems(settings: Config) -> Iterator[str]:
     for name, experiment in settings.experiments.items():
         truth = settings.experiment_truth(name)
         for k, (body, plain) in enumerate(zip(experiment.bodies, settings.experiment_bodies(name))):
             where = f"experiments.{name}.bodies.{k}"
             if body.shape is not None:
-                found += _start_problems(where, plain, truth.dt, truth.grid)
+                yield from _start_problems(where, plain, truth.dt, truth.grid)
             if experiment.dt is not None and plain["law"] is not None:
-                found += _courant_problem(where, plain["law"], plain["density"], truth.grid, truth.dt)
-    return found
+                yield from _courant_problem(where, plain["law"], plain["density"], truth.grid, truth.dt)
 
 
-def _start_problems(where: str, body: Mapping[str, Any], dt: float, grid: int) -> list[str]:
-    """Problems of the shape, the place and the motion that a body starts with."""
+def _start_problems(where: str, body: Mapping[str, Any], dt: float, grid: int) -> Iterator[str]:
+    """Problems of the shape, the position and the motion that a body starts with."""
     shape = body["shape"]
     if not (shape in SHAPES or re.fullmatch(r"letter_[A-Z]", shape)):
-        return [f"{where}.shape: {shape!r} is unknown{hint(shape, [*SHAPES, 'letter_A'])}"]
+        yield f"{where}.shape: {shape!r} is unknown{hint(shape, [*SHAPES, 'letter_A'])}"
+        return
     outline, own = (SHAPES[shape], OWN_SIZES[shape]) if shape in SHAPES else (LETTER, LETTER_SIZE)
     size = body["size"] or own
     half = size * np.array(outline.sides) / 2
     middle = np.array([body["center"][0], body["height"], body["center"][1]])
-    found = []
     for axis, key, low, high in zip("xyz", ("center", "height", "center"), middle - half, middle + half):
         if low < -ROUND_OFF or high > 1 + ROUND_OFF:
             wall = "below the floor at y = 0" if axis == "y" and low < 0 else "outside the box from 0 to 1 m"
-            found.append(
+            yield (
                 f"{where}.{key}: the body extends from {axis} = {low:.3g} to {high:.3g} m, {wall}. Move it, or change "
                 f"size = {size:g} m"
             )
     reach = float(np.linalg.norm(half + size * np.abs(outline.mass_centre)))
     speed = math.hypot(*body["velocity"]) + math.hypot(*body["spin"]) * reach
     if speed * dt * grid >= 1:
-        found.append(
+        yield (
             f"{where}.velocity: at up to {speed:.3g} m/s a particle crosses a grid cell of {1 / grid:.3g} m in a time "
             f"step of {dt:g} s. Reduce velocity, spin or dt"
         )
-    return found
 
 
-def _courant_problem(where: str, spec: Mapping[str, Any], density: Any, grid: int, dt: float) -> list[str]:
+def _courant_problem(
+    where: str, spec: Mapping[str, Any], density: Any, grid: int, dt: float
+) -> Iterator[str]:
     """The problem of a time step that is unstable for a law; none for a law that `law_problems` reports, or whose
     modulus is unknown here because it is not built in."""
     law, _ = _checked(where, spec)
     if law is None or ("elasticity", law["elasticity"]["name"]) in DEFINED_IN:
-        return []
+        return
     rho = min(density["below"], density["above"]) if isinstance(density, Mapping) else density
     number = math.sqrt(longitudinal_modulus(law["elasticity"]) / rho) * dt * grid
-    if number <= COURANT_LIMIT:
-        return []
-    return [
-        f"{where}: the Courant number {number:.3g} exceeds {COURANT_LIMIT} with dt = {dt:g} s and {grid} grid cells. "
-        f"The largest stable step is {dt * COURANT_LIMIT / number:.3g} s"
-    ]
+    if number > COURANT_LIMIT:
+        yield (
+            f"{where}: the Courant number {number:.3g} exceeds {COURANT_LIMIT} with dt = {dt:g} s and {grid} grid "
+            f"cells. The largest stable step is {dt * COURANT_LIMIT / number:.3g} s"
+        )
 
 
-def _device_problems(device: str) -> list[str]:
-    if device != "cuda":
-        return []
-    found = []
-    if gpus() == 0:
-        found.append(
-            "device: cuda is set, but the machine has no CUDA GPU or driver. Set device: cpu or auto"
-        )
-    if torch_version().endswith("+cpu"):
-        found.append(
-            f"device: cuda is set, but torch {torch_version()} is a CPU build. Install one with CUDA support"
-        )
-    return found
+def _device_problems(device: str) -> Iterator[str]:
+    if device == "cuda" and gpus() == 0:
+        yield "device: cuda is set, but the machine has no CUDA GPU or driver. Set device: cpu or auto"
+    if device == "cuda" and torch_version().endswith("+cpu"):
+        yield f"device: cuda is set, but torch {torch_version()} is a CPU build. Install one with CUDA support"
 
 
 def gpus() -> int:

@@ -1,4 +1,4 @@
-"""Checks of settings across sections: names that exist, options that fit their method, independent samplings."""
+"""Checks of settings across sections: names that exist, options that fit their method, independent seeds."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from neuma_lib.config.figures import FiguresConfig
 from neuma_lib.config.validation import hint, joined, validate
 from neuma_lib.errors import InputError
 from neuma_lib.methods.registry import methods
-from neuma_lib.project.cases import law_from
+from neuma_lib.project.cases import law_from, section_values
 from neuma_lib.project.paths import IDENTIFIED
 from neuma_lib.project.settings import Config
 
-TRUTH_SAMPLINGS = ("particles", "tracers", "second tracers")
+SAMPLED_IN_TRUTH = ("particles", "tracers", "second tracers")
 """What the seeds dataset.seed, dataset.seed + 1 and dataset.seed + 2 sample, see `neuma_lib.data.ground_truth`."""
 SHARED_BY_VIDEOS = ("law", "prior", "dt")
 """Keys that the scenes of several videos have in common."""
@@ -99,7 +99,7 @@ def _preset_errors(settings: Config, name: str) -> Iterator[InputError]:
     if preset.same_fit_as is not None:
         own = [known for known, entry in settings.methods.items() if entry.same_fit_as is None]
         if preset.same_fit_as not in own:
-            problem = f"no preset '{preset.same_fit_as}' with a fit of its own{hint(preset.same_fit_as, own)}"
+            problem = f"no preset '{preset.same_fit_as}' with its own fit{hint(preset.same_fit_as, own)}"
             yield InputError(f"{where}.same_fit_as", problem)
             return
         kind = settings.methods[preset.same_fit_as].kind
@@ -112,11 +112,8 @@ def _preset_errors(settings: Config, name: str) -> Iterator[InputError]:
         yield InputError(f"{where}.kind", f"no method '{preset.kind}'{hint(preset.kind, known_methods)}")
         return
     kind = known_methods[preset.kind]
-    sections = (getattr(settings, section).plain() for section in kind.sections)
-    known = kind.Options.model_fields
-    values = {key: value for section in sections for key, value in section.items() if key in known}
     try:
-        options = validate(kind.Options, values | preset.options, f"{where}.options")
+        options = validate(kind.Options, section_values(settings, kind) | preset.options, f"{where}.options")
     except InputError as error:
         yield error
         return
@@ -155,7 +152,7 @@ def _sampling_errors(settings: Config) -> Iterator[InputError]:
         )
     replicates = max((table.seeds for table in settings.tables.values()), default=1)
     used = range(settings.seed, settings.seed + replicates)
-    shared = [(k, sampled) for k, sampled in enumerate(TRUTH_SAMPLINGS, dataset.seed) if k in used]
+    shared = [(k, sampled) for k, sampled in enumerate(SAMPLED_IN_TRUTH, dataset.seed) if k in used]
     for k, sampled in shared[:1]:
         yield InputError(
             "dataset.seed",

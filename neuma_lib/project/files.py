@@ -37,7 +37,7 @@ class SceneFiles:
     Attributes:
         name: the scene, with the seeds of its replicate.
         simulation: arguments of `MPM`.
-        density: of the body, as for `load_body`.
+        density: of the body, as for `load_reconstruction`.
         particles, binding, gaussians, velocity: files of the reconstructed body.
         truth, transforms: files of the true motion and of the observed images, or None.
         runs: predicted motions.

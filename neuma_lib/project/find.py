@@ -16,7 +16,7 @@ from neuma_lib.methods.base import ModelSource
 from neuma_lib.methods.prior import prior_source
 from neuma_lib.project import cases, paths
 from neuma_lib.project.files import RunFiles, SceneFiles
-from neuma_lib.project.project import settings_around
+from neuma_lib.project.project import Project
 from neuma_lib.project.settings import Config
 
 
@@ -59,7 +59,7 @@ def scene_files(settings: Config, scene: str, methods: Sequence[str]) -> SceneFi
     )
 
 
-def found_scene(place: str | Path, configfiles: Sequence[str | Path] = ()) -> tuple[Config, SceneFiles]:
+def find_scene(place: str | Path, configfiles: Sequence[str | Path] = ()) -> tuple[Config, SceneFiles]:
     """Settings and files of a scene's folder, with all methods that have a motion there.
 
     The settings define the position of the data relative to the results, so the folder may be in another clone.
@@ -74,14 +74,14 @@ def found_scene(place: str | Path, configfiles: Sequence[str | Path] = ()) -> tu
     place = Path(place).absolute()
     if not place.is_dir():
         raise InputError(place, "is not a folder", "Give that of a scene, for example results/BouncyBall")
-    settings, _ = settings_around(place, configfiles)
+    settings, _ = Project.find(place, configfiles)
     base, results = place.name.partition("+")[0], place.parent
     if base not in settings.scenes:
         problem = f"the settings have no scene '{base}', only {', '.join(sorted(settings.scenes))}"
         raise InputError(place, problem, "Give the --configfile of the folder")
     data = os.path.abspath(results / os.path.relpath(settings.data_root, settings.results_root))
     settings = settings.model_copy(update={"results_root": str(results), "data_root": data})
-    files = scene_files(settings, place.name, found_methods(settings, place))
+    files = scene_files(settings, place.name, _find_methods(settings, place))
     for file in (files.particles, files.binding, files.gaussians):
         existing(file, f"Generate it with `snakemake --cores 2 results/{place.name}/<method>/rollout.h5`")
     optional = {name: getattr(files, name) for name in ("velocity", "truth", "transforms")}
@@ -89,7 +89,7 @@ def found_scene(place: str | Path, configfiles: Sequence[str | Path] = ()) -> tu
     return settings, replace(files, **dict.fromkeys(missing))
 
 
-def found_methods(settings: Config, place: Path) -> list[str]:
+def _find_methods(settings: Config, place: Path) -> list[str]:
     """Methods with a motion in a scene's folder, in the order of the settings, without unknown ones."""
     order = list(settings.methods)
     names = (file.parent.name for file in place.glob("*/rollout.h5"))
@@ -105,7 +105,7 @@ def _known(settings: Config, method: str) -> bool:
     return True
 
 
-def found_laws(settings: Config, scene: str | None = None) -> dict[str, ModelSource]:
+def find_laws(settings: Config, scene: str | None = None) -> dict[str, ModelSource]:
     """All laws with complete files in the folder of results, by display name, in order.
 
     Includes laws trained or identified in scenes, ``scene: title of the method``, and priors, ``prior: name``, with the

@@ -99,7 +99,7 @@ def _with_takes(scenes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _complete(scenes: Mapping[str, Any]) -> dict[str, Any]:
-    """Scenes in which those with ``like`` have the settings of that scene where they have none of their own."""
+    """Scenes in which those with ``like`` inherit the settings of that scene that they do not set."""
 
     def complete(name: str, asked: tuple[str, ...] = ()) -> Any:
         scene = scenes[name]

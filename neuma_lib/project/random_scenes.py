@@ -92,6 +92,10 @@ class DrawnPart(Section):
         """Minimum and maximum of each constant."""
         return self.__pydantic_extra__ or {}
 
+    def at(self, end: int) -> dict[str, Any]:
+        """The part at the minimum (0) or maximum (1) of all constants."""
+        return {"name": self.name, **{key: bounds[end] for key, bounds in self.ranges.items()}}
+
 
 class FamilyConfig(Section):
     """A family of materials."""

@@ -64,5 +64,5 @@ def _matches(raw: Any, steps: list[str], names: tuple[str, ...]) -> Iterator[tup
         if not others:
             yield key, here
         else:
-            for path, found in _matches(raw[key], others, here):
-                yield f"{key}.{path}", found
+            for path, stars in _matches(raw[key], others, here):
+                yield f"{key}.{path}", stars

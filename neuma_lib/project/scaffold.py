@@ -39,7 +39,7 @@ scenes:
     dt: 1.0e-3
     steps: 256
 
-    # How Blender renders it: `body` and other parts of the shape have colours of their own.
+    # How Blender renders it: `body` and other parts of the shape have their own colours.
     appearance:
       kind: solid                   # solid, grains or liquid
       colors: {{body: "#f4c534", wing: "#e8a528", beak: "#e8742c", eye: "#2b2522"}}

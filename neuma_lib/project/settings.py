@@ -105,22 +105,16 @@ class Config(Section):
 
     @property
     def plain_scenes(self) -> list[str]:
-        """Names of the scenes with a truth of default resolution, but not random ones or those of tables on request."""
-        requested, shown = (
-            {
-                scene
-                for table in self.tables.values()
-                if table.default_target == default
-                for scene in table.scenes
-            }
-            for default in (False, True)
-        )
-        others = {
-            *self.random_scenes,
-            *(requested - shown),
-            *(name for name, s in self.scenes.items() if not s.has_truth),
-        }
-        return [name for name, s in self.scenes.items() if name not in others and s.truth == TruthConfig()]
+        """Names of the scenes with a truth of default resolution, without random ones and those of optional tables."""
+        in_tables: dict[bool, set[str]] = {True: set(), False: set()}
+        for table in self.tables.values():
+            in_tables[table.default_target].update(table.scenes)
+        excluded = {*self.random_scenes, *(in_tables[False] - in_tables[True])}
+        return [
+            name
+            for name, scene in self.scenes.items()
+            if scene.has_truth and scene.truth == TruthConfig() and name not in excluded
+        ]
 
     def experiment(self, name: str) -> ExperimentConfig:
         """The experiment of a name or of the folder of a replicate."""

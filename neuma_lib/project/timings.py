@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from neuma_lib.errors import InputError
@@ -33,16 +34,15 @@ def timings_table(results: Path) -> str:
     Raises:
         InputError: the folder has no benchmark file.
     """
-    rows: dict[str, dict[str, float]] = {}
+    stages: dict[str, list[dict[str, float]]] = {}
     for file in sorted((results / "benchmarks").rglob("*.tsv")):
         log = results / "logs" / file.relative_to(results / "benchmarks").with_suffix(".log")
-        run = _measured(file, log)
-        row = rows.setdefault(file.stem, dict.fromkeys(COLUMNS, 0))
-        rows[file.stem] = {key: _aggregate(key)((row[key], run[key])) for key in COLUMNS}
-    if not rows:
+        stages.setdefault(file.stem, []).append(_measured(file, log))
+    if not stages:
         raise InputError(results, "has no benchmarks", "Name the results folder of a finished run.")
+    rows = {stage: _aggregate(runs) for stage, runs in stages.items()}
     rows = dict(sorted(rows.items(), key=lambda item: (-item[1]["core_seconds"], item[0])))
-    rows["total"] = {key: _aggregate(key)(row[key] for row in rows.values()) for key in COLUMNS}
+    rows["total"] = _aggregate(list(rows.values()))
     cells = [
         [stage, *(v if isinstance(v, int) else f"{v:.4g}" for v in row.values())]
         for stage, row in rows.items()
@@ -52,12 +52,12 @@ def timings_table(results: Path) -> str:
 
 def core_seconds(log: Path) -> tuple[float, float] | None:
     """Core seconds that a script took to start and to work, from its log; None if it did not finish."""
-    found = _CORE_SECONDS.findall(log.read_text()) if log.exists() else []
-    return tuple(map(float, found[-1])) if found else None
+    runs = _CORE_SECONDS.findall(log.read_text()) if log.exists() else []
+    return tuple(map(float, runs[-1])) if runs else None
 
 
-def _aggregate(column: str):
-    return max if column in MAXIMA else sum
+def _aggregate(runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    return {key: (max if key in MAXIMA else sum)(run[key] for run in runs) for key in COLUMNS}
 
 
 def _measured(benchmark: Path, log: Path) -> dict[str, float]:

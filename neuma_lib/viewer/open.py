@@ -12,7 +12,7 @@ import torch
 
 from neuma_lib.device import choose_device
 from neuma_lib.errors import InputError
-from neuma_lib.project.find import found_laws, found_scene
+from neuma_lib.project.find import find_laws, find_scene
 from neuma_lib.viewer.page import write_page
 from neuma_lib.viewer.playground import Playground, first_law
 from neuma_lib.viewer.scene import load_scene
@@ -48,7 +48,7 @@ def view(
     """
     if not file:
         viser()  # fails before anything is read
-    settings, files = found_scene(folder, configfiles)
+    settings, files = find_scene(folder, configfiles)
     if methods:
         known = {run.name: run for run in files.runs}
         if unknown := [name for name in methods if name not in known]:
@@ -64,7 +64,7 @@ def view(
         return
     chosen = choose_device(device)
     torch.set_num_threads(1)  # two OpenMP threads next to the server's are slower than one
-    laws = found_laws(settings, files.name)
+    laws = find_laws(settings, files.name)
     playground = Playground(files, laws, first_law(files, laws), chosen) if laws else None
     server = ViewerServer(scene, playground, host, port)
     counts = f"{len(scene.motions)} motions, {len(laws)} laws"

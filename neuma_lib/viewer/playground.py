@@ -17,7 +17,7 @@ from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.errors import InputError, NonFiniteError
 from neuma_lib.geometry.shapes import place
 from neuma_lib.geometry.volume import sample_volume
-from neuma_lib.io.particles import load_body, with_motion
+from neuma_lib.io.particles import load_reconstruction, with_motion
 from neuma_lib.mechanics.law import Law
 from neuma_lib.methods.base import ModelSource
 from neuma_lib.project.files import SceneFiles, inside
@@ -65,7 +65,7 @@ class Playground:
     ):
         self.laws, self.roots, self.device = dict(laws), files.roots, device
         paths = [files.checked(path) for path in (files.particles, files.binding, files.gaussians)]
-        first = load_body(*paths, files.density, gaussian_motion="affine").to(torch.float32)
+        first = load_reconstruction(*paths, files.density, gaussian_motion="affine").to(torch.float32)
         start = (
             with_motion(first, files.checked(files.velocity))
             if files.velocity

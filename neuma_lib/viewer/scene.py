@@ -19,7 +19,7 @@ from neuma_lib.errors import InputError
 from neuma_lib.io.files import one_line, parse_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import read_image_set, read_transforms
-from neuma_lib.io.particles import load_body
+from neuma_lib.io.particles import load_reconstruction
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.law import Law
 from neuma_lib.project.files import RunFiles, SceneFiles
@@ -128,7 +128,7 @@ def load_scene(
             (`SceneFiles.checked`).
     """
     paths = [files.checked(path) for path in (files.particles, files.binding, files.gaussians)]
-    body = load_body(*paths, files.density)
+    body = load_reconstruction(*paths, files.density)
     motions, notes = [], []
     if files.truth:
         motions.append(true_motion(files.checked(files.truth), body, files.simulation["dt"]))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from neuma_lib.capture.motion.ballistic_tracks import find_arcs
+from neuma_lib.capture.motion.ballistic_tracks import find_ballistic_tracks
 
 TIMES = np.arange(40) / 60.0
 
@@ -29,7 +29,7 @@ def test_the_arc_is_found_beside_a_larger_hand_and_flicker():
     ball = flight(TIMES)
     hand = np.stack([300 + 150 * np.sin(9 * TIMES), 200 + 90 * np.cos(14 * TIMES)], axis=1)
     flicker = np.random.default_rng(1).uniform(0, 400, (40, 2))
-    (first, *others) = find_arcs(
+    (first, *others) = find_ballistic_tracks(
         candidates((hand, 9000.0), (ball, 500.0), (flicker, 400.0), noise=0.3), TIMES
     )
     assert first.frames == (0, 39) and len(first.candidates) >= 38 and not others
@@ -41,10 +41,10 @@ def test_the_arc_is_found_beside_a_larger_hand_and_flicker():
 def test_a_bounce_makes_two_arcs_in_the_order_of_time():
     down, up = flight(TIMES[:20], vy=0), flight(TIMES[:20], y=0.0, vy=-600.0)
     up[:, 1] += down[-1, 1]
-    arcs = find_arcs(candidates((np.concatenate([down, up]), 500.0)), TIMES)
-    assert len(arcs) == 2
+    tracks = find_ballistic_tracks(candidates((np.concatenate([down, up]), 500.0)), TIMES)
+    assert len(tracks) == 2
     # a frame beside the impact may lie near enough to both
-    assert abs(arcs[0].frames[1] - 19) <= 1 and abs(arcs[1].frames[0] - 20) <= 1
+    assert abs(tracks[0].frames[1] - 19) <= 1 and abs(tracks[1].frames[0] - 20) <= 1
 
 
 def test_a_soft_bounce_is_no_flight():
@@ -58,10 +58,10 @@ def test_a_soft_bounce_is_no_flight():
     y = np.where(after >= 0, -speed * after + a * after**2 / 2, y)
     body = np.stack([100.0 + 20 * times, 200 + y], axis=1)
     seen = [np.array([[*place, 700.0]]) for place in body]
-    (longest,) = sorted(find_arcs(seen, times), key=lambda arc: len(arc.candidates))[-1:]
+    (longest,) = sorted(find_ballistic_tracks(seen, times), key=lambda track: len(track.candidates))[-1:]
     assert longest.frames[0] < 18 < 42 < longest.frames[1] and longest.coefficients[2, 1] < 0
-    first, *_ = arcs = find_arcs(seen, times, down=np.array([0.1, 0.9]))
-    assert all(arc.coefficients[2, 1] > 0 for arc in arcs)
+    first, *_ = tracks = find_ballistic_tracks(seen, times, down=np.array([0.1, 0.9]))
+    assert all(track.coefficients[2, 1] > 0 for track in tracks)
     assert (
         first.frames[0] == 0 and sum(first.frames) / 2 < 18
     )  # its middle, where the fit begins, is in the fall
@@ -70,21 +70,21 @@ def test_a_soft_bounce_is_no_flight():
 def test_missed_frames_are_bridged():
     ball = flight(TIMES)
     ball[[10, 11, 25]] = np.nan
-    (arc,) = find_arcs(candidates((ball, 500.0)), TIMES)
-    assert arc.frames == (0, 39) and 10 not in arc.candidates and len(arc.candidates) == 37
+    (track,) = find_ballistic_tracks(candidates((ball, 500.0)), TIMES)
+    assert track.frames == (0, 39) and 10 not in track.candidates and len(track.candidates) == 37
 
 
 def test_times_that_vary_do_not_break_an_arc():
     times = TIMES + 0.006 * np.random.default_rng(0).uniform(-1, 1, len(TIMES))
-    (arc,) = find_arcs(candidates((flight(times), 500.0)), times)
-    assert arc.frames == (0, 39)
-    np.testing.assert_allclose(arc.place(times), flight(times), atol=1e-6)
+    (track,) = find_ballistic_tracks(candidates((flight(times), 500.0)), times)
+    assert track.frames == (0, 39)
+    np.testing.assert_allclose(track.place(times), flight(times), atol=1e-6)
 
 
 def test_what_rests_or_moves_at_random_is_no_flight():
     rest = np.tile([200.0, 300.0], (40, 1))
     walk = np.cumsum(np.random.default_rng(0).normal(0, 25, (40, 2)), axis=0)
-    assert find_arcs(candidates((rest, 500.0), (walk, 300.0), noise=0.3), TIMES) == []
+    assert find_ballistic_tracks(candidates((rest, 500.0), (walk, 300.0), noise=0.3), TIMES) == []
 
 
 def test_what_changes_its_size_is_not_the_same_thing():
@@ -92,4 +92,4 @@ def test_what_changes_its_size_is_not_the_same_thing():
     frames = candidates((ball, 500.0))
     for i in range(0, 40, 2):
         frames[i][:, 2] = 5000.0
-    assert all(len(arc.candidates) <= 20 for arc in find_arcs(frames, TIMES))
+    assert all(len(track.candidates) <= 20 for track in find_ballistic_tracks(frames, TIMES))

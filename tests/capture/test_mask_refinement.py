@@ -8,7 +8,7 @@ from tests.support.ellipsoids import HEIGHT, WIDTH, K, ellipsoid_mask, ring
 pytest.importorskip("cv2")
 
 from neuma_lib.capture.masks.agreement import MIN_AGREEMENT, agreement  # noqa: E402
-from neuma_lib.capture.masks.mask_refinement import redrawn_masks  # noqa: E402
+from neuma_lib.capture.masks.mask_refinement import refined_masks  # noqa: E402
 from neuma_lib.capture.masks.regions import grown, iou  # noqa: E402
 
 COUNT = 14
@@ -48,7 +48,7 @@ def test_lost_parts_come_back_shadows_go_and_own_masks_stay():
     kept = [i == 4 for i in range(COUNT)]
     assert agreement(first, VIEWS, KS)[5] < MIN_AGREEMENT
     before = np.array([iou(a, b) for a, b in zip(first, true)])
-    found = redrawn_masks(pictures, first, VIEWS, KS, kept)
+    found = refined_masks(pictures, first, VIEWS, KS, kept)
     after = np.array([iou(a, b) for a, b in zip(found, true)])
     assert (found[4] == first[4]).all() and before[4] < 0.93
     assert before[[2, 5, 7]].max() < 0.75 and before[::2].max() < 0.93
@@ -59,7 +59,7 @@ def test_lost_parts_come_back_shadows_go_and_own_masks_stay():
 def test_what_is_right_stays_right_and_progress_is_told():
     pictures, true, _ = photographs(np.random.default_rng(4))
     told = []
-    found = redrawn_masks(pictures, true, VIEWS, KS, progress=lambda *done: told.append(done))
+    found = refined_masks(pictures, true, VIEWS, KS, progress=lambda *done: told.append(done))
     assert min(iou(a, b) for a, b in zip(found, true)) > 0.97
     assert told[-1] == (2 * COUNT, 2 * COUNT) and [done for done, _ in told] == list(range(1, 2 * COUNT + 1))
 
@@ -68,6 +68,6 @@ def test_a_photograph_that_does_not_show_the_body_keeps_its_mask():
     pictures, true, _ = photographs(np.random.default_rng(5))
     views = VIEWS.copy()
     views[3] = np.diag([-1.0, 1.0, -1.0, 1.0]) @ views[3]  # looks the other way
-    found = redrawn_masks(pictures, true, views, KS)
+    found = refined_masks(pictures, true, views, KS)
     assert (found[3] == true[3]).all()
     assert min(iou(a, b) for i, (a, b) in enumerate(zip(found, true)) if i != 3) > 0.96

@@ -90,8 +90,8 @@ def test_own_masks_of_a_video_show_its_flight():
     masks = np.stack([disc(15 + 200 * t, 12 + 0.5 * 1500 * t * t) for t in times])
     masks[5] = False
     found = given_masks(masks, times)
-    assert found.masks is masks and [arc.frames for arc in found.arcs] == [(0, 11)]
-    assert given_masks(masks[:3], times[:3]).arcs == ()
+    assert found.masks is masks and [track.frames for track in found.tracks] == [(0, 11)]
+    assert given_masks(masks[:3], times[:3]).tracks == ()
 
 
 def test_own_masks_lie_in_the_captures_folder(tmp_path):
@@ -121,22 +121,3 @@ def test_a_camera_that_saw_no_flight_is_named():
     )
     with refused("mug, first, left"):
         flight.find_flight([seen], "mug, first")
-
-
-def test_the_pages_checks_follow_what_was_found():
-    report = {
-        "gravity_ratio": 1.07,
-        "gravity_ratio_deviation": 0.005,
-        "gravity_angle_deg": 0.4,
-        "gravity_angle_deviation_deg": 0.1,
-        "rms_px": 0.3,
-        "agreement": {"left": 0.9, "right": 0.5},
-    }
-    good = {what: fine for what, _, _, fine in flight.flight_checks("first", report)}
-    assert good == {
-        "gravity in outlines of first": False,
-        "down in outlines of first": True,
-        "flight in first": True,
-        "mask of left at rest, first": True,
-        "mask of right at rest, first": False,
-    }

@@ -3,7 +3,7 @@
 import numpy as np
 
 from neuma_lib.capture.frames import Timeline
-from neuma_lib.capture.report.page import checks, markdown
+from neuma_lib.capture.report.page import checks, flight_checks, gravity_checks, markdown
 
 GOOD = {
     "registered": 40,
@@ -46,6 +46,27 @@ def test_page_shows_checks_and_pictures():
     page = markdown(
         "mug", checks({**GOOD, "reprojection_error_px": 2.0}, {}), {"Floor": "floor.png"}, "No videos."
     )
-    assert "| reprojection error | 2.00 px | < 1 px | **look** |" in page
+    assert "| reprojection error | 2.00 px | < 1 px | **failed** |" in page
     assert "| pictures with a place | 40 of 40 | all | ok |" in page
     assert "![Floor](floor.png)" in page and "No videos." in page and page.startswith("# mug\n")
+
+
+def test_checks_of_a_flight_mark_gravity_and_masks():
+    report = {
+        "gravity_ratio": 1.07,
+        "gravity_ratio_deviation": 0.005,
+        "gravity_angle_deg": 0.4,
+        "gravity_angle_deviation_deg": 0.1,
+        "rms_px": 0.3,
+        "agreement": {"left": 0.9, "right": 0.5},
+    }
+    good = {
+        check.what: check.good for check in gravity_checks("first", report) + flight_checks("first", report)
+    }
+    assert good == {
+        "gravity in first": False,
+        "down in first": True,
+        "flight in first": True,
+        "mask of left at rest, first": True,
+        "mask of right at rest, first": False,
+    }

@@ -15,13 +15,13 @@ from neuma_lib.capture.released import (
     read_configured,
     read_released,
     read_shots,
-    released_captures,
     room_cameras,
     seen_size,
     video_frames,
 )
 from neuma_lib.config.capture import ReleasedConfig
 from neuma_lib.io.images import OPENGL_TO_OPENCV
+from neuma_lib.project.released_captures import released_captures
 from tests.support import released_layouts as layouts
 from tests.support.errors import refused
 

@@ -11,7 +11,7 @@ from PIL import Image
 from neuma_lib.capture.report import warnings as module
 from neuma_lib.capture.report.images import COLUMNS
 from neuma_lib.capture.report.page import Check
-from neuma_lib.capture.report.report import Film, Report, number, page, picture_uri, prefixed, room_value
+from neuma_lib.capture.report.report import Film, number, page, picture_uri, prefixed, room_value
 from tests.support.errors import refused
 
 NASTY = "<script>alert(\"x\")</script> & 'mug'"
@@ -85,12 +85,12 @@ def whole(tmp_path):
 
 
 def test_the_page_holds_all_that_it_shows_and_asks_for_nothing_else(whole):
-    read = Reader(page(Report(**whole)))
+    read = Reader(page(**whole))
     assert {"video", "img", "table", "details"} <= set(read.tags) and "script" not in read.tags
     assert all(link.startswith(("data:", "#")) for link in read.links) and len(read.links) > 5
     anchors = [link[1:] for link in read.links if link.startswith("#")]
-    assert set(anchors) == set(re.findall(r'<h2 id="([^"]+)"', page(Report(**whole))))
-    style = page(Report(**whole)).partition("<style>")[2].partition("</style>")[0]
+    assert set(anchors) == set(re.findall(r'<h2 id="([^"]+)"', page(**whole)))
+    style = page(**whole).partition("<style>")[2].partition("</style>")[0]
     assert "url(" not in style and "@import" not in style
     for text in (
         "40 photographs.",
@@ -119,14 +119,14 @@ def test_names_and_texts_are_escaped(whole, tmp_path):
         "rows": [row(throw=NASTY, camera=NASTY, title=NASTY)],
         "identified": identified(family=NASTY, ties=[NASTY]),
     }
-    read = Reader(page(Report(**{**whole, **nasty})))
+    read = Reader(page(**{**whole, **nasty}))
     assert "script" not in read.tags
     assert read.said.count(NASTY) >= 15
     assert all(link.startswith(("data:", "#")) for link in read.links)
 
 
 def test_what_is_missing_is_said():
-    said = Reader(page(Report("mug", "NeuMA"))).said
+    said = Reader(page("mug", "NeuMA")).said
     for text in (
         "There are no videos.",
         "No pictures were measured.",
@@ -141,9 +141,7 @@ def test_what_is_missing_is_said():
 def test_files_that_are_not_there_are_said_to_be_missing(whole, tmp_path):
     gone = tmp_path / "gone"
     films = [Film("one", "left", True, gone)]
-    read = Reader(
-        page(Report(**{**whole, "films": films, "pictures": {"Videos": {"Sheet": gone}}, "curves": gone}))
-    )
+    read = Reader(page(**{**whole, "films": films, "pictures": {"Videos": {"Sheet": gone}}, "curves": gone}))
     assert "The video of left is missing." in read.said and "Sheet: the picture is missing." in read.said
     assert "There are no stress curves." in read.said and "video" not in read.tags
 
@@ -166,7 +164,7 @@ def test_stresses_are_those_of_the_room():
     assert room_value("viscosity", 40.0, 2.0) == (10.0, "Pa s")
     assert room_value("friction_angle", 30.0, 2.0) == (30.0, "°")
     assert room_value("yield_strain", 0.1, 2.0) == (0.1, "")
-    shown = Reader(page(Report("mug", "NeuMA", identified=identified(), scale=2.0))).said
+    shown = Reader(page("mug", "NeuMA", identified=identified(), scale=2.0)).said
     assert "100 kPa" in shown and "250 Pa" in shown and "lengths are 2 times" in shown
     # Two standard deviations of the logarithm, and one that says nothing.
     assert f"{number(250 / math.exp(0.1))} to {number(250 * math.exp(0.1))}" in shown

@@ -13,7 +13,6 @@ from neuma_lib.capture.report.images import (
     exposed,
     image_rows,
     images_csv,
-    overlap,
 )
 from neuma_lib.evaluation.image_metrics import object_window, psnr, ssim
 from tests.support.errors import refused
@@ -90,11 +89,6 @@ def test_pictures_of_other_sizes_are_refused(scene):
 def test_the_empty_scene_gets_the_exposure_of_the_frame():
     plate = np.array([[[100, 200, 50]]], np.uint8)
     np.testing.assert_allclose(exposed(plate, (0.5, 2.0, 1.0), (10, 0, -60)), [[[60 / 255, 1, 0]]], atol=1e-6)
-
-
-def test_masks_that_are_empty_agree():
-    nothing = torch.zeros(4, 4, dtype=torch.bool)
-    assert overlap(nothing, nothing) == 1 and overlap(nothing, ~nothing) == 0
 
 
 def test_differences_are_dark():

@@ -72,5 +72,5 @@ def test_colours_are_learned_from_the_object_and_not_from_its_shadow():
     red = palette.colours[:, 0] > 2 * palette.colours[:, 1]
     assert palette.shares[red].sum() > 0.95 and palette.shares.sum() == pytest.approx(1)
     assert outlines.learn_palette([frame], [plate], [np.zeros(body.shape, bool)]) is None
-    found = outlines.outline(frame, plate, body | dark, palette)
+    found = outlines.silhouette(frame, plate, body | dark, palette)
     assert (found & body).sum() / (found | body).sum() > 0.97

@@ -20,7 +20,7 @@ pytest.importorskip("cv2")
 
 from neuma_lib.capture.masks import background as plates  # noqa: E402
 from neuma_lib.capture.masks import video_masks as module  # noqa: E402
-from neuma_lib.capture.masks.regions import MAX_MOVING, check_flight, iou  # noqa: E402
+from neuma_lib.capture.masks.regions import MAX_MOVING, centroid, check_flight, iou  # noqa: E402
 from tests.support.errors import refused  # noqa: E402
 
 MIN_IOU = 0.96  # what the masks of the synthetic capture have to reach
@@ -36,9 +36,9 @@ def test_a_fall_is_masked_with_shadow_drifting_exposure_and_noise():
     found = module.video_masks(frames, "drop.mp4", np.rint(plate).astype(np.uint8), TIMES)
     assert min(overlaps(found)) > MIN_IOU
     # 800 pixels with an edge of some 95: half a pixel of random error along it moves the centre by less than 0.1
-    np.testing.assert_allclose(found.centroids, places(), atol=0.3)
+    np.testing.assert_allclose([centroid(mask) for mask in found.masks], places(), atol=0.3)
     # the flight ends within a frame of the contact, after which the parabola would go on
-    assert len(found.arcs) == 1 and abs(found.arcs[0].frames[1] - CONTACT) <= 1
+    assert len(found.tracks) == 1 and abs(found.tracks[0].frames[1] - CONTACT) <= 1
     assert found.moving.max() < MAX_MOVING
     jumps = check_flight(found.masks, "drop.mp4", range(CONTACT))
     assert jumps.max() < 0.06
@@ -67,7 +67,7 @@ def test_a_place_that_is_known_goes_before_the_arc():
         frame[150:180, 250:290] = (40, 60, 200)
     given = np.tile([270.0, 165.0], (COUNT, 1))
     found = module.video_masks(frames, "a.mp4", np.rint(plate).astype(np.uint8), TIMES, given)
-    np.testing.assert_allclose(found.centroids, given, atol=0.3)
+    np.testing.assert_allclose([centroid(mask) for mask in found.masks], given, atol=0.3)
 
 
 def test_exposure_is_found_exactly_and_beside_what_moves():

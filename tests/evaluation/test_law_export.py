@@ -113,7 +113,7 @@ def test_a_law_comes_back_from_one_file(tmp_path, make):
 @pytest.mark.parametrize("make", [networks, structured])
 def test_prior_and_adaptor_apart_keep_their_weight(tmp_path, make):
     law, path = make(), tmp_path / "law.safetensors"
-    save_law(path, law, about_law(law, DT), apart=True)
+    save_law(path, law, about_law(law, DT), separate_adaptor=True)
     again = load_law(path)
     same(again, law)
     for each in (law, again):
@@ -126,7 +126,7 @@ def test_prior_and_adaptor_apart_keep_their_weight(tmp_path, make):
 def test_as_a_prior_an_adaptor_apart_is_merged(tmp_path):
     """Else a training, which attaches a new one, would forget it."""
     law, path = networks(), tmp_path / "law.safetensors"
-    save_law(path, law, about_law(law, DT), apart=True)
+    save_law(path, law, about_law(law, DT), separate_adaptor=True)
     prior = load_adaptable(path, DT)
     prior.attach_adaptor(rank=4)
     same(prior, law, rel=1e-6)
@@ -141,7 +141,7 @@ def test_the_adaptor_of_a_structured_law_is_a_whole_law(tmp_path):
 
 def test_equal_laws_give_equal_bytes(tmp_path):
     for name in "ab":
-        save_law(tmp_path / name, networks(), about_law(networks(), DT), apart=True)
+        save_law(tmp_path / name, networks(), about_law(networks(), DT), separate_adaptor=True)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
@@ -202,7 +202,7 @@ def test_another_step_is_refused(tmp_path, make, load):
 def test_another_step_can_be_asked_for(tmp_path, make):
     law, path = make(), tmp_path / "law.safetensors"
     save_law(path, law, about_law(law, DT))
-    same(load_law(path, dt=2 * DT, any_step=True), law)
+    same(load_law(path, dt=2 * DT, any_time_step=True), law)
     assert main(["law", "export", str(path), str(tmp_path / "any.safetensors"), "--any-step"]) == 0
     same(load_prior(tmp_path / "any.safetensors", dt=2 * DT), law)
     assert read_about(tmp_path / "any.safetensors")["dt"] == DT

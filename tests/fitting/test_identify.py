@@ -16,7 +16,7 @@ from neuma_lib.fitting.frame_batches import first_contact
 from neuma_lib.fitting.identified import FamilyFit
 from neuma_lib.fitting.identify import _better_later, _prune, _Run, _select, identify
 from neuma_lib.fitting.least_squares import Linearisation, jackknife, levenberg_marquardt
-from neuma_lib.fitting.thrown_video import VideoResiduals, averaged
+from neuma_lib.fitting.video_residuals import VideoResiduals, averaged
 from neuma_lib.io.files import write_json
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.mechanics.combinations import named_combinations
@@ -336,7 +336,7 @@ def test_uncertainty_covers_the_error_of_patches_that_last():
 
 
 def test_a_family_that_diverges_loses_and_alone_is_an_error(monkeypatch):
-    import neuma_lib.fitting.thrown_video as module
+    import neuma_lib.fitting.video_residuals as module
 
     def rollout_batch(model, laws, *args, **options):
         paths = real(model, laws, *args, **options)

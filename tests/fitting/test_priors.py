@@ -7,6 +7,7 @@ import torch
 from safetensors.torch import save
 
 from neuma_lib.config.priors import RegressionConfig
+from neuma_lib.fitting.prior_launches import random_launch, random_rotations, reference_law, visited_stretches
 from neuma_lib.fitting.prior_regression import (
     Network,
     missing_states,
@@ -14,7 +15,6 @@ from neuma_lib.fitting.prior_regression import (
     targets,
     train_by_regression,
 )
-from neuma_lib.fitting.prior_throws import random_launch, random_rotations, reference_law, visited_stretches
 from neuma_lib.fitting.prior_training import evaluate_prior, remark, train_prior
 from neuma_lib.fitting.soap import SOAP
 from neuma_lib.mechanics.elasticity import STRETCH_MIN

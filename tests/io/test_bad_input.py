@@ -1,4 +1,4 @@
-"""Bad files end in one line that names the file; nothing is written, and no memory is taken on a header's word."""
+"""Bad files end in one line that names the file. Nothing is written, and headers cannot claim memory."""
 
 import json
 import pickle
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.core
 HUGE = 2**26
 """Zeros that archives below hide [bytes]."""
 MEMORY = HUGE / 2
-"""Most that a refusal may take [bytes]; what the headers below claim is 64 MiB to 22 TiB."""
+"""Maximum of a refusal [bytes]. The headers below claim 64 MiB to 22 TiB."""
 
 
 def refused(read, path, message=None):
@@ -60,15 +60,10 @@ def ply(body, form="binary_little_endian", end="end_header\n", data=b"\0" * 36):
 
 PLY = {
     "empty": b"",
-    "no header": b"solid nothing",
     "no end of the header": b"ply\nformat ascii 1.0\n" + b"comment\n" * 20000,
     "negative count": ply(f"element vertex -3\n{XYZ}"),
-    "negative count in text": ply(f"element vertex -3\n{XYZ}", "ascii"),
     "count in words": ply(f"element vertex three\n{XYZ}"),
-    "count with a fraction": ply(f"element vertex 3.5\n{XYZ}"),
-    "no count": ply(f"element vertex\n{XYZ}"),
     "count of 10^4300": ply(f"element vertex 1{'0' * 5000}\n{XYZ}"),
-    "property before its element": ply(f"{XYZ}element vertex 3\n"),
     "nothing after end_header": ply(f"element vertex 0\n{XYZ}", end="end_header", data=b""),
     "no new line after end_header": ply(f"element vertex 3\n{XYZ}", end="end_header"),
     "claims a terabyte": ply(f"element vertex {2**37}\n{XYZ}"),
@@ -79,9 +74,7 @@ PLY = {
     "truncated text": ply(f"element vertex 4\n{XYZ}", "ascii", data=b"0 0 0\n" * 3 + b" " * 99),
     "text that is no number": ply(f"element vertex 1\n{XYZ}", "ascii", data=b"0 zero 0\n"),
     "bytes that are no text": ply(f"element vertex 1\n{XYZ}", "ascii", data=b"\xff\xff\xff\xff\xff\xff\n"),
-    "unknown format": ply(f"element vertex 3\n{XYZ}", "binary_middle_endian"),
     "unknown type": ply("element vertex 3\nproperty quaternion x\n"),
-    "two properties of one name": ply("element vertex 3\nproperty float x\nproperty float x\n"),
     "two elements of one name": ply(f"element vertex 1\n{XYZ}element vertex 1\n{XYZ}"),
     "vertices with a list": ply("element vertex 3\nproperty list uchar int vertex_indices\n"),
     "a list elsewhere": ply(
@@ -148,17 +141,13 @@ HDF5 = {
     "external link": external_link,
     "soft link": soft_link,
     "dangling link": lambda file, folder: file.update(x=h5py.SoftLink("/absent")),
-    "link to itself": lambda file, folder: file.update(x=h5py.SoftLink("/x")),
     "external storage": external_storage,
     "virtual dataset": virtual,
     "a group": lambda file, folder: file.create_group("x"),
     "a type": lambda file, folder: file.update(x=np.dtype("f8")),
     "a text": lambda file, folder: file.update(x="text"),
-    "bytes": lambda file, folder: file.update(x=np.bytes_(b"text")),
-    "records": lambda file, folder: file.update(x=np.zeros(2, [("a", "f4")])),
     "texts of any length": lambda file, folder: file.create_dataset("x", (2,), h5py.string_dtype()),
     "references": lambda file, folder: file.create_dataset("x", (2,), h5py.ref_dtype),
-    "complex numbers": lambda file, folder: file.update(x=np.zeros(2, complex)),
     "nothing": lambda file, folder: file.update(x=h5py.Empty("f4")),
     "claims 22 TiB": lambda file, folder: file.create_dataset("x", (22 * 2**40,), "u1"),
     "claims 22 TiB in chunks": lambda file, folder: file.create_dataset(
@@ -167,7 +156,6 @@ HDF5 = {
     "chunks that were never written": incomplete,
     "an infinite number": lambda file, folder: file.update(x=np.array([1, np.inf])),
     "an attribute that is an array": attribute(np.zeros(9)),
-    "an attribute that is empty": attribute(h5py.Empty("f4")),
 }
 
 
@@ -179,7 +167,7 @@ def test_hdf5(tmp_path, change):
     refused(lambda p: read_arrays(p, required=("x",)), path)
 
 
-def test_what_is_not_asked_for_is_not_read(tmp_path):
+def test_other_datasets_are_not_read(tmp_path):
     path = tmp_path / "more.h5"
     with h5py.File(path, "w") as file:
         external_link(file, tmp_path)
@@ -188,7 +176,7 @@ def test_what_is_not_asked_for_is_not_read(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89HDF\r\n\x1a\n", b"\x89HDF\r\n\x1a\n" + bytes(300)])
-def test_what_is_not_hdf5(tmp_path, content):
+def test_other_files_than_hdf5(tmp_path, content):
     path = tmp_path / "bad.h5"
     path.write_bytes(content)
     refused(read_arrays, path)
@@ -199,9 +187,8 @@ def test_what_is_not_hdf5(tmp_path, content):
 
 def picture(kind="PNG", size=(16, 12), **options):
     file = BytesIO()
-    Image.new("RGBA" if kind != "JPEG" else "RGB", size, (1, 2, 3, 255)[: 3 + (kind != "JPEG")]).save(
-        file, kind, **options
-    )
+    image = Image.new("RGBA", size, (1, 2, 3, 255))
+    (image.convert("RGB") if kind == "JPEG" else image).save(file, kind, **options)
     return file.getvalue()
 
 
@@ -230,20 +217,15 @@ LISTS = {
     "a million by a million": with_top(w=10**6, h=10**6),
     "sha256 5": with_frame(sha256=5),
     "matrix of text": with_frame(transform_matrix=[["a"] * 4] * 4),
-    "matrix of numbers in text": with_frame(transform_matrix=[["1"] * 4] * 4),
     "ragged matrix": with_frame(transform_matrix=[[1, 0, 0, 0], [0, 1]]),
     "matrix of huge numbers": with_frame(transform_matrix=[[10**400] * 4] * 4),
-    "matrix of null": with_frame(transform_matrix=[[None] * 4] * 4),
     "nested matrix": with_frame(transform_matrix="NESTED").replace('"NESTED"', "[" * 500 + "]" * 500),
     "deep nesting": "[" * 100_000,
-    "deep nesting that ends": '{"frames": ' * 50_000 + "1" + "}" * 50_000,
     "NaN": with_frame(transform_matrix=[[float("nan")] * 4] * 4),
     "Infinity": with_top(fl_x=float("inf")),
     "overflow": with_top(fl_x=1).replace('"fl_x": 1,', '"fl_x": 1e999,'),
-    "number of 5000 digits": "[" + "1" * 5000 + "]",
     "not UTF-8": b"\xff\xfe\x00",
     "a number": "5",
-    "null": "null",
     "released: entry 5": "[5]",
     "released: file_path null": '[{"file_path": null, "c2w": [], "intrinsic": []}]',
     "released: c2w of text": '[{"file_path": "a.png", "c2w": [["a"]], "intrinsic": [[1]]}]',
@@ -273,15 +255,12 @@ IMAGES = {
     "text": b"no image",
     "a GIF": picture("GIF"),
     "a TIFF": picture("TIFF"),
-    "a BMP": picture("BMP"),
     "an EPS": b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 16 12\n%%EndComments\n",
     "a JPEG, which has no alpha": picture("JPEG"),
     "a bomb": png(7000, 7000, bytes(10)),
     "claims 10^6 x 10^6": png(10**6, 10**6, bytes(10)),
-    "claims 2^31": png(2**31 - 1, 2**31 - 1, bytes(10)),
     "of another size": picture(size=(17, 12)),
     "truncated": picture()[:-20],
-    "truncated WebP": picture("WEBP", lossless=True)[:-9],
     "rows that are missing": png(16, 12, bytes(10)),
     "a text chunk that unpacks to 64 MiB": picture()[:33]
     + chunk(b"zTXt", b"a\0\0" + zlib.compress(bytes(HUGE), 1))
@@ -347,7 +326,6 @@ TORCH = {
     "a command": torch_file({"elasticity": Command(), "plasticity": Command()}),
     "zeros on request": torch_file({"elasticity": Zeros()}),
     "a list": torch_file([1, 2]),
-    "a tensor": torch_file(torch.zeros(3)),
     "parts that are numbers": torch_file({"elasticity": 5, "plasticity": 5}),
     "weights that are numbers": torch_file(law_parts(5)),
     "weights that are text": torch_file(law_parts("text")),

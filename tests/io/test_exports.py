@@ -1,4 +1,4 @@
-"""Motions for other programs: what independent readers find in the files is what was simulated."""
+"""Motions for other programs: independent readers find the simulated motion in the files."""
 
 import dataclasses
 import json
@@ -65,16 +65,16 @@ def test_scales_and_rotations_make_the_covariances_again():
 def test_exported_gaussians_are_those_of_the_body_carried_along(body):
     """Means and covariances of x -> A x + b, and harmonics turned by the rotation of A = R S."""
     A = TURN @ STRETCH
-    found = gaussians_at(body, *moved(body, A))
-    torch.testing.assert_close(found.means, body.gaussians.means @ A.T + SHIFT, atol=1e-12, rtol=0)
-    torch.testing.assert_close(found.covars(), A @ body.gaussians.covars() @ A.T, atol=1e-12, rtol=1e-9)
+    exported = gaussians_at(body, *moved(body, A))
+    torch.testing.assert_close(exported.means, body.gaussians.means @ A.T + SHIFT, atol=1e-12, rtol=0)
+    torch.testing.assert_close(exported.covars(), A @ body.gaussians.covars() @ A.T, atol=1e-12, rtol=1e-9)
     R = local_rotations(body, A.expand(len(body.x0), 3, 3))
     torch.testing.assert_close(R, TURN.expand_as(R), atol=1e-12, rtol=0)
     seen = torch.nn.functional.normalize(body.gaussians.means + 0.1, dim=1)
-    sh, turned = body.gaussians.sh(), found.sh()
+    sh, turned = body.gaussians.sh(), exported.sh()
     torch.testing.assert_close(colours(turned, seen @ TURN.T), colours(sh, seen), atol=1e-12, rtol=0)
-    as_they_are = gaussians_at(body, *moved(body, A), rotate_harmonics=False)
-    assert torch.equal(as_they_are.sh(), sh)
+    unrotated = gaussians_at(body, *moved(body, A), rotate_harmonics=False)
+    assert torch.equal(unrotated.sh(), sh)
 
 
 def test_local_rotations_are_rotations_even_where_a_body_is_turned_inside_out(body):
@@ -89,15 +89,15 @@ def test_local_rotations_are_rotations_even_where_a_body_is_turned_inside_out(bo
 
 
 def test_frames_open_as_3dgs_files(tmp_path, body):
-    found = gaussians_at(body, *moved(body, TURN))
-    save_gaussians(tmp_path / "0000.ply", found)
+    exported = gaussians_at(body, *moved(body, TURN))
+    save_gaussians(tmp_path / "0000.ply", exported)
     rows = PlyData.read(tmp_path / "0000.ply")["vertex"]
     names = [p.name for p in rows.properties]
     rest = [f"f_rest_{i}" for i in range(45)]
     assert names == [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity",
                      "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]  # fmt: skip
     positions = np.stack([rows[axis] for axis in "xyz"], axis=1)
-    np.testing.assert_array_equal(positions, found.means.numpy().astype(np.float32))
+    np.testing.assert_array_equal(positions, exported.means.numpy().astype(np.float32))
 
 
 @pytest.fixture(scope="module")
@@ -141,9 +141,8 @@ def test_gltf_holds_the_motion(tmp_path, surface):
         entry = content["accessors"][index]
         view = content["bufferViews"][entry["bufferView"]]
         assert view["byteOffset"] % 4 == 0
-        raw = np.frombuffer(body[view["byteOffset"] :][: view["byteLength"]], "<f4").reshape(
-            entry["count"], -1
-        )
+        raw = np.frombuffer(body[view["byteOffset"] :][: view["byteLength"]], "<f4")
+        raw = raw.reshape(entry["count"], -1)
         if "min" in entry:
             np.testing.assert_array_equal(raw.min(axis=0), np.float32(entry["min"]))
             np.testing.assert_array_equal(raw.max(axis=0), np.float32(entry["max"]))
@@ -155,19 +154,12 @@ def test_gltf_holds_the_motion(tmp_path, surface):
     sampler = content["animations"][0]["samplers"][0]
     np.testing.assert_array_equal(array(sampler["input"])[:, 0], np.float32(times))
     weights = array(sampler["output"]).reshape(len(times), -1)
-    shown = base + np.einsum("tk,kvc->tvc", weights, targets)
-    np.testing.assert_allclose(shown, vertices, atol=2 * np.finfo(np.float32).eps)  # metres, below 1
+    animated = base + np.einsum("tk,kvc->tvc", weights, targets)
+    np.testing.assert_allclose(animated, vertices, atol=2 * np.finfo(np.float32).eps)  # metres, below 1
     np.testing.assert_allclose(array(primitive["attributes"]["COLOR_0"]), linear(colors), atol=1e-7)
-
-
-def test_gltf_is_valid_to_its_library(tmp_path, surface):
-    pygltflib = pytest.importorskip("pygltflib")
-    write_glb(tmp_path / "a.glb", *surface)
-    found = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))
-    assert len(found.meshes[0].primitives[0].targets) == 3 and len(found.animations[0].channels) == 1
     write_glb(tmp_path / "b.glb", *(part[:1] if k in (0, 2) else part for k, part in enumerate(surface)))
-    still = pygltflib.GLTF2().load(str(tmp_path / "b.glb"))
-    assert not still.animations and not still.meshes[0].primitives[0].targets
+    still = (tmp_path / "b.glb").read_bytes()
+    assert b"animations" not in still and b"targets" not in still
 
 
 @pytest.mark.parametrize("kind", ["usda", "usdc"])
@@ -232,10 +224,8 @@ def test_a_film_cuts_nothing_that_is_seen(body):
     g = body.gaussians
     large = dataclasses.replace(g, scales=0.25 + 0 * g.scales, sh0=-3 + 0 * g.sh0, shN=g.shN[:, :0])
     body = dataclasses.replace(body, gaussians=large).to(torch.float32)
-    x, F = (
-        torch.stack([a, b])
-        for a, b in zip(moved(body, torch.eye(3)), moved(body, STRETCH.float()), strict=True)
-    )
+    states = zip(moved(body, torch.eye(3)), moved(body, STRETCH.float()), strict=True)
+    x, F = map(torch.stack, states)
 
     def dark(points):
         """Largest darkness of border and picture, and the share of columns that are dark."""
@@ -245,7 +235,7 @@ def test_a_film_cuts_nothing_that_is_seen(body):
 
     border, darkest, filled = dark(seen_around(body, x, F))
     assert border < 0.1 * darkest and filled > 0.7
-    assert dark(x.numpy())[0] > 0.5 * darkest, "as centres would be framed"
+    assert dark(x.numpy())[0] > 0.5 * darkest, "as if centres were framed"
 
 
 @pytest.mark.slow
@@ -256,9 +246,9 @@ def test_blend_holds_the_motion(tmp_path, surface):
     with Image.open(tmp_path / "a.png") as image:
         alpha = np.asarray(image)[..., 3]
     assert 0.005 < (alpha > 128).mean() < 0.5
-    found = read_blend(tmp_path / "a.blend", [*times.tolist(), float(times[1:3].mean())])
+    read = read_blend(tmp_path / "a.blend", [*times.tolist(), float(times[1:3].mean())])
     # times are single precision in Blender, a frame is 1/24 s
-    np.testing.assert_allclose(found["co"][:4], vertices, atol=1e-5)
-    np.testing.assert_allclose(found["co"][4], vertices[1:3].mean(axis=0), atol=1e-5)
-    np.testing.assert_allclose(found["world"][:3, :3] @ [0, 1, 0], [0, 0, 1], atol=1e-6)  # y is up: z
+    np.testing.assert_allclose(read["co"][:4], vertices, atol=1e-5)
+    np.testing.assert_allclose(read["co"][4], vertices[1:3].mean(axis=0), atol=1e-5)
+    np.testing.assert_allclose(read["world"][:3, :3] @ [0, 1, 0], [0, 0, 1], atol=1e-6)  # y is up: z
     assert Path(tmp_path / "a.blend").stat().st_size > 1000

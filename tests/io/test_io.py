@@ -1,4 +1,4 @@
-"""Every artifact comes back as it was written, in the same bytes each time; damaged ones are named."""
+"""Reading gives what was written, equal content gives equal bytes, and damaged files are reported."""
 
 import json
 
@@ -76,11 +76,11 @@ def test_arrays_round_trip_with_units(tmp_path):
 
     arrays, path = trajectory(), tmp_path / "particles.h5"
     write_arrays(path, arrays, {"dt": 1e-3, "scene": {"shape": "ball"}, "title": "Ball"})
-    found, attributes = read_arrays(path, required=("x", "frames"))
-    assert set(found) == {"x", "F", "frames"}
-    for name in found:
-        assert found[name].dtype == arrays[name].dtype
-        np.testing.assert_array_equal(found[name], arrays[name])
+    read, attributes = read_arrays(path, required=("x", "frames"))
+    assert set(read) == {"x", "F", "frames"}
+    for name, array in read.items():
+        assert array.dtype == arrays[name].dtype
+        np.testing.assert_array_equal(array, arrays[name])
     assert attributes["dt"] == 1e-3 and json.loads(attributes["scene"]) == {"shape": "ball"}
     with h5py.File(path) as file:
         assert file["x"].attrs["unit"] == "m" and "shape (T, N, 3)" in file["x"].attrs["description"]
@@ -91,9 +91,8 @@ def test_arrays_round_trip_with_units(tmp_path):
 def test_arrays_problems(tmp_path):
     path = tmp_path / "particles.h5"
     write_arrays(path, trajectory())
-    with refused("particles.h5") as error:
+    with refused("particles.h5", problem="v, tracers"):
         read_arrays(path, required=("x", "v", "tracers"))
-    assert "v, tracers" in error.value.problem
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with refused("particles.h5"):
@@ -120,15 +119,8 @@ def image_set(tmp_path):
             Image.fromarray(pixels, "RGBA").save(tmp_path / name)
             pose = np.eye(4)
             pose[:3, 3] = (0.1 * view, 0.5, 2.0)
-            frames.append(
-                {
-                    "file_path": name,
-                    "transform_matrix": pose.tolist(),
-                    "view": view,
-                    "step": step,
-                    "time": 1e-3 * step,
-                }
-            )
+            frame = {"file_path": name, "transform_matrix": pose.tolist(), "view": view, "step": step}
+            frames.append({**frame, "time": 1e-3 * step})
     path = tmp_path / "transforms.json"
     write_transforms(path, INTRINSICS, frames)
     return path
@@ -144,14 +136,15 @@ def test_image_set(image_set):
     images = read_image_set(image_set)
     assert images.images.shape == (6, 12, 16, 4) and images.images.dtype == np.uint8
     assert (images.width, images.height) == (16, 12)
-    steps, index, columns = images.video([0, 1])
-    assert steps == (0, 2, 5) and index.shape == (3, 2)
-    assert images.images[index[2, 1], 0, 0, 0] == 51
+    assert images.views.tolist() == [1, 0] * 3 and images.steps.tolist() == [5, 5, 0, 0, 2, 2]
     np.testing.assert_allclose(images.Ks[0], [[20, 0, 8], [0, 21, 6], [0, 0, 1]])
     # A point one metre in front of an OpenGL camera (its -z) is one metre along +z of the OpenCV camera.
-    point = images.viewmats[columns[1]] @ np.array([0.1, 0.6, 1.0, 1.0])
+    point = images.viewmats[0] @ np.array([0.1, 0.6, 1.0, 1.0])
     np.testing.assert_allclose(point, [0, -0.1, 1, 1], atol=1e-12)
     assert len(read_image_set(image_set, views=[1]).images) == 3
+    video = load_observation(image_set, [0, 1])
+    assert video.frames == (0, 2, 5) and video.images.shape == (3, 2, 12, 16, 4)
+    assert video.images[2, 1, 0, 0, 0] == 51
 
 
 def test_camera_angle_and_own_intrinsics_of_a_frame(image_set):
@@ -174,13 +167,8 @@ def test_camera_angle_and_own_intrinsics_of_a_frame(image_set):
     [
         (lambda d: [d.pop(k) for k in ("fl_x", "fl_y")], "transforms.json: frame 0 (d_1_005.png)"),
         (lambda d: d.update(fl_x=-3), "frame 0 (d_1_005.png): fl_x"),
-        (lambda d: d.update(frames=[]), "transforms.json: frames"),
-        (lambda d: d["frames"][2].pop("file_path"), "frame 2"),
         (lambda d: d["frames"][2].pop("transform_matrix"), "frame 2 (d_1_000.png): transform_matrix"),
-        (
-            lambda d: d["frames"][1].update(transform_matrix=(2 * np.eye(4)).tolist()),
-            "frame 1 (d_0_005.png): transform_matrix",
-        ),
+        (lambda d: d["frames"][1].update(transform_matrix=(2 * np.eye(4)).tolist()), "transform_matrix"),
         (lambda d: d.update(w=32), "w, h of d_1_005.png"),
     ],
 )
@@ -190,29 +178,24 @@ def test_bad_transforms(image_set, change, where):
         read_image_set(image_set)
 
 
-def test_missing_image(image_set):
-    (image_set.parent / "d_1_002.png").unlink()
-    with refused("d_1_002.png") as error:
-        read_image_set(image_set)
-    assert "--forcerun" in error.value.remedy
-
-
-def test_changed_image(image_set):
-    Image.new("RGBA", (16, 12), (1, 2, 3, 255)).save(image_set.parent / "d_0_000.png")
-    with refused("d_0_000.png"):
-        read_image_set(image_set)
-
-
 def without_checksums(data):
     for frame in data["frames"]:
         del frame["sha256"]
 
 
-def test_truncated_png(image_set):
+def test_missing_changed_and_truncated_images(image_set):
+    with Image.open(image_set.parent / "d_0_002.png") as image:
+        image.transpose(Image.Transpose.ROTATE_180).save(image_set.parent / "d_0_000.png")
+    with refused("d_0_000.png", problem="sha256"):
+        read_image_set(image_set)
     edit(image_set, without_checksums)
+    read_image_set(image_set)
     path = image_set.parent / "d_0_000.png"
     path.write_bytes(path.read_bytes()[:-40])
     with refused("d_0_000.png"):
+        read_image_set(image_set)
+    path.unlink()
+    with refused("d_0_000.png", remedy="--forcerun"):
         read_image_set(image_set)
 
 
@@ -228,36 +211,25 @@ def test_truncated_png(image_set):
 def test_unusable_images(image_set, image, message):
     edit(image_set, without_checksums)
     image.save(image_set.parent / "d_0_000.png")
-    with refused("d_0_000.png") as error:
+    with refused("d_0_000.png", problem=message):
         read_image_set(image_set)
-    assert message in error.value.problem
 
 
-def test_views_that_do_not_exist_or_do_not_match(image_set):
-    with refused("views"):
-        read_image_set(image_set).video([7])
+def test_a_view_must_exist(image_set):
     with refused("transforms.json: view 7"):
         load_observation(image_set, [0, 7])
-    edit(image_set, lambda d: d["frames"].pop(0))
-    with refused("views"):
-        read_image_set(image_set).video([0, 1])
 
 
 # ---- meshes
 
 
-def test_mesh_round_trip(tmp_path):
-    mesh = cube()
-    write_mesh(tmp_path / "mesh.ply", mesh.vertices, mesh.faces)
-    found = read_mesh(tmp_path / "mesh.ply")
-    np.testing.assert_allclose(found.vertices, mesh.vertices, atol=1e-8)
-    np.testing.assert_array_equal(found.faces, mesh.faces)
-
-
-def test_foreign_meshes(tmp_path):
-    mesh = cube()
+def test_meshes_of_this_library_and_of_others(tmp_path):
+    mesh, path = cube(), tmp_path / "mesh.ply"
+    write_mesh(path, mesh.vertices, mesh.faces)
+    loaded = read_mesh(path)
+    np.testing.assert_allclose(loaded.vertices, mesh.vertices, atol=1e-8)
+    np.testing.assert_array_equal(loaded.faces, mesh.faces)
     for encoding in ("ascii", "binary"):
-        path = tmp_path / f"{encoding}.ply"
         path.write_bytes(mesh.export(file_type="ply", encoding=encoding))
         assert read_mesh(path).volume == pytest.approx(mesh.volume, rel=1e-5)
 
@@ -266,28 +238,15 @@ def test_bad_meshes(tmp_path):
     mesh, path = cube(), tmp_path / "mesh.ply"
     vertices = mesh.vertices.copy()
     vertices[3, 1] = np.nan
-    write_mesh(path, vertices, mesh.faces)
-    with refused("mesh.ply") as error:
-        read_mesh(path)
-    assert "vertex 3 of 8" in error.value.problem
-    write_mesh(path, mesh.vertices, mesh.faces[1:])
-    with refused("mesh.ply") as error:
-        read_mesh(path)
-    assert "watertight" in error.value.problem
+    for corners, faces, problem in (
+        (vertices, mesh.faces, "vertex 3 of 8"),
+        (mesh.vertices, mesh.faces[:, ::-1], "inwards"),
+        (mesh.vertices, mesh.faces[1:], "watertight"),
+    ):
+        write_mesh(path, corners, faces)
+        with refused("mesh.ply", problem=problem):
+            read_mesh(path)
     assert len(read_mesh(path, watertight=False).faces) == 11
-    write_mesh(path, mesh.vertices, mesh.faces[:, ::-1])
-    with refused("mesh.ply") as error:
-        read_mesh(path)
-    assert "inwards" in error.value.problem
-    write_mesh(path, mesh.vertices, mesh.faces)
-    path.write_bytes(path.read_bytes()[:-7])
-    with refused("mesh.ply") as error:
-        read_mesh(path)
-    assert "claims" in error.value.problem
-    path.write_bytes(b"solid nothing")
-    with refused("mesh.ply") as error:
-        read_mesh(path)
-    assert "no header" in error.value.problem
 
 
 # ---- Gaussians
@@ -311,26 +270,17 @@ def random_gaussians(count=7, bands=9, seed=0):
 def test_gaussians_round_trip(tmp_path, bands):
     expected = random_gaussians(bands=bands)
     save_gaussians(tmp_path / "g.ply", expected)
-    found = load_gaussians(tmp_path / "g.ply")
+    loaded = load_gaussians(tmp_path / "g.ply")
     for name, array in vars(expected).items():
-        assert getattr(found, name).dtype == torch.float32
-        torch.testing.assert_close(getattr(found, name), array, rtol=2e-6, atol=2e-6)
+        assert getattr(loaded, name).dtype == torch.float32
+        torch.testing.assert_close(getattr(loaded, name), array, rtol=2e-6, atol=2e-6)
 
 
 def test_gaussians_have_the_layout_of_the_3dgs_release(tmp_path):
     expected = random_gaussians(bands=16)
     save_gaussians(tmp_path / "g.ply", expected)
     rows, _ = read_ply(tmp_path / "g.ply")
-    names = [
-        "x",
-        "y",
-        "z",
-        "nx",
-        "ny",
-        "nz",
-        *(f"f_dc_{i}" for i in range(3)),
-        *(f"f_rest_{i}" for i in range(45)),
-    ]
+    names = [*"xyz", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(45))]
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     assert list(rows.dtype.names) == names
     # f_rest is stored channel by channel: 15 coefficients of red, then of green, then of blue.
@@ -348,23 +298,20 @@ def test_bad_gaussians(tmp_path):
     broken = random_gaussians()
     broken.means[4, 0] = np.inf
     save_gaussians(path, broken)
-    with refused("g.ply") as error:
+    with refused("g.ply", problem="means of Gaussian 4"):
         load_gaussians(path)
-    assert "means of Gaussian 4" in error.value.problem
     rows = read_ply(path)[0].copy()
     rows["x"], rows["opacity"][:3] = 0.0, [np.inf, -np.inf, np.nan]
     write_ply(path, rows)
-    with refused("g.ply") as error:
+    with refused("g.ply", problem="opacities of Gaussian 2"):
         load_gaussians(path)
-    assert "opacities of Gaussian 2" in error.value.problem
     rows["opacity"][2] = 0.0
     write_ply(path, rows)
     assert load_gaussians(path).opacities[:3].tolist() == [1.0, 0.0, 0.5], "converters from .spz write these"
     save_gaussians(path, random_gaussians(bands=4))
     path.write_bytes(path.read_bytes().replace(b"property float f_rest_8\n", b"property float other\n"))
-    with refused("g.ply") as error:
+    with refused("g.ply", problem="8 f_rest_"):
         load_gaussians(path)
-    assert "8 f_rest_" in error.value.problem
 
 
 # ---- weights
@@ -376,16 +323,15 @@ def test_weights(tmp_path):
     write_weights(path, tensors, {"rank": 4, "settings": {"lr": 0.1}})
     (tmp_path / "any").touch()
     assert path.stat().st_mode == (tmp_path / "any").stat().st_mode, "read by whoever reads other files"
-    found, metadata = read_weights(path)
+    read, metadata = read_weights(path)
     assert metadata == {"rank": 4, "settings": {"lr": 0.1}}
-    assert all(torch.equal(found[name], tensors[name]) for name in tensors)
+    assert all(torch.equal(read[name], tensors[name]) for name in tensors)
     path.write_bytes(path.read_bytes()[:-9])
     with refused("adaptor.safetensors"):
         read_weights(path)
     write_weights(path, {"B": torch.tensor([1.0, float("nan")])}, {})
-    with refused("adaptor.safetensors") as error:
+    with refused("adaptor.safetensors", problem="B is not finite"):
         read_weights(path)
-    assert "B is not finite" in error.value.problem
 
 
 # ---- same content, same bytes
@@ -416,7 +362,7 @@ def test_same_bytes(tmp_path, write):
     assert str(tmp_path).encode() not in contents.pop()
 
 
-def test_an_identified_start_throws_as_a_velocity_does(tmp_path):
+def test_the_start_of_identified_json_is_an_initial_motion_like_velocity_json(tmp_path):
     body = ball()
     motion = {"v0": [0.1, -1.0, 0.2], "angular_velocity": [1.0, 2.0, 3.0], "centre": [0.5, 0.3, 0.5]}
     write_json(tmp_path / "velocity.json", motion)

@@ -1,4 +1,4 @@
-"""Images in the layout of the authors' release load as they are, alone and as a scene's images in the workflow."""
+"""Images in the layout of the authors' release."""
 
 import json
 
@@ -11,7 +11,7 @@ from tests.support.errors import refused
 from tests.support.released_images import K, write_release
 
 
-def test_release_is_read_as_it_is(tmp_path):
+def test_release_is_read(tmp_path):
     images = read_image_set(write_release(tmp_path))
     assert images.images.shape == (6, 30, 32, 4)
     assert images.views.tolist() == [0, 0, 0, 2, 2, 2] and images.steps.tolist() == [0, 2, 4] * 2

@@ -20,11 +20,11 @@ from tests.support.errors import refused
 
 @pytest.fixture
 def captures(tmp_path):
-    """A capture `mug` with two throws of two cameras."""
-    for throw in ("one", "two"):
-        (tmp_path / f"mug/videos/{throw}").mkdir(parents=True)
+    """A capture `mug` with two takes of two cameras."""
+    for take in ("one", "two"):
+        (tmp_path / f"mug/videos/{take}").mkdir(parents=True)
         for camera in ("left", "right"):
-            (tmp_path / f"mug/videos/{throw}/{camera}.mp4").touch()
+            (tmp_path / f"mug/videos/{take}/{camera}.mp4").touch()
     settings(tmp_path)
     return tmp_path
 
@@ -37,42 +37,40 @@ def loaded(root):
     return load(read_yaml("config/config.yaml"), captured=captured_scenes(root))
 
 
-def test_a_capture_is_a_scene_and_each_throw_of_it_another(captures):
+def test_a_capture_and_each_of_its_takes_are_scenes(captures):
     settings(captures, "density: 900\nscale: 2\n")
-    found = loaded(captures).scenes
-    assert found["mug"].captured.throw is None and found["mug_one"].captured.throw == "one"
-    assert found["mug_one"].videos == ("mug_two",) and found["mug_two"].videos == ()
-    assert found["mug_one"].training["views"] == [0, 1]
-    assert found["mug_two"].density == 900 and found["mug_two"].captured.scale == 2
+    scenes = loaded(captures).scenes
+    assert scenes["mug"].captured.throw is None and scenes["mug_one"].captured.throw == "one"
+    assert scenes["mug_one"].videos == ("mug_two",) and scenes["mug_two"].videos == ()
+    assert scenes["mug_one"].training["views"] == [0, 1]
+    assert scenes["mug_two"].density == 900 and scenes["mug_two"].captured.scale == 2
     assert "mug_one" not in loaded(captures).plain_scenes
 
 
 def test_a_capture_falls_in_its_room_on_its_own_grid(captures):
     settings(captures, "scale: 2\n")
-    found = loaded(captures)
-    assert found.scene_world("mug_two") == {"grid": found.captures.grid, "gravity": [0.0, -19.62, 0.0]}
+    config = loaded(captures)
+    assert config.scene_world("mug_two") == {"grid": config.captures.grid, "gravity": [0.0, -19.62, 0.0]}
     settings(captures, "grid: 30\n")
     assert loaded(captures).scene_world("mug_two") == {"grid": 30, "gravity": [0.0, -9.81, 0.0]}
-    own = found.simulation
-    assert found.scene_world("BouncyBall") == {"grid": own.grid, "gravity": list(own.gravity)}
+    own = config.simulation
+    assert config.scene_world("BouncyBall") == {"grid": own.grid, "gravity": list(own.gravity)}
 
 
-def test_what_is_held_out_trains_nothing(captures):
+def test_takes_that_are_held_out_train_nothing(captures):
     settings(captures, "held_out: [one]\n")
-    found = loaded(captures).scenes
-    assert found["mug_two"].videos == () and found["mug_one"].videos == ()
+    scenes = loaded(captures).scenes
+    assert scenes["mug_two"].videos == () and scenes["mug_one"].videos == ()
     settings(captures, "held_out: [one, two]\n")
-    assert captured_scenes(captures) == {}  # its own rules say why
+    assert captured_scenes(captures) == {}  # its own rules report the error
 
 
-def test_nobody_knows_the_truth_of_a_capture(captures):
-    found = loaded(captures)
-    for ask in (
-        lambda: found.frame_steps("mug_one"),
-        lambda: cases.case(found, "mug_one", "true_law").source(),
-    ):
-        with pytest.raises(InputError, match=NO_TRUTH):
-            ask()
+def test_the_truth_of_a_capture_is_unknown(captures):
+    config = loaded(captures)
+    with pytest.raises(InputError, match=NO_TRUTH):
+        config.frame_steps("mug_one")
+    with pytest.raises(InputError, match=NO_TRUTH):
+        cases.case(config, "mug_one", "true_law").source()
 
 
 def test_two_scenes_of_one_name(captures):
@@ -85,7 +83,7 @@ def test_other_scenes_need_a_truth():
         load({"scenes": {"BouncyBall": {"law": None}}})
 
 
-def test_rows_are_read_one_after_the_other():
+def test_rows_are_read_in_turn():
     frames = [{"time": 0.1 * k, "h": 50} for k in range(3)]
     times = frame_times(frames, np.array([0.0, 25.0, 50.0]), 1e-5, 1000)
     np.testing.assert_allclose(times, [0.0, 0.105, 0.21])
@@ -107,9 +105,7 @@ def test_reduced_pictures_keep_coverage_and_colour_and_nothing_of_the_background
     small = reduced(rgba, 20)
     assert small.shape == (10, 20, 4)
     assert small[..., 3].sum() / 255 * 16 == pytest.approx(16 * 38, rel=0.01)
-    np.testing.assert_array_equal(
-        small[small[..., 3] > 0][:, :3], [(200, 100, 50)] * int((small[..., 3] > 0).sum())
-    )
+    assert (small[small[..., 3] > 0][:, :3] == (200, 100, 50)).all()
     assert not small[small[..., 3] == 0].any()
     assert reduced(rgba, 100) is rgba
 
@@ -122,8 +118,8 @@ def test_a_point_stays_on_its_part_of_a_reduced_picture():
         assert seen_small / (size / 4) == pytest.approx(seen / size), axis
 
 
-def test_the_gain_of_a_camera_is_taken_out():
+def test_the_gain_of_a_camera_is_divided_out():
     rgba = np.array([[[100, 80, 250, 255], [0, 0, 0, 0]]], np.uint8)
-    found = without_gain(rgba, (0.5, 1.0, 0.8))
-    np.testing.assert_array_equal(found[0, 0], [200, 80, 255, 255])
+    corrected = without_gain(rgba, (0.5, 1.0, 0.8))
+    np.testing.assert_array_equal(corrected[0, 0], [200, 80, 255, 255])
     np.testing.assert_array_equal(rgba[0, 0], [100, 80, 250, 255])

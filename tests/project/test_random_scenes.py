@@ -17,7 +17,6 @@ from neuma_lib.geometry import shapes
 from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.paper.random_scenes import failure, random_table
-from neuma_lib.project import loading
 from neuma_lib.project.random_scenes import DENSITY, FLAWS, SHAPES, draw_scenes
 from neuma_lib.sim.model import MPM
 from neuma_lib.sim.rollout import rollout
@@ -38,10 +37,7 @@ def drawn(loaded, grid=24, **changes):
 @pytest.fixture(scope="module")
 def many(loaded):
     """Draws of several seeds with their time step, by name."""
-    found = {}
-    for seed in SEEDS:
-        found |= drawn(loaded, seed=seed, count=12)
-    return found
+    return {name: scene for seed in SEEDS for name, scene in drawn(loaded, seed=seed, count=12).items()}
 
 
 def test_settings_know_the_shapes():
@@ -74,7 +70,7 @@ def test_every_block_has_every_family_and_shape_once(loaded):
         assert {words[3] for words in block} == set(loaded.random.families)
 
 
-def test_more_draws_leave_the_first_ones_as_they_are(loaded):
+def test_more_draws_keep_the_first_ones(loaded):
     few, more = drawn(loaded, count=5), drawn(loaded, count=40)
     assert [*more][:5] == [*few] and all(more[name] == few[name] for name in few)
 
@@ -93,7 +89,7 @@ def test_every_machine_draws_the_same(loaded):
     assert hashlib.sha256(text.encode()).hexdigest()[:16] == "9ccd2f814a104e9e"
 
 
-def test_materials_outside_the_families_are_drawn_when_asked_for(loaded):
+def test_materials_outside_the_families_are_drawn_on_request(loaded):
     random = loaded.random
     for draw_from, families in (
         ("outside", {*random.outside}),
@@ -151,7 +147,7 @@ def test_bodies_start_inside_and_land_in_time(many):
     """Of the turning mesh itself: six frames of 33 before it is at y = 0, no later than in half of the video.
 
     The stencil feels the ground half a cell above: five frames; till the body is at y = 0, it feels no other wall. The
-    ellipsoid that tells the latest contact does not fill every corner of a body: 5 % of the video later.
+    ellipsoid of the latest contact does not fill every corner of a body: 5 % of the video later.
     """
     low, high = MPM(grid=24, dt=1e-3).free_range
     bodies = {name: shapes.build(name, resolution=32) for name in SHAPES}
@@ -175,6 +171,7 @@ def test_bodies_start_inside_and_land_in_time(many):
         assert touched is not None and 6 <= touched <= 0.55 * 33 and felt >= 5, (name, touched, felt)
 
 
+WITHOUT_NU = {"elasticity": {"name": "hencky", "E": [1e5, 2e5]}}
 REACHES = {
     "outside": {"height": [0.01, 0.02]},
     "early": {"velocity": [[0, 0], [-9, -8], [0, 0]], "height": [0.3, 0.35]},
@@ -190,7 +187,7 @@ REACHES = {
 
 
 @pytest.mark.parametrize("flaw", FLAWS)
-def test_every_reason_to_reject_a_draw_is_said(loaded, flaw):
+def test_every_reason_to_reject_a_draw_is_reported(loaded, flaw):
     with pytest.raises(InputError, match=f"random: 1000 draws of a .*: [0-9]+ {FLAWS[flaw]}"):
         drawn(loaded, count=1, **REACHES[flaw])
 
@@ -201,25 +198,18 @@ def test_every_reason_to_reject_a_draw_is_said(loaded, flaw):
         ({"advanced": {"random.size": [0.4, 0.2]}}, "random.size"),
         ({"advanced": {"random.shapes": ["ball", "bal"]}}, "random.shapes.1"),
         ({"random": {"famlies": {}}}, "random.famlies"),
-        (
-            {
-                "random": {
-                    "families": {"mud": {"prior": "sand", "elasticity": {"name": "hencky", "E": [1e5, 2e5]}}}
-                }
-            },
-            "random.families.mud",
-        ),
+        ({"random": {"families": {"mud": {"prior": "sand", **WITHOUT_NU}}}}, "random.families.mud"),
     ],
 )
-def test_mistakes_are_named(raw, change, place):
+def test_mistakes_are_named(changed, change, place):
     with refused(place):
-        loading.load(loading.merged(raw, change), ROOT)
+        changed(**change)
 
 
-def test_priors_of_families_exist(raw):
+def test_priors_of_families_exist(changed):
     change = {"random": {"families": {"hencky": {"prior": "jely"}}}}
     with pytest.raises(InputError, match=r"no prior 'jely' in priors\.laws; did you mean jelly"):
-        loading.load(loading.merged(raw, change), ROOT)
+        changed(**change)
 
 
 def test_a_family_is_needed(loaded):
@@ -229,10 +219,11 @@ def test_a_family_is_needed(loaded):
         drawn(loaded, draw_from="outside", outside={})
 
 
-def test_settings_change_a_random_scene_as_any_other(raw, loaded):
+def test_settings_change_a_random_scene_as_any_other(changed, loaded):
     name = loaded.random_scenes[3]
-    changed = loading.load(loading.merged(raw, {"scenes": {name: {"size": 0.3}}}), ROOT).scene(name)
-    assert changed == loaded.scene(name).model_copy(update={"size": 0.3})
+    assert changed(scenes={name: {"size": 0.3}}).scene(name) == loaded.scene(name).model_copy(
+        update={"size": 0.3}
+    )
 
 
 # ---- the table
@@ -267,7 +258,7 @@ def test_table_and_sentences_count_scenes():
     ("change", "words"),
     [
         ({}, ["holds", "holds", "holds", "holds"]),
-        ({"judged": 9.0}, ["does not hold", "holds", "holds", "holds"]),
+        ({"scored": 9.0}, ["does not hold", "holds", "holds", "holds"]),
         ({"failed": {"nclaw": "its training diverged"}}, ["holds", "does not hold", "holds", "holds"]),
         ({"plane": 2.1}, ["holds", "holds", "does not hold", "holds"]),
         ({"depth": -0.21}, ["holds", "holds", "holds", "does not hold"]),
@@ -275,8 +266,8 @@ def test_table_and_sentences_count_scenes():
 )
 def test_claims_hold_from_the_number_of_scenes_that_they_name(change, words):
     """One scene more than a claim allows for changes its verdict, and no other."""
-    sound = {"prior": 8.0, "judged": 2.0}
-    excused = {"judged": 1, "failed": 0, "plane": 0, "depth": 2}
+    sound = {"prior": 8.0, "scored": 2.0}
+    excused = {"scored": 1, "failed": 0, "plane": 0, "depth": 2}
     for more in (0, 1):
         spoilt = sum(excused[key] + more for key in change)
         scenes = [result(str(k), **sound | (change if k < spoilt else {})) for k in range(12)]
@@ -303,7 +294,7 @@ def test_a_table_needs_scenes():
         random_table([], METHODS, 7)
 
 
-def test_failures_are_told():
+def test_failures_are_described():
     broken = {"happened": "became non-finite", "step": 8, "particle": 1}
     assert failure({"diverged": None, "stable": True}) is None
     assert failure({"diverged": None, "stable": False}) == "its training diverged"

@@ -1,4 +1,4 @@
-"""A .blend file, read back by a Blender in a process of its own."""
+"""Reader of a .blend file, by Blender in a separate process."""
 
 import json
 import subprocess
@@ -27,8 +27,8 @@ np.savez(sys.argv[3], co=np.stack(seen), world=np.array(body.matrix_world))
 def read_blend(path, times):
     """Vertices "co" (T, n, 3) of the object "body" at times [s], and its matrix "world" (4, 4)."""
     with tempfile.TemporaryDirectory() as folder:
-        script, found = Path(folder, "read.py"), Path(folder, "found.npz")
+        script, output = Path(folder, "read.py"), Path(folder, "read.npz")
         script.write_text(READ)
-        command = [sys.executable, str(script), str(path), json.dumps(times), str(found)]
+        command = [sys.executable, str(script), str(path), json.dumps(times), str(output)]
         subprocess.run(command, check=True, stdout=subprocess.PIPE)
-        return dict(np.load(found))
+        return dict(np.load(output))

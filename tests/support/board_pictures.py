@@ -1,4 +1,4 @@
-"""Pictures of a printed board, alone or in a room, through a known camera, drawn by following each pixel's rays."""
+"""Pictures of a printed board, alone or in a room, through a known camera, by ray casting."""
 
 from functools import cache
 
@@ -19,7 +19,7 @@ LENS = Lens(
 
 
 def looking_at(centre, target, up=(0.0, 0.0, 1.0)):
-    """World to camera (4, 4) of a camera at ``centre`` that looks at ``target``; x right, y down, z forward."""
+    """World to camera (4, 4) of a camera at ``centre`` aimed at ``target``; x right, y down, z forward."""
     forward = np.subtract(target, centre)
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, up)
@@ -93,14 +93,14 @@ BOXES = (
     ((-0.12, 0.10, 0.0), (-0.04, 0.20, 0.14)),
     ((0.05, 0.32, 0.0), (0.20, 0.40, 0.06)),
 )
-"""Least and greatest corners of things beside the board, in its frame [m]."""
+"""Minimum and maximum corners of boxes next to the board, in its frame [m]."""
 
 
 def room_cameras():
     """Name, pose and name of the lens of 24 photographs in two rings around the board, and of two stills."""
     rng = np.random.default_rng(11)
     middle = np.array([0.09, 0.15, 0.02])
-    found = []
+    cameras = []
     for ring, (height, radius) in enumerate(((0.36, 0.62), (0.62, 0.42))):
         for k in range(12):
             angle = 2 * np.pi * (k + 0.5 * ring) / 12 + rng.normal(0, 0.05)
@@ -109,10 +109,10 @@ def room_cameras():
             pose = looking_at(centre, middle + rng.normal(0, 0.03, 3))
             if k % 4 == 3:  # the phone was turned
                 pose[:3] = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]) @ pose[:3]
-            found.append((f"photographs/{ring}{k:02}.jpg", pose, "photographs"))
+            cameras.append((f"photographs/{ring}{k:02}.jpg", pose, "photographs"))
     for name, centre in (("left", (-0.55, -0.35, 0.45)), ("right", (0.75, -0.30, 0.5))):
-        found.append((f"{name}/{name}.jpg", looking_at(np.array(centre), middle), "fixed"))
-    return found
+        cameras.append((f"{name}/{name}.jpg", looking_at(np.array(centre), middle), "fixed"))
+    return cameras
 
 
 def room_picture(pose, lens_name, samples=2):

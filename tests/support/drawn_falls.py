@@ -1,4 +1,4 @@
-"""Drawn pictures of a ball that falls on to a floor, with everything that a room adds."""
+"""Drawn pictures of a ball that falls on a floor in a room."""
 
 import numpy as np
 from scipy import ndimage
@@ -27,12 +27,12 @@ def ellipse(place, rx=17.0, ry=13.0):
     return ((x - place[0]) / rx) ** 2 + ((y - place[1]) / ry) ** 2 <= 1
 
 
-def film(plate, hand=False, shadow=False, gain=(1.0, 1.0, 1.0), noise=2.0, colour=(225, 70, 40)):
-    """Frames (T, H, W, 3), uint8, of a red ball before a plate."""
+def film(background, hand=False, shadow=False, gain=(1.0, 1.0, 1.0), noise=2.0, colour=(225, 70, 40)):
+    """Frames (T, H, W, 3), uint8, of a red ball before a background."""
     rng = np.random.default_rng(3)
     frames = []
     for i, place in enumerate(places()):
-        picture = plate.copy()
+        picture = background.copy()
         if shadow:  # soft, on the floor below the ball
             dark = ellipse((place[0] + 12, 193.0), 26, 7).astype(float)
             picture *= 1 - 0.35 * ndimage.gaussian_filter(dark, 2)[..., None]
@@ -74,16 +74,16 @@ def to_light(levels):
     return (np.asarray(levels, float) / 255) ** 2.2
 
 
-def film_of_contact(plate, colour, size=(40.0, 30.0), noise=2.0):
+def film_of_contact(background, colour, size=(40.0, 30.0), noise=2.0):
     """Frames (T, H, W, 3), uint8, and silhouettes (T, H, W) of a ball that is lit from above and lands on a floor.
 
-    Two lamps cast its shadows, which are the darker and sharper, the nearer it is to the floor; in the end next to no
-    light is left under it, and what is left has its colour.
+    Two lamps cast its shadows, which become darker and sharper near the floor. At contact almost no light is left
+    under the ball, and the rest has its colour.
     """
     rng = np.random.default_rng(3)
     rx, ry = size
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    light, own = to_light(plate), to_light(colour)
+    light, own = to_light(background), to_light(colour)
     grain = ndimage.gaussian_filter(rng.normal(size=(2 * HEIGHT, 2 * WIDTH)), 2.5)
     grain = 1 + 0.15 * grain / grain.std()
     frames, silhouettes = [], []
@@ -97,14 +97,16 @@ def film_of_contact(plate, colour, size=(40.0, 30.0), noise=2.0):
         under = ellipse((place[0] + 0.25 * height + 6, foot), 0.6 * rx, 0.4 * ry).astype(float)
         under = ndimage.gaussian_filter(under, 2 + 0.1 * height) * (height < 40)
         lit = np.minimum(1 - 0.55 * lamps[0] - 0.40 * lamps[1], 1 - 0.95 * under)
-        thrown_back = 0.05 * np.exp(-height / 30) * lamps[0][..., None] * own
-        floor = light * (lit[..., None] + thrown_back)
+        reflected = 0.05 * np.exp(-height / 30) * lamps[0][..., None] * own
+        floor = light * (lit[..., None] + reflected)
         body = own * np.clip(1 - 0.75 * (y - place[1] + ry) / (2 * ry), 0.2, 1)[..., None]
         top, left = (int(c) for c in (HEIGHT - place[1], WIDTH - place[0]))
         body = body * grain[top : top + HEIGHT, left : left + WIDTH, None]
         whole = ellipse(place, rx, ry)
         cover = ndimage.gaussian_filter(whole.astype(float), 0.6)[..., None]
-        seen = 255 * (cover * body + (1 - cover) * floor) ** (1 / 2.2) + rng.normal(0, noise, plate.shape)
+        seen = 255 * (cover * body + (1 - cover) * floor) ** (1 / 2.2) + rng.normal(
+            0, noise, background.shape
+        )
         frames.append(np.clip(np.rint(seen), 0, 255).astype(np.uint8))
         silhouettes.append(whole)
     return frames, np.array(silhouettes)

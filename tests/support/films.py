@@ -8,9 +8,10 @@ SIZE = (96, 64)
 TICKS = 90_000
 
 
-def ffmpeg(*options):
+def ffmpeg(*options, content=None):
+    """Run ffmpeg; ``content`` is what it reads of the file ``-``."""
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-nostdin", *map(str, options)]
-    subprocess.run(command, check=True)
+    subprocess.run(command, input=content, check=True)
 
 
 def film(path, ticks, *options):

@@ -1,4 +1,4 @@
-"""A coloured body of Gaussians that falls, spinning, before cameras with gains, offsets and noise of their own."""
+"""A coloured body of Gaussians that falls, spinning, in front of cameras that differ in gain, offset and noise."""
 
 from __future__ import annotations
 
@@ -17,18 +17,15 @@ from neuma_lib.splatting.rasterizer import rasterize
 from neuma_lib.splatting.spherical_harmonics import SH_C0
 
 GRAVITY = np.array([0.0, -9.81, 0.0])
-PLACE, VELOCITY, SPIN = (
-    np.array([0.48, 0.62, 0.53]),
-    np.array([0.25, -0.4, -0.15]),
-    np.array([1.5, -2.5, 2.0]),
-)
+PLACE, VELOCITY = np.array([0.48, 0.62, 0.53]), np.array([0.25, -0.4, -0.15])
+SPIN = np.array([1.5, -2.5, 2.0])
 SIZE = (160, 120)
 GAINS = np.array([[0.8, 0.9, 1.0], [1.1, 1.0, 0.85], [1.0, 1.0, 1.0]])
 EYES = np.array([[0.5, 0.75, 1.5], [1.45, 0.7, 0.4], [-0.2, 0.9, -0.2]])
 
 
 @dataclass
-class Thing:
+class FlightBody:
     """Gaussians and particles as photographed."""
 
     gaussians: Gaussians
@@ -42,7 +39,7 @@ class Thing:
         return self.mass @ self.particles / self.mass.sum()
 
 
-def thing(count=500, radii=(0.06, 0.04, 0.05), coloured=True, bump=0.5, seed=0) -> Thing:
+def ellipsoid_body(count=500, radii=(0.06, 0.04, 0.05), coloured=True, bump=0.5, seed=0) -> FlightBody:
     """An ellipsoid with a knob, its colour a smooth function of the place; with ``bump`` 0 and one radius, a ball."""
     rng = np.random.default_rng(seed)
     k = np.arange(count) + 0.5
@@ -68,10 +65,9 @@ def thing(count=500, radii=(0.06, 0.04, 0.05), coloured=True, bump=0.5, seed=0) 
     )
     inside = rng.normal(size=(800, 3))
     inside *= rng.uniform(size=(800, 1)) ** (1 / 3) / np.linalg.norm(inside, axis=1, keepdims=True)
-    grown = 1 + bump * np.exp(
-        -((inside / np.linalg.norm(inside, axis=1, keepdims=True) - (0.8, 0.6, 0)) ** 2).sum(axis=1) / 0.15
-    )
-    return Thing(gaussians, inside * radii * grown[:, None] + photographed, np.ones(800), normal, colour)
+    outward = inside / np.linalg.norm(inside, axis=1, keepdims=True)
+    grown = 1 + bump * np.exp(-((outward - (0.8, 0.6, 0)) ** 2).sum(axis=1) / 0.15)
+    return FlightBody(gaussians, inside * radii * grown[:, None] + photographed, np.ones(800), normal, colour)
 
 
 def _frame(normal):
@@ -88,21 +84,21 @@ def lit(albedo, normals):
     return np.clip(albedo * light[:, None], 0, 1)
 
 
-def photographed_in_light(body: Thing) -> Thing:
-    """The body with the light of its photographs in its colours, and something grey where it lay on the floor."""
+def photographed_in_light(body: FlightBody) -> FlightBody:
+    """The body with the light of its photographs in its colours, and grey where it lay on the floor."""
     colour = lit(body.albedo, body.normals)
     colour[body.normals[:, 1] < -0.6] = 0.25
     g = body.gaussians
     return replace(body, gaussians=replace(g, sh0=torch.tensor((colour - 0.5) / SH_C0).float()[:, None]))
 
 
-def true_motion(body: Thing, rotation, spin=SPIN) -> RigidMotion:
+def true_motion(body: FlightBody, rotation, spin=SPIN) -> RigidMotion:
     inertia = moment_of_inertia(body.particles - body.pivot, body.mass)
     return RigidMotion(np.asarray(rotation), PLACE, VELOCITY, np.asarray(spin, float), GRAVITY, inertia)
 
 
 def filmed(
-    body: Thing,
+    body: FlightBody,
     motion: RigidMotion,
     views=2,
     frames=12,
@@ -113,7 +109,7 @@ def filmed(
     seed=0,
     light=False,
 ):
-    """`Sight`s of a flight; the clock of the second camera is ``offset`` behind. They know nothing of the offset."""
+    """`Sight`s of a flight. The clock of the second camera is ``offset`` behind, which they do not contain."""
     rng, width, height = np.random.default_rng(seed), *size
     focal = 1.1 * width
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
@@ -156,6 +152,6 @@ def filmed(
 
 
 def guess(spin=None) -> Parabola:
-    """What the masks' parabola would say: some millimetres and centimetres a second off."""
+    """A parabola as fitted to masks, with errors of millimetres and centimetres per second."""
     off = np.array([0.004, -0.003, 0.005])
     return Parabola(3.0, PLACE + off, VELOCITY + 3 * off, GRAVITY, spin)

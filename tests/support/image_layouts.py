@@ -1,4 +1,4 @@
-"""What several tests share of layouts."""
+"""Small image sets in the layouts of PAC-NeRF and Spring-Gaus."""
 
 import json
 
@@ -20,7 +20,7 @@ def centre_of(kind, frame):
 
 
 def poses_of(kind, count):
-    """OpenGL cameras (camera to world) on a ring, which look at the ball's start from above."""
+    """OpenGL cameras (camera to world) on a ring, which are aimed from above at the start of the ball."""
     target, poses = centre_of(kind, 0), []
     for angle in np.linspace(0.3, 5.0, count):
         eye = target + np.array([1.4 * np.cos(angle), 0.5, 1.4 * np.sin(angle)])
@@ -45,21 +45,20 @@ def picture(pose, centre, background):
 
 
 def write_pac_nerf(folder, cameras=3, frames=4, form="matted"):
-    """A set as PAC-NeRF lays it out, and its pictures by camera and frame; masks as 'matted', 'plate' or 'alpha'."""
+    """A set in PAC-NeRF's layout, and its pictures by camera and frame; masks as 'matted', 'background' or 'alpha'."""
     (folder / "data").mkdir(parents=True)
     entries, truth, seed = [], {}, np.random.default_rng(0)
     for view, pose in enumerate(poses_of("pac_nerf", cameras)):
-        plate = seed.integers(100, 180, (HEIGHT, WIDTH, 3)).astype(np.uint8)
-        plate[..., 2] = 250
+        background = seed.integers(100, 180, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+        background[..., 2] = 250
         for frame in (-1, *range(frames)):
             name = f"data/r_{view}_{frame}.png"
-            entries.append(
-                {"file_path": name, "c2w": pose.tolist(), "intrinsic": K, "time": max(frame, 0) / 24}
-            )
+            time = max(frame, 0) / 24
+            entries.append({"file_path": name, "c2w": pose.tolist(), "intrinsic": K, "time": time})
             if frame < 0:
-                Image.fromarray(plate).save(folder / name)
+                Image.fromarray(background).save(folder / name)
                 continue
-            image = picture(pose, centre_of("pac_nerf", frame), plate)
+            image = picture(pose, centre_of("pac_nerf", frame), background)
             truth[view, frame] = image
             Image.fromarray(image if form == "alpha" else image[..., :3]).save(folder / name)
             if form == "matted":
@@ -71,7 +70,7 @@ def write_pac_nerf(folder, cameras=3, frames=4, form="matted"):
 
 
 def write_spring_gaus(folder, cameras=3, frames=4):
-    """A set as Spring-Gaus lays its synthetic scenes out, and its pictures by camera and frame."""
+    """A set in the layout of Spring-Gaus' synthetic scenes, and its pictures by camera and frame."""
     entries, truth = [], {}
     for view, pose in enumerate(poses_of("spring_gaus", cameras)):
         name = f"camera_{view:02d}"
@@ -90,6 +89,5 @@ WRITERS = {"pac_nerf": write_pac_nerf, "spring_gaus": write_spring_gaus}
 
 
 def ours(kind, points, scale=1.0, offset=None):
-    return scale * points + (
-        OFFSETS[{"pac_nerf": COUNTED[0], "spring_gaus": COUNTED[1]}[kind]] if offset is None else offset
-    )
+    name = {"pac_nerf": COUNTED[0], "spring_gaus": COUNTED[1]}[kind]
+    return scale * points + (OFFSETS[name] if offset is None else offset)

@@ -1,13 +1,18 @@
-"""A copy of the project in a folder of its own, run by real Snakemake on the settings of tiny.yaml."""
+"""A copy of the project in its own folder, run by real Snakemake on the settings of tiny.yaml."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 import shutil
 import subprocess
 import sys
 import time
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import yaml
@@ -39,12 +44,84 @@ def wait_for(condition, seconds: float = 60.0):
     return value
 
 
+@dataclass(frozen=True)
+class Job:
+    """A job as Snakemake prints it, in a dry run or when it starts."""
+
+    rule: str
+    text: str
+
+    def listed(self, key: str) -> list[str]:
+        line = re.search(rf"^    {key}: (.*)$", self.text, re.MULTILINE)
+        return line[1].split(", ") if line else []
+
+    @cached_property
+    def inputs(self) -> list[str]:
+        return self.listed("input")
+
+    @cached_property
+    def outputs(self) -> list[str]:
+        return self.listed("output")
+
+
+class Plan(Counter):
+    """Rules with the number of their jobs, and the jobs of a run or a dry run.
+
+    Args:
+        requested: options of Snakemake, with the targets.
+    """
+
+    def __init__(self, jobs: Iterable[Job], requested: Iterable[str] = ()):
+        self.jobs, self.requested = list(jobs), {*requested}
+        super().__init__(job.rule for job in self.jobs)
+
+    @classmethod
+    def of(cls, output: str, requested: Iterable[str] = ()) -> Plan:
+        """Jobs that Snakemake prints. Raises AssertionError if these are not all that it counts."""
+        blocks = re.findall(r"^(?:local)?rule (\w+):\n((?:    .*\n)*)", output, re.MULTILINE)
+        plan = cls((Job(*block) for block in blocks), requested)
+        assert "Nothing to be done" in output or re.search(
+            rf"^total +{len(plan.jobs)}$", output, re.MULTILINE
+        )
+        return plan
+
+    def of_rule(self, rule: str) -> list[Job]:
+        return [job for job in self.jobs if job.rule == rule]
+
+    def one(self, rule: str) -> Job:
+        """The only job of a rule."""
+        (job,) = self.of_rule(rule)
+        return job
+
+    @cached_property
+    def makers(self) -> dict[str, Job]:
+        """The job of each output; a target rule is its own output."""
+        return {name: job for job in self.jobs for name in job.outputs or [job.rule]}
+
+    def behind(self, *targets: str) -> Plan:
+        """The jobs that a dry run of these targets alone would have, with the present files."""
+        unknown = {*targets} - self.makers.keys() - self.requested
+        assert not unknown, unknown
+        chosen, open_files = {}, list(targets)
+        while open_files:
+            job = self.makers.get(open_files.pop())
+            if job and job not in chosen:
+                chosen[job] = None
+                open_files += job.inputs
+        return Plan(chosen)
+
+
+def overlay(**settings) -> tuple[str, ...]:
+    """Options of Snakemake that change sections of the settings. Targets follow them."""
+    return "--config", *(f"{name}={json.dumps(value)}" for name, value in settings.items()), "--"
+
+
 class Project:
-    """A copy of the working tree in a folder of its own.
+    """A copy of the working tree in its own folder.
 
     Args:
         root: that folder.
-        executor: options of Snakemake that say where jobs run.
+        executor: options of Snakemake that state where jobs run.
         seconds: the longest that a run may take.
     """
 
@@ -75,15 +152,12 @@ class Project:
         assert (done.returncode == 0) == succeeds, done.stdout[-4000:]
         return done.stdout
 
-    def plan(self, *words: str) -> dict[str, int]:
-        """Rules that Snakemake would run, with the number of their jobs."""
-        text = self.run("--dry-run", *words)
-        stats = re.search(r"^job +count\n[- ]+\n(.*?)^total", text, re.MULTILINE | re.DOTALL)
-        assert stats or "Nothing to be done" in text, text[-4000:]
-        return {line.split()[0]: int(line.split()[1]) for line in stats[1].splitlines()} if stats else {}
+    def plan(self, *words: str) -> Plan:
+        """The jobs that Snakemake would run."""
+        return Plan.of(self.run("--dry-run", *words), words)
 
     def start(self, *words: str) -> subprocess.Popen:
-        """Start Snakemake as the leader of a process group of its own."""
+        """Start Snakemake as the leader of a separate process group."""
         with open(self.root / "started.log", "w") as log:
             return subprocess.Popen(
                 self.command(*words),
@@ -95,7 +169,7 @@ class Project:
 
     def processes(self, script: str) -> list[int]:
         """Running Python processes of a script of this copy."""
-        found = []
+        numbers = []
         for process in Path("/proc").glob("[0-9]*"):
             try:
                 here = (process / "cwd").resolve() == self.root
@@ -103,8 +177,8 @@ class Project:
             except OSError:
                 continue
             if here and b"python" in words[0] and any(w.endswith(f".{script}.py".encode()) for w in words):
-                found.append(int(process.name))
-        return found
+                numbers.append(int(process.name))
+        return numbers
 
     def artifacts(self) -> dict[str, str]:
         """Digests of all data and results; logs and benchmarks are no artifacts."""
@@ -119,7 +193,7 @@ class Project:
 
 
 def copied(folder: Path, kernels: Path, origin: Path = ROOT) -> Project:
-    """A copy of the sources at ``origin`` in a folder of its own."""
+    """A copy of the sources at ``origin`` in its own folder."""
     for part in PARTS:
         source, target = origin / part, folder / part
         target.parent.mkdir(parents=True, exist_ok=True)

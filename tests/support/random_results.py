@@ -1,9 +1,9 @@
-"""What several tests share of random scenes."""
+"""Results of random scenes."""
 
 from neuma_lib.paper.random_scenes import RandomScene
 
 
-def result(name, prior, judged, true=3.0, failed=None, depth=0.1, plane=1.0):
+def result(name, prior, scored, true=3.0, failed=None, depth=0.1, plane=1.0):
     start = {
         "velocity_error_in_plane_percent": plane,
         "velocity_error_depth": depth,
@@ -13,7 +13,7 @@ def result(name, prior, judged, true=3.0, failed=None, depth=0.1, plane=1.0):
         "angular_velocity_error_viewing_percent": 0.5,
         "angular_velocity_error_percent": 8.0,
     }
-    rmse = {"nclaw": prior, "neuma": judged, "true_law": true}
+    rmse = {"nclaw": prior, "neuma": scored, "true_law": true}
     return RandomScene(name, "ball", "hencky", "jelly", rmse, failed or {}, start)
 
 

@@ -1,4 +1,4 @@
-"""What several tests share of released."""
+"""A small image set in the layout of the authors' release."""
 
 import json
 
@@ -9,7 +9,7 @@ K = [[40.0, 0.0, 16.0], [0.0, 41.0, 15.0], [0.0, 0.0, 1.0]]
 
 
 def write_release(folder, kind="dynamic"):
-    """A set as the authors lay it out; pixel (0, 0) tells view and step. Returns its list."""
+    """Write a set whose pixel (0, 0) holds view and step, and return its list."""
     (folder / f"data_{kind}").mkdir(parents=True)
     entries = []
     for view in (0, 2):

@@ -1,4 +1,4 @@
-"""A small drop of an ellipsoid, written as Spring-Gaus' real captures are, and as NeuMA's copy of them is."""
+"""A small drop of an ellipsoid in the layouts of Spring-Gaus' real captures and of NeuMA's copy."""
 
 import json
 import struct
@@ -9,7 +9,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from neuma_lib.capture.calibration.lens import Lens
-from neuma_lib.capture.released import CALIBRATED_SIZE, GROUND, MIDDLE, RATE, video_lens
+from neuma_lib.capture.released import CALIBRATED_SIZE, MIDDLE, RATE, video_lens
+from neuma_lib.project.released_captures import GROUND
 from tests.support.board_pictures import looking_at
 
 OBJECT = "bun"
@@ -37,9 +38,8 @@ def drawn(viewmat, lens, middle, turn, radii=RADII):
     """Picture (H, W, 3) and mask (H, W) of the ellipsoid before grey."""
     x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     K = lens.K
-    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1).reshape(
-        -1, 3
-    )
+    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
+    rays = rays.reshape(-1, 3)
     eye, rays = -viewmat[:3, :3].T @ viewmat[:3, 3], rays @ viewmat[:3, :3]
     at, rays = turn.inv().apply(eye - middle) / radii, turn.inv().apply(rays) / radii
     a, b, c = (rays**2).sum(axis=1), rays @ at, at @ at - 1
@@ -68,11 +68,14 @@ def poses():
 
 
 def calibration(names):
-    found = {}
+    entries = {}
     for name, viewmat in zip(names, poses().values()):
         turn = Rotation.from_matrix(viewmat[:3, :3]).as_rotvec()
-        found[name] = {"rvecs": [[v] for v in turn.tolist()], "tvecs": [[v] for v in viewmat[:3, 3].tolist()]}
-    return found
+        entries[name] = {
+            "rvecs": [[v] for v in turn.tolist()],
+            "tvecs": [[v] for v in viewmat[:3, 3].tolist()],
+        }
+    return entries
 
 
 def write_picture(folder, name, pixels, mask, suffix=".jpg", mask_folder=None):

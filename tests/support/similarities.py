@@ -1,4 +1,4 @@
-"""What several tests share of capture board."""
+"""Random similarities, and exact detections of the board."""
 
 import numpy as np
 
@@ -15,11 +15,11 @@ def random_similarity(rng):
 
 
 def exact(poses, lens=LENS):
-    """The corners as each camera must see them."""
+    """The corners that each camera must detect."""
     points = boards.corner_positions(BOARD)
-    found = []
+    detections = []
     for pose in poses:
         pixels = lens.project(points @ pose[:3, :3].T + pose[:3, 3])
         inside = ((pixels > 0) & (pixels < [lens.width, lens.height])).all(axis=1)
-        found.append(boards.Detection(np.flatnonzero(inside), pixels[inside]))
-    return found
+        detections.append(boards.Detection(np.flatnonzero(inside), pixels[inside]))
+    return detections

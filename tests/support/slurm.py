@@ -2,10 +2,10 @@
 
     python tests/support/slurm.py --gpus 1 -- bash          # then: sinfo, sbatch, snakemake --workflow-profile ...
 
-munged, slurmctld and slurmd run with a key, a configuration, sockets and states of their own in a temporary folder.
+munged, slurmctld and slurmd run with their own key, configuration, sockets and states in a temporary folder.
 They listen on the loopback interface only, on free ports, as whoever starts them (root in a container will do); nothing
 of an installed SLURM's configuration is read or changed. There are no cgroups and there is no accounting database: what
-a job may use is still enforced, memory by looking at its processes (``OverMemoryKill``) and time by the controller.
+a job may use is still enforced, memory by checks of its processes (``OverMemoryKill``) and time by the controller.
 GPUs are empty files: jobs ask and wait for them, and find none.
 """
 
@@ -80,7 +80,7 @@ class Cluster:
         self.folder, self.environment = folder, environment
 
     def ask(self, *words: str) -> str:
-        """What a command of SLURM says."""
+        """Output of a command of SLURM."""
         done = subprocess.run(words, env=self.environment, capture_output=True, text=True, timeout=60)
         if done.returncode:
             raise RuntimeError(f"{' '.join(words)}: {done.stderr.strip() or done.stdout.strip()}")
@@ -112,7 +112,7 @@ def cluster(
         min_job_age: seconds for which the controller remembers ended jobs.
 
     Raises:
-        RuntimeError: SLURM is not installed, or a daemon did not start; says which, and the end of its log.
+        RuntimeError: SLURM is not installed, or a daemon did not start; names it, with the end of its log.
     """
     if problem := missing():
         raise RuntimeError(problem)
@@ -139,7 +139,7 @@ def _environment(folder: Path) -> dict[str, str]:
     """This process's environment with the paths of the cluster in `folder`.
 
     The executor's jobs clear variables of SLURM before they call srun, which then would look for its configuration in
-    /etc: a script of its name, first on the path, brings the variable back.
+    /etc: a script of its name, first on the path, restores the variable.
     """
     shim = folder / "bin" / "srun"
     shim.parent.mkdir()
@@ -223,8 +223,8 @@ def _wait(
             if ready():
                 return
         time.sleep(0.2)
-    said = "".join(log.read_text() for log in sorted(running.folder.glob("*.out")))
-    raise RuntimeError(f"{Path(daemon.args[0]).name} did not start; SLURM's daemons said:\n{said[-3000:]}")
+    logs = "".join(log.read_text() for log in sorted(running.folder.glob("*.out")))
+    raise RuntimeError(f"{Path(daemon.args[0]).name} did not start; SLURM's daemons logged:\n{logs[-3000:]}")
 
 
 def _cancel_all(running: Cluster) -> None:

@@ -1,4 +1,4 @@
-"""Small splats, and the layouts that splats are passed on in, written a Gaussian at a time as their authors say."""
+"""Small splats, and writers of the exchange formats, one Gaussian at a time, after their specifications."""
 
 import gzip
 import math
@@ -35,8 +35,8 @@ def rows_of(gaussians):
     return zip(*(getattr(gaussians, name).double().tolist() for name in fields), strict=True)
 
 
-def level(value, most):
-    return int(min(max(round(value), 0), most))
+def level(value, maximum):
+    return int(min(max(round(value), 0), maximum))
 
 
 def write_splat(path, gaussians):

@@ -71,9 +71,7 @@ def make_project(root, methods=("nclaw", "constants"), scene=SCENE):
         write_arrays(results / method / "rollout.h5", path, {"dt": 1e-3})
     x, F = motion(block(900, 7))
     truth = {"x": x.numpy(), "F": F.numpy(), "v": np.ones_like(x), "frames": np.asarray(STEPS)}
-    write_arrays(
-        data / "truth.h5", truth, {"dt": 1e-3, "bodies": [{"law": LAW}], "simulation": {"dt": 1e-3}}
-    )
+    write_arrays(data / "truth.h5", truth, {"dt": 1e-3, "bodies": [{"law": LAW}], "simulation": {"dt": 1e-3}})
     write_images(data / "dynamic")
     return results
 

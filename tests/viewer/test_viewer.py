@@ -11,7 +11,7 @@ import torch
 
 from neuma_lib.io.hdf5 import read_arrays, write_arrays
 from neuma_lib.project.files import SceneFiles, inside
-from neuma_lib.project.find import found_scene
+from neuma_lib.project.find import find_scene
 from neuma_lib.viewer import scalars
 from neuma_lib.viewer.page import Blob, page, quantised, roots
 from neuma_lib.viewer.scene import load_scene
@@ -27,7 +27,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def scene(folder):
-    return load_scene(found_scene(folder)[1])
+    return load_scene(find_scene(folder)[1])
 
 
 def stretched(a):
@@ -100,7 +100,7 @@ def test_a_law_of_another_time_step_is_shown_at_the_same_times(tmp_path, scene):
     arrays, attributes = read_arrays(place / "nclaw" / "rollout.h5", ("x", "F", "frames"))
     finer = {**arrays, "frames": 2 * arrays["frames"]}
     write_arrays(place / "nclaw" / "rollout.h5", finer, {"dt": attributes["dt"] / 2})
-    again = load_scene(found_scene(place)[1]).motion("nclaw")
+    again = load_scene(find_scene(place)[1]).motion("nclaw")
     assert again.steps == scene.motion("nclaw").steps
     assert torch.allclose(again.scalars["speed"], scene.motion("nclaw").scalars["speed"])
 
@@ -113,7 +113,7 @@ def test_cameras_have_their_images(scene):
 
 
 def test_plain_values_describe_the_files(folder):
-    files = found_scene(folder)[1]
+    files = find_scene(folder)[1]
     assert SceneFiles.of_plain(json.loads(json.dumps(files.plain()))) == files
     assert str(folder / "constants" / "rollout.h5") in files.files
 
@@ -129,7 +129,7 @@ def test_nothing_outside_the_folders_is_read(tmp_path):
             inside(outside, roots_)
     (place / "nclaw" / "rollout.h5").unlink()
     (place / "nclaw" / "rollout.h5").symlink_to(secret)
-    files = found_scene(place)[1]
+    files = find_scene(place)[1]
     with refused("rollout.h5"):
         load_scene(files)
     found = load_scene(files, skip_damaged=True)
@@ -142,21 +142,21 @@ def test_an_image_outside_the_data_is_not_read(tmp_path):
     transforms = tmp_path / "project" / "data" / SCENE / "dynamic" / "transforms.json"
     (transforms.parent / "d_10.png").rename(tmp_path / "d_10.png")
     transforms.write_text(transforms.read_text().replace("d_10.png", "../../../../d_10.png"))
-    found = load_scene(found_scene(place)[1])
+    found = load_scene(find_scene(place)[1])
     assert not found.views and "is outside" in found.notes[0]
 
 
 def test_bad_folders_say_what_to_do(folder, tmp_path):
     with refused("nothing"):
-        found_scene(tmp_path / "nothing")
+        find_scene(tmp_path / "nothing")
     (tmp_path / "results" / SCENE).mkdir(parents=True)
     with refused(tmp_path / "results" / SCENE):
-        found_scene(tmp_path / "results" / SCENE)
+        find_scene(tmp_path / "results" / SCENE)
     with refused("priors"):
-        found_scene(folder.parent / "priors")
+        find_scene(folder.parent / "priors")
     (folder.parent / "JellyDuck").mkdir()
     with refused("JellyDuck/particles.h5") as error:
-        found_scene(folder.parent / "JellyDuck")
+        find_scene(folder.parent / "JellyDuck")
     assert "snakemake" in error.value.remedy
 
 

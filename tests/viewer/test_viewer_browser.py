@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from neuma_lib.project.find import found_laws, found_scene
+from neuma_lib.project.find import find_laws, find_scene
 from neuma_lib.viewer.page import write_page
 from neuma_lib.viewer.playground import Playground, first_law
 from neuma_lib.viewer.scene import load_scene
@@ -39,7 +39,7 @@ def differ(a, b):
 
 
 def test_the_file_opens_without_a_server_plays_and_follows_its_controls(folder, tmp_path):
-    write_page(tmp_path / "viewer.html", load_scene(found_scene(folder)[1]))
+    write_page(tmp_path / "viewer.html", load_scene(find_scene(folder)[1]))
     with opened((tmp_path / "viewer.html").as_uri()) as (page, complaints):
         page.wait_for_selector("body[data-state=ready]")
         page.select_option("#right", "")  # one motion: the truth, beside nothing
@@ -91,7 +91,7 @@ def test_the_file_opens_without_a_server_plays_and_follows_its_controls(folder, 
 
 def test_the_file_of_a_splat_has_the_motion_of_its_law_alone_and_plays(tmp_path):
     folder, configured = make_splat(tmp_path)
-    scene = load_scene(found_scene(folder, [configured])[1])
+    scene = load_scene(find_scene(folder, [configured])[1])
     assert [motion.title for motion in scene.motions] == [f"NCLaw, law_from {SCENE}"] and not scene.notes
     assert scene.steps == tuple(2 * step for step in STEPS)  # its steps are half as long as those of the law
     write_page(tmp_path / "viewer.html", scene)
@@ -113,8 +113,8 @@ def test_the_file_of_a_splat_has_the_motion_of_its_law_alone_and_plays(tmp_path)
 @pytest.fixture
 def served(folder):
     pytest.importorskip("viser")
-    settings, files = found_scene(folder)
-    laws = found_laws(settings)
+    settings, files = find_scene(folder)
+    laws = find_laws(settings)
     playground = Playground(
         files, laws, first_law(files, laws, ("constants",))
     )  # the network is a random one

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from neuma_lib.errors import NonFiniteError
-from neuma_lib.project.find import found_laws, found_scene
+from neuma_lib.project.find import find_laws, find_scene
 from neuma_lib.splatting.gaussians import Gaussians
 from neuma_lib.viewer.playground import ADDED_PARTICLES, Playground, first_law
 from tests.support.errors import refused
@@ -18,8 +18,8 @@ PRIOR = "prior: jelly"
 
 @pytest.fixture
 def project(tmp_path):
-    settings, files = found_scene(make_project(tmp_path / "project"))
-    return files, found_laws(settings)
+    settings, files = find_scene(make_project(tmp_path / "project"))
+    return files, find_laws(settings)
 
 
 @pytest.fixture
@@ -44,11 +44,11 @@ def test_laws_of_the_results_are_found_with_their_time_steps(project):
 
 
 def test_a_prior_has_the_step_of_the_scene_that_is_shown(tmp_path):
-    settings, files = found_scene(make_project(tmp_path / "project"))
+    settings, files = find_scene(make_project(tmp_path / "project"))
     other = settings.scenes[SCENE].model_copy(update={"dt": 2e-3})
     settings = settings.model_copy(update={"scenes": {**settings.scenes, "Other": other}})
-    assert found_laws(settings)[PRIOR].dt == found_laws(settings, SCENE)[PRIOR].dt == 1e-3
-    assert found_laws(settings, "Other+seed=1")[PRIOR].dt == 2e-3
+    assert find_laws(settings)[PRIOR].dt == find_laws(settings, SCENE)[PRIOR].dt == 1e-3
+    assert find_laws(settings, "Other+seed=1")[PRIOR].dt == 2e-3
 
 
 def test_a_law_outside_the_folders_is_not_read(project, playground, tmp_path):

@@ -1,7 +1,8 @@
-"""What the tests of the workflow share: one finished run."""
+"""What the tests of the workflow share: a finished run of Table 1, and one of everything else."""
 
 import pytest
 
+from tests.support.full_run import run_in_full
 from tests.support.project import SCENE, TABLE, copied
 
 
@@ -17,6 +18,12 @@ def finished(tmp_path_factory, kernels):
     project = copied(tmp_path_factory.mktemp("project"), kernels)
     project.output = project.run(TABLE, f"{SCENE}/initial_state.json", f"{SCENE}/neuma/video.mp4")
     return project
+
+
+@pytest.fixture(scope="session")
+def full(finished, tmp_path_factory):
+    """A finished copy with everything of `full_run`. Tests leave it as they found it."""
+    return run_in_full(finished.clone(tmp_path_factory.mktemp("full") / "project"))
 
 
 @pytest.fixture

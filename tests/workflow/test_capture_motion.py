@@ -1,15 +1,15 @@
 """From photographs and videos of a drawn fall to masks, offsets and gravity, by real Snakemake runs."""
 
 import json
-import subprocess
+import shutil
 
-import imageio_ffmpeg
 import numpy as np
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from tests.support.board_pictures import BOARD, LENS, around, looking_at, picture
+from tests.support.films import ffmpeg
 from tests.support.project import copied
 
 PAGE = "tiny/results/mug/motion.md"
@@ -51,23 +51,10 @@ def motion(t):
     return start + VELOCITY * t - (0, 0, GRAVITY * t * t / 2), Rotation.from_rotvec(SPIN * t)
 
 
-def write_video(path, pictures, *options):
+def write_video(path, pictures):
     height, width = pictures[0].shape[:2]
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
-    command += [
-        "-s",
-        f"{width}x{height}",
-        "-r",
-        str(RATE),
-        "-i",
-        "-",
-        "-c:v",
-        "libx264",
-        "-crf",
-        "10",
-        *options,
-    ]
-    subprocess.run([*command, str(path)], input=np.stack(pictures).tobytes(), check=True)
+    raw = ("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", RATE, "-i", "-")
+    ffmpeg(*raw, "-c:v", "libx264", "-crf", 10, path, content=np.stack(pictures).tobytes())
 
 
 @pytest.fixture(scope="module")
@@ -96,30 +83,28 @@ def drawn(tmp_path_factory):
 
 
 @pytest.fixture
-def project(tmp_path, drawn):
-    made = copied(tmp_path / "project", tmp_path / "kernels")
-    subprocess.run(["cp", "-r", drawn, made.root / "captures-drawn"], check=True)
-    (made.root / "captures").mkdir(exist_ok=True)
-    (made.root / "captures-drawn").rename(made.root / "captures/mug")
+def project(tmp_path, kernels, drawn):
+    made = copied(tmp_path / "project", kernels)
+    shutil.copytree(drawn, made.root / "captures/mug")
     return made
 
 
 def test_masks_offset_gravity_velocity_and_spin_are_those_that_were_drawn(project):
     output = project.run(PAGE)
     results, data = project.root / "tiny/results/mug", project.root / "tiny/data/mug"
-    found = json.loads((results / "flight/first.json").read_text())
+    flight = json.loads((results / "flight/first.json").read_text())
     assert "gravity is" in output
     # The room's y is up, x and z lie as the board's x and -y.
     velocity = np.array([VELOCITY[0], VELOCITY[2], -VELOCITY[1]])
-    assert found["gravity_ratio"] == pytest.approx(1, abs=0.02)
-    assert found["gravity_angle_deg"] < 0.5
+    assert flight["gravity_ratio"] == pytest.approx(1, abs=0.02)
+    assert flight["gravity_angle_deg"] < 0.5
     assert (
-        np.linalg.norm(np.subtract(found["v0_m_s"], velocity)) < 0.03 * GRAVITY * 0.21
+        np.linalg.norm(np.subtract(flight["v0_m_s"], velocity)) < 0.03 * GRAVITY * 0.21
     )  # of the speed at the floor
-    assert found["offsets_s"]["right"] == pytest.approx(OFFSET, abs=1e-3)  # an eighth of a frame
+    assert flight["offsets_s"]["right"] == pytest.approx(OFFSET, abs=1e-3)  # an eighth of a frame
     spin = np.array([SPIN[0], SPIN[2], -SPIN[1]])
-    assert np.linalg.norm(np.subtract(found["spin_rad_s"], spin)) < 0.25 * np.linalg.norm(spin)
-    assert min(found["agreement"].values()) > 0.85
+    assert np.linalg.norm(np.subtract(flight["spin_rad_s"], spin)) < 0.25 * np.linalg.norm(spin)
+    assert min(flight["agreement"].values()) > 0.85
     photographs = json.loads((results / "masks/photographs.json").read_text())
     assert photographs["left_out"] == [] and min(photographs["agreement"].values()) > 0.85
     for file in (
@@ -135,10 +120,9 @@ def test_masks_offset_gravity_velocity_and_spin_are_those_that_were_drawn(projec
         "masks/first/right.png",
         "flight/first.png",
     ):
-        with Image.open(results / file) as shown:
-            assert shown.width > 500 and f"({file})" in page
-    assert project.plan(PAGE) == {}
-    # What is stated of a camera's time repeats the flight alone.
+        with Image.open(results / file) as image:
+            assert image.width > 500 and f"({file})" in page
+    # Nothing else is left to do. What is stated of a camera's time repeats the flight alone.
     (project.root / "captures/mug/capture.yaml").write_text(SETTINGS + "cameras: {right: {offset: 0.0035}}\n")
     assert set(project.plan(PAGE)) == {"capture_flight", "capture_motion_page"}
 
@@ -147,23 +131,21 @@ def test_masks_offset_gravity_velocity_and_spin_are_those_that_were_drawn(projec
 def test_a_wrong_square_size_is_caught_by_gravity(project):
     wrong = SETTINGS.replace("0.03}", f"{1.2 * BOARD.square}}}")
     (project.root / "captures/mug/capture.yaml").write_text(wrong)
-    said = project.run("tiny/results/mug/flight/first.json", succeeds=False)
-    assert "board's square size is 0.8" in said and "Traceback" not in said
+    output = project.run("tiny/results/mug/flight/first.json", succeeds=False)
+    assert "board's square size is 0.8" in output and "Traceback" not in output
     assert not (project.root / "tiny/results/mug/flight/first.json").exists()
 
 
 def test_bad_videos_and_masks_end_with_one_line(project):
-    mug, left = project.root / "captures/mug", "tiny/results/mug/masks/first/left.json"
-    video = (mug / "videos/left.mp4").read_bytes()
+    mug = project.root / "captures/mug"
     empty = np.asarray(Image.open(mug / "stills/left.png"))
     write_video(mug / "videos/left.mp4", [empty[:400]] * 8)
-    said = project.run(left, succeeds=False)
-    assert "left.mp4: the video is 800x400" in said and "Traceback" not in said
-    (mug / "videos/left.mp4").write_bytes(video)
-    (mug / "masks/first/left").mkdir(parents=True)
-    Image.new("L", (800, 600), 255).save(mug / "masks/first/left/900.png")
-    assert "900.png: it must be named after a frame of the video, 0 to 39" in project.run(
-        left, succeeds=False
-    )
-    assert not (project.root / left).exists()
-    assert not (project.root / "tiny/data/mug/videos/first/left/transforms.json").exists()
+    (mug / "masks/first/right").mkdir(parents=True)
+    Image.new("L", (800, 600), 255).save(mug / "masks/first/right/900.png")
+    files = [f"tiny/results/mug/masks/first/{camera}.json" for camera in ("left", "right")]
+    output = project.run("--keep-going", *files, succeeds=False)
+    assert "left.mp4: the video is 800x400" in output and "Traceback" not in output
+    assert "900.png: it must be named after a frame of the video, 0 to 39" in output
+    for camera, file in zip(("left", "right"), files):
+        assert not (project.root / file).exists()
+        assert not (project.root / f"tiny/data/mug/videos/first/{camera}/transforms.json").exists()

@@ -1,7 +1,6 @@
 """Motions for other programs, made by the workflow and read by other readers: of springs, of an experiment with another
 body, and of several bodies."""
 
-import importlib.util
 import json
 import struct
 
@@ -15,45 +14,19 @@ from plyfile import PlyData
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.splats import load_splat
 from tests.support.blends import read_blend
-from tests.support.project import SCENE
+from tests.support.full_run import EXPORTED, USD
 
-EXPERIMENTS = "tiny/results/experiments"
-SPRINGS = "spring_gaus+iterations=2"
-MOVED = {  # folders, with the number of bodies
-    f"{SCENE}/{SPRINGS}": 1,
-    f"{EXPERIMENTS}/letter/{SPRINGS}": 1,
-    f"{EXPERIMENTS}/letter_and_ball/nclaw": 2,
-}
-LETTER = {
-    "title": "I",
-    "bodies": [{"scene": "BouncyBall", "shape": "letter_I", "height": 0.4, "velocity": [0, -2, 0]}],
-    "steps": 60,
-}
-FILES = ["gaussians", "compressed", "particles.h5", "surface.glb", "motion.gif", "motion.blend"]
-USD = importlib.util.find_spec("pxr") is not None  # comes with `make viewer`
 MARGIN = 0.05
 """Gaussians and surface lie at most this far from the box of the particles [m]; these are about 0.02 m apart."""
 
 
-@pytest.fixture(scope="module")
-def project(finished, tmp_path_factory):
-    """The finished copy, with all exports of all motions."""
-    made = finished.clone(tmp_path_factory.mktemp("exports") / "project")
-    files = [*FILES, *(["surface.usdc", "surface.usda"] if USD else [])]
-    targets = [f"{folder}/export/{file}" for folder in MOVED for file in files]
-    settings = ("--config", f"experiments={json.dumps({'letter': LETTER})}", "--")
-    made.run(*settings, *targets)
-    assert made.plan(*settings, *targets) == {}
-    return made
-
-
-@pytest.fixture(params=MOVED, ids=["springs", "experiment", "bodies"])
-def moved(project, request):
+@pytest.fixture(params=EXPORTED, ids=["springs", "experiment", "bodies"])
+def moved(full, request):
     """Its export folder, its bodies, positions (T, N, 3) [m] and times (T,) [s]."""
-    folder = project.root / request.param
+    folder = full.root / request.param
     path, attributes = read_arrays(folder / "rollout.h5")
     assert len(path["x"]) == len(path["frames"]) > 5
-    return folder / "export", MOVED[request.param], path["x"], path["frames"] * attributes["dt"]
+    return folder / "export", EXPORTED[request.param], path["x"], path["frames"] * attributes["dt"]
 
 
 def assert_around(points, x):
@@ -84,12 +57,12 @@ def test_gaussians_plain_and_compressed(moved):
         rows = PlyData.read(plain[k])["vertex"]
         means = np.stack([rows[axis] for axis in "xyz"], axis=1)
         assert_around(means, x[k])
-        found = load_splat(packed[k])
+        loaded = load_splat(packed[k])
         ranges = np.ptp(means, axis=0) / 1023
-        assert len(found) == len(means)
-        nearest = np.linalg.norm((found.means.numpy()[:, None] - means) / ranges, axis=2).min(axis=1)
+        assert len(loaded) == len(means)
+        nearest = np.linalg.norm((loaded.means.numpy()[:, None] - means) / ranges, axis=2).min(axis=1)
         assert nearest.max() < 1.0  # half a step in each of three directions
-        assert found.scales.min() > 0 and np.isfinite(found.sh().numpy()).all()
+        assert loaded.scales.min() > 0 and np.isfinite(loaded.sh().numpy()).all()
 
 
 def shown(file):
@@ -136,8 +109,8 @@ def test_surface_as_usd(moved, kind):
     mesh = UsdGeom.Mesh(stage.GetDefaultPrim().GetChild("surface"))
     samples = mesh.GetPointsAttr().GetTimeSamples()
     np.testing.assert_allclose(np.array(samples) / stage.GetTimeCodesPerSecond(), time, rtol=1e-6)
-    found = np.stack([np.array(mesh.GetPointsAttr().Get(sample)) for sample in samples])
-    np.testing.assert_allclose(found, shown(folder / "surface.glb")[0], atol=1e-6)
+    loaded = np.stack([np.array(mesh.GetPointsAttr().Get(sample)) for sample in samples])
+    np.testing.assert_allclose(loaded, shown(folder / "surface.glb")[0], atol=1e-6)
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     errors = UsdValidation.ValidationContext(validators).Validate(stage)
     assert [error.GetMessage() for error in errors] == []
@@ -158,8 +131,8 @@ def test_films(moved):
 
 def test_blend(moved):
     folder, _, _, time = moved
-    found = read_blend(folder / "motion.blend", time.tolist())
+    loaded = read_blend(folder / "motion.blend", time.tolist())
     # times are single precision in Blender, a frame is 1/24 s
-    np.testing.assert_allclose(found["co"], shown(folder / "surface.glb")[0], atol=1e-4)
+    np.testing.assert_allclose(loaded["co"], shown(folder / "surface.glb")[0], atol=1e-4)
     with Image.open(folder / "motion.png") as image:
         assert 0.002 < (np.asarray(image)[..., 3] > 128).mean() < 0.9

@@ -1,4 +1,4 @@
-"""A stage tells what it does on any terminal, alone or beside others, and why it failed."""
+"""A stage reports what it does on any terminal, alone or next to others, and why it failed."""
 
 import fcntl
 import io
@@ -104,7 +104,7 @@ def test_plain_lines_now_and_then_where_there_is_no_terminal(monkeypatch, tmp_pa
         (KeyboardInterrupt(), "ERROR: interrupted; run the same command again to go on"),
     ],
 )
-def test_errors_are_told_in_one_line_and_logged_in_full(tmp_path, error, shown):
+def test_errors_are_reported_in_one_line_and_logged_in_full(tmp_path, error, shown):
     log, stream = tmp_path / "deep" / "stage.log", io.StringIO()
     with pytest.raises(SystemExit) as end, progress.stage("mesh Ball", log, stream):
         raise error

@@ -1,11 +1,15 @@
 """The code digest changes when, and only when, something that a script reaches changes."""
 
+import base64
+import json
 import os
 from pathlib import Path
 
 import pytest
 
 from neuma_lib.mechanics.catalogue import DEFINED_IN
+from neuma_lib.project import cases
+from tests.support.project import Plan
 from workflow.provenance import Sources, fingerprint, law_files
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -111,6 +115,73 @@ class TestThisProject:
     def test_no_stage_can_reach_the_truth(self, script):
         reached = self.reached(script, *(["neuma_lib.methods.structured"] if script == "fit" else []))
         assert "neuma_lib.data.ground_truth" not in reached and "neuma_lib.geometry.shapes" not in reached
+
+
+@pytest.fixture(scope="module")
+def jobs_with_code(finished, loaded):
+    """Jobs of Table 1 in their order, with the names of the files whose edits rerun them.
+
+    The digest of these files is the one that Snakemake has recorded of the job.
+    """
+    sources, jobs = Sources(), []
+    for job in Plan.of(finished.output).jobs:
+        wildcards = dict(word.split("=", 1) for word in job.listed("wildcards"))
+        folder, name = ("kernels", wildcards["group"]) if job.rule == "kernels" else ("scripts", job.rule)
+        script = Path("workflow", folder, f"{'fit' if name.startswith('fit_') else name}.py")
+        method = wildcards.get("method")
+        modules = (type(cases.kind_of(loaded, method)).__module__,) if method else ()
+        record = base64.urlsafe_b64encode(job.outputs[0].encode()).decode()
+        recorded = json.loads((finished.root / ".snakemake/metadata" / record).read_text())["params"]
+        assert repr(sources.digest(ROOT / script, modules)) in recorded, job.rule
+        reached = (f"{module.replace('.', '/')}.py" for module in sources.reached(ROOT / script, modules))
+        jobs.append((job, {str(script), *reached}))
+    return jobs
+
+
+@pytest.mark.parametrize(
+    ("file", "runs", "spared"),
+    [
+        (
+            "neuma_lib/evaluation/motion.py",
+            {"evaluate", "chamfer_table"},
+            {"fit_neuma", "velocity", "ground_truth"},
+        ),
+        ("neuma_lib/paper/tables.py", {"chamfer_table"}, {"evaluate"}),
+        (
+            "neuma_lib/coupling/particle_binding.py",
+            {"binding", "velocity", "fit_neuma", "evaluate"},
+            {"gaussians", "mesh", "prior"},
+        ),
+        (
+            "neuma_lib/data/blender/cycles.py",
+            {"render_static", "render_dynamic", "gaussians"},
+            {"ground_truth", "prior"},
+        ),
+        (
+            "neuma_lib/splatting/rasterizer.py",
+            {"kernels", "gaussians", "mesh", "binding", "velocity", "fit_neuma", "evaluate", "chamfer_table"},
+            {"ground_truth", "render_static", "render_dynamic", "prior"},
+        ),
+        ("neuma_lib/sim/rollout.py", {"ground_truth", "prior", "fit_neuma"}, set()),
+        ("neuma_lib/methods/neuma.py", {"fit_neuma", "evaluate"}, {"velocity", "ground_truth"}),
+        ("neuma_lib/methods/spring_gaus/method.py", set(), {"fit_neuma", "evaluate"}),
+        ("neuma_lib/methods/spring_gaus/fit.py", set(), {"fit_neuma", "evaluate"}),
+        (
+            "workflow/scripts/binding.py",
+            {"binding", "velocity", "evaluate"},
+            {"sampled_particles", "gaussians"},
+        ),
+    ],
+)
+def test_edits_rerun_what_depends_on_them(jobs_with_code, file, runs, spared):
+    """An edited file, and what reads the outputs of the jobs that it reruns."""
+    assert (ROOT / file).is_file()
+    rerun, replaced = set(), set()
+    for job, files in jobs_with_code:
+        if file in files or replaced & set(job.inputs):
+            rerun.add(job.rule)
+            replaced |= set(job.outputs)
+    assert runs <= rerun and not spared & rerun
 
 
 def test_a_method_in_a_file_counts_with_what_it_imports(tmp_path):

@@ -20,7 +20,7 @@ BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "
 FIGURES = ("main_res", "gradient_analysis", "material_response")
 TARGETS = ["tiny/results/table1.csv", *(f"tiny/results/figures/{name}.png" for name in FIGURES)]
 
-# Clicks on one thing after the other: a menu entry by its text, or the first (show) or second (about) button of a row.
+# Clicks on elements in turn: a menu entry by its text, or the first (show) or second (about) button of a row.
 CLICKS = """<script>addEventListener("load", () => {
 const steps = STEPS;
 const next = () => {
@@ -37,21 +37,22 @@ setTimeout(next, 700);
 
 
 @pytest.fixture(scope="module")
-def project(tmp_path_factory):
+def project(tmp_path_factory, kernels):
     """A small run."""
-    project = copied(tmp_path_factory.mktemp("project"), tmp_path_factory.mktemp("kernels"))
+    project = copied(tmp_path_factory.mktemp("project"), kernels)
     project.run(*TARGETS)
     return project
 
 
-def test_an_edit_of_a_figure_makes_this_figure_again(project):
-    module = project.root / "neuma_lib/paper/figures/main_res.py"
-    original = module.read_text()
-    module.write_text(original.replace('"""', '"""Another caption. ', 1))
-    assert project.plan(*TARGETS) == {}
-    module.write_text(original + "\nEDITED = True\n")
-    assert project.plan(*TARGETS) == {"main_res": 1}
-    module.write_text(original)
+def test_an_edit_of_a_figure_repeats_this_figure_and_that_of_a_caption_none(project):
+    figures = project.root / "neuma_lib/paper/figures"
+    texts = {figures / f"{name}.py": (figures / f"{name}.py").read_text() for name in FIGURES[:2]}
+    caption, code = texts
+    caption.write_text(texts[caption].replace('"""', '"""Another caption. ', 1))
+    code.write_text(texts[code] + "\nEDITED = True\n")
+    assert project.plan(*TARGETS) == {FIGURES[1]: 1}
+    for file, text in texts.items():
+        file.write_text(text)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +65,7 @@ def report(project):
 
 
 def browse(report: Path, steps: str, *options: str) -> str:
-    """Open the report, click, and let the browser do what the options say; its output."""
+    """Open the report, click, and run the browser with further options; its output."""
     before, after = report.read_text().rsplit("</body>", 1)
     page = report.with_name("clicked.html")
     page.write_text(f"{before}{CLICKS.replace('STEPS', steps)}</body>{after}")
@@ -75,12 +76,12 @@ def browse(report: Path, steps: str, *options: str) -> str:
 
 def test_report_lists_figures_and_tables(report):
     page = browse(report, '[["Figures", null]]', "--dump-dom")
-    shown = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
-    assert all(name in shown for name in FIGURES)
-    shown = re.sub(
+    text = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+    assert all(name in text for name in FIGURES)
+    text = re.sub(
         r"<script.*?</script>", "", browse(report, '[["Tables", null]]', "--dump-dom"), flags=re.DOTALL
     )
-    assert "table1" in shown
+    assert "table1" in text
 
 
 def test_report_shows_a_figure_with_its_caption(report):
@@ -91,7 +92,7 @@ def test_report_shows_a_figure_with_its_caption(report):
     content = screen[:, 420:]
     assert (content < 200).any(-1).mean() > 0.005  # the figure is there, not an empty page
     page = browse(report, '[["Figures", null], ["main_res", 1]]', "--dump-dom")
-    shown = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+    text = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
     module = ast.parse((ROOT / "neuma_lib/paper/figures/main_res.py").read_text())
     caption = ast.get_docstring(module).split(":")[0]
-    assert caption in " ".join(shown.split())
+    assert caption in " ".join(text.split())

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 GPUS = Path(__file__).parents[2] / "workflow" / "gpus"
-SAY = "import os\nprint(os.environ.get('CUDA_VISIBLE_DEVICES'), flush=True)\ninput()\n"
+SCRIPT = "import os\nprint(os.environ.get('CUDA_VISIBLE_DEVICES'), flush=True)\ninput()\n"
 
 
 @pytest.fixture
@@ -20,7 +20,7 @@ def start(tmp_path):
     def begin(folder=".snakemake/scripts", **variables):
         script = tmp_path / folder / "job.py"
         script.parent.mkdir(parents=True, exist_ok=True)
-        script.write_text(SAY)
+        script.write_text(SCRIPT)
         known = {name: value for name, value in os.environ.items() if name != "CUDA_VISIBLE_DEVICES"}
         known |= {"PYTHONPATH": str(GPUS), "TMPDIR": str(tmp_path), "NEUMA_GPUS": "2", **variables}
         process = subprocess.Popen(

@@ -15,7 +15,7 @@ from neuma_lib.io.laws import save_law
 from neuma_lib.io.splats import load_splat
 from neuma_lib.mechanics.analytic import analytic_law
 from neuma_lib.splatting.culling import morton_order
-from tests.support.project import copied
+from tests.support.project import copied, overlay
 from tests.support.splat_files import ball, write_spz
 
 RESULTS = "tiny/results"
@@ -32,16 +32,13 @@ def settings(**splat):
     scene = {"splat": {"file": "made/ball.spz", "up": "z", "count": 300, **splat}}
     scene |= {"height": 0.2, "size": 0.3, "velocity": [0.0, -2.0, 0.0], "dt": DT / 2, "steps": 100}
     scenes = {"Splat": scene, "BouncyBall": {"prior": "made/law.safetensors"}}
-    return [
-        *(
-            "--config",
-            f"scenes={json.dumps(scenes)}",
-            'figures={"i23d": ["BouncyBall"], "methods": ["nclaw"]}',
-            'viewer={"methods": ["nclaw+law_from=BouncyBall"]}',
-            'advanced={"scenes.Splat.splat.views": 12, "scenes.Splat.splat.pixels": 48}',
-        ),
-        'dataset={"frames": 11}',
-    ]
+    return overlay(
+        scenes=scenes,
+        figures={"i23d": ["BouncyBall"], "methods": ["nclaw"]},
+        viewer={"methods": ["nclaw+law_from=BouncyBall"]},
+        advanced={"scenes.Splat.splat.views": 12, "scenes.Splat.splat.pixels": 48},
+        dataset={"frames": 11},
+    )
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +55,7 @@ def project(tmp_path_factory, kernels):
 def test_a_law_from_elsewhere_moves_a_splat_and_the_motion_can_be_taken_away(project):
     files = ["gaussians", "compressed", "particles.h5", "surface.glb", "motion.gif"]
     viewer = f"{RESULTS}/Splat/viewer.html"
-    project.run(FIGURE, viewer, *(f"{EXPORT}/{file}" for file in files), *settings())
+    project.run(*settings(), FIGURE, viewer, *(f"{EXPORT}/{file}" for file in files))
     gaussians = load_gaussians(project.root / f"{RESULTS}/Splat/gaussians.ply")
     assert len(gaussians) == 300
     report = json.loads((project.root / f"{RESULTS}/Splat/gaussians.json").read_text())
@@ -100,20 +97,20 @@ def test_a_law_from_elsewhere_moves_a_splat_and_the_motion_can_be_taken_away(pro
     with Image.open(project.root / f"{EXPORT}/motion.gif") as image:
         assert image.n_frames == 11
     page = (project.root / viewer).read_text()
-    told = json.loads(re.search(r'id="meta">(.*?)</script>', page)[1])
-    assert [motion["name"] for motion in told["motions"]] == ["nclaw+law_from=BouncyBall"]
-    assert told["steps"] == list(range(0, 101, 10)) and told["motions"][0]["means"]["count"] == 300
+    meta = json.loads(re.search(r'id="meta">(.*?)</script>', page)[1])
+    assert [motion["name"] for motion in meta["motions"]] == ["nclaw+law_from=BouncyBall"]
+    assert meta["steps"] == list(range(0, 101, 10)) and meta["motions"][0]["means"]["count"] == 300
 
 
 def test_what_is_done_is_not_done_again_and_the_placement_repeats_what_it_moves(project):
-    assert project.plan(FIGURE, *settings()) == {}
-    again = project.plan(FIGURE, *settings(turn=30.0))
+    assert project.plan(*settings(), FIGURE) == {}
+    again = project.plan(*settings(turn=30.0), FIGURE)
     assert again["splat_gaussians"] == again["splat_mesh"] == again["predict_splat"] == 1
     assert not again.keys() & {"fit_neuma", "prior", "ground_truth", "gaussians", "evaluate"}
 
 
 @pytest.mark.parametrize(
-    "target, says",
+    "target, message",
     [
         ("Splat/neuma/rollout.h5", "no video to learn a law from"),
         ("Splat/true_law/rollout.h5", "true law and motion of a captured object or a splat are unknown"),
@@ -121,17 +118,12 @@ def test_what_is_done_is_not_done_again_and_the_placement_repeats_what_it_moves(
         ("Splat/neuma/metrics.json", "No rule|Missing"),
     ],
 )
-def test_what_a_splat_cannot_have_is_said(project, target, says):
-    assert re.search(says, project.run("-n", f"{RESULTS}/{target}", *settings(), succeeds=False))
+def test_what_a_splat_cannot_have_is_refused(project, target, message):
+    assert re.search(message, project.run("-n", *settings(), f"{RESULTS}/{target}", succeeds=False))
 
 
 def test_a_damaged_file_is_one_line(project):
     (project.root / "made/bad.spz").write_bytes(b"nothing")
-    said = project.run(f"{RESULTS}/Splat/gaussians.ply", *settings(file="made/bad.spz"), succeeds=False)
-    assert re.search(r"splat_gaussians Splat: ERROR: made/bad.spz: cannot be read", said)
+    output = project.run(*settings(file="made/bad.spz"), f"{RESULTS}/Splat/gaussians.ply", succeeds=False)
+    assert re.search(r"splat_gaussians Splat: ERROR: made/bad.spz: cannot be read", output)
     assert not (project.root / f"{RESULTS}/Splat/gaussians.ply").exists()
-
-
-def test_the_figure_asks_for_a_splat(tmp_path, kernels):
-    said = copied(tmp_path, kernels).run("-n", FIGURE, succeeds=False)
-    assert "no scene has a splat" in said

@@ -3,6 +3,7 @@
 from functools import cache
 
 from neuma_lib.project.capture_folder import NAME, inside, read_capture
+from neuma_lib.project.released_captures import released_captures
 
 CAPTURES = SETTINGS.captures.root.rstrip("/")
 CAPTURE_ENVIRONMENT = "../../envs/conda-capture.yaml"
@@ -44,8 +45,6 @@ wildcard_constraints:
 @cache
 def capture_named(name):
     if name in SETTINGS.captures.released:
-        from neuma_lib.capture.released import released_captures  # slow to import
-
         return released_captures({name: SETTINGS.captures.released[name]})[name]
     return PLANNED.get(name) or read_capture(f"{CAPTURES}/{name}")
 

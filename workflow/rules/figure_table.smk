@@ -57,7 +57,7 @@ def own_bodies(scenes):
         for scene in scenes:
             case = case_on(scene, method)
             if files := case.method.body_inputs(case):
-                source = body_parameter(case) | {"files": files, "carrier": case.method.carrier(case)}
+                source = body_parameter(case) | {"files": files, "carrier": case.method.particle_source(case)}
                 found.setdefault(method, {})[scene] = source
     return found
 

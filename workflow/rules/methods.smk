@@ -139,7 +139,7 @@ def carries_total(bodies):
 
 
 def carrier(bodies):
-    return bodies[0].method.carrier(bodies[0])
+    return bodies[0].method.particle_source(bodies[0])
 
 
 def shared_carrier(bodies):

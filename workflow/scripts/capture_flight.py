@@ -41,7 +41,7 @@ def main(inputs, output, params, run) -> None:
 def filmed(camera, video, transforms, masks, timeline, offset, row_time) -> Filmed:
     data, timeline = read_transforms(transforms), read_json(timeline)
     images = read_image_set(transforms).images
-    arcs = read_json(masks)["arcs"]
+    flights = read_json(masks)["arcs"]
     viewmat, K = metric_camera(data["frames"][0], data.get("world", {}))
     return Filmed(
         camera,
@@ -49,7 +49,7 @@ def filmed(camera, video, transforms, masks, timeline, offset, row_time) -> Film
         np.array([frame["time"] for frame in data["frames"]]),
         images[..., :3],
         images[..., 3] > 127,
-        tuple(arcs[0]) if arcs else None,
+        tuple(flights[0]) if flights else None,
         viewmat,
         K,
         timeline["height"],

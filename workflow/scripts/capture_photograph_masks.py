@@ -8,7 +8,7 @@ from neuma_lib.capture.calibration.board import board_outline
 from neuma_lib.capture.calibration.lens import read_lens
 from neuma_lib.capture.frames import Frame
 from neuma_lib.capture.masks.agreement import MIN_AGREEMENT, agreement
-from neuma_lib.capture.masks.mask_refinement import redrawn_masks
+from neuma_lib.capture.masks.mask_refinement import refined_masks
 from neuma_lib.capture.masks.mattes import (
     metric_camera,
     own_mask,
@@ -58,7 +58,7 @@ def main(inputs, output, params, run) -> None:
         def progress(done: int, total: int) -> None:
             run.progress(total + (_STEPS - 1) * done, _STEPS * total)
 
-        masks = redrawn_masks(pictures, masks, cameras, Ks, is_own, progress)
+        masks = refined_masks(pictures, masks, cameras, Ks, is_own, progress)
         ious = agreement(masks, cameras, Ks)
     doubtful = _check(ious, names, is_own, params.name)
     kept = [name not in doubtful for name in names]

@@ -77,11 +77,14 @@ def main(inputs, output, params, run) -> None:
     with atomic(output.binding) as partial:
         shutil.copyfile(inputs.binding, partial)
     pictures = []
-    for shown in registered.shown:
-        triple = [shown.seen, shown.rendered, (1 + shown.rendered - shown.seen) / 2]
+    for compared in registered.comparisons:
+        triple = [compared.seen, compared.rendered, (1 + compared.rendered - compared.seen) / 2]
         pixels = np.rint(255 * np.concatenate(triple, axis=1)).astype(np.uint8)
         pictures.append(
-            (f"{registered.names[shown.camera]}, {shown.time:.4f} s: seen, rendered, difference", pixels)
+            (
+                f"{registered.names[compared.camera]}, {compared.time:.4f} s: seen, rendered, difference",
+                pixels,
+            )
         )
     picture_sheet(output.picture, pictures, f"{params.name}: {registered.summary()}", columns=3)
     write_json(output.velocity, registered.velocity())

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from neuma_lib.capture.report.page import checks, motion_checks, object_checks, registration_checks
-from neuma_lib.capture.report.report import Film, Report, page
+from neuma_lib.capture.report.report import Film, page
 from neuma_lib.capture.report.warnings import (
     check_warnings,
     constants_warnings,
@@ -84,21 +84,21 @@ def main(inputs, output, params, run) -> None:
         f"{_counted(len(cameras), 'camera')}. Prior: {facts['prior']}, density {facts['density']:g} kg/m³, "
         f"time step {1e3 * facts['dt']:g} ms, training pictures of {facts['width']} pixels."
     ]
-    report = Report(
+    html = page(
         params.capture,
         params.titles[method],
-        summary,
-        warnings,
-        groups,
-        pictures,
-        films,
-        rows,
-        method,
-        Path(inputs.curves_picture),
-        identified,
-        facts["scale"],
+        summary=summary,
+        warnings=warnings,
+        checks=groups,
+        pictures=pictures,
+        films=films,
+        rows=rows,
+        own=method,
+        curves=Path(inputs.curves_picture),
+        identified=identified,
+        scale=facts["scale"],
     )
-    write_text(output.page, page(report))
+    write_text(output.page, html)
     failed = sum(not check.good for group in groups.values() for check in group)
     run.say(f"{len(films)} videos, {failed} failed checks, {len(warnings)} warnings: {output.page}")
 

@@ -40,13 +40,15 @@ def main(inputs, output, params, run) -> None:
         background = read_picture(Path(inputs.room).parent / still["file_path"])
         result = video_masks(pixels, inputs.video, background, timeline.times, down=down)
     masks, areas = result.masks, result.areas
-    arc = list(result.arcs[0].frames) if result.arcs else None
-    if arc and not own:
-        check_flight(masks, inputs.video, range(arc[0], arc[1] + 1))
+    flight = list(result.tracks[0].frames) if result.tracks else None
+    if flight and not own:
+        check_flight(masks, inputs.video, range(flight[0], flight[1] + 1))
     visible = np.flatnonzero(masks.any(axis=(1, 2)))
     chosen = visible[sheet_numbers(len(visible))]
     summary = f"{len(visible)} of {len(frames)} frames show the object"
-    summary += f", free flight in frames {arc[0]} to {arc[1]}" if arc else ", no free flight detected"
+    summary += (
+        f", free flight in frames {flight[0]} to {flight[1]}" if flight else ", no free flight detected"
+    )
     sheet = [overlay(frames[i], masks[i]) for i in chosen]
     contact_sheet(output.sheet, sheet, f"{params.name}: {summary}")
     mattes = (
@@ -58,13 +60,13 @@ def main(inputs, output, params, run) -> None:
         for i in visible
     )
     write_mattes(output.transforms, mattes, world_of(inputs.room))
-    flying = areas[arc[0] : arc[1] + 1] if arc else areas[:0]
+    flying = areas[flight[0] : flight[1] + 1] if flight else areas[:0]
     write_json(
         output.report,
         {
             "frames": len(frames),
             "shown": visible.tolist(),
-            "arcs": [list(a.frames) for a in result.arcs],
+            "arcs": [list(a.frames) for a in result.tracks],
             "areas": areas[visible].tolist(),
             "largest_jump": float(area_jumps(flying).max()) if len(flying) > 1 else None,
             "moving": float(result.moving[visible].max()),

@@ -25,7 +25,7 @@ from neuma_lib.fitting.frame_batches import frame_batches, spread_frames
 from neuma_lib.io.files import atomic, write_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import filmed_steps, load_videos, read_transforms
-from neuma_lib.io.particles import load_body, load_motion
+from neuma_lib.io.particles import load_motion, load_reconstruction
 from neuma_lib.io.weights import read_weights
 from workflow.stage import run_script
 
@@ -70,7 +70,7 @@ def main(inputs, output, params, run) -> None:
         if rollout:
             carrier = params.carrier if rollout == inputs.rollout else "binding"
             files = (inputs.particles, inputs.binding, inputs.gaussians)
-            body = load_body(*files, params.density, carrier, motion).to(torch.float32, device)
+            body = load_reconstruction(*files, params.density, carrier, motion).to(torch.float32, device)
             predictions.append(Prediction(body, rollout, needed))
     folder = Path(inputs.shown).parent
     entries = {f["step"]: f for f in read_transforms(inputs.shown)["frames"] if f["view"] == params.view}

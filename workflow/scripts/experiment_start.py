@@ -14,7 +14,7 @@ from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import read_json, write_json
 from neuma_lib.io.gaussians import save_gaussians
 from neuma_lib.io.mesh import read_mesh, write_mesh
-from neuma_lib.io.particles import INITIAL_MOTION, load_body, save_binding, save_particles
+from neuma_lib.io.particles import INITIAL_MOTION, load_reconstruction, save_binding, save_particles
 from workflow.stage import run_script
 
 
@@ -32,7 +32,7 @@ def main(inputs, output, params, run) -> None:
     for entry in params.bodies:
         if entry["reconstructed"]:
             *parts, surface, velocity = next(reconstructed)
-            body, mesh, found = load_body(*parts, 1.0), read_mesh(surface), read_json(velocity)
+            body, mesh, found = load_reconstruction(*parts, 1.0), read_mesh(surface), read_json(velocity)
         else:
             mesh = place(entry["shape"], entry["size"], entry["height"], entry["center"])
             x0 = sample_volume(mesh, params.particles, seed=params.seed, method=params.sampling)

@@ -5,7 +5,7 @@ import numpy as np
 from neuma_lib.evaluation.plotting.rendering import frontal, renders, seen_around
 from neuma_lib.evaluation.video import write_gif, write_mp4
 from neuma_lib.io.files import atomic
-from neuma_lib.io.particles import load_body, load_motion
+from neuma_lib.io.particles import load_motion, load_reconstruction
 from workflow.stage import run_script
 
 SQUARE = 2
@@ -14,7 +14,7 @@ SQUARE = 2
 
 def main(inputs, output, params, run) -> None:
     files = (inputs.particles, inputs.binding, inputs.gaussians)
-    body = load_body(*files, 1.0, params.carrier, params.gaussian_motion)
+    body = load_reconstruction(*files, 1.0, params.carrier, params.gaussian_motion)
     x, F = load_motion(inputs.rollout)
     seen = seen_around(body, x, F)
     wide, high = np.ptp(seen, axis=0)[:2]

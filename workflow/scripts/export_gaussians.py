@@ -7,14 +7,14 @@ import torch
 from neuma_lib.coupling.frames import gaussians_at
 from neuma_lib.io.compressed_splats import save_compressed
 from neuma_lib.io.gaussians import save_gaussians
-from neuma_lib.io.particles import load_body, load_motion
+from neuma_lib.io.particles import load_motion, load_reconstruction
 from neuma_lib.splatting.culling import morton_order
 from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
     files = (inputs.particles, inputs.binding, inputs.gaussians)
-    body = load_body(*files, 1.0, params.carrier, params.gaussian_motion)
+    body = load_reconstruction(*files, 1.0, params.carrier, params.gaussian_motion)
     x, F = load_motion(inputs.rollout)
     order = morton_order(body.gaussians.means.double().numpy())  # of all frames: a Gaussian keeps its place
     for k in range(len(x)):

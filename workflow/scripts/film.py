@@ -7,7 +7,7 @@ from neuma_lib.evaluation.plotting.rendering import magnified, observed, renders
 from neuma_lib.evaluation.video import side_by_side, write_gif, write_mp4
 from neuma_lib.io.files import atomic
 from neuma_lib.io.images import load_observation
-from neuma_lib.io.particles import load_body, load_motion
+from neuma_lib.io.particles import load_motion, load_reconstruction
 from workflow.stage import run_script
 
 
@@ -17,7 +17,7 @@ def main(inputs, output, params, run) -> None:
     cameras = magnified(video.cameras, params.magnify).to(device)
     panels = [observed(video, range(len(video.frames)), params.magnify)]
     for file, motion in zip(inputs.rollouts, params.motions, strict=True):
-        body = load_body(
+        body = load_reconstruction(
             inputs.particles, inputs.binding, inputs.gaussians, params.density, gaussian_motion=motion
         )
         x, F = load_motion(file)

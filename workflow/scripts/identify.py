@@ -11,7 +11,7 @@ from neuma_lib.geometry.volume import sample_volume
 from neuma_lib.io.files import listed, read_json, write_json
 from neuma_lib.io.images import load_videos
 from neuma_lib.io.mesh import read_mesh
-from neuma_lib.io.particles import load_body
+from neuma_lib.io.particles import load_reconstruction
 from neuma_lib.sim.model import MPM
 from workflow.stage import run_script
 
@@ -23,7 +23,9 @@ def main(inputs, output, params, run) -> None:
     videos = [
         (
             InitialMotion.of(read_json(velocity)),
-            load_body(*body, density, gaussian_motion=settings.gaussian_motion).to(torch.float32, device),
+            load_reconstruction(*body, density, gaussian_motion=settings.gaussian_motion).to(
+                torch.float32, device
+            ),
             [
                 video.to(torch.float32, device)
                 for video in load_videos(transforms, settings.views, **params.exposure)

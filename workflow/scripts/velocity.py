@@ -8,7 +8,7 @@ from neuma_lib.fitting.velocity import estimate_velocity
 from neuma_lib.io.files import write_json
 from neuma_lib.io.images import load_videos
 from neuma_lib.io.laws import load_prior
-from neuma_lib.io.particles import load_body
+from neuma_lib.io.particles import load_reconstruction
 from neuma_lib.sim.model import MPM
 from workflow.stage import run_script
 
@@ -18,7 +18,7 @@ def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
     model = MPM(**params.simulation)
     law = load_prior(inputs.prior, device, model.dt)
-    body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density)
+    body = load_reconstruction(inputs.particles, inputs.binding, inputs.gaussians, params.density)
     body = body.to(torch.float32, device)
     videos = [
         video.to(torch.float32, device)

@@ -45,7 +45,7 @@ class _View(NamedTuple):
     possible: np.ndarray
 
 
-def redrawn_masks(
+def refined_masks(
     pictures: Sequence[np.ndarray],
     masks: Sequence[np.ndarray],
     viewmats: np.ndarray,

@@ -111,7 +111,7 @@ def learn_palette(
     return Palette(colours, np.bincount(labels.ravel(), minlength=COLOURS) / len(labels))
 
 
-def outline(frame: np.ndarray, background: np.ndarray, mask: np.ndarray, palette: Palette) -> np.ndarray:
+def silhouette(frame: np.ndarray, background: np.ndarray, mask: np.ndarray, palette: Palette) -> np.ndarray:
     """Mask of the object, (H, W), from an initial mask that may contain shadows.
 
     Args:

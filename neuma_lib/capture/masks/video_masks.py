@@ -1,10 +1,10 @@
 """Masks of the object in videos of a fixed camera with a known background.
 
-After matching the exposure, the object, its shadow and other moving things differ from the background. Shadows darken
+After matching the exposure, the object, its shadow and other moving objects differ from the background. Shadows darken
 all channels by one factor. Of the rest, the component at the expected position of the object is selected. GrabCut
 (Rother et al. 2004) draws a first edge on the difference image, in which the background is flat whatever its texture.
 Dark, tinted shadows near the floor remain in this mask. They are removed with the colours of the object, learned in
-free flight (`outlines`).
+free flight (`silhouettes`).
 
 Pictures are RGB, uint8, (H, W, 3). Masks are Boolean, (H, W). Positions are (x, y) [px], pixel centres at +0.5.
 """
@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -37,18 +36,20 @@ from neuma_lib.capture.masks.regions import (
     min_area,
     opened,
     parts_of,
+    radius_of,
     shrunk,
     whole,
 )
-from neuma_lib.capture.masks.silhouettes import learn_palette, outline
-from neuma_lib.capture.motion.ballistic_tracks import Arc, find_arcs
+from neuma_lib.capture.masks.silhouettes import learn_palette, silhouette
+from neuma_lib.capture.motion.ballistic_tracks import BallisticTrack, find_ballistic_tracks
 from neuma_lib.errors import InputError
 
-SURE, POSSIBLE = 30.0, 12.0
-"""Differences from the background that are certainly, and possibly without noise, an object [levels of 255]."""
-MAX_NOISE = 6.0
-"""Maximum standard deviation of a camera's noise [levels]. Larger differences are motion."""
-_OUTLINES = 2  # iterations of learning colours and drawing outlines
+_SURE, _POSSIBLE = (
+    30.0,
+    12.0,
+)  # differences that are certainly, and possibly without noise, an object [levels of 255]
+_MAX_NOISE = 6.0  # maximum standard deviation of a camera's noise [levels]; larger differences are motion
+_ROUNDS = 2  # iterations of learning colours and drawing silhouettes
 _LOST = 2  # frames after which a lost object is no longer searched for
 
 
@@ -59,20 +60,12 @@ class VideoMasks:
     Attributes:
         masks: (T, H, W), Boolean, all False where the object is not visible.
         moving: share of the picture outside object and shadows that differs from the background, (T,).
-        gains, offsets: exposure of each frame relative to the background, (T, 3).
-        arcs: segments of free flight, in order of time.
+        tracks: segments of free flight, in order of time.
     """
 
     masks: np.ndarray
     moving: np.ndarray
-    gains: np.ndarray
-    offsets: np.ndarray
-    arcs: tuple[Arc, ...]
-
-    @property
-    def centroids(self) -> np.ndarray:
-        """(T, 2) [px], NaN where the mask is empty."""
-        return np.array([centroid(mask) for mask in self.masks])
+    tracks: tuple[BallisticTrack, ...]
 
     @property
     def areas(self) -> np.ndarray:
@@ -90,16 +83,17 @@ def video_masks(
 ) -> VideoMasks:
     """Masks of the object in a video of a fixed camera.
 
-    In free flight the object moves along an arc (`find_arcs`). Before and after, its position is extrapolated from the
-    two frames closer to the flight, and components far from it or of a very different size are ignored.
+    In free flight the object moves along a parabola (`find_ballistic_tracks`). Before and after, its position is
+    extrapolated from the two frames closer to the flight, and components far from it or of a very different size are
+    ignored.
 
     Args:
         frames: T pictures.
         name: of the file for messages.
         background: the empty scene. None: the median of the frames.
         times: of the frames [s], ascending, (T,). None: evenly spaced.
-        places: expected positions of the object, (T, 2), NaN if unknown. They take precedence over arcs.
-        down: direction of gravity in the picture, see `find_arcs`.
+        places: expected positions of the object, (T, 2), NaN if unknown. They take precedence over tracks.
+        down: direction of gravity in the picture, see `find_ballistic_tracks`.
 
     Raises:
         InputError: no frames, a background of another size or that moves, or the object is in no frame.
@@ -115,179 +109,158 @@ def video_masks(
             f" {frames[0].shape[1]}x{frames[0].shape[0]}",
             "Use a frame of the same camera in the same mode as the empty picture",
         )
-    seen = [_changed(frame, background) for frame in frames]
+    changes = [_Change(frame, background) for frame in frames]
     times = np.arange(len(frames), dtype=float) if times is None else np.asarray(times, float)
-    arcs = find_arcs([change.parts[~change.cut] for change in seen], times, down)
-    masks = np.zeros((len(frames), *background.shape[:2]), bool)
-    known = np.zeros(len(frames), bool)
-    arcs = [_mask_arc(arc, frames, background, seen, times, masks, known) for arc in arcs]
+    tracks = find_ballistic_tracks([change.parts[~change.cut] for change in changes], times, down)
+    drafts = _Drafts(changes)
+    tracks = [drafts.follow_track(track, times) for track in tracks]
     for i in [] if places is None else np.flatnonzero(~np.isnan(places).any(axis=1)):
-        masks[i], known[i] = _mask(frames[i], background, seen[i], places[i]), True
-    begin = arcs[0].frames[0] if arcs else 0
+        drafts.masks[i], drafts.known[i] = changes[i].mask(places[i]), True
+    begin = tracks[0].frames[0] if tracks else 0
     for order in (range(begin, len(frames)), range(begin - 1, -1, -1)):
-        _follow(order, frames, background, seen, masks, known)
-    drafts, masks = masks, _outlined(frames, background, seen, masks, arcs)
-    moving = np.array([(c.strong & ~grown(m, 5)).mean() for c, m in zip(seen, drafts)])
+        drafts.extrapolate(order)
+    masks = _silhouettes(changes, drafts.masks, tracks)
+    moving = np.array([(c.strong & ~grown(m, 5)).mean() for c, m in zip(changes, drafts.masks)])
     # A hand that holds the object before its flight is allowed.
     check_background(np.where(np.arange(len(frames)) < begin, 0, moving), name)
     check_not_empty(masks, name)
-    exposures = (np.stack([getattr(change, key) for change in seen]) for key in ("gain", "offset"))
-    return VideoMasks(masks, moving, *exposures, tuple(arcs))
+    return VideoMasks(masks, moving, tuple(tracks))
 
 
 def given_masks(masks: np.ndarray, times: np.ndarray, down: np.ndarray | None = None) -> VideoMasks:
-    """Masks (T, H, W) of the user at ascending times (T,) [s], with arcs detected by `find_arcs`."""
-    seen = [np.array([[*centroid(mask), mask.sum()]]) if whole(mask) else np.empty((0, 3)) for mask in masks]
-    still = np.ones((len(masks), 3))
-    return VideoMasks(masks, np.zeros(len(masks)), still, 0 * still, tuple(find_arcs(seen, times, down)))
+    """Masks (T, H, W) of the user at ascending times (T,) [s], with tracks by `find_ballistic_tracks`."""
+    parts = [np.array([[*centroid(mask), mask.sum()]]) if whole(mask) else np.empty((0, 3)) for mask in masks]
+    return VideoMasks(masks, np.zeros(len(masks)), tuple(find_ballistic_tracks(parts, times, down)))
 
 
-class _Change(NamedTuple):
+class _Change:
     """Difference of a frame from the background.
 
-    Exposure, noise, mask, components (x, y, area), and which of these touch the border.
+    Attributes:
+        frame, empty: the frame, and the background at its exposure, (H, W, 3).
+        noise: standard deviation of the camera's noise [levels].
+        strong: pixels that certainly differ, (H, W).
+        parts: their components (x, y, area), (N, 3).
+        cut: which components touch the border, (N,).
     """
 
-    gain: np.ndarray
-    offset: np.ndarray
-    noise: float
-    strong: np.ndarray
-    parts: np.ndarray
-    cut: np.ndarray
+    def __init__(self, frame: np.ndarray, background: np.ndarray):
+        self.frame, self.empty = frame, exposed(background, *match_exposure(frame, background))
+        difference, shadow = compare(frame, self.empty)
+        largest = largest_channel(np.abs(difference))
+        self.noise = min(1.4826 * float(np.median(largest[::4, ::4])), _MAX_NOISE)
+        self.strong = opened((largest > _SURE) & ~shadow)
+        labels, sizes, middles = parts_of(self.strong)
+        enough = np.flatnonzero(sizes >= min_area(self.strong))
+        border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+        self.parts = np.column_stack([middles[enough], sizes[enough]])
+        self.cut = np.isin(enough + 1, border)
+
+    def mask(
+        self,
+        place: np.ndarray | None = None,
+        area: float | None = None,
+        gate: float | None = None,
+        in_flight: bool = False,
+    ) -> np.ndarray:
+        """The refined mask near a position, see `component`. Empty if there is no component."""
+        mask = component(self.strong, place, area, gate)
+        if in_flight and not mask.any() and not component(self.strong, place, area, 2 * gate).any():
+            # Only the object can be here. Blurred and dark, it was taken for a shadow.
+            largest = largest_channel(np.abs(self.frame - self.empty))
+            mask = component(opened(largest > _SURE), place, area, gate)
+        if not mask.any():
+            return mask
+        box = box_of(mask, 2 * max(3, round(0.3 * radius_of(mask))))
+        difference, shadow = compare(self.frame[box], self.empty[box])
+        refined = _refined(difference, shadow, mask[box], max(_POSSIBLE, 3 * self.noise))
+        return in_full(refined, box, mask.shape)
 
 
-def _changed(frame: np.ndarray, background: np.ndarray) -> _Change:
-    gain, offset = match_exposure(frame, background)
-    difference, shadow = compare(frame, exposed(background, gain, offset))
-    largest = largest_channel(np.abs(difference))
-    noise = min(1.4826 * float(np.median(largest[::4, ::4])), MAX_NOISE)
-    strong = opened((largest > SURE) & ~shadow)
-    labels, sizes, middles = parts_of(strong)
-    enough = np.flatnonzero(sizes >= min_area(strong))
-    border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-    parts = np.column_stack([middles[enough], sizes[enough]])
-    return _Change(gain, offset, noise, strong, parts, np.isin(enough + 1, border))
+class _Drafts:
+    """Masks (T, H, W) of a video, and which of them are known, (T,)."""
 
+    def __init__(self, changes: Sequence[_Change]):
+        self.changes = changes
+        self.masks = np.zeros((len(changes), *changes[0].strong.shape), bool)
+        self.known = np.zeros(len(changes), bool)
 
-def _mask_arc(
-    arc: Arc,
-    frames: Sequence[np.ndarray],
-    background: np.ndarray,
-    seen: Sequence[_Change],
-    times: np.ndarray,
-    masks: np.ndarray,
-    known: np.ndarray,
-) -> Arc:
-    """Fill in the masks along an arc and return the arc.
+    def follow_track(self, track: BallisticTrack, times: np.ndarray) -> BallisticTrack:
+        """Fill in the masks along a track and return the track.
 
-    It is extended while the object is on it, since a fast, blurred object may have been taken for a shadow.
-    """
+        It is extended while the object is on it, since a fast, blurred object may have been taken for a shadow.
+        """
 
-    def flying(i: int) -> np.ndarray:
-        return _mask(
-            frames[i], background, seen[i], arc.place(times[i]), arc.area, 2 * arc.reach, in_flight=True
-        )
+        def flying(i: int) -> np.ndarray:
+            place = track.place(times[i])
+            return self.changes[i].mask(place, track.area, 2 * track.reach, in_flight=True)
 
-    first, last = arc.frames
-    for i in range(first, last + 1):
-        masks[i] = flying(i)
-        known[i] = masks[i].any()
-    while first > 0 and not known[first - 1] and whole(mask := flying(first - 1)):
-        first -= 1
-        masks[first], known[first] = mask, True
-    while last + 1 < len(frames) and not known[last + 1] and whole(mask := flying(last + 1)):
-        last += 1
-        masks[last], known[last] = mask, True
-    return replace(arc, frames=(first, last))
+        first, last = track.frames
+        for i in range(first, last + 1):
+            self.masks[i] = flying(i)
+            self.known[i] = self.masks[i].any()
+        while first > 0 and not self.known[first - 1] and whole(mask := flying(first - 1)):
+            first -= 1
+            self.masks[first], self.known[first] = mask, True
+        while last + 1 < len(times) and not self.known[last + 1] and whole(mask := flying(last + 1)):
+            last += 1
+            self.masks[last], self.known[last] = mask, True
+        return replace(track, frames=(first, last))
 
-
-def _follow(
-    order: range,
-    frames: Sequence[np.ndarray],
-    background: np.ndarray,
-    seen: Sequence[_Change],
-    masks: np.ndarray,
-    known: np.ndarray,
-) -> None:
-    """Fill in masks one after the other, each from the two previous ones."""
-    last: list[tuple[int, np.ndarray, float]] = []
-    if order.step < 0:  # start from the masks that follow
-        after = [i for i in range(order.start + 1, len(frames)) if masks[i].any()][:2]
-        last = [(i, centroid(masks[i]), float(masks[i].sum())) for i in reversed(after)]
-        if not last:
-            return
-    for i in order:
-        if not known[i]:
+    def extrapolate(self, order: range) -> None:
+        """Fill in unknown masks one after the other, each from the two previous ones."""
+        last: list[tuple[int, np.ndarray, float]] = []
+        if order.step < 0:  # start from the masks that follow
+            after = [i for i in range(order.start + 1, len(self.masks)) if self.masks[i].any()][:2]
+            last = [self._seen(i) for i in reversed(after)]
             if not last:
-                masks[i] = _mask(frames[i], background, seen[i])
-            elif abs(i - last[-1][0]) <= _LOST:
-                (_, place, area), step = last[-1], np.zeros(2)
-                if len(last) > 1:
-                    step = (place - last[-2][1]) / abs(last[-1][0] - last[-2][0]) * abs(i - last[-1][0])
-                # The object may have stopped or reversed.
-                gate = 1.5 * np.sqrt(area / np.pi) + 1.5 * np.linalg.norm(step)
-                masks[i] = _mask(frames[i], background, seen[i], place + step, area, gate)
-        if masks[i].any():
-            last = [*last[-1:], (i, centroid(masks[i]), float(masks[i].sum()))]
+                return
+        for i in order:
+            if not self.known[i]:
+                if not last:
+                    self.masks[i] = self.changes[i].mask()
+                elif abs(i - last[-1][0]) <= _LOST:
+                    (_, place, area), step = last[-1], np.zeros(2)
+                    if len(last) > 1:
+                        step = (place - last[-2][1]) / abs(last[-1][0] - last[-2][0]) * abs(i - last[-1][0])
+                    # The object may have stopped or reversed.
+                    gate = 1.5 * np.sqrt(area / np.pi) + 1.5 * np.linalg.norm(step)
+                    self.masks[i] = self.changes[i].mask(place + step, area, gate)
+            if self.masks[i].any():
+                last = [*last[-1:], self._seen(i)]
+
+    def _seen(self, i: int) -> tuple[int, np.ndarray, float]:
+        return i, centroid(self.masks[i]), float(self.masks[i].sum())
 
 
-def _outlined(
-    frames: Sequence[np.ndarray],
-    background: np.ndarray,
-    seen: Sequence[_Change],
-    masks: np.ndarray,
-    arcs: Sequence[Arc],
+def _silhouettes(
+    changes: Sequence[_Change], masks: np.ndarray, tracks: Sequence[BallisticTrack]
 ) -> np.ndarray:
-    """Masks with outlines from the colours of the object in its first flight. Unchanged without a flight."""
-    if not arcs:
+    """Masks refined with the colours of the object in its first flight. Unchanged without a flight."""
+    if not tracks:
         return masks
-    first, last = arcs[0].frames
-    flying = slice(first, last + 1)
-    backgrounds = [exposed(background, change.gain, change.offset) for change in seen]
-    for _ in range(_OUTLINES):
-        palette = learn_palette(frames[flying], backgrounds[flying], masks[flying])
+    flying = range(tracks[0].frames[0], tracks[0].frames[1] + 1)
+    for _ in range(_ROUNDS):
+        pictures = ((changes[i].frame, changes[i].empty, masks[i]) for i in flying)
+        palette = learn_palette(*zip(*pictures))
         if palette is None:
             break
         masks = masks.copy()
         for i in np.flatnonzero(masks.any(axis=(1, 2))):
-            outlined = outline(frames[i], backgrounds[i], masks[i], palette)
-            if outlined.any():
-                masks[i] = outlined
+            refined = silhouette(changes[i].frame, changes[i].empty, masks[i], palette)
+            if refined.any():
+                masks[i] = refined
     return masks
-
-
-def _mask(
-    frame: np.ndarray,
-    background: np.ndarray,
-    change: _Change,
-    place: np.ndarray | None = None,
-    area: float | None = None,
-    gate: float | None = None,
-    in_flight: bool = False,
-) -> np.ndarray:
-    """The refined mask of a frame near a position. Empty if there is no component."""
-    mask = component(change.strong, place, area, gate)
-    empty = exposed(background, change.gain, change.offset)
-    if in_flight and not mask.any() and not component(change.strong, place, area, 2 * gate).any():
-        # Only the object can be here. Blurred and dark, it was taken for a shadow.
-        largest = largest_channel(np.abs(frame - empty))
-        mask = component(opened(largest > SURE), place, area, gate)
-    if not mask.any():
-        return mask
-    radius = np.sqrt(mask.sum() / np.pi)
-    box = box_of(mask, 2 * max(3, round(0.3 * radius)))
-    difference, shadow = compare(frame[box], empty[box])
-    return in_full(_refined(difference, shadow, mask[box], max(POSSIBLE, 3 * change.noise)), box, mask.shape)
 
 
 def _refined(difference: np.ndarray, shadow: np.ndarray, mask: np.ndarray, possible: float) -> np.ndarray:
     """The mask with its edge refined by GrabCut on the difference from the background."""
-    radius = np.sqrt(mask.sum() / np.pi)
+    radius = radius_of(mask)
     inner, outer = max(1, round(0.15 * radius)), max(3, round(0.3 * radius))
     difference = np.where((shadow & ~mask)[..., None], 0, difference)
     strength = largest_channel(np.abs(difference))
     reach, sure = grown(mask, outer), shrunk(mask, inner)
-    foreground = (strength > SURE) & reach
+    foreground = (strength > _SURE) & reach
     background = ~reach | ((strength < possible) & ~mask)
     image = np.clip(128 + difference / 2, 0, 255).astype(np.uint8)
     return grabcut(image, sure, foreground, background)

@@ -1,7 +1,7 @@
-"""Detect ballistic tracks ("arcs") among the moving regions of one camera.
+"""Detect ballistic tracks among the moving regions of one camera.
 
 A hand that launches an object is often larger than the object and moves too. In free flight the position in the picture
-is nearly a quadratic function of time. Hands, noise and shadows follow a parabola only briefly. An arc starts from
+is nearly a quadratic function of time. Hands, noise and shadows follow a parabola only briefly. A track starts from
 three candidates at equal spacings and grows in both directions while candidates lie on it.
 
 Positions are (x, y) [px], pixel centres at +0.5.
@@ -15,25 +15,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 MIN_FRAMES = 5
-"""Frames of an arc: a parabola passes through any three."""
-MIN_TRAVEL = 1.0
-"""Path length of an arc, in diameters: resting objects fit a parabola, too."""
-MAX_CANDIDATES = 5
-"""Candidates per picture, the largest ones."""
-_TOLERANCE = 0.35  # distance from the arc, in radii
+"""Frames of a track: a parabola passes through any three."""
+_MIN_TRAVEL = 1.0  # path length of a track, in diameters: resting objects fit a parabola, too
+_MAX_CANDIDATES = 5  # per picture, the largest ones
+_TOLERANCE = 0.35  # distance from the track, in radii
 _MIN_TOLERANCE = 2.0  # [px]
-_MAX_AREA_RATIO = 2.5  # within an arc; motion blur changes areas
-_SPACINGS = (1, 2, 4, 8, 16)  # frames between the three candidates that start an arc
+_MAX_AREA_RATIO = 2.5  # within a track; motion blur changes areas
+_SPACINGS = (1, 2, 4, 8, 16)  # frames between the three candidates that start a track
 _MAX_GAP = 2  # frames in which the object may be missed
 
 
 @dataclass(frozen=True, eq=False)
-class Arc:
+class BallisticTrack:
     """A segment of free flight.
 
     Attributes:
         frames: numbers of its first and last frame.
-        candidates: frame -> number of the candidate on the arc; frames in which it was missed are left out.
+        candidates: frame -> number of the candidate on the track; frames in which it was missed are left out.
         start: time origin of the coefficients [s].
         coefficients: position = c0 + c1 t + c2 t^2, (3, 2) [px].
         area: median area of the candidates [px].
@@ -52,14 +50,14 @@ class Arc:
 
     @property
     def reach(self) -> float:
-        """Tolerated distance from the arc [px]."""
+        """Tolerated distance from the track [px]."""
         return max(_MIN_TOLERANCE, _TOLERANCE * float(np.sqrt(self.area / np.pi)))
 
 
-def find_arcs(
+def find_ballistic_tracks(
     candidates: Sequence[np.ndarray], times: np.ndarray, down: np.ndarray | None = None
-) -> list[Arc]:
-    """Arcs in order of time, without shared frames. The longest arcs are selected first.
+) -> list[BallisticTrack]:
+    """Tracks in order of time, without shared frames. The longest ones are selected first.
 
     Args:
         candidates: x, y and area of moving regions that do not touch the picture's border, (N, 3) for each of T frames.
@@ -67,38 +65,40 @@ def find_arcs(
         down: direction of gravity in the picture, (2,). It rejects the upward parabola of a bounce. None if unknown.
     """
     times = np.asarray(times, float)
-    table = np.full((len(times), MAX_CANDIDATES, 3), np.nan)
+    table = np.full((len(times), _MAX_CANDIDATES, 3), np.nan)
     order = []
     for row, regions in zip(table, candidates):
-        largest = np.argsort(-regions[:, 2], kind="stable")[:MAX_CANDIDATES]
+        largest = np.argsort(-regions[:, 2], kind="stable")[:_MAX_CANDIDATES]
         order.append(largest)
         row[: len(largest)] = regions[largest]
-    arcs: list[Arc] = []
+    tracks: list[BallisticTrack] = []
     while (best := _longest(table, times, down)) is not None:
         first, last = best.frames
         table[first : last + 1] = np.nan
-        arcs.append(replace(best, candidates={i: int(order[i][c]) for i, c in best.candidates.items()}))
-    return sorted(arcs, key=lambda arc: arc.frames)
+        tracks.append(replace(best, candidates={i: int(order[i][c]) for i, c in best.candidates.items()}))
+    return sorted(tracks, key=lambda track: track.frames)
 
 
-def _longest(table: np.ndarray, times: np.ndarray, down: np.ndarray | None) -> Arc | None:
-    best: Arc | None = None
+def _longest(table: np.ndarray, times: np.ndarray, down: np.ndarray | None) -> BallisticTrack | None:
+    best: BallisticTrack | None = None
     for spacing in _SPACINGS:
         for middle in range(spacing, len(times) - spacing):
             three = [middle - spacing, middle, middle + spacing]
             for chosen in np.ndindex(*(int(np.isfinite(table[i, :, 0]).sum()) for i in three)):
                 if best is not None and all(best.candidates.get(i) == c for i, c in zip(three, chosen)):
-                    continue  # would grow into the same arc
-                arc = _grown(table, times, three, chosen)
-                if arc is not None and down is not None and arc.coefficients[2] @ down <= 0:
+                    continue  # would grow into the same track
+                track = _grown(table, times, three, chosen)
+                if track is not None and down is not None and track.coefficients[2] @ down <= 0:
                     continue
-                if arc is not None and (best is None or len(arc.candidates) > len(best.candidates)):
-                    best = arc
+                if track is not None and (best is None or len(track.candidates) > len(best.candidates)):
+                    best = track
     return best
 
 
-def _grown(table: np.ndarray, times: np.ndarray, three: list[int], chosen: tuple[int, ...]) -> Arc | None:
-    """The arc through three candidates, refitted to the candidates on it until these no longer change."""
+def _grown(
+    table: np.ndarray, times: np.ndarray, three: list[int], chosen: tuple[int, ...]
+) -> BallisticTrack | None:
+    """The track through three candidates, refitted to the candidates on it until these no longer change."""
     areas = table[three, chosen, 2]
     if areas.max() > _MAX_AREA_RATIO * areas.min():
         return None
@@ -106,7 +106,7 @@ def _grown(table: np.ndarray, times: np.ndarray, three: list[int], chosen: tuple
     for _ in range(5):
         start = times[three[1]]
         area = float(np.median([table[i, c, 2] for i, c in members.items()]))
-        fitted = Arc((0, 0), members, start, _fit(table, times, members, start), area)
+        fitted = BallisticTrack((0, 0), members, start, _fit(table, times, members, start), area)
         updated = _candidates_on(table, times, fitted, three[1])
         if len(updated) < 3 or updated == members:
             break
@@ -116,9 +116,9 @@ def _grown(table: np.ndarray, times: np.ndarray, three: list[int], chosen: tuple
     first, last = min(members), max(members)
     places = fitted.place(times[first : last + 1])
     travel = np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
-    if travel < MIN_TRAVEL * 2 * np.sqrt(area / np.pi):
+    if travel < _MIN_TRAVEL * 2 * np.sqrt(area / np.pi):
         return None
-    return Arc((first, last), members, start, fitted.coefficients, area)
+    return BallisticTrack((first, last), members, start, fitted.coefficients, area)
 
 
 def _fit(table: np.ndarray, times: np.ndarray, members: dict[int, int], start: float) -> np.ndarray:
@@ -129,14 +129,16 @@ def _fit(table: np.ndarray, times: np.ndarray, members: dict[int, int], start: f
     )[0]
 
 
-def _candidates_on(table: np.ndarray, times: np.ndarray, arc: Arc, middle: int) -> dict[int, int]:
-    """Candidates on an arc around a frame, without a gap longer than `_MAX_GAP` frames."""
-    distance = np.linalg.norm(table[..., :2] - arc.place(times)[:, None], axis=2)
+def _candidates_on(
+    table: np.ndarray, times: np.ndarray, track: BallisticTrack, middle: int
+) -> dict[int, int]:
+    """Candidates on a track around a frame, without a gap longer than `_MAX_GAP` frames."""
+    distance = np.linalg.norm(table[..., :2] - track.place(times)[:, None], axis=2)
     with np.errstate(invalid="ignore"):
-        similar = np.abs(np.log(table[..., 2] / arc.area)) < np.log(_MAX_AREA_RATIO)
+        similar = np.abs(np.log(table[..., 2] / track.area)) < np.log(_MAX_AREA_RATIO)
     distance = np.where(similar & np.isfinite(distance), distance, np.inf)
     nearest = distance.argmin(axis=1)
-    on = distance[np.arange(len(distance)), nearest] <= arc.reach
+    on = distance[np.arange(len(distance)), nearest] <= track.reach
     members: dict[int, int] = {}
     for frames in (range(middle, len(on)), range(middle - 1, -1, -1)):
         missed = 0

@@ -41,7 +41,7 @@ class Filmed:
         times: on its clock [s], (T,).
         pixels: (T, H, W, 3), uint8.
         masks: (T, H, W).
-        arc: numbers of the first and last frame of its first free flight. None without free flight.
+        flight: numbers of the first and last frame of its first free flight. None without free flight.
         viewmat, K: in the room, (4, 4) and (3, 3).
         sensor_rows: rows of the recorded frames.
         row_time: of a rolling shutter [s].
@@ -54,7 +54,7 @@ class Filmed:
     times: np.ndarray
     pixels: np.ndarray
     masks: np.ndarray
-    arc: tuple[int, int] | None
+    flight: tuple[int, int] | None
     viewmat: np.ndarray
     K: np.ndarray
     sensor_rows: int
@@ -113,13 +113,13 @@ def find_flight(views: Sequence[Filmed], name: str, metric: bool = True) -> Flig
     """
     tracks, inside = [], []
     for view in views:
-        if view.arc is None:
+        if view.flight is None:
             raise InputError(
                 f"{name}, {view.camera}",
                 "no free flight detected: 5 frames or more in which the object moves along a parabola by its size",
                 "Film the whole fall from 0.3 m at 60 frames per second or more, and check the masks' contact sheet",
             )
-        flying = (view.numbers >= view.arc[0]) & (view.numbers <= view.arc[1])
+        flying = (view.numbers >= view.flight[0]) & (view.numbers <= view.flight[1])
         inside.append(np.flatnonzero(flying))
         times, places = view.row_times[flying], view.centroids[flying]
         radius = float(np.sqrt(np.median(view.masks[flying].sum(axis=(1, 2))) / np.pi))

@@ -32,10 +32,10 @@ class FittedPose:
     """A pose with its nuisance parameters.
 
     Attributes:
-        motion: motion of the body.
-        offsets: offsets (cameras,) to the times of each camera [s].
-        enlargement: relative enlargement of the rendered body.
-        gains: gains (cameras, 3) of the cameras.
+        motion: of the body.
+        offsets: to the times of each camera [s], (cameras,).
+        enlargement: of the rendered body, relative.
+        gains: of the cameras, (cameras, 3).
         cost: sum of squares in its stage.
     """
 
@@ -55,6 +55,7 @@ class Problem:
         all: indices of the fitted unknowns.
         start: initial unknowns.
         falling: directions along which gravity is fitted, rows (K, 3), none if it is known.
+        central: whether derivatives are central differences, at twice the cost of forward ones.
     """
 
     def __init__(
@@ -65,8 +66,10 @@ class Problem:
         fitted: Sequence[int],
         size: float = LIKELY_SIZE,
         falling: np.ndarray = _NO_DIRECTIONS,
+        central: bool = False,
     ):
-        self.pictures, self.begin, self.time, self.falling = pictures, begin, time, falling
+        self.pictures, self.begin, self.time = pictures, begin, time
+        self.falling, self.central = falling, central
         cameras = len(begin.offsets)
         self.size = OFFSETS + cameras - 1
         self.units = np.concatenate([_UNITS, [size], [_GRAVITY_UNIT] * 3, np.full(cameras - 1, _OFFSET_UNIT)])
@@ -77,7 +80,6 @@ class Problem:
         pictures.gains = begin.gains.copy()
 
     def pose(self, unknowns: np.ndarray) -> FittedPose:
-        """The pose of unknowns."""
         u, begin = self.units * unknowns, self.begin
         motion = replace(
             begin.motion,
@@ -94,7 +96,7 @@ class Problem:
         """Sum of squares."""
         return float(costs(self.pictures, self.pose(unknowns), self.time).sum())
 
-    def linearise(self, unknowns: np.ndarray, free: Sequence[int], central: bool = False) -> Linearisation:
+    def linearise(self, unknowns: np.ndarray, free: Sequence[int]) -> Linearisation:
         """The problem linearised at unknowns; columns that are not free are 0."""
         pictures, pose = self.pictures, self.pose(unknowns)
         times = picture_times(pictures, pose, self.time)
@@ -113,7 +115,7 @@ class Problem:
         held = np.setdiff1d(np.arange(self.size), free)
         G[..., held] = 0.0
         G *= self.units
-        H, g, cost = pictures.normal_equations(rotations, centres, pose.enlargement, central)
+        H, g, cost = pictures.normal_equations(rotations, centres, pose.enlargement, self.central)
         curvatures = np.einsum("nia,nbij,njc->nbac", G, H, G)
         scores = np.einsum("nia,nbi->nba", G, g)
         # Blocks extend over all pictures of a camera.
@@ -121,9 +123,8 @@ class Problem:
         curvatures, scores = (np.einsum("nc,nb...->cb...", of, each) for each in (curvatures, scores))
         total = float(cost.sum())
         rms = float(np.sqrt(total / pictures.covered))
-        return Linearisation(
-            curvatures.reshape(-1, self.size, self.size), scores.reshape(-1, self.size), total, rms
-        )
+        curvatures = curvatures.reshape(-1, self.size, self.size)
+        return Linearisation(curvatures, scores.reshape(-1, self.size), total, rms)
 
     def penalty(self, fit: Linearisation) -> np.ndarray:
         """Curvature of the prior 0 +- 1 of rotation, spin and enlargement."""
@@ -134,32 +135,16 @@ class Problem:
     def _turns(self, motion: RigidMotion, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Difference quotients (T, 3, 3) of the rotations at times by the initial rotation and by the initial spin."""
         step = 1e-4
-        small = Rotation.from_rotvec(step * np.concatenate([np.eye(3), -np.eye(3)])).as_matrix()
-        same = np.repeat(motion.rotation[None], 6, axis=0)
-        spins = np.repeat(motion.spin[None], 6, axis=0)
-        varied = spins + step * np.concatenate([np.eye(3), -np.eye(3)])
-        rotations, _ = rotate(
-            np.concatenate([small @ motion.rotation, same]),
-            np.concatenate([spins, varied]),
-            motion.inertia,
-            times,
-        )
+        changes = step * np.concatenate([np.eye(3), -np.eye(3)])
+        turned = Rotation.from_rotvec(changes).as_matrix() @ motion.rotation
+        same, spins = (np.repeat(value[None], 6, axis=0) for value in (motion.rotation, motion.spin))
+        initial = np.concatenate([turned, same]), np.concatenate([spins, spins + changes])
+        rotations, _ = rotate(*initial, motion.inertia, times)
         change = rotations.reshape(2, 2, 3, *rotations.shape[1:])  # (rotation or spin, side, axis, T, 3, 3)
-        rotvecs = Rotation.from_matrix(
-            (change[:, 0] @ np.swapaxes(change[:, 1], -1, -2)).reshape(-1, 3, 3)
-        ).as_rotvec()
+        between = (change[:, 0] @ np.swapaxes(change[:, 1], -1, -2)).reshape(-1, 3, 3)
+        rotvecs = Rotation.from_matrix(between).as_rotvec()
         by = rotvecs.reshape(2, 3, len(times), 3).transpose(0, 2, 3, 1) / (2 * step)
         return by[0], by[1]
-
-
-class Central:
-    """A problem with central differences."""
-
-    def __init__(self, problem: Problem):
-        self.cost, self._problem = problem.cost, problem
-
-    def linearise(self, unknowns: np.ndarray, free: Sequence[int]) -> Linearisation:
-        return self._problem.linearise(unknowns, free, central=True)
 
 
 def picture_times(pictures: Pictures, pose: FittedPose, start: float) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from neuma_lib.capture.registration.problem import OFFSETS, PLACE, SIZE, SPIN, TURN, VELOCITY, FittedPose
-from neuma_lib.capture.registration.rigid_views import Comparison
+from neuma_lib.capture.registration.rigid_views import Agreement, Comparison
 
 CLEAR_MARGIN = 0.25
 """Relative increase of the cost of the next distinct pose below which a pose is ambiguous: two standard deviations if
@@ -19,33 +19,16 @@ CLEAR_ANGLE = 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class Agreement:
-    """Agreement of a pose with the images, each of shape (pictures,).
-
-    Attributes:
-        camera: index of the camera.
-        iou: IoU of mask and rendered outline.
-        off: distance of their centroids [px of the video].
-        rms: root mean square residual of colours and coverage over the mask.
-    """
-
-    camera: np.ndarray
-    iou: np.ndarray
-    off: np.ndarray
-    rms: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class Registration:
     """A photographed object placed into its video, x_video = s R x_photo + t at the time `start`.
 
     Attributes:
-        names: names of the cameras.
+        names: of the cameras.
         start: time of the first frame of the flight in all cameras, by the clock of the first one [s].
         pivot: centre of mass as photographed [m], (3,).
         scale_known: whether photographs and video have the same scale, s = 1.
         pose: pose and motion.
-        covariance: covariance, (15 + cameras,) squared, of rotation about the world axes [rad], centre [m], velocity
+        covariance: (15 + cameras,) squared, of rotation about the world axes [rad], centre [m], velocity
             [m/s], spin [rad/s], enlargement, gravity [m/s^2] and offsets of all cameras but the first [s]; 0 for fixed
             values such as gravity.
         gravity, gravity_covariance: fitted gravity [m/s^2], (3,) and (3, 3).
@@ -55,7 +38,7 @@ class Registration:
         spin_significant: whether the spin differs significantly from 0; it is 0 otherwise.
         pictures: number of pictures in the last stage, and their side [px].
         axes: rows are the first camera's right, down and viewing direction, (3, 3).
-        shown: pictures of each camera with their renders.
+        comparisons: pictures of each camera with their renders.
     """
 
     names: tuple[str, ...]
@@ -72,7 +55,7 @@ class Registration:
     spin_significant: bool
     pictures: tuple[int, int]
     axes: np.ndarray
-    shown: list[Comparison]
+    comparisons: list[Comparison]
 
     @property
     def rotation(self) -> np.ndarray:
@@ -101,13 +84,11 @@ class Registration:
         texts = []
         worst = self.turn_deviations[-1]
         if worst > CLEAR_ANGLE:
-            values, vectors = np.linalg.eigh(self.covariance[TURN, TURN])
-            count = int((np.degrees(np.sqrt(np.maximum(values, 0))) > CLEAR_ANGLE).sum())
+            _, vectors = np.linalg.eigh(self.covariance[TURN, TURN])
+            count = int((self.turn_deviations > CLEAR_ANGLE).sum())
             axis = ", ".join(f"{x:.2f}" for x in vectors[:, -1])
-            about = (
-                f"about the axis ({axis})" if count == 1 else f"about {('two axes', 'any axis')[count - 2]}"
-            )
-            texts.append(f"the object looks alike when it is turned {about} (+-{worst:.0f} degrees)")
+            axes = (f"the axis ({axis})", "two axes", "any axis")[count - 1]
+            texts.append(f"the object looks alike when it is turned about {axes} (+-{worst:.0f} degrees)")
         if self.rival and self.rival[0] < 1 + CLEAR_MARGIN:
             texts.append(
                 f"a pose turned by {self.rival[1]:.0f} degrees explains the video nearly as well"
@@ -136,19 +117,7 @@ class Registration:
         }
 
     def report(self) -> dict[str, Any]:
-        """Plain values for the report and later stages."""
-        by_camera = {
-            when: {
-                name: {
-                    "iou": float(agreement.iou[agreement.camera == k].mean()),
-                    "least_iou": float(agreement.iou[agreement.camera == k].min()),
-                    "centroid_px": float(agreement.off[agreement.camera == k].mean()),
-                    "rms": float(np.sqrt(np.square(agreement.rms[agreement.camera == k]).mean())),
-                }
-                for k, name in enumerate(self.names)
-            }
-            for when, agreement in (("before", self.before), ("after", self.after))
-        }
+        """JSON values for the report and later stages."""
         offsets = np.zeros(len(self.names))
         offsets[1:] = np.sqrt(np.maximum(np.diag(self.covariance)[OFFSETS:], 0))
         return {
@@ -173,7 +142,8 @@ class Registration:
             "ambiguous": self.ambiguous,
             "pictures": self.pictures[0],
             "side_px": self.pictures[1],
-            **by_camera,
+            "before": self.before.by_camera(self.names),
+            "after": self.after.by_camera(self.names),
             "units": {"translation": "m", "centre": "m"},
         }
 

@@ -26,41 +26,33 @@ from neuma_lib.capture.registration.problem import (
     LIKELY_SIZE,
     SIZE,
     SPIN,
-    Central,
     FittedPose,
     Problem,
     difference,
     picture_times,
     render,
 )
-from neuma_lib.capture.registration.registered import Agreement, Registration
+from neuma_lib.capture.registration.registered import Registration
 from neuma_lib.capture.registration.rigid_motion import (
     RigidMotion,
     angle_between,
     moment_of_inertia,
     spread_rotations,
 )
-from neuma_lib.capture.registration.rigid_views import Body, Pictures, Sight
+from neuma_lib.capture.registration.rigid_views import Agreement, Body, Pictures, Sight
 from neuma_lib.errors import InputError
 from neuma_lib.fitting.frame_batches import spread_frames
 from neuma_lib.fitting.least_squares import BLOCKS, MIN_COST, jackknife, levenberg_marquardt
 from neuma_lib.splatting.gaussians import Gaussians
 
-GRID = 600
-"""Initial rotations in addition to that of the photographs. Every rotation is within 25 degrees of one of them."""
-DISTINCT = np.radians(15)
-"""Minimum angle between distinct rotations."""
-MIN_IOU = 0.8
-"""Minimum mean IoU of masks and rendered outlines for a successful registration."""
-SPIN_SIGNIFICANCE = 11.3
-"""Squared spin in standard deviations below which it is set to 0: the 99th percentile of a chi-squared distribution
-with three degrees of freedom."""
-
-MIN_FRAMES = 4
-"""Minimum number of frames of a camera that are kept above the floor."""
-SHOWN = 3
-"""Number of pictures of each camera that are shown with their renders."""
-
+_GRID = 600  # initial rotations besides that of the photographs; every rotation is within 25 degrees of one of them
+_DISTINCT = np.radians(15)  # minimum angle between distinct rotations
+_MIN_IOU = 0.8  # mean, of masks and rendered silhouettes
+# Squared spin in standard deviations up to which it is set to 0: 99th percentile of chi-squared with three degrees of
+# freedom.
+_MAX_NO_SPIN = 11.3
+_MIN_FRAMES = 4  # of a camera that are kept above the floor
+_COMPARISONS = 3  # pictures of each camera that the result contains with their renders
 _ACROSS = 24  # diameter of the object in the pictures of the search [px]
 _STARTS = 24  # number of rotations of the grid that are refined
 _FIRST_WEIGHT, _MIN_WEIGHT = 0.5, 0.1  # initial and minimum weight of colours relative to coverage
@@ -68,25 +60,15 @@ _HOPELESS = 4.0  # cost relative to the best pose, on all frames, above which a 
 
 
 class Stage(NamedTuple):
-    """A stage of the refinement.
+    """A stage of the refinement."""
 
-    Attributes:
-        across: diameter of the object [px].
-        reach: time from the start that is compared, in frame intervals of the first camera.
-        frames: maximum number of evenly spaced frames per camera.
-        free: indices of the fitted unknowns, or None for all.
-        kept: number of distinct poses for the next stage.
-        iterations: maximum number of steps.
-        central: whether to use central differences.
-    """
-
-    across: float
-    reach: float
-    frames: int
-    free: tuple[int, ...] | None
-    kept: int
-    iterations: int
-    central: bool
+    across: float  # diameter of the object [px]
+    reach: float  # time from the start that is compared, in frame intervals of the first camera
+    frames: int  # maximum number of evenly spaced frames per camera
+    free: tuple[int, ...] | None  # indices of the fitted unknowns, None for all
+    kept: int  # number of distinct poses for the next stage
+    iterations: int  # maximum number of steps
+    central: bool  # whether to use central differences
 
 
 _POSE = (0, 1, 2, 3, 4, 5)
@@ -104,10 +86,10 @@ class Parabola:
     """Initial estimate of a flight.
 
     Attributes:
-        time: time of the other values by the clock of the first camera [s].
-        place, velocity: position [m] and velocity [m/s] of the mask centres, (3,).
-        gravity: gravity [m/s^2], (3,).
-        spin: spin [rad/s], (3,), or None if unknown.
+        time: of the other values, by the clock of the first camera [s].
+        place, velocity: of the mask centres [m], [m/s], (3,).
+        gravity: [m/s^2], (3,).
+        spin: [rad/s], (3,). None if unknown.
     """
 
     time: float
@@ -119,12 +101,8 @@ class Parabola:
     def at(self, time: float) -> Parabola:
         """The same flight at another reference time."""
         t = time - self.time
-        return replace(
-            self,
-            time=time,
-            place=self.place + self.velocity * t + self.gravity * t**2 / 2,
-            velocity=self.velocity + self.gravity * t,
-        )
+        place = self.place + self.velocity * t + self.gravity * t**2 / 2
+        return replace(self, time=time, place=place, velocity=self.velocity + self.gravity * t)
 
 
 def first_common(sights: Sequence[Sight], name: str) -> float:
@@ -155,16 +133,15 @@ def register(
     """Estimate pose and motion of a photographed object in its video.
 
     Args:
-        gaussians: Gaussians of the photographed object.
-        particles, mass: particles of the object, (N, 3) [m] and (N,), for centre of mass and moment of inertia.
+        gaussians: of the photographed object.
+        particles, mass: of the object, (N, 3) [m] and (N,), for centre of mass and moment of inertia.
         sights: frames of free flight of each camera in the unit of the Gaussians. The first camera defines the time.
-        parabola: parabola of the mask centres.
-        name: name of the take for messages.
+        parabola: of the mask centres.
+        name: of the take for messages.
         scale_known: whether photographs and video have the same scale. Otherwise the size is fitted, which must be
             correct within a factor of about 1.5.
         progress: called with (step, steps, root mean square residual).
-        floor: height of the floor [m]. Frames in which the object would be below it are omitted, as after the contact.
-            None uses all frames.
+        floor: height [m]. Frames in which the object would be below it, after the contact, are omitted. None: no floor.
 
     Raises:
         InputError: the cameras have no common time, or the object does not match the video in any pose.
@@ -206,7 +183,9 @@ def register(
                 progress(*done, float(np.sqrt(refined[-1].cost / pictures.covered)))
         candidates, dropped = _distinct(refined, stage.kept)
         if 0 < number < len(STAGES) - 1:
-            weights = _colour_weights(pictures, candidates[0], start)
+            pictures.gains = candidates[0].gains.copy()
+            ratios = pictures.residual_ratio(render(pictures, candidates[0], start))
+            weights = np.clip(ratios, _MIN_WEIGHT, 1.0)
         if stage.reach == np.inf:
             best = max(candidates[0].cost, MIN_COST)
             going = [f for f in candidates if f.cost < _HOPELESS * best and stage is not STAGES[-1]]
@@ -216,16 +195,15 @@ def register(
     problem = Problem(pictures, best, start, fitted, size)
     covariance = _covariance(problem)
     spin, inverse = best.motion.spin, np.linalg.pinv(covariance[SPIN, SPIN])
-    significant = bool(spin @ inverse @ spin > SPIN_SIGNIFICANCE)
+    significant = bool(spin @ inverse @ spin > _MAX_NO_SPIN)
     if not significant:
         still = replace(best, motion=replace(best.motion, spin=np.zeros(3)))
         places = set(range(problem.size)) - set(range(*SPIN.indices(problem.size)))
         problem = Problem(pictures, still, start, fitted, size)
         best = _refine(problem, STAGES[-1]._replace(free=tuple(sorted(places & set(problem.all)))))
-    gravity, gravity_covariance = _gravity(
-        pictures, best, start, fitted, size, sights[0].viewmat[2, :3] if len(sights) == 1 else None
-    )
-    others = [(ratio, other) for ratio, other in others if _angle(best, other) >= DISTINCT]
+    view = sights[0].viewmat[2, :3] if len(sights) == 1 else None
+    gravity, gravity_covariance = _gravity(pictures, best, start, fitted, size, view)
+    others = [(ratio, other) for ratio, other in others if _angle(best, other) >= _DISTINCT]
     covariance += _spread(best, others)
     ratio, other = min(others, key=lambda each: each[0], default=(None, None))
     before = replace(best, motion=motion, enlargement=0.0)
@@ -244,17 +222,10 @@ def register(
         spin_significant=significant,
         pictures=(len(pictures), pictures.side),
         axes=sights[0].viewmat[:3, :3],
-        shown=pictures.comparisons(render(pictures, best, start), SHOWN),
+        comparisons=pictures.comparisons(render(pictures, best, start), _COMPARISONS),
     )
     _check(result, name)
     return result
-
-
-def _colour_weights(pictures: Pictures, pose: FittedPose, start: float) -> np.ndarray:
-    """Weights (cameras,) of colours relative to coverage, from their agreement in a pose."""
-    pictures.gains = pose.gains.copy()
-    ratio = pictures.residual_ratio(render(pictures, pose, start))
-    return np.clip(ratio, _MIN_WEIGHT, 1.0)
 
 
 def _near_frames(times: np.ndarray, stage: Stage, interval: float) -> np.ndarray:
@@ -268,14 +239,14 @@ def _near_frames(times: np.ndarray, stage: Stage, interval: float) -> np.ndarray
 def _above_floor(
     sight: Sight, arms: np.ndarray, pose: FittedPose, camera: int, start: float, floor: float
 ) -> Sight:
-    """Frames before particles at ``arms`` (N, 3) [m] from the centre reach the floor, at least `MIN_FRAMES`."""
+    """Frames before particles at ``arms`` (N, 3) [m] from the centre reach the floor, at least `_MIN_FRAMES`."""
     times = sight.times + pose.offsets[camera] - start
     centres, _ = pose.motion.place(times)
     turns, _ = pose.motion.turn(times)
     lowest = (1 + pose.enlargement) * np.einsum("tj,nj->tn", turns[:, 1], arms).min(axis=1) + centres[:, 1]
     after = np.flatnonzero((lowest < floor) & (times > 0))
     before = after[0] if len(after) else len(times)
-    return sight.select(range(max(before, min(MIN_FRAMES, len(times)))))
+    return sight.select(range(max(before, min(_MIN_FRAMES, len(times)))))
 
 
 def _search(pictures: Pictures, nothing: FittedPose, start: float, scale_known: bool) -> list[FittedPose]:
@@ -284,7 +255,7 @@ def _search(pictures: Pictures, nothing: FittedPose, start: float, scale_known: 
     If the scale is unknown, the size is estimated from the mean area of the masks.
     """
     motion, times = nothing.motion, picture_times(pictures, nothing, start)
-    grid = np.concatenate([np.eye(3)[None], spread_rotations(GRID)])
+    grid = np.concatenate([np.eye(3)[None], spread_rotations(_GRID)])
     centres, _ = motion.place(times)
     turns = Rotation.from_rotvec(times[:, None] * motion.spin).as_matrix()
     rotations = (turns @ grid[:, None]).reshape(-1, 3, 3)
@@ -304,17 +275,12 @@ def _search(pictures: Pictures, nothing: FittedPose, start: float, scale_known: 
     at = (centres + shifts[:, None]).reshape(-1, 3)
     costs = pictures.residuals(pictures.render(rotations, at, picture, enlargement), picture)[1].numpy()
     costs = costs.reshape(len(grid), -1).sum(axis=1)
-    gains = pictures.gains.copy()
-    return [
-        replace(
-            nothing,
-            motion=replace(motion, rotation=grid[k], centre=motion.centre + shifts[k]),
-            enlargement=enlargement,
-            gains=gains,
-            cost=float(costs[k]),
-        )
-        for k in np.argsort(costs)[:_STARTS]
-    ]
+    same = replace(nothing, enlargement=enlargement, gains=pictures.gains.copy())
+    candidates = []
+    for k in np.argsort(costs)[:_STARTS]:
+        moved = replace(motion, rotation=grid[k], centre=motion.centre + shifts[k])
+        candidates.append(replace(same, motion=moved, cost=float(costs[k])))
+    return candidates
 
 
 def _refine(problem: Problem, stage: Stage) -> FittedPose:
@@ -322,16 +288,11 @@ def _refine(problem: Problem, stage: Stage) -> FittedPose:
     pictures, u = problem.pictures, problem.start
     pose = (*_POSE, SIZE) if problem.units[SIZE] == ANY_SIZE else _POSE
     free = [k for k in problem.all if stage.free is None or k in stage.free or k in pose]
-    residuals = Central(problem) if stage.central else problem
+    problem.central = stage.central
+    min_gain = 1e-5 if stage.central else 1e-3
     for _ in range(2 if stage.central else 1):
         u, fit, _ = levenberg_marquardt(
-            residuals,
-            u,
-            free,
-            problem.penalty,
-            1e-5 if stage.central else 1e-3,
-            stage.iterations,
-            longest=0.3,
+            problem, u, free, problem.penalty, min_gain, stage.iterations, longest=0.3
         )
         pose = problem.pose(u)
         pictures.fit_gains(render(pictures, pose, problem.time))
@@ -344,10 +305,10 @@ def _angle(a: FittedPose, b: FittedPose) -> float:
 
 
 def _distinct(poses: Sequence[FittedPose], count: int) -> tuple[list[FittedPose], list[FittedPose]]:
-    """The best ``count`` poses that are `DISTINCT` from all better ones, and the other distinct poses, best first."""
+    """The best ``count`` poses that are distinct from all better ones, and the other distinct poses, best first."""
     kept: list[FittedPose] = []
     for each in sorted(poses, key=lambda f: f.cost):
-        if all(_angle(each, k) >= DISTINCT for k in kept):
+        if all(_angle(each, k) >= _DISTINCT for k in kept):
             kept.append(each)
     return kept[:count], kept[count:]
 
@@ -381,7 +342,8 @@ def _covariance(problem: Problem) -> np.ndarray:
 
     It includes the uncertainty of the prior for unknowns that the pictures do not determine.
     """
-    full = problem.linearise(problem.start, problem.all, central=True)
+    problem.central = True
+    full = problem.linearise(problem.start, problem.all)
     free = np.array(problem.all)
     fit = replace(full, curvatures=full.curvatures[:, free[:, None], free], scores=full.scores[:, free])
     P = problem.penalty(full)[free[:, None], free]
@@ -406,20 +368,18 @@ def _spread(best: FittedPose, others: Sequence[tuple[float, FittedPose]]) -> np.
 def _agreement(pictures: Pictures, pose: FittedPose, start: float) -> Agreement:
     pictures.gains, pictures.weights = pose.gains.copy(), np.ones(pictures.cameras)
     renders = render(pictures, pose, start)
-    costs = pictures.residuals(renders)[1].numpy()
-    return Agreement(pictures.camera.copy(), *pictures.agreement(renders, costs))
+    return pictures.agreement(renders, pictures.residuals(renders)[1].numpy())
 
 
 def _check(result: Registration, name: str) -> None:
     iou = result.after.iou.mean()
-    if iou < MIN_IOU:
+    if iou < _MIN_IOU:
         size = 100 * result.pose.enlargement
         raise InputError(
             name,
             "in the best pose the photographed object matches the masks of the video with an IoU of "
-            f"{iou:.2f} < {MIN_IOU} (size {size:+.0f} %). Possible causes: the video shows another object; photographs "
-            "and video differ in"
-            " scale (another position or print of the board); the shape has changed (soft, folded, opened); or masks of"
-            " the photographs or of this take are wrong",
+            f"{iou:.2f} < {_MIN_IOU} (size {size:+.0f} %). Possible causes: the video shows another object; "
+            "photographs and video differ in scale (another position or print of the board); the shape has changed "
+            "(soft, folded, opened); or masks of the photographs or of this take are wrong",
             "Check the contact sheets of the masks",
         )

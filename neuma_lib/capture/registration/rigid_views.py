@@ -78,9 +78,7 @@ class Sight:
         for k, image in enumerate(self.images):
             mask = image[..., 3] > 127
             if not mask.any():
-                raise InputError(
-                    self.name, f"the mask of frame {k} of the flight is empty", "Remove that frame"
-                )
+                raise InputError(self.name, f"the mask of flight frame {k} is empty", "Remove that frame")
             x, y = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
             boxes[k] = x[0], y[0], x[-1] + 1, y[-1] + 1
         return boxes
@@ -91,9 +89,9 @@ class Body:
     """Gaussians relative to the centre of mass of their body.
 
     Attributes:
-        gaussians: Gaussians with means relative to the centre [m].
-        covars: covariances (G, 3, 3) [m^2].
-        sh: colours (G, K, 3).
+        gaussians: with means relative to the centre [m].
+        covars: (G, 3, 3) [m^2].
+        sh: colours, (G, K, 3).
         radius: 98th percentile of the distances of means from the centre [m].
     """
 
@@ -111,13 +109,35 @@ class Body:
         return cls(moved, moved.covars(), moved.sh(), radius)
 
 
-class Comparison(NamedTuple):
-    """A picture and its render, over white, (side, side, 3) in [0, 1].
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """Agreement of a pose with the images, each of shape (pictures,).
 
     Attributes:
         camera: index of the camera.
-        time: time by its clock [s].
+        iou: IoU of mask and rendered silhouette.
+        off: distance of their centroids [px of the video].
+        rms: root mean square residual of colours and coverage over the mask.
     """
+
+    camera: np.ndarray
+    iou: np.ndarray
+    off: np.ndarray
+    rms: np.ndarray
+
+    def by_camera(self, names: Sequence[str]) -> dict[str, dict[str, float]]:
+        """JSON values by name of the camera."""
+        values = {}
+        for k, name in enumerate(names):
+            iou, off, rms = (value[self.camera == k] for value in (self.iou, self.off, self.rms))
+            rms = np.sqrt(np.square(rms).mean())
+            statistics = {"iou": iou.mean(), "least_iou": iou.min(), "centroid_px": off.mean(), "rms": rms}
+            values[name] = {key: float(value) for key, value in statistics.items()}
+        return values
+
+
+class Comparison(NamedTuple):
+    """A picture and its render, over white, (side, side, 3) in [0, 1]; index and time [s] of its camera."""
 
     camera: int
     time: float
@@ -168,9 +188,8 @@ class Pictures:
                 images.append(crop)
                 valid.append(inside)
                 Ks.append(K)
-                blur.append(
-                    (1 - factor**-2) / 12
-                )  # variance of the average over a square minus that of a pixel
+                # Variance of the average over a square minus that of a pixel.
+                blur.append((1 - factor**-2) / 12)
                 spacing.append(distance / K[0, 0])
         self._observed, self._valid = torch.stack(images), torch.stack(valid)[..., None]
         self._Ks, self._views = torch.tensor(np.stack(Ks)).float(), np.stack([s.viewmat for s in sights])
@@ -276,7 +295,7 @@ class Pictures:
     def residual_ratio(self, renders: Tensor) -> np.ndarray:
         """Ratio (cameras,) of the root mean square residuals of coverage to those of colours for each camera.
 
-        It weights colours, which are less reliable than outlines if the illumination differs.
+        It weights colours, which are less reliable than silhouettes if the illumination differs.
         """
         self.weights = np.ones(self.cameras)
         squares = self.residuals(renders)[0].square().sum(dim=(1, 2)).double().numpy()
@@ -289,7 +308,7 @@ class Pictures:
         valid = self._valid[picture]
         lit = self._lit(renders, picture) * valid
         r = lit - self._weighted(self._observed[picture], picture) * valid
-        shade = _columns(lit[..., :3, None] * self._ramps[:, :, None])  # colours only
+        shade = (lit[..., :3, None] * self._ramps[:, :, None]).flatten(1, 3)  # (M, P, 3), colours only
         flat = r[..., :3].reshape(len(r), -1)
         a = -torch.linalg.solve(self._shade_normal(shade, picture), shade.mT @ flat[..., None])
         r = torch.cat([(flat + (shade @ a)[..., 0]).reshape(r[..., :3].shape), r[..., 3:]], dim=-1)
@@ -302,8 +321,8 @@ class Pictures:
         """Linearised problem of each picture in its own unknowns (`LOCAL`) by blocks, with the shading eliminated.
 
         Args:
-            rotations, centres: poses of the body in the pictures, (N, 3, 3) and (N, 3).
-            enlargement: relative enlargement of the body.
+            rotations, centres: of the body in the pictures, (N, 3, 3) and (N, 3).
+            enlargement: of the body, relative.
             central: whether to use central differences, at twice the cost of forward ones.
 
         Returns:
@@ -311,10 +330,9 @@ class Pictures:
             costs (N,).
         """
         size = max(1, int(_BATCH_BYTES / (4 * 4 * 4 * LOCAL * self.side**2)))
+        every = np.arange(len(self))
         batches = [
-            self._normal_equations(
-                np.arange(len(self))[part], rotations[part], centres[part], enlargement, central
-            )
+            self._normal_equations(every[part], rotations[part], centres[part], enlargement, central)
             for part in frame_batches(len(self), size)
         ]
         return tuple(np.concatenate(parts) for parts in zip(*batches, strict=True))
@@ -322,22 +340,19 @@ class Pictures:
     def _normal_equations(self, picture, rotations, centres, enlargement, central):
         here = self.render(rotations, centres, picture, enlargement)
         r, cost, shade = self.residuals(here, picture)
-        step = _STEP * self.spacing[picture]
-        widths = np.stack(
-            [step / self.body.radius] * 3 + [step] * 3 + [np.full_like(step, step.mean() / self.body.radius)]
-        )
+        step, radius = _STEP * self.spacing[picture], self.body.radius
+        widths = np.stack([step / radius] * 3 + [step] * 3 + [np.full_like(step, step.mean() / radius)])
         sides = (1.0, -1.0) if central else (1.0,)
         turns, shifts = [], []
         for k, side in itertools.product(range(LOCAL - 1), sides):
             by = side * widths[k][:, None] * np.eye(3)[k % 3]
             turns.append(Rotation.from_rotvec(by).as_matrix() @ rotations if k < 3 else rotations)
             shifts.append(centres + by if k >= 3 else centres)
-        posed = self.render(
-            np.concatenate(turns), np.concatenate(shifts), np.tile(picture, len(turns)), enlargement
-        ).unflatten(0, (LOCAL - 1, len(sides), len(picture)))
-        grown = torch.stack([
-            self.render(rotations, centres, picture, enlargement + side * widths[-1, 0]) for side in sides
-        ])  # fmt: skip
+        poses = np.concatenate(turns), np.concatenate(shifts)
+        posed = self.render(*poses, np.tile(picture, len(turns)), enlargement)
+        posed = posed.unflatten(0, (LOCAL - 1, len(sides), len(picture)))
+        larger = (enlargement + side * widths[-1, 0] for side in sides)
+        grown = torch.stack([self.render(rotations, centres, picture, size) for size in larger])
         moved = torch.cat([posed, grown[None]])  # (7, sides, M, side, side, 4)
         change = (moved[:, 0] - moved[:, 1]) / 2 if central else moved[:, 0] - here
         change = change / torch.tensor(widths).float()[..., None, None, None]
@@ -357,15 +372,14 @@ class Pictures:
     def _shade_normal(self, shade: Tensor, picture: np.ndarray) -> Tensor:
         return shade.mT @ shade + torch.diag_embed(self._shade_cost(picture)[:, None].expand(-1, 3))
 
-    def agreement(self, renders: Tensor, costs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """IoU of outlines and masks, distance of their centroids [px of the video], and root mean square residual over
-        the mask, (N,) each, from renders of all pictures and their costs."""
+    def agreement(self, renders: Tensor, costs: np.ndarray) -> Agreement:
+        """Agreement of all pictures with their renders, from these and their costs (N,)."""
         valid = self._valid[..., 0] > 0
         a, b = ((image[..., 3] > 0.5) & valid for image in (renders, self._observed))
         iou = (a & b).sum(dim=(1, 2)) / (a | b).sum(dim=(1, 2)).clamp_min(1)
         off = np.linalg.norm(self.moments(renders)[0] - self.moments()[0], axis=1)
         off = np.where(np.isfinite(off), off, self.side) * self._factor
-        return iou.numpy(), off, np.sqrt(costs / self._mask_size.numpy())
+        return Agreement(self.camera, iou.numpy(), off, np.sqrt(costs / self._mask_size.numpy()))
 
     def comparisons(self, renders: Tensor, limit: int) -> list[Comparison]:
         """At most ``limit`` pictures of each camera with their renders, multiplied by the gain of the camera."""
@@ -373,14 +387,9 @@ class Pictures:
         for camera in range(self.cameras):
             of = np.flatnonzero(self.camera == camera)
             for k in of[spread_frames(len(of), limit)]:
-                seen, rendered = (
-                    np.clip((image[..., :3] + 1 - image[..., 3:]).numpy(), 0, 1)
-                    for image in (
-                        self._observed[k],
-                        self._scaled(renders[k : k + 1], self.gains[[camera]])[0],
-                    )
-                )
-                comparisons.append(Comparison(camera, float(self.times[k]), seen, rendered))
+                pair = self._observed[k], self._scaled(renders[k : k + 1], self.gains[[camera]])[0]
+                over_white = (np.clip((x[..., :3] + 1 - x[..., 3:]).numpy(), 0, 1) for x in pair)
+                comparisons.append(Comparison(camera, float(self.times[k]), *over_white))
         return comparisons
 
     def _shade_cost(self, picture: np.ndarray) -> Tensor:
@@ -400,11 +409,6 @@ class Pictures:
         return images * torch.cat([factors, torch.ones(len(factors), 1)], dim=1)[:, None, None]
 
 
-def _columns(values: Tensor) -> Tensor:
-    """(M, H, W, C, K) as (M, H W C, K)."""
-    return values.reshape(len(values), -1, values.shape[-1])
-
-
 def _crop(image: np.ndarray, corner: np.ndarray, side: int, factor: int) -> tuple[Tensor, Tensor]:
     """Colours over black and coverage (side, side, 4) of a square crop of straight-alpha RGBA (H, W, 4), uint8,
     averaged over squares of ``factor`` pixels, and a mask (side, side) of squares within the image."""
@@ -417,6 +421,5 @@ def _crop(image: np.ndarray, corner: np.ndarray, side: int, factor: int) -> tupl
         to = np.s_[y0 - corner[1] : y1 - corner[1], x0 - corner[0] : x1 - corner[0]]
         whole[to][..., :4], whole[to][..., 4] = part, 1
     small = whole.reshape(side, factor, side, factor, 5).mean(axis=(1, 3))
-    return torch.from_numpy(small[..., :4].copy()), torch.from_numpy(
-        (small[..., 4] > 0.999).astype(np.float32)
-    )
+    inside = (small[..., 4] > 0.999).astype(np.float32)
+    return torch.from_numpy(small[..., :4].copy()), torch.from_numpy(inside)

@@ -15,20 +15,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuma_lib.capture.masks.regions import iou
 from neuma_lib.errors import InputError
 from neuma_lib.evaluation.image_metrics import MEASURES, image_metrics, psnr, ssim
 from neuma_lib.evaluation.lpips import LPIPS
 from neuma_lib.evaluation.text_tables import as_csv
 
-SCENE = "scene_"
-"""Prefix of measures of the whole picture."""
+SCENE = "scene_"  # prefix of measures of the whole picture
 WHOLE = ("psnr", "ssim", "lpips_alex")
 """Measures of the whole picture, without VGG, which takes a second per frame on one core."""
 COLUMNS = (*MEASURES, "iou", *(f"{SCENE}{name}" for name in WHOLE))
 """Names of the measures of a frame. ``iou`` is that of predicted and true mask."""
 DIGITS = {"psnr": 2, "ssim": 4, "lpips_vgg": 4, "lpips_alex": 4, "iou": 4}
-OPAQUE = 0.5
-"""Opacity above which a pixel belongs to a mask."""
+OPAQUE = 0.5  # opacity above which a pixel belongs to a mask
 
 
 def composited(colours: Tensor, alpha: Tensor, background: Tensor | float) -> Tensor:
@@ -74,16 +73,10 @@ def captured_metrics(
     pair = [each.clamp(0, 1) for each in (composited(colours, alpha, empty), picture)]
     arrays = [each.cpu().numpy() for each in pair]
     planes = [each.permute(2, 0, 1)[None] for each in pair]
-    metrics["iou"] = overlap(alpha > OPAQUE, mask > OPAQUE)
+    metrics["iou"] = iou(*((each > OPAQUE).cpu().numpy() for each in (alpha, mask)))
     metrics |= {f"{SCENE}psnr": psnr(*arrays), f"{SCENE}ssim": ssim(*arrays)}
     networks = {name: network for name, network in networks.items() if f"lpips_{name}" in WHOLE}
     return metrics | {f"{SCENE}lpips_{name}": float(network(*planes)) for name, network in networks.items()}
-
-
-def overlap(a: Tensor, b: Tensor) -> float:
-    """Intersection over union of two masks. 1 if both are empty."""
-    union = int((a | b).sum())
-    return int((a & b).sum()) / union if union else 1.0
 
 
 def averaged(frames: Sequence[Mapping[str, float]]) -> dict[str, float]:

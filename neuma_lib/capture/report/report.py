@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from html import escape
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
 
+from neuma_lib.capture.pictures import read_picture
 from neuma_lib.capture.report.page import Check
-from neuma_lib.io.files import reading
-from neuma_lib.io.images import open_image
 
-PICTURE_WIDTH = 1000
-"""Maximum width of a picture in the page [px]."""
-QUALITY = 80
-"""JPEG quality of pictures."""
+_PICTURE_WIDTH, _QUALITY = 1000, 80  # maximum width [px] and JPEG quality of pictures in the page
 STRESS_UNITS = {
     **dict.fromkeys(("E", "G", "K", "mu", "lam", "kappa", "yield_stress", "cohesion"), "Pa"),
     **dict.fromkeys(("crush", "tension", "fibre_modulus"), "Pa"),
@@ -31,10 +27,9 @@ STRESS_UNITS = {
 }
 """Units of constants that are proportional to stress."""
 OTHER_UNITS = {"friction_angle": "°", "dilation_angle": "°", "relaxation_time": "s"}
-BARS = 2
-"""Standard deviations of an error bar."""
-UNKNOWN = 100.0
-"""Factor of an error bar above which a constant is unknown."""
+_UNKNOWN = (
+    100.0  # factor between value and limit of two standard deviations above which a constant is unknown
+)
 MEASURES = {
     "psnr": ("PSNR, object [dB]", 1),
     "ssim": ("SSIM, object", 3),
@@ -47,16 +42,8 @@ MEASURES = {
 """Columns of the table of measures: heading and number of decimals."""
 
 
-@dataclass(frozen=True)
-class Film:
-    """Comparison of prediction and video for a camera.
-
-    Attributes:
-        take, camera: of the video.
-        learned: whether the law was learned from it.
-        video: the mp4. None if missing.
-        caption: line below it.
-    """
+class Film(NamedTuple):
+    """Comparison of prediction and video: whether the law was learned from this video, the mp4, and a caption."""
 
     take: str
     camera: str
@@ -65,17 +52,30 @@ class Film:
     caption: str = ""
 
 
-@dataclass(frozen=True)
-class Report:
-    """Content of the page.
+def page(
+    title: str,
+    method: str,
+    *,
+    summary: Sequence[str] = (),
+    warnings: Sequence[str] = (),
+    checks: Mapping[str, Sequence[Check]] = MappingProxyType({}),
+    pictures: Mapping[str, Mapping[str, Path]] = MappingProxyType({}),
+    films: Sequence[Film] = (),
+    rows: Sequence[Mapping[str, Any]] = (),
+    own: str = "",
+    curves: Path | None = None,
+    identified: Mapping[str, Any] | None = None,
+    scale: float = 1.0,
+) -> str:
+    """The report of a capture as HTML, from the template ``report.html``. Missing files are reported in the page.
 
-    Attributes:
+    Args:
         title: name of the capture.
         method: title of the learned law.
         summary: lines below the title.
         warnings: of `neuma_lib.capture.report.warnings`.
         checks: by stage.
-        pictures: caption -> file, by stage. Missing files are reported in the page.
+        pictures: caption -> file, by stage.
         films: comparisons of prediction and video.
         rows: measures, of `neuma_lib.capture.report.images.image_rows`.
         own: the learned method, whose rows are highlighted.
@@ -83,59 +83,38 @@ class Report:
         identified: content of identified.json, if any.
         scale: simulated metres per metre of the room.
     """
-
-    title: str
-    method: str
-    summary: Sequence[str] = ()
-    warnings: Sequence[str] = ()
-    checks: Mapping[str, Sequence[Check]] = field(default_factory=dict)
-    pictures: Mapping[str, Mapping[str, Path]] = field(default_factory=dict)
-    films: Sequence[Film] = ()
-    rows: Sequence[Mapping[str, Any]] = ()
-    own: str = ""
-    curves: Path | None = None
-    identified: Mapping[str, Any] | None = None
-    scale: float = 1.0
-
-
-def page(report: Report) -> str:
-    """The report as HTML, from the template ``report.html``."""
-    failed = sum(not check.good for checks in report.checks.values() for check in checks)
+    failed = sum(not check.good for group in checks.values() for check in group)
     result = {0: "All checks passed.", 1: "One check failed."}.get(failed, f"{failed} checks failed.")
     environment = Environment(
         autoescape=True, finalize=_escaped, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     template = Path(__file__).with_suffix(".html").read_text(encoding="utf-8")
     return environment.from_string(template).render(
-        title=report.title,
-        method=report.method,
-        summary=[*report.summary, *([result] if report.checks else [])],
-        films=_films(report.films),
+        title=title,
+        method=method,
+        summary=[*summary, *([result] if checks else [])],
+        films=_films(films),
         headings=[heading for heading, _ in MEASURES.values()],
-        places=_places(report.rows, report.own),
-        curves=_uri_of(report.curves, picture_uri),
-        law=report.identified and _law(report.identified, report.scale),
-        warnings=report.warnings,
-        checks=report.checks,
+        places=_places(rows, own),
+        curves=_uri(curves),
+        law=identified and _law(identified, scale),
+        warnings=warnings,
+        checks=checks,
         pictures={
-            group: [
-                {"caption": caption, "uri": _uri_of(file, picture_uri)} for caption, file in files.items()
-            ]
-            for group, files in report.pictures.items()
+            group: [{"caption": caption, "uri": _uri(file)} for caption, file in files.items()]
+            for group, files in pictures.items()
         },
     )
 
 
-def picture_uri(path: str | Path, width: int = PICTURE_WIDTH) -> str:
-    """A picture as a data URI of at most ``width`` pixels. Raises InputError for a file that is no picture."""
-    with open_image(Path(path).read_bytes(), path) as image:
-        with reading(path, "an image"):
-            pixels = image.convert("RGB")
+def picture_uri(path: str | Path) -> str:
+    """A picture, reduced to the width of the page, as a data URI. Raises InputError for a file that is no picture."""
+    pixels, width = Image.fromarray(read_picture(path)), _PICTURE_WIDTH
     if pixels.width > width:
         pixels = pixels.resize((width, round(pixels.height * width / pixels.width)), Image.Resampling.LANCZOS)
     content = BytesIO()
-    pixels.save(content, "JPEG", quality=QUALITY)
-    return _uri("image/jpeg", content.getvalue())
+    pixels.save(content, "JPEG", quality=_QUALITY)
+    return _encoded("image/jpeg", content.getvalue())
 
 
 def room_value(name: str, value: float, scale: float) -> tuple[float, str]:
@@ -173,17 +152,17 @@ def _escaped(value: Any) -> Any:
     return value if hasattr(value, "__html__") else Markup(escape(str(value)))
 
 
-def _uri(kind: str, content: bytes) -> str:
+def _encoded(kind: str, content: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
-def _uri_of(file: Path | None, uri: Callable[[Path], str]) -> str | None:
-    """Data URI of a file. None if it is missing."""
-    return uri(file) if file is not None and Path(file).is_file() else None
-
-
-def _video_uri(file: Path) -> str:
-    return _uri("video/mp4", Path(file).read_bytes())
+def _uri(file: Path | None) -> str | None:
+    """Data URI of a picture or an mp4. None if the file is missing."""
+    if file is None or not Path(file).is_file():
+        return None
+    return (
+        _encoded("video/mp4", Path(file).read_bytes()) if Path(file).suffix == ".mp4" else picture_uri(file)
+    )
 
 
 def _kind(learned: bool) -> str:
@@ -194,9 +173,8 @@ def _films(films: Sequence[Film]) -> dict[str, list[dict[str, Any]]]:
     """Videos by take."""
     takes: dict[str, list[dict[str, Any]]] = {}
     for film in films:
-        uri = _uri_of(film.video, _video_uri)
-        entry = {"camera": film.camera, "caption": film.caption, "uri": uri, "kind": _kind(film.learned)}
-        takes.setdefault(film.take, []).append(entry)
+        entry = {"camera": film.camera, "caption": film.caption, "kind": _kind(film.learned)}
+        takes.setdefault(film.take, []).append(entry | {"uri": _uri(film.video)})
     return takes
 
 
@@ -205,12 +183,9 @@ def _places(rows: Sequence[Mapping[str, Any]], own: str) -> list[dict[str, Any]]
     places: dict[tuple[str, str, bool], dict[str, Any]] = {}
     for row in rows:
         take, camera, learned = row["throw"], row["camera"], row["learned"]
-        heading = (
-            f"All frames ({_kind(learned)})" if take == "all" else f"{take}, {camera} ({_kind(learned)})"
-        )
-        place = places.setdefault(
-            (take, camera, learned), {"heading": heading, "whole": take == "all", "rows": []}
-        )
+        place = places.setdefault((take, camera, learned), {"whole": take == "all", "rows": []})
+        name = "All frames" if take == "all" else f"{take}, {camera}"
+        place["heading"] = f"{name} ({_kind(learned)})"
         cells = [f"{row[key]:.{digits}f}" if key in row else "–" for key, (_, digits) in MEASURES.items()]
         place["rows"].append({"title": row["title"], "own": row["method"] == own, "cells": cells})
     return list(places.values())
@@ -223,8 +198,8 @@ def _law(identified: Mapping[str, Any], scale: float) -> dict[str, Any]:
         value, unit = room_value(name, entry["value"], scale)
         prefix, unit = prefixed(value, unit)
         value *= prefix
-        factor = math.exp(min(BARS * entry["log_std"], 700.0))  # without overflow
-        interval = "unknown" if factor > UNKNOWN else f"{number(value / factor)} to {number(value * factor)}"
+        factor = math.exp(min(2 * entry["log_std"], 700.0))  # without overflow
+        interval = "unknown" if factor > _UNKNOWN else f"{number(value / factor)} to {number(value * factor)}"
         text = f"{number(value)} {unit}".strip()
         constants.append(
             {"name": name, "value": text, "interval": interval, "determined": entry["determined"]}

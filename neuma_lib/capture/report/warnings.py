@@ -8,17 +8,13 @@ from typing import Any
 from neuma_lib.capture.report.page import Check
 from neuma_lib.evaluation.stress_curves import share_inside
 
-FEW_FRAMES = 10
-"""Frames of a camera after the first contact below which a warning is given."""
-WORSE = 1.5
-"""Ratio of the mean squared errors of held-out and training takes above which a warning is given."""
-MIN_IOU = 0.8
-"""Mean IoU of predicted masks with those of the video below which a warning is given."""
-MAX_OUTSIDE = 0.25
-"""Share of the visited range outside a 95 % band above which a warning is given."""
-BLUR = 1e-3
-"""Exposure assumed for the size of motion blur, if none is set [s]."""
-STRESS_TESTS = {"uniaxial": "stretch", "shear": "shear", "yield": "yielding"}
+# Limits of warnings.
+_MIN_FRAMES = 10  # of a camera after the first contact
+_MAX_RATIO = 1.5  # of the mean squared errors of held-out and training takes
+_MIN_IOU = 0.8  # mean, of predicted masks with those of the video
+_MAX_OUTSIDE = 0.25  # share of the visited range outside a 95 % band
+_BLUR = 1e-3  # exposure assumed for the size of motion blur, if none is set [s]
+_STRESS_TESTS = {"uniaxial": "stretch", "shear": "shear", "yield": "yielding"}
 
 
 def check_warnings(groups: Mapping[str, Sequence[Check]]) -> list[str]:
@@ -55,14 +51,14 @@ def filming_warnings(capture: Mapping[str, Any], takes: Mapping[str, Mapping[str
             warnings.append(f"{name}: the flight does not determine the pose of the object: {reason}.")
         unknown = [camera for camera, exposure in cameras.items() if not exposure]
         if unknown and motion.get("fastest_m_s"):
-            smear = 1e3 * BLUR * motion["fastest_m_s"]
+            smear = 1e3 * _BLUR * motion["fastest_m_s"]
             warnings.append(
                 f"{name}: no exposure is set for {', '.join(unknown)}, so motion blur is neglected. At the maximum "
                 f"speed of {motion['fastest_m_s']:.1f} m/s, an exposure of 1/1000 s blurs the object over {smear:.1f} "
                 "mm."
             )
         for camera, count in (motion.get("frames_after_contact") or {}).items():
-            if count < FEW_FRAMES:
+            if count < _MIN_FRAMES:
                 warnings.append(
                     f"{name}, {camera}: only {count} frames show the object after its first contact. Earlier "
                     "motion contains no information on the material."
@@ -111,25 +107,27 @@ def prediction_warnings(
             )
     if any(motion.get("stable") is False for motion in predictions.values()):
         warnings.append("The training diverged, and its best state is shown.")
-    own = {(row["throw"], row["camera"], row["learned"]): row for row in rows if row["method"] == method}
-    before = {(row["throw"], row["camera"], row["learned"]): row for row in rows if row["method"] == prior}
-    for (take, camera, learned), row in own.items():
-        if take == "all":
+
+    def rows_of(name: str) -> dict[tuple, Mapping[str, Any]]:
+        return {(row["throw"], row["camera"], row["learned"]): row for row in rows if row["method"] == name}
+
+    own, before = rows_of(method), rows_of(prior)
+    for key, row in own.items():
+        if row["throw"] == "all":
             continue
-        where, first = f"{take}, {camera}", before.get((take, camera, learned))
+        where, first = f"{row['throw']}, {row['camera']}", before.get(key)
         if method != prior and first and row["psnr"] < first["psnr"]:
             warnings.append(
                 f"{where}: the prior, without any learning, is closer to the video ({first['psnr']:.1f} dB "
                 f"against {row['psnr']:.1f} dB on the object)."
             )
-        if row["iou"] < MIN_IOU:
+        if row["iou"] < _MIN_IOU:
             warnings.append(
                 f"{where}: the mean IoU of predicted masks with those of the video is {row['iou']:.2f}: the "
                 "predicted position or shape of the object is wrong."
             )
-    for row in rows:
-        mine = own.get((row["throw"], row["camera"], row["learned"]))
-        if row["method"] == constants != method and row["throw"] == "all" and mine["psnr"] < row["psnr"]:
+    for key, row in rows_of(constants).items():
+        if constants != method and row["throw"] == "all" and (mine := own[key])["psnr"] < row["psnr"]:
             kind = "training" if row["learned"] else "held-out"
             warnings.append(
                 f"In {kind} frames, the identified constants alone fit better ({row['psnr']:.1f} dB against "
@@ -137,7 +135,7 @@ def prediction_warnings(
                 "them."
             )
     trained, held_out = (own.get(("all", "all", learned)) for learned in (True, False))
-    if trained and held_out and 10 ** ((trained["psnr"] - held_out["psnr"]) / 10) > WORSE:
+    if trained and held_out and 10 ** ((trained["psnr"] - held_out["psnr"]) / 10) > _MAX_RATIO:
         warnings.append(
             f"Held-out takes are predicted worse than training takes, {held_out['psnr']:.1f} dB against "
             f"{trained['psnr']:.1f} dB on the object: the law overfits its training videos."
@@ -198,9 +196,9 @@ def curve_warnings(
     for name, test in tests.items():
         for law, verdict in verdicts.items():
             share = share_inside(test, law, constants) if law in test["laws"] and law != constants else None
-            if share is not None and 1 - share > MAX_OUTSIDE:
+            if share is not None and 1 - share > _MAX_OUTSIDE:
                 warnings.append(
-                    f"{STRESS_TESTS[name].capitalize()}: over {100 * (1 - share):.0f} % of the visited range, "
+                    f"{_STRESS_TESTS[name].capitalize()}: over {100 * (1 - share):.0f} % of the visited range, "
                     f"{titles[law]} is outside the 95 % band of the identified constants: {verdict}."
                 )
     return warnings

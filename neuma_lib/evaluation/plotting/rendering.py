@@ -13,7 +13,7 @@ from neuma_lib.coupling.deformation import arms_at_rest, deform
 from neuma_lib.coupling.reconstruction import Reconstruction
 from neuma_lib.evaluation.plotting.spheres import draw_spheres
 from neuma_lib.io.images import load_observation
-from neuma_lib.io.particles import load_body
+from neuma_lib.io.particles import load_reconstruction
 from neuma_lib.mechanics.density import Density
 from neuma_lib.splatting.cameras import Cameras
 from neuma_lib.splatting.extent import outermost
@@ -41,7 +41,7 @@ def magnified(cameras: Cameras, factor: int) -> Cameras:
 def film(inputs, params, k: int, density: Density) -> tuple[Observation, Reconstruction, Cameras]:
     """Scene ``k`` of a figure: video in one view, body, and camera at the magnification of the figure."""
     video = load_observation(inputs.transforms[k], [params.view])
-    body = load_body(inputs.particles[k], inputs.binding[k], inputs.gaussians[k], density)
+    body = load_reconstruction(inputs.particles[k], inputs.binding[k], inputs.gaussians[k], density)
     return video, body, magnified(video.cameras, params.magnify)
 
 

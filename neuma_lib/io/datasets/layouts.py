@@ -42,7 +42,7 @@ OCCLUDED = 50
 BACKGROUND_DIFFERENCE = 24
 """Without a mask, the object is where a channel differs from the background by more than this [1/255]."""
 BOX_MARGIN = 0.1
-"""Allowed distance from the unit box of the point that all cameras look at [m]."""
+"""Allowed distance from the unit box of the point where all optical axes meet [m]."""
 _NAME = re.compile(r"[a-z]+_(\d{1,9})_(-?\d{1,9})", re.IGNORECASE)
 
 Frames = dict[tuple[int, int], dict[str, Any]]
@@ -226,6 +226,6 @@ def _check_inside_box(frames: Sequence[dict[str, Any]], path: Path) -> None:
     if (point < -BOX_MARGIN).any() or (point > 1 + BOX_MARGIN).any():
         raise InputError(
             path,
-            f"the cameras look at ({', '.join(f'{x:.2f}' for x in point)}) m, outside the unit cube of the simulator",
+            f"the optical axes meet at ({', '.join(f'{x:.2f}' for x in point)}) m, outside the simulator's unit cube",
             "Set images.offset and images.scale of the scene so that the object lies inside and its ground at y = 0",
         )

@@ -53,10 +53,10 @@ class PacNerf(Method):
         return {"constants": case.product()}
 
     def body_inputs(self, case: Case) -> Files:
-        return {"field": case.on_moved().result(FIELD)} if self.carrier(case) == "field" else {}
+        return {"field": case.on_moved().result(FIELD)} if self.particle_source(case) == "field" else {}
 
     def model_options(self, case: Case) -> dict:
-        if self.carrier(case) != "field":
+        if self.particle_source(case) != "field":
             return {}
         settings = {name: case.options.plain()[name] for name in PacNerfConfig.model_fields}
         return {**_seen(case), "settings": settings}
@@ -64,7 +64,7 @@ class PacNerf(Method):
     def start_file(self, case: Case) -> str:
         return case.on_moved().product()
 
-    def carrier(self, case: Case) -> str:
+    def particle_source(self, case: Case) -> str:
         return "field" if case.evaluate_on == "training_particles" else "binding"
 
     def fit(self, inputs, options, problem, run):
@@ -137,17 +137,19 @@ class PacNerf(Method):
 
         return LawOnGrid(analytic_law(read_json(inputs["constants"])["law"], dt=dt))
 
-    def load_initial_state(self, inputs, options, densities, carrier):
-        if carrier != "field":
-            return super().load_initial_state(inputs, options, densities, carrier)
+    def load_initial_state(self, inputs, options, densities, particle_source):
+        if particle_source != "field":
+            return super().load_initial_state(inputs, options, densities, particle_source)
         from neuma_lib.io.particles import with_motion
 
-        body = self.load_body(inputs, options, densities[0], carrier, "mean")
+        body = self.load_reconstruction(inputs, options, densities[0], particle_source, "mean")
         return with_motion(body, inputs["velocity"]), [len(body.moving.x)]
 
-    def load_body(self, inputs, options, density, carrier, gaussian_motion, device="cpu"):
-        if carrier != "field":
-            return super().load_body(inputs, options, density, carrier, gaussian_motion, device)
+    def load_reconstruction(self, inputs, options, density, particle_source, gaussian_motion, device="cpu"):
+        if particle_source != "field":
+            return super().load_reconstruction(
+                inputs, options, density, particle_source, gaussian_motion, device
+            )
         from neuma_lib.methods.pac_nerf.carried_field import CarriedField
 
         return CarriedField.load(inputs["field"], options, density, device)

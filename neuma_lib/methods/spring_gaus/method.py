@@ -55,7 +55,7 @@ class SpringGaus(Method):
         from neuma_lib.fitting.material import PixelLoss
         from neuma_lib.io.files import write_json
         from neuma_lib.io.images import load_videos
-        from neuma_lib.io.particles import load_body, with_motion
+        from neuma_lib.io.particles import load_reconstruction, with_motion
         from neuma_lib.methods.spring_gaus.body import SpringBody
         from neuma_lib.methods.spring_gaus.fit import fit_springs
         from neuma_lib.methods.spring_gaus.io import save_springs
@@ -65,7 +65,7 @@ class SpringGaus(Method):
 
         settings = SpringGausOptions(**options)
         files = (inputs[name] for name in ("particles", "binding", "gaussians"))
-        body = load_body(*files, problem.densities[0], gaussian_motion=settings.gaussian_motion)
+        body = load_reconstruction(*files, problem.densities[0], gaussian_motion=settings.gaussian_motion)
         body = body.to(torch.float32, run.device)
         videos = load_videos(inputs["transforms"], settings.views, **problem.exposure)
         videos = [video.to(torch.float32, run.device) for video in videos]

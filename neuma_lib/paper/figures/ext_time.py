@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from neuma_lib.evaluation.metrics import mean_height
 from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.io.hdf5 import read_arrays
-from neuma_lib.io.particles import load_body, load_motion
+from neuma_lib.io.particles import load_motion, load_reconstruction
 from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images, place
 
 LEFT, TOP, CURVE = 0.92, 0.2, 1.3
@@ -23,7 +23,7 @@ def data(inputs, params, say) -> ImageGrid:
     """
     names = ("x", "mass", "vol0", "frames")
     truth, attributes = read_arrays(inputs.truth, required=names, only=names)
-    body = load_body(inputs.particles, inputs.binding, inputs.gaussians, params.density)
+    body = load_reconstruction(inputs.particles, inputs.binding, inputs.gaussians, params.density)
     shown = rendering.evenly(params.shown, len(truth["frames"]))
     motions = [load_motion(file) for file in inputs.rollouts]
     everywhere = [np.asarray(x).reshape(-1, 3) for x in (truth["x"], *(x for x, _ in motions))]

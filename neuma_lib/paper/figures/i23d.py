@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.io.files import read_json
 from neuma_lib.io.hdf5 import read_arrays
-from neuma_lib.io.particles import load_body, load_motion
+from neuma_lib.io.particles import load_motion, load_reconstruction
 from neuma_lib.paper.image_grid import ImageGrid, rows_figure
 
 LEFT, TOP = 1.05, 0.2
@@ -27,7 +27,7 @@ def data(inputs, params, say) -> ImageGrid:
     """
     laws, splats = len(params.laws), list(params.splats)
     files = zip(inputs.particles, inputs.binding, inputs.gaussians, strict=True)
-    bodies = [load_body(*of_body, DENSITY, gaussian_motion="affine") for of_body in files]
+    bodies = [load_reconstruction(*of_body, DENSITY, gaussian_motion="affine") for of_body in files]
     paths = [read_arrays(file, required=("frames",), only=("frames",)) for file in inputs.rollouts]
     motions = []
     for file, (arrays, _) in zip(inputs.rollouts, paths, strict=True):

@@ -40,7 +40,9 @@ def data(inputs, params, say) -> ImageGrid:
 def own_body(source, density):
     """The body of particles that a method was fitted with."""
     method = method_of(source["module"])
-    return method.load_body(source["files"], source["options"][0], density, source["carrier"], "mean")
+    return method.load_reconstruction(
+        source["files"], source["options"][0], density, source["carrier"], "mean"
+    )
 
 
 @style.styled

@@ -14,7 +14,7 @@ from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.io.files import read_json
 from neuma_lib.io.hdf5 import read_arrays
 from neuma_lib.io.images import load_videos
-from neuma_lib.io.particles import load_body, load_motion
+from neuma_lib.io.particles import load_motion, load_reconstruction
 from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images, note
 
 LEFT, TOP, UNDER = 0.92, 0.3, 0.12
@@ -37,7 +37,7 @@ def data(inputs, params, say) -> ImageGrid:
         rows = [rendering.as_bytes(seen.colours()[:, 0])]
         measures.append([])
         for method in params.titles:
-            body = load_body(*files, DENSITY, gaussian_motion=setting["motion"][method])
+            body = load_reconstruction(*files, DENSITY, gaussian_motion=setting["motion"][method])
             rollout = next(rollouts)
             steps = read_arrays(rollout, required=("frames",), only=("frames",))[0]["frames"].tolist()
             renders = Filmed(body.particle_gs(video.cameras), seen, steps)

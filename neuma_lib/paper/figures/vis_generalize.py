@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from neuma_lib.evaluation.plotting import rendering, style
 from neuma_lib.io.hdf5 import read_arrays
-from neuma_lib.io.particles import load_body, load_motion
+from neuma_lib.io.particles import load_motion, load_reconstruction
 from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images, note
 
 LEFT, TOP, BETWEEN = 0.92, 0.36, 0.42
@@ -25,7 +25,7 @@ def data(inputs, params, say) -> ImageGrid:
     """
     paths = [read_arrays(file, required=("x", "frames"), only=("x", "frames")) for file in inputs.rollouts]
     reconstructed = zip(inputs.particles, inputs.binding, inputs.gaussians, strict=True)
-    bodies = [load_body(*files, DENSITY) for files in reconstructed]
+    bodies = [load_reconstruction(*files, DENSITY) for files in reconstructed]
     letters, count = len(params.letters), len(params.letters) or params.shown
     points = np.concatenate([arrays["x"].reshape(-1, 3) for arrays, _ in paths[:letters] or paths])
     width, height = rendering.picture_size(*np.ptp(points, axis=0)[:2], params.size)
