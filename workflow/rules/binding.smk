@@ -4,8 +4,8 @@
 rule binding:
     input:
         kernels=kernels("binding"),
-        gaussians=of_chain("gaussians.ply"),
-        sampled=of_chain("sampled_particles.h5"),
+        gaussians=of_replicate("gaussians.ply"),
+        sampled=of_replicate("sampled_particles.h5"),
     output:
         binding=f"{RESULTS}/{{scene}}/binding.h5",
         particles=f"{RESULTS}/{{scene}}/particles.h5",

@@ -94,6 +94,6 @@ rule capture_motion_page:
     params:
         title="{capture}: masks and free flight",
         videos=of_capture(videos_of),
-        throws=of_capture(lambda capture: list(capture.takes)),
+        takes=of_capture(lambda capture: list(capture.takes)),
     script:
         "../scripts/capture_motion_page.py"

@@ -28,10 +28,10 @@ FLIGHT = f"{RESULTS}/{{capture}}/flight/{{take}}"
 
 # Names of folders with other results.
 OTHERS = f"{TRUE_SCENE}|{SPLAT_SCENE}|figures|logs|benchmarks|experiments|priors"
-RELEASED_CAPTURE = names_of(SETTINGS.captures.released, chains=False)
+RELEASED_CAPTURE = names_of(SETTINGS.captures.released, replicates=False)
 OWN_CAPTURE = f"(?!({OTHERS}|{RELEASED_CAPTURE})/){NAME.pattern}"
 RELEASED_TAKE = scenes_that(
-    lambda scene: scene.captured and scene.captured.capture in SETTINGS.captures.released, chains=False
+    lambda scene: scene.captured and scene.captured.capture in SETTINGS.captures.released, replicates=False
 )
 OWN_TAKE = f"(?!{RELEASED_TAKE}/){TAKE_SCENE}"
 

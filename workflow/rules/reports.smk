@@ -19,7 +19,7 @@ def training_scene(name):
     trained = training_takes(capture)
     if not trained:
         raise InputError(
-            f"{capture.folder} has no videos: a report needs at least one throw, see docs/capture.md"
+            f"{capture.folder} has no videos: a report needs at least one take, see docs/capture.md"
         )
     return scene_name(name, trained[0])
 
@@ -35,7 +35,7 @@ def capture_start(wildcards):
     """File of the initial motion of a take: of the method, or of the free flight where the take is held out."""
     captured = SETTINGS.scene(wildcards.scene).captured
     if captured.throw in capture_named(captured.capture).settings.held_out:
-        return of_chain("velocity.json")(wildcards)
+        return of_replicate("velocity.json")(wildcards)
     case = case_on(wildcards.scene, wildcards.method)
     return case.method.start_file(case)
 

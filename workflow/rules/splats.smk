@@ -20,7 +20,7 @@ rule splat_gaussians:
 rule splat_mesh:
     input:
         kernels=kernels("rendering"),
-        gaussians=of_chain("gaussians.ply"),
+        gaussians=of_replicate("gaussians.ply"),
     output:
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
     wildcard_constraints:

@@ -19,7 +19,7 @@ def main(inputs, output, params, run) -> None:
     save_binding(output.binding, matrix)
     save_particles(output.particles, x, vol0, {"added": added})
     mean = float(matrix.counts.double().mean())
-    run.say(
+    run.log(
         f"{len(gaussians)} Gaussians to {len(x)} particles, {added} of them added, {mean:.1f} per Gaussian"
     )
 

@@ -45,7 +45,7 @@ def main(inputs, output, params, run) -> None:
         {"dt": params.dt, "bodies": params.bodies, "simulation": params.simulation},
     )
     count, lowest = arrays["x"].shape[1], float(arrays["x"][..., 1].min())
-    run.say(
+    run.log(
         f"{count} particles, {truth.frames[-1]} steps, {len(truth.frames)} frames, lowest point {lowest:.3f} m"
     )
 

@@ -27,7 +27,7 @@ def main(inputs, output, params, run) -> None:
         render_dynamic(body, views, steps, attributes["dt"], *how)
     else:
         render_static(body, views, *how)
-    run.say(f"{len(views)} views, {len(steps)} frames of {views.width}x{views.height} px")
+    run.log(f"{len(views)} views, {len(steps)} frames of {views.width}x{views.height} px")
 
 
 run_script(main, snakemake)
