@@ -29,7 +29,7 @@ def main(inputs, output, params, run) -> None:
         )
         new = display_frames(folder, camera, video, mattes, frames, background, params.width, gains[camera])
         entries += new
-        run.say(f"{camera}: {len(new)} frames")
+        run.log(f"{camera}: {len(new)} frames")
     write_transforms(output.transforms, {}, entries)
 
 

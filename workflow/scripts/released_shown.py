@@ -25,7 +25,7 @@ def main(inputs, output, params, run) -> None:
         entries += display_frames(
             folder, camera, video, mattes, frames, background, params.width, gains[camera]
         )
-        run.say(f"{camera}: {len(numbers_of(video, camera))} frames")
+        run.log(f"{camera}: {len(numbers_of(video, camera))} frames")
     write_transforms(output.transforms, {}, entries)
 
 
