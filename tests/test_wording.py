@@ -97,7 +97,8 @@ ALLOWED = {
         "names of settings"
     ),
     r"\bcarriers\b": "name of a setting",
-    r"[\"'`.](?:throw|spin_told|least_iou|plate|plate_gain|plate_offset|shown|arcs|says|any_step)[\"'`]": "keys of files",
+    r"[\"'`.](?:throw|spin_told|least_iou|shown|arcs|says|any_step)[\"'`]": "keys of files",
+    r"[\"'`.](?:plate|plate_gain|plate_offset)[\"'`]": "keys of files",
     r"[\"'`.](?:on_request|trained_as|judged_on)[\"'`]": "former names of settings",
     r"[\"'`]stock[\"'`]|guesses to stock": "value of a setting",
     r"plate_samples|beside_cameras|\"plate_\"": "settings and arrays of the demo captures",
