@@ -57,7 +57,10 @@ def own_bodies(scenes):
         for scene in scenes:
             case = case_on(scene, method)
             if files := case.method.body_inputs(case):
-                source = body_parameter(case) | {"files": files, "particle_source": case.method.particle_source(case)}
+                source = body_parameter(case) | {
+                    "files": files,
+                    "particle_source": case.method.particle_source(case),
+                }
                 sources.setdefault(method, {})[scene] = source
     return sources
 
