@@ -12,9 +12,10 @@ from neuma_lib.config.laws import LawConfig
 from neuma_lib.coupling.initial_motion import InitialMotion
 from neuma_lib.errors import NonFiniteError
 from neuma_lib.fitting.families import Family
+from neuma_lib.fitting.family_run import FamilyRun
 from neuma_lib.fitting.frame_batches import first_contact
 from neuma_lib.fitting.identified import FamilyFit
-from neuma_lib.fitting.identify import _better_later, _prune, _Run, _select, identify
+from neuma_lib.fitting.identify import _better_later, _prune, _select, identify
 from neuma_lib.fitting.least_squares import Linearisation, jackknife, levenberg_marquardt
 from neuma_lib.fitting.video_residuals import VideoResiduals, averaged
 from neuma_lib.io.files import write_json
@@ -91,13 +92,13 @@ def test_constants_and_family_of_the_truth_are_identified():
 def test_first_frames_that_mislead_are_not_where_the_last_fit_begins(monkeypatch):
     """All frames are fitted through all squares, from guesses too, if the last ones are predicted far worse, as those
     of a plastic body by an elastic one."""
-    begun, begin = [], _Run.begin
+    begun, begin = [], FamilyRun.begin
 
     def noted(run, starts, level=0, *args, **options):
         begun.append((len(starts), level))
         begin(run, starts, level, *args, **options)
 
-    monkeypatch.setattr(_Run, "begin", noted)
+    monkeypatch.setattr(FamilyRun, "begin", noted)
     truth = law("hencky", "von_mises", E=6e4, nu=0.3, yield_stress=2e3)
     for factor, expected in ((1e6, (1, len(SQUARES) - 1)), (1.2, (3, 0))):
         assert identified_in(truth, {"hencky": ELASTIC}, prune_factor=factor).best.refined
@@ -248,7 +249,9 @@ def test_a_flow_that_never_yields_shows_the_elastic_body():
     body, seen = video_of(ELASTIC, V0, FRAMES)
     chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", refined_particles=0)
     video = VideoResiduals(MODEL, known(body), body, seen, chosen)
-    runs = [_Run(Family("x", spec), [video], [len(FRAMES)], chosen) for spec in (ELASTIC, PLASTIC, PLASTIC)]
+    runs = [
+        FamilyRun(Family("x", spec), [video], [len(FRAMES)], chosen) for spec in (ELASTIC, PLASTIC, PLASTIC)
+    ]
     for run, limit in zip(runs, (1.0, 1e5, 1e3), strict=True):
         values = run.family.with_guesses({"yield_stress": limit})
         run._origin = run.family.unbounded(values)
@@ -289,7 +292,7 @@ def test_a_plateau_widens_what_is_not_determined(flat):
     """Squared residuals that rise so many times less on one side than their quadratic: so much larger is the variance,
     up to that of the spread. A determined axis costs no simulation."""
     chosen, curvature = settings({"hencky": ELASTIC}, spread=2.0, determined=0.1), np.diag([1e4, 5.0])
-    run = _Run(Family("hencky", ELASTIC), [None], [0], chosen)
+    run = FamilyRun(Family("hencky", ELASTIC), [None], [0], chosen)
     run.fit, tried = Linearisation(np.pad(curvature, (0, 9))[None], np.zeros((1, 11)), 1.0, 1.0), []
     run._covariance = lambda: np.diag([1e-4, 0.25] + [0.0] * 9)
 
@@ -390,7 +393,7 @@ def test_stiffness_that_the_time_step_does_not_bear_has_a_difference_too():
     body, seen = video_of(ELASTIC, V0, FRAMES)
     chosen = settings({"hencky": ELASTIC}, covariance_from="elastic", refined_particles=0)
     video, family = VideoResiduals(MODEL, known(body), body, seen, chosen), Family("hencky", ELASTIC)
-    run = _Run(family, [video], [len(FRAMES)], chosen)
+    run = FamilyRun(family, [video], [len(FRAMES)], chosen)
     run._origin = family.unbounded({"E": 1e9, "nu": 0.3})
     run._u[0] = math.log(run.values["E"] / 1e9) + 0.5  # beyond the limit by more than a small step
     here = run._residual(run._u)
