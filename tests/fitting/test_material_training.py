@@ -192,7 +192,7 @@ def test_the_setting_of_the_adjoint_reaches_both_networks(problem):
     assert [part.adjoint_precision for part in parts] == ["half", "half"]
     assert (
         law.elasticity.graph_key() != stiff_random_law().elasticity.graph_key()
-    )  # graphs are recorded apart
+    )  # graphs are recorded separately
 
 
 def test_nothing_to_train_is_an_input_error(problem):
