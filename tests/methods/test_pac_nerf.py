@@ -1,4 +1,4 @@
-"""PAC-NeRF's velocity and constants: their gradients through all of the chain, recovery of known truths, resuming."""
+"""PAC-NeRF's velocity and constants: their gradients from constants to pixels, recovery of known truths, resuming."""
 
 import math
 
@@ -185,7 +185,7 @@ def test_youngs_modulus_is_found_from_a_decade_off(elastic):
     assert elastic.history.loss[-1] < 0.05 * elastic.history.loss[0]
 
 
-def test_poissons_ratio_is_found(elastic):
+def test_poissons_ratio_is_recovered(elastic):
     assert float(elastic.constants.values()["nu"].detach()) == pytest.approx(0.3, abs=0.05)
 
 
@@ -196,7 +196,7 @@ def test_poissons_ratio_waits_for_the_modulus(elastic):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(BOUNDS))
-def test_constants_of_every_family_are_found_from_its_stock_guess(name, loaded):
+def test_constants_of_every_family_are_recovered_from_its_published_guess(name, loaded):
     """With default settings, within the bounds of docs/systems.md; see benchmarks/pac_nerf.py."""
     settings = loaded.pac_nerf.model_copy(update=benchmark.SMALL)
     fit = benchmark.recover(name, settings.families[name], settings, log=lambda _: None)
@@ -279,7 +279,7 @@ def test_elasticity_and_plasticity_share_their_moduli():
     assert float(mu) == pytest.approx(1e5 / 2.5) and float(lam + 2 * mu / 3) == pytest.approx(1e5 / 1.5)
 
 
-def test_stock_guesses_are_those_of_the_authors(loaded):
+def test_published_guesses_are_those_of_the_authors(loaded):
     """Their settings of the benchmark, in this project's conventions (docs/systems.md)."""
     families = loaded.pac_nerf.families
 
