@@ -107,7 +107,6 @@ PENDING = {
     "CHANGELOG.md": "names of former versions",
     "neuma_lib/project/renames.py": "names of former versions",
     "studies/": "being rewritten",
-    "workflow/": "being rewritten",
     "neuma_lib/capture/": "being rewritten",
     "neuma_lib/evaluation/": "being rewritten",
     "neuma_lib/fitting/": "being rewritten",

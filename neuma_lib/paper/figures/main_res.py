@@ -41,7 +41,7 @@ def own_body(source, density):
     """The body of particles that a method was fitted with."""
     method = method_of(source["module"])
     return method.load_reconstruction(
-        source["files"], source["options"][0], density, source["carrier"], "mean"
+        source["files"], source["options"][0], density, source["particle_source"], "mean"
     )
 
 
