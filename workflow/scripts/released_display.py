@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from neuma_lib.capture.released import background_behind, read_configured, read_shots
-from neuma_lib.capture.report.display_video import numbers_of, display_frames
+from neuma_lib.capture.report.display_video import display_frames, numbers_of
 from neuma_lib.config.capture import ReleasedConfig
 from neuma_lib.io.files import listed, read_json
 from neuma_lib.io.images import read_transforms, write_transforms
