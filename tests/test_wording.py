@@ -111,7 +111,6 @@ PENDING = {
     "neuma_lib/project/renames.py": "names of former versions",
     "studies/capture_benchmark/rules.smk": "being rewritten",
     "studies/capture_benchmark/scripts/": "being rewritten",
-    "workflow/": "being rewritten",
     "tests/workflow/": "being rewritten",
 }
 
