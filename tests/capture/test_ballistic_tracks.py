@@ -1,4 +1,4 @@
-"""Arcs of free flight among candidates: what keeps to a parabola of time is found, what does not is not."""
+"""Ballistic tracks: only candidates that follow a parabola of time are detected."""
 
 import numpy as np
 
@@ -25,7 +25,7 @@ def candidates(*tracks, noise=0.0, seed=0):
     return frames
 
 
-def test_the_arc_is_found_beside_a_larger_hand_and_flicker():
+def test_the_track_is_detected_next_to_a_larger_hand_and_flicker():
     ball = flight(TIMES)
     hand = np.stack([300 + 150 * np.sin(9 * TIMES), 200 + 90 * np.cos(14 * TIMES)], axis=1)
     flicker = np.random.default_rng(1).uniform(0, 400, (40, 2))
@@ -38,12 +38,12 @@ def test_the_arc_is_found_beside_a_larger_hand_and_flicker():
     np.testing.assert_allclose(first.place(TIMES[20]), ball[20], atol=0.5)
 
 
-def test_a_bounce_makes_two_arcs_in_the_order_of_time():
+def test_a_bounce_makes_two_tracks_in_the_order_of_time():
     down, up = flight(TIMES[:20], vy=0), flight(TIMES[:20], y=0.0, vy=-600.0)
     up[:, 1] += down[-1, 1]
     tracks = find_ballistic_tracks(candidates((np.concatenate([down, up]), 500.0)), TIMES)
     assert len(tracks) == 2
-    # a frame beside the impact may lie near enough to both
+    # a frame next to the impact may lie near enough to both
     assert abs(tracks[0].frames[1] - 19) <= 1 and abs(tracks[1].frames[0] - 20) <= 1
 
 
@@ -74,7 +74,7 @@ def test_missed_frames_are_bridged():
     assert track.frames == (0, 39) and 10 not in track.candidates and len(track.candidates) == 37
 
 
-def test_times_that_vary_do_not_break_an_arc():
+def test_times_that_vary_do_not_break_a_track():
     times = TIMES + 0.006 * np.random.default_rng(0).uniform(-1, 1, len(TIMES))
     (track,) = find_ballistic_tracks(candidates((flight(times), 500.0)), times)
     assert track.frames == (0, 39)
@@ -87,7 +87,7 @@ def test_what_rests_or_moves_at_random_is_no_flight():
     assert find_ballistic_tracks(candidates((rest, 500.0), (walk, 300.0), noise=0.3), TIMES) == []
 
 
-def test_what_changes_its_size_is_not_the_same_thing():
+def test_what_changes_its_size_is_not_the_same_object():
     ball = flight(TIMES)
     frames = candidates((ball, 500.0))
     for i in range(0, 40, 2):

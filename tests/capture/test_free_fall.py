@@ -97,21 +97,21 @@ def test_frames_of_the_hand_and_of_the_contact_are_left_out():
         track.places[:first] = track.places[first]  # held
         track.places[last:] += 3.0 * np.arange(1, 41 - last)[:, None] * (0.2, -1)  # stopped by the floor
     fall, kept = fit_flight(tracks)
-    # a frame beside them that is off by as little as the noise may stay
+    # a frame next to them that is off by as little as the noise may stay
     assert np.abs(np.subtract([(k.start, k.stop) for k in kept], [(3, 36), (5, 35)])).max() <= 1
     assert abs(fall.gravity.ratio[0] - 1) < 4 * fall.gravity.ratio[1] < 0.1
     spoiled = fit_free_fall(tracks)
     assert abs(spoiled.gravity.ratio[0] - 1) > 0.1 > abs(fall.gravity.ratio[0] - 1)
 
 
-def test_videos_of_different_throws_are_refused():
+def test_videos_of_different_takes_are_refused():
     tracks = [track((2.0, 1.0, 0.3)), track((0.2, 1.1, 2.2), v0=np.array([-1.5, 2.5, 0.7]))]
     with refused("(2.0, 1.0, 0.3).mp4", "(0.2, 1.1, 2.2).mp4"):
         fit_flight(tracks)
 
 
 def test_what_a_large_object_may_be_off_is_still_refused_by_gravity():
-    """Outlines of a body of 40 px may wander by 4 px; different throws that fit so well do not fall as things do."""
+    """Silhouettes of a body of 40 px may wander by 4 px. Different takes that fit so well do not show gravity."""
     rng = np.random.default_rng(0)
     count = 0
     for _ in range(20):
@@ -144,12 +144,12 @@ def test_the_deviation_of_gravity_is_that_of_the_closed_form():
     count, noise = 40, 0.3
     rng = np.random.default_rng(0)
     flat = np.array([0.4, 0.3, 0.0])
-    found = []
+    deviations = []
     for _ in range(30):
         one = track((0.1, 0.8, 2.1), v0=flat, noise=noise, rng=rng, count=count)
-        found.append(fit_free_fall([one], plane=(X0, np.array([0.0, 0, 1]))).gravity.ratio[1])
+        deviations.append(fit_free_fall([one], plane=(X0, np.array([0.0, 0, 1]))).gravity.ratio[1])
     expected = noise * 2.1 / 800 * np.sqrt(720 / count) / ((count - 1) / 120) ** 2 / GRAVITY
-    assert np.mean(found) == pytest.approx(expected, rel=0.1)
+    assert np.mean(deviations) == pytest.approx(expected, rel=0.1)
 
 
 def test_a_rolling_shutter_is_undone_by_the_times_of_the_rows():

@@ -48,8 +48,8 @@ def room(tmp_path):
 def test_cameras_are_those_of_the_room_again(room):
     path, view, world = room
     (frame,) = mattes.room_frames(path, "left")
-    found, intrinsics = mattes.metric_camera(frame, world)
-    np.testing.assert_allclose(found, view, atol=1e-12)
+    result, intrinsics = mattes.metric_camera(frame, world)
+    np.testing.assert_allclose(result, view, atol=1e-12)
     np.testing.assert_array_equal(intrinsics, K)
     with refused(path):
         mattes.room_frames(path, "right")
@@ -62,22 +62,22 @@ def test_mattes_are_read_as_they_were_written(room, tmp_path):
     masks = [disc(30 + 5 * i) for i in range(3)]
     entries = [({**still, "file_path": f"{i}.png", "step": i}, pixels, mask) for i, mask in enumerate(masks)]
     mattes.write_mattes(tmp_path / "out/transforms.json", entries, mattes.world_of(path))
-    found = read_image_set(tmp_path / "out/transforms.json")
+    result = read_image_set(tmp_path / "out/transforms.json")
     # A straight edge blurred has its half at the same place; on a disc of 9 px a few pixels of 254 differ.
-    for image, mask in zip(found.images, masks):
+    for image, mask in zip(result.images, masks):
         assert ((image[..., 3] > 127) ^ mask).sum() <= 8
         assert (image[image[..., 3] > 0, :3] == (200, 60, 50)).all() and (
             image[image[..., 3] == 0] == 0
         ).all()
-    assert found.steps.tolist() == [0, 1, 2]
+    assert result.steps.tolist() == [0, 1, 2]
 
 
 def test_own_masks_are_undistorted_as_their_pictures_are(tmp_path):
     lens = Lens(WIDTH, HEIGHT, K, np.array([-0.4, 0, 0, 0, 0.0]))
     mask = disc(60, 20)
     Image.fromarray(255 * mask.astype(np.uint8)).save(tmp_path / "a.png")
-    found = mattes.own_mask(tmp_path / "a.png", lens, 1000)
-    middle = np.argwhere(found).mean(axis=0)[::-1] + 0.5
+    result = mattes.own_mask(tmp_path / "a.png", lens, 1000)
+    middle = np.argwhere(result).mean(axis=0)[::-1] + 0.5
     # where the undistorting pinhole sees the disc's middle
     direction = lens.directions(np.array([[60.0, 20.0]]))[0]
     expected = direction * lens.pinhole().K[[0, 1], [0, 1]] + lens.pinhole().K[:2, 2]
@@ -89,8 +89,8 @@ def test_own_masks_of_a_video_show_its_flight():
     times = np.arange(12) / 60
     masks = np.stack([disc(15 + 200 * t, 12 + 0.5 * 1500 * t * t) for t in times])
     masks[5] = False
-    found = given_masks(masks, times)
-    assert found.masks is masks and [track.frames for track in found.tracks] == [(0, 11)]
+    result = given_masks(masks, times)
+    assert result.masks is masks and [track.frames for track in result.tracks] == [(0, 11)]
     assert given_masks(masks[:3], times[:3]).tracks == ()
 
 
@@ -99,12 +99,12 @@ def test_own_masks_lie_in_the_captures_folder(tmp_path):
     (capture / "masks/photographs").mkdir(parents=True)
     (capture / "capture.yaml").write_text("board: {square: 0.03}\n")
     Image.new("L", (4, 4), 255).save(capture / "masks/photographs/a.png")
-    found = read_capture(capture)
-    assert list(found.own_masks("photographs")) == ["a"] and found.own_masks("first/left") == {}
+    result = read_capture(capture)
+    assert list(result.own_masks("photographs")) == ["a"] and result.own_masks("first/left") == {}
     Image.new("L", (4, 4), 255).save(tmp_path / "other.png")
     (capture / "masks/photographs/b.png").symlink_to(tmp_path / "other.png")
     with refused("b.png"):
-        found.own_masks("photographs")
+        result.own_masks("photographs")
 
 
 def test_a_camera_that_saw_no_flight_is_named():

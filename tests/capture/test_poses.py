@@ -49,15 +49,15 @@ def test_notes_to_turn_pictures_are_removed(tmp_path):
         save(tmp_path / "b.jpg", pixels, quality=95),
         save(tmp_path / "c.png", pixels, exif=exif),
     ]
-    found = pics.copy_pictures(pics.name_pictures({"photographs": files}), tmp_path / "work")
-    assert list(found) == ["photographs/a.jpg", "photographs/b.jpg", "photographs/c.png"]
-    for file, copy in zip(files, found.values()):
+    result = pics.copy_pictures(pics.name_pictures({"photographs": files}), tmp_path / "work")
+    assert list(result) == ["photographs/a.jpg", "photographs/b.jpg", "photographs/c.png"]
+    for file, copy in zip(files, result.values()):
         with Image.open(copy) as image, Image.open(file) as original:
             assert image.getexif().get(pics.ORIENTATION, 1) == 1
             np.testing.assert_array_equal(np.asarray(image), np.asarray(original))
-    with Image.open(found["photographs/a.jpg"]) as image:
+    with Image.open(result["photographs/a.jpg"]) as image:
         assert image.getexif()[0x010F] == "maker"
-    assert found["photographs/b.jpg"].read_bytes() == files[1].read_bytes()
+    assert result["photographs/b.jpg"].read_bytes() == files[1].read_bytes()
 
 
 def test_pictures_of_other_sizes_or_none_are_refused(tmp_path):
@@ -109,8 +109,8 @@ def test_room_from_the_board():
     rng = np.random.default_rng(5)
     true = around(7)
     world = random_similarity(rng).inverse()
-    found = dict(zip(reconstruction(true).names, exact(true)))
-    room = rooms.room_of(reconstruction(world.move_cameras(true)), found, SETTINGS)
+    result = dict(zip(reconstruction(true).names, exact(true)))
+    room = rooms.room_of(reconstruction(world.move_cameras(true)), result, SETTINGS)
     centres = placement.camera_centres(true)
     wanted = np.stack([centres[:, 0] - 0.09, centres[:, 2], 0.12 - centres[:, 1]], axis=1)
     np.testing.assert_allclose(placement.camera_centres(room.poses.viewmats), wanted, atol=1e-7)
@@ -125,11 +125,11 @@ def test_room_from_a_stated_length():
     true = around(8)
     world = placement.Similarity(3.0, random_similarity(rng).rotation, np.array([1.0, -2, 0.5]))
     floor = np.concatenate([rng.uniform(-0.3, 0.4, (400, 2)), np.zeros((400, 1))], axis=1)
-    thing = rng.uniform([0.05, 0.08, 0.02], [0.13, 0.16, 0.1], (200, 3))
+    body = rng.uniform([0.05, 0.08, 0.02], [0.13, 0.16, 0.1], (200, 3))
     base = reconstruction(world.move_cameras(true))
     base = poses.replace(
         base,
-        points=world.apply(np.concatenate([floor, thing])),
+        points=world.apply(np.concatenate([floor, body])),
         colours=np.zeros((600, 3), np.uint8),
     )
     ends = np.array([[0.02, 0.1, 0.0], [0.02, 0.1, 0.15]])
@@ -221,7 +221,7 @@ def placed(filmed, tmp_path_factory):
     """Its settings, pictures and room."""
     root, _ = filmed
     capture = capture_folder.read_capture(root)
-    found = poses.find_poses(
+    result = poses.find_poses(
         capture.pictures(),
         "board",
         tmp_path_factory.mktemp("work"),
@@ -229,7 +229,7 @@ def placed(filmed, tmp_path_factory):
         capture.settings.board,
     )
     pictures = pics.name_pictures(capture.pictures())
-    return capture.settings, pictures, rooms.find_room(found, pictures, capture.settings)
+    return capture.settings, pictures, rooms.find_room(result, pictures, capture.settings)
 
 
 def test_a_capture_by_the_board_alone(filmed, placed, tmp_path):
@@ -242,8 +242,8 @@ def test_a_capture_by_the_board_alone(filmed, placed, tmp_path):
     off = placement.camera_centres(room.poses.viewmats) - wanted
     assert np.linalg.norm(off, axis=1).max() < 1.5e-3
     path = tmp_path / "out/transforms.json"
-    told = rooms.write_room(path, room, pictures, settings)
-    assert told["registered"] == 4 and told["lost"] == ["photographs/9.png"]
+    report = rooms.write_room(path, room, pictures, settings)
+    assert report["registered"] == 4 and report["lost"] == ["photographs/9.png"]
     data = read_transforms(path)
     assert data["world"] == {"scale": 1.0, "offset": [0.5, 0.0, 0.5]}
     corners = boards.room_from_board(BOARD, None).apply(boards.corner_positions(BOARD)) + [0.5, 0, 0.5]
@@ -252,9 +252,9 @@ def test_a_capture_by_the_board_alone(filmed, placed, tmp_path):
         view = np.linalg.inv(np.array(frame["transform_matrix"]) @ OPENGL_TO_OPENCV)
         K = np.array([[frame["fl_x"], 0, frame["cx"]], [0, frame["fl_y"], frame["cy"]], [0, 0, 1]])
         pixels = Lens(720, 540, K, np.zeros(5)).project(corners @ view[:3, :3].T + view[:3, 3])
-        found = boards.find_board(np.asarray(Image.open(path.parent / frame["file_path"])), BOARD)
-        off = found.pixels - pixels[found.ids]
-        assert len(found.ids) >= 20 and np.abs(off).mean() < 0.15 and np.abs(off.mean(axis=0)).max() < 0.1
+        result = boards.find_board(np.asarray(Image.open(path.parent / frame["file_path"])), BOARD)
+        off = result.pixels - pixels[result.ids]
+        assert len(result.ids) >= 20 and np.abs(off).mean() < 0.15 and np.abs(off.mean(axis=0)).max() < 0.1
     drawing.draw_room(tmp_path / "room.png", room)
     with Image.open(tmp_path / "room.png") as drawn:
         assert drawn.width > 500
@@ -327,21 +327,21 @@ def drawn(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def found_in_drawn(drawn, tmp_path_factory):
+def reconstructed(drawn, tmp_path_factory):
     pytest.importorskip("pycolmap")
     return poses.find_poses(drawn[0], "photographs", tmp_path_factory.mktemp("sfm"), seed=3, threads=2)
 
 
 @pytest.mark.slow
-def test_photographs_find_their_places(drawn, found_in_drawn):
+def test_photographs_find_their_places(drawn, reconstructed):
     """Of a phone and two fixed cameras, whose lenses nobody knows: within 5 mm and 0.2 degrees of the truth, the scale
     within 0.5 %, from drawn pictures with distortion, noise, and changing exposure; of the fixed cameras, whose lenses
-    are 0.25 degrees off the centre, within what is said to be unsure, too. Things appear within a pixel of where they
-    do where an object falls.
+    are 0.25 degrees off the centre, also within the reported uncertainty. Points of the volume in which an object falls
+    appear within a pixel.
     """
     groups, true = drawn
-    assert not found_in_drawn.lost and found_in_drawn.error < 1.0
-    room = rooms.find_room(found_in_drawn, pics.name_pictures(groups), CaptureConfig(board=BOARD))
+    assert not reconstructed.lost and reconstructed.error < 1.0
+    room = rooms.find_room(reconstructed, pics.name_pictures(groups), CaptureConfig(board=BOARD))
     names, got = room.poses.names, room.poses.viewmats
     place = boards.room_from_board(BOARD, None)
     wanted = place.move_cameras(np.stack([true[name] for name in names]))
@@ -353,11 +353,11 @@ def test_photographs_find_their_places(drawn, found_in_drawn):
     off = placement.fit_similarity(*centres)
     volume = place.apply(np.random.default_rng(0).uniform([-0.1, 0.0, 0.0], [0.3, 0.3, 0.4], (200, 3)))
     shifts = []
-    for lens, found, truth, phone in zip(room.poses.lenses, got, wanted, photographed):
+    for lens, result, truth, phone in zip(room.poses.lenses, got, wanted, photographed):
         true_lens = ROOM_LENSES["photographs" if phone else "fixed"]
         pixels = [
             seen.project(volume @ pose[:3, :3].T + pose[:3, 3])
-            for seen, pose in ((lens, found), (true_lens, truth))
+            for seen, pose in ((lens, result), (true_lens, truth))
         ]
         inside = ((pixels[1] > 0) & (pixels[1] < [true_lens.width, true_lens.height])).all(axis=1)
         assert inside.sum() > 50

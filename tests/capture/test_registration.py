@@ -1,4 +1,4 @@
-"""Registration: pose, velocity, spin and offsets are those that were rendered, and what cannot be told is said."""
+"""Registration: pose, velocity, spin and offsets are those that were rendered, and ambiguities are reported."""
 
 import json
 from dataclasses import replace
@@ -34,63 +34,63 @@ OFFSET = 0.0035
 def registered(body, motion, spin=None, **options):
     """Registration, and its errors (12,) in turn [rad], place [m], velocity [m/s] and spin [rad/s]."""
     sights = filmed(body, motion, **options)
-    found = register(body.gaussians, body.particles, body.mass, sights, guess(spin), "one")
-    t = np.array([found.start - 3.0])
+    result = register(body.gaussians, body.particles, body.mass, sights, guess(spin), "one")
+    t = np.array([result.start - 3.0])
     (R,), (w,) = motion.turn(t)
     (c,), (v,) = motion.place(t)
-    here = found.pose.motion
+    here = result.pose.motion
     turn = Rotation.from_matrix(here.rotation @ R.T).as_rotvec()
-    return found, np.concatenate([turn, here.centre - c, here.velocity - v, here.spin - w])
+    return result, np.concatenate([turn, here.centre - c, here.velocity - v, here.spin - w])
 
 
-def check_exact(found, errors, motion):
-    speed = np.linalg.norm(found.pose.motion.velocity)
+def check_exact(result, errors, motion):
+    speed = np.linalg.norm(result.pose.motion.velocity)
     assert np.degrees(np.linalg.norm(errors[:3])) < 1.5
     assert np.linalg.norm(errors[3:6]) < 0.003
     assert np.linalg.norm(errors[6:9]) < 0.03 * speed
     assert np.linalg.norm(errors[9:]) <= 0.1 * np.linalg.norm(motion.spin)
 
 
-def check_gravity(found, true=GRAVITY):
-    off = found.gravity - true
+def check_gravity(result, true=GRAVITY):
+    off = result.gravity - true
     assert np.linalg.norm(off) < 0.02 * 9.81
     assert (
-        off @ np.linalg.pinv(found.gravity_covariance) @ off < 16.3
+        off @ np.linalg.pinv(result.gravity_covariance) @ off < 16.3
     )  # one in a thousand of chi-squared, 3 degrees
 
 
 def test_pose_velocity_spin_offset_and_gains_are_those_that_were_rendered():
     body = ellipsoid_body(count=250)
     motion = true_motion(body, Rotation.random(random_state=1).as_matrix())
-    found, errors = registered(body, motion, frames=8, offset=OFFSET, noise=0.02)
-    check_exact(found, errors, motion)
-    assert found.pose.offsets == pytest.approx([0.0, OFFSET], abs=1e-4)
-    check_gravity(found)
+    result, errors = registered(body, motion, frames=8, offset=OFFSET, noise=0.02)
+    check_exact(result, errors, motion)
+    assert result.pose.offsets == pytest.approx([0.0, OFFSET], abs=1e-4)
+    check_gravity(result)
     # Noise in the coverage is cut off at 1, which darkens edges.
-    np.testing.assert_allclose(found.pose.gains, GAINS[:2], rtol=0.02)
-    assert found.before.iou.mean() < 0.85 and found.after.iou.min() > 0.97 and found.after.off.max() < 0.2
-    assert not found.ambiguous and found.rival[0] > 2 and found.spin_significant
-    x = body.particles @ found.rotation.T + found.translation
-    np.testing.assert_allclose(body.mass @ x / body.mass.sum(), found.pose.motion.centre, atol=1e-9)
-    throw = InitialMotion.of(found.velocity())
-    np.testing.assert_allclose(throw.velocity, found.pose.motion.velocity)
-    assert (throw.std > 0).all() and (throw.axes == found.axes).all()
-    report = json.loads(json.dumps(found.report(), allow_nan=False))
+    np.testing.assert_allclose(result.pose.gains, GAINS[:2], rtol=0.02)
+    assert result.before.iou.mean() < 0.85 and result.after.iou.min() > 0.97 and result.after.off.max() < 0.2
+    assert not result.ambiguous and result.rival[0] > 2 and result.spin_significant
+    x = body.particles @ result.rotation.T + result.translation
+    np.testing.assert_allclose(body.mass @ x / body.mass.sum(), result.pose.motion.centre, atol=1e-9)
+    launch = InitialMotion.of(result.velocity())
+    np.testing.assert_allclose(launch.velocity, result.pose.motion.velocity)
+    assert (launch.std > 0).all() and (launch.axes == result.axes).all()
+    report = json.loads(json.dumps(result.report(), allow_nan=False))
     assert set(report["offsets_s"]) == set(report["gains"]) == {"a", "b"} and report["ambiguous"] == ""
-    assert {each.camera for each in found.comparisons} == {0, 1}
-    assert all(each.seen.shape == each.rendered.shape for each in found.comparisons)
+    assert {each.camera for each in result.comparisons} == {0, 1}
+    assert all(each.seen.shape == each.rendered.shape for each in result.comparisons)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2, 7))
-def test_every_rotation_is_found(seed):
+def test_every_rotation_is_estimated(seed):
     body = ellipsoid_body()
     # The first is the pose of the photographs.
     turn = np.eye(3) if seed == 2 else Rotation.random(random_state=seed).as_matrix()
     motion = true_motion(body, turn)
-    found, errors = registered(body, motion, offset=OFFSET, noise=0.02, views=2 + seed % 2)
-    check_exact(found, errors, motion)
-    assert not found.ambiguous
+    result, errors = registered(body, motion, offset=OFFSET, noise=0.02, views=2 + seed % 2)
+    check_exact(result, errors, motion)
+    assert not result.ambiguous
 
 
 @pytest.mark.slow
@@ -99,38 +99,38 @@ def test_lamps_that_stay_while_the_body_turns_do_not_mislead(coloured):
     body = ellipsoid_body(count=300, coloured=coloured, bump=0.5 if coloured else 0.9)
     motion = true_motion(body, Rotation.random(random_state=2).as_matrix())
     photographed = photographed_in_light(body)  # and with a bottom that nobody saw
-    found, errors = registered(photographed, motion, offset=OFFSET, noise=0.02, light=True)
-    check_exact(found, errors, motion)
-    assert (np.abs(errors) < 4 * np.sqrt(np.diag(found.covariance)[:12])).all()
+    result, errors = registered(photographed, motion, offset=OFFSET, noise=0.02, light=True)
+    check_exact(result, errors, motion)
+    assert (np.abs(errors) < 4 * np.sqrt(np.diag(result.covariance)[:12])).all()
 
 
 def test_one_camera_is_enough_and_less_sure_of_the_depth():
     body = ellipsoid_body(count=250)
     motion = true_motion(body, Rotation.random(random_state=3).as_matrix())
-    found, errors = registered(body, motion, frames=8, views=1, noise=0.02)
+    result, errors = registered(body, motion, frames=8, views=1, noise=0.02)
     assert np.degrees(np.linalg.norm(errors[:3])) < 1.5
-    depth = found.axes[2]
+    depth = result.axes[2]
     across = errors[3:6] - depth * (depth @ errors[3:6])
     assert np.linalg.norm(across) < 0.002
-    std = found.deviations(slice(3, 6), found.axes)
+    std = result.deviations(slice(3, 6), result.axes)
     assert abs(depth @ errors[3:6]) < 4 * std[2] and std[2] > 5 * std[:2].max()
     # Along its view gravity is taken as known.
     level = depth - depth @ GRAVITY / (GRAVITY @ GRAVITY) * GRAVITY
-    assert abs(level @ found.gravity_covariance @ level) < 1e-9 and abs(level @ found.gravity) < 1e-9
-    check_gravity(found)
+    assert abs(level @ result.gravity_covariance @ level) < 1e-9 and abs(level @ result.gravity) < 1e-9
+    check_gravity(result)
 
 
-def test_a_plain_ball_is_said_to_be_ambiguous():
+def test_a_plain_ball_is_ambiguous():
     body = ellipsoid_body(count=250, radii=(0.05, 0.05, 0.05), coloured=False, bump=0.0)
     motion = true_motion(body, np.eye(3))
-    found, errors = registered(body, motion, frames=6, noise=0.02)
-    assert "explains the video nearly as well" in found.ambiguous or "any axis" in found.ambiguous
-    assert found.turn_deviations[-1] > 20
+    result, errors = registered(body, motion, frames=6, noise=0.02)
+    assert "explains the video nearly as well" in result.ambiguous or "any axis" in result.ambiguous
+    assert result.turn_deviations[-1] > 20
     assert np.linalg.norm(errors[3:6]) < 0.01 and np.linalg.norm(errors[6:9]) < 0.1
 
 
 def test_frames_after_the_contact_are_left_out():
-    """From the ninth frame on the body lies where it touched the floor, which outlines alone may take for flight."""
+    """From the ninth frame on the body lies where it touched the floor, which silhouettes alone may take for flight."""
     body = ellipsoid_body(count=250)
     motion = true_motion(body, Rotation.random(random_state=8).as_matrix())
     (turn,), (centre,) = motion.turn(np.array([8.5 / 120]))[0], motion.place(np.array([8.5 / 120]))[0]
@@ -139,38 +139,38 @@ def test_frames_after_the_contact_are_left_out():
     for sight in sights:
         sight.images[9:] = sight.images[8]
     for height, bound in ((floor, 0.005), (None, np.inf)):
-        found = register(body.gaussians, body.particles, body.mass, sights, guess(), "one", floor=height)
-        off = np.linalg.norm(found.pose.motion.velocity - motion.place(np.array([found.start - 3.0]))[1][0])
+        result = register(body.gaussians, body.particles, body.mass, sights, guess(), "one", floor=height)
+        off = np.linalg.norm(result.pose.motion.velocity - motion.place(np.array([result.start - 3.0]))[1][0])
         assert off < bound
     assert off > 0.05
 
 
 def test_gravity_that_is_not_what_was_assumed_is_measured():
     """As a square size off by 15 percent shows it, or a floor that is not level."""
-    body, shown = ellipsoid_body(count=250), np.array([0.6, -8.4, 0.0])
-    motion = replace(true_motion(body, Rotation.random(random_state=6).as_matrix()), gravity=shown)
-    found, _ = registered(body, motion, frames=12, offset=OFFSET, noise=0.02)
-    check_gravity(found, shown)
+    body, true_gravity = ellipsoid_body(count=250), np.array([0.6, -8.4, 0.0])
+    motion = replace(true_motion(body, Rotation.random(random_state=6).as_matrix()), gravity=true_gravity)
+    result, _ = registered(body, motion, frames=12, offset=OFFSET, noise=0.02)
+    check_gravity(result, true_gravity)
 
 
 @pytest.mark.slow
-def test_a_spin_that_is_not_told_from_0_is_none():
+def test_an_insignificant_spin_is_set_to_0():
     body = ellipsoid_body(count=250)
     motion = true_motion(body, Rotation.random(random_state=4).as_matrix(), spin=(0, 0, 0))
-    found, errors = registered(body, motion, frames=6, noise=0.03)
-    assert not found.spin_significant and not found.pose.motion.spin.any()
-    check_exact(found, errors[:9], motion)
-    assert (found.deviations(slice(9, 12)) > 0).all()
+    result, errors = registered(body, motion, frames=6, noise=0.03)
+    assert not result.spin_significant and not result.pose.motion.spin.any()
+    check_exact(result, errors[:9], motion)
+    assert (result.deviations(slice(9, 12)) > 0).all()
 
 
 @pytest.mark.slow
-def test_errors_are_as_large_as_the_deviations_say():
+def test_errors_are_as_large_as_the_deviations():
     body = ellipsoid_body(count=250)
     z = []
     for seed in range(8):
         motion = true_motion(body, Rotation.random(random_state=50 + seed).as_matrix())
-        found, errors = registered(body, motion, offset=OFFSET, noise=0.05, seed=seed)
-        z.append(errors / np.sqrt(np.diag(found.covariance)[:12]))
+        result, errors = registered(body, motion, offset=OFFSET, noise=0.05, seed=seed)
+        z.append(errors / np.sqrt(np.diag(result.covariance)[:12]))
     # 8 x 12 of them, correlated within a flight: mean squares of chi-squared over 12 / 8 degrees of freedom or so
     assert 0.2 < np.square(z).mean() < 2.5
     assert (np.abs(z) > 3).mean() < 0.06

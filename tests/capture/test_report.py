@@ -1,4 +1,4 @@
-"""The report of a capture: what it says, and that it holds all it shows."""
+"""The report of a capture: its text, and that it is self-contained."""
 
 import math
 import re
@@ -23,7 +23,7 @@ class Reader(HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.open, self.links, self.tags, self.said = [], [], [], ""
+        self.open, self.links, self.tags, self.content = [], [], [], ""
         self.feed(text)
         assert self.open == []
 
@@ -39,11 +39,11 @@ class Reader(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
-        self.said += data
+        self.content += data
 
 
-def row(method="neuma", throw="one", camera="left", learned=True, **values):
-    named = {"method": method, "title": method, "throw": throw, "camera": camera, "learned": learned}
+def row(method="neuma", take="one", camera="left", learned=True, **values):
+    named = {"method": method, "title": method, "throw": take, "camera": camera, "learned": learned}
     return {**named, "frames": 5, **dict.fromkeys(COLUMNS, 0.9), "psnr": 20.0, **values}
 
 
@@ -77,7 +77,7 @@ def whole(tmp_path):
         },
         "pictures": {"Videos": {"Frames: one, left": tmp_path / "sheet.png"}},
         "films": [Film("one", "left", True, tmp_path / "left.mp4", "PSNR 20.0 dB")],
-        "rows": [row("nclaw", psnr=15.0), row(), row(throw="all", camera="all")],
+        "rows": [row("nclaw", psnr=15.0), row(), row(take="all", camera="all")],
         "own": "neuma",
         "curves": tmp_path / "sheet.png",
         "identified": identified(),
@@ -100,8 +100,8 @@ def test_the_page_holds_all_that_it_shows_and_asks_for_nothing_else(whole):
         "✓ passed",
         "PSNR 20.0 dB",
     ):
-        assert text in read.said
-    assert read.said.count("not determined") == 2 and "(training)" in read.said
+        assert text in read.content
+    assert read.content.count("not determined") == 2 and "(training)" in read.content
 
 
 def test_names_and_texts_are_escaped(whole, tmp_path):
@@ -116,17 +116,17 @@ def test_names_and_texts_are_escaped(whole, tmp_path):
             Film(NASTY, NASTY, True, tmp_path / "left.mp4", NASTY),
             Film(NASTY, NASTY, True, None),
         ],
-        "rows": [row(throw=NASTY, camera=NASTY, title=NASTY)],
+        "rows": [row(take=NASTY, camera=NASTY, title=NASTY)],
         "identified": identified(family=NASTY, ties=[NASTY]),
     }
     read = Reader(page(**{**whole, **nasty}))
     assert "script" not in read.tags
-    assert read.said.count(NASTY) >= 15
+    assert read.content.count(NASTY) >= 15
     assert all(link.startswith(("data:", "#")) for link in read.links)
 
 
-def test_what_is_missing_is_said():
-    said = Reader(page("mug", "NeuMA")).said
+def test_missing_parts_are_reported():
+    content = Reader(page("mug", "NeuMA")).content
     for text in (
         "There are no videos.",
         "No pictures were measured.",
@@ -135,15 +135,17 @@ def test_what_is_missing_is_said():
         "There are no checks.",
         "There are no pictures.",
     ):
-        assert text in said
+        assert text in content
 
 
-def test_files_that_are_not_there_are_said_to_be_missing(whole, tmp_path):
+def test_missing_files_are_reported(whole, tmp_path):
     gone = tmp_path / "gone"
     films = [Film("one", "left", True, gone)]
     read = Reader(page(**{**whole, "films": films, "pictures": {"Videos": {"Sheet": gone}}, "curves": gone}))
-    assert "The video of left is missing." in read.said and "Sheet: the picture is missing." in read.said
-    assert "There are no stress curves." in read.said and "video" not in read.tags
+    assert (
+        "The video of left is missing." in read.content and "Sheet: the picture is missing." in read.content
+    )
+    assert "There are no stress curves." in read.content and "video" not in read.tags
 
 
 def test_a_file_that_is_no_picture_is_named(tmp_path):
@@ -164,11 +166,11 @@ def test_stresses_are_those_of_the_room():
     assert room_value("viscosity", 40.0, 2.0) == (10.0, "Pa s")
     assert room_value("friction_angle", 30.0, 2.0) == (30.0, "°")
     assert room_value("yield_strain", 0.1, 2.0) == (0.1, "")
-    shown = Reader(page("mug", "NeuMA", identified=identified(), scale=2.0)).said
-    assert "100 kPa" in shown and "250 Pa" in shown and "lengths are 2 times" in shown
-    # Two standard deviations of the logarithm, and one that says nothing.
-    assert f"{number(250 / math.exp(0.1))} to {number(250 * math.exp(0.1))}" in shown
-    assert "unknown" in shown
+    content = Reader(page("mug", "NeuMA", identified=identified(), scale=2.0)).content
+    assert "100 kPa" in content and "250 Pa" in content and "lengths are 2 times" in content
+    # Two standard deviations of the logarithm, and one that is undetermined.
+    assert f"{number(250 / math.exp(0.1))} to {number(250 * math.exp(0.1))}" in content
+    assert "unknown" in content
 
 
 @pytest.mark.parametrize(
@@ -209,7 +211,7 @@ def take(**changes):
 def test_a_capture_without_faults_has_no_warnings():
     assert module.filming_warnings(CAPTURE, take()) == []
     assert module.check_warnings({"Room": [Check("floor", "50 %", "> 20 %", True)]}) == []
-    rows = [row("nclaw", psnr=15.0), row(), row(throw="all", camera="all")]
+    rows = [row("nclaw", psnr=15.0), row(), row(take="all", camera="all")]
     assert module.prediction_warnings(rows, "neuma", "nclaw", "constants", {"one": GOOD_MOTION}) == []
     assert (
         module.constants_warnings(None) == [] and module.curve_warnings(None, {}, "nclaw", "constants") == []
@@ -217,7 +219,7 @@ def test_a_capture_without_faults_has_no_warnings():
 
 
 @pytest.mark.parametrize(
-    "changes, said",
+    "changes, content",
     [
         ({"cameras": {"left": 1e-3}}, "only one camera"),
         ({"flight": {"spin_rad_s": None}}, "no spin was measured"),
@@ -230,24 +232,24 @@ def test_a_capture_without_faults_has_no_warnings():
         ({"registration": {"ambiguous": "it looks alike"}}, "does not determine the pose .*: it looks alike"),
     ],
 )
-def test_each_fault_of_filming_is_said(changes, said):
-    (found,) = module.filming_warnings(CAPTURE, take(**changes))
-    assert re.search(said, found)
+def test_each_fault_of_filming_gives_a_warning(changes, content):
+    (warned,) = module.filming_warnings(CAPTURE, take(**changes))
+    assert re.search(content, warned)
 
 
-def test_what_nobody_stated_or_held_out_is_said():
+def test_defaults_that_limit_the_result_give_a_warning():
     (density,) = module.filming_warnings({**CAPTURE, "density_stated": False}, take())
     assert "900 kg/m³" in density
     (held,) = module.filming_warnings({**CAPTURE, "held_out": []}, take())
     assert "No take is held out" in held
 
 
-def test_predictions_that_are_worse_than_nothing_are_said():
+def test_predictions_worse_than_the_prior_give_warnings():
     rows = [row("nclaw", psnr=21.0), row(iou=0.5)]
-    rows += [row(throw="all", camera="all"), row(throw="all", camera="all", learned=False, psnr=18.0)]
-    rows += [row("constants", throw="all", camera="all", psnr=22.0)]
+    rows += [row(take="all", camera="all"), row(take="all", camera="all", learned=False, psnr=18.0)]
+    rows += [row("constants", take="all", camera="all", psnr=22.0)]
     broken = {**GOOD_MOTION, "stable": False, "diverged": {"step": 30, "happened": "became non-finite"}}
-    found = module.prediction_warnings(rows, "neuma", "nclaw", "constants", {"one": broken})
+    warned = module.prediction_warnings(rows, "neuma", "nclaw", "constants", {"one": broken})
     for text in (
         "diverged at step 30",
         "training diverged",
@@ -256,11 +258,11 @@ def test_predictions_that_are_worse_than_nothing_are_said():
         "Held-out",
         "In training frames, the identified constants alone fit better",
     ):
-        assert sum(text in line for line in found) == 1, text
-    assert len(found) == 6
+        assert sum(text in line for line in warned) == 1, text
+    assert len(warned) == 6
 
 
-def test_undetermined_constants_and_ties_are_said():
+def test_undetermined_constants_and_ties_give_warnings():
     tie, open_ = module.constants_warnings(identified(ties=["hencky"]))
     assert (
         "von_mises, hencky" in tie
@@ -275,7 +277,7 @@ def curve(stress, band=None):
     return {"stress": stress, "band": ends}
 
 
-def test_laws_outside_the_band_are_said():
+def test_laws_outside_the_band_give_warnings():
     laws = {
         "nclaw": curve([5.0, 6.0, 7.0, 8.0]),
         "constants": curve([0.0, 1.0, 2.0, 3.0], band=0.5),
@@ -284,6 +286,6 @@ def test_laws_outside_the_band_are_said():
     test = {"x": [0.0, 1.0, 2.0, 3.0], "visited": [0.0, 3.0], "by_stress": False, "laws": laws}
     curves = {"learned": "neuma", "rate": 20, "tests": {"shear": test}}
     titles = {"nclaw": "prior", "constants": "identified constants", "neuma": "NeuMA"}
-    found = module.curve_warnings(curves, titles, "nclaw", "constants")
-    assert len(found) == 3 and "no error bars" in found[1]
-    assert found[2].startswith("Shear: over 100 % of the visited range, prior is outside")
+    warned = module.curve_warnings(curves, titles, "nclaw", "constants")
+    assert len(warned) == 3 and "no error bars" in warned[1]
+    assert warned[2].startswith("Shear: over 100 % of the visited range, prior is outside")

@@ -1,4 +1,4 @@
-"""Measures of predicted pictures of a real throw against what was filmed."""
+"""Measures of predicted pictures compared with the video of a take."""
 
 import numpy as np
 import pytest
@@ -48,35 +48,35 @@ def measured(scene, **changes):
 
 
 def test_measures_are_those_of_pictures_that_are_put_together_by_hand(scene):
-    found = measured(scene)
+    metrics = measured(scene)
     alpha, mask = scene["alpha"].numpy()[..., None], scene["matte"].numpy()[..., 3:]
     predicted, filmed = (
         scene["colours"].numpy() + 1 - alpha,
         scene["matte"].numpy()[..., :3] * mask + 1 - mask,
     )
     window = object_window((alpha[..., 0] > 0.05) | (mask[..., 0] > 0.05), 0.1)
-    assert found["psnr"] == pytest.approx(psnr(predicted[window], filmed[window]), abs=1e-4)
-    assert found["ssim"] == pytest.approx(ssim(predicted[window], filmed[window]), abs=1e-5)
+    assert metrics["psnr"] == pytest.approx(psnr(predicted[window], filmed[window]), abs=1e-4)
+    assert metrics["ssim"] == pytest.approx(ssim(predicted[window], filmed[window]), abs=1e-5)
     whole = scene["colours"].numpy() + (1 - alpha) * scene["empty"].numpy()
-    assert found["scene_psnr"] == pytest.approx(psnr(whole, scene["picture"].numpy()), abs=1e-4)
-    assert found["scene_ssim"] == pytest.approx(ssim(whole, scene["picture"].numpy()), abs=1e-5)
+    assert metrics["scene_psnr"] == pytest.approx(psnr(whole, scene["picture"].numpy()), abs=1e-4)
+    assert metrics["scene_ssim"] == pytest.approx(ssim(whole, scene["picture"].numpy()), abs=1e-5)
     # Two discs of radius 12 whose centres are 3 apart.
     part = np.arccos(3 / 24) * 2 * 144 - 1.5 * np.sqrt(4 * 144 - 9)
-    assert found["iou"] == pytest.approx(part / (2 * np.pi * 144 - part), abs=0.02)
+    assert metrics["iou"] == pytest.approx(part / (2 * np.pi * 144 - part), abs=0.02)
 
 
 def test_what_lies_behind_the_object_changes_the_whole_picture_alone(scene):
     other = torch.rand_like(scene["empty"])
-    found, changed = measured(scene), measured(scene, picture=other)
-    assert (found["psnr"], found["iou"]) == (changed["psnr"], changed["iou"])
-    assert changed["scene_psnr"] < 12 < found["scene_psnr"]
+    metrics, changed = measured(scene), measured(scene, picture=other)
+    assert (metrics["psnr"], metrics["iou"]) == (changed["psnr"], changed["iou"])
+    assert changed["scene_psnr"] < 12 < metrics["scene_psnr"]
 
 
 def test_a_prediction_that_is_what_was_filmed_is_perfect(scene):
     mask = scene["matte"][..., 3]
-    found = measured(scene, colours=scene["matte"][..., :3] * mask[..., None], alpha=mask)
-    assert found["psnr"] > 100 and found["scene_psnr"] > 100 and found["iou"] == 1
-    assert found["ssim"] == pytest.approx(1) and found["scene_ssim"] == pytest.approx(1)
+    metrics = measured(scene, colours=scene["matte"][..., :3] * mask[..., None], alpha=mask)
+    assert metrics["psnr"] > 100 and metrics["scene_psnr"] > 100 and metrics["iou"] == 1
+    assert metrics["ssim"] == pytest.approx(1) and metrics["scene_ssim"] == pytest.approx(1)
 
 
 def test_pictures_of_other_sizes_are_refused(scene):
@@ -87,8 +87,10 @@ def test_pictures_of_other_sizes_are_refused(scene):
 
 
 def test_the_empty_scene_gets_the_exposure_of_the_frame():
-    plate = np.array([[[100, 200, 50]]], np.uint8)
-    np.testing.assert_allclose(exposed(plate, (0.5, 2.0, 1.0), (10, 0, -60)), [[[60 / 255, 1, 0]]], atol=1e-6)
+    background = np.array([[[100, 200, 50]]], np.uint8)
+    np.testing.assert_allclose(
+        exposed(background, (0.5, 2.0, 1.0), (10, 0, -60)), [[[60 / 255, 1, 0]]], atol=1e-6
+    )
 
 
 def test_differences_are_dark():
@@ -97,12 +99,12 @@ def test_differences_are_dark():
     np.testing.assert_allclose(error_picture(a, b), [[0.7] * 3, [0.0] * 3])
 
 
-def entry(method, throw, camera, learned, *values):
+def entry(method, take, camera, learned, *values):
     frames = [dict.fromkeys(COLUMNS, value) for value in values]
     return {
         "method": method,
         "title": method,
-        "throw": throw,
+        "throw": take,
         "camera": camera,
         "learned": learned,
         "frames": frames,

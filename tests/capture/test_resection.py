@@ -28,20 +28,20 @@ def sightings(points, noise):
     """Of 12 cameras around the scene, and of the fixed one."""
     rng = np.random.default_rng(5)
     eyes = [looking_at([np.cos(a), np.sin(a), 0.6], [0.1, 0.1, 0.0]) for a in np.linspace(0, 6, 12)]
-    found = []
+    result = []
     for lens, eye in [(LENS, eye) for eye in eyes] + [(TRUE, EYE)]:
         pixels = lens.project(points @ eye[:3, :3].T + eye[:3, 3])
         inside = np.flatnonzero(((pixels > 0) & (pixels < [lens.width, lens.height])).all(axis=1))
         noisy = pixels[inside] + rng.normal(0, noise, (len(inside), 2))
-        found.append(resection.Sighting(lens, eye, inside, noisy))
-    return found
+        result.append(resection.Sighting(lens, eye, inside, noisy))
+    return result
 
 
 def resected(height, noise, outliers=0):
     points = scene(height)
     *photographs, still = sightings(points, noise)
     rng = np.random.default_rng(6)
-    found, covariances, known = resection.triangulated(
+    result, covariances, known = resection.triangulated(
         points + rng.normal(0, 0.003, points.shape), photographs
     )
     chosen = known[still.points]
@@ -50,7 +50,7 @@ def resected(height, noise, outliers=0):
     near = EYE.copy()
     near[:3, :3] = Rotation.from_rotvec([0.008, -0.01, 0.003]).as_matrix() @ EYE[:3, :3]
     near[:3, 3] += [0.01, -0.005, 0.012]
-    return resection.resect(found[numbers], covariances[numbers], pixels, GUESS, near)
+    return resection.resect(result[numbers], covariances[numbers], pixels, GUESS, near)
 
 
 def turned(viewmat):
@@ -60,8 +60,8 @@ def turned(viewmat):
 def test_points_are_where_the_photographs_saw_them_with_the_deviations_of_noise():
     points = scene(0.3)
     *photographs, _ = sightings(points, 0.3)
-    found, covariances, known = resection.triangulated(points + 0.004, photographs)
-    off = found[known] - points[known]
+    result, covariances, known = resection.triangulated(points + 0.004, photographs)
+    off = result[known] - points[known]
     squares = np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariances[known]), off)
     assert known.mean() > 0.95
     assert squares.mean() == pytest.approx(3, rel=0.15)  # chi-squared with three degrees of freedom
@@ -85,7 +85,7 @@ def test_noise_and_outliers_stay_within_the_deviations_that_are_stated():
     assert turned(camera.viewmat) < min(0.2, 3 * camera.turn_deviation)
 
 
-def test_a_floor_alone_does_not_tell_the_centre_and_says_so():
+def test_a_floor_alone_leaves_the_centre_undetermined():
     flat, tall = resected(0.0, 0.3), resected(0.4, 0.3)
     assert flat.turn_deviation > 3 * tall.turn_deviation
     off = flat.lens.K[:2, 2] - TRUE.K[:2, 2]

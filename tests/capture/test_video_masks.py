@@ -1,4 +1,4 @@
-"""Masks of a drawn fall with everything that a room adds; and what is said of bad videos."""
+"""Masks of a drawn fall with shadows, a hand, noise and changing exposure, and errors of bad videos."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from tests.support.drawn_falls import (
 
 pytest.importorskip("cv2")
 
-from neuma_lib.capture.masks import background as plates  # noqa: E402
+from neuma_lib.capture.masks import background as backgrounds  # noqa: E402
 from neuma_lib.capture.masks import video_masks as module  # noqa: E402
 from neuma_lib.capture.masks.regions import MAX_MOVING, centroid, check_flight, iou  # noqa: E402
 from tests.support.errors import refused  # noqa: E402
@@ -26,64 +26,66 @@ from tests.support.errors import refused  # noqa: E402
 MIN_IOU = 0.96  # what the masks of the synthetic capture have to reach
 
 
-def overlaps(found, frames=range(COUNT)):
-    return [iou(found.masks[i], ellipse(places()[i])) for i in frames]
+def overlaps(result, frames=range(COUNT)):
+    return [iou(result.masks[i], ellipse(places()[i])) for i in frames]
 
 
 def test_a_fall_is_masked_with_shadow_drifting_exposure_and_noise():
-    plate = texture()
-    frames = film(plate, shadow=True, gain=(1.15, 1.1, 0.95))
-    found = module.video_masks(frames, "drop.mp4", np.rint(plate).astype(np.uint8), TIMES)
-    assert min(overlaps(found)) > MIN_IOU
+    background = texture()
+    frames = film(background, shadow=True, gain=(1.15, 1.1, 0.95))
+    result = module.video_masks(frames, "drop.mp4", np.rint(background).astype(np.uint8), TIMES)
+    assert min(overlaps(result)) > MIN_IOU
     # 800 pixels with an edge of some 95: half a pixel of random error along it moves the centre by less than 0.1
-    np.testing.assert_allclose([centroid(mask) for mask in found.masks], places(), atol=0.3)
+    np.testing.assert_allclose([centroid(mask) for mask in result.masks], places(), atol=0.3)
     # the flight ends within a frame of the contact, after which the parabola would go on
-    assert len(found.tracks) == 1 and abs(found.tracks[0].frames[1] - CONTACT) <= 1
-    assert found.moving.max() < MAX_MOVING
-    jumps = check_flight(found.masks, "drop.mp4", range(CONTACT))
+    assert len(result.tracks) == 1 and abs(result.tracks[0].frames[1] - CONTACT) <= 1
+    assert result.moving.max() < MAX_MOVING
+    jumps = check_flight(result.masks, "drop.mp4", range(CONTACT))
     assert jumps.max() < 0.06
 
 
 def test_the_hand_that_lets_go_is_not_the_object():
-    plate = texture()
-    found = module.video_masks(film(plate, hand=True), "drop.mp4", np.rint(plate).astype(np.uint8), TIMES)
+    background = texture()
+    result = module.video_masks(
+        film(background, hand=True), "drop.mp4", np.rint(background).astype(np.uint8), TIMES
+    )
     free = range(13, COUNT)
-    assert min(overlaps(found, free)) > MIN_IOU
+    assert min(overlaps(result, free)) > MIN_IOU
     # held, it is either left out, or found without the hand
-    assert all(m.sum() < 2 * ellipse(p).sum() for m, p in zip(found.masks, places()))
+    assert all(m.sum() < 2 * ellipse(p).sum() for m, p in zip(result.masks, places()))
 
 
 def test_the_median_of_the_frames_stands_in_for_the_empty_picture():
     frames = film(texture())[: CONTACT + 1]
-    found = module.video_masks(frames, "drop.mp4", times=TIMES[: CONTACT + 1])
+    result = module.video_masks(frames, "drop.mp4", times=TIMES[: CONTACT + 1])
     # while it is slow, at first, it covers a pixel in too many frames
-    assert min(overlaps(found, range(10, CONTACT + 1))) > 0.9
+    assert min(overlaps(result, range(10, CONTACT + 1))) > 0.9
 
 
-def test_a_place_that_is_known_goes_before_the_arc():
-    plate = texture()
-    frames = film(plate)
+def test_a_known_place_precedes_the_track():
+    background = texture()
+    frames = film(background)
     for frame in frames:
         frame[150:180, 250:290] = (40, 60, 200)
     given = np.tile([270.0, 165.0], (COUNT, 1))
-    found = module.video_masks(frames, "a.mp4", np.rint(plate).astype(np.uint8), TIMES, given)
-    np.testing.assert_allclose([centroid(mask) for mask in found.masks], given, atol=0.3)
+    result = module.video_masks(frames, "a.mp4", np.rint(background).astype(np.uint8), TIMES, given)
+    np.testing.assert_allclose([centroid(mask) for mask in result.masks], given, atol=0.3)
 
 
-def test_exposure_is_found_exactly_and_beside_what_moves():
-    plate = np.rint(texture()).astype(np.uint8)
-    frame = 1.2 * plate.astype(float) * (1, 0.9, 0.95) + 4
+def test_exposure_is_exact_in_spite_of_motion():
+    background = np.rint(texture()).astype(np.uint8)
+    frame = 1.2 * background.astype(float) * (1, 0.9, 0.95) + 4
     frame[ellipse((160, 120), 60, 50)] = 20
-    gain, offset = plates.match_exposure(np.rint(frame).astype(np.uint8), plate)
+    gain, offset = backgrounds.match_exposure(np.rint(frame).astype(np.uint8), background)
     np.testing.assert_allclose(gain, (1.2, 1.08, 1.14), atol=0.01)
     np.testing.assert_allclose(offset, 4, atol=0.8)
 
 
-def test_a_shadow_is_told_from_a_dark_object():
-    plate = texture()
-    shaded = np.where(ellipse((80, 120), 40, 40)[..., None], 0.6 * plate, plate)
-    tinted = np.where(ellipse((240, 120), 40, 40)[..., None], plate * (0.75, 0.5, 0.4), shaded)
-    _, shadow = plates.compare(np.clip(tinted, 0, 255).astype(np.uint8), plate.astype(np.float32))
+def test_a_shadow_is_distinguished_from_a_dark_object():
+    background = texture()
+    shaded = np.where(ellipse((80, 120), 40, 40)[..., None], 0.6 * background, background)
+    tinted = np.where(ellipse((240, 120), 40, 40)[..., None], background * (0.75, 0.5, 0.4), shaded)
+    _, shadow = backgrounds.compare(np.clip(tinted, 0, 255).astype(np.uint8), background.astype(np.float32))
     assert shadow[ellipse((80, 120), 35, 35)].mean() > 0.95
     assert shadow[ellipse((240, 120), 35, 35)].mean() < 0.05
 
@@ -92,25 +94,25 @@ def test_a_shadow_is_told_from_a_dark_object():
     "colour", [(225, 70, 40), (18, 165, 148), (150, 128, 100)], ids=["red", "teal", "stone"]
 )
 def test_the_dark_shadow_that_it_lands_on_is_left_out(colour):
-    """Of a ball in colours that the floor has not and that it has; its colours are not told beforehand."""
-    plate = stony()
-    noisy = plate + np.random.default_rng(9).normal(0, 2, plate.shape)
-    frames, silhouettes = film_of_contact(plate, colour)
-    found = module.video_masks(frames, "drop.mp4", np.clip(np.rint(noisy), 0, 255).astype(np.uint8), TIMES)
-    agreed = [iou(mask, whole) for mask, whole in zip(found.masks, silhouettes)]
+    """Of a ball in colours that the floor does not have, and in one that it has."""
+    background = stony()
+    noisy = background + np.random.default_rng(9).normal(0, 2, background.shape)
+    frames, silhouettes = film_of_contact(background, colour)
+    result = module.video_masks(frames, "drop.mp4", np.clip(np.rint(noisy), 0, 255).astype(np.uint8), TIMES)
+    agreed = [iou(mask, whole) for mask, whole in zip(result.masks, silhouettes)]
     assert min(agreed) > MIN_IOU
     assert np.mean(agreed[: CONTACT - 5]) > 0.98
 
 
 def test_bad_videos_end_with_what_to_do():
-    plate = np.rint(texture()).astype(np.uint8)
+    background = np.rint(texture()).astype(np.uint8)
     frames = film(texture())
     with refused("drop.mp4"):
-        module.video_masks([], "drop.mp4", plate)
+        module.video_masks([], "drop.mp4", background)
     with pytest.raises(InputError, match="the empty picture is 160x240, the frames 320x240"):
-        module.video_masks(frames, "drop.mp4", plate[:, ::2])
+        module.video_masks(frames, "drop.mp4", background[:, ::2])
     moved = [np.roll(frame, 9 * (i % 3), axis=1) for i, frame in enumerate(frames)]
     with pytest.raises(InputError, match=r"drop\.mp4, frame \d+: the background moves"):
-        module.video_masks(moved, "drop.mp4", plate)
+        module.video_masks(moved, "drop.mp4", background)
     with pytest.raises(InputError, match=r"drop\.mp4: the mask is empty"):
-        module.video_masks([plate] * 6, "drop.mp4", plate)
+        module.video_masks([background] * 6, "drop.mp4", background)

@@ -68,12 +68,12 @@ def without_print(pixels: np.ndarray, corners: np.ndarray) -> np.ndarray:
         corners: of the board in the picture, in order, (4, 2) [px], possibly outside the picture.
     """
     cv2 = opencv()
-    outlines = [np.zeros(pixels.shape[:2], np.uint8) for _ in range(2)]
+    polygons = [np.zeros(pixels.shape[:2], np.uint8) for _ in range(2)]
     middle = corners.mean(axis=0)
-    for outline, size in zip(outlines, (1.0, _AROUND)):
-        cv2.fillConvexPoly(outline, np.rint(middle + size * (corners - middle)).astype(np.int32), 1)
-    inside = outlines[0].astype(bool)
-    around = pixels[outlines[1].astype(bool) & ~inside]
+    for polygon, size in zip(polygons, (1.0, _AROUND)):
+        cv2.fillConvexPoly(polygon, np.rint(middle + size * (corners - middle)).astype(np.int32), 1)
+    inside = polygons[0].astype(bool)
+    around = pixels[polygons[1].astype(bool) & ~inside]
     if not inside.any() or len(around) == 0:
         return pixels
     smooth = cv2.medianBlur(pixels, 3)[inside].astype(np.float32)

@@ -247,7 +247,7 @@ def check_flight(masks: np.ndarray, name: str | Path, frames: Sequence[int]) -> 
             _where(name, frames[worst + 1]),
             f"the mask's area changes by {jumps[worst]:.0%} from the previous frame in free flight, the limit is"
             f" {MAX_JUMP:.0%}",
-            "Look at the contact sheet for a hand, a shadow or the background in the mask, leave such frames out, or"
+            "Check the contact sheet for a hand, a shadow or the background in the mask, leave such frames out, or"
             " provide masks",
         )
     return jumps

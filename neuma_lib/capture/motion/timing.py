@@ -71,7 +71,7 @@ def offset_from_sound(
     frequencies = np.fft.rfftfreq(size, 1 / rate)
     band = (frequencies >= _BAND[0]) & (frequencies <= _BAND[1])
     whitened = np.where(band, cross / np.maximum(np.abs(cross), 1e-12 * max(np.abs(cross).max(), 1e-300)), 0)
-    correlation = np.abs(signal.hilbert(np.fft.irfft(whitened, size)))  # envelope, without the carrier
+    correlation = np.abs(signal.hilbert(np.fft.irfft(whitened, size)))  # envelope
     reach = min(int(longest * rate), size // 2 - 2)
     lags = np.arange(-reach, reach + 1)
     values = correlation[lags]
