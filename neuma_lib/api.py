@@ -297,7 +297,9 @@ def adapt(law: Law, scene: Scene, options: Mapping[str, Any] | None = None) -> A
         settings = validate(NeumaOptions, {**Neuma.presets["neuma"].options, **given}, "options")
         law = copy.deepcopy(law)
         law.attach_adaptor(settings.rank, settings.alpha, settings.seed)
-        trained = train_material(scene.mpm, law, *_start_and_loss(scene, settings), settings, log=_ignore)
+        trained = train_material(
+            scene.mpm, law, *_start_and_loss(scene, settings), settings, log=lambda _: None
+        )
         return Adaptation(trained.law, trained.history.loss, trained.stable)
     settings = validate(
         StructuredOptions, {**Structured.presets["neuma_structured"].options, **given}, "options"
@@ -309,7 +311,7 @@ def adapt(law: Law, scene: Scene, options: Mapping[str, Any] | None = None) -> A
         corrected = structured_law(spec, scene.mpm.dt, seed=settings.seed)
     corrected.attach_adaptor(settings.rank, settings.alpha, settings.seed)
     problem = _start_and_loss(scene, settings)
-    trained, chosen = train_structured(scene.mpm, corrected, *problem, settings, settings, log=_ignore)
+    trained, chosen = train_structured(scene.mpm, corrected, *problem, settings, settings, log=lambda _: None)
     return Adaptation(trained.law, trained.history.loss, trained.stable, chosen.parts)
 
 
@@ -397,7 +399,3 @@ def _video(scene: Scene) -> Video:
 def _of_body(video: Video, body: Reconstruction) -> tuple[Observation, ...]:
     """Observations in the precision and on the device of a body."""
     return video.to(body.x0.dtype, body.x0.device).observations
-
-
-def _ignore(text: str) -> None:
-    pass

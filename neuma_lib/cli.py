@@ -164,23 +164,11 @@ def _group(commands: Any, name: str, summary: str) -> Any:
 # ---- demo, new, check, timings ---------------------------------------------------------------------------------------
 
 
-def _project() -> Path:
-    """The folder of the project that the current folder is in. Raises InputError outside of one."""
-    here = Path.cwd()
-    for folder in (here, *here.parents):
-        if (folder / "Snakefile").is_file() and (folder / "config/config.yaml").is_file():
-            return folder
-    raise InputError(
-        here,
-        "this folder is not in a project: it has no Snakefile and no config/config.yaml",
-        "Clone the repository and run the command in its folder",
-    )
-
-
 def _demo(options: argparse.Namespace) -> int:
     from neuma_lib.extras import require
+    from neuma_lib.project.project import project_folder
 
-    root = _project()
+    root = project_folder(".")
     require("snakemake", "workflow")
     command = [sys.executable, "-m", "snakemake", f"--cores={options.cores}", "--configfile=config/demo.yaml"]
     subprocess.run([sys.executable, "-m", "workflow.unlock"], cwd=root, check=True)
@@ -195,7 +183,7 @@ def _new_scene(options: argparse.Namespace) -> None:
     from neuma_lib.project.project import Project
     from neuma_lib.project.scaffold import new_scene
 
-    settings, root = Project.find(_project())
+    settings, root = Project.find(".")
     file, name = new_scene(root, options.name, settings).relative_to(root), options.name
     print(f"Created {file}. Edit it, then run in {root}:")
     print(f"  neuma check {file}")
@@ -206,7 +194,7 @@ def _new_capture(options: argparse.Namespace) -> None:
     from neuma_lib.project.project import Project
     from neuma_lib.project.scaffold import new_capture
 
-    settings, root = Project.find(_project())
+    settings, root = Project.find(".")
     file = new_capture(root, options.name, settings).relative_to(root)
     folder = file.parent
     print(f"Created {file}. docs/capture.md explains how to photograph and film. Next:")
@@ -219,14 +207,14 @@ def _new_capture(options: argparse.Namespace) -> None:
 def _check(options: argparse.Namespace) -> int:
     from neuma_lib.project import checks
     from neuma_lib.project.capture_folder import capture_folders
-    from neuma_lib.project.project import Project
+    from neuma_lib.project.project import Project, project_folder
 
     captures = [file for file in options.files if Path(file).name == "capture.yaml"]
     files = [file for file in options.files if file not in captures]
     problems = checks.capture_problems([Path(file).parent for file in captures])
     text = f"{', '.join(captures)}: no problems"
     if files or not captures:
-        root = _project()
+        root = project_folder(".")
         try:
             settings, _ = Project.find(root, files)
         except InputError as error:

@@ -1,4 +1,4 @@
-"""What a rule with a script need not say. What it says itself stands.
+"""Defaults of rules with a script. A rule may override each of them.
 
 log, benchmark  <results>/{logs,benchmarks}/<one folder for each wildcard>/<rule>.{log,tsv}
 conda           the locked environment, for `--sdm conda` (not tried)
@@ -20,10 +20,10 @@ CONDA = "../../envs/conda.yaml"  # relative to the files of the rules
 
 
 def complete(workflow, results: str, known: Collection[str] = ()) -> None:
-    """Give every rule of a workflow what it left out. To be called when all rules are known.
+    """Complete every rule of a workflow. Call it when all rules are known.
 
-    Snakemake makes a rule of what its directives say (`rule.ruleinfo`) in `snakemake.workflow.Workflow.rule`. This
-    does the same, in the same way, for directives that are missing.
+    `snakemake.workflow.Workflow.rule` makes a rule of its directives (`rule.ruleinfo`). This does the same for the
+    directives that are missing.
 
     Args:
         workflow: Snakemake's.
@@ -33,13 +33,13 @@ def complete(workflow, results: str, known: Collection[str] = ()) -> None:
     for rule in workflow.rules:
         if not rule.script or rule.name in known:
             continue
-        said, path = rule.ruleinfo, _wildcard_path(rule)
+        info, path = rule.ruleinfo, _wildcard_path(rule)
         rule.log_modifier = rule.benchmark_modifier = rule.output_modifier
-        if not said.log:
+        if not info.log:
             rule.set_log(f"{results}/logs/{path}.log")
-        if not said.benchmark:
+        if not info.benchmark:
             rule.benchmark = f"{results}/benchmarks/{path}.tsv"
-        if not said.conda_env:
+        if not info.conda_env:
             rule.conda_env = CONDA
         if "code" not in rule.params.keys():
             rule.set_params(code=digest_of(_script(rule)))
@@ -49,7 +49,7 @@ def complete(workflow, results: str, known: Collection[str] = ()) -> None:
                 rule.params.code, [p for p in rule.params if p is not rule.params.code]
             )
         resources = type(rule.resources).from_mapping(dict(RESOURCES))
-        resources.update(said.resources[1] if said.resources else {})
+        resources.update(info.resources[1] if info.resources else {})
         resources.update(workflow.resource_settings._parsed_overwrite_resources.get(rule.name, {}))
         rule.resources.update(resources)
 

@@ -17,8 +17,8 @@ def image_list(place: str, stride: int | None, key: str, stride_key: str) -> str
     if Path(place).is_dir():
         lists = [name for name in (*COUNTED, "transforms.json") if Path(place, name).is_file()]
         if len(lists) != 1:
-            found = " and ".join(lists) or f"none of {', '.join(COUNTED)}, transforms.json"
-            raise InputError(key, f"the folder {place} has {found}", "Give the file that lists the images")
+            content = " and ".join(lists) or f"none of {', '.join(COUNTED)}, transforms.json"
+            raise InputError(key, f"the folder {place} has {content}", "Give the file that lists the images")
         place = f"{place.rstrip('/')}/{lists[0]}"
     if Path(place).name in COUNTED and stride is None:
         raise InputError(

@@ -48,7 +48,7 @@ class FitStage(FitRun):
         self._stage.progress(done, total, loss)
 
     def log(self, text: str) -> None:
-        self._stage.say(text)
+        self._stage.log(text)
 
 
 def files_of(inputs, names: Iterable[str]) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 `code_digest` answers "would this script behave differently now?", so that an edit of the rasterizer reruns what
 renders and nothing else. It covers the script and every module of the library that the script imports, directly or
 through others (grimp's import graph): their syntax without docstrings, so comments, layout and documentation are free,
-and data files of the same stem (``compositor.cu`` beside ``compositor.py``). ``from a.b import c`` reaches the module
+and data files of the same stem (``compositor.cu`` next to ``compositor.py``). ``from a.b import c`` reaches the module
 a.b.c if there is one, else a.b; the ``__init__`` of a package counts only where a name is imported from it.
 """
 
@@ -139,11 +139,11 @@ def _file_digest(path: Path) -> str:
 
 def _imports(path: Path, modules: Set[str]) -> set[str]:
     """Those of some modules that a Python file imports itself."""
-    found = set()
+    imported = set()
     for node in ast.walk(ast.parse(path.read_text(), filename=str(path))):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            imported |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             inner = (f"{node.module}.{alias.name}" for alias in node.names)
-            found |= {name if name in modules else node.module for name in inner}
-    return found & modules
+            imported |= {name if name in modules else node.module for name in inner}
+    return imported & modules

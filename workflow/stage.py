@@ -1,11 +1,10 @@
-"""What a stage tells: its log file, its progress on the terminal, and errors in plain words.
+"""Log, progress on the terminal and error messages of a script.
 
-`stage` wraps the work of a script. What the script says goes to the terminal and to the log; so do warnings of the
-library, while those of Python go to the log alone. An exception ends the process with one line on the terminal and
-its traceback in the log.
+`stage` wraps the work of a script. Its messages and warnings of the library go to the terminal and the log, warnings
+of Python to the log alone. An exception ends the process with one line on the terminal and a traceback in the log.
 
-Several stages may run at once on one terminal. Only one of them, which holds a lock on it, draws a moving bar; the
-others, and all of them where there is no terminal, print a plain line now and then.
+Several stages may share a terminal. The one that holds a lock on it draws a moving bar. The others, and all stages
+without a terminal, print a plain line every 15 seconds.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from workflow.manager import end_with_snakemake
 PLAIN_INTERVAL = 15.0  # seconds between plain lines
 MOVING_INTERVAL = 0.2  # seconds between redraws of the moving bar
 STATE = "{n_fmt}/{total_fmt}{postfix}, {remaining} left"
-WIDTH, ROWS = 80, 24  # of a terminal that does not tell
+WIDTH, ROWS = 80, 24  # of a terminal of unknown size
 LOG_FORMAT = "[%(asctime)s] %(message)s"
 
 _LOGGER = logging.getLogger("neuma_lib.stage")
@@ -98,8 +97,8 @@ class Stage:
         self._terminal = _locked_terminal(stream)
         self._bar: tqdm | None = None
 
-    def say(self, text: str) -> None:
-        """A line for the terminal and the log: what was made, and how good it is."""
+    def log(self, text: str) -> None:
+        """Write a line to the terminal and the log."""
         _LOGGER.info(text)
 
     def progress(self, done: int, total: int, loss: float | None = None) -> None:
@@ -109,7 +108,7 @@ class Stage:
             interval = MOVING_INTERVAL if moving else PLAIN_INTERVAL
             # Where the bar cannot move, what it draws becomes lines.
             lines = SimpleNamespace(
-                write=lambda text: text.strip() and self.say(text.strip()), flush=lambda: None
+                write=lambda text: text.strip() and self.log(text.strip()), flush=lambda: None
             )
             self._bar = tqdm(
                 total=total,
@@ -130,7 +129,7 @@ class Stage:
         self._bar.update(done - self._bar.n)
 
     def close(self) -> None:
-        """Give the terminal back."""
+        """Release the terminal."""
         if self._bar is not None:
             self._bar.close()
         if self._terminal is not None:
@@ -138,7 +137,7 @@ class Stage:
 
 
 class _Terminal(logging.Handler):
-    """Shows what the stage says, and what the library warns of, above the moving bar."""
+    """Shows messages of the stage and warnings of the library above the moving bar."""
 
     def __init__(self, run: Stage):
         super().__init__()

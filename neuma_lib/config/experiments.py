@@ -14,8 +14,7 @@ class BodyConfig(Section):
     shape: str | None = Field(
         None,
         description="name of a shape with a known mesh; null: the reconstructed object of the scene, with its "
-        "estimated "
-        "initial motion",
+        "estimated initial motion",
     )
     size: float | None = Field(
         None, gt=0, description="longest side of the bounding box [m]; null: the shape's own"

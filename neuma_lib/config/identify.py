@@ -16,8 +16,7 @@ class IdentifyConfig(Section):
     families: dict[str, LawConfig] = Field(
         {},
         description="candidates by name. Every given constant is fitted, from its value here or from the scene's "
-        "prior, "
-        "whichever fits better; nu stays between 0 and 0.5",
+        "prior, whichever fits better; nu stays between 0 and 0.5",
     )
     views: tuple[int, ...] = Field(
         (0,),
@@ -33,8 +32,7 @@ class IdentifyConfig(Section):
         8000,
         ge=0,
         description="particles of the bodies that correct for the discretisation, more than `geometry.particles`; 0: "
-        "no "
-        "correction",
+        "no correction",
     )
     pose_tolerance: float = internal(1e-3, "expected shift [m] and enlargement of the rendered body", ge=0)
     resamplings: int = internal(

@@ -111,8 +111,7 @@ class SceneConfig(Section):
     splat: SplatConfig | None = Field(
         None,
         description="Gaussians of an object, or their file alone. Such a scene has no truth. Its defaults are size "
-        "0.4, "
-        "height 0.5, velocity 0, dt 5e-4, steps 1000, prior jelly",
+        "0.4, height 0.5, velocity 0, dt 5e-4, steps 1000, prior jelly",
     )
     videos: tuple[str, ...] = Field(
         (),

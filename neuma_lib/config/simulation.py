@@ -23,6 +23,5 @@ class SimulationConfig(Section):
     walls: Literal["outside", "released"] = Field(
         "outside",
         description="wall nodes outside the cube, so that bodies rest at y = 0; or inside, with clamped particles, as "
-        "in "
-        "the authors' released code",
+        "in the authors' released code",
     )

@@ -58,8 +58,7 @@ class TrainingConfig(MotionOptions):
     adjoint_precision: Literal["single", "half"] = Field(
         "single",
         description="factors of the matrix products in the adjoint of a neural law on a GPU: 22 bits, or 11 bits, "
-        "which "
-        "is faster and has relative gradient errors of 1e-3",
+        "which is faster and has relative gradient errors of 1e-3",
     )
     memory: float | None = Field(
         None,

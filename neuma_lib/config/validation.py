@@ -135,19 +135,21 @@ def _explained(kind: type, problem: Mapping[str, Any], origin: str) -> InputErro
 
 def _keys_at(kind: Any, path: Sequence) -> list[str]:
     """Public keys of the section at a path."""
-    for step in path:
-        kind = _below(kind, step)
-    section = _section_in(kind)
+    section = _section_at(kind, path)
     fields = section.model_fields.items() if section else ()
     return [key for key, entry in fields if not is_internal(entry)]
 
 
 def _entry(kind: Any, path: Sequence[str]) -> FieldInfo | None:
     """The field at a path; None if there is none."""
-    for step in path[:-1]:
-        kind = _below(kind, step)
-    section = _section_in(kind)
+    section = _section_at(kind, path[:-1])
     return section.model_fields.get(path[-1]) if section else None
+
+
+def _section_at(kind: Any, path: Sequence) -> type[BaseModel] | None:
+    for step in path:
+        kind = _below(kind, step)
+    return _section_in(kind)
 
 
 def _below(kind: Any, step: Any) -> Any:

@@ -103,7 +103,7 @@ def corrected_draws(
     Args:
         law: the structured law.
         fit: ``best`` of its identified.json.
-        visited: elastic deformation gradients of its own motion, shape (..., 3, 3).
+        visited: elastic deformation gradients of the motion that it predicts, shape (..., 3, 3).
         model_std: see `constants_draws`.
         spread: prior standard deviation of the unbounded constants.
         dt: time step [s].
@@ -122,10 +122,10 @@ def corrected_draws(
     _, sigma = rotation_and_singular_values(states[:: max(1, len(states) // STATES)].double())
     strain = sigma.clamp(min=STRETCH_MIN).log()
     felt = strain.square().sum(1, keepdim=True)
-    shown = (field(invariants(strain)) * (felt / felt.mean()).sqrt()).numpy()
+    observed = (field(invariants(strain)) * (felt / felt.mean()).sqrt()).numpy()
     outputs, covariance = _log_moduli(fit, dt, model_std)
     prior = np.append(np.full(FEATURES, SILENT), spread)
-    posterior = field_covariance(shown, np.linalg.inv(covariance), prior)
+    posterior = field_covariance(observed, np.linalg.inv(covariance), prior)
     root = np.linalg.cholesky(posterior)
     draws = (root @ generator.standard_normal((len(root), count))).T.reshape(count, len(outputs), -1)
     return [_deviating(law, field, dict(zip(outputs, torch.from_numpy(rows), strict=True))) for rows in draws]

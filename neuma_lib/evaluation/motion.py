@@ -3,7 +3,7 @@
 The main measure is the distance of tracers from the true positions of tracers with the same start. The Chamfer distance
 between filled volumes (paper Sec. 4.1) depends on silhouettes only: of points displaced by d, those within d of the
 surface contribute, so it grows with the cube of d and ignores the rotation of a ball. It also contains a sampling
-floor, the distance between two samplings of the same body, which decreases with their density. The excess is the
+floor, the distance between two sets of points of the same body, which decreases with their density. The excess is the
 distance without the floor.
 """
 
@@ -24,7 +24,7 @@ from neuma_lib.sim.prediction import Failure
 from neuma_lib.sim.state import State, Trajectory
 
 COUNT_TOLERANCE = 0.1
-"""Maximum relative difference of the counts of two jittered samplings, each within 5 % of the requested count."""
+"""Maximum relative difference of the counts of two jittered sets of points, each within 5 % of the requested count."""
 ENERGY_TOLERANCE = 0.01
 """Maximum gain of a passive body relative to its initial energy. The error of the integrator is smaller."""
 
@@ -102,7 +102,7 @@ def evaluate(
         truth_again: tracers of the ground truth from another sampling of the shape [m], shape (T, M'', 3).
         tracers: start positions inside the reconstructed shape [m], shape (M', 3).
         total: also carry the total deformation.
-        floor: Chamfer distances between the truth's two samplings, shape (T,). None: computed here.
+        floor: Chamfer distances between the truth's two sets of points, shape (T,). None: computed here.
 
     Raises:
         InputError: counts of tracers that differ by more than `COUNT_TOLERANCE`. The floor holds for equal counts.

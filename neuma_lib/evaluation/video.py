@@ -79,10 +79,10 @@ def write_gif(path: str | Path, video: np.ndarray, frame_rate: float) -> None:
     above `_GIF_RATE`.
     """
     stride = math.ceil(frame_rate / _GIF_RATE)
-    shown = video[::stride]
-    ends = np.round(100 * stride * np.arange(1, len(shown) + 1) / frame_rate)
+    kept = video[::stride]
+    ends = np.round(100 * stride * np.arange(1, len(kept) + 1) / frame_rate)
     palette = Image.fromarray(video[:: max(1, len(video) // 8)].reshape(-1, *video.shape[2:])).quantize(256)
-    frames = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in shown]
+    frames = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in kept]
     delays = (10 * np.diff(ends, prepend=0)).astype(int).tolist()
     each = {"duration": delays, "loop": 0, "optimize": False, "disposal": 1}
     frames[0].save(path, format="GIF", save_all=True, append_images=frames[1:], **each)

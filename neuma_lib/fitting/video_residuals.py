@@ -61,7 +61,7 @@ class VideoResiduals:
         unsure: indices of the deviations that are not fixed to 0.
         by_deviation: derivatives of the residuals of all frames with respect to these deviations, or None if not
             computed. All families share those of one family, because they are mostly kinematic.
-        spread: difference of the residuals of all frames between two samplings with many particles, or None.
+        spread: difference of the residuals of all frames between two sets of many particles, or None.
         rollouts: number of simulations.
     """
 

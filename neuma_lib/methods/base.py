@@ -207,7 +207,7 @@ class Method(ABC):
         product: file that `fit` writes. None: nothing is fitted.
         fit_kernels, kernels: groups of Warp kernels that `fit` and predictions use.
         body_kernels: groups that predictions and renderings with the files of `body_inputs` use in addition.
-        draws_module: module with the function `draws`, apart from the method, so that its edits repeat no fit.
+        draws_module: module with the function `draws`, separate from the method, so that its edits repeat no fit.
         has_law: whether the motion follows from a material law (`MotionModel.law`). Only laws move several bodies.
         moves_other_bodies: whether the model moves the bodies of other scenes (``+law_from=``).
     """

@@ -63,7 +63,7 @@ class LawOnGrid(MotionModel):
 
     @classmethod
     def together(cls, models: Sequence[MotionModel], counts: Sequence[int]) -> MotionModel:
-        """One model of several bodies, whose particles follow each other. One model is returned as it is."""
+        """One model of several bodies, whose particles follow each other. One model is returned unchanged."""
         if len(models) == 1:
             return models[0]
         return cls(

@@ -77,7 +77,7 @@ class Capture:
 
     def own_masks(self, name: str) -> dict[str, Path]:
         """Masks of the user in a subfolder, by file stem. Raises InputError for two masks of one picture."""
-        return _by_camera(self.folder, f"{self.settings.masks}/{name}", PICTURES)
+        return _by_stem(self.folder, f"{self.settings.masks}/{name}", PICTURES)
 
 
 def _no_videos(folder: Path) -> InputError:
@@ -127,16 +127,15 @@ def read_capture(folder: str | Path) -> Capture:
     settings = read_settings(source)
     photographs = _pictures(folder, settings.photographs)
     if settings.throws:
-        takes = {name: _by_camera(folder, take.folder, VIDEOS) for name, take in settings.throws.items()}
+        takes = {name: _by_stem(folder, take.folder, VIDEOS) for name, take in settings.throws.items()}
     else:
         takes = _default_takes(folder)
     for name, videos in takes.items():
         if not videos:
             take = settings.throws.get(name)
             raise _no_videos(folder / (take.folder if take else f"videos/{name}"))
-    stills = _by_camera(folder, settings.stills, PICTURES)
-    filmed = {camera for videos in takes.values() for camera in videos}
-    cameras = sorted(filmed | stills.keys())
+    stills = _by_stem(folder, settings.stills, PICTURES)
+    cameras = sorted({camera for videos in takes.values() for camera in videos} | stills.keys())
     for camera in settings.cameras:
         if camera not in cameras:
             raise InputError(
@@ -161,7 +160,7 @@ def read_capture(folder: str | Path) -> Capture:
 
 def _default_takes(folder: Path) -> dict[str, dict[str, Path]]:
     """The videos in `videos`, or one take for each of its folders."""
-    direct = _by_camera(folder, "videos", VIDEOS)
+    direct = _by_stem(folder, "videos", VIDEOS)
     below = sorted(p for p in _listed(folder, "videos") if p.is_dir())
     if direct and below:
         raise InputError(
@@ -170,7 +169,7 @@ def _default_takes(folder: Path) -> dict[str, dict[str, Path]]:
             "Put the videos of each take into a folder, or list the takes under `throws` in capture.yaml",
         )
     if below:
-        return {p.name: _by_camera(folder, f"videos/{p.name}", VIDEOS) for p in below}
+        return {p.name: _by_stem(folder, f"videos/{p.name}", VIDEOS) for p in below}
     return {"first": direct} if direct else {}
 
 
@@ -182,28 +181,21 @@ def _listed(folder: Path, name: str) -> list[Path]:
 
 
 def _pictures(folder: Path, name: str) -> tuple[Path, ...]:
-    files = _listed(folder, name)
-    for file in files:
+    for file in _listed(folder, name):
         if file.suffix.lower() in OTHER_PICTURES:
             raise InputError(
                 file, "this picture format is not supported", "Convert it to JPEG, and remove it"
             )
-    pictures = [file for file in files if file.suffix.lower() in PICTURES]
-    for i, file in enumerate(pictures):
-        if file.stem in [other.stem for other in pictures[:i]]:
-            raise InputError(
-                file, "another picture has the same name with another suffix", "Rename one of them"
-            )
-    return tuple(pictures)
+    return tuple(_by_stem(folder, name, PICTURES).values())
 
 
-def _by_camera(folder: Path, name: str, suffixes: Iterable[str]) -> dict[str, Path]:
+def _by_stem(folder: Path, name: str, suffixes: Iterable[str]) -> dict[str, Path]:
+    """Files of a folder with one of the suffixes, by their stem: a photograph, a camera or a frame."""
     files: dict[str, Path] = {}
     for file in _listed(folder, name):
         if file.is_file() and file.suffix.lower() in suffixes:
             if file.stem in files:
-                raise InputError(
-                    file, f"{files[file.stem].name} is of the same camera", "Remove one of the two"
-                )
+                problem = f"{files[file.stem].name} has the same name with another suffix"
+                raise InputError(file, problem, "Remove or rename one of the two")
             files[file.stem] = file
     return files

@@ -128,9 +128,8 @@ def preset(settings: Config, method: str) -> tuple[PresetConfig, dict[str, Any]]
         InputError: unknown preset or option, an option that is given twice, a piece without '='.
     """
     base = method.partition("+")[0]
-    keys = [LAW_FROM, *(kind_of(settings, base).Options.model_fields if base in settings.methods else ())]
-    base, texts = split_variant(method, settings.methods, keys, "method")
-    options = kind_of(settings, base).Options.model_fields
+    options = kind_of(settings, base).Options.model_fields if base in settings.methods else {}
+    base, texts = split_variant(method, settings.methods, [LAW_FROM, *options], "method")
     given: dict[str, Any] = {}
     for key, value in texts.items():
         is_list = key in options and typing.get_origin(options[key].annotation) is tuple
@@ -199,14 +198,16 @@ def case(settings: Config, scene: str, method: str) -> ProjectCase:
     chosen, _ = preset(settings, method)
     kind, source = kind_of(settings, method), source_scene(settings, scene, method)
     name, options = fit_name(settings, method), _options(settings, source, method)
-    known = [*settings.priors.laws, IDENTIFIED]
-    if getattr(options, "prior", None) not in (None, *known):
-        raise InputError(
-            method,
-            f"no prior '{options.prior}' in priors.laws{hint(options.prior, known)}",
-            "A law in a file is the prior of a scene",
-        )
+    check_prior(settings, method, options)
     return ProjectCase(settings, source, scene, name, method, options, chosen.evaluate_on, kind)
+
+
+def check_prior(settings: Config, where: str, options: Section) -> None:
+    """Raise an InputError if the option ``prior`` of a method is neither in priors.laws nor the identified law."""
+    prior, known = getattr(options, "prior", None), [*settings.priors.laws, IDENTIFIED]
+    if prior is not None and prior not in known:
+        problem = f"no prior '{prior}' in priors.laws{hint(prior, known)}"
+        raise InputError(where, problem, "A law in a file is the prior of a scene")
 
 
 def _options(settings: Config, scene: str, method: str) -> Section:

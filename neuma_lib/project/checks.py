@@ -17,13 +17,9 @@ from neuma_lib.errors import InputError
 from neuma_lib.mechanics.catalogue import COURANT_LIMIT, DEFINED_IN, check_law, longitudinal_modulus
 from neuma_lib.project.capture_folder import NAME, read_capture
 from neuma_lib.project.capture_scenes import training_takes
-from neuma_lib.project.random_scenes import SHAPES, Outline
+from neuma_lib.project.random_scenes import LETTER, SHAPES
 from neuma_lib.project.settings import Config
 
-OWN_SIZES = {"ball": 0.26, "duck": 0.41, "pawn": 0.417, "cat": 0.376, "bottle": 0.438, "fish": 0.402}
-"""Longest side of the shapes whose size is not given [m]."""
-LETTER, LETTER_SIZE = Outline((0.25, 0.7, 0.2), (0, 0, 0), ("body",)), 0.3
-"""Sides that every letter has at least, relative to its longest side, and that side where it is not given [m]."""
 ROUND_OFF = 1e-6
 
 
@@ -118,9 +114,9 @@ def _start_problems(where: str, body: Mapping[str, Any], dt: float, grid: int) -
     if not (shape in SHAPES or re.fullmatch(r"letter_[A-Z]", shape)):
         yield f"{where}.shape: {shape!r} is unknown{hint(shape, [*SHAPES, 'letter_A'])}"
         return
-    outline, own = (SHAPES[shape], OWN_SIZES[shape]) if shape in SHAPES else (LETTER, LETTER_SIZE)
-    size = body["size"] or own
-    half = size * np.array(outline.sides) / 2
+    proportions = SHAPES.get(shape, LETTER)
+    size = body["size"] or proportions.size
+    half = size * np.array(proportions.sides) / 2
     middle = np.array([body["center"][0], body["height"], body["center"][1]])
     for axis, key, low, high in zip("xyz", ("center", "height", "center"), middle - half, middle + half):
         if low < -ROUND_OFF or high > 1 + ROUND_OFF:
@@ -129,7 +125,7 @@ def _start_problems(where: str, body: Mapping[str, Any], dt: float, grid: int) -
                 f"{where}.{key}: the body extends from {axis} = {low:.3g} to {high:.3g} m, {wall}. Move it, or change "
                 f"size = {size:g} m"
             )
-    reach = float(np.linalg.norm(half + size * np.abs(outline.mass_centre)))
+    reach = float(np.linalg.norm(half + size * np.abs(proportions.mass_centre)))
     speed = math.hypot(*body["velocity"]) + math.hypot(*body["spin"]) * reach
     if speed * dt * grid >= 1:
         yield (

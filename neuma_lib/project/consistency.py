@@ -8,7 +8,7 @@ from neuma_lib.config.figures import FiguresConfig
 from neuma_lib.config.validation import hint, joined, validate
 from neuma_lib.errors import InputError
 from neuma_lib.methods.registry import methods
-from neuma_lib.project.cases import law_from, section_values
+from neuma_lib.project.cases import check_prior, law_from, section_values
 from neuma_lib.project.paths import IDENTIFIED
 from neuma_lib.project.settings import Config
 
@@ -117,10 +117,7 @@ def _preset_errors(settings: Config, name: str) -> Iterator[InputError]:
     except InputError as error:
         yield error
         return
-    priors = (*settings.priors.laws, IDENTIFIED)
-    if getattr(options, "prior", None) not in (None, *priors):
-        problem = f"no prior '{options.prior}' in priors.laws{hint(options.prior, priors)}"
-        yield InputError(f"{where}.options.prior", problem)
+    yield from _raised_by(check_prior, settings, f"{where}.options.prior", options)
 
 
 def _references(settings: Config) -> Iterator[tuple[str, str, str]]:

@@ -15,6 +15,16 @@ SETTINGS_FILE = Path("config/config.yaml")
 """Settings of a project, below its folder."""
 
 
+def project_folder(place: str | Path) -> Path:
+    """The folder of the project that a folder lies in. Raises InputError if it lies in none."""
+    place = Path(place).absolute()
+    for folder in (place, *place.parents):
+        if (folder / SETTINGS_FILE).is_file():
+            return folder
+    problem = f"is not in a project: neither it nor a folder above it has {SETTINGS_FILE}"
+    raise InputError(place, problem, "Clone the repository and use a folder in it")
+
+
 class Project(NamedTuple):
     """Settings of a project, as the workflow has them, and its folder."""
 
@@ -29,13 +39,9 @@ class Project(NamedTuple):
             configfiles: settings on top of those of the project, in this order, as by Snakemake's ``--configfile``.
 
         Raises:
-            InputError: no folder above it has settings, or these are not valid.
+            InputError: see `project_folder`, or the settings are not valid.
         """
-        place = Path(place).absolute()
-        root = next((up for up in (place, *place.parents) if (up / SETTINGS_FILE).is_file()), None)
-        if root is None:
-            problem = f"neither it nor a folder above it has {SETTINGS_FILE}"
-            raise InputError(place, problem, "Give a folder in a project's results")
+        root = project_folder(place)
         raw: dict[str, Any] = {}
         for file in (root / SETTINGS_FILE, *configfiles):
             raw = merged(raw, read_yaml(file))

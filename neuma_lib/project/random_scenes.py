@@ -23,36 +23,42 @@ from neuma_lib.errors import InputError
 Item = TypeVar("Item")
 
 
-class Outline(NamedTuple):
+class Proportions(NamedTuple):
     """Proportions of a shape. A test compares them with `geometry.shapes`, which settings do not import.
 
     Attributes:
+        size: longest side where a scene does not give it [m].
         sides: of the bounding box, the longest is 1.
         mass_centre: centre of mass relative to the centre of the box, in the same unit.
         parts: parts with a colour.
     """
 
+    size: float
     sides: Vector
     mass_centre: Vector
     parts: tuple[str, ...]
 
 
 SHAPES = {
-    "ball": Outline((1, 1, 1), (0, 0, 0), ("body", "second", "third", "caps")),
-    "duck": Outline((1, 0.9329, 0.7156), (-0.003, -0.076, 0.037), ("body", "wing", "beak", "eye")),
-    "pawn": Outline((0.6235, 1, 0.6235), (0, -0.123, 0), ("body", "foot", "collar")),
-    "cat": Outline(
+    "ball": Proportions(0.26, (1, 1, 1), (0, 0, 0), ("body", "second", "third", "caps")),
+    "duck": Proportions(0.41, (1, 0.9329, 0.7156), (-0.003, -0.076, 0.037), ("body", "wing", "beak", "eye")),
+    "pawn": Proportions(0.417, (0.6235, 1, 0.6235), (0, -0.123, 0), ("body", "foot", "collar")),
+    "cat": Proportions(
+        0.376,
         (0.8716, 1, 0.6639),
         (-0.06, -0.112, 0.018),
         ("body", "thighs", "tail", "stripes", "white", "inner_ear", "eyes", "nose"),
     ),
-    "bottle": Outline((0.5205, 1, 0.5205), (0, -0.11, 0), ("body", "cap", "label", "emblem")),
-    "fish": Outline(
+    "bottle": Proportions(0.438, (0.5205, 1, 0.5205), (0, -0.11, 0), ("body", "cap", "label", "emblem")),
+    "fish": Proportions(
+        0.402,
         (1, 0.664, 0.5764),
         (0.032, -0.007, 0),
         ("body", "fins", "side_fins", "stripes", "eye", "pupil", "mouth"),
     ),
 }
+LETTER = Proportions(0.3, (0.25, 0.7, 0.2), (0, 0, 0), ("body",))
+"""Size and sides that every letter has at least."""
 FLAWS = {
     "outside": "start outside the box",
     "early": "touch the ground before the velocity can be seen",
@@ -284,9 +290,9 @@ def _flaw(settings: RandomConfig, scene: Mapping[str, Any], gravity: Vector) -> 
     (`MPM.walls`; 0.021 m on 24 cells). A test moves the meshes of many scenes and confirms that no body touches a wall
     at the start, or another wall before the ground, and that at least five frames precede contact.
     """
-    outline = SHAPES[scene["shape"]]
-    half = scene["size"] * np.array(outline.sides) / 2
-    offset = scene["size"] * np.array(outline.mass_centre)
+    proportions = SHAPES[scene["shape"]]
+    half = scene["size"] * np.array(proportions.sides) / 2
+    offset = scene["size"] * np.array(proportions.mass_centre)
     middle = np.array([scene["center"][0], scene["height"], scene["center"][1]])
     if (middle - half < MARGIN).any() or (middle + half > 1 - MARGIN).any():
         return "outside"

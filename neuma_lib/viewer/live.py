@@ -304,9 +304,9 @@ class LiveSimulation:
 
     def _publish(self) -> None:
         state = self._state
-        shown = (value.cpu() for value in (state.x, state.v.expand_as(state.x), state.F, self._total))
+        arrays = (value.cpu() for value in (state.x, state.v.expand_as(state.x), state.F, self._total))
         snapshot = Snapshot(
-            self._number, self._time, *shown,
+            self._number, self._time, *arrays,
             tuple(self._counts), min(self._dts), self._moved / self._span, 1 / self._span, self._trouble,
             self._notice,
         )  # fmt: skip

@@ -55,7 +55,7 @@ def view(
             raise InputError(f"--methods {unknown[0]}", f"{folder} has {', '.join(known) or 'none'}")
         files = replace(files, runs=tuple(known[name] for name in methods))
     viewer = settings.viewer
-    scene = load_scene(files, say=print, side=viewer.image_side, skip_damaged=True)
+    scene = load_scene(files, log=print, side=viewer.image_side, skip_damaged=True)
     for note in scene.notes:
         print(note, file=sys.stderr)
     if file:

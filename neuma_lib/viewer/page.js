@@ -188,10 +188,10 @@ function drawInstances(name, camera, array, layout, count, radius) {
 }
 
 function drawPlain(name, camera, array, layout, mode, before) {
-  const found = use(name, camera);
+  const shader = use(name, camera);
   const vao = gl.createVertexArray();
   gl.bindVertexArray(vao);
-  if (before) before(found.uniforms);
+  if (before) before(shader.uniforms);
   attributes(name, array, layout, 0);
   gl.drawArrays(mode, 0, array.length / layout.reduce((sum, [, width]) => sum + width, 0));
   gl.bindVertexArray(null);
@@ -248,7 +248,7 @@ const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a
 const product = (R, p) => [0, 3, 6].map((i) => R[i] * p[0] + R[i + 1] * p[1] + R[i + 2] * p[2]);
 const backwards = (R, p) => [0, 1, 2].map((i) => R[i] * p[0] + R[i + 3] * p[1] + R[i + 6] * p[2]);
 
-// RGB of every Gaussian as the eye sees it: spherical harmonics along the line of sight, as they were fitted.
+// RGB of every Gaussian as seen by the camera: spherical harmonics along the line of sight, in the axes of the fit.
 function seenColours(means, eye, out, stride, offset) {
   const K = meta.gaussians.sh.components / 3, count = meta.gaussians.sh.count, basis = new Float64Array(16);
   for (let k = 0; k < count; k++) {
@@ -362,9 +362,9 @@ function drawFrusta(camera) {
 
 // The image of a view at the frame, or the one before; decoded when it is first wanted.
 function observed(view) {
-  const step = meta.steps[state.frame], found = view.images.filter(([n]) => n <= step).pop() || view.images[0];
-  if (!found) return null;
-  const [, start, length] = found;
+  const step = meta.steps[state.frame], image = view.images.filter(([n]) => n <= step).pop() || view.images[0];
+  if (!image) return null;
+  const [, start, length] = image;
   if (!textures.has(start)) {
     textures.set(start, null);
     createImageBitmap(new Blob([data.subarray(start, start + length)], { type: "image/webp" })).then((image) => {
@@ -478,12 +478,12 @@ function changed() {
 
 // Distance that 99 of 100 Gaussians of all frames do not exceed, rounded up [m].
 function gaps(left, right) {
-  const found = [];
+  const distances = [];
   for (let t = 0; t < meta.steps.length; t++) {
     const a = left.means.frame(t), b = right.means.frame(t);
-    for (let k = 0; k < a.length; k += 9) found.push(Math.hypot(a[k] - b[k], a[k + 1] - b[k + 1], a[k + 2] - b[k + 2]));
+    for (let k = 0; k < a.length; k += 9) distances.push(Math.hypot(a[k] - b[k], a[k + 1] - b[k + 1], a[k + 2] - b[k + 2]));
   }
-  const most = Math.max(Float64Array.from(found).sort()[Math.floor(0.99 * (found.length - 1))], 1e-4);
+  const most = Math.max(Float64Array.from(distances).sort()[Math.floor(0.99 * (distances.length - 1))], 1e-4);
   const power = 10 ** Math.floor(Math.log10(most));
   return [1, 1.5, 2, 3, 4, 5, 6, 8, 10].find((step) => step * power >= most * (1 - 1e-9)) * power;
 }

@@ -30,7 +30,7 @@ TRUTH = "truth"
 _BOUND = 8
 """Number of true particles bound to a Gaussian of the reconstruction."""
 
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -114,12 +114,12 @@ def frame_at(steps: tuple[int, ...], step: int) -> int:
 
 
 def load_scene(
-    files: SceneFiles, say: Say = lambda text: None, side: int = 160, skip_damaged: bool = False
+    files: SceneFiles, log: Log = lambda text: None, side: int = 160, skip_damaged: bool = False
 ) -> Scene:
     """Read a scene and deform its Gaussians with every motion.
 
     Args:
-        say: callback for progress messages.
+        log: callback for progress messages.
         side: see `load_views`.
         skip_damaged: replace a damaged predicted motion by a note.
 
@@ -133,7 +133,7 @@ def load_scene(
     if files.truth:
         motions.append(true_motion(files.checked(files.truth), body, files.simulation["dt"]))
     for run in files.runs:
-        say(f"{run.title}: {run.rollout}")
+        log(f"{run.title}: {run.rollout}")
         try:
             motions.append(_predicted(files, run, body, notes))
         except InputError as error:
@@ -149,10 +149,17 @@ def load_scene(
             views = load_views(files, side)
         except InputError as error:
             notes.append(f"no cameras: {one_line(error)}")
-    shown = scalars.ranges(motion.scalars for motion in motions)
+    bounds = scalars.ranges(motion.scalars for motion in motions)
     volume = float(body.vol0.sum())
     return Scene(
-        files.name, files.simulation["dt"], body.gaussians, volume, tuple(motions), views, shown, tuple(notes)
+        files.name,
+        files.simulation["dt"],
+        body.gaussians,
+        volume,
+        tuple(motions),
+        views,
+        bounds,
+        tuple(notes),
     )
 
 
@@ -222,10 +229,12 @@ def _predicted(files: SceneFiles, run: RunFiles, body: Reconstruction, notes: li
     elif x.shape[1] == len(g):
         means, covars = deform(*at_rest, Binding.identity(len(g), g.means), g.means, x, stretch)
     else:
-        notes.append(f"{run.title}: particles of its own, which carry no Gaussians")
+        notes.append(f"{run.title}: its own particles, which carry no Gaussians")
     # a law with another time step has other steps; the slider shows those of the scene
-    shown = tuple(round(step * dt / files.simulation["dt"]) for step in steps)
-    return Motion(run.name, run.title, shown, x, _values(x, F, total, None, steps, dt, law), means, covars)
+    scene_steps = tuple(round(step * dt / files.simulation["dt"]) for step in steps)
+    return Motion(
+        run.name, run.title, scene_steps, x, _values(x, F, total, None, steps, dt, law), means, covars
+    )
 
 
 def _values(

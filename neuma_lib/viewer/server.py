@@ -138,7 +138,7 @@ class ViewerServer:
         self._recorded = gui.add_folder("recorded motions")
         with self._recorded:
             add["left"] = gui.add_dropdown("motion", titles, initial_value=learned)
-            add["right"] = gui.add_dropdown("beside it", [NOTHING, *titles])
+            add["right"] = gui.add_dropdown("next to it", [NOTHING, *titles])
             add["frame"] = gui.add_slider("frame", 0, len(self.scene.steps) - 1, 1, 0)
             add["pace"] = gui.add_dropdown("pace", list(PACES), initial_value="1/16")
             add["play"] = gui.add_button("Play")
@@ -166,7 +166,7 @@ class ViewerServer:
             add["height"] = gui.add_slider("height [m]", 0.0, 0.9, 0.01, 0.4)
             add["drop"] = gui.add_button("Drop from there")
             add["velocity"] = gui.add_vector3("velocity [m/s]", (1.0, 1.5, 0.0), step=0.1)
-            add["throw"] = gui.add_button("Throw")
+            add["launch"] = gui.add_button("Launch")
             shapes = [f"letter_{c}" for c in string.ascii_uppercase]
             add["shape"] = gui.add_dropdown("solid", [*NAMES, *shapes], initial_value="letter_N")
             add["add"] = gui.add_button("Drop it on top")
@@ -182,7 +182,7 @@ class ViewerServer:
         presses = {
             "reset": play.reset,
             "drop": lambda: simulation.drop(value("height")),
-            "throw": lambda: simulation.launch(value("velocity")),
+            "launch": lambda: simulation.launch(value("velocity")),
             "add": lambda: play.add(value("shape")),
         }
         for name, act in reactions.items():
@@ -277,14 +277,14 @@ class ViewerServer:
         step = self.scene.steps[self.gui["frame"].value]
         left = self._titled(self.gui["left"].value)
         right = None if self.gui["right"].value == NOTHING else self._titled(self.gui["right"].value)
-        shown = self.gui["show"].value
+        display = self.gui["show"].value
         text = [f"**{1e3 * self.scene.dt * step:.0f} ms**"]
         self._turn(np.eye(3))
         with self.server.atomic():
-            pair = shown == DISTANCE
-            self._draw_motion("left", left, step, shown, right, text)
+            pair = display == DISTANCE
+            self._draw_motion("left", left, step, display, right, text)
             if right and not pair:
-                self._draw_motion("right", right, step, shown, left, text)
+                self._draw_motion("right", right, step, display, left, text)
             self._nodes["right", "frame"].visible = bool(right and not pair)
             for view in self.scene.views:
                 at = frame_at(tuple(sorted(view.images)), step)
@@ -296,24 +296,24 @@ class ViewerServer:
         self._set_status("  \n".join([*text, *self.scene.notes]))
 
     def _draw_motion(
-        self, side: str, motion: Motion, step: int, shown: str, other: Motion | None, text: list[str]
+        self, side: str, motion: Motion, step: int, display: str, other: Motion | None, text: list[str]
     ) -> None:
         frame = frame_at(motion.steps, step)
-        name = quantity_named(shown)
+        name = quantity_named(display)
         if name is None:
             if motion.means is None:
                 text.append(f"{motion.title} carries no Gaussians: show its particles")
                 return self._only(side, None)
             g = self.scene.gaussians
             rgb = sh0_to_rgb(g.sh0[:, 0]).clamp(0, 1).numpy()
-            if shown == DISTANCE and other is not None and other.means is not None:
+            if display == DISTANCE and other is not None and other.means is not None:
                 gap = (motion.means[frame] - other.means[frame_at(other.steps, step)]).norm(dim=-1).numpy()
                 reach = self._largest_gap(motion, other)
                 rgb = colours("viridis", gap / reach)
                 self._show_legend("viridis", f"distance from {other.title}", 0.0, 1e3 * reach, "mm")
             else:
                 self._hide_legend()
-                if shown == DISTANCE:
+                if display == DISTANCE:
                     text.append("choose a second motion with Gaussians to see the distance")
             return self._splats(side, motion.means[frame], motion.covars[frame], rgb, g.opacities)
         if name not in motion.scalars:
@@ -331,8 +331,8 @@ class ViewerServer:
         self._number, self._dirty = snapshot.number, False
         self._turn(play.simulation.floor)
         self._nodes["right", "frame"].visible = False
-        shown = self.gui["show"].value
-        name = quantity_named(shown)
+        display = self.gui["show"].value
+        name = quantity_named(display)
         with self.server.atomic():
             if name is None:
                 picture: Picture = play.picture(snapshot, self.gui["flow"].value)
@@ -440,9 +440,9 @@ def invisible_ball(radius: float) -> trimesh.Trimesh:
     return ball
 
 
-def quantity_named(shown: str) -> str | None:
+def quantity_named(display: str) -> str | None:
     """Name of the quantity of an entry of the list "show"; None for Gaussians."""
-    return next((name for name, q in QUANTITIES.items() if shown == f"particles by {q.label}"), None)
+    return next((name for name, q in QUANTITIES.items() if display == f"particles by {q.label}"), None)
 
 
 def colours(name: str, share: np.ndarray) -> np.ndarray:

@@ -22,14 +22,14 @@ rule demo_drop:
     input:
         kernels=kernels("geometry", "simulation"),
     output:
-        particles=f"{DEMO_DATA}/{{item}}/{{throw}}.h5",
+        particles=f"{DEMO_DATA}/{{item}}/{{take}}.h5",
     resources:
         gpu=EITHER_GPU,
         mem_mb=8000,
     params:
         demo=demo_settings(),
         name="{item}",
-        drop="{throw}",
+        drop="{take}",
         device=EITHER_DEVICE,
     script:
         "scripts/demo_drop.py"
@@ -52,13 +52,13 @@ rule demo_photographs:
 rule demo_videos:
     input:
         room=f"{DEMO_DATA}/room.npz",
-        particles=f"{DEMO_DATA}/{{item}}/{{throw}}.h5",
+        particles=f"{DEMO_DATA}/{{item}}/{{take}}.h5",
     output:
-        videos=[f"{DEMO_CAPTURE}/videos/{{throw}}/{camera}.mp4" for camera in DEMO_CAMERAS],
+        videos=[f"{DEMO_CAPTURE}/videos/{{take}}/{camera}.mp4" for camera in DEMO_CAMERAS],
     params:
         demo=demo_settings(),
         name="{item}",
-        drop="{throw}",
+        drop="{take}",
         threads=1,
     script:
         "scripts/demo_videos.py"

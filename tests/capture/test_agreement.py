@@ -14,9 +14,9 @@ from tests.support.errors import refused  # noqa: E402
 
 def test_exact_masks_of_one_body_agree():
     views = ring(16)
-    ious = agreement([ellipsoid_mask(v) for v in views], views, np.tile(K, (16, 1, 1)))
+    result = agreement([ellipsoid_mask(v) for v in views], views, np.tile(K, (16, 1, 1)))
     # The body's outline is drawn in voxels, some 45 of them across: half of one all around is 4 % of the area.
-    assert ious.min() > 0.93
+    assert result.min() > 0.93
 
 
 def test_one_mask_of_something_else_stands_out_and_spares_the_others():
@@ -25,15 +25,15 @@ def test_one_mask_of_something_else_stands_out_and_spares_the_others():
     masks[5] = np.roll(masks[5], 60, axis=1)
     y, _ = np.mgrid[:HEIGHT, :WIDTH]
     masks[9] = masks[9] | (y > 180)  # the floor has come along
-    ious = agreement(masks, views, np.tile(K, (16, 1, 1)))
-    assert ious[5] < MIN_AGREEMENT and ious[9] < MIN_AGREEMENT
-    assert np.delete(ious, [5, 9]).min() > 0.9
+    result = agreement(masks, views, np.tile(K, (16, 1, 1)))
+    assert result[5] < MIN_AGREEMENT and result[9] < MIN_AGREEMENT
+    assert np.delete(result, [5, 9]).min() > 0.9
 
 
 def test_two_fixed_cameras_are_enough():
     views = np.stack([looking((1, 0.5, 0)), looking((0, 0.5, 1))])
-    ious = agreement([ellipsoid_mask(v) for v in views], views, np.tile(K, (2, 1, 1)))
-    assert ious.min() > 0.9
+    result = agreement([ellipsoid_mask(v) for v in views], views, np.tile(K, (2, 1, 1)))
+    assert result.min() > 0.9
 
 
 def test_masks_of_different_objects_have_no_common_place():
@@ -49,9 +49,9 @@ def test_cameras_that_film_different_objects_at_one_place_are_named():
     same = agreement([ellipsoid_mask(v) for v in views], views, np.tile(K, (2, 1, 1)))
     check_one_object(same, ["left", "right"], "mug, first")
     masks = [ellipsoid_mask(views[0]), ellipsoid_mask(views[1], radii=np.full(3, 0.03))]
-    ious = agreement(masks, views, np.tile(K, (2, 1, 1)))
+    result = agreement(masks, views, np.tile(K, (2, 1, 1)))
     with pytest.raises(InputError, match="mug, first: .*that of left has an IoU"):
-        check_one_object(ious, ["left", "right"], "mug, first")
+        check_one_object(result, ["left", "right"], "mug, first")
 
 
 def test_a_part_that_many_pictures_cut_off_is_not_lost_by_one_mask():

@@ -1,4 +1,4 @@
-"""Ballistic tracks: only candidates that follow a parabola of time are detected."""
+"""Ballistic tracks among candidates: regions on a parabola are detected, others are not."""
 
 import numpy as np
 
@@ -87,7 +87,7 @@ def test_what_rests_or_moves_at_random_is_no_flight():
     assert find_ballistic_tracks(candidates((rest, 500.0), (walk, 300.0), noise=0.3), TIMES) == []
 
 
-def test_what_changes_its_size_is_not_the_same_object():
+def test_what_changes_its_size_is_another_object():
     ball = flight(TIMES)
     frames = candidates((ball, 500.0))
     for i in range(0, 40, 2):

@@ -1,4 +1,4 @@
-"""The printed board and the lens: print, detection, pose and scale."""
+"""The printed board and the lens: printing, detection and calibration."""
 
 import re
 
@@ -129,14 +129,14 @@ def test_a_board_that_does_not_fit_the_page(tmp_path):
 def test_corners_are_found_below_a_pixel_and_give_the_pose(view):
     """0.1 px at 700 px of focal length and 0.7 m are 0.1 mm; half a pixel, or y down, would stand out."""
     pose = around(5)[view]
-    detected = boards.find_board(picture(pose), BOARD)
-    assert len(detected.ids) >= 33  # of 35
+    board = boards.find_board(picture(pose), BOARD)
+    assert len(board.ids) >= 33  # of 35
     truth = exact([pose])[0]
-    off = detected.pixels - truth.pixels[np.searchsorted(truth.ids, detected.ids)]
+    off = board.pixels - truth.pixels[np.searchsorted(truth.ids, board.ids)]
     assert (
         np.abs(off).max() < 0.3 and np.sqrt((off**2).mean()) < 0.1 and np.abs(off.mean(axis=0)).max() < 0.05
     )
-    got, error = boards.board_pose(detected, BOARD, LENS, "picture")
+    got, error = boards.board_pose(board, BOARD, LENS, "picture")
     assert error < 0.15
     centre = placement.camera_centres(np.stack([pose, got]))
     assert np.linalg.norm(centre[0] - centre[1]) < 1e-3
@@ -145,8 +145,8 @@ def test_corners_are_found_below_a_pixel_and_give_the_pose(view):
 
 def test_pose_of_exact_corners_is_exact():
     poses = around(6)
-    for detected, pose in zip(exact(poses), poses):
-        got, error = boards.board_pose(detected, BOARD, LENS, "picture")
+    for result, pose in zip(exact(poses), poses):
+        got, error = boards.board_pose(result, BOARD, LENS, "picture")
         np.testing.assert_allclose(got, pose, atol=1e-6)
         assert error < 1e-4
 
@@ -157,15 +157,15 @@ def test_pictures_without_board_and_from_below_are_refused():
     assert len(nothing.ids) == 0 and nothing.pixels.shape == (0, 2)
     with refused("still.jpg"):
         boards.board_pose(nothing, BOARD, LENS, "still.jpg")
-    detected = exact(around(1))[0]
-    row = boards.Detection(detected.ids[:5], detected.pixels[:5])
+    result = exact(around(1))[0]
+    row = boards.Detection(result.ids[:5], result.pixels[:5])
     with pytest.raises(InputError, match="still.jpg: 5 corners"):
         boards.board_pose(row, BOARD, LENS, "still.jpg")
-    mirrored = boards.Detection(detected.ids, detected.pixels * [-1, 1] + [800, 0])
+    mirrored = boards.Detection(result.ids, result.pixels * [-1, 1] + [800, 0])
     with pytest.raises(InputError, match="do not fit a flat board"):
         boards.board_pose(mirrored, BOARD, LENS, "still.jpg")
     other = BoardConfig(square=0.03, squares=(5, 8))
-    wrong = boards.Detection(detected.ids[detected.ids < 28], detected.pixels[detected.ids < 28])
+    wrong = boards.Detection(result.ids[result.ids < 28], result.pixels[result.ids < 28])
     with pytest.raises(InputError, match="Check board.squares"):
         boards.board_pose(wrong, other, LENS, "still.jpg")
 
@@ -188,8 +188,8 @@ def test_similarity_from_noisy_corners():
     across the rays; 35 of them give the scale of a board of 0.09 m spread to 0.1 / sqrt(35) / 90 = 2e-4."""
     rng = np.random.default_rng(2)
     poses = around(8)
-    detected = [boards.Detection(f.ids, f.pixels + rng.normal(0, 0.3, f.pixels.shape)) for f in exact(poses)]
-    fit = boards.fit_board(detected, [LENS] * 8, poses, BOARD)
+    results = [boards.Detection(f.ids, f.pixels + rng.normal(0, 0.3, f.pixels.shape)) for f in exact(poses)]
+    fit = boards.fit_board(results, [LENS] * 8, poses, BOARD)
     assert abs(fit.board_from_world.scale - 1) < 4 * 2e-4
     assert 0.05e-3 < fit.residual < 0.4e-3 and fit.flatness <= fit.residual
     up = fit.board_from_world.rotation[2]
@@ -198,15 +198,15 @@ def test_similarity_from_noisy_corners():
 
 def test_a_moved_board_or_too_few_views_are_refused():
     poses = around(6)
-    detected = exact(poses)
+    result = exact(poses)
     with pytest.raises(InputError, match="board: it is visible in 1 of 6"):
         nothing = boards.Detection(np.empty(0, int), np.empty((0, 2)))
-        boards.fit_board([detected[0]] + [nothing] * 5, [LENS] * 6, poses, BOARD)
+        boards.fit_board([result[0]] + [nothing] * 5, [LENS] * 6, poses, BOARD)
     with refused("board"):
-        boards.fit_board(detected[:1] * 2, [LENS] * 2, poses[[0, 0]], BOARD)
+        boards.fit_board(result[:1] * 2, [LENS] * 2, poses[[0, 0]], BOARD)
     bent = BoardConfig(square=0.03, squares=(7, 8))  # numbers stand for other places
     with refused("board.squares"):
-        boards.fit_board(detected, [LENS] * 6, poses, bent)
+        boards.fit_board(result, [LENS] * 6, poses, bent)
 
 
 def test_room_is_upright():
@@ -291,12 +291,12 @@ def test_the_outline_of_the_board_is_a_square_larger_than_its_squares():
     back = room.inverse()
     in_room[:3, :3] = pose[:3, :3] @ back.rotation
     in_room[:3, 3] = pose[:3, :3] @ back.translation + pose[:3, 3]
-    detected = boards.board_outline(BOARD, None, in_room, K)
+    result = boards.board_outline(BOARD, None, in_room, K)
     s, (columns, rows) = BOARD.square, BOARD.squares
     corner = pose[:3, :3] @ (-s, -s, 0) + pose[:3, 3]
     opposite = pose[:3, :3] @ ((columns + 1) * s, (rows + 1) * s, 0) + pose[:3, 3]
     for k, point in ((0, corner), (2, opposite)):
         seen = K @ point
-        np.testing.assert_allclose(detected[k], seen[:2] / seen[2])
+        np.testing.assert_allclose(result[k], seen[:2] / seen[2])
     in_room[2] *= -1
     assert boards.board_outline(BOARD, None, in_room, K) is None

@@ -1,4 +1,4 @@
-"""Time of contact from silhouettes: a ball that falls, seen from above."""
+"""Where silhouettes reach the floor: a ball that falls, seen from above."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_the_lowest_point_of_a_ball_is_found_and_never_too_high(height):
     assert (off < pixel).all() and (off > -1.4 * RADIUS * (steepest - 1) - 1.5 * pixel).all()
 
 
-def test_contact_is_the_median_of_the_cameras():
+def test_contact_is_the_mean_of_the_cameras():
     times = [np.arange(5) / 100, np.arange(5) / 100 + 0.002, np.arange(5) / 100 + 0.004]
     falling = np.array([0.1, 0.05, 0.01, -0.01, -0.02])
     shadow = np.array([0.1, -0.05, -0.06, -0.07, -0.08])

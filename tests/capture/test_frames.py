@@ -144,9 +144,9 @@ def test_contact_sheet(tmp_path, variable):
     timeline = frames.read_timeline(variable[0])
     numbers = frames.sheet_numbers(10, 4)
     assert numbers == [0, 3, 6, 9]
-    selected = list(frames.read_frames(variable[0], timeline, numbers))
+    read = list(frames.read_frames(variable[0], timeline, numbers))
     for name in ("a.png", "b.png"):
-        frames.contact_sheet(tmp_path / name, selected, "phone", columns=2)
+        frames.contact_sheet(tmp_path / name, read, "phone", columns=2)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     with Image.open(tmp_path / "a.png") as sheet:
         greys = [np.asarray(sheet)[y, x].mean() for y in (200, 750) for x in (400, 1200)]

@@ -111,7 +111,7 @@ def test_videos_of_different_takes_are_refused():
 
 
 def test_what_a_large_object_may_be_off_is_still_refused_by_gravity():
-    """Silhouettes of a body of 40 px may wander by 4 px. Different takes that fit so well do not show gravity."""
+    """Silhouettes of a body of 40 px may deviate by 4 px. Different takes that fit so well contradict gravity."""
     rng = np.random.default_rng(0)
     count = 0
     for _ in range(20):
@@ -144,12 +144,12 @@ def test_the_deviation_of_gravity_is_that_of_the_closed_form():
     count, noise = 40, 0.3
     rng = np.random.default_rng(0)
     flat = np.array([0.4, 0.3, 0.0])
-    deviations = []
+    results = []
     for _ in range(30):
         one = track((0.1, 0.8, 2.1), v0=flat, noise=noise, rng=rng, count=count)
-        deviations.append(fit_free_fall([one], plane=(X0, np.array([0.0, 0, 1]))).gravity.ratio[1])
+        results.append(fit_free_fall([one], plane=(X0, np.array([0.0, 0, 1]))).gravity.ratio[1])
     expected = noise * 2.1 / 800 * np.sqrt(720 / count) / ((count - 1) / 120) ** 2 / GRAVITY
-    assert np.mean(deviations) == pytest.approx(expected, rel=0.1)
+    assert np.mean(results) == pytest.approx(expected, rel=0.1)
 
 
 def test_a_rolling_shutter_is_undone_by_the_times_of_the_rows():

@@ -1,4 +1,4 @@
-"""Refined masks of photographs: missing parts, included shadows, and masks of other objects."""
+"""Refined masks of photographs: missing parts, shadows, and masks of other objects."""
 
 import numpy as np
 import pytest
@@ -48,20 +48,20 @@ def test_lost_parts_come_back_shadows_go_and_own_masks_stay():
     kept = [i == 4 for i in range(COUNT)]
     assert agreement(first, VIEWS, KS)[5] < MIN_AGREEMENT
     before = np.array([iou(a, b) for a, b in zip(first, true)])
-    refined = refined_masks(pictures, first, VIEWS, KS, kept)
-    after = np.array([iou(a, b) for a, b in zip(refined, true)])
-    assert (refined[4] == first[4]).all() and before[4] < 0.93
+    result = refined_masks(pictures, first, VIEWS, KS, kept)
+    after = np.array([iou(a, b) for a, b in zip(result, true)])
+    assert (result[4] == first[4]).all() and before[4] < 0.93
     assert before[[2, 5, 7]].max() < 0.75 and before[::2].max() < 0.93
     assert np.delete(after, 4).min() > 0.96
-    assert agreement(refined, VIEWS, KS)[5] > 0.9
+    assert agreement(result, VIEWS, KS)[5] > 0.9
 
 
-def test_correct_masks_stay_and_progress_is_reported():
+def test_what_is_right_stays_right_and_progress_is_reported():
     pictures, true, _ = photographs(np.random.default_rng(4))
-    steps = []
-    refined = refined_masks(pictures, true, VIEWS, KS, progress=lambda *done: steps.append(done))
-    assert min(iou(a, b) for a, b in zip(refined, true)) > 0.97
-    assert steps[-1] == (2 * COUNT, 2 * COUNT) and [done for done, _ in steps] == list(
+    reported = []
+    result = refined_masks(pictures, true, VIEWS, KS, progress=lambda *done: reported.append(done))
+    assert min(iou(a, b) for a, b in zip(result, true)) > 0.97
+    assert reported[-1] == (2 * COUNT, 2 * COUNT) and [done for done, _ in reported] == list(
         range(1, 2 * COUNT + 1)
     )
 
@@ -70,6 +70,6 @@ def test_a_photograph_that_does_not_show_the_body_keeps_its_mask():
     pictures, true, _ = photographs(np.random.default_rng(5))
     views = VIEWS.copy()
     views[3] = np.diag([-1.0, 1.0, -1.0, 1.0]) @ views[3]  # looks the other way
-    refined = refined_masks(pictures, true, views, KS)
-    assert (refined[3] == true[3]).all()
-    assert min(iou(a, b) for i, (a, b) in enumerate(zip(refined, true)) if i != 3) > 0.96
+    result = refined_masks(pictures, true, views, KS)
+    assert (result[3] == true[3]).all()
+    assert min(iou(a, b) for i, (a, b) in enumerate(zip(result, true)) if i != 3) > 0.96

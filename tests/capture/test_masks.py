@@ -1,4 +1,4 @@
-"""Masks of the user, their mattes and overlaps, and errors of implausible flights."""
+"""Masks as given, their mattes and overlaps; and messages for impossible flights."""
 
 import numpy as np
 import pytest
@@ -67,7 +67,5 @@ def test_overlap_and_jumps_have_their_closed_forms():
     a[:, :4], b[:, 2:] = True, True
     assert module.iou(a, b) == pytest.approx(8 / 24) and module.iou(~a & a, a & ~a) == 1.0
     np.testing.assert_allclose(module.area_jumps([100, 110, 88]), [0.1, 0.25])
-    framed = module.overlay(Frame(3, 0.5, np.full((4, 6, 3), 100, np.uint8)), a)
-    assert (
-        framed.number == 3 and (framed.pixels[a] == 100).all() and (framed.pixels[:, 4] == (255, 0, 0)).all()
-    )
+    drawn = module.overlay(Frame(3, 0.5, np.full((4, 6, 3), 100, np.uint8)), a)
+    assert drawn.number == 3 and (drawn.pixels[a] == 100).all() and (drawn.pixels[:, 4] == (255, 0, 0)).all()

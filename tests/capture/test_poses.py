@@ -125,11 +125,11 @@ def test_room_from_a_stated_length():
     true = around(8)
     world = placement.Similarity(3.0, random_similarity(rng).rotation, np.array([1.0, -2, 0.5]))
     floor = np.concatenate([rng.uniform(-0.3, 0.4, (400, 2)), np.zeros((400, 1))], axis=1)
-    body = rng.uniform([0.05, 0.08, 0.02], [0.13, 0.16, 0.1], (200, 3))
+    object_points = rng.uniform([0.05, 0.08, 0.02], [0.13, 0.16, 0.1], (200, 3))
     base = reconstruction(world.move_cameras(true))
     base = poses.replace(
         base,
-        points=world.apply(np.concatenate([floor, body])),
+        points=world.apply(np.concatenate([floor, object_points])),
         colours=np.zeros((600, 3), np.uint8),
     )
     ends = np.array([[0.02, 0.1, 0.0], [0.02, 0.1, 0.15]])
@@ -252,9 +252,9 @@ def test_a_capture_by_the_board_alone(filmed, placed, tmp_path):
         view = np.linalg.inv(np.array(frame["transform_matrix"]) @ OPENGL_TO_OPENCV)
         K = np.array([[frame["fl_x"], 0, frame["cx"]], [0, frame["fl_y"], frame["cy"]], [0, 0, 1]])
         pixels = Lens(720, 540, K, np.zeros(5)).project(corners @ view[:3, :3].T + view[:3, 3])
-        result = boards.find_board(np.asarray(Image.open(path.parent / frame["file_path"])), BOARD)
-        off = result.pixels - pixels[result.ids]
-        assert len(result.ids) >= 20 and np.abs(off).mean() < 0.15 and np.abs(off.mean(axis=0)).max() < 0.1
+        board = boards.find_board(np.asarray(Image.open(path.parent / frame["file_path"])), BOARD)
+        off = board.pixels - pixels[board.ids]
+        assert len(board.ids) >= 20 and np.abs(off).mean() < 0.15 and np.abs(off.mean(axis=0)).max() < 0.1
     drawing.draw_room(tmp_path / "room.png", room)
     with Image.open(tmp_path / "room.png") as drawn:
         assert drawn.width > 500
@@ -327,21 +327,21 @@ def drawn(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def reconstructed(drawn, tmp_path_factory):
+def poses_of_drawn(drawn, tmp_path_factory):
     pytest.importorskip("pycolmap")
     return poses.find_poses(drawn[0], "photographs", tmp_path_factory.mktemp("sfm"), seed=3, threads=2)
 
 
 @pytest.mark.slow
-def test_photographs_find_their_places(drawn, reconstructed):
+def test_photographs_find_their_places(drawn, poses_of_drawn):
     """Of a phone and two fixed cameras, whose lenses nobody knows: within 5 mm and 0.2 degrees of the truth, the scale
     within 0.5 %, from drawn pictures with distortion, noise, and changing exposure; of the fixed cameras, whose lenses
-    are 0.25 degrees off the centre, also within the reported uncertainty. Points of the volume in which an object falls
-    appear within a pixel.
+    are 0.25 degrees off the centre, within the stated uncertainty. Points appear within a pixel of where they
+    do where an object falls.
     """
     groups, true = drawn
-    assert not reconstructed.lost and reconstructed.error < 1.0
-    room = rooms.find_room(reconstructed, pics.name_pictures(groups), CaptureConfig(board=BOARD))
+    assert not poses_of_drawn.lost and poses_of_drawn.error < 1.0
+    room = rooms.find_room(poses_of_drawn, pics.name_pictures(groups), CaptureConfig(board=BOARD))
     names, got = room.poses.names, room.poses.viewmats
     place = boards.room_from_board(BOARD, None)
     wanted = place.move_cameras(np.stack([true[name] for name in names]))

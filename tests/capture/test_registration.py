@@ -1,4 +1,4 @@
-"""Registration: pose, velocity, spin and offsets are those that were rendered, and ambiguities are reported."""
+"""Registration: pose, velocity, spin and offsets are those that were rendered, and undetermined ones are reported."""
 
 import json
 from dataclasses import replace
@@ -72,9 +72,9 @@ def test_pose_velocity_spin_offset_and_gains_are_those_that_were_rendered():
     assert not result.ambiguous and result.rival[0] > 2 and result.spin_significant
     x = body.particles @ result.rotation.T + result.translation
     np.testing.assert_allclose(body.mass @ x / body.mass.sum(), result.pose.motion.centre, atol=1e-9)
-    launch = InitialMotion.of(result.velocity())
-    np.testing.assert_allclose(launch.velocity, result.pose.motion.velocity)
-    assert (launch.std > 0).all() and (launch.axes == result.axes).all()
+    motion = InitialMotion.of(result.velocity())
+    np.testing.assert_allclose(motion.velocity, result.pose.motion.velocity)
+    assert (motion.std > 0).all() and (motion.axes == result.axes).all()
     report = json.loads(json.dumps(result.report(), allow_nan=False))
     assert set(report["offsets_s"]) == set(report["gains"]) == {"a", "b"} and report["ambiguous"] == ""
     assert {each.camera for each in result.comparisons} == {0, 1}
@@ -83,7 +83,7 @@ def test_pose_velocity_spin_offset_and_gains_are_those_that_were_rendered():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2, 7))
-def test_every_rotation_is_estimated(seed):
+def test_every_rotation_is_recovered(seed):
     body = ellipsoid_body()
     # The first is the pose of the photographs.
     turn = np.eye(3) if seed == 2 else Rotation.random(random_state=seed).as_matrix()
@@ -120,7 +120,7 @@ def test_one_camera_is_enough_and_less_sure_of_the_depth():
     check_gravity(result)
 
 
-def test_a_plain_ball_is_ambiguous():
+def test_a_plain_ball_is_reported_as_ambiguous():
     body = ellipsoid_body(count=250, radii=(0.05, 0.05, 0.05), coloured=False, bump=0.0)
     motion = true_motion(body, np.eye(3))
     result, errors = registered(body, motion, frames=6, noise=0.02)
@@ -147,14 +147,14 @@ def test_frames_after_the_contact_are_left_out():
 
 def test_gravity_that_is_not_what_was_assumed_is_measured():
     """As a square size off by 15 percent shows it, or a floor that is not level."""
-    body, true_gravity = ellipsoid_body(count=250), np.array([0.6, -8.4, 0.0])
-    motion = replace(true_motion(body, Rotation.random(random_state=6).as_matrix()), gravity=true_gravity)
+    body, velocity = ellipsoid_body(count=250), np.array([0.6, -8.4, 0.0])
+    motion = replace(true_motion(body, Rotation.random(random_state=6).as_matrix()), gravity=velocity)
     result, _ = registered(body, motion, frames=12, offset=OFFSET, noise=0.02)
-    check_gravity(result, true_gravity)
+    check_gravity(result, velocity)
 
 
 @pytest.mark.slow
-def test_an_insignificant_spin_is_set_to_0():
+def test_a_spin_that_is_not_distinguished_from_0_is_none():
     body = ellipsoid_body(count=250)
     motion = true_motion(body, Rotation.random(random_state=4).as_matrix(), spin=(0, 0, 0))
     result, errors = registered(body, motion, frames=6, noise=0.03)

@@ -39,7 +39,7 @@ def folders(tmp_path_factory):
 
 
 @pytest.fixture(params=["spring_gaus", "neuma"])
-def capture(request, folders):
+def result(request, folders):
     return read_released(folders[request.param], layouts.OBJECT)
 
 
@@ -49,24 +49,24 @@ def in_room(points):
     return layouts.UNIT * (np.atleast_2d(points) - origin) @ ROOM_FROM_WORLD.T
 
 
-def cameras_of(capture):
-    shots = [frames[0] for frames in capture.videos.values()]
-    viewmats = room_cameras(np.stack([shot.viewmat for shot in shots]), capture.ground, layouts.UNIT)
+def cameras_of(result):
+    shots = [frames[0] for frames in result.videos.values()]
+    viewmats = room_cameras(np.stack([shot.viewmat for shot in shots]), result.ground, layouts.UNIT)
     return shots, viewmats, np.stack([shot.lens.K for shot in shots])
 
 
-def test_cameras_see_the_object_where_it_was(capture):
-    shots, viewmats, Ks = cameras_of(capture)
-    assert len(shots) == 3 and all(len(frames) == layouts.COUNT for frames in capture.videos.values())
+def test_cameras_see_the_object_where_it_was(result):
+    shots, viewmats, Ks = cameras_of(result)
+    assert len(shots) == 3 and all(len(frames) == layouts.COUNT for frames in result.videos.values())
     for k in (0, layouts.CONTACT):
-        masks = [next(iter(read_shots([frames[k]], LONGEST)))[1] for frames in capture.videos.values()]
+        masks = [next(iter(read_shots([frames[k]], LONGEST)))[1] for frames in result.videos.values()]
         middle, radius = seen_size(masks, viewmats, Ks)
         np.testing.assert_allclose(middle, in_room(layouts.motion(k)[0])[0], atol=2e-3)
         assert radius == pytest.approx(layouts.UNIT * np.prod(layouts.RADII) ** (1 / 3), rel=0.1)
 
 
-def test_the_room_has_its_floor_below_and_metres(capture):
-    _, viewmats, _ = cameras_of(capture)
+def test_the_room_has_its_floor_below_and_metres(result):
+    _, viewmats, _ = cameras_of(result)
     eyes = np.linalg.inv(viewmats)[:, :3, 3]
     theirs = np.stack([np.linalg.inv(v)[:3, 3] for v in layouts.poses().values()])
     np.testing.assert_allclose(eyes, in_room(theirs), atol=1e-9)
@@ -76,24 +76,24 @@ def test_the_room_has_its_floor_below_and_metres(capture):
     np.testing.assert_allclose(in_room([*MIDDLE, layouts.GROUND[layouts.OBJECT]]), 0, atol=1e-12)
 
 
-def test_frames_have_the_times_of_the_camera(capture):
-    shots = next(iter(capture.videos.values()))
-    frames, world = video_frames(shots, capture.ground, layouts.UNIT, 48, 2.0)
+def test_frames_have_the_times_of_the_camera(result):
+    shots = next(iter(result.videos.values()))
+    frames, world = video_frames(shots, result.ground, layouts.UNIT, 48, 2.0)
     assert [f["step"] for f in frames] == list(range(layouts.COUNT))
     np.testing.assert_allclose([f["time"] for f in frames], np.arange(layouts.COUNT) / RATE)
     assert frames[0]["w"] == 48 and frames[0]["fl_x"] == pytest.approx(shots[0].lens.K[0, 0] / 2)
     pose = np.array(frames[0]["transform_matrix"]) @ OPENGL_TO_OPENCV
-    room = np.linalg.inv(room_cameras(shots[0].viewmat[None], capture.ground, layouts.UNIT)[0])
+    room = np.linalg.inv(room_cameras(shots[0].viewmat[None], result.ground, layouts.UNIT)[0])
     np.testing.assert_allclose(pose[:3, 3] - 2 * room[:3, 3], (0.5, 0, 0.5), atol=1e-12)
     assert world["world"] == {"scale": 2.0, "offset": [0.5, 0.0, 0.5]}
 
 
 def test_photographs_come_to_the_middle_and_to_size(folders):
-    capture = read_configured("bun", ReleasedConfig(folder=str(folders["spring_gaus"])))
-    assert len(capture.photographs) == layouts.PHOTOGRAPHS and capture.contact == layouts.CONTACT
-    pictures, masks = zip(*read_shots(capture.photographs, LONGEST))
+    result = read_configured("bun", ReleasedConfig(folder=str(folders["spring_gaus"])))
+    assert len(result.photographs) == layouts.PHOTOGRAPHS and result.contact == layouts.CONTACT
+    pictures, masks = zip(*read_shots(result.photographs, LONGEST))
     assert pictures[0].shape == (54, 96, 3)  # as large as its mask
-    frames, world = photographs_about_to_size(capture.photographs, masks, LONGEST, 0.05, 0.2)
+    frames, world = photographs_about_to_size(result.photographs, masks, LONGEST, 0.05, 0.2)
     viewmats = np.stack([np.linalg.inv(np.array(f["transform_matrix"]) @ OPENGL_TO_OPENCV) for f in frames])
     Ks = np.stack([[[f["fl_x"], 0, f["cx"]], [0, f["fl_y"], f["cy"]], [0, 0, 1]] for f in frames])
     middle, radius = seen_size(masks, viewmats, Ks)
@@ -112,15 +112,15 @@ def test_the_copy_takes_its_photographs_from_the_original(folders):
     with refused("captures.released.bun"):
         read_configured("bun", settings)
     settings = settings.model_copy(update={"photographs": str(folders["spring_gaus"])})
-    capture = read_configured("bun", settings)
-    assert len(capture.photographs) == layouts.PHOTOGRAPHS and capture.contact == 5
-    assert list(capture.videos) == ["r_0", "r_1", "r_2"]
+    result = read_configured("bun", settings)
+    assert len(result.photographs) == layouts.PHOTOGRAPHS and result.contact == 5
+    assert list(result.videos) == ["r_0", "r_1", "r_2"]
 
 
 def test_they_are_captures_like_others(folders):
-    capture = released_captures({"bun": ReleasedConfig(folder=str(folders["spring_gaus"]), density=300)})
-    assert list(capture["bun"].takes["first"]) == list(layouts.CAMERAS)
-    assert capture["bun"].settings.density == 300
+    result = released_captures({"bun": ReleasedConfig(folder=str(folders["spring_gaus"]), density=300)})
+    assert list(result["bun"].takes["first"]) == list(layouts.CAMERAS)
+    assert result["bun"].settings.density == 300
 
 
 def change(path, content):
@@ -161,7 +161,7 @@ def test_damaged_files_are_named(folders, file, content, where):
         path.write_bytes(before)
 
 
-def test_unknown_layouts_and_objects_are_refused(folders, tmp_path):
+def test_what_is_in_no_layout_or_of_no_object_is_named(folders, tmp_path):
     with refused(tmp_path):
         read_released(tmp_path, "bun")
     with refused("dynamic/sequences"):
@@ -190,8 +190,8 @@ def test_an_empty_mask_and_a_picture_of_another_shape_are_named(folders):
 
 
 def test_times_and_contact_are_plain_json(folders):
-    capture = read_released(folders["spring_gaus"], "bun")
-    frames, _ = video_frames(next(iter(capture.videos.values())), capture.ground, 0.75, LONGEST)
+    result = read_released(folders["spring_gaus"], "bun")
+    frames, _ = video_frames(next(iter(result.videos.values())), result.ground, 0.75, LONGEST)
     assert json.loads(json.dumps(frames)) == frames
 
 

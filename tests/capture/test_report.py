@@ -1,4 +1,4 @@
-"""The report of a capture: its text, and that it is self-contained."""
+"""The report of a capture: its text, and that it contains all its pictures."""
 
 import math
 import re
@@ -23,7 +23,7 @@ class Reader(HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.open, self.links, self.tags, self.content = [], [], [], ""
+        self.open, self.links, self.tags, self.text = [], [], [], ""
         self.feed(text)
         assert self.open == []
 
@@ -39,7 +39,7 @@ class Reader(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
-        self.content += data
+        self.text += data
 
 
 def row(method="neuma", take="one", camera="left", learned=True, **values):
@@ -100,8 +100,8 @@ def test_the_page_holds_all_that_it_shows_and_asks_for_nothing_else(whole):
         "✓ passed",
         "PSNR 20.0 dB",
     ):
-        assert text in read.content
-    assert read.content.count("not determined") == 2 and "(training)" in read.content
+        assert text in read.text
+    assert read.text.count("not determined") == 2 and "(training)" in read.text
 
 
 def test_names_and_texts_are_escaped(whole, tmp_path):
@@ -121,12 +121,12 @@ def test_names_and_texts_are_escaped(whole, tmp_path):
     }
     read = Reader(page(**{**whole, **nasty}))
     assert "script" not in read.tags
-    assert read.content.count(NASTY) >= 15
+    assert read.text.count(NASTY) >= 15
     assert all(link.startswith(("data:", "#")) for link in read.links)
 
 
-def test_missing_parts_are_reported():
-    content = Reader(page("mug", "NeuMA")).content
+def test_what_is_missing_is_named():
+    whole_text = Reader(page("mug", "NeuMA")).text
     for text in (
         "There are no videos.",
         "No pictures were measured.",
@@ -135,17 +135,15 @@ def test_missing_parts_are_reported():
         "There are no checks.",
         "There are no pictures.",
     ):
-        assert text in content
+        assert text in whole_text
 
 
-def test_missing_files_are_reported(whole, tmp_path):
+def test_files_that_are_not_there_are_named_as_missing(whole, tmp_path):
     gone = tmp_path / "gone"
     films = [Film("one", "left", True, gone)]
     read = Reader(page(**{**whole, "films": films, "pictures": {"Videos": {"Sheet": gone}}, "curves": gone}))
-    assert (
-        "The video of left is missing." in read.content and "Sheet: the picture is missing." in read.content
-    )
-    assert "There are no stress curves." in read.content and "video" not in read.tags
+    assert "The video of left is missing." in read.text and "Sheet: the picture is missing." in read.text
+    assert "There are no stress curves." in read.text and "video" not in read.tags
 
 
 def test_a_file_that_is_no_picture_is_named(tmp_path):
@@ -166,11 +164,11 @@ def test_stresses_are_those_of_the_room():
     assert room_value("viscosity", 40.0, 2.0) == (10.0, "Pa s")
     assert room_value("friction_angle", 30.0, 2.0) == (30.0, "°")
     assert room_value("yield_strain", 0.1, 2.0) == (0.1, "")
-    content = Reader(page("mug", "NeuMA", identified=identified(), scale=2.0)).content
-    assert "100 kPa" in content and "250 Pa" in content and "lengths are 2 times" in content
+    text = Reader(page("mug", "NeuMA", identified=identified(), scale=2.0)).text
+    assert "100 kPa" in text and "250 Pa" in text and "lengths are 2 times" in text
     # Two standard deviations of the logarithm, and one that is undetermined.
-    assert f"{number(250 / math.exp(0.1))} to {number(250 * math.exp(0.1))}" in content
-    assert "unknown" in content
+    assert f"{number(250 / math.exp(0.1))} to {number(250 * math.exp(0.1))}" in text
+    assert "unknown" in text
 
 
 @pytest.mark.parametrize(
@@ -219,7 +217,7 @@ def test_a_capture_without_faults_has_no_warnings():
 
 
 @pytest.mark.parametrize(
-    "changes, content",
+    "changes, message",
     [
         ({"cameras": {"left": 1e-3}}, "only one camera"),
         ({"flight": {"spin_rad_s": None}}, "no spin was measured"),
@@ -232,24 +230,24 @@ def test_a_capture_without_faults_has_no_warnings():
         ({"registration": {"ambiguous": "it looks alike"}}, "does not determine the pose .*: it looks alike"),
     ],
 )
-def test_each_fault_of_filming_gives_a_warning(changes, content):
-    (warned,) = module.filming_warnings(CAPTURE, take(**changes))
-    assert re.search(content, warned)
+def test_each_fault_of_filming_is_named(changes, message):
+    (result,) = module.filming_warnings(CAPTURE, take(**changes))
+    assert re.search(message, result)
 
 
-def test_defaults_that_limit_the_result_give_a_warning():
+def test_what_nobody_stated_or_held_out_is_named():
     (density,) = module.filming_warnings({**CAPTURE, "density_stated": False}, take())
     assert "900 kg/m³" in density
     (held,) = module.filming_warnings({**CAPTURE, "held_out": []}, take())
     assert "No take is held out" in held
 
 
-def test_predictions_worse_than_the_prior_give_warnings():
+def test_predictions_that_are_worse_than_nothing_are_named():
     rows = [row("nclaw", psnr=21.0), row(iou=0.5)]
     rows += [row(take="all", camera="all"), row(take="all", camera="all", learned=False, psnr=18.0)]
     rows += [row("constants", take="all", camera="all", psnr=22.0)]
     broken = {**GOOD_MOTION, "stable": False, "diverged": {"step": 30, "happened": "became non-finite"}}
-    warned = module.prediction_warnings(rows, "neuma", "nclaw", "constants", {"one": broken})
+    result = module.prediction_warnings(rows, "neuma", "nclaw", "constants", {"one": broken})
     for text in (
         "diverged at step 30",
         "training diverged",
@@ -258,11 +256,11 @@ def test_predictions_worse_than_the_prior_give_warnings():
         "Held-out",
         "In training frames, the identified constants alone fit better",
     ):
-        assert sum(text in line for line in warned) == 1, text
-    assert len(warned) == 6
+        assert sum(text in line for line in result) == 1, text
+    assert len(result) == 6
 
 
-def test_undetermined_constants_and_ties_give_warnings():
+def test_undetermined_constants_and_ties_are_named():
     tie, open_ = module.constants_warnings(identified(ties=["hencky"]))
     assert (
         "von_mises, hencky" in tie
@@ -277,7 +275,7 @@ def curve(stress, band=None):
     return {"stress": stress, "band": ends}
 
 
-def test_laws_outside_the_band_give_warnings():
+def test_laws_outside_the_band_are_named():
     laws = {
         "nclaw": curve([5.0, 6.0, 7.0, 8.0]),
         "constants": curve([0.0, 1.0, 2.0, 3.0], band=0.5),
@@ -286,6 +284,6 @@ def test_laws_outside_the_band_give_warnings():
     test = {"x": [0.0, 1.0, 2.0, 3.0], "visited": [0.0, 3.0], "by_stress": False, "laws": laws}
     curves = {"learned": "neuma", "rate": 20, "tests": {"shear": test}}
     titles = {"nclaw": "prior", "constants": "identified constants", "neuma": "NeuMA"}
-    warned = module.curve_warnings(curves, titles, "nclaw", "constants")
-    assert len(warned) == 3 and "no error bars" in warned[1]
-    assert warned[2].startswith("Shear: over 100 % of the visited range, prior is outside")
+    result = module.curve_warnings(curves, titles, "nclaw", "constants")
+    assert len(result) == 3 and "no error bars" in result[1]
+    assert result[2].startswith("Shear: over 100 % of the visited range, prior is outside")

@@ -1,4 +1,4 @@
-"""Measures of predicted pictures compared with the video of a take."""
+"""Measures of predicted pictures of a real take compared with its video."""
 
 import numpy as np
 import pytest
@@ -48,35 +48,35 @@ def measured(scene, **changes):
 
 
 def test_measures_are_those_of_pictures_that_are_put_together_by_hand(scene):
-    metrics = measured(scene)
+    result = measured(scene)
     alpha, mask = scene["alpha"].numpy()[..., None], scene["matte"].numpy()[..., 3:]
     predicted, filmed = (
         scene["colours"].numpy() + 1 - alpha,
         scene["matte"].numpy()[..., :3] * mask + 1 - mask,
     )
     window = object_window((alpha[..., 0] > 0.05) | (mask[..., 0] > 0.05), 0.1)
-    assert metrics["psnr"] == pytest.approx(psnr(predicted[window], filmed[window]), abs=1e-4)
-    assert metrics["ssim"] == pytest.approx(ssim(predicted[window], filmed[window]), abs=1e-5)
+    assert result["psnr"] == pytest.approx(psnr(predicted[window], filmed[window]), abs=1e-4)
+    assert result["ssim"] == pytest.approx(ssim(predicted[window], filmed[window]), abs=1e-5)
     whole = scene["colours"].numpy() + (1 - alpha) * scene["empty"].numpy()
-    assert metrics["scene_psnr"] == pytest.approx(psnr(whole, scene["picture"].numpy()), abs=1e-4)
-    assert metrics["scene_ssim"] == pytest.approx(ssim(whole, scene["picture"].numpy()), abs=1e-5)
+    assert result["scene_psnr"] == pytest.approx(psnr(whole, scene["picture"].numpy()), abs=1e-4)
+    assert result["scene_ssim"] == pytest.approx(ssim(whole, scene["picture"].numpy()), abs=1e-5)
     # Two discs of radius 12 whose centres are 3 apart.
     part = np.arccos(3 / 24) * 2 * 144 - 1.5 * np.sqrt(4 * 144 - 9)
-    assert metrics["iou"] == pytest.approx(part / (2 * np.pi * 144 - part), abs=0.02)
+    assert result["iou"] == pytest.approx(part / (2 * np.pi * 144 - part), abs=0.02)
 
 
 def test_what_lies_behind_the_object_changes_the_whole_picture_alone(scene):
     other = torch.rand_like(scene["empty"])
-    metrics, changed = measured(scene), measured(scene, picture=other)
-    assert (metrics["psnr"], metrics["iou"]) == (changed["psnr"], changed["iou"])
-    assert changed["scene_psnr"] < 12 < metrics["scene_psnr"]
+    result, changed = measured(scene), measured(scene, picture=other)
+    assert (result["psnr"], result["iou"]) == (changed["psnr"], changed["iou"])
+    assert changed["scene_psnr"] < 12 < result["scene_psnr"]
 
 
 def test_a_prediction_that_is_what_was_filmed_is_perfect(scene):
     mask = scene["matte"][..., 3]
-    metrics = measured(scene, colours=scene["matte"][..., :3] * mask[..., None], alpha=mask)
-    assert metrics["psnr"] > 100 and metrics["scene_psnr"] > 100 and metrics["iou"] == 1
-    assert metrics["ssim"] == pytest.approx(1) and metrics["scene_ssim"] == pytest.approx(1)
+    result = measured(scene, colours=scene["matte"][..., :3] * mask[..., None], alpha=mask)
+    assert result["psnr"] > 100 and result["scene_psnr"] > 100 and result["iou"] == 1
+    assert result["ssim"] == pytest.approx(1) and result["scene_ssim"] == pytest.approx(1)
 
 
 def test_pictures_of_other_sizes_are_refused(scene):

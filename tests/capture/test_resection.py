@@ -28,13 +28,13 @@ def sightings(points, noise):
     """Of 12 cameras around the scene, and of the fixed one."""
     rng = np.random.default_rng(5)
     eyes = [looking_at([np.cos(a), np.sin(a), 0.6], [0.1, 0.1, 0.0]) for a in np.linspace(0, 6, 12)]
-    result = []
+    results = []
     for lens, eye in [(LENS, eye) for eye in eyes] + [(TRUE, EYE)]:
         pixels = lens.project(points @ eye[:3, :3].T + eye[:3, 3])
         inside = np.flatnonzero(((pixels > 0) & (pixels < [lens.width, lens.height])).all(axis=1))
         noisy = pixels[inside] + rng.normal(0, noise, (len(inside), 2))
-        result.append(resection.Sighting(lens, eye, inside, noisy))
-    return result
+        results.append(resection.Sighting(lens, eye, inside, noisy))
+    return results
 
 
 def resected(height, noise, outliers=0):
@@ -85,7 +85,7 @@ def test_noise_and_outliers_stay_within_the_deviations_that_are_stated():
     assert turned(camera.viewmat) < min(0.2, 3 * camera.turn_deviation)
 
 
-def test_a_floor_alone_leaves_the_centre_undetermined():
+def test_a_floor_alone_does_not_determine_the_centre_and_warns():
     flat, tall = resected(0.0, 0.3), resected(0.4, 0.3)
     assert flat.turn_deviation > 3 * tall.turn_deviation
     off = flat.lens.K[:2, 2] - TRUE.K[:2, 2]

@@ -61,29 +61,29 @@ def exact_paths(tracks, noise=0.0, rng=None, shape=(1.0, 1.0, 1.0), points=40):
 
 def test_exact_paths_on_a_sphere_give_the_spin():
     tracks = cameras()
-    spin = fit_spin(exact_paths(tracks), tracks, FALL)
+    result = fit_spin(exact_paths(tracks), tracks, FALL)
     # The sphere's outline is seen a little before its middle, so that its radius is taken 1 % too small.
-    np.testing.assert_allclose(spin.velocity, SPIN, atol=0.03)
-    assert spin.rms < 0.02
+    np.testing.assert_allclose(result.velocity, SPIN, atol=0.03)
+    assert result.rms < 0.02
 
 
 def test_depths_are_fitted_where_the_object_is_no_sphere():
     tracks = cameras()
-    spin = fit_spin(exact_paths(tracks, shape=(1.3, 0.8, 1.0)), tracks, FALL)
-    np.testing.assert_allclose(spin.velocity, SPIN, atol=0.1)
+    result = fit_spin(exact_paths(tracks, shape=(1.3, 0.8, 1.0)), tracks, FALL)
+    np.testing.assert_allclose(result.velocity, SPIN, atol=0.1)
 
 
 def test_noise_stays_within_the_deviation():
     tracks, rng = cameras(), np.random.default_rng(4)
     z = []
     for _ in range(12):
-        spin = fit_spin(exact_paths(tracks, PIXEL_SPREAD, rng), tracks, FALL)
-        z.append((spin.velocity - SPIN) / np.sqrt(np.diag(spin.covariance)))
+        result = fit_spin(exact_paths(tracks, PIXEL_SPREAD, rng), tracks, FALL)
+        z.append((result.velocity - SPIN) / np.sqrt(np.diag(result.covariance)))
     # The deviation is a bound rather than an estimate: errors of a path are taken to be alike.
     assert np.abs(np.mean(z)) < 0.6 and np.square(z).mean() < 1.3
 
 
-def test_few_paths_give_no_spin_and_a_smooth_ball_has_none():
+def test_a_ball_at_rest_in_itself_has_no_spin_and_a_smooth_one_shows_none():
     tracks = cameras()
     paths = exact_paths(tracks)
     assert fit_spin(paths[:5], tracks, FALL) is None
@@ -121,7 +121,7 @@ def drawn(track, number):
 def test_the_spin_of_a_drawn_ball_is_found_within_a_tenth():
     tracks = cameras()
     paths = [p for k, track in enumerate(tracks) for p in follow(*drawn(track, k), track.times, k)]
-    spin = fit_spin(paths, tracks, FALL)
-    assert np.linalg.norm(spin.velocity - SPIN) < 0.1 * np.linalg.norm(SPIN)
-    size, deviation = spin.rate
+    result = fit_spin(paths, tracks, FALL)
+    assert np.linalg.norm(result.velocity - SPIN) < 0.1 * np.linalg.norm(SPIN)
+    size, deviation = result.rate
     assert abs(size - np.linalg.norm(SPIN)) < 4 * deviation < 1.0

@@ -23,8 +23,8 @@ def test_a_known_delay_of_sound_is_found_below_a_millisecond():
     late = 1234  # samples by which the second camera began earlier: it hears all later
     first = room + 0.02 * rng.normal(size=len(room))
     second = 0.3 * np.roll(room, late) + 0.02 * rng.normal(size=len(room))
-    estimated = offset_from_sound(first, second)
-    assert estimated.seconds == pytest.approx(-late / RATE, abs=2e-4)
+    result = offset_from_sound(first, second)
+    assert result.seconds == pytest.approx(-late / RATE, abs=2e-4)
 
 
 def test_sound_that_has_nothing_in_common_gives_no_offset():
@@ -36,11 +36,11 @@ def test_motion_gives_the_offset_within_a_third_of_a_frame():
     t1, t2 = np.arange(60) / 60, np.arange(70) / 50
     speed = lambda t: np.exp(-(((t - 0.5) / 0.1) ** 2))  # noqa: E731
     offset = -0.137
-    estimated = offset_from_motion((t1, t2), (speed(t1), speed(t2 + offset)))
-    assert abs(estimated.seconds - offset) < estimated.deviation
+    result = offset_from_motion((t1, t2), (speed(t1), speed(t2 + offset)))
+    assert abs(result.seconds - offset) < result.deviation
 
 
-def test_the_more_accurate_offset_is_chosen():
+def test_the_surer_offset_is_chosen_and_reported():
     sound, motion = Offset(0.1, 0.005, "sound"), Offset(0.104, 0.003, "motion")
     best, line = choose_offset(sound, motion, "mug")
     assert best is motion and "sound 100.0 +- 5.0 ms" in line

@@ -1,4 +1,4 @@
-"""Masks of a drawn fall with shadows, a hand, noise and changing exposure, and errors of bad videos."""
+"""Masks of a drawn fall with everything that a room adds; and messages for bad videos."""
 
 import numpy as np
 import pytest
@@ -62,7 +62,7 @@ def test_the_median_of_the_frames_stands_in_for_the_empty_picture():
     assert min(overlaps(result, range(10, CONTACT + 1))) > 0.9
 
 
-def test_a_known_place_precedes_the_track():
+def test_a_place_that_is_known_precedes_the_track():
     background = texture()
     frames = film(background)
     for frame in frames:
@@ -72,7 +72,7 @@ def test_a_known_place_precedes_the_track():
     np.testing.assert_allclose([centroid(mask) for mask in result.masks], given, atol=0.3)
 
 
-def test_exposure_is_exact_in_spite_of_motion():
+def test_exposure_is_found_exactly_and_outside_what_moves():
     background = np.rint(texture()).astype(np.uint8)
     frame = 1.2 * background.astype(float) * (1, 0.9, 0.95) + 4
     frame[ellipse((160, 120), 60, 50)] = 20
@@ -94,7 +94,7 @@ def test_a_shadow_is_distinguished_from_a_dark_object():
     "colour", [(225, 70, 40), (18, 165, 148), (150, 128, 100)], ids=["red", "teal", "stone"]
 )
 def test_the_dark_shadow_that_it_lands_on_is_left_out(colour):
-    """Of a ball in colours that the floor does not have, and in one that it has."""
+    """Of a ball in colours that the floor has not and that it has; its colours are unknown."""
     background = stony()
     noisy = background + np.random.default_rng(9).normal(0, 2, background.shape)
     frames, silhouettes = film_of_contact(background, colour)

@@ -1,4 +1,4 @@
-"""PAC-NeRF's velocity and constants: their gradients through all of the chain, recovery of known truths, resuming."""
+"""PAC-NeRF's velocity and constants: their gradients from constants to pixels, recovery of known truths, resuming."""
 
 import math
 
@@ -54,8 +54,8 @@ def body(settings=SMALL):
 
 
 def film(carried, spec):
-    """The video of a body with this law, thrown with V0; its own particles move."""
-    return benchmark.film(carried.field, carried.shown, spec, FRAMES, benchmark.cameras(24, torch.float64))
+    """The video of a body with this law, launched with V0; its own particles move."""
+    return benchmark.film(carried.field, carried.rendered, spec, FRAMES, benchmark.cameras(24, torch.float64))
 
 
 def contact(carried):
@@ -111,13 +111,13 @@ def test_gradient_of_constants_and_velocity_against_differences(family, carried)
 
 
 class TestMemory:
-    """Pictures are rendered in pieces, and stay bytes until they are looked at."""
+    """Pictures are rendered in pieces, and stay bytes until they are compared."""
 
     @staticmethod
     def video(carried, size):
         """A picture of the body where it is in three views, and one of noise, as files have them."""
         cameras = benchmark.cameras(size, torch.float64)
-        drawn = torch.stack([carried.field.draw(cameras, view, carried.shown) for view in range(3)])
+        drawn = torch.stack([carried.field.draw(cameras, view, carried.rendered) for view in range(3)])
         opaque = torch.full((3, size, size, 1), 255, dtype=torch.uint8)
         rgba = torch.cat([(255 * drawn.clamp(0, 1)).byte(), opaque], dim=-1)
         other = torch.randint(256, rgba.shape, generator=torch.Generator().manual_seed(0)).byte()
@@ -126,18 +126,18 @@ class TestMemory:
     @staticmethod
     def error(carried, video):
         """Loss of the body a little aside, its gradient in the positions, and the bytes that were kept for it."""
-        x = (carried.shown.x + 0.01).requires_grad_()
+        x = (carried.rendered.x + 0.01).requires_grad_()
         with kept_for_gradient() as kept:
             error = video.error(carried, x, 0, 1, None, None, 3)
             error.backward()
         return float(error.detach()), x.grad, kept[0]
 
     def test_a_picture_in_pieces_has_the_same_loss_and_gradient(self, carried, monkeypatch):
-        video, found = Video(self.video(carried, 24)), []
+        video, result = Video(self.video(carried, 24)), []
         for most in (10**9, 300, 1):
             monkeypatch.setitem(rendering.POINTS_AT_ONCE, "cpu", most)
-            found.append([*self.error(carried, video)[:2], carried.field.draw(video.views[0].cameras, 0)])
-        (loss, gradient, picture), *others = found
+            result.append([*self.error(carried, video)[:2], carried.field.draw(video.views[0].cameras, 0)])
+        (loss, gradient, picture), *others = result
         assert loss > 1e-4 and gradient.abs().max() > 1e-6
         for other in others:
             assert other[0] == pytest.approx(loss, rel=1e-12)
@@ -185,24 +185,24 @@ def test_youngs_modulus_is_found_from_a_decade_off(elastic):
     assert elastic.history.loss[-1] < 0.05 * elastic.history.loss[0]
 
 
-def test_poissons_ratio_is_found(elastic):
+def test_poissons_ratio_is_recovered(elastic):
     assert float(elastic.constants.values()["nu"].detach()) == pytest.approx(0.3, abs=0.05)
 
 
 def test_poissons_ratio_waits_for_the_modulus(elastic):
-    found = elastic.history.constants["nu"]
-    assert set(found[: SMALL.iterations_contact + 1]) == {found[0]} and found[-1] != found[0]
+    result = elastic.history.constants["nu"]
+    assert set(result[: SMALL.iterations_contact + 1]) == {result[0]} and result[-1] != result[0]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(BOUNDS))
-def test_constants_of_every_family_are_found_from_its_stock_guess(name, loaded):
+def test_constants_of_every_family_are_recovered_from_its_published_guess(name, loaded):
     """With default settings, within the bounds of docs/systems.md; see benchmarks/pac_nerf.py."""
     settings = loaded.pac_nerf.model_copy(update=benchmark.SMALL)
     fit = benchmark.recover(name, settings.families[name], settings, log=lambda _: None)
-    found = fit.constants.fitted_numbers()
+    result = fit.constants.fitted_numbers()
     for key, bound in BOUNDS[name].items():
-        assert benchmark.error(key, benchmark.TRUTHS[name][key], found[key]) < bound
+        assert benchmark.error(key, benchmark.TRUTHS[name][key], result[key]) < bound
 
 
 def test_resumes_bit_for_bit(carried, tmp_path):
@@ -239,26 +239,26 @@ def test_resumes_bit_for_bit(carried, tmp_path):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_cuda_agrees(carried):
     short = SMALL.model_copy(update=dict(velocity_iterations=2, iterations_contact=0, iterations_all=2))
-    video, found = film(carried, changed(ELASTIC, E=1e5)), []
+    video, result = film(carried, changed(ELASTIC, E=1e5)), []
     for device in ("cpu", "cuda"):
         own = CarriedField(ball().to(device), 1.0, 1e-3, short, 1000.0)
         seen = video.to(torch.float64, device)
         fit = fit_pac_nerf(
             MODEL, own, seen, contact(carried), FamilyConstants(ELASTIC), short, log=lambda _: None
         )
-        found.append([*fit.velocity.tolist(), *fit.history.loss, *fit.history.constants["E"]])
-    assert found[1] == pytest.approx(found[0], rel=1e-5)
+        result.append([*fit.velocity.tolist(), *fit.history.loss, *fit.history.constants["E"]])
+    assert result[1] == pytest.approx(result[0], rel=1e-5)
 
 
 def test_steps_are_halved_where_a_law_is_too_stiff(carried):
     short = SMALL.model_copy(update=dict(iterations_contact=0, iterations_all=2, velocity_iterations=3))
     video = film(carried, changed(ELASTIC, E=1e5))
-    stiff, said = FamilyConstants(ELASTIC, {"E": 8e6}), []
-    fit = fit_pac_nerf(MODEL, carried, video, contact(carried), stiff, short, log=said.append)
-    assert fit.history.halvings[0] == 2 and any("0.00025 s" in line for line in said)
+    stiff, messages = FamilyConstants(ELASTIC, {"E": 8e6}), []
+    fit = fit_pac_nerf(MODEL, carried, video, contact(carried), stiff, short, log=messages.append)
+    assert fit.history.halvings[0] == 2 and any("0.00025 s" in line for line in messages)
     with refused("pac_nerf.families"):
         stiffer = FamilyConstants(ELASTIC, {"E": 1e12})
-        fit_pac_nerf(MODEL, carried, video, contact(carried), stiffer, short, log=said.append)
+        fit_pac_nerf(MODEL, carried, video, contact(carried), stiffer, short, log=messages.append)
 
 
 def test_constants_are_stored_as_published():
@@ -279,7 +279,7 @@ def test_elasticity_and_plasticity_share_their_moduli():
     assert float(mu) == pytest.approx(1e5 / 2.5) and float(lam + 2 * mu / 3) == pytest.approx(1e5 / 1.5)
 
 
-def test_stock_guesses_are_those_of_the_authors(loaded):
+def test_published_guesses_are_those_of_the_authors(loaded):
     """Their settings of the benchmark, in this project's conventions (docs/systems.md)."""
     families = loaded.pac_nerf.families
 
@@ -344,7 +344,7 @@ def test_frames_are_spread_evenly():
 
 
 class TestOwnParticles:
-    """The row that is judged on the particles that carry the field, and its pictures."""
+    """The row that is evaluated on the particles that carry the field, and its pictures."""
 
     CAMERAS = benchmark.cameras(24, torch.float64)
 
@@ -356,12 +356,12 @@ class TestOwnParticles:
         """At t = 0 the pictures are those of the field's particles where they were drawn, bit for bit."""
         (images,) = self.rendered(carried, carried.moving.x[None])
         for view, image in enumerate(images):
-            assert torch.equal(image, carried.field.draw(self.CAMERAS, view, carried.shown))
+            assert torch.equal(image, carried.field.draw(self.CAMERAS, view, carried.rendered))
         assert images.amin() < 0.6 and images.amax() <= 1
 
     def test_a_rigid_motion_by_voxels_is_one_of_the_cameras(self, carried):
         """Nodes are multiples of the voxel, so that a shift by some of them is the same as moving the cameras back."""
-        shift = carried.shown.voxel * torch.tensor([2.0, -1.0, 3.0], dtype=torch.float64)
+        shift = carried.rendered.voxel * torch.tensor([2.0, -1.0, 3.0], dtype=torch.float64)
         x = carried.moving.x
         (moved,) = self.rendered(carried, (x + shift)[None])
         viewmats = self.CAMERAS.viewmats.clone()
@@ -378,7 +378,7 @@ class TestOwnParticles:
         over_white, over_black = (self.rendered(carried, x, background=(c, c, c)) for c in (1.0, 0.0))
         through = (over_white - over_black).mean(-1)[0, 1].flatten()
         rays = camera_rays(self.CAMERAS, 1)
-        _, passed = carried.field.render(*carried.shown.seen(), *rays)
+        _, passed = carried.field.render(*carried.rendered.seen(), *rays)
         assert torch.allclose(through, passed, atol=1e-12) and passed.amin() < 0.3 and passed.amax() == 1
         assert torch.equal(self.rendered(carried, x), over_white)
 
@@ -392,7 +392,7 @@ class TestOwnParticles:
         assert len(list(renderer.batches(x, F))) == 3
 
     def test_its_own_particles_make_the_video_that_it_was_fitted_to(self, carried):
-        """The loss that fitting sees is that of these pictures: own law, own throw, own particles, all the way."""
+        """The loss that fitting sees is that of these pictures: own law, own motion and own particles."""
         spec = changed(ELASTIC, E=1e5)
         law = FamilyConstants(ELASTIC, {"E": 1e5}).law(MODEL.dt)
         video, k = film(carried, spec), len(FRAMES) - 1
@@ -433,7 +433,7 @@ class TestOwnParticles:
         x = carried.moving.x[None] + 0.01
         assert torch.allclose(
             self.rendered(on_gpu, x).cpu(), self.rendered(carried, x), atol=1e-9
-        )  # x is brought to the field
+        )  # x is moved to the device of the field
 
     def test_bad_input_is_named(self, carried):
         with refused("rollout"):

@@ -57,9 +57,9 @@ def test_total_deformation_is_exact_for_affine_motions():
     generator = torch.Generator().manual_seed(0)
     x0 = torch.rand(200, 3, generator=generator, dtype=torch.float64)
     A = torch.eye(3, dtype=torch.float64) + 0.5 * torch.rand(3, 3, generator=generator, dtype=torch.float64)
-    found = scalars.total_deformation(torch.stack([x0, x0 @ A.T + 0.3]))
+    result = scalars.total_deformation(torch.stack([x0, x0 @ A.T + 0.3]))
     assert torch.allclose(
-        found, torch.stack([torch.eye(3, dtype=torch.float64), A])[:, None].expand(2, 200, 3, 3)
+        result, torch.stack([torch.eye(3, dtype=torch.float64), A])[:, None].expand(2, 200, 3, 3)
     )
 
 
@@ -88,18 +88,18 @@ def test_a_folder_gives_truth_and_methods_with_gaussians_that_follow(scene):
         assert torch.allclose(motion.means[-1], wanted, atol=2e-6)
         assert torch.allclose(motion.covars[-1], A, atol=1e-8)
         assert set(motion.scalars) == set(scalars.QUANTITIES)
-    true, found = (scene.motion(name).scalars for name in ("truth", "constants"))
+    true, result = (scene.motion(name).scalars for name in ("truth", "constants"))
     for name in ("von_mises", "volume_ratio"):  # the same law and deformation
-        assert torch.allclose(true[name][-1].mean(), found[name][-1].mean(), rtol=1e-5)
+        assert torch.allclose(true[name][-1].mean(), result[name][-1].mean(), rtol=1e-5)
     assert true["speed"].allclose(torch.tensor(3.0).sqrt()), "the stored velocities"
-    assert found["plastic_strain"].max() < 1e-3, "all of it is elastic"
+    assert result["plastic_strain"].max() < 1e-3, "all of it is elastic"
 
 
 def test_a_law_of_another_time_step_is_shown_at_the_same_times(tmp_path, scene):
     place = make_project(tmp_path, methods=("nclaw",))
     arrays, attributes = read_arrays(place / "nclaw" / "rollout.h5", ("x", "F", "frames"))
-    finer = {**arrays, "frames": 2 * arrays["frames"]}
-    write_arrays(place / "nclaw" / "rollout.h5", finer, {"dt": attributes["dt"] / 2})
+    refined = {**arrays, "frames": 2 * arrays["frames"]}
+    write_arrays(place / "nclaw" / "rollout.h5", refined, {"dt": attributes["dt"] / 2})
     again = load_scene(find_scene(place)[1]).motion("nclaw")
     assert again.steps == scene.motion("nclaw").steps
     assert torch.allclose(again.scalars["speed"], scene.motion("nclaw").scalars["speed"])
@@ -132,9 +132,9 @@ def test_nothing_outside_the_folders_is_read(tmp_path):
     files = find_scene(place)[1]
     with refused("rollout.h5"):
         load_scene(files)
-    found = load_scene(files, skip_damaged=True)
-    assert [motion.name for motion in found.motions] == ["truth", "constants"]
-    assert "NCLaw is left out" in found.notes[0]
+    result = load_scene(files, skip_damaged=True)
+    assert [motion.name for motion in result.motions] == ["truth", "constants"]
+    assert "NCLaw is left out" in result.notes[0]
 
 
 def test_an_image_outside_the_data_is_not_read(tmp_path):
@@ -142,11 +142,11 @@ def test_an_image_outside_the_data_is_not_read(tmp_path):
     transforms = tmp_path / "project" / "data" / SCENE / "dynamic" / "transforms.json"
     (transforms.parent / "d_10.png").rename(tmp_path / "d_10.png")
     transforms.write_text(transforms.read_text().replace("d_10.png", "../../../../d_10.png"))
-    found = load_scene(find_scene(place)[1])
-    assert not found.views and "is outside" in found.notes[0]
+    result = load_scene(find_scene(place)[1])
+    assert not result.views and "is outside" in result.notes[0]
 
 
-def test_bad_folders_say_what_to_do(folder, tmp_path):
+def test_bad_folders_are_refused_with_a_remedy(folder, tmp_path):
     with refused("nothing"):
         find_scene(tmp_path / "nothing")
     (tmp_path / "results" / SCENE).mkdir(parents=True)
@@ -203,9 +203,9 @@ def test_the_file_holds_everything_and_is_the_same_twice(scene):
     for motion, entry in zip(scene.motions, meta["motions"], strict=True):
         assert entry["title"] == motion.title and set(entry["scalars"]) == set(motion.scalars)
         for name, values, wide in (("x", motion.x, 1), ("means", motion.means, 1)):
-            found, wanted = decode(data, entry[name]), values.transpose(1, 2).numpy()
+            result, wanted = decode(data, entry[name]), values.transpose(1, 2).numpy()
             reach = np.subtract(entry[name]["high"], entry[name]["low"]).max()
-            assert np.abs(found - wanted).max() <= 0.51 * reach / 65535 * wide + 1e-7
+            assert np.abs(result - wanted).max() <= 0.51 * reach / 65535 * wide + 1e-7
     assert meta["steps"] == list(STEPS) and len(meta["views"][0]["images"]) == len(STEPS)
     assert not re.search(r"(src|href)=|https?://|url\(|import\s*\(", text), "it loads nothing"
 

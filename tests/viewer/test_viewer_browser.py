@@ -16,9 +16,9 @@ from tests.support.browser import opened
 from tests.support.viewer_project import SCENE, STEPS, make_project, make_splat
 
 OF_VISER = "THREE.BufferGeometry.computeBoundingSphere(): Computed radius is NaN"
-"""What viser's client 1.1.1 says of every scene with splats, once: it draws them on quads whose corners have two
+"""The message of viser's client 1.1.1 for every scene with splats, once: it draws them on quads whose corners have two
 coordinates, of which three.js wants the bounding sphere. Without a sphere it draws them always, as it should. Once
-`test_viser_alone_says_it` fails, this exception can go."""
+`test_viser_alone_reports_it` fails, this exception can go."""
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def test_the_file_opens_without_a_server_plays_and_follows_its_controls(folder, 
     write_page(tmp_path / "viewer.html", load_scene(find_scene(folder)[1]))
     with opened((tmp_path / "viewer.html").as_uri()) as (page, complaints):
         page.wait_for_selector("body[data-state=ready]")
-        page.select_option("#right", "")  # one motion: the truth, beside nothing
+        page.select_option("#right", "")  # one motion: the truth alone
         first = picture(page)
         assert differ(first, np.full_like(first, 255)) > 0.02, "something is drawn"
 
@@ -65,14 +65,14 @@ def test_the_file_opens_without_a_server_plays_and_follows_its_controls(folder, 
         assert differ(first, picture(page)) > 0.005, "it plays"
 
         seen = at(0)
-        shown = {name: None for name in ("speed", "von_mises", "plastic_strain", "volume_ratio")}
-        for name in shown:
+        pictures = {name: None for name in ("speed", "von_mises", "plastic_strain", "volume_ratio")}
+        for name in pictures:
             page.select_option("#show", name)
-            shown[name] = at(2)
-            assert page.is_visible("#legend") and differ(seen, shown[name]) > 0.01
+            pictures[name] = at(2)
+            assert page.is_visible("#legend") and differ(seen, pictures[name]) > 0.01
         assert page.inner_text("#quantity") == "elastic volume ratio det F"
         page.select_option("#right", "1")
-        assert differ(picture(page), shown["volume_ratio"]) > 0.01, "side by side"
+        assert differ(picture(page), pictures["volume_ratio"]) > 0.01, "side by side"
         page.select_option("#show", "distance")
         assert "distance from NCLaw" in page.inner_text("#quantity") and "mm" in page.inner_text("#ends")
         page.select_option("#right", "")
@@ -125,18 +125,18 @@ def served(folder):
 
 @pytest.mark.slow
 def test_the_server_plays_moves_and_simulates(served):
-    assert served.host == "127.0.0.1", "this machine alone, unless told otherwise"
+    assert served.host == "127.0.0.1", "this machine alone, by default"
     with opened(f"http://127.0.0.1:{served.port}", 800, 600) as (page, complaints):
-        page.wait_for_selector("text=beside it", timeout=60_000)
+        page.wait_for_selector("text=next to it", timeout=60_000)
 
         def settled():
             """The picture once it stands still, and something has faded in."""
-            shown = picture(page)
+            current = picture(page)
             for _ in range(60):
-                before, shown = shown, picture(page)
-                if differ(before, shown) < 0.001 and differ(shown, np.full_like(shown, 255)) > 0.02:
+                before, current = current, picture(page)
+                if differ(before, current) < 0.001 and differ(current, np.full_like(current, 255)) > 0.02:
                     break
-            return shown
+            return current
 
         first = settled()
         assert differ(first, np.full_like(first, 255)) > 0.02, "something is drawn"
@@ -175,7 +175,7 @@ def test_the_server_plays_moves_and_simulates(served):
 
 
 @pytest.mark.slow
-def test_viser_alone_says_it():
+def test_viser_alone_reports_it():
     """A Gaussian, and nothing of ours."""
     viser = pytest.importorskip("viser")
     server = viser.ViserServer(port=8470, verbose=False)

@@ -60,17 +60,17 @@ def reached(live, condition, timeout=20.0):
 
 
 def test_it_simulates_what_a_rollout_does(live):
-    found = reached(live(), lambda s: s.time > 0.25)
-    live_x, steps = found.x, round(found.time / DT)
-    assert steps == pytest.approx(found.time / DT, abs=1e-6)
+    result = reached(live(), lambda s: s.time > 0.25)
+    live_x, steps = result.x, round(result.time / DT)
+    assert steps == pytest.approx(result.time / DT, abs=1e-6)
     model = MPM(**CONSTANTS, dt=DT, gravity=(0.0, -EARTH, 0.0))
     wanted = rollout(
         model, make_law("hencky", torch.float32), start(), steps=steps, frames=[steps], total=True
     )
     # float32, rounded where the frames part
     assert torch.allclose(live_x, wanted.x[0], atol=2e-4)
-    assert torch.allclose(found.total, wanted.F_total[0], atol=5e-3)
-    assert (found.F - torch.eye(3)).abs().max() > 1e-3, "it has touched the floor"
+    assert torch.allclose(result.total, wanted.F_total[0], atol=5e-3)
+    assert (result.F - torch.eye(3)).abs().max() > 1e-3, "it has touched the floor"
 
 
 def test_a_tilted_floor_is_turned_gravity(live):
@@ -78,14 +78,14 @@ def test_a_tilted_floor_is_turned_gravity(live):
     simulation.set_floor(20.0, -10.0)
     simulation.reset()
     simulation.do()
-    found = reached(simulation, lambda s: s.time > 0.1)
-    steps = round(found.time / DT)
+    result = reached(simulation, lambda s: s.time > 0.1)
+    steps = round(result.time / DT)
     gravity = tilted(20.0, -10.0).T @ [0.0, -EARTH, 0.0]
     model = MPM(**CONSTANTS, dt=DT, gravity=tuple(gravity.tolist()))
     law = make_law("hencky", torch.float32)
     wanted = rollout(model, law, start(height=0.5), steps=steps, frames=[steps])
     assert np.linalg.norm(gravity) == pytest.approx(EARTH) and abs(gravity[0]) > 1
-    assert torch.allclose(found.x, wanted.x[0], atol=2e-4)
+    assert torch.allclose(result.x, wanted.x[0], atol=2e-4)
     down = simulation.floor @ np.asarray(gravity)
     assert np.allclose(down, [0, -EARTH, 0]), "seen in the room it points down"
     place = np.array([0.7, 0.2, 0.4])
@@ -93,12 +93,12 @@ def test_a_tilted_floor_is_turned_gravity(live):
     assert np.allclose(back, place)
 
 
-def test_a_law_that_diverges_says_so_and_a_reset_helps(live):
+def test_a_law_that_diverges_is_reported_and_a_reset_helps(live):
     simulation = live(height=0.14)
     simulation.set_law(exploding(), DT)
-    found = reached(simulation, lambda s: s.trouble)
-    assert "unstable" in found.trouble or "not finite" in found.trouble
-    assert found.x.isfinite().all() and found.F.isfinite().all(), "the last good state stays on the screen"
+    result = reached(simulation, lambda s: s.trouble)
+    assert "unstable" in result.trouble or "not finite" in result.trouble
+    assert result.x.isfinite().all() and result.F.isfinite().all(), "the last good state stays on the screen"
     before = simulation.do()
     assert simulation.wait(before.number + 2).time == before.time, "it waits"
     simulation.set_law(make_law("hencky", torch.float32), DT)
@@ -110,18 +110,18 @@ def test_a_law_that_diverges_says_so_and_a_reset_helps(live):
 def test_an_error_in_foreign_code_ends_nothing(live):
     class Broken(Elasticity):
         def response(self, F, weights):
-            raise RuntimeError("no such thing")
+            raise RuntimeError("no such file")
 
     law = make_law("hencky", torch.float32)
     simulation = live(height=0.14)
     simulation.set_law(Law(Broken(), law.plasticity), DT)
-    assert "RuntimeError: no such thing" in reached(simulation, lambda s: s.trouble).trouble
+    assert "RuntimeError: no such file" in reached(simulation, lambda s: s.trouble).trouble
     simulation.set_law(law, DT)
     simulation.reset()
     assert reached(simulation, lambda s: s.time > 0.02).trouble is None
 
 
-def test_reset_brings_the_start_back_bit_by_bit(live):
+def test_reset_restores_the_start_bit_by_bit(live):
     simulation = live()
     reached(simulation, lambda s: s.time > 0.1)
     simulation.add(start(), make_law("von_mises", torch.float32), DT)
@@ -129,9 +129,9 @@ def test_reset_brings_the_start_back_bit_by_bit(live):
     assert simulation.do().counts == (200, 200)
     simulation.run(False)
     simulation.reset()
-    found = simulation.do()
-    assert torch.equal(found.x, start().x) and found.time == 0 and found.counts == (200,)
-    assert torch.equal(found.F, torch.eye(3).expand(200, 3, 3))
+    result = simulation.do()
+    assert torch.equal(result.x, start().x) and result.time == 0 and result.counts == (200,)
+    assert torch.equal(result.F, torch.eye(3).expand(200, 3, 3))
 
 
 def test_uneven_frames_do_not_make_the_numbers_on_the_screen_larger(monkeypatch):
@@ -174,19 +174,19 @@ def test_launch_drop_and_gravity(live):
     simulation.launch((0.0, 1000.0, 0.0))
     assert torch.allclose(simulation.do().v, torch.tensor([0.0, MAX_SPEED, 0.0]))
     simulation.launch((float("nan"), 0.0, 0.0))
-    found = simulation.do()
-    assert "not finite" in found.notice and found.v.isfinite().all() and found.trouble is None
+    result = simulation.do()
+    assert "not finite" in result.notice and result.v.isfinite().all() and result.trouble is None
     simulation.drop(0.4)
-    found = simulation.do()
-    assert found.x[:, 1].min() == pytest.approx(0.4, abs=1e-6) and found.v.abs().max() == 0
+    result = simulation.do()
+    assert result.x[:, 1].min() == pytest.approx(0.4, abs=1e-6) and result.v.abs().max() == 0
     simulation.drop(50.0)
     assert simulation.do().x[:, 1].max() < 1
     simulation.drop(0.4)
     simulation.set_gravity(0.0)
     simulation.run(True)
     begun = simulation.do().time
-    found = reached(simulation, lambda s: s.time > begun + 0.05)
-    assert found.x[:, 1].min() == pytest.approx(0.4, abs=1e-5), "it hovers"
+    result = reached(simulation, lambda s: s.time > begun + 0.05)
+    assert result.x[:, 1].min() == pytest.approx(0.4, abs=1e-5), "it hovers"
 
 
 def test_a_held_body_comes_to_the_hand_and_flies_on(live):
@@ -199,10 +199,10 @@ def test_a_held_body_comes_to_the_hand_and_flies_on(live):
     simulation.hold((0.3, 0.6, 0.5))
     reached(simulation, lambda s: centre(s)[0] < 0.6)
     simulation.hold(None)
-    found = simulation.do()
-    assert found.v[:, 0].mean() < -0.5, "it keeps the velocity of the hand"
+    result = simulation.do()
+    assert result.v[:, 0].mean() < -0.5, "it keeps the velocity of the hand"
     simulation.hold((9.0, -9.0, 0.5))
-    assert reached(simulation, lambda s: s.time > found.time + 0.4).trouble is None, "never through a wall"
+    assert reached(simulation, lambda s: s.time > result.time + 0.4).trouble is None, "never through a wall"
 
 
 def test_the_weight_of_the_adaptor_goes_from_the_prior_on(live):
@@ -224,15 +224,15 @@ def test_bodies_are_put_above_each_other_until_there_is_no_room(live):
     simulation = live(height=0.2, paused=True)
     law = make_law("hencky", torch.float32)
     simulation.add(start(), law, 5e-4)
-    found = simulation.do()
-    first, second = found.x.split(list(found.counts))
-    assert second[:, 1].min() - first[:, 1].max() > 1 / 16 and found.dt == 5e-4, "the smaller step counts"
+    result = simulation.do()
+    first, second = result.x.split(list(result.counts))
+    assert second[:, 1].min() - first[:, 1].max() > 1 / 16 and result.dt == 5e-4, "the smaller step counts"
     simulation.add(start(), law, DT)
-    found = simulation.do()
-    assert "no room" in found.notice and found.counts == (200, 200) and found.trouble is None
+    result = simulation.do()
+    assert "no room" in result.notice and result.counts == (200, 200) and result.trouble is None
     simulation.run(True)
-    found = reached(simulation, lambda s: s.time > 0.05)
-    assert found.trouble is None
+    result = reached(simulation, lambda s: s.time > 0.05)
+    assert result.trouble is None
 
 
 def test_a_network_is_not_simulated_at_another_step_than_its_own(live):
@@ -240,16 +240,16 @@ def test_a_network_is_not_simulated_at_another_step_than_its_own(live):
     simulation.set_law(network, DT)
     assert simulation.do().notice is None
     simulation.add(start(), make_law("hencky", torch.float32), DT / 2)
-    found = simulation.do()
-    assert "another material" in found.notice and found.counts == (200,) and found.dt == DT
+    result = simulation.do()
+    assert "another material" in result.notice and result.counts == (200,) and result.dt == DT
     simulation.add(start(), network, DT)
     simulation.set_law(neural_law(seed=2), DT / 2)
-    found = simulation.do()
-    assert "reset" in found.notice and found.counts == (200, 200) and found.dt == DT
+    result = simulation.do()
+    assert "reset" in result.notice and result.counts == (200, 200) and result.dt == DT
     simulation.reset()
     simulation.set_law(neural_law(seed=2), DT / 2)
-    found = simulation.do()
-    assert found.notice is None and found.dt == DT / 2
+    result = simulation.do()
+    assert result.notice is None and result.dt == DT / 2
 
 
 def test_commands_are_not_held_up_by_a_slow_law(live):

@@ -43,7 +43,7 @@ def test_laws_of_the_results_are_found_with_their_time_steps(project):
         first_law(files, {})
 
 
-def test_a_prior_has_the_step_of_the_scene_that_is_shown(tmp_path):
+def test_a_prior_has_the_step_of_the_displayed_scene(tmp_path):
     settings, files = find_scene(make_project(tmp_path / "project"))
     other = settings.scenes[SCENE].model_copy(update={"dt": 2e-3})
     settings = settings.model_copy(update={"scenes": {**settings.scenes, "Other": other}})

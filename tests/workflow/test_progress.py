@@ -47,7 +47,7 @@ def test_a_bar_with_loss_and_time_left(terminal, tmp_path):
         time.sleep(2 * progress.MOVING_INTERVAL)
         run.progress(5, 10, 0.25)
         text = written()
-        run.say("loss 0.5 -> 0.25")
+        run.log("loss 0.5 -> 0.25")
     assert "\rmaterial Ball  " in text and re.search(r"5/10, loss 0.25, 00:0\d left", text)
     assert "█" * 12 + " " * 12 in text
     assert "\rmaterial Ball: loss 0.5 -> 0.25\r\n" in written()

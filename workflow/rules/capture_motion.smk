@@ -1,9 +1,5 @@
 """Masks of photographs and videos, time offsets between cameras, and free flight of a capture. Needs captures.smk."""
 
-MATTES = f"{DATA}/{{capture}}/videos/{{throw}}/{{camera}}/transforms.json"
-VIDEO_MASKS = f"{RESULTS}/{{capture}}/masks/{{throw}}/{{camera}}"
-FLIGHT = f"{RESULTS}/{{capture}}/flight/{{throw}}"
-
 
 rule saliency_network:
     output:
@@ -16,8 +12,8 @@ rule capture_photograph_masks:
     input:
         room=f"{DATA}/{{capture}}/room/transforms.json",
         report=f"{RESULTS}/{{capture}}/room.json",
-        network=saliency_network,
-        own=of_capture(photograph_masks),
+        network=of_capture(saliency_network),
+        own=of_capture(lambda capture: list(map(str, capture.own_masks("photographs").values()))),
     output:
         transforms=f"{DATA}/{{capture}}/static/transforms.json",
         report=f"{RESULTS}/{{capture}}/masks/photographs.json",
@@ -27,9 +23,9 @@ rule capture_photograph_masks:
     conda:
         CAPTURE_ENVIRONMENT
     params:
-        longest=of_capture(lambda capture: capture.settings.longest),
+        longest=capture_setting("longest"),
         board=of_capture(lambda capture: capture.settings.board and capture.settings.board.plain()),
-        center=of_capture(lambda capture: capture.settings.center),
+        center=capture_setting("center"),
         name="{capture}",
     script:
         "../scripts/capture_photograph_masks.py"
@@ -37,13 +33,13 @@ rule capture_photograph_masks:
 
 rule capture_video_masks:
     input:
-        video=checked(
-            lambda wildcards: str(capture_named(wildcards.capture).video(wildcards.throw, wildcards.camera))
-        ),
-        timeline=f"{RESULTS}/{{capture}}/frames/{{throw}}/{{camera}}.json",
+        video=VIDEO_FILE,
+        timeline=f"{VIDEO_FRAMES}.json",
         room=f"{DATA}/{{capture}}/room/transforms.json",
         report=f"{RESULTS}/{{capture}}/room.json",
-        own=video_masks,
+        own=of_video(
+            lambda capture, take, camera: list(map(str, capture.own_masks(f"{take}/{camera}").values()))
+        ),
     output:
         transforms=MATTES,
         report=f"{VIDEO_MASKS}.json",
@@ -56,19 +52,19 @@ rule capture_video_masks:
         mem_mb=8000,
     params:
         camera="{camera}",
-        rate=filmed_rate,
-        longest=of_capture(lambda capture: capture.settings.longest),
-        name="{capture}, {throw}, {camera}",
+        rate=VIDEO_RATE,
+        longest=capture_setting("longest"),
+        name="{capture}, {take}, {camera}",
     script:
         "../scripts/capture_video_masks.py"
 
 
 rule capture_flight:
     input:
-        videos=throw_videos,
-        transforms=of_throw(MATTES),
-        reports=of_throw(f"{VIDEO_MASKS}.json"),
-        timelines=of_throw(f"{RESULTS}/{{capture}}/frames/{{throw}}/{{camera}}.json"),
+        videos=TAKE_VIDEOS,
+        transforms=of_take_cameras(MATTES),
+        reports=of_take_cameras(f"{VIDEO_MASKS}.json"),
+        timelines=of_take_cameras(f"{VIDEO_FRAMES}.json"),
     output:
         flight=f"{FLIGHT}.json",
         picture=f"{FLIGHT}.png",
@@ -77,10 +73,10 @@ rule capture_flight:
     conda:
         CAPTURE_ENVIRONMENT
     params:
-        cameras=filmed_cameras,
+        cameras=TAKE_CAMERAS,
         timing=camera_timing,
         metric=True,
-        name="{capture}, {throw}",
+        name="{capture}, {take}",
     script:
         "../scripts/capture_flight.py"
 
@@ -89,15 +85,15 @@ rule capture_motion_page:
     input:
         photographs=f"{RESULTS}/{{capture}}/masks/photographs.json",
         photograph_sheet=f"{RESULTS}/{{capture}}/masks/photographs.png",
-        reports=of_videos("json", "masks"),
-        sheets=of_videos("png", "masks"),
-        flights=of_throws(f"{FLIGHT}.json"),
-        pictures=of_throws(f"{FLIGHT}.png"),
+        reports=of_videos(f"{VIDEO_MASKS}.json"),
+        sheets=of_videos(f"{VIDEO_MASKS}.png"),
+        flights=of_takes(f"{FLIGHT}.json"),
+        pictures=of_takes(f"{FLIGHT}.png"),
     output:
         page=f"{RESULTS}/{{capture}}/motion.md",
     params:
         title="{capture}: masks and free flight",
-        videos=of_capture(filmed_by),
-        throws=of_capture(lambda capture: list(capture.takes)),
+        videos=of_capture(videos_of),
+        takes=of_capture(lambda capture: list(capture.takes)),
     script:
         "../scripts/capture_motion_page.py"

@@ -4,15 +4,15 @@
 rule capture_registration:
     input:
         kernels=kernels("rendering"),
-        gaussians=of_the_object("gaussians.ply"),
-        mesh=of_the_object("mesh.ply"),
-        sampled=of_the_object("sampled_particles.h5"),
-        particles=of_the_object("particles.h5"),
-        binding=of_the_object("binding.h5"),
-        photographs=of_thrown(lambda wildcards: f"{DATA}/{wildcards.capture}/static/transforms.json"),
-        transforms=of_filmed(MATTES),
-        timelines=of_filmed(f"{RESULTS}/{{capture}}/frames/{{throw}}/{{camera}}.json"),
-        flight=of_thrown(lambda wildcards: FLIGHT.format(**vars(wildcards)) + ".json"),
+        gaussians=captured_file(f"{RESULTS}/{{capture}}/gaussians.ply"),
+        mesh=captured_file(f"{RESULTS}/{{capture}}/mesh.ply"),
+        sampled=captured_file(f"{RESULTS}/{{capture}}/sampled_particles.h5"),
+        particles=captured_file(f"{RESULTS}/{{capture}}/particles.h5"),
+        binding=captured_file(f"{RESULTS}/{{capture}}/binding.h5"),
+        photographs=captured_file(f"{DATA}/{{capture}}/static/transforms.json"),
+        transforms=of_take_cameras(MATTES),
+        timelines=of_take_cameras(f"{VIDEO_FRAMES}.json"),
+        flight=captured_file(f"{FLIGHT}.json"),
     output:
         gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
@@ -23,10 +23,10 @@ rule capture_registration:
         registration=f"{RESULTS}/{{scene}}/registration.json",
         picture=f"{RESULTS}/{{scene}}/registration.png",
     wildcard_constraints:
-        scene=THROW_SCENE,
+        scene=TAKE_SCENE,
     params:
         cameras=lambda wildcards: SETTINGS.scene(wildcards.scene).captured.cameras,
-        timing=of_thrown(camera_timing),
+        timing=camera_timing,
         name="{scene}",
     script:
         "../scripts/capture_registration.py"

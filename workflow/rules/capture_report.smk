@@ -5,27 +5,22 @@ SHOWN = f"{DATA}/{{scene}}/shown/transforms.json"
 
 rule capture_shown:
     input:
-        videos=of_thrown(throw_videos),
-        mattes=of_filmed(MATTES),
+        videos=TAKE_VIDEOS,
+        mattes=of_take_cameras(MATTES),
         dynamic=f"{DATA}/{{scene}}/dynamic/transforms.json",
         registration=f"{RESULTS}/{{scene}}/registration.json",
-        room=of_thrown(lambda capture: f"{DATA}/{capture.capture}/room/transforms.json"),
-        report=of_thrown(lambda capture: f"{RESULTS}/{capture.capture}/room.json"),
+        room=captured_file(f"{DATA}/{{capture}}/room/transforms.json"),
+        report=captured_file(f"{RESULTS}/{{capture}}/room.json"),
     output:
         transforms=SHOWN,
     wildcard_constraints:
-        scene=OWN_THROW,
+        scene=OWN_TAKE,
     conda:
         CAPTURE_ENVIRONMENT
     params:
         cameras=scene_cameras,
-        rates=lambda wildcards: [
-            of_thrown(lambda capture: filmed_rate(SimpleNamespace(**vars(capture), camera=camera)))(
-                wildcards
-            )
-            for camera in scene_cameras(wildcards)
-        ],
-        longest=of_thrown_capture(lambda capture: capture.settings.longest),
+        rates=camera_settings("rate"),
+        longest=capture_setting("longest"),
         width=SETTINGS.captures.shown,
     script:
         "../scripts/capture_shown.py"
@@ -33,21 +28,21 @@ rule capture_shown:
 
 rule released_shown:
     input:
-        folders=of_thrown(released_folders),
-        mattes=of_filmed(MATTES),
+        folders=RELEASED_FOLDERS,
+        mattes=of_take_cameras(MATTES),
         dynamic=f"{DATA}/{{scene}}/dynamic/transforms.json",
         registration=f"{RESULTS}/{{scene}}/registration.json",
     output:
         transforms=SHOWN,
     wildcard_constraints:
-        scene=RELEASED_THROW,
+        scene=RELEASED_TAKE,
     conda:
         CAPTURE_ENVIRONMENT
     params:
         cameras=scene_cameras,
-        settings=of_thrown(released_settings),
-        name=of_thrown(lambda capture: capture.capture),
-        longest=of_thrown_capture(lambda capture: capture.settings.longest),
+        settings=RELEASED_SETTINGS,
+        name=of_capture(lambda capture: capture.folder.name),
+        longest=capture_setting("longest"),
         width=SETTINGS.captures.shown,
     script:
         "../scripts/released_shown.py"
@@ -65,12 +60,12 @@ rule capture_view:
         video=f"{RESULTS}/{{scene}}/{{method}}/views/{{camera}}.mp4",
         measures=f"{RESULTS}/{{scene}}/{{method}}/views/{{camera}}.json",
     wildcard_constraints:
-        scene=THROW_SCENE,
+        scene=TAKE_SCENE,
     resources:
         gpu=GPU,
     params:
         view=scene_view,
-        title=lambda wildcards: method_names(wildcards)[wildcards.method].partition(",")[0],
+        title=lambda wildcards: report_titles(wildcards.method)[wildcards.method].partition(",")[0],
         density=scene_setting("density"),
         carrier=of_bodies(shared_carrier),
         gaussian_motion=gaussian_motion,
@@ -88,7 +83,12 @@ rule capture_view:
 
 rule capture_images:
     input:
-        measures=measured_files("json"),
+        measures=of_report(
+            lambda name, method: [
+                f"{take_run(name, cell['throw'], cell['method'])}/views/{cell['camera']}.json"
+                for cell in report_cells(name, method)
+            ]
+        ),
     output:
         csv=f"{RESULTS}/{{capture}}/{{method}}/images.csv",
         json=f"{RESULTS}/{{capture}}/{{method}}/images.json",
@@ -104,9 +104,7 @@ rule capture_curves:
         rollout=of_report(lambda name, method: f"{RESULTS}/{training_scene(name)}/{method}/rollout.h5"),
         laws=of_report(
             lambda name, method: [
-                file
-                for each in reported_methods(method)
-                for file in report_law(name, each)["files"].values()
+                file for law in report_laws(name, method).values() for file in law["files"].values()
             ]
         ),
     output:
@@ -114,12 +112,10 @@ rule capture_curves:
         picture=f"{RESULTS}/{{capture}}/{{method}}/stress_curves.png",
     params:
         method="{method}",
-        titles=method_names,
-        laws=of_report(
-            lambda name, method: {each: report_law(name, each) for each in reported_methods(method)}
-        ),
-        dt=of_capture(lambda capture: capture.settings.dt),
-        scale=of_capture(lambda capture: capture.settings.scale),
+        titles=of_report(lambda name, method: report_titles(method)),
+        laws=of_report(report_laws),
+        dt=capture_setting("dt"),
+        scale=capture_setting("scale"),
         rate=SETTINGS.figures.shear_rate,
         total_shear=SETTINGS.figures.total_shear,
         model_std=SETTINGS.identify.model_std,
@@ -130,29 +126,44 @@ rule capture_curves:
         "../scripts/capture_curves.py"
 
 
+# Released captures come with poses and masks, which their reports do not check.
+REPORTED = {
+    "timelines": of_videos(f"{VIDEO_FRAMES}.json"),
+    "photographs": f"{RESULTS}/{{capture}}/masks/photographs.json",
+    "photograph_sheet": f"{RESULTS}/{{capture}}/masks/photographs.png",
+    "masks": of_videos(f"{VIDEO_MASKS}.json"),
+    "mask_sheets": of_videos(f"{VIDEO_MASKS}.png"),
+    "flights": of_takes(f"{FLIGHT}.json"),
+    "flight_pictures": of_takes(f"{FLIGHT}.png"),
+    "object": f"{RESULTS}/{{capture}}/gaussians.json",
+    "registrations": of_takes(f"{RESULTS}/{scene_name('{capture}', '{take}')}/registration.json"),
+    "registration_pictures": of_takes(f"{RESULTS}/{scene_name('{capture}', '{take}')}/registration.png"),
+    "predictions": of_report(
+        lambda name, method: [
+            f"{take_run(name, take, method)}/prediction.json" for take in capture_named(name).takes
+        ]
+    ),
+    "films": of_report(
+        lambda name, method: [
+            f"{take_run(name, take, method)}/views/{camera}.mp4"
+            for take, camera in videos_of(capture_named(name))
+        ]
+    ),
+    "images": f"{RESULTS}/{{capture}}/{{method}}/images.json",
+    "table": f"{RESULTS}/{{capture}}/{{method}}/images.csv",
+    "curves": f"{RESULTS}/{{capture}}/{{method}}/stress_curves.json",
+    "curves_picture": f"{RESULTS}/{{capture}}/{{method}}/stress_curves.png",
+    "identified": of_report(report_identified),
+}
+
+
 rule capture_report:
     input:
+        **REPORTED,
         room=f"{RESULTS}/{{capture}}/room.json",
         cameras=f"{RESULTS}/{{capture}}/cameras.png",
         floor=f"{RESULTS}/{{capture}}/floor.png",
-        timelines=of_videos("json"),
-        frame_sheets=of_videos("png"),
-        photographs=f"{RESULTS}/{{capture}}/masks/photographs.json",
-        photograph_sheet=f"{RESULTS}/{{capture}}/masks/photographs.png",
-        masks=of_videos("json", "masks"),
-        mask_sheets=of_videos("png", "masks"),
-        flights=of_throws(f"{FLIGHT}.json"),
-        flight_pictures=of_throws(f"{FLIGHT}.png"),
-        object=f"{RESULTS}/{{capture}}/gaussians.json",
-        registrations=thrown_files("registration.json"),
-        registration_pictures=thrown_files("registration.png"),
-        predictions=own_files("prediction.json"),
-        films=own_files("views/{camera}.mp4", cameras=True),
-        images=f"{RESULTS}/{{capture}}/{{method}}/images.json",
-        table=f"{RESULTS}/{{capture}}/{{method}}/images.csv",
-        curves=f"{RESULTS}/{{capture}}/{{method}}/stress_curves.json",
-        curves_picture=f"{RESULTS}/{{capture}}/{{method}}/stress_curves.png",
-        identified=of_report(report_identified),
+        frame_sheets=of_videos(f"{VIDEO_FRAMES}.png"),
     output:
         page=f"{RESULTS}/{{capture}}/{{method}}/report.html",
     wildcard_constraints:
@@ -160,34 +171,17 @@ rule capture_report:
     params:
         capture="{capture}",
         method="{method}",
-        titles=method_names,
+        titles=of_report(lambda name, method: report_titles(method)),
         prior=PRIOR,
         constants=CONSTANTS,
-        videos=of_capture(filmed_by),
+        videos=of_capture(videos_of),
         facts=of_report(report_facts),
     script:
         "../scripts/capture_report.py"
 
 
-# Poses and masks come with the files and are not part of the report.
 use rule capture_report as released_report with:
     input:
-        timelines=of_videos("json"),
-        photographs=f"{RESULTS}/{{capture}}/masks/photographs.json",
-        photograph_sheet=f"{RESULTS}/{{capture}}/masks/photographs.png",
-        masks=of_videos("json", "masks"),
-        mask_sheets=of_videos("png", "masks"),
-        flights=of_throws(f"{FLIGHT}.json"),
-        flight_pictures=of_throws(f"{FLIGHT}.png"),
-        object=f"{RESULTS}/{{capture}}/gaussians.json",
-        registrations=thrown_files("registration.json"),
-        registration_pictures=thrown_files("registration.png"),
-        predictions=own_files("prediction.json"),
-        films=own_files("views/{camera}.mp4", cameras=True),
-        images=f"{RESULTS}/{{capture}}/{{method}}/images.json",
-        table=f"{RESULTS}/{{capture}}/{{method}}/images.csv",
-        curves=f"{RESULTS}/{{capture}}/{{method}}/stress_curves.json",
-        curves_picture=f"{RESULTS}/{{capture}}/{{method}}/stress_curves.png",
-        identified=of_report(report_identified),
+        **REPORTED,
     wildcard_constraints:
         capture=RELEASED_CAPTURE,

@@ -3,21 +3,21 @@
 
 rule capture_video:
     input:
-        transforms=of_filmed(MATTES),
-        timelines=of_filmed(f"{RESULTS}/{{capture}}/frames/{{throw}}/{{camera}}.json"),
+        transforms=of_take_cameras(MATTES),
+        timelines=of_take_cameras(f"{VIDEO_FRAMES}.json"),
         registration=f"{RESULTS}/{{scene}}/registration.json",
     output:
         transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
     wildcard_constraints:
-        scene=THROW_SCENE,
+        scene=TAKE_SCENE,
     params:
         cameras=lambda wildcards: SETTINGS.scene(wildcards.scene).captured.cameras,
-        timing=of_thrown(camera_timing),
-        exposures=of_thrown(camera_exposures),
+        timing=camera_timing,
+        exposures=camera_settings("exposure", 0.0),
         dt=scene_setting("dt"),
-        duration=of_thrown_capture(lambda capture: capture.settings.duration),
-        frames=of_thrown_capture(lambda capture: capture.settings.frames),
-        width=of_thrown_capture(lambda capture: capture.settings.width),
+        duration=capture_setting("duration"),
+        frames=capture_setting("frames"),
+        width=capture_setting("width"),
         name="{scene}",
     script:
         "../scripts/capture_video.py"

@@ -15,27 +15,30 @@ rule capture_board:
 
 rule capture_frames:
     input:
-        video=checked(
-            lambda wildcards: str(capture_named(wildcards.capture).video(wildcards.throw, wildcards.camera))
-        ),
+        video=VIDEO_FILE,
     output:
-        timeline=f"{RESULTS}/{{capture}}/frames/{{throw}}/{{camera}}.json",
-        sheet=f"{RESULTS}/{{capture}}/frames/{{throw}}/{{camera}}.png",
+        timeline=f"{VIDEO_FRAMES}.json",
+        sheet=f"{VIDEO_FRAMES}.png",
     wildcard_constraints:
         capture=OWN_CAPTURE,
     params:
-        rate=filmed_rate,
-        name=lambda wildcards: f"{wildcards.capture}, {wildcards.throw}, {wildcards.camera}",
+        rate=VIDEO_RATE,
+        name="{capture}, {take}, {camera}",
     script:
         "../scripts/capture_frames.py"
 
 
 rule capture_poses:
     input:
-        photographs=of_capture(capture_photographs),
-        stills=of_capture(capture_stills),
+        photographs=PHOTOGRAPHS,
+        stills=STILLS,
         lenses=of_capture(lambda capture: capture_file(capture, capture.settings.lens)),
-        given=of_capture(given_poses),
+        given=of_capture(
+            lambda capture: capture_file(
+                capture,
+                None if capture.settings.poses in ("photographs", "board") else capture.settings.poses,
+            )
+        ),
     output:
         poses=f"{RESULTS}/{{capture}}/poses.json",
         points=f"{RESULTS}/{{capture}}/points.ply",
@@ -49,8 +52,8 @@ rule capture_poses:
         mem_mb=8000,
         runtime=240,
     params:
-        poses=of_capture(lambda capture: capture.settings.poses),
-        seed=of_capture(lambda capture: capture.settings.seed),
+        poses=capture_setting("poses"),
+        seed=capture_setting("seed"),
         board=of_capture(
             lambda capture: (capture.settings.board.plain() if capture.settings.poses == "board" else None)
         ),
@@ -60,8 +63,8 @@ rule capture_poses:
 
 rule capture_room:
     input:
-        photographs=of_capture(capture_photographs),
-        stills=of_capture(capture_stills),
+        photographs=PHOTOGRAPHS,
+        stills=STILLS,
         poses=f"{RESULTS}/{{capture}}/poses.json",
         points=f"{RESULTS}/{{capture}}/points.ply",
     output:
@@ -84,12 +87,12 @@ rule capture_page:
         room=f"{RESULTS}/{{capture}}/room.json",
         cameras=f"{RESULTS}/{{capture}}/cameras.png",
         floor=f"{RESULTS}/{{capture}}/floor.png",
-        timelines=of_videos("json"),
-        sheets=of_videos("png"),
+        timelines=of_videos(f"{VIDEO_FRAMES}.json"),
+        sheets=of_videos(f"{VIDEO_FRAMES}.png"),
     output:
         page=f"{RESULTS}/{{capture}}/capture.md",
     params:
         title="{capture}",
-        videos=of_capture(filmed_by),
+        videos=of_capture(videos_of),
     script:
         "../scripts/capture_page.py"

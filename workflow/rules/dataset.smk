@@ -32,7 +32,7 @@ rule ground_truth:
     input:
         kernels=kernels("geometry", "simulation"),
     output:
-        particles=f"{DATA}/{{scene}}/truth.h5",
+        truth=f"{DATA}/{{scene}}/truth.h5",
     wildcard_constraints:
         scene=f"{scenes_with('truth', 'made')}|experiments/({'|'.join(SETTINGS.experiments) or 'none'})",
     resources:
@@ -51,71 +51,42 @@ rule ground_truth:
         "../scripts/ground_truth.py"
 
 
-rule render_static:
-    input:
-        particles=f"{DATA}/{{scene}}/truth.h5",
-    output:
-        transforms=f"{DATA}/{{scene}}/static/transforms.json",
-    wildcard_constraints:
-        scene=scenes_with("static", "made"),
-    threads: BLENDER.threads
-    resources:
-        gpu=RENDER_GPU,
-        runtime=render_minutes(SETTINGS.dataset.static, 1),
-    params:
-        scene=scene_setting("shape", "size", "height", "center", "appearance"),
-        images=SETTINGS.dataset.static.plain(),
-        threads=BLENDER.threads,
-        device=RENDER_DEVICE,
-    script:
-        "../scripts/render_static.py"
+for part, part_images in (("static", SETTINGS.dataset.static), ("dynamic", SETTINGS.dataset.dynamic)):
 
+    rule:
+        name:
+            f"render_{part}"
+        input:
+            truth=f"{DATA}/{{scene}}/truth.h5",
+        output:
+            transforms=f"{DATA}/{{scene}}/{part}/transforms.json",
+        wildcard_constraints:
+            scene=scenes_with(part, "made"),
+        threads: BLENDER.threads
+        resources:
+            gpu=RENDER_GPU,
+            runtime=render_minutes(part),
+        params:
+            scene=scene_setting("shape", "size", "height", "center", "appearance"),
+            moving=part == "dynamic",
+            images=part_images.plain(),
+            threads=BLENDER.threads,
+            device=RENDER_DEVICE,
+        script:
+            "../scripts/render.py"
 
-rule render_dynamic:
-    input:
-        particles=f"{DATA}/{{scene}}/truth.h5",
-    output:
-        transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
-    wildcard_constraints:
-        scene=scenes_with("dynamic", "made"),
-    threads: BLENDER.threads
-    resources:
-        gpu=RENDER_GPU,
-        runtime=lambda wildcards: render_minutes(
-            SETTINGS.dataset.dynamic, len(SETTINGS.frame_steps(wildcards.scene))
-        ),
-    params:
-        scene=scene_setting("shape", "size", "height", "center", "appearance"),
-        images=SETTINGS.dataset.dynamic.plain(),
-        threads=BLENDER.threads,
-        device=RENDER_DEVICE,
-    script:
-        "../scripts/render_dynamic.py"
-
-
-rule supplied_static:
-    input:
-        images=supplied_list("static"),
-    output:
-        transforms=f"{DATA}/{{scene}}/static/transforms.json",
-    wildcard_constraints:
-        scene=scenes_with("static", "supplied"),
-    params:
-        images=supplied_world,
-        dt=scene_setting("dt"),
-        steps=[0],
-    script:
-        "../scripts/supplied.py"
-
-
-use rule supplied_static as supplied_dynamic with:
-    input:
-        images=supplied_list("dynamic"),
-    output:
-        transforms=f"{DATA}/{{scene}}/dynamic/transforms.json",
-    wildcard_constraints:
-        scene=scenes_with("dynamic", "supplied"),
-    params:
-        images=supplied_world,
-        dt=scene_setting("dt"),
-        steps=frame_steps,
+    rule:
+        name:
+            f"supplied_{part}"
+        input:
+            images=supplied_list(part),
+        output:
+            transforms=f"{DATA}/{{scene}}/{part}/transforms.json",
+        wildcard_constraints:
+            scene=scenes_with(part, "supplied"),
+        params:
+            images=supplied_world,
+            dt=scene_setting("dt"),
+            steps=frame_steps if part == "dynamic" else [0],
+        script:
+            "../scripts/supplied.py"

@@ -5,7 +5,7 @@ rule film:
     input:
         **body_files(),
         kernels=kernels("rendering"),
-        transforms=of_scene("dynamic/transforms.json"),
+        transforms=of_data("dynamic/transforms.json"),
         rollouts=expand(f"{RESULTS}/{{{{scene}}}}/{{method}}/rollout.h5", method=SETTINGS.demo.methods),
     output:
         mp4=f"{RESULTS}/{{scene}}/film.mp4",

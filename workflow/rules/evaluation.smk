@@ -4,11 +4,11 @@
 rule initial_state:
     input:
         kernels=kernels("geometry"),
-        truth=of_scene("truth.h5"),
-        gaussians=of_chain("gaussians.json"),
-        mesh=of_chain("mesh.ply"),
-        particles=of_chain("particles.h5"),
-        velocity=of_chain("velocity.json"),
+        truth=of_data("truth.h5"),
+        gaussians=of_replicate("gaussians.json"),
+        mesh=of_replicate("mesh.ply"),
+        particles=of_replicate("particles.h5"),
+        velocity=of_replicate("velocity.json"),
     output:
         report=f"{RESULTS}/{{scene}}/initial_state.json",
     wildcard_constraints:
@@ -23,8 +23,8 @@ rule initial_state:
 rule tracers:
     input:
         kernels=kernels("geometry"),
-        truth=of_scene("truth.h5"),
-        mesh=of_chain("mesh.ply"),
+        truth=of_data("truth.h5"),
+        mesh=of_replicate("mesh.ply"),
     output:
         tracers=f"{RESULTS}/{{scene}}/tracers.h5",
     wildcard_constraints:
@@ -41,8 +41,8 @@ rule evaluate:
         unpack(of_bodies(model_files)),
         **body_files(),
         kernels=of_bodies(model_kernels),
-        truth=of_scene("truth.h5"),
-        tracers=of_chain("tracers.h5"),
+        truth=of_data("truth.h5"),
+        tracers=of_replicate("tracers.h5"),
         velocity=evaluated_start,
     output:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
@@ -76,7 +76,7 @@ rule predict:
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
         report=f"{RESULTS}/{{scene}}/{{method}}/prediction.json",
     wildcard_constraints:
-        scene=THROW_SCENE,
+        scene=TAKE_SCENE,
     resources:
         gpu=GPU,
     params:
@@ -100,7 +100,7 @@ rule video:
         unpack(of_case(lambda case: case.method.body_inputs(case))),
         **body_files(),
         kernels=of_case(body_kernels),
-        transforms=of_scene("dynamic/transforms.json"),
+        transforms=of_data("dynamic/transforms.json"),
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
     output:
         video=f"{RESULTS}/{{scene}}/{{method}}/video.mp4",

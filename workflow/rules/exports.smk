@@ -28,14 +28,14 @@ rule export_gaussians:
 rule export_particles:
     input:
         **MOVED,
-        velocity=of_chain("velocity.json"),
+        velocity=of_replicate("velocity.json"),
     output:
         frames=directory(f"{EXPORT}/particles"),
         together=f"{EXPORT}/particles.h5",
     wildcard_constraints:
         scene=SCENE_OR_EXPERIMENT,
     params:
-        densities=moved_densities,
+        densities=body_densities,
         carrier=of_bodies(shared_carrier),
     script:
         "../scripts/export_particles.py"
@@ -44,7 +44,7 @@ rule export_particles:
 rule export_surface:
     input:
         **MOVED,
-        mesh=of_chain("mesh.ply"),
+        mesh=of_replicate("mesh.ply"),
     output:
         surface=f"{EXPORT}/surface.{{kind}}",
     wildcard_constraints:
@@ -59,7 +59,7 @@ rule export_surface:
 rule export_blend:
     input:
         **MOVED,
-        mesh=of_chain("mesh.ply"),
+        mesh=of_replicate("mesh.ply"),
     output:
         blend=f"{EXPORT}/motion.blend",
         picture=f"{EXPORT}/motion.png",

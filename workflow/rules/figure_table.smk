@@ -1,16 +1,16 @@
-"""What figures are made of: files, parameters and resources of each. figures.smk makes their rules."""
+"""Files, parameters and resources of each figure. figures.smk has their rules."""
 
 import ast
 
 DRAWN = SETTINGS.figures
 COMPARED = SETTINGS.tables["table1"] if "table1" in SETTINGS.tables else None
-# A law that is judged twice is shown once, on the particles that all methods share, unless figures.beside names it.
+# A law that is evaluated twice is drawn once, on the particles that all methods share, unless figures.beside names it.
 SHARED = [m for m in (COMPARED or SETTINGS).methods if cases.fit_name(SETTINGS, m) == m]
 METHODS = SHARED + [m for m in DRAWN.beside if m not in SHARED]
 NAMES = table_titles("table1") if COMPARED else {}
 TITLES = {method: NAMES.get(method) or cases.title(SETTINGS, method) for method in METHODS}
 PREDICTED = ["nclaw", *DRAWN.methods]
-# Laws of tests of material points: those whose stresses are compared, in all their chains.
+# Laws of tests of material points: those whose stresses are compared, in all replicates.
 RESPONDING = SETTINGS.tables.get("stress")
 RESPONSES = [
     (scene, method, cases.runs(SETTINGS, "stress", method, scene))
@@ -20,7 +20,7 @@ RESPONSES = [
 SHOWN_EXPERIMENTS = [*DRAWN.letters, *DRAWN.meetings]
 
 
-# ---- what figures are made of
+# ---- inputs of figures
 
 
 def of_methods(scenes, methods, name):
@@ -51,24 +51,19 @@ def truths_of(scenes):
 
 
 def own_bodies(scenes):
-    """Methods that are rendered on particles of their fit: what their bodies are loaded from, by method and scene."""
-    found = {}
+    """Sources of the bodies of methods that are rendered on particles of their fit, by method and scene."""
+    sources = {}
     for method in METHODS:
         for scene in scenes:
             case = case_on(scene, method)
             if files := case.method.body_inputs(case):
                 source = body_parameter(case) | {"files": files, "carrier": case.method.particle_source(case)}
-                found.setdefault(method, {})[scene] = source
-    return found
-
-
-def priors_of(scenes):
-    """The priors that NeuMA starts from."""
-    return [case_on(scene, "neuma").prior_file() for scene in scenes]
+                sources.setdefault(method, {})[scene] = source
+    return sources
 
 
 def filmed(scenes):
-    """What renders of scenes beside their videos need."""
+    """Inputs of renders of scenes next to their videos."""
     return {
         "kernels": kernels("rendering"),
         "transforms": [f"{DATA}/{scene}/dynamic/transforms.json" for scene in scenes],
@@ -87,7 +82,7 @@ def learned(scenes, method="neuma"):
 
 
 def scene_constants(scenes):
-    """What rollouts and material tests of scenes need to know."""
+    """Constants of scenes for rollouts and material tests."""
     plain = {scene: SETTINGS.scene(scene).plain() for scene in scenes}
     return {
         scene: {name: values[name] for name in ("dt", "density", "law")}
@@ -111,7 +106,7 @@ def wrong_laws(scene):
 
 
 def caption(figure):
-    """A figure's caption in the report: the docstring of its module."""
+    """Caption of a figure in the report: the docstring of its module."""
     return ast.get_docstring(ast.parse(figure_module(figure).read_text()))
 
 
@@ -126,8 +121,8 @@ IN_VIEW = {"view": DRAWN.view, "magnify": DRAWN.magnify}
 
 
 def interpolation(method):
-    """What lora_alphav is made of for a method."""
-    shown = [case_on(scene, method) for scene in DRAWN.lora_alphav]
+    """Entry of lora_alphav for a method."""
+    each = [case_on(scene, method) for scene in DRAWN.lora_alphav]
     return {
         "kind": "h5",
         "input": {
@@ -135,11 +130,11 @@ def interpolation(method):
             **learned(DRAWN.lora_alphav, method),
             "kernels": kernels("laws", "rendering"),
             "truth": truths_of(DRAWN.lora_alphav),
-            "start": [case.method.start_file(case) for case in shown],
+            "start": [case.method.start_file(case) for case in each],
         },
         "params": {
             "scenes": scene_constants(DRAWN.lora_alphav),
-            "total": {case.scene: carries_total([case]) for case in shown},
+            "total": {case.scene: carries_total([case]) for case in each},
             "weights": list(DRAWN.weights),
             "shown": DRAWN.shown - 1,
             "device": SETTINGS.device,
@@ -150,7 +145,7 @@ def interpolation(method):
 
 
 def elsewhere(method):
-    """What vis_generalize is made of for a method."""
+    """Entry of vis_generalize for a method."""
     return {
         "kind": "h5",
         "input": {
@@ -172,10 +167,10 @@ def elsewhere(method):
 
 def splats():
     """The scenes with a splat. Raises InputError where there are none."""
-    found = [name for name, scene in SETTINGS.scenes.items() if scene.splat]
-    if not found:
+    names = [name for name, scene in SETTINGS.scenes.items() if scene.splat]
+    if not names:
         raise InputError("scenes", "no scene has a splat", "Add one, for example Guitar: {splat: guitar.ply}")
-    return found
+    return names
 
 
 def of_splats(files):
@@ -210,7 +205,7 @@ def of_cameras(scenes):
 
 
 def filmed_constants(scenes):
-    """What pictures of filmed throws need to know."""
+    """Constants of takes for their pictures."""
     return {
         scene: {
             "dt": SETTINGS.scene(scene).dt,
@@ -291,7 +286,7 @@ FIGURES = {
         "input": {
             "kernels": kernels("rendering"),
             "truth": f"{DATA}/experiments/{DRAWN.ext_time}/truth.h5",
-            **{name: home(DRAWN.ext_time, file) for name, file in BODY.items()},
+            **{name: result_path(DRAWN.ext_time, file) for name, file in BODY.items()},
             "rollouts": [f"{RESULTS}/experiments/{DRAWN.ext_time}/{m}/rollout.h5" for m in PREDICTED],
         },
         "params": {

@@ -4,7 +4,7 @@
 rule gaussians:
     input:
         kernels=kernels("rendering"),
-        transforms=of_scene("static/transforms.json"),
+        transforms=of_data("static/transforms.json"),
     output:
         gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
         report=f"{RESULTS}/{{scene}}/gaussians.json",

@@ -3,8 +3,8 @@
 
 rule mesh:
     input:
-        transforms=of_scene("static/transforms.json"),
-        gaussians=of_chain("gaussians.ply"),
+        transforms=of_data("static/transforms.json"),
+        gaussians=of_replicate("gaussians.ply"),
     output:
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
     wildcard_constraints:
@@ -19,7 +19,7 @@ rule mesh:
 rule sampled_particles:
     input:
         kernels=kernels("geometry"),
-        mesh=of_chain("mesh.ply"),
+        mesh=of_replicate("mesh.ply"),
     output:
         particles=f"{RESULTS}/{{scene}}/sampled_particles.h5",
     wildcard_constraints:

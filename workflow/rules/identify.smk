@@ -1,13 +1,13 @@
-"""Family and constants of the material, found in the video; what training could start from, or a law by itself."""
+"""Family and constants of the material in the video: a start of training, or a law."""
 
 
 rule identify:
     input:
-        **{name: of_each_video(of_chain(file)) for name, file in BODY.items()},
+        **{name: of_each_video(of_replicate(file)) for name, file in BODY.items()},
         kernels=kernels("binding", "geometry", "laws", "rendering"),
-        mesh=of_each_video(of_chain("mesh.ply")),
-        transforms=of_each_video(of_scene("dynamic/transforms.json")),
-        velocity=of_each_video(of_chain("velocity.json")),
+        mesh=of_each_video(of_replicate("mesh.ply")),
+        transforms=of_each_video(of_data("dynamic/transforms.json")),
+        velocity=of_each_video(of_replicate("velocity.json")),
     output:
         identified=f"{RESULTS}/{{scene}}/identified.json",
     resources:
@@ -18,7 +18,7 @@ rule identify:
         binding=SETTINGS.binding.plain(),
         identify=identify_settings,
         seed=seed_of("particles"),
-        stock=stock_law,
+        stock=published_law,
         exposure=exposure,
         device=SETTINGS.device,
     script:
@@ -44,7 +44,7 @@ rule identified_page:
 
 rule identified_table:
     input:
-        identified=[home(entry["name"], "identified.json") for entry in identified_scenes()],
+        identified=[result_path(entry["name"], "identified.json") for entry in identified_scenes()],
     output:
         csv=f"{RESULTS}/identified.csv",
         markdown=f"{RESULTS}/identified.md",
@@ -57,7 +57,7 @@ rule identified_table:
 use rule identified_table as identified_behind_table with:
     input:
         identified=lambda wildcards: [
-            home(entry["name"], "identified.json") for entry in identified_behind(wildcards.table)
+            result_path(entry["name"], "identified.json") for entry in identified_behind(wildcards.table)
         ],
     output:
         csv=f"{RESULTS}/identified_{{table}}.csv",

@@ -162,7 +162,7 @@ def evaluated_carrier(wildcards):
 def evaluated_start(wildcards):
     """File of the initial motion: of the method on a scene, or of an experiment."""
     if of_experiment(wildcards):
-        return home(subject(wildcards), "velocity.json")
+        return result_path(subject(wildcards), "velocity.json")
     case = case_on(wildcards.scene, wildcards.method)
     return case.method.start_file(case)
 
@@ -173,14 +173,14 @@ def gaussian_motion(wildcards):
     return cases.gaussian_motion(SETTINGS, SETTINGS.body_scenes(subject(wildcards))[0], wildcards.method)
 
 
-def prior_chain(wildcards):
-    """Name of a prior, and the seeds of its chain."""
+def prior_replicate(wildcards):
+    """Name of a prior, and the seeds of its replicate."""
     return parse_replicate(wildcards.prior, SETTINGS.priors.laws, "prior")
 
 
 @checked
-def stock_law(wildcards):
-    """The analytic law that a scene's prior is trained on; none where the prior is a file of the user's."""
+def published_law(wildcards):
+    """The analytic law that a scene's prior is trained on. None if the prior is a file of the user."""
     law = SETTINGS.priors.laws.get(SETTINGS.scene(wildcards.scene).prior)
     return law.plain() if law else None
 
@@ -213,10 +213,10 @@ def film_motions(wildcards):
 
 
 def evaluation_views(case):
-    """Views that image metrics are taken in: those that are asked for, or those that training does not see.
+    """Views of image metrics: those of the settings, or those that training does not see.
 
-    Where training sees all views, those that other methods are measured in, or all: image metrics and figures then say
-    so.
+    If training sees all views, those in which other methods are measured, or all. Image metrics and figures then state
+    this.
     """
     seen = case.options.views
     views = range(SETTINGS.dataset.dynamic.views)
@@ -227,7 +227,7 @@ def evaluation_views(case):
 
 
 def own_result(file):
-    """A function of wildcards: a file of the same run; none where it would be another scene's, or there is no truth."""
+    """A function of wildcards: a file of the same run. None if it is of another scene, or there is no truth."""
 
     def choose(wildcards):
         case = case_on(wildcards.scene, wildcards.method)
@@ -239,6 +239,6 @@ def own_result(file):
 
 @checked
 def viewer_files(wildcards):
-    """What the viewer in a file shows of a scene."""
+    """Files and settings of a scene for the viewer in a file."""
     methods = cases.moving_methods(SETTINGS, wildcards.scene, SETTINGS.viewer.methods)
     return replace(scene_files(SETTINGS, wildcards.scene, methods), velocity=None)

@@ -14,7 +14,7 @@ rule image_metrics:
         **body_files(),
         kernels=of_case(body_kernels),
         weights=f"{DATA}/weights/lpips.safetensors",
-        transforms=of_scene("dynamic/transforms.json"),
+        transforms=of_data("dynamic/transforms.json"),
         rollout=f"{RESULTS}/{{scene}}/{{method}}/rollout.h5",
     output:
         metrics=f"{RESULTS}/{{scene}}/{{method}}/image_metrics.json",

@@ -8,10 +8,10 @@ rule prior:
         weights=f"{RESULTS}/priors/{{prior}}.safetensors",
         report=f"{RESULTS}/priors/{{prior}}.json",
     params:
-        name=lambda wildcards: prior_chain(wildcards)[0],
-        law=lambda wildcards: SETTINGS.priors.laws[prior_chain(wildcards)[0]].plain(),
+        name=lambda wildcards: prior_replicate(wildcards)[0],
+        law=lambda wildcards: SETTINGS.priors.laws[prior_replicate(wildcards)[0]].plain(),
         options=SETTINGS.priors.regression.plain(),
-        seed=lambda wildcards: SETTINGS.priors.seed + prior_chain(wildcards)[1]["prior"],
+        seed=lambda wildcards: SETTINGS.priors.seed + prior_replicate(wildcards)[1]["prior"],
     script:
         "../scripts/prior.py"
 

@@ -4,7 +4,7 @@
 rule radiance_field:
     input:
         kernels=kernels("radiance"),
-        transforms=of_scene("static/transforms.json"),
+        transforms=of_data("static/transforms.json"),
     output:
         field=f"{RESULTS}/{{scene}}/pac_nerf/field.safetensors",
         report=f"{RESULTS}/{{scene}}/pac_nerf/field.json",

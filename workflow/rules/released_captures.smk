@@ -3,7 +3,7 @@
 
 rule released_photographs:
     input:
-        folders=released_folders,
+        folders=RELEASED_FOLDERS,
     output:
         transforms=f"{DATA}/{{capture}}/static/transforms.json",
         report=f"{RESULTS}/{{capture}}/masks/photographs.json",
@@ -13,7 +13,7 @@ rule released_photographs:
     conda:
         CAPTURE_ENVIRONMENT
     params:
-        settings=released_settings,
+        settings=RELEASED_SETTINGS,
         name="{capture}",
     script:
         "../scripts/released_photographs.py"
@@ -21,18 +21,18 @@ rule released_photographs:
 
 rule released_video:
     input:
-        folders=released_folders,
+        folders=RELEASED_FOLDERS,
     output:
         transforms=MATTES,
         report=f"{VIDEO_MASKS}.json",
-        timeline=f"{RESULTS}/{{capture}}/frames/{{throw}}/{{camera}}.json",
+        timeline=f"{VIDEO_FRAMES}.json",
         sheet=f"{VIDEO_MASKS}.png",
     wildcard_constraints:
         capture=RELEASED_CAPTURE,
     conda:
         CAPTURE_ENVIRONMENT
     params:
-        settings=released_settings,
+        settings=RELEASED_SETTINGS,
         name="{capture}",
         camera="{camera}",
     script:
@@ -42,13 +42,17 @@ rule released_video:
 # All cameras share a clock. The world is not metric, so gravity is reported but not checked.
 use rule capture_flight as released_flight with:
     input:
-        transforms=of_throw(MATTES),
-        reports=of_throw(f"{VIDEO_MASKS}.json"),
-        timelines=of_throw(f"{RESULTS}/{{capture}}/frames/{{throw}}/{{camera}}.json"),
+        transforms=of_take_cameras(MATTES),
+        reports=of_take_cameras(f"{VIDEO_MASKS}.json"),
+        timelines=of_take_cameras(f"{VIDEO_FRAMES}.json"),
     wildcard_constraints:
         capture=RELEASED_CAPTURE,
     params:
-        cameras=filmed_cameras,
-        timing=one_clock,
+        cameras=TAKE_CAMERAS,
+        timing=of_take(
+            lambda capture, take: dict.fromkeys(
+                ("offsets", "row_times"), [0.0] * len(capture.cameras_of(take))
+            )
+        ),
         metric=False,
-        name="{capture}, {throw}",
+        name="{capture}, {take}",

@@ -1,4 +1,4 @@
-"""Files and settings of scenes and experiments, each in its chain. Needs settings.smk."""
+"""Files and settings of scenes and experiments, each in its replicate. Needs settings.smk."""
 
 from types import SimpleNamespace
 
@@ -7,23 +7,23 @@ from neuma_lib.project.settings import NO_TRUTH
 from workflow.inputs import image_list
 
 
-def home(name, file):
-    """The one path of a file of a scene or experiment in a chain."""
+def result_path(name, file):
+    """Path of a file of a scene or experiment in a replicate."""
     return paths.result_path(SETTINGS, name, file)
 
 
 def scene_prior(scene):
-    """The file of the prior of a scene in its chain."""
+    """The file of the prior of a scene in its replicate."""
     return paths.prior_file(SETTINGS, scene, SETTINGS.scene(scene).prior)
 
 
-def of_chain(file):
-    """A function of wildcards: a file of the scene or experiment in its chain."""
-    return checked(lambda wildcards: home(subject(wildcards), file))
+def of_replicate(file):
+    """A function of wildcards: a file of the scene or experiment in its replicate."""
+    return checked(lambda wildcards: result_path(subject(wildcards), file))
 
 
-def of_scene(file):
-    """A function of wildcards: a file of the scene's or experiment's data, which all its chains share."""
+def of_data(file):
+    """A function of wildcards: a file of the data of the scene or experiment, which all its replicates share."""
 
     @checked
     def choose(wildcards):
@@ -34,7 +34,7 @@ def of_scene(file):
 
 
 def seed_of(drawn):
-    """A function of wildcards: the seed of what a scene or experiment draws in its chain."""
+    """A function of wildcards: the seed of a random choice of a scene or experiment in its replicate."""
     return checked(lambda wildcards: SETTINGS.seed + SETTINGS.replicate(subject(wildcards))[1][drawn])
 
 
@@ -63,7 +63,7 @@ BODY = {"particles": "particles.h5", "binding": "binding.h5", "gaussians": "gaus
 
 def body_files():
     """Functions of wildcards: the files of the body of a scene or experiment, by name."""
-    return {name: of_chain(file) for name, file in BODY.items()}
+    return {name: of_replicate(file) for name, file in BODY.items()}
 
 
 def of_each_video(function):
@@ -71,15 +71,15 @@ def of_each_video(function):
 
     @checked
     def choose(wildcards):
-        found = [function(SimpleNamespace(scene=scene)) for scene in SETTINGS.video_scenes(wildcards.scene)]
-        return found if len(found) > 1 else found[0]
+        values = [function(SimpleNamespace(scene=scene)) for scene in SETTINGS.video_scenes(wildcards.scene)]
+        return values if len(values) > 1 else values[0]
 
     return choose
 
 
 def each_of(bodies):
     """Files by name of the bodies of several scenes or experiments."""
-    return {name: [home(body, file) for body in bodies] for name, file in BODY.items()}
+    return {name: [result_path(body, file) for body in bodies] for name, file in BODY.items()}
 
 
 def scene_setting(*names):
@@ -104,8 +104,8 @@ def known_law(wildcards):
 def origin_of(part, scene):
     """Whether a part ('static', 'dynamic', 'truth') of a scene is 'made' or 'supplied' by the user.
 
-    A truth is not supplied: that of a scene with a video of the user's is simulated. All of a capture is 'captured', and
-    a splat has neither images nor a truth.
+    A truth is always simulated, also where the user supplies the video. All of a capture is 'captured'. A splat has
+    neither images nor a truth.
     """
     if not SETTINGS.scenes[scene].has_truth:
         return "captured" if SETTINGS.scenes[scene].captured else "none"
@@ -115,7 +115,7 @@ def origin_of(part, scene):
 
 
 def scenes_with(part, origin):
-    """Pattern of the scenes whose part is of an origin: each file has one maker."""
+    """Pattern of the scenes whose part is of an origin, so that one rule makes each file."""
     return "|".join(scene for scene in SETTINGS.scenes if origin_of(part, scene) == origin) or "none"
 
 
@@ -132,7 +132,7 @@ def supplied_list(part):
 
 
 def supplied_world(wildcards):
-    """How the world and the frames of supplied images become those of a scene."""
+    """Conversion of the world and the frames of supplied images to those of a scene."""
     images = SETTINGS.scene(wildcards.scene).images.plain()
     return {name: images[name] for name in ("stride", "scale", "offset")}
 
@@ -143,13 +143,17 @@ def truth_memory(wildcards):
     return 2000 + 2 * len(frame_steps(wildcards)) * bytes_a_frame // 10**6
 
 
-def render_minutes(images, frames):
-    """Minutes that the renders of all frames may take: an hour, and a minute a megapixel at 16 samples.
+def render_minutes(part):
+    """A function of wildcards: minutes that the renders of all frames of a part ('static', 'dynamic') may take.
 
-    At the paper's scale a core took 0.2 minutes a megapixel, and 0.8 for a liquid (docs/scale.md).
+    An hour, and a minute a megapixel at 16 samples. At the paper's scale a core took 0.2 minutes a megapixel, and 0.8
+    for a liquid (docs/scale.md).
     """
-    samples = frames * images.views * images.width * images.height * images.samples
-    return 60 + round(samples / 16e6)
+    images = getattr(SETTINGS.dataset, part)
+    samples = images.views * images.width * images.height * images.samples
+    return lambda wildcards: 60 + round(
+        (len(frame_steps(wildcards)) if part == "dynamic" else 1) * samples / 16e6
+    )
 
 
 frame_steps = by_subject(
@@ -167,7 +171,7 @@ def simulation_settings(wildcards):
 
 
 def exposure(wildcards):
-    """What turns the exposures that a video states into renders."""
+    """Settings that renders of a video with exposures need."""
     return {"dt": SETTINGS.scene(wildcards.scene).dt, "exposure_samples": SETTINGS.dataset.exposure_samples}
 
 
@@ -206,6 +210,6 @@ def reconstructed_files(name):
     def choose(wildcards):
         bodies = SETTINGS.experiment(subject(wildcards)).bodies
         scenes = SETTINGS.body_scenes(subject(wildcards))
-        return [home(scene, name) for body, scene in zip(bodies, scenes) if body.shape is None]
+        return [result_path(scene, name) for body, scene in zip(bodies, scenes) if body.shape is None]
 
     return choose

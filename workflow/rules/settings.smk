@@ -68,22 +68,22 @@ onstart:
             ) from None
 
 
-def names_of(scenes, chains=True):
-    """Pattern of the names of scenes, and of the folders of their chains."""
-    return f"({'|'.join(scenes) or 'none'})" + ("([+][^/]*)?" if chains else "")
+def names_of(scenes, replicates=True):
+    """Pattern of the names of scenes, and of the folders of their replicates."""
+    return f"({'|'.join(scenes) or 'none'})" + ("([+][^/]*)?" if replicates else "")
 
 
-def scenes_that(holds, chains=True):
+def scenes_that(holds, replicates=True):
     """Pattern of the names of the scenes that something holds for."""
-    return names_of((name for name, scene in SETTINGS.scenes.items() if holds(scene)), chains)
+    return names_of((name for name, scene in SETTINGS.scenes.items() if holds(scene)), replicates)
 
 
-# Scenes of captures and of splats have no truth. Throws have the body and the motion that registration found.
+# Scenes of captures and of splats have no truth. Takes have the body and the motion from registration.
 TRUE_SCENE = scenes_that(lambda scene: scene.has_truth)
 SPLAT_SCENE = scenes_that(lambda scene: scene.splat)
 OBJECT_SCENE = scenes_that(lambda scene: not (scene.captured and scene.captured.throw))
 PICTURED_SCENE = scenes_that(lambda scene: not scene.splat and not (scene.captured and scene.captured.throw))
-THROW_SCENE = scenes_that(lambda scene: scene.captured and scene.captured.throw, chains=False)
+TAKE_SCENE = scenes_that(lambda scene: scene.captured and scene.captured.throw, replicates=False)
 # Experiments are folders of their own, and rules that also accept scenes have the wildcard `scene` for both.
 EXPERIMENT = f"experiments/{names_of(SETTINGS.experiments)}"
 
@@ -97,7 +97,7 @@ wildcard_constraints:
 
 
 def kernels(*groups):
-    """Files that say that groups of Warp kernels are compiled; `laws` brings `simulation` with it."""
+    """Markers of compiled groups of Warp kernels. The group `laws` requires `simulation`."""
     return [f"{KERNELS}/{group}.ready" for group in groups]
 
 

@@ -20,7 +20,7 @@ rule splat_gaussians:
 rule splat_mesh:
     input:
         kernels=kernels("rendering"),
-        gaussians=of_chain("gaussians.ply"),
+        gaussians=of_replicate("gaussians.ply"),
     output:
         mesh=f"{RESULTS}/{{scene}}/mesh.ply",
     wildcard_constraints:
@@ -32,23 +32,6 @@ rule splat_mesh:
         surface=SETTINGS.geometry.surface.plain(),
     script:
         "../scripts/splat_mesh.py"
-
-
-rule splat_binding:
-    input:
-        kernels=kernels("binding"),
-        gaussians=of_chain("gaussians.ply"),
-        sampled=of_chain("sampled_particles.h5"),
-    output:
-        binding=f"{RESULTS}/{{scene}}/binding.h5",
-        particles=f"{RESULTS}/{{scene}}/particles.h5",
-    wildcard_constraints:
-        scene=SPLAT_SCENE,
-    params:
-        binding=SETTINGS.binding.plain(),
-        own_particles=splat_setting(lambda scene: scene.splat.own_particles),
-    script:
-        "../scripts/splat_binding.py"
 
 
 rule splat_velocity:

@@ -5,7 +5,7 @@ rule visited:
     input:
         **body_files(),
         kernels=kernels("simulation"),
-        velocity=of_chain("velocity.json"),
+        velocity=of_replicate("velocity.json"),
     output:
         visited=f"{RESULTS}/{{scene}}/visited.h5",
     resources:
@@ -27,7 +27,7 @@ rule stress:
     input:
         unpack(of_bodies(law_files)),
         kernels=kernels("laws"),
-        visited=of_chain("visited.h5"),
+        visited=of_replicate("visited.h5"),
     output:
         stress=f"{RESULTS}/{{scene}}/{{method}}/stress.json",
     params:
@@ -43,8 +43,8 @@ rule response:
     input:
         unpack(of_bodies(uncertainty_files)),
         kernels=kernels("laws"),
-        # that of the first chain: the tests of all chains have one axis
-        visited=checked(lambda wildcards: home(SETTINGS.replicate(wildcards.scene)[0], "visited.h5")),
+        # of the first replicate, so that the tests of all replicates have one axis
+        visited=checked(lambda wildcards: result_path(SETTINGS.replicate(wildcards.scene)[0], "visited.h5")),
     output:
         response=f"{RESULTS}/{{scene}}/{{method}}/response.json",
     params:

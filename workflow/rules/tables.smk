@@ -10,7 +10,7 @@ wildcard_constraints:
 
 
 def random_scenes():
-    """What tables of random scenes say of each."""
+    """Shape, family and prior of each random scene."""
     plain = {name: SETTINGS.scene(name) for name in SETTINGS.random_scenes}
     return {
         name: {"shape": scene.shape, "family": SETTINGS.random.family(name), "prior": scene.prior}
@@ -24,7 +24,7 @@ def random_files(methods, name):
 
 
 def identified_scenes():
-    """Every identification that a table judges: the scenes of table1 in all its chains, and the random scenes."""
+    """Every identification in a table: the scenes of table1 in all replicates, and the random scenes."""
     table, constants = SETTINGS.tables.get("table1"), cases.of_kind(SETTINGS, "constants")[:1]
     runs = [
         run
@@ -42,7 +42,7 @@ def identified_behind(table):
     """The same of every scene whose identified constants have a row in a table."""
     rows = [case_on(run["scene"], run["method"]) for run in table_runs(table) if run["scene"]]
     scenes = [case.scene for case in rows if "identified" in case.method.model_inputs(case)]
-    return with_truths({Path(home(scene, "identified.json")).parent.name: table for scene in scenes})
+    return with_truths({Path(result_path(scene, "identified.json")).parent.name: table for scene in scenes})
 
 
 def with_truths(groups):
@@ -69,7 +69,7 @@ def method_runs(table, method):
 
 
 def table_runs(table):
-    """Every run behind a table, row by row and chain by chain, see `method_runs`."""
+    """Every run behind a table, row by row and replicate by replicate, see `method_runs`."""
     return [run for method in SETTINGS.tables[table].methods for run in method_runs(table, method)]
 
 
@@ -90,7 +90,7 @@ def table_titles(table):
 
 
 def table_notes(table):
-    """What readers must know of the rows of a table, by method."""
+    """Notes to the rows of a table, by method."""
     notes = {m: cases.preset(SETTINGS, m)[0].note for m in SETTINGS.tables[table].methods}
     return {method: note for method, note in notes.items() if note}
 

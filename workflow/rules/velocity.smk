@@ -5,7 +5,7 @@ rule velocity:
     input:
         **body_files(),
         kernels=kernels("laws", "rendering"),
-        transforms=of_scene("dynamic/transforms.json"),
+        transforms=of_data("dynamic/transforms.json"),
         prior=lambda wildcards: scene_prior(wildcards.scene),
     output:
         velocity=f"{RESULTS}/{{scene}}/velocity.json",

@@ -9,7 +9,7 @@ def main(inputs, output, params, run) -> None:
     csv, markdown = benchmark_table(params.scenes)
     write_text(output.csv, csv)
     write_text(output.markdown, markdown)
-    run.say(f"{len(params.scenes)} benchmarks: {output.markdown}")
+    run.log(f"{len(params.scenes)} benchmarks: {output.markdown}")
 
 
 run_script(main, snakemake)

@@ -9,7 +9,7 @@ def main(inputs, output, params, run) -> None:
     board = BoardConfig(**params.board)
     print_board(output.board, board, params.paper)
     columns, rows = board.squares
-    run.say(
+    run.log(
         f"{columns} x {rows} squares of {1000 * board.square:.1f} mm on {params.paper}: print it at 100 %, measure the"
         " side of a square, and set it as board.square in capture.yaml"
     )

@@ -27,7 +27,7 @@ def main(inputs, output, params, run) -> None:
     )
     write_json(output.curves, curves)
     save(draw(curves, params.titles), output.picture)
-    run.say(f"{len(laws)} laws, bands of {', '.join(draws) or 'none'}")
+    run.log(f"{len(laws)} laws, bands of {', '.join(draws) or 'none'}")
 
 
 run_script(main, snakemake)

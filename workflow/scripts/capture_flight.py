@@ -32,10 +32,10 @@ def main(inputs, output, params, run) -> None:
     draw_flight(output.picture, flight, views, flight.gravity)
     write_json(output.flight, report(flight, views))
     for line in [*flight.offsets_from, flight.gravity]:
-        run.say(line)
+        run.log(line)
     if flight.spin:
         size, deviation = flight.spin.rate
-        run.say(f"spin {size:.2f} +- {deviation:.2f} rad/s from {flight.spin.points} points")
+        run.log(f"spin {size:.2f} +- {deviation:.2f} rad/s from {flight.spin.points} points")
 
 
 def filmed(camera, video, transforms, masks, timeline, offset, row_time) -> Filmed:

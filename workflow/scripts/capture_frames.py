@@ -16,7 +16,7 @@ def main(inputs, output, params, run) -> None:
         summary += " and others" if len(timeline.lost) > 5 else ""
     contact_sheet(output.sheet, frames, f"{params.name}: {summary}")
     write_json(output.timeline, timeline.plain())
-    run.say(summary)
+    run.log(summary)
 
 
 run_script(main, snakemake)

@@ -16,7 +16,7 @@ def main(inputs, output, params, run) -> None:
     for row in rows:
         if row["throw"] == "all":
             kind = "training" if row["learned"] else "held-out"
-            run.say(
+            run.log(
                 f"{row['title']}, {kind} frames: PSNR {row['psnr']:.2f} dB, SSIM {row['ssim']:.3f}, LPIPS"
                 f" {row['lpips_vgg']:.3f} on the object"
             )

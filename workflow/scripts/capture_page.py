@@ -8,19 +8,19 @@ from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
-    home = Path(output.page).parent
-    names = [f"{throw}, {camera}" for throw, camera in params.videos]
+    folder = Path(output.page).parent
+    names = [f"{take}, {camera}" for take, camera in params.videos]
     results = checks(read_json(inputs.room), dict(zip(names, map(read_json, listed(inputs.timelines)))))
     files = {
         "Cameras and points": inputs.cameras,
         "Floor and box": inputs.floor,
         **{f"Frames: {name}": sheet for name, sheet in zip(names, listed(inputs.sheets))},
     }
-    pictures = {caption: str(Path(file).relative_to(home)) for caption, file in files.items()}
+    pictures = {caption: str(Path(file).relative_to(folder)) for caption, file in files.items()}
     missing = None if names else "There are no videos yet."
     write_text(output.page, markdown(params.title, results, pictures, missing))
     for check in results:
-        run.say(f"{check.what}: {check.value}" + ("" if check.good else f" (expected: {check.wanted})"))
+        run.log(f"{check.what}: {check.value}" + ("" if check.good else f" (expected: {check.wanted})"))
 
 
 run_script(main, snakemake)

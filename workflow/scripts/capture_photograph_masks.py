@@ -86,7 +86,7 @@ def main(inputs, output, params, run) -> None:
             "own": sorted(own),
         },
     )
-    run.say(summary + (f", left out: {', '.join(doubtful)}" if doubtful else ""))
+    run.log(summary + (f", left out: {', '.join(doubtful)}" if doubtful else ""))
 
 
 def _check(ious, names, is_own, name) -> list[str]:

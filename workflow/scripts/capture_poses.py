@@ -13,7 +13,7 @@ from workflow.stage import run_script
 
 def main(inputs, output, params, run) -> None:
     groups = {PHOTOGRAPHS: listed(inputs.photographs)} | {Path(f).stem: [f] for f in listed(inputs.stills)}
-    run.say(f"{len(groups[PHOTOGRAPHS])} photographs, {len(groups) - 1} fixed cameras")
+    run.log(f"{len(groups[PHOTOGRAPHS])} photographs, {len(groups) - 1} fixed cameras")
     given, lenses = listed(inputs.given), listed(inputs.lenses)
     with tempfile.TemporaryDirectory(dir=Path(output.poses).parent, prefix=".colmap-") as work:
         poses = find_poses(
@@ -27,7 +27,7 @@ def main(inputs, output, params, run) -> None:
         )
     draw_poses(output.picture, poses)
     save_poses(output.poses, output.points, poses)
-    run.say(
+    run.log(
         f"{len(poses.names)} of {len(poses.names) + len(poses.lost)} pictures registered, {len(poses.points)} points,"
         f" reprojection error {poses.error:.2f} px"
     )

@@ -89,10 +89,10 @@ def main(inputs, output, params, run) -> None:
     picture_sheet(output.picture, pictures, f"{params.name}: {registered.summary()}", columns=3)
     write_json(output.velocity, registered.velocity())
     write_json(output.registration, {**registered.report(), **gravity.report(), "gravity": line})
-    run.say(registered.summary())
-    run.say(line)
+    run.log(registered.summary())
+    run.log(line)
     if registered.ambiguous:
-        run.say(f"undetermined: {registered.ambiguous}")
+        run.log(f"undetermined: {registered.ambiguous}")
 
 
 def sight(camera, transforms, timeline, row_time, flight, name) -> Sight:

@@ -100,7 +100,7 @@ def main(inputs, output, params, run) -> None:
     )
     write_text(output.page, html)
     failed = sum(not check.good for group in groups.values() for check in group)
-    run.say(f"{len(films)} videos, {failed} failed checks, {len(warnings)} warnings: {output.page}")
+    run.log(f"{len(films)} videos, {failed} failed checks, {len(warnings)} warnings: {output.page}")
 
 
 def _counted(count: int, noun: str) -> str:

@@ -22,11 +22,11 @@ def main(inputs, output, params, run) -> None:
     draw_floor(output.floor, output.transforms)
     write_json(output.report, report)
     if room.board:
-        run.say(
+        run.log(
             f"{len(room.board.corners)} corners of the board, residual {1000 * room.board.residual:.2f} mm"
         )
     elif room.floor is not None:
-        run.say(f"{100 * room.floor:.0f} % of the points lie on the floor")
+        run.log(f"{100 * room.floor:.0f} % of the points lie on the floor")
 
 
 run_script(main, snakemake)

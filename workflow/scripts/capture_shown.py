@@ -6,7 +6,7 @@ from neuma_lib.capture.calibration.lens import read_lens
 from neuma_lib.capture.frames import read_frames, read_timeline
 from neuma_lib.capture.masks.mattes import room_frames
 from neuma_lib.capture.pictures import read_picture, undistorted
-from neuma_lib.capture.report.display_video import numbers_of, write_display_frames
+from neuma_lib.capture.report.display_video import display_frames, numbers_of
 from neuma_lib.io.files import listed, read_json
 from neuma_lib.io.images import read_transforms, write_transforms
 from workflow.stage import run_script
@@ -27,11 +27,9 @@ def main(inputs, output, params, run) -> None:
             (frame.number, undistorted(frame.pixels, lens, params.longest))
             for frame in read_frames(file, read_timeline(file, rate), numbers_of(video, camera))
         )
-        new = write_display_frames(
-            folder, camera, video, mattes, frames, background, params.width, gains[camera]
-        )
+        new = display_frames(folder, camera, video, mattes, frames, background, params.width, gains[camera])
         entries += new
-        run.say(f"{camera}: {len(new)} frames")
+        run.log(f"{camera}: {len(new)} frames")
     write_transforms(output.transforms, {}, entries)
 
 

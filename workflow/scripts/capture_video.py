@@ -52,7 +52,7 @@ def main(inputs, output, params, run) -> None:
                 "time": float(times[k]),
             }
             entries.append(entry | ({"exposure": exposure} if exposure else {}))
-        run.say(f"{camera}: {len(chosen)} of {len(frames)} frames in the first {times[chosen[-1]]:.3f} s")
+        run.log(f"{camera}: {len(chosen)} of {len(frames)} frames in the first {times[chosen[-1]]:.3f} s")
     entries = [entry for entry in entries if entry["step"] >= 0]
     write_transforms(output.transforms, {}, entries, **{k: data[k] for k in ("world", "room") if k in data})
 

@@ -73,7 +73,7 @@ def main(inputs, output, params, run) -> None:
             "own": len(own),
         },
     )
-    run.say(summary)
+    run.log(summary)
 
 
 def _own(own, lens, longest, pixels) -> np.ndarray:

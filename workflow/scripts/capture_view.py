@@ -107,7 +107,7 @@ def main(inputs, output, params, run) -> None:
     mean = averaged([{k: v for k, v in frame.items() if k != "step"} for frame in measures])
     measures.sort(key=lambda frame: frame["step"])
     write_json(output.measures, {"frames": measures, "mean": mean})
-    run.say(
+    run.log(
         f"{len(panels)} frames, {len(measures)} measured. Object: PSNR {mean['psnr']:.1f} dB, SSIM {mean['ssim']:.3f},"
         f" LPIPS {mean['lpips_vgg']:.3f}, IoU {mean['iou']:.2f}. Whole picture: PSNR {mean['scene_psnr']:.1f} dB"
     )

@@ -15,9 +15,9 @@ def main(inputs, output, params, run) -> None:
     )
     write_text(output.csv, table.csv())
     write_text(output.markdown, table.markdown())
-    run.say(f"{len(params.titles)} methods, {len(params.columns)} columns: {output.markdown}")
+    run.log(f"{len(params.titles)} methods, {len(params.columns)} columns: {output.markdown}")
     for verdict in table.verdicts():
-        run.say(str(verdict))
+        run.log(str(verdict))
 
 
 run_script(main, snakemake)

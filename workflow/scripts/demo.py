@@ -1,4 +1,4 @@
-"""Say what the demo made, and how good it is."""
+"""Page of the demo: its files, and the errors of the motions."""
 
 from pathlib import Path
 
@@ -27,9 +27,11 @@ def main(inputs, output, params, run) -> None:
     viewer = listed(inputs.get("viewer"))
     line = f"- to play with: {Path(viewer[0]).relative_to(folder)}\n" if viewer else ""
     write_text(output.page, PAGE.format(rows="\n".join(rows), viewer=line, **place))
-    said = ", ".join(f"{title} {error:.1f} mm" for title, error in zip(params.titles, errors, strict=True))
-    run.say(
-        f"error of the motion: {said}. Look at {', '.join([inputs.film, *viewer])}; all of it: {output.page}"
+    errors_text = ", ".join(
+        f"{title} {error:.1f} mm" for title, error in zip(params.titles, errors, strict=True)
+    )
+    run.log(
+        f"error of the motion: {errors_text}. Look at {', '.join([inputs.film, *viewer])}; all of it: {output.page}"
     )
 
 

@@ -34,7 +34,7 @@ def main(inputs, output, params, run) -> None:
     arrays = evaluation.path.arrays()
     write_arrays(output.rollout, {**arrays, "frames": np.asarray(params.frames)}, {"dt": dt})
     write_json(output.metrics, {**evaluation.metrics, "stable": model.stable})
-    run.say(evaluation.summary())
+    run.log(evaluation.summary())
 
 
 run_script(main, snakemake)

@@ -1,4 +1,4 @@
-"""Put the bodies of an experiment together: solids filled anew, or objects as they were reconstructed."""
+"""Put the bodies of an experiment together: solids filled with particles, or reconstructed objects."""
 
 from collections.abc import Iterator
 
@@ -32,16 +32,16 @@ def main(inputs, output, params, run) -> None:
     for entry in params.bodies:
         if entry["reconstructed"]:
             *parts, surface, velocity = next(reconstructed)
-            body, mesh, found = load_reconstruction(*parts, 1.0), read_mesh(surface), read_json(velocity)
+            body, mesh, start = load_reconstruction(*parts, 1.0), read_mesh(surface), read_json(velocity)
         else:
             mesh = place(entry["shape"], entry["size"], entry["height"], entry["center"])
             x0 = sample_volume(mesh, params.particles, seed=params.seed, method=params.sampling)
             colors = torch.from_numpy(colors_at(mesh, x0, look_of(entry)))
             body = coloured_solid(mesh, torch.as_tensor(x0, dtype=torch.float32), 1.0, colors)
-            found = {"v0": entry["velocity"], "angular_velocity": entry["spin"], "centre": None}
+            start = {"v0": entry["velocity"], "angular_velocity": entry["spin"], "centre": None}
         bodies.append(body)
         meshes.append(mesh)
-        motion = {key: found[key] for key in INITIAL_MOTION}
+        motion = {key: start[key] for key in INITIAL_MOTION}
         counts = {"particles": len(body.x0), "gaussians": len(body.gaussians)}
         starts.append({"scene": entry["scene"], **motion, **counts})
     together, surface = join(bodies), trimesh.util.concatenate(meshes)
@@ -50,7 +50,7 @@ def main(inputs, output, params, run) -> None:
     save_binding(output.binding, together.binding)
     write_mesh(output.mesh, np.asarray(surface.vertices), np.asarray(surface.faces))
     write_json(output.velocity, {"bodies": starts})
-    run.say(f"{len(bodies)} bodies, {len(together.x0)} particles, {len(together.gaussians)} Gaussians")
+    run.log(f"{len(bodies)} bodies, {len(together.x0)} particles, {len(together.gaussians)} Gaussians")
 
 
 run_script(main, snakemake)

@@ -18,7 +18,7 @@ def main(inputs, output, params, run) -> None:
     write_blend(
         output.blend, output.picture, vertices, mesh.faces, path["frames"] * attributes["dt"], colours
     )
-    run.say(f"{vertices.shape[0]} frames of {vertices.shape[1]} vertices")
+    run.log(f"{vertices.shape[0]} frames of {vertices.shape[1]} vertices")
 
 
 run_script(main, snakemake)

@@ -24,7 +24,7 @@ def main(inputs, output, params, run) -> None:
     for file, write in ((output.film, write_mp4), (output.gif, write_gif)):
         with atomic(file) as partial:
             write(partial, video, params.frame_rate)
-    run.say(f"{len(video)} frames of {width}x{height} px")
+    run.log(f"{len(video)} frames of {width}x{height} px")
 
 
 run_script(main, snakemake)

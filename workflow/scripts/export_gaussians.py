@@ -25,7 +25,7 @@ def main(inputs, output, params, run) -> None:
         else:
             save_gaussians(Path(output.frames, f"{k:04d}.ply"), gaussians)
         run.progress(k + 1, len(x))
-    run.say(f"{len(x)} frames of {len(body.gaussians)} Gaussians")
+    run.log(f"{len(x)} frames of {len(body.gaussians)} Gaussians")
 
 
 run_script(main, snakemake)

@@ -1,4 +1,4 @@
-"""Write a method's law into one file, with what is known of it, and draw what it says."""
+"""Write a method's law into one file, with its origin and measures, and draw its curves."""
 
 from neuma_lib.evaluation.law_export import export_law, head_commit
 from workflow.motion import Prediction
@@ -7,10 +7,10 @@ from workflow.stage import run_script
 
 def main(inputs, output, params, run) -> None:
     law = Prediction(inputs, params.method).law(params.origin["dt"])
-    beside = {name: inputs.get(name) or None for name in ("metrics", "rollout")}
-    known = {**params.origin, "commit": head_commit("."), **beside}
+    measured = {name: inputs.get(name) or None for name in ("metrics", "rollout")}
+    known = {**params.origin, "commit": head_commit("."), **measured}
     about = export_law(output.law, law, page=output.page, **known)
-    run.say(f"{about['kind']}, learned at dt = {about['dt']:g} s")
+    run.log(f"{about['kind']}, learned at dt = {about['dt']:g} s")
 
 
 run_script(main, snakemake)

@@ -23,7 +23,7 @@ def main(inputs, output, params, run) -> None:
     vol0, mass = (getattr(start, name).numpy() for name in ("vol0", "mass"))
     time = path["frames"] * attributes["dt"]
     write_arrays(output.together, {"x": path["x"], "time": time, "vol0": vol0, "mass": mass}, {})
-    run.say(f"{len(path['x'])} frames of {len(start.x)} particles")
+    run.log(f"{len(path['x'])} frames of {len(start.x)} particles")
 
 
 run_script(main, snakemake)

@@ -18,7 +18,7 @@ def main(inputs, output, params, run) -> None:
     write = write_glb if Path(output.surface).suffix == ".glb" else write_usd
     colours = vertex_colours(mesh, load_gaussians(inputs.gaussians))
     write(output.surface, vertices, mesh.faces, path["frames"] * attributes["dt"], colours)
-    run.say(f"{vertices.shape[0]} frames of {vertices.shape[1]} vertices")
+    run.log(f"{vertices.shape[0]} frames of {vertices.shape[1]} vertices")
 
 
 run_script(main, snakemake)

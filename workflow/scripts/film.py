@@ -1,4 +1,4 @@
-"""Film methods beside the video, as mp4 and as gif."""
+"""Film methods next to the video, as mp4 and as gif."""
 
 import torch
 
@@ -27,7 +27,7 @@ def main(inputs, output, params, run) -> None:
         write_mp4(partial, film, params.frame_rate)
     with atomic(output.gif) as partial:
         write_gif(partial, film, params.frame_rate)
-    run.say(f"{len(film)} frames: {output.mp4}, {output.gif}")
+    run.log(f"{len(film)} frames: {output.mp4}, {output.gif}")
 
 
 run_script(main, snakemake)

@@ -16,7 +16,7 @@ def main(inputs, output, params, run) -> None:
     device = choose_device(params.device)
     views = load_static(inputs.transforms, PhotographsConfig(**params.photographs)).to(device)
     if views.left_out:
-        run.say(f"left out, since their masks lack a part of the body: {', '.join(views.left_out)}")
+        run.log(f"left out, since their masks lack a part of the body: {', '.join(views.left_out)}")
     settings = GaussiansConfig(**params.fit)
     gaussians, report = fit_gaussians(
         views.images,
@@ -29,7 +29,7 @@ def main(inputs, output, params, run) -> None:
     )
     save_gaussians(output.gaussians, gaussians)
     write_json(output.report, {key: value for key, value in asdict(report).items() if value is not None})
-    run.say(
+    run.log(
         f"{report.count} Gaussians ({report.culled} culled), PSNR on held-out views {report.psnr:.1f} dB,"
         f" inside the object {report.psnr_object:.1f} dB"
         + (", after the exposure of each was fitted" if report.gains else "")

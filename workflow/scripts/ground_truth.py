@@ -40,12 +40,12 @@ def main(inputs, output, params, run) -> None:
         **{name: getattr(truth, name).numpy() for name in ("vol0", "mass", "tracers", "tracers_again")},
     }
     write_arrays(
-        output.particles,
+        output.truth,
         arrays,
         {"dt": params.dt, "bodies": params.bodies, "simulation": params.simulation},
     )
     count, lowest = arrays["x"].shape[1], float(arrays["x"][..., 1].min())
-    run.say(
+    run.log(
         f"{count} particles, {truth.frames[-1]} steps, {len(truth.frames)} frames, lowest point {lowest:.3f} m"
     )
 

@@ -1,4 +1,4 @@
-"""Identified materials beside the true ones, as a table."""
+"""Identified materials next to the true ones, as a table."""
 
 from neuma_lib.io.files import read_json, write_text
 from neuma_lib.paper.identified_table import IdentifiedScene, identified_table

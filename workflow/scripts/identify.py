@@ -51,7 +51,7 @@ def main(inputs, output, params, run) -> None:
         ]
         for (_, body, _), mesh, density in zip(videos, meshes, params.densities, strict=True)
     ]
-    found = identify(
+    identification = identify(
         MPM(**params.simulation),
         *videos[0],
         settings,
@@ -59,10 +59,10 @@ def main(inputs, output, params, run) -> None:
         refined=finer,
         other_videos=videos[1:],
         progress=run.progress,
-        log=run.say,
+        log=run.log,
     )
-    write_json(output.identified, found.as_dict())
-    run.say(found.summary())
+    write_json(output.identified, identification.as_dict())
+    run.log(identification.summary())
 
 
 run_script(main, snakemake)

@@ -23,7 +23,7 @@ def measure_view(body, observation, steps, x, F, networks, margin) -> list[dict[
     """Measures of every frame of one view; x and F are states at the steps."""
     white = Filmed(body.particle_gs(observation.cameras), observation, steps)
     black = Filmed(body.particle_gs(observation.cameras, background=(0.0, 0.0, 0.0)), observation, steps)
-    found = []
+    measures = []
     for part in frame_batches(len(observation.frames), white.batch):
         states = (white.states(x, part), white.states(F, part))
         images = white(*states)
@@ -31,8 +31,8 @@ def measure_view(body, observation, steps, x, F, networks, margin) -> list[dict[
         alphas = 1 - (images - black(*states)).mean(-1)
         seen, masks = observation.colours(part), observation.images[part][..., 3].to(images) / 255
         for frame in zip(images[:, 0], alphas[:, 0], seen[:, 0], masks[:, 0], strict=True):
-            found.append(image_metrics(*frame, networks, margin))
-    return found
+            measures.append(image_metrics(*frame, networks, margin))
+    return measures
 
 
 def main(inputs, output, params, run) -> None:
@@ -43,7 +43,7 @@ def main(inputs, output, params, run) -> None:
     body = prediction.body(params.density, params.carrier, params.gaussian_motion, device)
     arrays, _ = read_arrays(inputs.rollout, required=("frames",), only=("frames",))
     x, F = (state.to(device) for state in load_motion(inputs.rollout))
-    steps, found = arrays["frames"].tolist(), {}
+    steps, by_step = arrays["frames"].tolist(), {}
     for k, view in enumerate(params.views):
         for video in load_videos(inputs.transforms, [view], **params.exposure):
             if not set(rendered_steps([video])) <= set(steps):
@@ -55,11 +55,11 @@ def main(inputs, output, params, run) -> None:
                     body, video.to(torch.float32, device), steps, x, F, networks, params.margin
                 )
             for step, measured in zip(video.frames, measures, strict=True):
-                found.setdefault(step, []).append(measured)
+                by_step.setdefault(step, []).append(measured)
         run.progress(k + 1, len(params.views), float(np.mean([m["psnr"] for m in measures])))
-    frames = sorted(found)
+    frames = sorted(by_step)
     per_frame = {
-        name: np.array([np.mean([m[name] for m in found[step]]) for step in frames]) for name in MEASURES
+        name: np.array([np.mean([m[name] for m in by_step[step]]) for step in frames]) for name in MEASURES
     }
     seen = sorted(set(params.views) & set(params.training_views))
     report = {"views": params.views, "views_seen_in_training": seen}
@@ -68,7 +68,7 @@ def main(inputs, output, params, run) -> None:
     report |= {f"{name}_per_frame": values.tolist() for name, values in per_frame.items()}
     write_json(output.metrics, report)
     views = ", ".join(map(str, params.views)) + (" (SEEN IN TRAINING)" if seen else "")
-    run.say(
+    run.log(
         f"views {views}: PSNR {report['psnr']:.1f} dB, SSIM {report['ssim']:.3f},"
         f" LPIPS {report['lpips_vgg']:.3f} (VGG) {report['lpips_alex']:.3f} (Alex)"
     )

@@ -28,9 +28,7 @@ def main(inputs, output, params, run) -> None:
     centre = np.average(truth["x"][0], axis=0, weights=truth["mass"])
     # The true velocity where the estimated one is: at the reconstruction's centre of mass.
     v0 = np.asarray(scene["velocity"]) + np.cross(spin, np.asarray(velocity["centre"]) - centre)
-    in_camera, free = (
-        axes @ (np.asarray(found["v0"]) - v0) for found in (velocity, velocity["without_ridge"])
-    )
+    in_camera, free = (axes @ (np.asarray(fit["v0"]) - v0) for fit in (velocity, velocity["without_ridge"]))
     turning = axes @ (np.asarray(velocity["angular_velocity"]) - spin)
     speed, rate = float(np.linalg.norm(v0)), max(float(np.linalg.norm(spin)), LEAST_SPIN)
     added = int(attributes["added"])
@@ -57,7 +55,7 @@ def main(inputs, output, params, run) -> None:
         "angular_velocity_error_percent": float(100 * np.linalg.norm(turning) / rate),
     }
     write_json(output.report, report)
-    run.say(
+    run.log(
         f"PSNR {report['psnr']:.1f} dB, volume IoU {report['volume_iou']:.3f}, {report['particles']} particles"
         f" (+{added}), velocity error {report['velocity_error_in_plane_percent']:.2f} % in plane,"
         f" {report['velocity_error_depth']:+.3f} m/s in depth, spin error {np.linalg.norm(turning):.2f} rad/s"

@@ -27,7 +27,7 @@ def main(inputs, output, params, run) -> None:
     csv, markdown = report_table(reports, COLUMNS, "scene")
     write_text(output.csv, csv)
     write_text(output.markdown, markdown)
-    run.say(f"{len(reports)} scenes: {output.markdown}")
+    run.log(f"{len(reports)} scenes: {output.markdown}")
 
 
 run_script(main, snakemake)

@@ -10,7 +10,7 @@ from workflow.stage import run_script
 def main(inputs, output, params, run) -> None:
     import_module(f"workflow.kernels.{params.group}").compile_kernels(choose_device(params.device))
     write_text(output.ready, f"{params.group}\n")
-    run.say("compiled")
+    run.log("compiled")
 
 
 run_script(main, snakemake)

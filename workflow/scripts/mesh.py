@@ -16,7 +16,7 @@ def main(inputs, output, params, run) -> None:
     if views.photographs:
         mesh = photographed(mesh, views.photographs.edge, views.floor)
     write_mesh(output.mesh, mesh.vertices, mesh.faces)
-    run.say(f"{len(mesh.faces)} faces, watertight: {mesh.is_watertight}, volume {1e3 * mesh.volume:.3f} l")
+    run.log(f"{len(mesh.faces)} faces, watertight: {mesh.is_watertight}, volume {1e3 * mesh.volume:.3f} l")
 
 
 run_script(main, snakemake)

@@ -38,7 +38,7 @@ def main(inputs, output, params, run) -> None:
         report = {"diverged": None, "energy_gain_after_step": energy_gain_after(mpm.gravity, start, path)}
     report |= {"diverged": failure and asdict(failure), "stable": model.stable}
     write_json(output.report, report)
-    run.say(
+    run.log(
         message + (f". DIVERGED: a particle {failure.happened} at step {failure.step}" if failure else "")
     )
 

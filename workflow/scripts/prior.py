@@ -9,7 +9,7 @@ from workflow.stage import run_script
 
 
 def at_step(spec: dict, dt: float) -> dict:
-    """A law for the scene's time step, whatever that of the throws: a network knows one step only."""
+    """The law at the time step of the scene, since a network is defined for one time step."""
     depends = "dt" in analytic_law(spec, dt).plasticity.values
     return {**spec, "plasticity": {**spec["plasticity"], "dt": dt}} if depends else spec
 
@@ -19,7 +19,7 @@ def main(inputs, output, params, run) -> None:
     law, report = train_prior(spec, RegressionConfig(**params.options), params.seed, run.progress)
     write_weights(output.weights, law.prior_state(), {"prior": params.name, "law": spec, "method": METHOD})
     write_json(output.report, report)
-    run.say(remark(report))
+    run.log(remark(report))
 
 
 run_script(main, snakemake)

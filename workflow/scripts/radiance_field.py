@@ -1,4 +1,4 @@
-"""Fit a voxel radiance field to the views at t = 0, and show held-out views beside the images."""
+"""Fit a voxel radiance field to the views at t = 0, and show held-out views next to the images."""
 
 from dataclasses import asdict
 
@@ -43,7 +43,7 @@ def main(inputs, output, params, run) -> None:
     save_field(output.field, field, {"settings": params.fit, "seed": params.seed})
     write_json(output.report, asdict(report))
     checkpoint.remove()
-    run.say(
+    run.log(
         f"{report.particles} particles, voxel {1000 * report.voxel:.0f} mm, PSNR on held-out views"
         f" {report.psnr:.1f} dB, inside the object {report.psnr_object:.1f} dB"
         f" ({report.direct_psnr_object:.1f} dB without particles)"

@@ -26,7 +26,7 @@ def main(inputs, output, params, run) -> None:
     write_text(output.csv, csv)
     write_text(output.markdown, markdown)
     for sentence in sentences:
-        run.say(sentence)
+        run.log(sentence)
 
 
 run_script(main, snakemake)

@@ -46,7 +46,7 @@ def main(inputs, output, params, run) -> None:
     write_mattes(output.transforms, zip(frames, pictures, masks, strict=True), world)
     report = {"photographs": len(names), "agreement": dict(zip(names, ious.tolist())), "left_out": []}
     write_json(output.report, {**report, "own": names})
-    run.say(summary)
+    run.log(summary)
 
 
 run_script(main, snakemake)

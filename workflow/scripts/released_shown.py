@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from neuma_lib.capture.released import background_behind, read_configured, read_shots
-from neuma_lib.capture.report.display_video import numbers_of, write_display_frames
+from neuma_lib.capture.report.display_video import display_frames, numbers_of
 from neuma_lib.config.capture import ReleasedConfig
 from neuma_lib.io.files import listed, read_json
 from neuma_lib.io.images import read_transforms, write_transforms
@@ -22,10 +22,10 @@ def main(inputs, output, params, run) -> None:
         frames = ((number, by_number[number]) for number in numbers_of(video, camera))
         # There is no picture of the empty scene.
         background = background_behind(pictures, masks)
-        entries += write_display_frames(
+        entries += display_frames(
             folder, camera, video, mattes, frames, background, params.width, gains[camera]
         )
-        run.say(f"{camera}: {len(numbers_of(video, camera))} frames")
+        run.log(f"{camera}: {len(numbers_of(video, camera))} frames")
     write_transforms(output.transforms, {}, entries)
 
 

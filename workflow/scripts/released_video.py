@@ -34,7 +34,7 @@ def main(inputs, output, params, run) -> None:
     size = {"width": shots[0].lens.width, "height": shots[0].lens.height}
     times = [frame["time"] for frame in frames]
     write_json(output.timeline, {**timeline, **size, "times_s": np.asarray(times).tolist()})
-    run.say(summary)
+    run.log(summary)
 
 
 run_script(main, snakemake)

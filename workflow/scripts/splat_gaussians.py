@@ -18,7 +18,7 @@ def main(inputs, output, params, run) -> None:
     gaussians = placed(turned(gaussians, upright(settings.up, settings.turn)), **params.place)
     save_gaussians(output.gaussians, gaussians)
     write_json(output.report, asdict(counts))
-    run.say(
+    run.log(
         f"{counts.read} Gaussians: {counts.faint} faint, {counts.oversized} oversized, {counts.isolated} isolated, "
         f"{counts.kept} kept of the others"
     )

@@ -13,11 +13,11 @@ def main(inputs, output, params, run) -> None:
     cameras = views_around(gaussians, params.views, params.pixels)
     mesh = splat_surface(gaussians, cameras, SurfaceConfig(**params.surface))
     if params.edge and not has_meshlab():
-        run.say("the surface is not repaired, as pymeshlab is missing (`make capture` installs it)")
+        run.log("the surface is not repaired, as pymeshlab is missing (`make capture` installs it)")
     elif params.edge:
         mesh = repaired(mesh, params.edge * float(mesh.extents.max()), "surface")
     write_mesh(output.mesh, mesh.vertices, mesh.faces)
-    run.say(f"{len(mesh.faces)} faces, watertight: {mesh.is_watertight}, volume {1e3 * mesh.volume:.3f} l")
+    run.log(f"{len(mesh.faces)} faces, watertight: {mesh.is_watertight}, volume {1e3 * mesh.volume:.3f} l")
 
 
 run_script(main, snakemake)

@@ -14,7 +14,7 @@ def main(inputs, output, params, run) -> None:
     truth = analytic_law(params.truth, params.dt)
     errors = stress_errors(law, truth, VisitedStates.of_arrays(arrays), params.dt)
     write_json(output.stress, errors)
-    run.say(", ".join(f"{part} {errors[part]:.3f}" for part in ("stress", "returned")))
+    run.log(", ".join(f"{part} {errors[part]:.3f}" for part in ("stress", "returned")))
 
 
 run_script(main, snakemake)

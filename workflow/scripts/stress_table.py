@@ -7,19 +7,19 @@ from workflow.stage import run_script
 
 
 def main(inputs, output, params, run) -> None:
-    found: dict[str, dict[str, dict[str, list]]] = {}
+    results: dict[str, dict[str, dict[str, list]]] = {}
     for kind in ("stress", "responses"):
         for (method, column), file in zip(params.cells, list(inputs[kind]), strict=True):
-            runs = found.setdefault(kind, {}).setdefault(method, {}).setdefault(column, [])
+            runs = results.setdefault(kind, {}).setdefault(method, {}).setdefault(column, [])
             runs.append(read_json(file))
     csv, markdown, verdicts = stress_table(
-        found["stress"], params.titles, params.columns, PAPER["stress"], found["responses"]
+        results["stress"], params.titles, params.columns, PAPER["stress"], results["responses"]
     )
     write_text(output.csv, csv)
     write_text(output.markdown, markdown)
-    run.say(f"{len(params.titles)} methods, {len(params.columns)} columns: {output.markdown}")
+    run.log(f"{len(params.titles)} methods, {len(params.columns)} columns: {output.markdown}")
     for verdict in verdicts:
-        run.say(str(verdict))
+        run.log(str(verdict))
 
 
 run_script(main, snakemake)

@@ -9,15 +9,15 @@ from workflow.stage import run_script
 
 def main(inputs, output, params, run) -> None:
     world = {key: params.images[key] for key in ("scale", "offset")}
-    said = f"from {inputs.images}"
+    source = f"from {inputs.images}"
     if Path(inputs.images).name in OFFSETS:
         stride = params.images["stride"]
         images = take_video(inputs.images, output.transforms, params.steps, stride, **world)
-        said += f", a frame every {stride * params.dt:.6g} s"
+        source += f", a frame every {stride * params.dt:.6g} s"
     else:
         images = list_images(inputs.images, output.transforms, **world)
     views = len(set(images.views.tolist()))
-    run.say(f"{len(images.images)} images of {images.width}x{images.height} px, {views} views, {said}")
+    run.log(f"{len(images.images)} images of {images.width}x{images.height} px, {views} views, {source}")
 
 
 run_script(main, snakemake)

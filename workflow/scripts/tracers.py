@@ -16,7 +16,7 @@ def main(inputs, output, params, run) -> None:
     floor = chamfer_sequence(*(torch.from_numpy(truth[name]) for name in reversed(samplings)))
     starts = np.asarray(sample_tracers(read_mesh(inputs.mesh), params.tracers, seed=params.seed), np.float32)
     write_arrays(output.tracers, {"starts": starts, "floor": floor.numpy()})
-    run.say(f"{len(starts)} tracers, sampling floor {float(floor.mean()):.3f}e-4 m^2")
+    run.log(f"{len(starts)} tracers, sampling floor {float(floor.mean()):.3f}e-4 m^2")
 
 
 run_script(main, snakemake)

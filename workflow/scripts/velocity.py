@@ -28,9 +28,9 @@ def main(inputs, output, params, run) -> None:
     free = estimate
     if settings.ridge:
         free = estimate_velocity(model, law, body, videos, settings.model_copy(update={"ridge": 0.0}))
-        run.say(f"without the ridge: {free.summary()}")
+        run.log(f"without the ridge: {free.summary()}")
     write_json(output.velocity, {**estimate.as_dict(), "without_ridge": free.as_dict()})
-    run.say(estimate.summary())
+    run.log(estimate.summary())
 
 
 run_script(main, snakemake)

@@ -1,4 +1,4 @@
-"""Film the prediction beside the observation."""
+"""Film the prediction next to the observation."""
 
 import numpy as np
 import torch
@@ -42,7 +42,7 @@ def main(inputs, output, params, run) -> None:
     video = np.stack([panels[step] for step in sorted(panels)])
     with atomic(output.video) as partial:
         write_mp4(partial, video, params.frame_rate)
-    run.say(f"{len(video)} frames, PSNR {sum(quality) / len(quality):.1f} dB on average")
+    run.log(f"{len(video)} frames, PSNR {sum(quality) / len(quality):.1f} dB on average")
 
 
 run_script(main, snakemake)

@@ -11,7 +11,7 @@ def main(inputs, output, params, run) -> None:
     scene = load_scene(SceneFiles.of_plain(params.files), side=settings["image_side"])
     size = write_page(output.page, scene, settings["particles"], settings["megabytes"])
     titles = ", ".join(motion.title for motion in scene.motions)
-    run.say(f"{titles}: {len(scene.steps)} frames, {size / 1e6:.1f} MB")
+    run.log(f"{titles}: {len(scene.steps)} frames, {size / 1e6:.1f} MB")
 
 
 run_script(main, snakemake)

@@ -16,9 +16,9 @@ def main(inputs, output, params, run) -> None:
     dt = params.simulation["dt"]
     law = analytic_law(params.law, dt).to(device)
     draws = {"states": params.states, "paths": params.paths, "seed": params.seed}
-    found = visit(MPM(**params.simulation), law, start.to(device), params.frames, **draws)
-    write_arrays(output.visited, found.arrays(), {"dt": dt})
-    run.say(f"{len(found.F)} states and {found.C.shape[1]} paths, from step {found.frames[0]} on")
+    visits = visit(MPM(**params.simulation), law, start.to(device), params.frames, **draws)
+    write_arrays(output.visited, visits.arrays(), {"dt": dt})
+    run.log(f"{len(visits.F)} states and {visits.C.shape[1]} paths, from step {visits.frames[0]} on")
 
 
 run_script(main, snakemake)

@@ -16,7 +16,7 @@ from neuma_lib.errors import InputError
 from neuma_lib.io.images import open_image, read_transforms
 
 
-def write_display_frames(
+def display_frames(
     folder: Path,
     camera: str,
     video: Sequence[Mapping[str, Any]],

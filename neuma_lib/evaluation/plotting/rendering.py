@@ -138,10 +138,10 @@ def cropped(
     boxes = []
     for images in guides or groups:
         flat = images.reshape(-1, *images.shape[-3:])
-        shown = (flat < _WHITE).any(axis=(0, 3))
-        if not shown.any():
-            shown[:] = True
-        rows, columns = np.flatnonzero(shown.any(1)), np.flatnonzero(shown.any(0))
+        visible = (flat < _WHITE).any(axis=(0, 3))
+        if not visible.any():
+            visible[:] = True
+        rows, columns = np.flatnonzero(visible.any(1)), np.flatnonzero(visible.any(0))
         boxes.append((rows[0], rows[-1] + 1, columns[0], columns[-1] + 1))
     pad = round(margin * max(max(images.shape[-3:-1]) for images in groups))
     height = max(bottom - top for top, bottom, _, _ in boxes) + 2 * pad

@@ -28,7 +28,7 @@ ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILION, PURPLE = (
     "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7",
 )  # fmt: skip
 SEQUENCE = (BLUE, ORANGE, GREEN, PURPLE, VERMILION, SKY)
-"""Colours of other things than methods, in order."""
+"""Colours of lines that are not methods, in order."""
 RAMP = "cividis"
 """Colour map of ordered quantities, uniform in lightness and suited to colour-blind readers."""
 

@@ -42,13 +42,13 @@ class CarriedField:
         density: Density,
     ):
         self.field = field.requires_grad_(False)
-        self.shown = field.particles(spacing, min_opacity)
-        if not len(self.shown.x):
+        self.rendered = field.particles(spacing, min_opacity)
+        if not len(self.rendered.x):
             raise InputError("radiance field", "it has no particles", "Run the rule radiance_field again")
-        coarser = max(1.0, (len(self.shown.x) / settings.particles) ** (1 / 3))
+        coarser = max(1.0, (len(self.rendered.x) / settings.particles) ** (1 / 3))
         self.moving = field.particles(coarser * spacing, max(min_opacity, settings.min_opacity))
         self.mass = self.moving.masses(density_at(self.moving.x, density))
-        self._follow = Interpolation(self.shown.x, self.moving.x, settings.followed)
+        self._follow = Interpolation(self.rendered.x, self.moving.x, settings.followed)
 
     @classmethod
     def load(
@@ -102,7 +102,7 @@ class FieldRenderer:
 
     def __init__(self, body: CarriedField, cameras: Cameras, background: Sequence[float] = WHITE):
         self.body, self.background = body, background
-        self.cameras = cameras.to(body.shown.x.device, body.shown.x.dtype)
+        self.cameras = cameras.to(body.rendered.x.device, body.rendered.x.dtype)
 
     def __call__(self, x: Tensor, F: Tensor | None = None) -> Tensor:
         """Images (T, V, H, W, 3) in [0, 1] for simulated particles at x (T, A, 3) [m]. The deformations F are ignored.
@@ -114,11 +114,11 @@ class FieldRenderer:
         if x.shape[1:] != moving.shape:
             problem = f"{x.shape[1]} particles must be the {len(moving)} simulated ones of the field"
             raise InputError("rollout", problem, "Run the evaluation again")
-        field, shown = self.body.field, self.body.shown
+        field, rendered = self.body.field, self.body.rendered
         positions = self.body.positions(x.to(moving))
         views = range(len(self.cameras))
         images = [
-            field.draw(self.cameras, view, replace(shown, x=at), self.background)
+            field.draw(self.cameras, view, replace(rendered, x=at), self.background)
             for at in positions
             for view in views
         ]

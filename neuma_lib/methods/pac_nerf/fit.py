@@ -78,7 +78,7 @@ class Video:
         images. Differentiable with respect to x. The gradient is computed during rendering, piece by piece
         (`rendering.POINTS_AT_ONCE`), so that the memory does not depend on the size of the image.
         """
-        lattice, values = body.shown.seen(x)
+        lattice, values = body.rendered.seen(x)
         image = self.image(k, view)
         chosen = self.shows_body(image, view, lattice)
         count = len(chosen)
@@ -188,7 +188,7 @@ def fit_pac_nerf(
             progress(fit.iteration, fit.iterations, fit.history.loss[-1])
         if checkpoint is not None and fit.iteration % settings.save_every == 0:
             checkpoint.save(fit.state_dict())
-    counts = len(body.moving.x), len(body.shown.x)
+    counts = len(body.moving.x), len(body.rendered.x)
     return PacNerfFit(fit.velocity, fit.velocity_losses, constants, fit.history, counts)
 
 

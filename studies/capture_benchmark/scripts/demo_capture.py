@@ -22,7 +22,7 @@ def main(inputs, output, params, run) -> None:
             Image.fromarray(developed(backgrounds[camera], demo.videos.noise, rng)).save(partial, "PNG")
     write_json(output.truth, truth_of(demo, params.name, read_json(inputs.photographs)))
     write_text(output.settings, yaml.safe_dump(capture_settings(demo, params.name), sort_keys=False))
-    run.say(f"{len(backgrounds)} stills, capture.yaml and truth.json")
+    run.log(f"{len(backgrounds)} stills, capture.yaml and truth.json")
 
 
 run_script(main, snakemake)

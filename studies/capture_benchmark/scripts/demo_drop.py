@@ -20,7 +20,7 @@ def main(inputs, output, params, run) -> None:
     write_arrays(output.particles, arrays, {"dt": time_step(demo)})
     lowest = arrays["x"][..., 1].min(axis=1)
     landed = arrays["time"][np.argmax(lowest < 0.5 / demo.truth.grid)]
-    run.say(
+    run.log(
         f"{len(arrays['mass'])} particles, {steps[-1]} steps, {len(steps)} states, on the floor after {landed:.3f} s"
     )
 

@@ -59,7 +59,7 @@ def main(inputs, output, params, run) -> None:
     write_text(output.csv, text.getvalue())
     write_text(output.page, "# The demo captures compared with the ground truth\n\n" + markdown)
     missed = [row.what for _, _, row in rows if row.reached is False]
-    run.say(f"{sum(row.reached is True for _, _, row in rows)} goals reached, {len(missed)} missed")
+    run.log(f"{sum(row.reached is True for _, _, row in rows)} goals reached, {len(missed)} missed")
 
 
 def mattes(path):

@@ -20,7 +20,7 @@ def main(inputs, output, params, run) -> None:
         write_jpeg(path, pixels, demo.photographs.quality)
         truth[Path(path).name] = {**eye.plain(), "light": light}
     write_json(output.truth, truth)
-    run.say(f"{len(truth)} photographs")
+    run.log(f"{len(truth)} photographs")
 
 
 run_script(main, snakemake)

@@ -25,7 +25,7 @@ def main(inputs, output, params, run) -> None:
     where = scenery(demo.room, page, (page.shape[1] * texel, page.shape[0] * texel))
     write_room(output.room, where, backgrounds(demo, where, params.threads, run.progress))
     pixels = np.prod(where.pictures[0].shape[:2])
-    run.say(f"floor of {pixels / 1e6:.0f} million pixels, backgrounds of {len(demo.cameras)} cameras")
+    run.log(f"floor of {pixels / 1e6:.0f} million pixels, backgrounds of {len(demo.cameras)} cameras")
 
 
 run_script(main, snakemake)

@@ -14,7 +14,7 @@ def main(inputs, output, params, run) -> None:
     pictures = film(demo, where, body, frames, backgrounds, seed, params.threads, run.progress)
     for path, camera in zip(output.videos, sorted(demo.cameras)):
         write_video(path, pictures[camera], demo.videos.rate, demo.videos.quality)
-    run.say(f"{len(pictures)} videos of {demo.videos.frames} frames")
+    run.log(f"{len(pictures)} videos of {demo.videos.frames} frames")
 
 
 run_script(main, snakemake)

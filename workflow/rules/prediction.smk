@@ -1,4 +1,4 @@
-"""What splats, and motions for other programs, are made of. Needs methods.smk."""
+"""Inputs of predictions of splats and of exported motions. Needs methods.smk."""
 
 
 def splat_setting(choose):
@@ -18,7 +18,7 @@ def splat_start(wildcards):
             "a splat has no video to learn a law from",
             f"Use the law of another scene, {method}+{LAW_FROM}=<scene>, or the prior alone, nclaw",
         )
-    return of_chain("velocity.json")(wildcards)
+    return of_replicate("velocity.json")(wildcards)
 
 
 @checked
@@ -34,7 +34,7 @@ def splat_frames(wildcards):
 
 
 @checked
-def moved_densities(wildcards):
+def body_densities(wildcards):
     """Densities of the bodies of a scene or an experiment."""
     scenes = SETTINGS.body_scenes(subject(wildcards))
     return [SETTINGS.scene(scene).plain()["density"] for scene in scenes]

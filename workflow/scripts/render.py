@@ -1,0 +1,33 @@
+"""Render the object: at t = 0 from cameras on a sphere, or in motion from a ring of cameras."""
+
+from pathlib import Path
+
+from neuma_lib.config.blender import AppearanceConfig, ImagesConfig
+from neuma_lib.data.blender.bodies import make_body
+from neuma_lib.data.blender.scene import render_dynamic, render_static
+from neuma_lib.geometry.shapes import place
+from neuma_lib.io.hdf5 import read_arrays
+from neuma_lib.splatting.viewpoints import static_views, video_views
+from workflow.stage import run_script
+
+
+def main(inputs, output, params, run) -> None:
+    scene, images = params.scene, ImagesConfig(**params.images)
+    names = ("x", "tracers", "frames")
+    arrays, attributes = read_arrays(inputs.truth, only=names, required=names)
+    steps = arrays["frames"].tolist() if params.moving else [0]
+    mesh = place(scene["shape"], scene["size"], scene["height"], scene["center"])
+    look = AppearanceConfig(**scene["appearance"])
+    body = make_body(mesh, look, arrays["x"][: len(steps)], arrays["tracers"][: len(steps)])
+    viewpoints = video_views if params.moving else static_views
+    views = viewpoints(body.points, images.views, images.width, images.height)
+    folder = Path(output.transforms).parent
+    how = (folder, images.samples, params.threads, run.progress, params.device)
+    if params.moving:
+        render_dynamic(body, views, steps, attributes["dt"], *how)
+    else:
+        render_static(body, views, *how)
+    run.log(f"{len(views)} views, {len(steps)} frames of {views.width}x{views.height} px")
+
+
+run_script(main, snakemake)
