@@ -6,7 +6,7 @@ DRAWN = SETTINGS.figures
 COMPARED = SETTINGS.tables["table1"] if "table1" in SETTINGS.tables else None
 # A law that is evaluated twice is drawn once, on the particles that all methods share, unless figures.beside names it.
 SHARED = [m for m in (COMPARED or SETTINGS).methods if cases.fit_name(SETTINGS, m) == m]
-METHODS = SHARED + [m for m in DRAWN.beside if m not in SHARED]
+METHODS = SHARED + [m for m in SETTINGS.figures.beside if m not in SHARED]
 NAMES = table_titles("table1") if COMPARED else {}
 TITLES = {method: NAMES.get(method) or cases.title(SETTINGS, method) for method in METHODS}
 PREDICTED = ["nclaw", *DRAWN.methods]
@@ -57,7 +57,10 @@ def own_bodies(scenes):
         for scene in scenes:
             case = case_on(scene, method)
             if files := case.method.body_inputs(case):
-                source = body_parameter(case) | {"files": files, "carrier": case.method.particle_source(case)}
+                source = body_parameter(case) | {
+                    "files": files,
+                    "particle_source": case.method.particle_source(case),
+                }
                 sources.setdefault(method, {})[scene] = source
     return sources
 

@@ -18,7 +18,7 @@ rule identify:
         binding=SETTINGS.binding.plain(),
         identify=identify_settings,
         seed=seed_of("particles"),
-        stock=published_law,
+        published=published_law,
         exposure=exposure,
         device=SETTINGS.device,
     script:

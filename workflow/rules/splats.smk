@@ -61,7 +61,7 @@ use rule predict as predict_splat with:
         simulation=splat_simulation,
         densities=of_case(lambda case: [SETTINGS.scene(case.moved).plain()["density"]]),
         total=of_bodies(carries_total),
-        carrier=of_bodies(shared_carrier),
+        particle_source=of_bodies(shared_particle_source),
         frames=splat_frames,
         cameras=None,
         scale=None,
