@@ -1,16 +1,35 @@
 """Splats that were made elsewhere: their Gaussians and surface, and their motion under learned laws (docs/splats.md)."""
 
+@checked
+def splat_start(wildcards):
+    """File of the initial motion of a splat. Its law is that of another scene, as it has no video."""
+    scene, method = wildcards.scene, wildcards.method
+    case = case_on(scene, method)
+    case.method.model_options(case)  # refuses a true law, which a splat does not have
+    if case.learned_from_moved_scene:
+        raise InputError(
+            f"{scene}/{method}",
+            "a splat has no video to learn a law from",
+            f"Use the law of another scene, {method}+{LAW_FROM}=<scene>, or the prior alone, nclaw",
+        )
+    return of_replicate("velocity.json")(wildcards)
+
+
+def splat_clock(choose):
+    """A function of wildcards: something of the time step [s] and the frames of a splat's motion."""
+    return checked(lambda wildcards: choose(*cases.motion_clock(SETTINGS, wildcards.scene, wildcards.method)))
+
 
 rule splat_gaussians:
     input:
-        splat=splat_setting(lambda scene: scene.splat.file),
+        splat=of_section(lambda scene: scene.splat.file),
     output:
         gaussians=f"{RESULTS}/{{scene}}/gaussians.ply",
         report=f"{RESULTS}/{{scene}}/gaussians.json",
     wildcard_constraints:
         scene=SPLAT_SCENE,
     params:
-        splat=splat_setting(lambda scene: scene.splat.plain()),
+        splat=of_section(lambda scene: scene.splat.plain()),
         place=scene_setting("size", "height", "center"),
         seed=seed_of("gaussians"),
     script:
@@ -26,9 +45,9 @@ rule splat_mesh:
     wildcard_constraints:
         scene=SPLAT_SCENE,
     params:
-        views=splat_setting(lambda scene: scene.splat.views),
-        pixels=splat_setting(lambda scene: scene.splat.pixels),
-        edge=splat_setting(lambda scene: scene.splat.edge),
+        views=of_section(lambda scene: scene.splat.views),
+        pixels=of_section(lambda scene: scene.splat.pixels),
+        edge=of_section(lambda scene: scene.splat.edge),
         surface=SETTINGS.geometry.surface.plain(),
     script:
         "../scripts/splat_mesh.py"
@@ -58,11 +77,11 @@ use rule predict as predict_splat with:
         scene=SPLAT_SCENE,
     params:
         method=of_bodies(model_parameter),
-        simulation=splat_simulation,
+        simulation=splat_clock(lambda dt, frames: simulator(dt)),
         densities=of_case(lambda case: [SETTINGS.scene(case.moved).plain()["density"]]),
         total=of_bodies(carries_total),
         particle_source=of_bodies(shared_particle_source),
-        frames=splat_frames,
+        frames=splat_clock(lambda dt, frames: list(frames)),
         cameras=None,
         scale=None,
         exposure=None,
