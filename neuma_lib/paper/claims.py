@@ -157,7 +157,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Claim(ABC):
-    """A statement about methods. Subclasses say how it is checked."""
+    """A statement about methods. Subclasses define how it is checked."""
 
     text: str
 
@@ -202,20 +202,20 @@ class Closer(Claim):
         first, second = (np.stack([row.mean[:-1] for row in rows]) for rows in groups)
         lower, count = int((first.max(axis=0) < second.min(axis=0)).sum()), first.shape[1]
         majority = 2 * lower > count
-        doubts = ([] if average else ["not on average"]) + ([] if majority else ["not in most columns"])
+        caveats = ([] if average else ["not on average"]) + ([] if majority else ["not in most columns"])
         if few := _too_few(*better, *worse):
-            doubts.append(few)
+            caveats.append(few)
         elif average and max(r.mean[-1] + r.std[-1] for r in better) >= min(
             r.mean[-1] - r.std[-1] for r in worse
         ):
-            doubts.append("the ± overlap")
+            caveats.append("the ± overlap")
         if any((m, c) in frame.broken for m in self.better for c in self.columns or frame.columns):
-            doubts.append("a prediction broke off")
+            caveats.append("a prediction broke off")
         here = f"{high.average()} ({high.title}) against {low.average()} ({low.title}), lower in {lower} of {count}"
         if not (average or majority):
             return Verdict(self.text, FAILS, here, self._paper(frame))
-        here += f"; {', '.join(doubts)}" if doubts else ""
-        return Verdict(self.text, MIXED if doubts else HOLDS, here, self._paper(frame))
+        here += f"; {', '.join(caveats)}" if caveats else ""
+        return Verdict(self.text, MIXED if caveats else HOLDS, here, self._paper(frame))
 
     def _paper(self, frame: Frame) -> str:
         """The same comparison with the paper's distances."""
@@ -264,17 +264,17 @@ class Bound(Claim):
         within = row.mean <= bound
         surely = within if row.std is None else row.mean + row.std <= bound
         met, sure = (ok[-1] if self.count is None else ok[:-1].sum() >= self.count for ok in (within, surely))
-        doubts = [] if sure else ["not with the ±"]
-        doubts += filter(None, [_too_few(row)])
+        caveats = [] if sure else ["not with the ±"]
+        caveats += filter(None, [_too_few(row)])
         columns = self.columns or tuple(frame.columns)
         away = sum((self.method, column) in frame.broken for column in columns)
         if away and self.quantity != BROKEN:
-            doubts.append(f"broke off in {away} of {len(columns)}")
+            caveats.append(f"broke off in {away} of {len(columns)}")
         here = f"{row.average()} {'mm' if self.quantity == RMSE else '%'} ({row.title})"
         here += f" against {of[0].average()} ({of[0].title})" if of else ""
         here += f", kept in {within[:-1].sum()} of {len(columns)}" if self.count is not None else ""
-        word = FAILS if not met else MIXED if doubts else HOLDS
-        return Verdict(self.text, word, "; ".join([here, *doubts]) if word == MIXED else here)
+        word = FAILS if not met else MIXED if caveats else HOLDS
+        return Verdict(self.text, word, "; ".join([here, *caveats]) if word == MIXED else here)
 
 
 def counted(

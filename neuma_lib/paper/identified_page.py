@@ -39,7 +39,7 @@ def identified_page(identified: Mapping[str, Any], truth: Mapping[str, Mapping[s
     losses.margins(0.15)
     losses.set_yticks(range(len(order)), order)
     dropped = [name for name in identified["families"] if name not in scored]
-    title = f"given up: {', '.join(dropped)}" if dropped else "all families"
+    title = f"dropped: {', '.join(dropped)}" if dropped else "all families"
     losses.set(xscale="log", xlabel="mean squared residual of held-out frames", title=title)
     losses.xaxis.set_minor_formatter(NullFormatter())
 

@@ -38,11 +38,11 @@ def stress_table(
     Returns:
         CSV, with a row ``<part>_std`` after each row of means of several replicates; Markdown; verdicts on the claims.
     """
-    chains = min(len(runs) for row in errors.values() for runs in row.values())
+    repeats = min(len(runs) for row in errors.values() for runs in row.values())
     frame = Frame(dict(columns))
     for part in HEADINGS:
         for method, title in titles.items():
-            runs = [[errors[method][c][k][part] for c in columns] for k in range(chains)]
+            runs = [[errors[method][c][k][part] for c in columns] for k in range(repeats)]
             frame.add(
                 part, method, title, 100 * np.array(runs, dtype=float)
             )  # None, of broken paths, becomes NaN
@@ -68,9 +68,9 @@ def stress_table(
             cells.append(["*true stress, root mean square [kPa]*", *scaled, ""])
         header = ["Method", *columns.values(), "Average"]
         text += [f"**{heading}**", "", *as_markdown(header, cells, numbers=True), ""]
-    if chains > 1:
+    if repeats > 1:
         text += [
-            f"± is the standard deviation over {chains} replicates; behind an average, of their averages.",
+            f"± is the standard deviation over {repeats} replicates; behind an average, of their averages.",
             "",
         ]
     broken = [

@@ -96,8 +96,8 @@ class Table(Frame):
         parts = [f"# {self.paper.heading}", ""] if self.paper else []
         parts += [*self._errors(), *self._distances()]
         paragraphs = []
-        if chains := max(len(row.runs) for row in self.rows.values()) - 1:
-            spread = f"± is the standard deviation over {chains + 1} replicates; behind an average, of their averages."
+        if repeats := max(len(row.runs) for row in self.rows.values()) - 1:
+            spread = f"± is the standard deviation over {repeats + 1} replicates; behind an average, of their averages."
             paragraphs.append(spread)
         signs = "".join(self.marks.values())
         paragraphs += [f"{sign} {note}" for sign, note in FOOTNOTES.items() if sign in signs]
@@ -266,8 +266,8 @@ def chamfer_table(
             for k, run in enumerate(runs):
                 if run.get("diverged"):
                     table.broken.add((method, column))
-                    chain = f", replicate {k + 1} of {len(runs)}" if len(runs) > 1 else ""
-                    table.failures.append(f"{title} on {heading}{chain}: {_describe_failure(run)}")
+                    replicate = f", replicate {k + 1} of {len(runs)}" if len(runs) > 1 else ""
+                    table.failures.append(f"{title} on {heading}{replicate}: {_describe_failure(run)}")
             if signs := signs + ROLLOUT_DIVERGED * ((method, column) in table.broken):
                 table.marks[method, column] = signs
     return table

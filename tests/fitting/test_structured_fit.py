@@ -116,7 +116,7 @@ def test_a_training_in_two_stretches_is_the_whole(problem):
 
 
 def test_a_correction_may_stiffen_beyond_the_limit_where_training_may_begin(problem):
-    """Constants found at the edge of what the time step bears are corrected upwards, too."""
+    """Constants at the stiffness limit of the time step can also be corrected upwards."""
     body, loss = problem
     density, spec = float(body.state(V0).density.min()), {"elasticity": FLOWS["elasticity"]}
     number = MODEL.courant(structured_law(spec, MODEL.dt).double(), density)

@@ -24,7 +24,7 @@ MEASURES = {
 MARKERS = "osDv^P"
 
 
-def data(inputs, params, say) -> dict:
+def data(inputs, params, log) -> dict:
     """``scenes`` in order, ``titles`` {variant: name} and for each of `MEASURES` {variant: {scene: value}}.
 
     ``seen``: scenes without other views than those of the training.
@@ -38,7 +38,7 @@ def data(inputs, params, say) -> dict:
     cells = params.titles, params.scenes
     measures = {name: read_results(files, *cells, value) for name, (files, value) in values.items()}
     seen = seen_in_training(read_results(inputs.image_metrics, *cells), params.scenes)
-    say(f"{len(params.titles)} variants on {len(params.scenes)} scenes")
+    log(f"{len(params.titles)} variants on {len(params.scenes)} scenes")
     return {"scenes": params.scenes, "titles": params.titles, "seen": seen, **measures}
 
 

@@ -28,7 +28,7 @@ APART = 0.002
 """Minimum difference of heights that counts [m]. Before contact, all motions are equal."""
 
 
-def data(inputs, params, say) -> ImageGrid:
+def data(inputs, params, log) -> ImageGrid:
     """Rows are times, scene by scene. Columns are the weights and the observation.
 
     Numbers: ``weights`` and ``scenes`` {scene: {rows, time [s], heights [m] of each weight, truth [m]}}.
@@ -43,22 +43,22 @@ def data(inputs, params, say) -> ImageGrid:
         law = load_law(inputs.prior[k] if inputs.prior else None, inputs.adaptor[k], model.dt).to(device)
         start = with_motion(body, inputs.start[k])
         truth, _ = read_arrays(inputs.truth[k], required=("x", "mass"), only=("x", "mass"))
-        shown = rendering.evenly(params.shown, len(video.frames))[1:]  # the start is the same for all
+        chosen = rendering.evenly(params.shown, len(video.frames))[1:]  # the start is the same for all
         columns, heights = [], []
         for weight in params.weights:
             law.set_adaptor_weight(weight)
             path, failure = predict(model, law, start, video.frames, total=params.total[scene])
-            columns.append(rendering.renders(body, cameras, path.x[shown], path.stretch[shown]))
+            columns.append(rendering.renders(body, cameras, path.x[chosen], path.stretch[chosen]))
             heights.append(mean_height(path.x.cpu(), body.mass.cpu()))
             if failure:
-                say(f"{scene}: w = {weight:g}: a particle {failure.happened} at step {failure.step}")
+                log(f"{scene}: w = {weight:g}: a particle {failure.happened} at step {failure.step}")
         monotone, parted = monotone_frames([heights[k] for k in inside])
-        say(f"{scene}: between 0 and 1, height monotone in w in {monotone} of {parted} frames after contact")
-        columns.append(rendering.observed(video, shown, params.magnify))
+        log(f"{scene}: between 0 and 1, height monotone in w in {monotone} of {parted} frames after contact")
+        columns.append(rendering.observed(video, chosen, params.magnify))
         blocks.append(np.stack(columns, axis=1))
-        rows += rendering.milliseconds([video.frames[i] for i in shown], model.dt)
+        rows += rendering.milliseconds([video.frames[i] for i in chosen], model.dt)
         scenes[scene] = {
-            "rows": len(shown),
+            "rows": len(chosen),
             "time": [model.dt * step for step in video.frames],
             "heights": heights,
             "truth": mean_height(truth["x"], truth["mass"]),
@@ -105,7 +105,7 @@ def draw(grid: ImageGrid) -> Figure:
         axes.grid(axis="y")
         if first == 0:
             spacing = {"columnspacing": 1.2, "handlelength": 1.6, "borderaxespad": 0.1}
-            shown = axes.get_legend_handles_labels()
-            figure.legend(*shown, loc="upper center", ncols=len(weights) + 1, **spacing)
+            chosen = axes.get_legend_handles_labels()
+            figure.legend(*chosen, loc="upper center", ncols=len(weights) + 1, **spacing)
         top, first = top + block, first + scene["rows"]
     return figure
