@@ -87,7 +87,7 @@ rule predict:
         particle_source=of_bodies(shared_particle_source),
         frames=None,
         cameras=scene_cameras,
-        scale=scene_scale,
+        scale=of_section(lambda scene: scene.captured.scale),
         exposure=exposure,
         device=SETTINGS.device,
         code=code_of("predict.py"),

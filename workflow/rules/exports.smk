@@ -35,7 +35,7 @@ rule export_particles:
     wildcard_constraints:
         scene=SCENE_OR_EXPERIMENT,
     params:
-        densities=body_densities,
+        densities=densities_of(SETTINGS.body_scenes),
         particle_source=of_bodies(shared_particle_source),
     script:
         "../scripts/export_particles.py"
