@@ -57,7 +57,7 @@ def test_same_seed_same_bytes_in_another_folder(finished, kernels, tmp_path):
     first, second = finished.artifacts(), again.artifacts()
     assert first == second
     assert {Path(name).name for name in first} >= {
-        *("particles.h5", "sampled_particles.h5", "transforms.json", "gaussians.ply", "mesh.ply"),
+        *("truth.h5", "particles.h5", "sampled_particles.h5", "transforms.json", "gaussians.ply", "mesh.ply"),
         *("binding.h5", "velocity.json", "jelly.safetensors", "adaptor.safetensors", "rollout.h5"),
         *("metrics.json", "video.mp4", "table1.csv"),
     }
