@@ -39,7 +39,7 @@ def identified_page(identified: Mapping[str, Any], truth: Mapping[str, Mapping[s
     losses.margins(0.15)
     losses.set_yticks(range(len(order)), order)
     dropped = [name for name in identified["families"] if name not in scored]
-    title = f"given up: {', '.join(dropped)}" if dropped else "all families"
+    title = f"pruned: {', '.join(dropped)}" if dropped else "all families"
     losses.set(xscale="log", xlabel="mean squared residual of held-out frames", title=title)
     losses.xaxis.set_minor_formatter(NullFormatter())
 
@@ -54,7 +54,9 @@ def identified_page(identified: Mapping[str, Any], truth: Mapping[str, Mapping[s
             constants.plot([true[name] / entry["value"]], [place], "x", color=style.SEQUENCE[0], zorder=3)
     names = [f"{name} = {entry['value']:.3g}" for name, entry in quantities.items()]
     constants.set_yticks(range(len(names)), names[::-1])
-    constants.set(xscale="log", xlabel="over what was found\n(cross: truth, grey: not determined)")
+    constants.set(
+        xscale="log", xlabel="relative to the identified value\n(cross: truth, grey: not determined)"
+    )
     low, high = constants.get_xlim()
     ticks = [tick for tick in _RATIOS if low < tick < high]
     constants.set_xticks(ticks, [f"{tick:g}" for tick in ticks], minor=False)

@@ -57,7 +57,7 @@ def own_bodies(scenes):
         for scene in scenes:
             case = case_on(scene, method)
             if files := case.method.body_inputs(case):
-                source = body_parameter(case) | {"files": files, "carrier": case.method.particle_source(case)}
+                source = body_parameter(case) | {"files": files, "particle_source": case.method.particle_source(case)}
                 sources.setdefault(method, {})[scene] = source
     return sources
 
@@ -317,7 +317,7 @@ FIGURES = {
         "kind": "h5",
         "input": {
             "kernels": kernels("rendering"),
-            "shown": of_captures(
+            "display": of_captures(
                 lambda scenes: [f"{DATA}/{scene}/shown/transforms.json" for scene in scenes]
             ),
             "rollouts": of_captures(lambda scenes: of_methods(scenes, DRAWN.realworld_methods, "rollout.h5")),

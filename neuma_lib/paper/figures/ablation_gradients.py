@@ -1,5 +1,5 @@
-"""Choices that the paper leaves open, on three scenes: image gradients through means and covariances (NeuMA) or through
-means only (as in the authors' released code); gradients zeroed before every iteration or accumulated (as in the
+"""Alternatives that the paper leaves open, on three scenes: image gradients through means and covariances (NeuMA) or
+through means only (as in the authors' released code); gradients zeroed before every iteration or accumulated (as in the
 released loop); covariances stretched by the elastic deformation (paper) or by the total one, plastic flow included. Not
 in the paper.
 """
@@ -24,7 +24,7 @@ MEASURES = {
 MARKERS = "osDv^P"
 
 
-def data(inputs, params, say) -> dict:
+def data(inputs, params, log) -> dict:
     """``scenes`` in order, ``titles`` {variant: name} and for each of `MEASURES` {variant: {scene: value}}.
 
     ``seen``: scenes without other views than those of the training.
@@ -38,7 +38,7 @@ def data(inputs, params, say) -> dict:
     cells = params.titles, params.scenes
     measures = {name: read_results(files, *cells, value) for name, (files, value) in values.items()}
     seen = seen_in_training(read_results(inputs.image_metrics, *cells), params.scenes)
-    say(f"{len(params.titles)} variants on {len(params.scenes)} scenes")
+    log(f"{len(params.titles)} variants on {len(params.scenes)} scenes")
     return {"scenes": params.scenes, "titles": params.titles, "seen": seen, **measures}
 
 

@@ -1,7 +1,7 @@
-"""Errors over time, all methods and scenes, measured on dense passive tracers. Above: root mean square distance of
-tracers that start alike in truth and prediction. Below: the paper's Chamfer distance between predicted and true body,
-which sees outlines only; grey: below the sampling floor, the distance of two samplings of the truth itself. Before
-contact the motion is the same for every material. Paper: fig:ch_dist_curve (Chamfer distances).
+"""Errors over time of all methods and scenes, measured with dense passive tracers. Above: root mean square distance of
+tracers with the same start in truth and prediction. Below: the paper's Chamfer distance between predicted and true
+body, which compares shapes only. Grey: below the sampling floor, the distance between two random samples of the true
+body. Before contact, the motion does not depend on the material. Paper: fig:ch_dist_curve (Chamfer distances).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from neuma_lib.paper.results import read_results
 COLUMNS = 3
 
 
-def data(inputs, params, say) -> dict:
+def data(inputs, params, log) -> dict:
     """``titles`` {method: name}, ``scenes`` {scene: numbers}.
 
     Numbers of a scene: time [s], floor [1e-4 m^2], and {method: values} as rmse [mm] and chamfer [1e-4 m^2].
@@ -33,7 +33,7 @@ def data(inputs, params, say) -> dict:
         }
         for scene, dt in params.scenes.items()
     }
-    say(f"{len(params.titles)} methods on {len(scenes)} scenes")
+    log(f"{len(params.titles)} methods on {len(scenes)} scenes")
     return {"titles": params.titles, "scenes": scenes}
 
 

@@ -1,6 +1,6 @@
 """Which law does training change? Norms of the loss gradient with respect to the adaptors of the elastic and of the
 plastic network over the iterations, their medians, and how far the merged weights moved from those of the prior. The
-titles say which laws of the prior really are wrong. Paper: fig:gradient_analysis.
+titles name the laws of the prior that are wrong. Paper: fig:gradient_analysis.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from neuma_lib.io.laws import load_law
 NETWORKS = {"elastic": (style.BLUE, "-"), "plastic": (style.VERMILION, (0, (4, 1.5)))}
 
 
-def data(inputs, params, say) -> dict:
+def data(inputs, params, log) -> dict:
     """For each scene ``norms`` {network: a value per iteration} and ``change`` {network: ||W - W0|| / ||W0||}.
 
     ``wrong`` names the laws of the prior that differ from the truth.
@@ -33,7 +33,7 @@ def data(inputs, params, say) -> dict:
         scenes[scene] = {"norms": norms, "change": change, "wrong": wrong}
         middle = ", ".join(f"{median(values):.2f} {name}" for name, values in norms.items())
         moved = " and ".join(f"{100 * c:.1f} %" for c in change.values())
-        say(f"{scene}: median gradient norm {middle}; weights moved {moved}")
+        log(f"{scene}: median gradient norm {middle}; weights moved {moved}")
     return scenes
 
 

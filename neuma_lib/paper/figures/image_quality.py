@@ -1,7 +1,7 @@
 """Quality of renders against the observation: PSNR, SSIM (higher is better) and LPIPS with the VGG and Alex networks
-(lower is better), averaged over all frames, on the bounding box of the object plus a margin, in views that training did
-not see; a scene without such a view says so, and so does a method that trains on all views. Grey column: mean over the
-scenes. NCLaw is the prior rendered by Particle-GS (the paper's NCLaw+R); PAC-NeRF on its own particles is rendered as
+(lower is better), averaged over all frames, on the bounding box of the object plus a margin, in views not used for
+training. Labels mark scenes without such a view, and methods that train on all views. Grey column: mean over the
+scenes. NCLaw is the prior rendered by Particle-GS (the paper's NCLaw+R). PAC-NeRF on its own particles is rendered as
 its radiance field. Paper: fig:image_quality.
 """
 
@@ -28,7 +28,7 @@ LEGEND_COLUMNS = 5
 """Maximum number of names in a row of the legend."""
 
 
-def data(inputs, params, say) -> dict:
+def data(inputs, params, log) -> dict:
     """``titles`` {method: name}, ``scenes`` in order, and a {method: {scene: value}} for each of `MEASURES`.
 
     ``seen``: scenes without other views than those of the training.
@@ -41,7 +41,7 @@ def data(inputs, params, say) -> dict:
     titles = {
         m: f"{title} (training views)" if m in everywhere else title for m, title in params.titles.items()
     }
-    say(f"{len(titles)} methods on {len(params.scenes)} scenes")
+    log(f"{len(titles)} methods on {len(params.scenes)} scenes")
     return {"titles": titles, "scenes": params.scenes, "seen": seen, **values}
 
 

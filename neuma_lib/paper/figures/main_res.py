@@ -1,5 +1,5 @@
-"""Renders over time: the observation as it was filmed, the prior (NCLaw), NeuMA and its ablations, at the same times
-and from the training view. Renders have a higher resolution than the video; those of PAC-NeRF on its own particles are
+"""Renders over time: the observation, the prior (NCLaw), NeuMA and its ablations, at the same times from the training
+view. Renders have a higher resolution than the video; those of PAC-NeRF on its own particles are
 of its radiance field. Paper: fig:main_res.
 """
 
@@ -16,24 +16,24 @@ from neuma_lib.paper.image_grid import GAP, ImageGrid, draw_images, note
 LEFT, TOP, BETWEEN = 0.92, 0.3, 0.06
 
 
-def data(inputs, params, say) -> ImageGrid:
+def data(inputs, params, log) -> ImageGrid:
     """A row for the observation and each method. Numbers: ``groups``, (scene, number of its columns) in order."""
     blocks, times, groups = [], [], []
     rollouts = iter(inputs.rollouts)
     for k, (scene, setting) in enumerate(params.scenes.items()):
         video, body, cameras = rendering.film(inputs, params, k, setting["density"])
-        shown = rendering.evenly(params.shown, len(video.frames))
-        rows = [rendering.observed(video, shown, params.magnify)]
+        picked = rendering.evenly(params.shown, len(video.frames))
+        rows = [rendering.observed(video, picked, params.magnify)]
         for method in params.titles:
-            states = (state[shown] for state in load_motion(next(rollouts)))
+            states = (state[picked] for state in load_motion(next(rollouts)))
             own = params.own.get(method, {}).get(scene)
             seen = own_body(own, setting["density"]) if own else body
             rows.append(rendering.renders(seen, cameras, *states))
         blocks.append(np.stack(rows))
-        times += rendering.milliseconds([video.frames[i] for i in shown], setting["dt"])
-        groups.append((scene, len(shown)))
+        times += rendering.milliseconds([video.frames[i] for i in picked], setting["dt"])
+        groups.append((scene, len(picked)))
     images = np.concatenate(rendering.cropped(blocks), axis=1)
-    say(f"{images.shape[0]} x {images.shape[1]} pictures")
+    log(f"{images.shape[0]} x {images.shape[1]} pictures")
     return ImageGrid(images, ("Observation", *params.titles.values()), tuple(times), {"groups": groups})
 
 
@@ -41,7 +41,7 @@ def own_body(source, density):
     """The body of particles that a method was fitted with."""
     method = method_of(source["module"])
     return method.load_reconstruction(
-        source["files"], source["options"][0], density, source["carrier"], "mean"
+        source["files"], source["options"][0], density, source["particle_source"], "mean"
     )
 
 

@@ -1,13 +1,12 @@
-"""Tests of single material points: what the laws themselves say, without grid or body. Top: axial Kirchhoff stress of
-the elastic law over the axial stretch, the sides free of traction. Middle: shear stress of the elastic law over simple
-shear, compressed to the 5th percentile of the observed volume ratios J. Bottom: the same shear at a constant rate of 20
-per second with elastic law and return map step by step, as in the simulation: where the curve bends, the material
-yields or flows. Blue ground: the range of elastic stretches, shears and shear stresses that the true law goes through
-on the reconstruction (99 % of them). Ranges are marginal: not every combination inside them was visited. Coloured
-bands: 95 % of the laws that the video leaves possible, by the constants' covariance and, around a correction, a process
-that is as free as the correction where the video is silent; of laws without such an account, the range of their chains,
-if there are several. The video determines motion, that is elastic law and return map together; where the two can trade
-places, each alone may differ from the truth. Laws far off are cut where they leave the panel. Not in the paper.
+"""Material point tests: responses of the laws without grid or body. Top: axial Kirchhoff stress of the elastic law over
+axial stretch, with traction-free sides. Middle: shear stress of the elastic law in simple shear, compressed to the 5th
+percentile of the observed volume ratios J. Bottom: the same shear at a constant rate of 20 per second, with elastic law
+and return map in every step; the curve bends where the material yields or flows. Blue: range of elastic stretches,
+shears and shear stresses of the true law on the reconstruction (99 % of them). Ranges are marginal, so not every
+combination inside them occurs. Coloured bands: 95 % of the laws that the video allows, from the covariance of the
+constants and, for corrections, a Gaussian process. Laws without a covariance have the range of their replicates. The
+video determines elastic law and return map together, so each alone may differ from the truth. Curves far from the truth
+are cut at the edge of the panel. Not in the paper.
 """
 
 from __future__ import annotations
@@ -33,27 +32,26 @@ HEADROOM = 0.6
 """Limit of the curves of compared laws beyond those of the truth, relative to the range of the truth."""
 
 
-def data(inputs, params, say) -> dict:
+def data(inputs, params, log) -> dict:
     """``titles`` of the laws, and ``scenes`` with the tests of `TESTS`.
 
     A test has ``x``, ``visited`` (low, high), ``by_stress``, ``true`` [Pa] and ``laws`` with ``stress`` [Pa] and
     ``band``: None, or ``x``, ``low``, ``high``, and ``inside``, the share of visited points with the truth in it.
     """
     files = iter(inputs.responses)
-    runs = [(*cell, [read_json(next(files)) for _ in range(chains)]) for *cell, chains in params.cells]
     scenes: dict = {}
-    for scene, method, chains in runs:
+    for scene, method, count in params.cells:
+        replicates = [read_json(next(files)) for _ in range(count)]
         for test in TESTS:
-            of_test = [chain[test] for chain in chains]
-            first = of_test[0]
-            shared = {key: first[key] for key in ("x", "visited", "by_stress", "true")}
+            runs = [replicate[test] for replicate in replicates]
+            shared = {key: runs[0][key] for key in ("x", "visited", "by_stress", "true")}
             entry = scenes.setdefault(scene, {}).setdefault(test, {**shared, "laws": {}})
-            entry["laws"][method] = {"stress": first["stress"], "band": _band(of_test)}
+            entry["laws"][method] = {"stress": runs[0]["stress"], "band": _band(runs)}
     content = {"titles": params.titles, "scenes": scenes}
     for method, parts in covered(content).items():
         whole = sum(part == 1 for values in parts.values() for part in values)
         total = sum(map(len, parts.values()))
-        say(f"{params.titles[method]}: the truth is inside {whole} of {total} bands everywhere")
+        log(f"{params.titles[method]}: the truth is inside {whole} of {total} bands everywhere")
     return content
 
 
@@ -68,17 +66,17 @@ def covered(data: Mapping) -> dict[str, dict[str, list[float]]]:
     return shares
 
 
-def _band(chains: Sequence[Mapping]) -> dict | None:
+def _band(runs: Sequence[Mapping]) -> dict | None:
     """The band of all replicates of a law in a test, or of their curves for laws without bands."""
-    if all("band" in chain for chain in chains):
-        x, ends = chains[0]["band"]["x"], [(chain["band"]["low"], chain["band"]["high"]) for chain in chains]
-    elif len(chains) > 1:
-        x, ends = chains[0]["x"], [(chain["stress"], chain["stress"]) for chain in chains]
+    if all("band" in run for run in runs):
+        x, ends = runs[0]["band"]["x"], [(run["band"]["low"], run["band"]["high"]) for run in runs]
+    elif len(runs) > 1:
+        x, ends = runs[0]["x"], [(run["stress"], run["stress"]) for run in runs]
     else:
         return None
     low, high = envelope(ends)
     band = {"x": x, "low": low.tolist(), "high": high.tolist()}
-    return {**band, "inside": inside({**chains[0], "band": band})}
+    return {**band, "inside": inside({**runs[0], "band": band})}
 
 
 @style.styled
@@ -107,16 +105,16 @@ def _curves(axes, test: str, values: Mapping, titles: Mapping[str, str]) -> None
     scale = 1e-3 if values["by_stress"] else 1.0
     span(scale * low, scale * high, color=VISITED, linewidth=0, label="visited in the video")
     axes.plot(x, true, color=style.GREY, linewidth=2.4, label="true law")
-    shown = [true]
+    curves = [true]
     for law, entry in values["laws"].items():
         line = style.look(law).line
         if entry["band"]:
             ends = [1e-3 * np.asarray(entry["band"][key]) for key in ("low", "high")]
             axes.fill_between(entry["band"]["x"], *ends, color=line["color"], alpha=0.18, linewidth=0)
-        shown.append(1e-3 * np.asarray(entry["stress"]))
-        axes.plot(x, shown[-1], **line, label=titles[law])
+        curves.append(1e-3 * np.asarray(entry["stress"]))
+        axes.plot(x, curves[-1], **line, label=titles[law])
     room = HEADROOM * (np.ptp(true) or 1.0)
-    ends = max(np.min(shown), true.min() - room), min(np.max(shown), true.max() + room)
+    ends = max(np.min(curves), true.min() - room), min(np.max(curves), true.max() + room)
     margin = 0.08 * (ends[1] - ends[0] or 1.0)
     axes.set(xlim=(x.min(), x.max()), ylim=(ends[0] - margin, ends[1] + margin))
     axes.axhline(0, color=style.GREY, linewidth=0.4, zorder=0.5)

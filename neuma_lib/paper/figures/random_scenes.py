@@ -16,7 +16,7 @@ from neuma_lib.paper.results import read_results
 MARKERS = "os^Dv*P"
 
 
-def data(inputs, params, say) -> dict:
+def data(inputs, params, log) -> dict:
     """``titles`` of prior and method, ``families`` {family: scenes}, scenes as {scene: [errors [mm], failed]}."""
     metrics = read_results(inputs.metrics, params.titles, params.scenes)
     families: dict[str, dict] = {}
@@ -24,7 +24,7 @@ def data(inputs, params, say) -> dict:
         runs = [row[scene] for row in metrics.values()]
         point = [[run["tracer_rmse_mm"] for run in runs], any(map(failure, runs))]
         families.setdefault(known["family"], {})[scene] = point
-    say(f"{len(params.scenes)} scenes of {len(families)} families")
+    log(f"{len(params.scenes)} scenes of {len(families)} families")
     return {"titles": list(params.titles.values()), "families": families}
 
 

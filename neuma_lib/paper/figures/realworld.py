@@ -1,5 +1,5 @@
-"""Filmed objects, cut from their videos, beside what Spring-Gaus and NeuMA predict from the first frame on, from the
-same camera. At the right: PSNR and LPIPS (VGG) of the object, means over all cameras and measured frames. Paper:
+"""Filmed objects, segmented in their videos, and predictions of Spring-Gaus and NeuMA from the first frame, in the same
+camera. Right: PSNR and LPIPS (VGG) of the object, means over all cameras and measured frames. Paper:
 fig:realworld.
 """
 
@@ -22,7 +22,7 @@ DENSITY = 1000.0
 """Density of all bodies [kg/m^3]. It does not affect the pictures."""
 
 
-def data(inputs, params, say) -> ImageGrid:
+def data(inputs, params, log) -> ImageGrid:
     """Blocks of rows are takes: the video, then each method. Columns are times.
 
     Numbers: ``scenes``; ``measures``, for each scene and method PSNR [dB] and LPIPS.
@@ -30,10 +30,10 @@ def data(inputs, params, say) -> ImageGrid:
     blocks, times, measures = [], [], []
     rollouts, files_of_measures = iter(inputs.rollouts), iter(inputs.measures)
     for k, setting in enumerate(params.scenes.values()):
-        (video,) = load_videos(inputs.shown[k], [params.view], **setting["exposure"])
+        (video,) = load_videos(inputs.display[k], [params.view], **setting["exposure"])
         files = (inputs.particles[k], inputs.binding[k], inputs.gaussians[k])
-        shown = rendering.evenly(params.frames, len(video.frames))
-        seen = video.select(shown)
+        picked = rendering.evenly(params.frames, len(video.frames))
+        seen = video.select(picked)
         rows = [rendering.as_bytes(seen.colours()[:, 0])]
         measures.append([])
         for method in params.titles:
@@ -50,7 +50,7 @@ def data(inputs, params, say) -> ImageGrid:
         times.append(rendering.milliseconds(seen.frames, setting["dt"]))
     images = _one_size(rendering.cropped([block[None] for block in blocks]))
     count = images.shape[1]
-    say(f"{len(blocks)} throws, {images.shape[0]} x {count} pictures")
+    log(f"{len(blocks)} takes, {images.shape[0]} x {count} pictures")
     titles = [title for _ in blocks for title in ("video", *params.titles.values())]
     numbers = {"scenes": list(params.scenes), "measures": measures, "times": [t[:count] for t in times]}
     return ImageGrid(images, tuple(titles), tuple(str(k) for k in range(count)), numbers)
