@@ -112,7 +112,6 @@ PENDING = {
     "neuma_lib/project/renames.py": "names of former versions",
     "studies/": "being rewritten",
     "workflow/": "being rewritten",
-    "neuma_lib/paper/": "being rewritten",
     "tests/workflow/": "being rewritten",
 }
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from neuma_lib.evaluation.plotting import style
-from neuma_lib.mechanics.combinations import named_combinations
+from neuma_lib.paper.identified_table import true_values
 
 _BARS = 2  # standard deviations that error bars show
 _RATIOS = (0.01, 0.1, 0.3, 0.5, 0.7, 1, 1.5, 2, 3, 10, 100)  # ticks
@@ -44,7 +44,7 @@ def identified_page(identified: Mapping[str, Any], truth: Mapping[str, Mapping[s
     losses.xaxis.set_minor_formatter(NullFormatter())
 
     quantities = identified["best"]["quantities"]
-    true = _true_values(truth) if truth else {}
+    true = true_values(truth or {})
     for place, (name, entry) in enumerate(reversed(quantities.items())):
         std = min(_BARS * entry["log_std"], _WIDEST * math.log(10))
         reach = [[1 - math.exp(-std)], [math.exp(std) - 1]]
@@ -65,9 +65,3 @@ def identified_page(identified: Mapping[str, Any], truth: Mapping[str, Mapping[s
     tied = f", tie with {', '.join(identified['ties'])}" if identified["ties"] else ""
     constants.set_title(identified["family"] + tied)
     return figure
-
-
-def _true_values(truth: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Constants of a true law and their combinations."""
-    values = {key: float(value) for part in truth.values() for key, value in part.items() if key != "name"}
-    return named_combinations(values) if {"E", "nu"} <= values.keys() else values
